@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from fluoro_calib_ros.checks.cluster_watch import Cluster
-from fluoro_calib_ros.checks.drift_observations import EpipolarObservations, PointObservations
+from fluoro_calib_ros.bodies.body import Body, declared_bodies
+from fluoro_calib_ros.checks.drift_observations import EpipolarObservations
 from fluoro_calib_ros.checks.drift_options import ERROR, OK, WARN, DriftOptions, DriftState
 from fluoro_calib_ros.checks.drift_watch import DriftWatch
 from fluoro_calib_ros.correction.base import CorrectionStatus
@@ -38,6 +38,7 @@ from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.reconstruction.epipolar import EpipolarGeometry
 from fluoro_calib_ros.reconstruction.intersection import Intersector
+from fluoro_calib_ros.reconstruction.reconstruct import IntersectedViews, MatchedViews
 from fluoro_calib_ros.simulation.exposures import simulate_exposures
 from fluoro_calib_ros.simulation.rig import virtual_rig
 
@@ -86,17 +87,17 @@ class Scene:
     pixels: dict[str, np.ndarray]
 
     @property
-    def clusters(self) -> tuple[Cluster, ...]:
-        """The Clusters, their distances unknown."""
+    def bodies(self) -> tuple[Body, ...]:
+        """The bodies, their shapes unknown."""
         ids = IDS.reshape(CLUSTERS, BEADS).tolist()
-        return tuple(Cluster(f'bone {i + 1}', tuple(own)) for i, own in enumerate(ids))
+        return declared_bodies(f'bone {i + 1}: {str(own)[1:-1]}' for i, own in enumerate(ids))
 
     def watch(self, options: DriftOptions | None = None, clusters: bool = True) -> DriftWatch:
         """A DriftWatch of the scene."""
         return DriftWatch(
             dict.fromkeys(self.names, (SIZE, SIZE)),
             options,
-            self.clusters if clusters else (),
+            self.bodies if clusters else (),
             self.orientation,
         )
 
@@ -228,22 +229,22 @@ def feed(scene_: Scene, watch: DriftWatch, block: Block, clusters: bool = True) 
     if clusters:
         uv = np.stack([corrected[a], corrected[b]])
         uv[:, ~good] = np.nan
-        points = scene_.intersector.intersect(
-            uv, np.repeat(np.array(noise)[:, None], uv.shape[1], axis=1)
-        )
-        where = np.stack([seen[a], seen[b]])
-        sd = np.stack([systematic[a], systematic[b]])
+        correction = np.stack([systematic[a], systematic[b]])
         for k, stamp in enumerate(stamps):
             rows = slice(k * len(IDS), (k + 1) * len(IDS))
-            bead_points = PointObservations(
-                IDS,
-                points.xyz_mm[rows],
-                points.covariance_noise[rows],
-                where[:, rows],
-                sd[:, rows],
-            )
-            state = watch.add_points(stamp, bead_points)
+            sd = correction[:, rows]
+            state = watch.add_points(stamp, intersected(scene_, uv[:, rows], sd, noise))
     return state
+
+
+def intersected(
+    scene_: Scene, uv: np.ndarray, correction_sd: np.ndarray, noise_px: Sequence[float]
+) -> IntersectedViews:
+    """Views of an exposure from corrected pixels (2, n, 2) of all markers."""
+    sigma = np.hypot(correction_sd, np.array(noise_px)[:, None])
+    outside = np.zeros(sigma.shape, dtype=bool)
+    views = MatchedViews(IDS, uv, sigma, correction_sd, outside)
+    return IntersectedViews(views, scene_.intersector.intersect(uv, sigma))
 
 
 @dataclass(frozen=True)

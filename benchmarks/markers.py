@@ -5,6 +5,7 @@
 
     python -m benchmarks.markers --frames 500           all settings, as the table of
                                                         docs/how_good.md
+    python -m benchmarks.markers --start 3              ids by shapes alone, in 3 rigs of each set
     python -m benchmarks.markers --speed                seconds of a core, and where they go
     python -m benchmarks.markers --picture PATH         an image with its overlay
 
@@ -22,6 +23,7 @@ import cProfile
 import pstats
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -31,9 +33,11 @@ from scipy.spatial.distance import cdist
 from threadpoolctl import threadpool_limits
 
 from fluoro_calib_ros.api import calibrate
-from fluoro_calib_ros.checks.cluster_watch import Cluster
+from fluoro_calib_ros.bodies.body import Body, declared_bodies
 from fluoro_calib_ros.correction.fluoroscope_calibration import FluoroscopeCalibration
+from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.images.marker_decisions import revise
+from fluoro_calib_ros.images.marker_ids import identify_markers
 from fluoro_calib_ros.images.marker_pair import MarkerPair
 from fluoro_calib_ros.images.markers import FirstMarkers, MarkerFrame, MarkerOptions, MarkerTracker
 from fluoro_calib_ros.images.overlay import draw_markers
@@ -59,6 +63,8 @@ BOUND_EVERY = 50
 BOUND_REACH = 7
 STEP_MM = 0.05
 SEED = 100
+START_EVERY = 20  # exposures in which bodies are looked for
+SHAPE_SD_MM = 0.05
 GIVEN_SD_PX = 0.5  # of the given places of the first frame
 
 SETS = ('plain', 'usual', 'fast', 'hard')
@@ -206,10 +212,10 @@ def follow(kind: str, number: int, frames: int) -> tuple[Record, Record]:
     markers = MovingMarkers(scene, SEED + 10 * number + SETS.index(kind))
     sequence = MarkerSequence(rig, markers, settings, frames, SEED + number)
     ids = markers.target_id
-    clusters = [
-        Cluster(f'bone {cluster}', tuple(ids[markers.cluster == cluster].tolist()))
+    bodies = declared_bodies(
+        f'bone {cluster}: {" ".join(map(str, ids[markers.cluster == cluster]))}'
         for cluster in range(scene.clusters)
-    ]
+    )
     options = MarkerOptions(shutter=scene.shutter)
     live = Record()
     final = Record()
@@ -221,7 +227,7 @@ def follow(kind: str, number: int, frames: int) -> tuple[Record, Record]:
             if follower is None:
                 first = {name: first_markers(rng, ids, image) for name, image in images.items()}
                 follower = MarkerPair(
-                    calibrations, orientation, options, first=first, clusters=clusters
+                    calibrations, orientation, options, first=first, bodies=bodies
                 )
             found = follower.update({n: image.image for n, image in images.items()}, exposure)
             for name, image in images.items():
@@ -244,6 +250,52 @@ def follow(kind: str, number: int, frames: int) -> tuple[Record, Record]:
             live.bound.append(found_bounds[good])
             final.bound.append(found_bounds[good])
     return live, final
+
+
+def measure_start(kind: str, rigs: int) -> None:
+    """Print how many bodies are found by their shapes in single exposures, and wrong ids."""
+    found = ids = wrong = bodies = 0
+    seconds = []
+    for number in range(rigs):
+        rng = np.random.default_rng([SEED, number, SETS.index(kind)])
+        scene, settings = settings_of(rng, kind)
+        seed = 900 + 10 * number + SETS.index(kind)
+        rig, calibrations, orientation = calibrated(FIRST_RIG + seed)
+        markers = MovingMarkers(scene, SEED + seed)
+        known = []
+        for cluster in range(scene.clusters):
+            own = markers.cluster == cluster
+            sd = np.full(np.count_nonzero(own), SHAPE_SD_MM)
+            known.append(Body(f'{cluster}', markers.target_id[own], markers.local_mm[own], sd))
+        views = {
+            f.name: MarkerRadiography(f, markers, settings, FRAMES_OF_A_SEQUENCE, SEED + number)
+            for f in rig.fluoroscopes
+        }
+        for exposure in range(1, FRAMES_OF_A_SEQUENCE + 1, START_EVERY):
+            images = {name: view.take(exposure) for name, view in views.items()}
+            began = time.process_time()
+            with threadpool_limits(1), suppress(DataError):
+                first = identify_markers(
+                    {name: image.image for name, image in images.items()},
+                    calibrations,
+                    orientation,
+                    known,
+                )
+                for name, of_view in first.items():
+                    row = np.searchsorted(markers.target_id, of_view.target_id)
+                    away = np.linalg.norm(of_view.uv - images[name].uv[row], axis=1)
+                    wrong += int(np.count_nonzero(away > 2 * FALSE_PX))
+                    ids += len(away)
+                seen = np.concatenate([of_view.target_id for of_view in first.values()])
+                found += sum(bool(np.isin(body.target_id, seen).any()) for body in known)
+            seconds.append(time.process_time() - began)
+            bodies += len(known)
+    print(
+        f'{kind}: {found} of {bodies} bodies found in {len(seconds)} exposures of {rigs} rigs, '
+        f'{wrong} of {ids} ids wrong, {np.median(seconds):.2f} s of a core an exposure, at most '
+        f'{max(seconds):.2f} s',
+        flush=True,
+    )
 
 
 def joined(records: list[Record]) -> Record:
@@ -312,6 +364,7 @@ def main() -> None:
     )
     parser.add_argument('--frames', type=int, default=0, metavar='N', help='exposures of a set')
     parser.add_argument('--sets', nargs='+', default=SETS, choices=SETS)
+    parser.add_argument('--start', type=int, default=0, metavar='N', help='rigs of a set')
     parser.add_argument('--speed', action='store_true')
     parser.add_argument('--picture', type=Path)
     arguments = parser.parse_args()
@@ -325,6 +378,8 @@ def main() -> None:
                 print('   ', records[-1][1].line(f'{kind} {number}'), flush=True)
             print(joined([live for live, _ in records]).line(f'{kind}, live'), flush=True)
             print(joined([final for _, final in records]).line(f'{kind}, revised'), flush=True)
+    for kind in arguments.sets if arguments.start else ():
+        measure_start(kind, arguments.start)
     if arguments.speed:
         measure_speed()
     if arguments.picture:

@@ -103,7 +103,7 @@ def weak_intersection():
 
 
 def other_view_missing():
-    follower = Fake(_begun=False, _trackers={'a': None, 'b': None})
+    follower = Fake(_begun=False, _settings=Fake(names=('a', 'b')))
     image = np.zeros((4, 4), np.uint8)
     return MarkerFollower._results(follower, {'a': image}, 1, (), None)['a'].finding
 

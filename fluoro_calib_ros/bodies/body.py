@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
 from functools import cached_property
@@ -84,6 +84,15 @@ class Body:
         """Whether the place of a marker (m,) is known."""
         return np.asarray(np.isfinite(self.xyz_mm).all(axis=1))
 
+    def rows(self, chosen: NDArray[np.bool_]) -> Body:
+        """The body with some of its markers (m,) only."""
+        return replace(
+            self,
+            target_id=self.target_id[chosen],
+            xyz_mm=self.xyz_mm[chosen],
+            sd_mm=self.sd_mm[chosen],
+        )
+
     @cached_property
     def centre(self) -> NDArray[np.float64]:
         """Mean (3,) of the known markers [mm]."""
@@ -109,6 +118,32 @@ def check_bodies(bodies: Sequence[Body]) -> None:
             owners[marker] = body.name
 
 
+def declared_bodies(texts: Iterable[str]) -> tuple[Body, ...]:
+    """Bodies of unknown shapes from texts such as 'tibia: 1001 1002 1003'.
+
+    Raises DataError for a text of another form, fewer than two markers, and as check_bodies.
+    """
+    bodies = tuple(_declared_body(text) for text in texts)
+    if bodies:
+        check_bodies(bodies)
+    return bodies
+
+
+def _declared_body(text: str) -> Body:
+    name, colon, ids = text.partition(':')
+    try:
+        target_id = [int(i) for i in ids.replace(',', ' ').split()]
+    except ValueError:
+        target_id = []
+    if not colon or not name.strip() or not target_id:
+        raise DataError(f"{text!r} does not declare a body, as 'tibia: 1001 1002 1003' does")
+    if len(target_id) < 2:
+        raise DataError(f'body {name.strip()}: needs two markers or more, not {target_id}')
+    count = len(target_id)
+    unknown = np.full((count, 3), np.nan)
+    return Body(name.strip(), np.array(target_id), unknown, np.full(count, np.inf))
+
+
 def solvable_bodies(bodies: Sequence[Body]) -> tuple[Body, ...]:
     """Return bodies without the markers whose place is unknown.
 
@@ -129,14 +164,7 @@ def solvable_bodies(bodies: Sequence[Body]) -> tuple[Body, ...]:
                 f'body {body.name}: marker {loose[0]} has no standard deviation; it is estimated '
                 'from a recording, or given'
             )
-        out.append(
-            replace(
-                body,
-                target_id=body.target_id[known],
-                xyz_mm=body.xyz_mm[known],
-                sd_mm=body.sd_mm[known],
-            )
-        )
+        out.append(body.rows(known))
     return tuple(out)
 
 

@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
-from ..photogrammetry.rotations import cross_matrix
 from ..reconstruction.intersection import OK, OUTSIDE
 from ..reconstruction.reconstruct import IntersectedViews
-from .body import POSE_SIZE
+from .rigid import by_pose
 
 
 @dataclass(frozen=True)
@@ -95,7 +94,7 @@ class Cameras:
     def places(self, exposure: IntersectedViews) -> NDArray[np.float64]:
         """Places (B, M, 3) of the markers of the exposure that was sorted last [mm], or NaN."""
         points = exposure.points
-        good = np.isin(points.status, (OK, OUTSIDE))
+        good = (points.status == OK) | (points.status == OUTSIDE)
         xyz = np.concatenate([np.where(good[:, None], points.xyz_mm, np.nan), [[np.nan] * 3]])
         return xyz[self._rows].reshape(*self.target_id.shape, 3)
 
@@ -117,10 +116,7 @@ class Cameras:
         good = points.seen & np.isfinite(depth)
         residual = np.where(good[..., None], points.uv - uv, 0.0)
         by_place = np.where(good[..., None, None], by_place, 0.0)
-        by_pose = np.zeros((*shape[:2], 3, POSE_SIZE))
-        by_pose[..., :3] = np.eye(3)
-        by_pose[..., 3:] = -cross_matrix(arm)
-        return Linear(residual, by_place, uv, by_pose)
+        return Linear(residual, by_place, uv, by_pose(arm))
 
     def by_orientation(self, linear: Linear) -> np.ndarray:
         """Derivatives (B, M, F, 2, 9) of image points by T, w, xp, yp, c, see collinearity."""

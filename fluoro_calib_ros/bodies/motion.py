@@ -165,7 +165,9 @@ class MotionFilter:
         self._log_variance = np.full((count, 2), START_LOG_SD**2)
         # Derivatives of the covariance by the two log densities.
         self._slope = np.zeros((count, 2, STATE, STATE))
+        # Of the prediction, which may be repeated before it is updated.
         self._predicted: _Step | None = None
+        self._pending = self._slope, self._log_variance
 
     def predict(self, dt_s: float, log_q: NDArray[np.float64] | None = None) -> None:
         """Predict the next exposure, dt_s later; log_q (B, 2) are given densities."""
@@ -179,9 +181,11 @@ class MotionFilter:
         mean[:, 3:6] = 0
         back = np.swapaxes(into, 1, 2)
         covariance = into @ self.covariance @ back + noise[:, 0] + noise[:, 1]
+        self._pending = self._slope, self._log_variance
         if log_q is None:
-            self._slope = into[:, None] @ self._slope @ back[:, None] + noise
-            self._log_variance = np.minimum(self._log_variance + WALK * dt_s, START_LOG_SD**2)
+            slope = into[:, None] @ self._slope @ back[:, None] + noise
+            variance = np.minimum(self._log_variance + WALK * dt_s, START_LOG_SD**2)
+            self._pending = slope, variance
         self._predicted = _Step(
             dt_s,
             into,
@@ -208,6 +212,7 @@ class MotionFilter:
         """
         step = self._predicted
         assert step is not None
+        self._slope, self._log_variance = self._pending
         if start.any():
             self._start(step, seen, start)
         normal = np.where(self.alive[:, None, None], seen.normal, 0)

@@ -182,7 +182,7 @@ class PoseSolver:
     def solve(self, exposure: IntersectedViews, prediction: Prediction) -> FramePoses:
         """Solve for the poses of one exposure; the views are those of the orientation."""
         points = self.cameras.sorted(exposure)
-        rotation, centre, started = self._start(exposure, prediction)
+        rotation, centre, started = self._start(exposure, points, prediction)
         used = points.seen.any(axis=2) & started[:, None]
         prior = np.where(
             prediction.known[:, None, None],
@@ -240,20 +240,21 @@ class PoseSolver:
         return bool(squares > self._limit[3])
 
     def _start(
-        self, exposure: IntersectedViews, prediction: Prediction
+        self, exposure: IntersectedViews, points: ImagePoints, prediction: Prediction
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """First rotations and centres, and whether (B,) there are any."""
         rotation = np.where(prediction.known[:, None, None], prediction.rotation, np.eye(3))
         centre = np.where(prediction.known[:, None], prediction.centre_mm, 0.0)
         started = prediction.known.copy()
-        missing = np.flatnonzero(~started)
+        xyz = self.cameras.places(exposure)
+        seen = np.isfinite(xyz).all(axis=2) & (points.seen.sum(axis=2) > 1)
+        missing = np.flatnonzero(~started & (np.count_nonzero(seen, axis=1) >= 3))
         if len(missing):
-            xyz = self.cameras.places(exposure)
-            for row in missing:
-                seen = np.isfinite(xyz[row]).all(axis=1)
-                if np.count_nonzero(seen) >= 3:
-                    rotation[row], centre[row] = fitted_pose(self.xyz[row, seen], xyz[row, seen])
-                    started[row] = True
+            place = np.where(seen[..., None], xyz, 0.0)[missing]
+            rotation[missing], centre[missing] = fitted_pose(
+                self.xyz[missing], place, seen[missing].astype(float)
+            )
+            started[missing] = True
         return rotation, centre, started
 
     def _converge(
@@ -305,7 +306,7 @@ class PoseSolver:
 
     def _marker(self, linear: Linear, weight: np.ndarray) -> _Marker:
         """Sum up the image points of each marker with weights (B, M, F)."""
-        s_matrix, s_vector = _sums(linear, weight)
+        s_matrix, s_vector = marker_sums(linear, weight)
         squares = np.sum(np.sum(linear.residual**2, axis=-1) * weight, axis=-1)
         m = np.linalg.inv(_EYE_3 + self._variance_3 * s_matrix)
         return _Marker(
@@ -407,7 +408,7 @@ class PoseSolver:
         )
         # A filter takes shape and correction as they are: their errors stay.
         linear = solution.linear
-        s_matrix, s_vector = _sums(linear, _weight(points, used, points.noise))
+        s_matrix, s_vector = marker_sums(linear, _weight(points, used, points.noise))
         transposed = np.swapaxes(linear.by_pose, 2, 3)
         information = (transposed @ s_matrix @ linear.by_pose).sum(axis=1)
         right = (transposed @ s_vector[..., None])[..., 0].sum(axis=1)
@@ -470,7 +471,7 @@ def _weight(points: ImagePoints, used: np.ndarray, variance: np.ndarray) -> np.n
     return np.where(used[..., None] & points.seen, 1 / variance, 0.0)
 
 
-def _sums(linear: Linear, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def marker_sums(linear: Linear, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """S (B, M, 3, 3) and s (B, M, 3) of markers."""
     rows = weight.shape[:2]
     weighted = (linear.by_place * weight[..., None, None]).reshape(*rows, -1, 3)

@@ -1,26 +1,38 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The rigid motion that takes points to others."""
+"""Rigid motions of points."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..photogrammetry.rotations import cross_matrix
+
 
 def fitted_pose(
     source: np.ndarray, target: np.ndarray, weight: np.ndarray | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Rotation (3, 3) and shift (3,) that take points (k, 3) to others, by least squares.
+    """Rotations (..., 3, 3) and shifts (..., 3) that take points (..., k, 3) to others.
 
-    weight (k,): of the points, by default the same for all. Kabsch, "A solution for the best
-    rotation to relate two sets of vectors", Acta Cryst. A32, 1976.
+    By least squares; weight (..., k): of the points, by default the same for all. Kabsch, "A
+    solution for the best rotation to relate two sets of vectors", Acta Cryst. A32, 1976.
     """
-    share = np.full(len(source), 1 / len(source)) if weight is None else weight / weight.sum()
-    a = share @ source
-    b = share @ target
-    u, _, vt = np.linalg.svd((source - a).T @ (share[:, None] * (target - b)))
-    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))])
-    rotation = vt.T @ sign @ u.T
-    return rotation, b - rotation @ a
+    weight = np.ones(source.shape[:-1]) if weight is None else weight
+    share = (weight / weight.sum(axis=-1, keepdims=True))[..., None]
+    a = np.sum(share * source, axis=-2, keepdims=True)
+    b = np.sum(share * target, axis=-2, keepdims=True)
+    u, _, vt = np.linalg.svd(np.swapaxes(source - a, -1, -2) @ (share * (target - b)))
+    back = np.swapaxes(vt, -1, -2).copy()
+    back[..., 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
+    rotation = back @ np.swapaxes(u, -1, -2)
+    return rotation, (b - a @ np.swapaxes(rotation, -1, -2))[..., 0, :]
+
+
+def by_pose(arm: np.ndarray) -> NDArray[np.float64]:
+    """Derivatives (..., 3, 6) of places by position and rotation; arm (..., 3): R x."""
+    out = np.zeros((*arm.shape, 6))
+    out[..., :3] = np.eye(3)
+    out[..., 3:] = -cross_matrix(arm)
+    return out

@@ -30,7 +30,7 @@ from scipy.special import chdtri
 from ..findings import Finding, Kind, Place, Severity
 from ..photogrammetry.rotations import cross_matrix
 from .body import POSE_SIZE, Body
-from .rigid import fitted_pose
+from .rigid import by_pose, fitted_pose
 
 ROUNDS = 4  # the problem is nearly linear once poses are known
 # ISO 16087:2013 and Valstar et al., "Guidelines for standardization of radiostereometry", Acta
@@ -42,6 +42,7 @@ REJECT_TAIL = 6.3e-5  # probability of four standard deviations, as everywhere
 # Of the coordinates of a body in another unit, or mirrored, the images tell at once: by the fit of
 # its shape to points in space.
 SCALE_TOLERANCE = 0.05
+REGULAR = 1e-10  # of the largest element of a normal matrix, added to its diagonal
 _MOVED = (Kind.MARKER_MIGRATED, Kind.MARKERS_EXCHANGED)
 UNITS = {10.0: 'cm', 1000.0: 'm', 25.4: 'inches'}
 
@@ -152,6 +153,23 @@ def estimate_shape(body: Body, places: BodyPlaces) -> EstimatedShape:
     )
 
 
+def learned_shape(
+    body: Body, xyz_mm: NDArray[np.float64], covariance: NDArray[np.float64]
+) -> Body:
+    """Return a body with the shape that places alone tell, in its present frame.
+
+    xyz_mm (T, m, 3) and covariance (T, m, 3, 3): as of BodyPlaces. Errors that stay are left out:
+    they are those of what is compared with the shape, too.
+    """
+    blank = replace(body, xyz_mm=np.full_like(body.xyz_mm, np.nan))
+    found = estimate_shape(blank, BodyPlaces(xyz_mm, covariance, np.zeros_like(covariance))).body
+    both = found.known & body.known
+    if np.count_nonzero(both) < 2:
+        return found
+    rotation, shift = fitted_pose(found.xyz_mm[both], body.xyz_mm[both])
+    return replace(found, xyz_mm=found.xyz_mm @ rotation.T + shift)
+
+
 @dataclass(frozen=True)
 class _Adjustment:
     """Coordinates (m, 3), covariance (3k, 3k) of the k known ones, and how markers fit.
@@ -173,8 +191,9 @@ def _start(body: Body, places: BodyPlaces) -> tuple[np.ndarray, np.ndarray] | No
     where its frame is.
     """
     seen = places.seen
+    least = min(3, len(body.target_id))  # two markers are all of a body that has no more
     richest = int(np.argmax(seen.sum(axis=1))) if len(seen) else 0
-    if not len(seen) or np.count_nonzero(seen[richest]) < 3:
+    if not len(seen) or np.count_nonzero(seen[richest]) < least:
         return None
     xyz = np.where(seen[richest][:, None], places.xyz_mm[richest], np.nan)
     for marker in np.flatnonzero(~seen[richest]):
@@ -191,7 +210,7 @@ def _start(body: Body, places: BodyPlaces) -> tuple[np.ndarray, np.ndarray] | No
         xyz = xyz @ rotation.T + shift
     else:
         xyz = xyz - xyz[found].mean(axis=0)
-    return xyz, np.flatnonzero(np.count_nonzero(seen & found, axis=1) >= 3)
+    return xyz, np.flatnonzero(np.count_nonzero(seen & found, axis=1) >= least)
 
 
 @dataclass(frozen=True)
@@ -225,9 +244,7 @@ def _adjust(body: Body, places: BodyPlaces, start: tuple[np.ndarray, np.ndarray]
     known = np.flatnonzero(np.isfinite(xyz).all(axis=1))
     problem = _problem(body, places, xyz, (rows, known))
     shape = xyz[known].copy()
-    poses = [fitted_pose(shape[s], p[s]) for s, p in zip(problem.seen, problem.place)]
-    rotation = np.array([one[0] for one in poses])
-    shift = np.array([one[1] for one in poses])
+    rotation, shift = fitted_pose(shape, problem.place, problem.seen.astype(float))
     for _ in range(ROUNDS):
         reduced = _reduced(problem, shape, rotation, shift)
         covariance = np.linalg.inv(reduced.matrix)
@@ -287,14 +304,14 @@ def _reduced(
     """Eliminate the poses from the normal equations."""
     exposures, count = problem.seen.shape
     residual = _residual(problem, shape, rotation, shift)
-    by_pose = np.zeros((exposures, count, 3, POSE_SIZE))
-    by_pose[..., :3] = np.eye(3)
-    by_pose[..., 3:] = -cross_matrix(shape @ np.swapaxes(rotation, 1, 2))
-    transposed = np.swapaxes(by_pose, 2, 3)
+    d = by_pose(shape @ np.swapaxes(rotation, 1, 2))
+    transposed = np.swapaxes(d, 2, 3)
     back = np.swapaxes(rotation, 1, 2)[:, None]
     turned = problem.information @ rotation[:, None]  # S R
     told = problem.information @ residual[..., None]  # s
-    normal = (transposed @ problem.information @ by_pose).sum(axis=1)
+    normal = (transposed @ problem.information @ d).sum(axis=1)
+    # Markers on a line do not tell the rotation about it, which changes nothing else.
+    normal += REGULAR * normal.max(axis=(1, 2), keepdims=True) * np.eye(POSE_SIZE)
     cross = (transposed @ turned).transpose(0, 2, 1, 3).reshape(exposures, POSE_SIZE, 3 * count)
     right = (transposed @ told).sum(axis=1)
     solved = np.linalg.solve(normal, np.concatenate([cross, right], axis=2))
@@ -314,7 +331,7 @@ def _reduced(
         matrix,
         by_shape.ravel() - flat.T @ solved[:, :, -1].ravel(),
         solved=solved,
-        by_pose=by_pose,
+        by_pose=d,
         normal=normal,
     )
 
@@ -348,9 +365,9 @@ def _stays(
     fixed = np.where(seen[..., None, None], places.fixed[np.ix_(*chosen)], 0.0)
     mean = fixed.sum(axis=0) / np.maximum(seen.sum(axis=0), 1)[:, None, None]
     direct = (np.swapaxes(rotation, 1, 2)[:, None] @ problem.information).sum(axis=0)
-    by_pose = np.swapaxes(reduced.by_pose, 2, 3) @ problem.information  # (T, k, 6, 3), D'S
-    by_pose = by_pose.transpose(0, 2, 1, 3).reshape(exposures * POSE_SIZE, 3 * count)
-    pulled = -reduced.solved[:, :, :-1].reshape(-1, 3 * count).T @ by_pose
+    told = np.swapaxes(reduced.by_pose, 2, 3) @ problem.information  # (T, k, 6, 3), D'S
+    told = told.transpose(0, 2, 1, 3).reshape(exposures * POSE_SIZE, 3 * count)
+    pulled = -reduced.solved[:, :, :-1].reshape(-1, 3 * count).T @ told
     root = np.zeros((3 * count, 3 * count))
     for k in range(count):
         rows = slice(3 * k, 3 * k + 3)
@@ -375,9 +392,7 @@ def _datum(xyz: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 def _motion(xyz: np.ndarray) -> np.ndarray:
     """Derivatives (3k, 6) of coordinates (k, 3) by a motion of all of them about their centre."""
-    arm = xyz - xyz.mean(axis=0)
-    turn = -cross_matrix(arm).reshape(-1, 3)
-    return np.concatenate([np.tile(np.eye(3), (len(xyz), 1)), turn], axis=1)
+    return by_pose(xyz - xyz.mean(axis=0)).reshape(-1, POSE_SIZE)
 
 
 # What is wrong with a body.
@@ -542,9 +557,7 @@ def _against_others(
     weight = 1 / sd[others] ** 2
     rotation, shift = fitted_pose(found[others], given[others], weight)
     arm = np.concatenate([given[others], given[[marker]]]) - given[others].mean(axis=0)
-    motion = np.zeros((len(arm), 3, POSE_SIZE))
-    motion[..., :3] = np.eye(3)
-    motion[..., 3:] = -cross_matrix(arm)
+    motion = by_pose(arm)
     normal = (np.swapaxes(motion[:-1], 1, 2) @ (motion[:-1] * weight[:, None, None])).sum(axis=0)
     away = rotation @ found[marker] + shift - given[marker]
     covariance = sd[marker] ** 2 * np.eye(3) + motion[-1] @ np.linalg.solve(normal, motion[-1].T)

@@ -100,6 +100,7 @@ class BodyTracker:
         lag: int | None = 0,
     ) -> None:
         self.solver = PoseSolver(orientation, bodies, reject)
+        self._reject = reject
         self.lag = lag
         count = len(bodies)
         self.filter = MotionFilter(count, lag)
@@ -123,20 +124,32 @@ class BodyTracker:
         """
         if self._stamp_ns is not None and stamp_ns <= self._stamp_ns:
             return None
-        dt_s = 0.0 if self._stamp_ns is None else (stamp_ns - self._stamp_ns) / NS_PER_S
+        expected = self.predict(stamp_ns)
         self._stamp_ns = stamp_ns
-        self.filter.predict(dt_s)
-        rotation, centre, covariance = self.filter.prediction
-        variance = np.diagonal(covariance, axis1=1, axis2=2)[:, 3:].max(axis=1)
-        expected = self.filter.alive & (variance < LOST_SD_RAD**2)
-        frame = self.solver.solve(exposure, Prediction(rotation, centre, covariance, expected))
+        frame = self.solver.solve(exposure, expected)
         # A body that has just appeared is not expected anywhere yet: its speed is unknown.
-        self.filter.lose(~expected & ~frame.alone)
+        self.filter.lose(~expected.known & ~frame.alone)
         self.filter.update(frame.information, frame.alone & ~self.filter.alive)
         self._keep(number, stamp_ns, frame)
         if self.lag is None or len(self._taken) <= self.lag:
             return None
         return self._report(self._taken.pop(0), self.filter.smoothed(), 0)
+
+    def predict(self, stamp_ns: int) -> Prediction:
+        """Return the poses that are expected at a time after the last exposure."""
+        dt_s = 0.0 if self._stamp_ns is None else (stamp_ns - self._stamp_ns) / NS_PER_S
+        self.filter.predict(dt_s)
+        rotation, centre, covariance = self.filter.prediction
+        variance = np.diagonal(covariance, axis1=1, axis2=2)[:, 3:].max(axis=1)
+        known = self.filter.alive & (variance < LOST_SD_RAD**2)
+        return Prediction(rotation, centre, covariance, known)
+
+    def reshape(self, bodies: Sequence[Body]) -> None:
+        """Take better shapes of the bodies, in the same frames."""
+        before = self.solver.centre
+        self.solver = PoseSolver(self.solver.orientation, bodies, self._reject)
+        moved = self.filter.rotation @ (self.solver.centre - before)[:, :, None]
+        self.filter.mean[:, :3] += moved[:, :, 0]
 
     def flush(self) -> list[TrackedExposure]:
         """Return the exposures that are not reported yet, at the end of a stream."""

@@ -3,7 +3,7 @@
 
 """Evidence of a drift, and where it is: control charts together with the newest blocks.
 
-Epipolar residuals and distances in clusters each have charts of their own. Both find the area and
+Epipolar residuals and rigid bodies each have charts of their own. Both find the area and
 the size of a drift in the same way, and differ in how they tell which fluoroscope it belongs to.
 """
 
@@ -19,17 +19,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .body_watch import COMPONENTS
 from .charts import MIN_INFORMATION, CusumCharts
-from .cluster_watch import COMPONENTS, ClusterBlock
 
 WINDOW_S = 30.0  # newest blocks from which place and size of a drift are estimated
 # Log-likelihood of another fluoroscope, over that of the likeliest one, from which both are named.
 SIMILAR = 0.8
-MIN_CONFIRMATION = 3.0  # standard deviations by which the other clusters must show a drift too
-# Fraction of the systematic standard deviation that distances in an area have in common. Measured:
-# a fifth to two fifths, since their reference is what they were at the start, and beads some
-# centimetres apart have errors of their own.
-COMMON_SYSTEMATIC = 0.5
+MIN_CONFIRMATION = 3.0  # standard deviations by which the other bodies must show a drift too
 REFERENCES = ('calibration', 'start')  # of the charts of epipolar residuals
 EPIPOLAR = 'epipolar'  # source of a drift that residuals show
 SERIES_OF_PAIR = 4  # images a and b against the calibration, then against the start
@@ -39,7 +35,7 @@ SERIES_OF_PAIR = 4  # images a and b against the calibration, then against the s
 class BlockRecord:
     """One block: time of its begin and statistics (K, A) of the series.
 
-    detail: normals (pairs, 2, A, 2) of the epipolar lines, or a ClusterBlock.
+    detail: normals (pairs, 2, A, 2) of the epipolar lines, or a BodyBlock.
     """
 
     begin_ns: int
@@ -68,7 +64,7 @@ class DriftEstimate:
     source : str
         'epipolar' or 'cluster NAME'.
     confirmed : bool
-        False where a single cluster shows it, in which a bead may have moved.
+        False where a single body shows it, in which a marker may have moved.
     begin_ns : int
         Estimated begin.
     """
@@ -237,10 +233,10 @@ class EpipolarEvidence(Evidence):
         return REFERENCES[series % SERIES_OF_PAIR // 2]
 
 
-class ClusterEvidence(Evidence):
-    """Evidence from distances in clusters: the series are drifts along u and v of each view.
+class BodyEvidence(Evidence):
+    """Evidence from rigid bodies: the series are drifts along u and v of each view.
 
-    clusters: their names, in the order of the ClusterBlocks.
+    bodies: their names, in the order of the BodyBlocks.
     """
 
     def __init__(
@@ -248,10 +244,10 @@ class ClusterEvidence(Evidence):
         charts: CusumCharts,
         fluoroscopes: Sequence[str],
         window: int,
-        clusters: Sequence[str],
+        bodies: Sequence[str],
     ) -> None:
         super().__init__(charts, fluoroscopes, window)
-        self._clusters = tuple(clusters)
+        self._bodies = tuple(bodies)
 
     def _preferred(self, likelihood: np.ndarray) -> np.ndarray:
         return likelihood
@@ -278,18 +274,8 @@ class ClusterEvidence(Evidence):
         others = np.arange(len(score)) != strongest
         noise = np.sqrt(max(information[others].sum() * factor, MIN_INFORMATION))
         confirmed = bool(sign * score[others].sum() / noise > MIN_CONFIRMATION)
-        source = f'cluster {self._clusters[strongest]}'
+        source = f'cluster {self._bodies[strongest]}'
         return np.eye(COMPONENTS)[series % COMPONENTS], source, confirmed
 
     def _reference(self, series: int) -> str:
         return 'start'
-
-
-def common_systematic(block: ClusterBlock) -> NDArray[np.float64]:
-    """Systematic standard deviations (2F, A) [px] of what all clusters show together.
-
-    It is the weighted mean, times the fraction that they have in common.
-    """
-    with np.errstate(divide='ignore', invalid='ignore'):
-        weighted = np.nansum(block.systematic * block.information, axis=0)
-        return COMMON_SYSTEMATIC * weighted / block.information.sum(axis=0)

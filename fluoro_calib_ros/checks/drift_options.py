@@ -48,7 +48,7 @@ class DriftState:
         clipped, a size of more than a pixel is a lower bound.
     direction : tuple of float
         Unit vector (2,) in the image: the normal of the epipolar lines, or u or v where the drift
-        was found by clusters.
+        was found by bodies.
     against : str
         Reference of the drift: 'calibration' or 'start'.
     source : str

@@ -8,8 +8,8 @@ A calibration is off by a little from its first day, and the markers see that ev
 image is accepted while it stays within a dead band. There are two: what the calibration's own
 uncertainty allows (against the calibration), and a narrower one of what remains unknown after the
 first seconds of markers have shown the errors of the calibration (against the start). A drift
-along an epipolar line does not show in the residuals; it shows in the distances within rigid
-clusters of beads (see cluster_watch).
+along an epipolar line does not show in the residuals; it shows in the shapes of rigid bodies (see
+body_watch).
 
 The test is a CUSUM in every area (see charts); its thresholds follow from the mean time between
 false alarms that is asked for. The variance comes from the data, from differences of successive
@@ -19,7 +19,7 @@ that is correlated in time (measured: up to 0.9 in frames of 120 Hz). Single res
 (Huber, Annals of Mathematical Statistics 35, 1964), and so is what a block can add to a chart.
 
 Not detected: a drift that exists from the start and is within what the calibration claims; along
-the epipolar lines, one without clusters, or one that moves all beads of a cluster alike, as the
+the epipolar lines, one without bodies, or one that moves all markers of a body alike, as the
 shift of a whole image does; and any drift where there are no markers.
 """
 
@@ -30,25 +30,26 @@ from itertools import combinations
 
 import numpy as np
 
+from ..bodies.body import Body
 from ..findings import Finding, Kind, Place, Severity
 from ..photogrammetry.rig_orientation import RigOrientation
+from ..reconstruction.reconstruct import IntersectedViews
+from .body_watch import COMPONENTS, BodyWatch
 from .charts import EVIDENCE_CAP, CusumCharts, ImageAreas
-from .cluster_watch import CHUNK_S, COMPONENTS, Cluster, ClusterWatch
 from .drift_evidence import (
     EPIPOLAR,
     SERIES_OF_PAIR,
     WINDOW_S,
     BlockRecord,
-    ClusterEvidence,
+    BodyEvidence,
     DriftEstimate,
     EpipolarEvidence,
-    common_systematic,
 )
-from .drift_observations import EpipolarObservations, PointObservations
+from .drift_observations import EpipolarObservations
 from .drift_options import ERROR, LEVEL_NAMES, OK, WARN, DriftOptions, DriftState
 from .pair_watch import PairWatch
 
-CLUSTER_STEP = 2.0  # times step_px in the charts of the clusters, which have less information
+BODY_STEP = 2.0  # times step_px in the charts of the bodies, which have less information
 HYSTERESIS = 0.5  # times the threshold of WARN: an alarm ends below it
 
 
@@ -60,9 +61,10 @@ class DriftWatch:
     image_sizes : mapping of str to tuple of int
         Width and height of the images by fluoroscope [px], in the order of the orientation.
     options : DriftOptions, optional
-    clusters : sequence of Cluster
+    bodies : sequence of Body
+        Shapes that are not given are learned.
     orientation : RigOrientation, optional
-        Needed for clusters only.
+        Needed for bodies only.
 
     Attributes
     ----------
@@ -73,14 +75,14 @@ class DriftWatch:
     Raises
     ------
     ValueError
-        For fewer than two fluoroscopes, for clusters without orientation, and as ClusterWatch.
+        For fewer than two fluoroscopes, for bodies without orientation, and as BodyWatch.
     """
 
     def __init__(
         self,
         image_sizes: Mapping[str, tuple[int, int]],
         options: DriftOptions | None = None,
-        clusters: Sequence[Cluster] = (),
+        bodies: Sequence[Body] = (),
         orientation: RigOrientation | None = None,
     ) -> None:
         if len(image_sizes) < 2:
@@ -91,14 +93,14 @@ class DriftWatch:
         self._names = tuple(self._sizes)
         self._areas = ImageAreas(int(options.cells))
         self._pairs = list(combinations(self._names, 2))
-        self._cluster_watch = None
-        if clusters:
+        self._body_watch = None
+        if bodies:
             if orientation is None:
-                raise ValueError('clusters need the orientation of the rig')
+                raise ValueError('bodies need the orientation of the rig')
             sizes = list(self._sizes.values())
-            self._cluster_watch = ClusterWatch(clusters, orientation, sizes, self._areas, options)
+            self._body_watch = BodyWatch(bodies, orientation, sizes, self._areas, options)
         series = SERIES_OF_PAIR * len(self._pairs)
-        if clusters:
+        if bodies:
             series += COMPONENTS * len(self._names)
         charts = 2 * series * len(self._areas)
         self.thresholds = tuple(
@@ -122,21 +124,21 @@ class DriftWatch:
             self._names,
             window,
         )
-        self._clusters = ClusterEvidence(
-            CusumCharts(COMPONENTS * len(self._names), areas, CLUSTER_STEP * options.step_px, cap),
+        self._bodies = BodyEvidence(
+            CusumCharts(COMPONENTS * len(self._names), areas, BODY_STEP * options.step_px, cap),
             self._names,
             window,
-            self._cluster_watch.names if self._cluster_watch else (),
+            self._body_watch.names if self._body_watch else (),
         )
         self._collected: list[list[EpipolarObservations]] = [[] for _ in self._pairs]
         self._learned_blocks = [0] * len(self._pairs)
-        self._learned_cluster_blocks = 0
+        self._learned_body_blocks = 0
         self._tested_blocks = 0
         self._clock = BlockClock(options.block_s)
         self._observations = 0
         self._level = OK
-        if self._cluster_watch:
-            self._cluster_watch.clear()
+        if self._body_watch:
+            self._body_watch.clear()
         self.state = self._present_state()
 
     @property
@@ -157,18 +159,19 @@ class DriftWatch:
             self._collected[number].append(observations.swapped() if swapped else observations)
         return self.state
 
-    def add_points(self, stamp_ns: int, points: PointObservations) -> DriftState:
-        """Add intersected points for the clusters; without clusters they are ignored.
+    def add_points(self, stamp_ns: int, exposure: IntersectedViews) -> DriftState:
+        """Add intersected views for the bodies; without bodies they are ignored.
 
-        Returns the present state. Raises ValueError for points of another number of views.
+        Returns the present state. Raises ValueError for another number of views.
         """
-        if len(points.uv) != len(self._names):
+        views = len(exposure.views.uv)
+        if views != len(self._names):
             raise ValueError(
-                f'the points must have pixels of {len(self._names)} views, not {len(points.uv)}'
+                f'the points must have pixels of {len(self._names)} views, not {views}'
             )
         self._advance(stamp_ns)
-        if self._cluster_watch:
-            self._cluster_watch.add(self._clock.continued_ns(stamp_ns) / 1e9, points)
+        if self._body_watch:
+            self._body_watch.add(exposure)
         return self.state
 
     def _pair_number(self, a: str, b: str) -> tuple[int, bool]:
@@ -187,7 +190,7 @@ class DriftWatch:
         if ended_ns is None:
             return
         tested = self._close_residuals(ended_ns)
-        tested |= self._close_distances(ended_ns)
+        tested |= self._close_bodies(ended_ns)
         self._tested_blocks += bool(tested)
         self.state = self._present_state()
 
@@ -220,7 +223,7 @@ class DriftWatch:
             return False
         stretch = np.array([watch.stretch() for watch in self._watches])
         self._epipolar.charts.stretch[:, 0] = np.repeat(stretch, SERIES_OF_PAIR)
-        self._clusters.charts.stretch[:] = stretch.max()
+        self._bodies.charts.stretch[:] = stretch.max()
         bands = np.repeat([options.band_calibration, options.band_start], 2)
         bands = np.tile(bands, len(self._pairs))[:, None]
         self._epipolar.update(record, self._dead_band(bands, record.systematic), testing)
@@ -228,23 +231,21 @@ class DriftWatch:
             self._learn(number)
         return bool(testing.any())
 
-    def _close_distances(self, begin_ns: int) -> bool:
-        """Update the charts of the distances; returns whether a drift could be detected."""
-        watch = self._cluster_watch
+    def _close_bodies(self, begin_ns: int) -> bool:
+        """Update the charts of the bodies; returns whether a drift could be detected."""
+        watch = self._body_watch
         block = watch.block() if watch else None
         if watch is None or block is None:
             return False
-        options = self.options
         self._observations += block.count
-        enough = block.pairs > 2 * options.block_s / CHUNK_S
-        testing = enough & self._has_learned(self._learned_cluster_blocks)
+        testing = block.enough & self._has_learned(self._learned_body_blocks)
         score = block.score.sum(axis=0)
         information = block.information.sum(axis=0)
-        record = BlockRecord(begin_ns, score, information, common_systematic(block), block)
-        band = self._dead_band(options.band_start, record.systematic)
-        self._clusters.update(record, band, testing)
-        self._learned_cluster_blocks += 1
-        if self._has_learned(self._learned_cluster_blocks):
+        record = BlockRecord(begin_ns, score, information, block.systematic, block)
+        band = self._dead_band(self.options.band_start, record.systematic)
+        self._bodies.update(record, band, testing)
+        self._learned_body_blocks += 1
+        if self._has_learned(self._learned_body_blocks):
             watch.learn()
         return bool(testing.any())
 
@@ -268,14 +269,14 @@ class DriftWatch:
 
     def _is_learning(self) -> bool:
         """Whether no start has begun yet, or one is still being learned."""
-        counts = [*self._learned_blocks, self._learned_cluster_blocks]
+        counts = [*self._learned_blocks, self._learned_body_blocks]
         begun = [count for count in counts if count]
         return not begun or not all(self._has_learned(count) for count in begun)
 
     def _present_state(self) -> DriftState:
         """State by the charts as they are."""
         warn, error = self.thresholds
-        strongest = max((self._epipolar, self._clusters), key=lambda evidence: evidence.peak)
+        strongest = max((self._epipolar, self._bodies), key=lambda evidence: evidence.peak)
         peak = strongest.peak
         level: Severity = OK
         if peak >= error:
@@ -375,16 +376,12 @@ class BlockClock:
         self._late = 0  # calls with a stamp before the newest one, since that came
         self._offset_ns = 0  # added to stamps, so that time goes on where a stream begins anew
 
-    def continued_ns(self, stamp_ns: int) -> int:
-        """Time of a stamp, as if the stream had not begun anew [ns]."""
-        return stamp_ns + self._offset_ns
-
     def advance(self, stamp_ns: int) -> int | None:
         """Begin of the block that this stamp ends [ns], if any.
 
         A late frame belongs to the present block.
         """
-        now = self.continued_ns(int(stamp_ns))
+        now = int(stamp_ns) + self._offset_ns
         if self._begin_ns is None:
             self._begin_ns = now
             self.newest_ns = now

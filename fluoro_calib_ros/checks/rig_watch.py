@@ -14,16 +14,14 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..bodies.body import Body
 from ..findings import Finding, Kind
 from ..photogrammetry.rig_orientation import RigOrientation
-from ..reconstruction import intersection
 from ..reconstruction.epipolar import EpipolarGeometry
-from ..reconstruction.intersection import IntersectedPoints
+from ..reconstruction.reconstruct import IntersectedViews
 from .charts import MIN_BLOCKS_TO_ALARM
-from .cluster_watch import Cluster
-from .drift_observations import EpipolarObservations, PointObservations
+from .drift_observations import EpipolarObservations
 from .drift_options import ERROR, LEVEL_NAMES, OK, WARN, DriftOptions, DriftState
 from .drift_watch import DriftWatch
 
@@ -42,7 +40,7 @@ class RigDriftWatch:
     image_sizes : mapping of str to tuple of int
         Width and height of the images by fluoroscope [px].
     options : DriftOptions, optional
-    clusters : sequence of Cluster
+    bodies : sequence of Body
     rate_hz : float
         Largest number of exposures to examine per second.
 
@@ -59,7 +57,7 @@ class RigDriftWatch:
         orientation: RigOrientation,
         image_sizes: Mapping[str, tuple[int, int]],
         options: DriftOptions | None = None,
-        clusters: Sequence[Cluster] = (),
+        bodies: Sequence[Body] = (),
         rate_hz: float = 120.0,
     ) -> None:
         names = orientation.fluoroscopes
@@ -69,11 +67,11 @@ class RigDriftWatch:
             for i, j in combinations(range(len(names)), 2)
         ]
         sizes = {name: image_sizes[name] for name in names}
-        self._watch = DriftWatch(sizes, options, clusters, orientation)
+        self._watch = DriftWatch(sizes, options, bodies, orientation)
         # Stamps jitter: a stream at this very rate must not lose any exposure.
         self._min_interval_ns = round(0.9e9 / rate_hz)
         self._last_ns: int | None = None
-        self._has_clusters = bool(clusters)
+        self._has_bodies = bool(bodies)
 
     @property
     def options(self) -> DriftOptions:
@@ -95,30 +93,12 @@ class RigDriftWatch:
         last = self._last_ns
         return last is None or not 0 <= stamp_ns - last < self._min_interval_ns
 
-    def add_exposure(
-        self,
-        stamp_ns: int,
-        target_id: NDArray[np.int64],
-        uv: NDArray[np.float64],
-        sigma: NDArray[np.float64],
-        correction_sd: NDArray[np.float64],
-        points: IntersectedPoints,
-    ) -> DriftState:
-        """Add an exposure and return the state.
-
-        Parameters
-        ----------
-        stamp_ns : int
-        target_id : ndarray
-            (n,)
-        uv : ndarray
-            (F, n, 2), corrected pixels, NaN where a fluoroscope does not see a target.
-        sigma, correction_sd : ndarray
-            (F, n), standard deviations of the corrected pixels, and of the correction alone [px].
-        points : IntersectedPoints
-        """
+    def add_exposure(self, stamp_ns: int, exposure: IntersectedViews) -> DriftState:
+        """Add an exposure of the fluoroscopes of the orientation, and return the state."""
         self._last_ns = stamp_ns
-        noise2 = np.maximum(sigma * sigma - correction_sd * correction_sd, 0)
+        target_id = exposure.target_id
+        uv, sigma = exposure.views.uv, exposure.views.sigma
+        noise2 = np.maximum(sigma * sigma - exposure.views.correction_sd**2, 0)
         for i, j, geometry in self._pairs:
             found = geometry.residuals(uv[i], uv[j], sigma[i], sigma[j])
             noise = found.factor_a**2 * noise2[i] + found.factor_b**2 * noise2[j]
@@ -137,27 +117,9 @@ class RigDriftWatch:
                 factor_b=found.factor_b[good],
             )
             self._watch.add_residuals(stamp_ns, self._names[i], self._names[j], observations)
-        if self._has_clusters:
-            noise_fraction = _mean_where_finite(noise2 / (sigma * sigma))
-            covariance = points.covariance_noise * noise_fraction[:, None, None]
-            good = np.flatnonzero(points.status == intersection.OK)
-            self._watch.add_points(
-                stamp_ns,
-                PointObservations(
-                    target_id[good],
-                    points.xyz_mm[good],
-                    covariance[good],
-                    uv[:, good],
-                    correction_sd[:, good],
-                ),
-            )
+        if self._has_bodies:
+            self._watch.add_points(stamp_ns, exposure)
         return self.state
-
-
-def _mean_where_finite(values: np.ndarray) -> np.ndarray:
-    """Means (n,) of the finite values (F, n) of every column, 0 where there are none."""
-    finite = np.isfinite(values)
-    return np.where(finite, values, 0).sum(axis=0) / np.maximum(finite.sum(axis=0), 1)
 
 
 @dataclass(frozen=True)
@@ -213,28 +175,18 @@ class RecordingDriftWatch(RigDriftWatch):
         orientation: RigOrientation,
         image_sizes: Mapping[str, tuple[int, int]],
         options: DriftOptions | None = None,
-        clusters: Sequence[Cluster] = (),
+        bodies: Sequence[Body] = (),
         rate_hz: float = 120.0,
     ) -> None:
-        super().__init__(orientation, image_sizes, options, clusters, rate_hz)
+        super().__init__(orientation, image_sizes, options, bodies, rate_hz)
         self._first_ns: int | None = None
         self._worst = self.state
         self._worst_ns = 0
         self._found_ns = 0
 
-    def add_exposure(
-        self,
-        stamp_ns: int,
-        target_id: np.ndarray,
-        uv: np.ndarray,
-        sigma: np.ndarray,
-        correction_sd: np.ndarray,
-        points: IntersectedPoints,
-    ) -> DriftState:
+    def add_exposure(self, stamp_ns: int, exposure: IntersectedViews) -> DriftState:
         """Add an exposure as a RigDriftWatch does, and return the state."""
-        state = super().add_exposure(
-            stamp_ns, target_id, uv=uv, sigma=sigma, correction_sd=correction_sd, points=points
-        )
+        state = super().add_exposure(stamp_ns, exposure)
         if self._first_ns is None:
             self._first_ns = stamp_ns
         worst = self._worst

@@ -30,7 +30,6 @@ from .output import ProgressBar, print_note, print_notes, print_result
 
 if TYPE_CHECKING:
     from ..exposures.frame import Frame
-    from ..images.marker_ids import ClusterShape
     from ..jobs.extraction import ExtractionOutcome
     from ..jobs.marker_extraction import DoubtfulSpan, MarkerOutcome, MarkerRequest
 
@@ -129,6 +128,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='coordinates target_id,x,y,z,sd [mm] of the markers of each --cluster in a frame of '
         'its own, or of any phantom format; without --markers, they give the ids',
     )
+    group.add_argument(
+        '--bodies',
+        type=Path,
+        metavar='FILE',
+        help='bodies.csv: rigid bodies and the places of their markers, in the place of '
+        '--cluster; without --markers, the shapes give the ids',
+    )
     add_options(group, MarkerOptions, ('shutter', 'gate', 'lost_after', 'search_every'))
     angles = parser.add_argument_group('angle of a C-arm')
     add_angle_options(angles)
@@ -137,21 +143,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
-    """Read the clusters; call error with a sentence for arguments that exclude each other."""
-    from ..checks.cluster_watch import parse_clusters
+    """Read the bodies; call error with a sentence for arguments that exclude each other."""
+    from ..bodies.body import declared_bodies
 
     try:
-        arguments.clusters = parse_clusters(arguments.cluster)
+        arguments.rigid = declared_bodies(arguments.cluster)
     except ValueError as fault:
         error(f'--cluster: {fault}')
-    if arguments.cluster_shapes is not None and not arguments.clusters:
+    if arguments.bodies is not None and arguments.rigid:
+        error('--bodies: it names the markers of each body, as --cluster does')
+    if arguments.cluster_shapes is not None and not arguments.rigid:
         error('--cluster-shapes: name the markers of each cluster with --cluster')
-    if arguments.markers is None and arguments.cluster_shapes is None:
+    if not _follows_markers(arguments):
         if arguments.phantom is None:
             error('give --phantom for beads of a phantom, or --markers for markers in motion')
         if len(arguments.fluoroscope) != 1:
             error('--fluoroscope: the images of a phantom are of one fluoroscope')
-        if arguments.clusters:
+        if arguments.rigid:
             error('--cluster is for --markers')
         return
     if len(arguments.fluoroscope) > 2:
@@ -161,13 +169,20 @@ def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
             error('markers of two fluoroscopes are followed with their --calibration')
         if len(arguments.sources) > 2:
             error('give one SOURCE for each fluoroscope, or one for both')
-    elif arguments.clusters:
-        error('--cluster is for two fluoroscopes, the --fluoroscope A,B and their --calibration')
+    elif arguments.rigid or arguments.bodies is not None:
+        error(
+            'rigid bodies are for two fluoroscopes, the --fluoroscope A,B and their --calibration'
+        )
+
+
+def _follows_markers(arguments: argparse.Namespace) -> bool:
+    given = (arguments.markers, arguments.cluster_shapes, arguments.bodies)
+    return any(path is not None for path in given)
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Extract the beads or markers of images. Raises DataError."""
-    if arguments.markers is not None or arguments.cluster_shapes is not None:
+    if _follows_markers(arguments):
         _run_markers(arguments)
     else:
         _run_phantom(arguments)
@@ -254,7 +269,12 @@ def _run_markers(arguments: argparse.Namespace) -> None:
 
     for name in arguments.fluoroscope:
         check_safe_name(name, '--fluoroscope')
-    given = (arguments.markers, arguments.calibration, arguments.cluster_shapes)
+    given = (
+        arguments.markers,
+        arguments.calibration,
+        arguments.cluster_shapes,
+        arguments.bodies,
+    )
     inputs = [*arguments.sources, *(path for path in given if path is not None)]
     check_output_file(arguments.out, inputs)
     request = _marker_request(arguments)
@@ -281,9 +301,10 @@ def _run_markers(arguments: argparse.Namespace) -> None:
 def _marker_request(arguments: argparse.Namespace) -> MarkerRequest:
     """Read what is known of the markers and the fluoroscopes. Raises DataError."""
     from ..images.markers import MarkerOptions
+    from ..io.bodies import read_bodies
     from ..io.rig_orientation import load_orientation, orientation_path
     from ..jobs.image_sources import ImageAngles
-    from ..jobs.marker_extraction import MarkerRequest, sequences, shapes_of
+    from ..jobs.marker_extraction import MarkerRequest, sequences, shaped
     from ..jobs.reconstruction import check_orientation
     from ..jobs.sources import read_calibrations, read_source, read_survey
 
@@ -302,11 +323,13 @@ def _marker_request(arguments: argparse.Namespace) -> MarkerRequest:
         print_notes(recording.notes)
         first = recording.frames
         target_names = recording.names.target_names()
-    shapes: tuple[ClusterShape, ...] = ()
+    bodies = arguments.rigid
+    if arguments.bodies is not None:
+        bodies = read_bodies(arguments.bodies)
     if arguments.cluster_shapes is not None:
         survey = read_survey(arguments.cluster_shapes, file_settings(arguments))
         print_notes(survey.notes)
-        shapes = shapes_of(arguments.clusters, survey.phantom, arguments.cluster_shapes)
+        bodies = shaped(bodies, survey.phantom, arguments.cluster_shapes)
         target_names = target_names or survey.names.target_names()
     calibrations = {}
     orientation = None
@@ -324,8 +347,7 @@ def _marker_request(arguments: argparse.Namespace) -> MarkerRequest:
         options_of(MarkerOptions, arguments),
         calibrations,
         orientation,
-        clusters=() if shapes else arguments.clusters,
-        shapes=shapes,
+        bodies=bodies,
         overlay=arguments.overlay,
         target_names=target_names,
         angles=angles,

@@ -56,17 +56,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
-    """Read the clusters; call error with a sentence for arguments that exclude each other."""
-    from ..checks.cluster_watch import parse_clusters
+    """Read the bodies; call error with a sentence for arguments that exclude each other."""
+    from ..bodies.body import declared_bodies
     from ..jobs.sources import is_bag
 
     try:
-        arguments.clusters = parse_clusters(arguments.cluster)
+        arguments.bodies = declared_bodies(arguments.cluster)
     except ValueError as fault:
         error(f'--cluster: {fault}')
-    if arguments.clusters and arguments.no_drift_watch:
+    if arguments.bodies and arguments.no_drift_watch:
         error('--cluster is for the drift watch, it cannot be used with --no-drift-watch')
-    if arguments.clusters and not is_bag(arguments.source):
+    if arguments.bodies and not is_bag(arguments.source):
         error(
             f'--cluster is for the drift watch, but {arguments.source}, which is no bag, '
             'does not contain the times of its exposures'
@@ -90,7 +90,7 @@ def run(arguments: argparse.Namespace) -> None:
         ReconstructionOptions,
         arguments,
         drift_watch=not arguments.no_drift_watch,
-        clusters=arguments.clusters,
+        bodies=arguments.bodies,
         has_stamps=is_bag(arguments.source),
         pair_tolerance=arguments.pair_tolerance,
     )

@@ -18,7 +18,7 @@ from .markers import MarkerFrame, MarkerTracker
 
 @dataclass(frozen=True)
 class Decision:
-    """What the other view, or its cluster, says of a doubtful id.
+    """What the other view, or its body, says of a doubtful id.
 
     Attributes
     ----------
@@ -183,26 +183,31 @@ def revise(found: MarkerFrame, decision: Decision) -> MarkerFrame:
 
 DECIDED = 3  # exposures that agree before an id is confirmed
 WRONG = 3  # exposures that disagree before an id is wrong
-NEAR_PX = 1.0  # from where its cluster says, that a marker is; or so many
+NEAR_PX = 1.0  # from where its body says, that a marker is; or so many
 NEAR_SIGMAS = 3.5
 FAR = 1.5  # times that, from which it is something else
 MAX_DISTANCE_PX = 50.0  # beyond it, distances are alike
 
 
-class ClusterDecisions:
-    """Decides on the ids of a view by the places that clusters say."""
+class BodyDecisions:
+    """Decides on the ids of a view by the places that bodies say."""
 
     def __init__(self, view: DecidedView) -> None:
         self._view = view
         self._seen_right = np.zeros(len(view.target_id), dtype=int)  # last image in the place
 
-    def decide(self, exposure: PairExposure, place: np.ndarray, frame: int) -> list[Decision]:
-        """Confirm, exchange or drop ids by places (n, 2) of markers [px], NaN for unknown."""
+    def decide(
+        self, exposure: PairExposure, place: np.ndarray, sd: np.ndarray, frame: int
+    ) -> list[Decision]:
+        """Confirm, exchange or drop ids by places (n, 2) of markers [px], NaN for unknown.
+
+        sd (n,): standard deviations of these places [px].
+        """
         view = self._view
         seen = exposure.observed[view.view]
         doubtful = exposure.doubtful[view.view]
         away = np.linalg.norm(seen - place, axis=1)
-        near = np.maximum(NEAR_PX, NEAR_SIGMAS * exposure.sigma[view.view])
+        near = np.maximum(NEAR_PX, NEAR_SIGMAS * np.hypot(exposure.sigma[view.view], sd))
         right = away < near
         wrong = away > FAR * near
         self._seen_right[right] = frame
@@ -225,7 +230,7 @@ class ClusterDecisions:
     def _exchange(self, rows: tuple[int, int], frame: int) -> Decision:
         """Exchange two ids, each of which is where the other one should be."""
         view = self._view
-        # They were not exchanged while one of them was where its cluster says.
+        # They were not exchanged while one of them was where its body says.
         together = int(self._seen_right[list(rows)].max()) + 1
         since = max(view.doubted_since(rows, frame), together)
         view.counts.clear(rows)
@@ -246,7 +251,7 @@ class ClusterDecisions:
 def _crossed(
     seen: np.ndarray, place: np.ndarray, near: np.ndarray, suspects: np.ndarray
 ) -> list[tuple[int, int]]:
-    """Pairs of suspects that are where clusters say that the other is.
+    """Pairs of suspects that are where bodies say that the other is.
 
     Markers beside each other exchange places only if both are nearer to the other's.
     """
@@ -282,7 +287,7 @@ class RayDecisions:
         self._kept: dict[tuple[int, int], int] = {}
 
     def decide(self, exposure: PairExposure, known: np.ndarray, frame: int) -> list[Decision]:
-        """Confirm or exchange ids; known (n,) are those that clusters decide on."""
+        """Confirm or exchange ids; known (n,) are those that bodies decide on."""
         view = self._view
         out: list[Decision] = []
         both = np.isfinite(exposure.standardised) & ~known

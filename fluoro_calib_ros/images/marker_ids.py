@@ -1,23 +1,28 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Ids of markers from the shapes of their rigid clusters, in the images of one exposure.
+"""Ids of markers from the shapes of their rigid bodies, in the images of one exposure.
 
 Round shadows of both views are intersected, each with each, as far as their rays meet (epipolar
-distance). Among these points in space, the members of a cluster are those with its distances: a
+distance). Among these points in space, the members of a body are those with its distances: a
 search with backtracking, in the manner of the interpretation trees of Grimson and Lozano-Perez
 ("Localizing overlapping parts by searching the interpretation tree", IEEE PAMI 9, 1987). The
-mirror image of a cluster has the same distances, and is excluded by the rotation that fits. A
-cluster that fits in two ways is refused.
+mirror image of a body has the same distances, and is excluded by the rotation that fits. A
+body that fits in two ways is refused, and one that would be found as well among as many points
+anywhere.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
+from math import comb
 
 import numpy as np
+from scipy.spatial.distance import pdist
 
+from ..bodies.body import Body
 from ..bodies.rigid import fitted_pose
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError
@@ -33,32 +38,17 @@ SHARE = 0.4  # of the response to a typical marker
 SHADOW_SD_PX = 0.25  # of the place of a shadow that is not measured
 AGREE = 4.0  # standardised epipolar distance
 TOLERANCE_MM = 0.6  # of a distance between two points that are not measured yet
-RMS_MM = 0.35  # of the members of a cluster about its shape
+RMS_MM = 0.35  # of the members of a body about its shape
 MIN_MEMBERS = 4
 MIN_SHARE = 0.6  # of the members that are found
 BETTER = 2.0  # factor on the RMS of another way to fit as many members
+MAX_CHANCE = 1e-3  # number of fits as good that chance gives in an exposure
 MAX_SHADOWS = 120
 MAX_STEPS = 200_000  # of the search
 
 
 @dataclass(frozen=True)
-class ClusterShape:
-    """Markers (k,) that are rigid together, and their coordinates (k, 3) in a frame [mm]."""
-
-    name: str
-    target_id: np.ndarray
-    xyz_mm: np.ndarray
-
-    def __post_init__(self) -> None:
-        if len(self.target_id) < MIN_MEMBERS:
-            raise DataError(
-                f'cluster {self.name}: {len(self.target_id)} markers give no ids, at least '
-                f'{MIN_MEMBERS} are needed'
-            )
-
-
-@dataclass(frozen=True)
-class _Rig:
+class CalibratedRig:
     """Orientation and calibrations of two fluoroscopes, and the angles of their C-arms [rad]."""
 
     orientation: RigOrientation
@@ -68,7 +58,7 @@ class _Rig:
 
 @dataclass(frozen=True)
 class _Fit:
-    """Points (k,) of the members of a cluster, -1 for none, and how well they fit."""
+    """Points (k,) of the members of a body, -1 for none, and how well they fit."""
 
     point: np.ndarray
     rms_mm: float
@@ -82,10 +72,10 @@ def identify_markers(
     images: Mapping[str, np.ndarray],
     calibrations: Mapping[str, FluoroscopeCalibration],
     orientation: RigOrientation,
-    shapes: Sequence[ClusterShape],
+    bodies: Sequence[Body],
     angles: Mapping[str, float | None] | None = None,
 ) -> dict[str, FirstMarkers]:
-    """Find the markers of rigid clusters in the images of one exposure.
+    """Find the markers of rigid bodies in the images of one exposure.
 
     Parameters
     ----------
@@ -94,64 +84,96 @@ def identify_markers(
     calibrations : mapping of str to FluoroscopeCalibration
     orientation : RigOrientation
         Of these two.
-    shapes : sequence of ClusterShape
+    bodies : sequence of Body
+        Of known shapes.
     angles : mapping of str to float or None, optional
         Of the C-arms [rad], for corrections that change with them; None where they are unknown.
 
     Returns
     -------
     dict of str to FirstMarkers
-        By fluoroscope. Members of a cluster that are not seen are where it says.
+        By fluoroscope, of the bodies that are found. Members that are not seen are where their
+        body says.
 
     Raises
     ------
     DataError
-        For a cluster that is not found, or fits in two ways.
+        Where none of the bodies is found, or fits in one way only.
     """
     names = list(orientation.fluoroscopes)
-    rig = _Rig(orientation, calibrations, angles or {})
+    bodies = identifiable(bodies)
+    if not bodies:
+        raise DataError(f'there is no body with {MIN_MEMBERS} markers of known places')
+    rig = CalibratedRig(orientation, calibrations, angles or {})
     for name in names:
         check_image(images[name], calibrations[name].image_size)
-    count = sum(len(shape.target_id) for shape in shapes)
+    count = sum(len(body.target_id) for body in bodies)
     reason: DataError | None = None
-    # What else is round in the images may be larger, and more distinct.
-    for scale in MARKER_SCALES:
+    best: dict[str, FirstMarkers] = {}
+    # What else is round in the images may be larger, and more distinct. Of many bodies, perhaps
+    # one is there.
+    for strongest, scale in product((2 * count, MIN_MEMBERS), MARKER_SCALES):
         try:
-            shadows = [_shadows(images[name], count, scale) for name in names]
-            return _identified(shadows, rig, shapes)
+            shadows = [_shadows(images[name], strongest, scale) for name in names]
+            found, missing = find_bodies(shadows, rig, bodies)
         except DataError as error:
             reason = reason or error
-    assert reason is not None
-    raise reason
+            continue
+        if _count(found) > _count(best):
+            best = found
+        if not missing:
+            break
+        reason = reason or missing[0]
+    if not best and reason is not None:
+        raise reason
+    return best
+
+
+def identifiable(bodies: Sequence[Body]) -> tuple[Body, ...]:
+    """Return the bodies whose shapes are known well enough to give ids, with the known markers."""
+    return tuple(
+        body.rows(body.known) for body in bodies if np.count_nonzero(body.known) >= MIN_MEMBERS
+    )
+
+
+def _count(found: Mapping[str, FirstMarkers]) -> int:
+    return sum(len(first.target_id) for first in found.values())
 
 
 def _shadows(image: np.ndarray, count: int, scale: float) -> np.ndarray:
     """Places (n, 2) of the most distinct shadows of a size. Raises DataError for none."""
-    found = search_image(image, learn_look(image, None, 2 * count, (scale,)), SHARE)
-    strongest = np.argsort(-found.strength, kind='stable')[:MAX_SHADOWS]
-    return np.asarray(found.uv[strongest])
+    found = search_image(image, learn_look(image, None, count, (scale,)), SHARE)
+    return found.strongest(MAX_SHADOWS).uv
 
 
-def _identified(
-    shadows: Sequence[np.ndarray], rig: _Rig, shapes: Sequence[ClusterShape]
-) -> dict[str, FirstMarkers]:
-    """Find clusters among shadows of both views. Raises DataError."""
+def find_bodies(
+    shadows: Sequence[np.ndarray], rig: CalibratedRig, bodies: Sequence[Body]
+) -> tuple[dict[str, FirstMarkers], list[DataError]]:
+    """Find bodies among shadows (k, 2) of both views; return their markers, and why not all."""
     xyz, pairs = _points(shadows, rig)
-    fits: list[tuple[ClusterShape, _Fit]] = []
+    fits: list[tuple[Body, _Fit]] = []
+    missing = []
     free = np.ones(len(xyz), dtype=bool)
-    for shape in sorted(shapes, key=lambda shape: -len(shape.target_id)):
-        fit = _fit(shape, xyz, free)
-        fits.append((shape, fit))
+    for body in sorted(bodies, key=lambda body: -len(body.target_id)):
+        try:
+            fit = _fit(body, xyz, free)
+        except DataError as error:
+            missing.append(error)
+            continue
+        fits.append((body, fit))
         taken = pairs[fit.point[fit.point >= 0]]
         # A shadow is that of one marker, except where two lie behind each other.
         free &= ~(np.isin(pairs[:, 0], taken[:, 0]) & np.isin(pairs[:, 1], taken[:, 1]))
-    return {
+    if not fits:
+        return {}, missing
+    found = {
         name: _first(view, rig, fits, (xyz, pairs, shadows[view]))
         for view, name in enumerate(rig.orientation.fluoroscopes)
     }
+    return found, missing
 
 
-def _points(shadows: Sequence[np.ndarray], rig: _Rig) -> tuple[np.ndarray, np.ndarray]:
+def _points(shadows: Sequence[np.ndarray], rig: CalibratedRig) -> tuple[np.ndarray, np.ndarray]:
     """Points (n, 3) [mm] where rays of shadows meet, and the rows (n, 2) of these shadows."""
     orientation = rig.orientation
     names = orientation.fluoroscopes
@@ -173,39 +195,64 @@ def _points(shadows: Sequence[np.ndarray], rig: _Rig) -> tuple[np.ndarray, np.nd
     return points.xyz_mm[good], np.column_stack([a, b])[good]
 
 
-def _fit(shape: ClusterShape, xyz: np.ndarray, free: np.ndarray) -> _Fit:
-    """Find the members of a cluster among points (n, 3). Raises DataError."""
-    search = _Search(shape, xyz, free)
+def _fit(body: Body, xyz: np.ndarray, free: np.ndarray) -> _Fit:
+    """Find the members of a body among points (n, 3). Raises DataError."""
+    search = _Search(body, xyz, free)
     search.run()
-    least = max(MIN_MEMBERS, int(np.ceil(MIN_SHARE * len(shape.target_id))))
+    least = max(MIN_MEMBERS, int(np.ceil(MIN_SHARE * len(body.target_id))))
     best = search.best
     if best is None or best.count < least:
         found = 0 if best is None else best.count
         raise DataError(
-            f'cluster {shape.name}: only {found} of {len(shape.target_id)} markers fit its shape '
+            f'body {body.name}: only {found} of {len(body.target_id)} markers fit its shape '
             'in this exposure'
         )
     if search.second is not None and search.second.rms_mm < BETTER * best.rms_mm:
         raise DataError(
-            f'cluster {shape.name}: its shape fits in more than one way in this exposure, its '
+            f'body {body.name}: its shape fits in more than one way in this exposure, its '
             'distances do not tell the markers apart'
+        )
+    if _by_chance(body, best, xyz[free]) > MAX_CHANCE:
+        raise DataError(
+            f'body {body.name}: {best.count} of {len(body.target_id)} markers fit its shape in '
+            f'this exposure, but so may others of {np.count_nonzero(free)} points by chance'
         )
     return best
 
 
-class _Search:
-    """Search of a cluster with backtracking: members are points with the right distances."""
+def _by_chance(body: Body, fit: _Fit, xyz: np.ndarray) -> float:
+    """Expected number of fits as good among as many points anywhere in the space of xyz (n, 3).
 
-    def __init__(self, shape: ClusterShape, xyz: np.ndarray, free: np.ndarray) -> None:
-        self.shape = shape
+    The second member is on a sphere about the first, the third on a circle, and each further one
+    in a place that these tell, all to within twice the RMS of the fit (Grimson and Huttenlocher,
+    "On the verification of hypothesized matches in model-based recognition", IEEE PAMI 13, 1991;
+    the number is the one of Desolneux, Moisan and Morel, "From Gestalt Theory to Image Analysis",
+    2008).
+    """
+    reach = 2 * fit.rms_mm
+    distance = float(pdist(body.xyz_mm[fit.point >= 0]).mean())
+    density = len(xyz) / max(float(np.prod(np.ptp(xyz, axis=0))), 1.0)  # points per mm^3
+    on_sphere = density * 4 * np.pi * distance**2 * 2 * reach
+    on_circle = density * np.pi * distance * (2 * reach) ** 2  # of half the distance
+    at_place = density * 4 / 3 * np.pi * reach**3
+    choices = comb(len(body.target_id), fit.count)
+    expected = choices * len(xyz) * on_sphere * on_circle * at_place ** (fit.count - 3)
+    return float(expected)
+
+
+class _Search:
+    """Search of a body with backtracking: members are points with the right distances."""
+
+    def __init__(self, body: Body, xyz: np.ndarray, free: np.ndarray) -> None:
+        self.body = body
         self.xyz = xyz
-        self.wanted = np.linalg.norm(shape.xyz_mm[:, None] - shape.xyz_mm[None], axis=2)
+        self.wanted = np.linalg.norm(body.xyz_mm[:, None] - body.xyz_mm[None], axis=2)
         self.given = np.linalg.norm(xyz[:, None] - xyz[None], axis=2)
         self.free = free
         self.best: _Fit | None = None
         self.second: _Fit | None = None
         self.steps = 0
-        self.point = np.full(len(shape.target_id), -1)
+        self.point = np.full(len(body.target_id), -1)
 
     def run(self) -> None:
         """Search from the first member on."""
@@ -215,7 +262,7 @@ class _Search:
         """Choose a point for a member, and for those after it."""
         self.steps += 1
         if self.steps > MAX_STEPS:
-            raise DataError(f'cluster {self.shape.name}: too many round shadows to search')
+            raise DataError(f'body {self.body.name}: too many round shadows to search')
         size = len(self.point)
         chosen = np.flatnonzero(self.point >= 0)
         least = self.best.count if self.best is not None else MIN_MEMBERS
@@ -242,8 +289,8 @@ class _Search:
         if np.count_nonzero(chosen) < MIN_MEMBERS:
             return
         xyz = self.xyz[self.point[chosen]]
-        rotation, shift = fitted_pose(self.shape.xyz_mm[chosen], xyz)
-        error = self.shape.xyz_mm[chosen] @ rotation.T + shift - xyz
+        rotation, shift = fitted_pose(self.body.xyz_mm[chosen], xyz)
+        error = self.body.xyz_mm[chosen] @ rotation.T + shift - xyz
         rms = float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
         if rms > RMS_MM:
             return
@@ -265,8 +312,8 @@ class _Search:
 
 def _first(
     view: int,
-    rig: _Rig,
-    fits: Sequence[tuple[ClusterShape, _Fit]],
+    rig: CalibratedRig,
+    fits: Sequence[tuple[Body, _Fit]],
     found: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> FirstMarkers:
     """Return the markers of a view; found are points, their pairs, and the shadows of the view."""
@@ -275,14 +322,14 @@ def _first(
     calibration = rig.calibrations[name]
     ids = []
     places = []
-    for shape, fit in fits:
+    for body, fit in fits:
         chosen = fit.point >= 0
-        rotation, shift = fitted_pose(shape.xyz_mm[chosen], xyz[fit.point[chosen]])
-        members = shape.xyz_mm @ rotation.T + shift
+        rotation, shift = fitted_pose(body.xyz_mm[chosen], xyz[fit.point[chosen]])
+        members = body.xyz_mm @ rotation.T + shift
         place = project_observed(rig.orientation, view, calibration, members, rig.angles.get(name))
         place[chosen] = shadows[pairs[fit.point[chosen], view]]
         width, height = calibration.image_size
         inside = ((place > 0) & (place < np.array([width - 1, height - 1]))).all(axis=1)
-        ids.append(np.asarray(shape.target_id)[inside])
+        ids.append(np.asarray(body.target_id)[inside])
         places.append(place[inside])
     return FirstMarkers(np.concatenate(ids), np.concatenate(places))

@@ -43,6 +43,11 @@ class Shadows:
     uv: np.ndarray
     strength: np.ndarray
 
+    def strongest(self, count: int) -> Shadows:
+        """Return so many of the shadows at most."""
+        order = np.argsort(-self.strength, kind='stable')[:count]
+        return Shadows(self.uv[order], self.strength[order])
+
     def distinct(self) -> Shadows:
         """Return the shadows without those at the place of a stronger one."""
         order = np.argsort(-self.strength, kind='stable')

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.intersection import Intersector
+from ..reconstruction.reconstruct import IntersectedViews, MatchedViews
 from .markers import MarkerFrame
 
 AGREE = 4.0  # standardised epipolar distance up to which two rays belong together
@@ -26,22 +27,36 @@ class PairExposure:
 
     Attributes
     ----------
-    observed, corrected : (2, n, 2) ndarray
+    observed : (2, n, 2) ndarray
         [px], NaN where a view does not see a marker.
-    sigma : (2, n) ndarray
-        Of the corrected image points.
     doubtful : (2, n) ndarray of bool
-    xyz_mm : (n, 3) ndarray
-    standardised : (n,) ndarray
-        Epipolar distance.
+    intersected : IntersectedViews
+        Corrected image points and the places of the markers.
     """
 
     observed: NDArray[np.float64]
-    corrected: NDArray[np.float64]
-    sigma: NDArray[np.float64]
     doubtful: NDArray[np.bool_]
-    xyz_mm: NDArray[np.float64]
-    standardised: NDArray[np.float64]
+    intersected: IntersectedViews
+
+    @property
+    def corrected(self) -> NDArray[np.float64]:
+        """Corrected image points (2, n, 2) [px]."""
+        return self.intersected.views.uv
+
+    @property
+    def sigma(self) -> NDArray[np.float64]:
+        """Standard deviations (2, n) of the corrected image points [px]."""
+        return self.intersected.views.sigma
+
+    @property
+    def xyz_mm(self) -> NDArray[np.float64]:
+        """Places (n, 3) [mm]."""
+        return self.intersected.points.xyz_mm
+
+    @property
+    def standardised(self) -> NDArray[np.float64]:
+        """Epipolar distances (n,) over their standard deviations."""
+        return self.intersected.points.standardised
 
     @property
     def agree(self) -> np.ndarray:
@@ -87,27 +102,23 @@ class PairRays:
         n = len(self._target_id)
         observed = np.full((2, n, 2), np.nan)
         corrected = np.full((2, n, 2), np.nan)
-        sigma = np.full((2, n), np.nan)
+        sigma, correction_sd = np.full((2, 2, n), np.nan)
         doubtful = np.zeros((2, n), dtype=bool)
         for view, name in enumerate(self._names):
             found = views[name]
             rows = np.searchsorted(self._target_id, found.target_id)
             observed[view, rows] = found.uv
-            u, v, total, _, _ = self._calibrations[name].correct_arrays(
+            u, v, total, sd, _ = self._calibrations[name].correct_arrays(
                 found.uv[:, 0].copy(), found.uv[:, 1].copy(), found.sigma, angles.get(name)
             )
             corrected[view, rows] = np.stack([u, v], axis=1)
             sigma[view, rows] = np.hypot(total, SYSTEMATIC_PX)
+            correction_sd[view, rows] = np.hypot(sd, SYSTEMATIC_PX)
             doubtful[view, rows] = found.doubtful
         points = self._intersector.intersect(corrected, sigma)
-        return PairExposure(
-            observed,
-            corrected,
-            sigma=sigma,
-            doubtful=doubtful,
-            xyz_mm=points.xyz_mm,
-            standardised=points.standardised,
-        )
+        outside = np.zeros(sigma.shape, dtype=bool)
+        matched = MatchedViews(self._target_id, corrected, sigma, correction_sd, outside)
+        return PairExposure(observed, doubtful, IntersectedViews(matched, points))
 
     def exchanged(self, exposure: PairExposure, view: int, rows: Sequence[int]) -> np.ndarray:
         """Standardised epipolar distances (2,) of two markers if a view exchanged them."""
@@ -137,6 +148,19 @@ class PairRays:
                 angles.get(name),
             )
         return uv
+
+    def spread(self, view: int, xyz_mm: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+        """Standard deviations (k,) of a coordinate in a view [px] of points (k, 3).
+
+        covariance (k, 3, 3) is that of the points [mm^2].
+        """
+        rig = self._intersector.orientation
+        axes = rig.rotation[view]
+        sensor = (xyz_mm - rig.position_mm[view]) @ axes.T
+        depth = sensor[:, 2, None, None]
+        slope = rig.interior[view, 2] / depth * (axes[:2] - sensor[:, :2, None] / depth * axes[2])
+        variance = np.trace(slope @ covariance @ np.swapaxes(slope, 1, 2), axis1=1, axis2=2)
+        return np.asarray(np.sqrt(variance / 2))
 
 
 STEPS = 3  # the correction changes slowly

@@ -54,10 +54,16 @@ class MarkerStart:
     density: float
 
 
-def learn_start(image: np.ndarray, target_id: np.ndarray, uv: np.ndarray) -> MarkerStart:
+NOWHERE_PX = -2e4  # where markers are whose place is not known yet
+
+
+def learn_start(
+    image: np.ndarray, target_id: np.ndarray, uv: np.ndarray, later: int = 0
+) -> MarkerStart:
     """Learn from an image with markers near uv (n, 2) [px].
 
-    Raises DataError where the markers are not there.
+    later: number of further markers, whose places are not known yet. Raises DataError where the
+    markers are not there.
     """
     height, width = image.shape
     inside = ((uv > -0.5) & (uv < np.array([width, height]) - 0.5)).all(axis=1)
@@ -74,12 +80,13 @@ def learn_start(image: np.ndarray, target_id: np.ndarray, uv: np.ndarray) -> Mar
         )
     place = uv.copy()
     place[row] = found.uv[column]
-    unseen = np.ones(len(uv), dtype=int)
+    unseen = np.ones(len(uv) + later, dtype=int)
     unseen[row] = 0
     top = float(np.iinfo(image.dtype).max)
     light = image.astype(np.float32)
     light = top - light if look.inverted else light
     seen = place[row]
+    place = np.concatenate([place, np.full((later, 2), NOWHERE_PX)])
     return MarkerStart(
         MarkerStates.start(Motion.start(place, FIRST_SD_PX), unseen),
         look,
@@ -119,6 +126,10 @@ class MarkerSearch:
         self._lost_after = lost_after
         self._search_every = search_every
 
+    def everywhere(self, image: np.ndarray) -> Shadows:
+        """Find the shadows of a whole image."""
+        return search_image(image, self._look, SHARE)
+
     def lost(self, states: MarkerStates) -> np.ndarray:
         """Return (n,) whether markers are searched in the whole image."""
         return np.asarray(states.unseen > self._lost_after)
@@ -129,7 +140,7 @@ class MarkerSearch:
         """Find shadows in an image; number is that of images since the first one."""
         lost = self.lost(states)
         if lost.any() and number % self._search_every == 0:
-            return search_image(image, self._look, SHARE)
+            return self.everywhere(image)
         reach = np.ceil(self._gate * np.sqrt(states.shadow_variance))
         near = ~lost | (reach <= MAX_HALF)
         if not near.any():

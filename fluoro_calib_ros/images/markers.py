@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from ..errors import DataError
 from ..findings import Finding, Kind
 from ..options import option, validate_options
-from .marker_intensity import LightWindows, MarkerLook, check_image
+from .marker_intensity import LightWindows, MarkerLook, Shadows, check_image
 from .marker_measurement import MarkerMeasurement
-from .marker_start import MarkerSearch, learn_start
+from .marker_start import NOWHERE_PX, MarkerSearch, learn_start
 from .marker_states import MarkerStates, MeasuredMarkers
 from .marker_watch import MarkerDoubts, MarkerWatch, follow_beside, shift_together
 from .shadow_profile import Profile
@@ -114,7 +114,7 @@ class MarkerFrame:
     missing : (k,) ndarray of int
         Markers that were not measured.
     predicted : (k, 2) ndarray
-        Where they are believed to be [px].
+        Where they are believed to be [px], NaN for those that were never seen.
     lost : (k,) ndarray of bool
         Whether they are searched in the whole image.
     doubts : tuple of Finding
@@ -177,22 +177,28 @@ class MarkerTracker:
     options : MarkerOptions, optional
     first : FirstMarkers
         Ids and places in the first image.
+    later : (k,) ndarray of int, optional
+        Markers that are followed once their places are suggested.
     """
 
-    def __init__(self, options: MarkerOptions | None = None, *, first: FirstMarkers) -> None:
+    def __init__(
+        self,
+        options: MarkerOptions | None = None,
+        *,
+        first: FirstMarkers,
+        later: NDArray[np.int64] | None = None,
+    ) -> None:
         self.options = options or MarkerOptions()
         self.first = first
+        self.target_id = first.target_id  # of all markers
+        if later is not None:
+            self.target_id = np.concatenate([first.target_id, later])
         self._followed: _Followed | None = None
         self._frame = 0
         self._gap = 1  # frames between the last two images
         self._images = 0  # since the first one
         self._led: np.ndarray | None = None
-        self._suggested: tuple[np.ndarray, ...] | None = None
-
-    @property
-    def target_id(self) -> np.ndarray:
-        """Ids (n,) of all markers."""
-        return self.first.target_id
+        self._suggested: list[tuple[np.ndarray, ...]] = []
 
     @property
     def profile(self) -> Profile | None:
@@ -280,6 +286,14 @@ class MarkerTracker:
         followed = self._known()
         return self.target_id[(followed.states.unseen > 0) | followed.doubts.doubtful]
 
+    def unseen(self) -> np.ndarray:
+        """Ids (k,) of markers that were not measured last."""
+        return self.target_id[self._known().states.unseen > 0]
+
+    def shadows(self, image: np.ndarray) -> Shadows:
+        """Return all shadows in an image that look like markers."""
+        return self._known().search.everywhere(image)
+
     def suggest(
         self,
         target_id: NDArray[np.int64],
@@ -298,7 +312,7 @@ class MarkerTracker:
             Where it is smaller than that of the own prediction, this one is used.
         """
         rows = np.array([self._row(int(i)) for i in target_id], dtype=int)
-        self._suggested = (rows, np.asarray(uv), np.asarray(velocity), np.asarray(sd_px))
+        self._suggested.append((rows, np.asarray(uv), np.asarray(velocity), np.asarray(sd_px)))
 
     def _known(self) -> _Followed:
         if self._followed is None:
@@ -306,15 +320,19 @@ class MarkerTracker:
         return self._followed
 
     def _row(self, target_id: int) -> int:
-        rows = np.flatnonzero(self.first.target_id == target_id)
+        rows = np.flatnonzero(self.target_id == target_id)
         if not len(rows):
             raise DataError(f'there is no marker {target_id}')
         return int(rows[0])
 
     def _start(self, image: np.ndarray) -> _Followed:
         """Learn from the first image. Raises DataError where the markers are not there."""
-        start = learn_start(image, self.target_id, self.first.uv)
+        given = len(self.first.target_id)
+        later = len(self.target_id) - given
+        start = learn_start(image, self.first.target_id, self.first.uv, later)
         options = self.options
+        for row in range(given, given + later):
+            start.states.forget(row, options.lost_after + 1)
         doubts = MarkerDoubts(len(self.target_id))
         return _Followed(
             start.states,
@@ -346,9 +364,9 @@ class MarkerTracker:
         self._frame = frame
         self._images += 1
         states.advance(self._gap, self._led)
-        if self._suggested is not None:
-            states.motion.place(*self._suggested)
-            self._suggested = None
+        for suggested in self._suggested:
+            states.motion.place(*suggested)
+        self._suggested = []
 
     def _measure(
         self, image: np.ndarray, frame: int
@@ -384,6 +402,7 @@ class MarkerTracker:
         followed = self._known()
         measured = found.measured
         missing = ~measured
+        predicted = followed.states.motion.uv[missing]
         return MarkerFrame(
             self._frame,
             self.target_id[measured],
@@ -392,7 +411,7 @@ class MarkerTracker:
             overlapped=found.overlapped[measured],
             doubtful=followed.doubts.doubtful[measured],
             missing=self.target_id[missing],
-            predicted=followed.states.motion.uv[missing],
+            predicted=np.where(predicted > NOWHERE_PX / 2, predicted, np.nan),
             lost=followed.search.lost(followed.states)[missing],
             doubts=doubts,
             finding=finding,

@@ -11,12 +11,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ..checks.cluster_watch import Cluster
+from ..bodies.body import Body
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError
 from ..findings import Finding, Kind, Place
 from ..images.marker_decisions import Decision
-from ..images.marker_ids import ClusterShape
+from ..images.marker_ids import identifiable, identify_markers
 from ..images.marker_pair import MarkerPair, PairFrame
 from ..images.markers import FirstMarkers, MarkerFrame, MarkerOptions, MarkerTracker
 from ..images.overlay import draw_markers, draw_overlay
@@ -37,29 +37,29 @@ class MarkerSettings:
     Attributes
     ----------
     first : mapping of str to FirstMarkers
-        Ids and places in the first images of one fluoroscope, or of two.
+        Ids and places in the first images of one fluoroscope, or of two; empty: the shapes of the
+        bodies tell them.
     options : MarkerOptions
     calibrations : mapping of str to FluoroscopeCalibration
         Of two fluoroscopes.
     orientation : RigOrientation or None
         Of two fluoroscopes.
-    clusters : tuple of Cluster
+    bodies : tuple of Body
         Markers that are rigid together, of two fluoroscopes.
-    shapes : tuple of ClusterShape
-        Clusters whose shapes are known.
     """
 
     first: Mapping[str, FirstMarkers]
     options: MarkerOptions = field(default_factory=MarkerOptions)
     calibrations: Mapping[str, FluoroscopeCalibration] = field(default_factory=dict)
     orientation: RigOrientation | None = None
-    clusters: tuple[Cluster, ...] = ()
-    shapes: tuple[ClusterShape, ...] = ()
+    bodies: tuple[Body, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
         """The fluoroscopes."""
-        return tuple(self.first)
+        if self.first or self.orientation is None:
+            return tuple(self.first)
+        return self.orientation.fluoroscopes
 
     def __call__(self) -> MarkerFollower:
         """Return a new MarkerFollower. Raises DataError as MarkerPair."""
@@ -77,15 +77,25 @@ class MarkerFollower:
         self._settings = settings
         self._begun = False
         self._renew()
+        if not settings.first and not identifiable(settings.bodies):
+            raise DataError(
+                'there are neither given markers nor a body of four markers of known places'
+            )
 
     def _renew(self) -> None:
         """Begin again. Raises DataError."""
-        settings = self._settings
         self._pair: MarkerPair | None = None
-        if len(settings.first) == 1:
+        self._trackers: dict[str, MarkerTracker] = {}
+        if self._settings.first:
+            self._follow(self._settings.first)
+
+    def _follow(self, first: Mapping[str, FirstMarkers]) -> None:
+        """Follow markers from their first places on. Raises DataError."""
+        settings = self._settings
+        if len(first) == 1:
             self._trackers = {
-                name: MarkerTracker(settings.options, first=first)
-                for name, first in settings.first.items()
+                name: MarkerTracker(settings.options, first=markers)
+                for name, markers in first.items()
             }
             return
         if settings.orientation is None:
@@ -94,9 +104,8 @@ class MarkerFollower:
             settings.calibrations,
             settings.orientation,
             settings.options,
-            first=settings.first,
-            clusters=settings.clusters,
-            shapes=settings.shapes,
+            first=first,
+            bodies=settings.bodies,
         )
         self._trackers = self._pair.trackers
 
@@ -135,10 +144,12 @@ class MarkerFollower:
         overlays: Collection[str],
         angles: Mapping[str, float | None] | None,
     ) -> dict[str, Observations]:
-        if not self._begun and len(images) < len(self._trackers):
+        if not self._begun and len(images) < len(self._settings.names):
             missing = Finding(Kind.OTHER_VIEW_MISSING, 'the other view is missing')
             return {name: Observations(finding=missing) for name in images}
         try:
+            if not self._trackers:
+                self._identify(images, angles)
             exposure = self.update(images, number, angles)
             if not self._begun:
                 self._check_start(exposure)
@@ -162,10 +173,22 @@ class MarkerFollower:
             out[name] = replace(result, note=note, picture=picture)
         return out
 
+    def _identify(
+        self, images: Mapping[str, np.ndarray], angles: Mapping[str, float | None] | None
+    ) -> None:
+        """Begin with the bodies that are found by their shapes. Raises DataError."""
+        settings = self._settings
+        assert settings.orientation is not None
+        self._follow(
+            identify_markers(
+                images, settings.calibrations, settings.orientation, settings.bodies, angles
+            )
+        )
+
     def _check_start(self, exposure: PairFrame) -> None:
         """Begin, or wait for another exposure. Raises DataError."""
         for name, view in exposure.views.items():
-            problem = _wrong_start(view, len(self._settings.first[name].target_id))
+            problem = _wrong_start(view, len(self._trackers[name].first.target_id))
             if problem is not None:
                 self._renew()
                 place = Place((name,)) if self._pair is not None else Place()

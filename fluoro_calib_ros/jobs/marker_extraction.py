@@ -20,14 +20,14 @@ import cv2
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from ..checks.cluster_watch import Cluster
+from ..bodies.body import Body
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError
 from ..exposures.frame import Frame
 from ..exposures.phantom import Phantom
 from ..findings import Finding
 from ..images.marker_decisions import Decision, revise
-from ..images.marker_ids import ClusterShape, identify_markers
+from ..images.marker_ids import identifiable, identify_markers
 from ..images.markers import FirstMarkers, MarkerFrame, MarkerOptions
 from ..images.overlay import draw_markers
 from ..io.access import make_folder
@@ -64,10 +64,9 @@ class MarkerRequest:
         Of two fluoroscopes.
     orientation : RigOrientation or None
         Of two fluoroscopes.
-    clusters : tuple of Cluster
-        Markers that are rigid together, of two fluoroscopes.
-    shapes : tuple of ClusterShape
-        Clusters whose shapes are known. They give the ids where no markers are given.
+    bodies : tuple of Body
+        Markers that are rigid together, of two fluoroscopes. Known shapes give the ids where no
+        markers are given.
     overlay : Path or None
         Folder for pictures.
     target_names : mapping of int to str
@@ -81,8 +80,7 @@ class MarkerRequest:
     options: MarkerOptions = field(default_factory=MarkerOptions)
     calibrations: Mapping[str, FluoroscopeCalibration] = field(default_factory=dict)
     orientation: RigOrientation | None = None
-    clusters: tuple[Cluster, ...] = ()
-    shapes: tuple[ClusterShape, ...] = ()
+    bodies: tuple[Body, ...] = ()
     overlay: Path | None = None
     target_names: Mapping[int, str] = field(default_factory=dict)
     angles: ImageAngles = field(default_factory=ImageAngles)
@@ -238,18 +236,16 @@ def sequences(
     return out, (first.image.shape[1], first.image.shape[0])
 
 
-def shapes_of(
-    clusters: Sequence[Cluster], phantom: Phantom, path: Path
-) -> tuple[ClusterShape, ...]:
-    """Return the shapes of clusters from coordinates of their markers. Raises DataError."""
-    row = {target: number for number, target in enumerate(phantom.target_id.tolist())}
+def shaped(bodies: Sequence[Body], phantom: Phantom, path: Path) -> tuple[Body, ...]:
+    """Return bodies with coordinates of their markers. Raises DataError."""
     out = []
-    for cluster in clusters:
-        absent = [target for target in cluster.target_id if target not in row]
-        if absent:
-            raise DataError(f'{path}: there is no marker {absent[0]} of cluster {cluster.name}')
-        rows = [row[target] for target in cluster.target_id]
-        out.append(ClusterShape(cluster.name, phantom.target_id[rows], phantom.xyz_mm[rows]))
+    for body in bodies:
+        absent = np.setdiff1d(body.target_id, phantom.target_id)
+        if len(absent):
+            raise DataError(f'{path}: there is no marker {absent[0]} of cluster {body.name}')
+        order = np.argsort(phantom.target_id)
+        rows = order[np.searchsorted(phantom.target_id, body.target_id, sorter=order)]
+        out.append(replace(body, xyz_mm=phantom.xyz_mm[rows], sd_mm=phantom.sd_mm[rows]))
     return tuple(out)
 
 
@@ -306,7 +302,7 @@ class _Recording:
         }
         self._tries = 0
         self._reason = ''
-        by_shape = bool(request.shapes) and not request.first
+        by_shape = bool(identifiable(request.bodies)) and not request.first
         for name in self._names:
             if not self._given[name] and not by_shape:
                 raise DataError(f'there are no given markers of fluoroscope {name}')
@@ -369,7 +365,7 @@ class _Recording:
         return first
 
     def _by_shape(self, images: Mapping[str, SourceImage]) -> dict[str, FirstMarkers]:
-        """Identify markers by the shapes of their clusters, in one of the first exposures."""
+        """Identify markers by the shapes of their bodies, in one of the first exposures."""
         request = self._request
         assert request.orientation is not None
         arrays = {name: image.image for name, image in images.items()}
@@ -382,7 +378,7 @@ class _Recording:
                 whole,
                 request.calibrations,
                 request.orientation,
-                request.shapes,
+                request.bodies,
                 _angles_of(images),
             )
         except DataError as error:
@@ -409,8 +405,7 @@ class _Recording:
                 request.options,
                 request.calibrations,
                 request.orientation,
-                clusters=request.clusters,
-                shapes=request.shapes,
+                bodies=request.bodies,
             )
         )
 

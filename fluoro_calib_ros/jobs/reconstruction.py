@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..checks.cluster_watch import Cluster
+from ..bodies.body import Body
 from ..checks.rig_watch import DriftVerdict, RecordingDriftWatch
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError
@@ -29,7 +29,7 @@ from ..reconstruction.reconstruct import ReconstructedFrame, reconstruct_recordi
 class ReconstructionOptions:
     """Options of a reconstruction.
 
-    The drift watch also monitors the distances in rigid clusters of targets. A recording without
+    The drift watch also monitors the shapes of rigid bodies. A recording without
     time stamps (has_stamps False) can only be paired by frame number, and cannot show a drift.
     Raises ValueError for a value that an option cannot have.
     """
@@ -45,7 +45,7 @@ class ReconstructionOptions:
         unit='standard deviations',
     )
     drift_watch: bool = True
-    clusters: tuple[Cluster, ...] = ()
+    bodies: tuple[Body, ...] = ()
     has_stamps: bool = True
     pair_tolerance: float = PairingOptions.tolerance_s
 
@@ -192,7 +192,7 @@ def _drift_watch(
         return None, DriftVerdict(Finding(Kind.NOT_WATCHED, why, severity=Severity.WARNING))
     sizes = {name: calibrations[name].image_size for name in orientation.fluoroscopes}
     try:
-        return RecordingDriftWatch(orientation, sizes, clusters=options.clusters), None
+        return RecordingDriftWatch(orientation, sizes, bodies=options.bodies), None
     except DataError as error:
         why = f'a drift cannot be detected: {error}'
         return None, DriftVerdict(Finding(Kind.NOT_WATCHED, why, severity=Severity.WARNING))

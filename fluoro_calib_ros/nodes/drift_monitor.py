@@ -12,7 +12,7 @@ from fluoro_calib_msgs.srv import Reset
 from rclpy.client import Client
 from rclpy.publisher import Publisher
 
-from ..checks.cluster_watch import Cluster, parse_clusters
+from ..bodies.body import Body, declared_bodies
 from ..checks.drift_options import DriftOptions, DriftState
 from ..checks.rig_watch import RigDriftWatch
 from ..options import option
@@ -47,13 +47,13 @@ class DriftParameters:
 
     def __post_init__(self) -> None:
         try:
-            self.rigid_clusters()
+            self.rigid_bodies()
         except ValueError as error:
             raise ValueError(f'clusters: {error}') from None
 
-    def rigid_clusters(self) -> tuple[Cluster, ...]:
-        """Return the clusters. Raises ValueError for a text that declares none."""
-        return parse_clusters([text for text in self.clusters if text])
+    def rigid_bodies(self) -> tuple[Body, ...]:
+        """Return the bodies. Raises ValueError for a text that declares none."""
+        return declared_bodies([text for text in self.clusters if text])
 
 
 class DriftMonitor:
@@ -75,7 +75,7 @@ class DriftMonitor:
         self._names = tuple(names)
         self._parameters = parameters
         self._options = options
-        self._clusters = parameters.rigid_clusters()
+        self._bodies = parameters.rigid_bodies()
         self._logger = logger
         self.reset()
 
@@ -83,7 +83,7 @@ class DriftMonitor:
         """Use other parameters; returns whether the watches have to be made anew."""
         old = self._parameters
         self._parameters = parameters
-        self._clusters = parameters.rigid_clusters()
+        self._bodies = parameters.rigid_bodies()
         return replace(old, collect_on_drift=parameters.collect_on_drift) != parameters
 
     def use_options(self, options: DriftOptions) -> None:
@@ -119,7 +119,7 @@ class DriftMonitor:
             orientation,
             self._sizes,
             self._options,
-            self._clusters,
+            self._bodies,
             self._parameters.drift_rate,
         )
 

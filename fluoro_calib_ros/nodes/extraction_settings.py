@@ -9,11 +9,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..checks.cluster_watch import Cluster, parse_clusters
+from ..bodies.body import Body, declared_bodies
 from ..errors import DataError
 from ..exposures.angles import AngleOptions
 from ..exposures.pairing import PairingOptions
 from ..images.markers import FirstMarkers, MarkerOptions
+from ..io.bodies import read_bodies
 from ..io.rig_orientation import load_orientation, orientation_path
 from ..jobs.live_extraction import MakeFollower, PhantomSettings
 from ..jobs.live_markers import MarkerSettings
@@ -62,6 +63,11 @@ class ExtractionParameters(ManagedParameters):
         "for the mode markers and two views: rigid clusters, each a text such as 'tibia: 1001 "
         "1002 1003 1004'",
     )
+    bodies: str = option(
+        '',
+        'for the mode markers and two views: bodies.csv with rigid bodies and the places of their '
+        'markers, in the place of clusters; without the file markers, the shapes give the ids',
+    )
     principal_distance: float = option(
         0.0,
         'principal distance, to some 10 %; 0: four times the width of the image, to 25 %',
@@ -82,13 +88,15 @@ class ExtractionParameters(ManagedParameters):
 
     def __post_init__(self) -> None:
         try:
-            self.rigid_clusters()
+            self.rigid_bodies()
         except ValueError as error:
             raise ValueError(f'clusters: {error}') from None
+        if self.bodies and self.rigid_bodies():
+            raise ValueError('bodies: the file names the markers of each body, as clusters do')
 
-    def rigid_clusters(self) -> tuple[Cluster, ...]:
-        """Return the clusters. Raises ValueError for a text that declares none."""
-        return parse_clusters([text for text in self.clusters if text])
+    def rigid_bodies(self) -> tuple[Body, ...]:
+        """Return the bodies. Raises ValueError for a text that declares none."""
+        return declared_bodies([text for text in self.clusters if text])
 
 
 _NODE = ParameterGroup(ExtractionParameters)
@@ -125,13 +133,14 @@ def read_followers(settings: ExtractionSettings, logger: Logger) -> Sequence[Mak
     """Return what makes the followers: one for each view, or one for both. Raises StartError."""
     mode = settings.node.mode
     path = settings.node.phantom if mode == 'phantom' else settings.node.markers
-    if not path:
+    by_shape = mode == 'markers' and settings.node.bodies and settings.node.calibration_directory
+    if not path and not by_shape:
         example = 'phantom.csv' if mode == 'phantom' else 'with the markers'
         raise StartError(f'parameter {mode} is not set: it names the file {example}')
     try:
         if mode == 'phantom':
             return _of_phantom(expand_path(path), settings.node, logger)
-        first = _first_markers(expand_path(path), settings.node.fluoroscopes)
+        first = _first_markers(expand_path(path), settings.node.fluoroscopes) if path else {}
         if settings.node.calibration_directory:
             return [_of_pair(settings, first)]
         return [
@@ -174,13 +183,10 @@ def _of_pair(settings: ExtractionSettings, first: Mapping[str, FirstMarkers]) ->
         )
     calibrations = read_calibrations(folder, names)
     orientation = load_orientation(orientation_path(folder)).subset(names)
-    pair = MarkerSettings(
-        first,
-        settings.following,
-        calibrations,
-        orientation,
-        clusters=settings.node.rigid_clusters(),
-    )
+    bodies = settings.node.rigid_bodies()
+    if settings.node.bodies:
+        bodies = read_bodies(expand_path(settings.node.bodies))
+    pair = MarkerSettings(first, settings.following, calibrations, orientation, bodies=bodies)
     check_orientation(orientation, calibrations)
     pair()  # refuses what does not belong together before the node starts
     return pair

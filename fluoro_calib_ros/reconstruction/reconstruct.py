@@ -10,7 +10,7 @@ both give the same numbers.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -115,24 +115,6 @@ def _equal(one: np.ndarray, other: np.ndarray) -> bool:
     return len(one) == len(other) and bool((one == other).all())
 
 
-class ExposureWatch(Protocol):
-    """What examines the exposures of a reconstruction, such as a RigDriftWatch."""
-
-    def is_due(self, stamp_ns: int) -> bool:
-        """Whether the exposure with this stamp is to be examined."""
-
-    def add_exposure(
-        self,
-        stamp_ns: int,
-        target_id: np.ndarray,
-        uv: np.ndarray,
-        sigma: np.ndarray,
-        correction_sd: np.ndarray,
-        points: IntersectedPoints,
-    ) -> Any:
-        """Examine an exposure; the arrays are those of MatchedViews."""
-
-
 @dataclass(frozen=True)
 class IntersectedViews:
     """The matched views of an exposure and their intersected points."""
@@ -144,6 +126,16 @@ class IntersectedViews:
     def target_id(self) -> np.ndarray:
         """Target ids (n,) of the points."""
         return self.views.target_id
+
+
+class ExposureWatch(Protocol):
+    """What examines the exposures of a reconstruction, such as a RigDriftWatch."""
+
+    def is_due(self, stamp_ns: int) -> bool:
+        """Whether the exposure with this stamp is to be examined."""
+
+    def add_exposure(self, stamp_ns: int, exposure: IntersectedViews) -> Any:
+        """Examine an exposure."""
 
 
 @dataclass(frozen=True)
@@ -192,9 +184,7 @@ def watch_exposure(watch: ExposureWatch, stamp_ns: int, exposure: IntersectedVie
     if watch.is_due(stamp_ns):
         views = exposure.views
         inside = np.where(views.outside[:, :, None], np.nan, views.uv)
-        watch.add_exposure(
-            stamp_ns, views.target_id, inside, views.sigma, views.correction_sd, exposure.points
-        )
+        watch.add_exposure(stamp_ns, replace(exposure, views=replace(views, uv=inside)))
 
 
 def reconstruct_exposure(

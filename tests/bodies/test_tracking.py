@@ -83,6 +83,28 @@ def test_a_trial_is_smoothed_with_honest_deviations():
         assert (poses.status == PoseStatus.OK).all() and (poses.markers == 4).all()
 
 
+def test_poses_are_predicted_any_number_of_times_and_shapes_replaced_on_the_way():
+    """A prediction changes nothing, nor does a shape with other markers in the same frame."""
+    trial = Trial(2)
+    _, expected = trial.follow(lag=0)
+    tracker = BodyTracker(trial.rig, trial.bodies)
+    fewer = [one.rows(np.arange(4) < 3) for one in trial.bodies]
+    for k, one in enumerate(trial.exposures):
+        stamp_ns = 1 + round(1e9 * k / RATE)
+        for _ in range(3):
+            ahead = tracker.predict(stamp_ns)
+        found = tracker.add(one, k, stamp_ns)
+        if k < 60:
+            assert np.array_equal(found.centre_mm, expected[k].centre_mm)
+            assert np.array_equal(found.covariance, expected[k].covariance)
+        for row, body_ in enumerate(tracker.bodies) if k > 20 else ():
+            true = trial.position[row][k] + trial.rotation[row][k] @ body_.centre
+            sd = np.sqrt(np.diagonal(ahead.covariance[row])[:3])
+            assert (np.abs(ahead.centre_mm[row] - true) < 5 * sd).all()
+        if k == 60:
+            tracker.reshape(fewer)
+
+
 def test_markers_that_come_and_go_make_no_jump():
     """A third of all image points is lost: nowhere more than five standard deviations off."""
     trial = Trial(1, lost=0.35)

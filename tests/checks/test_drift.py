@@ -11,17 +11,21 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.spatial.distance import pdist
 
+from fluoro_calib_ros.bodies.body import Body, declared_bodies
+from fluoro_calib_ros.checks.body_watch import BodyWatch
 from fluoro_calib_ros.checks.charts import CusumCharts, ImageAreas
-from fluoro_calib_ros.checks.cluster_watch import Cluster
-from fluoro_calib_ros.checks.drift_observations import EpipolarObservations, PointObservations
+from fluoro_calib_ros.checks.drift_observations import EpipolarObservations
 from fluoro_calib_ros.checks.drift_options import ERROR, OK, WARN, DriftOptions
 from fluoro_calib_ros.checks.drift_watch import DriftWatch
 from fluoro_calib_ros.checks.pair_watch import SystematicErrorField
+from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.findings import Kind
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 from fluoro_calib_ros.reconstruction.epipolar import EpipolarGeometry
 from fluoro_calib_ros.reconstruction.intersection import Intersector
+from fluoro_calib_ros.reconstruction.reconstruct import IntersectedViews, MatchedViews
 from fluoro_calib_ros.simulation.rig import virtual_rig
 
 sys.path.append(str(Path(__file__).resolve().parents[2]))  # benchmarks are not installed
@@ -37,6 +41,7 @@ from benchmarks.drift import (
     blocks,
     detection,
     feed,
+    intersected,
     markers,
 )
 
@@ -548,7 +553,7 @@ def test_clusters_see_a_drift_along_the_epipolar_lines(name, quarter, direction)
     assert found['source'].startswith('cluster bone')
     assert abs(found['size_error']) <= 3 * found['sd'] <= 0.3 and found['kind'] == 'image_drift'
     blind = copy.deepcopy(watch)
-    blind._cluster_watch = None
+    blind._body_watch = None
     missed = detection(scene, blind, first, drift, np.random.default_rng(17), False, after_s=5)
     assert missed['warn'] == np.inf
 
@@ -568,95 +573,105 @@ def test_undetectable_drift_is_not_reported():
         assert found['warn'] == np.inf
 
 
+def projected(orientation, view, place):
+    """Ideal pixel (2,) of a point (3,) [mm]."""
+    xp, yp, c = orientation.interior[view]
+    x, y, z = orientation.rotation[view] @ (place - orientation.position_mm[view])
+    return np.array([xp + c * x / z, yp + c * y / z])
+
+
 def test_moved_bead_is_named_as_a_possible_cause():
     scene, watch, first = perfect()
     watch = copy.deepcopy(watch)
     rng = np.random.default_rng(19)
+    orientation = scene.orientation
     for _, corrected, _, stamps in blocks(scene, rng, first, 24):
         for k, stamp in enumerate(stamps):
             rows = slice(k * len(IDS), (k + 1) * len(IDS))
             uv = np.stack([corrected[n][rows] for n in 'ab'])
-            points = scene.intersector.intersect(uv, np.full((2, len(IDS)), 0.25))
-            xyz = points.xyz_mm.copy()
-            xyz[7] += (0.0, 0.0, 2.0)
             systematic = np.full((2, len(IDS)), 0.04)
-            state = watch.add_points(
-                stamp, PointObservations(IDS, xyz, points.covariance_noise, uv, systematic)
-            )
+            place = intersected(scene, uv, systematic, (0.25, 0.25)).points.xyz_mm[7]
+            for view in (0, 1):
+                there = projected(orientation, view, place + (0.0, 0.0, 2.0))
+                uv[view, 7] += there - projected(orientation, view, place)
+            state = watch.add_points(stamp, intersected(scene, uv, systematic, (0.25, 0.25)))
     assert state.level >= WARN and state.source == 'cluster bone 2'
     assert state.finding.kind is Kind.CLUSTER_CHANGE
 
 
-def test_distances_can_be_declared():
+def test_shapes_can_be_declared():
     scene, watch, first = perfect()
     rng = np.random.default_rng(16)
     beads = rng.uniform(-22, 22, (5, BEADS, 3))
-    distances = np.linalg.norm(beads[:, :, None] - beads[:, None], axis=3)
-    o = scene.orientation
-    clusters = [
-        Cluster(str(i), IDS[BEADS * i : BEADS * (i + 1)], d, 0.01) for i, d in enumerate(distances)
+    bodies = [
+        Body(str(i), IDS[BEADS * i : BEADS * (i + 1)], xyz, np.full(BEADS, 0.01))
+        for i, xyz in enumerate(beads)
     ]
-    declared = DriftWatch(SIZES, DriftOptions(), clusters, o)
-    np.testing.assert_allclose(
-        watch._cluster_watch.distances, declared._cluster_watch.distances, atol=0.05
-    )
+    declared = DriftWatch(SIZES, DriftOptions(), bodies, scene.orientation)
+    for learned, given in zip(watch._body_watch.bodies, bodies):
+        np.testing.assert_allclose(pdist(learned.xyz_mm), pdist(given.xyz_mm), atol=0.05)
+        assert learned.sd_mm.max() < 0.05
     for block in blocks(scene, np.random.default_rng(20), first, 8):
         state = feed(scene, declared, block)
     assert (
         state.level == OK
-        and np.isfinite(declared._clusters._records[-1].score).all()
-        and declared._clusters._records[-1].information.sum() > 0
+        and np.isfinite(declared._bodies._records[-1].score).all()
+        and declared._bodies._records[-1].information.sum() > 0
     )
 
 
-@pytest.mark.parametrize(
-    'arguments, sentence',
-    [
-        (('c', (1,)), 'two beads or more'),
-        (('c', (1, 1)), 'each named once'),
-        (('c', (1, 2), np.zeros((2, 2))), 'above 0 mm'),
-        (('c', (1, 2), np.ones((3, 3))), '2 x 2'),
-        (('c', (1, 2), None, -1.0), 'sd_mm'),
-    ],
-)
-def test_invalid_clusters_are_refused(arguments, sentence):
-    with pytest.raises(ValueError, match=sentence):
-        Cluster(*arguments)
+def test_score_of_a_body_is_the_most_likely_drift():
+    """By score over information, against a shift that is known; with two beads, too."""
+    scene, _, first = perfect()
+    beads = np.random.default_rng(16).uniform(-22, 22, (5, BEADS, 3))
+    areas = ImageAreas(4)
+    for count in (BEADS, 2):
+        bodies = [
+            Body(str(i), IDS[BEADS * i : BEADS * i + count], xyz[:count], np.zeros(count))
+            for i, xyz in enumerate(beads)
+        ]
+        watch = BodyWatch(bodies, scene.orientation, [(1024, 1024)] * 2, areas, DriftOptions())
+        size = 0.2
+        for _, corrected, _, stamps in blocks(scene, np.random.default_rng(3), first, 40):
+            for k in range(0, len(stamps), 3):
+                rows = slice(k * len(IDS), (k + 1) * len(IDS))
+                uv = np.stack([corrected[n][rows] for n in 'ab'])
+                uv[0, :, 0] += size * (uv[0, :, 0] < 511.5)
+                watch.add(intersected(scene, uv, np.full((2, len(IDS)), 0.01), (0.25, 0.25)))
+        block = watch.block()
+        names = [areas.describe(area, (1024, 1024))[1] for area in range(len(areas))]
+        left = names.index('left half')
+        information = block.information[:, 0, left].sum()
+        print(count, information, block.score[:, 0, left].sum() / information, block.count)
+        assert information > 100
+        assert block.score[:, 0, left].sum() / information == pytest.approx(
+            size, abs=4 / np.sqrt(information)
+        )
 
 
-def points(n, views=2, **arrays):
-    """PointObservations of zeros, except for the given arrays."""
-    zeros = {
-        'xyz_mm': np.zeros((n, 3)),
-        'covariance': np.zeros((n, 3, 3)),
-        'uv': np.zeros((views, n, 2)),
-        'sd_systematic': np.full((views, n), 0.04),
-    }
-    return PointObservations(np.arange(n), **{**zeros, **arrays})
+def exposure_of(views, ids=IDS):
+    n = len(ids)
+    seen = MatchedViews(
+        ids, *np.zeros((1, views, n, 2)), *np.ones((2, views, n)), np.zeros((views, n), bool)
+    )
+    return IntersectedViews(
+        seen, perfect()[0].intersector.intersect(np.zeros((2, n, 2)), np.ones((2, n)))
+    )
 
 
 def test_invalid_watches_are_refused():
     o = perfect()[0].orientation
-    cluster = Cluster('c', (1, 2, 3))
+    bodies = declared_bodies(['c: 1 2 3'])
     with pytest.raises(ValueError, match='two fluoroscopes'):
         DriftWatch({'a': (1024, 1024)})
     with pytest.raises(ValueError, match='orientation of the rig'):
-        DriftWatch(SIZES, clusters=[cluster])
-    with pytest.raises(ValueError, match='a bead is in two clusters'):
-        DriftWatch(
-            SIZES,
-            DriftOptions(),
-            [cluster, Cluster('d', (3, 4))],
-            o,
-        )
-    watch = DriftWatch(SIZES, DriftOptions(), [cluster], o)
-    with pytest.raises(ValueError, match='uv must have the shape'):
-        points(2, uv=np.zeros((2, 3, 2)))
-    with pytest.raises(ValueError, match='xyz_mm must have the shape'):
-        points(2, xyz_mm=np.zeros((3, 3)))
+        DriftWatch(SIZES, bodies=bodies)
+    with pytest.raises(DataError, match='a marker belongs to one body'):
+        DriftWatch(SIZES, DriftOptions(), [*bodies, *declared_bodies(['d: 3 4'])], o)
+    watch = DriftWatch(SIZES, DriftOptions(), bodies, o)
     with pytest.raises(ValueError, match='pixels of 2 views, not 3'):
-        watch.add_points(0, points(2, views=3))
-    assert watch.add_points(0, points(0)).level == OK
+        watch.add_points(0, exposure_of(3))
+    assert watch.add_points(0, exposure_of(2, IDS[:0])).level == OK
 
 
 @pytest.mark.parametrize('length_s, watched_s', [(0.5, 5), (3.0, 40)])

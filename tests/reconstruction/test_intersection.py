@@ -11,7 +11,7 @@ import pytest
 from rigs import calibrated
 from scipy.optimize import least_squares
 
-from fluoro_calib_ros.checks.cluster_watch import parse_clusters
+from fluoro_calib_ros.bodies.body import declared_bodies
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.photogrammetry.noise import ObservedScatter
@@ -597,21 +597,23 @@ def test_invalid_recordings_are_refused():
 @pytest.mark.parametrize(
     'texts, sentence',
     [
-        (['1001 1002'], "does not declare a cluster, as 'tibia: 1001 1002 1003' does"),
-        (['tibia:'], 'does not declare a cluster'),
-        (['tibia: 1 x'], 'does not declare a cluster'),
-        (['tibia: 1'], 'cluster tibia: needs two beads or more'),
-        (['tibia: 1 2', 'tibia: 3 4'], 'two clusters have the same name'),
-        (['tibia: 1 2', 'femur: 2 3'], 'target 2 is in two clusters'),
+        (['1001 1002'], "does not declare a body, as 'tibia: 1001 1002 1003' does"),
+        (['tibia:'], 'does not declare a body'),
+        (['tibia: 1 x'], 'does not declare a body'),
+        (['tibia: 1'], 'body tibia: needs two markers or more'),
+        (['tibia: 1 2', 'tibia: 3 4'], 'two bodies are called tibia'),
+        (['tibia: 1 2', 'femur: 2 3'], 'marker 2 is one of tibia and of femur'),
     ],
 )
-def test_invalid_declarations_of_clusters_are_refused(texts, sentence):
+def test_invalid_declarations_of_bodies_are_refused(texts, sentence):
     with pytest.raises(ValueError, match=sentence):
-        parse_clusters(texts)
+        declared_bodies(texts)
 
 
-def test_declared_clusters():
-    assert [(c.name, c.target_id) for c in parse_clusters(['tibia: 1 2,3', 'my femur :4 5'])] == [
-        ('tibia', (1, 2, 3)),
-        ('my femur', (4, 5)),
+def test_declared_bodies():
+    bodies = declared_bodies(['tibia: 3 1,2', 'my femur :4 5'])
+    assert [(body.name, body.target_id.tolist()) for body in bodies] == [
+        ('tibia', [1, 2, 3]),
+        ('my femur', [4, 5]),
     ]
+    assert not any(body.known.any() for body in bodies)

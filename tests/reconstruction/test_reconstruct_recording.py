@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from rigs import run, true_calibrations, true_orientation
 
-from fluoro_calib_ros.checks.cluster_watch import parse_clusters
+from fluoro_calib_ros.bodies.body import declared_bodies
 from fluoro_calib_ros.checks.drift_options import ERROR, DriftOptions
 from fluoro_calib_ros.checks.rig_watch import RecordingDriftWatch, RigDriftWatch
 from fluoro_calib_ros.findings import Kind, Severity
@@ -80,7 +80,7 @@ def watched(frames, names, clusters=(), options=DriftOptions()):
         orientation,
         {n: c.image_size for n, c in calibrations.items()},
         options,
-        parse_clusters(clusters),
+        declared_bodies(clusters),
     )
     reconstruct_recording(frames, calibrations, Intersector(orientation), watch=watch)
     return watch
@@ -395,13 +395,13 @@ def test_reconstruct_reports_where_no_drift_can_be_detected(folder, capsys):
         (
             'short',
             ['--cluster', '1001 1002'],
-            "--cluster: '1001 1002' does not declare a cluster, as 'tibia: 1001 1002",
+            "--cluster: '1001 1002' does not declare a body, as 'tibia: 1001 1002",
         ),
-        ('short', ['--cluster', 'tibia: 1'], '--cluster: cluster tibia: needs two beads or more'),
+        ('short', ['--cluster', 'tibia: 1'], '--cluster: body tibia: needs two markers or more'),
         (
             'short',
             ['--cluster', 'tibia: 1 2', '--cluster', 'femur: 2 3'],
-            '--cluster: target 2 is in two clusters',
+            '--cluster: marker 2 is one of tibia and of femur',
         ),
         (
             'short',

@@ -14,9 +14,11 @@ from rclpy.serialization import serialize_message
 from ros_graph import NAMES
 from sensor_msgs.msg import CompressedImage, Image
 
+from fluoro_calib_ros.bodies.body import Body
 from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.images.codec import encode
+from fluoro_calib_ros.io.bodies import write_bodies
 from fluoro_calib_ros.io.observations import write_observations_csv
 from fluoro_calib_ros.io.phantom import read_phantom, write_phantom
 from fluoro_calib_ros.jobs.calibration import run_calibration
@@ -330,6 +332,31 @@ def test_markers_are_followed_in_both_views_together(graph, calibrated):
     assert node.running and 'Traceback' not in node.log
 
 
+def test_bodies_give_the_ids_of_the_first_markers(graph, calibrated):
+    """Without first places: the shapes of the bodies alone, in whatever pose."""
+    rate = 0.2
+    tracking = simulate_tracking(virtual_rig(1), 6.0, rate, 1, 0.0)
+    bodies = graph.directory / 'bodies.csv'
+    shapes = zip(tracking.marker_id.reshape(-1, 6), tracking.points_mm[0].reshape(-1, 6, 3))
+    write_bodies(
+        bodies,
+        [Body(f'bone {ids[0]}', ids, xyz - xyz[0], np.full(6, 0.05)) for ids, xyz in shapes],
+    )
+    found = {name: graph.client.listen(f'{name}/target_observations') for name in NAMES}
+    together = {'mode': 'markers', 'bodies': bodies, 'calibration_directory': calibrated}
+    node = graph.start('extraction_node', together)
+    scene = {'scene': 'markers', 'images': 'clean', 'rate': rate, 'frames': 2, 'noise': 0.0}
+    simulator = graph.start('simulator_node', {**scene, 'wait_for_readers': 1}, wait=False)
+    graph.client.wait_until(lambda: all(found.values()), what='the markers of both views')
+    assert simulator.wait() == 0, simulator.log
+    for name in NAMES:
+        true = dict(zip(tracking.marker_id.tolist(), tracking.frames[name][0].uv))
+        seen = found[name][0]
+        error = [np.hypot(u - true[i][0], v - true[i][1]) for i, u, v in zip(*columns(seen))]
+        assert len(error) > 5 and max(error) < 1.0
+    assert node.running and 'Traceback' not in node.log
+
+
 def test_views_that_cannot_be_followed_together_are_refused(graph, calibrated):
     tracking = simulate_tracking(virtual_rig(1), 2.0, 1.0, 1, 0.0)
     markers = graph.directory / 'markers.csv'
@@ -338,7 +365,8 @@ def test_views_that_cannot_be_followed_together_are_refused(graph, calibrated):
     for more, sentence in (
         ({'fluoroscopes': '[a]'}, 'two fluoroscopes are followed together, not 1'),
         ({'calibration_directory': graph.directory / 'nothing'}, 'nothing'),
-        ({'clusters': '[tibia]'}, 'does not declare a cluster'),
+        ({'clusters': '[tibia]'}, 'does not declare a body'),
+        ({'bodies': graph.directory / 'nowhere.csv'}, 'nowhere.csv'),
     ):
         node = graph.start('extraction_node', {**together, **more}, wait=False)
         assert node.wait() == 1

@@ -20,6 +20,7 @@ from sensor_msgs.msg import Image, JointState
 import tests.images.test_markers as markers
 from fluoro_calib_ros.correction.fluoroscope_calibration import digest_of_sources
 from fluoro_calib_ros.exposures.angles import AngleOptions
+from fluoro_calib_ros.exposures.frame import angle_in_degrees
 from fluoro_calib_ros.images.angle_maps import AngleMaps
 from fluoro_calib_ros.images.markers import FirstMarkers
 from fluoro_calib_ros.io.bags.definitions import (
@@ -323,14 +324,18 @@ def test_markers_are_followed_at_the_angles_of_their_images(graph, tmp_path):
         name: FirstMarkers(each.target_id, np.round(each.uv, 6))
         for name, each in markers.turned_first().items()
     }
-    clusters = markers.followed_clusters()
+    bodies = markers.followed_bodies()
+
+    def rounded(number):  # as the angles of joint states are
+        angles = markers.angles_of_exposure(number)
+        return {name: np.radians(angle_in_degrees(angle)) for name, angle in angles.items()}
 
     def offline(known):
         follower = MarkerSettings(
-            first, markers.OPTIONS, markers.turning(), markers.turning_orientation(), clusters
+            first, markers.OPTIONS, markers.turning(), markers.turning_orientation(), bodies
         )()
         return [
-            follower.extract(images, n, (), markers.angles_of_exposure(n) if known else None)
+            follower.extract(images, n, (), rounded(n) if known else None)
             for n, images in enumerate(markers.turned_images(), 1)
         ]
 
@@ -343,7 +348,7 @@ def test_markers_are_followed_at_the_angles_of_their_images(graph, tmp_path):
     client = graph.client
     found = {n: client.listen(f'{n}/target_observations') for n in NAMES}
     shown = {n: client.create_publisher(Image, f'{n}/image_raw', images_qos()) for n in NAMES}
-    texts = [f'{c.name}: ' + ' '.join(map(str, c.target_id)) for c in clusters]
+    texts = [f'{body.name}: ' + ' '.join(map(str, body.target_id)) for body in bodies]
     parameters = {
         'mode': 'markers',
         'markers': tmp_path / 'first.csv',

@@ -1,0 +1,383 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""What rigid bodies tell of a drift that epipolar residuals cannot see.
+
+A shift along an epipolar line moves the intersected point in depth, and all rays still meet. If
+one of two markers of a body is in the area that has drifted and the other is not, the points no
+longer fit the shape of the body. With the pose of a body from its image points (see bodies.pose),
+let the image points of a marker have the derivatives B by its place, weights W, S = B'WB and the
+displacement p = S^-1 B'Wr from the place that the body says. A shift of one pixel in an area moves
+its markers by q = S^-1 B'W, of which the pose takes up a part: with D of the place by the pose,
+N = sum D'SD and g = sum D'Sq over the area, the shift has
+
+    score = sum q'S p - g'N^-1 sum D'Sp,  information = sum q'Sq - g'N^-1 g
+
+(Foerstner and Wrobel, "Photogrammetric Computer Vision", Springer 2016, 4.6). So each body
+measures the drift of an area [px], as every epipolar residual does; displacements across the
+epipolar lines are left to those. Where all markers of a body shift alike the pose takes up
+everything: a drift of the whole image along the epipolar lines moves and turns a body without
+deforming it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtri, erfc
+
+from ..bodies.body import POSE_SIZE, Body, check_bodies
+from ..bodies.image_points import Cameras, ImagePoints, Linear
+from ..bodies.pose import marker_sums
+from ..bodies.rigid import fitted_pose
+from ..bodies.shapes import learned_shape
+from ..photogrammetry.rig_orientation import RigOrientation
+from ..reconstruction.reconstruct import IntersectedViews
+from .charts import ImageAreas
+from .drift_options import DriftOptions
+
+COMPONENTS = 2  # of a shift in an image, u and v
+# Fraction of the systematic standard deviation that markers in an area have in common. Measured:
+# a fifth to two fifths, since their reference is what they were at the start, and markers some
+# centimetres apart have errors of their own.
+COMMON_SYSTEMATIC = 0.5
+MIN_PAIRS = 2  # of markers in an exposure, one in an area and one outside, to test the area
+LEARNED = 200  # exposures from which a shape is learned: its noise is a fourteenth of theirs
+REWEIGHTINGS = 3
+REGULAR = 1e-10  # of the largest element of a normal matrix, added to its diagonal
+MAX_LEARNING = 5000  # exposures that are kept until all markers are known
+_EYE = np.eye(3)
+
+
+@dataclass(frozen=True)
+class BodyBlock:
+    """Statistics of the bodies in a block.
+
+    The 2F series are the drifts along u and v of the F fluoroscopes.
+
+    Attributes
+    ----------
+    score, information : ndarray
+        (B, 2F, A), of a drift of each area, by body [1/px, 1/px^2].
+    systematic : ndarray
+        (2F, A), systematic standard deviations of what all bodies show together [px].
+    enough : ndarray
+        (2F, A), whether enough pairs of markers are on both sides of the border of the area.
+    count : int
+        Number of places of markers.
+    """
+
+    score: NDArray[np.float64]
+    information: NDArray[np.float64]
+    systematic: NDArray[np.float64]
+    enough: NDArray[np.bool_]
+    count: int
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """One exposure: image points of the bodies, and places (B, M, 3) of their markers."""
+
+    points: ImagePoints
+    places: np.ndarray
+
+
+class BodyWatch:
+    """Turns the image points of rigid bodies into statistics, block by block.
+
+    Parameters
+    ----------
+    bodies : sequence of Body
+        Shapes that are not given are learned at the start of a stream.
+    orientation : RigOrientation
+    sizes : sequence
+        (F, 2), width and height of the images [px].
+    areas : ImageAreas
+    options : DriftOptions
+
+    Raises
+    ------
+    DataError
+        For a marker of two bodies, and for two bodies of the same name.
+    """
+
+    def __init__(
+        self,
+        bodies: Sequence[Body],
+        orientation: RigOrientation,
+        sizes: Sequence[Sequence[int]],
+        areas: ImageAreas,
+        options: DriftOptions,
+    ) -> None:
+        check_bodies(bodies)
+        self._given = tuple(bodies)
+        self._orientation = orientation
+        self._sizes = sizes
+        self._areas = areas
+        self._options = options
+        # A quarter of the start, for a marker that is hidden in between.
+        self._least_blocks = max(1, round(options.learn_s / options.block_s / 4))
+        self.names = tuple(body.name for body in bodies)
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget the learned shapes and all observations."""
+        self._set_bodies(self._given)
+        self._seen: list[_Seen] = []
+        self._learning: list[_Seen] = []
+        self._blocks = np.zeros(self._known.shape, dtype=int)  # in which a marker was seen
+
+    def _set_bodies(self, bodies: Sequence[Body]) -> None:
+        """Take shapes; markers whose places are not known yet are not used."""
+        self.bodies = tuple(bodies)
+        shape = (len(bodies), max(len(body.target_id) for body in bodies))
+        target_id = np.full(shape, -1)
+        self._xyz = np.zeros((*shape, 3))
+        self._variance = np.zeros(shape)
+        self._known = np.ones(shape, dtype=bool)  # of rows without a marker, nothing is learned
+        for row, body in enumerate(bodies):
+            own = slice(len(body.target_id))
+            known = body.known
+            target_id[row, own] = body.target_id
+            self._known[row, own] = known
+            self._xyz[row, own] = np.where(known[:, None], body.xyz_mm, 0.0)
+            self._variance[row, own] = np.where(known, body.sd_mm, 0.0) ** 2
+        self._cameras = Cameras(self._orientation, target_id)
+
+    def add(self, exposure: IntersectedViews) -> None:
+        """Add an exposure of the fluoroscopes of the orientation."""
+        if not len(exposure.target_id):
+            return
+        points = self._cameras.sorted(exposure)
+        places = self._cameras.places(exposure)
+        # Depth needs two rays that meet.
+        there = (points.seen.sum(axis=2) > 1) & np.isfinite(places).all(axis=2)
+        points = replace(points, seen=points.seen & there[..., None])
+        self._seen.append(_Seen(points, np.where(there[..., None], places, np.nan)))
+
+    def block(self) -> BodyBlock | None:
+        """Statistics of the exposures since the last call, None without any.
+
+        Markers that are still being learned contribute nothing.
+        """
+        if not self._seen:
+            return None
+        seen, self._seen = self._seen, []
+        if not self._known.all():
+            unknown = [one.points.seen.any(axis=2) & ~self._known for one in seen]
+            self._blocks += np.any(unknown, axis=0)
+            new = [one for one, of_it in zip(seen, unknown) if of_it.any()]
+            self._learning = (self._learning + new)[-MAX_LEARNING:]
+        return self._statistics(_joined(seen), len(seen))
+
+    def learn(self) -> None:
+        """Learn the places of markers that were not given, once they have been seen enough.
+
+        To be called after the start of the stream. A marker that appears later is learned then.
+        """
+        fresh = ~self._known & (self._blocks >= self._least_blocks)
+        rows = np.flatnonzero(fresh.any(axis=1))
+        if not len(rows):
+            return
+        bodies = list(self.bodies)
+        for row in rows.tolist():
+            bodies[row] = self._learned(row, fresh[row])
+        self._blocks[rows] = 0
+        self._set_bodies(bodies)
+        if self._known.all():
+            self._learning = []
+
+    def _learned(self, row: int, fresh: np.ndarray) -> Body:
+        """Return a body with the places of fresh (M,) markers; the known ones stay."""
+        body = self.bodies[row]
+        count = len(body.target_id)
+        wanted = (fresh | self._known[row])[:count]
+        every = max(1, len(self._learning) // LEARNED)
+        seen = [one for one in self._learning[::every] if one.points.seen[row].any()]
+        points = _joined([_row(one, row) for one in seen]).points
+        xyz = np.where(
+            wanted[:, None], np.stack([one.places[row, :count] for one in seen]), np.nan
+        )
+        places = np.nan_to_num(np.stack([one.places[row] for one in seen]))
+        weight = np.where(points.seen, 1 / points.noise, 0.0)
+        still = (np.eye(3)[None], np.zeros((1, 3)))
+        information, _ = marker_sums(self._cameras.linear(places, still, points), weight)
+        known = np.asarray(np.isfinite(xyz).all(axis=2))
+        covariance = np.linalg.inv(np.where(known[..., None, None], information[:, :count], _EYE))
+        found = learned_shape(body, xyz, covariance)
+        new = found.known & ~body.known
+        return replace(
+            body,
+            xyz_mm=np.where(new[:, None], found.xyz_mm, body.xyz_mm),
+            sd_mm=np.where(new, found.sd_mm, body.sd_mm),
+        )
+
+    def _statistics(self, seen: _Seen, exposures: int) -> BodyBlock:
+        """Statistics of the bodies in exposures, all of which are solved at once."""
+        there = seen.points.seen.any(axis=2) & np.tile(self._known, (exposures, 1))
+        rows = np.flatnonzero(np.count_nonzero(there, axis=1) > 1)
+        shape = (COMPONENTS * len(self._sizes), len(self._areas))
+        if not len(rows):
+            nothing = np.zeros((len(self.bodies), *shape))
+            return BodyBlock(nothing, nothing, np.zeros(shape), np.zeros(shape, bool), 0)
+        body = rows % len(self.bodies)
+        there = there[rows]
+        points = ImagePoints(*(getattr(seen.points, e.name)[rows] for e in fields(ImagePoints)))
+        points = replace(points, seen=points.seen & there[..., None])
+        places = np.where(there[..., None], seen.places[rows], 0.0)
+        pose = fitted_pose(self._xyz[body], places, there.astype(float))
+        linear = self._cameras.linear(self._xyz[body], pose, points)
+        drift = _Drift.of(linear, points, self._variance[body])
+        inside = self._inside(points)
+        told = _by_area(drift, self._clipped(drift), inside)
+        score, information, amplitude = np.zeros((3, len(self.bodies), *shape))
+        for total, values in zip((score, information, amplitude), told):
+            np.add.at(total, body, values)
+        with np.errstate(divide='ignore', invalid='ignore'):
+            systematic = amplitude.sum(axis=0) / information.sum(axis=0)
+        within = inside.sum(axis=2)
+        pairs = (within * (there.sum(axis=1)[:, None, None] - within)).sum(axis=0)
+        return BodyBlock(
+            score,
+            information,
+            COMMON_SYSTEMATIC * systematic,
+            np.repeat(pairs > MIN_PAIRS * exposures, COMPONENTS, axis=0),
+            int(there.sum()),
+        )
+
+    def _inside(self, points: ImagePoints) -> np.ndarray:
+        """Whether (n, F, M, A) image points are seen in an area."""
+        member = self._areas.member.T
+        parts = []
+        for view, size in enumerate(self._sizes):
+            uv = points.uv[:, :, view]
+            cell = self._areas.cell(uv.reshape(-1, 2), size).reshape(uv.shape[:2])
+            parts.append(member[cell] * points.seen[:, :, view, None])
+        return np.stack(parts, axis=1)
+
+    def _clipped(self, drift: _Drift) -> np.ndarray:
+        """Displacements (n, M, 3) [mm] from the robust pose, clipped.
+
+        Clipped at what noise, systematic errors and the smallest drift to be found explain; the
+        pose is that of Huber 1964, by reweighting.
+        """
+        options = self._options
+        noise = np.sqrt(chdtri(3, erfc(options.clip / np.sqrt(2))))
+        strongest = np.sqrt(drift.square.max(axis=(2, 3)))
+        limit = (
+            noise
+            + options.band_start * np.sqrt(3 * drift.systematic)
+            + (options.tolerance_px + 2 * options.step_px) * strongest
+        )
+        count = len(limit)
+        gradient = drift.pulled @ drift.displacement[..., None]
+        told = np.concatenate([drift.pulled @ drift.by_pose, gradient], axis=3)
+        told = told.reshape(count, -1, POSE_SIZE * (POSE_SIZE + 1))
+        p = drift.displacement
+        for _ in range(REWEIGHTINGS):
+            length = np.sqrt(np.sum(p * (drift.s_matrix @ p[..., None])[..., 0], axis=2))
+            weight = np.minimum(1.0, limit / np.maximum(length, 1e-9))[..., None]
+            sums = (weight.transpose(0, 2, 1) @ told).reshape(count, POSE_SIZE, POSE_SIZE + 1)
+            step = _inverse(sums[..., :POSE_SIZE]) @ sums[..., POSE_SIZE:]
+            p = drift.displacement - (drift.by_pose @ step[:, None])[..., 0]
+        p = p * weight
+        taken = drift.inverse @ (drift.pulled @ p[..., None]).sum(axis=1)
+        return p - (drift.by_pose @ taken[:, None])[..., 0]
+
+
+@dataclass(frozen=True)
+class _Drift:
+    """What markers (n, M) of bodies tell of shifts in the images.
+
+    s_matrix (n, M, 3, 3); displacement (n, M, 3)
+    from the place by the body [mm]; weighted (n, M, F, 2, 3), W B of image points; square
+    (n, M, F, 2), q'Sq; systematic (n, M), variance of a coordinate by systematic errors over that
+    by noise; by_pose D; pulled (n, M, 6, 3), D'S; inverse (n, 6, 6) of N.
+    """
+
+    s_matrix: np.ndarray
+    displacement: np.ndarray
+    weighted: np.ndarray
+    square: np.ndarray
+    systematic: np.ndarray
+    by_pose: np.ndarray
+    pulled: np.ndarray
+    inverse: np.ndarray
+
+    @classmethod
+    def of(cls, linear: Linear, points: ImagePoints, variance: np.ndarray) -> _Drift:
+        """Of image points at a pose, and shapes of variances (n, M) [mm^2]."""
+        weight = np.where(points.seen, 1 / points.noise, 0.0)
+        s_matrix, s_vector = marker_sums(linear, weight)
+        regular = np.asarray(points.seen.any(axis=2))[..., None, None]
+        inverse = np.linalg.inv(np.where(regular, s_matrix, _EYE))
+        weighted = linear.by_place * weight[..., None, None]
+        square = np.sum((weighted @ inverse[:, :, None]) * weighted, axis=-1)
+        systematic = np.sum(points.correction[..., None] * square, axis=(2, 3))
+        systematic = systematic + variance * np.trace(s_matrix, axis1=2, axis2=3)
+        pulled = np.swapaxes(linear.by_pose, 2, 3) @ s_matrix
+        return cls(
+            s_matrix,
+            displacement=(inverse @ s_vector[..., None])[..., 0],
+            weighted=weighted,
+            square=square,
+            systematic=systematic / 3,
+            by_pose=linear.by_pose,
+            pulled=pulled,
+            inverse=_inverse((pulled @ linear.by_pose).sum(axis=1)),
+        )
+
+
+def _inverse(normal: np.ndarray) -> np.ndarray:
+    """Inverses (n, 6, 6) of normal matrices, of which two markers leave a rotation open."""
+    diagonal = REGULAR * normal.max(axis=(1, 2), keepdims=True) * np.eye(POSE_SIZE)
+    return np.linalg.inv(normal + diagonal)
+
+
+def _by_area(
+    drift: _Drift, displacement: np.ndarray, inside: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Score, information and systematic error of the score (n, 2F, A) of shifts of areas."""
+    n, views, markers, areas = inside.shape
+    told = np.concatenate(
+        [
+            (drift.weighted @ displacement[:, :, None, :, None])[..., 0],
+            drift.square,
+            (drift.weighted @ drift.by_pose[:, :, None]).reshape(n, markers, views, -1),
+        ],
+        axis=3,
+    )
+    sums = np.swapaxes(inside, 2, 3) @ np.swapaxes(told, 1, 2)  # (n, F, A, .)
+    taken = sums[..., 2 * COMPONENTS :].reshape(n, views, areas, COMPONENTS, POSE_SIZE)
+    taken = np.sum((taken @ drift.inverse[:, None, None]) * taken, axis=-1)
+    information = np.maximum(sums[..., COMPONENTS : 2 * COMPONENTS] - taken, 0.0)
+    # A systematic error of the images is to the score as the noise is, but in all exposures.
+    there = inside.any(axis=(1, 3)).sum(axis=1)
+    share = drift.systematic.sum(axis=1) / there
+    amplitude = np.sqrt(share[:, None, None, None] * information)
+    score, information, amplitude = (
+        np.swapaxes(values, 2, 3).reshape(n, -1, areas)
+        for values in (sums[..., :COMPONENTS], information, amplitude)
+    )
+    return score, information, amplitude
+
+
+def _joined(seen: Sequence[_Seen]) -> _Seen:
+    """All exposures as one with as many bodies more."""
+    points = ImagePoints(
+        *(
+            np.concatenate([getattr(one.points, entry.name) for one in seen])
+            for entry in fields(ImagePoints)
+        )
+    )
+    return _Seen(points, np.concatenate([one.places for one in seen]))
+
+
+def _row(seen: _Seen, row: int) -> _Seen:
+    """One body of an exposure."""
+    chosen = slice(row, row + 1)
+    points = ImagePoints(*(getattr(seen.points, e.name)[chosen] for e in fields(ImagePoints)))
+    return _Seen(points, seen.places[chosen])

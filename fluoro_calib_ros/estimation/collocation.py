@@ -13,12 +13,11 @@ After each adjustment:
 
 1. The variances of the terms of exposures, where there are such terms, are renewed.
 2. The prior of each fluoroscope is renewed by one step towards the largest marginal likelihood.
-   Where it hardly changes, a short field is searched that the last steps may have missed; where
-   the signal varies more in places, more of these.
+   Where the signal varies more in places, more of these are looked for.
 3. The number of sines becomes that which the image points can tell with this prior.
 4. Once the priors are steady, the residuals are searched for what the terms cannot follow yet, one
-   after the other: ripples; rejected image points that agree; exposures that differ, or else a
-   signal shorter than the sines; places where the signal varies more.
+   after the other: ripples; rejected image points that agree; exposures that differ; places where
+   the signal varies more.
 
 A change of 3 or 4 leads to another adjustment. After two renewals that change nothing, the priors
 stay as they are.
@@ -39,7 +38,7 @@ from .estimator import AdjustedTerms, AdjustmentProblem, coefficients_of
 from .exposure_terms import ExposureTerms, estimates_beside_free_points
 from .fluoroscope_terms import FluoroscopeTerms, SeriesEquations
 from .lack_of_fit import LeftOut
-from .priors import Prior
+from .priors import Prior, most_likely_prior
 from .refinements import (
     SETTLED_PRIOR,
     START_MODES,
@@ -48,15 +47,11 @@ from .refinements import (
     MorePlaces,
     NumberOfSines,
     Once,
-    PriorRefinement,
     Refinement,
-    ShortField,
     Solution,
     exposure_terms,
     places,
-    renewed_prior,
     ripples,
-    short_sines,
 )
 
 if TYPE_CHECKING:
@@ -117,20 +112,20 @@ class CollocationTerms(AdjustedTerms):
         self.network = problem.network
         self.gauge_kinds = problem.gauges
         self.parts: list[FluoroscopeTerms] = []
-        self._of_priors: list[list[PriorRefinement]] = []
+        self._more_places: list[MorePlaces] = []
         self._steady_renewals = 0
         if earlier is not None:
             self._continue(problem, earlier)
             return
         for f in range(len(problem.image_sizes)):
             self.parts.append(FluoroscopeTerms.first(problem, f, modes))
-            self._of_priors.append([ShortField(), MorePlaces()])
+            self._more_places.append(MorePlaces())
         self._start = self.zeros()
         self._refinements: list[Refinement] = [
             NumberOfSines(),
             Once(ripples),  # they may pass for a change between exposures
             AgreeingOutliers(),  # and so may a dent whose image points are rejected
-            Once(exposure_terms, short_sines),
+            Once(exposure_terms),
             Once(places),
         ]
 
@@ -143,12 +138,12 @@ class CollocationTerms(AdjustedTerms):
             self.parts.append(part)
             start.append(coefficients)
             # A prior that is given was refined where it was estimated.
-            self._of_priors.append([ShortField(), MorePlaces()] if prior is None else [])
+            self._more_places.append(MorePlaces() if prior is None else MorePlaces(0))
         self._start = tuple(start)
         # The ripples of the earlier series stay, and its number of sines is not the first.
         self._refinements = [NumberOfSines(changes=1), AgreeingOutliers()]
         if earlier.is_varying:
-            self._refinements.append(Once(exposure_terms, short_sines))
+            self._refinements.append(Once(exposure_terms))
         if any(prior is None for prior in earlier.priors):
             self._refinements.append(Once(places))
 
@@ -213,8 +208,8 @@ class CollocationTerms(AdjustedTerms):
         self._renew_exposure_terms(network, adjustment)
         equations = [part.equations(network, matrix, own) for part, own in zip(self.parts, solved)]
         steady = [
-            _renew_prior(part, own, refinements)
-            for part, own, refinements in zip(self.parts, equations, self._of_priors)
+            _renew_prior(part, own, more_places)
+            for part, own, more_places in zip(self.parts, equations, self._more_places)
         ]
         return Solution(self.parts, adjustment, equations, all(steady))
 
@@ -277,14 +272,13 @@ class CollocationTerms(AdjustedTerms):
 
 
 def _renew_prior(
-    part: FluoroscopeTerms,
-    equations: SeriesEquations,
-    refinements: Sequence[PriorRefinement],
+    part: FluoroscopeTerms, equations: SeriesEquations, more_places: MorePlaces
 ) -> bool:
     """Renew the prior of a fluoroscope; return whether it hardly changes."""
     last = part.prior
-    prior = renewed_prior(part, equations)
-    for refinement in refinements:
-        prior = refinement.propose(part, equations, prior) or prior
+    prior = most_likely_prior(
+        part.functions, equations.information, equations.right, part.gauge, prior=last
+    )
+    prior = more_places.propose(part, equations, prior) or prior
     part.use_prior(prior)
     return not part.functions.modes or prior.change(last, part.functions) < SETTLED_PRIOR

@@ -191,11 +191,6 @@ def _growth(product: np.ndarray, distance: np.ndarray, other: np.ndarray) -> flo
     return float(np.clip(at_zero / mean, 1.0, MAX_GROWTH)) if mean > 0 else 1.0
 
 
-def has_common_error(points: FittedPoints) -> bool:
-    """Whether residuals show an error that all exposures have in common."""
-    return _products(points).is_significant()
-
-
 def sd_with_lack_of_fit(
     points: FittedPoints, series: Series, left_out: LeftOut | None = None
 ) -> NDArray[np.float64]:

@@ -177,7 +177,6 @@ def most_likely_prior(
     right: NDArray[np.float64],
     gauge: NDArray[np.float64],
     prior: Prior,
-    search: bool = False,
 ) -> Prior:
     """Return a prior with a larger marginal likelihood: signal first, then trend.
 
@@ -192,20 +191,18 @@ def most_likely_prior(
         Precision matrix of the gauge.
     prior : Prior
         Present prior.
-    search : bool
-        Whether to look for a short field that may have been missed.
 
     Returns
     -------
     Prior
     """
     if functions.modes:
-        prior = _most_likely_signal(functions, information + gauge, right, prior, search)
+        prior = _most_likely_signal(functions, information + gauge, right, prior)
     return _most_likely_trend(functions, information + gauge, right, prior)
 
 
 def _most_likely_signal(
-    functions: Functions, information: np.ndarray, right: np.ndarray, prior: Prior, search: bool
+    functions: Functions, information: np.ndarray, right: np.ndarray, prior: Prior
 ) -> Prior:
     """Return the prior with a renewed signal."""
     at = _trend_columns(functions)
@@ -217,7 +214,7 @@ def _most_likely_signal(
     if local is not None:
         base, right = _with_bumps(functions, base, right, local)
     equations = SignalEquations(functions.frequency, base, right, columns)
-    found = most_likely_signal(prior.signal, equations, side, search)
+    found = most_likely_signal(prior.signal, equations, side)
     if local is not None:
         local = _renewed(local, equations, found.variance(functions.frequency))
     return replace(prior, signal=found, local=local)

@@ -22,7 +22,7 @@ from .angle_fit import can_be_fitted
 from .estimator import coefficients_of
 from .exposure_terms import ExposureTerms, exposure_functions, variation
 from .fluoroscope_terms import FluoroscopeTerms, SeriesEquations
-from .lack_of_fit import LARGEST_SD, FittedPoints, areas_of_rejected, has_common_error
+from .lack_of_fit import LARGEST_SD, FittedPoints, areas_of_rejected
 from .priors import Prior, most_likely_prior, prior_precision, with_more_places, with_shown_places
 from .signal import Ripples, shown_ripples
 
@@ -42,10 +42,6 @@ FEWER_MODES = 0.75
 MODE_CHANGES = 3  # at most: numbers must not alternate for ever
 # Mean change of the logarithms of the variances of the signal that changes no correction visibly.
 SETTLED_PRIOR = 0.3
-# Times that a short field is searched, in renewals without visible change, and sines along the
-# image up to which it is: more of them have found one.
-MAX_SEARCHES = 3
-SEARCHED_MODES = 20
 MAX_VARYING_EXPOSURES = 60  # of a fluoroscope that can have terms of their own, to limit the time
 
 
@@ -109,48 +105,6 @@ class Refinement(Protocol):
         """Return the change that a solution shows to be due, or None."""
 
 
-class PriorRefinement(Protocol):
-    """A refinement of the prior of one fluoroscope."""
-
-    def propose(
-        self, part: FluoroscopeTerms, equations: SeriesEquations, renewed: Prior
-    ) -> Prior | None:
-        """Return a prior in place of the renewed one, or None; part: with the last prior."""
-
-
-def renewed_prior(
-    part: FluoroscopeTerms, equations: SeriesEquations, search: bool = False
-) -> Prior:
-    """Return a prior of larger marginal likelihood; search: see `most_likely_prior`."""
-    return most_likely_prior(
-        part.functions,
-        equations.information,
-        equations.right,
-        part.gauge,
-        prior=part.prior,
-        search=search,
-    )
-
-
-class ShortField:
-    """A short field that may have been missed, or has vanished: it cannot return by itself."""
-
-    def __init__(self, searches: int = MAX_SEARCHES) -> None:
-        self._left = searches
-
-    def propose(
-        self, part: FluoroscopeTerms, equations: SeriesEquations, renewed: Prior
-    ) -> Prior | None:
-        """See `PriorRefinement`."""
-        functions = part.functions
-        if not self._left or not 0 < functions.modes <= SEARCHED_MODES:
-            return None
-        if renewed.change(part.prior, functions) >= SETTLED_PRIOR:
-            return None
-        self._left -= 1
-        return renewed_prior(part, equations, search=True)
-
-
 class MorePlaces:
     """More places where the signal varies more, beside those that there are."""
 
@@ -160,7 +114,7 @@ class MorePlaces:
     def propose(
         self, part: FluoroscopeTerms, equations: SeriesEquations, renewed: Prior
     ) -> Prior | None:
-        """See `PriorRefinement`."""
+        """Return a prior in place of the renewed one, or None; part: with the last prior."""
         if not self._left or renewed.local is None:
             return None
         self._left -= 1
@@ -215,19 +169,18 @@ class NumberOfSines:
 
 
 class Once:
-    """The first change of several alternatives, looked for once, at steady priors."""
+    """A change that is looked for once, at steady priors."""
 
-    def __init__(self, *alternatives: Callable[[Solution], Change | None]) -> None:
-        self._alternatives = alternatives
+    def __init__(self, search: Callable[[Solution], Change | None]) -> None:
+        self._search = search
+        self._is_done = False
 
     def propose(self, solution: Solution) -> Change | None:
         """See `Refinement`."""
-        if not solution.is_steady:
+        if self._is_done or not solution.is_steady:
             return None
-        alternatives = self._alternatives
-        self._alternatives = ()
-        changes = (alternative(solution) for alternative in alternatives)
-        return next((change for change in changes if change is not None), None)
+        self._is_done = True
+        return self._search(solution)
 
 
 def ripples(solution: Solution) -> Change | None:
@@ -243,13 +196,13 @@ def ripples(solution: Solution) -> Change | None:
         signal = part.prior.signal
         points = part.inliers(solution.adjustment)
         found = _shown_ripples(part, points, points.residuals, modes[f])
-        if found is None and modes[f] > GAP_FROM and signal.ripples is None:
+        if found is None and modes[f] > GAP_FROM:
             found = _followed_ripples(part, points, coefficients)
             if found is not None:
                 signal = signal.without_short_field(max(part.image_size))
                 modes[f] = GAP_FROM
         if found is not None:
-            signal = replace(signal, ripples=found.joined(signal.ripples))
+            signal = replace(signal, ripples=found)
             priors[f] = replace(part.prior, signal=signal)
     return Change(modes, priors) if priors else None
 
@@ -295,18 +248,6 @@ def exposure_terms(solution: Solution) -> Change | None:
     if not found:
         return None
     return Change([min(number, START_MODES) for number in solution.modes], exposure_terms=found)
-
-
-def short_sines(solution: Solution) -> Change | None:
-    """All sines where residuals show an error that is common to all exposures."""
-    modes = solution.modes
-    priors = {}
-    for part in solution.parts:
-        f = part.number
-        if modes[f] < MAX_MODES and has_common_error(part.inliers(solution.adjustment)):
-            priors[f] = _with_short_field(part)
-            modes[f] = MAX_MODES
-    return Change(modes, priors) if priors else None
 
 
 def _with_short_field(part: FluoroscopeTerms) -> Prior:
@@ -388,7 +329,7 @@ def _followed(
     right = (weighted.T @ observed).T.ravel()
     if prior.local is None:
         prior = _with_short_field(part)
-        prior = most_likely_prior(functions, information, right, gauge, prior=prior, search=True)
+        prior = most_likely_prior(functions, information, right, gauge, prior=prior)
     precision = information + gauge + prior_precision(functions, prior)
     return prior, np.linalg.solve(precision, right)
 

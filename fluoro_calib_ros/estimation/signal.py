@@ -88,14 +88,6 @@ class Ripples:
         used = np.convolve(variances > BESIDE_PEAK * largest, np.ones(2 * BESIDE + 1), 'same') > 0
         return replace(self, variances=tuple(float(v) for v in np.where(used, variances, 0.0)))
 
-    def joined(self, other: Ripples | None) -> Ripples:
-        """Return ripples with the bands of another, too; the variances of both add."""
-        if other is None:
-            return self
-        count = max(len(self.variances), len(other.variances))
-        both = [np.pad(r.variances, (0, count - len(r.variances))) for r in (self, other)]
-        return replace(self, variances=tuple(float(value) for value in np.sum(both, axis=0)))
-
 
 def ripples_of(functions: Functions, coefficients: np.ndarray) -> Ripples | None:
     """Ripples of a series that has them, as its coefficients (2, m) show them, or None."""
@@ -197,14 +189,13 @@ FINE_RANGE = (0.012, 0.2)
 # JASA 114, 2019), so that it only exists where the observations need it.
 FINE_PER_EXTENT = 15.0
 FINE_PX = 0.5
-# Short fields that may have been missed: their standard deviation [px], their correlation lengths
-# relative to the image, and the gain of the logarithm of the likelihood from which they exist.
-SEARCH_PX = 0.1
-SEARCH_REACH = (0.03, 0.06, 0.12)
-MIN_SEARCH_GAIN = 3.0
+# Correlation lengths relative to the image of the long and the short field to start with.
 START_REACH = 0.15
+START_FINE_REACH = 0.06
 START_FINE_SHARE = 0.1  # of the standard deviation of the long field
-SHOWN_PX = 0.2  # standard deviation of a short field that residuals show, to start with
+# Standard deviation and relative correlation length of a short field that residuals show.
+SHOWN_PX = 0.2
+SHOWN_REACH = 0.03
 MAX_STEP = 0.8  # of the logarithm of a standard deviation or length
 STEPS = 4  # of the likelihood in one renewal
 RIPPLE_STEPS = 2  # of the variances of ripples in one renewal
@@ -275,11 +266,11 @@ class Signal:
 
     def with_short_field(self, side: float) -> Signal:
         """Return a signal with a short field to start with; side: of the image [px]."""
-        return replace(self, fine_sd=SHOWN_PX, fine_reach=min(SEARCH_REACH) * side)
+        return replace(self, fine_sd=SHOWN_PX, fine_reach=SHOWN_REACH * side)
 
     def without_short_field(self, side: float) -> Signal:
         """Return a signal whose short field starts anew, very small; side: of the image [px]."""
-        return replace(self, fine_sd=MIN_SD_PX, fine_reach=SEARCH_REACH[1] * side)
+        return replace(self, fine_sd=MIN_SD_PX, fine_reach=START_FINE_REACH * side)
 
     def change(self, other: Signal, frequency: np.ndarray) -> float:
         """Mean change of the logarithms of the variances at frequency (s,) from another signal."""
@@ -301,7 +292,7 @@ def spectral_density(
 
 def starting_signal(sd: float, side: float) -> Signal:
     """Return a signal to start with; sd: standard deviation of the long field, side [px]."""
-    return Signal(sd, START_REACH * side, START_FINE_SHARE * sd, SEARCH_REACH[1] * side)
+    return Signal(sd, START_REACH * side, START_FINE_SHARE * sd, START_FINE_REACH * side)
 
 
 def _parameters(signal: Signal) -> np.ndarray:
@@ -357,52 +348,21 @@ class _Likelihood:
     curvature: np.ndarray
 
 
-def most_likely_signal(
-    signal: Signal, coefficients: SignalEquations, side: float, search: bool = False
-) -> Signal:
-    """Return a signal with a larger marginal likelihood.
-
-    Parameters
-    ----------
-    signal : Signal
-        Present one.
-    coefficients : SignalEquations
-    side : float
-        Longer side of the image [px].
-    search : bool
-        Whether to start from several short fields too. One that has vanished cannot return by
-        itself, and a rough long field may have taken its place.
-
-    Returns
-    -------
-    Signal
-    """
-    cost, found = _more_likely(signal, coefficients, side)
+def most_likely_signal(signal: Signal, coefficients: SignalEquations, side: float) -> Signal:
+    """Return a signal with a larger marginal likelihood; side: longer side of the image [px]."""
+    found = _more_likely(signal, coefficients, side)
     if found.ripples is not None:
         found = _with_likely_ripples(found, found.ripples, coefficients)
-    if not search:
-        return found
-    for reach in SEARCH_REACH:
-        for smoothness in (found.smoothness, SMOOTHNESS):
-            start = replace(
-                found, fine_sd=SEARCH_PX, fine_reach=reach * side, smoothness=smoothness
-            )
-            there, other = _more_likely(start, coefficients, side)
-            if there < cost - MIN_SEARCH_GAIN:
-                cost = there
-                found = other
     return found
 
 
-def _more_likely(
-    signal: Signal, coefficients: SignalEquations, side: float
-) -> tuple[float, Signal]:
-    """Return cost and signal after some steps of Fisher scoring."""
+def _more_likely(signal: Signal, coefficients: SignalEquations, side: float) -> Signal:
+    """Return the signal after some steps of Fisher scoring."""
     low, high = _ranges(side)
     at = np.clip(_parameters(signal), low, high)
     here = _likelihood(at, coefficients, ripples=signal.ripples)
     if here is None:
-        return np.inf, signal
+        return signal
     damping = RIDGE
     for _ in range(STEPS):
         step = np.linalg.solve(here.curvature + damping * np.eye(len(at)), -here.slopes)
@@ -418,7 +378,7 @@ def _more_likely(
         damping = max(RIDGE, damping / 10)
         if gain < MIN_GAIN:
             break
-    return here.cost, _signal(at, signal.ripples)
+    return _signal(at, signal.ripples)
 
 
 def _signal(at: np.ndarray, ripples: Ripples | None) -> Signal:

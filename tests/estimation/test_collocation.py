@@ -383,23 +383,6 @@ def test_prior_of_a_signal_says_what_short_waves_have(smoothness):
         assert prior.signal.sd_beyond(at) == pytest.approx(there.signal.sd_beyond(at), rel=0.4)
 
 
-def test_a_short_field_that_has_vanished_is_found_again():
-    """The long field alone explains such an image worse, however rough it is."""
-    functions = Functions((1024, 1024), -1, 22)
-    uv = pixels(2500, 3, (1024, 1024))
-    information, right = drawn_field(
-        functions, Prior(Signal(3.0, 600.0, 0.3, 60.0), np.zeros(0)), 2, uv, 0.25
-    )
-    prior = Prior(Signal(1.0, 300.0, 1e-3, 200.0), np.zeros(0))
-    gauge = np.zeros_like(information)
-    for _ in range(3):
-        prior = most_likely_prior(functions, information, right, gauge, prior)
-    assert prior.signal.fine_sd < 0.05
-    prior = most_likely_prior(functions, information, right, gauge, prior, search=True)
-    assert prior.signal.fine_sd == pytest.approx(0.3, rel=0.25)
-    assert prior.signal.fine_reach == pytest.approx(60, rel=0.3)
-
-
 def test_a_signal_of_two_scales_is_found_from_the_observations():
     """Ripples on a long wave: the standard deviation of the ripples within a quarter, and the
     prior says how much a series without them leaves out.

@@ -218,29 +218,6 @@ class FluoroscopeCalibration:
         )
         return replace(self, model=model, angle_field=None)
 
-    def with_drift(
-        self, functions: Functions, coefficients: np.ndarray, sd: np.ndarray
-    ) -> FluoroscopeCalibration:
-        """Return the calibration with a change of its correction.
-
-        functions, coefficients (2, n) [px]: of the change; sd (33, 33): its standard deviation, on
-        the grid of `Series`. Raises DataError for a model without a series, which cannot tell how
-        well the change is known.
-        """
-        series = self.model.series
-        if series is None:
-            raise DataError(
-                f'fluoroscope {self.fluoroscope}: the model {self.model.kind} has no field of '
-                'standard deviations, a change of the distortion cannot be added to it'
-            )
-        drift = Series(functions, coefficients, sd)
-        model = replace(
-            self.model,
-            train_duv=self.model.train_duv + drift.predict(self.model.train_uv),
-            series=series.plus(drift),
-        )
-        return replace(self, model=model)
-
     def correct(
         self,
         uv: ArrayLike,
@@ -346,6 +323,30 @@ class FluoroscopeCalibration:
             correction.outside, CorrectionStatus.OUTSIDE, CorrectionStatus.OK
         )
         return out
+
+
+def with_drift(
+    calibration: FluoroscopeCalibration, drift: Functions, coefficients: np.ndarray, sd: np.ndarray
+) -> FluoroscopeCalibration:
+    """Return a calibration with a change of its correction.
+
+    drift, coefficients (2, n) [px]: of the change; sd (33, 33): its standard deviation, on the
+    grid of `Series`. Raises DataError for a model without a series, which cannot tell how well the
+    change is known.
+    """
+    model = calibration.model
+    if model.series is None:
+        raise DataError(
+            f'fluoroscope {calibration.fluoroscope}: the model {model.kind} has no field of '
+            'standard deviations, a change of the distortion cannot be added to it'
+        )
+    change = Series(drift, coefficients, sd)
+    changed = replace(
+        model,
+        train_duv=model.train_duv + change.predict(model.train_uv),
+        series=model.series.plus(change),
+    )
+    return replace(calibration, model=changed)
 
 
 def at_common_angle(

@@ -28,7 +28,7 @@ from ..bodies.rig_adjustment import ObservedBodies, Poses, RigAdjustment, RigErr
 from ..bodies.rigid import fitted_pose
 from ..checks.check import Check, verdict_of
 from ..correction.base import CorrectionStatus
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration, with_drift
 from ..correction.series import sd_over_image
 from ..errors import DataError
 from ..exposures.frame import Frame
@@ -263,7 +263,7 @@ class _Rig:
             if f in healed.drift:
                 functions, coefficients, covariance = healed.drift[f]
                 sd = sd_over_image(functions, covariance)
-                one = one.with_drift(functions, coefficients, sd)
+                one = with_drift(one, functions, coefficients, sd)
             if healed.changes[f, 6:].any():
                 rows = healed.orientation.covariance_rows([f])[6:]
                 one = replace(

@@ -1,0 +1,45 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""A correction to which a change is added."""
+
+import numpy as np
+import pytest
+from rigs import calibrated, rig, true_calibrations
+
+from fluoro_calib_ros.correction.calibration_record import SD_GRID
+from fluoro_calib_ros.correction.fluoroscope_calibration import with_drift
+from fluoro_calib_ros.correction.series import Functions, Series
+from fluoro_calib_ros.errors import DataError
+
+SIZE = (1024, 1024)
+
+
+def random_series(seed, functions, sd):
+    rng = np.random.default_rng(seed)
+    return Series(functions, rng.normal(size=(2, len(functions))), np.full((SD_GRID,) * 2, sd))
+
+
+def test_sum_of_series_is_the_sum_of_their_corrections():
+    """Of other degrees and numbers of sines, and of radial polynomials; errors are independent."""
+    one = random_series(1, Functions(SIZE, 2, 7, rings=1), 0.3)
+    other = random_series(2, Functions(SIZE, 3, 4), 0.4)
+    uv = np.random.default_rng(3).uniform(0, 1023, (50, 2))
+    total = one.plus(other)
+    np.testing.assert_allclose(total.predict(uv), one.predict(uv) + other.predict(uv), atol=1e-8)
+    np.testing.assert_allclose(total.sd, 0.5)
+
+
+def test_calibration_with_a_drift_corrects_by_it_too():
+    calibration = calibrated().calibrations['a']
+    drift = random_series(4, Functions(SIZE, 3, 4), 0.2)
+    changed = with_drift(calibration, drift.functions, drift.coefficients, drift.sd)
+    uv = np.random.default_rng(5).uniform(300, 700, (40, 2))
+    before = calibration.correct(uv, exact=True)
+    after = changed.correct(uv, exact=True)
+    np.testing.assert_allclose(before.uv - after.uv, drift.predict(uv), atol=1e-8)
+    assert changed.calibration_id != calibration.calibration_id
+    assert (after.sigma > before.sigma).all()
+    without = true_calibrations(rig().fluoroscopes)['a']
+    with pytest.raises(DataError, match='has no field of standard deviations'):
+        with_drift(without, drift.functions, drift.coefficients, drift.sd)

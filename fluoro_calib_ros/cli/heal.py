@@ -96,7 +96,9 @@ def _lines(arguments: argparse.Namespace, outcome: HealingOutcome) -> list[str]:
     lines = []
     healed = outcome.healed
     if healed is None:
-        lines.append('no change of the rig is evident: it stays as it was calibrated, nothing is written')
+        lines.append(
+            'no change of the rig is evident: it stays as it was calibrated, nothing is written'
+        )
     else:
         for f, name in enumerate(outcome.orientation.fluoroscopes):
             if healed.changes[f].any():

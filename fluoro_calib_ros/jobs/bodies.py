@@ -132,13 +132,7 @@ def track_bodies(
     """
     options = options or BodiesOptions()
     check_bodies(bodies)
-    names = [name for name in orientation.fluoroscopes if name in frames]
-    if len(names) < 2:
-        raise DataError(
-            f'there are image points of {", ".join(frames)}, but two fluoroscopes of the '
-            f'orientation ({", ".join(orientation.fluoroscopes)}) are needed'
-        )
-    orientation = orientation.subset(names)
+    orientation = orientation_of_recorded(frames, orientation)
     exposures, unpaired = _intersected(frames, calibrations, orientation, options)
     shapes = _shapes(bodies, [one.views for one in exposures], options)
     usable = solvable_bodies([shape.body for shape in shapes])
@@ -165,6 +159,19 @@ def track_bodies(
         unpaired=unpaired,
         findings=tuple(findings),
     )
+
+
+def orientation_of_recorded(
+    frames: Mapping[str, Sequence[Frame]], orientation: RigOrientation
+) -> RigOrientation:
+    """Return the orientation of the recorded fluoroscopes. Raises DataError for less than two."""
+    names = [name for name in orientation.fluoroscopes if name in frames]
+    if len(names) < 2:
+        raise DataError(
+            f'there are image points of {", ".join(frames)}, but two fluoroscopes of the '
+            f'orientation ({", ".join(orientation.fluoroscopes)}) are needed'
+        )
+    return orientation.subset(names)
 
 
 @dataclass(frozen=True)

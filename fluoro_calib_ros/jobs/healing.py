@@ -38,6 +38,7 @@ from ..options import option, validate_options
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.intersection import OK, OUTSIDE, Intersector
 from ..reconstruction.reconstruct import pair_recording
+from .bodies import orientation_of_recorded
 
 BLOCKS = 10  # of a recording, used in turn for the diagnosis and for its verdict
 MAX_EXPOSURES = 200  # of a recording that are used for each, evenly spread
@@ -132,13 +133,8 @@ def heal_rig(
     step = progress or (lambda done, total: None)
     check_bodies(bodies)
     usable = solvable_bodies(bodies)
-    names = [name for name in orientation.fluoroscopes if name in frames]
-    if len(names) < 2:
-        raise DataError(
-            f'there are image points of {", ".join(frames)}, but two fluoroscopes of the '
-            f'orientation ({", ".join(orientation.fluoroscopes)}) are needed'
-        )
-    orientation = orientation.subset(names)
+    orientation = orientation_of_recorded(frames, orientation)
+    names = orientation.fluoroscopes
     paired, _ = pair_recording(frames, names, options.pair_by, options.pair_tolerance)
     used, unused = _chosen(len(paired))
     rig = _Rig(calibrations, orientation, usable)
@@ -165,11 +161,9 @@ def heal_rig(
         now = rig.healed(healed)
         after = rig_errors(now.orientation, places)
     step(3, 4)
+    kept_back = [paired[row] for row in unused]
     checks = [_identified(healed), _sure(diagnosis, rig)]
-    halves = [unused[: len(unused) // 2], unused[len(unused) // 2 :]]
-    for number, half in enumerate(halves, 1):
-        rest = now.diagnose([paired[row] for row in half], diagnosis, before.scale)
-        checks.append(_unused(rest, number, rig))
+    checks += _unused_exposures(now, kept_back, diagnosis, before.scale)
     step(4, 4)
     return HealingOutcome(
         diagnosis,
@@ -394,6 +388,18 @@ def _sure(diagnosis: Diagnosis, rig: _Rig) -> Check:
         value=doubt,
         limit=limit,
     )
+
+
+def _unused_exposures(
+    now: _Rig, exposures: Sequence[Mapping[str, Frame]], known: Diagnosis, shape_scale: float
+) -> list[Check]:
+    """Check both halves of the exposures that were not used: a rig that creeps changes between."""
+    middle = len(exposures) // 2
+    halves = exposures[:middle], exposures[middle:]
+    return [
+        _unused(now.diagnose(half, known, shape_scale), number, now)
+        for number, half in enumerate(halves, 1)
+    ]
 
 
 def _unused(rest: Diagnosis | None, half: int, rig: _Rig) -> Check:

@@ -93,14 +93,12 @@ class Evidence:
         Adjustment of the frames with the calibrations fixed.
     report_step : callable
         To be called with the name of a step before every step of a check.
-    raise_if_cancelled : callable or None
     """
 
     request: CalibrationRequest
     calibrations: Mapping[str, FluoroscopeCalibration]
     result: CalibrationResult
     report_step: Callable[[str], None]
-    raise_if_cancelled: Callable[[], None] | None = None
 
     @property
     def frames(self) -> Mapping[str, Sequence[Frame]]:
@@ -204,12 +202,12 @@ class Evidence:
         if options.model == CollocationModel.kind:
             starts = replace(self.starts, earlier=self.earlier)
             with contextlib.suppress(DataError):
-                found = calibrate_part(part, starts, self.calibrations, self.raise_if_cancelled)
+                found = calibrate_part(part, starts, self.calibrations)
                 if not self._has_lost_points(found, frames):
                     return found
         # The gauge of the part is another one. Outliers can keep the exposures of a part from it
         # where the distortion is large.
-        return calibrate_part(part, self.starts, self.calibrations, self.raise_if_cancelled)
+        return calibrate_part(part, self.starts, self.calibrations)
 
     def calibrate_free(self, names: Sequence[str]) -> Mapping[str, FluoroscopeCalibration]:
         """Calibrate all frames of some fluoroscopes without a given interior orientation.
@@ -243,7 +241,6 @@ class Evidence:
             self.phantom,
             calibrations=calibrations,
             loss=self.request.options.loss,
-            raise_if_cancelled=self.raise_if_cancelled,
             known=self.request.known_orientations,
             starts=self.starts,
         )

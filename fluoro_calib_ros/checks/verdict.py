@@ -45,7 +45,6 @@ def validate(
     request: CalibrationRequest,
     calibrations: Mapping[str, FluoroscopeCalibration],
     progress: Progress | None = None,
-    raise_if_cancelled: Callable[[], None] | None = None,
     rig: RigFindings | None = None,
 ) -> Validation:
     """Validate calibrations with the exposures that they were made from.
@@ -58,8 +57,6 @@ def validate(
         By fluoroscope.
     progress : callable, optional
         Called with the name of a step, the number of steps done and their total before each step.
-    raise_if_cancelled : callable, optional
-        Called before every step of an adjustment; may raise to stop.
     rig : RigFindings, optional
         What is known of the orientation of the rig; by default it is determined.
 
@@ -78,12 +75,11 @@ def validate(
         request.phantom,
         calibrations=calibrations,
         loss=request.options.loss,
-        raise_if_cancelled=raise_if_cancelled,
         known=request.known_orientations,
     )
     request = replace(request, frames=_used_frames(request.frames, result))
     steps = _StepCounter(progress, 1 + _count_steps(len(request.groups)))
-    evidence = Evidence(request, calibrations, result, steps.report, raise_if_cancelled)
+    evidence = Evidence(request, calibrations, result, steps.report)
     steps.report('residuals and beads')
     checks = []
     for subject in SUBJECTS:
@@ -128,12 +124,11 @@ def validate_or_report(
     request: CalibrationRequest,
     calibrations: Mapping[str, FluoroscopeCalibration],
     progress: Progress | None = None,
-    raise_if_cancelled: Callable[[], None] | None = None,
     rig: RigFindings | None = None,
 ) -> Validation:
     """Validate; where that raises DataError, the verdict is 'cannot tell' with its message."""
     try:
-        return validate(request, calibrations, progress, raise_if_cancelled, rig)
+        return validate(request, calibrations, progress, rig)
     except DataError as error:
         check = Check(Kind.VALIDATION, f'the validation could not be made: {error}')
         return Validation('cannot tell', (check,), _identities(calibrations), 0.0)

@@ -193,14 +193,12 @@ class _Alternation:
         start: Adjustment,
         regressions: Regressions,
         history: History,
-        raise_if_cancelled: Callable[[], None] | None,
     ) -> None:
         self.correction = np.zeros_like(network.uv)
         self.changed = False
         self._network = network
         self._regressions = regressions
         self._history = history
-        self._raise_if_cancelled = raise_if_cancelled
         self._acceleration = Anderson()
         self._image = start.residuals
         information, _ = _information(network, start, self.correction)
@@ -221,7 +219,6 @@ class _Alternation:
             correction=correction,
             noise=state.noise,
             options=SolverOptions(ROUND_TOLERANCE),
-            raise_if_cancelled=self._raise_if_cancelled,
         )
         information, noise = _information(self._network, after, correction)
         image = regressions.without_gauge(after.residuals + correction, after.parameters.interior)
@@ -254,7 +251,6 @@ def calibrate_by_regression(
     terms: AdjustedTerms | None,
     regressions: Regressions,
     progress: Callable[[Round], None] | None = None,
-    raise_if_cancelled: Callable[[], None] | None = None,
 ) -> SelfCalibration:
     """Self-calibrate by adjustment and regression in turn.
 
@@ -270,8 +266,6 @@ def calibrate_by_regression(
         What fits the rest of the correction.
     progress : callable, optional
         Called with the Round after every round.
-    raise_if_cancelled : callable, optional
-        Called before every step of an adjustment; may raise to stop.
 
     Returns
     -------
@@ -288,7 +282,7 @@ def calibrate_by_regression(
         network = terms.with_additional(network)
         after = with_additional(before, terms.zeros())
     history = History(measured, progress)
-    rounds = _Alternation(network, after, regressions, history, raise_if_cancelled)
+    rounds = _Alternation(network, after, regressions, history)
     converged = False
     for iteration in range(1, options.max_iterations + 1):
         rounds.advance()
@@ -305,7 +299,6 @@ def calibrate_by_regression(
         start,
         rounds.correction,
         rounds.state.noise,
-        raise_if_cancelled=raise_if_cancelled,
         noise_fixed=True,
     )
     return SelfCalibration(

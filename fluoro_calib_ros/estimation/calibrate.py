@@ -77,7 +77,6 @@ def calibrate(
     joint: bool = False,
     principal_distance: float | None = None,
     progress: Callable[[str, Round], None] | None = None,
-    raise_if_cancelled: Callable[[], None] | None = None,
 ) -> CalibrationResult:
     """Self-calibrate fluoroscopes, one after the other or in one adjustment.
 
@@ -94,9 +93,7 @@ def calibrate(
     principal_distance : float, optional
         Start value [px]; by default it is taken from the observations.
     progress : callable, optional
-        Called with the name of the fluoroscope and the Round after every round.
-    raise_if_cancelled : callable, optional
-        Called before every step; may raise to stop.
+        Called with the name of the fluoroscope and the Round after every round; may raise to stop.
 
     Returns
     -------
@@ -112,13 +109,12 @@ def calibrate(
     request = CalibrationRequest(
         frames, phantom, options or CalibrationOptions(), joint, principal_distance
     )
-    return calibrate_request(request, progress, raise_if_cancelled)
+    return calibrate_request(request, progress)
 
 
 def calibrate_request(
     request: CalibrationRequest,
     progress: Callable[[str, Round], None] | None = None,
-    raise_if_cancelled: Callable[[], None] | None = None,
     starts: StartValues | None = None,
 ) -> CalibrationResult:
     """Self-calibrate the fluoroscopes of a request; see `calibrate` for the other arguments.
@@ -140,9 +136,7 @@ def calibrate_request(
             start = time.perf_counter()
             label = '+'.join(group)
             of_group = {name: request.frames[name] for name in group}
-            run = _calibrated_group(
-                request, of_group, _progress_of(label, progress), raise_if_cancelled, starts
-            )
+            run = _calibrated_group(request, of_group, _progress_of(label, progress), starts)
             seconds = time.perf_counter() - start
             runs[label] = run
             figures |= _figures_of_run(run)
@@ -181,7 +175,6 @@ def calibrate_part(
     request: CalibrationRequest,
     starts: StartValues,
     whole: Mapping[str, FluoroscopeCalibration],
-    raise_if_cancelled: Callable[[], None] | None = None,
 ) -> dict[str, FluoroscopeCalibration]:
     """Self-calibrate with a part of the exposures of an earlier calibration.
 
@@ -193,8 +186,6 @@ def calibrate_part(
         Of the earlier calibration.
     whole : mapping of str to FluoroscopeCalibration
         The earlier calibration, of all exposures, whose noise of image coordinates is taken over.
-    raise_if_cancelled : callable, optional
-        Called before every step; may raise to stop.
 
     Returns
     -------
@@ -210,7 +201,7 @@ def calibrate_part(
         for group in request.groups:
             start = time.perf_counter()
             frames = {name: request.frames[name] for name in group}
-            run = _calibrated_group(request, frames, None, raise_if_cancelled, starts)
+            run = _calibrated_group(request, frames, None, starts)
             seconds = time.perf_counter() - start
             for f, name in enumerate(run.measured.fluoroscopes):
                 digest = digest_of_sources(frames[name], request.phantom)
@@ -261,7 +252,7 @@ def _calibrations_of_run(
             name=name,
             digest=digest_of_sources(frames[name], phantom),
             seconds=seconds,
-            noise=_light(run, f, name),
+            noise=_image_noise(run, f, name),
         )
         for f, name in enumerate(run.measured.fluoroscopes)
     }
@@ -271,7 +262,6 @@ def _calibrated_group(
     request: CalibrationRequest,
     frames: Frames,
     progress: Callable[[Round], None] | None,
-    raise_if_cancelled: Callable[[], None] | None,
     starts: StartValues | None,
 ) -> SelfCalibration:
     """Calibrate fluoroscopes in one adjustment, without exposures of which too little fits."""
@@ -281,12 +271,11 @@ def _calibrated_group(
             frames,
             request.phantom,
             principal_distance=request.principal_distance,
-            raise_if_cancelled=raise_if_cancelled,
             known=request.known_orientations,
             starts=starts,
         )
         earlier = None if starts is None else starts.earlier
-        run = self_calibrate(measured, request.options, progress, raise_if_cancelled, earlier)
+        run = self_calibrate(measured, request.options, progress, earlier)
         misfits = exposures_that_do_not_fit(run)
         kept = {
             name: [f for f in exposures if (name, f.number) not in misfits]
@@ -337,7 +326,6 @@ def adjust_with_calibrations(
     phantom: Phantom,
     calibrations: Mapping[str, FluoroscopeCalibration],
     loss: str = 'student_t',
-    raise_if_cancelled: Callable[[], None] | None = None,
     known: Mapping[str, KnownOrientation] | None = None,
     starts: StartValues | None = None,
 ) -> CalibrationResult:
@@ -354,8 +342,6 @@ def adjust_with_calibrations(
     calibrations : mapping of str to FluoroscopeCalibration
     loss : str
         Noise model of the image points.
-    raise_if_cancelled : callable, optional
-        Called before every step; may raise to stop.
     known : mapping of str to KnownOrientation, optional
         Orientations that are known beforehand, by fluoroscope.
     starts : StartValues, optional
@@ -381,7 +367,6 @@ def adjust_with_calibrations(
             frames,
             phantom,
             calibrations=calibrations,
-            raise_if_cancelled=raise_if_cancelled,
             known=known,
             starts=starts,
         )
@@ -391,7 +376,6 @@ def adjust_with_calibrations(
             measured.start,
             correction,
             noise_of_calibrations(loss, calibrations.values()),
-            raise_if_cancelled=raise_if_cancelled,
             noise_fixed=too_few_rays_for_noise(network),
         )
         before = None
@@ -405,7 +389,6 @@ def adjust_with_calibrations(
                 correction=np.zeros_like(correction),
                 noise=after.noise,
                 tolerance=TOLERANCE_WITHOUT_CORRECTION,
-                raise_if_cancelled=raise_if_cancelled,
             )
     figures = {
         name: _figures(
@@ -484,7 +467,7 @@ class _ImageNoise:
     profile: NoiseProfile | None
 
 
-def _light(run: SelfCalibration, f: int, name: str) -> _ImageNoise:
+def _image_noise(run: SelfCalibration, f: int, name: str) -> _ImageNoise:
     """Noise of an image coordinate of fluoroscope number f.
 
     It is that of the inlier residuals, which are smaller than the noise by the root of their

@@ -44,7 +44,6 @@ def calibrate_by_adjustment(
     terms: AdjustedTerms,
     max_rounds: int,
     progress: Callable[[Round], None] | None = None,
-    raise_if_cancelled: Callable[[], None] | None = None,
 ) -> SelfCalibration:
     """Self-calibrate with the model among the unknowns.
 
@@ -60,8 +59,6 @@ def calibrate_by_adjustment(
     max_rounds : int
     progress : callable, optional
         Called with the Round after every adjustment.
-    raise_if_cancelled : callable, optional
-        Called before every step of an adjustment; may raise to stop.
 
     Returns
     -------
@@ -86,7 +83,6 @@ def calibrate_by_adjustment(
             terms=terms,
             max_rounds=max_rounds,
             report=report,
-            raise_if_cancelled=raise_if_cancelled,
         )
         network, parameters = in_determined_datum(network, after.parameters, after.inliers)
         after = replace(after, parameters=parameters)
@@ -168,7 +164,6 @@ def adjust_with_terms(
     terms: AdjustedTerms,
     max_rounds: int,
     report: Callable[[Adjustment, float], None],
-    raise_if_cancelled: Callable[[], None] | None = None,
 ) -> tuple[Network, Adjustment, bool]:
     """Adjust a network together with terms of its distortion.
 
@@ -182,8 +177,6 @@ def adjust_with_terms(
     max_rounds : int
     report : callable
         Called with every Adjustment and the RMS change of the correction [px].
-    raise_if_cancelled : callable, optional
-        Called before every step of an adjustment; may raise to stop.
 
     Returns
     -------
@@ -214,7 +207,6 @@ def adjust_with_terms(
             correction=zero,
             noise=noise,
             options=SolverOptions(tolerance),
-            raise_if_cancelled=raise_if_cancelled,
         )
         last = correction
         correction = network.additional_correction(result.parameters)

@@ -184,7 +184,6 @@ def network_of_calibrations(
     frames: Frames,
     phantom: Phantom,
     calibrations: Mapping[str, FluoroscopeCalibration],
-    raise_if_cancelled: Callable[[], None] | None = None,
     known: Known | None = None,
     starts: StartValues | None = None,
 ) -> Measured:
@@ -199,7 +198,6 @@ def network_of_calibrations(
         frames,
         phantom,
         sensors=sensors,
-        raise_if_cancelled=raise_if_cancelled,
         known=known,
         starts=starts,
     )

@@ -67,7 +67,6 @@ def adjusted_with_precision(
     correction: NDArray[np.float64],
     noise: Noise,
     tolerance: float = 1e-8,
-    raise_if_cancelled: Callable[[], None] | None = None,
     noise_fixed: bool = False,
 ) -> tuple[Adjustment, Precision]:
     """Adjust a network and compute its precision.
@@ -83,8 +82,6 @@ def adjusted_with_precision(
         Start values of the noise model, or the noise model where noise_fixed.
     tolerance : float
         Decrease of the cost at which the adjustment stops.
-    raise_if_cancelled : callable, optional
-        Called before every step; may raise to stop.
     noise_fixed : bool
         True where the noise model is not to be estimated.
 
@@ -105,7 +102,6 @@ def adjusted_with_precision(
                 correction=correction,
                 noise=noise,
                 options=SolverOptions(tolerance),
-                raise_if_cancelled=raise_if_cancelled,
             )
         else:
             result = adjust_and_estimate_noise(
@@ -114,7 +110,6 @@ def adjusted_with_precision(
                 correction=correction,
                 noise=noise,
                 options=SolverOptions(tolerance),
-                raise_if_cancelled=raise_if_cancelled,
             )
         return result, precision(network, result, correction)
     except np.linalg.LinAlgError:
@@ -268,7 +263,6 @@ class _Task:
     sensors: Mapping[str, KnownSensor] | None
     principal_distance: float | None
     known: Known
-    raise_if_cancelled: Callable[[], None] | None
     starts: StartValues | None = None
 
     def has_starts(self, name: str, frames: Sequence[Frame]) -> bool:
@@ -311,7 +305,6 @@ def measured_network(
     frames: Frames,
     phantom: Phantom,
     principal_distance: float | None = None,
-    raise_if_cancelled: Callable[[], None] | None = None,
     known: Known | None = None,
     starts: StartValues | None = None,
 ) -> Measured:
@@ -323,8 +316,6 @@ def measured_network(
     phantom : Phantom
     principal_distance : float, optional
         Start value [px]; by default it is taken from the observations.
-    raise_if_cancelled : callable, optional
-        Called for every exposure; may raise to stop.
     known : mapping of str to KnownOrientation, optional
         Orientations that are known beforehand, by fluoroscope.
     starts : StartValues, optional
@@ -345,7 +336,6 @@ def measured_network(
         None,
         principal_distance=principal_distance,
         known=known or {},
-        raise_if_cancelled=raise_if_cancelled,
         starts=starts,
     )
     return _measured(
@@ -357,7 +347,6 @@ def network_of_known_sensors(
     frames: Frames,
     phantom: Phantom,
     sensors: Mapping[str, KnownSensor],
-    raise_if_cancelled: Callable[[], None] | None = None,
     known: Known | None = None,
     starts: StartValues | None = None,
 ) -> Measured:
@@ -371,7 +360,6 @@ def network_of_known_sensors(
         sensors,
         principal_distance=None,
         known=known or {},
-        raise_if_cancelled=raise_if_cancelled,
         starts=starts,
     )
     return _measured(
@@ -581,8 +569,6 @@ def _resect_all(
     correction = _no_correction if sensor is None else sensor.correction
     views = []
     for frame in frames:
-        if task.raise_if_cancelled is not None:
-            task.raise_if_cancelled()
         xyz = task.phantom.xyz_mm[task.phantom.index(frame.target_id)]
         views.append(view_of(frame, xyz, frame.uv - correction(frame)))
     excluded = [_not_oriented(view.frame, view.error) for view in views if view.error]

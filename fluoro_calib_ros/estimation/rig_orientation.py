@@ -19,7 +19,7 @@ intersected afterwards: C_ei describes that.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -207,7 +207,6 @@ def orientation_of_capture(
     calibrations: Calibrations,
     frame_id: str = 'rig',
     loss: str = 'student_t',
-    raise_if_cancelled: Callable[[], None] | None = None,
 ) -> RigOrientation:
     """Orientation from a capture of the phantom at rest, whose frame is that of the rig.
 
@@ -225,8 +224,6 @@ def orientation_of_capture(
         Name of the rig frame.
     loss : str
         Noise model of the image points.
-    raise_if_cancelled : callable, optional
-        Called during the adjustment; may raise to stop it.
 
     Returns
     -------
@@ -247,8 +244,8 @@ def orientation_of_capture(
                 f'phantom, {MIN_TARGETS_OF_EXPOSURE} are needed'
             )
     with threadpool_limits(1):
-        measured = network_of_calibrations(still, phantom, calibrations, raise_if_cancelled)
-        held = _adjusted(measured, calibrations, loss, True, raise_if_cancelled)
+        measured = network_of_calibrations(still, phantom, calibrations)
+        held = _adjusted(measured, calibrations, loss, True)
         known = held.covariance_of_all()
     parameters = held.after.parameters
     count = len(frames)
@@ -268,7 +265,6 @@ def orientation_of_exposures(
     phantom: Phantom,
     calibrations: Calibrations,
     loss: str = 'student_t',
-    raise_if_cancelled: Callable[[], None] | None = None,
     starts: StartValues | None = None,
 ) -> RigOrientation:
     """Orientation in the optical frame of the first fluoroscope, from exposures of the phantom.
@@ -287,8 +283,6 @@ def orientation_of_exposures(
         Held.
     loss : str
         Noise model of the image points.
-    raise_if_cancelled : callable, optional
-        Called during the adjustment; may raise to stop it.
     starts : StartValues, optional
         Of an earlier adjustment of the frames.
 
@@ -306,7 +300,6 @@ def orientation_of_exposures(
         phantom,
         calibrations=calibrations,
         loss=loss,
-        raise_if_cancelled=raise_if_cancelled,
         starts=starts,
     )[0]
 
@@ -316,7 +309,6 @@ def orientation_and_scatter(
     phantom: Phantom,
     calibrations: Calibrations,
     loss: str = 'student_t',
-    raise_if_cancelled: Callable[[], None] | None = None,
     starts: StartValues | None = None,
 ) -> tuple[RigOrientation, tuple[PairScatter, ...]]:
     """Return `orientation_of_exposures`, and how the exposures scatter about it.
@@ -326,10 +318,8 @@ def orientation_and_scatter(
     _validate(frames, phantom, calibrations)
     paired = _paired(frames)
     with threadpool_limits(1):
-        measured = network_of_calibrations(
-            paired, phantom, calibrations, raise_if_cancelled, starts=starts
-        )
-        held = _adjusted(measured, calibrations, loss, False, raise_if_cancelled)
+        measured = network_of_calibrations(paired, phantom, calibrations, starts=starts)
+        held = _adjusted(measured, calibrations, loss, False)
         turning = {name for name, each in calibrations.items() if each.angle_field is not None}
         exteriors, scatter = _relative_to_first(held, turning)
     first = held.measured.fluoroscopes[0]
@@ -513,7 +503,6 @@ def _adjusted(
     calibrations: Calibrations,
     loss: str,
     noise_fixed: bool,
-    raise_if_cancelled: Callable[[], None] | None,
 ) -> _HeldAdjustment:
     """Adjust a network with the calibrations fixed.
 
@@ -527,7 +516,6 @@ def _adjusted(
         measured.start,
         correction,
         noise_of_calibrations(loss, used),
-        raise_if_cancelled=raise_if_cancelled,
         noise_fixed=noise_fixed or too_few_rays_for_noise(network),
     )
     if not np.isfinite(after.parameters.position_mm).all():

@@ -46,7 +46,6 @@ def self_calibrate(
     measured: Measured,
     options: CalibrationOptions | None = None,
     progress: Callable[[Round], None] | None = None,
-    raise_if_cancelled: Callable[[], None] | None = None,
     earlier: EarlierCalibration | None = None,
 ) -> SelfCalibration:
     """Self-calibrate the fluoroscopes of a network.
@@ -61,8 +60,6 @@ def self_calibrate(
     options : CalibrationOptions, optional
     progress : callable, optional
         Called with the Round after every round.
-    raise_if_cancelled : callable, optional
-        Called before every step of an adjustment; may raise to stop.
     earlier : EarlierCalibration, optional
         By collocation, with these exposures and others; the network starts with its solution. The
         adjustment without correction is then not made: its residuals are those of the start.
@@ -80,9 +77,9 @@ def self_calibrate(
     network = replace(measured.network, interior_free=interiors_to_estimate(measured, options))
     measured = with_constraints(replace(measured, network=network), options)
     if earlier is not None:
-        return _continued(measured, earlier, options, progress, raise_if_cancelled)
-    before = _adjusted_without_correction(measured, options, raise_if_cancelled)
-    job = _Job(measured, before, gauges_of(measured, options), options, raise_if_cancelled)
+        return _continued(measured, earlier, options, progress)
+    before = _adjusted_without_correction(measured, options)
+    job = _Job(measured, before, gauges_of(measured, options), options)
     if options.model == AUTO:
         run, terms = job.by_collocation(progress)
         better = better_model(run, terms)
@@ -105,7 +102,6 @@ def _continued(
     earlier: EarlierCalibration,
     options: CalibrationOptions,
     progress: Callable[[Round], None] | None,
-    raise_if_cancelled: Callable[[], None] | None,
 ) -> SelfCalibration:
     """Self-calibrate by collocation from the solution of an earlier calibration."""
     network = measured.network
@@ -139,7 +135,6 @@ def _continued(
         terms=terms,
         max_rounds=options.max_iterations,
         progress=progress,
-        raise_if_cancelled=raise_if_cancelled,
     )
     earlier.priors.update(zip(names, terms.priors))
     return run
@@ -156,14 +151,12 @@ class _Job:
         Without correction.
     gauges : sequence of GaugeKind
     options : CalibrationOptions
-    raise_if_cancelled : callable or None
     """
 
     measured: Measured
     before: Adjustment
     gauges: Sequence[GaugeKind]
     options: CalibrationOptions
-    raise_if_cancelled: Callable[[], None] | None
 
     @property
     def problem(self) -> AdjustmentProblem:
@@ -188,7 +181,6 @@ class _Job:
             terms=terms,
             regressions=Regressions(self.measured, steps),
             progress=progress,
-            raise_if_cancelled=self.raise_if_cancelled,
         )
 
     def by_collocation(
@@ -216,7 +208,6 @@ class _Job:
             terms=terms,
             max_rounds=self.options.max_iterations,
             progress=progress,
-            raise_if_cancelled=self.raise_if_cancelled,
         )
 
     def _regression_steps(
@@ -244,7 +235,6 @@ class _Job:
 def _adjusted_without_correction(
     measured: Measured,
     options: CalibrationOptions,
-    raise_if_cancelled: Callable[[], None] | None,
 ) -> Adjustment:
     """Adjustment without correction. Raises DataError where it leaves unknowns undetermined."""
     try:
@@ -254,7 +244,6 @@ def _adjusted_without_correction(
             correction=np.zeros_like(measured.network.uv),
             noise=start_noise(options.loss),
             tolerance=TOLERANCE if options.model == NoCorrection.kind else FINAL_TOLERANCE,
-            raise_if_cancelled=raise_if_cancelled,
         )
     except DataError as error:
         raise DataError(undetermined_unknowns(measured) or error.finding) from None

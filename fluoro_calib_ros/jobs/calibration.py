@@ -99,7 +99,6 @@ MAX_SHARED = 1 / 3  # of the exposures of a fluoroscope that another one has as 
 
 Frames = Mapping[str, Sequence[Frame]]
 Progress = Callable[[str, Round], None]
-Cancellation = Callable[[], None]
 
 
 @dataclass(frozen=True)
@@ -166,7 +165,6 @@ def run_calibration(
     rig: Rig | None = None,
     progress: Progress | None = None,
     report_step: Callable[[str, int, int], None] | None = None,
-    raise_if_cancelled: Cancellation | None = None,
 ) -> CalibrationOutcome:
     """Self-calibrate the fluoroscopes of a request, and orient the rig.
 
@@ -185,11 +183,10 @@ def run_calibration(
     rig : Rig, optional
         Further fluoroscopes of the rig.
     progress : callable, optional
-        Called with the names of the fluoroscopes and the Round after every round.
+        Called after every round with the names of the fluoroscopes and the Round; may raise to
+        stop.
     report_step : callable, optional
         Called as the progress of `checks.verdict.validate`.
-    raise_if_cancelled : callable, optional
-        Called before every step; may raise to stop the job.
 
     Returns
     -------
@@ -209,7 +206,7 @@ def run_calibration(
     wrong = _wrong_input(request)
     if wrong and not force:
         raise DataError(*wrong)
-    result = _calibrated(request, progress, raise_if_cancelled)
+    result = _calibrated(request, progress)
     excluded += _with_causes(request, result)
     wrong += [*implausible(request, result), *_interchanged(result)]
     if wrong and not force:
@@ -220,9 +217,7 @@ def run_calibration(
     validation = None
     if validate:
         used = request.with_exposures(result.used_exposures)
-        validation = validate_or_report(
-            used, result.calibrations, report_step, raise_if_cancelled, of_rig
-        )
+        validation = validate_or_report(used, result.calibrations, report_step, of_rig)
     return CalibrationOutcome(request, result, rig, of_rig.orientation, validation)
 
 
@@ -252,11 +247,10 @@ def _wrong_input(request: CalibrationRequest) -> list[Finding]:
 def _calibrated(
     request: CalibrationRequest,
     progress: Progress | None,
-    raise_if_cancelled: Cancellation | None,
 ) -> CalibrationResult:
     """Calibrate; a normal matrix that breaks down is a fault in the data. Raises DataError."""
     try:
-        return calibrate_request(request, progress, raise_if_cancelled)
+        return calibrate_request(request, progress)
     except np.linalg.LinAlgError as error:
         raise DataError(
             f'the exposures do not determine the calibration: {str(error).lower()}; add exposures '

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -59,7 +59,6 @@ def orient(
     phantom: Phantom,
     calibrations: Mapping[str, FluoroscopeCalibration],
     frame_id: str = 'rig',
-    raise_if_cancelled: Callable[[], None] | None = None,
     present: RigOrientation | None = None,
 ) -> OrientationOutcome:
     """Orient the rig in the frame of a phantom that stands still.
@@ -72,8 +71,6 @@ def orient(
     calibrations : mapping of str to FluoroscopeCalibration
     frame_id : str
         Name of the rig frame.
-    raise_if_cancelled : callable, optional
-        Called during the adjustment; may raise to stop it.
     present : RigOrientation, optional
         The orientation so far, with which the new one is compared.
 
@@ -88,9 +85,7 @@ def orient(
         be of the phantom or are corrected already, and where most rays do not meet.
     """
     require_phantom(frames, phantom)
-    orientation = orientation_of_capture(
-        frames, phantom, calibrations, frame_id, raise_if_cancelled=raise_if_cancelled
-    )
+    orientation = orientation_of_capture(frames, phantom, calibrations, frame_id)
     found = _intersected(frames, calibrations, orientation)
     met = _met(found, phantom)
     if not met.is_good and _fits_uncorrected(frames, phantom, calibrations, frame_id):

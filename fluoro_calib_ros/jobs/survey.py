@@ -106,7 +106,6 @@ class SurveyOutcome:
 def survey(
     request: SurveyRequest,
     progress: Callable[[str, Round], None] | None = None,
-    raise_if_cancelled: Callable[[], None] | None = None,
 ) -> SurveyOutcome:
     """Survey a phantom from its own exposures.
 
@@ -114,9 +113,8 @@ def survey(
     ----------
     request : SurveyRequest
     progress : callable, optional
-        Called with the names of the fluoroscopes and the Round after every round.
-    raise_if_cancelled : callable, optional
-        Called before every step; may raise to stop.
+        Called after every round with the names of the fluoroscopes and the Round; may raise to
+        stop.
 
     Returns
     -------
@@ -130,7 +128,7 @@ def survey(
     """
     began = time.perf_counter()
     _require_known(request)
-    result = _free_network(request, progress, raise_if_cancelled)
+    result = _free_network(request, progress)
     if not result.converged:
         raise DataError(
             'the adjustment did not converge: the exposures hardly determine coordinates, '
@@ -149,7 +147,7 @@ def survey(
             *(replace(one, severity=Severity.ERROR) for one in left_out),
             kind=Kind.FEW_TARGETS,
         )
-    checks.append(_halves(request, result, raise_if_cancelled))
+    checks.append(_halves(request, result))
     moved = displaced(beads)
     return SurveyOutcome(
         _phantom(request, beads),
@@ -173,7 +171,6 @@ def _require_known(request: SurveyRequest) -> None:
 def _free_network(
     request: SurveyRequest,
     progress: Callable[[str, Round], None] | None,
-    raise_if_cancelled: Callable[[], None] | None,
 ) -> CalibrationResult:
     """Self-calibrate with inner constraints; rough coordinates are replaced and tried again.
 
@@ -185,7 +182,6 @@ def _free_network(
             request.calibration_of(request.frames, given),
             force=force,
             progress=progress,
-            raise_if_cancelled=raise_if_cancelled,
         ).result
 
     try:
@@ -212,7 +208,6 @@ def _with_found(given: Phantom, result: CalibrationResult) -> Phantom:
 def _halves(
     request: SurveyRequest,
     result: CalibrationResult,
-    raise_if_cancelled: Callable[[], None] | None,
 ) -> Check:
     """Compare surveys of every other exposure."""
     numbers = sorted({e.exposure for one in result.fluoroscopes.values() for e in one.exposures})
@@ -233,9 +228,7 @@ def _halves(
             for name, exposures in request.frames.items()
         }
         try:
-            part = calibrate_request(
-                request.calibration_of(frames, start), None, raise_if_cancelled
-            )
+            part = calibrate_request(request.calibration_of(frames, start), None)
         except (DataError, np.linalg.LinAlgError) as error:
             return halves_not_compared(f'half of the exposures cannot be adjusted ({error})')
         beads = surveyed_beads(part, start)

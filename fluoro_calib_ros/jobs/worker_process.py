@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 from ..estimation.options import CalibrationRequest
 from ..processes import OF_JOB, WorkerProcess
-from .calibration import CalibrationOutcome, Cancellation, Progress, Rig, run_calibration
+from .calibration import CalibrationOutcome, Progress, Rig, run_calibration
 
 
 def run_in_worker_process(
@@ -18,7 +18,7 @@ def run_in_worker_process(
     validate: bool = False,
     rig: Rig | None = None,
     progress: Progress | None = None,
-    raise_if_cancelled: Cancellation | None = None,
+    raise_if_cancelled: Callable[[], None] | None = None,
 ) -> CalibrationOutcome:
     """Run `run_calibration` in another process.
 

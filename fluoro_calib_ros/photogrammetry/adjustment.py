@@ -12,7 +12,6 @@ model around it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -375,7 +374,6 @@ def adjust(
     correction: NDArray[np.float64] | None = None,
     noise: Noise = DEFAULT_NOISE,
     options: SolverOptions = DEFAULT_OPTIONS,
-    raise_if_cancelled: Callable[[], None] | None = None,
 ) -> Adjustment:
     """Adjust a network for a given noise model.
 
@@ -389,8 +387,6 @@ def adjust(
     noise : Noise
         Noise model; it is not changed.
     options : SolverOptions
-    raise_if_cancelled : callable, optional
-        Called before every step; may raise to stop the adjustment.
 
     Returns
     -------
@@ -403,7 +399,6 @@ def adjust(
         correction=correction,
         noise=noise,
         options=options,
-        raise_if_cancelled=raise_if_cancelled,
     )[0]
 
 
@@ -413,7 +408,6 @@ def adjust_with_matrix(
     correction: np.ndarray | None = None,
     noise: Noise = DEFAULT_NOISE,
     options: SolverOptions = DEFAULT_OPTIONS,
-    raise_if_cancelled: Callable[[], None] | None = None,
 ) -> tuple[Adjustment, FactorizedNormalMatrix | None]:
     """Adjust a network; return also the normal matrix of the last steps.
 
@@ -425,8 +419,6 @@ def adjust_with_matrix(
     problem = _Problem(network, correction, noise, elimination)
     iteration = _LevenbergMarquardt(problem, start, options.tolerance)
     while not iteration.finished and iteration.steps < options.max_steps:
-        if raise_if_cancelled is not None:
-            raise_if_cancelled()
         iteration.step()
     found = iteration.current
     adjustment = Adjustment(

@@ -13,7 +13,6 @@ Springer 2016, 4.2.4).
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -42,7 +41,6 @@ def adjust_and_estimate_noise(
     correction: NDArray[np.float64] | None = None,
     noise: Noise = DEFAULT_NOISE,
     options: SolverOptions = DEFAULT_OPTIONS,
-    raise_if_cancelled: Callable[[], None] | None = None,
 ) -> Adjustment:
     """Adjust a network and estimate its noise model.
 
@@ -57,8 +55,6 @@ def adjust_and_estimate_noise(
         Loss and start values of the noise model.
     options : SolverOptions
         Options of the last adjustment; those before it have a looser tolerance.
-    raise_if_cancelled : callable, optional
-        Called before every step; may raise to stop.
 
     Returns
     -------
@@ -88,7 +84,6 @@ def adjust_and_estimate_noise(
             correction=correction,
             noise=noise,
             options=loose,
-            raise_if_cancelled=raise_if_cancelled,
         )
         parameters = result.parameters
         equations = normal_equations(network, parameters, correction, noise)
@@ -104,7 +99,6 @@ def adjust_and_estimate_noise(
         correction=correction,
         noise=noise,
         options=options,
-        raise_if_cancelled=raise_if_cancelled,
     )
     return replace(result, converged=result.converged and settled)
 

@@ -272,11 +272,11 @@ def test_joint_validation_reports_progress_and_can_be_cancelled():
         6
     }
 
-    def stop():
+    def stop(*_):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        validate(request, job.calibrations, raise_if_cancelled=stop)
+        validate(request, job.calibrations, progress=stop)
 
 
 def test_failed_adjustment_gives_cannot_tell():

@@ -506,22 +506,6 @@ def test_running_out_of_steps_is_reported():
     assert not result.converged and result.steps == 2
 
 
-def test_cancellation_stops_an_adjustment_before_its_next_step():
-    network, truth = rigs.small_network(**MANY_TARGETS)
-    calls = []
-
-    def check():
-        calls.append(1)
-        if len(calls) == 3:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        adjust_and_estimate_noise(
-            network, rigs.disturbed(truth, degrees=3.0, mm=40.0), raise_if_cancelled=check
-        )
-    assert len(calls) == 3
-
-
 def test_undetermined_network_is_rejected():
     """Two targets do not determine the orientation of an exposure."""
     network, truth = rigs.small_network(**MANY_TARGETS, seen=1.0)

@@ -157,7 +157,7 @@ def calibrate(
     joint : bool
         Whether all fluoroscopes are adjusted together; else one after the other.
     principal_distance : float, optional
-        Start value, or with interior 'fixed' the held value [px].
+        Start value, or with interior 'fixed' the value [px].
     validated : bool
         Whether the calibration is validated with its own exposures, which takes some six times as
         long.
@@ -208,7 +208,7 @@ def calibrate_with_known_orientations(
     phantom : Phantom
         Targets in the frame of the lab; `MovingPoints.as_phantom` makes one of points in motion.
     known : mapping of str to KnownOrientation
-        By fluoroscope; held, or weighted by its standard deviations.
+        By fluoroscope; fixed, or weighted by its standard deviations.
     options : CalibrationOptions, optional
     validated : bool
         Whether the calibration is validated with its own exposures.

@@ -388,7 +388,7 @@ def healed_rig(
         if change.cause in OF_RIG:
             changed = np.hypot(changed, diagnostician.sd_of(change))
             largest = np.hypot(largest, diagnostician.sd_of(replace(change, size=SIZES[0])))
-    solution = adjustment.held(
+    solution = adjustment.with_fixed(
         diagnosis.observed, diagnosis.prior, diagnosis.solution, changed > 0
     )
     covariance = solution.covariance[adjustment.rig, adjustment.rig]

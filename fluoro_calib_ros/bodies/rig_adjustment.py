@@ -302,7 +302,7 @@ class RigAdjustment:
 
     # -- the solution
 
-    def held(
+    def with_fixed(
         self, observed: ObservedBodies, prior: Prior, solution: RigSolution, free: np.ndarray
     ) -> RigSolution:
         """Return the solution where unknowns of the rig change only if they are free (K,).

@@ -37,7 +37,7 @@ DOES_NOT_HOLD = (
 )
 
 NAME = 'adjust'
-HELP = 'Adjust the exposures of a bag or CSV file with the calibration held (out-of-sample test).'
+HELP = 'Adjust the exposures of a bag or CSV file with the calibration fixed (out-of-sample test).'
 EXAMPLE = 'fluoro-calib adjust test --phantom phantom.csv --calibration result --out check'
 
 

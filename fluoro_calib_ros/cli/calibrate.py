@@ -111,8 +111,7 @@ def _add_adjustment(parser: argparse.ArgumentParser) -> None:
         '--principal-distance',
         type=number_in(1, 1e7),
         metavar='PX',
-        help='start value, or with --interior fixed the held value '
-        '(default: from the observations)',
+        help='start value, or with --interior fixed the value (default: from the observations)',
     )
     adjustment.add_argument(
         '--known-orientation',

@@ -4,7 +4,7 @@
 """Self-calibration by adjustment and regression in turn (section 3.1 of Chow et al.).
 
 One round: a correction model is fitted to (residual + present correction) of the inliers, its k
-chosen by cross-validation; then the network is adjusted with that correction held. The rounds are
+chosen by cross-validation; then the network is adjusted with that correction fixed. The rounds are
 a fixed-point iteration of the values the model is fitted to, and Anderson acceleration shortens
 it. Model and adjustment of a round belong together.
 """
@@ -182,7 +182,7 @@ class _Alternation:
     state : _Iterate
         After the last round.
     correction : (N, 2) ndarray
-        Held correction of the last round [px].
+        Fixed correction of the last round [px].
     changed : bool
         Whether inliers or k changed in the last round.
     """
@@ -205,7 +205,7 @@ class _Alternation:
         self.state = _Iterate(start.residuals, information, start, start.noise)
 
     def advance(self) -> None:
-        """Make one round: fit the models, adjust with their correction held, and record it."""
+        """Make one round: fit the models, adjust with their correction fixed, and record it."""
         regressions = self._regressions
         state = self.state
         score, self.changed = regressions.choose(state.values, state.after.q, state.information)

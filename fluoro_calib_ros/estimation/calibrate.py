@@ -329,7 +329,7 @@ def adjust_with_calibrations(
     known: Mapping[str, KnownOrientation] | None = None,
     starts: StartValues | None = None,
 ) -> CalibrationResult:
-    """Adjust frames with calibrations held: interior orientations and corrections do not change.
+    """Adjust frames with calibrations fixed: interior orientations and corrections do not change.
 
     Covariances hold the uncertainty of both: that of the interior orientation is common to all
     exposures, that of the correction is part of the noise of every image point.
@@ -380,9 +380,9 @@ def adjust_with_calibrations(
         )
         before = None
         solved = replace(measured, network=network)
-        held = np.stack([calibrations[name].interior_covariance for name in frames])
+        fixed = np.stack([calibrations[name].interior_covariance for name in frames])
         if starts is None:
-            precise = precision_with_fixed_interiors(network, after, correction, precise, held)
+            precise = precision_with_fixed_interiors(network, after, correction, precise, fixed)
             before, _ = adjusted_with_precision(
                 network,
                 after.parameters,
@@ -408,7 +408,7 @@ def adjust_with_calibrations(
         statistics=(statistics_of(solved, after, precise),),
         residuals=residuals_of_adjustment(measured, after, precise, correction),
         created=_now(),
-        solved={'+'.join(frames): SolvedNetwork(solved, after, correction, held)},
+        solved={'+'.join(frames): SolvedNetwork(solved, after, correction, fixed)},
     )
 
 

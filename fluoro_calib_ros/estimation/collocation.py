@@ -61,9 +61,9 @@ if TYPE_CHECKING:
     from ..photogrammetry.precision import Precision
 
 SETTLED_VARIATION = 0.05  # relative change of the size of what differs between exposures
-# Renewals without visible change after which the priors are held. Noise and signal would otherwise
+# Renewals without visible change after which the priors stay. Noise and signal would otherwise
 # swing about their solution for long where the signal is as short as the distance of the points.
-HELD_AFTER = 2
+STAY_AFTER = 2
 # Decrease of F that terms which continue an earlier calibration may leave: a thirtieth of a sigma.
 CONTINUED_TOLERANCE = 1e-3
 
@@ -187,7 +187,7 @@ class CollocationTerms(AdjustedTerms):
         Returns whether the priors have settled, and the coefficients with which to continue.
         """
         coefficients = coefficients_of(adjustment)
-        if self._steady_renewals == HELD_AFTER:
+        if self._steady_renewals == STAY_AFTER:
             return True, coefficients
         solution = self._renewed(network, matrix, adjustment)
         for refinement in self._refinements:

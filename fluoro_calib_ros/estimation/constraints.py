@@ -96,7 +96,7 @@ def paired_exposures(measured: Measured, b: int, a: int = 0) -> np.ndarray:
 def interiors_to_estimate(measured: Measured, options: CalibrationOptions) -> np.ndarray:
     """Whether (F,) the interior orientation of each fluoroscope is estimated.
 
-    It is held where it is known and has no standard deviation, and where flat targets parallel to
+    It is fixed where it is known and has no standard deviation, and where flat targets parallel to
     the image cannot show it.
     """
     estimated = options.interior == 'estimated'
@@ -115,13 +115,13 @@ def gauges_of(measured: Measured, options: CalibrationOptions) -> tuple[GaugeKin
     Targets parallel to the image show no shift or scale that the exterior orientations could not
     take up, though the interior orientation is fixed.
     """
-    held = GaugeKind.TURNS if options.interior == 'fixed' else GaugeKind.FULL
+    fixed = GaugeKind.TURNS if options.interior == 'fixed' else GaugeKind.FULL
     return tuple(
         GaugeKind.NONE
         if name in measured.known
         else GaugeKind.TREND
         if _is_untilted(measured, f)
-        else held
+        else fixed
         for f, name in enumerate(measured.fluoroscopes)
     )
 

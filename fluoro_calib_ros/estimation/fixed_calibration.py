@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Networks whose interior orientations and corrections are held at their calibrations."""
+"""Networks whose interior orientations and corrections are fixed at their calibrations."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class JointPrecision:
     values : (u,) ndarray
         NaN for rotations, which have no value.
     covariance : (u, u) ndarray
-        Zeros for what was held.
+        Zeros for what was fixed.
     """
 
     names: tuple[str, ...]
@@ -72,9 +72,9 @@ class SolvedNetwork:
     measured : Measured
     adjustment : Adjustment
     correction : (N, 2) ndarray
-        Correction that was held [px].
-    held : (F, 3, 3) ndarray or None
-        Covariances of interior orientations that were held [px^2].
+        Correction that was fixed [px].
+    fixed : (F, 3, 3) ndarray or None
+        Covariances of interior orientations that were fixed [px^2].
     stated : Precision or None
         What the unknowns claim where that is not the precision of the network: the matrix then
         has these standard deviations, and the correlations of the network.
@@ -83,7 +83,7 @@ class SolvedNetwork:
     measured: Measured
     adjustment: Adjustment
     correction: NDArray[np.float64]
-    held: NDArray[np.float64] | None = None
+    fixed: NDArray[np.float64] | None = None
     stated: Precision | None = None
 
     def joint_precision(self) -> JointPrecision:
@@ -134,9 +134,9 @@ class SolvedNetwork:
         """Return blocks of the covariance matrix, those of the network."""
         network = self.measured.network
         noise = self.adjustment.noise
-        if self.held is not None:
+        if self.fixed is not None:
             network, equations = equations_with_fixed_interiors(
-                network, self.adjustment, self.correction, self.held
+                network, self.adjustment, self.correction, self.fixed
             )
         else:
             factor = noise.information_factor(self.adjustment.q)
@@ -157,7 +157,7 @@ class SolvedNetwork:
         )
         variance = np.diagonal(covariance)[: len(claimed)]
         scale = np.ones(len(covariance))
-        free = variance > 0  # not of what was held
+        free = variance > 0  # not of what was fixed
         scale[: len(claimed)][free] = np.sqrt(claimed[free] / variance[free])
         return scale[:, None] * covariance * scale
 
@@ -189,7 +189,7 @@ def network_of_calibrations(
 ) -> Measured:
     """Return network and start values of frames {fluoroscope: [Frame, ...]}.
 
-    calibrations {fluoroscope: FluoroscopeCalibration} are held, as are exterior orientations that
+    calibrations {fluoroscope: FluoroscopeCalibration} are fixed, as are exterior orientations that
     are known {fluoroscope: KnownOrientation}. starts: of an earlier adjustment of the frames.
     Raises DataError as `measured_network`.
     """

@@ -77,7 +77,7 @@ def adjusted_with_precision(
     start : Parameters
         Start values of the unknowns.
     correction : (N, 2) ndarray
-        Corrections of the image points [px], held.
+        Corrections of the image points [px], fixed.
     noise : Noise
         Start values of the noise model, or the noise model where noise_fixed.
     tolerance : float

@@ -44,7 +44,7 @@ class CalibrationOptions:
         Correction model; 'auto': chosen by cross-validation. A regressor of the user's own is
         given as an object (see `estimation.user_regressor.resolve_model`).
     interior : str
-        'estimated', or 'fixed': held, and learned by the model.
+        'estimated', or 'fixed', its error being learned by the model.
     loss : str
         Noise model of the image points.
     k : int or None
@@ -73,7 +73,7 @@ class CalibrationOptions:
     )
     interior: str = option(
         'estimated',
-        'interior orientation, estimated, or held and learned by the model',
+        'interior orientation, estimated, or fixed, its error being learned by the model',
         choices=INTERIORS,
     )
     loss: str = option('student_t', 'noise model of the image points', choices=LOSSES)
@@ -165,7 +165,7 @@ class CalibrationRequest:
     joint : bool
         Whether all fluoroscopes are adjusted together; else one after the other.
     principal_distance : float or None
-        Start value, or with interior 'fixed' the held value [px]; None: from the observations.
+        Start value, or with interior 'fixed' the value [px]; None: from the observations.
     names : Names
         Names of targets, exposures and fluoroscopes in the files that they were read from.
     known_orientations : mapping of str to KnownOrientation

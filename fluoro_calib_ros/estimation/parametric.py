@@ -163,7 +163,7 @@ class StepwiseTerms(AdjustedTerms):
         return self._values
 
     def with_additional(self, network: Network) -> Network:
-        """Return the network with the terms; those that are not selected are held at zero."""
+        """Return the network with the terms; those that are not selected are fixed at zero."""
         additional = tuple(
             AdditionalParameters(values, np.diag(np.where(selected, 0.0, ZERO_PRECISION)))
             for values, selected in zip(self._values, self.selected)
@@ -211,7 +211,7 @@ class StepwiseTerms(AdjustedTerms):
         limit = stdtrit(max(dof, 1), 1 - SIGNIFICANCE / (2 * len(self.names)))  # quantile of t
         if self._remove_insignificant(f, information, coefficients, limit):
             return True
-        score = present @ coefficients  # gradient of the likelihood by terms held at zero
+        score = present @ coefficients  # gradient of the likelihood by terms fixed at zero
         mixed = np.linalg.solve(information[np.ix_(selected, selected)], information[selected])
         own = np.diagonal(information) - np.einsum('ij,ij->j', information[selected], mixed)
         dependent = own <= 1e-9 * np.diagonal(information)

@@ -25,7 +25,7 @@ from .local_signal import LocalSignal, SineEstimates, bumps, largest_gain, with_
 from .parametric import covariance_with_uncertain_terms
 from .signal import Signal, SignalEquations, most_likely_signal, starting_signal
 
-# Standard deviation to which the gauge is held; a much smaller one would damp the steps of the
+# Standard deviation to which the gauge is fixed; a much smaller one would damp the steps of the
 # adjustment.
 GAUGE_SD_PX = 3e-5
 # Prior variance of a trend term that does not exist, relative to that with which it is determined.

@@ -110,7 +110,7 @@ class Targets:
 
 @dataclass(frozen=True)
 class CalibrationResult:
-    """Result of a calibration, or of an adjustment with calibrations held.
+    """Result of a calibration, or of an adjustment with calibrations fixed.
 
     Attributes
     ----------

@@ -3,7 +3,7 @@
 
 """Orientation of the fluoroscopes of a rig, from a capture of the phantom or from the exposures.
 
-Interior orientations and corrections are held at their calibrations, so that rays and corrected
+Interior orientations and corrections are fixed at their calibrations, so that rays and corrected
 image points are consistent. The uncertainty of the interior orientation is propagated, not
 estimated again. With N the normal matrix of the adjustment of exteriors e and object points, with
 the interiors i as further unknowns,
@@ -11,7 +11,7 @@ the interiors i as further unknowns,
     de/di = -N_ee^-1 N_ei (object points eliminated),
     C_e = N_ee^-1 + de/di C_i (de/di)^T,   C_ei = de/di C_i,
 
-the covariance of an estimate with parameters that are held, but not known (consider parameters of
+the covariance of an estimate with parameters that are fixed, but not known (consider parameters of
 Schmidt: Bierman, "Factorization Methods for Discrete Sequential Estimation", Academic Press 1977,
 ch. VIII). An error of the principal distance moves the source, but hardly the points that are
 intersected afterwards: C_ei describes that.
@@ -77,7 +77,7 @@ def orientation_of_known(
 ) -> RigOrientation:
     """Return the orientation of the rig in the frame in which its fluoroscopes are known.
 
-    It is the mean of those of the exposures: the known one where it is held, else the weighted
+    It is the mean of those of the exposures: the known one where it is fixed, else the weighted
     one. Its standard deviations are the given ones: an error of a known orientation is the same in
     all exposures.
     """
@@ -133,8 +133,8 @@ ASSUMED_SD_PX = 1.0
 
 
 @dataclass(frozen=True)
-class _HeldAdjustment:
-    """An adjustment of m exposures with the calibrations of F fluoroscopes held.
+class _FixedAdjustment:
+    """An adjustment of m exposures with the calibrations of F fluoroscopes fixed.
 
     Attributes
     ----------
@@ -219,7 +219,7 @@ def orientation_of_capture(
     phantom : Phantom
         Survey of its targets, or the better known object points of a calibration (`phantom_of`).
     calibrations : mapping of str to FluoroscopeCalibration
-        Held.
+        Fixed.
     frame_id : str
         Name of the rig frame.
     loss : str
@@ -245,19 +245,19 @@ def orientation_of_capture(
             )
     with threadpool_limits(1):
         measured = network_of_calibrations(still, phantom, calibrations)
-        held = _adjusted(measured, calibrations, loss, True)
-        known = held.covariance_of_all()
-    parameters = held.after.parameters
+        fixed = _adjusted(measured, calibrations, loss, True)
+        known = fixed.covariance_of_all()
+    parameters = fixed.after.parameters
     count = len(frames)
     exteriors = _Exteriors(
         parameters.rotation,
         parameters.position_mm,
         known,
-        held.by_interior.reshape(6 * count, -1),
+        fixed.by_interior.reshape(6 * count, -1),
     )
     exposures = min(len(of_one) for of_one in frames.values())
     origin = _Origin(frame_id, 'capture', _last_stamp(frames), exposures)
-    return _orientation(held, exteriors, calibrations, origin)
+    return _orientation(fixed, exteriors, calibrations, origin)
 
 
 def orientation_of_exposures(
@@ -280,7 +280,7 @@ def orientation_of_exposures(
         Those of the same number belong together.
     phantom : Phantom
     calibrations : mapping of str to FluoroscopeCalibration
-        Held.
+        Fixed.
     loss : str
         Noise model of the image points.
     starts : StartValues, optional
@@ -319,16 +319,16 @@ def orientation_and_scatter(
     paired = _paired(frames)
     with threadpool_limits(1):
         measured = network_of_calibrations(paired, phantom, calibrations, starts=starts)
-        held = _adjusted(measured, calibrations, loss, False)
+        fixed = _adjusted(measured, calibrations, loss, False)
         turning = {name for name, each in calibrations.items() if each.angle_field is not None}
-        exteriors, scatter = _relative_to_first(held, turning)
-    first = held.measured.fluoroscopes[0]
+        exteriors, scatter = _relative_to_first(fixed, turning)
+    first = fixed.measured.fluoroscopes[0]
     frame_id = calibrations[first].frame_id or f'{first}_optical'
     exposures = min(int(of_one.used.sum()) for of_one in scatter)
     origin = _Origin(frame_id, 'joint calibration', _last_stamp(paired), exposures)
-    found = _orientation(held, exteriors, calibrations, origin)
+    found = _orientation(fixed, exteriors, calibrations, origin)
     try:
-        return with_datum_of_points(found, _seen_by_first(held)), scatter
+        return with_datum_of_points(found, _seen_by_first(fixed)), scatter
     except np.linalg.LinAlgError:
         raise DataError(
             'the fluoroscopes see the phantom from one place, so that their rays do not intersect'
@@ -336,40 +336,40 @@ def orientation_and_scatter(
 
 
 def _relative_to_first(
-    held: _HeldAdjustment, turning: Collection[str]
+    fixed: _FixedAdjustment, turning: Collection[str]
 ) -> tuple[_Exteriors, tuple[PairScatter, ...]]:
     """Exteriors relative to the first fluoroscope, and the scatter of the paired exposures.
 
     turning: names of those whose corrections change with the angle of a C-arm.
     Raises DataError where no exposures can be paired.
     """
-    names = held.measured.fluoroscopes
+    names = fixed.measured.fluoroscopes
     count = len(names)
     rotation = np.tile(np.eye(3), (count, 1, 1))
     position = np.zeros((count, 3))
-    operator = np.zeros((6 * count, 6 * len(held.measured.frames)))
+    operator = np.zeros((6 * count, 6 * len(fixed.measured.frames)))
     growth = np.ones(6 * count)
     scatter = []
     for b in range(1, count):
-        pairs = paired_exposures(held.measured, b)
+        pairs = paired_exposures(fixed.measured, b)
         if not len(pairs):
             raise DataError(_unpaired(names, b))
         rows = slice(6 * b, 6 * b + 6)
         corrected = names[0] in turning or names[b] in turning
-        pose, operator[rows], of_pairs = _mean_of_pairs(held, pairs, corrected)
+        pose, operator[rows], of_pairs = _mean_of_pairs(fixed, pairs, corrected)
         growth[rows] = of_pairs.growth
         rotation[b] = pose.rotation
         position[b] = pose.translation_mm
         scatter.append(of_pairs)
-    known = growth[:, None] * (operator @ held.covariance_of_all() @ operator.T) * growth
-    by_interior = operator @ held.by_interior.reshape(operator.shape[1], -1)
+    known = growth[:, None] * (operator @ fixed.covariance_of_all() @ operator.T) * growth
+    by_interior = operator @ fixed.by_interior.reshape(operator.shape[1], -1)
     return _Exteriors(rotation, position, known, by_interior), tuple(scatter)
 
 
-def _seen_by_first(held: _HeldAdjustment) -> np.ndarray:
+def _seen_by_first(fixed: _FixedAdjustment) -> np.ndarray:
     """Object points (n, 3) [mm] that the first fluoroscope sees, in its sensor frame."""
-    network = held.measured.network
-    parameters = held.after.parameters
+    network = fixed.measured.network
+    parameters = fixed.after.parameters
     rows = network.rows(0)
     exposure = network.exposure[rows]
     points = parameters.points_mm[network.point[rows]]
@@ -503,7 +503,7 @@ def _adjusted(
     calibrations: Calibrations,
     loss: str,
     noise_fixed: bool,
-) -> _HeldAdjustment:
+) -> _FixedAdjustment:
     """Adjust a network with the calibrations fixed.
 
     noise_fixed: the noise is that of the calibrations; else only where the exposures are too few
@@ -522,7 +522,7 @@ def _adjusted(
         raise DataError('the exposures do not determine the orientation of the fluoroscopes')
     blocks = _with_free_interiors(network, after, correction)
     by_interior = blocks.eg @ np.linalg.inv(blocks.gg)
-    return _HeldAdjustment(measured, after, by_interior, blocks, _covariance_of_interiors(used))
+    return _FixedAdjustment(measured, after, by_interior, blocks, _covariance_of_interiors(used))
 
 
 def _with_free_interiors(
@@ -552,33 +552,33 @@ def _covariance_of_interiors(calibrations: Iterable[FluoroscopeCalibration]) -> 
 
 
 def _mean_of_pairs(
-    held: _HeldAdjustment, pairs: np.ndarray, corrected: bool
+    fixed: _FixedAdjustment, pairs: np.ndarray, corrected: bool
 ) -> tuple[RelativePose, np.ndarray, PairScatter]:
     """Weighted mean of the relative orientations of pairs (k, 2) of exposures.
 
     corrected: whether a correction changes with the angle of a C-arm. Returns the mean, its
     derivatives (6, 6m) by the exposures, and how the pairs scatter about it.
     """
-    parameters = held.after.parameters
-    frames = held.measured.frames
+    parameters = fixed.after.parameters
+    frames = fixed.measured.frames
     pairs = pairs[np.argsort([frames[row].number for row in pairs[:, 0]], kind='stable')]
     angles = [angles_of(frames[row] for row in rows) for rows in pairs.T]
     constraint = RelativeConstraint((0, 1), pairs, 1.0, 1.0)
     start = mean_pose(parameters, pairs)
     _, d_a, d_b, _ = discrepancies_with_jacobian(constraint, start, parameters)
-    weights = np.linalg.inv(_covariance_of_pairs(held, pairs, d_a, d_b))
+    weights = np.linalg.inv(_covariance_of_pairs(fixed, pairs, d_a, d_b))
     columns = functions_of_angles(angles)
     found = agreeing(parameters, constraint, weights, columns)
     used = found.used
     pose = mean_pose(parameters, pairs[used], weights[used])
-    operator = np.zeros((6, len(held.measured.frames), 6))
+    operator = np.zeros((6, len(fixed.measured.frames), 6))
     share = np.linalg.solve(
         weights[used].sum(axis=0), weights[used].transpose(1, 0, 2).reshape(6, -1)
     ).reshape(6, -1, 6)
     for rows, derivative in zip(pairs[used].T, (d_a[used], d_b[used])):
         operator[:, rows] += np.einsum('ika,kab->ikb', share, derivative)
     poses = [pose.updated(step) for step in found.trend]
-    network = held.measured.network
+    network = fixed.measured.network
     by_angle = displacements(network, parameters, pairs, poses, [pose] * len(poses))
     turn, shift = relative_poses(parameters, pairs)
     scatter = PairScatter(
@@ -599,32 +599,32 @@ def _mean_of_pairs(
 
 
 def _covariance_of_pairs(
-    held: _HeldAdjustment, pairs: np.ndarray, d_a: np.ndarray, d_b: np.ndarray
+    fixed: _FixedAdjustment, pairs: np.ndarray, d_a: np.ndarray, d_b: np.ndarray
 ) -> np.ndarray:
     """Covariances (k, 6, 6) of the relative orientations of pairs (k, 2) of exposures.
 
     d_a, d_b (k, 6, 6) are their derivatives by the exposures.
     """
     a, b = pairs.T
-    mixed = d_a @ held.covariance(a, b) @ d_b.transpose(0, 2, 1)
+    mixed = d_a @ fixed.covariance(a, b) @ d_b.transpose(0, 2, 1)
     return (
-        d_a @ held.covariance(a, a) @ d_a.transpose(0, 2, 1)
-        + d_b @ held.covariance(b, b) @ d_b.transpose(0, 2, 1)
+        d_a @ fixed.covariance(a, a) @ d_a.transpose(0, 2, 1)
+        + d_b @ fixed.covariance(b, b) @ d_b.transpose(0, 2, 1)
         + mixed
         + mixed.transpose(0, 2, 1)
     )
 
 
 def _orientation(
-    held: _HeldAdjustment, exteriors: _Exteriors, calibrations: Calibrations, origin: _Origin
+    fixed: _FixedAdjustment, exteriors: _Exteriors, calibrations: Calibrations, origin: _Origin
 ) -> RigOrientation:
     """Rig orientation of exteriors, with the uncertainty of the interiors."""
-    names = held.measured.fluoroscopes
+    names = fixed.measured.fluoroscopes
     used = [calibrations[name] for name in names]
     by_interior = exteriors.by_interior
-    mixed = by_interior @ held.interiors
+    mixed = by_interior @ fixed.interiors
     total = exteriors.covariance + mixed @ by_interior.T
-    every = np.block([[total, mixed], [mixed.T, held.interiors]])
+    every = np.block([[total, mixed], [mixed.T, fixed.interiors]])
     count = len(names)
     order = np.concatenate(
         [np.r_[6 * f : 6 * f + 6, 6 * count + 3 * f : 6 * count + 3 * f + 3] for f in range(count)]

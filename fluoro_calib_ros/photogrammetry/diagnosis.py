@@ -118,7 +118,7 @@ def high_correlations(
 
 
 def _correlations(covariance: np.ndarray, row_sd: np.ndarray, column_sd: np.ndarray) -> np.ndarray:
-    """Correlations of covariances (r, c); zero where an unknown is held."""
+    """Correlations of covariances (r, c); zero where an unknown is fixed."""
     with np.errstate(divide='ignore', invalid='ignore'):
         out = covariance / np.outer(row_sd, column_sd)
     return np.where(np.isfinite(out), out, 0.0)

@@ -146,7 +146,7 @@ class BorderedCovariance:
     rest : (q, q) ndarray
         The inverse; of the part between two different blocks, see `conditional` and `gain`.
     conditional : (k, s, s) ndarray
-        B^-1: covariances of the blocks with the rest held.
+        B^-1: covariances of the blocks with the rest fixed.
     gain : (k, s, q) ndarray
         B^-1 C. The inverse between blocks i and j is (i = j) B^-1 - border[i] gain[j]^T.
     """
@@ -160,7 +160,7 @@ class BorderedCovariance:
 
 @dataclass(frozen=True)
 class CovarianceBlocks:
-    """Blocks of the inverse normal matrix; zeros where a global unknown is held.
+    """Blocks of the inverse normal matrix; zeros where a global unknown is fixed.
 
     Attributes
     ----------
@@ -203,7 +203,7 @@ class Elimination(ABC):
     def bordered_system(self, equations: NormalEquations) -> BorderedSystem:
         """Normal equations in the order of this elimination.
 
-        Held global unknowns are left out. The open directions of a free network are fixed in the
+        Fixed global unknowns are left out. The open directions of a free network are fixed in the
         part that remains.
         """
 
@@ -323,8 +323,8 @@ class EliminatePoints(Elimination):
 
         def points_between(p: np.ndarray, q: np.ndarray) -> np.ndarray:
             same = (p == q)[:, None, None]
-            held = np.where(same, covariance.conditional[p], 0.0)
-            return held - covariance.border[p] @ covariance.gain[q].transpose(0, 2, 1)
+            fixed = np.where(same, covariance.conditional[p], 0.0)
+            return fixed - covariance.border[p] @ covariance.gain[q].transpose(0, 2, 1)
 
         return CovarianceBlocks(
             ee=ee,
@@ -433,8 +433,8 @@ class EliminateExposures(Elimination):
 
         def between(e: np.ndarray, f: np.ndarray) -> np.ndarray:
             same_cell = (cell[e] == cell[f])[:, None, None]
-            held = np.where(same_cell, conditional[cell[e], place[e], :, place[f], :], 0.0)
-            return held - border[e] @ gain[cell[f], place[f]].transpose(0, 2, 1)
+            fixed = np.where(same_cell, conditional[cell[e], place[e], :, place[f], :], 0.0)
+            return fixed - border[e] @ gain[cell[f], place[f]].transpose(0, 2, 1)
 
         return CovarianceBlocks(
             ee=blocks[cell, place, :, place, :],

@@ -21,7 +21,7 @@ from .rotations import vector_from_matrix
 
 # Exterior orientations that are known beforehand: weighted observations of the adjustment.
 
-# Standard deviations that stand for an orientation that is held: a thousandth of what images of
+# Standard deviations that stand for an orientation that is fixed: a thousandth of what images of
 # 0.25 px noise determine.
 HELD_SD_MM = 3e-4
 HELD_SD_RAD = 1e-7
@@ -81,10 +81,10 @@ class KnownOrientation:
     position_mm : (3,) ndarray
         Position of the source in the frame of the lab.
     interior_sd : (3,) sequence of float or None
-        Standard deviations of the interior orientation [px]; None: it is held.
+        Standard deviations of the interior orientation [px]; None: it is fixed.
     exterior_sd : (2,) sequence of float or None
         Standard deviations of each coordinate of the source [mm] and of each angle [rad]; None:
-        they are held.
+        they are fixed.
     """
 
     interior: NDArray[np.float64]
@@ -120,7 +120,7 @@ class KnownOrientation:
 
     @property
     def is_fixed(self) -> bool:
-        """Whether interior and exterior orientation are both held."""
+        """Whether interior and exterior orientation are both fixed."""
         return self.interior_sd is None and self.exterior_sd is None
 
     @classmethod

@@ -175,7 +175,7 @@ def target_statistics(
 ) -> TargetTest:
     """Test the surveyed coordinates of the targets.
 
-    Each target is intersected from its rays without its survey. The orientations are held, and
+    Each target is intersected from its rays without its survey. The orientations are fixed, and
     their uncertainty is added to that of the rays.
     """
     n = network.n_points

@@ -46,7 +46,7 @@ class Precision:
     Attributes
     ----------
     interior : (F, 3, 3) ndarray
-        Of the interior orientations [px^2]; zeros where held.
+        Of the interior orientations [px^2]; zeros where fixed.
     exterior : (m, 6, 6) ndarray
         Of T [mm] and w [rad] of the exposures.
     points : (n, 3, 3) ndarray
@@ -459,13 +459,13 @@ def geometric_redundancy(network: Network, parameters: Parameters, noise: Noise)
 
 # Precision of an adjustment that holds interior orientations which are not known exactly.
 #
-# What is held has the covariance S, and moves the other unknowns by J = -N^-1 B, where N is their
-# normal matrix and B its mixed blocks with what is held. Their covariance is N^-1 + J S J^T, with
+# What is fixed has the covariance S, and moves the other unknowns by J = -N^-1 B, where N is their
+# normal matrix and B its mixed blocks with what is fixed. Their covariance is N^-1 + J S J^T, with
 # "consider parameters" (Tapley, Schutz and Born, "Statistical Orbit Determination", 2004, 6.2).
-# It is a block of the inverse of the normal matrix with D = S^-1 + B^T N^-1 B for what is held,
+# It is a block of the inverse of the normal matrix with D = S^-1 + B^T N^-1 B for what is fixed,
 # in which the observations do not improve it.
 
-MIN_SD_PX = 1e-6  # of an interior orientation that is held
+MIN_SD_PX = 1e-6  # of an interior orientation that is fixed
 
 
 def precision_with_fixed_interiors(
@@ -475,12 +475,12 @@ def precision_with_fixed_interiors(
     precise: Precision,
     covariances: NDArray[np.float64],
 ) -> Precision:
-    """Return the precision of an adjustment with the uncertainty of its held interiors.
+    """Return the precision of an adjustment with the uncertainty of its fixed interiors.
 
     Parameters
     ----------
     network : Network
-        With interior orientations that are held.
+        With interior orientations that are fixed.
     adjustment : Adjustment
     correction : (N, 2) ndarray
         Correction of the image points [px] in the adjustment.
@@ -492,7 +492,7 @@ def precision_with_fixed_interiors(
     Returns
     -------
     Precision
-        Residuals and redundancy numbers are those of `precise`: the interiors are held.
+        Residuals and redundancy numbers are those of `precise`: the interiors are fixed.
 
     Raises
     ------
@@ -517,7 +517,7 @@ def precision_with_fixed_interiors(
 def equations_with_fixed_interiors(
     network: Network, adjustment: Adjustment, correction: np.ndarray, covariances: np.ndarray
 ) -> tuple[Network, NormalEquations]:
-    """Network and normal equations whose inverse holds the uncertainty of held interiors.
+    """Network and normal equations whose inverse holds the uncertainty of fixed interiors.
 
     See `precision_with_fixed_interiors` for the arguments.
     """

@@ -134,7 +134,7 @@ class UnknownLayout:
 
     @property
     def n_globals(self) -> int:
-        """Number G of global unknowns, free or held."""
+        """Number G of global unknowns, free or fixed."""
         return len(self.free)
 
     @cached_property
@@ -174,7 +174,7 @@ class UnknownLayout:
         return ReducedLayout(self.n_points, POINT_SIZE, self.n_free_globals)
 
     def expand_globals(self, free_values: np.ndarray) -> np.ndarray:
-        """Values (G, ...) of all global unknowns from those of the free ones; zeros where held."""
+        """Values (G, ...) of all global unknowns from the free ones; zeros where fixed."""
         out = np.zeros((self.n_globals, *free_values.shape[1:]))
         out[self.free] = free_values
         return out
@@ -191,7 +191,7 @@ class UnknownVector:
     points : (n, 3, ...) ndarray
         Of the object points [mm].
     globals : (G, ...) ndarray
-        Of the global unknowns; zeros where held.
+        Of the global unknowns; zeros where fixed.
     """
 
     exteriors: NDArray[np.float64]

@@ -75,7 +75,7 @@ def _column(result: CalibrationResult, name: str) -> dict[str, str]:
         'observations': str(figures.observations),
         'inliers': f'{figures.inliers} ({inlier_percent:.1f} %)',
         'exposures': str(len(figures.exposures)),
-        'interior orientation': 'estimated' if calibration.interior_estimated else 'held',
+        'interior orientation': 'estimated' if calibration.interior_estimated else 'fixed',
         **_interior_rows(figures),
         'noise of an image coordinate [px]': _noise_text(calibration),
         'median sd of the correction [px]': number_text(_median_sd(calibration)),
@@ -102,8 +102,8 @@ def _noise_text(calibration: FluoroscopeCalibration) -> str:
     profile = calibration.noise_profile
     if profile is None:
         return number_text(calibration.image_sd)
-    middle, rim = (number_text(calibration.image_sd * f) for f in (profile.middle, profile.rim))
-    return f'{middle}; rim {rim}'
+    middle, border = (number_text(calibration.image_sd * f) for f in (profile.middle, profile.rim))
+    return f'{middle}; border {border}'
 
 
 def _angle_rows(field: AngleField | None) -> dict[str, str]:

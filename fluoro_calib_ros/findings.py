@@ -13,6 +13,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum, IntEnum
 
+MAX_LISTED = 5  # names in a sentence
+
 
 class Severity(IntEnum):
     """How much a finding matters; the values are the levels of diagnostics and of DriftStatus."""
@@ -256,6 +258,14 @@ def sentences(findings: Iterable[Finding], severity: Severity | None = None) -> 
 def sentence_of(*parts: object) -> str:
     """Return place, cause and advice as a sentence, without those that are empty."""
     return ': '.join(filter(None, map(str, parts)))
+
+
+def first_few(names: Iterable[object], separator: str = ', ') -> str:
+    """Return the first of some names as text, and how many there are further."""
+    texts = list(map(str, names))
+    first = separator.join(texts[:MAX_LISTED])
+    further = len(texts) - MAX_LISTED
+    return f'{first} and {further} more' if further > 0 else first
 
 
 def _named(noun: str, things: tuple[object, ...]) -> str:

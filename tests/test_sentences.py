@@ -608,7 +608,7 @@ SENTENCES = {
     ),
     Kind.FEW_RAYS: (
         '# targets are seen in fewer than # exposures, which do not determine them safely '
-        'without surveyed coordinates: #, #, #, #, #, #, #, #, #, # and more'
+        'without surveyed coordinates: #, #, #, #, # and # more'
     ),
     Kind.FEW_TARGETS: 'fluoroscope a, exposure #: # targets are too few, # are needed',
     Kind.NOT_ORIENTED: (
@@ -662,8 +662,8 @@ SENTENCES = {
         'fluoroscope a, exposure #: sigma of target # is # px, between # and # px are plausible'
     ),
     Kind.MIXED_UNITS: (
-        'phantom: # targets, #, #, #, #, # ..., are in another unit than the others: they fit '
-        'when their coordinates are multiplied by # (cm in place of mm)'
+        'phantom: # targets, #, #, #, #, # and # more, are in another unit than the others: '
+        'they fit when their coordinates are multiplied by # (cm in place of mm)'
     ),
     Kind.OTHER_PHANTOM: (
         'fluoroscope a: the image points do not fit the phantom: this is another phantom, or '

@@ -13,14 +13,13 @@ from scipy.special import chdtri
 from scipy.stats import binom
 
 from ..estimation.diagnostics import ResidualTable
-from ..findings import Kind, Place
+from ..findings import Kind, Place, first_few
 from .bead_intersection import Beads, distances, intersect, least_chi2_without_a_ray
 from .calibration_evidence import Evidence, Subject
 from .check import Check
 from .faces import displaced_layer
 
 MIN_BEADS = 10  # for distances
-MAX_NAMED = 5  # beads in a sentence
 FALSE_ALARM = 2e-3  # chance that any bead of a good phantom is reported
 # For the part of the errors of orientations and calibration that all beads have in common.
 SD_FACTOR = 1.1
@@ -65,13 +64,10 @@ def rejected_beads(residuals: ResidualTable | None) -> NDArray[np.int64]:
 
 def _rejected(target_id: NDArray[np.int64]) -> Check:
     """Return check 'beads' that fails because the image points of some beads are rejected."""
-    named = ', '.join(map(str, target_id[:MAX_NAMED]))
-    further = len(target_id) - MAX_NAMED
     return Check(
         Kind.BEADS,
-        f'most image points of bead {named}{f" and {further} more" if further > 0 else ""} are '
-        'rejected, more than false matches explain: its survey is wrong, or it is exchanged with '
-        'another',
+        f'most image points of bead {first_few(target_id)} are rejected, more than false matches '
+        'explain: its survey is wrong, or it is exchanged with another',
         Place(target_id=tuple(target_id.tolist())),
         'survey again, and calibrate again',
         numbers={'beads': len(target_id)},
@@ -161,13 +157,8 @@ def compare_with_survey(
 
 def _wrong_beads(target_id: np.ndarray, size: np.ndarray) -> str:
     """Return the names of the beads with a wrong survey, and their errors [mm]."""
-    named = ', '.join(
-        f'{target} is wrong by {mm:.1f} mm'
-        for target, mm in zip(target_id[:MAX_NAMED], size[:MAX_NAMED])
-    )
-    further = len(target_id) - MAX_NAMED
-    rest = f', and that of {further} more' if further > 0 else ''
-    return f'the survey of bead {named}{rest}'
+    wrong = first_few(f'{target} is wrong by {mm:.1f} mm' for target, mm in zip(target_id, size))
+    return f'the survey of bead {wrong}'
 
 
 def _check_distances(beads: Beads, has_trend: bool) -> Check:

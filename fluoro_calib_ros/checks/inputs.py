@@ -27,7 +27,7 @@ from ..estimation.options import CalibrationRequest
 from ..estimation.result import CalibrationResult, FluoroscopeResult
 from ..exposures.frame import Frame, validate_frame
 from ..exposures.phantom import Phantom
-from ..findings import Finding, Kind, Place
+from ..findings import Finding, Kind, Place, first_few
 from ..photogrammetry.collinearity import project
 from ..photogrammetry.known_orientation import KnownOrientation
 from ..photogrammetry.plane_resection import flatness, plane_of, robust_homography
@@ -44,7 +44,6 @@ UNITS_MM = {'cm': 10.0, 'inches': 25.4, 'm': 1000.0}
 MAX_COORDINATE_MM = 1e6
 EXTENT_SHARE = 0.9  # of the targets, within the extent of the phantom
 MAX_EXTENT = 6.0  # distance of a target from the middle over that extent
-MAX_LISTED = 5  # targets in a sentence
 SD_MM = (1e-6, 1e3)  # of surveyed coordinates
 SIGMA_PX = (1e-4, 1e3)  # of image points
 MIN_REACH = 0.6  # of the image points over the image, to the right and down
@@ -181,7 +180,7 @@ def find_wrong_phantom(frames: Mapping[str, Sequence[Frame]], phantom: Phantom) 
         out.append(
             Finding(
                 Kind.REPEATED_COORDINATES,
-                f'targets {_first(ids)} are all at ({x:g}, {y:g}, {z:g}) mm',
+                f'targets {first_few(ids)} are all at ({x:g}, {y:g}, {z:g}) mm',
                 replace(_PHANTOM, target_id=tuple(ids.tolist())),
                 'a repeated row, or a fill value for targets that are not surveyed',
             )
@@ -193,8 +192,8 @@ def find_wrong_phantom(frames: Mapping[str, Sequence[Frame]], phantom: Phantom) 
         out.append(
             Finding(
                 Kind.REMOTE_TARGETS,
-                f'target {_first(seen_id[far])} is {distance[far].max():.0f} mm from the middle '
-                f'of the others, most of which are within {extent:.0f} mm',
+                f'target {first_few(seen_id[far])} is {distance[far].max():.0f} mm from the '
+                f'middle of the others, most of which are within {extent:.0f} mm',
                 replace(_PHANTOM, target_id=tuple(seen_id[far].tolist())),
                 'a wrong coordinate, another unit, or a fill value for targets that are not '
                 'surveyed',
@@ -202,12 +201,6 @@ def find_wrong_phantom(frames: Mapping[str, Sequence[Frame]], phantom: Phantom) 
             )
         )
     return out
-
-
-def _first(ids: np.ndarray) -> str:
-    """Return some ids as text."""
-    listed = ', '.join(map(str, ids[:MAX_LISTED]))
-    return listed if len(ids) <= MAX_LISTED else f'{listed} and {len(ids) - MAX_LISTED} more'
 
 
 def _validate_sigma(frame: Frame) -> None:

@@ -20,7 +20,7 @@ import numpy as np
 from ..errors import DataError
 from ..exposures.frame import Frame
 from ..exposures.phantom import Phantom
-from ..findings import Finding, Kind, Place
+from ..findings import Finding, Kind, Place, first_few
 from ..photogrammetry.resection import (
     SAMPLE_SIZE,
     decompose,
@@ -41,7 +41,6 @@ UNCLEAR = 0.6  # share of targets at their places below which there may be no ma
 MIN_GROUP = 3  # targets in either unit
 SAMPLES = 1500
 STEPS = 10
-MAX_LISTED = 5
 
 
 def mixed_units(
@@ -209,12 +208,11 @@ def _whole_group(
 
 def _finding(ids: np.ndarray, factor: float) -> Finding:
     """Return the finding on targets that fit when they are multiplied by a factor."""
-    listed = ', '.join(map(str, ids[:MAX_LISTED])) + ' ...' * (len(ids) > MAX_LISTED)
     unit = UNITS.get(factor)
     meant = f' ({unit} in place of mm)' if unit else ''
     return Finding(
         Kind.MIXED_UNITS,
-        f'{len(ids)} targets, {listed}, are in another unit than the others',
+        f'{len(ids)} targets, {first_few(ids)}, are in another unit than the others',
         Place(target_id=tuple(ids.tolist()), name='phantom'),
         f'they fit when their coordinates are multiplied by {factor:.4g}{meant}',
         numbers={'factor': factor},

@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 from scipy.special import chdtri
 
 from ..estimation.survey import SurveyedBeads
-from ..findings import Finding, Kind, Place, Severity
+from ..findings import Finding, Kind, Place, Severity, first_few
 from ..photogrammetry.datum import similarity_directions
 from .check import Check
 
@@ -27,7 +27,6 @@ MIN_BEADS = 10  # of both halves
 # simulated surveys whose sds are right, and was 1.64 in one with an NSE of 1.6 (8 exposures, seed
 # 7 of benchmarks.survey).
 HALVES_LIMIT = 1.5
-MAX_NAMED = 5
 OFF_SD = 1.5  # times what the sd of rough coordinates says, as an RMS of many beads
 DATUM = 7
 UNKNOWN = 1e6  # variance of a datum that is not known, over that of the beads
@@ -44,7 +43,7 @@ def unsurveyed(beads: SurveyedBeads) -> list[Finding]:
             Finding(
                 Kind.FEW_RAYS,
                 f'{len(ids)} beads are not surveyed, fewer than {MIN_RAYS} of their image points '
-                f'agree: {_named(ids)}',
+                f'agree: {first_few(ids)}',
                 Place(target_id=tuple(ids.tolist()), name=''),
                 severity=Severity.NOTE,
                 numbers={'beads': len(ids)},
@@ -56,7 +55,7 @@ def unsurveyed(beads: SurveyedBeads) -> list[Finding]:
             Finding(
                 Kind.WEAK_INTERSECTION,
                 f'{len(ids)} beads are not surveyed, their rays meet at less than '
-                f'{np.rad2deg(MIN_ANGLE_RAD):.0f} degrees: {_named(ids)}',
+                f'{np.rad2deg(MIN_ANGLE_RAD):.0f} degrees: {first_few(ids)}',
                 Place(target_id=tuple(ids.tolist()), name=''),
                 severity=Severity.NOTE,
                 numbers={'beads': len(ids)},
@@ -79,7 +78,7 @@ def displaced(beads: SurveyedBeads) -> Finding | None:
     return Finding(
         Kind.BEADS,
         f'{len(ids)} beads lie further from the given coordinates than their sd says, by up to '
-        f'{largest:.2f} mm: {_named(ids)}',
+        f'{largest:.2f} mm: {first_few(ids)}',
         Place(target_id=tuple(ids.tolist()), name=''),
         severity=Severity.NOTE,
         numbers={'beads': len(ids), 'largest_mm': largest},
@@ -239,10 +238,3 @@ def _check_precision(beads: SurveyedBeads) -> Check:
         limit=given,
         unit='mm',
     )
-
-
-def _named(target_id: NDArray[np.int64]) -> str:
-    """Return some ids as text."""
-    listed = ', '.join(map(str, target_id[:MAX_NAMED]))
-    further = len(target_id) - MAX_NAMED
-    return f'{listed} and {further} more' if further > 0 else listed

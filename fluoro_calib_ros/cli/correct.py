@@ -6,11 +6,12 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import DataError
+from ..findings import first_few
 from .arguments import (
     add_angle,
     add_calibration,
@@ -30,7 +31,6 @@ NAME = 'correct'
 HELP = 'Correct image points (CSV file) or images (image, TIFF stack, folder or video).'
 EXAMPLE = 'fluoro-calib correct points.csv --calibration result --out corrected.csv'
 POINTS_SUFFIXES = ('.csv', '.txt', '.xma', '.pho', '')  # of files with image points
-MAX_NAMES = 5  # of files in a note
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -177,10 +177,10 @@ def _correct_images(
         done = run_image_correction(request, progress)
     if done.passed_over:
         print_note(
-            f'{source}: files that are not images were skipped: {_some(done.passed_over, ", ")}'
+            f'{source}: files that are not images were skipped: {first_few(done.passed_over)}'
         )
     if done.failed:
-        print_note(f'not corrected: {_some(done.failed, "; ")}')
+        print_note(f'not corrected: {first_few(done.failed, "; ")}')
     if angles is not None:
         unknown = sum(number not in angles for number in range(1, done.images + 1))
         if unknown:
@@ -226,10 +226,3 @@ def _angles_of_images(
         print_note(f'{arguments.angles}: not used, {name} does not depend on an angle')
         return None
     return read_image_angles(arguments.angles)
-
-
-def _some(names: Sequence[str], separator: str) -> str:
-    """Return the first of some names, and how many there are further."""
-    further = len(names) - MAX_NAMES
-    text = separator.join(names[:MAX_NAMES])
-    return f'{text} and {further} more' if further > 0 else text

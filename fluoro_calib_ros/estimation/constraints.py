@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DataError
-from ..findings import Finding, Kind, Place, Severity
+from ..findings import Finding, Kind, Place, Severity, first_few
 from ..photogrammetry.elimination import factorize
 from ..photogrammetry.normal_equations import normal_equations
 from ..photogrammetry.precision import covariance_blocks
@@ -39,7 +39,6 @@ from .rounds import SelfCalibration
 # among them could not be detected, and would move it anywhere.
 MIN_RAYS = 3
 MIN_PAIRS = 2  # of exposures for a constraint of the relative orientation
-MAX_LISTED = 10  # targets named in a sentence
 
 
 @dataclass(frozen=True)
@@ -215,12 +214,10 @@ def _without_targets_of_few_rays(measured: Measured) -> Measured:
         survey_mm=network.survey_mm[~few],
         survey_sd_mm=network.survey_sd_mm[~few],
     )
-    names = ', '.join(str(i) for i in measured.target_id[few][:MAX_LISTED])
-    names += ' and more' if few.sum() > MAX_LISTED else ''
     excluded = Finding(
         Kind.FEW_RAYS,
         f'{few.sum()} targets are seen in fewer than {MIN_RAYS} exposures, which do not determine '
-        f'them safely without surveyed coordinates: {names}',
+        f'them safely without surveyed coordinates: {first_few(measured.target_id[few])}',
         Place(target_id=tuple(measured.target_id[few].tolist())),
         severity=Severity.NOTE,
     )

@@ -15,15 +15,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..findings import Finding, Kind, Severity
+from ..findings import Finding, Kind, Severity, first_few
 from .frame import Frame, points_on_image
 from .phantom import Phantom
 
 MIN_TOGETHER = 4  # targets at the same image point that are fill values
 MIN_SHARE_TOGETHER = 0.02  # the same, of the targets of the frame; the larger of both holds
-MAX_LISTED = 10  # targets in a sentence
 MAX_SHARE = 0.05  # of the image points of a frame that are excluded; one always is
 
 
@@ -60,7 +58,7 @@ def without_strays(frame: Frame, phantom: Phantom | None = None) -> tuple[Frame,
         sigma=None if frame.sigma is None else np.asarray(frame.sigma)[kept],
     )
     causes = [
-        f'target {_listed(ids[chosen])} {cause}'
+        f'target {first_few(ids[chosen])} {cause}'
         for chosen, cause in (
             (off & single, 'off the image'),
             (unknown & single & ~off, 'not on the phantom'),
@@ -104,8 +102,3 @@ def _together(uv: np.ndarray) -> np.ndarray:
         return np.zeros(len(uv), dtype=bool)
     _, place, count = np.unique(uv, axis=0, return_inverse=True, return_counts=True)
     return count[place.reshape(-1)] >= max(MIN_TOGETHER, MIN_SHARE_TOGETHER * len(uv))
-
-
-def _listed(ids: NDArray[np.int64]) -> str:
-    listed = ', '.join(str(i) for i in ids[:MAX_LISTED])
-    return listed if len(ids) <= MAX_LISTED else f'{listed} and {len(ids) - MAX_LISTED} more'

@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.linalg import eigh
 
-from ..findings import Finding, Kind, Place
+from ..findings import Finding, Kind, Place, first_few
 from .elimination import EliminatePoints
 from .network import Network
 from .noise import Noise
@@ -268,16 +268,10 @@ def describe_directions(directions: Sequence[Sequence[str]]) -> str:
         named = ', '.join((interior + others)[:4])
         if named and exposures:
             parts.append(
-                f'{named} cannot be separated from the orientation of {_abbreviated(exposures)}'
+                f'{named} cannot be separated from the orientation of {first_few(exposures)}'
             )
         elif exposures:
-            parts.append(f'the orientation of {_abbreviated(exposures)} is left open')
+            parts.append(f'the orientation of {first_few(exposures)} is left open')
         else:
             parts.append(f'{named} cannot be separated')
     return '; '.join(dict.fromkeys(parts))
-
-
-def _abbreviated(names: Sequence[str]) -> str:
-    """The first three names, and how many more there are."""
-    shown = ', '.join(names[:3])
-    return f'{shown} and {len(names) - 3} more' if len(names) > 3 else shown

@@ -95,11 +95,11 @@ SERVICES = {
 }
 
 
-def has_stale_ports(domain):
-    """Return whether processes have left ports of a ROS domain in shared memory."""
-    first = 7400 + 250 * domain
-    names = {path.name for path in Path('/dev/shm').glob('fastrtps_port*')}
-    return any(f'fastrtps_port{port}' in names for port in range(first, first + 250))
+def domains_with_stale_ports():
+    """Return the ROS domains of which processes have left ports in shared memory."""
+    names = os.listdir('/dev/shm')
+    ports = (name.removeprefix('fastrtps_port') for name in names)
+    return {(int(port) - 7400) // 250 for port in ports if port.isdecimal()}
 
 
 _next_domain = itertools.count(os.getpid())
@@ -113,7 +113,8 @@ def free_domain():
     """
     first = next(_next_domain)
     domains = [1 + (first + i) % 100 for i in range(100)]
-    for domain in sorted(domains, key=has_stale_ports):
+    stale = domains_with_stale_ports()
+    for domain in sorted(domains, key=stale.__contains__):
         path = Path(tempfile.gettempdir()) / f'fluoro_calib_test_domain_{domain}.lock'
         lock = open(path, 'a')  # noqa: SIM115 the lock is held by the caller
         try:

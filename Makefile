@@ -5,6 +5,9 @@ SHELL := /bin/sh
 .PHONY: help setup demo test oldest lint docs fuzz lock audit bench online endurance validation precision convergence pathologies real-data bags bag-readers faults mutants clean
 .NOTPARALLEL:
 
+# Many tests start commands; without bytecode on disk each compiles what it loads.
+unexport PYTHONDONTWRITEBYTECODE
+
 RUN := .venv/bin/python
 # processes that run tests: one more than two cores, for tests of nodes wait most of the time
 WORKERS ?= 3

@@ -3,6 +3,7 @@
 
 """Distribution of the tests over the workers of pytest-xdist."""
 
+import gc
 import os
 
 import pytest
@@ -17,6 +18,16 @@ except ImportError:  # without the plugin, one process runs all tests
 # for each other.
 for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS'):
     os.environ.setdefault(_name, '1')
+
+# A third of the time to load the tests is that of the collector, and little of it is garbage.
+gc.disable()
+
+
+def pytest_collection_finish() -> None:
+    """Collect garbage again, but not that of the tests and modules, which stay."""
+    gc.freeze()
+    gc.enable()
+
 
 ROS = ('tests/ros 1', 'tests/ros 2')
 # Files whose tests share the calibrations of tests/rigs.py or tests/turning_rig.py, so that one
@@ -35,10 +46,12 @@ SHARING = (
 )
 # Other files that take more than 20 s of CPU time. Short files fill the gaps at the end.
 LENGTHY = (
+    'tests/bodies/test_healing.py',
     'tests/estimation/test_survey.py',
     'tests/report/test_experiment.py',
     'tests/test_lint.py',
     'tests/checks/test_wrong_input.py',
+    'tests/cli/test_extract.py',
     'tests/cli/test_examples.py',
     'tests/cli/test_cli.py',
     'tests/reconstruction/test_reconstruct_recording.py',

@@ -126,7 +126,7 @@ def test_calibration_with_angles_fits_exposures_at_other_angles():
     test = recording()[1]
     with_angle = rmse_of_test(turning().calibrations['a'], test)
     without = rmse_of_test(turning(False).calibrations['a'], recording(False)[1])
-    at_rest = rmse_of_test(calibrated('a').calibrations['a'], exposures(24, seed=11)['a'][16:])
+    at_rest = rmse_of_test(calibrated('a').calibrations['a'], exposures(22, seed=11)['a'][14:])
     assert with_angle < 1.1 * at_rest
     assert without > 1.2 * at_rest
 
@@ -151,6 +151,7 @@ def test_change_is_found_and_stated():
     assert 0.1 * CHANGE_PX < found.size_px < 0.5 * CHANGE_PX  # it is that at the corners
 
 
+@pytest.mark.long
 def test_constant_distortion_has_no_field_of_the_angle():
     frames = [
         replace(frame, angle=angle)
@@ -162,6 +163,7 @@ def test_constant_distortion_has_no_field_of_the_angle():
     np.testing.assert_array_equal(found.model.train_duv, plain.model.train_duv)
 
 
+@pytest.mark.long
 def test_points_are_corrected_at_their_angle():
     calibration = turning().calibrations['a']
     uv = np.array([[200.0, 300.0], [800.0, 700.0], [5000.0, 0.0]])
@@ -179,6 +181,7 @@ def test_points_are_corrected_at_their_angle():
     np.testing.assert_allclose(each.uv[1], unknown.uv[1])
 
 
+@pytest.mark.long
 def test_calibration_at_an_angle_gives_the_same_corrections_without_one():
     calibration = turning().calibrations['a']
     uv = np.random.default_rng(3).uniform(100, 900, (50, 2))
@@ -194,6 +197,7 @@ def test_calibration_at_an_angle_gives_the_same_corrections_without_one():
         calibration.at_angle(np.pi)
 
 
+@pytest.mark.long
 def test_points_at_an_angle_that_was_not_calibrated_are_outside():
     calibration = turning().calibrations['a']
     found = calibration.correct([[500.0, 500.0]], angle=np.pi)

@@ -122,7 +122,7 @@ def test_healthy_rig_has_not_changed():
 def test_moved_fluoroscope_is_found_and_estimated_with_its_deviations():
     """Over rigs: the change of b is what was done to it, as its covariance claims."""
     squares = []
-    for seed in range(4, 9):
+    for seed in range(4, 7):
         scene = Scene(seed)
         moved = np.zeros(18)
         moved[9:15] = [4.0, -3.0, 2.0, 0.006, -0.004, 0.005]
@@ -142,8 +142,8 @@ def test_moved_fluoroscope_is_found_and_estimated_with_its_deviations():
         np.testing.assert_allclose(
             healed.orientation.covariance[15:, 15:], scene.covariance[15:, 15:], rtol=1e-6
         )
-    # chi-square with 30 degrees of freedom
-    assert 13 < np.sum(squares) < 54
+    # chi-square with 18 degrees of freedom: 0.5 % are beyond each limit
+    assert 6.3 < np.sum(squares) < 37.2
 
 
 @pytest.mark.long

@@ -130,6 +130,7 @@ def hide(first, last, keep):
     return hidden
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ('keep', 'status'),
     [

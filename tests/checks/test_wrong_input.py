@@ -433,6 +433,7 @@ def test_wide_angle_is_no_wrong_unit(distance, extent, kind):
     assert (found and found.kind) == kind
 
 
+@pytest.mark.long
 def test_stretched_image_is_accepted():
     """A far principal point, with a turn of the sensor, takes up the stretch to second order."""
     stretched = mapped(lambda uv: 511.5 + (uv - 511.5) * [0.99, 0.91])
@@ -564,6 +565,7 @@ def test_forced_input_is_validated_without_a_traceback(kind):
     assert verdict.verdict != 'pass'
 
 
+@pytest.mark.long
 def test_impossible_result_is_refused_unless_forced():
     """Beads have the ids of neighbours: half of them fit by chance, the others bend the result."""
     request = CalibrationRequest({'a': frames(10, false_matches=0.45)}, PHANTOM, FAST)
@@ -575,6 +577,7 @@ def test_impossible_result_is_refused_unless_forced():
     assert wrong == implausible(request, outcome.result)
 
 
+@pytest.mark.long
 def test_frames_that_do_not_belong_together_give_no_orientation():
     """Fluoroscope b is one exposure behind a: both are calibrated well, the rig is not rigid."""
     seen = {n: list(f[:8]) for n, f in exposures().items()}
@@ -588,6 +591,7 @@ def test_frames_that_do_not_belong_together_give_no_orientation():
     assert run_calibration(CalibrationRequest(seen, PHANTOM, FAST)).orientation is not None
 
 
+@pytest.mark.long
 def test_the_command_refuses_wrong_input_and_writes_it_only_when_forced(tmp_path, capsys):
     write_observations_csv(tmp_path / 'observations.csv', {'a': relabelled(lambda ids: ids + 1)})
     write_phantom(tmp_path / 'phantom.csv', PHANTOM)

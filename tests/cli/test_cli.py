@@ -139,6 +139,7 @@ def test_simulate_is_reproducible(tmp_path):
     } <= one.keys()
 
 
+@pytest.mark.long
 def test_sample_bags_were_made_by_the_documented_command(tmp_path):
     """fluoro-calib simulate --out bags: file by file what is in bags/."""
     assert 'fluoro-calib simulate --out bags' in (ROOT / 'bags' / 'README.md').read_text()
@@ -255,6 +256,7 @@ def test_bag_and_csv_give_the_same_numbers(rig, tmp_path):
     check_result(bag, ['a'], list(range(1, 16)))
 
 
+@pytest.mark.long
 def test_json_is_the_only_standard_output(rig, tmp_path):
     """What result.json says; nothing on standard error."""
     done = command(
@@ -287,6 +289,7 @@ def test_summary_is_printed_without_json(rig, tmp_path, capsys):
     assert err == '' and out.count('\n') >= 2 and 'NaN' not in out and not out.startswith('{')
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     'options, check',
     [
@@ -444,6 +447,7 @@ def test_missing_files_are_reported_by_name(rig, tmp_path, capsys):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.long
 def test_failing_process_prints_one_sentence(rig, tmp_path):
     """Status 1, and no traceback, whatever the process prints else."""
     done = command(*calibrate(rig, tmp_path / 'x', source='nowhere'))

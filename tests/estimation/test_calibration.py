@@ -299,6 +299,7 @@ def test_a_progress_that_raises_stops_a_calibration():
     assert len(told) == 1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     'options',
     [
@@ -769,6 +770,7 @@ def test_points_that_are_worse_than_the_survey_add_nothing_to_it(is_joint):
     np.testing.assert_allclose(with_good.xyz_mm, parts[2].xyz_mm)
 
 
+@pytest.mark.long
 def test_parametric_model_finds_terms_that_follow_the_distortion():
     """With few exposures its tests of significance need the normal matrix at the solution."""
     found = rigs.calibrated('a', 8, model='parametric').fluoroscopes['a']

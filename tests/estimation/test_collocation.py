@@ -856,6 +856,7 @@ def test_random_rigs_converge_to_the_right_answer(seed):
     assert result['end'] == 'converged' and not result['wrong']
 
 
+@pytest.mark.long
 def test_claims_hold_for_unseen_exposures_where_the_distortion_varies():
     rng = np.random.default_rng(4)
     frames = []

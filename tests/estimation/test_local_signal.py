@@ -106,6 +106,7 @@ def test_gain_of_a_window_is_that_of_the_marginal_likelihood():
     assert gain > 6
 
 
+@pytest.mark.long
 def test_place_is_found_and_its_variance_estimated():
     """Where it is, and its variance within a half, mean of several fields."""
     functions = Functions(SIZE, -1, 24)
@@ -127,6 +128,7 @@ def test_place_is_found_and_its_variance_estimated():
     assert np.mean(variances) == pytest.approx(0.36, rel=0.5)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('seed', range(3))
 @pytest.mark.parametrize('bend', [0.0, 0.1])
 def test_low_edge_is_found_by_the_band_along_it(seed, bend):

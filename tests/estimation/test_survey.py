@@ -148,6 +148,7 @@ def test_distances_equal_a_dense_adjustment_with_unknown_scale():
     assert found.freedom == 3
 
 
+@pytest.mark.long
 def test_a_perturbed_phantom_is_recovered_within_its_claims():
     rig, _, outcome = surveyed()
     beads = outcome.beads
@@ -161,6 +162,7 @@ def test_a_perturbed_phantom_is_recovered_within_its_claims():
     assert np.abs(np.mean(beads.xyz_mm - beads.given_mm, axis=0)).max() < 0.02
 
 
+@pytest.mark.long
 def test_a_wrong_distance_is_found_with_its_error():
     rig, _, outcome = surveyed()
     distances = measured(rig)
@@ -176,6 +178,7 @@ def test_a_wrong_distance_is_found_with_its_error():
     assert check.place.target_id == (*ENDS[0], *ENDS[2])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('count', [0, 1])
 def test_a_scale_that_nothing_checks_does_not_pass(count):
     rig, _, outcome = surveyed()
@@ -186,6 +189,7 @@ def test_a_scale_that_nothing_checks_does_not_pass(count):
     assert verdict_of(check_survey(beads)) == 'cannot tell'
 
 
+@pytest.mark.long
 def test_halves_that_differ_by_more_than_they_claim_are_found():
     _, _, outcome = surveyed()
     beads = outcome.beads
@@ -206,6 +210,7 @@ def test_halves_that_differ_by_more_than_they_claim_are_found():
     assert check_survey_halves(one, moved).passed is False
 
 
+@pytest.mark.long
 def test_coordinates_that_are_wrong_are_named():
     rig, _, outcome = surveyed()
     given = rough(rig)
@@ -218,6 +223,7 @@ def test_coordinates_that_are_wrong_are_named():
     assert set(found.place.target_id) == {50, 60}
 
 
+@pytest.mark.long
 def test_beads_of_few_or_acute_rays_are_named_and_left_out():
     _, frames, outcome = surveyed()
     beads = outcome.beads
@@ -241,6 +247,7 @@ def test_beads_of_few_or_acute_rays_are_named_and_left_out():
     assert named == set(np.setdiff1d(seen, outcome.phantom.target_id).tolist()) != set()
 
 
+@pytest.mark.long
 def test_a_distance_to_a_bead_that_is_not_there_is_refused():
     rig, frames, outcome = surveyed()
     with rigs.refused(Kind.NOT_IN_BOTH):
@@ -253,6 +260,7 @@ def test_a_distance_to_a_bead_that_is_not_there_is_refused():
             MeasuredDistance(*wrong)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     'degrees, kind', [(0, Kind.INTERIOR_UNDETERMINED), (2, Kind.WEAK_INTERSECTION)]
 )
@@ -268,6 +276,7 @@ def test_poses_that_do_not_separate_the_unknowns_are_refused(monkeypatch, degree
         survey(SurveyRequest(frames, rough(rig)))
 
 
+@pytest.mark.long
 def test_a_bead_with_one_good_ray_does_not_spoil_the_datum_of_a_free_network():
     """Its place along the ray is open; all other beads had that in their sd: 2 mm of 0.06 mm."""
     rig = rigs.rig()
@@ -293,6 +302,7 @@ def test_a_bead_with_one_good_ray_does_not_spoil_the_datum_of_a_free_network():
     assert np.median(sd) < 0.15
 
 
+@pytest.mark.long
 def test_the_command_writes_the_phantom_unless_it_fails(tmp_path, capsys, monkeypatch):
     rig, frames, outcome = surveyed()
     write_observations_csv(tmp_path / 'seen.csv', frames)
@@ -351,13 +361,12 @@ def test_rough_coordinates_and_kept_ones():
 def test_claims_of_beads_and_scale_hold_over_seeds():
     squares = []
     scales = []
-    for seed in range(2, 6):
+    for seed in range(2, 5):
         rig, request = of_one_fluoroscope(seed, 10)
         outcome = survey(request)
-        if outcome.validation.verdict == 'pass':
-            squares.append(nse(outcome.beads, rig))
-            scales.append(scale_error(outcome.beads, rig))
-    assert len(squares) >= 3
+        assert outcome.validation.verdict == 'pass'
+        squares.append(nse(outcome.beads, rig))
+        scales.append(scale_error(outcome.beads, rig))
     assert 0.8 < np.mean(squares) < 1.25
     assert np.max(np.abs(scales)) < 3.5
 

@@ -42,6 +42,7 @@ def errors(corrector, angle):
     return np.hypot(x - u, y - v), corrector.status[v, u]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('angle', ANGLES)
 def test_sources_of_pixels_are_corrected_to_them_at_the_angle(angle):
     corrector = maps().at(angle)
@@ -55,6 +56,7 @@ def test_sources_of_pixels_are_corrected_to_them_at_the_angle(angle):
     assert mean.max() > 1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('interpolation', ['linear', 'cubic'])
 def test_image_is_that_of_the_calibration_at_the_angle(interpolation):
     """The map of the direct way, by a lookup grid of its own and an iteration at every pixel."""
@@ -98,6 +100,7 @@ def test_unknown_angle_gives_the_mean():
     assert maps().at(None) is found and maps().built == built
 
 
+@pytest.mark.long
 def test_angle_changes_nothing_where_the_correction_does_not_depend_on_it():
     found = AngleMaps(rigs.calibrated('a').calibrations['a'])
     assert found.at(0.3) is found.at(None) is found.mean

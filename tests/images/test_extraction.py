@@ -58,6 +58,7 @@ def extraction() -> Extraction:
     return extract_beads(radiograph()[0], model(), LENS)
 
 
+@pytest.mark.long
 def test_free_beads_are_found_and_no_match_is_false():
     found = extraction()
     _, true, radiography = radiograph()
@@ -160,6 +161,7 @@ def test_a_view_is_fitted_to_its_own_projection():
     assert np.abs(fitted.project(xyz) - true.project(xyz)).max() < 0.05
 
 
+@pytest.mark.long
 def test_the_pose_of_a_regular_phantom_is_refused():
     axis = np.arange(4) * 40.0 - 60
     cube = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
@@ -189,6 +191,7 @@ def regular_cube(large: list[int]) -> tuple[np.ndarray, np.ndarray]:
     return cube, diameter
 
 
+@pytest.mark.long
 def test_reference_beads_of_another_size_tell_the_sides_of_a_regular_cube():
     cube, diameter = regular_cube([0, 5, 23, 61])
     radiography = Radiography(rig().fluoroscopes[0], replace(HARD, bits=16))
@@ -214,6 +217,7 @@ def seen_of(xyz: np.ndarray) -> Seen:
     return Seen.of(view.project(xyz), np.ones((1024, 1024), bool), 3.0)
 
 
+@pytest.mark.long
 def test_another_phantom_is_refused():
     seen = seen_of(small_phantom(1))
     assert len(match(seen, PhantomModel.of(small_phantom(1)), LENS).bead) == 80

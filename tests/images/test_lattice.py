@@ -59,6 +59,7 @@ def test_a_grid_with_missing_beads_is_told_from_its_symmetries(steps, tilt):
     assert len(found.bead) > 0.9 * np.isfinite(true[:, 0]).sum()
 
 
+@pytest.mark.long
 def test_a_regular_grid_is_ambiguous_unless_any_place_will_do():
     xyz = grid(SQUARE, 27)  # reaches beyond the image
     seen = seen_of(pixels(xyz, (0.2, 0.1, 0.5)))
@@ -97,6 +98,7 @@ def test_a_mark_outside_of_the_image_does_not_tell_where_a_sheet_is():
         match(seen_of(pixels(xyz, (0.2, 0.1, 0.5))), PhantomModel.of(xyz), LENS)
 
 
+@pytest.mark.long
 def test_a_sheet_without_mark_is_indexed_from_the_middle():
     xyz = grid(HEXAGONAL, 41)
     seen = seen_of(pixels(xyz, (0.1, 0.05, 0.2)))

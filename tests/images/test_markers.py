@@ -378,6 +378,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.mark.long
 def test_the_command_follows_markers_of_one_and_of_two_fluoroscopes(folder, capsys):
     ids, images = sequence()
     words = ['extract', folder / 'images', '--markers', folder / 'first.csv', '--json']
@@ -711,6 +712,7 @@ def write_turned_first(path: Path) -> None:
                 file.write(f'{name},1,{target},{u:.6f},{v:.6f}\n')
 
 
+@pytest.mark.long
 def test_command_follows_markers_at_the_angles_of_a_bag(tmp_path, capsys):
     """The angles also stand in the table that it writes; without them a note says so."""
     time = message_class('builtin_interfaces/msg/Time')

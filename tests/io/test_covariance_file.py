@@ -13,6 +13,7 @@ from fluoro_calib_ros.io.result_tables import read_covariance
 from fluoro_calib_ros.jobs.result_folder import save_result
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('model', ['parametric', 'none', 'held'])
 def test_covariance_matrix_holds_the_precision_of_all_unknowns(model, tmp_path):
     """With unknowns of the correction, without, and of an adjustment with a calibration held."""

@@ -66,6 +66,7 @@ def rows_of(path):
         return list(csv.DictReader(file))
 
 
+@pytest.mark.long
 def test_calibration_from_xmalab_is_the_same(lab, result, capsys):
     """As from our own files, given the standard deviation that a frame specification lacks."""
     phantom = rows_of(lab / 'phantom.csv')

@@ -82,6 +82,7 @@ def test_an_exchanged_calibration_is_named(folder, capsys):
     assert not (folder / 'report.html').exists()
 
 
+@pytest.mark.long
 def test_an_edited_result_is_named(folder, capsys):
     edit(folder, improve)
     sentence = f'{folder / "result.json"}: the file was changed after it was written'

@@ -239,6 +239,7 @@ if __name__ == '__main__':
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGTERM])
 def test_workers_end_with_their_caller(tmp_path, number):
     """Neither signal lets the caller end them."""

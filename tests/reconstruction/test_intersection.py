@@ -565,6 +565,7 @@ def recording(count=3, **change):
     return frames, calibrations, Intersector(replace(orientation, **change)), xyz
 
 
+@pytest.mark.long
 def test_recording_frame_by_frame():
     """Observed points are corrected first; frames without partner are counted."""
     frames, calibrations, intersector, xyz = recording()

@@ -259,6 +259,7 @@ def test_a_healthy_recording_is_ok():
     assert found.finding.numbers['watched_s'] == found.watched_s
 
 
+@pytest.mark.long
 def test_an_undecided_verdict_is_not_ok():
     """Too short, without common markers, and with too few of them."""
     frames = tracking(30.0, 30.0, 'ab').frames

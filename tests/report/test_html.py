@@ -87,6 +87,7 @@ def write_verdict(folder, verdict, sentence, **changes):
     (folder / 'validation.json').write_text(json.dumps({**document, **changes}))
 
 
+@pytest.mark.long
 def test_report_needs_nothing_else(folder, capsys):
     """One file below 5 MB; pictures inside, no address; names are text, never markup."""
     assert run('report', folder) == 0

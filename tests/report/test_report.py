@@ -66,6 +66,7 @@ def test_figures_are_complete(job, tmp_path):
             assert np.asarray(picture.convert('L')).std() > 10
 
 
+@pytest.mark.long
 def test_figures_are_reproducible(plain, tmp_path, monkeypatch):
     """The same result gives the same bytes, whatever matplotlib's settings, which stay."""
     first = {path: Path(path).read_bytes() for path in write_figures(plain, tmp_path)}

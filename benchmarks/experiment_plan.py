@@ -211,10 +211,10 @@ def quick_plan() -> Plan:
     return Plan(
         tuple(m for m in available_models() if m in ('knn', default)),
         default,
-        available_relative(),
+        available_relative()[:1],
         20,
         4,
-        (5, 6),
+        (6,),
         (1,),
         (1,),
         (1,),

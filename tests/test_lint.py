@@ -4,6 +4,7 @@
 """The linters, the type checker and the import contracts, as tests."""
 
 import ast
+import functools
 import pathlib
 import subprocess
 import sys
@@ -70,36 +71,39 @@ def test_every_source_names_its_licence_itself():
     assert not without
 
 
-def functions():
-    """All functions of the package, with the name of their module."""
-    for path in SOURCES:
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
-                yield f'{path.relative_to(ROOT)}: {node.name}', node
+@functools.cache
+def nodes():
+    """Pairs of a path and a syntax node, of all functions and assignments of the package."""
+    kinds = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Assign)
+    return [
+        (path.relative_to(ROOT), node)
+        for path in SOURCES
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, kinds)
+    ]
 
 
 def test_no_function_has_more_than_seven_parameters():
     too_many = []
-    for name, node in functions():
+    for path, node in nodes():
+        if isinstance(node, ast.Assign):
+            continue
         parameters = [
             a.arg for a in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)
         ]
         if parameters and parameters[0] in ('self', 'cls'):
             parameters = parameters[1:]
         if len(parameters) > 7:
-            too_many.append(f'{name} has {len(parameters)}')
+            too_many.append(f'{path}: {node.name} has {len(parameters)}')
     assert not too_many
 
 
 def test_parallel_assignments_are_rare():
     """One statement a line: `a, b = x, y` is for swaps and for values that belong together."""
-    count = 0
-    total = 0
-    for path in SOURCES:
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.Assign):
-                total += 1
-                count += isinstance(node.targets[0], ast.Tuple) and isinstance(
-                    node.value, ast.Tuple
-                )
-    assert count < 0.01 * total
+    assigned = [node for _, node in nodes() if isinstance(node, ast.Assign)]
+    parallel = [
+        node
+        for node in assigned
+        if isinstance(node.targets[0], ast.Tuple) and isinstance(node.value, ast.Tuple)
+    ]
+    assert len(parallel) < 0.01 * len(assigned)

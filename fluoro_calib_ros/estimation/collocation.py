@@ -203,7 +203,7 @@ class CollocationTerms(AdjustedTerms):
     ) -> Solution:
         """Renew what the priors assume; return the solution with what that shows."""
         for part, interior in zip(self.parts, adjustment.parameters.interior):
-            part.interior = interior
+            part.use_interior(interior)
         solved = solved_additional(matrix, network, adjustment)
         self._renew_exposure_terms(network, adjustment)
         equations = [part.equations(network, matrix, own) for part, own in zip(self.parts, solved)]

@@ -98,6 +98,8 @@ class FluoroscopeTerms:
         self.gauge_kind = problem.gauges[number]
         self.angles = np.zeros(0) if problem.angles is None else problem.angles[number]
         self.interior = problem.before.parameters.interior[number]
+        self._offset = np.zeros(3)  # of the interior orientation estimated last from this one
+        self._relaxation = 1.0
         self.own: ExposureTerms | None = None
         self._angle_fit: AngleFit | None = None
         self._use(functions)
@@ -157,6 +159,21 @@ class FluoroscopeTerms:
     def gauge_of(self, values: np.ndarray) -> NDArray[np.float64]:
         """Precision matrix (2m, 2m) of the gauge for values (n, m) of functions."""
         return gauge_precision(values, self.uv, self.interior, self.gauge_kind)
+
+    def use_interior(self, estimated: np.ndarray) -> None:
+        """Let the gauge follow an estimated interior orientation (3,).
+
+        The estimate depends on the gauge. Where the image points hardly tell the principal point,
+        a step of the gauge may move the estimate back and farther: such steps are relaxed (Aitken;
+        Irons and Tuck, "A version of the Aitken accelerator for computer iteration", Int. J. Num.
+        Meth. Eng. 1, 1969).
+        """
+        offset = estimated - self.interior
+        change = offset - self._offset
+        if self._offset @ offset < 0 and self._offset @ (self._offset + 2 * offset) < 0:
+            self._relaxation *= -(self._offset @ change) / (change @ change)
+        self.interior = estimated - (1 - self._relaxation) * offset
+        self._offset = offset
 
     def use_prior(self, prior: Prior) -> None:
         """Use this prior, and the gauge about the present interior orientation."""

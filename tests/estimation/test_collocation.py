@@ -40,6 +40,7 @@ from fluoro_calib_ros.estimation.collocation import CollocationTerms, EarlierTer
 from fluoro_calib_ros.estimation.combined_adjustment import calibrate_by_adjustment
 from fluoro_calib_ros.estimation.estimator import AdjustmentProblem
 from fluoro_calib_ros.estimation.estimators import estimator_of
+from fluoro_calib_ros.estimation.fluoroscope_terms import FluoroscopeTerms
 from fluoro_calib_ros.estimation.gauge import GaugeKind, gauge_basis
 from fluoro_calib_ros.estimation.initial_network import (
     adjusted_with_precision,
@@ -55,6 +56,7 @@ from fluoro_calib_ros.estimation.priors import (
     most_likely_prior,
     starting_prior,
 )
+from fluoro_calib_ros.estimation.refinements import START_MODES
 from fluoro_calib_ros.estimation.signal import (
     Ripples,
     Signal,
@@ -769,6 +771,18 @@ def test_ripples_of_one_wavelength_are_corrected():
     parts = CollocationTerms(problem, earlier=EarlierTerms([model.series], [None], False))
     assert parts.functions == state.functions
     assert parts.priors[0].signal.ripples.bands == state.priors[0].signal.ripples.bands
+
+
+@pytest.mark.parametrize('feedback', [-1.5, -0.6, -0.1, 0.3])
+def test_gauge_settles_where_its_steps_move_the_principal_point(feedback):
+    """With half of the image blind, a step of the gauge moves the estimate back and farther."""
+    network, truth = rigs.small_network()
+    problem = AdjustmentProblem(network, [(1024, 1024)], adjust(network, truth), (GaugeKind.FULL,))
+    part = FluoroscopeTerms.first(problem, 0, START_MODES)
+    settled = part.interior + [80.0, -50.0, 3.0]
+    for _ in range(12):
+        part.use_interior(settled + feedback * (part.interior - settled))
+    assert np.abs(part.interior - settled).max() < 0.01
 
 
 @pytest.mark.long

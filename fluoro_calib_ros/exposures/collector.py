@@ -258,18 +258,10 @@ MAX_AREAS = 2  # named at once
 
 @dataclass(frozen=True)
 class Readiness:
-    """What is still missing before a calibration is worthwhile.
+    """What is still missing before a calibration is worthwhile."""
 
-    Attributes
-    ----------
-    ready : bool
-        Whether there are enough exposures and enough of the image is covered.
-    advice : str
-        What the next pose should show, or that it is time to calibrate.
-    """
-
-    ready: bool
-    advice: str
+    ready: bool  #: whether there are enough exposures and enough of the image is covered
+    advice: str  #: what the next pose should show, or that it is time to calibrate
 
 
 def readiness(exposures: int, coverage: Coverage | None) -> Readiness:

@@ -28,30 +28,18 @@ class Drawing:
     """A regular phantom.
 
     Raises DataError for what cannot be drawn.
-
-    Attributes
-    ----------
-    columns, rows, layers : int
-    pitch_mm : (float, float, float)
-        Along x, y and z; hexagonal: along x, from which that along y follows.
-    hexagonal : bool
-        Whether every second row is shifted by half a pitch.
-    blocked : sequence of (int, ...)
-        Places without hole or bead: row and column, or row, column and layer, from 1.
-    diameter_mm : float or None
-        Of holes or beads.
-    sd_mm : float
-        Tolerance of the manufacture.
     """
 
     columns: int
     rows: int
     layers: int = 1
+    #: along x, y and z; hexagonal: along x, from which that along y follows
     pitch_mm: tuple[float, float, float] = (10.0, 10.0, 10.0)
-    hexagonal: bool = False
+    hexagonal: bool = False  #: whether every second row is shifted by half a pitch
+    #: places without hole or bead: row and column, or row, column and layer, from 1
     blocked: Sequence[tuple[int, ...]] = ()
-    diameter_mm: float | None = None
-    sd_mm: float = 0.1
+    diameter_mm: float | None = None  #: of holes or beads
+    sd_mm: float = 0.1  #: tolerance of the manufacture
 
     def __post_init__(self) -> None:
         if min(self.columns, self.rows, self.layers) < 1:

@@ -55,31 +55,12 @@ class Refusal:
 
 @dataclass(frozen=True)
 class Extraction:
-    """Observations of one radiograph.
+    """Observations of one radiograph."""
 
-    Attributes
-    ----------
-    bead : (n,) ndarray of int
-        Rows of the phantom.
-    uv : (n, 2) ndarray
-        Centres [px].
-    sigma : (n,) ndarray
-        Standard deviation of a coordinate [px].
-    overlapped : (n,) ndarray of bool
-        The shadow of another bead reaches into that of the bead.
-    refused : tuple of Refusal
-    view : View
-    detections : Detections
-    match : Match
-    profile : Profile
-    noise : Noise
-    followed : bool
-        The pose comes from the exposure before, not from a search.
-    """
-
-    bead: NDArray[np.int64]
-    uv: NDArray[np.float64]
-    sigma: NDArray[np.float64]
+    bead: NDArray[np.int64]  #: (n,), rows of the phantom
+    uv: NDArray[np.float64]  #: (n, 2), centres [px]
+    sigma: NDArray[np.float64]  #: (n,), standard deviation of a coordinate [px]
+    #: (n,), the shadow of another bead reaches into that of the bead
     overlapped: NDArray[np.bool_]
     refused: tuple[Refusal, ...]
     view: View
@@ -87,7 +68,7 @@ class Extraction:
     match: Match
     profile: Profile
     noise: Noise
-    followed: bool = False
+    followed: bool = False  #: the pose comes from the exposure before, not from a search
 
     @property
     def nearby(self) -> Nearby:
@@ -105,30 +86,15 @@ class Extraction:
 
 @dataclass(frozen=True)
 class Nearby:
-    """What is taken over from an exposure nearby, such as the previous one of a video.
-
-    Attributes
-    ----------
-    view : View
-    scale_px : float
-        Robust standard deviation of its residuals [px].
-    profile : Profile
-    noise : Noise
-    radius_px : float
-        Of a bead.
-    inverted : bool
-        Beads are bright.
-    far : Far or None
-        For images that were left out since.
-    """
+    """What is taken over from an exposure nearby, such as the previous one of a video."""
 
     view: View
-    scale_px: float
+    scale_px: float  #: robust standard deviation of its residuals [px]
     profile: Profile
     noise: Noise
-    radius_px: float
-    inverted: bool
-    far: Far | None = None
+    radius_px: float  #: of a bead
+    inverted: bool  #: beads are bright
+    far: Far | None = None  #: for images that were left out since
 
 
 def extract_beads(

@@ -52,22 +52,13 @@ QUADRATURE = ((0.7, 1), (3.0, 2), (6.0, 3), (10.0, 5), (np.inf, 7))
 
 @dataclass(frozen=True)
 class MarkerGuess:
-    """Where markers may be, and what they look like.
+    """Where markers may be, and what they look like."""
 
-    Attributes
-    ----------
-    uv : (n, 2) ndarray
-        Centres [px].
-    depth, depth_sd : (n,) ndarray
-        Of their shadows, 1 for the profile.
-    motion : (n, 2) ndarray
-        Way of their shadows while the light is on [px].
-    """
-
-    uv: NDArray[np.float64]
+    uv: NDArray[np.float64]  #: (n, 2), centres [px]
+    #: (n,), of their shadows, 1 for the profile
     depth: NDArray[np.float64]
     depth_sd: NDArray[np.float64]
-    motion: NDArray[np.float64]
+    motion: NDArray[np.float64]  #: (n, 2), way of their shadows while the light is on [px]
 
 
 def fit_markers(

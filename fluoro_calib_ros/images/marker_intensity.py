@@ -60,30 +60,14 @@ class Shadows:
 
 @dataclass(frozen=True)
 class MarkerLook:
-    """What markers look like in the images of a sequence.
+    """What markers look like in the images of a sequence."""
 
-    Attributes
-    ----------
-    scale : float
-        Blur at which they stand out most [px].
-    inverted : bool
-        Markers are bright in the image.
-    field : (h, w) ndarray of bool
-        The field of view.
-    strength : float
-        Response to a typical marker over the light around it.
-    floor : float
-        Response below which noise is, in the light of the middle of the range.
-    light : float
-        That light.
-    """
-
-    scale: float
-    inverted: bool
-    field: NDArray[np.bool_]
-    strength: float
-    floor: float
-    light: float
+    scale: float  #: blur at which they stand out most [px]
+    inverted: bool  #: markers are bright in the image
+    field: NDArray[np.bool_]  #: (h, w), the field of view
+    strength: float  #: response to a typical marker over the light around it
+    floor: float  #: response below which noise is, in the light of the middle of the range
+    light: float  #: that light
 
     @property
     def radius_px(self) -> float:

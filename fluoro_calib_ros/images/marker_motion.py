@@ -37,28 +37,14 @@ MIN_VOTE_SHARE = 0.3
 
 @dataclass
 class Motion:
-    """State of the filters of n markers.
+    """State of the filters of n markers."""
 
-    Attributes
-    ----------
-    uv, velocity : (n, 2) ndarray
-        [px], [px a frame].
-    covariance : (n, 2, 2) ndarray
-        Of place and velocity, the same along u and v.
-    squared : (n,) ndarray
-        Running mean of squared accelerations.
-    unlike : (n, n) ndarray
-        Running mean of squared differences of velocities.
-    together : (n, n) ndarray of int
-        Images in which they were compared.
-    """
-
-    uv: NDArray[np.float64]
-    velocity: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-    squared: NDArray[np.float64]
-    unlike: NDArray[np.float64]
-    together: NDArray[np.int64]
+    uv: NDArray[np.float64]  #: (n, 2) [px], [px a frame]
+    velocity: NDArray[np.float64]  #: (n, 2) [px], [px a frame]
+    covariance: NDArray[np.float64]  #: (n, 2, 2), of place and velocity, the same along u and v
+    squared: NDArray[np.float64]  #: (n,), running mean of squared accelerations
+    unlike: NDArray[np.float64]  #: (n, n), running mean of squared differences of velocities
+    together: NDArray[np.int64]  #: (n, n), images in which they were compared
 
     @classmethod
     def start(cls, uv: np.ndarray, sd_px: float) -> Motion:

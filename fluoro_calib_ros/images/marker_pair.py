@@ -30,17 +30,10 @@ from .markers import FirstMarkers, MarkerFrame, MarkerOptions, MarkerTracker
 
 @dataclass(frozen=True)
 class PairFrame:
-    """Markers of one exposure of two fluoroscopes.
+    """Markers of one exposure of two fluoroscopes."""
 
-    Attributes
-    ----------
-    views : mapping of str to MarkerFrame
-        By fluoroscope.
-    decisions : tuple of Decision
-        They hold for the images since the doubt began; the views of this exposure obey them.
-    """
-
-    views: Mapping[str, MarkerFrame]
+    views: Mapping[str, MarkerFrame]  #: by fluoroscope
+    #: they hold for the images since the doubt began; the views of this exposure obey them
     decisions: tuple[Decision, ...] = ()
 
 

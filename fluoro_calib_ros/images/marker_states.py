@@ -20,29 +20,15 @@ DEPTH_MEMORY = 0.9
 
 @dataclass(frozen=True)
 class MeasuredMarkers:
-    """Shadows of n markers in one image, by row.
+    """Shadows of n markers in one image, by row."""
 
-    Attributes
-    ----------
-    measured : (n,) ndarray of bool
-        The other values say nothing where it is False.
-    uv : (n, 2) ndarray
-        Centres [px].
-    sigma : (n,) ndarray
-        Standard deviation of a coordinate [px].
-    depth : (n,) ndarray
-    overlapped : (n,) ndarray of bool
-        The shadow of another marker reaches into that of the marker.
-    free : (k, 2) ndarray
-        Shadows that no marker has [px].
-    """
-
-    measured: NDArray[np.bool_]
-    uv: NDArray[np.float64]
-    sigma: NDArray[np.float64]
-    depth: NDArray[np.float64]
+    measured: NDArray[np.bool_]  #: (n,), the other values say nothing where it is False
+    uv: NDArray[np.float64]  #: (n, 2), centres [px]
+    sigma: NDArray[np.float64]  #: (n,), standard deviation of a coordinate [px]
+    depth: NDArray[np.float64]  #: (n,)
+    #: (n,), the shadow of another marker reaches into that of the marker
     overlapped: NDArray[np.bool_]
-    free: NDArray[np.float64]
+    free: NDArray[np.float64]  #: (k, 2), shadows that no marker has [px]
 
     @classmethod
     def nothing(cls, count: int) -> MeasuredMarkers:
@@ -55,21 +41,13 @@ class MeasuredMarkers:
 
 @dataclass
 class MarkerStates:
-    """What is known of n markers, by row.
-
-    Attributes
-    ----------
-    motion : Motion
-    depth, depth_sd : (n,) ndarray
-        Of the shadow, 1 for that of a typical marker.
-    unseen : (n,) ndarray of int
-        Images since a marker was measured.
-    """
+    """What is known of n markers, by row."""
 
     motion: Motion
+    #: (n,), of the shadow, 1 for that of a typical marker
     depth: NDArray[np.float64]
     depth_sd: NDArray[np.float64]
-    unseen: NDArray[np.int64]
+    unseen: NDArray[np.int64]  #: (n,), images since a marker was measured
 
     @classmethod
     def start(cls, motion: Motion, unseen: np.ndarray) -> MarkerStates:

@@ -96,46 +96,23 @@ class FirstMarkers:
 
 @dataclass(frozen=True)
 class MarkerFrame:
-    """Markers of one image.
-
-    Attributes
-    ----------
-    frame : int
-    target_id : (n,) ndarray of int
-        Of the markers that were measured.
-    uv : (n, 2) ndarray
-        Centres [px], of the middle of the exposure.
-    sigma : (n,) ndarray
-        Standard deviation of a coordinate [px].
-    overlapped : (n,) ndarray of bool
-        The shadow of another marker reaches into that of the marker.
-    doubtful : (n,) ndarray of bool
-        The id may be wrong.
-    missing : (k,) ndarray of int
-        Markers that were not measured.
-    predicted : (k, 2) ndarray
-        Where they are believed to be [px], NaN for those that were never seen.
-    lost : (k,) ndarray of bool
-        Whether they are searched in the whole image.
-    doubts : tuple of Finding
-        Two markers that may have been exchanged, or one that may be something else.
-        Those that began with this image.
-    finding : Finding or None
-        Why nothing was measured.
-    seconds : float
-    """
+    """Markers of one image."""
 
     frame: int
-    target_id: NDArray[np.int64]
-    uv: NDArray[np.float64]
-    sigma: NDArray[np.float64]
+    target_id: NDArray[np.int64]  #: (n,), of the markers that were measured
+    uv: NDArray[np.float64]  #: (n, 2), centres [px], of the middle of the exposure
+    sigma: NDArray[np.float64]  #: (n,), standard deviation of a coordinate [px]
+    #: (n,), the shadow of another marker reaches into that of the marker
     overlapped: NDArray[np.bool_]
-    doubtful: NDArray[np.bool_]
-    missing: NDArray[np.int64]
+    doubtful: NDArray[np.bool_]  #: (n,), the id may be wrong
+    missing: NDArray[np.int64]  #: (k,), markers that were not measured
+    #: (k, 2), where they are believed to be [px], NaN for those that were never seen
     predicted: NDArray[np.float64]
-    lost: NDArray[np.bool_]
+    lost: NDArray[np.bool_]  #: (k,), whether they are searched in the whole image
+    #: two markers that may have been exchanged, or one that may be something else; those that
+    #: began with this image
     doubts: tuple[Finding, ...] = ()
-    finding: Finding | None = None
+    finding: Finding | None = None  #: why nothing was measured
     seconds: float = 0.0
 
     @property
@@ -146,24 +123,13 @@ class MarkerFrame:
 
 @dataclass(frozen=True)
 class _Followed:
-    """What follows markers, from the first image on.
+    """What follows markers, from the first image on."""
 
-    Attributes
-    ----------
-    states : MarkerStates
-        Predicted, then updated.
-    doubts : MarkerDoubts
-    look : MarkerLook
-    size : tuple of int
-        Width and height of the images [px].
-    search, measurement, watch
-        The steps of an image, in their order.
-    """
-
-    states: MarkerStates
+    states: MarkerStates  #: predicted, then updated
     doubts: MarkerDoubts
     look: MarkerLook
-    size: tuple[int, int]
+    size: tuple[int, int]  #: width and height of the images [px]
+    #: the steps of an image, in their order
     search: MarkerSearch
     measurement: MarkerMeasurement
     watch: MarkerWatch

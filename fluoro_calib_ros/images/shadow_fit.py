@@ -42,75 +42,39 @@ Group = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True)
 class Beads:
-    """Measured beads, in the order in which they were given.
+    """Measured beads, in the order in which they were given."""
 
-    Attributes
-    ----------
-    uv : (n, 2) ndarray
-        Centres [px].
-    sigma : (n,) ndarray
-        Standard deviation of a coordinate [px].
-    depth : (n,) ndarray
-        Of the shadow, 1 for the profile.
-    light : (n,) ndarray
-        Grey values in the middle without the beads.
-    misfit : (n,) ndarray
-        Mean squared residual over the noise, 1 where the model is right.
-    overlapped : (n,) ndarray of bool
-        The shadow of another bead reaches into that of the bead.
-    measured : (n,) ndarray of bool
-        False where the window is cut off or the fit failed.
-    """
-
-    uv: NDArray[np.float64]
-    sigma: NDArray[np.float64]
-    depth: NDArray[np.float64]
-    light: NDArray[np.float64]
+    uv: NDArray[np.float64]  #: (n, 2), centres [px]
+    sigma: NDArray[np.float64]  #: (n,), standard deviation of a coordinate [px]
+    depth: NDArray[np.float64]  #: (n,), of the shadow, 1 for the profile
+    light: NDArray[np.float64]  #: (n,), grey values in the middle without the beads
+    #: (n,), mean squared residual over the noise, 1 where the model is right
     misfit: NDArray[np.float64]
+    #: (n,), the shadow of another bead reaches into that of the bead
     overlapped: NDArray[np.bool_]
-    measured: NDArray[np.bool_]
+    measured: NDArray[np.bool_]  #: (n,), False where the window is cut off or the fit failed
 
 
 @dataclass(frozen=True)
 class FitSettings:
     """What differs between fits of shadows.
 
-    Attributes
-    ----------
-    steps : int
-        Gauss-Newton steps.
-    crossing_steps : tuple of int
-        Before which shadows that touch are blurred together.
-    crowds : tuple of tuple of int
-        Least and largest number of neighbours of the beads that are fitted together.
-    max_step_px : float
-        Largest step of a centre.
-    pooled : float
-        Degrees of freedom of the noise of all beads, in that of one.
-    crossed : float
-        Factor on the standard deviation where shadows cross.
-    dtype : type
-        Precision of model and derivatives.
-    whole_scale : bool
-        Whether the polynomial of the background is scaled by a whole number of pixels.
-    robust_relative : bool
-        Whether a residual of half weight is relative to the typical lack of fit.
-    moves_unusable : bool
-        Whether beads move whose windows are cut off.
-
-    The last three keep the numbers of two fits that were once apart.
+    The last three fields keep the numbers of two fits that were once apart.
     """
 
-    steps: int
-    crossing_steps: tuple[int, ...]
+    steps: int  #: Gauss-Newton steps
+    crossing_steps: tuple[int, ...]  #: before which shadows that touch are blurred together
+    #: least and largest number of neighbours of the beads that are fitted together
     crowds: tuple[tuple[int, int], ...]
-    max_step_px: float
-    pooled: float
-    crossed: float
-    dtype: type[np.floating]
+    max_step_px: float  #: largest step of a centre
+    pooled: float  #: degrees of freedom of the noise of all beads, in that of one
+    crossed: float  #: factor on the standard deviation where shadows cross
+    dtype: type[np.floating]  #: precision of model and derivatives
+    #: whether the polynomial of the background is scaled by a whole number of pixels
     whole_scale: bool
+    #: whether a residual of half weight is relative to the typical lack of fit
     robust_relative: bool
-    moves_unusable: bool
+    moves_unusable: bool  #: whether beads move whose windows are cut off
 
     @property
     def neighbours(self) -> int:
@@ -120,19 +84,11 @@ class FitSettings:
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Normal equations of some windows, for steps of u = 6 + 3 + 3 k unknowns.
+    """Normal equations of some windows, for steps of u = 6 + 3 + 3 k unknowns."""
 
-    Attributes
-    ----------
-    matrix : (g, u, u) ndarray
-    right : (g, u) ndarray
-    weighted : (g, u, m) ndarray
-        Derivatives of the pixels times their weights.
-    """
-
-    matrix: NDArray[np.float64]
-    right: NDArray[np.float64]
-    weighted: np.ndarray
+    matrix: NDArray[np.float64]  #: (g, u, u)
+    right: NDArray[np.float64]  #: (g, u)
+    weighted: np.ndarray  #: (g, u, m), derivatives of the pixels times their weights
 
 
 def window_offsets(radius_px: float) -> np.ndarray:

@@ -26,23 +26,12 @@ HIGH = (40.0, 6.0, 6.0, 0.6)
 
 @dataclass(frozen=True)
 class Profile:
-    """Shadow of a bead.
-
-    Attributes
-    ----------
-    radius_px : float
-    blur_px : float
-        Standard deviation.
-    attenuation : float
-        Along the radius: coefficient times radius.
-    scatter : float
-        Share of the light that is not attenuated.
-    """
+    """Shadow of a bead."""
 
     radius_px: float
-    blur_px: float
-    attenuation: float
-    scatter: float = 0.0
+    blur_px: float  #: standard deviation
+    attenuation: float  #: along the radius: coefficient times radius
+    scatter: float = 0.0  #: share of the light that is not attenuated
     _table: np.ndarray = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:

@@ -44,28 +44,14 @@ SIDES = 2**30  # px, more cannot be meant
 
 @dataclass(frozen=True)
 class CineHeader:
-    """What the headers of a cine file say.
+    """What the headers of a cine file say."""
 
-    Attributes
-    ----------
-    width, height : int
-        Of the images [px].
-    bits : int
-        Of a pixel as it is stored: 8, 10 (packed) or 16.
-    from_bottom : bool
-        Whether the last row comes first.
-    offsets : (n,) ndarray of int64
-        Positions of the images in the file.
-    frame_rate : float
-        [Hz]
-    """
-
-    width: int
-    height: int
-    bits: int
-    from_bottom: bool
-    offsets: NDArray[np.int64]
-    frame_rate: float
+    width: int  #: of the images [px]
+    height: int  #: of the images [px]
+    bits: int  #: of a pixel as it is stored: 8, 10 (packed) or 16
+    from_bottom: bool  #: whether the last row comes first
+    offsets: NDArray[np.int64]  #: (n,), positions of the images in the file
+    frame_rate: float  #: [Hz]
 
     @property
     def image_bytes(self) -> int:

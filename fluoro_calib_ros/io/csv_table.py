@@ -34,23 +34,12 @@ MAX_HEADER = 200  # characters of a header in a message
 
 @dataclass(frozen=True)
 class Block:
-    """Some rows of a table.
+    """Some rows of a table."""
 
-    Attributes
-    ----------
-    path : path-like
-        File, for messages.
-    header : list of str
-        Names of the columns.
-    rows : list of list of str
-    lines : (n,) ndarray of int
-        Number of each row in the file; the header is row 1.
-    """
-
-    path: PathLike
-    header: list[str]
+    path: PathLike  #: file, for messages
+    header: list[str]  #: names of the columns
     rows: list[list[str]]
-    lines: NDArray[np.int64]
+    lines: NDArray[np.int64]  #: (n,), number of each row in the file; the header is row 1
 
     def __contains__(self, name: str) -> bool:
         return name in self.header

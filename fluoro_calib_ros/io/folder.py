@@ -42,21 +42,13 @@ _NO_EXCHANGE = (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EXDEV)
 
 @dataclass(frozen=True)
 class FolderKind:
-    """What a folder of one kind consists of.
+    """What a folder of one kind consists of."""
 
-    Attributes
-    ----------
-    title : str
-        What it is called in messages, such as 'a result folder'.
-    is_own : callable
-        Whether an entry of this name is part of such a folder, and is replaced with it. All other
-        entries belong to the user and are carried over.
-    marks : callable
-        Whether an entry of this name shows that a folder is of this kind.
-    """
-
-    title: str
+    title: str  #: what it is called in messages, such as 'a result folder'
+    #: whether an entry of this name is part of such a folder, and is replaced with it; all other
+    #: entries belong to the user and are carried over
     is_own: Callable[[str], bool]
+    #: whether an entry of this name shows that a folder is of this kind
     marks: Callable[[str], bool]
 
 

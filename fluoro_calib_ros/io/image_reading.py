@@ -187,24 +187,14 @@ os.environ.setdefault('OPENCV_FFMPEG_LOGLEVEL', '-8')
 
 @dataclass(frozen=True)
 class ImageSource:
-    """Images of one file.
+    """Images of one file."""
 
-    Attributes
-    ----------
-    kind : {'image', 'stack', 'video'}
-    count : int
-        Number of images; of a video as its header states it.
-    images : iterator
-        Place in words, for error messages, and image (h, w) of uint8 or uint16. It raises
-        DataError for an image that cannot be read.
-    frame_rate : float or None
-        Of a video [Hz].
-    """
-
-    kind: str
-    count: int
+    kind: str  #: {'image', 'stack', 'video'}
+    count: int  #: number of images; of a video as its header states it
+    #: place in words, for error messages, and image (h, w) of uint8 or uint16; it raises DataError
+    #: for an image that cannot be read
     images: Iterator[tuple[str, np.ndarray]]
-    frame_rate: float | None = None
+    frame_rate: float | None = None  #: of a video [Hz]
 
 
 def open_images(path: Path) -> ImageSource:

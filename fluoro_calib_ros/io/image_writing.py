@@ -175,24 +175,13 @@ def _check_written(out: Path, path: Path, count: int) -> None:
 
 @dataclass(frozen=True)
 class CorrectedImages:
-    """What was corrected.
+    """What was corrected."""
 
-    Attributes
-    ----------
-    kind : {'image', 'stack', 'video', 'folder'}
-    images : int
-        Number of images, pages and frames.
-    files : int
-    passed_over : tuple of str
-        Names of the files of a folder that are no images.
-    failed : tuple of str
-        What is wrong with the files of a folder that could not be corrected.
-    """
-
-    kind: str
-    images: int
+    kind: str  #: {'image', 'stack', 'video', 'folder'}
+    images: int  #: number of images, pages and frames
     files: int = 1
-    passed_over: tuple[str, ...] = ()
+    passed_over: tuple[str, ...] = ()  #: names of the files of a folder that are no images
+    #: what is wrong with the files of a folder that could not be corrected
     failed: tuple[str, ...] = ()
 
 
@@ -279,23 +268,13 @@ _WRITTEN_AS = dict.fromkeys(CINE_SUFFIXES, '.avi') | dict.fromkeys(DICOM_SUFFIXE
 
 @dataclass(frozen=True)
 class ImageFolder:
-    """Files with images in a folder.
-
-    Attributes
-    ----------
-    path : Path
-    files : tuple of Path
-        Images and videos, relative to the folder, in the order of their names.
-    passed_over : tuple of str
-        Other files.
-    recursive : bool
-        Whether the folders in the folder belong to it.
-    """
+    """Files with images in a folder."""
 
     path: Path
+    #: images and videos, relative to the folder, in the order of their names
     files: tuple[Path, ...]
-    passed_over: tuple[str, ...]
-    recursive: bool
+    passed_over: tuple[str, ...]  #: other files
+    recursive: bool  #: whether the folders in the folder belong to it
 
     @property
     def written(self) -> tuple[Path, ...]:

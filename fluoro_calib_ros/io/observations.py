@@ -38,30 +38,15 @@ COLUMNS = ('fluoroscope', 'exposure', 'target_id', 'u', 'v')
 
 @dataclass(frozen=True)
 class _Rows:
-    """Rows of the file as arrays.
+    """Rows of the file as arrays."""
 
-    Attributes
-    ----------
-    code : (n,) ndarray of int
-        Index of the fluoroscope in the order of first occurrence.
-    exposure, target_id : (n,) ndarray of int
-    uv : (n, 2) ndarray
-        [px]
-    sigma : (n,) ndarray
-        [px], NaN where unknown.
-    angle : (n,) ndarray
-        Of the C-arm [degrees], NaN where unknown.
-    line : (n,) ndarray of int
-        Number of the row in the file.
-    """
-
-    code: NDArray[np.int64]
-    exposure: NDArray[np.int64]
-    target_id: NDArray[np.int64]
-    uv: NDArray[np.float64]
-    sigma: NDArray[np.float64]
-    angle: NDArray[np.float64]
-    line: NDArray[np.int64]
+    code: NDArray[np.int64]  #: (n,), index of the fluoroscope in the order of first occurrence
+    exposure: NDArray[np.int64]  #: (n,)
+    target_id: NDArray[np.int64]  #: (n,)
+    uv: NDArray[np.float64]  #: (n, 2) [px]
+    sigma: NDArray[np.float64]  #: (n,) [px], NaN where unknown
+    angle: NDArray[np.float64]  #: (n,), of the C-arm [degrees], NaN where unknown
+    line: NDArray[np.int64]  #: (n,), number of the row in the file
 
     def __getitem__(self, rows: np.ndarray) -> _Rows:
         return _Rows(*(getattr(self, field.name)[rows] for field in fields(self)))
@@ -432,33 +417,17 @@ ADDED_COLUMNS = ('u_corrected', 'v_corrected', 'sigma', 'status')
 
 @dataclass(frozen=True)
 class PointsFile:
-    """Image points of a CSV file.
-
-    Attributes
-    ----------
-    path : path-like
-    header : list of str
-    rows : list of list of str
-        All cells as text.
-    lines : (n,) ndarray of int
-        Number of each row in the file.
-    uv : (n, 2) ndarray
-        [px], NaN where a cell is empty or nan.
-    sigma : (n,) ndarray or None
-        [px], NaN where a cell is empty; None without such a column.
-    fluoroscope : (n,) ndarray of str or None
-        None without such a column.
-    angle : (n,) ndarray or None
-        Of the C-arm [rad], NaN where a cell is empty; None without such a column.
-    """
+    """Image points of a CSV file."""
 
     path: PathLike
     header: list[str]
-    rows: list[list[str]]
-    lines: NDArray[np.int64]
-    uv: NDArray[np.float64]
+    rows: list[list[str]]  #: all cells as text
+    lines: NDArray[np.int64]  #: (n,), number of each row in the file
+    uv: NDArray[np.float64]  #: (n, 2) [px], NaN where a cell is empty or nan
+    #: (n,) [px], NaN where a cell is empty; None without such a column
     sigma: NDArray[np.float64] | None
-    fluoroscope: np.ndarray | None
+    fluoroscope: np.ndarray | None  #: (n,), None without such a column
+    #: (n,), of the C-arm [rad], NaN where a cell is empty; None without such a column
     angle: NDArray[np.float64] | None = None
 
     @property

@@ -35,28 +35,17 @@ KEYS = (
 
 @dataclass(frozen=True)
 class RigFile:
-    """Content of a rig.toml; None for what it does not say.
-
-    Attributes
-    ----------
-    path : Path
-    fluoroscopes : list of str or None
-    image_size : tuple of int or None
-        Width and height [px].
-    phantom, calibration : Path or None
-        File with the phantom, and result folder.
-    angle_joint : str or None
-        Joint of the C-arm, or one for each fluoroscope, as the option of this name.
-    angle_max_age : float or None
-        Longest time from the last state of the joint to an exposure [s].
-    """
+    """Content of a rig.toml; None for what it does not say."""
 
     path: Path
     fluoroscopes: list[str] | None = None
-    image_size: tuple[int, int] | None = None
+    image_size: tuple[int, int] | None = None  #: width and height [px]
+    #: file with the phantom, and result folder
     phantom: Path | None = None
     calibration: Path | None = None
+    #: joint of the C-arm, or one for each fluoroscope, as the option of this name
     angle_joint: str | None = None
+    #: longest time from the last state of the joint to an exposure [s]
     angle_max_age: float | None = None
 
 

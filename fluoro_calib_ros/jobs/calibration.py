@@ -103,20 +103,13 @@ Progress = Callable[[str, Round], None]
 
 @dataclass(frozen=True)
 class Rig:
-    """Fluoroscopes that belong to the rig but are not calibrated by this job.
+    """Fluoroscopes that belong to the rig but are not calibrated by this job."""
 
-    Attributes
-    ----------
-    fluoroscopes : sequence of str
-        Names of all fluoroscopes of the rig in their order; empty: those of the request.
-    frames : mapping of str to sequence of Frame
-        Exposures of the other fluoroscopes.
-    calibrations : mapping of str to FluoroscopeCalibration
-        Present calibrations of the other fluoroscopes.
-    """
-
+    #: names of all fluoroscopes of the rig in their order; empty: those of the request
     fluoroscopes: Sequence[str] = ()
+    #: exposures of the other fluoroscopes
     frames: Mapping[str, Sequence[Frame]] = field(default_factory=dict)
+    #: present calibrations of the other fluoroscopes
     calibrations: Mapping[str, FluoroscopeCalibration] = field(default_factory=dict)
 
 

@@ -42,23 +42,12 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class ImageResult(Observations):
-    """What was found in one image of a recording.
-
-    Attributes
-    ----------
-    exposure : int
-    place : str
-        File, page or message.
-    frame : Frame or None
-        None where the image gives no observations; the finding says why.
-    png : bytes or None
-        Overlay, if it was asked for.
-    """
+    """What was found in one image of a recording."""
 
     exposure: int = 0
-    place: str = ''
-    frame: Frame | None = None
-    png: bytes | None = None
+    place: str = ''  #: file, page or message
+    frame: Frame | None = None  #: None where the image gives no observations; the finding says why
+    png: bytes | None = None  #: overlay, if it was asked for
 
 
 @dataclass(frozen=True)

@@ -40,17 +40,10 @@ from .result_folder import REPORT, belongs_to, saved_orientation, saved_rig_note
 
 @dataclass(frozen=True)
 class ComparedFolders:
-    """Comparisons by fluoroscope, the scale at the phantom, and what could not be compared.
-
-    Attributes
-    ----------
-    comparisons : dict of str to Comparison
-    mm_per_px : dict of str to float
-        At the median distance of the phantom; without an entry where result.json is missing.
-    findings : tuple of Finding
-    """
+    """Comparisons by fluoroscope, the scale at the phantom, and what could not be compared."""
 
     comparisons: dict[str, Comparison]
+    #: at the median distance of the phantom; without an entry where result.json is missing
     mm_per_px: dict[str, float]
     findings: tuple[Finding, ...]
 

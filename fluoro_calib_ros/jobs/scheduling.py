@@ -122,22 +122,16 @@ class Cluster:
 
     Functions, tasks and results travel as pickles: scheduler and workers can run code here, and
     whoever reaches them can run code there.
-
-    Attributes
-    ----------
-    scheduler : str
-        Address: tls://host:port, or tcp://host:port on this machine or in a trusted network.
-    tls_ca, tls_cert, tls_key : str
-        Files (PEM) of the authority that has signed the certificates of the cluster, and of the
-        certificate of this process and its key; '' for none.
-    trusted_network : bool
-        Whether all who reach the network of a tcp:// scheduler are trusted.
     """
 
+    #: address: tls://host:port, or tcp://host:port on this machine or in a trusted network
     scheduler: str
+    #: files (PEM) of the authority that has signed the certificates of the cluster, and of the
+    #: certificate of this process and its key; '' for none
     tls_ca: str = ''
     tls_cert: str = ''
     tls_key: str = ''
+    #: whether all who reach the network of a tcp:// scheduler are trusted
     trusted_network: bool = False
 
     def security(self) -> Any:

@@ -299,27 +299,13 @@ MARKER_ATTENUATION = 7.0  # of tantalum at 55 keV (NIST XCOM) [1/mm]
 
 @dataclass(frozen=True)
 class RenderedScene:
-    """What a radiograph is taken of.
+    """What a radiograph is taken of."""
 
-    Attributes
-    ----------
-    points_mm : (n, 3) ndarray
-        Centres of beads or markers.
-    pose : Pose
-        That takes them into the rig frame.
-    seed : int
-        Of noise and clutter.
-    diameter_mm : (n,) ndarray or None
-        None: the usual one of beads.
-    plates : bool
-        Whether there are the faces of the phantom.
-    """
-
-    points_mm: NDArray[np.float64]
-    pose: Pose
-    seed: int = 0
-    diameter_mm: NDArray[np.float64] | None = None
-    plates: bool = True
+    points_mm: NDArray[np.float64]  #: (n, 3), centres of beads or markers
+    pose: Pose  #: that takes them into the rig frame
+    seed: int = 0  #: of noise and clutter
+    diameter_mm: NDArray[np.float64] | None = None  #: (n,), None: the usual one of beads
+    plates: bool = True  #: whether there are the faces of the phantom
 
 
 class Renderers:

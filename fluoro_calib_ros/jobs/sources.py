@@ -63,23 +63,15 @@ class Recording:
 
 @dataclass(frozen=True)
 class BagSelection:
-    """What is used of a bag, and how its frames are paired.
+    """What is used of a bag, and how its frames are paired."""
 
-    Attributes
-    ----------
-    start_s, end_s : float or None
-        Time window from the stamp of the first frame [s]; None: not limited.
-    pair_by : {'frame_number', 'stamp'}
-    tolerance_s : float
-        Largest difference between the stamps of an exposure [s].
-    angles : AngleOptions
-        Which joint gives the angle of the C-arm.
-    """
-
+    #: time window from the stamp of the first frame [s]; None: not limited
     start_s: float | None = None
     end_s: float | None = None
-    pair_by: str = 'frame_number'
+    pair_by: str = 'frame_number'  #: {'frame_number', 'stamp'}
+    #: largest difference between the stamps of an exposure [s]
     tolerance_s: float = PairingOptions.tolerance_s
+    #: which joint gives the angle of the C-arm
     angles: AngleOptions = field(default_factory=AngleOptions)
 
     def check_file(self, path: object) -> None:

@@ -42,21 +42,12 @@ MAX_CAUSE = 120  # characters
 
 
 class BagMessage(NamedTuple):
-    """A message of a bag.
-
-    Attributes
-    ----------
-    topic, type : str
-    log_time_ns : int
-        Time at which it was received [ns].
-    data : bytes
-        CDR.
-    """
+    """A message of a bag."""
 
     topic: str
     type: str
-    log_time_ns: int
-    data: bytes
+    log_time_ns: int  #: time at which it was received [ns]
+    data: bytes  #: CDR
 
 
 @dataclass(frozen=True)

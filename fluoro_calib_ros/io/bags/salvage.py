@@ -73,22 +73,14 @@ class SalvagedTopic:
 
 @dataclass(frozen=True)
 class Damage:
-    """Bytes of a file that cannot be used.
-
-    Attributes
-    ----------
-    path : str
-    cause : str
-    start_ns, end_ns : int or None
-        Messages between these times may be missing [ns]; None: from the beginning, to the end.
-    lost : mapping of str to int
-        Number of lost messages by topic, empty where it is not known.
-    """
+    """Bytes of a file that cannot be used."""
 
     path: str
     cause: str
+    #: messages between these times may be missing [ns]; None: from the beginning, to the end
     start_ns: int | None
     end_ns: int | None
+    #: number of lost messages by topic, empty where it is not known
     lost: dict[str, int] = field(default_factory=dict)
 
 
@@ -369,23 +361,13 @@ def _is_whole(content: bytes) -> bool:
 
 @dataclass(frozen=True)
 class Recovery:
-    """What was recovered from a bag.
+    """What was recovered from a bag."""
 
-    Attributes
-    ----------
-    counts : mapping of str to int
-        Number of recovered messages by topic.
-    expected : mapping of str to int
-        Number of messages that the bag had, as far as it says so, by topic.
-    damages : sequence of Damage
-    skipped : mapping of str to str
-        Why topics were left out.
-    """
-
-    counts: dict[str, int]
+    counts: dict[str, int]  #: number of recovered messages by topic
+    #: number of messages that the bag had, as far as it says so, by topic
     expected: dict[str, int]
     damages: tuple[Damage, ...]
-    skipped: dict[str, str]
+    skipped: dict[str, str]  #: why topics were left out
 
     @property
     def lost(self) -> dict[str, int]:
@@ -509,24 +491,14 @@ _NUMBERED = (TARGET_OBSERVATIONS, f'{PACKAGE}/msg/CorrectedObservations')
 
 @dataclass
 class TopicReport:
-    """What a topic holds.
-
-    Attributes
-    ----------
-    type : str
-    log_ns, stamp_ns : list of int
-        Times at which the messages were received, and those of their headers, if any [ns].
-    numbers : list of int
-        Frame numbers, of observations only.
-    undecodable : int
-        Messages whose header cannot be read.
-    """
+    """What a topic holds."""
 
     type: str
+    #: times at which the messages were received, and those of their headers, if any [ns]
     log_ns: list[int] = field(default_factory=list)
     stamp_ns: list[int] = field(default_factory=list)
-    numbers: list[int] = field(default_factory=list)
-    undecodable: int = 0
+    numbers: list[int] = field(default_factory=list)  #: frame numbers, of observations only
+    undecodable: int = 0  #: messages whose header cannot be read
 
     @property
     def duration_s(self) -> float:
@@ -581,24 +553,14 @@ class TopicReport:
 
 @dataclass(frozen=True)
 class BagReport:
-    """What a bag holds, and its damages.
-
-    Attributes
-    ----------
-    files : list of str
-    topics : dict of str to TopicReport
-    without_partner : dict of str to int
-        Frames of every fluoroscope whose number another one does not have.
-    damages : tuple of Damage
-    lost : dict of str to int
-        Number of messages that are known to be lost, by topic.
-    """
+    """What a bag holds, and its damages."""
 
     files: list[str]
     topics: dict[str, TopicReport]
+    #: frames of every fluoroscope whose number another one does not have
     without_partner: dict[str, int]
     damages: tuple[Damage, ...]
-    lost: dict[str, int]
+    lost: dict[str, int]  #: number of messages that are known to be lost, by topic
 
     @property
     def faults(self) -> list[str]:

@@ -79,8 +79,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..io.bodies import read_bodies
     from ..io.joints import read_joints
     from ..io.rig_orientation import orientation_path
-    from ..jobs.bodies import BodiesOptions, track_bodies
-    from ..jobs.bodies_folder import check_bodies_folder, save_bodies
+    from ..jobs.bodies import BodiesOptions, check_bodies_folder, save_bodies, track_bodies
     from ..jobs.sources import is_bag
 
     path = arguments.orientation or orientation_path(arguments.calibration)

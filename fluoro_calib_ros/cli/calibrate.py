@@ -199,7 +199,7 @@ def run(arguments: argparse.Namespace) -> bool:
 
     def write_more(folder: Path) -> None:
         if arguments.figures:
-            from ..report.figures import write_figures
+            from ..report.report_figures import write_figures
 
             write_figures(outcome.result, folder / 'figures')
         if arguments.covariance:
@@ -265,8 +265,7 @@ def _print(arguments: argparse.Namespace, outcome: CalibrationOutcome) -> None:
     """Print notes, the summary, and the verdict with the report."""
     from ..io.result_document import validation_document
     from ..jobs.result_folder import written_document
-    from ..report.tables import summary_table
-    from ..report.verdict import verdict_line
+    from ..report.tables import summary_table, verdict_line
 
     print_findings(outcome.result.findings, 'this cannot be right: ')
     document = written_document(outcome.result)

@@ -65,8 +65,13 @@ def run(arguments: argparse.Namespace) -> bool:
     from ..errors import DataError
     from ..io.bodies import read_bodies
     from ..io.rig_orientation import orientation_path
-    from ..jobs.healing import HealingOptions, heal_rig
-    from ..jobs.healing_folder import check_healing_folder, healing_document, save_healing
+    from ..jobs.healing import (
+        HealingOptions,
+        check_healing_folder,
+        heal_rig,
+        healing_document,
+        save_healing,
+    )
 
     path = arguments.orientation or orientation_path(arguments.calibration)
     check_healing_folder(

@@ -120,9 +120,8 @@ def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Write the phantom file and its picture. Raises DataError."""
-    from ..exposures.phantom import require_size
-    from ..exposures.phantom_drawing import Drawing
-    from ..io.atomic import write_bytes
+    from ..exposures.phantom import Drawing, require_size
+    from ..io.access import write_bytes
     from ..io.phantom import write_phantom
     from ..report.phantom_figure import phantom_figure, picture_bytes
 

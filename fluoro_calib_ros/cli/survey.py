@@ -177,7 +177,7 @@ def _document(outcome: SurveyOutcome, path: str | None) -> dict[str, Any]:
 
 
 def _text(outcome: SurveyOutcome, path: str | None) -> str:
-    from ..report.verdict import verdict_text
+    from ..report.tables import verdict_text
 
     sd = outcome.beads.sd_mm
     counted = f'{len(sd)} beads surveyed, sd of a coordinate {min(sd):.3f} to {max(sd):.3f} mm'

@@ -76,7 +76,7 @@ def run(arguments: argparse.Namespace) -> bool:
     from ..io.result_document import write_validation
     from ..jobs.result_folder import saved_orientation
     from ..jobs.sources import read_calibrations
-    from ..report.verdict import verdict_text
+    from ..report.tables import verdict_text
 
     calibrations = read_calibrations(arguments.directory, arguments.fluoroscopes)
     document = read_result(arguments.directory)

@@ -26,8 +26,7 @@ import numpy as np
 from ..errors import DataError
 from ..limits import read_limits
 from ..records import Field
-from .access import PathLike, read_bytes
-from .atomic import atomic_file
+from .access import PathLike, atomic_file, read_bytes
 
 _DATE = (1980, 1, 1, 0, 0, 0)  # of every member, so that the same arrays give the same bytes
 _UNIX = 3  # system of every member, for the same reason

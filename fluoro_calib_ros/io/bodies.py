@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from ..bodies.body import Body, check_bodies
 from ..errors import DataError
 from ..limits import read_limits
-from .access import PathLike
-from .atomic import atomic_file
+from .access import PathLike, atomic_file
 from .csv_table import Block, format_float, read_blocks, write_rows
 
 COLUMNS = ('body', 'marker', 'x', 'y', 'z', 'sd')

@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 from ..errors import DataError
 from ..exposures.names import MAX_ID, Names, number_names
 from ..limits import MAX_ROWS_CSV
-from .access import PathLike, check_rows, check_safe_name, os_error_reason, read_text
-from .atomic import atomic_file
+from .access import PathLike, atomic_file, check_rows, check_safe_name, os_error_reason, read_text
 
 BLOCK = 10_000  # rows converted at a time, to bound the memory
 MAX_HEADER = 200  # characters of a header in a message

@@ -25,8 +25,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import DataError
-from .access import PathLike, make_folder, os_error_reason
-from .atomic import sync_folder
+from .access import PathLike, make_folder, os_error_reason, sync_folder
 
 PREVIOUS = '.previous'
 # Ends of the names of files that are read from a folder: of a bag, or a result.

@@ -21,8 +21,7 @@ import numpy as np
 from ..errors import DataError
 from ..images.codec import encode
 from ..images.corrector import ImageCorrector
-from .access import make_folder
-from .atomic import atomic_file, sync_folder, write_bytes
+from .access import atomic_file, make_folder, sync_folder, write_bytes
 from .folder import temporary_folder
 from .image_reading import (
     CINE_SUFFIXES,

@@ -41,8 +41,7 @@ from ..bodies.joint_conventions import Convention, convention
 from ..bodies.joints import STATUS_NAMES, Joint, JointMotion, check_joints
 from ..errors import DataError
 from ..limits import MAX_JOINTS
-from .access import PathLike, read_text
-from .atomic import atomic_file
+from .access import PathLike, atomic_file, read_text
 from .csv_table import format_float, write_rows
 
 if sys.version_info >= (3, 11):

@@ -22,13 +22,12 @@ from numpy.typing import NDArray
 from ..correction.base import CorrectionStatus
 from ..correction.fluoroscope_calibration import CorrectedPoints, FluoroscopeCalibration
 from ..errors import DataError
-from ..exposures.columns import first_repeated, is_positive
 from ..exposures.frame import MAX_ANGLE, Frame, angle_in_degrees, angles_of, points_on_image
 from ..exposures.names import Names, safe_names, without_trivial
+from ..exposures.phantom import first_repeated, is_positive
 from ..exposures.strays import few
 from ..limits import MAX_FRAMES
-from .access import PathLike, check_safe_name
-from .atomic import atomic_file
+from .access import PathLike, atomic_file, check_safe_name
 from .csv_table import Block, NamedColumn, format_float, read_blocks, write_rows
 
 ANGLE = 'angle_deg'

@@ -14,12 +14,11 @@ import os
 import numpy as np
 
 from ..errors import DataError
-from ..exposures.columns import first_repeated
-from ..exposures.moving_points import MovingPoints
+from ..exposures.frame import MovingPoints
 from ..exposures.names import Names, without_trivial
-from ..exposures.phantom import Phantom
+from ..exposures.phantom import Phantom, first_repeated
 from ..limits import read_limits
-from .atomic import atomic_file
+from .access import atomic_file
 from .csv_table import NamedColumn, read_blocks, write_rows
 
 COLUMNS = ('target_id', 'x', 'y', 'z', 'sd')

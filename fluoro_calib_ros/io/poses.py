@@ -16,8 +16,7 @@ import numpy as np
 from ..bodies.body import STATUS_NAMES, Body, BodyPoses
 from ..bodies.tracking import TrackedExposure
 from ..photogrammetry.rotations import quaternion_from_matrix
-from .access import PathLike
-from .atomic import atomic_file
+from .access import PathLike, atomic_file
 from .csv_table import format_float, write_rows
 
 COLUMNS = (

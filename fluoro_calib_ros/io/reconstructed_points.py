@@ -14,7 +14,7 @@ import numpy as np
 from ..exposures.names import Names
 from ..reconstruction.intersection import STATUS_NAMES
 from ..reconstruction.reconstruct import ReconstructedFrame
-from .atomic import atomic_file
+from .access import atomic_file
 from .csv_table import format_float, write_rows
 
 COLUMNS = (

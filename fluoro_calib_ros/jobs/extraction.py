@@ -19,8 +19,7 @@ from ..exposures.phantom import Phantom
 from ..findings import Finding, Kind, Place
 from ..images.lattice import NOT_MARKED, FlatGrid
 from ..images.view import Lens, assumed_lens, may_be_found, shared_lens
-from ..io.access import check_safe_name, make_folder
-from ..io.atomic import write_bytes
+from ..io.access import check_safe_name, make_folder, write_bytes
 from ..io.bags.reader import image_topics
 from .image_sources import (
     ImageAngles,

@@ -30,8 +30,7 @@ from ..images.marker_decisions import Decision, revise
 from ..images.marker_ids import identifiable, identify_markers
 from ..images.markers import FirstMarkers, MarkerFrame, MarkerOptions
 from ..images.overlay import draw_markers
-from ..io.access import make_folder
-from ..io.atomic import write_bytes
+from ..io.access import make_folder, write_bytes
 from ..photogrammetry.rig_orientation import RigOrientation
 from .extraction import Progress
 from .image_sources import (

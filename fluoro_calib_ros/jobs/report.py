@@ -17,7 +17,7 @@ from jinja2 import UndefinedError
 from ..checks.comparison import Comparison, compare_calibrations
 from ..errors import DataError
 from ..findings import Finding, Kind, Place, Severity
-from ..io.atomic import write_text
+from ..io.access import write_text
 from ..io.calibration import load_calibrations
 from ..io.calibration_request import read_request
 from ..io.csv_table import read_names

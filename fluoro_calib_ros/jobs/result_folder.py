@@ -17,6 +17,7 @@ from ..findings import Finding, Kind, Severity
 from ..io import csv_table as names
 from ..io.calibration import SUFFIX, load_calibrations, save_calibration
 from ..io.calibration_request import write_request
+from ..io.documents import write_json
 from ..io.folder import FolderKind, check_output_folder, replaced_folder
 from ..io.result_check import (
     KNOWN_ORIENTATION,
@@ -28,13 +29,11 @@ from ..io.result_check import (
     with_digest,
 )
 from ..io.result_check import RESULT_NAME as RESULT
-from ..io.result_document import result_document, write_validation
-from ..io.result_tables import NAMES as TABLES
-from ..io.result_tables import SUFFIX as COVARIANCE
-from ..io.result_tables import write_covariance, write_tables
+from ..io.result_document import NAMES as TABLES
+from ..io.result_document import SUFFIX as COVARIANCE
+from ..io.result_document import result_document, write_covariance, write_tables, write_validation
 from ..io.rig_orientation import NAME as ORIENTATION
 from ..io.rig_orientation import load_orientation, orientation_path, save_orientation
-from ..io.text_files import write_json
 from ..photogrammetry.rig_orientation import RigOrientation
 from .calibration import CalibrationOutcome
 

@@ -19,16 +19,15 @@ from numpy.typing import NDArray
 from ..exposures.frame import Frame
 from ..exposures.phantom import Phantom
 from ..images.codec import encode
-from ..io.access import PathLike, make_folder
-from ..io.atomic import write_bytes, write_text
+from ..io.access import PathLike, make_folder, write_bytes, write_text
 from ..io.bags.writer import BagWriter
 from ..io.bodies import write_bodies
+from ..io.documents import write_json
 from ..io.folder import FolderKind, replaced_folder
 from ..io.joints import COLUMNS as JOINT_COLUMNS
 from ..io.joints import joint_definition
 from ..io.observations import write_observations_csv
 from ..io.phantom import write_phantom
-from ..io.text_files import write_json
 from ..options import option, validate_options
 from ..photogrammetry.rotations import quaternion_from_matrix
 from ..processes import OF_STREAM, WorkerProcess

@@ -27,7 +27,7 @@ from ..io.calibration import load_calibrations
 from ..io.csv_table import read_names
 from ..io.formats import registry
 from ..io.formats.content import PARTS, Content, FileSettings
-from ..io.known_orientation import holds_known_orientations, read_known_orientations
+from ..io.formats.known_orientation import holds_known_orientations, read_known_orientations
 from ..io.observations import CORRECTED_BY, PointsFile, points_of_frames, read_points
 from ..io.result_check import disagreements
 from ..photogrammetry.known_orientation import KnownOrientation

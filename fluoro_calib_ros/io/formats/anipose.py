@@ -18,11 +18,19 @@ import numpy as np
 
 from ...errors import DataError
 from ...photogrammetry.rotations import matrix_from_vector, vector_from_matrix
-from ..access import PathLike
-from ..atomic import write_text
+from ..access import PathLike, write_text
 from ..documents import read_toml
-from .camera_files import check_matrix
-from .content import Camera, Content, FileSettings, Format, Sample, Written, from_units, in_units
+from .content import (
+    Camera,
+    Content,
+    FileSettings,
+    Format,
+    Sample,
+    Written,
+    check_matrix,
+    from_units,
+    in_units,
+)
 
 
 def recognise(sample: Sample) -> bool:

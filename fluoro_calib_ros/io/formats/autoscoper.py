@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..atomic import atomic_file
+from ..access import atomic_file
 from .content import Content, FileSettings, Format, Sample, Written, homogeneous
 from .frames_of_points import bodies_of, frames_of
 from .text import joined

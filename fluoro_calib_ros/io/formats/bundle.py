@@ -24,12 +24,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ...errors import DataError
-from ...exposures.columns import first_repeated
 from ...exposures.frame import Frame, points_on_image
-from ...exposures.phantom import Phantom
-from ..access import make_folder
-from ..atomic import write_text
-from .camera_files import common_focal_length, refuse_distortion
+from ...exposures.phantom import Phantom, first_repeated
+from ..access import make_folder, write_text
 from .content import (
     Camera,
     Content,
@@ -38,8 +35,10 @@ from .content import (
     Sample,
     Station,
     Written,
+    common_focal_length,
     from_units,
     in_units,
+    refuse_distortion,
 )
 from .text import Row, joined, read_table, require_width
 from .xmalab_points import camera_order

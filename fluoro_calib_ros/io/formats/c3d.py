@@ -24,8 +24,7 @@ import numpy as np
 from ...errors import DataError
 from ...exposures.names import Names, number_names
 from ...processes import run_module
-from ..access import read_bytes
-from ..atomic import write_bytes
+from ..access import read_bytes, write_bytes
 from . import c3d_process
 from .content import (
     UNITS_MM,

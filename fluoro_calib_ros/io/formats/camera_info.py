@@ -20,8 +20,16 @@ import yaml
 from ...errors import DataError
 from ..documents import read_yaml
 from .anipose import numbers_of
-from .camera_files import check_matrix, write_cameras
-from .content import Camera, Content, FileSettings, Format, Sample, Written
+from .content import (
+    Camera,
+    Content,
+    FileSettings,
+    Format,
+    Sample,
+    Written,
+    check_matrix,
+    write_cameras,
+)
 
 ENDING = '_camera_info.yaml'
 _MODELS = ('plumb_bob', 'rational_polynomial')

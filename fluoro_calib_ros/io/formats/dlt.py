@@ -17,9 +17,17 @@ import numpy as np
 from scipy.linalg import rq
 
 from ...errors import DataError
-from ..atomic import write_text
-from .camera_files import refuse_distortion
-from .content import Camera, Content, FileSettings, Format, Sample, Written, camera_at
+from ..access import write_text
+from .content import (
+    Camera,
+    Content,
+    FileSettings,
+    Format,
+    Sample,
+    Written,
+    camera_at,
+    refuse_distortion,
+)
 from .text import joined, read_table, require_width
 
 ROWS = 11

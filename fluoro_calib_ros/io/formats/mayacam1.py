@@ -18,8 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ...errors import DataError
-from .camera_files import name_of_file
-from .content import Content, FileSettings, Format, Sample, camera_at, from_units
+from .content import Content, FileSettings, Format, Sample, camera_at, from_units, name_of_file
 from .text import Row, read_table, require_width
 
 ENDING = '_MayaCam.csv'

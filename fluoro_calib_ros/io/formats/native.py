@@ -15,7 +15,7 @@ import numpy as np
 
 from ...errors import DataError
 from ...exposures.names import Names, without_trivial
-from ..atomic import atomic_file
+from ..access import atomic_file
 from ..csv_table import format_float, read_blocks, write_rows
 from ..observations import COLUMNS as OBSERVATIONS
 from ..observations import corrections_of, read_named_observations, write_observations_csv

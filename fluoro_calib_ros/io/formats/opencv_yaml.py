@@ -18,8 +18,20 @@ import numpy as np
 from ...errors import DataError
 from ..access import read_text
 from ..documents import check_budget
-from .camera_files import check_matrix, check_rotation, name_of_file, write_cameras
-from .content import Camera, Content, FileSettings, Format, Sample, Written, from_units, in_units
+from .content import (
+    Camera,
+    Content,
+    FileSettings,
+    Format,
+    Sample,
+    Written,
+    check_matrix,
+    check_rotation,
+    from_units,
+    in_units,
+    name_of_file,
+    write_cameras,
+)
 
 ENDING = '_opencv.yaml'
 MATRIX_NAMES = ('camera_matrix', 'Camera_Matrix', 'cameraMatrix', 'K')

@@ -19,8 +19,7 @@ import numpy as np
 from ...bodies.joints import JointMotion
 from ...errors import DataError
 from ...photogrammetry.rotations import quaternion_from_matrix
-from ..access import PathLike
-from ..atomic import atomic_file
+from ..access import PathLike, atomic_file
 from .content import Content, FileSettings, Format, Sample, Written, in_units
 from .frames_of_points import bodies_of, frames_of
 from .text import joined

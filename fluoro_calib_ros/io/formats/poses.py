@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import DataError
-from ...exposures.columns import first_repeated
+from ...exposures.phantom import first_repeated
 from ...photogrammetry.rotations import matrix_from_quaternion
 from ..csv_table import read_blocks
 from ..poses import COLUMNS as ALL_COLUMNS

@@ -19,8 +19,7 @@ import numpy as np
 
 from ...errors import DataError
 from ...exposures.names import Names, number_names
-from ..access import read_text
-from ..atomic import atomic_file
+from ..access import atomic_file, read_text
 from .content import (
     UNITS_MM,
     Content,

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import DataError
-from ..atomic import atomic_file
+from ..access import atomic_file
 from ..csv_table import as_text
 from .content import (
     Bodies,

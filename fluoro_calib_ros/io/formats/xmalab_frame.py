@@ -19,8 +19,7 @@ import numpy as np
 from ...errors import DataError
 from ...exposures.names import Names, number_names, without_trivial
 from ...exposures.phantom import Phantom
-from ..access import read_text
-from ..atomic import write_text
+from ..access import read_text, write_text
 from .content import Content, FileSettings, Format, Sample, Written, from_units, in_units
 from .text import Row, joined, separator_of, table_of
 

@@ -17,10 +17,8 @@ import numpy as np
 
 from ...errors import DataError
 from ...limits import MAX_IMAGE_SIDE
-from ..access import check_rows, check_safe_name, make_folder, read_text
-from ..atomic import atomic_file
-from .camera_files import name_of_file
-from .content import Content, FileSettings, Format, Sample, Written
+from ..access import atomic_file, check_rows, check_safe_name, make_folder, read_text
+from .content import Content, FileSettings, Format, Sample, Written, name_of_file
 from .text import Row, separator_of
 
 ENDING = '_LUT.csv'

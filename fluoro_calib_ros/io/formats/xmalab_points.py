@@ -22,7 +22,7 @@ import numpy as np
 from ...errors import DataError
 from ...exposures.frame import Frame, points_on_image
 from ...exposures.names import Names, number_names
-from ..atomic import atomic_file
+from ..access import atomic_file
 from ..csv_table import as_text
 from .content import Content, FileSettings, Format, Sample, Written
 from .frames_of_points import default_name, named_targets

@@ -17,7 +17,7 @@ import numpy as np
 
 from ...errors import DataError
 from ...exposures.names import Names, number_names
-from ..atomic import atomic_file
+from ..access import atomic_file
 from ..csv_table import as_text
 from .content import (
     Content,

@@ -3,8 +3,7 @@
 
 """Known orientations of this package: K, R and t_mm of every fluoroscope as YAML.
 
-`io.known_orientation` describes the layout; a calibration takes the orientations from it. It
-has no image size.
+A calibration takes the orientations from it. It has no image size.
 """
 
 from __future__ import annotations

@@ -119,6 +119,22 @@ def _separated(path: PathLike, text: str, separator: str) -> list[Row]:
     return rows
 
 
+def read_frames(path: PathLike) -> tuple[Row, list[Row], int]:
+    """Return header and rows of a table with a row a frame, and its number of columns Frame.
+
+    Raises DataError as `read_table`, and for a header without rows.
+    """
+    header, *rows = read_table(path)
+    if not rows:
+        raise DataError(f'{path}: the file has a header, but no rows')
+    return header, rows, int(header.cells[0].lower() == 'frame')
+
+
+def frame_numbers(rows: Sequence[Row], first: int) -> list[int]:
+    """Return the numbers of frames: those of the column Frame, without one from 1 on."""
+    return [row.whole(0, 'Frame') if first else number for number, row in enumerate(rows, 1)]
+
+
 def require_width(rows: Iterable[Row], width: int, what: str) -> None:
     """Raise DataError for the first row that does not have `width` cells."""
     for row in rows:

@@ -30,7 +30,6 @@ from ...images.codec import check_size, declared_size
 from ...limits import MAX_MEMBER, read_limits
 from ..access import os_error_reason
 from ..documents import parse_xml
-from . import xmalab_frame
 from .content import (
     Camera,
     Content,
@@ -42,6 +41,7 @@ from .content import (
     check_rotation,
 )
 from .frames_of_points import default_name, named_targets
+from .phantoms import content_of
 from .text import Row, table_of
 
 _SEEN = 0  # a marker is seen where its status is above
@@ -127,7 +127,7 @@ class _Project:
         name = '' if element is None else element.get('FrameSpecifications', '')
         if not name:
             return Content()
-        return xmalab_frame.content_of(
+        return content_of(
             Path(f'{self.archive.path}, {name}'), self.archive.member_text(name), self.settings
         )
 

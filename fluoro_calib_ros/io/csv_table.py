@@ -14,10 +14,10 @@ import io
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import islice
+from itertools import chain, islice
 from operator import itemgetter
 from pathlib import Path
-from typing import IO, Any, NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -123,9 +123,14 @@ def decimal_point(cell: str) -> str:
     return changed if _is_number(changed, float) else cell
 
 
-def write_rows(file: IO[Any], rows: Iterable[Iterable[Any]]) -> None:
-    """Write rows of cells to an open text file as CSV, with line feeds."""
-    csv.writer(file, lineterminator='\n').writerows(map(_as_texts, rows))
+def write_table(path: PathLike, header: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
+    """Write a CSV file of a header and rows of cells, with line feeds.
+
+    Raises DataError where the file cannot be written.
+    """
+    with atomic_file(path, 'w') as file:
+        writer = csv.writer(file, lineterminator='\n')
+        writer.writerows(map(_as_texts, chain([header], rows)))
 
 
 # A spreadsheet runs a cell that begins so. In a file of ours such a name begins with an
@@ -333,11 +338,12 @@ def write_names(directory: PathLike, names: Names) -> None:
         except OSError as error:
             raise DataError(f'{path}: cannot be deleted ({os_error_reason(error)})') from None
         return
-    with atomic_file(path, 'w') as file:
-        write_rows(file, [COLUMNS])
-        for kind, attribute in _KINDS.items():
-            table = getattr(names, attribute)
-            write_rows(file, ([kind, identity, name] for name, identity in table.items()))
+    rows = (
+        [kind, identity, name]
+        for kind, attribute in _KINDS.items()
+        for name, identity in getattr(names, attribute).items()
+    )
+    write_table(path, COLUMNS, rows)
 
 
 def read_names(directory: PathLike) -> Names:

@@ -27,8 +27,8 @@ from ..exposures.names import Names, safe_names, without_trivial
 from ..exposures.phantom import first_repeated, is_positive
 from ..exposures.strays import few
 from ..limits import MAX_FRAMES
-from .access import PathLike, atomic_file, check_safe_name
-from .csv_table import Block, NamedColumn, format_float, read_blocks, write_rows
+from .access import PathLike, check_safe_name
+from .csv_table import Block, NamedColumn, format_float, read_blocks, write_table
 
 ANGLE = 'angle_deg'
 CORRECTED_BY = 'corrected_by'  # id of the calibration, of image points that are corrected already
@@ -185,14 +185,13 @@ def write_observations_csv(
     with_sigma = any(frame.sigma is not None for frame in frames)
     with_angle = any(frame.angle is not None for frame in frames)
     labels = _labels(frames, names or Names())
-    with atomic_file(path, 'w') as file:
-        header = COLUMNS + ('sigma',) * with_sigma + (ANGLE,) * with_angle
-        write_rows(file, [header + (CORRECTED_BY,) * bool(corrected_by)])
-        for frame in frames:
-            check_safe_name(frame.fluoroscope, path)
-            last = [corrected_by.get(frame.fluoroscope, '')] if corrected_by else []
-            rows = _csv_rows(frame, with_sigma, with_angle, labels)
-            write_rows(file, ([*row, *last] for row in rows))
+    header = COLUMNS + ('sigma',) * with_sigma + (ANGLE,) * with_angle
+    rows = (
+        [*row, *([corrected_by.get(frame.fluoroscope, '')] if corrected_by else [])]
+        for frame in frames
+        for row in _csv_rows(path, frame, with_sigma, with_angle, labels)
+    )
+    write_table(path, header + (CORRECTED_BY,) * bool(corrected_by), rows)
 
 
 def corrections_of(path: PathLike) -> dict[str, str]:
@@ -326,8 +325,9 @@ def _angle(path: PathLike, where: str, rows: _Rows) -> float | None:
 
 
 def _csv_rows(
-    frame: Frame, with_sigma: bool, with_angle: bool, labels: _Labels
+    path: PathLike, frame: Frame, with_sigma: bool, with_angle: bool, labels: _Labels
 ) -> Iterator[list[Any]]:
+    check_safe_name(frame.fluoroscope, path)
     fluoroscope = labels.fluoroscopes.get(frame.fluoroscope, frame.fluoroscope)
     exposure = labels.exposures.get(int(frame.number), int(frame.number))
     columns: list[Iterable[Any]] = [
@@ -338,8 +338,7 @@ def _csv_rows(
         sigma = np.full(len(frame.target_id), np.nan) if frame.sigma is None else frame.sigma
         columns.append(map(format_float, sigma))
     if with_angle:
-        angle = np.nan if frame.angle is None else angle_in_degrees(frame.angle)
-        columns.append([format_float(angle)] * len(frame.target_id))
+        columns.append([_angle_text(frame)] * len(frame.target_id))
     return ([fluoroscope, exposure, *cells] for cells in zip(*columns))
 
 
@@ -385,12 +384,16 @@ def _write(
 ) -> None:
     """Write frames with their flags, and with the angle if any frame has one."""
     with_angle = any(frame.angle is not None for frame, _ in frames)
-    with atomic_file(path, 'w') as file:
-        write_rows(file, [(*COLUMNS, 'sigma', *flags, *(ANGLE,) * with_angle)])
-        for frame, values in frames:
-            angle = '' if frame.angle is None else format_float(angle_in_degrees(frame.angle))
-            rows = _rows(path, frame, values, target_names)
-            write_rows(file, ([*row, angle] if with_angle else row for row in rows))
+    rows = (
+        [*row, _angle_text(frame)] if with_angle else row
+        for frame, values in frames
+        for row in _rows(path, frame, values, target_names)
+    )
+    write_table(path, (*COLUMNS, 'sigma', *flags, *(ANGLE,) * with_angle), rows)
+
+
+def _angle_text(frame: Frame) -> str:
+    return '' if frame.angle is None else format_float(angle_in_degrees(frame.angle))
 
 
 def _rows(
@@ -585,12 +588,8 @@ def write_points(path: PathLike, points: PointsFile, corrected: CorrectedPoints)
     file cannot be written.
     """
     numbers = np.column_stack([corrected.uv, corrected.sigma]).tolist()
-    with atomic_file(path, 'w') as file:
-        write_rows(file, [points.header + points.added_columns])
-        write_rows(
-            file,
-            (
-                [*row, *map(format_float, values), STATUS[status]]
-                for row, values, status in zip(points.rows, numbers, corrected.status.tolist())
-            ),
-        )
+    rows = (
+        [*row, *map(format_float, values), STATUS[status]]
+        for row, values, status in zip(points.rows, numbers, corrected.status.tolist())
+    )
+    write_table(path, points.header + points.added_columns, rows)

@@ -18,8 +18,7 @@ from ..exposures.frame import MovingPoints
 from ..exposures.names import Names, without_trivial
 from ..exposures.phantom import Phantom, first_repeated
 from ..limits import read_limits
-from .access import atomic_file
-from .csv_table import NamedColumn, read_blocks, write_rows
+from .csv_table import NamedColumn, read_blocks, write_table
 
 COLUMNS = ('target_id', 'x', 'y', 'z', 'sd')
 DIAMETER = 'diameter'  # of the beads, optional
@@ -121,15 +120,13 @@ def write_phantom(
     labels = (names or Names()).target_names()
     if not all(target in labels for target in phantom.target_id.tolist()):
         labels = {}
-    with atomic_file(path, 'w') as file:
-        numbers = [phantom.xyz_mm, phantom.sd_mm[:, None]]
-        if phantom.diameter_mm is not None:
-            numbers.append(phantom.diameter_mm[:, None])
-        write_rows(file, [(*COLUMNS, DIAMETER)[: sum(part.shape[1] for part in numbers) + 1]])
-        write_rows(
-            file,
-            (
-                [labels.get(int(target), int(target)), *map(repr, row)]
-                for target, row in zip(phantom.target_id, np.hstack(numbers).tolist())
-            ),
-        )
+    header: tuple[str, ...] = COLUMNS
+    columns = [*phantom.xyz_mm.T, phantom.sd_mm]
+    if phantom.diameter_mm is not None:
+        header = (*COLUMNS, DIAMETER)
+        columns.append(phantom.diameter_mm)
+    rows = (
+        [labels.get(target, target), *map(repr, row)]
+        for target, row in zip(phantom.target_id.tolist(), np.column_stack(columns).tolist())
+    )
+    write_table(path, header, rows)

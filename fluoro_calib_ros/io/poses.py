@@ -9,15 +9,15 @@ about the axes of that frame. The motion is that of the centre of the markers of
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from ..bodies.body import STATUS_NAMES, Body, BodyPoses
 from ..bodies.tracking import TrackedExposure
 from ..photogrammetry.rotations import quaternion_from_matrix
-from .access import PathLike, atomic_file
-from .csv_table import format_float, write_rows
+from .access import PathLike
+from .csv_table import format_float, write_table
 
 COLUMNS = (
     *('body', 'exposure', 'time_s', 'x_mm', 'y_mm', 'z_mm', 'qx', 'qy', 'qz', 'qw'),
@@ -35,28 +35,18 @@ def write_poses(path: PathLike, poses: Sequence[BodyPoses], start_ns: int) -> No
 
     Raises DataError where the file cannot be written.
     """
-    with atomic_file(path, 'w') as file:
-        write_rows(file, [COLUMNS])
-        for one in poses:
-            known = one.known
-            quaternion = np.full((len(known), 4), np.nan)
-            quaternion[known] = quaternion_from_matrix(one.rotation[known])
-            numbers = np.hstack(
-                [
-                    (one.stamp_ns - start_ns)[:, None] / 1e9,
-                    one.position_mm,
-                    np.roll(quaternion, -1, axis=1),
-                    one.sd,
-                ]
-            )
-            rows = zip(one.number.tolist(), numbers.tolist(), one.markers.tolist(), one.status)
-            write_rows(
-                file,
-                (
-                    [one.body, number, *map(format_float, values), markers, STATUS_NAMES[status]]
-                    for number, values, markers, status in rows
-                ),
-            )
+    write_table(path, COLUMNS, (row for one in poses for row in _rows(one, start_ns)))
+
+
+def _rows(one: BodyPoses, start_ns: int) -> Iterator[list[object]]:
+    known = one.known
+    quaternion = np.full((len(known), 4), np.nan)
+    quaternion[known] = quaternion_from_matrix(one.rotation[known])
+    time_s = (one.stamp_ns - start_ns)[:, None] / 1e9
+    numbers = np.hstack([time_s, one.position_mm, np.roll(quaternion, -1, axis=1), one.sd])
+    rows = zip(one.number.tolist(), numbers.tolist(), one.markers.tolist(), one.status)
+    for number, values, markers, status in rows:
+        yield [one.body, number, *map(format_float, values), markers, STATUS_NAMES[status]]
 
 
 def write_motion(
@@ -66,10 +56,10 @@ def write_motion(
 
     Raises DataError where the file cannot be written.
     """
-    with atomic_file(path, 'w') as file:
-        write_rows(file, [MOTION_COLUMNS])
-        for row, body in enumerate(bodies):
-            write_rows(file, (_motion(body, row, one, start_ns) for one in exposures))
+    rows = (
+        _motion(body, row, one, start_ns) for row, body in enumerate(bodies) for one in exposures
+    )
+    write_table(path, MOTION_COLUMNS, rows)
 
 
 def _motion(body: Body, row: int, one: TrackedExposure, start_ns: int) -> list[object]:

@@ -14,22 +14,11 @@ import numpy as np
 from ..exposures.names import Names
 from ..reconstruction.intersection import STATUS_NAMES
 from ..reconstruction.reconstruct import ReconstructedFrame
-from .access import atomic_file
-from .csv_table import format_float, write_rows
+from .csv_table import format_float, write_table
 
 COLUMNS = (
-    'frame',
-    'stamp_ns',
-    'target_id',
-    'x',
-    'y',
-    'z',
-    'sd_x',
-    'sd_y',
-    'sd_z',
-    'residual',
-    'rays',
-    'status',
+    *('frame', 'stamp_ns', 'target_id', 'x', 'y', 'z'),
+    *('sd_x', 'sd_y', 'sd_z', 'residual', 'rays', 'status'),
 )
 NAME_COLUMN = 'name'  # the last one, of targets that have names
 
@@ -43,13 +32,12 @@ def write_reconstruction(
     cell. Raises DataError where the file cannot be written.
     """
     labels = (names or Names()).target_names()
-    with atomic_file(path, 'w') as file:
-        write_rows(file, [(*COLUMNS, NAME_COLUMN) if labels else COLUMNS])
-        for frame in frames:
-            rows = _rows(frame)
-            if labels:
-                rows = ([*row, labels.get(row[2], '')] for row in rows)
-            write_rows(file, rows)
+    rows = (
+        [*row, labels.get(row[2], '')] if labels else row
+        for frame in frames
+        for row in _rows(frame)
+    )
+    write_table(path, (*COLUMNS, NAME_COLUMN) if labels else COLUMNS, rows)
 
 
 def _rows(frame: ReconstructedFrame) -> Iterable[list[Any]]:

@@ -24,9 +24,9 @@ from ..findings import Finding, Severity, sentences
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import quaternion_from_matrix
 from ..records import Field
-from .access import PathLike, atomic_file, os_error_reason
+from .access import PathLike, os_error_reason
 from .arrays import Layout, read_arrays, to_arrays, write_arrays
-from .csv_table import format_float, write_rows
+from .csv_table import format_float, write_table
 from .documents import write_json
 from .result_check import VALIDATION_NAME, with_digests
 
@@ -339,9 +339,7 @@ def write_tables(directory: Path, result: CalibrationResult) -> None:
     if result.residuals is not None:
         tables[RESIDUALS] = (_RESIDUALS_HEADER, _residuals(result.residuals))
     for name, (header, rows) in tables.items():
-        with atomic_file(directory / name, 'w') as file:
-            write_rows(file, [header.split(',')])
-            write_rows(file, rows)
+        write_table(directory / name, header.split(','), rows)
 
 
 def _floats(values: Iterable[float]) -> list[str]:

@@ -8,15 +8,14 @@ Targets, exposures and fluoroscopes may have names in them.
 
 from __future__ import annotations
 
-import math
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 
 from ...errors import DataError
 from ...exposures.names import Names, without_trivial
-from ..access import atomic_file
-from ..csv_table import format_float, read_blocks, write_rows
+from ..csv_table import format_float, read_blocks, write_table
 from ..observations import COLUMNS as OBSERVATIONS
 from ..observations import corrections_of, read_named_observations, write_observations_csv
 from ..phantom import COLUMNS as PHANTOM
@@ -115,28 +114,29 @@ def _write_points(path: Path, content: Content, settings: FileSettings) -> Writt
     """Write the points that were seen, with what is known about them."""
     points = content.points
     assert points is not None
-    named = content.names.target_names()
     rate = settings.rate_hz or points.rate_hz
-    empty = dict.fromkeys(POINTS, '')
-    with atomic_file(path, 'w') as file:
-        write_rows(file, [[*POINTS, NAME_COLUMN]])
-        for row, number in enumerate(points.frame.tolist()):
-            stamp = '' if rate is None else round((number - int(points.frame[0])) / rate * NS)
-            for column, target in enumerate(points.target_id.tolist()):
-                xyz = points.xyz_mm[row, column].tolist()
-                if math.isnan(xyz[0]):
-                    continue
-                cells = {
-                    **empty,
-                    'frame': number,
-                    'stamp_ns': stamp,
-                    'target_id': target,
-                    **dict(zip('xyz', map(repr, xyz))),
-                    'residual': format_float(points.residual_px[row, column]),
-                }
-                write_rows(file, [[*cells.values(), named.get(target, '')]])
+    rows = _point_rows(points, rate, content.names.target_names())
+    write_table(path, (*POINTS, NAME_COLUMN), rows)
     note = f'{path}: standard deviations of the coordinates are not written, only coordinates'
     return Written((str(path),), (note,))
+
+
+def _point_rows(
+    points: Points, rate: float | None, named: Mapping[int, str]
+) -> Iterator[list[object]]:
+    first = int(points.frame[0])
+    for row, column in np.argwhere(~np.isnan(points.xyz_mm[..., 0])).tolist():
+        number = int(points.frame[row])
+        target = int(points.target_id[column])
+        cells = {
+            **dict.fromkeys(POINTS, ''),
+            'frame': number,
+            'stamp_ns': '' if rate is None else round((number - first) / rate * NS),
+            'target_id': target,
+            **dict(zip('xyz', map(repr, points.xyz_mm[row, column].tolist()))),
+            'residual': format_float(points.residual_px[row, column]),
+        }
+        yield [*cells.values(), named.get(target, '')]
 
 
 def _read_grid(path: Path, settings: FileSettings) -> Content:
@@ -149,10 +149,10 @@ def _read_grid(path: Path, settings: FileSettings) -> Content:
 
 
 def _write_grid(path: Path, content: Content, settings: FileSettings) -> Written:
-    with atomic_file(path, 'w') as file:
-        write_rows(file, [GRID])
-        for name, rows in content.grids.items():
-            write_rows(file, ([name, *map(repr, row)] for row in rows.tolist()))
+    rows = (
+        [name, *map(repr, row)] for name, grid in content.grids.items() for row in grid.tolist()
+    )
+    write_table(path, GRID, rows)
     return Written((str(path),))
 
 

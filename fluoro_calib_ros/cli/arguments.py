@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from ..errors import DataError
+from ..errors import ErrorsAt
 from ..io.rig_file import NAME
 from ..limits import ReadLimits, use_read_limits
 from ..options import Option, declared
@@ -149,10 +149,8 @@ def read_oriented_source(
     )
     orientation = load_orientation(path)
     names = [name for name in orientation.fluoroscopes if name in recording.frames]
-    try:
+    with ErrorsAt(path):
         check_orientation(orientation.subset(names) if names else orientation, calibrations)
-    except DataError as error:
-        raise error.at(path) from None
     return recording, calibrations, orientation
 
 

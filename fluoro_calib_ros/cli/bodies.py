@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import DataError
+from ..errors import DataError, ErrorsAt
 from .arguments import (
     add_bag_options,
     add_calibration,
@@ -102,19 +102,16 @@ def run(arguments: argparse.Namespace) -> None:
         estimate_shapes=not arguments.keep_shapes,
         rate=arguments.rate,
     )
-    try:
-        with ProgressBar('exposures') as bar:
-            outcome = track_bodies(
-                recording.frames,
-                calibrations,
-                orientation,
-                bodies,
-                joints=joints,
-                options=options,
-                progress=bar,
-            )
-    except DataError as error:
-        raise error.at(arguments.source) from None
+    with ErrorsAt(arguments.source), ProgressBar('exposures') as bar:
+        outcome = track_bodies(
+            recording.frames,
+            calibrations,
+            orientation,
+            bodies,
+            joints=joints,
+            options=options,
+            progress=bar,
+        )
     save_bodies(arguments.out, outcome, arguments.figures)
     print_unpaired(arguments.source, outcome.unpaired)
     print_findings(outcome.findings, 'doubtful: ')

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import DataError
+from ..errors import ErrorsAt
 from .arguments import (
     add_angle,
     add_angle_options,
@@ -337,10 +337,8 @@ def _marker_request(arguments: argparse.Namespace) -> MarkerRequest:
         calibrations = read_calibrations(arguments.calibration, arguments.fluoroscope)
         path = arguments.orientation or orientation_path(arguments.calibration)
         orientation = load_orientation(path).subset(arguments.fluoroscope)
-        try:
+        with ErrorsAt(path):
             check_orientation(orientation, calibrations)
-        except DataError as error:
-            raise error.at(path) from None
     return MarkerRequest(
         sources,
         first,

@@ -62,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> bool:
     """Heal a rig; return whether the verdict is pass. Raises DataError."""
-    from ..errors import DataError
+    from ..errors import ErrorsAt
     from ..io.bodies import read_bodies
     from ..io.rig_orientation import orientation_path
     from ..jobs.healing import (
@@ -81,13 +81,10 @@ def run(arguments: argparse.Namespace) -> bool:
     recording, calibrations, orientation = read_oriented_source(arguments, path)
     print_notes(recording.notes)
     options = options_of(HealingOptions, arguments, pair_tolerance=arguments.pair_tolerance)
-    try:
-        with ProgressBar('steps') as bar:
-            outcome = heal_rig(
-                recording.frames, calibrations, orientation, bodies, options, progress=bar
-            )
-    except DataError as error:
-        raise error.at(arguments.source) from None
+    with ErrorsAt(arguments.source), ProgressBar('steps') as bar:
+        outcome = heal_rig(
+            recording.frames, calibrations, orientation, bodies, options, progress=bar
+        )
     if outcome.healed is not None:
         save_healing(arguments.out, outcome, orientation)
     print_findings(outcome.findings, 'changed: ')

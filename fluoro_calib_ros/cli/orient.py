@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 
-from ..errors import DataError
+from ..errors import ErrorsAt
 from ..findings import sentences
 from .arguments import (
     add_bag_options,
@@ -93,10 +93,8 @@ def run(arguments: argparse.Namespace) -> None:
     present = saved_orientation(arguments.calibration)
     if present is not None and not belongs_to(present, calibrations):
         present = None
-    try:
+    with ErrorsAt(arguments.source):
         outcome = orient(frames, survey.phantom, calibrations, arguments.frame_id, present=present)
-    except DataError as error:
-        raise error.at(arguments.source) from None
     path = save_orientation(arguments.calibration, outcome.orientation)
     print_notes(outcome.findings)
     document = {

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..errors import DataError
+from ..errors import ErrorsAt
 from .arguments import (
     add_bag_options,
     add_calibration,
@@ -94,10 +94,8 @@ def run(arguments: argparse.Namespace) -> None:
         has_stamps=is_bag(arguments.source),
         pair_tolerance=arguments.pair_tolerance,
     )
-    try:
+    with ErrorsAt(arguments.source):
         outcome = reconstruct(frames, calibrations, orientation, options)
-    except DataError as error:
-        raise error.at(arguments.source) from None
     write_reconstruction(arguments.out, outcome.frames, recording.names)
     print_unpaired(arguments.source, outcome.unpaired)
     if outcome.disagreement:

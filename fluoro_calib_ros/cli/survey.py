@@ -9,7 +9,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import DataError
+from ..errors import DataError, ErrorsAt
 from ..options import declared
 from .arguments import (
     add_bag_options,
@@ -121,10 +121,8 @@ def run(arguments: argparse.Namespace) -> None:
         arguments.principal_distance,
         keep_given=arguments.keep_given,
     )
-    try:
+    with ErrorsAt(arguments.source):
         outcome = survey(request, print_round)
-    except DataError as error:
-        raise error.at(arguments.source) from None
     print_findings(outcome.findings, 'this cannot be right: ')
     failed = [check for check in outcome.validation.checks if check.passed is False]
     written = not failed or arguments.force

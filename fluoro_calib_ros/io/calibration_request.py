@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration, digest_of_sources
-from ..errors import DataError
+from ..errors import DataError, ErrorsAt
 from ..estimation.options import CalibrationOptions, CalibrationRequest
 from ..exposures.frame import Frame, validate_frame
 from ..exposures.phantom import Phantom
@@ -139,10 +139,8 @@ def _read_frames(
             frames[name] = [replace(frame, image_size=size) for frame in of_fluoroscope]
     for of_fluoroscope in frames.values():
         for frame in of_fluoroscope:
-            try:
+            with ErrorsAt(path):
                 validate_frame(frame)
-            except DataError as error:
-                raise error.at(path) from None
     return frames
 
 

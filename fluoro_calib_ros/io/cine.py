@@ -24,7 +24,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import DataError
+from ..errors import DataError, ErrorsAt
 from ..images.codec import check_size
 from .access import check_regular_file, os_error_reason
 
@@ -84,10 +84,8 @@ def read_cine_images(path: Path, header: CineHeader) -> Iterator[tuple[str, np.n
         with open(path, 'rb') as file:
             for number, offset in enumerate(header.offsets.tolist(), 1):
                 where = f'{path}, frame {number}'
-                try:
+                with ErrorsAt(where):
                     image = _image(file, offset, header)
-                except DataError as error:
-                    raise error.at(where) from None
                 yield where, image
     except OSError as error:
         raise DataError(f'cannot be read ({os_error_reason(error)})', at=path) from None

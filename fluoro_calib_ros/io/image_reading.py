@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from tifffile import TiffFile, TiffFileError, TiffWriter
 
-from ..errors import DataError
+from ..errors import DataError, ErrorsAt
 from ..exposures.frame import MAX_ANGLE
 from ..images.codec import as_grey, check_size, decode
 from .access import os_error_reason, read_bytes
@@ -154,10 +154,8 @@ def count_pages(path: str | PathLike[str]) -> int:
         complete = False
     if not count or not complete:
         raise DataError('this is no TIFF file, or it is cut off or damaged', at=path)
-    try:
+    with ErrorsAt(path):
         check_size(*size)
-    except DataError as error:
-        raise error.at(path) from None
     return count
 
 
@@ -240,10 +238,8 @@ def check_name(path: Path) -> None:
 
 def _read_image(path: Path) -> Iterator[tuple[str, np.ndarray]]:
     content = read_bytes(path)
-    try:
+    with ErrorsAt(path):
         image = decode(content)
-    except DataError as error:
-        raise error.at(path) from None
     yield str(path), image
 
 
@@ -265,10 +261,8 @@ def _read_pages(path: Path, pages: int) -> Iterator[tuple[str, np.ndarray]]:
         for image in images:
             done += 1
             where = f'{path}, page {done}'
-            try:
+            with ErrorsAt(where):
                 yield where, as_grey(image)
-            except DataError as error:
-                raise error.at(where) from None
         batch = max(1, MAX_BATCH_BYTES // images[0].nbytes)
 
 
@@ -279,10 +273,8 @@ def _open_video(path: Path) -> ImageSource:
     video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     if not video.isOpened():
         raise DataError('this is no video that can be read, or it is damaged', at=path)
-    try:
+    with ErrorsAt(path):
         check_size(*(int(video.get(key)) for key in VIDEO_SIZE))
-    except DataError as error:
-        raise error.at(path) from None
     frame_rate = video.get(cv2.CAP_PROP_FPS)
     count = max(0, round(video.get(cv2.CAP_PROP_FRAME_COUNT)))
     if not 0 < frame_rate < 1e6:

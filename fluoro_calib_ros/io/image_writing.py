@@ -18,7 +18,7 @@ from typing import cast
 import cv2
 import numpy as np
 
-from ..errors import DataError
+from ..errors import DataError, ErrorsAt
 from ..images.codec import encode
 from ..images.corrector import ImageCorrector
 from .access import atomic_file, make_folder, sync_folder, write_bytes
@@ -69,10 +69,8 @@ def write_images(out: Path, source: ImageSource, progress: Progress) -> int:
             f'({listed(IMAGE_SUFFIXES)})'
         )
     _, image = next(source.images)
-    try:
+    with ErrorsAt(out):
         content = encode(image, suffix)
-    except DataError as error:
-        raise error.at(out) from None
     write_bytes(out, content)
     progress(1, 1)
     return 1
@@ -250,10 +248,8 @@ def _corrected_images(
     out = None
     for number, (where, image) in enumerate(source.images, 1):
         corrector = correctors(number)
-        try:
+        with ErrorsAt(where):
             corrector.check(image)
-        except DataError as error:
-            raise error.at(where) from None
         if out is None or out.dtype != image.dtype:
             out = np.empty(corrector.shape, dtype=image.dtype)
         yield where, corrector.correct(image, out)

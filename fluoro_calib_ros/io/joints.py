@@ -39,7 +39,7 @@ from ..bodies.anatomical_frames import (
 )
 from ..bodies.joint_conventions import Convention, convention
 from ..bodies.joints import STATUS_NAMES, Joint, JointMotion, check_joints
-from ..errors import DataError
+from ..errors import DataError, ErrorsAt
 from ..limits import MAX_JOINTS
 from .access import PathLike, read_text
 from .csv_table import format_float, write_table
@@ -100,10 +100,8 @@ def read_joints(path: PathLike, bodies: Iterable[str]) -> tuple[JointEntry, ...]
     if len(found) > MAX_JOINTS:
         raise DataError(f'{path}: {len(found)} joints, more than {MAX_JOINTS} are not read')
     entries = tuple(_entry(path, n, table) for n, table in enumerate(found, 1))
-    try:
+    with ErrorsAt(path):
         check_joints([entry.joint for entry in entries], bodies)
-    except DataError as error:
-        raise error.at(path) from None
     return entries
 
 

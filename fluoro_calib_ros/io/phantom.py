@@ -13,7 +13,7 @@ import os
 
 import numpy as np
 
-from ..errors import DataError
+from ..errors import DataError, ErrorsAt
 from ..exposures.frame import MovingPoints
 from ..exposures.names import Names, without_trivial
 from ..exposures.phantom import Phantom, first_repeated
@@ -70,11 +70,9 @@ def _read(path: str | os.PathLike[str], column: NamedColumn) -> Phantom:
             f'{path}, row {lines[second]}: target {ids[second]} is already given in row '
             f'{lines[first]}'
         )
-    try:
+    with ErrorsAt(path):
         diameters = np.concatenate(diameter_parts) if diameter_parts else None
         return Phantom(ids, numbers[:, :3], numbers[:, 3], diameters)
-    except DataError as error:
-        raise error.at(path) from None
 
 
 def has_exposures(path: str | os.PathLike[str]) -> bool:

@@ -9,7 +9,7 @@ import os
 from contextlib import suppress
 from dataclasses import replace
 
-from ..errors import DataError
+from ..errors import DataError, ErrorsAt
 from ..limits import read_limits
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..records import Field
@@ -81,12 +81,10 @@ def load_orientation(path: PathLike) -> RigOrientation:
         )
     for name in values['fluoroscope'].tolist():
         check_safe_name(name, path)
-    try:
+    with ErrorsAt(path):
         orientation = RigOrientation(
             **{_ATTRIBUTES.get(name, name): value for name, value in values.items()}
         )
-    except DataError as error:
-        raise error.at(path) from None
     if orientation.orientation_id != identity:
         raise DataError(
             f'{path}: the content does not belong to its orientation_id {identity}, '

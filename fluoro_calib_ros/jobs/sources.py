@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
-from ..errors import DataError
+from ..errors import DataError, ErrorsAt
 from ..exposures.angles import AngleOptions
 from ..exposures.collector import collect_recorded
 from ..exposures.frame import Frame
@@ -154,10 +154,8 @@ def read_survey(path: str | os.PathLike[str], settings: FileSettings | None = No
     content = read_content(path, settings or FileSettings(), 'survey', 'phantom')
     if content.survey is None:
         raise DataError(f'{path}: the file has no phantom')
-    try:
+    with ErrorsAt(path):
         require_size(content.survey)
-    except DataError as error:
-        raise error.at(path) from None
     return Survey(content.survey, content.names, content.notes)
 
 
@@ -189,10 +187,8 @@ def _orientations_of_cameras(
     content = read_content(path, settings, 'cameras', 'camera')
     out = {}
     for camera in content.cameras:
-        try:
+        with ErrorsAt(f'{path}, camera {camera.name}'):
             out[camera.name] = KnownOrientation.from_matrices(camera.matrix, *camera.pose)
-        except DataError as error:
-            raise error.at(f'{path}, camera {camera.name}') from None
     return out
 
 

@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 from rosbags.typesys.store import Typestore
 
 from ...correction.calibration_record import FIELDS, VERSION
-from ...errors import DataError
+from ...errors import DataError, ErrorsAt
 from ...exposures.frame import Frame, stack_image_points
 
 PACKAGE = 'fluoro_calib_msgs'
@@ -248,12 +248,10 @@ def frame_from_message(message: Any, fluoroscope: str) -> Frame:
 
     Raises DataError for arrays of different lengths; nothing else is validated.
     """
-    try:
+    with ErrorsAt(f'frame {message.frame_number}'):
         target_id, uv, sigma = stack_image_points(
             message.target_id, message.u, message.v, message.sigma
         )
-    except DataError as error:
-        raise error.at(f'frame {message.frame_number}') from None
     stamp = message.header.stamp
     return Frame(
         fluoroscope=fluoroscope,

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from mcap.records import Schema
 
-from ...errors import DataError
+from ...errors import DataError, ErrorsAt
 from ...exposures.angles import AngleOptions, JointAngles
 from ...exposures.frame import Frame, validate_frame
 from ...exposures.strays import without_strays
@@ -97,7 +97,7 @@ def read_frames(source: PathLike, validate: bool = True) -> BagContents:
         name = fluoroscopes[message.topic]
         number = len(frames[name]) + 1
         where = f'{source}, topic {message.topic}, message {number}'
-        try:
+        with ErrorsAt(where):
             if len(message.data) > MAX_OBSERVATIONS:
                 raise DataError(
                     f'the message has {len(message.data)} bytes, more than {MAX_OBSERVATIONS} '
@@ -108,8 +108,6 @@ def read_frames(source: PathLike, validate: bool = True) -> BagContents:
                 frame, stray = without_strays(frame)
                 notes += [f'not used: {stray}'] if stray else []
                 validate_frame(frame)
-        except DataError as error:
-            raise error.at(where) from None
         if frames[name] and _is_restart(frames[name][-1], frame):
             restarts[name] += 1
         segments[name].append(restarts[name])
@@ -208,10 +206,8 @@ def _observation_topics(source: PathLike) -> dict[str, str]:
     for topic, info in topics_of(source).items():
         if info.type != TARGET_OBSERVATIONS:
             continue
-        try:
+        with ErrorsAt(source):
             name = fluoroscope_of_topic(topic)
-        except DataError as error:
-            raise error.at(source) from None
         check_safe_name(name, f'{source}, topic {topic}')
         for other, fluoroscope in out.items():
             if fluoroscope == name:
@@ -230,10 +226,8 @@ def _check_definitions(source: PathLike, topics: Collection[str]) -> None:
         for info in channels:
             if info.channel.topic not in topics:
                 continue
-            try:
+            with ErrorsAt(f'{path}, topic {info.channel.topic}'):
                 _check_definition(info)
-            except DataError as error:
-                raise error.at(f'{path}, topic {info.channel.topic}') from None
 
 
 def _check_definition(info: ChannelInfo) -> None:
@@ -399,10 +393,8 @@ def _read_states(source: PathLike, angles: JointAngles) -> None:
         )
     found: dict[str, set[str]] = {}  # topics by joint
     for message in iterate_messages(source, topics):
-        try:
+        with ErrorsAt(f'{source}, topic {message.topic}'):
             state = from_cdr(message.data, JOINT_STATE)
-        except DataError as error:
-            raise error.at(f'{source}, topic {message.topic}') from None
         for joint in state.name:
             found.setdefault(joint, set()).add(message.topic)
         stamp = state.header.stamp

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ...errors import DataError
+from ...errors import DataError, ErrorsAt
 from ...exposures.frame import Frame, points_on_image
 from ...exposures.phantom import Phantom, first_repeated
 from ..access import make_folder, write_text
@@ -218,10 +218,8 @@ def _survey(path: Path, rows: Sequence[Row], mm: float) -> Phantom:
     values = np.array([row.numbers() for row in rows])
     sd = np.sqrt(np.mean(values[:, 4:] ** 2, axis=1))
     ids = [row.whole(0, 'the target') for row in rows]
-    try:
+    with ErrorsAt(path):
         return Phantom(np.array(ids), from_units(values[:, 1:4], mm), from_units(sd, mm))
-    except DataError as error:
-        raise error.at(path) from None
 
 
 def write(path: Path, content: Content, settings: FileSettings) -> Written:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from ...errors import DataError
+from ...errors import DataError, ErrorsAt
 from ...photogrammetry.known_orientation import KnownOrientation
 from ..access import PathLike, read_text, write_text
 from ..documents import read_yaml
@@ -61,10 +61,8 @@ def write(path: Path, content: Content, settings: FileSettings) -> Written:
     for camera in content.cameras:
         refuse_distortion(path, camera, TITLE)
         common_focal_length(path, camera, TITLE)
-        try:
+        with ErrorsAt(f'camera {camera.name}'):
             known[camera.name] = KnownOrientation.from_matrices(camera.matrix, *camera.pose)
-        except DataError as error:
-            raise error.at(f'camera {camera.name}') from None
     write_known_orientations(path, known)
     return Written((str(path),))
 

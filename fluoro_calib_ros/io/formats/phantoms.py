@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import DataError
+from ...errors import DataError, ErrorsAt
 from ...exposures.names import MAX_ID, Names, number_names, without_trivial
 from ...exposures.phantom import Phantom
 from ...limits import read_limits
@@ -91,10 +91,8 @@ def _read_coordinates(path: Path, settings: FileSettings) -> Content:
         notes = (f'{path}: the file has no standard deviation, {DEFAULT_SD_MM:g} mm is used',)
     diameter = _positive(beads, layout, 'diameter') * mm if 'diameter' in layout.columns else None
     ids = _ids(beads, layout)
-    try:
+    with ErrorsAt(path):
         survey = Phantom(np.array(list(ids.values())), xyz, sd, diameter)
-    except DataError as error:
-        raise error.at(path) from None
     return Content(survey=survey, names=Names(without_trivial(ids)), notes=notes)
 
 
@@ -268,10 +266,8 @@ def content_of(path: Path, text: str, settings: FileSettings) -> Content:
         *notes,
         f'{path}: the format has no standard deviation, {DEFAULT_SD_MM:g} mm is used',
     )
-    try:
+    with ErrorsAt(path):
         survey = Phantom(np.array(list(ids.values())), xyz, np.full(len(xyz), DEFAULT_SD_MM))
-    except DataError as error:
-        raise error.at(path) from None
     return Content(survey=survey, names=Names(without_trivial(ids)), notes=notes)
 
 

@@ -23,7 +23,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from ...errors import DataError
+from ...errors import DataError, ErrorsAt
 from ...exposures.frame import Frame, points_on_image
 from ...exposures.names import Names, number_names, safe_names, without_trivial
 from ...images.codec import check_size, declared_size
@@ -146,10 +146,8 @@ class _Project:
                 return self.archive.whole(image, 'Width'), self.archive.whole(image, 'Height')
             name = self.archive.text(image, 'Filename')
             size = declared_size(memoryview(self.archive.member(name)))
-            try:
+            with ErrorsAt(f'{self.archive.path}: {name}'):
                 check_size(*size)
-            except DataError as error:
-                raise error.at(f'{self.archive.path}: {name}') from None
             if min(size) > 0:
                 return size
         if self.settings.image_size is None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -126,6 +125,16 @@ def add_orientation(parser: Parser) -> None:
     )
 
 
+def add_oriented_source(parser: argparse.ArgumentParser, options: type, **metavars: str) -> None:
+    """Add what `read_oriented_source` reads, and options with those of `RecordedPairing`."""
+    add_source(parser, 'image size of a file [px] (default: that of the calibration)')
+    add_bag_options(parser, pairing=False)
+    add_calibration(parser)
+    add_orientation(parser)
+    metavars = {'pair_tolerance': 'S', **metavars}
+    add_options(parser, options, **{name: {'metavar': text} for name, text in metavars.items()})
+
+
 def read_oriented_source(
     arguments: argparse.Namespace, path: PathLike
 ) -> tuple[Recording, dict[str, FluoroscopeCalibration], RigOrientation]:
@@ -217,8 +226,8 @@ def add_source(
 
 
 def add_bag_options(parser: argparse.ArgumentParser, pairing: bool = True) -> None:
-    """Add what is used of a bag: time window and, where it is not an option already, pairing."""
-    from ..exposures.pairing import PairingOptions
+    """Add what is used of a bag: time window and, where they are not options already, pairing."""
+    from ..exposures.pairing import RecordedPairing
 
     group = parser.add_argument_group('bags')
     for name, text in (('start', 'first'), ('end', 'last')):
@@ -228,13 +237,8 @@ def add_bag_options(parser: argparse.ArgumentParser, pairing: bool = True) -> No
             metavar='S',
             help=f'{text} time that is used [s from the stamp of the first frame] (default: all)',
         )
-    options = declared(PairingOptions)
     if pairing:
-        add_option(group, options['pair_by'])
-    tolerance = options['tolerance_s']
-    description = f'{tolerance.description}, with --pair-by stamp'
-    tolerance = replace(tolerance, name='pair_tolerance', description=description)
-    add_option(group, tolerance, metavar='S')
+        add_options(group, RecordedPairing, pair_tolerance={'metavar': 'S'})
     add_angle_options(group)
 
 

@@ -13,11 +13,7 @@ import numpy as np
 
 from ..errors import DataError, ErrorsAt
 from .arguments import (
-    add_bag_options,
-    add_calibration,
-    add_options,
-    add_orientation,
-    add_source,
+    add_oriented_source,
     number_in,
     options_of,
     read_oriented_source,
@@ -39,9 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     from ..jobs.bodies import BodiesOptions
 
-    add_source(parser, 'image size of a file [px] (default: that of the calibration)')
-    add_bag_options(parser, pairing=False)
-    add_calibration(parser)
+    add_oriented_source(parser, BodiesOptions, reject='S')
     parser.add_argument(
         '--bodies',
         required=True,
@@ -54,8 +48,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--joints', type=Path, metavar='FILE', help='joints between the bodies, TOML'
     )
     parser.add_argument('--out', required=True, type=Path, metavar='DIR', help='folder to write')
-    add_orientation(parser)
-    add_options(parser, BodiesOptions, reject={'metavar': 'S'})
     parser.add_argument(
         '--keep-shapes',
         action='store_true',
@@ -98,7 +90,6 @@ def run(arguments: argparse.Namespace) -> None:
     options = options_of(
         BodiesOptions,
         arguments,
-        pair_tolerance=arguments.pair_tolerance,
         estimate_shapes=not arguments.keep_shapes,
         rate=arguments.rate,
     )

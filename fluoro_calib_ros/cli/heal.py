@@ -12,12 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .arguments import (
-    add_bag_options,
-    add_calibration,
     add_exit_zero,
-    add_options,
-    add_orientation,
-    add_source,
+    add_oriented_source,
     options_of,
     read_oriented_source,
 )
@@ -37,9 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     from ..jobs.healing import HealingOptions
 
-    add_source(parser, 'image size of a file [px] (default: that of the calibration)')
-    add_bag_options(parser, pairing=False)
-    add_calibration(parser)
+    add_oriented_source(parser, HealingOptions)
     parser.add_argument(
         '--bodies',
         required=True,
@@ -55,8 +49,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='DIR',
         help='folder to write: calibrations and orientation as they are now, healing.json',
     )
-    add_orientation(parser)
-    add_options(parser, HealingOptions)
     add_exit_zero(parser)
 
 
@@ -80,7 +72,7 @@ def run(arguments: argparse.Namespace) -> bool:
     bodies = read_bodies(arguments.bodies)
     recording, calibrations, orientation = read_oriented_source(arguments, path)
     print_notes(recording.notes)
-    options = options_of(HealingOptions, arguments, pair_tolerance=arguments.pair_tolerance)
+    options = options_of(HealingOptions, arguments)
     with ErrorsAt(arguments.source), ProgressBar('steps') as bar:
         outcome = heal_rig(
             recording.frames, calibrations, orientation, bodies, options, progress=bar

@@ -12,11 +12,7 @@ from typing import TYPE_CHECKING
 
 from ..errors import ErrorsAt
 from .arguments import (
-    add_bag_options,
-    add_calibration,
-    add_options,
-    add_orientation,
-    add_source,
+    add_oriented_source,
     options_of,
     read_oriented_source,
 )
@@ -34,12 +30,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     from ..jobs.reconstruction import ReconstructionOptions
 
-    add_source(parser, 'image size of a file [px] (default: that of the calibration)')
-    add_bag_options(parser, pairing=False)
-    add_calibration(parser)
+    add_oriented_source(parser, ReconstructionOptions, reject='S')
     parser.add_argument('--out', required=True, type=Path, metavar='OUT.csv', help='file to write')
-    add_orientation(parser)
-    add_options(parser, ReconstructionOptions, reject={'metavar': 'S'})
     parser.add_argument(
         '--cluster',
         action='append',
@@ -92,7 +84,6 @@ def run(arguments: argparse.Namespace) -> None:
         drift_watch=not arguments.no_drift_watch,
         bodies=arguments.bodies,
         has_stamps=is_bag(arguments.source),
-        pair_tolerance=arguments.pair_tolerance,
     )
     with ErrorsAt(arguments.source):
         outcome = reconstruct(frames, calibrations, orientation, options)

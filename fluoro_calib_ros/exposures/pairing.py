@@ -18,7 +18,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
-from ..options import option
+from ..options import option, validate_options
 from .stamp_agreement import StampAgreement, StampedFrame
 
 PAIR_BY = ('frame_number', 'stamp')
@@ -73,6 +73,25 @@ class PairingOptions:
         if self.pair_by not in PAIR_BY:
             raise ValueError(f"pair_by is 'frame_number' or 'stamp', not {self.pair_by!r}")
         return self.pair_by == 'frame_number'
+
+
+@dataclass(frozen=True)
+class RecordedPairing:
+    """How a recording is paired. Raises ValueError for a value that an option cannot have."""
+
+    pair_by: str = option(
+        'frame_number', 'what the frames of one exposure have in common', choices=PAIR_BY
+    )
+    pair_tolerance: float = option(
+        PairingOptions.tolerance_s,
+        'largest difference between the stamps of an exposure, with --pair-by stamp',
+        minimum=0.0,
+        maximum=1.0,
+        unit='s',
+    )
+
+    def __post_init__(self) -> None:
+        validate_options(self)
 
 
 class Pairer(Protocol):

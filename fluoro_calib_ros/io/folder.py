@@ -19,9 +19,10 @@ import os
 import secrets
 import shutil
 import stat
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 from ..errors import DataError
@@ -44,11 +45,22 @@ class FolderKind:
     """What a folder of one kind consists of."""
 
     title: str  #: what it is called in messages, such as 'a result folder'
-    #: whether an entry of this name is part of such a folder, and is replaced with it; all other
-    #: entries belong to the user and are carried over
-    is_own: Callable[[str], bool]
-    #: whether an entry of this name shows that a folder is of this kind
-    marks: Callable[[str], bool]
+    #: patterns of the names of entries that are replaced with such a folder; all others belong to
+    #: the user and are carried over
+    parts: tuple[str, ...]
+    marks: tuple[str, ...]  #: patterns of names that show that a folder is of this kind
+
+    def owns(self, name: str) -> bool:
+        """Return whether an entry is a part of the folder, or what a killed run left of one."""
+        return _matches(name, (*self.parts, '.*.tmp'))
+
+    def is_marked_by(self, name: str) -> bool:
+        """Return whether an entry of this name shows that a folder is of this kind."""
+        return _matches(name, self.marks)
+
+
+def _matches(name: str, patterns: Iterable[str]) -> bool:
+    return any(fnmatchcase(name, pattern) for pattern in patterns)
 
 
 def check_output_folder(path: PathLike, kind: FolderKind, inputs: Iterable[PathLike] = ()) -> None:
@@ -253,7 +265,7 @@ def _move_entries(staging: str, target: str, kind: FolderKind) -> None:
     new = set(os.listdir(staging))
     for name in os.listdir(target):
         path = os.path.join(target, name)
-        if kind.is_own(name) and (name not in new or os.path.isdir(path)):
+        if kind.owns(name) and (name not in new or os.path.isdir(path)):
             _delete(path)
     for name in sorted(new):
         os.replace(os.path.join(staging, name), os.path.join(target, name))
@@ -272,7 +284,7 @@ def _carry_over(old: str, new: str, kind: FolderKind) -> None:
 
     for name in sorted(os.listdir(old)):
         source = os.path.join(old, name)
-        if kind.is_own(name):
+        if kind.owns(name):
             continue
         if os.path.isdir(source) and not os.path.islink(source):
             shutil.copytree(source, os.path.join(new, name), symlinks=True, copy_function=link)
@@ -342,7 +354,7 @@ def _is_fixed(target: str, kind: FolderKind) -> bool:
 
 
 def _is_of_kind(path: str, kind: FolderKind) -> bool:
-    return os.path.isdir(path) and any(kind.marks(name) for name in os.listdir(path))
+    return os.path.isdir(path) and any(kind.is_marked_by(name) for name in os.listdir(path))
 
 
 def _check_kind(folder: str, kind: FolderKind) -> None:
@@ -357,7 +369,7 @@ def _check_kind(folder: str, kind: FolderKind) -> None:
         ]
     except OSError as error:
         raise DataError(f'{folder}: cannot be read ({os_error_reason(error)})') from None
-    if names and not any(kind.marks(name) for name in names):
+    if names and not any(kind.is_marked_by(name) for name in names):
         raise DataError(
             f'{folder}: this is not {kind.title}, it holds {min(names)}; it is not overwritten'
         )

@@ -18,7 +18,7 @@ from ..bodies.tracking import BodyTracker, TrackedExposure, poses_alone, poses_o
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError
 from ..exposures.frame import Frame
-from ..exposures.pairing import PAIR_BY, PairingOptions
+from ..exposures.pairing import RecordedPairing
 from ..findings import Finding, Kind, Place, Severity
 from ..io.access import PathLike
 from ..io.bodies import write_bodies
@@ -26,11 +26,16 @@ from ..io.folder import FolderKind, check_output_folder, replaced_folder
 from ..io.formats.opensim import write_joint_motion
 from ..io.joints import JointEntry, write_joints
 from ..io.poses import write_motion, write_poses
-from ..options import option, validate_options
+from ..options import option
 from ..photogrammetry.noise import ObservedScatter
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.intersection import OK, OUTSIDE, Intersector
-from ..reconstruction.reconstruct import IntersectedViews, intersect_frames, pair_recording
+from ..reconstruction.reconstruct import (
+    IntersectedViews,
+    intersect_frames,
+    orientation_of_recorded,
+    pair_recording,
+)
 
 SMOOTH = ('auto', 'none', 'lag', 'butterworth')
 SHAPE_EXPOSURES = 600  # of a recording that shapes are estimated from, evenly spread
@@ -38,7 +43,7 @@ NS_PER_S = 1_000_000_000
 
 
 @dataclass(frozen=True)
-class BodiesOptions:
+class BodiesOptions(RecordedPairing):
     """Options of poses and joints. Raises ValueError for a value that an option cannot have."""
 
     smooth: str = option(
@@ -60,15 +65,8 @@ class BodiesOptions:
         maximum=1000.0,
         unit='standard deviations',
     )
-    pair_by: str = option(
-        'frame_number', 'what the frames of one exposure have in common', choices=PAIR_BY
-    )
-    pair_tolerance: float = PairingOptions.tolerance_s
     estimate_shapes: bool = True
     rate: float | None = None
-
-    def __post_init__(self) -> None:
-        validate_options(self)
 
 
 @dataclass(frozen=True)
@@ -164,19 +162,6 @@ def track_bodies(
         unpaired=unpaired,
         findings=tuple(findings),
     )
-
-
-def orientation_of_recorded(
-    frames: Mapping[str, Sequence[Frame]], orientation: RigOrientation
-) -> RigOrientation:
-    """Return the orientation of the recorded fluoroscopes. Raises DataError for less than two."""
-    names = [name for name in orientation.fluoroscopes if name in frames]
-    if len(names) < 2:
-        raise DataError(
-            f'there are image points of {", ".join(frames)}, but two fluoroscopes of the '
-            f'orientation ({", ".join(orientation.fluoroscopes)}) are needed'
-        )
-    return orientation.subset(names)
 
 
 @dataclass(frozen=True)
@@ -291,18 +276,11 @@ SHAPES = 'shapes.csv'
 JOINTS = 'joints.csv'
 OPENSIM = 'joints.mot'
 FIGURES = 'figures'
-NAMES = (POSES, MOTION, SHAPES, JOINTS, OPENSIM, FIGURES)
-
-
-def _is_own(name: str) -> bool:
-    return name in NAMES or (name.startswith('.') and name.endswith('.tmp'))
-
-
-def _marks(name: str) -> bool:
-    return name == POSES
-
-
-BODIES_FOLDER = FolderKind('a folder of bodies', _is_own, _marks)
+BODIES_FOLDER = FolderKind(
+    'a folder of bodies',
+    parts=(POSES, MOTION, SHAPES, JOINTS, OPENSIM, FIGURES),
+    marks=(POSES,),
+)
 
 
 def check_bodies_folder(directory: PathLike, inputs: Iterable[PathLike]) -> None:

@@ -25,7 +25,7 @@ from ..correction.fluoroscope_calibration import FluoroscopeCalibration, with_dr
 from ..correction.series import sd_over_image
 from ..errors import DataError
 from ..exposures.frame import Frame
-from ..exposures.pairing import PAIR_BY, PairingOptions
+from ..exposures.pairing import RecordedPairing
 from ..findings import Finding, Kind, Place, Severity
 from ..io.access import PathLike
 from ..io.calibration import SUFFIX, save_calibration
@@ -33,11 +33,9 @@ from ..io.documents import write_json
 from ..io.folder import FolderKind, check_output_folder, replaced_folder
 from ..io.rig_orientation import NAME as ORIENTATION
 from ..io.rig_orientation import save_orientation
-from ..options import option, validate_options
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.intersection import OK, OUTSIDE, Intersector
-from ..reconstruction.reconstruct import pair_recording
-from .bodies import orientation_of_recorded
+from ..reconstruction.reconstruct import orientation_of_recorded, pair_recording
 
 BLOCKS = 10  # of a recording, used in turn for the diagnosis and for its verdict
 MAX_EXPOSURES = 200  # of a recording that are used for each, evenly spread
@@ -48,16 +46,8 @@ IDENTIFIED = 0.5
 
 
 @dataclass(frozen=True)
-class HealingOptions:
+class HealingOptions(RecordedPairing):
     """Options of healing. Raises ValueError for a value that an option cannot have."""
-
-    pair_by: str = option(
-        'frame_number', 'what the frames of one exposure have in common', choices=PAIR_BY
-    )
-    pair_tolerance: float = PairingOptions.tolerance_s
-
-    def __post_init__(self) -> None:
-        validate_options(self)
 
 
 @dataclass(frozen=True)
@@ -430,16 +420,9 @@ HEALING = 'healing.json'
 VERSION = 1
 
 
-def _is_own(name: str) -> bool:
-    hidden = name.startswith('.') and name.endswith('.tmp')
-    return name in (HEALING, ORIENTATION) or name.endswith(SUFFIX) or hidden
-
-
-def _marks(name: str) -> bool:
-    return name == HEALING
-
-
-HEALING_FOLDER = FolderKind('a folder of a healed rig', _is_own, _marks)
+HEALING_FOLDER = FolderKind(
+    'a folder of a healed rig', parts=(HEALING, ORIENTATION, f'*{SUFFIX}'), marks=(HEALING,)
+)
 
 
 def check_healing_folder(directory: PathLike, inputs: Iterable[PathLike]) -> None:

@@ -38,34 +38,15 @@ from ..photogrammetry.rig_orientation import RigOrientation
 from .calibration import CalibrationOutcome
 
 REPORT = 'report.html'
-# All that belongs to one calibration; calibrations of other fluoroscopes stay in the folder.
-_OWN = (
-    RESULT,
-    OBSERVATIONS,
-    PHANTOM,
-    OPTIONS,
-    KNOWN_ORIENTATION,
-    ORIENTATION,
-    names.NAMES_FILE,
-    VALIDATION_NAME,
-    *TABLES,
-    'figures',
-    REPORT,
+# Calibrations of other fluoroscopes stay in the folder.
+RESULT_FOLDER = FolderKind(
+    'a result folder',
+    parts=(
+        *(RESULT, OBSERVATIONS, PHANTOM, OPTIONS, KNOWN_ORIENTATION, ORIENTATION),
+        *(names.NAMES_FILE, VALIDATION_NAME, *TABLES, f'*{COVARIANCE}', 'figures', REPORT),
+    ),
+    marks=(RESULT, ORIENTATION, f'*{SUFFIX}'),
 )
-
-
-def _is_own(name: str) -> bool:
-    """Return whether an entry belongs to a result, or is what a killed run left of a file."""
-    if name in _OWN or name.endswith(COVARIANCE):
-        return True
-    return name.startswith('.') and name.endswith('.tmp')
-
-
-def _marks(name: str) -> bool:
-    return name in (RESULT, ORIENTATION) or name.endswith(SUFFIX)
-
-
-RESULT_FOLDER = FolderKind('a result folder', _is_own, _marks)
 
 
 def save_outcome(

@@ -353,30 +353,14 @@ def _camera(
 
 
 HOUR_NS = 3600 * 10**9
-_PARTS = (
-    'calibration',
-    'calibration.csv',
-    'test',
-    'test.csv',
-    'tracking',
-    'phantom.csv',
-    IMAGES,
-    MARKER_IMAGES,
-    FIRST_MARKERS,
-    CLUSTERS,
-    *MOTIONS,
-    BODIES,
-    JOINTS,
-    TRUTH,
+DATA_SET = FolderKind(
+    'a data set of the virtual rig',
+    parts=(
+        *('calibration', 'calibration.csv', 'test', 'test.csv', 'tracking', 'phantom.csv'),
+        *(IMAGES, MARKER_IMAGES, FIRST_MARKERS, CLUSTERS, *MOTIONS, BODIES, JOINTS, TRUTH),
+    ),
+    marks=(TRUTH,),
 )
-
-
-def _is_own(name: str) -> bool:
-    """Return whether an entry belongs to a data set, or is what a killed run left of a part."""
-    return name in _PARTS or (name.startswith('.') and name.endswith('.tmp'))
-
-
-DATA_SET = FolderKind('a data set of the virtual rig', _is_own, lambda name: name == TRUTH)
 
 
 @dataclasses.dataclass(frozen=True)

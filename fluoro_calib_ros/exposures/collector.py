@@ -76,14 +76,8 @@ class StillOptions:
 class ExposureCollector:
     """Exposures collected from paired frames.
 
-    Attributes
-    ----------
-    fluoroscopes : tuple of str
-    still : StillOptions
-    exposures : list of dict of str to Frame
-        The collected pairs.
-    coverage : dict of str to Coverage
-        Coverage of the image by fluoroscope; it grows with the exposures.
+    exposures are the collected pairs, coverage that of the image by fluoroscope, which grows with
+    them.
     """
 
     def __init__(self, fluoroscopes: Iterable[str], still: StillOptions | None = None) -> None:

@@ -93,20 +93,12 @@ def validate_frame(
 ) -> None:
     """Validate a frame before it is used in a calculation.
 
-    Parameters
-    ----------
-    frame : Frame
-    phantom : Phantom, optional
-        The frame may only contain its targets.
-    image_size : (int, int), optional
-        Image size of the calibration [px], which the frame must have.
+    Of a phantom, the frame may only contain its targets; image_size [px] is that of the
+    calibration, which the frame must have.
 
-    Raises
-    ------
-    DataError
-        For an empty frame, arrays of different lengths, values that are not finite, a sigma that
-        is not positive, a point off the image, a repeated or unknown target, or another image
-        size. The message names the fluoroscope, the frame and the first wrong target.
+    Raises DataError that names the fluoroscope, the frame and the first wrong target: for an empty
+    frame, arrays of different lengths, values that are not finite, a sigma that is not positive, a
+    point off the image, a repeated or unknown target, or another image size.
     """
     error = _frame_error(frame, phantom, image_size)
     if error:

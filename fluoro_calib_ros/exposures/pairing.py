@@ -178,17 +178,8 @@ class CompletePairer:
     Frames belong together by number, or by stamp within the tolerance. Of each fluoroscope the
     last `waiting` frames wait for their partners; a frame that is displaced counts as unpaired. A
     frame that arrives after one of its partners was displaced is late: it counts as late and as
-    unpaired. Exposures may be ready in another order than that of their frames.
-
-    Parameters
-    ----------
-    fluoroscopes : iterable of str
-    options : PairingOptions, optional
-
-    Raises
-    ------
-    ValueError
-        For an unknown pair_by.
+    unpaired. Exposures may be ready in another order than that of their frames. Raises ValueError
+    for an unknown pair_by.
     """
 
     def __init__(self, fluoroscopes: Iterable[str], options: PairingOptions | None = None) -> None:
@@ -295,17 +286,8 @@ class PartialPairer:
     nothing while two others went on by `patience` frames is silent: it is not waited for until it
     delivers again. Of each fluoroscope at most `waiting` frames wait. A frame alone in its
     exposure counts as unpaired. One that arrives after its exposure, or after a later one of its
-    own stream, counts as late, too. A stream that starts again releases all waiting frames.
-
-    Parameters
-    ----------
-    fluoroscopes : iterable of str
-    options : PairingOptions, optional
-
-    Raises
-    ------
-    ValueError
-        For an unknown pair_by.
+    own stream, counts as late, too. A stream that starts again releases all waiting frames. Raises
+    ValueError for an unknown pair_by.
     """
 
     def __init__(self, fluoroscopes: Iterable[str], options: PairingOptions | None = None) -> None:

@@ -138,13 +138,8 @@ class _Followed:
 class MarkerTracker:
     """Follows markers through the images of one fluoroscope.
 
-    Parameters
-    ----------
-    options : MarkerOptions, optional
-    first : FirstMarkers
-        Ids and places in the first image.
-    later : (k,) ndarray of int, optional
-        Markers that are followed once their places are suggested.
+    first: ids and places in the first image; later (k,): ids of markers that are followed once
+    their places are suggested.
     """
 
     def __init__(
@@ -172,25 +167,12 @@ class MarkerTracker:
         return None if self._followed is None else self._followed.measurement.profile
 
     def update(self, image: np.ndarray | None, frame: int) -> MarkerFrame:
-        """Measure the markers of the next image.
+        """Measure the markers of the next image (h, w), of uint8 or uint16; None: there is none.
 
-        Parameters
-        ----------
-        image : (h, w) ndarray of uint8 or uint16, or None
-            None where there is no image of this number.
-        frame : int
-            Number of the image, above that of the one before; markers move on through numbers
-            that are left out.
-
-        Returns
-        -------
-        MarkerFrame
-            With all markers missing, and why, for an image in which nothing can be seen.
-
-        Raises
-        ------
-        DataError
-            For a number that does not grow; for a first image without the markers.
+        frame is its number, above that of the one before; markers move on through numbers that are
+        left out. For an image in which nothing can be seen, all markers are missing, and the
+        finding says why. Raises DataError for a number that does not grow, and for a first image
+        without the markers.
         """
         begin = time.perf_counter()
         followed = self._followed

@@ -126,20 +126,7 @@ class PhantomModel:
 def match(seen: Seen, model: PhantomModel, lens: Lens) -> Match:
     """Match what was found in an image with a phantom.
 
-    Parameters
-    ----------
-    seen : Seen
-    model : PhantomModel
-    lens : Lens
-
-    Returns
-    -------
-    Match
-
-    Raises
-    ------
-    DataError
-        Where no pose is sure, with the reason.
+    Raises DataError where no pose is sure, with the reason.
     """
     if len(seen.uv) < MIN_BEADS:
         raise DataError(

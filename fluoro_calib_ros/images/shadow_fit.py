@@ -102,12 +102,8 @@ def window_offsets(radius_px: float) -> np.ndarray:
 class FineGrid:
     """Grid finer than the pixels, on which light that passes several beads is blurred.
 
-    The blur of the light that passes two beads is not the product of their blurred shadows.
-
-    Attributes
-    ----------
-    axis : (a,) ndarray
-        Coordinates of its points, from the middle of a window [px].
+    The blur of the light that passes two beads is not the product of their blurred shadows. axis
+    (a,) are the coordinates of its points, from the middle of a window [px].
     """
 
     def __init__(self, offset: np.ndarray, blur_px: float) -> None:

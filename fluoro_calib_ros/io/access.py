@@ -124,16 +124,8 @@ def make_folder(path: PathLike) -> None:
 def atomic_file(path: PathLike, mode: str = 'wb') -> Iterator[IO[Any]]:
     """Open a file for writing that gets its name when the block ends without an error.
 
-    Parameters
-    ----------
-    path : path-like
-    mode : {'wb', 'w'}
-        Bytes, or UTF-8 text without conversion of line ends.
-
-    Raises
-    ------
-    DataError
-        Where the file cannot be written. After any exception an earlier file is unchanged.
+    mode is 'wb', or 'w' for UTF-8 text without conversion of line ends. Raises DataError where the
+    file cannot be written. After any exception an earlier file is unchanged.
     """
     target = os.path.realpath(path)  # a symbolic link remains one
     folder, name = os.path.split(target)

@@ -264,12 +264,8 @@ def _is_number(cell: str, kind: Callable[[str], Any]) -> bool:
 class NamedColumn:
     """The ids of a column, read block by block.
 
-    Parameters
-    ----------
-    column : str
-    known : mapping of str to int, or None
-        Names with known ids; None where the column may only have whole numbers. A column has names
-        if none of its first cells is a number.
+    known: names with known ids, None where the column may only have whole numbers. A column has
+    names if none of its first cells is a number.
     """
 
     def __init__(self, column: str, known: Mapping[str, int] | None) -> None:

@@ -109,17 +109,9 @@ def check_output_file(path: PathLike, inputs: Iterable[PathLike] = ()) -> None:
 def replaced_folder(path: PathLike, kind: FolderKind) -> Iterator[Path]:
     """Yield a new folder to write into, which gets its name when the block ends without an error.
 
-    Parameters
-    ----------
-    path : path-like
-    kind : FolderKind
-        Entries of an earlier folder that are not of this kind are carried over. A part of the
-        earlier folder that is to be kept is to be written again.
-
-    Raises
-    ------
-    DataError
-        Where the folder cannot be written. After any exception the earlier folder is unchanged.
+    Entries of an earlier folder that are not of this kind are carried over; a part of it that is
+    to be kept is to be written again. Raises DataError where the folder cannot be written. After
+    any exception the earlier folder is unchanged.
     """
     check_output_folder(path, kind)
     target = os.path.realpath(path)
@@ -265,7 +257,7 @@ def _move_entries(staging: str, target: str, kind: FolderKind) -> None:
     new = set(os.listdir(staging))
     for name in os.listdir(target):
         path = os.path.join(target, name)
-        if kind.owns(name) and (name not in new or os.path.isdir(path)):
+        if path != staging and kind.owns(name) and (name not in new or os.path.isdir(path)):
             _delete(path)
     for name in sorted(new):
         os.replace(os.path.join(staging, name), os.path.join(target, name))

@@ -108,11 +108,7 @@ logging.getLogger('tifffile').addHandler(logging.NullHandler())
 class StackWriter:
     """Writes uncompressed pages into a seekable binary file; to be used in a with statement.
 
-    Parameters
-    ----------
-    file : binary file
-    pages, page_bytes : int
-        Largest number of pages and the size of one; they decide the size of the offsets.
+    The largest number of pages and the size of one decide the size of the offsets.
     """
 
     def __init__(self, file: IO[bytes], pages: int, page_bytes: int) -> None:

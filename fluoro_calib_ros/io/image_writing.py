@@ -309,13 +309,8 @@ def folder_like(out: Path, source: ImageFolder) -> Iterator[Path]:
     """A temporary folder with the folders of another one; at the end its files move to `out`.
 
     Files of the same names in `out` are replaced, other ones stay. After an error, `out` is as it
-    was.
-
-    Raises
-    ------
-    DataError
-        Where `out` is a file, the source itself, or inside of it and would be read as a part of
-        it, and where a file would replace a folder.
+    was. Raises DataError where `out` is a file, the source itself, or inside of it and would be
+    read as a part of it, and where a file would replace a folder.
     """
     check_apart(source.path, out)
     if out.exists() and not out.is_dir():

@@ -57,24 +57,11 @@ def read_observations_csv(
     """Read the frames of a CSV file, fluoroscopes by name and exposures by number.
 
     The rows of a frame may be anywhere in the file. sigma is given for all targets of a frame or
-    for none.
+    for none. image_size is that of all fluoroscopes [px]; it is required, as the file does not
+    contain it.
 
-    Parameters
-    ----------
-    path : path-like
-    image_size : (int, int), optional
-        Width and height of the images of all fluoroscopes [px]; required, as the file does not
-        contain it.
-
-    Returns
-    -------
-    dict of str to list of Frame
-
-    Raises
-    ------
-    DataError
-        For text that is not a number, a point off the image, and a target that occurs twice in a
-        frame. The message names the row.
+    Raises DataError that names the row for text that is not a number, a point off the image, and a
+    target that occurs twice in a frame.
     """
     return _read(path, image_size, _Columns(None))[0]
 

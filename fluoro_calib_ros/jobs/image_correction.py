@@ -72,22 +72,10 @@ def run_image_correction(
 ) -> CorrectedImages:
     """Correct an image file, a stack, a video, or all of them in a folder.
 
-    Parameters
-    ----------
-    request : ImageCorrectionRequest
-    progress : callable, optional
-        Called with what is done, and the total: images of a file, files of a folder.
-
-    Returns
-    -------
-    CorrectedImages
-
-    Raises
-    ------
-    DataError
-        If a source cannot be read, is damaged, or is no grey image of the size of the
-        calibration; if `out` cannot be written, or its format cannot hold the images; for
-        workers that are lost, and angles of a folder. `out` is left as it was.
+    progress is called with what is done, and the total: images of a file, files of a folder.
+    Raises DataError if a source cannot be read, is damaged, or is no grey image of the size of the
+    calibration; if `out` cannot be written, or its format cannot hold the images; for workers that
+    are lost, and angles of a folder. `out` is left as it was.
     """
     if not request.source.is_dir():
         if request.angles is not None:

@@ -215,23 +215,10 @@ def run_marker_extraction(
 ) -> MarkerOutcome:
     """Follow markers through the images of one or two fluoroscopes.
 
-    A damaged image, or one of another size, is passed over, and its result says why.
-
-    Parameters
-    ----------
-    request : MarkerRequest
-    progress : callable, optional
-        Called after every exposure with the number of those that are done, and their total.
-
-    Returns
-    -------
-    MarkerOutcome
-
-    Raises
-    ------
-    DataError
-        For sources that cannot be read, markers that are not in the images, and fluoroscopes
-        without calibration.
+    A damaged image, or one of another size, is passed over, and its result says why. progress is
+    called after every exposure with the number of those that are done, and their total. Raises
+    DataError for sources that cannot be read, markers that are not in the images, and fluoroscopes
+    without calibration.
     """
     names = list(request.sources)
     sources = {name: open_sources(request.sources[name], name, request.angles) for name in names}

@@ -39,22 +39,11 @@ class Workers(Protocol):
 def open_workers(
     count: int = 0, scheduler: Cluster | str | None = None, tasks: int = 0
 ) -> AbstractContextManager[Workers]:
-    """Return workers, as a context that ends them.
+    """Return workers, as a context that ends them: processes, or those of a Dask cluster.
 
-    Parameters
-    ----------
-    count : int
-        Processes; 0: as many as there are cores.
-    scheduler : Cluster or str or None
-        A Dask cluster, or the address of the scheduler of one, in place of processes.
-    tasks : int
-        How many there will be, 0 where it is not known. For a single one, no process is started.
-
-    Raises
-    ------
-    DataError
-        Where the scheduler cannot be reached or is not trusted, or the package `distributed` is
-        missing.
+    count: of the processes, 0 for as many as there are cores. tasks: how many there will be, 0
+    where it is not known; for a single one, no process is started. Raises DataError where the
+    scheduler cannot be reached or is not trusted, or the package `distributed` is missing.
     """
     if scheduler is not None:
         return DaskWorkers(Cluster(scheduler) if isinstance(scheduler, str) else scheduler)

@@ -310,13 +310,7 @@ class RenderedScene:
 
 
 class Renderers:
-    """Takes radiographs with the fluoroscopes of a virtual rig, each in a process of its own.
-
-    Parameters
-    ----------
-    fluoroscopes : sequence of VirtualFluoroscope
-    settings : RadiographSettings
-    """
+    """Takes radiographs with the fluoroscopes of a virtual rig, each in a process of its own."""
 
     def __init__(
         self, fluoroscopes: Sequence[VirtualFluoroscope], settings: RadiographSettings

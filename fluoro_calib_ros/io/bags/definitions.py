@@ -175,17 +175,8 @@ def _count_empty(message: Any) -> int:
 def fields_of(msg_type: str, text: str, encoding: str) -> dict[str, Any]:
     """Return the fields of a message type and of those it depends on, by type.
 
-    Parameters
-    ----------
-    msg_type : str
-    text : str
-        Definition in the schema of a bag.
-    encoding : {'ros2msg', 'ros2idl'}
-
-    Raises
-    ------
-    DataError
-        For a definition that cannot be read.
+    text is the definition in the schema of a bag, encoding 'ros2msg' or 'ros2idl'. Raises
+    DataError for a definition that cannot be read.
     """
     try:
         if encoding == 'ros2msg':

@@ -66,25 +66,12 @@ def read_frames(source: PathLike, validate: bool = True) -> BagContents:
     """Read all frames of a bag: those of every topic of type TargetObservations.
 
     The fluoroscope is the part of the topic's name before the last. Where the frame numbers of a
-    stream begin again, a power of ten is added to those that follow, so that they differ.
+    stream begin again, a power of ten is added to those that follow, so that they differ. Without
+    validate only the lengths of the arrays of a frame are checked.
 
-    Parameters
-    ----------
-    source : path-like
-        An .mcap file or a bag folder.
-    validate : bool
-        Whether every frame is validated; else only the lengths of its arrays are checked.
-
-    Returns
-    -------
-    BagContents
-
-    Raises
-    ------
-    DataError
-        For a source that is not a bag, a damaged or truncated one, one without observations, a
-        different definition of the message, and an invalid or repeated frame. The message names
-        bag, topic and message.
+    Raises DataError that names bag, topic and message: for a source that is not a bag, a damaged
+    or truncated one, one without observations, a different definition of the message, and an
+    invalid or repeated frame.
     """
     fluoroscopes = _observation_topics(source)
     _check_definitions(source, fluoroscopes)
@@ -340,19 +327,9 @@ def with_angles(
 ) -> tuple[dict[str, list[Frame]], tuple[str, ...]]:
     """Return frames of a bag with the angles that the nodes give them, and notes about them.
 
-    Parameters
-    ----------
-    source : path-like
-    frames : mapping of str to sequence of Frame
-        By fluoroscope.
-    options : AngleOptions
-        Which joint is the C-arm, in any topic of joint states.
-
-    Raises
-    ------
-    DataError
-        For a bag without this joint, with states of it on several topics or damaged ones, and for
-        a joint of another fluoroscope.
+    options say which joint is the C-arm, in any topic of joint states. Raises DataError for a bag
+    without this joint, with states of it on several topics or damaged ones, and for a joint of
+    another fluoroscope.
     """
     angles = angles_in(source, frames, options)
     if not angles.joints:

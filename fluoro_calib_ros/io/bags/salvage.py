@@ -404,23 +404,9 @@ class Salvage:
 
 
 def recover_bag(source: PathLike, out: PathLike) -> Recovery:
-    """Write the intact messages of a bag to a new one.
+    """Write the intact messages of a bag to a new one, which must not exist.
 
-    Parameters
-    ----------
-    source : path-like
-        An .mcap file or a bag folder.
-    out : path-like
-        Folder of the new bag, which must not exist.
-
-    Returns
-    -------
-    Recovery
-
-    Raises
-    ------
-    DataError
-        For a source without any intact message, and where the bag cannot be written.
+    Raises DataError for a source without any intact message, and where the bag cannot be written.
     """
     salvage = Salvage(source)
     if os.path.realpath(out).startswith(os.path.join(os.path.realpath(source), '')):

@@ -69,17 +69,9 @@ class Row:
 def read_table(path: PathLike, separator: str | None = None) -> list[Row]:
     """Return the rows of a text file that are not blank.
 
-    Parameters
-    ----------
-    path : path-like
-    separator : str, optional
-        ' ' for any blanks. By default a semicolon where the first row has one, then with decimal
-        commas, as spreadsheets write it in many countries; else a tabulator or a comma.
-
-    Raises
-    ------
-    DataError
-        For a file that cannot be read, is not text or has no rows.
+    separator: ' ' for any blanks; by default a semicolon where the first row has one, then with
+    decimal commas, as spreadsheets write it in many countries, else a tabulator or a comma. Raises
+    DataError for a file that cannot be read, is not text or has no rows.
     """
     return table_of(path, read_text(path), separator)
 

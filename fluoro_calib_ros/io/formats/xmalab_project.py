@@ -398,19 +398,10 @@ DOCUMENT = 'project.xml'
 
 
 class ProjectArchive:
-    """An open project; a context manager.
+    """An open project; a context manager. root is the element of project.xml.
 
-    Attributes
-    ----------
-    path : Path
-        For messages.
-    root : Element
-        Of project.xml.
-
-    Raises
-    ------
-    DataError
-        Where the file is no project; so do the methods, for whatever is missing or damaged.
+    Raises DataError where the file is no project; so do the methods, for whatever is missing or
+    damaged.
     """
 
     def __init__(self, path: Path) -> None:

@@ -11,7 +11,6 @@ import os
 import struct
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from os import PathLike
 from pathlib import Path
 from typing import IO
 
@@ -22,7 +21,7 @@ from tifffile import TiffFile, TiffFileError, TiffWriter
 from ..errors import DataError, ErrorsAt
 from ..exposures.frame import MAX_ANGLE
 from ..images.codec import as_grey, check_size, decode
-from .access import os_error_reason, read_bytes
+from .access import PathLike, os_error_reason, read_bytes
 from .cine import read_cine_header, read_cine_images
 from .csv_table import read_blocks
 from .dicom import read_dicom_header, read_dicom_images
@@ -35,7 +34,7 @@ from .dicom import read_dicom_header, read_dicom_images
 COLUMNS = ('image', 'angle_deg')
 
 
-def read_image_angles(path: str | os.PathLike[str]) -> dict[int, float]:
+def read_image_angles(path: PathLike) -> dict[int, float]:
     """Return the angle [rad] of each image by its number, the first one being 1.
 
     Raises DataError for a file that cannot be read, an image that is named twice or has no
@@ -77,12 +76,12 @@ EXPOSURE_SUFFIXES = (*IMAGE_SUFFIXES, *DICOM_SUFFIXES)
 READ_SUFFIXES = (*IMAGE_SUFFIXES, *VIDEO_CODECS, *CINE_SUFFIXES, *DICOM_SUFFIXES)
 
 
-def suffix_of(path: str | os.PathLike[str]) -> str:
+def suffix_of(path: PathLike) -> str:
     """Suffix of a path in lower case, with its dot."""
     return Path(path).suffix.lower()
 
 
-def is_image_source(path: str | os.PathLike[str]) -> bool:
+def is_image_source(path: PathLike) -> bool:
     """Whether a path is a folder, or a file with the suffix of an image or a video."""
     return os.path.isdir(path) or suffix_of(path) in READ_SUFFIXES
 
@@ -128,7 +127,7 @@ class StackWriter:
         self._writer.close()
 
 
-def count_pages(path: str | PathLike[str]) -> int:
+def count_pages(path: PathLike) -> int:
     """Number of pages of a TIFF file.
 
     Raises DataError for a file that cannot be read, is no TIFF file, is cut off or is damaged, and

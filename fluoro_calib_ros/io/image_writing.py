@@ -21,7 +21,7 @@ import numpy as np
 from ..errors import DataError, ErrorsAt
 from ..images.codec import encode
 from ..images.corrector import ImageCorrector
-from .access import atomic_file, make_folder, sync_folder, write_bytes
+from .access import PathLike, atomic_file, make_folder, sync_folder, write_bytes
 from .folder import temporary_folder
 from .image_reading import (
     CINE_SUFFIXES,
@@ -187,8 +187,8 @@ Correctors = Callable[[int], ImageCorrector]
 
 
 def correct_images(
-    source: str | os.PathLike[str],
-    out: str | os.PathLike[str],
+    source: PathLike,
+    out: PathLike,
     corrector: ImageCorrector | Correctors,
     progress: Progress | None = None,
 ) -> CorrectedImages:

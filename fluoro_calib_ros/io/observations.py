@@ -11,7 +11,6 @@ Files of a lab may have names instead of ids in the first three columns.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -338,7 +337,7 @@ DECIMALS = 4  # of a pixel, and of its standard deviation
 
 
 def write_extracted(
-    path: str | os.PathLike[str],
+    path: PathLike,
     frames: Iterable[tuple[Frame, np.ndarray]],
     target_names: Mapping[int, str],
 ) -> None:
@@ -351,7 +350,7 @@ def write_extracted(
 
 
 def write_markers(
-    path: str | os.PathLike[str],
+    path: PathLike,
     frames: Iterable[tuple[Frame, np.ndarray, np.ndarray]],
     target_names: Mapping[int, str],
 ) -> None:
@@ -364,7 +363,7 @@ def write_markers(
 
 
 def _write(
-    path: str | os.PathLike[str],
+    path: PathLike,
     frames: Sequence[tuple[Frame, Sequence[np.ndarray]]],
     flags: tuple[str, ...],
     target_names: Mapping[int, str],
@@ -384,7 +383,7 @@ def _angle_text(frame: Frame) -> str:
 
 
 def _rows(
-    path: str | os.PathLike[str],
+    path: PathLike,
     frame: Frame,
     flags: Sequence[np.ndarray],
     target_names: Mapping[int, str],

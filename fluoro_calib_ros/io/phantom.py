@@ -9,8 +9,6 @@ Files of a lab may have names of beads instead of ids. Points in motion have a f
 
 from __future__ import annotations
 
-import os
-
 import numpy as np
 
 from ..errors import DataError, ErrorsAt
@@ -18,6 +16,7 @@ from ..exposures.frame import MovingPoints
 from ..exposures.names import Names, without_trivial
 from ..exposures.phantom import Phantom, first_repeated
 from ..limits import read_limits
+from .access import PathLike
 from .csv_table import NamedColumn, read_blocks, write_table
 
 COLUMNS = ('target_id', 'x', 'y', 'z', 'sd')
@@ -25,7 +24,7 @@ DIAMETER = 'diameter'  # of the beads, optional
 EXPOSURE = 'exposure'
 
 
-def read_phantom(path: str | os.PathLike[str]) -> Phantom:
+def read_phantom(path: PathLike) -> Phantom:
     """Read a Phantom from a CSV file with the columns target_id and x, y, z, sd [mm].
 
     The columns may have any order. Raises DataError that names row and cause.
@@ -33,14 +32,14 @@ def read_phantom(path: str | os.PathLike[str]) -> Phantom:
     return _read(path, NamedColumn('target_id', None))
 
 
-def read_named_phantom(path: str | os.PathLike[str], known: Names) -> tuple[Phantom, Names]:
+def read_named_phantom(path: PathLike, known: Names) -> tuple[Phantom, Names]:
     """Read a Phantom whose targets may have names, and the names. Raises DataError."""
     column = NamedColumn('target_id', known.targets)
     phantom = _read(path, column)
     return phantom, Names(without_trivial(column.ids()))
 
 
-def _read(path: str | os.PathLike[str], column: NamedColumn) -> Phantom:
+def _read(path: PathLike, column: NamedColumn) -> Phantom:
     id_parts = []
     number_parts = []
     line_parts = []
@@ -75,7 +74,7 @@ def _read(path: str | os.PathLike[str], column: NamedColumn) -> Phantom:
         return Phantom(ids, numbers[:, :3], numbers[:, 3], diameters)
 
 
-def has_exposures(path: str | os.PathLike[str]) -> bool:
+def has_exposures(path: PathLike) -> bool:
     """Return whether a file holds coordinates by exposure; False for files of other programs."""
     try:
         return any(EXPOSURE in block for block in read_blocks(path, COLUMNS))
@@ -83,7 +82,7 @@ def has_exposures(path: str | os.PathLike[str]) -> bool:
         return False
 
 
-def read_moving_points(path: str | os.PathLike[str]) -> MovingPoints:
+def read_moving_points(path: PathLike) -> MovingPoints:
     """Read MovingPoints from a CSV file with the columns exposure, target_id and x, y, z, sd [mm].
 
     Raises DataError that names row and cause.
@@ -107,9 +106,7 @@ def read_moving_points(path: str | os.PathLike[str]) -> MovingPoints:
     return points
 
 
-def write_phantom(
-    path: str | os.PathLike[str], phantom: Phantom, names: Names | None = None
-) -> None:
+def write_phantom(path: PathLike, phantom: Phantom, names: Names | None = None) -> None:
     """Write a Phantom to a CSV file, from which the same values are read again.
 
     Names are written instead of ids where all targets have one. Raises DataError where the file

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable
 from typing import Any
 
@@ -14,6 +13,7 @@ import numpy as np
 from ..exposures.names import Names
 from ..reconstruction.intersection import STATUS_NAMES
 from ..reconstruction.reconstruct import ReconstructedFrame
+from .access import PathLike
 from .csv_table import format_float, write_table
 
 COLUMNS = (
@@ -24,7 +24,7 @@ NAME_COLUMN = 'name'  # the last one, of targets that have names
 
 
 def write_reconstruction(
-    path: str | os.PathLike[str], frames: Iterable[ReconstructedFrame], names: Names | None = None
+    path: PathLike, frames: Iterable[ReconstructedFrame], names: Names | None = None
 ) -> None:
     """Write reconstructed frames to a CSV file, with a column name where targets have names.
 

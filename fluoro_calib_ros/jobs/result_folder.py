@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from ..errors import DataError
 from ..estimation.result import CalibrationResult
 from ..findings import Finding, Kind, Severity
 from ..io import csv_table as names
+from ..io.access import PathLike
 from ..io.calibration import SUFFIX, load_calibrations, save_calibration
 from ..io.calibration_request import write_request
 from ..io.documents import write_json
@@ -50,7 +50,7 @@ RESULT_FOLDER = FolderKind(
 
 
 def save_outcome(
-    directory: str | os.PathLike[str],
+    directory: PathLike,
     outcome: CalibrationOutcome,
     present: RigOrientation | None = None,
     write_more: Callable[[Path], object] | None = None,
@@ -96,7 +96,7 @@ def save_outcome(
 
 
 def save_result(
-    directory: str | os.PathLike[str],
+    directory: PathLike,
     result: CalibrationResult,
     covariance: bool = False,
 ) -> None:
@@ -121,7 +121,7 @@ def write_covariances(folder: Path, result: CalibrationResult) -> None:
 
 
 def save_calibrations(
-    directory: str | os.PathLike[str],
+    directory: PathLike,
     calibrations: Mapping[str, FluoroscopeCalibration],
     orientation: RigOrientation | None,
 ) -> None:
@@ -142,9 +142,7 @@ def save_calibrations(
             save_orientation(folder, orientation)
 
 
-def check_result_folder(
-    directory: str | os.PathLike[str], inputs: Iterable[str | os.PathLike[str]] = ()
-) -> None:
+def check_result_folder(directory: PathLike, inputs: Iterable[PathLike] = ()) -> None:
     """Raise DataError unless a result folder can be written there without harm to the inputs."""
     check_output_folder(directory, RESULT_FOLDER, inputs)
 
@@ -162,7 +160,7 @@ def written_document(result: CalibrationResult) -> dict[str, Any]:
 
 
 def _saved_ids(
-    directory: str | os.PathLike[str], calibrations: Mapping[str, FluoroscopeCalibration]
+    directory: PathLike, calibrations: Mapping[str, FluoroscopeCalibration]
 ) -> list[str]:
     """Return the ids of the calibrations of these fluoroscopes in a folder, none for a fault."""
     try:
@@ -172,7 +170,7 @@ def _saved_ids(
     return [saved[name].calibration_id for name in calibrations if name in saved]
 
 
-def saved_orientation(directory: str | os.PathLike[str]) -> RigOrientation | None:
+def saved_orientation(directory: PathLike) -> RigOrientation | None:
     """Return the orientation in a folder, None where there is no valid one."""
     try:
         return load_orientation(orientation_path(directory))
@@ -180,7 +178,7 @@ def saved_orientation(directory: str | os.PathLike[str]) -> RigOrientation | Non
         return None
 
 
-def saved_rig_note(directory: str | os.PathLike[str]) -> Finding | None:
+def saved_rig_note(directory: PathLike) -> Finding | None:
     """Return what result.json says about the orientation of the rig from its exposures.
 
     None for nothing, and where the folder has a captured orientation, which the exposures do not

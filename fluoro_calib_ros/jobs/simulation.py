@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -409,7 +408,7 @@ class SimulationOptions:
 
 
 def simulate(
-    directory: str | os.PathLike[str],
+    directory: PathLike,
     options: SimulationOptions | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> None:

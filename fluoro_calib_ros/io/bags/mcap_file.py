@@ -24,7 +24,7 @@ from mcap.summary import Summary
 
 from ...errors import DataError
 from ...limits import MAX_CHUNK, MAX_TOPICS
-from ..access import check_regular_file, os_error_reason
+from ..access import PathLike, check_regular_file, os_error_reason
 from ..documents import read_yaml
 from .metadata import to_yaml
 
@@ -243,8 +243,6 @@ def _one_line(error: Exception) -> str:
 
 
 # Storage files of a bag: an .mcap file, or those in the folder of a rosbag2 bag.
-
-PathLike = str | os.PathLike[str]
 
 
 def storage_files(source: PathLike) -> list[str]:

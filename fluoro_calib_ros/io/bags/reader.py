@@ -18,7 +18,7 @@ from ...exposures.angles import AngleOptions, JointAngles
 from ...exposures.frame import Frame, validate_frame
 from ...exposures.strays import without_strays
 from ...limits import MAX_OBSERVATIONS
-from ..access import check_safe_name
+from ..access import PathLike, check_safe_name
 from .definitions import (
     TARGET_OBSERVATIONS,
     fields_of,
@@ -31,7 +31,6 @@ from .definitions import (
 from .mcap_file import (
     BagMessage,
     ChannelInfo,
-    PathLike,
     channels_of_bag,
     channels_of_file,
     is_foreign,

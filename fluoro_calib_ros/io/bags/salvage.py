@@ -31,10 +31,10 @@ from mcap.records import Channel, MessageIndex, Schema, Statistics
 
 from ...errors import DataError
 from ...limits import MAX_CHUNK
-from ..access import check_regular_file, os_error_reason
+from ..access import PathLike, check_regular_file, os_error_reason
 from ..documents import read_yaml
 from .definitions import PACKAGE, TARGET_OBSERVATIONS, Definition, fluoroscope_of_topic, typestore
-from .mcap_file import PathLike, candidate_files
+from .mcap_file import candidate_files
 from .metadata import parse_profiles, profile
 from .writer import BagWriter
 

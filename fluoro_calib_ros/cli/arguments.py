@@ -142,7 +142,7 @@ def read_oriented_source(
 
     Raises DataError, also where the orientation belongs to other calibrations.
     """
-    from ..io.rig_orientation import load_orientation
+    from ..io.calibration import load_orientation
     from ..jobs.reconstruction import check_orientation
     from ..jobs.sources import read_calibrated_source
 

@@ -69,8 +69,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Write poses and joints of a recording. Raises DataError."""
     from ..io.bodies import read_bodies
+    from ..io.calibration import orientation_path
     from ..io.joints import read_joints
-    from ..io.rig_orientation import orientation_path
     from ..jobs.bodies import BodiesOptions, check_bodies_folder, save_bodies, track_bodies
     from ..jobs.sources import is_bag
 

@@ -302,7 +302,7 @@ def _marker_request(arguments: argparse.Namespace) -> MarkerRequest:
     """Read what is known of the markers and the fluoroscopes. Raises DataError."""
     from ..images.markers import MarkerOptions
     from ..io.bodies import read_bodies
-    from ..io.rig_orientation import load_orientation, orientation_path
+    from ..io.calibration import load_orientation, orientation_path
     from ..jobs.image_sources import ImageAngles
     from ..jobs.marker_extraction import MarkerRequest, sequences, shaped
     from ..jobs.reconstruction import check_orientation

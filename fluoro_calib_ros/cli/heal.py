@@ -56,7 +56,7 @@ def run(arguments: argparse.Namespace) -> bool:
     """Heal a rig; return whether the verdict is pass. Raises DataError."""
     from ..errors import ErrorsAt
     from ..io.bodies import read_bodies
-    from ..io.rig_orientation import orientation_path
+    from ..io.calibration import orientation_path
     from ..jobs.healing import (
         HealingOptions,
         check_healing_folder,

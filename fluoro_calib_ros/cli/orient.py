@@ -64,9 +64,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Write DIR/rig_orientation.npz. Raises DataError."""
+    from ..io.calibration import save_orientation
     from ..io.csv_table import read_names
     from ..io.result_document import orientation_document
-    from ..io.rig_orientation import save_orientation
     from ..jobs.orientation import orient
     from ..jobs.result_folder import belongs_to, saved_orientation
     from ..jobs.sources import read_calibrated_source, read_survey

@@ -67,9 +67,9 @@ def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Write the points of a recording. Raises DataError."""
+    from ..io.calibration import orientation_path
     from ..io.folder import check_output_file
-    from ..io.reconstructed_points import write_reconstruction
-    from ..io.rig_orientation import orientation_path
+    from ..io.poses import write_reconstruction
     from ..jobs.reconstruction import ReconstructionOptions, reconstruct
     from ..jobs.sources import is_bag
 

@@ -21,8 +21,7 @@ from .growth import Match, Seen, smoothed, supported
 from .light import Noise
 from .matching import PhantomModel, match
 from .measurement import FIRST_STEPS, STEPS, estimate_profile, measure_beads
-from .shadow_fit import Beads
-from .shadow_profile import Profile
+from .shadow_fit import Beads, Profile
 from .view import Lens, View, fit_view
 
 MAX_SIGMA_PX = 0.3

@@ -19,10 +19,9 @@ from .marker_intensity import (
     search_image,
     search_windows,
 )
-from .marker_motion import Motion, assign
-from .marker_states import MarkerStates
+from .marker_motion import MarkerStates, Motion, assign
 from .measurement import estimate_profile
-from .shadow_profile import Profile
+from .shadow_fit import Profile
 
 FIRST_SD_PX = 1.5  # of a given place of the first frame
 FIRST_GATE = 3.0  # standard deviations from a given place, within which its shadow is

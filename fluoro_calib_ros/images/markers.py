@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 from ..errors import DataError
 from ..findings import Finding, Kind
 from ..options import option, validate_options
+from .marker_fit import MarkerMeasurement
 from .marker_intensity import LightWindows, MarkerLook, Shadows, check_image
-from .marker_measurement import MarkerMeasurement
+from .marker_motion import MarkerStates, MeasuredMarkers
 from .marker_start import NOWHERE_PX, MarkerSearch, learn_start
-from .marker_states import MarkerStates, MeasuredMarkers
 from .marker_watch import MarkerDoubts, MarkerWatch, follow_beside, shift_together
-from .shadow_profile import Profile
+from .shadow_fit import Profile
 
 
 @dataclass(frozen=True)

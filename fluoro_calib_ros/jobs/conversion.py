@@ -21,7 +21,7 @@ from ..exposures.frame import Frame
 from ..images.corrector import ImageCorrector
 from ..io.access import PathLike
 from ..io.bags.reader import read_frames, with_angles
-from ..io.calibration import SUFFIX, load_calibrations
+from ..io.calibration import SUFFIX, load_calibrations, load_orientation, orientation_path
 from ..io.csv_table import read_names
 from ..io.documents import read_json
 from ..io.formats import registry
@@ -40,7 +40,6 @@ from ..io.phantom import read_phantom
 from ..io.result_check import OBSERVATIONS
 from ..io.result_check import PHANTOM as PHANTOM_FILE
 from ..io.result_check import RESULT_NAME as RESULT
-from ..io.rig_orientation import load_orientation, orientation_path
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import matrix_from_quaternion
 from .result_folder import belongs_to

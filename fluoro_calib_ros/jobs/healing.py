@@ -28,11 +28,10 @@ from ..exposures.frame import Frame
 from ..exposures.pairing import RecordedPairing
 from ..findings import Finding, Kind, Place, Severity
 from ..io.access import PathLike
-from ..io.calibration import SUFFIX, save_calibration
+from ..io.calibration import ORIENTATION_NAME as ORIENTATION
+from ..io.calibration import SUFFIX, save_calibration, save_orientation
 from ..io.documents import write_json
 from ..io.folder import FolderKind, check_output_folder, replaced_folder
-from ..io.rig_orientation import NAME as ORIENTATION
-from ..io.rig_orientation import save_orientation
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.intersection import OK, OUTSIDE, Intersector
 from ..reconstruction.reconstruct import orientation_of_recorded, pair_recording

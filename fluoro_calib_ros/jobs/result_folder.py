@@ -15,7 +15,15 @@ from ..estimation.result import CalibrationResult
 from ..findings import Finding, Kind, Severity
 from ..io import csv_table as names
 from ..io.access import PathLike
-from ..io.calibration import SUFFIX, load_calibrations, save_calibration
+from ..io.calibration import ORIENTATION_NAME as ORIENTATION
+from ..io.calibration import (
+    SUFFIX,
+    load_calibrations,
+    load_orientation,
+    orientation_path,
+    save_calibration,
+    save_orientation,
+)
 from ..io.calibration_request import write_request
 from ..io.documents import write_json
 from ..io.folder import FolderKind, check_output_folder, replaced_folder
@@ -32,8 +40,6 @@ from ..io.result_check import RESULT_NAME as RESULT
 from ..io.result_document import NAMES as TABLES
 from ..io.result_document import SUFFIX as COVARIANCE
 from ..io.result_document import result_document, write_covariance, write_tables, write_validation
-from ..io.rig_orientation import NAME as ORIENTATION
-from ..io.rig_orientation import load_orientation, orientation_path, save_orientation
 from ..photogrammetry.rig_orientation import RigOrientation
 from .calibration import CalibrationOutcome
 

@@ -26,7 +26,9 @@ from fluoro_calib_ros.io.access import atomic_file, write_bytes, write_text
 from fluoro_calib_ros.io.calibration import (
     load_calibration,
     load_calibrations,
+    load_orientation,
     save_calibration,
+    save_orientation,
 )
 from fluoro_calib_ros.io.documents import read_json, write_json
 from fluoro_calib_ros.io.observations import (
@@ -37,7 +39,6 @@ from fluoro_calib_ros.io.observations import (
     write_points,
 )
 from fluoro_calib_ros.io.phantom import read_phantom, write_phantom
-from fluoro_calib_ros.io.rig_orientation import load_orientation, save_orientation
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 
 SIZE = (1024, 960)

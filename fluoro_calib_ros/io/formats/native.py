@@ -20,8 +20,8 @@ from ..observations import COLUMNS as OBSERVATIONS
 from ..observations import corrections_of, read_named_observations, write_observations_csv
 from ..phantom import COLUMNS as PHANTOM
 from ..phantom import read_named_phantom, write_phantom
-from ..reconstructed_points import COLUMNS as POINTS
-from ..reconstructed_points import NAME_COLUMN
+from ..poses import NAME_COLUMN
+from ..poses import POINT_COLUMNS as POINTS
 from .content import Content, FileSettings, Format, Points, Sample, Written
 from .frames_of_points import NS, rate_of
 

@@ -117,7 +117,7 @@ def _recover(arguments: argparse.Namespace) -> None:
         'out': str(arguments.out),
         'messages': recovery.counts,
         'lost': lost,
-        'damages': [_damage_document(damage) for damage in recovery.damages],
+        'damages': [vars(damage) for damage in recovery.damages],
         'left_out': recovery.skipped,
     }
     lines = [f'{total} messages recovered, written to {arguments.out}']
@@ -142,7 +142,7 @@ def _info(arguments: argparse.Namespace) -> None:
         'topics': {topic: _topic_document(each) for topic, each in report.topics.items()},
         'without_partner': report.without_partner,
         'lost': report.lost,
-        'damages': [_damage_document(damage) for damage in report.damages],
+        'damages': [vars(damage) for damage in report.damages],
         'faults': faults,
     }
     print_result(arguments, document, _info_text(report, faults))
@@ -209,16 +209,6 @@ def _topic_document(topic: TopicReport) -> dict[str, Any]:
         'repeated_frames': topic.repeated_frames,
         'restarts': topic.restarts,
         'undecodable': topic.undecodable,
-    }
-
-
-def _damage_document(damage: Damage) -> dict[str, Any]:
-    return {
-        'path': damage.path,
-        'cause': damage.cause,
-        'start_ns': damage.start_ns,
-        'end_ns': damage.end_ns,
-        'lost': damage.lost,
     }
 
 

@@ -21,10 +21,9 @@ from .growth import Match, Seen, smoothed, supported
 from .light import Noise
 from .matching import PhantomModel, match
 from .measurement import FIRST_STEPS, STEPS, estimate_profile, measure_beads
-from .shadow_fit import Beads, Profile
+from .shadow_fit import MAX_SIGMA_PX, Beads, Profile
 from .view import Lens, View, fit_view
 
-MAX_SIGMA_PX = 0.3
 MAX_SIGMAS = 2.9  # times that of a usual bead of the image: an eighth of its weight
 MAX_MISFIT = 5.0
 DEPTH = (0.55, 1.7)  # of the shadow of a bead, 1 for what is usual in such light

@@ -24,6 +24,7 @@ from .shadow_fit import (
     DEPTH_SD,
     DISTURBED,
     MARGIN_PX,
+    MAX_SIGMA_PX,
     MIN_PASSED,
     TERMS,
     Beads,
@@ -249,7 +250,6 @@ class _MarkerFit(ShadowFit):
 # Measurement of markers: shadows are assigned to all of them together, fitted and checked.
 
 LOST_SD_PX = 25.0  # of a prediction, from which only markers that move together are found again
-MAX_SIGMA_PX = 0.3
 MAX_MISFIT = 10.0
 DEPTH = (0.5, 1.8)  # of a shadow, over that of its marker
 SAME_PLACE = 0.35  # of the radius, at which two markers are one shadow

@@ -23,6 +23,7 @@ from scipy.optimize import least_squares
 from .light import Noise
 from .texture import Cosines
 
+MAX_SIGMA_PX = 0.3  # of a centre: a larger one is that of no shadow, or of one hardly seen
 MARGIN_PX = 2.0  # of background around the shadow
 TERMS = 6  # of the background: a polynomial of degree 2
 OWN = TERMS + 3  # unknowns of a bead alone: its background, centre and depth

@@ -115,6 +115,13 @@ def read_blocks(path: PathLike, required: Sequence[str]) -> Iterator[Block]:
         raise DataError(f'{path}: the file has a header, but no rows')
 
 
+def read_all(path: PathLike, required: Sequence[str]) -> Block:
+    """Return all rows of a CSV file as one block. Raises DataError as `read_blocks`."""
+    blocks = list(read_blocks(path, required))
+    rows = [row for block in blocks for row in block.rows]
+    return Block(path, blocks[0].header, rows, np.concatenate([block.lines for block in blocks]))
+
+
 def decimal_point(cell: str) -> str:
     """Return a number with a decimal comma as one with a point, any other cell as it is."""
     if cell.count(',') != 1 or '.' in cell:

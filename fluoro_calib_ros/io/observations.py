@@ -27,7 +27,7 @@ from ..exposures.phantom import first_repeated, is_positive
 from ..exposures.strays import few
 from ..limits import MAX_FRAMES
 from .access import PathLike, check_safe_name
-from .csv_table import Block, NamedColumn, format_float, read_blocks, write_table
+from .csv_table import Block, NamedColumn, format_float, read_all, read_blocks, write_table
 
 ANGLE = 'angle_deg'
 CORRECTED_BY = 'corrected_by'  # id of the calibration, of image points that are corrected already
@@ -468,24 +468,17 @@ def read_points(path: PathLike, known: Mapping[str, str] | None = None) -> Point
     will have the status INVALID. known are the ids of
     fluoroscopes that have names. Raises DataError that names row and cause.
     """
-    known = known or {}
-    blocks = list(read_blocks(path, ('u', 'v')))
-    header = blocks[0].header
+    table = read_all(path, ('u', 'v'))
+    header = table.header
     points = PointsFile(
         path=path,
         header=header,
-        rows=[row for block in blocks for row in block.rows],
-        lines=np.concatenate([block.lines for block in blocks]),
-        uv=np.concatenate([_uv(block) for block in blocks]),
-        sigma=np.concatenate([_sigma(block) for block in blocks]) if 'sigma' in header else None,
-        fluoroscope=np.array(
-            [known.get(n, n) for block in blocks for n in block.strings('fluoroscope')]
-        )
-        if 'fluoroscope' in header
-        else None,
-        angle=np.concatenate([_image_angle(block) for block in blocks])
-        if ANGLE in header
-        else None,
+        rows=table.rows,
+        lines=table.lines,
+        uv=np.column_stack([table.floats_or_nan('u'), table.floats_or_nan('v')]),
+        sigma=_sigma(table) if 'sigma' in header else None,
+        fluoroscope=_fluoroscopes(table, known or {}) if 'fluoroscope' in header else None,
+        angle=_image_angle(table) if ANGLE in header else None,
     )
     if CORRECTED_BY in header:
         raise DataError(
@@ -500,8 +493,8 @@ def read_points(path: PathLike, known: Mapping[str, str] | None = None) -> Point
     return points
 
 
-def _uv(block: Block) -> np.ndarray:
-    return np.column_stack([block.floats_or_nan('u'), block.floats_or_nan('v')])
+def _fluoroscopes(block: Block, known: Mapping[str, str]) -> np.ndarray:
+    return np.array([known.get(name, name) for name in block.strings('fluoroscope')])
 
 
 def _sigma(block: Block) -> np.ndarray:

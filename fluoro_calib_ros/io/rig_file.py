@@ -15,7 +15,7 @@ All keys are optional; paths are relative to the folder of the file.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -23,14 +23,6 @@ from ..errors import DataError
 from .documents import read_toml
 
 NAME = 'rig.toml'
-KEYS = (
-    'fluoroscopes',
-    'image_size',
-    'phantom',
-    'calibration',
-    'angle_joint',
-    'angle_max_age',
-)
 
 
 @dataclass(frozen=True)
@@ -47,6 +39,9 @@ class RigFile:
     angle_joint: str | None = None
     #: longest time from the last state of the joint to an exposure [s]
     angle_max_age: float | None = None
+
+
+KEYS = tuple(field.name for field in fields(RigFile)[1:])
 
 
 def read_rig_file(path: Path) -> RigFile:

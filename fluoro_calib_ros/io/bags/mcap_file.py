@@ -37,7 +37,7 @@ FOOTER_OPCODE = 2
 CHUNK_OPCODE = 6
 DATA_END_OPCODE = 15
 CHUNK_HEAD = 100  # bytes that contain sizes and compression of a chunk
-_RECORD = struct.Struct('<BQ')  # opcode and length
+RECORD = struct.Struct('<BQ')  # opcode and length
 MAX_CAUSE = 120  # characters
 
 
@@ -156,15 +156,15 @@ def _check_chunks(file: BinaryIO) -> None:
     """Raise DataError for a chunk that would take too much memory; none is decompressed."""
     position = len(MAGIC)
     size = file.seek(0, os.SEEK_END)
-    while position + _RECORD.size <= size:
+    while position + RECORD.size <= size:
         file.seek(position)
         head = file.read(CHUNK_HEAD)
-        opcode, length = _RECORD.unpack_from(head)
+        opcode, length = RECORD.unpack_from(head)
         if opcode == CHUNK_OPCODE and len(head) == CHUNK_HEAD:
-            (held,) = struct.unpack_from('<Q', head, _RECORD.size + 16)
-            (name_length,) = struct.unpack_from('<I', head, _RECORD.size + 28)
-            start = _RECORD.size + 32 + name_length + 8
-            if head[_RECORD.size + 32 : start - 8] == b'zstd':
+            (held,) = struct.unpack_from('<Q', head, RECORD.size + 16)
+            (name_length,) = struct.unpack_from('<I', head, RECORD.size + 28)
+            start = RECORD.size + 32 + name_length + 8
+            if head[RECORD.size + 32 : start - 8] == b'zstd':
                 with suppress(zstandard.ZstdError):
                     held = max(held, zstandard.frame_content_size(head[start:]))
             if held > MAX_CHUNK:
@@ -174,7 +174,7 @@ def _check_chunks(file: BinaryIO) -> None:
                 )
         elif opcode == DATA_END_OPCODE:
             break
-        position += _RECORD.size + length
+        position += RECORD.size + length
     file.seek(0)
 
 

@@ -34,18 +34,16 @@ from ...limits import MAX_CHUNK
 from ..access import PathLike, check_regular_file, os_error_reason
 from ..documents import read_yaml
 from .definitions import PACKAGE, TARGET_OBSERVATIONS, Definition, fluoroscope_of_topic, typestore
-from .mcap_file import candidate_files
+from .mcap_file import MAGIC, RECORD, candidate_files
 from .metadata import parse_profiles, profile
 from .writer import BagWriter
 
-MAGIC = b'\x89MCAP0\r\n'
-_HEAD = struct.Struct('<BQ')  # of a record: opcode and length
 _CHUNK = struct.Struct('<QQQI')  # of a chunk: first and last time, size, checksum
 _MESSAGE = struct.Struct('<HIQQ')  # of a message: channel, sequence, log and publish time
 _FOOTER = struct.Struct('<BQQQI')
 # Where a chunk may begin: a short record with its opcode, or the name of its compression.
 _CANDIDATE = re.compile(rb'\x06[\x00-\xff]{4}\x00{4}|\x04\x00{3}zstd|\x03\x00{3}lz4')
-_TO_COMPRESSION = _HEAD.size + _CHUNK.size  # bytes
+_TO_COMPRESSION = RECORD.size + _CHUNK.size  # bytes
 
 
 class SalvagedMessage(NamedTuple):
@@ -151,15 +149,15 @@ class FileSalvage:
                 position = chunk_at
                 continue
             self._has_end = is_end
-            yield from self._record(data[position], data[position + _HEAD.size : end])
+            yield from self._record(data[position], data[position + RECORD.size : end])
             position = end
 
     def _end_of_record(self, data: mmap.mmap, position: int) -> int | None:
         """Return the position behind a record, None where there is no complete record."""
-        if position + _HEAD.size > len(data):
+        if position + RECORD.size > len(data):
             return None
-        opcode, length = _HEAD.unpack_from(data, position)
-        end = position + _HEAD.size + length
+        opcode, length = RECORD.unpack_from(data, position)
+        end = position + RECORD.size + length
         return end if 0 < opcode <= Opcode.DATA_END and end <= len(data) else None
 
     def _next_chunk(self, data: mmap.mmap, position: int, limit: int = sys.maxsize) -> int:
@@ -177,9 +175,9 @@ class FileSalvage:
     def _messages_of(self, content: bytes | memoryview) -> Iterator[SalvagedMessage]:
         """Yield the messages of an intact chunk."""
         position = 0
-        while position + _HEAD.size <= len(content):
-            opcode, length = _HEAD.unpack_from(content, position)
-            position += _HEAD.size
+        while position + RECORD.size <= len(content):
+            opcode, length = RECORD.unpack_from(content, position)
+            position += RECORD.size
             yield from self._record(opcode, bytes(content[position : position + length]))
             position += length
 
@@ -241,8 +239,8 @@ class FileSalvage:
             return
         position = start
         while position < footer:
-            opcode, length = _HEAD.unpack_from(data, position)
-            position += _HEAD.size
+            opcode, length = RECORD.unpack_from(data, position)
+            position += RECORD.size
             content = data[position : position + length]
             position += length
             if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
@@ -257,7 +255,7 @@ class FileSalvage:
     def _note_lost_chunk(self, data: mmap.mmap, position: int, end: int | None) -> None:
         """Note a damaged chunk, with what its message index says about it."""
         if end is None:
-            is_cut = position + _HEAD.size > len(data) or data[position] in range(1, 16)
+            is_cut = position + RECORD.size > len(data) or data[position] in range(1, 16)
             self._note(
                 'the file is cut off or damaged here' if is_cut else 'these bytes are damaged'
             )
@@ -268,7 +266,7 @@ class FileSalvage:
             if data[position] != Opcode.MESSAGE_INDEX:
                 break
             try:
-                content = BytesIO(data[position + _HEAD.size : behind])
+                content = BytesIO(data[position + RECORD.size : behind])
                 index = MessageIndex.read(ReadDataStream(content))
             except Exception:  # damaged bytes make the reader raise almost anything
                 break
@@ -304,7 +302,7 @@ def _chunk_at(data: mmap.mmap, position: int) -> _Chunk | None:
 
     Its length is taken from its own fields: opcode and length of the record may be damaged.
     """
-    start = position + _HEAD.size
+    start = position + RECORD.size
     if start + _CHUNK.size + 4 > len(data):
         return None
     _, _, size, checksum = _CHUNK.unpack_from(data, start)
@@ -348,11 +346,11 @@ def _decompressed(compression: bytes, data: memoryview, size: int) -> bytes | No
 def _is_whole(content: bytes) -> bool:
     """Return whether a chunk without checksum consists of whole records."""
     position = 0
-    while position + _HEAD.size <= len(content):
-        opcode, length = _HEAD.unpack_from(content, position)
+    while position + RECORD.size <= len(content):
+        opcode, length = RECORD.unpack_from(content, position)
         if opcode not in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
             return False
-        position += _HEAD.size + length
+        position += RECORD.size + length
     return position == len(content)
 
 
@@ -372,8 +370,7 @@ class Recovery:
     @property
     def lost(self) -> dict[str, int]:
         """Number of messages that are known to be lost, by topic."""
-        lost = {t: n - self.counts.get(t, 0) for t, n in self.expected.items()}
-        return {topic: count for topic, count in lost.items() if count > 0}
+        return dict(Counter(self.expected) - Counter(self.counts))
 
 
 class Salvage:
@@ -487,11 +484,6 @@ class TopicReport:
     undecodable: int = 0  #: messages whose header cannot be read
 
     @property
-    def duration_s(self) -> float:
-        """Time from the first message to the last."""
-        return (max(self.log_ns) - min(self.log_ns)) * 1e-9 if self.log_ns else 0.0
-
-    @property
     def interval_ns(self) -> float:
         """Usual time between two messages, by their stamps if they have some; NaN for one."""
         times = self.stamp_ns if len(self.stamp_ns) > 1 else self.log_ns
@@ -579,13 +571,12 @@ def inspect_bag(source: PathLike) -> BagReport:
     if not topics and salvage.damages:
         raise DataError(f'{source}: nothing can be read ({salvage.damages[0].cause})')
     counts = {topic: len(report.log_ns) for topic, report in topics.items()}
-    lost = {t: n - counts.get(t, 0) for t, n in salvage.expected.items()}
     return BagReport(
         [file.path for file in salvage.files],
         dict(sorted(topics.items())),
         _without_partner(topics),
         salvage.damages,
-        {topic: count for topic, count in lost.items() if count > 0},
+        dict(Counter(salvage.expected) - Counter(counts)),
     )
 
 

@@ -18,11 +18,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import DataError
 from ...exposures.phantom import first_repeated
 from ...photogrammetry.rotations import matrix_from_quaternion
 from ..access import atomic_file
-from ..csv_table import as_text, read_blocks
+from ..csv_table import as_text, read_all
 from ..poses import COLUMNS as POSE_COLUMNS
 from .content import (
     Bodies,
@@ -35,7 +34,7 @@ from .content import (
     homogeneous,
 )
 from .frames_of_points import NS, bodies_of, frames_of, rate_of
-from .text import Row, frame_numbers, joined, read_frames, require_width
+from .text import Row, frame_numbers, joined, read_frames, require_width, write_frames
 
 COLUMNS = (
     *('R11', 'R12', 'R13', '01', 'R21', 'R22', 'R23', '02', 'R31', 'R32', 'R33', '03'),
@@ -108,14 +107,8 @@ def _write_xmalab(path: Path, content: Content, settings: FileSettings) -> Writt
     assert bodies is not None
     mm, notes = settings.unit_or('mm', str(path))
     matrices = homogeneous(bodies, mm)
-    header = [
-        'Frame',
-        *(f'{as_text(name)}_{column}' for name in bodies.names for column in COLUMNS),
-    ]
-    with atomic_file(path, 'w') as file:
-        file.write(','.join(header) + '\n')
-        for number, of_frame in zip(bodies.frame.tolist(), matrices):
-            file.write(f'{number},{joined(of_frame.transpose(0, 2, 1).ravel())}\n')
+    columns = [f'{as_text(name)}_{column}' for name in bodies.names for column in COLUMNS]
+    write_frames(path, columns, bodies.frame, matrices.transpose(0, 1, 3, 2))
     return Written((str(path),), notes)
 
 
@@ -181,37 +174,32 @@ def _is_poses(sample: Sample) -> bool:
 
 def _read_poses(path: Path, settings: FileSettings) -> Content:
     """Read the poses of bodies. Raises DataError that names the row."""
-    blocks = list(read_blocks(path, _POSES))
-    body = np.array([name for block in blocks for name in block.strings('body')])
-    frame = np.concatenate([block.ids('exposure') for block in blocks])
-    line = np.concatenate([block.lines for block in blocks])
-    seconds, *columns = (
-        np.concatenate([block.floats_or_nan(name) for block in blocks]) for name in _POSES[2:]
-    )
+    rows = read_all(path, _POSES)
+    body = np.array(rows.strings('body'))
+    frame = rows.ids('exposure')
+    seconds, *columns = (rows.floats_or_nan(name) for name in _POSES[2:])
     values = np.column_stack(columns)
-    for block in blocks:
-        for name in _POSES[3:]:
-            block.require(name, ~np.isinf(block.floats_or_nan(name)), 'not a finite number')
+    for name, column in zip(_POSES[3:], columns):
+        rows.require(name, ~np.isinf(column), 'not a finite number')
     names = list(dict.fromkeys(body.tolist()))
     frames, row = np.unique(frame, return_inverse=True)
-    column = np.array([names.index(name) for name in body.tolist()])
-    repeated = first_repeated(row * len(names) + column)
+    place = np.array([names.index(name) for name in body.tolist()])
+    repeated = first_repeated(row * len(names) + place)
     if repeated is not None:
         first, second = repeated
-        raise DataError(
-            f'{path}, row {line[second]}: exposure {frame[second]} of {body[second]} is already '
-            f'given in row {line[first]}'
+        rows.fail(
+            second,
+            f'exposure {frame[second]} of {body[second]} is already given in row '
+            f'{rows.lines[first]}',
         )
     known = ~np.isnan(values).any(axis=1)
     wrong = known & ~(np.abs(np.linalg.norm(values[:, 3:], axis=1) - 1) < NORM_TOLERANCE)
     if wrong.any():
-        raise DataError(
-            f'{path}, row {line[np.argmax(wrong)]}: the quaternion does not have length one'
-        )
+        rows.fail(int(np.argmax(wrong)), 'the quaternion does not have length one')
     shape = (len(frames), len(names), 3)
     translation = np.full(shape, np.nan)
     rotation = np.full((*shape, 3), np.nan)
-    at = row[known], column[known]
+    at = row[known], place[known]
     translation[at] = values[known, :3]
     rotation[at] = matrix_from_quaternion(values[known][:, [6, 3, 4, 5]])
     rate = rate_of(frame, seconds * NS)

@@ -13,9 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import DataError
 from ...exposures.names import Names, without_trivial
-from ..csv_table import format_float, read_blocks, write_table
+from ..csv_table import format_float, read_all, write_table
 from ..observations import COLUMNS as OBSERVATIONS
 from ..observations import corrections_of, read_named_observations, write_observations_csv
 from ..phantom import COLUMNS as PHANTOM
@@ -25,6 +24,7 @@ from ..poses import POINT_COLUMNS as POINTS
 from .content import Content, FileSettings, Format, Points, Sample, Written
 from .frames_of_points import NS, rate_of
 
+POINTS_NEEDED = ('frame', 'target_id', 'x', 'y', 'z')
 GRID = ('fluoroscope', 'u', 'v', 'u_reference', 'v_reference')
 
 
@@ -66,14 +66,13 @@ def _write_phantom(path: Path, content: Content, settings: FileSettings) -> Writ
 
 def _read_points(path: Path, settings: FileSettings) -> Content:
     """Read reconstructed points. Raises DataError."""
-    blocks = list(read_blocks(path, ('frame', 'target_id', 'x', 'y', 'z')))
-    frame, target = (
-        np.concatenate([block.ids(name) for block in blocks]) for name in ('frame', 'target_id')
-    )
+    rows = read_all(path, POINTS_NEEDED)
+    frame = rows.ids('frame')
+    target = rows.ids('target_id')
     numbers = {
-        name: np.concatenate([block.floats_or_nan(name) for block in blocks])
+        name: rows.floats_or_nan(name)
         for name in ('x', 'y', 'z', 'sd_x', 'sd_y', 'sd_z', 'residual', 'stamp_ns')
-        if name in blocks[0]
+        if name in rows
     }
     unknown = np.full(len(frame), np.nan)
     frames, row = np.unique(frame, return_inverse=True)
@@ -81,10 +80,7 @@ def _read_points(path: Path, settings: FileSettings) -> Content:
     cell = row * len(targets) + column
     if len(np.unique(cell)) < len(cell):
         index = np.setdiff1d(np.arange(len(cell)), np.unique(cell, return_index=True)[1])[0]
-        line = np.concatenate([block.lines for block in blocks])[index]
-        raise DataError(
-            f'{path}, row {line}: target {target[index]} of frame {frame[index]} is given twice'
-        )
+        rows.fail(index, f'target {target[index]} of frame {frame[index]} is given twice')
     shape = (len(frames), len(targets))
 
     def table(values: np.ndarray) -> np.ndarray:
@@ -104,9 +100,9 @@ def _read_points(path: Path, settings: FileSettings) -> Content:
         rate_hz=rate_of(frame, numbers.get('stamp_ns', unknown)),
     )
     names = Names()
-    if NAME_COLUMN in blocks[0]:
-        cells = [cell for block in blocks for cell in block.strings(NAME_COLUMN)]
-        names = Names(without_trivial({n: int(i) for n, i in zip(cells, target.tolist()) if n}))
+    if NAME_COLUMN in rows:
+        cells = zip(rows.strings(NAME_COLUMN), target.tolist())
+        names = Names(without_trivial({name: identity for name, identity in cells if name}))
     return Content(points=points, names=names)
 
 
@@ -140,11 +136,9 @@ def _point_rows(
 
 
 def _read_grid(path: Path, settings: FileSettings) -> Content:
-    blocks = list(read_blocks(path, GRID))
-    names = np.array([name for block in blocks for name in block.strings('fluoroscope')])
-    numbers = np.concatenate(
-        [np.column_stack([block.floats(name) for name in GRID[1:]]) for block in blocks]
-    )
+    rows = read_all(path, GRID)
+    names = np.array(rows.strings('fluoroscope'))
+    numbers = np.column_stack([rows.floats(name) for name in GRID[1:]])
     return Content(grids={str(n): numbers[names == n] for n in dict.fromkeys(names.tolist())})
 
 
@@ -180,7 +174,7 @@ FORMATS = (
         'points',
         f'reconstructed points, {_OWN}',
         parts=('points',),
-        recognise=lambda sample: _has_columns(sample, ('frame', 'target_id', 'x', 'y', 'z')),
+        recognise=lambda sample: _has_columns(sample, POINTS_NEEDED),
         read=_read_points,
         write=_write_points,
         looks_like=','.join(POINTS),

@@ -33,7 +33,7 @@ from .content import (
     points_without_precision,
 )
 from .frames_of_points import frames_of, labels, named_targets, points_of
-from .text import Row, frame_numbers, joined, number_text, read_frames, require_width
+from .text import Row, frame_numbers, joined, number_text, read_frames, require_width, write_frames
 
 _COLUMN = re.compile(r'(?P<target>.+)_(?P<axis>[XYZ])', re.IGNORECASE)
 
@@ -92,10 +92,7 @@ def _write_xmalab3d(path: Path, content: Content, settings: FileSettings) -> Wri
     assert points is not None
     mm, notes = settings.unit_or('mm', str(path))
     columns = [f'{as_text(name)}_{axis}' for name in labels(content) for axis in 'XYZ']
-    with atomic_file(path, 'w') as file:
-        file.write(','.join(['Frame', *columns]) + '\n')
-        for number, xyz in zip(points.frame.tolist(), in_units(points.xyz_mm, mm)):
-            file.write(f'{number},{joined(xyz.ravel())}\n')
+    write_frames(path, columns, points.frame, in_units(points.xyz_mm, mm))
     return Written((str(path),), notes)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from ...errors import DataError
 from ...limits import MAX_ROWS
-from ..access import PathLike, check_rows, read_text
+from ..access import PathLike, atomic_file, check_rows, read_text
 from ..csv_table import decimal_point
 
 MISSING = ('', 'nan', 'none', 'null', 'na', 'n/a')
@@ -142,3 +142,13 @@ def number_text(value: float) -> str:
 def joined(values: Sequence[float] | np.ndarray, separator: str = ',') -> str:
     """Return numbers as a row of text."""
     return separator.join(number_text(value) for value in np.asarray(values, dtype=float).tolist())
+
+
+def write_frames(
+    path: PathLike, columns: Iterable[str], frame: np.ndarray, values: np.ndarray
+) -> None:
+    """Write a table with the column Frame and the numbers (m, ...) of each frame (m,)."""
+    with atomic_file(path, 'w') as file:
+        file.write(','.join(['Frame', *columns]) + '\n')
+        for number, numbers in zip(frame.tolist(), values):
+            file.write(f'{number},{joined(numbers.ravel())}\n')

@@ -9,7 +9,7 @@ import argparse
 import math
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from ..errors import ErrorsAt
 from ..io.rig_file import NAME
@@ -18,6 +18,7 @@ from ..options import Option, declared
 from .rig import JointOfRig
 
 if TYPE_CHECKING:
+    from ..bodies.body import Body
     from ..correction.fluoroscope_calibration import FluoroscopeCalibration
     from ..exposures.angles import AngleOptions
     from ..io.access import PathLike
@@ -163,6 +164,40 @@ def read_oriented_source(
     return recording, calibrations, orientation
 
 
+def add_out(parser: Parser, text: str, metavar: str = 'DIR') -> None:
+    """Add --out, what is written."""
+    parser.add_argument('--out', required=True, type=Path, metavar=metavar, help=text)
+
+
+def add_image_size(parser: Parser, text: str) -> None:
+    """Add --image-size."""
+    parser.add_argument('--image-size', type=image_size, metavar='WxH', help=text)
+
+
+def add_principal_distance(parser: Parser, text: str) -> None:
+    """Add --principal-distance."""
+    distance = number_in(1, 1e7)
+    parser.add_argument('--principal-distance', type=distance, metavar='PX', help=text)
+
+
+def add_clusters(parser: Parser, text: str) -> None:
+    """Add --cluster; `rigid_clusters` returns the bodies."""
+    metavar = "'NAME: ID ID ...'"
+    parser.add_argument('--cluster', action='append', default=[], metavar=metavar, help=text)
+
+
+def rigid_clusters(
+    arguments: argparse.Namespace, error: Callable[[str], NoReturn]
+) -> tuple[Body, ...]:
+    """Return the bodies of `add_clusters`; call error with a sentence for one that is wrong."""
+    from ..bodies.body import declared_bodies
+
+    try:
+        return declared_bodies(arguments.cluster)
+    except ValueError as fault:
+        error(f'--cluster: {fault}')
+
+
 def add_exit_zero(parser: Parser) -> None:
     """Add --exit-zero, for commands that give a verdict."""
     parser.add_argument(
@@ -219,7 +254,7 @@ def add_source(
         'program: XMALab 2-D points or project, .pho (docs/formats.md)' + more,
     )
     group = parser.add_argument_group('input')
-    group.add_argument('--image-size', type=image_size, metavar='WxH', help=image_size_help)
+    add_image_size(group, image_size_help)
     add_fluoroscopes(group)
     add_file_options(parser)
     return group
@@ -441,7 +476,7 @@ def add_result_folder(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def result_folder(arguments: argparse.Namespace, error: Callable[[str], None]) -> Path:
+def result_folder(arguments: argparse.Namespace, error: Callable[[str], NoReturn]) -> Path:
     """Return the folder of `add_result_folder`; call error with a sentence where there is none."""
     if arguments.directory is None and arguments.calibration is None:
         error('the following arguments are required: DIR')

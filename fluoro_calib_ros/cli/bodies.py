@@ -12,12 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import DataError, ErrorsAt
-from .arguments import (
-    add_oriented_source,
-    number_in,
-    options_of,
-    read_oriented_source,
-)
+from .arguments import add_oriented_source, add_out, number_in, options_of, read_oriented_source
 from .output import ProgressBar, print_findings, print_notes, print_result, print_unpaired
 
 if TYPE_CHECKING:
@@ -47,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--joints', type=Path, metavar='FILE', help='joints between the bodies, TOML'
     )
-    parser.add_argument('--out', required=True, type=Path, metavar='DIR', help='folder to write')
+    add_out(parser, 'folder to write')
     parser.add_argument(
         '--keep-shapes',
         action='store_true',

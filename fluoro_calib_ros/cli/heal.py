@@ -14,6 +14,7 @@ import numpy as np
 from .arguments import (
     add_exit_zero,
     add_oriented_source,
+    add_out,
     options_of,
     read_oriented_source,
 )
@@ -42,13 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='shapes of the bodies as they were learned while the rig was healthy: shapes.csv of '
         'fluoro-calib bodies',
     )
-    parser.add_argument(
-        '--out',
-        required=True,
-        type=Path,
-        metavar='DIR',
-        help='folder to write: calibrations and orientation as they are now, healing.json',
-    )
+    add_out(parser, 'folder to write: calibrations and orientation as they are now, healing.json')
     add_exit_zero(parser)
 
 

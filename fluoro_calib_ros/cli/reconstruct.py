@@ -7,14 +7,16 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 from ..errors import ErrorsAt
 from .arguments import (
+    add_clusters,
     add_oriented_source,
+    add_out,
     options_of,
     read_oriented_source,
+    rigid_clusters,
 )
 from .output import print_note, print_notes, print_result, print_unpaired
 
@@ -31,13 +33,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     from ..jobs.reconstruction import ReconstructionOptions
 
     add_oriented_source(parser, ReconstructionOptions, reject='S')
-    parser.add_argument('--out', required=True, type=Path, metavar='OUT.csv', help='file to write')
-    parser.add_argument(
-        '--cluster',
-        action='append',
-        default=[],
-        metavar="'NAME: ID ID ...'",
-        help="rigid cluster of targets, such as 'tibia: 1001 1002 1003', whose distances the "
+    add_out(parser, 'file to write', 'OUT.csv')
+    add_clusters(
+        parser,
+        "rigid cluster of targets, such as 'tibia: 1001 1002 1003', whose distances the "
         'drift watch also monitors; may be repeated',
     )
     parser.add_argument(
@@ -47,15 +46,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
+def check(arguments: argparse.Namespace, error: Callable[[str], NoReturn]) -> None:
     """Read the bodies; call error with a sentence for arguments that exclude each other."""
-    from ..bodies.body import declared_bodies
     from ..jobs.sources import is_bag
 
-    try:
-        arguments.bodies = declared_bodies(arguments.cluster)
-    except ValueError as fault:
-        error(f'--cluster: {fault}')
+    arguments.bodies = rigid_clusters(arguments, error)
     if arguments.bodies and arguments.no_drift_watch:
         error('--cluster is for the drift watch, it cannot be used with --no-drift-watch')
     if arguments.bodies and not is_bag(arguments.source):

@@ -28,7 +28,6 @@ from .content import (
     Content,
     FileSettings,
     Format,
-    Sample,
     Written,
     from_units,
     homogeneous,
@@ -43,11 +42,6 @@ COLUMNS = (
 _FIRST = re.compile(r'(?P<body>.+)_R11(?P<filter>_[\d.]+Hz)?')
 ROTATION_TOLERANCE = 1e-6  # rounding of 12 digits is far below
 LAST_TOLERANCE = 1e-9
-
-
-def _is_xmalab(sample: Sample) -> bool:
-    """Return whether the header names the elements of a matrix."""
-    return bool(sample.lines) and '_R11' in sample.lines[0] and '_TX' in sample.lines[0]
 
 
 def _read_xmalab(path: Path, settings: FileSettings) -> Content:
@@ -116,7 +110,7 @@ RIGIDBODY = Format(
     'rigidbody',
     'XMALab rigid body transformations',
     parts=('bodies',),
-    recognise=_is_xmalab,
+    recognise=lambda sample: '_R11' in sample.first and '_TX' in sample.first,
     read=_read_xmalab,
     write=_write_xmalab,
     looks_like='Frame,femur_R11,femur_R12,...,femur_TX,femur_TY,femur_TZ,femur_1',
@@ -130,11 +124,6 @@ RIGIDBODY = Format(
 # rows (r11, r12, r13, t1, r21, and so on, 0, 0, 0, 1), with commas, in mm, without header. Row 1
 # is the first frame. A matrix takes a volume to the world. Autoscoper places a volume by its first
 # voxel and its own axes, which are not those of the CT from which the markers of a body are.
-
-
-def _is_autoscoper(sample: Sample) -> bool:
-    """Return whether the suffix is that of tracking files."""
-    return sample.suffix == '.tra'
 
 
 def _write_autoscoper(path: Path, content: Content, settings: FileSettings) -> Written:
@@ -153,7 +142,7 @@ AUTOSCOPER = Format(
     'autoscoper',
     'Autoscoper tracking',
     parts=('bodies',),
-    recognise=_is_autoscoper,
+    recognise=lambda sample: sample.suffix == '.tra',
     read=None,
     write=_write_autoscoper,
     looks_like='rows of 16 numbers a body',
@@ -165,11 +154,6 @@ AUTOSCOPER = Format(
 
 _POSES = POSE_COLUMNS[:10]  # the poses without standard deviations, as the truth has them
 NORM_TOLERANCE = 1e-6  # of a quaternion: rounding of nine digits is far below
-
-
-def _is_poses(sample: Sample) -> bool:
-    """Return whether the header is that of poses.csv."""
-    return bool(sample.lines) and sample.lines[0].startswith(','.join(_POSES))
 
 
 def _read_poses(path: Path, settings: FileSettings) -> Content:
@@ -210,7 +194,7 @@ POSES = Format(
     'poses',
     'poses of bodies, poses.csv of the command bodies',
     parts=('bodies',),
-    recognise=_is_poses,
+    recognise=lambda sample: sample.first.startswith(','.join(_POSES)),
     read=_read_poses,
     write=None,
     looks_like=','.join(_POSES),

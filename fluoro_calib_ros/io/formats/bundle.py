@@ -32,7 +32,6 @@ from .content import (
     Content,
     FileSettings,
     Format,
-    Sample,
     Station,
     Written,
     common_focal_length,
@@ -48,11 +47,6 @@ WIDTHS = {'.pho': 8, '.iop': 25, '.eop': 8, '.xyz': 7}
 # x right, y up, z backwards -> x right, y down, z forwards.
 _AXES = np.diag([1.0, -1.0, -1.0])
 _SIGMA_PX = 1.0  # of observations whose precision is unknown
-
-
-def recognise(sample: Sample) -> bool:
-    """Return whether the suffix is one of the four."""
-    return sample.suffix in WIDTHS
 
 
 @dataclass(frozen=True)
@@ -313,7 +307,7 @@ FORMAT = Format(
     'bundle',
     'file of the program of Chow et al.',
     parts=('observations', 'cameras', 'stations', 'survey'),
-    recognise=recognise,
+    recognise=lambda sample: sample.suffix in WIDTHS,
     read=read,
     write=write,
     looks_like='NAME.pho, NAME.iop, NAME.eop, NAME.xyz',

@@ -277,6 +277,11 @@ class Sample:
         """Suffix of the name in lower case, with the dot."""
         return self.path.suffix.lower()
 
+    @property
+    def first(self) -> str:
+        """The first line that is not blank, '' for a file that is not text."""
+        return self.lines[0] if self.lines else ''
+
 
 @dataclass(frozen=True)
 class Format:

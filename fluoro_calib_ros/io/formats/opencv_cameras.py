@@ -45,7 +45,7 @@ DISTORTION_NAMES = ('distortion_coefficients', 'Distortion_Coefficients', 'distC
 
 def _is_opencv(sample: Sample) -> bool:
     """Return whether the file has the first line of OpenCV's file storage."""
-    if not sample.lines or not sample.lines[0].startswith('%YAML'):
+    if not sample.first.startswith('%YAML'):
         return False
     return any(line.split(':')[0] in MATRIX_NAMES for line in sample.lines)
 
@@ -269,7 +269,7 @@ _MODELS = ('plumb_bob', 'rational_polynomial')
 
 def _is_camera_info(sample: Sample) -> bool:
     """Return whether the file has the entries of camera_info, and no first line of OpenCV."""
-    if not sample.lines or sample.lines[0].startswith('%YAML'):
+    if sample.first.startswith('%YAML'):
         return False
     keys = {line.split(':')[0] for line in sample.lines}
     return {'camera_matrix', 'image_width'} <= keys

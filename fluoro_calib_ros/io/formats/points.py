@@ -40,9 +40,7 @@ _COLUMN = re.compile(r'(?P<target>.+)_(?P<axis>[XYZ])', re.IGNORECASE)
 
 def _is_xmalab3d(sample: Sample) -> bool:
     """Return whether the header has triples of columns of a marker."""
-    if not sample.lines:
-        return False
-    cells = re.split(r'[,;\t]', sample.lines[0])
+    cells = re.split(r'[,;\t]', sample.first)
     cells = cells[cells[0].strip().lower() == 'frame' :]
     return len(cells) >= 3 and all(
         cell.strip().upper().endswith(f'_{axis}') for cell, axis in zip(cells[:3], 'XYZ')
@@ -124,11 +122,6 @@ _NAMES = (
 )
 
 
-def _is_trc(sample: Sample) -> bool:
-    """Return whether the first row is that of TRC."""
-    return bool(sample.lines) and sample.lines[0].startswith('PathFileType')
-
-
 def _read_trc(path: Path, settings: FileSettings) -> Content:
     """Read points in space. Raises DataError that names the row."""
     lines = read_text(path).splitlines()
@@ -208,7 +201,7 @@ TRC = Format(
     'trc',
     'TRC',
     parts=('points',),
-    recognise=_is_trc,
+    recognise=lambda sample: sample.first.startswith('PathFileType'),
     read=_read_trc,
     write=_write_trc,
     looks_like='PathFileType  4  (X/Y/Z)',

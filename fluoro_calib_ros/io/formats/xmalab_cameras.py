@@ -47,11 +47,6 @@ _UNDISTORTION = 19  # line of its title
 _COEFFICIENTS = 8
 
 
-def _is_mayacam2(sample: Sample) -> bool:
-    """Return whether the first line is the title of MayaCam 2.0."""
-    return bool(sample.lines) and sample.lines[0] == 'image size'
-
-
 def _read_mayacam2(path: Path, settings: FileSettings) -> Content:
     """Read a camera, which is called like the file. Raises DataError that names the line."""
     lines = read_text(path).splitlines()
@@ -134,7 +129,7 @@ MAYACAM2 = Format(
     'mayacam2',
     'MayaCam 2.0',
     parts=('cameras',),
-    recognise=_is_mayacam2,
+    recognise=lambda sample: sample.first == 'image size',
     read=_read_mayacam2,
     write=_write_mayacam2,
     looks_like='image size, 1024,1024, (blank), camera matrix, ...',

@@ -28,9 +28,7 @@ _MIN_COLUMNS = 32  # narrower tables are something else
 
 def recognise(sample: Sample) -> bool:
     """Return whether the first row has as many numbers as an image has columns."""
-    if not sample.lines:
-        return False
-    cells = sample.lines[0].split(',')[:_MIN_COLUMNS]
+    cells = sample.first.split(',')[:_MIN_COLUMNS]
     try:
         return len([float(cell) for cell in cells]) == _MIN_COLUMNS
     except ValueError:

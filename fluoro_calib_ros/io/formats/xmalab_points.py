@@ -24,18 +24,13 @@ from ...exposures.frame import Frame, points_on_image
 from ...exposures.names import Names, number_names
 from ..access import atomic_file
 from ..csv_table import as_text
-from .content import Content, FileSettings, Format, Sample, Written
+from .content import Content, FileSettings, Format, Written
 from .frames_of_points import default_name, named_targets
 from .text import Row, frame_numbers, joined, read_frames, require_width
 
 COLUMN = re.compile(r'(?P<target>.+)_cam(?P<camera>\d+)_(?P<axis>[XY])', re.IGNORECASE)
 _OFFSET = re.compile(r'cam\d+_offset', re.IGNORECASE)
 MAX_ROWS = 10**6
-
-
-def recognise(sample: Sample) -> bool:
-    """Return whether the header has columns of a marker and a camera."""
-    return bool(sample.lines) and re.search(r'_cam\d+_[XY]\b', sample.lines[0], re.I) is not None
 
 
 def read(path: Path, settings: FileSettings) -> Content:
@@ -208,7 +203,7 @@ FORMAT = Format(
     'xmalab2d',
     'XMALab 2-D points',
     parts=('observations',),
-    recognise=recognise,
+    recognise=lambda sample: re.search(r'_cam\d+_[XY]\b', sample.first, re.I) is not None,
     read=read,
     write=write,
     looks_like='bead01_cam1_X,bead01_cam1_Y,bead01_cam2_X,bead01_cam2_Y',

@@ -35,7 +35,6 @@ from .content import (
     Content,
     FileSettings,
     Format,
-    Sample,
     Station,
     check_matrix,
     check_rotation,
@@ -47,11 +46,6 @@ from .text import Row, table_of
 _SEEN = 0  # a marker is seen where its status is above
 _INLIER = 1
 NO_POINT = -1.0
-
-
-def recognise(sample: Sample) -> bool:
-    """Return whether the file is a ZIP file with the suffix of a project."""
-    return sample.suffix == '.xma' and sample.head.startswith(b'PK')
 
 
 def read(path: Path, settings: FileSettings) -> Content:
@@ -384,7 +378,7 @@ FORMAT = Format(
     'xma',
     'XMALab project',
     parts=('observations', 'survey', 'cameras', 'stations', 'grids'),
-    recognise=recognise,
+    recognise=lambda sample: sample.suffix == '.xma' and sample.head.startswith(b'PK'),
     read=read,
     write=None,
     looks_like='a ZIP file with project.xml',

@@ -83,13 +83,19 @@ def _write_stack(out: Path, source: ImageSource, progress: Progress) -> int:
         atomic_file(out) as file,
         StackWriter(file, max(source.count, 1), image.nbytes) as writer,
     ):
-        writer.write(image)
-        number = 1
+        return _write_each(source, image, writer.write, progress)
+
+
+def _write_each(
+    source: ImageSource, image: np.ndarray, write: Callable[[np.ndarray], None], progress: Progress
+) -> int:
+    """Write the first image and those that follow; returns their number."""
+    number = 1
+    write(image)
+    progress(number, source.count)
+    for number, (_, image) in enumerate(source.images, 2):
+        write(image)
         progress(number, source.count)
-        for _, image in source.images:
-            writer.write(image)
-            number += 1
-            progress(number, source.count)
     return number
 
 
@@ -99,15 +105,8 @@ def write_video(out: Path, source: ImageSource, progress: Progress) -> int:
     with temporary_folder(out) as folder:
         temporary = folder / out.name
         video = _open_video(out, temporary, image, cast(float, source.frame_rate))
-        number = 0
         try:
-            video.write(image)
-            number += 1
-            progress(number, source.count)
-            for _, image in source.images:
-                video.write(image)
-                number += 1
-                progress(number, source.count)
+            number = _write_each(source, image, video.write, progress)
         finally:
             video.release()
         _check_written(out, temporary, number)
@@ -220,7 +219,8 @@ def correct_images(
         raise DataError(f'this is a folder, but {source} is a file', at=out)
     images = open_images(source)
     correctors = (lambda number: corrector) if isinstance(corrector, ImageCorrector) else corrector
-    written = write_images(out, _corrected(images, correctors), progress or _no_progress)
+    corrected = replace(images, images=_corrected_images(images, correctors))
+    written = write_images(out, corrected, progress or (lambda done, total: None))
     return CorrectedImages(images.kind, written)
 
 
@@ -230,15 +230,6 @@ def check_apart(source: Path, out: Path) -> None:
         raise DataError('this is the source itself, corrected images need another name', at=out)
     if not out.absolute().parent.is_dir():
         raise DataError(f'cannot be written, there is no folder {out.absolute().parent}', at=out)
-
-
-def _no_progress(done: int, total: int) -> None:
-    """Ignore the progress."""
-
-
-def _corrected(source: ImageSource, correctors: Correctors) -> ImageSource:
-    """A source of the corrected images of another."""
-    return replace(source, images=_corrected_images(source, correctors))
 
 
 def _corrected_images(

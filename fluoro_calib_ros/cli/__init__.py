@@ -92,8 +92,6 @@ class _Completion(argparse.Action):
         values: Any,
         option_string: str | None = None,
     ) -> None:
-        from .completion import completion_script
-
         print(completion_script(make_parser(), values))
         parser.exit()
 

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, BinaryIO, NamedTuple
 
 import zstandard
 from mcap.exceptions import EndOfFile
+from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
 from mcap.records import Channel, McapRecord, Message, Schema
 from mcap.stream_reader import StreamReader
@@ -32,11 +33,8 @@ if TYPE_CHECKING:
     from rosbags.rosbag2 import Reader
 
 MAGIC = b'\x89MCAP0\r\n'
-FOOTER_SIZE = 1 + 8 + 8 + 8 + 4  # bytes: opcode, length, two offsets, CRC
-FOOTER_OPCODE = 2
-CHUNK_OPCODE = 6
-DATA_END_OPCODE = 15
 CHUNK_HEAD = 100  # bytes that contain sizes and compression of a chunk
+FOOTER = struct.Struct('<BQQQI')  # opcode, length, two offsets, checksum
 RECORD = struct.Struct('<BQ')  # opcode and length
 MAX_CAUSE = 120  # characters
 
@@ -139,11 +137,11 @@ def _check_ends(path: str, file: BinaryIO) -> None:
     if file.read(len(MAGIC)) != MAGIC:
         raise DataError(f'{path}: this is not an MCAP file')
     file.seek(max(size - len(MAGIC), 0))
-    if size < 2 * len(MAGIC) + FOOTER_SIZE or file.read() != MAGIC:
+    if size < 2 * len(MAGIC) + FOOTER.size or file.read() != MAGIC:
         raise DataError(f'{path}: the bag is cut off, the end of the file is missing')
-    file.seek(size - len(MAGIC) - FOOTER_SIZE)
-    opcode, _, start, _, crc = struct.unpack('<BQQQI', file.read(FOOTER_SIZE))
-    if opcode != FOOTER_OPCODE or start > size:
+    file.seek(size - len(MAGIC) - FOOTER.size)
+    opcode, _, start, _, crc = FOOTER.unpack(file.read(FOOTER.size))
+    if opcode != Opcode.FOOTER or start > size:
         raise DataError(f'{path}: the bag is damaged, it has no footer')
     if start and crc:
         file.seek(start)
@@ -160,7 +158,7 @@ def _check_chunks(file: BinaryIO) -> None:
         file.seek(position)
         head = file.read(CHUNK_HEAD)
         opcode, length = RECORD.unpack_from(head)
-        if opcode == CHUNK_OPCODE and len(head) == CHUNK_HEAD:
+        if opcode == Opcode.CHUNK and len(head) == CHUNK_HEAD:
             (held,) = struct.unpack_from('<Q', head, RECORD.size + 16)
             (name_length,) = struct.unpack_from('<I', head, RECORD.size + 28)
             start = RECORD.size + 32 + name_length + 8
@@ -172,7 +170,7 @@ def _check_chunks(file: BinaryIO) -> None:
                     f'{file.name}: a chunk of the bag takes {held / 1e6:.0f} MB, more than '
                     f'{MAX_CHUNK / 1e6:.0f} MB are not read'
                 )
-        elif opcode == DATA_END_OPCODE:
+        elif opcode == Opcode.DATA_END:
             break
         position += RECORD.size + length
     file.seek(0)

@@ -34,13 +34,12 @@ from ...limits import MAX_CHUNK
 from ..access import PathLike, check_regular_file, os_error_reason
 from ..documents import read_yaml
 from .definitions import PACKAGE, TARGET_OBSERVATIONS, Definition, fluoroscope_of_topic, typestore
-from .mcap_file import MAGIC, RECORD, candidate_files
+from .mcap_file import FOOTER, MAGIC, RECORD, candidate_files
 from .metadata import parse_profiles, profile
 from .writer import BagWriter
 
 _CHUNK = struct.Struct('<QQQI')  # of a chunk: first and last time, size, checksum
 _MESSAGE = struct.Struct('<HIQQ')  # of a message: channel, sequence, log and publish time
-_FOOTER = struct.Struct('<BQQQI')
 # Where a chunk may begin: a short record with its opcode, or the name of its compression.
 _CANDIDATE = re.compile(rb'\x06[\x00-\xff]{4}\x00{4}|\x04\x00{3}zstd|\x03\x00{3}lz4')
 _TO_COMPRESSION = RECORD.size + _CHUNK.size  # bytes
@@ -229,13 +228,13 @@ class FileSalvage:
     def _read_summary(self, data: mmap.mmap) -> None:
         """Read topics and counts of an intact end: their first chunk may be damaged."""
         size = len(data)
-        footer = size - len(MAGIC) - _FOOTER.size
+        footer = size - len(MAGIC) - FOOTER.size
         if footer < len(MAGIC) or data[-len(MAGIC) :] != MAGIC:
             return
-        opcode, _, start, _, checksum = _FOOTER.unpack_from(data, footer)
+        opcode, _, start, _, checksum = FOOTER.unpack_from(data, footer)
         if opcode != Opcode.FOOTER or not len(MAGIC) < start <= footer or not checksum:
             return
-        if zlib.crc32(data[start : footer + _FOOTER.size - 4]) != checksum:
+        if zlib.crc32(data[start : footer + FOOTER.size - 4]) != checksum:
             return
         position = start
         while position < footer:

@@ -25,12 +25,11 @@ from ...exposures.names import Names, number_names
 from ..access import atomic_file
 from ..csv_table import as_text
 from .content import Content, FileSettings, Format, Written
-from .frames_of_points import default_name, named_targets
+from .frames_of_points import MAX_FRAMES, default_name, named_targets
 from .text import Row, frame_numbers, joined, read_frames, require_width
 
 COLUMN = re.compile(r'(?P<target>.+)_cam(?P<camera>\d+)_(?P<axis>[XY])', re.IGNORECASE)
 _OFFSET = re.compile(r'cam\d+_offset', re.IGNORECASE)
-MAX_ROWS = 10**6
 
 
 def read(path: Path, settings: FileSettings) -> Content:
@@ -154,8 +153,10 @@ def write(path: Path, content: Content, settings: FileSettings) -> Written:
     ids = sorted({int(i) for of in frames.values() for f in of.values() for i in f.target_id})
     labels = [named.get(i, default_name(i)) for i in ids]
     shift = int(numbers[0] == 0)
-    if numbers[-1] + shift > MAX_ROWS:
-        raise DataError(f'{path}: frame {numbers[-1]} would need as many rows, at most {MAX_ROWS}')
+    if numbers[-1] + shift > MAX_FRAMES:
+        raise DataError(
+            f'{path}: frame {numbers[-1]} would need as many rows, at most {MAX_FRAMES}'
+        )
     with atomic_file(path, 'w') as file:
         file.write(
             ','.join(

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 from PIL import Image
 
-from fluoro_calib_ros.io.atomic import write_bytes
+from fluoro_calib_ros.io.access import write_bytes
 from fluoro_calib_ros.report.style import BLACK, BLUE, GREY, RED, STYLE, new_figure, png_bytes
 from fluoro_calib_ros.simulation.rig import IMAGE_SIZE
 

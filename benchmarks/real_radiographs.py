@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 
 from fluoro_calib_ros.errors import DataError
-from fluoro_calib_ros.exposures.phantom_drawing import Drawing
+from fluoro_calib_ros.exposures.phantom import Drawing
 from fluoro_calib_ros.images.extraction import Extraction, extract_beads
 from fluoro_calib_ros.images.matching import PhantomModel
 from fluoro_calib_ros.images.overlay import draw_overlay

@@ -23,8 +23,7 @@ from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.options import CalibrationRequest
 from fluoro_calib_ros.estimation.survey import MeasuredDistance, SurveyedBeads
 from fluoro_calib_ros.exposures.frame import Frame
-from fluoro_calib_ros.exposures.phantom import Phantom
-from fluoro_calib_ros.exposures.phantom_drawing import Drawing
+from fluoro_calib_ros.exposures.phantom import Drawing, Phantom
 from fluoro_calib_ros.findings import Kind
 from fluoro_calib_ros.jobs.calibration import run_calibration
 from fluoro_calib_ros.jobs.reconstruction import ReconstructionOptions, reconstruct

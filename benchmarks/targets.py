@@ -29,8 +29,7 @@ from fluoro_calib_ros.estimation.initial_network import (
     start_noise,
 )
 from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
-from fluoro_calib_ros.exposures.frame import Frame, points_on_image
-from fluoro_calib_ros.exposures.moving_points import MovingPoints
+from fluoro_calib_ros.exposures.frame import Frame, MovingPoints, points_on_image
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.photogrammetry.known_orientation import KnownOrientation
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector

@@ -23,27 +23,24 @@ from .errors import DataError
 from .estimation.options import CalibrationOptions, CalibrationRequest
 from .estimation.result import CalibrationResult
 from .estimation.survey import MeasuredDistance
-from .exposures.frame import Frame
-from .exposures.moving_points import MovingPoints
+from .exposures.frame import Frame, MovingPoints
 from .exposures.names import Names
 from .exposures.phantom import Phantom
 from .findings import Finding, Kind, Severity
 from .io.access import PathLike
 from .io.bodies import read_bodies, write_bodies
+from .io.calibration import load_orientation, save_orientation
 from .io.calibration_request import read_request
 from .io.formats.content import FileSettings
 from .io.joints import JointEntry, read_joints
 from .io.phantom import read_moving_points, read_phantom, write_phantom
-from .io.reconstructed_points import write_reconstruction
-from .io.rig_orientation import load_orientation, save_orientation
-from .jobs.bodies import BodiesOptions, BodiesOutcome, track_bodies
-from .jobs.bodies_folder import save_bodies
+from .io.poses import write_reconstruction
+from .jobs.bodies import BodiesOptions, BodiesOutcome, save_bodies, track_bodies
 from .jobs.calibration import CalibrationOutcome, adjust, run_calibration
 from .jobs.conversion import ConversionRequest, convert
 from .jobs.extraction import ExtractionOutcome, ExtractionRequest
 from .jobs.extraction import run_extraction as extract
-from .jobs.healing import HealingOptions, HealingOutcome, heal_rig
-from .jobs.healing_folder import save_healing
+from .jobs.healing import HealingOptions, HealingOutcome, heal_rig, save_healing
 from .jobs.orientation import OrientationOutcome, orient
 from .jobs.reconstruction import ReconstructionOptions, ReconstructionOutcome, reconstruct
 from .jobs.result_folder import save_outcome, save_result

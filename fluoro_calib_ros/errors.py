@@ -79,6 +79,20 @@ class DataError(ValueError):
         return DataError(*self.findings, at=where)
 
 
+class ErrorsAt:
+    """Context in which a DataError is put at a place, such as a path."""
+
+    def __init__(self, where: object) -> None:
+        self._where = where
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
+        if isinstance(error, DataError):
+            raise error.at(self._where) from None
+
+
 def _shown(text: str) -> str:
     if len(text) > MAX_MESSAGE:  # before megabytes are examined
         text = shortened(text)

@@ -18,7 +18,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..exposures.columns import cells_of
+from ..exposures.frame import cells_of
 
 # The areas of an image in which the drift watch looks for a drift.
 

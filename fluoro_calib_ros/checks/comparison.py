@@ -26,7 +26,7 @@ from ..correction.base import Correction
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration, at_common_angle
 from ..errors import DataError
 from ..estimation.gauge import interior_about
-from ..exposures.columns import cells_of
+from ..exposures.frame import cells_of
 
 # Comparison of two independent calibrations of one fluoroscope, and names of image areas.
 #

@@ -24,8 +24,7 @@ from scipy.spatial import cKDTree
 
 from ..estimation.lack_of_fit import LARGEST_SD, FittedPoints, areas_of_rejected
 from ..estimation.result import CalibrationResult
-from ..exposures.columns import cells_of
-from ..exposures.frame import Frame, angles_of
+from ..exposures.frame import Frame, angles_of, cells_of
 from ..photogrammetry.collinearity import project
 from ..photogrammetry.noise import INLIER_Q
 from ..photogrammetry.rotations import matrix_from_quaternion

@@ -9,6 +9,7 @@ import argparse
 import contextlib
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import DataError, printable, shortened
@@ -33,7 +34,6 @@ from . import (
     watch,
 )
 from .arguments import add_read_limits, set_read_limits
-from .completion import SHELLS
 from .output import print_note, styled
 from .rig import add_rig, find_rig
 from .termination import terminated_by_signals
@@ -92,8 +92,6 @@ class _Completion(argparse.Action):
         values: Any,
         option_string: str | None = None,
     ) -> None:
-        from .completion import completion_script
-
         print(completion_script(make_parser(), values))
         parser.exit()
 
@@ -169,3 +167,31 @@ def _run(words: list[str]) -> None:
         sys.exit(130)
     if passed is False and not options.exit_zero:
         sys.exit(NOT_PASSED)
+
+
+# Completion of the command line in shells, by shtab.
+
+SHELLS = ('bash', 'zsh', 'tcsh')
+
+
+def completion_script(parser: argparse.ArgumentParser, shell: str) -> str:
+    """Return the script that completes a command line. Raises DataError without shtab."""
+    try:
+        import shtab
+    except ImportError:
+        raise DataError(
+            'shell completion needs shtab, which is not installed: pip install shtab'
+        ) from None
+    _complete_paths(parser, shtab.FILE)
+    script: str = shtab.complete(parser, shell)
+    return script
+
+
+def _complete_paths(parser: argparse.ArgumentParser, complete: object) -> None:
+    """Let every argument that is a path be completed as one, in all subcommands."""
+    for action in parser._actions:
+        if action.type is Path:
+            action.complete = complete  # type: ignore[attr-defined]
+        if isinstance(action, argparse._SubParsersAction):
+            for sub in action.choices.values():
+                _complete_paths(sub, complete)

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from ..findings import Kind
 from ..options import declared
@@ -16,6 +15,7 @@ from .arguments import (
     add_covariance,
     add_exit_zero,
     add_option,
+    add_out,
     add_phantom,
     add_source,
     bag_selection,
@@ -51,9 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_phantom(source)
     add_bag_options(parser)
-    parser.add_argument(
-        '--out', required=True, type=Path, metavar='DIR', help='result folder to write'
-    )
+    add_out(parser, 'result folder to write')
     add_covariance(parser)
     add_exit_zero(parser)
     add_calibration(parser)

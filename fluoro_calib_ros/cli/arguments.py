@@ -8,17 +8,17 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
-from ..errors import DataError
+from ..errors import ErrorsAt
 from ..io.rig_file import NAME
 from ..limits import ReadLimits, use_read_limits
 from ..options import Option, declared
 from .rig import JointOfRig
 
 if TYPE_CHECKING:
+    from ..bodies.body import Body
     from ..correction.fluoroscope_calibration import FluoroscopeCalibration
     from ..exposures.angles import AngleOptions
     from ..io.access import PathLike
@@ -126,6 +126,16 @@ def add_orientation(parser: Parser) -> None:
     )
 
 
+def add_oriented_source(parser: argparse.ArgumentParser, options: type, **metavars: str) -> None:
+    """Add what `read_oriented_source` reads, and options with those of `RecordedPairing`."""
+    add_source(parser, 'image size of a file [px] (default: that of the calibration)')
+    add_bag_options(parser, pairing=False)
+    add_calibration(parser)
+    add_orientation(parser)
+    metavars = {'pair_tolerance': 'S', **metavars}
+    add_options(parser, options, **{name: {'metavar': text} for name, text in metavars.items()})
+
+
 def read_oriented_source(
     arguments: argparse.Namespace, path: PathLike
 ) -> tuple[Recording, dict[str, FluoroscopeCalibration], RigOrientation]:
@@ -133,7 +143,7 @@ def read_oriented_source(
 
     Raises DataError, also where the orientation belongs to other calibrations.
     """
-    from ..io.rig_orientation import load_orientation
+    from ..io.calibration import load_orientation
     from ..jobs.reconstruction import check_orientation
     from ..jobs.sources import read_calibrated_source
 
@@ -149,11 +159,43 @@ def read_oriented_source(
     )
     orientation = load_orientation(path)
     names = [name for name in orientation.fluoroscopes if name in recording.frames]
-    try:
+    with ErrorsAt(path):
         check_orientation(orientation.subset(names) if names else orientation, calibrations)
-    except DataError as error:
-        raise error.at(path) from None
     return recording, calibrations, orientation
+
+
+def add_out(parser: Parser, text: str, metavar: str = 'DIR') -> None:
+    """Add --out, what is written."""
+    parser.add_argument('--out', required=True, type=Path, metavar=metavar, help=text)
+
+
+def add_image_size(parser: Parser, text: str) -> None:
+    """Add --image-size."""
+    parser.add_argument('--image-size', type=image_size, metavar='WxH', help=text)
+
+
+def add_principal_distance(parser: Parser, text: str) -> None:
+    """Add --principal-distance."""
+    distance = number_in(1, 1e7)
+    parser.add_argument('--principal-distance', type=distance, metavar='PX', help=text)
+
+
+def add_clusters(parser: Parser, text: str) -> None:
+    """Add --cluster; `rigid_clusters` returns the bodies."""
+    metavar = "'NAME: ID ID ...'"
+    parser.add_argument('--cluster', action='append', default=[], metavar=metavar, help=text)
+
+
+def rigid_clusters(
+    arguments: argparse.Namespace, error: Callable[[str], NoReturn]
+) -> tuple[Body, ...]:
+    """Return the bodies of `add_clusters`; call error with a sentence for one that is wrong."""
+    from ..bodies.body import declared_bodies
+
+    try:
+        return declared_bodies(arguments.cluster)
+    except ValueError as fault:
+        error(f'--cluster: {fault}')
 
 
 def add_exit_zero(parser: Parser) -> None:
@@ -212,15 +254,15 @@ def add_source(
         'program: XMALab 2-D points or project, .pho (docs/formats.md)' + more,
     )
     group = parser.add_argument_group('input')
-    group.add_argument('--image-size', type=image_size, metavar='WxH', help=image_size_help)
+    add_image_size(group, image_size_help)
     add_fluoroscopes(group)
     add_file_options(parser)
     return group
 
 
 def add_bag_options(parser: argparse.ArgumentParser, pairing: bool = True) -> None:
-    """Add what is used of a bag: time window and, where it is not an option already, pairing."""
-    from ..exposures.pairing import PairingOptions
+    """Add what is used of a bag: time window and, where they are not options already, pairing."""
+    from ..exposures.pairing import RecordedPairing
 
     group = parser.add_argument_group('bags')
     for name, text in (('start', 'first'), ('end', 'last')):
@@ -230,13 +272,8 @@ def add_bag_options(parser: argparse.ArgumentParser, pairing: bool = True) -> No
             metavar='S',
             help=f'{text} time that is used [s from the stamp of the first frame] (default: all)',
         )
-    options = declared(PairingOptions)
     if pairing:
-        add_option(group, options['pair_by'])
-    tolerance = options['tolerance_s']
-    description = f'{tolerance.description}, with --pair-by stamp'
-    tolerance = replace(tolerance, name='pair_tolerance', description=description)
-    add_option(group, tolerance, metavar='S')
+        add_options(group, RecordedPairing, pair_tolerance={'metavar': 'S'})
     add_angle_options(group)
 
 
@@ -439,7 +476,7 @@ def add_result_folder(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def result_folder(arguments: argparse.Namespace, error: Callable[[str], None]) -> Path:
+def result_folder(arguments: argparse.Namespace, error: Callable[[str], NoReturn]) -> Path:
     """Return the folder of `add_result_folder`; call error with a sentence where there is none."""
     if arguments.directory is None and arguments.calibration is None:
         error('the following arguments are required: DIR')

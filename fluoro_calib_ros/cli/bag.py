@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from ..errors import printable
-from .arguments import add_options, names, number_in, options_of
+from .arguments import add_options, add_out, names, number_in, options_of
 from .output import print_result
 
 if TYPE_CHECKING:
@@ -36,9 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         actions, 'recover', 'Write all intact messages of a damaged or cut-off bag to a new one.'
     )
     recover.add_argument('source', type=Path, metavar='SOURCE', help='bag (file or folder)')
-    recover.add_argument(
-        '--out', required=True, type=Path, metavar='FOLDER', help='new bag, which must not exist'
-    )
+    add_out(recover, 'new bag, which must not exist', 'FOLDER')
     info = _add_action(actions, 'info', 'Say what is in a bag and what is wrong with it.')
     info.add_argument('source', type=Path, metavar='SOURCE', help='bag (file or folder)')
 
@@ -48,9 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     record.add_argument(
         'topics', nargs='*', metavar='TOPIC', help='topics to record (default: all)'
     )
-    record.add_argument(
-        '--out', required=True, type=Path, metavar='FOLDER', help='new bag, which must not exist'
-    )
+    add_out(record, 'new bag, which must not exist', 'FOLDER')
     add_options(record, RecordingOptions)
     play = _add_action(
         actions, 'play', 'Publish the messages of a bag as they were recorded (needs ROS 2).'
@@ -117,7 +113,7 @@ def _recover(arguments: argparse.Namespace) -> None:
         'out': str(arguments.out),
         'messages': recovery.counts,
         'lost': lost,
-        'damages': [_damage_document(damage) for damage in recovery.damages],
+        'damages': [vars(damage) for damage in recovery.damages],
         'left_out': recovery.skipped,
     }
     lines = [f'{total} messages recovered, written to {arguments.out}']
@@ -142,7 +138,7 @@ def _info(arguments: argparse.Namespace) -> None:
         'topics': {topic: _topic_document(each) for topic, each in report.topics.items()},
         'without_partner': report.without_partner,
         'lost': report.lost,
-        'damages': [_damage_document(damage) for damage in report.damages],
+        'damages': [vars(damage) for damage in report.damages],
         'faults': faults,
     }
     print_result(arguments, document, _info_text(report, faults))
@@ -209,16 +205,6 @@ def _topic_document(topic: TopicReport) -> dict[str, Any]:
         'repeated_frames': topic.repeated_frames,
         'restarts': topic.restarts,
         'undecodable': topic.undecodable,
-    }
-
-
-def _damage_document(damage: Damage) -> dict[str, Any]:
-    return {
-        'path': damage.path,
-        'cause': damage.cause,
-        'start_ns': damage.start_ns,
-        'end_ns': damage.end_ns,
-        'lost': damage.lost,
     }
 
 

@@ -11,17 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import DataError
-from .arguments import (
-    add_bag_options,
-    add_calibration,
-    add_options,
-    add_orientation,
-    add_source,
-    number_in,
-    options_of,
-    read_oriented_source,
-)
+from ..errors import DataError, ErrorsAt
+from .arguments import add_oriented_source, add_out, number_in, options_of, read_oriented_source
 from .output import ProgressBar, print_findings, print_notes, print_result, print_unpaired
 
 if TYPE_CHECKING:
@@ -39,9 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     from ..jobs.bodies import BodiesOptions
 
-    add_source(parser, 'image size of a file [px] (default: that of the calibration)')
-    add_bag_options(parser, pairing=False)
-    add_calibration(parser)
+    add_oriented_source(parser, BodiesOptions, reject='S')
     parser.add_argument(
         '--bodies',
         required=True,
@@ -53,9 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--joints', type=Path, metavar='FILE', help='joints between the bodies, TOML'
     )
-    parser.add_argument('--out', required=True, type=Path, metavar='DIR', help='folder to write')
-    add_orientation(parser)
-    add_options(parser, BodiesOptions, reject={'metavar': 'S'})
+    add_out(parser, 'folder to write')
     parser.add_argument(
         '--keep-shapes',
         action='store_true',
@@ -77,10 +64,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Write poses and joints of a recording. Raises DataError."""
     from ..io.bodies import read_bodies
+    from ..io.calibration import orientation_path
     from ..io.joints import read_joints
-    from ..io.rig_orientation import orientation_path
-    from ..jobs.bodies import BodiesOptions, track_bodies
-    from ..jobs.bodies_folder import check_bodies_folder, save_bodies
+    from ..jobs.bodies import BodiesOptions, check_bodies_folder, save_bodies, track_bodies
     from ..jobs.sources import is_bag
 
     path = arguments.orientation or orientation_path(arguments.calibration)
@@ -99,23 +85,19 @@ def run(arguments: argparse.Namespace) -> None:
     options = options_of(
         BodiesOptions,
         arguments,
-        pair_tolerance=arguments.pair_tolerance,
         estimate_shapes=not arguments.keep_shapes,
         rate=arguments.rate,
     )
-    try:
-        with ProgressBar('exposures') as bar:
-            outcome = track_bodies(
-                recording.frames,
-                calibrations,
-                orientation,
-                bodies,
-                joints=joints,
-                options=options,
-                progress=bar,
-            )
-    except DataError as error:
-        raise error.at(arguments.source) from None
+    with ErrorsAt(arguments.source), ProgressBar('exposures') as bar:
+        outcome = track_bodies(
+            recording.frames,
+            calibrations,
+            orientation,
+            bodies,
+            joints=joints,
+            options=options,
+            progress=bar,
+        )
     save_bodies(arguments.out, outcome, arguments.figures)
     print_unpaired(arguments.source, outcome.unpaired)
     print_findings(outcome.findings, 'doubtful: ')

@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from ..errors import DataError
 from ..options import Option, declared
@@ -18,14 +18,15 @@ from .arguments import (
     add_covariance,
     add_exit_zero,
     add_option,
+    add_out,
     add_phantom,
+    add_principal_distance,
     add_scheduler,
     add_source,
     angle_options,
     bag_selection,
     cluster_of,
     file_settings,
-    number_in,
     options_of,
 )
 from .output import (
@@ -66,9 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_bag_options(parser)
     _add_adjustment(parser)
     result = parser.add_argument_group('result')
-    result.add_argument(
-        '--out', required=True, type=Path, metavar='DIR', help='result folder to write'
-    )
+    add_out(result, 'result folder to write')
     result.add_argument(
         '--force',
         action='store_true',
@@ -107,11 +106,9 @@ def _add_adjustment(parser: argparse.ArgumentParser) -> None:
     together.add_argument(
         '--separate', action='store_true', help='one fluoroscope after the other (the default)'
     )
-    adjustment.add_argument(
-        '--principal-distance',
-        type=number_in(1, 1e7),
-        metavar='PX',
-        help='start value, or with --interior fixed the value (default: from the observations)',
+    add_principal_distance(
+        adjustment,
+        'start value, or with --interior fixed the value (default: from the observations)',
     )
     adjustment.add_argument(
         '--known-orientation',
@@ -160,7 +157,7 @@ _METAVARS = {
 }
 
 
-def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
+def check(arguments: argparse.Namespace, error: Callable[[str], NoReturn]) -> None:
     """Call error with a sentence for arguments that exclude each other."""
     from ..correction.registry import neighbour_models
 
@@ -199,7 +196,7 @@ def run(arguments: argparse.Namespace) -> bool:
 
     def write_more(folder: Path) -> None:
         if arguments.figures:
-            from ..report.figures import write_figures
+            from ..report.report_figures import write_figures
 
             write_figures(outcome.result, folder / 'figures')
         if arguments.covariance:
@@ -265,8 +262,7 @@ def _print(arguments: argparse.Namespace, outcome: CalibrationOutcome) -> None:
     """Print notes, the summary, and the verdict with the report."""
     from ..io.result_document import validation_document
     from ..jobs.result_folder import written_document
-    from ..report.tables import summary_table
-    from ..report.verdict import verdict_line
+    from ..report.tables import summary_table, verdict_line
 
     print_findings(outcome.result.findings, 'this cannot be right: ')
     document = written_document(outcome.result)

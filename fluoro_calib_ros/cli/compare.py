@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Compare, and draw the figure. Raises DataError."""
-    from ..io.atomic import write_bytes
+    from ..io.access import write_bytes
     from ..io.folder import check_output_file
     from ..jobs.report import compare_folders
     from ..report.comparison import comparison_document, comparison_png, comparison_text

@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from pathlib import Path
+from typing import NoReturn
 
 from ..errors import DataError
 from .arguments import (
@@ -16,10 +17,12 @@ from .arguments import (
     add_angle_options,
     add_file_options,
     add_fluoroscopes,
+    add_image_size,
+    add_out,
     angle_of,
     angle_options,
     file_settings,
-    image_size,
+    number_in,
 )
 from .output import print_notes, print_result
 
@@ -32,7 +35,6 @@ MAX_RATE = 1e6
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     from ..jobs.conversion import kinds_read, kinds_written
-    from .arguments import number_in
 
     parser.add_argument(
         'source',
@@ -48,13 +50,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='KIND',
         help=f'format to write: {", ".join(kinds_written())}',
     )
-    parser.add_argument(
-        '--out',
-        required=True,
-        type=Path,
-        metavar='PATH',
-        help='file to write; for mayacam2, opencv, camera_info and lut a folder with one file a '
+    add_out(
+        parser,
+        'file to write; for mayacam2, opencv, camera_info and lut a folder with one file a '
         'fluoroscope, for bundle a folder',
+        'PATH',
     )
     parser.add_argument(
         '--from',
@@ -63,12 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='KIND',
         help='format of SOURCE (default: as it is recognised)',
     )
-    parser.add_argument(
-        '--image-size',
-        type=image_size,
-        metavar='WxH',
-        help='where SOURCE does not contain it [px]',
-    )
+    add_image_size(parser, 'where SOURCE does not contain it [px]')
     add_fluoroscopes(parser, 'convert')
     parser.add_argument(
         '--exposure',
@@ -104,7 +99,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
+def check(arguments: argparse.Namespace, error: Callable[[str], NoReturn]) -> None:
     """Call error with a sentence for arguments that exclude each other."""
     if arguments.corrected and arguments.calibration is None:
         error('--corrected needs --calibration')

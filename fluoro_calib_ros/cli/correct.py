@@ -16,6 +16,7 @@ from .arguments import (
     add_angle,
     add_calibration,
     add_file_options,
+    add_out,
     add_scheduler,
     add_workers,
     angle_of,
@@ -45,12 +46,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'recording (cine, dcm) such as trial.cine',
     )
     add_calibration(parser)
-    parser.add_argument(
-        '--out',
-        required=True,
-        type=Path,
-        metavar='OUT',
-        help='file to write, whose suffix determines the format; a folder for a folder of images',
+    add_out(
+        parser,
+        'file to write, whose suffix determines the format; a folder for a folder of images',
+        'OUT',
     )
     parser.add_argument(
         '--fluoroscopes',

@@ -8,14 +8,19 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
-from ..errors import DataError
+from ..errors import ErrorsAt
 from .arguments import (
     add_angle,
     add_angle_options,
+    add_clusters,
+    add_file_options,
     add_options,
+    add_orientation,
+    add_out,
     add_phantom,
+    add_principal_distance,
     add_scheduler,
     add_workers,
     angle_of,
@@ -23,8 +28,8 @@ from .arguments import (
     cluster_of,
     file_settings,
     names,
-    number_in,
     options_of,
+    rigid_clusters,
 )
 from .output import ProgressBar, print_note, print_notes, print_result
 
@@ -42,9 +47,6 @@ EXAMPLE = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    from ..images.markers import MarkerOptions
-    from .arguments import add_file_options
-
     parser.add_argument(
         'sources',
         type=Path,
@@ -70,14 +72,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='of the images; A,B for markers of two calibrated fluoroscopes, with one SOURCE for '
         'each, or one that has a folder or a topic of each',
     )
-    parser.add_argument(
-        '--out', required=True, type=Path, metavar='CSV', help='file of observations to write'
-    )
-    parser.add_argument(
-        '--principal-distance',
-        type=number_in(1, 1e7),
-        metavar='PX',
-        help='to some 10 %% (default: not known, about four times the width of the image)',
+    add_out(parser, 'file of observations to write', 'CSV')
+    add_principal_distance(
+        parser, 'to some 10 %% (default: not known, about four times the width of the image)'
     )
     parser.add_argument(
         '--overlay',
@@ -93,7 +90,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='the phantom is a regular flat grid, which fits in many places: take any of them; '
         'this serves the distortion of one fluoroscope, not the orientation of two',
     )
-    group = parser.add_argument_group('markers in motion')
+    _add_markers(parser.add_argument_group('markers in motion'))
+    angles = parser.add_argument_group('angle of a C-arm')
+    add_angle_options(angles)
+    add_angle(angles, 'of all images, where no joint gives it', 'unknown')
+    add_file_options(parser)
+
+
+def _add_markers(group: argparse._ArgumentGroup) -> None:
+    """Add what is known of markers that are followed."""
+    from ..images.markers import MarkerOptions
+
     group.add_argument(
         '--markers',
         type=Path,
@@ -107,18 +114,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='DIR',
         help='result folder of calibrate, for two fluoroscopes that are followed together',
     )
-    group.add_argument(
-        '--orientation',
-        type=Path,
-        metavar='FILE',
-        help='orientation of the rig (default: rig_orientation.npz in the result folder)',
-    )
-    group.add_argument(
-        '--cluster',
-        action='append',
-        default=[],
-        metavar="'NAME: ID ID ...'",
-        help="markers that are rigid together, such as 'tibia: 1001 1002 1003'; with two "
+    add_orientation(group)
+    add_clusters(
+        group,
+        "markers that are rigid together, such as 'tibia: 1001 1002 1003'; with two "
         'fluoroscopes, they predict and check each other; may be repeated',
     )
     group.add_argument(
@@ -136,20 +135,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--cluster; without --markers, the shapes give the ids',
     )
     add_options(group, MarkerOptions, ('shutter', 'gate', 'lost_after', 'search_every'))
-    angles = parser.add_argument_group('angle of a C-arm')
-    add_angle_options(angles)
-    add_angle(angles, 'of all images, where no joint gives it', 'unknown')
-    add_file_options(parser)
 
 
-def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
+def check(arguments: argparse.Namespace, error: Callable[[str], NoReturn]) -> None:
     """Read the bodies; call error with a sentence for arguments that exclude each other."""
-    from ..bodies.body import declared_bodies
-
-    try:
-        arguments.rigid = declared_bodies(arguments.cluster)
-    except ValueError as fault:
-        error(f'--cluster: {fault}')
+    arguments.rigid = rigid_clusters(arguments, error)
     if arguments.bodies is not None and arguments.rigid:
         error('--bodies: it names the markers of each body, as --cluster does')
     if arguments.cluster_shapes is not None and not arguments.rigid:
@@ -302,7 +292,7 @@ def _marker_request(arguments: argparse.Namespace) -> MarkerRequest:
     """Read what is known of the markers and the fluoroscopes. Raises DataError."""
     from ..images.markers import MarkerOptions
     from ..io.bodies import read_bodies
-    from ..io.rig_orientation import load_orientation, orientation_path
+    from ..io.calibration import load_orientation, orientation_path
     from ..jobs.image_sources import ImageAngles
     from ..jobs.marker_extraction import MarkerRequest, sequences, shaped
     from ..jobs.reconstruction import check_orientation
@@ -337,10 +327,8 @@ def _marker_request(arguments: argparse.Namespace) -> MarkerRequest:
         calibrations = read_calibrations(arguments.calibration, arguments.fluoroscope)
         path = arguments.orientation or orientation_path(arguments.calibration)
         orientation = load_orientation(path).subset(arguments.fluoroscope)
-        try:
+        with ErrorsAt(path):
             check_orientation(orientation, calibrations)
-        except DataError as error:
-            raise error.at(path) from None
     return MarkerRequest(
         sources,
         first,

@@ -12,12 +12,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .arguments import (
-    add_bag_options,
-    add_calibration,
     add_exit_zero,
-    add_options,
-    add_orientation,
-    add_source,
+    add_oriented_source,
+    add_out,
     options_of,
     read_oriented_source,
 )
@@ -37,9 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     from ..jobs.healing import HealingOptions
 
-    add_source(parser, 'image size of a file [px] (default: that of the calibration)')
-    add_bag_options(parser, pairing=False)
-    add_calibration(parser)
+    add_oriented_source(parser, HealingOptions)
     parser.add_argument(
         '--bodies',
         required=True,
@@ -48,25 +43,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='shapes of the bodies as they were learned while the rig was healthy: shapes.csv of '
         'fluoro-calib bodies',
     )
-    parser.add_argument(
-        '--out',
-        required=True,
-        type=Path,
-        metavar='DIR',
-        help='folder to write: calibrations and orientation as they are now, healing.json',
-    )
-    add_orientation(parser)
-    add_options(parser, HealingOptions)
+    add_out(parser, 'folder to write: calibrations and orientation as they are now, healing.json')
     add_exit_zero(parser)
 
 
 def run(arguments: argparse.Namespace) -> bool:
     """Heal a rig; return whether the verdict is pass. Raises DataError."""
-    from ..errors import DataError
+    from ..errors import ErrorsAt
     from ..io.bodies import read_bodies
-    from ..io.rig_orientation import orientation_path
-    from ..jobs.healing import HealingOptions, heal_rig
-    from ..jobs.healing_folder import check_healing_folder, healing_document, save_healing
+    from ..io.calibration import orientation_path
+    from ..jobs.healing import (
+        HealingOptions,
+        check_healing_folder,
+        heal_rig,
+        healing_document,
+        save_healing,
+    )
 
     path = arguments.orientation or orientation_path(arguments.calibration)
     check_healing_folder(
@@ -75,14 +67,11 @@ def run(arguments: argparse.Namespace) -> bool:
     bodies = read_bodies(arguments.bodies)
     recording, calibrations, orientation = read_oriented_source(arguments, path)
     print_notes(recording.notes)
-    options = options_of(HealingOptions, arguments, pair_tolerance=arguments.pair_tolerance)
-    try:
-        with ProgressBar('steps') as bar:
-            outcome = heal_rig(
-                recording.frames, calibrations, orientation, bodies, options, progress=bar
-            )
-    except DataError as error:
-        raise error.at(arguments.source) from None
+    options = options_of(HealingOptions, arguments)
+    with ErrorsAt(arguments.source), ProgressBar('steps') as bar:
+        outcome = heal_rig(
+            recording.frames, calibrations, orientation, bodies, options, progress=bar
+        )
     if outcome.healed is not None:
         save_healing(arguments.out, outcome, orientation)
     print_findings(outcome.findings, 'changed: ')

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 
-from ..errors import DataError
+from ..errors import ErrorsAt
 from ..findings import sentences
 from .arguments import (
     add_bag_options,
@@ -64,9 +64,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Write DIR/rig_orientation.npz. Raises DataError."""
+    from ..io.calibration import save_orientation
     from ..io.csv_table import read_names
     from ..io.result_document import orientation_document
-    from ..io.rig_orientation import save_orientation
     from ..jobs.orientation import orient
     from ..jobs.result_folder import belongs_to, saved_orientation
     from ..jobs.sources import read_calibrated_source, read_survey
@@ -93,10 +93,8 @@ def run(arguments: argparse.Namespace) -> None:
     present = saved_orientation(arguments.calibration)
     if present is not None and not belongs_to(present, calibrations):
         present = None
-    try:
+    with ErrorsAt(arguments.source):
         outcome = orient(frames, survey.phantom, calibrations, arguments.frame_id, present=present)
-    except DataError as error:
-        raise error.at(arguments.source) from None
     path = save_orientation(arguments.calibration, outcome.orientation)
     print_notes(outcome.findings)
     document = {

@@ -52,7 +52,7 @@ def print_result(
 ) -> None:
     """Print a result: as JSON with --json, else as text for people, with the next command."""
     if arguments.json:
-        from ..io.text_files import json_text
+        from ..io.documents import json_text
 
         print(json_text(document).rstrip('\n'))
         return

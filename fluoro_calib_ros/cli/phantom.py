@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from pathlib import Path
+from typing import NoReturn
 
 from ..errors import DataError
 from .arguments import number_in
@@ -111,7 +112,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
+def check(arguments: argparse.Namespace, error: Callable[[str], NoReturn]) -> None:
     """Call error with a sentence unless there is one file to write."""
     if (arguments.file is None) == (arguments.out is None):
         error('one file to write is needed: OUT.csv')
@@ -120,9 +121,8 @@ def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Write the phantom file and its picture. Raises DataError."""
-    from ..exposures.phantom import require_size
-    from ..exposures.phantom_drawing import Drawing
-    from ..io.atomic import write_bytes
+    from ..exposures.phantom import Drawing, require_size
+    from ..io.access import write_bytes
     from ..io.phantom import write_phantom
     from ..report.phantom_figure import phantom_figure, picture_bytes
 

@@ -7,18 +7,16 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
-from ..errors import DataError
+from ..errors import ErrorsAt
 from .arguments import (
-    add_bag_options,
-    add_calibration,
-    add_options,
-    add_orientation,
-    add_source,
+    add_clusters,
+    add_oriented_source,
+    add_out,
     options_of,
     read_oriented_source,
+    rigid_clusters,
 )
 from .output import print_note, print_notes, print_result, print_unpaired
 
@@ -34,18 +32,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     from ..jobs.reconstruction import ReconstructionOptions
 
-    add_source(parser, 'image size of a file [px] (default: that of the calibration)')
-    add_bag_options(parser, pairing=False)
-    add_calibration(parser)
-    parser.add_argument('--out', required=True, type=Path, metavar='OUT.csv', help='file to write')
-    add_orientation(parser)
-    add_options(parser, ReconstructionOptions, reject={'metavar': 'S'})
-    parser.add_argument(
-        '--cluster',
-        action='append',
-        default=[],
-        metavar="'NAME: ID ID ...'",
-        help="rigid cluster of targets, such as 'tibia: 1001 1002 1003', whose distances the "
+    add_oriented_source(parser, ReconstructionOptions, reject='S')
+    add_out(parser, 'file to write', 'OUT.csv')
+    add_clusters(
+        parser,
+        "rigid cluster of targets, such as 'tibia: 1001 1002 1003', whose distances the "
         'drift watch also monitors; may be repeated',
     )
     parser.add_argument(
@@ -55,15 +46,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
+def check(arguments: argparse.Namespace, error: Callable[[str], NoReturn]) -> None:
     """Read the bodies; call error with a sentence for arguments that exclude each other."""
-    from ..bodies.body import declared_bodies
     from ..jobs.sources import is_bag
 
-    try:
-        arguments.bodies = declared_bodies(arguments.cluster)
-    except ValueError as fault:
-        error(f'--cluster: {fault}')
+    arguments.bodies = rigid_clusters(arguments, error)
     if arguments.bodies and arguments.no_drift_watch:
         error('--cluster is for the drift watch, it cannot be used with --no-drift-watch')
     if arguments.bodies and not is_bag(arguments.source):
@@ -75,9 +62,9 @@ def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Write the points of a recording. Raises DataError."""
+    from ..io.calibration import orientation_path
     from ..io.folder import check_output_file
-    from ..io.reconstructed_points import write_reconstruction
-    from ..io.rig_orientation import orientation_path
+    from ..io.poses import write_reconstruction
     from ..jobs.reconstruction import ReconstructionOptions, reconstruct
     from ..jobs.sources import is_bag
 
@@ -92,12 +79,9 @@ def run(arguments: argparse.Namespace) -> None:
         drift_watch=not arguments.no_drift_watch,
         bodies=arguments.bodies,
         has_stamps=is_bag(arguments.source),
-        pair_tolerance=arguments.pair_tolerance,
     )
-    try:
+    with ErrorsAt(arguments.source):
         outcome = reconstruct(frames, calibrations, orientation, options)
-    except DataError as error:
-        raise error.at(arguments.source) from None
     write_reconstruction(arguments.out, outcome.frames, recording.names)
     print_unpaired(arguments.source, outcome.unpaired)
     if outcome.disagreement:

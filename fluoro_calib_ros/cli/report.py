@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from typing import NoReturn
 
 from .arguments import add_result_folder, result_folder
 from .output import print_result
@@ -21,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_result_folder(parser)
 
 
-def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
+def check(arguments: argparse.Namespace, error: Callable[[str], NoReturn]) -> None:
     """Find the result folder; call error with a sentence where none is given."""
     arguments.directory = result_folder(arguments, error)
 

@@ -7,9 +7,8 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-from pathlib import Path
 
-from .arguments import add_options, options_of
+from .arguments import add_options, add_out, options_of
 from .output import ProgressBar, print_result
 
 NAME = 'simulate'
@@ -21,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     from ..jobs.simulation import SimulationOptions
 
-    parser.add_argument('--out', required=True, type=Path, metavar='DIR', help='folder to write')
+    add_out(parser, 'folder to write')
     add_options(parser, SimulationOptions, images={'nargs': '?', 'const': 'clean'})
 
 

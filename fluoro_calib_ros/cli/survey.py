@@ -6,20 +6,19 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import DataError
-from ..options import declared
+from ..errors import DataError, ErrorsAt
 from .arguments import (
     add_bag_options,
     add_collect,
-    add_option,
+    add_options,
+    add_out,
     add_phantom,
+    add_principal_distance,
     add_source,
     bag_selection,
     file_settings,
-    number_in,
     options_of,
 )
 from .output import print_findings, print_notes, print_result, print_round, print_unpaired
@@ -72,15 +71,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'the scale follows from one, and a second one checks it (default: scale of --phantom)',
     )
     group = parser.add_argument_group('adjustment')
-    options = declared(CalibrationOptions)
-    for name in OPTIONS:
-        add_option(group, options[name])
-    group.add_argument(
-        '--principal-distance',
-        type=number_in(1, 1e7),
-        metavar='PX',
-        help='start value [px] (default: from the observations)',
-    )
+    add_options(group, CalibrationOptions, OPTIONS)
+    add_principal_distance(group, 'start value [px] (default: from the observations)')
     parser.add_argument(
         '--keep-given',
         action='store_true',
@@ -90,9 +82,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--force', action='store_true', help='write the coordinates though the verdict is fail'
     )
-    parser.add_argument(
-        '--out', required=True, type=Path, metavar='OUT.csv', help='phantom file to write'
-    )
+    add_out(parser, 'phantom file to write', 'OUT.csv')
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -121,10 +111,8 @@ def run(arguments: argparse.Namespace) -> None:
         arguments.principal_distance,
         keep_given=arguments.keep_given,
     )
-    try:
+    with ErrorsAt(arguments.source):
         outcome = survey(request, print_round)
-    except DataError as error:
-        raise error.at(arguments.source) from None
     print_findings(outcome.findings, 'this cannot be right: ')
     failed = [check for check in outcome.validation.checks if check.passed is False]
     written = not failed or arguments.force
@@ -177,7 +165,7 @@ def _document(outcome: SurveyOutcome, path: str | None) -> dict[str, Any]:
 
 
 def _text(outcome: SurveyOutcome, path: str | None) -> str:
-    from ..report.verdict import verdict_text
+    from ..report.tables import verdict_text
 
     sd = outcome.beads.sd_mm
     counted = f'{len(sd)} beads surveyed, sd of a coordinate {min(sd):.3f} to {max(sd):.3f} mm'

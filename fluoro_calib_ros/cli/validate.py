@@ -9,7 +9,7 @@ import argparse
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 from ..errors import DataError
 from .arguments import (
@@ -18,11 +18,11 @@ from .arguments import (
     add_exit_zero,
     add_file_options,
     add_fluoroscopes,
+    add_image_size,
     add_phantom,
     add_result_folder,
     angle_options,
     file_settings,
-    image_size,
     result_folder,
 )
 from .output import print_notes, print_result, print_step, print_unpaired
@@ -47,11 +47,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'DIR/observations.csv)',
     )
     add_phantom(parser, required=False, help='its surveyed coordinates (default: DIR/phantom.csv)')
-    parser.add_argument(
-        '--image-size',
-        type=image_size,
-        metavar='WxH',
-        help='image size of a file given as --source [px] (default: that of the calibration)',
+    add_image_size(
+        parser,
+        'image size of a file given as --source [px] (default: that of the calibration)',
     )
     add_fluoroscopes(parser, 'validate')
     add_angle_options(parser)
@@ -60,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_exit_zero(parser)
 
 
-def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
+def check(arguments: argparse.Namespace, error: Callable[[str], NoReturn]) -> None:
     """Find the result folder; call error with a sentence where none is given."""
     arguments.directory = result_folder(arguments, error)
 
@@ -76,7 +74,7 @@ def run(arguments: argparse.Namespace) -> bool:
     from ..io.result_document import write_validation
     from ..jobs.result_folder import saved_orientation
     from ..jobs.sources import read_calibrations
-    from ..report.verdict import verdict_text
+    from ..report.tables import verdict_text
 
     calibrations = read_calibrations(arguments.directory, arguments.fluoroscopes)
     document = read_result(arguments.directory)

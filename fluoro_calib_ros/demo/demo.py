@@ -22,11 +22,11 @@ from ..errors import DataError
 from ..estimation.calibrate import calibrate
 from ..estimation.result import CalibrationResult
 from ..exposures.collector import collect_recorded
-from ..io.atomic import write_text
+from ..io.access import write_text
 from ..io.bags.reader import read_frames
 from ..io.phantom import read_phantom
 from ..nodes.demo_client import DemoClient, DemoError, demo_clients
-from ..report.figures import write_figures
+from ..report.report_figures import write_figures
 from ..report.tables import markdown_table, summary_table
 from .assessment import image_errors, latencies_ms, space_figures
 from .image_twin import NAMESPACE, ImageTwin, calibrate_from_images, comparison_table

@@ -98,21 +98,11 @@ def joints_by_fluoroscope(text: str) -> str | dict[str, str]:
 class AngleTrack:
     """Positions of a joint by stamp.
 
-    A position that is not finite, or is no angle in radians, counts as unknown.
-
-    Parameters
-    ----------
-    max_age_s : float
-        Of the state that gives an angle [s].
-    capacity : int or None
-        States that are kept, the newest; None: all. A state before all that are kept means that
-        the clock was set back, and the track begins again.
-
-    Attributes
-    ----------
-    late : int
-        States that were added after an angle at or after their stamp had been asked for: it would
-        have been another one.
+    A position that is not finite, or is no angle in radians, counts as unknown. A state older than
+    max_age_s gives no angle. The newest `capacity` states are kept, all for None; a state before
+    all that are kept means that the clock was set back, and the track begins again. late counts
+    the states that were added after an angle at or after their stamp had been asked for: it would
+    have been another one.
     """
 
     def __init__(self, max_age_s: float, capacity: int | None = CAPACITY) -> None:
@@ -185,12 +175,8 @@ class AngleTrack:
 class JointAngles:
     """Angles of the C-arms of fluoroscopes, from the states of their joints.
 
-    Parameters
-    ----------
-    joints : mapping of str to str
-        Joints by fluoroscope; several may have the same one.
-    max_age_s, capacity
-        See `AngleTrack`.
+    joints by fluoroscope; several may have the same one. max_age_s and capacity as in
+    `AngleTrack`.
     """
 
     def __init__(

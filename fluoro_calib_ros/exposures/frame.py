@@ -11,16 +11,15 @@ bag, a frame of a stream.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sized
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence, Sized
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import DataError
 from ..findings import Place
-from .columns import first_repeated, is_positive
-from .phantom import Phantom
+from .phantom import Phantom, first_repeated, is_positive
 
 MAX_ANGLE = 4 * np.pi  # two turns either way: more is no angle in radians
 
@@ -94,20 +93,12 @@ def validate_frame(
 ) -> None:
     """Validate a frame before it is used in a calculation.
 
-    Parameters
-    ----------
-    frame : Frame
-    phantom : Phantom, optional
-        The frame may only contain its targets.
-    image_size : (int, int), optional
-        Image size of the calibration [px], which the frame must have.
+    Of a phantom, the frame may only contain its targets; image_size [px] is that of the
+    calibration, which the frame must have.
 
-    Raises
-    ------
-    DataError
-        For an empty frame, arrays of different lengths, values that are not finite, a sigma that
-        is not positive, a point off the image, a repeated or unknown target, or another image
-        size. The message names the fluoroscope, the frame and the first wrong target.
+    Raises DataError that names the fluoroscope, the frame and the first wrong target: for an empty
+    frame, arrays of different lengths, values that are not finite, a sigma that is not positive, a
+    point off the image, a repeated or unknown target, or another image size.
     """
     error = _frame_error(frame, phantom, image_size)
     if error:
@@ -240,3 +231,78 @@ def _image_error(ids: np.ndarray, uv: np.ndarray, image_size: tuple[int, int]) -
 def _phantom_error(ids: np.ndarray, phantom: Phantom) -> str:
     known = phantom.index(ids) >= 0
     return '' if known.all() else f'target {ids[~known][0]} is not on the phantom'
+
+
+def cells_of(uv: ArrayLike, image_size: ArrayLike, count: int) -> NDArray[np.int64]:
+    """Return column and row (n, 2) of image points in a grid of count x count cells.
+
+    Points off the image belong to the nearest cell.
+    """
+    place = (np.asarray(uv, dtype=float) + 0.5) / np.asarray(image_size) * count
+    return np.clip(np.floor(place), 0, count - 1).astype(np.int64)
+
+
+# Targets whose coordinates are known in every exposure, such as markers of a motion capture.
+
+
+@dataclass(frozen=True)
+class MovingPoints:
+    """Coordinates of targets that differ between exposures, in the frame of the lab.
+
+    Raises DataError for a negative exposure or target id.
+
+    Parameters
+    ----------
+    exposure, target_id : (n,) ndarray of int
+    xyz_mm : (n, 3) ndarray
+        Coordinates [mm].
+    sd_mm : (n,) ndarray
+        Standard deviation of each coordinate [mm].
+    """
+
+    exposure: NDArray[np.int64]
+    target_id: NDArray[np.int64]
+    xyz_mm: NDArray[np.float64]
+    sd_mm: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        for name in ('exposure', 'target_id'):
+            numbers = np.asarray(getattr(self, name), dtype=np.int64)
+            if (numbers < 0).any():
+                raise DataError(f'moving points: {name} is {numbers.min()}, it must be 0 or above')
+            object.__setattr__(self, name, numbers)
+
+    @property
+    def base(self) -> int:
+        """The power of ten by which the ids of two exposures are apart."""
+        return int(10 ** len(str(int(self.target_id.max(initial=0)))))
+
+    def ids(self, exposure: ArrayLike, target_id: ArrayLike) -> NDArray[np.int64]:
+        """Return an id (n,) of its own for each target of each exposure.
+
+        Target 7 of exposure 12 is 1207 where all ids have two digits at most.
+        """
+        return np.asarray(exposure, dtype=np.int64) * self.base + np.asarray(target_id)
+
+    def as_phantom(
+        self, frames: Mapping[str, Sequence[Frame]]
+    ) -> tuple[dict[str, list[Frame]], Phantom]:
+        """Return frames and phantom in which each target of each exposure has an id of its own.
+
+        Raises DataError for a target whose coordinates in an exposure are missing, and for
+        coordinates of which no phantom can be made.
+        """
+        phantom = Phantom(self.ids(self.exposure, self.target_id), self.xyz_mm, self.sd_mm)
+        out: dict[str, list[Frame]] = {}
+        for name, exposures in frames.items():
+            out[name] = []
+            for frame in exposures:
+                ids = self.ids(frame.number, frame.target_id)
+                known = (phantom.index(ids) >= 0) & (np.asarray(frame.target_id) < self.base)
+                if not known.all():
+                    raise DataError(
+                        f'fluoroscope {name}, exposure {frame.number}: the coordinates of target '
+                        f'{np.asarray(frame.target_id)[~known][0]} are not given'
+                    )
+                out[name].append(replace(frame, target_id=ids))
+        return out, phantom

@@ -14,15 +14,9 @@ RECENT = 512  # exposures whose images may still come
 class ExposureNumbers:
     """Gives images of several fluoroscopes the same number where they are of one exposure.
 
-    Images belong together by stamp, within the tolerance. Exposures are counted from 1 in the
+    Images belong together by stamp, within the tolerance [ns]. Exposures are counted from 1 in the
     order of their first image, so an image that is lost, of any fluoroscope, shifts no number.
     Images without a stamp (0) are counted by fluoroscope.
-
-    Parameters
-    ----------
-    fluoroscopes : iterable of str
-    tolerance_ns : int
-        Largest difference between the stamps of an exposure.
     """
 
     def __init__(self, fluoroscopes: Iterable[str], tolerance_ns: int) -> None:

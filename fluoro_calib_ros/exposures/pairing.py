@@ -18,7 +18,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
-from ..options import option
+from ..options import option, validate_options
 from .stamp_agreement import StampAgreement, StampedFrame
 
 PAIR_BY = ('frame_number', 'stamp')
@@ -73,6 +73,25 @@ class PairingOptions:
         if self.pair_by not in PAIR_BY:
             raise ValueError(f"pair_by is 'frame_number' or 'stamp', not {self.pair_by!r}")
         return self.pair_by == 'frame_number'
+
+
+@dataclass(frozen=True)
+class RecordedPairing:
+    """How a recording is paired. Raises ValueError for a value that an option cannot have."""
+
+    pair_by: str = option(
+        'frame_number', 'what the frames of one exposure have in common', choices=PAIR_BY
+    )
+    pair_tolerance: float = option(
+        PairingOptions.tolerance_s,
+        'largest difference between the stamps of an exposure, with --pair-by stamp',
+        minimum=0.0,
+        maximum=1.0,
+        unit='s',
+    )
+
+    def __post_init__(self) -> None:
+        validate_options(self)
 
 
 class Pairer(Protocol):
@@ -159,17 +178,8 @@ class CompletePairer:
     Frames belong together by number, or by stamp within the tolerance. Of each fluoroscope the
     last `waiting` frames wait for their partners; a frame that is displaced counts as unpaired. A
     frame that arrives after one of its partners was displaced is late: it counts as late and as
-    unpaired. Exposures may be ready in another order than that of their frames.
-
-    Parameters
-    ----------
-    fluoroscopes : iterable of str
-    options : PairingOptions, optional
-
-    Raises
-    ------
-    ValueError
-        For an unknown pair_by.
+    unpaired. Exposures may be ready in another order than that of their frames. Raises ValueError
+    for an unknown pair_by.
     """
 
     def __init__(self, fluoroscopes: Iterable[str], options: PairingOptions | None = None) -> None:
@@ -276,17 +286,8 @@ class PartialPairer:
     nothing while two others went on by `patience` frames is silent: it is not waited for until it
     delivers again. Of each fluoroscope at most `waiting` frames wait. A frame alone in its
     exposure counts as unpaired. One that arrives after its exposure, or after a later one of its
-    own stream, counts as late, too. A stream that starts again releases all waiting frames.
-
-    Parameters
-    ----------
-    fluoroscopes : iterable of str
-    options : PairingOptions, optional
-
-    Raises
-    ------
-    ValueError
-        For an unknown pair_by.
+    own stream, counts as late, too. A stream that starts again releases all waiting frames. Raises
+    ValueError for an unknown pair_by.
     """
 
     def __init__(self, fluoroscopes: Iterable[str], options: PairingOptions | None = None) -> None:

@@ -51,30 +51,15 @@ MIN_CONTRAST = 0.05  # of a bead, as a fraction of the light around it
 
 @dataclass(frozen=True)
 class Detections:
-    """Blobs of an image, and what they were found with.
+    """Blobs of an image, and what they were found with."""
 
-    Attributes
-    ----------
-    light : Light
-        Grey values, turned round where beads are bright, so that beads are dark.
-    noise : Noise
-        Of the light.
-    uv : (n, 2) ndarray
-        Centres [px], to some 0.1 px.
-    strength : (n,) ndarray
-        Response at a wider scale, 1 for a typical bead; it increases with the size.
-    radius_px : float
-        Radius of a typical bead with its blur [px].
-    inverted : bool
-        Beads are bright in the image.
-    """
-
-    light: Light
-    noise: Noise
-    uv: NDArray[np.float64]
+    light: Light  #: grey values, turned round where beads are bright, so that beads are dark
+    noise: Noise  #: of the light
+    uv: NDArray[np.float64]  #: (n, 2), centres [px], to some 0.1 px
+    #: (n,), response at a wider scale, 1 for a typical bead; it increases with the size
     strength: NDArray[np.float64]
-    radius_px: float
-    inverted: bool
+    radius_px: float  #: radius of a typical bead with its blur [px]
+    inverted: bool  #: beads are bright in the image
 
 
 def detect_beads(
@@ -259,20 +244,11 @@ def field_of_view(light: np.ndarray, scale: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Blobs:
-    """Blobs that the noise does not explain.
+    """Blobs that the noise does not explain."""
 
-    Attributes
-    ----------
-    uv : (n, 2) ndarray
-        [px]
-    response : (n,) ndarray
-    relative : (n,) ndarray
-        The same as fractions of the light around.
-    """
-
-    uv: NDArray[np.float64]
-    response: NDArray[np.float64]
-    relative: NDArray[np.float64]
+    uv: NDArray[np.float64]  #: (n, 2) [px]
+    response: NDArray[np.float64]  #: (n,)
+    relative: NDArray[np.float64]  #: (n,), the same as fractions of the light around
 
     def chosen(self, mask: NDArray[np.bool_]) -> _Blobs:
         """Return those of a mask (n,)."""

@@ -21,11 +21,9 @@ from .growth import Match, Seen, smoothed, supported
 from .light import Noise
 from .matching import PhantomModel, match
 from .measurement import FIRST_STEPS, STEPS, estimate_profile, measure_beads
-from .shadow_fit import Beads
-from .shadow_profile import Profile
+from .shadow_fit import MAX_SIGMA_PX, Beads, Profile
 from .view import Lens, View, fit_view
 
-MAX_SIGMA_PX = 0.3
 MAX_SIGMAS = 2.9  # times that of a usual bead of the image: an eighth of its weight
 MAX_MISFIT = 5.0
 DEPTH = (0.55, 1.7)  # of the shadow of a bead, 1 for what is usual in such light
@@ -55,31 +53,12 @@ class Refusal:
 
 @dataclass(frozen=True)
 class Extraction:
-    """Observations of one radiograph.
+    """Observations of one radiograph."""
 
-    Attributes
-    ----------
-    bead : (n,) ndarray of int
-        Rows of the phantom.
-    uv : (n, 2) ndarray
-        Centres [px].
-    sigma : (n,) ndarray
-        Standard deviation of a coordinate [px].
-    overlapped : (n,) ndarray of bool
-        The shadow of another bead reaches into that of the bead.
-    refused : tuple of Refusal
-    view : View
-    detections : Detections
-    match : Match
-    profile : Profile
-    noise : Noise
-    followed : bool
-        The pose comes from the exposure before, not from a search.
-    """
-
-    bead: NDArray[np.int64]
-    uv: NDArray[np.float64]
-    sigma: NDArray[np.float64]
+    bead: NDArray[np.int64]  #: (n,), rows of the phantom
+    uv: NDArray[np.float64]  #: (n, 2), centres [px]
+    sigma: NDArray[np.float64]  #: (n,), standard deviation of a coordinate [px]
+    #: (n,), the shadow of another bead reaches into that of the bead
     overlapped: NDArray[np.bool_]
     refused: tuple[Refusal, ...]
     view: View
@@ -87,7 +66,7 @@ class Extraction:
     match: Match
     profile: Profile
     noise: Noise
-    followed: bool = False
+    followed: bool = False  #: the pose comes from the exposure before, not from a search
 
     @property
     def nearby(self) -> Nearby:
@@ -105,30 +84,15 @@ class Extraction:
 
 @dataclass(frozen=True)
 class Nearby:
-    """What is taken over from an exposure nearby, such as the previous one of a video.
-
-    Attributes
-    ----------
-    view : View
-    scale_px : float
-        Robust standard deviation of its residuals [px].
-    profile : Profile
-    noise : Noise
-    radius_px : float
-        Of a bead.
-    inverted : bool
-        Beads are bright.
-    far : Far or None
-        For images that were left out since.
-    """
+    """What is taken over from an exposure nearby, such as the previous one of a video."""
 
     view: View
-    scale_px: float
+    scale_px: float  #: robust standard deviation of its residuals [px]
     profile: Profile
     noise: Noise
-    radius_px: float
-    inverted: bool
-    far: Far | None = None
+    radius_px: float  #: of a bead
+    inverted: bool  #: beads are bright
+    far: Far | None = None  #: for images that were left out since
 
 
 def extract_beads(

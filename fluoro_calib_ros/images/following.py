@@ -33,15 +33,9 @@ SCATTER_PX = 0.1
 
 @dataclass(frozen=True)
 class Far:
-    """Images were left out since the exposure nearby.
+    """Images were left out since the exposure nearby."""
 
-    Attributes
-    ----------
-    ahead : View or None
-        The pose to which the phantom should have moved since.
-    """
-
-    ahead: View | None = None
+    ahead: View | None = None  #: the pose to which the phantom should have moved since
 
 
 def follow(

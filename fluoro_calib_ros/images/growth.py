@@ -30,29 +30,15 @@ MIN_SUPPORT = 0.5
 
 @dataclass(frozen=True)
 class Seen:
-    """What was found in an image.
+    """What was found in an image."""
 
-    Attributes
-    ----------
-    uv : (n, 2) ndarray
-        Beads [px].
-    tree : cKDTree
-        Of uv.
-    field : (h, w) ndarray of bool
-        The field of view.
-    radius_px : float
-        Of a bead: two closer than this may be found as one.
-    tolerance_px : float
-        Largest distance from a prediction at which a bead is matched while the pose grows.
-    strength : (n,) ndarray or None
-        Response to each bead, which increases with its size.
-    """
-
-    uv: NDArray[np.float64]
-    tree: cKDTree
-    field: NDArray[np.bool_]
-    radius_px: float
+    uv: NDArray[np.float64]  #: (n, 2), beads [px]
+    tree: cKDTree  #: of uv
+    field: NDArray[np.bool_]  #: (h, w), the field of view
+    radius_px: float  #: of a bead: two closer than this may be found as one
+    #: largest distance from a prediction at which a bead is matched while the pose grows
     tolerance_px: float
+    #: (n,), response to each bead, which increases with its size
     strength: NDArray[np.float64] | None = None
 
     @classmethod
@@ -82,33 +68,18 @@ class Seen:
 
 @dataclass(frozen=True)
 class Match:
-    """A pose with its matched beads and the evidence for it.
-
-    Attributes
-    ----------
-    view : View
-    bead, detection : (n,) ndarray of int
-        Rows of the phantom and of the image that belong together.
-    predicted : (m, 2) ndarray
-        Pixels of all beads of the phantom, with the residuals of neighbours.
-    found : float
-        Share of the beads predicted in the field that are found.
-    explained : float
-        Share of what was found in the image that is predicted.
-    scale_px : float
-        Robust standard deviation of the residuals.
-    expected : int
-        Number of beads predicted in the field.
-    """
+    """A pose with its matched beads and the evidence for it."""
 
     view: View
+    #: (n,), rows of the phantom and of the image that belong together
     bead: NDArray[np.int64]
     detection: NDArray[np.int64]
+    #: (m, 2), pixels of all beads of the phantom, with the residuals of neighbours
     predicted: NDArray[np.float64]
-    found: float
-    explained: float
-    scale_px: float
-    expected: int
+    found: float  #: share of the beads predicted in the field that are found
+    explained: float  #: share of what was found in the image that is predicted
+    scale_px: float  #: robust standard deviation of the residuals
+    expected: int  #: number of beads predicted in the field
 
     @property
     def score(self) -> float:

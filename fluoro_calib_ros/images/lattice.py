@@ -50,36 +50,19 @@ NOT_MARKED = Finding(
 
 @dataclass(frozen=True)
 class Lattice:
-    """Beads of a plane in rows and columns.
+    """Beads of a plane in rows and columns."""
 
-    Attributes
-    ----------
-    row : (n,) ndarray of int
-        Rows of the beads that are numbered.
-    index : (n, 2) ndarray of int
-        Their places along both steps of the lattice.
-    """
-
-    row: NDArray[np.int64]
-    index: NDArray[np.int64]
+    row: NDArray[np.int64]  #: (n,), rows of the beads that are numbered
+    index: NDArray[np.int64]  #: (n, 2), their places along both steps of the lattice
 
 
 @dataclass(frozen=True)
 class FlatGrid:
-    """A flat phantom on a lattice.
-
-    Attributes
-    ----------
-    lattice : Lattice
-    centre : (3,) ndarray
-        [mm]
-    axes : (3, 3) ndarray
-        Rows: two directions in the plane, and its normal.
-    """
+    """A flat phantom on a lattice."""
 
     lattice: Lattice
-    centre: NDArray[np.float64]
-    axes: NDArray[np.float64]
+    centre: NDArray[np.float64]  #: (3,) [mm]
+    axes: NDArray[np.float64]  #: (3, 3), rows: two directions in the plane, and its normal
 
     @classmethod
     def of(cls, xyz: np.ndarray) -> FlatGrid | None:
@@ -157,20 +140,12 @@ def _numbered(
 
 @dataclass(frozen=True)
 class GridPose:
-    """A pose of a flat grid.
-
-    Attributes
-    ----------
-    match : Match
-    against : int
-        Beads found where the grid has none, and beads of the grid that are missing among others.
-    numbered : int
-        Beads found in rows and columns.
-    """
+    """A pose of a flat grid."""
 
     match: Match
+    #: beads found where the grid has none, and beads of the grid that are missing among others
     against: int
-    numbered: int
+    numbered: int  #: beads found in rows and columns
 
 
 def grid_poses(grid: FlatGrid, xyz: np.ndarray, seen: Seen, lens: Lens) -> Iterator[GridPose]:

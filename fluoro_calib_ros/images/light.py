@@ -25,19 +25,11 @@ MAX_SLOW = 0.9  # share of slow changes, beyond which there is no noise to see
 
 @dataclass(frozen=True)
 class Light:
-    """Grey values of an image that has dark beads.
+    """Grey values of an image that has dark beads."""
 
-    Attributes
-    ----------
-    grey : (h, w) ndarray of float32
-    field : (h, w) ndarray of bool
-        The field of view.
-    low, high : float
-        Values at which grey values are clipped: there is no less, or more, light than they say.
-    """
-
-    grey: np.ndarray
-    field: NDArray[np.bool_]
+    grey: np.ndarray  #: (h, w)
+    field: NDArray[np.bool_]  #: (h, w), the field of view
+    #: values at which grey values are clipped: there is no less, or more, light than they say
     low: float = -np.inf
     high: float = np.inf
 
@@ -62,17 +54,11 @@ def _is_clipped(grey: np.ndarray, outermost: float, beside: float) -> bool:
 
 @dataclass(frozen=True)
 class Noise:
-    """Variance of a grey value: constant + gain * grey value; and its correlation.
-
-    Attributes
-    ----------
-    constant, gain : float
-    correlation : (2 LAGS + 1, 2 LAGS + 1) ndarray
-        Of the noise of pixels at lags (row, column), 1 in the middle.
-    """
+    """Variance of a grey value: constant + gain * grey value; and its correlation."""
 
     constant: float
     gain: float
+    #: (2 LAGS + 1, 2 LAGS + 1), of the noise of pixels at lags (row, column), 1 in the middle
     correlation: NDArray[np.float64]
 
     def variance(self, light: np.ndarray) -> np.ndarray:

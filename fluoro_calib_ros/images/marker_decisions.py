@@ -18,23 +18,14 @@ from .markers import MarkerFrame, MarkerTracker
 
 @dataclass(frozen=True)
 class Decision:
-    """What the other view, or its body, says of a doubtful id.
+    """What the other view, or its body, says of a doubtful id."""
 
-    Attributes
-    ----------
-    kind : {'confirmed', 'exchanged', 'dropped'}
-    fluoroscope : str
-    frame, since : int
-        The image of the decision, and the first one that it holds for.
-    target_id : tuple of int
-        One id, or the two that were exchanged.
-    """
-
-    kind: str
+    kind: str  #: {'confirmed', 'exchanged', 'dropped'}
     fluoroscope: str
+    #: the image of the decision, and the first one that it holds for
     frame: int
     since: int
-    target_id: tuple[int, ...]
+    target_id: tuple[int, ...]  #: one id, or the two that were exchanged
 
 
 class ViewCounts:
@@ -78,26 +69,13 @@ class ViewCounts:
 
 @dataclass(frozen=True)
 class DecidedView:
-    """One of two views, whose ids are decided on.
+    """One of two views, whose ids are decided on."""
 
-    Attributes
-    ----------
-    view : int
-        0 or 1, its row in an exposure.
-    name : str
-        Of the fluoroscope.
-    tracker : MarkerTracker
-    target_id : (n,) ndarray
-        Of the markers of both views, ascending.
-    counts : ViewCounts
-        By row of these.
-    """
-
-    view: int
-    name: str
+    view: int  #: 0 or 1, its row in an exposure
+    name: str  #: of the fluoroscope
     tracker: MarkerTracker
-    target_id: NDArray[np.int64]
-    counts: ViewCounts
+    target_id: NDArray[np.int64]  #: (n,), of the markers of both views, ascending
+    counts: ViewCounts  #: by row of these
 
     def ids(self, *rows: int) -> tuple[int, ...]:
         """Return the ids of rows."""

@@ -29,14 +29,12 @@ from ..errors import DataError
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.epipolar import EpipolarGeometry
 from ..reconstruction.intersection import OK, OUTSIDE, Intersector
-from .marker_intensity import check_image, learn_look, search_image
-from .marker_rays import project_observed
+from .marker_intensity import MARKER_SCALES, check_image, learn_look, search_image
+from .marker_rays import AGREE, project_observed
 from .markers import FirstMarkers
 
-MARKER_SCALES = (1.1, 1.5, 2.1)  # of the blur at which markers stand out [px]
 SHARE = 0.4  # of the response to a typical marker
 SHADOW_SD_PX = 0.25  # of the place of a shadow that is not measured
-AGREE = 4.0  # standardised epipolar distance
 TOLERANCE_MM = 0.6  # of a distance between two points that are not measured yet
 RMS_MM = 0.35  # of the members of a body about its shape
 MIN_MEMBERS = 4
@@ -112,7 +110,7 @@ def identify_markers(
     best: dict[str, FirstMarkers] = {}
     # What else is round in the images may be larger, and more distinct. Of many bodies, perhaps
     # one is there.
-    for strongest, scale in product((2 * count, MIN_MEMBERS), MARKER_SCALES):
+    for strongest, scale in product((2 * count, MIN_MEMBERS), MARKER_SCALES[:3]):
         try:
             shadows = [_shadows(images[name], strongest, scale) for name in names]
             found, missing = find_bodies(shadows, rig, bodies)

@@ -20,9 +20,9 @@ from scipy.spatial import cKDTree
 
 from ..errors import DataError
 from ..findings import Kind
-from .detection import BLOB_RADIUS, MIN_SIZE, field_of_view
+from .detection import BLOB_RADIUS, MIN_SIZE, SCALES, field_of_view
 
-SCALES = (1.1, 1.5, 2.1, 3.0, 4.2)  # standard deviations of the blur [px]
+MARKER_SCALES = SCALES[:5]  # markers are smaller than beads
 NOISE_WEIGHT = 0.1  # of the response, in the noise that it is compared with
 NEAR_PX = 3  # from a given point, within which its shadow is
 MIN_CONTRAST = 0.02  # of a response, as a fraction of the light around it
@@ -60,30 +60,14 @@ class Shadows:
 
 @dataclass(frozen=True)
 class MarkerLook:
-    """What markers look like in the images of a sequence.
+    """What markers look like in the images of a sequence."""
 
-    Attributes
-    ----------
-    scale : float
-        Blur at which they stand out most [px].
-    inverted : bool
-        Markers are bright in the image.
-    field : (h, w) ndarray of bool
-        The field of view.
-    strength : float
-        Response to a typical marker over the light around it.
-    floor : float
-        Response below which noise is, in the light of the middle of the range.
-    light : float
-        That light.
-    """
-
-    scale: float
-    inverted: bool
-    field: NDArray[np.bool_]
-    strength: float
-    floor: float
-    light: float
+    scale: float  #: blur at which they stand out most [px]
+    inverted: bool  #: markers are bright in the image
+    field: NDArray[np.bool_]  #: (h, w), the field of view
+    strength: float  #: response to a typical marker over the light around it
+    floor: float  #: response below which noise is, in the light of the middle of the range
+    light: float  #: that light
 
     @property
     def radius_px(self) -> float:
@@ -150,7 +134,7 @@ def learn_look(
     image: np.ndarray,
     near: np.ndarray | None,
     count: int,
-    scales: Sequence[float] = SCALES,
+    scales: Sequence[float] = MARKER_SCALES,
 ) -> MarkerLook:
     """Learn what markers look like, from an image and points (n, 2) near them.
 

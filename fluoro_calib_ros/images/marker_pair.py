@@ -30,17 +30,10 @@ from .markers import FirstMarkers, MarkerFrame, MarkerOptions, MarkerTracker
 
 @dataclass(frozen=True)
 class PairFrame:
-    """Markers of one exposure of two fluoroscopes.
+    """Markers of one exposure of two fluoroscopes."""
 
-    Attributes
-    ----------
-    views : mapping of str to MarkerFrame
-        By fluoroscope.
-    decisions : tuple of Decision
-        They hold for the images since the doubt began; the views of this exposure obey them.
-    """
-
-    views: Mapping[str, MarkerFrame]
+    views: Mapping[str, MarkerFrame]  #: by fluoroscope
+    #: they hold for the images since the doubt began; the views of this exposure obey them
     decisions: tuple[Decision, ...] = ()
 
 
@@ -121,24 +114,10 @@ class MarkerPair:
     ) -> PairFrame:
         """Measure the markers of the next images.
 
-        Parameters
-        ----------
-        images : mapping of str to ndarray or None
-            By fluoroscope; one may be missing, after the first exposure.
-        frame : int
-            Number of the exposure, above that of the one before.
-        angles : mapping of str to float or None, optional
-            Of the C-arms [rad], by fluoroscope, for corrections that change with them; None where
-            they are unknown.
-
-        Returns
-        -------
-        PairFrame
-
-        Raises
-        ------
-        DataError
-            As MarkerTracker.update, and for an image of another size than the calibration's.
+        images by fluoroscope; one may be missing, after the first exposure. frame is the number of
+        the exposure, above that of the one before. angles [rad] are those of the C-arms, for
+        corrections that change with them; None where they are unknown. Raises DataError as
+        MarkerTracker.update, and for an image of another size than the calibration's.
         """
         if self._frame == 0:
             self._check_sizes(images)

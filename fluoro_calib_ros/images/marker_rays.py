@@ -23,20 +23,11 @@ SYSTEMATIC_PX = 0.1  # of a corrected image point, beyond its standard deviation
 
 @dataclass(frozen=True)
 class PairExposure:
-    """Markers of one exposure in all views, by row of all ids.
+    """Markers of one exposure in all views, by row of all ids."""
 
-    Attributes
-    ----------
-    observed : (2, n, 2) ndarray
-        [px], NaN where a view does not see a marker.
-    doubtful : (2, n) ndarray of bool
-    intersected : IntersectedViews
-        Corrected image points and the places of the markers.
-    """
-
-    observed: NDArray[np.float64]
-    doubtful: NDArray[np.bool_]
-    intersected: IntersectedViews
+    observed: NDArray[np.float64]  #: (2, n, 2) [px], NaN where a view does not see a marker
+    doubtful: NDArray[np.bool_]  #: (2, n)
+    intersected: IntersectedViews  #: corrected image points and the places of the markers
 
     @property
     def corrected(self) -> NDArray[np.float64]:

@@ -19,10 +19,9 @@ from .marker_intensity import (
     search_image,
     search_windows,
 )
-from .marker_motion import Motion, assign
-from .marker_states import MarkerStates
+from .marker_motion import MarkerStates, Motion, assign
 from .measurement import estimate_profile
-from .shadow_profile import Profile
+from .shadow_fit import Profile
 
 FIRST_SD_PX = 1.5  # of a given place of the first frame
 FIRST_GATE = 3.0  # standard deviations from a given place, within which its shadow is
@@ -31,27 +30,14 @@ MIN_DENSITY = 2e-6  # of false shadows [1/px^2]
 
 @dataclass(frozen=True)
 class MarkerStart:
-    """What the first image says of the markers.
-
-    Attributes
-    ----------
-    states : MarkerStates
-    look : MarkerLook
-    profile : Profile
-        Shadow of a typical marker.
-    noise : Noise
-    size : tuple of int
-        Width and height of the images [px].
-    density : float
-        Of false shadows [1/px^2].
-    """
+    """What the first image says of the markers."""
 
     states: MarkerStates
     look: MarkerLook
-    profile: Profile
+    profile: Profile  #: shadow of a typical marker
     noise: Noise
-    size: tuple[int, int]
-    density: float
+    size: tuple[int, int]  #: width and height of the images [px]
+    density: float  #: of false shadows [1/px^2]
 
 
 NOWHERE_PX = -2e4  # where markers are whose place is not known yet

@@ -13,8 +13,14 @@ from scipy.spatial import cKDTree
 
 from ..findings import Finding, Kind, Place, Severity
 from .marker_intensity import Shadows
-from .marker_motion import Motion, common_shift, doubtful_pairs
-from .marker_states import SHADOW_SD_PX, MarkerStates, MeasuredMarkers
+from .marker_motion import (
+    SHADOW_SD_PX,
+    MarkerStates,
+    MeasuredMarkers,
+    Motion,
+    common_shift,
+    doubtful_pairs,
+)
 
 FALSE_SHADOWS = 0.02  # expected in the gate, from which a marker found again is doubtful
 MERGED_PX = 5.0  # between predictions, within which two markers are one shadow

@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 from ..errors import DataError
 from ..findings import Finding, Kind
 from ..options import option, validate_options
+from .marker_fit import MarkerMeasurement
 from .marker_intensity import LightWindows, MarkerLook, Shadows, check_image
-from .marker_measurement import MarkerMeasurement
+from .marker_motion import MarkerStates, MeasuredMarkers
 from .marker_start import NOWHERE_PX, MarkerSearch, learn_start
-from .marker_states import MarkerStates, MeasuredMarkers
 from .marker_watch import MarkerDoubts, MarkerWatch, follow_beside, shift_together
-from .shadow_profile import Profile
+from .shadow_fit import Profile
 
 
 @dataclass(frozen=True)
@@ -96,46 +96,23 @@ class FirstMarkers:
 
 @dataclass(frozen=True)
 class MarkerFrame:
-    """Markers of one image.
-
-    Attributes
-    ----------
-    frame : int
-    target_id : (n,) ndarray of int
-        Of the markers that were measured.
-    uv : (n, 2) ndarray
-        Centres [px], of the middle of the exposure.
-    sigma : (n,) ndarray
-        Standard deviation of a coordinate [px].
-    overlapped : (n,) ndarray of bool
-        The shadow of another marker reaches into that of the marker.
-    doubtful : (n,) ndarray of bool
-        The id may be wrong.
-    missing : (k,) ndarray of int
-        Markers that were not measured.
-    predicted : (k, 2) ndarray
-        Where they are believed to be [px], NaN for those that were never seen.
-    lost : (k,) ndarray of bool
-        Whether they are searched in the whole image.
-    doubts : tuple of Finding
-        Two markers that may have been exchanged, or one that may be something else.
-        Those that began with this image.
-    finding : Finding or None
-        Why nothing was measured.
-    seconds : float
-    """
+    """Markers of one image."""
 
     frame: int
-    target_id: NDArray[np.int64]
-    uv: NDArray[np.float64]
-    sigma: NDArray[np.float64]
+    target_id: NDArray[np.int64]  #: (n,), of the markers that were measured
+    uv: NDArray[np.float64]  #: (n, 2), centres [px], of the middle of the exposure
+    sigma: NDArray[np.float64]  #: (n,), standard deviation of a coordinate [px]
+    #: (n,), the shadow of another marker reaches into that of the marker
     overlapped: NDArray[np.bool_]
-    doubtful: NDArray[np.bool_]
-    missing: NDArray[np.int64]
+    doubtful: NDArray[np.bool_]  #: (n,), the id may be wrong
+    missing: NDArray[np.int64]  #: (k,), markers that were not measured
+    #: (k, 2), where they are believed to be [px], NaN for those that were never seen
     predicted: NDArray[np.float64]
-    lost: NDArray[np.bool_]
+    lost: NDArray[np.bool_]  #: (k,), whether they are searched in the whole image
+    #: two markers that may have been exchanged, or one that may be something else; those that
+    #: began with this image
     doubts: tuple[Finding, ...] = ()
-    finding: Finding | None = None
+    finding: Finding | None = None  #: why nothing was measured
     seconds: float = 0.0
 
     @property
@@ -146,24 +123,13 @@ class MarkerFrame:
 
 @dataclass(frozen=True)
 class _Followed:
-    """What follows markers, from the first image on.
+    """What follows markers, from the first image on."""
 
-    Attributes
-    ----------
-    states : MarkerStates
-        Predicted, then updated.
-    doubts : MarkerDoubts
-    look : MarkerLook
-    size : tuple of int
-        Width and height of the images [px].
-    search, measurement, watch
-        The steps of an image, in their order.
-    """
-
-    states: MarkerStates
+    states: MarkerStates  #: predicted, then updated
     doubts: MarkerDoubts
     look: MarkerLook
-    size: tuple[int, int]
+    size: tuple[int, int]  #: width and height of the images [px]
+    #: the steps of an image, in their order
     search: MarkerSearch
     measurement: MarkerMeasurement
     watch: MarkerWatch
@@ -172,13 +138,8 @@ class _Followed:
 class MarkerTracker:
     """Follows markers through the images of one fluoroscope.
 
-    Parameters
-    ----------
-    options : MarkerOptions, optional
-    first : FirstMarkers
-        Ids and places in the first image.
-    later : (k,) ndarray of int, optional
-        Markers that are followed once their places are suggested.
+    first: ids and places in the first image; later (k,): ids of markers that are followed once
+    their places are suggested.
     """
 
     def __init__(
@@ -206,25 +167,12 @@ class MarkerTracker:
         return None if self._followed is None else self._followed.measurement.profile
 
     def update(self, image: np.ndarray | None, frame: int) -> MarkerFrame:
-        """Measure the markers of the next image.
+        """Measure the markers of the next image (h, w), of uint8 or uint16; None: there is none.
 
-        Parameters
-        ----------
-        image : (h, w) ndarray of uint8 or uint16, or None
-            None where there is no image of this number.
-        frame : int
-            Number of the image, above that of the one before; markers move on through numbers
-            that are left out.
-
-        Returns
-        -------
-        MarkerFrame
-            With all markers missing, and why, for an image in which nothing can be seen.
-
-        Raises
-        ------
-        DataError
-            For a number that does not grow; for a first image without the markers.
+        frame is its number, above that of the one before; markers move on through numbers that are
+        left out. For an image in which nothing can be seen, all markers are missing, and the
+        finding says why. Raises DataError for a number that does not grow, and for a first image
+        without the markers.
         """
         begin = time.perf_counter()
         followed = self._followed

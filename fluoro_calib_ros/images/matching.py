@@ -68,20 +68,11 @@ SCALE_BY_SIZE = (0.55, 1.6)  # of a bead's image over its diameter, with the blu
 
 @dataclass(frozen=True)
 class Symmetry:
-    """A motion that takes many beads of a phantom near to others.
+    """A motion that takes many beads of a phantom near to others."""
 
-    Attributes
-    ----------
-    rotation : (3, 3) ndarray
-    shift : (3,) ndarray
-        [mm]
-    row : (n,) ndarray of int
-        Rows of the beads that beads are taken to, -1 for none.
-    """
-
-    rotation: NDArray[np.float64]
-    shift: NDArray[np.float64]
-    row: NDArray[np.int64]
+    rotation: NDArray[np.float64]  #: (3, 3)
+    shift: NDArray[np.float64]  #: (3,) [mm]
+    row: NDArray[np.int64]  #: (n,), rows of the beads that beads are taken to, -1 for none
 
     @property
     def turn_rad(self) -> float:
@@ -99,27 +90,14 @@ class Symmetry:
 
 @dataclass(frozen=True)
 class PhantomModel:
-    """Beads of a phantom, prepared for matching.
+    """Beads of a phantom, prepared for matching."""
 
-    Attributes
-    ----------
-    xyz : (n, 3) ndarray
-        [mm]
-    diameter_mm : (n,) ndarray or None
-    triples : tuple of Triples
-        By level of the search.
-    symmetries : tuple of Symmetry
-    grid : FlatGrid or None
-        For a flat grid.
-    regular : bool
-        Any of several poses that fit equally well is taken: a regular grid looks alike in all.
-    """
-
-    xyz: NDArray[np.float64]
-    diameter_mm: NDArray[np.float64] | None
-    triples: tuple[Triples, ...]
+    xyz: NDArray[np.float64]  #: (n, 3) [mm]
+    diameter_mm: NDArray[np.float64] | None  #: (n,)
+    triples: tuple[Triples, ...]  #: by level of the search
     symmetries: tuple[Symmetry, ...]
-    grid: FlatGrid | None
+    grid: FlatGrid | None  #: for a flat grid
+    #: any of several poses that fit equally well is taken: a regular grid looks alike in all
     regular: bool = False
 
     @classmethod
@@ -148,20 +126,7 @@ class PhantomModel:
 def match(seen: Seen, model: PhantomModel, lens: Lens) -> Match:
     """Match what was found in an image with a phantom.
 
-    Parameters
-    ----------
-    seen : Seen
-    model : PhantomModel
-    lens : Lens
-
-    Returns
-    -------
-    Match
-
-    Raises
-    ------
-    DataError
-        Where no pose is sure, with the reason.
+    Raises DataError where no pose is sure, with the reason.
     """
     if len(seen.uv) < MIN_BEADS:
         raise DataError(

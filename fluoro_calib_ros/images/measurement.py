@@ -24,9 +24,10 @@ from .shadow_fit import (
     FineGrid,
     FitSettings,
     NormalEquations,
+    Profile,
     ShadowFit,
+    fit_profile,
 )
-from .shadow_profile import Profile, fit_profile
 
 SETTINGS = FitSettings(
     steps=5,

@@ -37,26 +37,16 @@ KEPT = 10  # best poses of three beads
 
 @dataclass(frozen=True)
 class Triples:
-    """Triples of a phantom: a bead, and two of its k nearest neighbours.
+    """Triples of a phantom: a bead, and two of its k nearest neighbours."""
 
-    Attributes
-    ----------
-    bead : (t, 3) ndarray of int
-    products : (4, t) ndarray
-        Squares of both sides, their product [mm^2], and the determinant of these [mm^4].
-    voter : (VOTERS, 3, t) ndarray of float32
-        Neighbours of the first bead, the nearest first, in the axes of both sides and their cross
-        product.
-    sides : (t, 2, 3) ndarray
-        From the first bead [mm].
-    planar : (t,) ndarray of bool
-        All voters lie in one plane, so that both solutions have the same votes.
-    """
-
-    bead: NDArray[np.int64]
+    bead: NDArray[np.int64]  #: (t, 3)
+    #: (4, t), squares of both sides, their product [mm^2], and the determinant of these [mm^4]
     products: NDArray[np.float64]
+    #: (VOTERS, 3, t), neighbours of the first bead, the nearest first, in the axes of both sides
+    #: and their cross product
     voter: NDArray[np.float64]
-    sides: NDArray[np.float64]
+    sides: NDArray[np.float64]  #: (t, 2, 3), from the first bead [mm]
+    #: (t,), all voters lie in one plane, so that both solutions have the same votes
     planar: NDArray[np.bool_]
 
     def of_beads(self, chosen: np.ndarray) -> Triples:
@@ -73,27 +63,14 @@ class Triples:
 
 @dataclass(frozen=True)
 class LocalPose:
-    """A scaled-orthographic pose around one bead.
+    """A scaled-orthographic pose around one bead."""
 
-    Attributes
-    ----------
-    bead : int
-        Row of the phantom.
-    uv : (2,) ndarray
-        Its pixel.
-    rotation : (3, 3) ndarray
-        Phantom -> a sensor that looks along the ray of the bead.
-    scale : float
-        [px/mm]
-    vote : float
-        Share of the voters that are found.
-    """
-
-    bead: int
-    uv: NDArray[np.float64]
+    bead: int  #: row of the phantom
+    uv: NDArray[np.float64]  #: (2,), its pixel
+    #: (3, 3), phantom -> a sensor that looks along the ray of the bead
     rotation: NDArray[np.float64]
-    scale: float
-    vote: float
+    scale: float  #: [px/mm]
+    vote: float  #: share of the voters that are found
 
 
 def triples_of(xyz: np.ndarray, neighbours: int) -> Triples:

@@ -11,17 +11,19 @@ All windows of an image take their Gauss-Newton steps at once.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.optimize import least_squares
 
 from .light import Noise
-from .shadow_profile import Profile
 from .texture import Cosines
 
+MAX_SIGMA_PX = 0.3  # of a centre: a larger one is that of no shadow, or of one hardly seen
 MARGIN_PX = 2.0  # of background around the shadow
 TERMS = 6  # of the background: a polynomial of degree 2
 OWN = TERMS + 3  # unknowns of a bead alone: its background, centre and depth
@@ -42,75 +44,39 @@ Group = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True)
 class Beads:
-    """Measured beads, in the order in which they were given.
+    """Measured beads, in the order in which they were given."""
 
-    Attributes
-    ----------
-    uv : (n, 2) ndarray
-        Centres [px].
-    sigma : (n,) ndarray
-        Standard deviation of a coordinate [px].
-    depth : (n,) ndarray
-        Of the shadow, 1 for the profile.
-    light : (n,) ndarray
-        Grey values in the middle without the beads.
-    misfit : (n,) ndarray
-        Mean squared residual over the noise, 1 where the model is right.
-    overlapped : (n,) ndarray of bool
-        The shadow of another bead reaches into that of the bead.
-    measured : (n,) ndarray of bool
-        False where the window is cut off or the fit failed.
-    """
-
-    uv: NDArray[np.float64]
-    sigma: NDArray[np.float64]
-    depth: NDArray[np.float64]
-    light: NDArray[np.float64]
+    uv: NDArray[np.float64]  #: (n, 2), centres [px]
+    sigma: NDArray[np.float64]  #: (n,), standard deviation of a coordinate [px]
+    depth: NDArray[np.float64]  #: (n,), of the shadow, 1 for the profile
+    light: NDArray[np.float64]  #: (n,), grey values in the middle without the beads
+    #: (n,), mean squared residual over the noise, 1 where the model is right
     misfit: NDArray[np.float64]
+    #: (n,), the shadow of another bead reaches into that of the bead
     overlapped: NDArray[np.bool_]
-    measured: NDArray[np.bool_]
+    measured: NDArray[np.bool_]  #: (n,), False where the window is cut off or the fit failed
 
 
 @dataclass(frozen=True)
 class FitSettings:
     """What differs between fits of shadows.
 
-    Attributes
-    ----------
-    steps : int
-        Gauss-Newton steps.
-    crossing_steps : tuple of int
-        Before which shadows that touch are blurred together.
-    crowds : tuple of tuple of int
-        Least and largest number of neighbours of the beads that are fitted together.
-    max_step_px : float
-        Largest step of a centre.
-    pooled : float
-        Degrees of freedom of the noise of all beads, in that of one.
-    crossed : float
-        Factor on the standard deviation where shadows cross.
-    dtype : type
-        Precision of model and derivatives.
-    whole_scale : bool
-        Whether the polynomial of the background is scaled by a whole number of pixels.
-    robust_relative : bool
-        Whether a residual of half weight is relative to the typical lack of fit.
-    moves_unusable : bool
-        Whether beads move whose windows are cut off.
-
-    The last three keep the numbers of two fits that were once apart.
+    The last three fields keep the numbers of two fits that were once apart.
     """
 
-    steps: int
-    crossing_steps: tuple[int, ...]
+    steps: int  #: Gauss-Newton steps
+    crossing_steps: tuple[int, ...]  #: before which shadows that touch are blurred together
+    #: least and largest number of neighbours of the beads that are fitted together
     crowds: tuple[tuple[int, int], ...]
-    max_step_px: float
-    pooled: float
-    crossed: float
-    dtype: type[np.floating]
+    max_step_px: float  #: largest step of a centre
+    pooled: float  #: degrees of freedom of the noise of all beads, in that of one
+    crossed: float  #: factor on the standard deviation where shadows cross
+    dtype: type[np.floating]  #: precision of model and derivatives
+    #: whether the polynomial of the background is scaled by a whole number of pixels
     whole_scale: bool
+    #: whether a residual of half weight is relative to the typical lack of fit
     robust_relative: bool
-    moves_unusable: bool
+    moves_unusable: bool  #: whether beads move whose windows are cut off
 
     @property
     def neighbours(self) -> int:
@@ -120,19 +86,11 @@ class FitSettings:
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Normal equations of some windows, for steps of u = 6 + 3 + 3 k unknowns.
+    """Normal equations of some windows, for steps of u = 6 + 3 + 3 k unknowns."""
 
-    Attributes
-    ----------
-    matrix : (g, u, u) ndarray
-    right : (g, u) ndarray
-    weighted : (g, u, m) ndarray
-        Derivatives of the pixels times their weights.
-    """
-
-    matrix: NDArray[np.float64]
-    right: NDArray[np.float64]
-    weighted: np.ndarray
+    matrix: NDArray[np.float64]  #: (g, u, u)
+    right: NDArray[np.float64]  #: (g, u)
+    weighted: np.ndarray  #: (g, u, m), derivatives of the pixels times their weights
 
 
 def window_offsets(radius_px: float) -> np.ndarray:
@@ -146,12 +104,8 @@ def window_offsets(radius_px: float) -> np.ndarray:
 class FineGrid:
     """Grid finer than the pixels, on which light that passes several beads is blurred.
 
-    The blur of the light that passes two beads is not the product of their blurred shadows.
-
-    Attributes
-    ----------
-    axis : (a,) ndarray
-        Coordinates of its points, from the middle of a window [px].
+    The blur of the light that passes two beads is not the product of their blurred shadows. axis
+    (a,) are the coordinates of its points, from the middle of a window [px].
     """
 
     def __init__(self, offset: np.ndarray, blur_px: float) -> None:
@@ -386,3 +340,97 @@ class ShadowFit(ABC):
             overlapped=self.distance < 2 * self.profile.reach_px * OVERLAP,
             measured=measured,
         )
+
+
+# Shadow of a sphere in an image: attenuated light, blurred, as a function of the distance.
+#
+# A ray at a distance d from the centre of a sphere of radius r is attenuated by exp(-2 m sqrt(r^2
+# - d^2)) (Beer and Lambert). Focal spot, detector and pixel blur it, about as a Gaussian;
+# scattered light adds a part that no bead takes away.
+
+STEP = 0.2  # of the grid on which a profile is computed [px]
+TABLE_STEP = 0.05  # of the table of a profile [px]
+REACH_SIGMAS = 3.2
+# Bounds of radius, blur [px], attenuation along the radius, and scattered light.
+LOW = (0.5, 0.35, 0.05, 0.0)
+HIGH = (40.0, 6.0, 6.0, 0.6)
+
+
+@dataclass(frozen=True)
+class Profile:
+    """Shadow of a bead."""
+
+    radius_px: float
+    blur_px: float  #: standard deviation
+    attenuation: float  #: along the radius: coefficient times radius
+    scatter: float = 0.0  #: share of the light that is not attenuated
+    _table: np.ndarray = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, '_table', _tabulated(self))
+
+    @property
+    def reach_px(self) -> float:
+        """Distance from the centre at which the shadow has ended [px]."""
+        return self.radius_px + REACH_SIGMAS * self.blur_px
+
+    def absorbed(self, squared: np.ndarray) -> np.ndarray:
+        """Absorbed share of the light without blur at squared distances [px^2]."""
+        chord = 2 * np.sqrt(np.maximum(self.radius_px**2 - squared, 0)) / self.radius_px
+        return 1 - np.exp(-self.attenuation * chord)
+
+    def shadow(self, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Absorbed share of the light at distances [px], and its derivative [1/px]."""
+        value, slope = self._table.astype(distance.dtype)
+        position = np.minimum(
+            distance * distance.dtype.type(1 / TABLE_STEP), distance.dtype.type(len(value) - 2)
+        )
+        index = position.astype(np.intp)
+        part = position - index.astype(distance.dtype)
+        return (
+            value.take(index) + part * np.diff(value).take(index),
+            slope.take(index) + part * np.diff(slope).take(index),
+        )
+
+
+def _tabulated(profile: Profile) -> np.ndarray:
+    """Absorbed shares and their derivatives (2, n) at multiples of TABLE_STEP from the centre."""
+    step = min(STEP, profile.radius_px / 4)
+    axis = np.arange(int(np.ceil((profile.reach_px + 3) / step)) + 4) * step
+    squared = axis[:, None] ** 2 + axis**2
+    quarter = profile.absorbed(squared)
+    # The blur of a square pixel has a variance of 1/12. Only the row through the centre is needed:
+    # all columns are weighted to one row, which is blurred along itself.
+    sigma = np.sqrt(profile.blur_px**2 + 1 / 12)
+    kernel = np.exp(-0.5 * (axis / sigma) ** 2)
+    row = quarter @ np.append(kernel[0], 2 * kernel[1:])
+    both_sides = np.concatenate([kernel[:0:-1], kernel])
+    blurred = np.convolve(np.concatenate([row[:0:-1], row]), both_sides / both_sides.sum() ** 2)
+    blurred = blurred[2 * len(axis) - 2 : 3 * len(axis) - 2]
+    spline = CubicSpline(axis, blurred, bc_type=((1, 0.0), (1, 0.0)))
+    wanted = np.arange(0, profile.reach_px + 2, TABLE_STEP)
+    return np.stack([spline(wanted), spline(wanted, 1)])
+
+
+def fit_profile(
+    distance: np.ndarray, absorbed: np.ndarray, weight: np.ndarray, start: Profile
+) -> Profile:
+    """Fit a profile to absorbed shares (n,) of the light at distances (n,) [px] from beads."""
+    edges = np.arange(0, start.reach_px + 1, 0.25)
+    cell = np.digitize(distance, edges)
+    total = np.bincount(cell, weights=weight, minlength=len(edges) + 1)[1:-1]
+    sums = np.bincount(cell, weights=weight * absorbed, minlength=len(edges) + 1)[1:-1]
+    moments = np.bincount(cell, weights=weight * distance, minlength=len(edges) + 1)[1:-1]
+    used = total > 0
+    mean = sums[used] / total[used]
+    place = moments[used] / total[used]
+    root = np.sqrt(total[used])
+
+    def residual(unknowns: np.ndarray) -> np.ndarray:
+        value, _ = Profile(*unknowns[:3]).shadow(place)
+        return root * ((1 - unknowns[3]) * value - mean)
+
+    first = np.array([start.radius_px, start.blur_px, start.attenuation, start.scatter])
+    first = np.clip(first, np.asarray(LOW) * 1.01 + 1e-3, np.asarray(HIGH) * 0.99)
+    found = least_squares(residual, first, bounds=(LOW, HIGH), x_scale=first, max_nfev=12)
+    return Profile(*map(float, found.x))

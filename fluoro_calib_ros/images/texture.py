@@ -29,11 +29,7 @@ RATIOS = 2.0 ** np.arange(-4, 13)
 class Cosines:
     """Cosines on the pixels of a window, and their variances.
 
-    Parameters
-    ----------
-    offset : (m, 2) ndarray
-        Pixels, from the middle of the window [px].
-    dtype : type
+    offset (m, 2): pixels, from the middle of the window [px].
     """
 
     def __init__(self, offset: np.ndarray, dtype: type[np.floating]) -> None:

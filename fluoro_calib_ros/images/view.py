@@ -33,26 +33,14 @@ SMOOTHING_PRIOR = 2.0  # neighbours of residual 0 among them
 
 @dataclass(frozen=True)
 class Lens:
-    """What is known of a fluoroscope before an exposure is seen.
+    """What is known of a fluoroscope before an exposure is seen."""
 
-    Attributes
-    ----------
-    image_size : tuple of int
-        Width and height [px].
-    principal_distance_px : float
-    principal_distance_sd : float
-        Relative standard deviation.
-    coefficients : (2, k) ndarray
-        Expected polynomial [px], of any degree; empty for zero.
-    certainty : float
-        Factor on the standard deviations of the coefficients.
-    """
-
-    image_size: tuple[int, int]
+    image_size: tuple[int, int]  #: width and height [px]
     principal_distance_px: float
-    principal_distance_sd: float = 0.08
+    principal_distance_sd: float = 0.08  #: relative standard deviation
+    #: (2, k), expected polynomial [px], of any degree; empty for zero
     coefficients: NDArray[np.float64] = field(default_factory=lambda: np.zeros((2, 0)))
-    certainty: float = 1.0
+    certainty: float = 1.0  #: factor on the standard deviations of the coefficients
 
     @property
     def centre(self) -> np.ndarray:
@@ -79,26 +67,13 @@ class Lens:
 
 @dataclass(frozen=True)
 class View:
-    """Orientation and distortion of an exposure.
-
-    Attributes
-    ----------
-    lens : Lens
-    rotation : (3, 3) ndarray
-        Phantom -> sensor.
-    position : (3,) ndarray
-        The source in the frame of the phantom [mm].
-    principal_distance_px : float
-    coefficients : (2, k) ndarray
-        Of the polynomial [px].
-    degree : int
-    """
+    """Orientation and distortion of an exposure."""
 
     lens: Lens
-    rotation: NDArray[np.float64]
-    position: NDArray[np.float64]
+    rotation: NDArray[np.float64]  #: (3, 3), phantom -> sensor
+    position: NDArray[np.float64]  #: (3,), the source in the frame of the phantom [mm]
     principal_distance_px: float
-    coefficients: NDArray[np.float64]
+    coefficients: NDArray[np.float64]  #: (2, k), of the polynomial [px]
     degree: int
 
     @property

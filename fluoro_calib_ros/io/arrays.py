@@ -26,8 +26,7 @@ import numpy as np
 from ..errors import DataError
 from ..limits import read_limits
 from ..records import Field
-from .access import PathLike, read_bytes
-from .atomic import atomic_file
+from .access import PathLike, atomic_file, read_bytes
 
 _DATE = (1980, 1, 1, 0, 0, 0)  # of every member, so that the same arrays give the same bytes
 _UNIX = 3  # system of every member, for the same reason
@@ -46,21 +45,11 @@ _DTYPES = {'int': np.dtype('<i8'), 'float': np.dtype('<f8'), 'bool': np.dtype('?
 
 @dataclass(frozen=True)
 class Layout:
-    """Layout of a file.
+    """Layout of a file."""
 
-    Attributes
-    ----------
-    content : str
-        What the file holds, with its article, such as 'a calibration'.
-    fields : sequence of Field
-        Its arrays.
-    version : int
-        Version that is written; all earlier ones can be read.
-    """
-
-    content: str
-    fields: Sequence[Field]
-    version: int
+    content: str  #: what the file holds, with its article, such as 'a calibration'
+    fields: Sequence[Field]  #: its arrays
+    version: int  #: version that is written; all earlier ones can be read
 
 
 def to_arrays(where: object, layout: Layout, values: Mapping[str, Any]) -> dict[str, np.ndarray]:

@@ -9,7 +9,7 @@ empty sd.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NoReturn
 
 import numpy as np
@@ -19,8 +19,7 @@ from ..bodies.body import Body, check_bodies
 from ..errors import DataError
 from ..limits import read_limits
 from .access import PathLike
-from .atomic import atomic_file
-from .csv_table import Block, format_float, read_blocks, write_rows
+from .csv_table import Block, format_float, read_blocks, write_table
 
 COLUMNS = ('body', 'marker', 'x', 'y', 'z', 'sd')
 
@@ -86,16 +85,12 @@ def _fail_repeated(block: Block, index: int, name: str, row: int, owner: str) ->
 
 def write_bodies(path: PathLike, bodies: Sequence[Body]) -> None:
     """Write bodies to a CSV file, from which the same values are read again. Raises DataError."""
-    with atomic_file(path, 'w') as file:
-        write_rows(file, [COLUMNS])
-        for body in bodies:
-            sd = np.where(np.isfinite(body.sd_mm), body.sd_mm, np.nan)
-            numbers = np.column_stack([body.xyz_mm, sd])
-            numbers[~body.known] = np.nan
-            write_rows(
-                file,
-                (
-                    [body.name, marker, *map(format_float, values)]
-                    for marker, values in zip(body.target_id.tolist(), numbers.tolist())
-                ),
-            )
+    write_table(path, COLUMNS, (row for body in bodies for row in _rows(body)))
+
+
+def _rows(body: Body) -> Iterator[list[object]]:
+    sd = np.where(np.isfinite(body.sd_mm), body.sd_mm, np.nan)
+    numbers = np.column_stack([body.xyz_mm, sd])
+    numbers[~body.known] = np.nan
+    for marker, values in zip(body.target_id.tolist(), numbers.tolist()):
+        yield [body.name, marker, *map(format_float, values)]

@@ -13,19 +13,18 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration, digest_of_sources
-from ..errors import DataError
+from ..errors import DataError, ErrorsAt
 from ..estimation.options import CalibrationOptions, CalibrationRequest
 from ..exposures.frame import Frame, validate_frame
 from ..exposures.phantom import Phantom
 from .access import PathLike
 from .csv_table import read_names, write_names
-from .documents import read_json
-from .known_orientation import read_known_orientations, write_known_orientations
+from .documents import read_json, write_json
+from .formats.known_orientation import read_known_orientations, write_known_orientations
 from .observations import read_observations_csv, write_observations_csv
 from .phantom import read_phantom, write_phantom
 from .result_check import KNOWN_ORIENTATION, OBSERVATIONS, OPTIONS, PHANTOM
 from .result_document import delete_validation
-from .text_files import write_json
 
 VERSION = 1  # of options.json
 
@@ -140,10 +139,8 @@ def _read_frames(
             frames[name] = [replace(frame, image_size=size) for frame in of_fluoroscope]
     for of_fluoroscope in frames.values():
         for frame in of_fluoroscope:
-            try:
+            with ErrorsAt(path):
                 validate_frame(frame)
-            except DataError as error:
-                raise error.at(path) from None
     return frames
 
 

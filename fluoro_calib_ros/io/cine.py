@@ -24,7 +24,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import DataError
+from ..errors import DataError, ErrorsAt
 from ..images.codec import check_size
 from .access import check_regular_file, os_error_reason
 
@@ -44,28 +44,14 @@ SIDES = 2**30  # px, more cannot be meant
 
 @dataclass(frozen=True)
 class CineHeader:
-    """What the headers of a cine file say.
+    """What the headers of a cine file say."""
 
-    Attributes
-    ----------
-    width, height : int
-        Of the images [px].
-    bits : int
-        Of a pixel as it is stored: 8, 10 (packed) or 16.
-    from_bottom : bool
-        Whether the last row comes first.
-    offsets : (n,) ndarray of int64
-        Positions of the images in the file.
-    frame_rate : float
-        [Hz]
-    """
-
-    width: int
-    height: int
-    bits: int
-    from_bottom: bool
-    offsets: NDArray[np.int64]
-    frame_rate: float
+    width: int  #: of the images [px]
+    height: int  #: of the images [px]
+    bits: int  #: of a pixel as it is stored: 8, 10 (packed) or 16
+    from_bottom: bool  #: whether the last row comes first
+    offsets: NDArray[np.int64]  #: (n,), positions of the images in the file
+    frame_rate: float  #: [Hz]
 
     @property
     def image_bytes(self) -> int:
@@ -98,10 +84,8 @@ def read_cine_images(path: Path, header: CineHeader) -> Iterator[tuple[str, np.n
         with open(path, 'rb') as file:
             for number, offset in enumerate(header.offsets.tolist(), 1):
                 where = f'{path}, frame {number}'
-                try:
+                with ErrorsAt(where):
                     image = _image(file, offset, header)
-                except DataError as error:
-                    raise error.at(where) from None
                 yield where, image
     except OSError as error:
         raise DataError(f'cannot be read ({os_error_reason(error)})', at=path) from None

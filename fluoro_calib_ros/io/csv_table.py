@@ -14,10 +14,10 @@ import io
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import islice
+from itertools import chain, islice
 from operator import itemgetter
 from pathlib import Path
-from typing import IO, Any, NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 from ..errors import DataError
 from ..exposures.names import MAX_ID, Names, number_names
 from ..limits import MAX_ROWS_CSV
-from .access import PathLike, check_rows, check_safe_name, os_error_reason, read_text
-from .atomic import atomic_file
+from .access import PathLike, atomic_file, check_rows, check_safe_name, os_error_reason, read_text
 
 BLOCK = 10_000  # rows converted at a time, to bound the memory
 MAX_HEADER = 200  # characters of a header in a message
@@ -34,23 +33,12 @@ MAX_HEADER = 200  # characters of a header in a message
 
 @dataclass(frozen=True)
 class Block:
-    """Some rows of a table.
+    """Some rows of a table."""
 
-    Attributes
-    ----------
-    path : path-like
-        File, for messages.
-    header : list of str
-        Names of the columns.
-    rows : list of list of str
-    lines : (n,) ndarray of int
-        Number of each row in the file; the header is row 1.
-    """
-
-    path: PathLike
-    header: list[str]
+    path: PathLike  #: file, for messages
+    header: list[str]  #: names of the columns
     rows: list[list[str]]
-    lines: NDArray[np.int64]
+    lines: NDArray[np.int64]  #: (n,), number of each row in the file; the header is row 1
 
     def __contains__(self, name: str) -> bool:
         return name in self.header
@@ -127,6 +115,13 @@ def read_blocks(path: PathLike, required: Sequence[str]) -> Iterator[Block]:
         raise DataError(f'{path}: the file has a header, but no rows')
 
 
+def read_all(path: PathLike, required: Sequence[str]) -> Block:
+    """Return all rows of a CSV file as one block. Raises DataError as `read_blocks`."""
+    blocks = list(read_blocks(path, required))
+    rows = [row for block in blocks for row in block.rows]
+    return Block(path, blocks[0].header, rows, np.concatenate([block.lines for block in blocks]))
+
+
 def decimal_point(cell: str) -> str:
     """Return a number with a decimal comma as one with a point, any other cell as it is."""
     if cell.count(',') != 1 or '.' in cell:
@@ -135,9 +130,14 @@ def decimal_point(cell: str) -> str:
     return changed if _is_number(changed, float) else cell
 
 
-def write_rows(file: IO[Any], rows: Iterable[Iterable[Any]]) -> None:
-    """Write rows of cells to an open text file as CSV, with line feeds."""
-    csv.writer(file, lineterminator='\n').writerows(map(_as_texts, rows))
+def write_table(path: PathLike, header: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
+    """Write a CSV file of a header and rows of cells, with line feeds.
+
+    Raises DataError where the file cannot be written.
+    """
+    with atomic_file(path, 'w') as file:
+        writer = csv.writer(file, lineterminator='\n')
+        writer.writerows(map(_as_texts, chain([header], rows)))
 
 
 # A spreadsheet runs a cell that begins so. In a file of ours such a name begins with an
@@ -271,12 +271,8 @@ def _is_number(cell: str, kind: Callable[[str], Any]) -> bool:
 class NamedColumn:
     """The ids of a column, read block by block.
 
-    Parameters
-    ----------
-    column : str
-    known : mapping of str to int, or None
-        Names with known ids; None where the column may only have whole numbers. A column has names
-        if none of its first cells is a number.
+    known: names with known ids, None where the column may only have whole numbers. A column has
+    names if none of its first cells is a number.
     """
 
     def __init__(self, column: str, known: Mapping[str, int] | None) -> None:
@@ -345,11 +341,12 @@ def write_names(directory: PathLike, names: Names) -> None:
         except OSError as error:
             raise DataError(f'{path}: cannot be deleted ({os_error_reason(error)})') from None
         return
-    with atomic_file(path, 'w') as file:
-        write_rows(file, [COLUMNS])
-        for kind, attribute in _KINDS.items():
-            table = getattr(names, attribute)
-            write_rows(file, ([kind, identity, name] for name, identity in table.items()))
+    rows = (
+        [kind, identity, name]
+        for kind, attribute in _KINDS.items()
+        for name, identity in getattr(names, attribute).items()
+    )
+    write_table(path, COLUMNS, rows)
 
 
 def read_names(directory: PathLike) -> Names:

@@ -32,28 +32,15 @@ GREY = ('MONOCHROME1', 'MONOCHROME2')
 
 @dataclass(frozen=True)
 class DicomHeader:
-    """What the header of a DICOM file says of its images.
+    """What the header of a DICOM file says of its images."""
 
-    Attributes
-    ----------
-    count : int
-        Number of frames.
-    bits : int
-        Used of a pixel.
-    signed, inverted : bool
-        Whether grey values can be negative, and whether they fall with brightness.
-    shape : tuple of int
-        Rows and columns.
-    frame_rate : float or None
-        [Hz]
-    """
-
-    count: int
-    bits: int
+    count: int  #: number of frames
+    bits: int  #: used of a pixel
+    #: whether grey values can be negative, and whether they fall with brightness
     signed: bool
     inverted: bool
-    shape: tuple[int, int]
-    frame_rate: float | None
+    shape: tuple[int, int]  #: rows and columns
+    frame_rate: float | None  #: [Hz]
 
 
 def read_dicom_header(path: Path) -> DicomHeader:

@@ -12,17 +12,19 @@ multiple of the bytes of the text.
 from __future__ import annotations
 
 import json
+import math
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NoReturn
 from xml.etree import ElementTree
 
+import numpy as np
 import yaml
 
 from ..errors import DataError
 from ..limits import DOCUMENT_BYTES, MAX_DEPTH
-from .access import PathLike, read_text
+from .access import PathLike, read_text, write_text
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -195,3 +197,29 @@ def _whole(value: str | int) -> int:
 
 def _not_finite(word: str) -> NoReturn:
     raise ValueError(f'{word} is not a number of JSON')
+
+
+# Results written as JSON files.
+
+
+def write_json(path: PathLike, document: Mapping[str, Any]) -> None:
+    """Write a document; numbers that are not finite become null. Raises DataError."""
+    write_text(path, json_text(document))
+
+
+def json_text(document: Mapping[str, Any]) -> str:
+    """Return a document as JSON, with an indentation of two blanks and the keys in order."""
+    return (
+        json.dumps(to_json_values(document), indent=2, allow_nan=False, ensure_ascii=False) + '\n'
+    )
+
+
+def to_json_values(value: Any) -> Any:
+    """Return a value with lists for arrays, Python numbers, and None for what is not finite."""
+    if isinstance(value, Mapping):
+        return {str(key): to_json_values(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [to_json_values(item) for item in value]
+    if isinstance(value, (np.ndarray, np.generic)):
+        return to_json_values(value.tolist())
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -19,14 +19,14 @@ import os
 import secrets
 import shutil
 import stat
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 from ..errors import DataError
-from .access import PathLike, make_folder, os_error_reason
-from .atomic import sync_folder
+from .access import PathLike, make_folder, os_error_reason, sync_folder
 
 PREVIOUS = '.previous'
 # Ends of the names of files that are read from a folder: of a bag, or a result.
@@ -42,22 +42,25 @@ _NO_EXCHANGE = (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EXDEV)
 
 @dataclass(frozen=True)
 class FolderKind:
-    """What a folder of one kind consists of.
+    """What a folder of one kind consists of."""
 
-    Attributes
-    ----------
-    title : str
-        What it is called in messages, such as 'a result folder'.
-    is_own : callable
-        Whether an entry of this name is part of such a folder, and is replaced with it. All other
-        entries belong to the user and are carried over.
-    marks : callable
-        Whether an entry of this name shows that a folder is of this kind.
-    """
+    title: str  #: what it is called in messages, such as 'a result folder'
+    #: patterns of the names of entries that are replaced with such a folder; all others belong to
+    #: the user and are carried over
+    parts: tuple[str, ...]
+    marks: tuple[str, ...]  #: patterns of names that show that a folder is of this kind
 
-    title: str
-    is_own: Callable[[str], bool]
-    marks: Callable[[str], bool]
+    def owns(self, name: str) -> bool:
+        """Return whether an entry is a part of the folder, or what a killed run left of one."""
+        return _matches(name, (*self.parts, '.*.tmp'))
+
+    def is_marked_by(self, name: str) -> bool:
+        """Return whether an entry of this name shows that a folder is of this kind."""
+        return _matches(name, self.marks)
+
+
+def _matches(name: str, patterns: Iterable[str]) -> bool:
+    return any(fnmatchcase(name, pattern) for pattern in patterns)
 
 
 def check_output_folder(path: PathLike, kind: FolderKind, inputs: Iterable[PathLike] = ()) -> None:
@@ -106,17 +109,9 @@ def check_output_file(path: PathLike, inputs: Iterable[PathLike] = ()) -> None:
 def replaced_folder(path: PathLike, kind: FolderKind) -> Iterator[Path]:
     """Yield a new folder to write into, which gets its name when the block ends without an error.
 
-    Parameters
-    ----------
-    path : path-like
-    kind : FolderKind
-        Entries of an earlier folder that are not of this kind are carried over. A part of the
-        earlier folder that is to be kept is to be written again.
-
-    Raises
-    ------
-    DataError
-        Where the folder cannot be written. After any exception the earlier folder is unchanged.
+    Entries of an earlier folder that are not of this kind are carried over; a part of it that is
+    to be kept is to be written again. Raises DataError where the folder cannot be written. After
+    any exception the earlier folder is unchanged.
     """
     check_output_folder(path, kind)
     target = os.path.realpath(path)
@@ -262,7 +257,7 @@ def _move_entries(staging: str, target: str, kind: FolderKind) -> None:
     new = set(os.listdir(staging))
     for name in os.listdir(target):
         path = os.path.join(target, name)
-        if kind.is_own(name) and (name not in new or os.path.isdir(path)):
+        if path != staging and kind.owns(name) and (name not in new or os.path.isdir(path)):
             _delete(path)
     for name in sorted(new):
         os.replace(os.path.join(staging, name), os.path.join(target, name))
@@ -281,7 +276,7 @@ def _carry_over(old: str, new: str, kind: FolderKind) -> None:
 
     for name in sorted(os.listdir(old)):
         source = os.path.join(old, name)
-        if kind.is_own(name):
+        if kind.owns(name):
             continue
         if os.path.isdir(source) and not os.path.islink(source):
             shutil.copytree(source, os.path.join(new, name), symlinks=True, copy_function=link)
@@ -351,7 +346,7 @@ def _is_fixed(target: str, kind: FolderKind) -> bool:
 
 
 def _is_of_kind(path: str, kind: FolderKind) -> bool:
-    return os.path.isdir(path) and any(kind.marks(name) for name in os.listdir(path))
+    return os.path.isdir(path) and any(kind.is_marked_by(name) for name in os.listdir(path))
 
 
 def _check_kind(folder: str, kind: FolderKind) -> None:
@@ -366,7 +361,7 @@ def _check_kind(folder: str, kind: FolderKind) -> None:
         ]
     except OSError as error:
         raise DataError(f'{folder}: cannot be read ({os_error_reason(error)})') from None
-    if names and not any(kind.marks(name) for name in names):
+    if names and not any(kind.is_marked_by(name) for name in names):
         raise DataError(
             f'{folder}: this is not {kind.title}, it holds {min(names)}; it is not overwritten'
         )

@@ -11,7 +11,6 @@ import os
 import struct
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from os import PathLike
 from pathlib import Path
 from typing import IO
 
@@ -19,10 +18,10 @@ import cv2
 import numpy as np
 from tifffile import TiffFile, TiffFileError, TiffWriter
 
-from ..errors import DataError
+from ..errors import DataError, ErrorsAt
 from ..exposures.frame import MAX_ANGLE
 from ..images.codec import as_grey, check_size, decode
-from .access import os_error_reason, read_bytes
+from .access import PathLike, os_error_reason, read_bytes
 from .cine import read_cine_header, read_cine_images
 from .csv_table import read_blocks
 from .dicom import read_dicom_header, read_dicom_images
@@ -35,7 +34,7 @@ from .dicom import read_dicom_header, read_dicom_images
 COLUMNS = ('image', 'angle_deg')
 
 
-def read_image_angles(path: str | os.PathLike[str]) -> dict[int, float]:
+def read_image_angles(path: PathLike) -> dict[int, float]:
     """Return the angle [rad] of each image by its number, the first one being 1.
 
     Raises DataError for a file that cannot be read, an image that is named twice or has no
@@ -77,12 +76,12 @@ EXPOSURE_SUFFIXES = (*IMAGE_SUFFIXES, *DICOM_SUFFIXES)
 READ_SUFFIXES = (*IMAGE_SUFFIXES, *VIDEO_CODECS, *CINE_SUFFIXES, *DICOM_SUFFIXES)
 
 
-def suffix_of(path: str | os.PathLike[str]) -> str:
+def suffix_of(path: PathLike) -> str:
     """Suffix of a path in lower case, with its dot."""
     return Path(path).suffix.lower()
 
 
-def is_image_source(path: str | os.PathLike[str]) -> bool:
+def is_image_source(path: PathLike) -> bool:
     """Whether a path is a folder, or a file with the suffix of an image or a video."""
     return os.path.isdir(path) or suffix_of(path) in READ_SUFFIXES
 
@@ -108,11 +107,7 @@ logging.getLogger('tifffile').addHandler(logging.NullHandler())
 class StackWriter:
     """Writes uncompressed pages into a seekable binary file; to be used in a with statement.
 
-    Parameters
-    ----------
-    file : binary file
-    pages, page_bytes : int
-        Largest number of pages and the size of one; they decide the size of the offsets.
+    The largest number of pages and the size of one decide the size of the offsets.
     """
 
     def __init__(self, file: IO[bytes], pages: int, page_bytes: int) -> None:
@@ -132,7 +127,7 @@ class StackWriter:
         self._writer.close()
 
 
-def count_pages(path: str | PathLike[str]) -> int:
+def count_pages(path: PathLike) -> int:
     """Number of pages of a TIFF file.
 
     Raises DataError for a file that cannot be read, is no TIFF file, is cut off or is damaged, and
@@ -154,10 +149,8 @@ def count_pages(path: str | PathLike[str]) -> int:
         complete = False
     if not count or not complete:
         raise DataError('this is no TIFF file, or it is cut off or damaged', at=path)
-    try:
+    with ErrorsAt(path):
         check_size(*size)
-    except DataError as error:
-        raise error.at(path) from None
     return count
 
 
@@ -187,24 +180,14 @@ os.environ.setdefault('OPENCV_FFMPEG_LOGLEVEL', '-8')
 
 @dataclass(frozen=True)
 class ImageSource:
-    """Images of one file.
+    """Images of one file."""
 
-    Attributes
-    ----------
-    kind : {'image', 'stack', 'video'}
-    count : int
-        Number of images; of a video as its header states it.
-    images : iterator
-        Place in words, for error messages, and image (h, w) of uint8 or uint16. It raises
-        DataError for an image that cannot be read.
-    frame_rate : float or None
-        Of a video [Hz].
-    """
-
-    kind: str
-    count: int
+    kind: str  #: {'image', 'stack', 'video'}
+    count: int  #: number of images; of a video as its header states it
+    #: place in words, for error messages, and image (h, w) of uint8 or uint16; it raises DataError
+    #: for an image that cannot be read
     images: Iterator[tuple[str, np.ndarray]]
-    frame_rate: float | None = None
+    frame_rate: float | None = None  #: of a video [Hz]
 
 
 def open_images(path: Path) -> ImageSource:
@@ -250,10 +233,8 @@ def check_name(path: Path) -> None:
 
 def _read_image(path: Path) -> Iterator[tuple[str, np.ndarray]]:
     content = read_bytes(path)
-    try:
+    with ErrorsAt(path):
         image = decode(content)
-    except DataError as error:
-        raise error.at(path) from None
     yield str(path), image
 
 
@@ -275,10 +256,8 @@ def _read_pages(path: Path, pages: int) -> Iterator[tuple[str, np.ndarray]]:
         for image in images:
             done += 1
             where = f'{path}, page {done}'
-            try:
+            with ErrorsAt(where):
                 yield where, as_grey(image)
-            except DataError as error:
-                raise error.at(where) from None
         batch = max(1, MAX_BATCH_BYTES // images[0].nbytes)
 
 
@@ -289,10 +268,8 @@ def _open_video(path: Path) -> ImageSource:
     video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     if not video.isOpened():
         raise DataError('this is no video that can be read, or it is damaged', at=path)
-    try:
+    with ErrorsAt(path):
         check_size(*(int(video.get(key)) for key in VIDEO_SIZE))
-    except DataError as error:
-        raise error.at(path) from None
     frame_rate = video.get(cv2.CAP_PROP_FPS)
     count = max(0, round(video.get(cv2.CAP_PROP_FRAME_COUNT)))
     if not 0 < frame_rate < 1e6:

@@ -18,11 +18,10 @@ from typing import cast
 import cv2
 import numpy as np
 
-from ..errors import DataError
+from ..errors import DataError, ErrorsAt
 from ..images.codec import encode
 from ..images.corrector import ImageCorrector
-from .access import make_folder
-from .atomic import atomic_file, sync_folder, write_bytes
+from .access import PathLike, atomic_file, make_folder, sync_folder, write_bytes
 from .folder import temporary_folder
 from .image_reading import (
     CINE_SUFFIXES,
@@ -70,10 +69,8 @@ def write_images(out: Path, source: ImageSource, progress: Progress) -> int:
             f'({listed(IMAGE_SUFFIXES)})'
         )
     _, image = next(source.images)
-    try:
+    with ErrorsAt(out):
         content = encode(image, suffix)
-    except DataError as error:
-        raise error.at(out) from None
     write_bytes(out, content)
     progress(1, 1)
     return 1
@@ -86,13 +83,19 @@ def _write_stack(out: Path, source: ImageSource, progress: Progress) -> int:
         atomic_file(out) as file,
         StackWriter(file, max(source.count, 1), image.nbytes) as writer,
     ):
-        writer.write(image)
-        number = 1
+        return _write_each(source, image, writer.write, progress)
+
+
+def _write_each(
+    source: ImageSource, image: np.ndarray, write: Callable[[np.ndarray], None], progress: Progress
+) -> int:
+    """Write the first image and those that follow; returns their number."""
+    number = 1
+    write(image)
+    progress(number, source.count)
+    for number, (_, image) in enumerate(source.images, 2):
+        write(image)
         progress(number, source.count)
-        for _, image in source.images:
-            writer.write(image)
-            number += 1
-            progress(number, source.count)
     return number
 
 
@@ -102,15 +105,8 @@ def write_video(out: Path, source: ImageSource, progress: Progress) -> int:
     with temporary_folder(out) as folder:
         temporary = folder / out.name
         video = _open_video(out, temporary, image, cast(float, source.frame_rate))
-        number = 0
         try:
-            video.write(image)
-            number += 1
-            progress(number, source.count)
-            for _, image in source.images:
-                video.write(image)
-                number += 1
-                progress(number, source.count)
+            number = _write_each(source, image, video.write, progress)
         finally:
             video.release()
         _check_written(out, temporary, number)
@@ -175,24 +171,13 @@ def _check_written(out: Path, path: Path, count: int) -> None:
 
 @dataclass(frozen=True)
 class CorrectedImages:
-    """What was corrected.
+    """What was corrected."""
 
-    Attributes
-    ----------
-    kind : {'image', 'stack', 'video', 'folder'}
-    images : int
-        Number of images, pages and frames.
-    files : int
-    passed_over : tuple of str
-        Names of the files of a folder that are no images.
-    failed : tuple of str
-        What is wrong with the files of a folder that could not be corrected.
-    """
-
-    kind: str
-    images: int
+    kind: str  #: {'image', 'stack', 'video', 'folder'}
+    images: int  #: number of images, pages and frames
     files: int = 1
-    passed_over: tuple[str, ...] = ()
+    passed_over: tuple[str, ...] = ()  #: names of the files of a folder that are no images
+    #: what is wrong with the files of a folder that could not be corrected
     failed: tuple[str, ...] = ()
 
 
@@ -201,8 +186,8 @@ Correctors = Callable[[int], ImageCorrector]
 
 
 def correct_images(
-    source: str | os.PathLike[str],
-    out: str | os.PathLike[str],
+    source: PathLike,
+    out: PathLike,
     corrector: ImageCorrector | Correctors,
     progress: Progress | None = None,
 ) -> CorrectedImages:
@@ -234,7 +219,8 @@ def correct_images(
         raise DataError(f'this is a folder, but {source} is a file', at=out)
     images = open_images(source)
     correctors = (lambda number: corrector) if isinstance(corrector, ImageCorrector) else corrector
-    written = write_images(out, _corrected(images, correctors), progress or _no_progress)
+    corrected = replace(images, images=_corrected_images(images, correctors))
+    written = write_images(out, corrected, progress or (lambda done, total: None))
     return CorrectedImages(images.kind, written)
 
 
@@ -246,15 +232,6 @@ def check_apart(source: Path, out: Path) -> None:
         raise DataError(f'cannot be written, there is no folder {out.absolute().parent}', at=out)
 
 
-def _no_progress(done: int, total: int) -> None:
-    """Ignore the progress."""
-
-
-def _corrected(source: ImageSource, correctors: Correctors) -> ImageSource:
-    """A source of the corrected images of another."""
-    return replace(source, images=_corrected_images(source, correctors))
-
-
 def _corrected_images(
     source: ImageSource, correctors: Correctors
 ) -> Iterator[tuple[str, np.ndarray]]:
@@ -262,10 +239,8 @@ def _corrected_images(
     out = None
     for number, (where, image) in enumerate(source.images, 1):
         corrector = correctors(number)
-        try:
+        with ErrorsAt(where):
             corrector.check(image)
-        except DataError as error:
-            raise error.at(where) from None
         if out is None or out.dtype != image.dtype:
             out = np.empty(corrector.shape, dtype=image.dtype)
         yield where, corrector.correct(image, out)
@@ -279,23 +254,13 @@ _WRITTEN_AS = dict.fromkeys(CINE_SUFFIXES, '.avi') | dict.fromkeys(DICOM_SUFFIXE
 
 @dataclass(frozen=True)
 class ImageFolder:
-    """Files with images in a folder.
-
-    Attributes
-    ----------
-    path : Path
-    files : tuple of Path
-        Images and videos, relative to the folder, in the order of their names.
-    passed_over : tuple of str
-        Other files.
-    recursive : bool
-        Whether the folders in the folder belong to it.
-    """
+    """Files with images in a folder."""
 
     path: Path
+    #: images and videos, relative to the folder, in the order of their names
     files: tuple[Path, ...]
-    passed_over: tuple[str, ...]
-    recursive: bool
+    passed_over: tuple[str, ...]  #: other files
+    recursive: bool  #: whether the folders in the folder belong to it
 
     @property
     def written(self) -> tuple[Path, ...]:
@@ -335,13 +300,8 @@ def folder_like(out: Path, source: ImageFolder) -> Iterator[Path]:
     """A temporary folder with the folders of another one; at the end its files move to `out`.
 
     Files of the same names in `out` are replaced, other ones stay. After an error, `out` is as it
-    was.
-
-    Raises
-    ------
-    DataError
-        Where `out` is a file, the source itself, or inside of it and would be read as a part of
-        it, and where a file would replace a folder.
+    was. Raises DataError where `out` is a file, the source itself, or inside of it and would be
+    read as a part of it, and where a file would replace a folder.
     """
     check_apart(source.path, out)
     if out.exists() and not out.is_dir():

@@ -24,7 +24,7 @@ Without a frame, the axes are those of the body. docs/joints.md describes both f
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -39,11 +39,10 @@ from ..bodies.anatomical_frames import (
 )
 from ..bodies.joint_conventions import Convention, convention
 from ..bodies.joints import STATUS_NAMES, Joint, JointMotion, check_joints
-from ..errors import DataError
+from ..errors import DataError, ErrorsAt
 from ..limits import MAX_JOINTS
 from .access import PathLike, read_text
-from .atomic import atomic_file
-from .csv_table import format_float, write_rows
+from .csv_table import format_float, write_table
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -101,10 +100,8 @@ def read_joints(path: PathLike, bodies: Iterable[str]) -> tuple[JointEntry, ...]
     if len(found) > MAX_JOINTS:
         raise DataError(f'{path}: {len(found)} joints, more than {MAX_JOINTS} are not read')
     entries = tuple(_entry(path, n, table) for n, table in enumerate(found, 1))
-    try:
+    with ErrorsAt(path):
         check_joints([entry.joint for entry in entries], bodies)
-    except DataError as error:
-        raise error.at(path) from None
     return entries
 
 
@@ -238,24 +235,15 @@ def write_joints(path: PathLike, motions: Sequence[JointMotion], start_ns: int) 
 
     What is unknown is an empty cell. Raises DataError where the file cannot be written.
     """
-    with atomic_file(path, 'w') as file:
-        write_rows(file, [COLUMNS])
-        for motion in motions:
-            sd = motion.sd
-            numbers = np.hstack(
-                [
-                    (motion.stamp_ns - start_ns)[:, None] / 1e9,
-                    np.rad2deg(motion.angles),
-                    motion.translations,
-                    np.rad2deg(sd[:, :3]),
-                    sd[:, 3:],
-                ]
-            )
-            rows = zip(motion.number.tolist(), numbers.tolist(), motion.status.tolist())
-            write_rows(
-                file,
-                (
-                    [motion.joint.name, number, *map(format_float, values), STATUS_NAMES[status]]
-                    for number, values, status in rows
-                ),
-            )
+    write_table(path, COLUMNS, (row for motion in motions for row in _rows(motion, start_ns)))
+
+
+def _rows(motion: JointMotion, start_ns: int) -> Iterator[list[object]]:
+    time_s = (motion.stamp_ns - start_ns)[:, None] / 1e9
+    sd_deg = np.rad2deg(motion.sd[:, :3])
+    numbers = np.hstack(
+        [time_s, np.rad2deg(motion.angles), motion.translations, sd_deg, motion.sd[:, 3:]]
+    )
+    rows = zip(motion.number.tolist(), numbers.tolist(), motion.status.tolist())
+    for number, values, status in rows:
+        yield [motion.joint.name, number, *map(format_float, values), STATUS_NAMES[status]]

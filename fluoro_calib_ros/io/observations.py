@@ -11,7 +11,6 @@ Files of a lab may have names instead of ids in the first three columns.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -22,14 +21,13 @@ from numpy.typing import NDArray
 from ..correction.base import CorrectionStatus
 from ..correction.fluoroscope_calibration import CorrectedPoints, FluoroscopeCalibration
 from ..errors import DataError
-from ..exposures.columns import first_repeated, is_positive
 from ..exposures.frame import MAX_ANGLE, Frame, angle_in_degrees, angles_of, points_on_image
 from ..exposures.names import Names, safe_names, without_trivial
+from ..exposures.phantom import first_repeated, is_positive
 from ..exposures.strays import few
 from ..limits import MAX_FRAMES
 from .access import PathLike, check_safe_name
-from .atomic import atomic_file
-from .csv_table import Block, NamedColumn, format_float, read_blocks, write_rows
+from .csv_table import Block, NamedColumn, format_float, read_all, read_blocks, write_table
 
 ANGLE = 'angle_deg'
 CORRECTED_BY = 'corrected_by'  # id of the calibration, of image points that are corrected already
@@ -38,30 +36,15 @@ COLUMNS = ('fluoroscope', 'exposure', 'target_id', 'u', 'v')
 
 @dataclass(frozen=True)
 class _Rows:
-    """Rows of the file as arrays.
+    """Rows of the file as arrays."""
 
-    Attributes
-    ----------
-    code : (n,) ndarray of int
-        Index of the fluoroscope in the order of first occurrence.
-    exposure, target_id : (n,) ndarray of int
-    uv : (n, 2) ndarray
-        [px]
-    sigma : (n,) ndarray
-        [px], NaN where unknown.
-    angle : (n,) ndarray
-        Of the C-arm [degrees], NaN where unknown.
-    line : (n,) ndarray of int
-        Number of the row in the file.
-    """
-
-    code: NDArray[np.int64]
-    exposure: NDArray[np.int64]
-    target_id: NDArray[np.int64]
-    uv: NDArray[np.float64]
-    sigma: NDArray[np.float64]
-    angle: NDArray[np.float64]
-    line: NDArray[np.int64]
+    code: NDArray[np.int64]  #: (n,), index of the fluoroscope in the order of first occurrence
+    exposure: NDArray[np.int64]  #: (n,)
+    target_id: NDArray[np.int64]  #: (n,)
+    uv: NDArray[np.float64]  #: (n, 2) [px]
+    sigma: NDArray[np.float64]  #: (n,) [px], NaN where unknown
+    angle: NDArray[np.float64]  #: (n,), of the C-arm [degrees], NaN where unknown
+    line: NDArray[np.int64]  #: (n,), number of the row in the file
 
     def __getitem__(self, rows: np.ndarray) -> _Rows:
         return _Rows(*(getattr(self, field.name)[rows] for field in fields(self)))
@@ -73,24 +56,11 @@ def read_observations_csv(
     """Read the frames of a CSV file, fluoroscopes by name and exposures by number.
 
     The rows of a frame may be anywhere in the file. sigma is given for all targets of a frame or
-    for none.
+    for none. image_size is that of all fluoroscopes [px]; it is required, as the file does not
+    contain it.
 
-    Parameters
-    ----------
-    path : path-like
-    image_size : (int, int), optional
-        Width and height of the images of all fluoroscopes [px]; required, as the file does not
-        contain it.
-
-    Returns
-    -------
-    dict of str to list of Frame
-
-    Raises
-    ------
-    DataError
-        For text that is not a number, a point off the image, and a target that occurs twice in a
-        frame. The message names the row.
+    Raises DataError that names the row for text that is not a number, a point off the image, and a
+    target that occurs twice in a frame.
     """
     return _read(path, image_size, _Columns(None))[0]
 
@@ -201,14 +171,13 @@ def write_observations_csv(
     with_sigma = any(frame.sigma is not None for frame in frames)
     with_angle = any(frame.angle is not None for frame in frames)
     labels = _labels(frames, names or Names())
-    with atomic_file(path, 'w') as file:
-        header = COLUMNS + ('sigma',) * with_sigma + (ANGLE,) * with_angle
-        write_rows(file, [header + (CORRECTED_BY,) * bool(corrected_by)])
-        for frame in frames:
-            check_safe_name(frame.fluoroscope, path)
-            last = [corrected_by.get(frame.fluoroscope, '')] if corrected_by else []
-            rows = _csv_rows(frame, with_sigma, with_angle, labels)
-            write_rows(file, ([*row, *last] for row in rows))
+    header = COLUMNS + ('sigma',) * with_sigma + (ANGLE,) * with_angle
+    rows = (
+        [*row, *([corrected_by.get(frame.fluoroscope, '')] if corrected_by else [])]
+        for frame in frames
+        for row in _csv_rows(path, frame, with_sigma, with_angle, labels)
+    )
+    write_table(path, header + (CORRECTED_BY,) * bool(corrected_by), rows)
 
 
 def corrections_of(path: PathLike) -> dict[str, str]:
@@ -342,8 +311,9 @@ def _angle(path: PathLike, where: str, rows: _Rows) -> float | None:
 
 
 def _csv_rows(
-    frame: Frame, with_sigma: bool, with_angle: bool, labels: _Labels
+    path: PathLike, frame: Frame, with_sigma: bool, with_angle: bool, labels: _Labels
 ) -> Iterator[list[Any]]:
+    check_safe_name(frame.fluoroscope, path)
     fluoroscope = labels.fluoroscopes.get(frame.fluoroscope, frame.fluoroscope)
     exposure = labels.exposures.get(int(frame.number), int(frame.number))
     columns: list[Iterable[Any]] = [
@@ -354,8 +324,7 @@ def _csv_rows(
         sigma = np.full(len(frame.target_id), np.nan) if frame.sigma is None else frame.sigma
         columns.append(map(format_float, sigma))
     if with_angle:
-        angle = np.nan if frame.angle is None else angle_in_degrees(frame.angle)
-        columns.append([format_float(angle)] * len(frame.target_id))
+        columns.append([_angle_text(frame)] * len(frame.target_id))
     return ([fluoroscope, exposure, *cells] for cells in zip(*columns))
 
 
@@ -368,7 +337,7 @@ DECIMALS = 4  # of a pixel, and of its standard deviation
 
 
 def write_extracted(
-    path: str | os.PathLike[str],
+    path: PathLike,
     frames: Iterable[tuple[Frame, np.ndarray]],
     target_names: Mapping[int, str],
 ) -> None:
@@ -381,7 +350,7 @@ def write_extracted(
 
 
 def write_markers(
-    path: str | os.PathLike[str],
+    path: PathLike,
     frames: Iterable[tuple[Frame, np.ndarray, np.ndarray]],
     target_names: Mapping[int, str],
 ) -> None:
@@ -394,23 +363,27 @@ def write_markers(
 
 
 def _write(
-    path: str | os.PathLike[str],
+    path: PathLike,
     frames: Sequence[tuple[Frame, Sequence[np.ndarray]]],
     flags: tuple[str, ...],
     target_names: Mapping[int, str],
 ) -> None:
     """Write frames with their flags, and with the angle if any frame has one."""
     with_angle = any(frame.angle is not None for frame, _ in frames)
-    with atomic_file(path, 'w') as file:
-        write_rows(file, [(*COLUMNS, 'sigma', *flags, *(ANGLE,) * with_angle)])
-        for frame, values in frames:
-            angle = '' if frame.angle is None else format_float(angle_in_degrees(frame.angle))
-            rows = _rows(path, frame, values, target_names)
-            write_rows(file, ([*row, angle] if with_angle else row for row in rows))
+    rows = (
+        [*row, _angle_text(frame)] if with_angle else row
+        for frame, values in frames
+        for row in _rows(path, frame, values, target_names)
+    )
+    write_table(path, (*COLUMNS, 'sigma', *flags, *(ANGLE,) * with_angle), rows)
+
+
+def _angle_text(frame: Frame) -> str:
+    return '' if frame.angle is None else format_float(angle_in_degrees(frame.angle))
 
 
 def _rows(
-    path: str | os.PathLike[str],
+    path: PathLike,
     frame: Frame,
     flags: Sequence[np.ndarray],
     target_names: Mapping[int, str],
@@ -432,33 +405,17 @@ ADDED_COLUMNS = ('u_corrected', 'v_corrected', 'sigma', 'status')
 
 @dataclass(frozen=True)
 class PointsFile:
-    """Image points of a CSV file.
-
-    Attributes
-    ----------
-    path : path-like
-    header : list of str
-    rows : list of list of str
-        All cells as text.
-    lines : (n,) ndarray of int
-        Number of each row in the file.
-    uv : (n, 2) ndarray
-        [px], NaN where a cell is empty or nan.
-    sigma : (n,) ndarray or None
-        [px], NaN where a cell is empty; None without such a column.
-    fluoroscope : (n,) ndarray of str or None
-        None without such a column.
-    angle : (n,) ndarray or None
-        Of the C-arm [rad], NaN where a cell is empty; None without such a column.
-    """
+    """Image points of a CSV file."""
 
     path: PathLike
     header: list[str]
-    rows: list[list[str]]
-    lines: NDArray[np.int64]
-    uv: NDArray[np.float64]
+    rows: list[list[str]]  #: all cells as text
+    lines: NDArray[np.int64]  #: (n,), number of each row in the file
+    uv: NDArray[np.float64]  #: (n, 2) [px], NaN where a cell is empty or nan
+    #: (n,) [px], NaN where a cell is empty; None without such a column
     sigma: NDArray[np.float64] | None
-    fluoroscope: np.ndarray | None
+    fluoroscope: np.ndarray | None  #: (n,), None without such a column
+    #: (n,), of the C-arm [rad], NaN where a cell is empty; None without such a column
     angle: NDArray[np.float64] | None = None
 
     @property
@@ -511,24 +468,17 @@ def read_points(path: PathLike, known: Mapping[str, str] | None = None) -> Point
     will have the status INVALID. known are the ids of
     fluoroscopes that have names. Raises DataError that names row and cause.
     """
-    known = known or {}
-    blocks = list(read_blocks(path, ('u', 'v')))
-    header = blocks[0].header
+    table = read_all(path, ('u', 'v'))
+    header = table.header
     points = PointsFile(
         path=path,
         header=header,
-        rows=[row for block in blocks for row in block.rows],
-        lines=np.concatenate([block.lines for block in blocks]),
-        uv=np.concatenate([_uv(block) for block in blocks]),
-        sigma=np.concatenate([_sigma(block) for block in blocks]) if 'sigma' in header else None,
-        fluoroscope=np.array(
-            [known.get(n, n) for block in blocks for n in block.strings('fluoroscope')]
-        )
-        if 'fluoroscope' in header
-        else None,
-        angle=np.concatenate([_image_angle(block) for block in blocks])
-        if ANGLE in header
-        else None,
+        rows=table.rows,
+        lines=table.lines,
+        uv=np.column_stack([table.floats_or_nan('u'), table.floats_or_nan('v')]),
+        sigma=_sigma(table) if 'sigma' in header else None,
+        fluoroscope=_fluoroscopes(table, known or {}) if 'fluoroscope' in header else None,
+        angle=_image_angle(table) if ANGLE in header else None,
     )
     if CORRECTED_BY in header:
         raise DataError(
@@ -543,8 +493,8 @@ def read_points(path: PathLike, known: Mapping[str, str] | None = None) -> Point
     return points
 
 
-def _uv(block: Block) -> np.ndarray:
-    return np.column_stack([block.floats_or_nan('u'), block.floats_or_nan('v')])
+def _fluoroscopes(block: Block, known: Mapping[str, str]) -> np.ndarray:
+    return np.array([known.get(name, name) for name in block.strings('fluoroscope')])
 
 
 def _sigma(block: Block) -> np.ndarray:
@@ -617,12 +567,8 @@ def write_points(path: PathLike, points: PointsFile, corrected: CorrectedPoints)
     file cannot be written.
     """
     numbers = np.column_stack([corrected.uv, corrected.sigma]).tolist()
-    with atomic_file(path, 'w') as file:
-        write_rows(file, [points.header + points.added_columns])
-        write_rows(
-            file,
-            (
-                [*row, *map(format_float, values), STATUS[status]]
-                for row, values, status in zip(points.rows, numbers, corrected.status.tolist())
-            ),
-        )
+    rows = (
+        [*row, *map(format_float, values), STATUS[status]]
+        for row, values, status in zip(points.rows, numbers, corrected.status.tolist())
+    )
+    write_table(path, points.header + points.added_columns, rows)

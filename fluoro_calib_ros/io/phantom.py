@@ -9,25 +9,22 @@ Files of a lab may have names of beads instead of ids. Points in motion have a f
 
 from __future__ import annotations
 
-import os
-
 import numpy as np
 
-from ..errors import DataError
-from ..exposures.columns import first_repeated
-from ..exposures.moving_points import MovingPoints
+from ..errors import DataError, ErrorsAt
+from ..exposures.frame import MovingPoints
 from ..exposures.names import Names, without_trivial
-from ..exposures.phantom import Phantom
+from ..exposures.phantom import Phantom, first_repeated
 from ..limits import read_limits
-from .atomic import atomic_file
-from .csv_table import NamedColumn, read_blocks, write_rows
+from .access import PathLike
+from .csv_table import NamedColumn, read_blocks, write_table
 
 COLUMNS = ('target_id', 'x', 'y', 'z', 'sd')
 DIAMETER = 'diameter'  # of the beads, optional
 EXPOSURE = 'exposure'
 
 
-def read_phantom(path: str | os.PathLike[str]) -> Phantom:
+def read_phantom(path: PathLike) -> Phantom:
     """Read a Phantom from a CSV file with the columns target_id and x, y, z, sd [mm].
 
     The columns may have any order. Raises DataError that names row and cause.
@@ -35,14 +32,14 @@ def read_phantom(path: str | os.PathLike[str]) -> Phantom:
     return _read(path, NamedColumn('target_id', None))
 
 
-def read_named_phantom(path: str | os.PathLike[str], known: Names) -> tuple[Phantom, Names]:
+def read_named_phantom(path: PathLike, known: Names) -> tuple[Phantom, Names]:
     """Read a Phantom whose targets may have names, and the names. Raises DataError."""
     column = NamedColumn('target_id', known.targets)
     phantom = _read(path, column)
     return phantom, Names(without_trivial(column.ids()))
 
 
-def _read(path: str | os.PathLike[str], column: NamedColumn) -> Phantom:
+def _read(path: PathLike, column: NamedColumn) -> Phantom:
     id_parts = []
     number_parts = []
     line_parts = []
@@ -72,14 +69,12 @@ def _read(path: str | os.PathLike[str], column: NamedColumn) -> Phantom:
             f'{path}, row {lines[second]}: target {ids[second]} is already given in row '
             f'{lines[first]}'
         )
-    try:
+    with ErrorsAt(path):
         diameters = np.concatenate(diameter_parts) if diameter_parts else None
         return Phantom(ids, numbers[:, :3], numbers[:, 3], diameters)
-    except DataError as error:
-        raise error.at(path) from None
 
 
-def has_exposures(path: str | os.PathLike[str]) -> bool:
+def has_exposures(path: PathLike) -> bool:
     """Return whether a file holds coordinates by exposure; False for files of other programs."""
     try:
         return any(EXPOSURE in block for block in read_blocks(path, COLUMNS))
@@ -87,7 +82,7 @@ def has_exposures(path: str | os.PathLike[str]) -> bool:
         return False
 
 
-def read_moving_points(path: str | os.PathLike[str]) -> MovingPoints:
+def read_moving_points(path: PathLike) -> MovingPoints:
     """Read MovingPoints from a CSV file with the columns exposure, target_id and x, y, z, sd [mm].
 
     Raises DataError that names row and cause.
@@ -111,9 +106,7 @@ def read_moving_points(path: str | os.PathLike[str]) -> MovingPoints:
     return points
 
 
-def write_phantom(
-    path: str | os.PathLike[str], phantom: Phantom, names: Names | None = None
-) -> None:
+def write_phantom(path: PathLike, phantom: Phantom, names: Names | None = None) -> None:
     """Write a Phantom to a CSV file, from which the same values are read again.
 
     Names are written instead of ids where all targets have one. Raises DataError where the file
@@ -122,15 +115,13 @@ def write_phantom(
     labels = (names or Names()).target_names()
     if not all(target in labels for target in phantom.target_id.tolist()):
         labels = {}
-    with atomic_file(path, 'w') as file:
-        numbers = [phantom.xyz_mm, phantom.sd_mm[:, None]]
-        if phantom.diameter_mm is not None:
-            numbers.append(phantom.diameter_mm[:, None])
-        write_rows(file, [(*COLUMNS, DIAMETER)[: sum(part.shape[1] for part in numbers) + 1]])
-        write_rows(
-            file,
-            (
-                [labels.get(int(target), int(target)), *map(repr, row)]
-                for target, row in zip(phantom.target_id, np.hstack(numbers).tolist())
-            ),
-        )
+    header: tuple[str, ...] = COLUMNS
+    columns = [*phantom.xyz_mm.T, phantom.sd_mm]
+    if phantom.diameter_mm is not None:
+        header = (*COLUMNS, DIAMETER)
+        columns.append(phantom.diameter_mm)
+    rows = (
+        [labels.get(target, target), *map(repr, row)]
+        for target, row in zip(phantom.target_id.tolist(), np.column_stack(columns).tolist())
+    )
+    write_table(path, header, rows)

@@ -1,24 +1,29 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Poses and motion of bodies as CSV: a row for each body and exposure, in mm, s and rad.
+"""Results in space as CSV: poses and motion of bodies, and reconstructed points.
 
-A pose takes points of the body to the frame of the reconstructed points; errors of a rotation are
-about the axes of that frame. The motion is that of the centre of the markers of a body.
+Poses and motion have a row for each body and exposure, in mm, s and rad. A pose takes points of
+the body to the frame of the reconstructed points; errors of a rotation are about the axes of that
+frame. The motion is that of the centre of the markers of a body.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
-from ..bodies.body import STATUS_NAMES, Body, BodyPoses
+from ..bodies.body import STATUS_NAMES as POSE_STATUS
+from ..bodies.body import Body, BodyPoses
 from ..bodies.tracking import TrackedExposure
+from ..exposures.names import Names
 from ..photogrammetry.rotations import quaternion_from_matrix
+from ..reconstruction.intersection import STATUS_NAMES
+from ..reconstruction.reconstruct import ReconstructedFrame
 from .access import PathLike
-from .atomic import atomic_file
-from .csv_table import format_float, write_rows
+from .csv_table import format_float, write_table
 
 COLUMNS = (
     *('body', 'exposure', 'time_s', 'x_mm', 'y_mm', 'z_mm', 'qx', 'qy', 'qz', 'qw'),
@@ -36,28 +41,18 @@ def write_poses(path: PathLike, poses: Sequence[BodyPoses], start_ns: int) -> No
 
     Raises DataError where the file cannot be written.
     """
-    with atomic_file(path, 'w') as file:
-        write_rows(file, [COLUMNS])
-        for one in poses:
-            known = one.known
-            quaternion = np.full((len(known), 4), np.nan)
-            quaternion[known] = quaternion_from_matrix(one.rotation[known])
-            numbers = np.hstack(
-                [
-                    (one.stamp_ns - start_ns)[:, None] / 1e9,
-                    one.position_mm,
-                    np.roll(quaternion, -1, axis=1),
-                    one.sd,
-                ]
-            )
-            rows = zip(one.number.tolist(), numbers.tolist(), one.markers.tolist(), one.status)
-            write_rows(
-                file,
-                (
-                    [one.body, number, *map(format_float, values), markers, STATUS_NAMES[status]]
-                    for number, values, markers, status in rows
-                ),
-            )
+    write_table(path, COLUMNS, (row for one in poses for row in _rows(one, start_ns)))
+
+
+def _rows(one: BodyPoses, start_ns: int) -> Iterator[list[object]]:
+    known = one.known
+    quaternion = np.full((len(known), 4), np.nan)
+    quaternion[known] = quaternion_from_matrix(one.rotation[known])
+    time_s = (one.stamp_ns - start_ns)[:, None] / 1e9
+    numbers = np.hstack([time_s, one.position_mm, np.roll(quaternion, -1, axis=1), one.sd])
+    rows = zip(one.number.tolist(), numbers.tolist(), one.markers.tolist(), one.status)
+    for number, values, markers, status in rows:
+        yield [one.body, number, *map(format_float, values), markers, POSE_STATUS[status]]
 
 
 def write_motion(
@@ -67,10 +62,10 @@ def write_motion(
 
     Raises DataError where the file cannot be written.
     """
-    with atomic_file(path, 'w') as file:
-        write_rows(file, [MOTION_COLUMNS])
-        for row, body in enumerate(bodies):
-            write_rows(file, (_motion(body, row, one, start_ns) for one in exposures))
+    rows = (
+        _motion(body, row, one, start_ns) for row, body in enumerate(bodies) for one in exposures
+    )
+    write_table(path, MOTION_COLUMNS, rows)
 
 
 def _motion(body: Body, row: int, one: TrackedExposure, start_ns: int) -> list[object]:
@@ -78,3 +73,39 @@ def _motion(body: Body, row: int, one: TrackedExposure, start_ns: int) -> list[o
     values = np.concatenate([one.velocity[row], one.acceleration[row], sd])
     time_s = (one.stamp_ns - start_ns) / 1e9
     return [body.name, one.number, *map(format_float, [time_s, *values.tolist()])]
+
+
+# Reconstructed points as CSV: one row for a point of a frame, lengths in mm, residuals in px.
+
+POINT_COLUMNS = (
+    *('frame', 'stamp_ns', 'target_id', 'x', 'y', 'z'),
+    *('sd_x', 'sd_y', 'sd_z', 'residual', 'rays', 'status'),
+)
+NAME_COLUMN = 'name'  # the last one, of targets that have names
+
+
+def write_reconstruction(
+    path: PathLike, frames: Iterable[ReconstructedFrame], names: Names | None = None
+) -> None:
+    """Write reconstructed frames to a CSV file, with a column name where targets have names.
+
+    What is unknown, such as the coordinates of a point that only one fluoroscope sees, is an empty
+    cell. Raises DataError where the file cannot be written.
+    """
+    labels = (names or Names()).target_names()
+    rows = (
+        [*row, labels.get(row[2], '')] if labels else row
+        for frame in frames
+        for row in _point_rows(frame)
+    )
+    write_table(path, (*POINT_COLUMNS, NAME_COLUMN) if labels else POINT_COLUMNS, rows)
+
+
+def _point_rows(frame: ReconstructedFrame) -> Iterable[list[Any]]:
+    points = frame.points
+    numbers = np.column_stack([points.xyz_mm, points.sd_mm, points.residual])
+    for target, values, rays, status in zip(
+        frame.target_id.tolist(), numbers.tolist(), points.rays.tolist(), points.status.tolist()
+    ):
+        cells = map(format_float, values)
+        yield [frame.number, frame.stamp_ns, target, *cells, rays, STATUS_NAMES[status]]

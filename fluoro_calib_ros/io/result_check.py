@@ -24,8 +24,7 @@ from ..findings import Finding, Kind, Place, Severity
 from .access import PathLike, read_bytes
 from .calibration import SUFFIX
 from .csv_table import NAMES_FILE
-from .documents import read_json
-from .text_files import to_json_values
+from .documents import read_json, to_json_values
 
 Frames = Mapping[str, Sequence[Frame]]
 

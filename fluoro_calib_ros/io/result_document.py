@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +16,19 @@ from ..checks.rig_watch import DriftVerdict
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError
 from ..estimation.constraints import RelativeOrientation
-from ..estimation.diagnostics import AdjustmentStatistics
+from ..estimation.diagnostics import AdjustmentStatistics, ResidualTable
+from ..estimation.fixed_calibration import JointPrecision
 from ..estimation.result import CalibrationResult, FluoroscopeResult
 from ..estimation.rounds import Round
 from ..findings import Finding, Severity, sentences
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import quaternion_from_matrix
+from ..records import Field
 from .access import PathLike, os_error_reason
+from .arrays import Layout, read_arrays, to_arrays, write_arrays
+from .csv_table import format_float, write_table
+from .documents import write_json
 from .result_check import VALIDATION_NAME, with_digests
-from .text_files import write_json
 
 # 1 had neither version, date, units nor adjustments; 2 no ids, no note on the rig and no digest.
 FORMAT_VERSION = 3
@@ -300,3 +304,132 @@ def delete_validation(directory: PathLike) -> None:
         path.unlink(missing_ok=True)
     except OSError as error:
         raise DataError(f'{path}: cannot be deleted ({os_error_reason(error)})') from None
+
+
+# Tables of a result as CSV files, and covariance matrices (docs/files.md).
+
+RESIDUALS = 'residuals.csv'
+EXPOSURES = 'exposures.csv'
+TARGETS = 'targets.csv'
+INTERIOR = 'interior.csv'
+NAMES = (RESIDUALS, EXPOSURES, TARGETS, INTERIOR)
+
+_RESIDUALS_HEADER = (
+    'fluoroscope,exposure,target_id,u_px,v_px,correction_u_px,correction_v_px,residual_u_px,'
+    'residual_v_px,redundancy_u,redundancy_v,weight,outlier'
+)
+_EXPOSURES_HEADER = (
+    'fluoroscope,exposure,x_mm,y_mm,z_mm,qw,qx,qy,qz,sd_x_mm,sd_y_mm,sd_z_mm,'
+    'sd_turn_x_rad,sd_turn_y_rad,sd_turn_z_rad,image_points,outliers,rmse_u_px,rmse_v_px'
+)
+_TARGETS_HEADER = 'target_id,x_mm,y_mm,z_mm,sd_x_mm,sd_y_mm,sd_z_mm,image_points,outliers'
+_INTERIOR_HEADER = (
+    'fluoroscope,xp_px,yp_px,c_px,sd_xp_px,sd_yp_px,sd_c_px,width_px,height_px,model,k,'
+    'image_points,inliers,rmse_before_u_px,rmse_before_v_px,rmse_after_u_px,rmse_after_v_px'
+)
+
+
+def write_tables(directory: Path, result: CalibrationResult) -> None:
+    """Write the tables of a result into a folder. Raises DataError."""
+    tables = {
+        EXPOSURES: (_EXPOSURES_HEADER, _exposures(result)),
+        TARGETS: (_TARGETS_HEADER, _targets(result)),
+        INTERIOR: (_INTERIOR_HEADER, _interior(result)),
+    }
+    if result.residuals is not None:
+        tables[RESIDUALS] = (_RESIDUALS_HEADER, _residuals(result.residuals))
+    for name, (header, rows) in tables.items():
+        write_table(directory / name, header.split(','), rows)
+
+
+def _floats(values: Iterable[float]) -> list[str]:
+    return [format_float(float(value)) for value in values]
+
+
+def _residuals(table: ResidualTable) -> Iterator[Sequence[Any]]:
+    figures = np.column_stack(
+        [table.uv, table.correction, table.residual, table.redundancy, table.weight]
+    )
+    for name, exposure, target, row, outlier in zip(
+        table.fluoroscope, table.exposure, table.target_id, figures, table.outlier
+    ):
+        yield [name, int(exposure), int(target), *_floats(row), int(outlier)]
+
+
+def _exposures(result: CalibrationResult) -> Iterator[Sequence[Any]]:
+    for name, figures in result.fluoroscopes.items():
+        for e in figures.exposures:
+            orientation = (*e.position_mm, *e.quaternion_wxyz, *e.sd_mm, *e.sd_rad)
+            yield [
+                name,
+                e.exposure,
+                *_floats(orientation),
+                *_fit_of_exposure(result.residuals, name, e.exposure),
+            ]
+
+
+def _fit_of_exposure(table: ResidualTable | None, name: str, exposure: int) -> list[Any]:
+    """Image points, outliers and RMSE [px] of the inliers of an exposure; blanks without table."""
+    if table is None:
+        return ['', '', '', '']
+    own = (table.fluoroscope == name) & (table.exposure == exposure)
+    core = own & ~table.outlier
+    rmse = np.sqrt(np.mean(table.residual[core] ** 2, axis=0)) if core.any() else [np.nan] * 2
+    return [int(own.sum()), int(own.sum() - core.sum()), *_floats(rmse)]
+
+
+def _targets(result: CalibrationResult) -> Iterator[Sequence[Any]]:
+    targets = result.targets
+    sd = np.sqrt(np.diagonal(targets.covariance, axis1=1, axis2=2))
+    table = result.residuals
+    for target, xyz, own_sd in zip(targets.target_id, targets.xyz_mm, sd):
+        counts: list[Any] = ['', '']
+        if table is not None:
+            own = table.target_id == target
+            counts = [int(own.sum()), int((own & table.outlier).sum())]
+        yield [int(target), *_floats(xyz), *_floats(own_sd), *counts]
+
+
+def _interior(result: CalibrationResult) -> Iterator[Sequence[Any]]:
+    for name, figures in result.fluoroscopes.items():
+        yield [
+            name,
+            *_floats((*figures.interior, *figures.interior_sd)),
+            *figures.image_size,
+            figures.model_kind,
+            figures.k,
+            figures.observations,
+            figures.inliers,
+            *_floats((*figures.rmse_before, *figures.rmse_after)),
+        ]
+
+
+# Files <adjustment>.covariance.npz: the covariance matrix of all unknowns.
+
+SUFFIX = '.covariance.npz'
+_LAYOUT = Layout(
+    'a covariance',
+    (
+        Field('names', 'text', ('u',)),
+        Field('values', 'float', ('u',), allowed='nan'),
+        Field('covariance', 'float', ('u', 'u')),
+    ),
+    version=1,
+)
+
+
+def write_covariance(path: PathLike, joint: JointPrecision) -> None:
+    """Write the covariance matrix of an adjustment. Raises DataError."""
+    values = {
+        'names': np.array(joint.names),
+        'values': joint.values,
+        'covariance': joint.covariance,
+    }
+    write_arrays(path, _LAYOUT, to_arrays(path, _LAYOUT, values))
+
+
+def read_covariance(path: PathLike) -> JointPrecision:
+    """Read the covariance matrix of an adjustment. Raises DataError."""
+    arrays = read_arrays(path, _LAYOUT)
+    names = tuple(str(name) for name in arrays['names'])
+    return JointPrecision(names, arrays['values'], arrays['covariance'])

@@ -15,7 +15,7 @@ All keys are optional; paths are relative to the folder of the file.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -23,41 +23,25 @@ from ..errors import DataError
 from .documents import read_toml
 
 NAME = 'rig.toml'
-KEYS = (
-    'fluoroscopes',
-    'image_size',
-    'phantom',
-    'calibration',
-    'angle_joint',
-    'angle_max_age',
-)
 
 
 @dataclass(frozen=True)
 class RigFile:
-    """Content of a rig.toml; None for what it does not say.
-
-    Attributes
-    ----------
-    path : Path
-    fluoroscopes : list of str or None
-    image_size : tuple of int or None
-        Width and height [px].
-    phantom, calibration : Path or None
-        File with the phantom, and result folder.
-    angle_joint : str or None
-        Joint of the C-arm, or one for each fluoroscope, as the option of this name.
-    angle_max_age : float or None
-        Longest time from the last state of the joint to an exposure [s].
-    """
+    """Content of a rig.toml; None for what it does not say."""
 
     path: Path
     fluoroscopes: list[str] | None = None
-    image_size: tuple[int, int] | None = None
+    image_size: tuple[int, int] | None = None  #: width and height [px]
+    #: file with the phantom, and result folder
     phantom: Path | None = None
     calibration: Path | None = None
+    #: joint of the C-arm, or one for each fluoroscope, as the option of this name
     angle_joint: str | None = None
+    #: longest time from the last state of the joint to an exposure [s]
     angle_max_age: float | None = None
+
+
+KEYS = tuple(field.name for field in fields(RigFile)[1:])
 
 
 def read_rig_file(path: Path) -> RigFile:

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,14 +18,24 @@ from ..bodies.tracking import BodyTracker, TrackedExposure, poses_alone, poses_o
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError
 from ..exposures.frame import Frame
-from ..exposures.pairing import PAIR_BY, PairingOptions
+from ..exposures.pairing import RecordedPairing
 from ..findings import Finding, Kind, Place, Severity
-from ..io.joints import JointEntry
-from ..options import option, validate_options
+from ..io.access import PathLike
+from ..io.bodies import write_bodies
+from ..io.folder import FolderKind, check_output_folder, replaced_folder
+from ..io.formats.opensim import write_joint_motion
+from ..io.joints import JointEntry, write_joints
+from ..io.poses import write_motion, write_poses
+from ..options import option
 from ..photogrammetry.noise import ObservedScatter
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.intersection import OK, OUTSIDE, Intersector
-from ..reconstruction.reconstruct import IntersectedViews, intersect_frames, pair_recording
+from ..reconstruction.reconstruct import (
+    IntersectedViews,
+    intersect_frames,
+    orientation_of_recorded,
+    pair_recording,
+)
 
 SMOOTH = ('auto', 'none', 'lag', 'butterworth')
 SHAPE_EXPOSURES = 600  # of a recording that shapes are estimated from, evenly spread
@@ -33,7 +43,7 @@ NS_PER_S = 1_000_000_000
 
 
 @dataclass(frozen=True)
-class BodiesOptions:
+class BodiesOptions(RecordedPairing):
     """Options of poses and joints. Raises ValueError for a value that an option cannot have."""
 
     smooth: str = option(
@@ -55,15 +65,8 @@ class BodiesOptions:
         maximum=1000.0,
         unit='standard deviations',
     )
-    pair_by: str = option(
-        'frame_number', 'what the frames of one exposure have in common', choices=PAIR_BY
-    )
-    pair_tolerance: float = PairingOptions.tolerance_s
     estimate_shapes: bool = True
     rate: float | None = None
-
-    def __post_init__(self) -> None:
-        validate_options(self)
 
 
 @dataclass(frozen=True)
@@ -159,19 +162,6 @@ def track_bodies(
         unpaired=unpaired,
         findings=tuple(findings),
     )
-
-
-def orientation_of_recorded(
-    frames: Mapping[str, Sequence[Frame]], orientation: RigOrientation
-) -> RigOrientation:
-    """Return the orientation of the recorded fluoroscopes. Raises DataError for less than two."""
-    names = [name for name in orientation.fluoroscopes if name in frames]
-    if len(names) < 2:
-        raise DataError(
-            f'there are image points of {", ".join(frames)}, but two fluoroscopes of the '
-            f'orientation ({", ".join(orientation.fluoroscopes)}) are needed'
-        )
-    return orientation.subset(names)
 
 
 @dataclass(frozen=True)
@@ -276,3 +266,49 @@ def _unseen(poses: BodyPoses) -> Finding:
         severity=Severity.WARNING,
         numbers={'exposures': float(len(poses.number))},
     )
+
+
+# The folder with the bodies of a recording.
+
+POSES = 'poses.csv'
+MOTION = 'motion.csv'
+SHAPES = 'shapes.csv'
+JOINTS = 'joints.csv'
+OPENSIM = 'joints.mot'
+FIGURES = 'figures'
+BODIES_FOLDER = FolderKind(
+    'a folder of bodies',
+    parts=(POSES, MOTION, SHAPES, JOINTS, OPENSIM, FIGURES),
+    marks=(POSES,),
+)
+
+
+def check_bodies_folder(directory: PathLike, inputs: Iterable[PathLike]) -> None:
+    """Raise DataError unless the bodies of a recording may be written to a folder."""
+    check_output_folder(directory, BODIES_FOLDER, inputs)
+
+
+def save_bodies(directory: PathLike, outcome: BodiesOutcome, figures: bool = False) -> None:
+    """Write poses, motion, shapes and joints, all or nothing; with pictures of them on request.
+
+    Raises DataError.
+    """
+    start_ns = int(outcome.exposures[0].stamp_ns)
+    with replaced_folder(directory, BODIES_FOLDER) as folder:
+        write_poses(folder / POSES, outcome.poses, start_ns)
+        write_motion(folder / MOTION, outcome.bodies, outcome.exposures, start_ns)
+        write_bodies(folder / SHAPES, outcome.bodies)
+        if outcome.joints:
+            write_joints(folder / JOINTS, outcome.joints, start_ns)
+        if _some_exposure_has_all(outcome.joints):
+            write_joint_motion(folder / OPENSIM, outcome.joints, start_ns)
+        if figures:
+            from ..report.motion_figure import write_motion_figures
+
+            write_motion_figures(folder / FIGURES, outcome.joints, outcome.poses)
+
+
+def _some_exposure_has_all(joints: Sequence[JointMotion]) -> bool:
+    """Return whether the motion of all joints is known in an exposure, as OpenSim needs it."""
+    known = [np.isfinite(motion.angles).all(axis=1) for motion in joints]
+    return bool(known) and bool(np.all(known, axis=0).any())

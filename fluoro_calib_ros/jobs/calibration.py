@@ -43,10 +43,10 @@ from ..estimation.result import CalibrationResult
 from ..estimation.rounds import Round
 from ..exposures.frame import Frame
 from ..exposures.phantom import Phantom
-from ..exposures.repeats import without_repeats
-from ..exposures.strays import frames_without_strays
+from ..exposures.strays import frames_without_strays, without_repeats
 from ..findings import Finding, Kind, Place, Severity
 from ..photogrammetry.rig_orientation import RigOrientation
+from ..processes import OF_JOB, WorkerProcess
 from .sources import select_calibrations
 
 # The adjustment job: adjust exposures with calibrations fixed, an out-of-sample test.
@@ -103,20 +103,13 @@ Progress = Callable[[str, Round], None]
 
 @dataclass(frozen=True)
 class Rig:
-    """Fluoroscopes that belong to the rig but are not calibrated by this job.
+    """Fluoroscopes that belong to the rig but are not calibrated by this job."""
 
-    Attributes
-    ----------
-    fluoroscopes : sequence of str
-        Names of all fluoroscopes of the rig in their order; empty: those of the request.
-    frames : mapping of str to sequence of Frame
-        Exposures of the other fluoroscopes.
-    calibrations : mapping of str to FluoroscopeCalibration
-        Present calibrations of the other fluoroscopes.
-    """
-
+    #: names of all fluoroscopes of the rig in their order; empty: those of the request
     fluoroscopes: Sequence[str] = ()
+    #: exposures of the other fluoroscopes
     frames: Mapping[str, Sequence[Frame]] = field(default_factory=dict)
+    #: present calibrations of the other fluoroscopes
     calibrations: Mapping[str, FluoroscopeCalibration] = field(default_factory=dict)
 
 
@@ -375,3 +368,44 @@ def _findings_of_rig(
         {name: frames[name] for name in names if name in frames},
         {name: calibrations[name] for name in names},
     )
+
+
+# Run a calibration job in another process, so that it does not delay its caller.
+
+
+def run_in_worker_process(
+    request: CalibrationRequest,
+    *,
+    validate: bool = False,
+    rig: Rig | None = None,
+    progress: Progress | None = None,
+    raise_if_cancelled: Callable[[], None] | None = None,
+) -> CalibrationOutcome:
+    """Run `run_calibration` in another process.
+
+    Parameters and errors are those of `run_calibration`. The outcome has no networks.
+    raise_if_cancelled is called repeatedly and may raise to terminate the process. Raises
+    RuntimeError for any other failure of the process.
+    """
+    process = WorkerProcess(_calibration, 'the worker process', OF_JOB)
+    try:
+        return process(
+            request, validate, rig, progress=progress, raise_if_cancelled=raise_if_cancelled
+        )
+    finally:
+        process.close()
+
+
+def _calibration() -> Callable[..., CalibrationOutcome]:
+    return _outcome
+
+
+def _outcome(
+    request: CalibrationRequest,
+    validate: bool,
+    rig: Rig | None,
+    progress: Progress | None = None,
+) -> CalibrationOutcome:
+    """Run the job in the worker process."""
+    outcome = run_calibration(request, validate=validate, rig=rig, progress=progress)
+    return outcome.without_runs()

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,8 +19,9 @@ from ..errors import DataError
 from ..exposures.angles import AngleOptions
 from ..exposures.frame import Frame
 from ..images.corrector import ImageCorrector
+from ..io.access import PathLike
 from ..io.bags.reader import read_frames, with_angles
-from ..io.calibration import SUFFIX, load_calibrations
+from ..io.calibration import SUFFIX, load_calibrations, load_orientation, orientation_path
 from ..io.csv_table import read_names
 from ..io.documents import read_json
 from ..io.formats import registry
@@ -40,7 +40,6 @@ from ..io.phantom import read_phantom
 from ..io.result_check import OBSERVATIONS
 from ..io.result_check import PHANTOM as PHANTOM_FILE
 from ..io.result_check import RESULT_NAME as RESULT
-from ..io.rig_orientation import load_orientation, orientation_path
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import matrix_from_quaternion
 from .result_folder import belongs_to
@@ -86,12 +85,12 @@ class ConversionRequest:
         Which joint gives the angles of the frames of a bag.
     """
 
-    source: str | os.PathLike[str]
+    source: PathLike
     kind: str
-    out: str | os.PathLike[str]
+    out: PathLike
     source_kind: str | None = None
     exposure: int | None = None
-    calibration: str | os.PathLike[str] | None = None
+    calibration: PathLike | None = None
     corrected: bool = False
     fluoroscopes: Sequence[str] = ()
     settings: FileSettings = field(default_factory=FileSettings)
@@ -287,7 +286,7 @@ def _corrected(
 
 
 def result_content(
-    directory: str | os.PathLike[str],
+    directory: PathLike,
     settings: FileSettings | None = None,
     exposure: int | None = None,
     angle: float | None = None,

@@ -19,8 +19,7 @@ from ..exposures.phantom import Phantom
 from ..findings import Finding, Kind, Place
 from ..images.lattice import NOT_MARKED, FlatGrid
 from ..images.view import Lens, assumed_lens, may_be_found, shared_lens
-from ..io.access import check_safe_name, make_folder
-from ..io.atomic import write_bytes
+from ..io.access import check_safe_name, make_folder, write_bytes
 from ..io.bags.reader import image_topics
 from .image_sources import (
     ImageAngles,
@@ -42,23 +41,12 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class ImageResult(Observations):
-    """What was found in one image of a recording.
-
-    Attributes
-    ----------
-    exposure : int
-    place : str
-        File, page or message.
-    frame : Frame or None
-        None where the image gives no observations; the finding says why.
-    png : bytes or None
-        Overlay, if it was asked for.
-    """
+    """What was found in one image of a recording."""
 
     exposure: int = 0
-    place: str = ''
-    frame: Frame | None = None
-    png: bytes | None = None
+    place: str = ''  #: file, page or message
+    frame: Frame | None = None  #: None where the image gives no observations; the finding says why
+    png: bytes | None = None  #: overlay, if it was asked for
 
 
 @dataclass(frozen=True)

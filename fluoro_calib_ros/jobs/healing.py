@@ -9,21 +9,14 @@ passes where no block that was not used tells of a further change.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from ..bodies.body import Body, check_bodies, solvable_bodies
-from ..bodies.healing import (
-    OF_RIG,
-    Cause,
-    Change,
-    Diagnosis,
-    Diagnostician,
-    HealedRig,
-    healed_rig,
-)
+from ..bodies.healing import OF_RIG, Cause, Change, Diagnosis, Diagnostician, HealedRig, healed_rig
 from ..bodies.rig_adjustment import ObservedBodies, Poses, RigAdjustment, RigErrors, rig_errors
 from ..bodies.rigid import fitted_pose
 from ..checks.check import Check, verdict_of
@@ -32,13 +25,16 @@ from ..correction.fluoroscope_calibration import FluoroscopeCalibration, with_dr
 from ..correction.series import sd_over_image
 from ..errors import DataError
 from ..exposures.frame import Frame
-from ..exposures.pairing import PAIR_BY, PairingOptions
+from ..exposures.pairing import RecordedPairing
 from ..findings import Finding, Kind, Place, Severity
-from ..options import option, validate_options
+from ..io.access import PathLike
+from ..io.calibration import ORIENTATION_NAME as ORIENTATION
+from ..io.calibration import SUFFIX, save_calibration, save_orientation
+from ..io.documents import write_json
+from ..io.folder import FolderKind, check_output_folder, replaced_folder
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.intersection import OK, OUTSIDE, Intersector
-from ..reconstruction.reconstruct import pair_recording
-from .bodies import orientation_of_recorded
+from ..reconstruction.reconstruct import orientation_of_recorded, pair_recording
 
 BLOCKS = 10  # of a recording, used in turn for the diagnosis and for its verdict
 MAX_EXPOSURES = 200  # of a recording that are used for each, evenly spread
@@ -49,16 +45,8 @@ IDENTIFIED = 0.5
 
 
 @dataclass(frozen=True)
-class HealingOptions:
+class HealingOptions(RecordedPairing):
     """Options of healing. Raises ValueError for a value that an option cannot have."""
-
-    pair_by: str = option(
-        'frame_number', 'what the frames of one exposure have in common', choices=PAIR_BY
-    )
-    pair_tolerance: float = PairingOptions.tolerance_s
-
-    def __post_init__(self) -> None:
-        validate_options(self)
 
 
 @dataclass(frozen=True)
@@ -423,3 +411,97 @@ def _unused(rest: Diagnosis | None, half: int, rig: _Rig) -> Check:
         value=float(len(changes)),
         limit=0.0,
     )
+
+
+# The folder with a healed rig: calibrations, orientation, and what was changed and why.
+
+HEALING = 'healing.json'
+VERSION = 1
+
+
+HEALING_FOLDER = FolderKind(
+    'a folder of a healed rig', parts=(HEALING, ORIENTATION, f'*{SUFFIX}'), marks=(HEALING,)
+)
+
+
+def check_healing_folder(directory: PathLike, inputs: Iterable[PathLike]) -> None:
+    """Raise DataError unless a healed rig may be written to a folder."""
+    check_output_folder(directory, HEALING_FOLDER, inputs)
+
+
+def save_healing(directory: PathLike, outcome: HealingOutcome, parent: RigOrientation) -> None:
+    """Write a healed rig, all or nothing. parent: its orientation before. Raises DataError."""
+    with replaced_folder(directory, HEALING_FOLDER) as folder:
+        for calibration in outcome.calibrations.values():
+            save_calibration(folder, calibration)
+        save_orientation(folder, outcome.orientation)
+        write_json(folder / HEALING, healing_document(outcome, parent))
+
+
+def healing_document(outcome: HealingOutcome, parent: RigOrientation) -> dict[str, Any]:
+    """Return what healing.json contains; docs/bodies.md describes it."""
+    return {
+        'version': VERSION,
+        'orientation_id': outcome.orientation.orientation_id,
+        'parent_orientation_id': parent.orientation_id,
+        'calibration_ids': dict(
+            zip(outcome.orientation.fluoroscopes, outcome.orientation.calibration_ids)
+        ),
+        'parent_calibration_ids': dict(zip(parent.fluoroscopes, parent.calibration_ids)),
+        'verdict': outcome.verdict,
+        'exposures': outcome.exposures,
+        'noise_factor': outcome.diagnosis.noise,
+        'nothing_else_probability': outcome.diagnosis.rest,
+        'findings': [_finding_document(one) for one in outcome.findings],
+        'checks': [
+            {
+                **_finding_document(check),
+                'value': check.value,
+                'limit': check.limit,
+                'passed': check.passed,
+            }
+            for check in outcome.checks
+        ],
+        'changes': _changes(outcome),
+        'errors_before': _errors(outcome.before),
+        'errors_after': _errors(outcome.after),
+    }
+
+
+def _finding_document(finding: Finding) -> dict[str, Any]:
+    return {
+        'kind': finding.kind.value,
+        'fluoroscopes': list(finding.place.fluoroscopes),
+        'target_id': list(finding.place.target_id),
+        'sentence': str(finding),
+        'numbers': dict(finding.numbers),
+    }
+
+
+def _errors(errors: RigErrors) -> dict[str, float]:
+    return {'scale_ppm': 1e6 * errors.scale, 'place_mm': errors.place_mm}
+
+
+def _changes(outcome: HealingOutcome) -> dict[str, Any]:
+    """Return the changes of the fluoroscopes that have changed, with their sd."""
+    healed = outcome.healed
+    if healed is None:
+        return {}
+    out = {}
+    for f, name in enumerate(outcome.orientation.fluoroscopes):
+        if not healed.changes[f].any() and f not in healed.drift:
+            continue
+        value = healed.changes[f]
+        sd = healed.sd[f]
+        out[name] = {
+            'position_mm': value[:3],
+            'position_sd_mm': sd[:3],
+            'rotation_deg': np.degrees(value[3:6]),
+            'rotation_sd_deg': np.degrees(sd[3:6]),
+            'principal_point_px': value[6:8],
+            'principal_point_sd_px': sd[6:8],
+            'principal_distance_px': value[8],
+            'principal_distance_sd_px': sd[8],
+            'distortion': f in healed.drift,
+        }
+    return out

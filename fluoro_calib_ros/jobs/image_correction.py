@@ -31,37 +31,23 @@ PER_PROCESS = 50  # images that are worth the start of a process
 
 @dataclass(frozen=True)
 class ImageCorrectionRequest:
-    """Images of one fluoroscope, and how to correct them.
+    """Images of one fluoroscope, and how to correct them."""
 
-    Attributes
-    ----------
-    source, out : Path
-        `out` is a folder if `source` is one, else a file.
-    calibration : FluoroscopeCalibration
-    interpolation : {'linear', 'cubic'}
-    workers : int
-        Processes for the files of a folder; 0: as many as there are cores, and as are worth it.
-    scheduler : Cluster or str or None
-        A Dask cluster, or the address of its scheduler, in place of processes. Its workers read
-        and write the same
-        folders under the same names.
-    recursive : bool
-        Whether the folders in a folder belong to it.
-    keep_going : bool
-        Whether the other files of a folder are corrected where some cannot be.
-    angles : mapping of int to float or None
-        Angle of the C-arm [rad] in an image of a file, by the number of the image, from 1; others
-        get the mean correction, as all do where it is None.
-    """
-
+    #: `out` is a folder if `source` is one, else a file
     source: Path
     out: Path
     calibration: FluoroscopeCalibration
-    interpolation: str = 'linear'
+    interpolation: str = 'linear'  #: {'linear', 'cubic'}
+    #: processes for the files of a folder; 0: as many as there are cores, and as are worth it
     workers: int = 0
+    #: a Dask cluster, or the address of its scheduler, in place of processes; its workers read and
+    #: write the same folders under the same names
     scheduler: Cluster | str | None = None
-    recursive: bool = False
+    recursive: bool = False  #: whether the folders in a folder belong to it
+    #: whether the other files of a folder are corrected where some cannot be
     keep_going: bool = False
+    #: angle of the C-arm [rad] in an image of a file, by the number of the image, from 1; others
+    #: get the mean correction, as all do where it is None
     angles: Mapping[int, float] | None = None
 
 
@@ -86,22 +72,10 @@ def run_image_correction(
 ) -> CorrectedImages:
     """Correct an image file, a stack, a video, or all of them in a folder.
 
-    Parameters
-    ----------
-    request : ImageCorrectionRequest
-    progress : callable, optional
-        Called with what is done, and the total: images of a file, files of a folder.
-
-    Returns
-    -------
-    CorrectedImages
-
-    Raises
-    ------
-    DataError
-        If a source cannot be read, is damaged, or is no grey image of the size of the
-        calibration; if `out` cannot be written, or its format cannot hold the images; for
-        workers that are lost, and angles of a folder. `out` is left as it was.
+    progress is called with what is done, and the total: images of a file, files of a folder.
+    Raises DataError if a source cannot be read, is damaged, or is no grey image of the size of the
+    calibration; if `out` cannot be written, or its format cannot hold the images; for workers that
+    are lost, and angles of a folder. `out` is left as it was.
     """
     if not request.source.is_dir():
         if request.angles is not None:

@@ -30,42 +30,22 @@ BAG_SUFFIXES = ('.mcap', '.db3')
 
 @dataclass(frozen=True)
 class SourceImage:
-    """An image of a source.
-
-    Attributes
-    ----------
-    exposure : int
-    place : str
-        File, page or message, in words.
-    image : (h, w) ndarray or DataError
-        The error says why it cannot be read.
-    frame : int or None
-        Place in its video; None for an image that is of no video.
-    angle : float or None
-        Of the C-arm [rad], None where it is unknown.
-    """
+    """An image of a source."""
 
     exposure: int
-    place: str
-    image: np.ndarray | DataError
-    frame: int | None = None
-    angle: float | None = None
+    place: str  #: file, page or message, in words
+    image: np.ndarray | DataError  #: (h, w), the error says why it cannot be read
+    frame: int | None = None  #: place in its video; None for an image that is of no video
+    angle: float | None = None  #: of the C-arm [rad], None where it is unknown
 
 
 @dataclass(frozen=True)
 class ImageAngles:
-    """Angles of the C-arm in images.
+    """Angles of the C-arm in images."""
 
-    Attributes
-    ----------
-    joints : AngleOptions
-        Joints whose states in a bag give the angle of its images.
-    angle : float or None
-        That of images without a joint [rad].
-    """
-
+    #: joints whose states in a bag give the angle of its images
     joints: AngleOptions = field(default_factory=AngleOptions)
-    angle: float | None = None
+    angle: float | None = None  #: that of images without a joint [rad]
 
     def check(self, sources: Sequence[Path], fluoroscopes: Iterable[str]) -> None:
         """Raise DataError for a joint of another fluoroscope, or without a bag."""

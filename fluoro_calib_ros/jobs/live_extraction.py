@@ -34,47 +34,26 @@ VIEWS = 30  # solved images whose distortion helps where a pose is not found
 
 @dataclass(frozen=True)
 class Observations:
-    """What was found in one image.
+    """What was found in one image."""
 
-    Attributes
-    ----------
-    target_id : (n,) ndarray of int
-    uv : (n, 2) ndarray
-        Centres [px].
-    sigma : (n,) ndarray
-        Standard deviation of a coordinate [px].
-    overlapped : (n,) ndarray of bool
-    finding : Finding or None
-        Why there are no observations; None where there are.
-    note : str
-        What should be known of the observations, such as ids that may have been exchanged.
-    expected : int
-        Targets that should be visible.
-    found, explained : float
-        Shares of the expected targets that are found, and of what is found that is expected.
-    view : View or None
-        Of the phantom.
-    followed : bool
-        Whether the image before gave the start.
-    doubtful : int
-        Targets whose id may be wrong.
-    picture : (h, w, 3) ndarray or None
-        Overlay of uint8, blue, green, red, if it was asked for.
-    seconds : float
-    """
-
+    #: (n,)
     target_id: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    #: (n, 2), centres [px]
     uv: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
+    #: (n,), standard deviation of a coordinate [px]
     sigma: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
-    overlapped: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
-    finding: Finding | None = None
+    overlapped: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))  #: (n,)
+    finding: Finding | None = None  #: why there are no observations; None where there are
+    #: what should be known of the observations, such as ids that may have been exchanged
     note: str = ''
-    expected: int = 0
+    expected: int = 0  #: targets that should be visible
+    #: shares of the expected targets that are found, and of what is found that is expected
     found: float = 0.0
     explained: float = 0.0
-    view: View | None = None
-    followed: bool = False
-    doubtful: int = 0
+    view: View | None = None  #: of the phantom
+    followed: bool = False  #: whether the image before gave the start
+    doubtful: int = 0  #: targets whose id may be wrong
+    #: (h, w, 3), overlay of uint8, blue, green, red, if it was asked for
     picture: np.ndarray | None = None
     seconds: float = 0.0
 
@@ -131,26 +110,15 @@ def _extract_of(make: MakeFollower) -> Callable[..., dict[str, Observations]]:
 
 @dataclass(frozen=True)
 class PhantomSettings:
-    """What a PhantomFollower is made of.
-
-    Attributes
-    ----------
-    fluoroscope : str
-    phantom : Phantom
-    principal_distance_px : float or None
-        None: not known.
-    lens : Lens or None
-        What is known of the fluoroscope in a recording, all of whose images come. None: a stream,
-        whose images may be shed, and whose distortion helps where a pose is not found.
-    regular_grid : bool
-        The phantom is a regular flat grid.
-    """
+    """What a PhantomFollower is made of."""
 
     fluoroscope: str
     phantom: Phantom
-    principal_distance_px: float | None = None
+    principal_distance_px: float | None = None  #: None: not known
+    #: what is known of the fluoroscope in a recording, all of whose images come; None: a stream,
+    #: whose images may be shed, and whose distortion helps where a pose is not found
     lens: Lens | None = None
-    regular_grid: bool = False
+    regular_grid: bool = False  #: the phantom is a regular flat grid
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -32,27 +32,16 @@ DECIDED = {
 
 @dataclass(frozen=True)
 class MarkerSettings:
-    """What a MarkerFollower is made of.
+    """What a MarkerFollower is made of."""
 
-    Attributes
-    ----------
-    first : mapping of str to FirstMarkers
-        Ids and places in the first images of one fluoroscope, or of two; empty: the shapes of the
-        bodies tell them.
-    options : MarkerOptions
-    calibrations : mapping of str to FluoroscopeCalibration
-        Of two fluoroscopes.
-    orientation : RigOrientation or None
-        Of two fluoroscopes.
-    bodies : tuple of Body
-        Markers that are rigid together, of two fluoroscopes.
-    """
-
+    #: ids and places in the first images of one fluoroscope, or of two; empty: the shapes of the
+    #: bodies tell them
     first: Mapping[str, FirstMarkers]
     options: MarkerOptions = field(default_factory=MarkerOptions)
+    #: of two fluoroscopes
     calibrations: Mapping[str, FluoroscopeCalibration] = field(default_factory=dict)
-    orientation: RigOrientation | None = None
-    bodies: tuple[Body, ...] = ()
+    orientation: RigOrientation | None = None  #: of two fluoroscopes
+    bodies: tuple[Body, ...] = ()  #: markers that are rigid together, of two fluoroscopes
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -30,8 +30,7 @@ from ..images.marker_decisions import Decision, revise
 from ..images.marker_ids import identifiable, identify_markers
 from ..images.markers import FirstMarkers, MarkerFrame, MarkerOptions
 from ..images.overlay import draw_markers
-from ..io.access import make_folder
-from ..io.atomic import write_bytes
+from ..io.access import make_folder, write_bytes
 from ..photogrammetry.rig_orientation import RigOrientation
 from .extraction import Progress
 from .image_sources import (
@@ -50,40 +49,23 @@ AHEAD = 3  # images that are read before they are wanted
 
 @dataclass(frozen=True)
 class MarkerRequest:
-    """Image sequences of one or two fluoroscopes, and their markers.
+    """Image sequences of one or two fluoroscopes, and their markers."""
 
-    Attributes
-    ----------
-    sources : mapping of str to sequence of Path
-        Images by fluoroscope.
-    first : mapping of str to sequence of Frame
-        Markers of one or more exposures, by fluoroscope. Following begins with the first image
-        that has one.
-    options : MarkerOptions
-    calibrations : mapping of str to FluoroscopeCalibration
-        Of two fluoroscopes.
-    orientation : RigOrientation or None
-        Of two fluoroscopes.
-    bodies : tuple of Body
-        Markers that are rigid together, of two fluoroscopes. Known shapes give the ids where no
-        markers are given.
-    overlay : Path or None
-        Folder for pictures.
-    target_names : mapping of int to str
-        Names of markers, for pictures.
-    angles : ImageAngles
-        Angles of the C-arms.
-    """
-
-    sources: Mapping[str, Sequence[Path]]
+    sources: Mapping[str, Sequence[Path]]  #: images by fluoroscope
+    #: markers of one or more exposures, by fluoroscope; following begins with the first image that
+    #: has one
     first: Mapping[str, Sequence[Frame]]
     options: MarkerOptions = field(default_factory=MarkerOptions)
+    #: of two fluoroscopes
     calibrations: Mapping[str, FluoroscopeCalibration] = field(default_factory=dict)
-    orientation: RigOrientation | None = None
+    orientation: RigOrientation | None = None  #: of two fluoroscopes
+    #: markers that are rigid together, of two fluoroscopes; known shapes give the ids where no
+    #: markers are given
     bodies: tuple[Body, ...] = ()
-    overlay: Path | None = None
+    overlay: Path | None = None  #: folder for pictures
+    #: names of markers, for pictures
     target_names: Mapping[int, str] = field(default_factory=dict)
-    angles: ImageAngles = field(default_factory=ImageAngles)
+    angles: ImageAngles = field(default_factory=ImageAngles)  #: angles of the C-arms
 
 
 @dataclass(frozen=True)
@@ -98,51 +80,30 @@ class MarkerImageResult:
 
 @dataclass(frozen=True)
 class DoubtfulSpan:
-    """An id that may be wrong in some exposures.
-
-    Attributes
-    ----------
-    fluoroscope : str
-    target_id : int
-    first, last : int
-        Exposures.
-    images : int
-    others : tuple of int
-        Markers that it may be exchanged with; none where it may be something else.
-    reason : str
-    """
+    """An id that may be wrong in some exposures."""
 
     fluoroscope: str
     target_id: int
-    first: int
-    last: int
+    first: int  #: exposures
+    last: int  #: exposures
     images: int
+    #: markers that it may be exchanged with; none where it may be something else
     others: tuple[int, ...]
     reason: str
 
 
 @dataclass(frozen=True)
 class MarkerOutcome:
-    """Followed markers.
+    """Followed markers."""
 
-    Attributes
-    ----------
-    results : mapping of str to tuple of MarkerImageResult
-        By fluoroscope, in the order of the exposures.
-    decisions : tuple of Decision
-        What the two views decided on doubtful ids; the results obey them.
-    image_size : mapping of str to (int, int)
-    before : mapping of str to int
-        Images before the first one with given markers, which were not used.
-    notes : tuple of str
-        What a user has to know about the angles.
-    """
-
+    #: by fluoroscope, in the order of the exposures
     results: Mapping[str, tuple[MarkerImageResult, ...]]
+    #: what the two views decided on doubtful ids; the results obey them
     decisions: tuple[Decision, ...]
     image_size: Mapping[str, tuple[int, int]]
+    #: images before the first one with given markers, which were not used
     before: Mapping[str, int]
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  #: what a user has to know about the angles
 
     def frames(self) -> list[tuple[Frame, np.ndarray, np.ndarray]]:
         """Observations, with flags (n,) of overlapped markers and of doubtful ids."""
@@ -254,23 +215,10 @@ def run_marker_extraction(
 ) -> MarkerOutcome:
     """Follow markers through the images of one or two fluoroscopes.
 
-    A damaged image, or one of another size, is passed over, and its result says why.
-
-    Parameters
-    ----------
-    request : MarkerRequest
-    progress : callable, optional
-        Called after every exposure with the number of those that are done, and their total.
-
-    Returns
-    -------
-    MarkerOutcome
-
-    Raises
-    ------
-    DataError
-        For sources that cannot be read, markers that are not in the images, and fluoroscopes
-        without calibration.
+    A damaged image, or one of another size, is passed over, and its result says why. progress is
+    called after every exposure with the number of those that are done, and their total. Raises
+    DataError for sources that cannot be read, markers that are not in the images, and fluoroscopes
+    without calibration.
     """
     names = list(request.sources)
     sources = {name: open_sources(request.sources[name], name, request.angles) for name in names}

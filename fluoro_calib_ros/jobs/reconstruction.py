@@ -15,18 +15,22 @@ from ..checks.rig_watch import DriftVerdict, RecordingDriftWatch
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError
 from ..exposures.frame import Frame
-from ..exposures.pairing import PAIR_BY, PairingOptions, disagreement_of_recording
+from ..exposures.pairing import RecordedPairing, disagreement_of_recording
 from ..findings import Finding, Kind, Severity
-from ..options import option, validate_options
+from ..options import option
 from ..photogrammetry.noise import MAX_WIDENING, ObservedScatter
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.intersection import STATUS_NAMES, Intersector
 from ..reconstruction.mismatch import cause_of_misses, mismatch
-from ..reconstruction.reconstruct import ReconstructedFrame, reconstruct_recording
+from ..reconstruction.reconstruct import (
+    ReconstructedFrame,
+    orientation_of_recorded,
+    reconstruct_recording,
+)
 
 
 @dataclass(frozen=True)
-class ReconstructionOptions:
+class ReconstructionOptions(RecordedPairing):
     """Options of a reconstruction.
 
     The drift watch also monitors the shapes of rigid bodies. A recording without
@@ -34,9 +38,6 @@ class ReconstructionOptions:
     Raises ValueError for a value that an option cannot have.
     """
 
-    pair_by: str = option(
-        'frame_number', 'what the frames of one exposure have in common', choices=PAIR_BY
-    )
     reject: float = option(
         4.0,
         'epipolar distance above which a match is false',
@@ -47,10 +48,6 @@ class ReconstructionOptions:
     drift_watch: bool = True
     bodies: tuple[Body, ...] = ()
     has_stamps: bool = True
-    pair_tolerance: float = PairingOptions.tolerance_s
-
-    def __post_init__(self) -> None:
-        validate_options(self)
 
 
 @dataclass(frozen=True)
@@ -128,13 +125,8 @@ def reconstruct(
         raise DataError(
             'the recording does not contain the times of its exposures, pair them by frame_number'
         )
-    names = [name for name in orientation.fluoroscopes if name in frames]
-    if len(names) < 2:
-        raise DataError(
-            f'there are image points of {", ".join(frames)}, but two fluoroscopes of the '
-            f'orientation ({", ".join(orientation.fluoroscopes)}) are needed'
-        )
-    orientation = orientation.subset(names)
+    orientation = orientation_of_recorded(frames, orientation)
+    names = orientation.fluoroscopes
     watch, drift = _drift_watch(orientation, calibrations, options)
     scatter = ObservedScatter()
     intersector = Intersector(orientation, options.reject)

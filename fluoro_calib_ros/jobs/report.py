@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime, timezone
@@ -17,7 +16,7 @@ from jinja2 import UndefinedError
 from ..checks.comparison import Comparison, compare_calibrations
 from ..errors import DataError
 from ..findings import Finding, Kind, Place, Severity
-from ..io.atomic import write_text
+from ..io.access import PathLike, write_text
 from ..io.calibration import load_calibrations
 from ..io.calibration_request import read_request
 from ..io.csv_table import read_names
@@ -40,24 +39,15 @@ from .result_folder import REPORT, belongs_to, saved_orientation, saved_rig_note
 
 @dataclass(frozen=True)
 class ComparedFolders:
-    """Comparisons by fluoroscope, the scale at the phantom, and what could not be compared.
-
-    Attributes
-    ----------
-    comparisons : dict of str to Comparison
-    mm_per_px : dict of str to float
-        At the median distance of the phantom; without an entry where result.json is missing.
-    findings : tuple of Finding
-    """
+    """Comparisons by fluoroscope, the scale at the phantom, and what could not be compared."""
 
     comparisons: dict[str, Comparison]
+    #: at the median distance of the phantom; without an entry where result.json is missing
     mm_per_px: dict[str, float]
     findings: tuple[Finding, ...]
 
 
-def compare_folders(
-    first: str | os.PathLike[str], second: str | os.PathLike[str]
-) -> ComparedFolders:
+def compare_folders(first: PathLike, second: PathLike) -> ComparedFolders:
     """Compare the calibrations of the fluoroscopes that two result folders have in common.
 
     Raises DataError where there are none, and for calibrations that cannot be compared.
@@ -99,7 +89,7 @@ def _distances(directory: Path) -> dict[str, float]:
     return {name: float(np.median(values)) for name, values in found.items()}
 
 
-def write_report(directory: str | os.PathLike[str]) -> str:
+def write_report(directory: PathLike) -> str:
     """Write DIR/report.html from the result folder of a calibration, and return its path.
 
     Raises DataError for a folder that is not the result of a calibration, and where the file
@@ -128,7 +118,7 @@ def write_report(directory: str | os.PathLike[str]) -> str:
     return str(path)
 
 
-def read_report_input(directory: str | os.PathLike[str]) -> ReportInput:
+def read_report_input(directory: PathLike) -> ReportInput:
     """Read what the report of a result folder needs. Raises DataError."""
     directory = Path(directory)
     calibrations = load_calibrations(directory)

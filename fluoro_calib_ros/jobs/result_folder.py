@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,8 +14,18 @@ from ..errors import DataError
 from ..estimation.result import CalibrationResult
 from ..findings import Finding, Kind, Severity
 from ..io import csv_table as names
-from ..io.calibration import SUFFIX, load_calibrations, save_calibration
+from ..io.access import PathLike
+from ..io.calibration import ORIENTATION_NAME as ORIENTATION
+from ..io.calibration import (
+    SUFFIX,
+    load_calibrations,
+    load_orientation,
+    orientation_path,
+    save_calibration,
+    save_orientation,
+)
 from ..io.calibration_request import write_request
+from ..io.documents import write_json
 from ..io.folder import FolderKind, check_output_folder, replaced_folder
 from ..io.result_check import (
     KNOWN_ORIENTATION,
@@ -28,49 +37,26 @@ from ..io.result_check import (
     with_digest,
 )
 from ..io.result_check import RESULT_NAME as RESULT
-from ..io.result_document import result_document, write_validation
-from ..io.result_tables import NAMES as TABLES
-from ..io.result_tables import SUFFIX as COVARIANCE
-from ..io.result_tables import write_covariance, write_tables
-from ..io.rig_orientation import NAME as ORIENTATION
-from ..io.rig_orientation import load_orientation, orientation_path, save_orientation
-from ..io.text_files import write_json
+from ..io.result_document import NAMES as TABLES
+from ..io.result_document import SUFFIX as COVARIANCE
+from ..io.result_document import result_document, write_covariance, write_tables, write_validation
 from ..photogrammetry.rig_orientation import RigOrientation
 from .calibration import CalibrationOutcome
 
 REPORT = 'report.html'
-# All that belongs to one calibration; calibrations of other fluoroscopes stay in the folder.
-_OWN = (
-    RESULT,
-    OBSERVATIONS,
-    PHANTOM,
-    OPTIONS,
-    KNOWN_ORIENTATION,
-    ORIENTATION,
-    names.NAMES_FILE,
-    VALIDATION_NAME,
-    *TABLES,
-    'figures',
-    REPORT,
+# Calibrations of other fluoroscopes stay in the folder.
+RESULT_FOLDER = FolderKind(
+    'a result folder',
+    parts=(
+        *(RESULT, OBSERVATIONS, PHANTOM, OPTIONS, KNOWN_ORIENTATION, ORIENTATION),
+        *(names.NAMES_FILE, VALIDATION_NAME, *TABLES, f'*{COVARIANCE}', 'figures', REPORT),
+    ),
+    marks=(RESULT, ORIENTATION, f'*{SUFFIX}'),
 )
 
 
-def _is_own(name: str) -> bool:
-    """Return whether an entry belongs to a result, or is what a killed run left of a file."""
-    if name in _OWN or name.endswith(COVARIANCE):
-        return True
-    return name.startswith('.') and name.endswith('.tmp')
-
-
-def _marks(name: str) -> bool:
-    return name in (RESULT, ORIENTATION) or name.endswith(SUFFIX)
-
-
-RESULT_FOLDER = FolderKind('a result folder', _is_own, _marks)
-
-
 def save_outcome(
-    directory: str | os.PathLike[str],
+    directory: PathLike,
     outcome: CalibrationOutcome,
     present: RigOrientation | None = None,
     write_more: Callable[[Path], object] | None = None,
@@ -116,7 +102,7 @@ def save_outcome(
 
 
 def save_result(
-    directory: str | os.PathLike[str],
+    directory: PathLike,
     result: CalibrationResult,
     covariance: bool = False,
 ) -> None:
@@ -141,7 +127,7 @@ def write_covariances(folder: Path, result: CalibrationResult) -> None:
 
 
 def save_calibrations(
-    directory: str | os.PathLike[str],
+    directory: PathLike,
     calibrations: Mapping[str, FluoroscopeCalibration],
     orientation: RigOrientation | None,
 ) -> None:
@@ -162,9 +148,7 @@ def save_calibrations(
             save_orientation(folder, orientation)
 
 
-def check_result_folder(
-    directory: str | os.PathLike[str], inputs: Iterable[str | os.PathLike[str]] = ()
-) -> None:
+def check_result_folder(directory: PathLike, inputs: Iterable[PathLike] = ()) -> None:
     """Raise DataError unless a result folder can be written there without harm to the inputs."""
     check_output_folder(directory, RESULT_FOLDER, inputs)
 
@@ -182,7 +166,7 @@ def written_document(result: CalibrationResult) -> dict[str, Any]:
 
 
 def _saved_ids(
-    directory: str | os.PathLike[str], calibrations: Mapping[str, FluoroscopeCalibration]
+    directory: PathLike, calibrations: Mapping[str, FluoroscopeCalibration]
 ) -> list[str]:
     """Return the ids of the calibrations of these fluoroscopes in a folder, none for a fault."""
     try:
@@ -192,7 +176,7 @@ def _saved_ids(
     return [saved[name].calibration_id for name in calibrations if name in saved]
 
 
-def saved_orientation(directory: str | os.PathLike[str]) -> RigOrientation | None:
+def saved_orientation(directory: PathLike) -> RigOrientation | None:
     """Return the orientation in a folder, None where there is no valid one."""
     try:
         return load_orientation(orientation_path(directory))
@@ -200,7 +184,7 @@ def saved_orientation(directory: str | os.PathLike[str]) -> RigOrientation | Non
         return None
 
 
-def saved_rig_note(directory: str | os.PathLike[str]) -> Finding | None:
+def saved_rig_note(directory: PathLike) -> Finding | None:
     """Return what result.json says about the orientation of the rig from its exposures.
 
     None for nothing, and where the folder has a captured orientation, which the exposures do not

@@ -39,22 +39,11 @@ class Workers(Protocol):
 def open_workers(
     count: int = 0, scheduler: Cluster | str | None = None, tasks: int = 0
 ) -> AbstractContextManager[Workers]:
-    """Return workers, as a context that ends them.
+    """Return workers, as a context that ends them: processes, or those of a Dask cluster.
 
-    Parameters
-    ----------
-    count : int
-        Processes; 0: as many as there are cores.
-    scheduler : Cluster or str or None
-        A Dask cluster, or the address of the scheduler of one, in place of processes.
-    tasks : int
-        How many there will be, 0 where it is not known. For a single one, no process is started.
-
-    Raises
-    ------
-    DataError
-        Where the scheduler cannot be reached or is not trusted, or the package `distributed` is
-        missing.
+    count: of the processes, 0 for as many as there are cores. tasks: how many there will be, 0
+    where it is not known; for a single one, no process is started. Raises DataError where the
+    scheduler cannot be reached or is not trusted, or the package `distributed` is missing.
     """
     if scheduler is not None:
         return DaskWorkers(Cluster(scheduler) if isinstance(scheduler, str) else scheduler)
@@ -122,22 +111,16 @@ class Cluster:
 
     Functions, tasks and results travel as pickles: scheduler and workers can run code here, and
     whoever reaches them can run code there.
-
-    Attributes
-    ----------
-    scheduler : str
-        Address: tls://host:port, or tcp://host:port on this machine or in a trusted network.
-    tls_ca, tls_cert, tls_key : str
-        Files (PEM) of the authority that has signed the certificates of the cluster, and of the
-        certificate of this process and its key; '' for none.
-    trusted_network : bool
-        Whether all who reach the network of a tcp:// scheduler are trusted.
     """
 
+    #: address: tls://host:port, or tcp://host:port on this machine or in a trusted network
     scheduler: str
+    #: files (PEM) of the authority that has signed the certificates of the cluster, and of the
+    #: certificate of this process and its key; '' for none
     tls_ca: str = ''
     tls_cert: str = ''
     tls_key: str = ''
+    #: whether all who reach the network of a tcp:// scheduler are trusted
     trusted_network: bool = False
 
     def security(self) -> Any:

@@ -6,8 +6,7 @@
 from __future__ import annotations
 
 import dataclasses
-import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -19,16 +18,18 @@ from numpy.typing import NDArray
 from ..exposures.frame import Frame
 from ..exposures.phantom import Phantom
 from ..images.codec import encode
-from ..io.access import PathLike, make_folder
-from ..io.atomic import write_bytes, write_text
+from ..io.access import PathLike, make_folder, write_bytes, write_text
 from ..io.bags.writer import BagWriter
 from ..io.bodies import write_bodies
+from ..io.csv_table import write_table
+from ..io.documents import write_json
 from ..io.folder import FolderKind, replaced_folder
 from ..io.joints import COLUMNS as JOINT_COLUMNS
 from ..io.joints import joint_definition
+from ..io.observations import COLUMNS as OBSERVATION_COLUMNS
 from ..io.observations import write_observations_csv
 from ..io.phantom import write_phantom
-from ..io.text_files import write_json
+from ..io.poses import COLUMNS as POSE_COLUMNS
 from ..options import option, validate_options
 from ..photogrammetry.rotations import quaternion_from_matrix
 from ..processes import OF_STREAM, WorkerProcess
@@ -76,6 +77,14 @@ def write_bag(path: PathLike, frames: Mapping[str, Sequence[Frame]]) -> None:
             bag.write_frame(frame)
 
 
+def _rows(
+    begin: Sequence[object], ids: Iterable[object], values: Iterable[np.ndarray], digits: int
+) -> Iterator[list[object]]:
+    """Yield rows that begin alike, with an id and numbers of so many digits."""
+    for identity, numbers in zip(ids, values):
+        yield [*begin, identity, *(f'{x:.{digits}f}' for x in numbers)]
+
+
 def write_exposures(
     directory: PathLike, name: str, rig: VirtualRig, simulated: SimulatedExposures
 ) -> None:
@@ -95,13 +104,14 @@ def write_exposures(
         for fluoroscope, frames in simulated.frames.items()
     }
     write_observations_csv(directory / TRUTH / f'{name}_undistorted.csv', perfect)
-    lines = ['fluoroscope,exposure,x_mm,y_mm,z_mm,qw,qx,qy,qz']
+    rows: list[list[object]] = []
     for fluoroscope in rig.fluoroscopes:
-        for frame, pose in zip(simulated.frames[fluoroscope.name], simulated.poses):
-            rotation, position = fluoroscope.exterior(pose)
-            numbers = [f'{x:.9f}' for x in (*position, *quaternion_from_matrix(rotation))]
-            lines.append(','.join([fluoroscope.name, str(frame.number), *numbers]))
-    write_text(directory / TRUTH / f'{name}_exposures.csv', '\n'.join(lines) + '\n')
+        numbers = [frame.number for frame in simulated.frames[fluoroscope.name]]
+        exterior = [fluoroscope.exterior(pose) for pose in simulated.poses]
+        values = [np.append(position, quaternion_from_matrix(turn)) for turn, position in exterior]
+        rows += _rows([fluoroscope.name], numbers, values, 9)
+    header = ('fluoroscope', 'exposure', 'x_mm', 'y_mm', 'z_mm', 'qw', 'qx', 'qy', 'qz')
+    write_table(directory / TRUTH / f'{name}_exposures.csv', header, rows)
 
 
 def write_radiographs(
@@ -117,7 +127,7 @@ def write_radiographs(
     after every image with the number of images that are done, and their total. Raises DataError.
     """
     directory = Path(directory)
-    lines = ['fluoroscope,exposure,target_id,u,v']
+    rows: list[list[object]] = []
     total = len(rig.fluoroscopes) * len(simulated.poses)
     done = 0
     for fluoroscope in rig.fluoroscopes:
@@ -129,14 +139,12 @@ def write_radiographs(
             write_bytes(folder / f'{frame.number:04d}.png', encode(image, '.png'))
             centres = radiography.centres(rig.true_mm, pose)
             seen = np.flatnonzero(radiography.in_field(centres))
-            lines += [
-                f'{fluoroscope.name},{frame.number},{target},{u:.4f},{v:.4f}'
-                for target, (u, v) in zip(rig.phantom.target_id[seen], centres[seen])
-            ]
+            begin = (fluoroscope.name, frame.number)
+            rows += _rows(begin, rig.phantom.target_id[seen], centres[seen], 4)
             done += 1
             if progress is not None:
                 progress(done, total)
-    write_text(directory / TRUTH / 'images.csv', '\n'.join(lines) + '\n')
+    write_table(directory / TRUTH / 'images.csv', OBSERVATION_COLUMNS, rows)
 
 
 def write_marker_radiographs(
@@ -156,26 +164,25 @@ def write_marker_radiographs(
     names = [fluoroscope.name for fluoroscope in sequence.rig.fluoroscopes]
     for name in names:
         make_folder(directory / MARKER_IMAGES / name)
-    lines = ['fluoroscope,exposure,target_id,u,v,seen']
-    points = ['exposure,target_id,x_mm,y_mm,z_mm']
+    rows: list[list[object]] = []
+    points: list[list[object]] = []
     for number, views in enumerate(sequence, 1):
         for name, view in views.items():
             path = directory / MARKER_IMAGES / name / f'{number:04d}.png'
             write_bytes(path, encode(view.image, '.png'))
-            lines += [
-                f'{name},{number},{target},{u:.4f},{v:.4f},{int(seen)}'
-                for target, (u, v), seen in zip(markers.target_id, view.uv, view.seen)
-            ]
-        points += [
-            f'{number},{target},{x:.6f},{y:.6f},{z:.6f}'
-            for target, (x, y, z) in zip(markers.target_id, markers.points_mm(number))
-        ]
+            of_view = _rows((name, number), markers.target_id, view.uv, 4)
+            rows += ([*row, int(seen)] for row, seen in zip(of_view, view.seen))
+        points += _rows([number], markers.target_id, markers.points_mm(number), 6)
         if number == 1:
             write_observations_csv(directory / FIRST_MARKERS, _first_markers(views, markers))
         if progress is not None:
             progress(number * len(names), sequence.frames * len(names))
-    write_text(directory / TRUTH / 'marker_images.csv', '\n'.join(lines) + '\n')
-    write_text(directory / TRUTH / 'marker_images_points.csv', '\n'.join(points) + '\n')
+    write_table(directory / TRUTH / 'marker_images.csv', (*OBSERVATION_COLUMNS, 'seen'), rows)
+    write_table(
+        directory / TRUTH / 'marker_images_points.csv',
+        ('exposure', 'target_id', 'x_mm', 'y_mm', 'z_mm'),
+        points,
+    )
     clusters = [
         f'cluster_{number + 1}: {" ".join(map(str, markers.target_id[markers.cluster == number]))}'
         for number in range(markers.scene.clusters)
@@ -206,13 +213,13 @@ def write_tracking(directory: PathLike, tracking: SimulatedTracking) -> None:
     directory = Path(directory)
     write_bag(directory / 'tracking', tracking.frames)
     numbers = [frame.number for frame in next(iter(tracking.frames.values()))]
-    lines = ['frame,target_id,x_mm,y_mm,z_mm']
-    for number, points in zip(numbers, tracking.points_mm):
-        lines += [
-            f'{number},{marker},{x:.6f},{y:.6f},{z:.6f}'
-            for marker, (x, y, z) in zip(tracking.marker_id, points)
-        ]
-    write_text(directory / TRUTH / 'markers.csv', '\n'.join(lines) + '\n')
+    rows = (
+        row
+        for number, points in zip(numbers, tracking.points_mm)
+        for row in _rows([number], tracking.marker_id, points, 6)
+    )
+    header = ('frame', 'target_id', 'x_mm', 'y_mm', 'z_mm')
+    write_table(directory / TRUTH / 'markers.csv', header, rows)
 
 
 def write_knee(directory: PathLike, knee: VirtualKnee) -> None:
@@ -232,24 +239,17 @@ def write_knee_recording(directory: PathLike, name: str, recording: SimulatedKne
     write_bag(directory / name, recording.frames)
     motion = recording.motion
     numbers = [frame.number for frame in next(iter(recording.frames.values()))]
-    lines = ['body,exposure,time_s,x_mm,y_mm,z_mm,qx,qy,qz,qw']
+    rows: list[list[object]] = []
     for body, rotation in motion.rotation.items():
         wxyz = quaternion_from_matrix(rotation)
         values = np.column_stack(
             [motion.times_s, motion.position_mm[body], wxyz[:, 1:], wxyz[:, :1]]
         )
-        lines += [
-            ','.join([body, str(number), *(f'{x:.9f}' for x in row)])
-            for number, row in zip(numbers, values)
-        ]
-    write_text(directory / TRUTH / f'{name}_poses.csv', '\n'.join(lines) + '\n')
-    lines = [','.join(JOINT_COLUMNS[:9])]
+        rows += _rows([body], numbers, values, 9)
+    write_table(directory / TRUTH / f'{name}_poses.csv', POSE_COLUMNS[:10], rows)
     values = np.column_stack([motion.times_s, np.rad2deg(motion.angles), motion.translations])
-    lines += [
-        ','.join([KNEE, str(number), *(f'{x:.9f}' for x in row)])
-        for number, row in zip(numbers, values)
-    ]
-    write_text(directory / TRUTH / f'{name}_joints.csv', '\n'.join(lines) + '\n')
+    rows = list(_rows([KNEE], numbers, values, 9))
+    write_table(directory / TRUTH / f'{name}_joints.csv', JOINT_COLUMNS[:9], rows)
 
 
 def write_rig(directory: PathLike, rig: VirtualRig, options: Mapping[str, Any]) -> None:
@@ -299,37 +299,17 @@ MARKER_ATTENUATION = 7.0  # of tantalum at 55 keV (NIST XCOM) [1/mm]
 
 @dataclass(frozen=True)
 class RenderedScene:
-    """What a radiograph is taken of.
+    """What a radiograph is taken of."""
 
-    Attributes
-    ----------
-    points_mm : (n, 3) ndarray
-        Centres of beads or markers.
-    pose : Pose
-        That takes them into the rig frame.
-    seed : int
-        Of noise and clutter.
-    diameter_mm : (n,) ndarray or None
-        None: the usual one of beads.
-    plates : bool
-        Whether there are the faces of the phantom.
-    """
-
-    points_mm: NDArray[np.float64]
-    pose: Pose
-    seed: int = 0
-    diameter_mm: NDArray[np.float64] | None = None
-    plates: bool = True
+    points_mm: NDArray[np.float64]  #: (n, 3), centres of beads or markers
+    pose: Pose  #: that takes them into the rig frame
+    seed: int = 0  #: of noise and clutter
+    diameter_mm: NDArray[np.float64] | None = None  #: (n,), None: the usual one of beads
+    plates: bool = True  #: whether there are the faces of the phantom
 
 
 class Renderers:
-    """Takes radiographs with the fluoroscopes of a virtual rig, each in a process of its own.
-
-    Parameters
-    ----------
-    fluoroscopes : sequence of VirtualFluoroscope
-    settings : RadiographSettings
-    """
+    """Takes radiographs with the fluoroscopes of a virtual rig, each in a process of its own."""
 
     def __init__(
         self, fluoroscopes: Sequence[VirtualFluoroscope], settings: RadiographSettings
@@ -368,30 +348,14 @@ def _camera(
 
 
 HOUR_NS = 3600 * 10**9
-_PARTS = (
-    'calibration',
-    'calibration.csv',
-    'test',
-    'test.csv',
-    'tracking',
-    'phantom.csv',
-    IMAGES,
-    MARKER_IMAGES,
-    FIRST_MARKERS,
-    CLUSTERS,
-    *MOTIONS,
-    BODIES,
-    JOINTS,
-    TRUTH,
+DATA_SET = FolderKind(
+    'a data set of the virtual rig',
+    parts=(
+        *('calibration', 'calibration.csv', 'test', 'test.csv', 'tracking', 'phantom.csv'),
+        *(IMAGES, MARKER_IMAGES, FIRST_MARKERS, CLUSTERS, *MOTIONS, BODIES, JOINTS, TRUTH),
+    ),
+    marks=(TRUTH,),
 )
-
-
-def _is_own(name: str) -> bool:
-    """Return whether an entry belongs to a data set, or is what a killed run left of a part."""
-    return name in _PARTS or (name.startswith('.') and name.endswith('.tmp'))
-
-
-DATA_SET = FolderKind('a data set of the virtual rig', _is_own, lambda name: name == TRUTH)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -444,7 +408,7 @@ class SimulationOptions:
 
 
 def simulate(
-    directory: str | os.PathLike[str],
+    directory: PathLike,
     options: SimulationOptions | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> None:

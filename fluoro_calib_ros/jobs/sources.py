@@ -6,14 +6,13 @@
 from __future__ import annotations
 
 import math
-import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
-from ..errors import DataError
+from ..errors import DataError, ErrorsAt
 from ..exposures.angles import AngleOptions
 from ..exposures.collector import collect_recorded
 from ..exposures.frame import Frame
@@ -21,13 +20,13 @@ from ..exposures.names import Names
 from ..exposures.pairing import PairingOptions, disagreement_of_recording
 from ..exposures.phantom import Phantom, require_size
 from ..findings import Kind, sentences
-from ..io.access import check_regular_file
+from ..io.access import PathLike, check_regular_file
 from ..io.bags.reader import joint_topics, read_frames, with_angles
 from ..io.calibration import load_calibrations
 from ..io.csv_table import read_names
 from ..io.formats import registry
 from ..io.formats.content import PARTS, Content, FileSettings
-from ..io.known_orientation import holds_known_orientations, read_known_orientations
+from ..io.formats.known_orientation import holds_known_orientations, read_known_orientations
 from ..io.observations import CORRECTED_BY, PointsFile, points_of_frames, read_points
 from ..io.result_check import disagreements
 from ..photogrammetry.known_orientation import KnownOrientation
@@ -63,23 +62,15 @@ class Recording:
 
 @dataclass(frozen=True)
 class BagSelection:
-    """What is used of a bag, and how its frames are paired.
+    """What is used of a bag, and how its frames are paired."""
 
-    Attributes
-    ----------
-    start_s, end_s : float or None
-        Time window from the stamp of the first frame [s]; None: not limited.
-    pair_by : {'frame_number', 'stamp'}
-    tolerance_s : float
-        Largest difference between the stamps of an exposure [s].
-    angles : AngleOptions
-        Which joint gives the angle of the C-arm.
-    """
-
+    #: time window from the stamp of the first frame [s]; None: not limited
     start_s: float | None = None
     end_s: float | None = None
-    pair_by: str = 'frame_number'
+    pair_by: str = 'frame_number'  #: {'frame_number', 'stamp'}
+    #: largest difference between the stamps of an exposure [s]
     tolerance_s: float = PairingOptions.tolerance_s
+    #: which joint gives the angle of the C-arm
     angles: AngleOptions = field(default_factory=AngleOptions)
 
     def check_file(self, path: object) -> None:
@@ -123,7 +114,7 @@ class Survey:
     notes: tuple[str, ...] = ()
 
 
-def is_bag(path: str | os.PathLike[str]) -> bool:
+def is_bag(path: PathLike) -> bool:
     """Return whether a source is a bag, which contains times; else it is a file of exposures."""
     path = Path(path)
     if path.is_dir() or path.suffix.lower() in ('', '.mcap', '.db3'):
@@ -136,9 +127,7 @@ def is_bag(path: str | os.PathLike[str]) -> bool:
         return False
 
 
-def read_content(
-    path: str | os.PathLike[str], settings: FileSettings, part: str, default: str
-) -> Content:
+def read_content(path: PathLike, settings: FileSettings, part: str, default: str) -> Content:
     """Read a part of a file of any format.
 
     default is the kind of a CSV file that is not recognised, whose reader says what is wrong.
@@ -157,20 +146,18 @@ def read_content(
     return registry.read(path, replace(settings, wanted=(part,)), kind)
 
 
-def read_survey(path: str | os.PathLike[str], settings: FileSettings | None = None) -> Survey:
+def read_survey(path: PathLike, settings: FileSettings | None = None) -> Survey:
     """Read a phantom from a file of any format. Raises DataError."""
     content = read_content(path, settings or FileSettings(), 'survey', 'phantom')
     if content.survey is None:
         raise DataError(f'{path}: the file has no phantom')
-    try:
+    with ErrorsAt(path):
         require_size(content.survey)
-    except DataError as error:
-        raise error.at(path) from None
     return Survey(content.survey, content.names, content.notes)
 
 
 def read_orientations(
-    paths: Iterable[str | os.PathLike[str]], settings: FileSettings | None = None
+    paths: Iterable[PathLike], settings: FileSettings | None = None
 ) -> dict[str, KnownOrientation]:
     """Read known orientations of fluoroscopes by name.
 
@@ -191,21 +178,19 @@ def read_orientations(
 
 
 def _orientations_of_cameras(
-    path: str | os.PathLike[str], settings: FileSettings
+    path: PathLike, settings: FileSettings
 ) -> dict[str, KnownOrientation]:
     """Read the cameras of a file. Raises DataError for one without position and attitude."""
     content = read_content(path, settings, 'cameras', 'camera')
     out = {}
     for camera in content.cameras:
-        try:
+        with ErrorsAt(f'{path}, camera {camera.name}'):
             out[camera.name] = KnownOrientation.from_matrices(camera.matrix, *camera.pose)
-        except DataError as error:
-            raise error.at(f'{path}, camera {camera.name}') from None
     return out
 
 
 def read_source(
-    path: str | os.PathLike[str],
+    path: PathLike,
     *,
     image_size: tuple[int, int] | None = None,
     fluoroscopes: Sequence[str] | None = None,
@@ -283,7 +268,7 @@ def read_source(
 def select_calibrations(
     calibrations: Mapping[str, FluoroscopeCalibration],
     fluoroscopes: Iterable[str],
-    where: str | os.PathLike[str] = '',
+    where: PathLike = '',
 ) -> dict[str, FluoroscopeCalibration]:
     """Return the calibrations of some fluoroscopes.
 
@@ -309,7 +294,7 @@ def _numbered_hint(name: str, calibrations: Mapping[str, FluoroscopeCalibration]
 
 
 def read_calibrations(
-    directory: str | os.PathLike[str], fluoroscopes: Sequence[str] | None = None
+    directory: PathLike, fluoroscopes: Sequence[str] | None = None
 ) -> dict[str, FluoroscopeCalibration]:
     """Read the calibrations in a result folder, by default all.
 
@@ -332,8 +317,8 @@ def require_observed(path: object, corrected_by: Mapping[str, str]) -> None:
 
 
 def read_calibrated_source(
-    path: str | os.PathLike[str],
-    directory: str | os.PathLike[str],
+    path: PathLike,
+    directory: PathLike,
     *,
     image_size: tuple[int, int] | None = None,
     fluoroscopes: Sequence[str] | None = None,
@@ -383,7 +368,7 @@ def read_calibrated_source(
 
 
 def _unknown_angles(
-    path: str | os.PathLike[str],
+    path: PathLike,
     frames: Mapping[str, Sequence[Frame]],
     calibrations: Mapping[str, FluoroscopeCalibration],
     selection: BagSelection | None,
@@ -406,7 +391,7 @@ def _unknown_angles(
 
 
 def read_point_table(
-    path: str | os.PathLike[str], directory: str | os.PathLike[str], settings: FileSettings
+    path: PathLike, directory: PathLike, settings: FileSettings
 ) -> tuple[PointsFile, tuple[str, ...]]:
     """Read image points to be corrected with the calibrations in a folder, and notes about them.
 

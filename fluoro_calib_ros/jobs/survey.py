@@ -35,8 +35,8 @@ from ..exposures.phantom import MIN_TARGETS, Phantom
 from ..findings import Finding, Kind, Severity
 from .calibration import run_calibration
 
-EXACT_SD_MM = 1e-6  # of coordinates that count as known
 DECIMALS = 6  # of mm in the file
+EXACT_SD_MM = 10.0**-DECIMALS  # of coordinates that count as known
 
 
 @dataclass(frozen=True)

@@ -14,11 +14,10 @@ from fluoro_calib_msgs.srv import LoadCalibration, SaveCalibration
 
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError, printable
-from ..io.calibration import SUFFIX, load_calibrations
+from ..io.calibration import SUFFIX, load_calibrations, load_orientation, orientation_path
 from ..io.phantom import read_phantom
 from ..io.result_check import PHANTOM as PHANTOM_FILE
 from ..io.result_check import disagreements
-from ..io.rig_orientation import load_orientation, orientation_path
 from ..jobs.calibration import CalibrationOutcome
 from ..jobs.result_folder import belongs_to, kept_orientation, save_calibrations, save_outcome
 from ..photogrammetry.rig_orientation import RigOrientation

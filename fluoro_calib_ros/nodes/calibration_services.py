@@ -15,7 +15,7 @@ from rclpy.task import Future
 from ..errors import DataError
 from ..exposures.frame import Frame
 from ..findings import sentences
-from ..io.rig_orientation import save_orientation
+from ..io.calibration import save_orientation
 from ..jobs.orientation import OrientationOutcome, orient
 from ..jobs.result_folder import belongs_to
 from .calibration_output import CalibrationOutput

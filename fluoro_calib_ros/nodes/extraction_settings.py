@@ -15,7 +15,7 @@ from ..exposures.angles import AngleOptions
 from ..exposures.pairing import PairingOptions
 from ..images.markers import FirstMarkers, MarkerOptions
 from ..io.bodies import read_bodies
-from ..io.rig_orientation import load_orientation, orientation_path
+from ..io.calibration import load_orientation, orientation_path
 from ..jobs.live_extraction import MakeFollower, PhantomSettings
 from ..jobs.live_markers import MarkerSettings
 from ..jobs.reconstruction import check_orientation

@@ -14,7 +14,7 @@ from fluoro_calib_msgs.msg import RigOrientation
 
 from ..checks.rig_watch import RigDriftWatch
 from ..errors import DataError
-from ..io.rig_orientation import load_orientation, orientation_path
+from ..io.calibration import load_orientation, orientation_path
 from ..photogrammetry import rig_orientation
 from ..photogrammetry.noise import ObservedScatter
 from ..reconstruction.intersection import Intersector

@@ -21,9 +21,8 @@ from ..errors import DataError
 from ..estimation.options import CalibrationRequest
 from ..estimation.rounds import Round
 from ..findings import Severity
-from ..jobs.calibration import CalibrationOutcome, Rig
+from ..jobs.calibration import CalibrationOutcome, Rig, run_in_worker_process
 from ..jobs.result_folder import check_result_folder
-from ..jobs.worker_process import run_in_worker_process
 from .calibration_files import CalibrationFiles
 from .calibration_output import CalibrationOutput
 from .calibration_settings import RigSetup

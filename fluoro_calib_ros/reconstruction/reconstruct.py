@@ -22,6 +22,7 @@ from ..errors import DataError
 from ..exposures.frame import Frame, image_size_error, repeated_target_error
 from ..exposures.pairing import PairingOptions, recorded_pairer
 from ..photogrammetry.noise import ObservedScatter
+from ..photogrammetry.rig_orientation import RigOrientation
 from .intersection import IntersectedPoints, Intersector
 
 # Matching of the image points of one exposure that have the same target id in several views.
@@ -312,6 +313,19 @@ def reconstruct_recording(
         for exposure in exposures
     ]
     return out, unpaired
+
+
+def orientation_of_recorded(
+    frames: Mapping[str, Sequence[Frame]], orientation: RigOrientation
+) -> RigOrientation:
+    """Return the orientation of the recorded fluoroscopes. Raises DataError for less than two."""
+    names = [name for name in orientation.fluoroscopes if name in frames]
+    if len(names) < 2:
+        raise DataError(
+            f'there are image points of {", ".join(frames)}, but two fluoroscopes of the '
+            f'orientation ({", ".join(orientation.fluoroscopes)}) are needed'
+        )
+    return orientation.subset(names)
 
 
 def pair_recording(

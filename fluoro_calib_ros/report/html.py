@@ -50,43 +50,21 @@ MAX_ROWS = 40  # of the lists of outliers and correlations
 
 @dataclass(frozen=True)
 class ReportInput:
-    """What a result folder contains.
-
-    Attributes
-    ----------
-    title : str
-    result : mapping
-        Content of result.json.
-    calibrations : mapping of str to FluoroscopeCalibration
-    frames : mapping of str to sequence of Frame
-        Exposures of the calibration.
-    phantom : Phantom
-    settings : mapping
-        Content of options.json.
-    validation : mapping or None
-        Content of validation.json.
-    orientation : RigOrientation or None
-    names : Names
-    written : str
-        Date of result.json, as text.
-    rig_note : Finding or None
-        Why the rig has no orientation, or what is doubtful about it.
-    edited : Finding or None
-        What is wrong with result.json itself.
-    """
+    """What a result folder contains."""
 
     title: str
-    result: Mapping[str, Any]
+    result: Mapping[str, Any]  #: content of result.json
     calibrations: Mapping[str, FluoroscopeCalibration]
-    frames: Mapping[str, Sequence[Frame]]
+    frames: Mapping[str, Sequence[Frame]]  #: exposures of the calibration
     phantom: Phantom
-    settings: Mapping[str, Any]
-    validation: Mapping[str, Any] | None = None
+    settings: Mapping[str, Any]  #: content of options.json
+    validation: Mapping[str, Any] | None = None  #: content of validation.json
     orientation: RigOrientation | None = None
     names: Names = field(default_factory=Names)
-    written: str = ''
+    written: str = ''  #: date of result.json, as text
+    #: why the rig has no orientation, or what is doubtful about it
     rig_note: Finding | None = None
-    edited: Finding | None = None
+    edited: Finding | None = None  #: what is wrong with result.json itself
 
 
 def report_html(given: ReportInput) -> str:

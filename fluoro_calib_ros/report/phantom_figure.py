@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
-from ..exposures.phantom_drawing import Drawing
+from ..exposures.phantom import Drawing
 from .style import BLACK, BLUE, RED, STYLE, new_figure, png_bytes
 
 INCH = 0.33  # of a place, so that an id of four digits can be read

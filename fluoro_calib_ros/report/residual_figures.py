@@ -27,19 +27,12 @@ def normalised_residuals(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Inlier residuals in units of their standard deviation, before (n, 2) and after (m, 2).
 
-    The standard deviation of a residual is s0 sigma sqrt(redundancy number): it is smaller than
-    that of the image noise by what the unknowns absorb. s0 is estimated from the inliers after the
-    calibration and used for both, so that remaining distortion shows as width. The root of
-    diag C_r would not do: it contains the robust weight of each point, which depends on that very
-    residual, and every tail would vanish.
-
-    Parameters
-    ----------
-    run : SelfCalibration
-    rows : ndarray
-        (k,), image points.
-    redundancy : ndarray
-        (k,), their redundancy numbers.
+    rows (k,) are image points, redundancy (k,) their redundancy numbers. The standard deviation of
+    a residual is s0 sigma sqrt(redundancy number): it is smaller than that of the image noise by
+    what the unknowns absorb. s0 is estimated from the inliers after the calibration and used for
+    both, so that remaining distortion shows as width. The root of diag C_r would not do: it
+    contains the robust weight of each point, which depends on that very residual, and every tail
+    would vanish.
     """
     sd = run.measured.network.sigma[rows] * np.sqrt(redundancy)
     inliers = run.after.inliers[rows]

@@ -20,27 +20,16 @@ Pose = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True)
 class Residuals:
-    """Image residuals of one fluoroscope.
+    """Image residuals of one fluoroscope."""
 
-    Attributes
-    ----------
-    exposure, target_id : (n,) ndarray of int
-    uv : (n, 2) ndarray
-        Observed pixels.
-    before, after : (n, 2) ndarray
-        Observed and corrected minus computed [px].
-    inlier : (n,) ndarray of bool
-        False for image points that fail their test.
-    angle : (n,) ndarray or None
-        Of the C-arm [rad], NaN where it is unknown; None: it is nowhere known.
-    """
-
-    exposure: NDArray[np.int64]
-    target_id: NDArray[np.int64]
-    uv: NDArray[np.float64]
+    exposure: NDArray[np.int64]  #: (n,)
+    target_id: NDArray[np.int64]  #: (n,)
+    uv: NDArray[np.float64]  #: (n, 2), observed pixels
+    #: (n, 2), observed and corrected minus computed [px]
     before: NDArray[np.float64]
     after: NDArray[np.float64]
-    inlier: NDArray[np.bool_]
+    inlier: NDArray[np.bool_]  #: (n,), False for image points that fail their test
+    #: (n,), of the C-arm [rad], NaN where it is unknown; None: it is nowhere known
     angle: NDArray[np.float64] | None = None
 
     def of_exposures(self) -> list[tuple[int, int, float, float]]:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from fluoro_calib_ros.estimation.fixed_calibration import JointPrecision
-from fluoro_calib_ros.io.result_tables import read_covariance, write_covariance
+from fluoro_calib_ros.io.result_document import read_covariance, write_covariance
 
 from ..harness import Broken, Target
 from ..seeds import archive_of, flattened, written

@@ -10,8 +10,7 @@ from pathlib import Path
 
 from fluoro_calib_ros.estimation.options import CalibrationOptions
 from fluoro_calib_ros.io.calibration_request import read_options
-from fluoro_calib_ros.io.documents import read_json
-from fluoro_calib_ros.io.text_files import json_text
+from fluoro_calib_ros.io.documents import json_text, read_json
 
 from ..harness import Target, both
 

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from fluoro_calib_ros.io.rig_orientation import load_orientation, save_orientation
+from fluoro_calib_ros.io.calibration import load_orientation, save_orientation
 
 from ..harness import Target
 from ..seeds import archive_of, flattened, in_folder, orientation

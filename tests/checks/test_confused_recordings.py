@@ -25,10 +25,9 @@ from fluoro_calib_ros.estimation.rig_orientation import orientation_and_scatter
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.findings import Kind, Severity
-from fluoro_calib_ros.io.calibration import save_calibration
+from fluoro_calib_ros.io.calibration import save_calibration, save_orientation
 from fluoro_calib_ros.io.observations import write_observations_csv
 from fluoro_calib_ros.io.phantom import write_phantom
-from fluoro_calib_ros.io.rig_orientation import save_orientation
 from fluoro_calib_ros.jobs.calibration import adjust
 from fluoro_calib_ros.jobs.orientation import orient
 from fluoro_calib_ros.jobs.reconstruction import ReconstructionOptions, reconstruct

@@ -50,7 +50,7 @@ from fluoro_calib_ros.findings import Kind, Place, Severity
 from fluoro_calib_ros.io.calibration import load_calibrations, save_calibration
 from fluoro_calib_ros.io.calibration_request import read_request, write_request
 from fluoro_calib_ros.io.result_document import validation_document
-from fluoro_calib_ros.report.verdict import verdict_text
+from fluoro_calib_ros.report.tables import verdict_text
 from fluoro_calib_ros.simulation.exposures import simulate_exposures
 from fluoro_calib_ros.simulation.rig import virtual_rig
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from rigs import run
 
-from fluoro_calib_ros.io.rig_orientation import load_orientation
+from fluoro_calib_ros.io.calibration import load_orientation
 from fluoro_calib_ros.jobs.simulation import write_knee_recording
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.simulation.knee import simulate_knee, virtual_knee, walking

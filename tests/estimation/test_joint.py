@@ -19,10 +19,10 @@ from fluoro_calib_ros.estimation.constraints import paired_exposures, with_const
 from fluoro_calib_ros.estimation.initial_network import measured_network
 from fluoro_calib_ros.estimation.options import CalibrationOptions
 from fluoro_calib_ros.findings import Kind
+from fluoro_calib_ros.io.documents import json_text
 from fluoro_calib_ros.io.observations import write_observations_csv
 from fluoro_calib_ros.io.phantom import write_phantom
 from fluoro_calib_ros.io.result_document import result_document
-from fluoro_calib_ros.io.text_files import json_text
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_quaternion
 
 PHANTOM = rigs.rig().phantom

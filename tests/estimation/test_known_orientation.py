@@ -14,12 +14,11 @@ from fluoro_calib_ros.checks.verdict import validate_or_report
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.calibrate import calibrate_request
 from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
-from fluoro_calib_ros.exposures.frame import Frame
-from fluoro_calib_ros.exposures.moving_points import MovingPoints
+from fluoro_calib_ros.exposures.frame import Frame, MovingPoints
 from fluoro_calib_ros.findings import Kind
 from fluoro_calib_ros.io.calibration import load_calibrations
 from fluoro_calib_ros.io.calibration_request import read_request
-from fluoro_calib_ros.io.known_orientation import write_known_orientations
+from fluoro_calib_ros.io.formats.known_orientation import write_known_orientations
 from fluoro_calib_ros.io.observations import write_observations_csv
 from fluoro_calib_ros.jobs.calibration import run_calibration
 from fluoro_calib_ros.jobs.result_folder import save_outcome

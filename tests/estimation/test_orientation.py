@@ -26,9 +26,13 @@ from fluoro_calib_ros.estimation.rig_orientation import (
 )
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.exposures.phantom import Phantom
-from fluoro_calib_ros.io.calibration import save_calibration
+from fluoro_calib_ros.io.calibration import (
+    FIELDS,
+    load_orientation,
+    save_calibration,
+    save_orientation,
+)
 from fluoro_calib_ros.io.observations import write_observations_csv
-from fluoro_calib_ros.io.rig_orientation import FIELDS, load_orientation, save_orientation
 from fluoro_calib_ros.jobs.simulation import write_bag
 from fluoro_calib_ros.photogrammetry.collinearity import project
 from fluoro_calib_ros.photogrammetry.rig_orientation import (

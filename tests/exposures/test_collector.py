@@ -10,12 +10,12 @@ import pytest
 
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.collector import (
+    Coverage,
     ExposureCollector,
     StillOptions,
     collect_recorded,
     displacement,
 )
-from fluoro_calib_ros.exposures.coverage import Coverage
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.exposures.pairing import CompletePairer, PairingOptions
 

@@ -16,8 +16,8 @@ import tifffile
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.images.codec import decode
 from fluoro_calib_ros.io.bags.reader import topics_of
+from fluoro_calib_ros.io.calibration import load_orientation
 from fluoro_calib_ros.io.image_reading import open_images
-from fluoro_calib_ros.io.rig_orientation import load_orientation
 from fluoro_calib_ros.photogrammetry.resection import robust_dlt
 from fuzz.__main__ import load
 from fuzz.harness import Broken, check_message

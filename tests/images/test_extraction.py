@@ -23,7 +23,7 @@ from fluoro_calib_ros.images.growth import Seen
 from fluoro_calib_ros.images.light import Light, estimate_noise
 from fluoro_calib_ros.images.matching import PhantomModel, match
 from fluoro_calib_ros.images.measurement import measure_beads
-from fluoro_calib_ros.images.shadow_profile import Profile
+from fluoro_calib_ros.images.shadow_fit import Profile
 from fluoro_calib_ros.images.view import Lens, View, exponents, fit_view, may_be_found
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.simulation.bead_images import bead_image

@@ -9,7 +9,7 @@ import rigs
 
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.calibrate import adjust_with_calibrations
-from fluoro_calib_ros.io.result_tables import read_covariance
+from fluoro_calib_ros.io.result_document import read_covariance
 from fluoro_calib_ros.jobs.result_folder import save_result
 
 

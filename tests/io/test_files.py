@@ -22,13 +22,15 @@ from fluoro_calib_ros.correction.registry import create_model
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.exposures.phantom import Phantom
-from fluoro_calib_ros.io.atomic import atomic_file, write_bytes, write_text
+from fluoro_calib_ros.io.access import atomic_file, write_bytes, write_text
 from fluoro_calib_ros.io.calibration import (
     load_calibration,
     load_calibrations,
+    load_orientation,
     save_calibration,
+    save_orientation,
 )
-from fluoro_calib_ros.io.documents import read_json
+from fluoro_calib_ros.io.documents import read_json, write_json
 from fluoro_calib_ros.io.observations import (
     correct_points,
     read_observations_csv,
@@ -37,8 +39,6 @@ from fluoro_calib_ros.io.observations import (
     write_points,
 )
 from fluoro_calib_ros.io.phantom import read_phantom, write_phantom
-from fluoro_calib_ros.io.rig_orientation import load_orientation, save_orientation
-from fluoro_calib_ros.io.text_files import write_json
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 
 SIZE = (1024, 960)

@@ -34,7 +34,7 @@ from fluoro_calib_ros.jobs.simulation import SimulationOptions, simulate
 
 KILLS = 25
 ROOT = Path(__file__).parents[2]
-KIND = FolderKind('a test folder', lambda name: name.startswith('own'), lambda n: n == 'own.txt')
+KIND = FolderKind('a test folder', parts=('own*',), marks=('own.txt',))
 
 
 @pytest.fixture(scope='module')

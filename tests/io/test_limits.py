@@ -14,9 +14,13 @@ from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.images.codec import decode
 from fluoro_calib_ros.io import access
-from fluoro_calib_ros.io.calibration import load_calibration, save_calibration
+from fluoro_calib_ros.io.calibration import (
+    load_calibration,
+    load_orientation,
+    save_calibration,
+    save_orientation,
+)
 from fluoro_calib_ros.io.phantom import read_phantom, write_phantom
-from fluoro_calib_ros.io.rig_orientation import load_orientation, save_orientation
 from fluoro_calib_ros.jobs.scheduling import LocalWorkers
 from fluoro_calib_ros.limits import ReadLimits, read_limits, use_read_limits
 from fuzz.seeds import orientation

@@ -8,8 +8,7 @@ import pytest
 import rigs
 
 from fluoro_calib_ros.errors import DataError
-from fluoro_calib_ros.exposures.phantom import Phantom, require_size
-from fluoro_calib_ros.exposures.phantom_drawing import Drawing
+from fluoro_calib_ros.exposures.phantom import Drawing, Phantom, require_size
 from fluoro_calib_ros.findings import Kind
 from fluoro_calib_ros.io.formats import registry
 from fluoro_calib_ros.io.formats.content import FileSettings

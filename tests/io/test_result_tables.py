@@ -11,7 +11,7 @@ import pytest
 
 from fluoro_calib_ros.estimation.calibrate import adjust_with_calibrations, calibrate
 from fluoro_calib_ros.estimation.options import CalibrationOptions
-from fluoro_calib_ros.io.result_tables import NAMES
+from fluoro_calib_ros.io.result_document import NAMES
 from fluoro_calib_ros.jobs.result_folder import save_result
 from fluoro_calib_ros.simulation.exposures import Detection, simulate_exposures
 from fluoro_calib_ros.simulation.rig import virtual_rig

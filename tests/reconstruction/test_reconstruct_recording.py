@@ -16,9 +16,8 @@ from fluoro_calib_ros.bodies.body import declared_bodies
 from fluoro_calib_ros.checks.drift_options import ERROR, DriftOptions
 from fluoro_calib_ros.checks.rig_watch import RecordingDriftWatch, RigDriftWatch
 from fluoro_calib_ros.findings import Kind, Severity
-from fluoro_calib_ros.io.calibration import save_calibration
+from fluoro_calib_ros.io.calibration import save_calibration, save_orientation
 from fluoro_calib_ros.io.observations import write_observations_csv
-from fluoro_calib_ros.io.rig_orientation import save_orientation
 from fluoro_calib_ros.jobs.simulation import write_bag
 from fluoro_calib_ros.reconstruction.intersection import OK, SINGLE_VIEW, Intersector
 from fluoro_calib_ros.reconstruction.reconstruct import (

@@ -18,7 +18,7 @@ from fluoro_calib_ros.estimation.calibrate import adjust_with_calibrations, cali
 from fluoro_calib_ros.estimation.options import CalibrationOptions
 from fluoro_calib_ros.findings import Finding, Kind, Place, Severity
 from fluoro_calib_ros.report.cost_figure import relative_costs
-from fluoro_calib_ros.report.figures import write_figures
+from fluoro_calib_ros.report.report_figures import write_figures
 from fluoro_calib_ros.report.residual_figures import normalised_residuals
 from fluoro_calib_ros.report.style import STYLE
 from fluoro_calib_ros.report.tables import markdown_table, summary_table

@@ -172,7 +172,7 @@ sys.path.insert(0, {str(ROOT / 'tests')!r})
 from fluoro_calib_ros.io.bags.reader import read_frames
 from fluoro_calib_ros.estimation.options import CalibrationRequest
 from fluoro_calib_ros.io.phantom import read_phantom
-from fluoro_calib_ros.jobs.worker_process import run_in_worker_process
+from fluoro_calib_ros.jobs.calibration import run_in_worker_process
 import multiprocessing, threading
 
 def report(label, last):

@@ -10,7 +10,7 @@ from fluoro_calib_msgs.srv import Calibrate, Orient, Reset
 from ros_graph import BAGS, NAMES, value_of
 from test_reconstruction import coordinates, publish, truth
 
-from fluoro_calib_ros.io.rig_orientation import load_orientation, orientation_path
+from fluoro_calib_ros.io.calibration import load_orientation, orientation_path
 from fluoro_calib_ros.nodes.messages.rig_orientation import orientation_from_message
 
 

@@ -14,7 +14,7 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from ros_graph import BAGS, NAMES, entry_point, value_of
 
-from fluoro_calib_ros.io.rig_orientation import load_orientation, orientation_path
+from fluoro_calib_ros.io.calibration import load_orientation, orientation_path
 from fluoro_calib_ros.nodes.messages.observations import message_from_frame
 from fluoro_calib_ros.nodes.messages.points import POINT_TYPE
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import rigs
 
-from fluoro_calib_ros.exposures.coverage import Coverage
+from fluoro_calib_ros.exposures.collector import Coverage
 from fluoro_calib_ros.exposures.frame import points_on_image, validate_frame
 from fluoro_calib_ros.photogrammetry.collinearity import project
 from fluoro_calib_ros.photogrammetry.rotations import rotation_angle

@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 from rosbags.typesys.store import Typestore
 
 from ...correction.calibration_record import FIELDS, VERSION
-from ...errors import DataError
+from ...errors import DataError, ErrorsAt
 from ...exposures.frame import Frame, stack_image_points
 
 PACKAGE = 'fluoro_calib_msgs'
@@ -175,17 +175,8 @@ def _count_empty(message: Any) -> int:
 def fields_of(msg_type: str, text: str, encoding: str) -> dict[str, Any]:
     """Return the fields of a message type and of those it depends on, by type.
 
-    Parameters
-    ----------
-    msg_type : str
-    text : str
-        Definition in the schema of a bag.
-    encoding : {'ros2msg', 'ros2idl'}
-
-    Raises
-    ------
-    DataError
-        For a definition that cannot be read.
+    text is the definition in the schema of a bag, encoding 'ros2msg' or 'ros2idl'. Raises
+    DataError for a definition that cannot be read.
     """
     try:
         if encoding == 'ros2msg':
@@ -248,12 +239,10 @@ def frame_from_message(message: Any, fluoroscope: str) -> Frame:
 
     Raises DataError for arrays of different lengths; nothing else is validated.
     """
-    try:
+    with ErrorsAt(f'frame {message.frame_number}'):
         target_id, uv, sigma = stack_image_points(
             message.target_id, message.u, message.v, message.sigma
         )
-    except DataError as error:
-        raise error.at(f'frame {message.frame_number}') from None
     stamp = message.header.stamp
     return Frame(
         fluoroscope=fluoroscope,

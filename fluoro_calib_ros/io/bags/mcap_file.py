@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, BinaryIO, NamedTuple
 
 import zstandard
 from mcap.exceptions import EndOfFile
+from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
 from mcap.records import Channel, McapRecord, Message, Schema
 from mcap.stream_reader import StreamReader
@@ -24,7 +25,7 @@ from mcap.summary import Summary
 
 from ...errors import DataError
 from ...limits import MAX_CHUNK, MAX_TOPICS
-from ..access import check_regular_file, os_error_reason
+from ..access import PathLike, check_regular_file, os_error_reason
 from ..documents import read_yaml
 from .metadata import to_yaml
 
@@ -32,31 +33,19 @@ if TYPE_CHECKING:
     from rosbags.rosbag2 import Reader
 
 MAGIC = b'\x89MCAP0\r\n'
-FOOTER_SIZE = 1 + 8 + 8 + 8 + 4  # bytes: opcode, length, two offsets, CRC
-FOOTER_OPCODE = 2
-CHUNK_OPCODE = 6
-DATA_END_OPCODE = 15
 CHUNK_HEAD = 100  # bytes that contain sizes and compression of a chunk
-_RECORD = struct.Struct('<BQ')  # opcode and length
+FOOTER = struct.Struct('<BQQQI')  # opcode, length, two offsets, checksum
+RECORD = struct.Struct('<BQ')  # opcode and length
 MAX_CAUSE = 120  # characters
 
 
 class BagMessage(NamedTuple):
-    """A message of a bag.
-
-    Attributes
-    ----------
-    topic, type : str
-    log_time_ns : int
-        Time at which it was received [ns].
-    data : bytes
-        CDR.
-    """
+    """A message of a bag."""
 
     topic: str
     type: str
-    log_time_ns: int
-    data: bytes
+    log_time_ns: int  #: time at which it was received [ns]
+    data: bytes  #: CDR
 
 
 @dataclass(frozen=True)
@@ -148,11 +137,11 @@ def _check_ends(path: str, file: BinaryIO) -> None:
     if file.read(len(MAGIC)) != MAGIC:
         raise DataError(f'{path}: this is not an MCAP file')
     file.seek(max(size - len(MAGIC), 0))
-    if size < 2 * len(MAGIC) + FOOTER_SIZE or file.read() != MAGIC:
+    if size < 2 * len(MAGIC) + FOOTER.size or file.read() != MAGIC:
         raise DataError(f'{path}: the bag is cut off, the end of the file is missing')
-    file.seek(size - len(MAGIC) - FOOTER_SIZE)
-    opcode, _, start, _, crc = struct.unpack('<BQQQI', file.read(FOOTER_SIZE))
-    if opcode != FOOTER_OPCODE or start > size:
+    file.seek(size - len(MAGIC) - FOOTER.size)
+    opcode, _, start, _, crc = FOOTER.unpack(file.read(FOOTER.size))
+    if opcode != Opcode.FOOTER or start > size:
         raise DataError(f'{path}: the bag is damaged, it has no footer')
     if start and crc:
         file.seek(start)
@@ -165,15 +154,15 @@ def _check_chunks(file: BinaryIO) -> None:
     """Raise DataError for a chunk that would take too much memory; none is decompressed."""
     position = len(MAGIC)
     size = file.seek(0, os.SEEK_END)
-    while position + _RECORD.size <= size:
+    while position + RECORD.size <= size:
         file.seek(position)
         head = file.read(CHUNK_HEAD)
-        opcode, length = _RECORD.unpack_from(head)
-        if opcode == CHUNK_OPCODE and len(head) == CHUNK_HEAD:
-            (held,) = struct.unpack_from('<Q', head, _RECORD.size + 16)
-            (name_length,) = struct.unpack_from('<I', head, _RECORD.size + 28)
-            start = _RECORD.size + 32 + name_length + 8
-            if head[_RECORD.size + 32 : start - 8] == b'zstd':
+        opcode, length = RECORD.unpack_from(head)
+        if opcode == Opcode.CHUNK and len(head) == CHUNK_HEAD:
+            (held,) = struct.unpack_from('<Q', head, RECORD.size + 16)
+            (name_length,) = struct.unpack_from('<I', head, RECORD.size + 28)
+            start = RECORD.size + 32 + name_length + 8
+            if head[RECORD.size + 32 : start - 8] == b'zstd':
                 with suppress(zstandard.ZstdError):
                     held = max(held, zstandard.frame_content_size(head[start:]))
             if held > MAX_CHUNK:
@@ -181,9 +170,9 @@ def _check_chunks(file: BinaryIO) -> None:
                     f'{file.name}: a chunk of the bag takes {held / 1e6:.0f} MB, more than '
                     f'{MAX_CHUNK / 1e6:.0f} MB are not read'
                 )
-        elif opcode == DATA_END_OPCODE:
+        elif opcode == Opcode.DATA_END:
             break
-        position += _RECORD.size + length
+        position += RECORD.size + length
     file.seek(0)
 
 
@@ -252,8 +241,6 @@ def _one_line(error: Exception) -> str:
 
 
 # Storage files of a bag: an .mcap file, or those in the folder of a rosbag2 bag.
-
-PathLike = str | os.PathLike[str]
 
 
 def storage_files(source: PathLike) -> list[str]:

@@ -134,26 +134,14 @@ class FileSpan:
 
 @dataclass
 class BagTopic:
-    """A topic that is written to a bag.
-
-    Attributes
-    ----------
-    name : str
-    msg_type : str
-    qos : list of dict
-        Offered QoS profiles.
-    definition : Definition
-    count : int
-        Number of messages.
-    channel : int
-        Its channel in the file that is being written.
-    """
+    """A topic that is written to a bag."""
 
     name: str
     msg_type: str
-    qos: list[dict[str, Any]]
+    qos: list[dict[str, Any]]  #: offered QoS profiles
     definition: Definition
-    count: int = 0
+    count: int = 0  #: number of messages
+    #: its channel in the file that is being written
     channel: int = field(default=0, compare=False)
 
 

@@ -13,12 +13,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from mcap.records import Schema
 
-from ...errors import DataError
+from ...errors import DataError, ErrorsAt
 from ...exposures.angles import AngleOptions, JointAngles
 from ...exposures.frame import Frame, validate_frame
 from ...exposures.strays import without_strays
 from ...limits import MAX_OBSERVATIONS
-from ..access import check_safe_name
+from ..access import PathLike, check_safe_name
 from .definitions import (
     TARGET_OBSERVATIONS,
     fields_of,
@@ -31,7 +31,6 @@ from .definitions import (
 from .mcap_file import (
     BagMessage,
     ChannelInfo,
-    PathLike,
     channels_of_bag,
     channels_of_file,
     is_foreign,
@@ -66,25 +65,12 @@ def read_frames(source: PathLike, validate: bool = True) -> BagContents:
     """Read all frames of a bag: those of every topic of type TargetObservations.
 
     The fluoroscope is the part of the topic's name before the last. Where the frame numbers of a
-    stream begin again, a power of ten is added to those that follow, so that they differ.
+    stream begin again, a power of ten is added to those that follow, so that they differ. Without
+    validate only the lengths of the arrays of a frame are checked.
 
-    Parameters
-    ----------
-    source : path-like
-        An .mcap file or a bag folder.
-    validate : bool
-        Whether every frame is validated; else only the lengths of its arrays are checked.
-
-    Returns
-    -------
-    BagContents
-
-    Raises
-    ------
-    DataError
-        For a source that is not a bag, a damaged or truncated one, one without observations, a
-        different definition of the message, and an invalid or repeated frame. The message names
-        bag, topic and message.
+    Raises DataError that names bag, topic and message: for a source that is not a bag, a damaged
+    or truncated one, one without observations, a different definition of the message, and an
+    invalid or repeated frame.
     """
     fluoroscopes = _observation_topics(source)
     _check_definitions(source, fluoroscopes)
@@ -97,7 +83,7 @@ def read_frames(source: PathLike, validate: bool = True) -> BagContents:
         name = fluoroscopes[message.topic]
         number = len(frames[name]) + 1
         where = f'{source}, topic {message.topic}, message {number}'
-        try:
+        with ErrorsAt(where):
             if len(message.data) > MAX_OBSERVATIONS:
                 raise DataError(
                     f'the message has {len(message.data)} bytes, more than {MAX_OBSERVATIONS} '
@@ -108,8 +94,6 @@ def read_frames(source: PathLike, validate: bool = True) -> BagContents:
                 frame, stray = without_strays(frame)
                 notes += [f'not used: {stray}'] if stray else []
                 validate_frame(frame)
-        except DataError as error:
-            raise error.at(where) from None
         if frames[name] and _is_restart(frames[name][-1], frame):
             restarts[name] += 1
         segments[name].append(restarts[name])
@@ -208,10 +192,8 @@ def _observation_topics(source: PathLike) -> dict[str, str]:
     for topic, info in topics_of(source).items():
         if info.type != TARGET_OBSERVATIONS:
             continue
-        try:
+        with ErrorsAt(source):
             name = fluoroscope_of_topic(topic)
-        except DataError as error:
-            raise error.at(source) from None
         check_safe_name(name, f'{source}, topic {topic}')
         for other, fluoroscope in out.items():
             if fluoroscope == name:
@@ -230,10 +212,8 @@ def _check_definitions(source: PathLike, topics: Collection[str]) -> None:
         for info in channels:
             if info.channel.topic not in topics:
                 continue
-            try:
+            with ErrorsAt(f'{path}, topic {info.channel.topic}'):
                 _check_definition(info)
-            except DataError as error:
-                raise error.at(f'{path}, topic {info.channel.topic}') from None
 
 
 def _check_definition(info: ChannelInfo) -> None:
@@ -346,19 +326,9 @@ def with_angles(
 ) -> tuple[dict[str, list[Frame]], tuple[str, ...]]:
     """Return frames of a bag with the angles that the nodes give them, and notes about them.
 
-    Parameters
-    ----------
-    source : path-like
-    frames : mapping of str to sequence of Frame
-        By fluoroscope.
-    options : AngleOptions
-        Which joint is the C-arm, in any topic of joint states.
-
-    Raises
-    ------
-    DataError
-        For a bag without this joint, with states of it on several topics or damaged ones, and for
-        a joint of another fluoroscope.
+    options say which joint is the C-arm, in any topic of joint states. Raises DataError for a bag
+    without this joint, with states of it on several topics or damaged ones, and for a joint of
+    another fluoroscope.
     """
     angles = angles_in(source, frames, options)
     if not angles.joints:
@@ -399,10 +369,8 @@ def _read_states(source: PathLike, angles: JointAngles) -> None:
         )
     found: dict[str, set[str]] = {}  # topics by joint
     for message in iterate_messages(source, topics):
-        try:
+        with ErrorsAt(f'{source}, topic {message.topic}'):
             state = from_cdr(message.data, JOINT_STATE)
-        except DataError as error:
-            raise error.at(f'{source}, topic {message.topic}') from None
         for joint in state.name:
             found.setdefault(joint, set()).add(message.topic)
         stamp = state.header.stamp

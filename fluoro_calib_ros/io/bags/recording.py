@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 
 from ...errors import DataError
 from ...options import option, validate_options
+from ..access import PathLike
 from .definitions import Definition
-from .mcap_file import PathLike
 from .writer import BagWriter
 
 MEGABYTE = 10**6

@@ -31,21 +31,18 @@ from mcap.records import Channel, MessageIndex, Schema, Statistics
 
 from ...errors import DataError
 from ...limits import MAX_CHUNK
-from ..access import check_regular_file, os_error_reason
+from ..access import PathLike, check_regular_file, os_error_reason
 from ..documents import read_yaml
 from .definitions import PACKAGE, TARGET_OBSERVATIONS, Definition, fluoroscope_of_topic, typestore
-from .mcap_file import PathLike, candidate_files
+from .mcap_file import FOOTER, MAGIC, RECORD, candidate_files
 from .metadata import parse_profiles, profile
 from .writer import BagWriter
 
-MAGIC = b'\x89MCAP0\r\n'
-_HEAD = struct.Struct('<BQ')  # of a record: opcode and length
 _CHUNK = struct.Struct('<QQQI')  # of a chunk: first and last time, size, checksum
 _MESSAGE = struct.Struct('<HIQQ')  # of a message: channel, sequence, log and publish time
-_FOOTER = struct.Struct('<BQQQI')
 # Where a chunk may begin: a short record with its opcode, or the name of its compression.
 _CANDIDATE = re.compile(rb'\x06[\x00-\xff]{4}\x00{4}|\x04\x00{3}zstd|\x03\x00{3}lz4')
-_TO_COMPRESSION = _HEAD.size + _CHUNK.size  # bytes
+_TO_COMPRESSION = RECORD.size + _CHUNK.size  # bytes
 
 
 class SalvagedMessage(NamedTuple):
@@ -73,22 +70,14 @@ class SalvagedTopic:
 
 @dataclass(frozen=True)
 class Damage:
-    """Bytes of a file that cannot be used.
-
-    Attributes
-    ----------
-    path : str
-    cause : str
-    start_ns, end_ns : int or None
-        Messages between these times may be missing [ns]; None: from the beginning, to the end.
-    lost : mapping of str to int
-        Number of lost messages by topic, empty where it is not known.
-    """
+    """Bytes of a file that cannot be used."""
 
     path: str
     cause: str
+    #: messages between these times may be missing [ns]; None: from the beginning, to the end
     start_ns: int | None
     end_ns: int | None
+    #: number of lost messages by topic, empty where it is not known
     lost: dict[str, int] = field(default_factory=dict)
 
 
@@ -159,15 +148,15 @@ class FileSalvage:
                 position = chunk_at
                 continue
             self._has_end = is_end
-            yield from self._record(data[position], data[position + _HEAD.size : end])
+            yield from self._record(data[position], data[position + RECORD.size : end])
             position = end
 
     def _end_of_record(self, data: mmap.mmap, position: int) -> int | None:
         """Return the position behind a record, None where there is no complete record."""
-        if position + _HEAD.size > len(data):
+        if position + RECORD.size > len(data):
             return None
-        opcode, length = _HEAD.unpack_from(data, position)
-        end = position + _HEAD.size + length
+        opcode, length = RECORD.unpack_from(data, position)
+        end = position + RECORD.size + length
         return end if 0 < opcode <= Opcode.DATA_END and end <= len(data) else None
 
     def _next_chunk(self, data: mmap.mmap, position: int, limit: int = sys.maxsize) -> int:
@@ -185,9 +174,9 @@ class FileSalvage:
     def _messages_of(self, content: bytes | memoryview) -> Iterator[SalvagedMessage]:
         """Yield the messages of an intact chunk."""
         position = 0
-        while position + _HEAD.size <= len(content):
-            opcode, length = _HEAD.unpack_from(content, position)
-            position += _HEAD.size
+        while position + RECORD.size <= len(content):
+            opcode, length = RECORD.unpack_from(content, position)
+            position += RECORD.size
             yield from self._record(opcode, bytes(content[position : position + length]))
             position += length
 
@@ -239,18 +228,18 @@ class FileSalvage:
     def _read_summary(self, data: mmap.mmap) -> None:
         """Read topics and counts of an intact end: their first chunk may be damaged."""
         size = len(data)
-        footer = size - len(MAGIC) - _FOOTER.size
+        footer = size - len(MAGIC) - FOOTER.size
         if footer < len(MAGIC) or data[-len(MAGIC) :] != MAGIC:
             return
-        opcode, _, start, _, checksum = _FOOTER.unpack_from(data, footer)
+        opcode, _, start, _, checksum = FOOTER.unpack_from(data, footer)
         if opcode != Opcode.FOOTER or not len(MAGIC) < start <= footer or not checksum:
             return
-        if zlib.crc32(data[start : footer + _FOOTER.size - 4]) != checksum:
+        if zlib.crc32(data[start : footer + FOOTER.size - 4]) != checksum:
             return
         position = start
         while position < footer:
-            opcode, length = _HEAD.unpack_from(data, position)
-            position += _HEAD.size
+            opcode, length = RECORD.unpack_from(data, position)
+            position += RECORD.size
             content = data[position : position + length]
             position += length
             if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
@@ -265,7 +254,7 @@ class FileSalvage:
     def _note_lost_chunk(self, data: mmap.mmap, position: int, end: int | None) -> None:
         """Note a damaged chunk, with what its message index says about it."""
         if end is None:
-            is_cut = position + _HEAD.size > len(data) or data[position] in range(1, 16)
+            is_cut = position + RECORD.size > len(data) or data[position] in range(1, 16)
             self._note(
                 'the file is cut off or damaged here' if is_cut else 'these bytes are damaged'
             )
@@ -276,7 +265,7 @@ class FileSalvage:
             if data[position] != Opcode.MESSAGE_INDEX:
                 break
             try:
-                content = BytesIO(data[position + _HEAD.size : behind])
+                content = BytesIO(data[position + RECORD.size : behind])
                 index = MessageIndex.read(ReadDataStream(content))
             except Exception:  # damaged bytes make the reader raise almost anything
                 break
@@ -312,7 +301,7 @@ def _chunk_at(data: mmap.mmap, position: int) -> _Chunk | None:
 
     Its length is taken from its own fields: opcode and length of the record may be damaged.
     """
-    start = position + _HEAD.size
+    start = position + RECORD.size
     if start + _CHUNK.size + 4 > len(data):
         return None
     _, _, size, checksum = _CHUNK.unpack_from(data, start)
@@ -356,11 +345,11 @@ def _decompressed(compression: bytes, data: memoryview, size: int) -> bytes | No
 def _is_whole(content: bytes) -> bool:
     """Return whether a chunk without checksum consists of whole records."""
     position = 0
-    while position + _HEAD.size <= len(content):
-        opcode, length = _HEAD.unpack_from(content, position)
+    while position + RECORD.size <= len(content):
+        opcode, length = RECORD.unpack_from(content, position)
         if opcode not in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
             return False
-        position += _HEAD.size + length
+        position += RECORD.size + length
     return position == len(content)
 
 
@@ -369,29 +358,18 @@ def _is_whole(content: bytes) -> bool:
 
 @dataclass(frozen=True)
 class Recovery:
-    """What was recovered from a bag.
+    """What was recovered from a bag."""
 
-    Attributes
-    ----------
-    counts : mapping of str to int
-        Number of recovered messages by topic.
-    expected : mapping of str to int
-        Number of messages that the bag had, as far as it says so, by topic.
-    damages : sequence of Damage
-    skipped : mapping of str to str
-        Why topics were left out.
-    """
-
-    counts: dict[str, int]
+    counts: dict[str, int]  #: number of recovered messages by topic
+    #: number of messages that the bag had, as far as it says so, by topic
     expected: dict[str, int]
     damages: tuple[Damage, ...]
-    skipped: dict[str, str]
+    skipped: dict[str, str]  #: why topics were left out
 
     @property
     def lost(self) -> dict[str, int]:
         """Number of messages that are known to be lost, by topic."""
-        lost = {t: n - self.counts.get(t, 0) for t, n in self.expected.items()}
-        return {topic: count for topic, count in lost.items() if count > 0}
+        return dict(Counter(self.expected) - Counter(self.counts))
 
 
 class Salvage:
@@ -422,23 +400,9 @@ class Salvage:
 
 
 def recover_bag(source: PathLike, out: PathLike) -> Recovery:
-    """Write the intact messages of a bag to a new one.
+    """Write the intact messages of a bag to a new one, which must not exist.
 
-    Parameters
-    ----------
-    source : path-like
-        An .mcap file or a bag folder.
-    out : path-like
-        Folder of the new bag, which must not exist.
-
-    Returns
-    -------
-    Recovery
-
-    Raises
-    ------
-    DataError
-        For a source without any intact message, and where the bag cannot be written.
+    Raises DataError for a source without any intact message, and where the bag cannot be written.
     """
     salvage = Salvage(source)
     if os.path.realpath(out).startswith(os.path.join(os.path.realpath(source), '')):
@@ -509,29 +473,14 @@ _NUMBERED = (TARGET_OBSERVATIONS, f'{PACKAGE}/msg/CorrectedObservations')
 
 @dataclass
 class TopicReport:
-    """What a topic holds.
-
-    Attributes
-    ----------
-    type : str
-    log_ns, stamp_ns : list of int
-        Times at which the messages were received, and those of their headers, if any [ns].
-    numbers : list of int
-        Frame numbers, of observations only.
-    undecodable : int
-        Messages whose header cannot be read.
-    """
+    """What a topic holds."""
 
     type: str
+    #: times at which the messages were received, and those of their headers, if any [ns]
     log_ns: list[int] = field(default_factory=list)
     stamp_ns: list[int] = field(default_factory=list)
-    numbers: list[int] = field(default_factory=list)
-    undecodable: int = 0
-
-    @property
-    def duration_s(self) -> float:
-        """Time from the first message to the last."""
-        return (max(self.log_ns) - min(self.log_ns)) * 1e-9 if self.log_ns else 0.0
+    numbers: list[int] = field(default_factory=list)  #: frame numbers, of observations only
+    undecodable: int = 0  #: messages whose header cannot be read
 
     @property
     def interval_ns(self) -> float:
@@ -581,24 +530,14 @@ class TopicReport:
 
 @dataclass(frozen=True)
 class BagReport:
-    """What a bag holds, and its damages.
-
-    Attributes
-    ----------
-    files : list of str
-    topics : dict of str to TopicReport
-    without_partner : dict of str to int
-        Frames of every fluoroscope whose number another one does not have.
-    damages : tuple of Damage
-    lost : dict of str to int
-        Number of messages that are known to be lost, by topic.
-    """
+    """What a bag holds, and its damages."""
 
     files: list[str]
     topics: dict[str, TopicReport]
+    #: frames of every fluoroscope whose number another one does not have
     without_partner: dict[str, int]
     damages: tuple[Damage, ...]
-    lost: dict[str, int]
+    lost: dict[str, int]  #: number of messages that are known to be lost, by topic
 
     @property
     def faults(self) -> list[str]:
@@ -631,13 +570,12 @@ def inspect_bag(source: PathLike) -> BagReport:
     if not topics and salvage.damages:
         raise DataError(f'{source}: nothing can be read ({salvage.damages[0].cause})')
     counts = {topic: len(report.log_ns) for topic, report in topics.items()}
-    lost = {t: n - counts.get(t, 0) for t, n in salvage.expected.items()}
     return BagReport(
         [file.path for file in salvage.files],
         dict(sorted(topics.items())),
         _without_partner(topics),
         salvage.damages,
-        {topic: count for topic, count in lost.items() if count > 0},
+        dict(Counter(salvage.expected) - Counter(counts)),
     )
 
 

@@ -22,8 +22,7 @@ from mcap.writer import CompressionType, Writer
 
 from ...errors import DataError
 from ...exposures.frame import Frame
-from ..access import os_error_reason
-from ..atomic import sync_folder, write_text
+from ..access import PathLike, os_error_reason, sync_folder, write_text
 from .definitions import (
     TARGET_OBSERVATIONS,
     Definition,
@@ -68,7 +67,7 @@ class BagWriter:
 
     def __init__(
         self,
-        path: str | os.PathLike[str],
+        path: PathLike,
         overwrite: bool = False,
         live: bool = False,
         split_bytes: int = 0,

@@ -23,23 +23,21 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ...errors import DataError
-from ...exposures.columns import first_repeated
+from ...errors import DataError, ErrorsAt
 from ...exposures.frame import Frame, points_on_image
-from ...exposures.phantom import Phantom
-from ..access import make_folder
-from ..atomic import write_text
-from .camera_files import common_focal_length, refuse_distortion
+from ...exposures.phantom import Phantom, first_repeated
+from ..access import make_folder, write_text
 from .content import (
     Camera,
     Content,
     FileSettings,
     Format,
-    Sample,
     Station,
     Written,
+    common_focal_length,
     from_units,
     in_units,
+    refuse_distortion,
 )
 from .text import Row, joined, read_table, require_width
 from .xmalab_points import camera_order
@@ -49,11 +47,6 @@ WIDTHS = {'.pho': 8, '.iop': 25, '.eop': 8, '.xyz': 7}
 # x right, y up, z backwards -> x right, y down, z forwards.
 _AXES = np.diag([1.0, -1.0, -1.0])
 _SIGMA_PX = 1.0  # of observations whose precision is unknown
-
-
-def recognise(sample: Sample) -> bool:
-    """Return whether the suffix is one of the four."""
-    return sample.suffix in WIDTHS
 
 
 @dataclass(frozen=True)
@@ -219,10 +212,8 @@ def _survey(path: Path, rows: Sequence[Row], mm: float) -> Phantom:
     values = np.array([row.numbers() for row in rows])
     sd = np.sqrt(np.mean(values[:, 4:] ** 2, axis=1))
     ids = [row.whole(0, 'the target') for row in rows]
-    try:
+    with ErrorsAt(path):
         return Phantom(np.array(ids), from_units(values[:, 1:4], mm), from_units(sd, mm))
-    except DataError as error:
-        raise error.at(path) from None
 
 
 def write(path: Path, content: Content, settings: FileSettings) -> Written:
@@ -316,7 +307,7 @@ FORMAT = Format(
     'bundle',
     'file of the program of Chow et al.',
     parts=('observations', 'cameras', 'stations', 'survey'),
-    recognise=recognise,
+    recognise=lambda sample: sample.suffix in WIDTHS,
     read=read,
     write=write,
     looks_like='NAME.pho, NAME.iop, NAME.eop, NAME.xyz',

@@ -24,8 +24,7 @@ import numpy as np
 from ...errors import DataError
 from ...exposures.names import Names, number_names
 from ...processes import run_module
-from ..access import read_bytes
-from ..atomic import write_bytes
+from ..access import read_bytes, write_bytes
 from . import c3d_process
 from .content import (
     UNITS_MM,
@@ -34,7 +33,6 @@ from .content import (
     FileSettings,
     Format,
     Points,
-    Sample,
     Written,
     homogeneous,
 )
@@ -51,11 +49,6 @@ _MAGIC = 0x50
 _INTEL = 84  # processor type
 BLOCK = 512  # bytes
 ROTATION_TOLERANCE = 1e-4  # float32, and programs that compute in it
-
-
-def recognise(sample: Sample) -> bool:
-    """Return whether the second byte is that of C3D."""
-    return sample.suffix == '.c3d' and len(sample.head) > 1 and sample.head[1] == _MAGIC
 
 
 def _ezc3d() -> Any:
@@ -238,7 +231,7 @@ FORMAT = Format(
     'c3d',
     'C3D',
     parts=('points', 'bodies'),
-    recognise=recognise,
+    recognise=lambda sample: sample.suffix == '.c3d' and sample.head[1:2] == bytes([_MAGIC]),
     read=read,
     write=write,
     looks_like='a binary file of c3d.org',

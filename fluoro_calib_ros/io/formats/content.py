@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
@@ -19,6 +20,7 @@ from ...errors import DataError
 from ...exposures.frame import Frame
 from ...exposures.names import Names
 from ...exposures.phantom import Phantom
+from ..access import PathLike, check_safe_name, make_folder, write_text
 
 UNITS_MM = {'mm': 1.0, 'cm': 10.0, 'm': 1000.0}
 # Attributes of a Content, as messages call them.
@@ -56,28 +58,16 @@ def _shifted(values: np.ndarray, mm: float, sign: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera: what a fluoroscope is once its images are corrected.
-
-    Attributes
-    ----------
-    name : str
-    matrix : (3, 3) ndarray
-        Camera matrix [px]; for a fluoroscope [[c, 0, xp], [0, c, yp], [0, 0, 1]].
-    image_size : (int, int) or None
-        Width and height [px].
-    rotation : (3, 3) ndarray or None
-        World -> sensor; None where the format has no exterior orientation.
-    translation_mm : (3,) ndarray or None
-        t of X_sensor = rotation P + t.
-    distortion : tuple of float
-        Coefficients of OpenCV's model (k1, k2, p1, p2, k3, ...), empty without.
-    """
+    """A pinhole camera: what a fluoroscope is once its images are corrected."""
 
     name: str
+    #: (3, 3), camera matrix [px]; for a fluoroscope [[c, 0, xp], [0, c, yp], [0, 0, 1]]
     matrix: NDArray[np.float64]
-    image_size: tuple[int, int] | None = None
+    image_size: tuple[int, int] | None = None  #: width and height [px]
+    #: (3, 3), world -> sensor; None where the format has no exterior orientation
     rotation: NDArray[np.float64] | None = None
-    translation_mm: NDArray[np.float64] | None = None
+    translation_mm: NDArray[np.float64] | None = None  #: (3,), t of X_sensor = rotation P + t
+    #: coefficients of OpenCV's model (k1, k2, p1, p2, k3, ...), empty without
     distortion: tuple[float, ...] = ()
 
     @property
@@ -129,29 +119,17 @@ class Station:
 
 @dataclass(frozen=True)
 class Points:
-    """Points in space over time; NaN where a point was not seen.
+    """Points in space over time; NaN where a point was not seen."""
 
-    Attributes
-    ----------
-    frame : (m,) ndarray of int
-        Numbers of the frames, ascending.
-    target_id : (n,) ndarray of int
-    xyz_mm : (m, n, 3) ndarray
-    sd_mm : (m, n) ndarray
-        Standard deviation of the position, the root of the sum of its three variances; NaN where
-        it is unknown.
-    residual_px : (m, n) ndarray
-        RMS of the image residuals; NaN where it is unknown.
-    rate_hz : float or None
-        Frames per second; None where it is unknown.
-    """
-
-    frame: NDArray[np.int64]
-    target_id: NDArray[np.int64]
-    xyz_mm: NDArray[np.float64]
+    frame: NDArray[np.int64]  #: (m,), numbers of the frames, ascending
+    target_id: NDArray[np.int64]  #: (n,)
+    xyz_mm: NDArray[np.float64]  #: (m, n, 3)
+    #: (m, n), standard deviation of the position, the root of the sum of its three variances; NaN
+    #: where it is unknown
     sd_mm: NDArray[np.float64]
+    #: (m, n), RMS of the image residuals; NaN where it is unknown
     residual_px: NDArray[np.float64]
-    rate_hz: float | None = None
+    rate_hz: float | None = None  #: frames per second; None where it is unknown
 
 
 def points_without_precision(
@@ -166,23 +144,13 @@ def points_without_precision(
 
 @dataclass(frozen=True)
 class Bodies:
-    """Poses of rigid bodies over time, P_world = R P_body + t; NaN where there is none.
-
-    Attributes
-    ----------
-    names : tuple of str
-    frame : (m,) ndarray of int
-    rotation : (m, b, 3, 3) ndarray
-    translation_mm : (m, b, 3) ndarray
-    rate_hz : float or None
-        Frames per second; None where it is unknown.
-    """
+    """Poses of rigid bodies over time, P_world = R P_body + t; NaN where there is none."""
 
     names: tuple[str, ...]
-    frame: NDArray[np.int64]
-    rotation: NDArray[np.float64]
-    translation_mm: NDArray[np.float64]
-    rate_hz: float | None = None
+    frame: NDArray[np.int64]  #: (m,)
+    rotation: NDArray[np.float64]  #: (m, b, 3, 3)
+    translation_mm: NDArray[np.float64]  #: (m, b, 3)
+    rate_hz: float | None = None  #: frames per second; None where it is unknown
 
 
 def homogeneous(bodies: Bodies, mm: float = 1.0) -> NDArray[np.float64]:
@@ -197,41 +165,23 @@ def homogeneous(bodies: Bodies, mm: float = 1.0) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class Content:
-    """What a file contains; a part that it does not have is None or empty.
+    """What a file contains; a part that it does not have is None or empty."""
 
-    Attributes
-    ----------
-    observations : mapping of str to sequence of Frame, or None
-        Image points by fluoroscope.
-    survey : Phantom or None
-    cameras : tuple of Camera
-    stations : tuple of Station
-    points : Points or None
-    bodies : Bodies or None
-    lookups : mapping of str to (2, h, w) ndarray
-        By fluoroscope the observed column and row of every pixel of the corrected image [px], NaN
-        without support.
-    grids : mapping of str to (n, 4) ndarray
-        By fluoroscope the observed u, v and the reference u, v of points of a distortion grid.
-    names : Names
-        The names in the file.
-    notes : tuple of str
-        What a user has to know about the conversion.
-    corrected_by : mapping of str to str
-        By fluoroscope the id of the calibration that corrected the observations; empty: they are
-        as observed.
-    """
-
-    observations: Mapping[str, Sequence[Frame]] | None = None
+    observations: Mapping[str, Sequence[Frame]] | None = None  #: image points by fluoroscope
     survey: Phantom | None = None
     cameras: tuple[Camera, ...] = ()
     stations: tuple[Station, ...] = ()
     points: Points | None = None
     bodies: Bodies | None = None
+    #: by fluoroscope the observed column and row of every pixel of the corrected image [px], NaN
+    #: without support
     lookups: Mapping[str, np.ndarray] = field(default_factory=dict)
+    #: by fluoroscope the observed u, v and the reference u, v of points of a distortion grid
     grids: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
-    names: Names = field(default_factory=Names)
-    notes: tuple[str, ...] = ()
+    names: Names = field(default_factory=Names)  #: the names in the file
+    notes: tuple[str, ...] = ()  #: what a user has to know about the conversion
+    #: by fluoroscope the id of the calibration that corrected the observations; empty: they are as
+    #: observed
     corrected_by: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -314,20 +264,12 @@ Writer = Callable[[Path, Content, FileSettings], Written]
 
 @dataclass(frozen=True)
 class Sample:
-    """The name of a file and how it begins, by which formats recognise it.
-
-    Attributes
-    ----------
-    path : Path
-    head : bytes
-        The first bytes.
-    lines : list of str
-        The first lines that are not blank, without surrounding blanks; empty for a file that is
-        not text.
-    """
+    """The name of a file and how it begins, by which formats recognise it."""
 
     path: Path
-    head: bytes
+    head: bytes  #: the first bytes
+    #: the first lines that are not blank, without surrounding blanks; empty for a file that is not
+    #: text
     lines: list[str]
 
     @property
@@ -335,36 +277,87 @@ class Sample:
         """Suffix of the name in lower case, with the dot."""
         return self.path.suffix.lower()
 
+    @property
+    def first(self) -> str:
+        """The first line that is not blank, '' for a file that is not text."""
+        return self.lines[0] if self.lines else ''
+
 
 @dataclass(frozen=True)
 class Format:
-    """A format.
+    """A format."""
 
-    Attributes
-    ----------
-    kind : str
-        Name on the command line.
-    title : str
-        Name in messages.
-    parts : tuple of str
-        What it can contain, names of `content.PARTS`.
-    recognise : callable
-        Returns whether a file, by its Sample, has the format.
-    read : callable or None
-        Reads a Content; None where the format is only written. Raises DataError.
-    write : callable or None
-        Writes a part of a Content; None where the format is only read. Raises DataError.
-    looks_like : str
-        How a file of the format begins, for messages.
-    says_units : bool
-        Whether the format says the unit of its lengths, or has none.
-    """
-
-    kind: str
-    title: str
-    parts: tuple[str, ...]
-    recognise: Callable[[Sample], bool]
+    kind: str  #: name on the command line
+    title: str  #: name in messages
+    parts: tuple[str, ...]  #: what it can contain, names of `content.PARTS`
+    recognise: Callable[[Sample], bool]  #: returns whether a file, by its Sample, has the format
+    #: reads a Content; None where the format is only written; raises DataError
     read: Reader | None
+    #: writes a part of a Content; None where the format is only read; raises DataError
     write: Writer | None
-    looks_like: str
-    says_units: bool = True
+    looks_like: str  #: how a file of the format begins, for messages
+    says_units: bool = True  #: whether the format says the unit of its lengths, or has none
+
+
+# What the formats of cameras have in common: one file a fluoroscope, in a folder.
+
+ROTATION_TOLERANCE = 1e-5  # of rotations that other programs rounded to six digits
+
+
+def write_cameras(
+    folder: Path, cameras: Sequence[Camera], ending: str, text_of: Callable[[Camera], str]
+) -> tuple[str, ...]:
+    """Write a file <camera><ending> for each camera into a folder, after all texts are made.
+
+    Returns the paths. Raises DataError.
+    """
+    texts = {}
+    for camera in cameras:
+        check_safe_name(camera.name, folder)
+        texts[os.path.join(folder, camera.name + ending)] = text_of(camera)
+    make_folder(folder)
+    for path, text in texts.items():
+        write_text(path, text)
+    return tuple(texts)
+
+
+def name_of_file(path: Path, ending: str) -> str:
+    """Return the name of the camera that a file is of: the file's without its ending."""
+    return path.name[: -len(ending)] if path.name.endswith(ending) else path.stem
+
+
+def check_rotation(where: object, rotation: np.ndarray) -> None:
+    """Raise DataError for a matrix (3, 3) that is not a rotation."""
+    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if not error <= ROTATION_TOLERANCE:
+        raise DataError(f'{where}: the matrix is not a rotation, its rows are not orthonormal')
+    if np.linalg.det(rotation) < 0:
+        raise DataError(f'{where}: the matrix is not a rotation, it mirrors')
+
+
+def check_matrix(where: object, matrix: np.ndarray) -> None:
+    """Raise DataError for a matrix (3, 3) that is not a camera matrix."""
+    if not (matrix[0, 0] > 0 and matrix[1, 1] > 0):
+        raise DataError(f'{where}: the focal lengths in the camera matrix are not above 0')
+    if np.abs(matrix[2] - [0, 0, 1]).max() > 0 or matrix[1, 0]:
+        raise DataError(f'{where}: this is not a camera matrix, its last row must be 0,0,1')
+
+
+def refuse_distortion(path: PathLike, camera: Camera, title: str) -> None:
+    """Raise DataError for a camera with distortion, for a format that cannot hold it."""
+    if camera.is_distorted:
+        raise DataError(
+            f'{path}: camera {camera.name} has a distortion, which {title} cannot contain'
+        )
+
+
+def common_focal_length(path: PathLike, camera: Camera, title: str) -> float:
+    """Return the principal distance of a camera with square pixels. Raises DataError."""
+    fx = float(camera.matrix[0, 0])
+    fy = float(camera.matrix[1, 1])
+    if camera.matrix[0, 1] or abs(fx - fy) > 1e-9 * fx:
+        raise DataError(
+            f'{path}: camera {camera.name} has pixels that are not square (fx {fx:g}, fy {fy:g}), '
+            f'which {title} cannot contain'
+        )
+    return fx

@@ -8,24 +8,23 @@ Targets, exposures and fluoroscopes may have names in them.
 
 from __future__ import annotations
 
-import math
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 
-from ...errors import DataError
 from ...exposures.names import Names, without_trivial
-from ..atomic import atomic_file
-from ..csv_table import format_float, read_blocks, write_rows
+from ..csv_table import format_float, read_all, write_table
 from ..observations import COLUMNS as OBSERVATIONS
 from ..observations import corrections_of, read_named_observations, write_observations_csv
 from ..phantom import COLUMNS as PHANTOM
 from ..phantom import read_named_phantom, write_phantom
-from ..reconstructed_points import COLUMNS as POINTS
-from ..reconstructed_points import NAME_COLUMN
+from ..poses import NAME_COLUMN
+from ..poses import POINT_COLUMNS as POINTS
 from .content import Content, FileSettings, Format, Points, Sample, Written
 from .frames_of_points import NS, rate_of
 
+POINTS_NEEDED = ('frame', 'target_id', 'x', 'y', 'z')
 GRID = ('fluoroscope', 'u', 'v', 'u_reference', 'v_reference')
 
 
@@ -67,14 +66,13 @@ def _write_phantom(path: Path, content: Content, settings: FileSettings) -> Writ
 
 def _read_points(path: Path, settings: FileSettings) -> Content:
     """Read reconstructed points. Raises DataError."""
-    blocks = list(read_blocks(path, ('frame', 'target_id', 'x', 'y', 'z')))
-    frame, target = (
-        np.concatenate([block.ids(name) for block in blocks]) for name in ('frame', 'target_id')
-    )
+    rows = read_all(path, POINTS_NEEDED)
+    frame = rows.ids('frame')
+    target = rows.ids('target_id')
     numbers = {
-        name: np.concatenate([block.floats_or_nan(name) for block in blocks])
+        name: rows.floats_or_nan(name)
         for name in ('x', 'y', 'z', 'sd_x', 'sd_y', 'sd_z', 'residual', 'stamp_ns')
-        if name in blocks[0]
+        if name in rows
     }
     unknown = np.full(len(frame), np.nan)
     frames, row = np.unique(frame, return_inverse=True)
@@ -82,10 +80,7 @@ def _read_points(path: Path, settings: FileSettings) -> Content:
     cell = row * len(targets) + column
     if len(np.unique(cell)) < len(cell):
         index = np.setdiff1d(np.arange(len(cell)), np.unique(cell, return_index=True)[1])[0]
-        line = np.concatenate([block.lines for block in blocks])[index]
-        raise DataError(
-            f'{path}, row {line}: target {target[index]} of frame {frame[index]} is given twice'
-        )
+        rows.fail(index, f'target {target[index]} of frame {frame[index]} is given twice')
     shape = (len(frames), len(targets))
 
     def table(values: np.ndarray) -> np.ndarray:
@@ -105,9 +100,9 @@ def _read_points(path: Path, settings: FileSettings) -> Content:
         rate_hz=rate_of(frame, numbers.get('stamp_ns', unknown)),
     )
     names = Names()
-    if NAME_COLUMN in blocks[0]:
-        cells = [cell for block in blocks for cell in block.strings(NAME_COLUMN)]
-        names = Names(without_trivial({n: int(i) for n, i in zip(cells, target.tolist()) if n}))
+    if NAME_COLUMN in rows:
+        cells = zip(rows.strings(NAME_COLUMN), target.tolist())
+        names = Names(without_trivial({name: identity for name, identity in cells if name}))
     return Content(points=points, names=names)
 
 
@@ -115,44 +110,43 @@ def _write_points(path: Path, content: Content, settings: FileSettings) -> Writt
     """Write the points that were seen, with what is known about them."""
     points = content.points
     assert points is not None
-    named = content.names.target_names()
     rate = settings.rate_hz or points.rate_hz
-    empty = dict.fromkeys(POINTS, '')
-    with atomic_file(path, 'w') as file:
-        write_rows(file, [[*POINTS, NAME_COLUMN]])
-        for row, number in enumerate(points.frame.tolist()):
-            stamp = '' if rate is None else round((number - int(points.frame[0])) / rate * NS)
-            for column, target in enumerate(points.target_id.tolist()):
-                xyz = points.xyz_mm[row, column].tolist()
-                if math.isnan(xyz[0]):
-                    continue
-                cells = {
-                    **empty,
-                    'frame': number,
-                    'stamp_ns': stamp,
-                    'target_id': target,
-                    **dict(zip('xyz', map(repr, xyz))),
-                    'residual': format_float(points.residual_px[row, column]),
-                }
-                write_rows(file, [[*cells.values(), named.get(target, '')]])
+    rows = _point_rows(points, rate, content.names.target_names())
+    write_table(path, (*POINTS, NAME_COLUMN), rows)
     note = f'{path}: standard deviations of the coordinates are not written, only coordinates'
     return Written((str(path),), (note,))
 
 
+def _point_rows(
+    points: Points, rate: float | None, named: Mapping[int, str]
+) -> Iterator[list[object]]:
+    first = int(points.frame[0])
+    for row, column in np.argwhere(~np.isnan(points.xyz_mm[..., 0])).tolist():
+        number = int(points.frame[row])
+        target = int(points.target_id[column])
+        cells = {
+            **dict.fromkeys(POINTS, ''),
+            'frame': number,
+            'stamp_ns': '' if rate is None else round((number - first) / rate * NS),
+            'target_id': target,
+            **dict(zip('xyz', map(repr, points.xyz_mm[row, column].tolist()))),
+            'residual': format_float(points.residual_px[row, column]),
+        }
+        yield [*cells.values(), named.get(target, '')]
+
+
 def _read_grid(path: Path, settings: FileSettings) -> Content:
-    blocks = list(read_blocks(path, GRID))
-    names = np.array([name for block in blocks for name in block.strings('fluoroscope')])
-    numbers = np.concatenate(
-        [np.column_stack([block.floats(name) for name in GRID[1:]]) for block in blocks]
-    )
+    rows = read_all(path, GRID)
+    names = np.array(rows.strings('fluoroscope'))
+    numbers = np.column_stack([rows.floats(name) for name in GRID[1:]])
     return Content(grids={str(n): numbers[names == n] for n in dict.fromkeys(names.tolist())})
 
 
 def _write_grid(path: Path, content: Content, settings: FileSettings) -> Written:
-    with atomic_file(path, 'w') as file:
-        write_rows(file, [GRID])
-        for name, rows in content.grids.items():
-            write_rows(file, ([name, *map(repr, row)] for row in rows.tolist()))
+    rows = (
+        [name, *map(repr, row)] for name, grid in content.grids.items() for row in grid.tolist()
+    )
+    write_table(path, GRID, rows)
     return Written((str(path),))
 
 
@@ -180,7 +174,7 @@ FORMATS = (
         'points',
         f'reconstructed points, {_OWN}',
         parts=('points',),
-        recognise=lambda sample: _has_columns(sample, ('frame', 'target_id', 'x', 'y', 'z')),
+        recognise=lambda sample: _has_columns(sample, POINTS_NEEDED),
         read=_read_points,
         write=_write_points,
         looks_like=','.join(POINTS),

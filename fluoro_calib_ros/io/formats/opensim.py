@@ -19,19 +19,13 @@ import numpy as np
 from ...bodies.joints import JointMotion
 from ...errors import DataError
 from ...photogrammetry.rotations import quaternion_from_matrix
-from ..access import PathLike
-from ..atomic import atomic_file
-from .content import Content, FileSettings, Format, Sample, Written, in_units
+from ..access import PathLike, atomic_file
+from .content import Content, FileSettings, Format, Written, in_units
 from .frames_of_points import bodies_of, frames_of
 from .text import joined
 
 END = 'endheader'
 METRE = 1000.0  # mm
-
-
-def recognise(sample: Sample) -> bool:
-    """Return whether the header is that of a table of OpenSim."""
-    return sample.suffix in ('.sto', '.mot') and END in sample.lines
 
 
 def write(path: Path, content: Content, settings: FileSettings) -> Written:
@@ -109,7 +103,7 @@ FORMAT = Format(
     'opensim',
     'OpenSim table',
     parts=('bodies',),
-    recognise=recognise,
+    recognise=lambda sample: sample.suffix in ('.sto', '.mot') and END in sample.lines,
     read=None,
     write=write,
     looks_like='a header that ends with endheader',

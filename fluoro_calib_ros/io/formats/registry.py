@@ -3,42 +3,33 @@
 
 """The registry of the formats: the only place that lists them.
 
-A new format is a module with a `base.Format` and one line here. The command line takes the kinds
+A new format is a `content.Format` and one line here. The command line takes the kinds
 from this module, and reads every source by it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 from ...errors import DataError
 from ..access import PathLike, check_regular_file, os_error_reason
 from . import (
-    anipose,
-    autoscoper,
     bundle,
     c3d,
-    camera_info,
-    coordinates,
-    dlt,
     known_orientation,
-    mayacam1,
-    mayacam2,
     native,
-    opencv_yaml,
     opensim,
-    poses,
-    trc,
-    xmalab_bodies,
-    xmalab_frame,
     xmalab_lookup,
     xmalab_points,
-    xmalab_points3d,
     xmalab_project,
 )
+from .bodies import AUTOSCOPER, POSES, RIGIDBODY
 from .content import PARTS, Content, FileSettings, Format, Sample, Written, has_content
+from .opencv_cameras import ANIPOSE, CAMERA_INFO, OPENCV
+from .phantoms import COORDINATES, FRAMESPEC
+from .points import TRC, XMALAB3D
+from .xmalab_cameras import DLT, MAYACAM1, MAYACAM2
 
 HEAD = 65536  # bytes by which a format is recognised
 LINES = 20
@@ -52,22 +43,22 @@ FORMATS: dict[str, Format] = {
         known_orientation.FORMAT,
         xmalab_points.FORMAT,
         xmalab_project.FORMAT,
-        xmalab_frame.FORMAT,
-        xmalab_bodies.FORMAT,
-        poses.FORMAT,
-        xmalab_points3d.FORMAT,
-        mayacam2.FORMAT,
-        mayacam1.FORMAT,
-        dlt.FORMAT,
-        autoscoper.FORMAT,
+        FRAMESPEC,
+        RIGIDBODY,
+        POSES,
+        XMALAB3D,
+        MAYACAM2,
+        MAYACAM1,
+        DLT,
+        AUTOSCOPER,
         xmalab_lookup.FORMAT,
-        anipose.FORMAT,
-        opencv_yaml.FORMAT,
-        camera_info.FORMAT,
-        coordinates.FORMAT,
+        ANIPOSE,
+        OPENCV,
+        CAMERA_INFO,
+        COORDINATES,
         bundle.FORMAT,
         c3d.FORMAT,
-        trc.FORMAT,
+        TRC,
         opensim.FORMAT,
     )
 }
@@ -178,8 +169,3 @@ def write(path: PathLike, kind: str, content: Content, settings: FileSettings) -
         )
         raise DataError(f'{format_.title} needs {needed}, but the source has {has}')
     return format_.write(Path(path), content, settings)
-
-
-def settings_for(kind: str, settings: FileSettings) -> FileSettings:
-    """Return settings that read only what a format can hold."""
-    return replace(settings, wanted=FORMATS[kind].parts)

@@ -16,7 +16,7 @@ import numpy as np
 
 from ...errors import DataError
 from ...limits import MAX_ROWS
-from ..access import PathLike, check_rows, read_text
+from ..access import PathLike, atomic_file, check_rows, read_text
 from ..csv_table import decimal_point
 
 MISSING = ('', 'nan', 'none', 'null', 'na', 'n/a')
@@ -69,17 +69,9 @@ class Row:
 def read_table(path: PathLike, separator: str | None = None) -> list[Row]:
     """Return the rows of a text file that are not blank.
 
-    Parameters
-    ----------
-    path : path-like
-    separator : str, optional
-        ' ' for any blanks. By default a semicolon where the first row has one, then with decimal
-        commas, as spreadsheets write it in many countries; else a tabulator or a comma.
-
-    Raises
-    ------
-    DataError
-        For a file that cannot be read, is not text or has no rows.
+    separator: ' ' for any blanks; by default a semicolon where the first row has one, then with
+    decimal commas, as spreadsheets write it in many countries, else a tabulator or a comma. Raises
+    DataError for a file that cannot be read, is not text or has no rows.
     """
     return table_of(path, read_text(path), separator)
 
@@ -119,6 +111,22 @@ def _separated(path: PathLike, text: str, separator: str) -> list[Row]:
     return rows
 
 
+def read_frames(path: PathLike) -> tuple[Row, list[Row], int]:
+    """Return header and rows of a table with a row a frame, and its number of columns Frame.
+
+    Raises DataError as `read_table`, and for a header without rows.
+    """
+    header, *rows = read_table(path)
+    if not rows:
+        raise DataError(f'{path}: the file has a header, but no rows')
+    return header, rows, int(header.cells[0].lower() == 'frame')
+
+
+def frame_numbers(rows: Sequence[Row], first: int) -> list[int]:
+    """Return the numbers of frames: those of the column Frame, without one from 1 on."""
+    return [row.whole(0, 'Frame') if first else number for number, row in enumerate(rows, 1)]
+
+
 def require_width(rows: Iterable[Row], width: int, what: str) -> None:
     """Raise DataError for the first row that does not have `width` cells."""
     for row in rows:
@@ -134,3 +142,13 @@ def number_text(value: float) -> str:
 def joined(values: Sequence[float] | np.ndarray, separator: str = ',') -> str:
     """Return numbers as a row of text."""
     return separator.join(number_text(value) for value in np.asarray(values, dtype=float).tolist())
+
+
+def write_frames(
+    path: PathLike, columns: Iterable[str], frame: np.ndarray, values: np.ndarray
+) -> None:
+    """Write a table with the column Frame and the numbers (m, ...) of each frame (m,)."""
+    with atomic_file(path, 'w') as file:
+        file.write(','.join(['Frame', *columns]) + '\n')
+        for number, numbers in zip(frame.tolist(), values):
+            file.write(f'{number},{joined(numbers.ravel())}\n')

@@ -17,10 +17,8 @@ import numpy as np
 
 from ...errors import DataError
 from ...limits import MAX_IMAGE_SIDE
-from ..access import check_rows, check_safe_name, make_folder, read_text
-from ..atomic import atomic_file
-from .camera_files import name_of_file
-from .content import Content, FileSettings, Format, Sample, Written
+from ..access import atomic_file, check_rows, check_safe_name, make_folder, read_text
+from .content import Content, FileSettings, Format, Sample, Written, name_of_file
 from .text import Row, separator_of
 
 ENDING = '_LUT.csv'
@@ -30,9 +28,7 @@ _MIN_COLUMNS = 32  # narrower tables are something else
 
 def recognise(sample: Sample) -> bool:
     """Return whether the first row has as many numbers as an image has columns."""
-    if not sample.lines:
-        return False
-    cells = sample.lines[0].split(',')[:_MIN_COLUMNS]
+    cells = sample.first.split(',')[:_MIN_COLUMNS]
     try:
         return len([float(cell) for cell in cells]) == _MIN_COLUMNS
     except ValueError:

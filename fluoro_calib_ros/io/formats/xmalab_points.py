@@ -22,29 +22,20 @@ import numpy as np
 from ...errors import DataError
 from ...exposures.frame import Frame, points_on_image
 from ...exposures.names import Names, number_names
-from ..atomic import atomic_file
+from ..access import atomic_file
 from ..csv_table import as_text
-from .content import Content, FileSettings, Format, Sample, Written
-from .frames_of_points import default_name, named_targets
-from .text import Row, joined, read_table, require_width
+from .content import Content, FileSettings, Format, Written
+from .frames_of_points import MAX_FRAMES, default_name, named_targets
+from .text import Row, frame_numbers, joined, read_frames, require_width
 
 COLUMN = re.compile(r'(?P<target>.+)_cam(?P<camera>\d+)_(?P<axis>[XY])', re.IGNORECASE)
 _OFFSET = re.compile(r'cam\d+_offset', re.IGNORECASE)
-MAX_ROWS = 10**6
-
-
-def recognise(sample: Sample) -> bool:
-    """Return whether the header has columns of a marker and a camera."""
-    return bool(sample.lines) and re.search(r'_cam\d+_[XY]\b', sample.lines[0], re.I) is not None
 
 
 def read(path: Path, settings: FileSettings) -> Content:
     """Read image points. Raises DataError."""
-    rows = read_table(path)
-    header, offsets, first = _header(rows[0])
-    body = rows[1:]
-    if not body:
-        raise DataError(f'{path}: the file has a header, but no rows')
+    top, body, first = read_frames(path)
+    header, offsets = _header(top, first)
     require_width(body, len(header) + offsets + first, 'the header')
     targets = list(dict.fromkeys(name for name, _ in header[::2]))
     cameras = sorted({camera for _, camera in header})
@@ -54,8 +45,7 @@ def read(path: Path, settings: FileSettings) -> Content:
     column_camera = np.array([camera for _, camera in header[::2]])
     column_id = np.array([ids[name] for name, _ in header[::2]], dtype=np.int64)
     size = _image_size(path, settings)
-    for index, row in enumerate(body, 1):
-        number = row.whole(0, 'Frame') if first else index
+    for number, row in zip(frame_numbers(body, first), body):
         _check_offsets(row, first, offsets)
         uv = _pixels(row.numbers_or_nan(first + offsets), settings, size)
         _check_point(row, uv, size, header)
@@ -78,14 +68,12 @@ def read(path: Path, settings: FileSettings) -> Content:
     )
 
 
-def _header(row: Row) -> tuple[list[tuple[str, int]], int, int]:
-    """Return target and camera of every column of points, offset columns and Frame columns.
+def _header(row: Row, first: int) -> tuple[list[tuple[str, int]], int]:
+    """Return target and camera of every column of points, and the number of offset columns.
 
     Raises DataError for columns that do not come in pairs of X and Y, or twice.
     """
-    cells = list(row.cells)
-    first = int(cells[0].lower() == 'frame')
-    cells = cells[first:]
+    cells = row.cells[first:]
     offsets = 0
     while cells and _OFFSET.match(cells[0]):  # XMALab forgets the commas between them
         offsets += 1
@@ -103,7 +91,7 @@ def _header(row: Row) -> tuple[list[tuple[str, int]], int, int]:
     for pair in pairs[::2]:
         if pairs.count(pair) > 2:
             row.fail(f'{pair[0]}_cam{pair[1]} is given twice')
-    return pairs, offsets, first
+    return pairs, offsets
 
 
 def _labels(cameras: Sequence[int], settings: FileSettings) -> dict[int, str]:
@@ -165,8 +153,10 @@ def write(path: Path, content: Content, settings: FileSettings) -> Written:
     ids = sorted({int(i) for of in frames.values() for f in of.values() for i in f.target_id})
     labels = [named.get(i, default_name(i)) for i in ids]
     shift = int(numbers[0] == 0)
-    if numbers[-1] + shift > MAX_ROWS:
-        raise DataError(f'{path}: frame {numbers[-1]} would need as many rows, at most {MAX_ROWS}')
+    if numbers[-1] + shift > MAX_FRAMES:
+        raise DataError(
+            f'{path}: frame {numbers[-1]} would need as many rows, at most {MAX_FRAMES}'
+        )
     with atomic_file(path, 'w') as file:
         file.write(
             ','.join(
@@ -214,7 +204,7 @@ FORMAT = Format(
     'xmalab2d',
     'XMALab 2-D points',
     parts=('observations',),
-    recognise=recognise,
+    recognise=lambda sample: re.search(r'_cam\d+_[XY]\b', sample.first, re.I) is not None,
     read=read,
     write=write,
     looks_like='bead01_cam1_X,bead01_cam1_Y,bead01_cam2_X,bead01_cam2_Y',

@@ -14,6 +14,8 @@ too. The unit is that of the frame specification, which XMALab does not say: cm,
 from __future__ import annotations
 
 import posixpath
+import sys
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,24 +23,29 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from ...errors import DataError
+from ...errors import DataError, ErrorsAt
 from ...exposures.frame import Frame, points_on_image
 from ...exposures.names import Names, number_names, safe_names, without_trivial
 from ...images.codec import check_size, declared_size
-from . import xmalab_frame
-from .camera_files import check_matrix, check_rotation
-from .content import Camera, Content, FileSettings, Format, Sample, Station
+from ...limits import MAX_MEMBER, read_limits
+from ..access import os_error_reason
+from ..documents import parse_xml
+from .content import (
+    Camera,
+    Content,
+    FileSettings,
+    Format,
+    Station,
+    check_matrix,
+    check_rotation,
+)
 from .frames_of_points import default_name, named_targets
-from .xmalab_archive import DOCUMENT, ProjectArchive
+from .phantoms import content_of
+from .text import Row, table_of
 
 _SEEN = 0  # a marker is seen where its status is above
 _INLIER = 1
 NO_POINT = -1.0
-
-
-def recognise(sample: Sample) -> bool:
-    """Return whether the file is a ZIP file with the suffix of a project."""
-    return sample.suffix == '.xma' and sample.head.startswith(b'PK')
 
 
 def read(path: Path, settings: FileSettings) -> Content:
@@ -114,7 +121,7 @@ class _Project:
         name = '' if element is None else element.get('FrameSpecifications', '')
         if not name:
             return Content()
-        return xmalab_frame.content_of(
+        return content_of(
             Path(f'{self.archive.path}, {name}'), self.archive.member_text(name), self.settings
         )
 
@@ -133,10 +140,8 @@ class _Project:
                 return self.archive.whole(image, 'Width'), self.archive.whole(image, 'Height')
             name = self.archive.text(image, 'Filename')
             size = declared_size(memoryview(self.archive.member(name)))
-            try:
+            with ErrorsAt(f'{self.archive.path}: {name}'):
                 check_size(*size)
-            except DataError as error:
-                raise error.at(f'{self.archive.path}: {name}') from None
             if min(size) > 0:
                 return size
         if self.settings.image_size is None:
@@ -373,9 +378,99 @@ FORMAT = Format(
     'xma',
     'XMALab project',
     parts=('observations', 'survey', 'cameras', 'stations', 'grids'),
-    recognise=recognise,
+    recognise=lambda sample: sample.suffix == '.xma' and sample.head.startswith(b'PK'),
     read=read,
     write=None,
     looks_like='a ZIP file with project.xml',
     says_units=False,
 )
+
+
+# The files of an XMALab project: a ZIP file with project.xml and the tables it names.
+
+DOCUMENT = 'project.xml'
+
+
+class ProjectArchive:
+    """An open project; a context manager. root is the element of project.xml.
+
+    Raises DataError where the file is no project; so do the methods, for whatever is missing or
+    damaged.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            self._archive = zipfile.ZipFile(path)
+        except OSError as error:
+            raise DataError(f'{path}: cannot be read ({os_error_reason(error)})') from None
+        except zipfile.BadZipFile:
+            raise DataError(
+                f'{path}: this is not an XMALab project, which is a ZIP file'
+            ) from None
+        self._members = {
+            posixpath.normpath(info.filename.replace('\\', '/')): info
+            for info in self._archive.infolist()
+        }
+        self.root = self._document()
+
+    def __enter__(self) -> ProjectArchive:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._archive.close()
+
+    def _document(self) -> ElementTree.Element:
+        root = parse_xml(self.member_text(DOCUMENT), f'{self.path}, {DOCUMENT}')
+        if root.tag != 'Project':
+            raise DataError(f'{self.path}, {DOCUMENT}: this is not a project of XMALab')
+        return root
+
+    def member(self, name: str, most: int = sys.maxsize) -> bytes:
+        """Return a file of the archive, of at most so many bytes."""
+        info = self._members.get(posixpath.normpath(name.replace('\\', '/')))
+        if info is None:
+            raise DataError(f'{self.path}: the project does not contain {name}')
+        if info.file_size > min(most, read_limits().max_file_bytes):
+            raise DataError(f'{self.path}: {name} is too large, {info.file_size} bytes')
+        try:
+            return self._archive.read(info)
+        except Exception as error:  # whatever zipfile and its decompressors make of the damage
+            raise DataError(f'{self.path}: {name} is damaged ({error})') from None
+
+    def member_text(self, name: str) -> str:
+        """Return a file of the archive as text."""
+        return self.member(name, MAX_MEMBER).decode('utf-8', 'replace')
+
+    def numbers(self, name: str) -> np.ndarray:
+        """Return a table of numbers; an error for rows of different lengths, too."""
+        rows: list[Row] = table_of(f'{self.path}, {name}', self.member_text(name))
+        values = [row.numbers_or_nan() for row in rows]
+        for row, of_row in zip(rows, values):
+            if len(of_row) != len(values[0]):
+                row.fail(f'{len(of_row)} columns, but the first row has {len(values[0])}')
+        return np.array(values)
+
+    def text(self, element: ElementTree.Element, name: str) -> str:
+        """Return an attribute."""
+        value = element.get(name)
+        if value is None:
+            raise DataError(f'{self.path}, {DOCUMENT}: a {element.tag} has no attribute {name}')
+        return value
+
+    def whole(self, element: ElementTree.Element, name: str) -> int:
+        """Return an attribute that is a whole number."""
+        text = self.text(element, name)
+        if not text.isascii() or not text.isdigit():
+            raise DataError(
+                f'{self.path}, {DOCUMENT}: {name} of a {element.tag} is {text!r}, not a whole '
+                'number'
+            )
+        return int(text)
+
+    def file_of(self, element: ElementTree.Element, tag: str) -> str:
+        """Return the name of the file of a child."""
+        child = element.find(tag)
+        if child is None:
+            raise DataError(f'{self.path}, {DOCUMENT}: a {element.tag} has no {tag}')
+        return self.text(child, 'Filename')

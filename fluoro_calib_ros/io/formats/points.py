@@ -1,26 +1,26 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""TRC of Motion Analysis, as OpenSim reads it: points in space, at a constant rate.
+"""Points in space: files of XMALab, and TRC.
 
-Header of five rows: PathFileType, names and values of DataRate, CameraRate, NumFrames, NumMarkers,
-Units, OrigDataRate, OrigDataStartFrame, OrigNumFrames; names of the markers; X1 Y1 Z1 and so on.
-Then a row a frame: its number, time [s] and coordinates, between tabulators. Where a marker is not
-seen, OpenSim writes and reads NaN; other programs leave the cell empty, which is read, too. TRC
-has no residuals.
+XMALab: `[Frame,]name_X,name_Y,name_Z,...`, one row a frame, NaN where not seen. The layout is that
+of `Trial::save3dPoints` of XMALab 2.2.7. The unit is that of the calibration object, and the file
+does not say it. Without the column Frame the first row is frame 1. A filtered export appends the
+cut-off frequency to the names, which then belongs to them.
 """
 
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 
 import numpy as np
 
 from ...errors import DataError
 from ...exposures.names import Names, number_names
-from ..access import read_text
-from ..atomic import atomic_file
+from ..access import atomic_file, read_text
+from ..csv_table import as_text
 from .content import (
     UNITS_MM,
     Content,
@@ -33,7 +33,86 @@ from .content import (
     points_without_precision,
 )
 from .frames_of_points import frames_of, labels, named_targets, points_of
-from .text import Row, joined, number_text
+from .text import Row, frame_numbers, joined, number_text, read_frames, require_width, write_frames
+
+_COLUMN = re.compile(r'(?P<target>.+)_(?P<axis>[XYZ])', re.IGNORECASE)
+
+
+def _is_xmalab3d(sample: Sample) -> bool:
+    """Return whether the header has triples of columns of a marker."""
+    cells = re.split(r'[,;\t]', sample.first)
+    cells = cells[cells[0].strip().lower() == 'frame' :]
+    return len(cells) >= 3 and all(
+        cell.strip().upper().endswith(f'_{axis}') for cell, axis in zip(cells[:3], 'XYZ')
+    )
+
+
+def _read_xmalab3d(path: Path, settings: FileSettings) -> Content:
+    """Read points in space. Raises DataError."""
+    header, body, first = read_frames(path)
+    targets = _targets(header, first)
+    require_width(body, 3 * len(targets) + first, 'the header')
+    mm = settings.unit_read(path)
+    ids = number_names(targets, settings.names.targets)
+    frame = frame_numbers(body, first)
+    for before, row, number in zip(frame, body[1:], frame[1:]):
+        if number <= before:
+            row.fail(f'frame {number} comes after frame {before}')
+    values = np.array([row.numbers_or_nan(first) for row in body])
+    xyz = from_units(values.reshape(len(body), -1, 3), mm)
+    xyz[np.isnan(xyz).any(axis=2)] = np.nan
+    target_id = np.array([ids[name] for name in targets], dtype=np.int64)
+    points = points_without_precision(np.array(frame), target_id, xyz, settings.rate_hz)
+    named = Names(named_targets({name: ids[name] for name in targets}))
+    return Content(points=points, names=named)
+
+
+def _targets(row: Row, first: int) -> list[str]:
+    """Return the names of the targets of a header. Raises DataError."""
+    found = []
+    for cell, axis in zip(row.cells[first:], 'XYZ' * len(row.cells)):
+        match = _COLUMN.fullmatch(cell)
+        if match is None or match['axis'].upper() != axis:
+            row.fail(f'the column {cell!r} is not <name>_{axis}')
+        found.append(match['target'])
+    targets = found[::3]
+    if len(found) % 3 or found != [name for name in targets for _ in 'XYZ']:
+        row.fail('the columns are not triples <name>_X,<name>_Y,<name>_Z')
+    for name in targets:
+        if targets.count(name) > 1:
+            row.fail(f'the target {name} is given twice')
+    return targets
+
+
+def _write_xmalab3d(path: Path, content: Content, settings: FileSettings) -> Written:
+    """Write points in space, with the column Frame."""
+    points = content.points
+    assert points is not None
+    mm, notes = settings.unit_or('mm', str(path))
+    columns = [f'{as_text(name)}_{axis}' for name in labels(content) for axis in 'XYZ']
+    write_frames(path, columns, points.frame, in_units(points.xyz_mm, mm))
+    return Written((str(path),), notes)
+
+
+XMALAB3D = Format(
+    'xmalab3d',
+    'XMALab 3-D points',
+    parts=('points',),
+    recognise=_is_xmalab3d,
+    read=_read_xmalab3d,
+    write=_write_xmalab3d,
+    looks_like='Frame,bead01_X,bead01_Y,bead01_Z',
+    says_units=False,
+)
+
+
+# TRC of Motion Analysis, as OpenSim reads it: points in space, at a constant rate.
+#
+# Header of five rows: PathFileType, names and values of DataRate, CameraRate, NumFrames,
+# NumMarkers, Units, OrigDataRate, OrigDataStartFrame, OrigNumFrames; names of the markers; X1 Y1
+# Z1 and so on. Then a row a frame: its number, time [s] and coordinates, between tabulators. Where
+# a marker is not seen, OpenSim writes and reads NaN; other programs leave the cell empty, which is
+# read, too. TRC has no residuals.
 
 _HEADER_ROWS = 5
 TAB = '\t'
@@ -43,12 +122,7 @@ _NAMES = (
 )
 
 
-def recognise(sample: Sample) -> bool:
-    """Return whether the first row is that of TRC."""
-    return bool(sample.lines) and sample.lines[0].startswith('PathFileType')
-
-
-def read(path: Path, settings: FileSettings) -> Content:
+def _read_trc(path: Path, settings: FileSettings) -> Content:
     """Read points in space. Raises DataError that names the row."""
     lines = read_text(path).splitlines()
     if len(lines) < _HEADER_ROWS or not lines[0].startswith('PathFileType'):
@@ -101,7 +175,7 @@ def _coordinates(row: Row, count: int) -> np.ndarray:
     return xyz
 
 
-def write(path: Path, content: Content, settings: FileSettings) -> Written:
+def _write_trc(path: Path, content: Content, settings: FileSettings) -> Written:
     """Write points in space. Raises DataError."""
     assert content.points is not None
     points = points_of(content.points, frames_of(path, [content.points], settings))
@@ -123,12 +197,12 @@ def write(path: Path, content: Content, settings: FileSettings) -> Written:
     return Written((str(path),), (f'{path}: TRC has no residuals',))
 
 
-FORMAT = Format(
+TRC = Format(
     'trc',
     'TRC',
     parts=('points',),
-    recognise=recognise,
-    read=read,
-    write=write,
+    recognise=lambda sample: sample.first.startswith('PathFileType'),
+    read=_read_trc,
+    write=_write_trc,
     looks_like='PathFileType  4  (X/Y/Z)',
 )

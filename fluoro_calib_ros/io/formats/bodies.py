@@ -1,0 +1,201 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Poses of rigid bodies: files of XMALab and Autoscoper, and poses.csv of the command bodies.
+
+XMALab: 16 columns a body, one row a frame, NaN without pose. The layout is that of
+`Trial::saveRigidBodyTransformations` of XMALab 2.2.7: the 4 x 4 matrix that takes points of the
+body (a bone's model) to the world, column after column (r11, r21, r31, 0, r12, and so on, t1, t2,
+t3, 1), which Maya reads as rows. XMALab calls its columns R11, R12, R13, 01, R21, and so on, TX,
+TY, TZ, 1; the column Frame need not be there. The unit is that of the calibration object, and the
+file does not say it.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from ...exposures.phantom import first_repeated
+from ...photogrammetry.rotations import matrix_from_quaternion
+from ..access import atomic_file
+from ..csv_table import as_text, read_all
+from ..poses import COLUMNS as POSE_COLUMNS
+from .content import (
+    Bodies,
+    Content,
+    FileSettings,
+    Format,
+    Written,
+    from_units,
+    homogeneous,
+)
+from .frames_of_points import NS, bodies_of, frames_of, rate_of
+from .text import Row, frame_numbers, joined, read_frames, require_width, write_frames
+
+COLUMNS = (
+    *('R11', 'R12', 'R13', '01', 'R21', 'R22', 'R23', '02', 'R31', 'R32', 'R33', '03'),
+    *('TX', 'TY', 'TZ', '1'),
+)
+_FIRST = re.compile(r'(?P<body>.+)_R11(?P<filter>_[\d.]+Hz)?')
+ROTATION_TOLERANCE = 1e-6  # rounding of 12 digits is far below
+LAST_TOLERANCE = 1e-9
+
+
+def _read_xmalab(path: Path, settings: FileSettings) -> Content:
+    """Read the poses of rigid bodies. Raises DataError."""
+    header, body, first = read_frames(path)
+    names = _bodies(header, first)
+    require_width(body, len(header.cells), 'the header')
+    mm = settings.unit_read(path)
+    frame = frame_numbers(body, first)
+    values = np.array([row.numbers_or_nan(first) for row in body])
+    matrices = values.reshape(len(body), len(names), 4, 4).transpose(0, 1, 3, 2)
+    for row, of_row in zip(body, matrices):
+        _check(row, of_row, names)
+    missing = np.isnan(matrices).any(axis=(2, 3))
+    rotation = matrices[..., :3, :3].copy()
+    translation = from_units(matrices[..., :3, 3], mm)
+    rotation[missing] = np.nan
+    translation[missing] = np.nan
+    return Content(bodies=Bodies(tuple(names), np.array(frame), rotation, translation))
+
+
+def _bodies(row: Row, first: int) -> list[str]:
+    """Return the names of the bodies of a header. Raises DataError."""
+    cells = row.cells[first:]
+    if len(cells) % len(COLUMNS):
+        row.fail(f'{len(cells)} columns, but a rigid body has {len(COLUMNS)}')
+    names = []
+    for start in range(0, len(cells), len(COLUMNS)):
+        match = _FIRST.fullmatch(cells[start])
+        if match is None:
+            row.fail(f'the column {cells[start]!r} is not <body>_R11')
+        expected = [f'{match["body"]}_{column}{match["filter"] or ""}' for column in COLUMNS]
+        given = cells[start : start + len(COLUMNS)]
+        for cell, name in zip(given, expected):
+            if cell != name:
+                row.fail(f'the column {cell!r} should be {name!r}')
+        names.append(match['body'] + (match['filter'] or ''))
+    return names
+
+
+def _check(row: Row, matrices: np.ndarray, names: list[str]) -> None:
+    """Raise DataError for a matrix (4, 4) that is not a pose."""
+    for name, matrix in zip(names, matrices):
+        if np.isnan(matrix).any():
+            continue
+        turn = matrix[:3, :3]
+        error = np.abs(turn @ turn.T - np.eye(3)).max()
+        if error > ROTATION_TOLERANCE or np.linalg.det(turn) < 0:
+            row.fail(f'the matrix of {name} is not a rotation')
+        if np.abs(matrix[3] - [0, 0, 0, 1]).max() > LAST_TOLERANCE:
+            row.fail(f'the columns 01, 02, 03 and 1 of {name} are not 0, 0, 0 and 1')
+
+
+def _write_xmalab(path: Path, content: Content, settings: FileSettings) -> Written:
+    """Write the poses of rigid bodies, with header and column Frame."""
+    bodies = content.bodies
+    assert bodies is not None
+    mm, notes = settings.unit_or('mm', str(path))
+    matrices = homogeneous(bodies, mm)
+    columns = [f'{as_text(name)}_{column}' for name in bodies.names for column in COLUMNS]
+    write_frames(path, columns, bodies.frame, matrices.transpose(0, 1, 3, 2))
+    return Written((str(path),), notes)
+
+
+RIGIDBODY = Format(
+    'rigidbody',
+    'XMALab rigid body transformations',
+    parts=('bodies',),
+    recognise=lambda sample: '_R11' in sample.first and '_TX' in sample.first,
+    read=_read_xmalab,
+    write=_write_xmalab,
+    looks_like='Frame,femur_R11,femur_R12,...,femur_TX,femur_TY,femur_TZ,femur_1',
+    says_units=False,
+)
+
+
+# Tracking files (.tra) of Autoscoper: a row a frame, 16 columns a body, NaN without pose.
+#
+# The layout is that of `save_tracking_results` of Autoscoper with its default options: matrices by
+# rows (r11, r12, r13, t1, r21, and so on, 0, 0, 0, 1), with commas, in mm, without header. Row 1
+# is the first frame. A matrix takes a volume to the world. Autoscoper places a volume by its first
+# voxel and its own axes, which are not those of the CT from which the markers of a body are.
+
+
+def _write_autoscoper(path: Path, content: Content, settings: FileSettings) -> Written:
+    """Write the poses of bodies, in all frames from the first to the last. Raises DataError."""
+    assert content.bodies is not None
+    mm, notes = settings.unit_or('mm', str(path))
+    frames = frames_of(path, [content.bodies], settings, needs_rate=False)
+    matrices = homogeneous(bodies_of(content.bodies, frames), mm)
+    with atomic_file(path, 'w') as file:
+        file.writelines(joined(of_frame.ravel()) + '\n' for of_frame in matrices)
+    order = f'{path}: row 1 is frame {frames.first}, bodies are {", ".join(content.bodies.names)}'
+    return Written((str(path),), (*notes, order))
+
+
+AUTOSCOPER = Format(
+    'autoscoper',
+    'Autoscoper tracking',
+    parts=('bodies',),
+    recognise=lambda sample: sample.suffix == '.tra',
+    read=None,
+    write=_write_autoscoper,
+    looks_like='rows of 16 numbers a body',
+    says_units=False,
+)
+
+
+# poses.csv of the command bodies, so that its poses go into the files of other programs.
+
+_POSES = POSE_COLUMNS[:10]  # the poses without standard deviations, as the truth has them
+NORM_TOLERANCE = 1e-6  # of a quaternion: rounding of nine digits is far below
+
+
+def _read_poses(path: Path, settings: FileSettings) -> Content:
+    """Read the poses of bodies. Raises DataError that names the row."""
+    rows = read_all(path, _POSES)
+    body = np.array(rows.strings('body'))
+    frame = rows.ids('exposure')
+    seconds, *columns = (rows.floats_or_nan(name) for name in _POSES[2:])
+    values = np.column_stack(columns)
+    for name, column in zip(_POSES[3:], columns):
+        rows.require(name, ~np.isinf(column), 'not a finite number')
+    names = list(dict.fromkeys(body.tolist()))
+    frames, row = np.unique(frame, return_inverse=True)
+    place = np.array([names.index(name) for name in body.tolist()])
+    repeated = first_repeated(row * len(names) + place)
+    if repeated is not None:
+        first, second = repeated
+        rows.fail(
+            second,
+            f'exposure {frame[second]} of {body[second]} is already given in row '
+            f'{rows.lines[first]}',
+        )
+    known = ~np.isnan(values).any(axis=1)
+    wrong = known & ~(np.abs(np.linalg.norm(values[:, 3:], axis=1) - 1) < NORM_TOLERANCE)
+    if wrong.any():
+        rows.fail(int(np.argmax(wrong)), 'the quaternion does not have length one')
+    shape = (len(frames), len(names), 3)
+    translation = np.full(shape, np.nan)
+    rotation = np.full((*shape, 3), np.nan)
+    at = row[known], place[known]
+    translation[at] = values[known, :3]
+    rotation[at] = matrix_from_quaternion(values[known][:, [6, 3, 4, 5]])
+    rate = rate_of(frame, seconds * NS)
+    return Content(bodies=Bodies(tuple(names), frames, rotation, translation, rate))
+
+
+POSES = Format(
+    'poses',
+    'poses of bodies, poses.csv of the command bodies',
+    parts=('bodies',),
+    recognise=lambda sample: sample.first.startswith(','.join(_POSES)),
+    read=_read_poses,
+    write=None,
+    looks_like=','.join(_POSES),
+)

@@ -1,0 +1,310 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Cameras as XMALab exports them: MayaCam 2.0, MayaCam 1.0 and DLT coefficients.
+
+MayaCam 2.0 is camera matrix, rotation and translation of one camera. The layout is that of
+`Camera::saveMayaCamVersion2` of XMALab 2.2.7 and `Camera::loadMayaCam2` of Autoscoper, which reads
+values by the number of the line: 1 `image size`, 2 width,height, 5 to 7 the camera matrix, 10 to
+12 the rotation, 15 to 17 the translation; comments and other blank lines are not allowed. Pixel
+centres are at integers from (0, 0), v downwards; X = R P + t. The unit of the translation is that
+of the calibration object (often mm), and the file does not say it. The camera is that of corrected
+images; XMALab may add a block `undistortion` with eight coefficients of OpenCV, which Autoscoper
+does not read.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from scipy.linalg import rq
+from scipy.spatial.transform import Rotation
+
+from ...errors import DataError
+from ..access import read_text, write_text
+from .content import (
+    Camera,
+    Content,
+    FileSettings,
+    Format,
+    Sample,
+    Written,
+    camera_at,
+    check_matrix,
+    check_rotation,
+    from_units,
+    in_units,
+    name_of_file,
+    refuse_distortion,
+    write_cameras,
+)
+from .text import Row, joined, number_text, read_table, require_width
+
+_MAYACAM2 = '_MayaCam2.txt'
+_TITLES = {1: 'image size', 4: 'camera matrix', 9: 'rotation', 14: 'translation'}
+_UNDISTORTION = 19  # line of its title
+_COEFFICIENTS = 8
+
+
+def _read_mayacam2(path: Path, settings: FileSettings) -> Content:
+    """Read a camera, which is called like the file. Raises DataError that names the line."""
+    lines = read_text(path).splitlines()
+    for number, title in _TITLES.items():
+        if _line(path, lines, number).strip() != title:
+            raise DataError(
+                f'{path}, row {number}: {_line(path, lines, number)[:40]!r} stands where MayaCam '
+                f'2.0 has the line {title!r}'
+            )
+    width, height = _numbers(path, lines, 2, 2)
+    if not (width > 0 and height > 0 and width == int(width) and height == int(height)):
+        raise DataError(f'{path}, row 2: {width:g} x {height:g} px is not an image size')
+    matrix = np.array([_numbers(path, lines, number, 3) for number in (5, 6, 7)])
+    rotation = np.array([_numbers(path, lines, number, 3) for number in (10, 11, 12)])
+    translation = np.array([_numbers(path, lines, number, 1)[0] for number in (15, 16, 17)])
+    check_matrix(f'{path}, row 5', matrix)
+    check_rotation(f'{path}, row 10', rotation)
+    distortion: tuple[float, ...] = ()
+    if len(lines) >= _UNDISTORTION and lines[_UNDISTORTION - 1].strip() == 'undistortion':
+        numbers = range(_UNDISTORTION + 1, _UNDISTORTION + 1 + _COEFFICIENTS)
+        distortion = tuple(_numbers(path, lines, number, 1)[0] for number in numbers)
+    camera = Camera(
+        name_of_file(path, _MAYACAM2),
+        matrix,
+        image_size=(int(width), int(height)),
+        rotation=rotation,
+        translation_mm=from_units(translation, settings.unit_read(path)),
+        distortion=distortion,
+    )
+    return Content(cameras=(camera,))
+
+
+def _line(path: Path, lines: list[str], number: int) -> str:
+    if number > len(lines):
+        raise DataError(f'{path}: the file ends at row {len(lines)}, MayaCam 2.0 has 17 rows')
+    return lines[number - 1]
+
+
+def _numbers(path: Path, lines: list[str], number: int, count: int) -> list[float]:
+    """Return the numbers of a line. Raises DataError for another count of them."""
+    cells = [cell.strip() for cell in _line(path, lines, number).split(',')]
+    row = Row(path, number, cells)
+    if len(cells) != count:
+        row.fail(f'{len(cells)} numbers, but MayaCam 2.0 has {count} here')
+    return row.numbers()
+
+
+def _write_mayacam2(path: Path, content: Content, settings: FileSettings) -> Written:
+    """Write a file <fluoroscope>_MayaCam2.txt for each camera into the folder path."""
+    mm, notes = settings.unit_or('mm', str(path))
+    paths = write_cameras(
+        path, content.cameras, _MAYACAM2, lambda camera: _mayacam2_text(camera, mm)
+    )
+    return Written(paths, notes)
+
+
+def _mayacam2_text(camera: Camera, mm: float) -> str:
+    rotation, translation = camera.pose
+    width, height = camera.size
+    lines = [
+        'image size',
+        f'{width},{height}',
+        '',
+        'camera matrix',
+        *map(joined, camera.matrix),
+        '',
+        'rotation',
+        *map(joined, rotation),
+        '',
+        'translation',
+        *map(number_text, in_units(translation, mm)),
+    ]
+    if camera.is_distorted:
+        padded = [*camera.distortion, *[0.0] * _COEFFICIENTS][:_COEFFICIENTS]
+        lines += ['', 'undistortion', *map(number_text, padded)]
+    return '\n'.join(lines) + '\n'
+
+
+MAYACAM2 = Format(
+    'mayacam2',
+    'MayaCam 2.0',
+    parts=('cameras',),
+    recognise=lambda sample: sample.first == 'image size',
+    read=_read_mayacam2,
+    write=_write_mayacam2,
+    looks_like='image size, 1024,1024, (blank), camera matrix, ...',
+    says_units=False,
+)
+
+
+# MayaCam 1.0: five rows of three numbers; read only.
+#
+# The layout is that of `Camera::getMayaCam` of XMALab 2.2.7 and `Camera::loadMayaCam1` of
+# Autoscoper: position of the source; angles x, y, z [degrees] of the camera's axes in the world,
+# turned about z, then y, then x; position of the film plane (derived, not read); principal point
+# u0, v0 and -c [px], counted from 1, v upwards; scale, width, height (0: 1024). The camera looks
+# along -z, y upwards. The unit is that of the calibration object, and the file does not say it.
+
+_MAYACAM1 = '_MayaCam.csv'
+_DEFAULT_SIZE = 1024
+_ROWS_MAYACAM1 = 5
+# x right, y up, z backwards -> x right, y down, z forwards.
+_AXES = np.diag([1.0, -1.0, -1.0])
+
+
+def _is_mayacam1(sample: Sample) -> bool:
+    """Return whether the file has just five rows of three numbers."""
+    if len(sample.lines) != _ROWS_MAYACAM1:
+        return False
+    try:
+        return all(len([float(c) for c in line.split(',')]) == 3 for line in sample.lines)
+    except ValueError:
+        return False
+
+
+def _read_mayacam1(path: Path, settings: FileSettings) -> Content:
+    """Read a camera, which is called like the file. Raises DataError that names the row."""
+    rows = read_table(path)
+    if len(rows) != _ROWS_MAYACAM1:
+        raise DataError(f'{path}: {len(rows)} rows, but MayaCam 1.0 has {_ROWS_MAYACAM1}')
+    require_width(rows, 3, 'MayaCam 1.0')
+    position, angles, _, (u0, v0, z), (_, width, height) = (row.numbers() for row in rows)
+    size = (_pixels(rows[4], width), _pixels(rows[4], height))
+    if not z:
+        rows[3].fail('the principal distance is 0')
+    # x, y, z of the camera in the world as columns: extrinsic rotations about x, y and z.
+    axes = Rotation.from_euler('xyz', angles, degrees=True).as_matrix()
+    matrix = np.array([[abs(z), 0, u0 - 1], [0, abs(z), size[1] - 1 - (v0 - 1)], [0, 0, 1]])
+    camera = camera_at(
+        name_of_file(path, _MAYACAM1),
+        matrix,
+        size,
+        (axes @ _AXES).T,
+        from_units(np.array(position), settings.unit_read(path)),
+    )
+    return Content(cameras=(camera,))
+
+
+def _pixels(row: Row, value: float) -> int:
+    if value < 0 or value != int(value):
+        row.fail(f'{value:g} px is not a side of an image')
+    return int(value) or _DEFAULT_SIZE
+
+
+MAYACAM1 = Format(
+    'mayacam1',
+    'MayaCam 1.0',
+    parts=('cameras',),
+    recognise=_is_mayacam1,
+    read=_read_mayacam1,
+    write=None,
+    looks_like='five rows of three numbers',
+    says_units=False,
+)
+
+
+# Eleven coefficients of the direct linear transformation, one column a camera.
+#
+# The layout is that of `Project::exportDLT` of XMALab 2.2.7, as DLTdv and Argus read it: eleven
+# rows L1 to L11, x = (L1 X + L2 Y + L3 Z + L4) / (L9 X + L10 Y + L11 Z + 1), y with L5 to L8
+# (Abdel-Aziz and Karara, 1971). x and y count from 1, y upwards; the image height turns them into
+# ours. The unit is that of the calibration object, and the file does not say it.
+
+_ROWS_DLT = 11
+
+
+def _is_dlt(sample: Sample) -> bool:
+    """Return whether the file has eleven rows of as many numbers."""
+    if len(sample.lines) != _ROWS_DLT:
+        return False
+    try:
+        widths = {len([float(cell) for cell in line.split(',')]) for line in sample.lines}
+    except ValueError:
+        return False
+    return len(widths) == 1
+
+
+def _read_dlt(path: Path, settings: FileSettings) -> Content:
+    """Read the cameras, which are called cam1, cam2, ... unless settings name them.
+
+    Raises DataError, also without the image size.
+    """
+    rows = read_table(path)
+    if len(rows) != _ROWS_DLT:
+        raise DataError(
+            f'{path}: {len(rows)} rows, but there are {_ROWS_DLT} coefficients of a DLT'
+        )
+    require_width(rows, len(rows[0].cells), 'the first row')
+    if settings.image_size is None:
+        raise DataError(
+            f'{path}: DLT coefficients do not contain the image size, --image-size WxH is needed'
+        )
+    mm = settings.unit_read(path)
+    columns = np.array([row.numbers() for row in rows]).T
+    names = settings.fluoroscopes
+    if len(names) != len(columns):
+        names = tuple(f'cam{number}' for number in range(1, len(columns) + 1))
+    cameras = []
+    for name, column in zip(names, columns):
+        try:
+            cameras.append(_dlt_camera(name, column, settings.image_size, mm))
+        except ValueError as error:
+            raise DataError(f'{path}, {name}: {error}') from None
+    return Content(cameras=tuple(cameras))
+
+
+def _file_pixels(size: tuple[int, int]) -> np.ndarray:
+    """Return the matrix (3, 3) from our homogeneous pixels to those of the file."""
+    return np.array([[1.0, 0, 1], [0, -1, size[1]], [0, 0, 1]])
+
+
+def _dlt_camera(name: str, coefficients: np.ndarray, size: tuple[int, int], mm: float) -> Camera:
+    """Return the camera of the coefficients (11,).
+
+    Source: Hartley and Zisserman, Multiple View Geometry, 2nd edition, section 6.2.4. Raises
+    ValueError for coefficients that are not of a camera.
+    """
+    projection = np.append(coefficients, 1.0).reshape(3, 4)
+    projection = np.linalg.inv(_file_pixels(size)) @ projection
+    if not np.linalg.det(projection[:, :3]):
+        raise ValueError('the coefficients are not those of a camera with a finite position')
+    position = -np.linalg.solve(projection[:, :3], projection[:, 3])
+    # Points before the camera have a positive depth where the determinant is positive.
+    upper, rotation = rq(projection[:, :3] * np.sign(np.linalg.det(projection[:, :3])))
+    signs = np.diag(np.sign(np.diag(upper)))
+    matrix = upper @ signs
+    rotation = signs @ rotation
+    matrix = matrix / matrix[2, 2]
+    return camera_at(name, matrix, size, rotation, position * mm)
+
+
+def _write_dlt(path: Path, content: Content, settings: FileSettings) -> Written:
+    """Write the coefficients of all cameras, in their order."""
+    mm, notes = settings.unit_or('mm', str(path))
+    columns = []
+    for camera in content.cameras:
+        refuse_distortion(path, camera, 'a DLT')
+        rotation, translation = camera.pose
+        pose = np.column_stack([rotation, translation / mm])
+        projection = _file_pixels(camera.size) @ camera.matrix @ pose
+        if not abs(projection[2, 3]) > 0:
+            raise DataError(
+                f'{path}: the origin lies in the plane of the source of {camera.name}, a DLT with '
+                'eleven coefficients does not exist'
+            )
+        columns.append((projection / projection[2, 3]).ravel()[:_ROWS_DLT])
+    write_text(path, '\n'.join(map(joined, np.array(columns).T)) + '\n')
+    order = ', '.join(camera.name for camera in content.cameras)
+    return Written((str(path),), (*notes, f'{path}: the columns are {order}'))
+
+
+DLT = Format(
+    'dlt',
+    'DLT coefficients',
+    parts=('cameras',),
+    recognise=_is_dlt,
+    read=_read_dlt,
+    write=_write_dlt,
+    looks_like='eleven rows of numbers',
+    says_units=False,
+)

@@ -34,8 +34,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
+from scipy.spatial.transform import Rotation
 
-from ..photogrammetry.rotations import left_jacobian, matrix_from_vector, vector_from_matrix
+from ..photogrammetry.rotations import left_jacobian
 
 STATE = 18
 POSE = slice(0, 6)
@@ -189,7 +190,7 @@ class MotionFilter:
         self._predicted = _Step(
             dt_s,
             into,
-            reference=matrix_from_vector(turn) @ self.rotation,
+            reference=into[:, 3:6, 3:6] @ self.rotation,
             mean=mean,
             covariance=covariance,
             z=np.zeros((count, 6)),
@@ -219,20 +220,19 @@ class MotionFilter:
         right = np.where(self.alive[:, None], seen.right, 0)
         difference = np.empty_like(right)
         difference[:, :3] = seen.centre_mm - step.mean[:, :3]
-        difference[:, 3:] = vector_from_matrix(seen.rotation @ np.swapaxes(step.reference, 1, 2))
+        turned = seen.rotation @ np.swapaxes(step.reference, 1, 2)
+        difference[:, 3:] = Rotation.from_matrix(turned).as_rotvec()
         right = right + (normal @ difference[:, :, None])[:, :, 0]
-        _weigh(step, normal, right)
-        for _ in range(ADAPTATIONS if adapt else 0):
-            if not self._adapt(step):
-                break
-            _weigh(step, normal, right)
+        _weigh(step, step.covariance[:, POSE, POSE], (normal, right))
+        if adapt:
+            self._adapt(step, (normal, right))
         gain = step.covariance[:, :, POSE]
         mean = step.mean + (gain @ step.z[:, :, None])[:, :, 0]
         covariance = step.covariance - gain @ step.m @ np.swapaxes(gain, 1, 2)
         if adapt:
             kept = _EYE_STATE - gain @ step.m @ _POSE_ROWS
             self._slope = kept[:, None] @ self._slope @ np.swapaxes(kept, 1, 2)[:, None]
-        self.rotation = matrix_from_vector(mean[:, 3:6]) @ step.reference
+        self.rotation = Rotation.from_rotvec(mean[:, 3:6]).as_matrix() @ step.reference
         mean[:, 3:6] = 0
         self.mean = mean
         self.covariance = (covariance + np.swapaxes(covariance, 1, 2)) / 2
@@ -262,8 +262,8 @@ class MotionFilter:
         self._log_variance[start] = START_LOG_SD**2
         self._slope[start] = 0
 
-    def _adapt(self, step: _Step) -> bool:
-        """Improve the log densities by the likelihood of an exposure; return whether they grew.
+    def _adapt(self, step: _Step, seen: tuple[np.ndarray, np.ndarray]) -> None:
+        """Improve the log densities by the likelihood of an exposure.
 
         With S the covariance of the prediction error and D its derivative by h, the derivative of
         the log likelihood is (e'S^-1 D S^-1 e - tr S^-1 D) / 2, its expected information
@@ -271,23 +271,27 @@ class MotionFilter:
         that itself does not depend on h). Here S^-1 e is z, and S^-1 is M. Where a density grows,
         the prediction was less sure than it seemed: its covariance grows with it.
         """
-        slope = self._slope[:, :, POSE, POSE]
-        z = step.z[:, None, :, None]
-        moved = step.m[:, None] @ slope
-        gradient = 0.5 * (
-            (np.swapaxes(z, 2, 3) @ slope @ z)[..., 0, 0] - np.trace(moved, axis1=2, axis2=3)
-        )
-        information = 0.5 * np.sum(moved * np.swapaxes(moved, 2, 3), axis=(2, 3))
-        variance = 1 / (1 / self._log_variance + information)
-        change = np.clip(variance * gradient, -MAX_STEP, MAX_STEP)
-        self.log_q = np.clip(self.log_q + change, *LOG_RANGE)
-        self._log_variance = variance
-        if not (change > ROUND_ENDS).any():
-            return False
-        more = np.maximum(np.expm1(change), 0)[:, :, None, None] * self._slope
-        step.covariance = step.covariance + more[:, 0] + more[:, 1]
-        self._slope = self._slope + more
-        return True
+        first = self._slope[:, :, POSE, POSE]
+        growth = np.ones(self.log_q.shape)  # of the derivatives
+        for _ in range(ADAPTATIONS):
+            slope = growth[:, :, None, None] * first
+            z = step.z[:, None, :, None]
+            moved = step.m[:, None] @ slope
+            expected = moved.trace(axis1=2, axis2=3)
+            gradient = 0.5 * ((np.swapaxes(z, 2, 3) @ slope @ z)[..., 0, 0] - expected)
+            information = 0.5 * (moved * np.swapaxes(moved, 2, 3)).sum(axis=(2, 3))
+            variance = 1 / (1 / self._log_variance + information)
+            change = np.clip(variance * gradient, -MAX_STEP, MAX_STEP)
+            self.log_q = np.clip(self.log_q + change, *LOG_RANGE)
+            self._log_variance = variance
+            if not (change > ROUND_ENDS).any():
+                break
+            growth = growth * np.maximum(np.exp(change), 1)
+            more = ((growth - 1)[:, :, None, None] * first).sum(axis=1)
+            _weigh(step, step.covariance[:, POSE, POSE] + more, seen)
+        grown = growth[:, :, None, None] * self._slope
+        step.covariance = step.covariance + (grown - self._slope).sum(axis=1)
+        self._slope = grown
 
     def smoothed(self) -> Motion:
         """Motion of the exposures that are kept, by all of them."""
@@ -303,9 +307,10 @@ class MotionFilter:
         )
 
 
-def _weigh(step: _Step, normal: np.ndarray, right: np.ndarray) -> None:
-    """Weigh an exposure (B, 6, 6), (B, 6) against its prediction."""
-    inner = np.linalg.inv(_EYE_6 + normal @ step.covariance[:, POSE, POSE])
+def _weigh(step: _Step, covariance: np.ndarray, seen: tuple[np.ndarray, np.ndarray]) -> None:
+    """Weigh an exposure (B, 6, 6), (B, 6) against the covariance (B, 6, 6) of its prediction."""
+    normal, right = seen
+    inner = np.linalg.inv(_EYE_6 + normal @ covariance)
     step.z = (inner @ right[:, :, None])[:, :, 0]
     m = inner @ normal
     step.m = (m + np.swapaxes(m, 1, 2)) / 2
@@ -351,7 +356,7 @@ def _smooth(steps: Sequence[_Step]) -> tuple[Motion, _Scores]:
         n[:, POSE, POSE] += step.m
         mean = step.mean + (step.covariance @ r[:, :, None])[:, :, 0]
         covariance = step.covariance - step.covariance @ n @ step.covariance
-        motion.rotation[k] = matrix_from_vector(mean[:, 3:6]) @ step.reference
+        motion.rotation[k] = Rotation.from_rotvec(mean[:, 3:6]).as_matrix() @ step.reference
         motion.centre_mm[k] = mean[:, :3]
         motion.velocity[k] = mean[:, 6:12]
         motion.acceleration[k] = mean[:, 12:]
@@ -459,7 +464,7 @@ def _transition(dt_s: float, turn: np.ndarray) -> np.ndarray:
     jacobian = left_jacobian(turn)
     out[:, 0:3, 6:9] = dt_s * _EYE_3
     out[:, 0:3, 12:15] = dt_s**2 / 2 * _EYE_3
-    out[:, 3:6, 3:6] = matrix_from_vector(turn)
+    out[:, 3:6, 3:6] = Rotation.from_rotvec(turn).as_matrix()
     out[:, 3:6, 9:12] = dt_s * jacobian
     out[:, 3:6, 15:18] = dt_s**2 / 2 * jacobian
     out[:, 6:12, 12:18] = dt_s * _EYE_6

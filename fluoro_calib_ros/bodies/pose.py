@@ -177,8 +177,9 @@ class PoseSolver:
         self._variance_3 = self.variance[..., None, None]
         self.cameras = Cameras(orientation, self.target_id)
         # Of each element of a step, how much of it the next one is about.
-        far = np.linalg.norm(orientation.position_mm - orientation.position_mm.mean(axis=0), axis=1)
-        self._share_left = np.repeat([1 / max(far.max(), 1.0), 1.0], 3)
+        source = orientation.position_mm
+        far = np.linalg.norm(source - source.mean(axis=0), axis=1).max()
+        self._share_left = np.repeat([1 / max(far, 1.0), 1.0], 3)
         tail = erfc(reject / np.sqrt(2))
         freedom = np.arange(max(2 * len(orientation.fluoroscopes), 3) + 1)
         self._limit = np.where(freedom > 0, chdtri(np.maximum(freedom, 1), tail), np.inf)
@@ -500,12 +501,12 @@ def _weighted(linear: Linear, weight: np.ndarray) -> np.ndarray:
 
 
 def _vectors(weighted: np.ndarray, residual: np.ndarray) -> np.ndarray:
-    """s (B, M, 3) of markers."""
+    """Vectors s (B, M, 3) of markers."""
     return (weighted @ residual.reshape(*weighted.shape[:2], -1, 1))[..., 0]
 
 
 def _squares(linear: Linear, weight: np.ndarray) -> np.ndarray:
-    """r'Wr (B, M) of markers."""
+    """Sums r'Wr (B, M) of markers."""
     return ((linear.residual**2).sum(axis=-1) * weight).sum(axis=-1)
 
 

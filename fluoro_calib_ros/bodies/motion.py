@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 from scipy.spatial.transform import Rotation
 
-from ..photogrammetry.rotations import left_jacobian
+from ..photogrammetry.rotations import left_jacobian, vector_from_matrix
 
 STATE = 18
 POSE = slice(0, 6)
@@ -54,6 +54,7 @@ WALK = 90.0
 MAX_ROUNDS = 12
 ROUND_ENDS = 0.1  # largest change of h in a round; it changes a standard deviation by 1 %
 MAX_STEP = 2.5  # of h in a round
+LOST_DIGITS = 1e-9  # of a variance, where the difference keeps too few of sixteen digits
 ADAPTATIONS = 4  # rounds of h in an exposure, live
 LOG_RANGE = (-20.0, 50.0)
 
@@ -221,7 +222,7 @@ class MotionFilter:
         difference = np.empty_like(right)
         difference[:, :3] = seen.centre_mm - step.mean[:, :3]
         turned = seen.rotation @ np.swapaxes(step.reference, 1, 2)
-        difference[:, 3:] = Rotation.from_matrix(turned).as_rotvec()
+        difference[:, 3:] = vector_from_matrix(turned)
         right = right + (normal @ difference[:, :, None])[:, :, 0]
         _weigh(step, step.covariance[:, POSE, POSE], (normal, right))
         if adapt:
@@ -355,7 +356,7 @@ def _smooth(steps: Sequence[_Step]) -> tuple[Motion, _Scores]:
         r[:, POSE] += step.z
         n[:, POSE, POSE] += step.m
         mean = step.mean + (step.covariance @ r[:, :, None])[:, :, 0]
-        covariance = step.covariance - step.covariance @ n @ step.covariance
+        covariance = _smoothed_covariance(step.covariance, n)
         motion.rotation[k] = Rotation.from_rotvec(mean[:, 3:6]).as_matrix() @ step.reference
         motion.centre_mm[k] = mean[:, :3]
         motion.velocity[k] = mean[:, 6:12]
@@ -374,6 +375,24 @@ def _smooth(steps: Sequence[_Step]) -> tuple[Motion, _Scores]:
         array[~seen] = np.nan
     motion.covariance[~seen] = np.nan
     return motion, scores
+
+
+def _smoothed_covariance(covariance: np.ndarray, n: np.ndarray) -> np.ndarray:
+    """P - P N P (B, 18, 18).
+
+    Where a body appears, variances fall by twelve digits, which the difference loses. There it is
+    L (I - L'NL) L' with P = LL', whose eigenvalues have to be positive.
+    """
+    out = covariance - covariance @ n @ covariance
+    left, whole = (np.diagonal(each, axis1=1, axis2=2) for each in (out, covariance))
+    lost = np.flatnonzero((left < LOST_DIGITS * whole).any(axis=1))
+    if len(lost):
+        scale = np.sqrt(np.diagonal(covariance[lost], axis1=1, axis2=2))[:, :, None]
+        root = scale * np.linalg.cholesky(covariance[lost] / (scale * np.swapaxes(scale, 1, 2)))
+        values, vectors = np.linalg.eigh(_EYE_STATE - np.swapaxes(root, 1, 2) @ n[lost] @ root)
+        root = root @ vectors * np.sqrt(np.maximum(values, 0))[:, None]
+        out[lost] = root @ np.swapaxes(root, 1, 2)
+    return out
 
 
 def smooth_trial(first: MotionFilter, seen: Sequence[PoseInformation]) -> Motion:

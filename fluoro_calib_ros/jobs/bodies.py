@@ -6,11 +6,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from ..bodies.body import Body, BodyPoses, check_bodies, solvable_bodies
+from ..bodies.body import STATUS_NAMES, Body, BodyPoses, check_bodies, solvable_bodies
 from ..bodies.butterworth import filtered_poses
 from ..bodies.joints import JointMotion, joint_motion, with_neutral
 from ..bodies.shapes import EstimatedShape, estimate_shape, places_of
@@ -30,6 +31,7 @@ from ..reconstruction.reconstruct import IntersectedViews, intersect_frames, pai
 SMOOTH = ('auto', 'none', 'lag', 'butterworth')
 SHAPE_EXPOSURES = 600  # of a recording that shapes are estimated from, evenly spread
 NS_PER_S = 1_000_000_000
+EVERY_EXPOSURE = (0, 2**63 - 1)
 
 
 @dataclass(frozen=True)
@@ -95,6 +97,32 @@ class BodiesOutcome:
         """The bodies with their estimated shapes."""
         return tuple(shape.body for shape in self.shapes)
 
+    def summary(self) -> dict[str, Any]:
+        """How well bodies and joints are known: medians of standard deviations."""
+        bodies: dict[str, Any] = {}
+        for poses, shape in zip(self.poses, self.shapes):
+            known = poses.known
+            sd = np.median(poses.sd[known], axis=0) if known.any() else np.full(6, np.nan)
+            status, count = np.unique(poses.status, return_counts=True)
+            bodies[poses.body] = {
+                'poses': int(np.count_nonzero(known)),
+                'status': {STATUS_NAMES[s]: int(n) for s, n in zip(status, count)},
+                'sd_mm': float(np.sqrt(np.mean(sd[:3] ** 2))),
+                'sd_deg': float(np.degrees(np.sqrt(np.mean(sd[3:] ** 2)))),
+                'condition_per_m': shape.condition,
+                'mean_error_mm': shape.mean_error_mm,
+            }
+        joints = {}
+        for motion in self.joints:
+            angles = np.degrees(motion.angles[np.isfinite(motion.angles).all(axis=1)])
+            span = np.ptp(angles, axis=0) if len(angles) else np.full(3, np.nan)
+            sd = np.degrees(np.nanmedian(motion.sd[:, :3], axis=0))
+            joints[motion.joint.name] = {
+                name: {'range_deg': float(a), 'sd_deg': float(s)}
+                for name, a, s in zip(motion.angle_names, span, sd)
+            }
+        return {'bodies': bodies, 'joints': joints}
+
 
 def track_bodies(
     frames: Mapping[str, Sequence[Frame]],
@@ -104,6 +132,8 @@ def track_bodies(
     joints: Sequence[JointEntry] = (),
     options: BodiesOptions | None = None,
     progress: Callable[[int, int], None] | None = None,
+    *,
+    neutral: Mapping[str, Sequence[Frame]] | None = None,
 ) -> BodiesOutcome:
     """Find the poses of bodies and the motion of joints in a recording of observed image points.
 
@@ -119,6 +149,8 @@ def track_bodies(
     options : BodiesOptions, optional
     progress : callable, optional
         Called with the number of exposures that are solved, and of all.
+    neutral : mapping of str to sequence of Frame, optional
+        Another recording with all joints in neutral position, in place of theirs.
 
     Returns
     -------
@@ -147,6 +179,10 @@ def track_bodies(
             progress(count, len(exposures))
     tracked = tracker.smoothed() if lag is None else tracked + tracker.flush()
     poses = _poses(usable, tracked, options)
+    at_rest = []
+    if neutral is not None:
+        at_rest = _poses_alone(neutral, calibrations, orientation, usable, options)
+        joints = [replace(one, neutral=EVERY_EXPOSURE) for one in joints]
     findings = [finding for shape in shapes for finding in shape.findings]
     named = {one.place for one in findings if one.kind is Kind.BODY_UNSEEN}
     unseen = [_unseen(one) for one in poses if not one.known.any()]
@@ -155,7 +191,7 @@ def track_bodies(
         tuple(shapes),
         tracked,
         poses=poses,
-        joints=_joints(joints, poses),
+        joints=_joints(joints, poses, at_rest or poses),
         unpaired=unpaired,
         findings=tuple(findings),
     )
@@ -229,9 +265,9 @@ def _split(exposure: IntersectedViews) -> dict[str, np.ndarray]:
     views = exposure.views
     points = exposure.points
     good = np.isin(points.status, (OK, OUTSIDE))
-    with np.errstate(invalid='ignore'):
-        share = np.nanmean((views.correction_sd / views.sigma) ** 2, axis=0, where=good)
-    share = np.where(good, np.clip(share, 0.0, 0.99), 0.0)[:, None, None]
+    seen = np.isfinite(views.sigma) & good
+    share = np.where(seen, (views.correction_sd / views.sigma) ** 2, 0.0).sum(axis=0)
+    share = np.clip(share / np.maximum(seen.sum(axis=0), 1), 0.0, 0.99)[:, None, None]
     covariance = points.covariance_noise
     return {
         'xyz_mm': np.where(good[:, None], points.xyz_mm, np.nan),
@@ -252,9 +288,26 @@ def _poses(
     return [filtered_poses(poses, options.cutoff) for poses in alone]
 
 
-def _joints(requests: Sequence[JointEntry], poses: Sequence[BodyPoses]) -> list[JointMotion]:
-    """Motion of joints, with their neutral position. Raises DataError."""
+def _poses_alone(
+    frames: Mapping[str, Sequence[Frame]],
+    calibrations: Mapping[str, FluoroscopeCalibration],
+    orientation: RigOrientation,
+    bodies: Sequence[Body],
+    options: BodiesOptions,
+) -> list[BodyPoses]:
+    """Poses that the exposures of another recording give alone. Raises DataError."""
+    exposures, _ = _intersected(frames, calibrations, orientation, options)
+    tracker = BodyTracker(orientation, bodies, options.reject)
+    tracked = [tracker.add(one.views, one.number, one.stamp_ns) for one in exposures]
+    return poses_alone(bodies, [one for one in tracked if one is not None])
+
+
+def _joints(
+    requests: Sequence[JointEntry], poses: Sequence[BodyPoses], at_rest: Sequence[BodyPoses]
+) -> list[JointMotion]:
+    """Motion of joints, with their neutral position by the poses at rest. Raises DataError."""
     by_name = {one.body: one for one in poses}
+    neutral = {one.body: one for one in at_rest}
     out = []
     for request in requests:
         joint = request.joint
@@ -262,8 +315,9 @@ def _joints(requests: Sequence[JointEntry], poses: Sequence[BodyPoses]) -> list[
         distal = by_name[joint.distal]
         if request.neutral is not None:
             first, last = request.neutral
-            rows = (proximal.number >= first) & (proximal.number <= last)
-            joint = with_neutral(joint, proximal.rows(rows), distal.rows(rows))
+            both = neutral[joint.proximal], neutral[joint.distal]
+            rows = (both[0].number >= first) & (both[0].number <= last)
+            joint = with_neutral(joint, both[0].rows(rows), both[1].rows(rows))
         out.append(joint_motion(joint, proximal, distal))
     return out
 

@@ -12,6 +12,7 @@ section of docs/how_good.md: python -m benchmarks.bodies
 from __future__ import annotations
 
 import argparse
+import textwrap
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -515,9 +516,6 @@ the others. Live: without lag.
 
 {motions}
 
-A smoother with white jerk of the true density, which nobody knows, has 0.64 and 0.70 in place of
-the figures of the reach without losses.
-
 {jumps}
 
 Angles of a Cardan joint by their distance from gimbal lock, of single exposures:
@@ -564,7 +562,7 @@ def main() -> None:
         single=single,
         flag=flag,
         motions=of_motion,
-        jumps=of_jumps,
+        jumps=textwrap.fill(of_jumps, width=99),
         joints=of_joints,
         cost=cost(),
     )

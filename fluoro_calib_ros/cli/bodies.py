@@ -121,6 +121,7 @@ def run(arguments: argparse.Namespace) -> None:
         pair_tolerance=arguments.pair_tolerance,
         estimate_shapes=not arguments.keep_shapes,
         rate=arguments.rate,
+        neutral=neutral,
     )
     try:
         with ProgressBar('exposures') as bar:
@@ -132,7 +133,6 @@ def run(arguments: argparse.Namespace) -> None:
                 joints=joints,
                 options=options,
                 progress=bar,
-                neutral=neutral,
             )
     except DataError as error:
         raise error.at(arguments.source) from None

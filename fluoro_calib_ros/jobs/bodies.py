@@ -36,7 +36,11 @@ EVERY_EXPOSURE = (0, 2**63 - 1)
 
 @dataclass(frozen=True)
 class BodiesOptions:
-    """Options of poses and joints. Raises ValueError for a value that an option cannot have."""
+    """Options of poses and joints. Raises ValueError for a value that an option cannot have.
+
+    neutral: frames by fluoroscope of another recording with all joints in neutral position, in
+    place of the exposures that the joints name.
+    """
 
     smooth: str = option(
         'auto',
@@ -63,6 +67,7 @@ class BodiesOptions:
     pair_tolerance: float = PairingOptions.tolerance_s
     estimate_shapes: bool = True
     rate: float | None = None
+    neutral: Mapping[str, Sequence[Frame]] | None = None
 
     def __post_init__(self) -> None:
         validate_options(self)
@@ -132,8 +137,6 @@ def track_bodies(
     joints: Sequence[JointEntry] = (),
     options: BodiesOptions | None = None,
     progress: Callable[[int, int], None] | None = None,
-    *,
-    neutral: Mapping[str, Sequence[Frame]] | None = None,
 ) -> BodiesOutcome:
     """Find the poses of bodies and the motion of joints in a recording of observed image points.
 
@@ -149,8 +152,6 @@ def track_bodies(
     options : BodiesOptions, optional
     progress : callable, optional
         Called with the number of exposures that are solved, and of all.
-    neutral : mapping of str to sequence of Frame, optional
-        Another recording with all joints in neutral position, in place of theirs.
 
     Returns
     -------
@@ -180,8 +181,8 @@ def track_bodies(
     tracked = tracker.smoothed() if lag is None else tracked + tracker.flush()
     poses = _poses(usable, tracked, options)
     at_rest = []
-    if neutral is not None:
-        at_rest = _poses_alone(neutral, calibrations, orientation, usable, options)
+    if options.neutral is not None:
+        at_rest = _poses_alone(options.neutral, calibrations, orientation, usable, options)
         joints = [replace(one, neutral=EVERY_EXPOSURE) for one in joints]
     findings = [finding for shape in shapes for finding in shape.findings]
     named = {one.place for one in findings if one.kind is Kind.BODY_UNSEEN}

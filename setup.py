@@ -23,7 +23,7 @@ setup(
     packages=find_packages(include=[package_name, package_name + '.*']),
     package_data={
         package_name + '.io.bags': ['msg/*.msg'],
-        package_name + '.report': ['templates/*.html'],
+        package_name + '.report': ['templates/*'],
     },
     data_files=[
         ('share/ament_index/resource_index/packages', ['resource/' + package_name]),

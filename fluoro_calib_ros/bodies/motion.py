@@ -34,8 +34,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
+from scipy.spatial.transform import Rotation
 
-from ..photogrammetry.rotations import left_jacobian, matrix_from_vector, vector_from_matrix
+from ..photogrammetry.rotations import left_jacobian, vector_from_matrix
 
 STATE = 18
 POSE = slice(0, 6)
@@ -53,6 +54,7 @@ WALK = 90.0
 MAX_ROUNDS = 12
 ROUND_ENDS = 0.1  # largest change of h in a round; it changes a standard deviation by 1 %
 MAX_STEP = 2.5  # of h in a round
+LOST_DIGITS = 1e-9  # of a variance, where the difference keeps too few of sixteen digits
 ADAPTATIONS = 4  # rounds of h in an exposure, live
 LOG_RANGE = (-20.0, 50.0)
 
@@ -189,7 +191,7 @@ class MotionFilter:
         self._predicted = _Step(
             dt_s,
             into,
-            reference=matrix_from_vector(turn) @ self.rotation,
+            reference=into[:, 3:6, 3:6] @ self.rotation,
             mean=mean,
             covariance=covariance,
             z=np.zeros((count, 6)),
@@ -219,20 +221,19 @@ class MotionFilter:
         right = np.where(self.alive[:, None], seen.right, 0)
         difference = np.empty_like(right)
         difference[:, :3] = seen.centre_mm - step.mean[:, :3]
-        difference[:, 3:] = vector_from_matrix(seen.rotation @ np.swapaxes(step.reference, 1, 2))
+        turned = seen.rotation @ np.swapaxes(step.reference, 1, 2)
+        difference[:, 3:] = vector_from_matrix(turned)
         right = right + (normal @ difference[:, :, None])[:, :, 0]
-        _weigh(step, normal, right)
-        for _ in range(ADAPTATIONS if adapt else 0):
-            if not self._adapt(step):
-                break
-            _weigh(step, normal, right)
+        _weigh(step, step.covariance[:, POSE, POSE], (normal, right))
+        if adapt:
+            self._adapt(step, (normal, right))
         gain = step.covariance[:, :, POSE]
         mean = step.mean + (gain @ step.z[:, :, None])[:, :, 0]
         covariance = step.covariance - gain @ step.m @ np.swapaxes(gain, 1, 2)
         if adapt:
             kept = _EYE_STATE - gain @ step.m @ _POSE_ROWS
             self._slope = kept[:, None] @ self._slope @ np.swapaxes(kept, 1, 2)[:, None]
-        self.rotation = matrix_from_vector(mean[:, 3:6]) @ step.reference
+        self.rotation = Rotation.from_rotvec(mean[:, 3:6]).as_matrix() @ step.reference
         mean[:, 3:6] = 0
         self.mean = mean
         self.covariance = (covariance + np.swapaxes(covariance, 1, 2)) / 2
@@ -262,8 +263,8 @@ class MotionFilter:
         self._log_variance[start] = START_LOG_SD**2
         self._slope[start] = 0
 
-    def _adapt(self, step: _Step) -> bool:
-        """Improve the log densities by the likelihood of an exposure; return whether they grew.
+    def _adapt(self, step: _Step, seen: tuple[np.ndarray, np.ndarray]) -> None:
+        """Improve the log densities by the likelihood of an exposure.
 
         With S the covariance of the prediction error and D its derivative by h, the derivative of
         the log likelihood is (e'S^-1 D S^-1 e - tr S^-1 D) / 2, its expected information
@@ -271,23 +272,27 @@ class MotionFilter:
         that itself does not depend on h). Here S^-1 e is z, and S^-1 is M. Where a density grows,
         the prediction was less sure than it seemed: its covariance grows with it.
         """
-        slope = self._slope[:, :, POSE, POSE]
-        z = step.z[:, None, :, None]
-        moved = step.m[:, None] @ slope
-        gradient = 0.5 * (
-            (np.swapaxes(z, 2, 3) @ slope @ z)[..., 0, 0] - np.trace(moved, axis1=2, axis2=3)
-        )
-        information = 0.5 * np.sum(moved * np.swapaxes(moved, 2, 3), axis=(2, 3))
-        variance = 1 / (1 / self._log_variance + information)
-        change = np.clip(variance * gradient, -MAX_STEP, MAX_STEP)
-        self.log_q = np.clip(self.log_q + change, *LOG_RANGE)
-        self._log_variance = variance
-        if not (change > ROUND_ENDS).any():
-            return False
-        more = np.maximum(np.expm1(change), 0)[:, :, None, None] * self._slope
-        step.covariance = step.covariance + more[:, 0] + more[:, 1]
-        self._slope = self._slope + more
-        return True
+        first = self._slope[:, :, POSE, POSE]
+        growth = np.ones(self.log_q.shape)  # of the derivatives
+        for _ in range(ADAPTATIONS):
+            slope = growth[:, :, None, None] * first
+            z = step.z[:, None, :, None]
+            moved = step.m[:, None] @ slope
+            expected = moved.trace(axis1=2, axis2=3)
+            gradient = 0.5 * ((np.swapaxes(z, 2, 3) @ slope @ z)[..., 0, 0] - expected)
+            information = 0.5 * (moved * np.swapaxes(moved, 2, 3)).sum(axis=(2, 3))
+            variance = 1 / (1 / self._log_variance + information)
+            change = np.clip(variance * gradient, -MAX_STEP, MAX_STEP)
+            self.log_q = np.clip(self.log_q + change, *LOG_RANGE)
+            self._log_variance = variance
+            if not (change > ROUND_ENDS).any():
+                break
+            growth = growth * np.maximum(np.exp(change), 1)
+            more = ((growth - 1)[:, :, None, None] * first).sum(axis=1)
+            _weigh(step, step.covariance[:, POSE, POSE] + more, seen)
+        grown = growth[:, :, None, None] * self._slope
+        step.covariance = step.covariance + (grown - self._slope).sum(axis=1)
+        self._slope = grown
 
     def smoothed(self) -> Motion:
         """Motion of the exposures that are kept, by all of them."""
@@ -303,9 +308,10 @@ class MotionFilter:
         )
 
 
-def _weigh(step: _Step, normal: np.ndarray, right: np.ndarray) -> None:
-    """Weigh an exposure (B, 6, 6), (B, 6) against its prediction."""
-    inner = np.linalg.inv(_EYE_6 + normal @ step.covariance[:, POSE, POSE])
+def _weigh(step: _Step, covariance: np.ndarray, seen: tuple[np.ndarray, np.ndarray]) -> None:
+    """Weigh an exposure (B, 6, 6), (B, 6) against the covariance (B, 6, 6) of its prediction."""
+    normal, right = seen
+    inner = np.linalg.inv(_EYE_6 + normal @ covariance)
     step.z = (inner @ right[:, :, None])[:, :, 0]
     m = inner @ normal
     step.m = (m + np.swapaxes(m, 1, 2)) / 2
@@ -350,8 +356,8 @@ def _smooth(steps: Sequence[_Step]) -> tuple[Motion, _Scores]:
         r[:, POSE] += step.z
         n[:, POSE, POSE] += step.m
         mean = step.mean + (step.covariance @ r[:, :, None])[:, :, 0]
-        covariance = step.covariance - step.covariance @ n @ step.covariance
-        motion.rotation[k] = matrix_from_vector(mean[:, 3:6]) @ step.reference
+        covariance = _smoothed_covariance(step.covariance, n)
+        motion.rotation[k] = Rotation.from_rotvec(mean[:, 3:6]).as_matrix() @ step.reference
         motion.centre_mm[k] = mean[:, :3]
         motion.velocity[k] = mean[:, 6:12]
         motion.acceleration[k] = mean[:, 12:]
@@ -369,6 +375,24 @@ def _smooth(steps: Sequence[_Step]) -> tuple[Motion, _Scores]:
         array[~seen] = np.nan
     motion.covariance[~seen] = np.nan
     return motion, scores
+
+
+def _smoothed_covariance(covariance: np.ndarray, n: np.ndarray) -> np.ndarray:
+    """P - P N P (B, 18, 18).
+
+    Where a body appears, variances fall by twelve digits, which the difference loses. There it is
+    L (I - L'NL) L' with P = LL', whose eigenvalues have to be positive.
+    """
+    out = covariance - covariance @ n @ covariance
+    left, whole = (np.diagonal(each, axis1=1, axis2=2) for each in (out, covariance))
+    lost = np.flatnonzero((left < LOST_DIGITS * whole).any(axis=1))
+    if len(lost):
+        scale = np.sqrt(np.diagonal(covariance[lost], axis1=1, axis2=2))[:, :, None]
+        root = scale * np.linalg.cholesky(covariance[lost] / (scale * np.swapaxes(scale, 1, 2)))
+        values, vectors = np.linalg.eigh(_EYE_STATE - np.swapaxes(root, 1, 2) @ n[lost] @ root)
+        root = root @ vectors * np.sqrt(np.maximum(values, 0))[:, None]
+        out[lost] = root @ np.swapaxes(root, 1, 2)
+    return out
 
 
 def smooth_trial(first: MotionFilter, seen: Sequence[PoseInformation]) -> Motion:
@@ -422,7 +446,10 @@ def _improved(
         pull = prior * np.diff(h)
         right[:-1] += pull
         right[1:] -= pull
-        step = np.clip(solveh_banded(banded, right), -MAX_STEP, MAX_STEP)
+        step = solveh_banded(banded, right)
+        # At rest the likelihood hardly depends on h any more; a step down is taken in q.
+        step = np.where(step < 0, np.log1p(np.maximum(step, -0.99)), step)
+        step = np.clip(step, -MAX_STEP, MAX_STEP)
         out[:, body, kind] = np.clip(h + step, *LOG_RANGE)
         largest = max(largest, float(np.abs(step).max()))
         spread = _variance_of_steps(banded)
@@ -459,7 +486,7 @@ def _transition(dt_s: float, turn: np.ndarray) -> np.ndarray:
     jacobian = left_jacobian(turn)
     out[:, 0:3, 6:9] = dt_s * _EYE_3
     out[:, 0:3, 12:15] = dt_s**2 / 2 * _EYE_3
-    out[:, 3:6, 3:6] = matrix_from_vector(turn)
+    out[:, 3:6, 3:6] = Rotation.from_rotvec(turn).as_matrix()
     out[:, 3:6, 9:12] = dt_s * jacobian
     out[:, 3:6, 15:18] = dt_s**2 / 2 * jacobian
     out[:, 6:12, 12:18] = dt_s * _EYE_6

@@ -30,10 +30,11 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from scipy.special import chdtri, erfc
 
 from ..photogrammetry.rig_orientation import RigOrientation
-from ..photogrammetry.rotations import matrix_from_vector, vector_from_matrix
+from ..photogrammetry.rotations import vector_from_matrix
 from ..reconstruction.reconstruct import IntersectedViews
 from .body import POSE_SIZE, Body
 from .image_points import Cameras, ImagePoints, Linear
@@ -41,9 +42,9 @@ from .motion import PoseInformation
 from .rigid import fitted_pose
 
 MAX_STEPS = 8
-# Square of a step in standard deviations after which the iteration ends: what remains after a
-# Gauss-Newton step is far smaller.
-LAST_STEP = 1e-3
+# Square of the next step in standard deviations below which the iteration ends. A step of
+# Gauss-Newton leaves a share of about its own rotation, and of its shift over the distance.
+LAST_STEP = 1e-4  # a hundredth of a standard deviation
 # Rotation [rad] up to which derivatives hold: what they neglect of a marker's place is half of its
 # square, 0.1 % of the distance from the centre.
 LINEAR_RAD = 0.05
@@ -129,7 +130,7 @@ class _Marker:
 
 @dataclass(frozen=True)
 class _Solution:
-    """Poses of B bodies, whether (B,) the exposure alone gives them, and their normal matrices.
+    """Poses of B bodies, whether (B,) the exposure alone gives them, parts of normal matrices.
 
     prior (B, 6, 6): normal matrices of the predictions; away (B, 6): from pose to prediction.
     """
@@ -137,7 +138,7 @@ class _Solution:
     rotation: np.ndarray
     centre: np.ndarray
     alone: np.ndarray
-    normal: np.ndarray
+    parts: _Eigen
     linear: Linear
     marker: _Marker
     prior: np.ndarray
@@ -175,6 +176,10 @@ class PoseSolver:
             self.variance[row, :count] = body.sd_mm**2
         self._variance_3 = self.variance[..., None, None]
         self.cameras = Cameras(orientation, self.target_id)
+        # Of each element of a step, how much of it the next one is about.
+        source = orientation.position_mm
+        far = np.linalg.norm(source - source.mean(axis=0), axis=1).max()
+        self._share_left = np.repeat([1 / max(far, 1.0), 1.0], 3)
         tail = erfc(reject / np.sqrt(2))
         freedom = np.arange(max(2 * len(orientation.fluoroscopes), 3) + 1)
         self._limit = np.where(freedom > 0, chdtri(np.maximum(freedom, 1), tail), np.inf)
@@ -246,6 +251,8 @@ class PoseSolver:
         rotation = np.where(prediction.known[:, None, None], prediction.rotation, np.eye(3))
         centre = np.where(prediction.known[:, None], prediction.centre_mm, 0.0)
         started = prediction.known.copy()
+        if started.all():
+            return rotation, centre, started
         xyz = self.cameras.places(exposure)
         seen = np.isfinite(xyz).all(axis=2) & (points.seen.sum(axis=2) > 1)
         missing = np.flatnonzero(~started & (np.count_nonzero(seen, axis=1) >= 3))
@@ -286,18 +293,25 @@ class PoseSolver:
                 parts = _eigen(normal)
             step = _solved(parts, right)
             centre = centre + step[:, :3]
-            rotation = matrix_from_vector(step[:, 3:]) @ rotation
-            if not (np.sum(step * right, axis=1) > LAST_STEP).any():
+            rotation = Rotation.from_rotvec(step[:, 3:]).as_matrix() @ rotation
+            left = ((step * self._share_left) ** 2).sum(axis=1)
+            if not (left * (step * right).sum(axis=1) > LAST_STEP).any():
                 break
         # The derivatives hold; only the residuals change by the last step.
         moved = (linear.by_pose @ step[:, None, :, None])[:, :, None]
         linear = replace(linear, residual=linear.residual - (linear.by_place @ moved)[..., 0])
-        marker = self._marker(linear, weight)
+        s_vector = _vectors(_weighted(linear, weight), linear.residual)
+        marker = replace(
+            marker,
+            s_vector=s_vector,
+            squares=_squares(linear, weight),
+            ms_vector=(marker.m @ s_vector[..., None])[..., 0],
+        )
         return _Solution(
             rotation,
             centre,
             alone,
-            normal=normal,
+            parts=parts,
             linear=linear,
             marker=marker,
             prior=prior,
@@ -307,13 +321,12 @@ class PoseSolver:
     def _marker(self, linear: Linear, weight: np.ndarray) -> _Marker:
         """Sum up the image points of each marker with weights (B, M, F)."""
         s_matrix, s_vector = marker_sums(linear, weight)
-        squares = np.sum(np.sum(linear.residual**2, axis=-1) * weight, axis=-1)
         m = np.linalg.inv(_EYE_3 + self._variance_3 * s_matrix)
         return _Marker(
             weight,
             s_matrix,
             s_vector,
-            squares,
+            _squares(linear, weight),
             m,
             ms_matrix=m @ s_matrix,
             ms_vector=(m @ s_vector[..., None])[..., 0],
@@ -335,16 +348,17 @@ class PoseSolver:
         # Markers are compared with each other. A prediction that they contradict is no reason to
         # reject them: the body may have been hit.
         normal = by_marker.sum(axis=1)
-        away = _solved(_eigen(normal), gradient.sum(axis=1))[:, None, :, None]
-        change = (by_marker @ away)[..., 0]
         own = self._own_squares(marker)
-        own = own + np.sum((change - 2 * gradient) * away[..., 0], axis=-1)
-        gradient = gradient - change
+        if not solution.alone.all():
+            away = _solved(_eigen(normal), gradient.sum(axis=1))[:, None, :, None]
+            change = (by_marker @ away)[..., 0]
+            own = own + np.sum((change - 2 * gradient) * away[..., 0], axis=-1)
+            gradient = gradient - change
         limit = self._limit[2 * points.seen.sum(axis=2) * used]
         suspect = np.flatnonzero((own.sum(axis=1)[:, None] > limit).any(axis=1))
         if not len(suspect):
             return suspect, suspect
-        limit = limit[suspect] * self._growth_by_rig(solution, points, normal, suspect)
+        limit = limit[suspect]
         gradient = gradient[suspect]
         others = normal[suspect, None] - by_marker[suspect]
         # A marker that the others do not predict is tested by its own rays only.
@@ -356,6 +370,8 @@ class PoseSolver:
         gain = np.sum(reduced * (inverse @ reduced[..., None])[..., 0], axis=-1)
         excess = (own[suspect] + np.where(predicted, gain, 0.0)) / limit
         excess = np.where(used[suspect], excess, 0.0)
+        if (excess > 1).any():
+            excess = excess / self._growth_by_rig(solution, points, normal, suspect)
         test[suspect] = np.where(used[suspect], excess, test[suspect])
         # Of several that contradict each other, the one goes without which the rest agrees best,
         # with the prediction, too.
@@ -402,7 +418,7 @@ class PoseSolver:
         """Return the poses with their covariances."""
         alone = solution.alone
         seen = used.any(axis=1)
-        inverse = _inverse(solution.normal, np.asarray(seen))
+        inverse = _inverse(solution.parts, np.asarray(seen))
         noise, fixed, rig_root = _covariances(
             inverse, solution, (points, self.variance), self.cameras
         )
@@ -473,11 +489,25 @@ def _weight(points: ImagePoints, used: np.ndarray, variance: np.ndarray) -> np.n
 
 def marker_sums(linear: Linear, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """S (B, M, 3, 3) and s (B, M, 3) of markers."""
-    rows = weight.shape[:2]
-    weighted = (linear.by_place * weight[..., None, None]).reshape(*rows, -1, 3)
-    transposed = np.swapaxes(weighted, 2, 3)
-    s_matrix = transposed @ linear.by_place.reshape(*rows, -1, 3)
-    return s_matrix, (transposed @ linear.residual.reshape(*rows, -1, 1))[..., 0]
+    weighted = _weighted(linear, weight)
+    s_matrix = weighted @ linear.by_place.reshape(*weight.shape[:2], -1, 3)
+    return s_matrix, _vectors(weighted, linear.residual)
+
+
+def _weighted(linear: Linear, weight: np.ndarray) -> np.ndarray:
+    """A'W (B, M, 3, 2 F) of markers."""
+    weighted = linear.by_place * weight[..., None, None]
+    return np.swapaxes(weighted.reshape(*weight.shape[:2], -1, 3), 2, 3)
+
+
+def _vectors(weighted: np.ndarray, residual: np.ndarray) -> np.ndarray:
+    """Vectors s (B, M, 3) of markers."""
+    return (weighted @ residual.reshape(*weighted.shape[:2], -1, 1))[..., 0]
+
+
+def _squares(linear: Linear, weight: np.ndarray) -> np.ndarray:
+    """Sums r'Wr (B, M) of markers."""
+    return ((linear.residual**2).sum(axis=-1) * weight).sum(axis=-1)
 
 
 class _Eigen(NamedTuple):
@@ -489,23 +519,17 @@ class _Eigen(NamedTuple):
 
 
 def _eigen(normal: np.ndarray) -> _Eigen:
-    unit, scale = _scaled(normal)
-    return _Eigen(*np.linalg.eigh(unit), scale)
-
-
-def _scaled(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Matrices of unit diagonal, and the scale (B, 6)."""
     scale = np.sqrt(np.maximum(np.diagonal(normal, axis1=1, axis2=2), 1e-30))
-    return normal / (scale[:, :, None] * scale[:, None, :]), scale
+    return _Eigen(*np.linalg.eigh(normal / (scale[:, :, None] * scale[:, None, :])), scale)
 
 
-def _inverse(normal: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Inverses (B, 6, 6) of those that are wanted (B,), else NaN."""
-    unit, scale = _scaled(normal)
-    regular = wanted & (np.linalg.eigvalsh(unit)[:, 0] > SINGULAR)
-    inverse = np.linalg.inv(np.where(regular[:, None, None], unit, _EYE_6))
-    inverse = inverse / (scale[:, :, None] * scale[:, None, :])
-    return np.where(regular[:, None, None], inverse, np.nan)
+def _inverse(parts: _Eigen, wanted: np.ndarray) -> np.ndarray:
+    """Inverses (B, 6, 6) of those normal matrices that are wanted (B,), else NaN."""
+    values, vectors, scale = parts
+    regular = (wanted & (values[:, 0] > SINGULAR))[:, None]
+    scaled = vectors / scale[:, :, None]
+    divided = scaled / np.where(regular, values, np.nan)[:, None]
+    return divided @ np.swapaxes(scaled, 1, 2)
 
 
 def _is_determined(parts: _Eigen) -> np.ndarray:

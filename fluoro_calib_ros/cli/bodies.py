@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
+from typing import TYPE_CHECKING
 
 from ..errors import DataError, ErrorsAt
 from .arguments import add_oriented_source, add_out, number_in, options_of, read_oriented_source
@@ -42,6 +40,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--joints', type=Path, metavar='FILE', help='joints between the bodies, TOML'
     )
+    parser.add_argument(
+        '--neutral',
+        type=Path,
+        metavar='RECORDING',
+        help='another recording with all joints in neutral position, in place of the exposures '
+        'that the joints file names',
+    )
     add_out(parser, 'folder to write')
     parser.add_argument(
         '--keep-shapes',
@@ -49,9 +54,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='take the coordinates of the markers as they are, do not estimate them anew',
     )
     parser.add_argument(
-        '--figures',
+        '--report',
         action='store_true',
-        help='draw joints and bodies over time, with bands, into DIR/figures',
+        help='write DIR/report.html: joints and bodies over time, with bands, and paths in space',
+    )
+    parser.add_argument(
+        '--film',
+        type=Path,
+        metavar='IMAGES',
+        help='radiographs of the recording, a bag or a folder with a folder for each fluoroscope; '
+        'draw markers and axes of the bodies into them, DIR/film_<fluoroscope>.mp4',
     )
     parser.add_argument(
         '--rate',
@@ -67,6 +79,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..io.calibration import orientation_path
     from ..io.joints import read_joints
     from ..jobs.bodies import BodiesOptions, check_bodies_folder, save_bodies, track_bodies
+    from ..jobs.bodies_film import Film
     from ..jobs.sources import is_bag
 
     path = arguments.orientation or orientation_path(arguments.calibration)
@@ -82,11 +95,18 @@ def run(arguments: argparse.Namespace) -> None:
             f'{arguments.source}: the file does not contain the times of its exposures; give '
             'their rate, --rate HZ'
         )
+    neutral = None
+    if arguments.neutral is not None:
+        if not joints:
+            raise DataError('--neutral: there are no joints, give --joints')
+        given = argparse.Namespace(**{**vars(arguments), 'source': arguments.neutral})
+        neutral = read_oriented_source(given, path)[0].frames
     options = options_of(
         BodiesOptions,
         arguments,
         estimate_shapes=not arguments.keep_shapes,
         rate=arguments.rate,
+        neutral=neutral,
     )
     with ErrorsAt(arguments.source), ProgressBar('exposures') as bar:
         outcome = track_bodies(
@@ -98,7 +118,10 @@ def run(arguments: argparse.Namespace) -> None:
             options=options,
             progress=bar,
         )
-    save_bodies(arguments.out, outcome, arguments.figures)
+    film = None
+    if arguments.film is not None:
+        film = Film(arguments.film, calibrations, orientation.subset(list(recording.frames)))
+    save_bodies(arguments.out, outcome, arguments.report, film)
     print_unpaired(arguments.source, outcome.unpaired)
     print_findings(outcome.findings, 'doubtful: ')
     _print(arguments, outcome)
@@ -106,35 +129,17 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _print(arguments: argparse.Namespace, outcome: BodiesOutcome) -> None:
     """Print how well poses and joints are known."""
+    summary = outcome.summary()
     lines = [f'{len(outcome.exposures)} exposures, written to {arguments.out}']
-    document: dict[str, Any] = {'out': str(arguments.out), 'bodies': {}, 'joints': {}}
-    for poses, shape in zip(outcome.poses, outcome.shapes):
-        known = poses.known
-        sd = np.median(poses.sd[known], axis=0) if known.any() else np.full(6, np.nan)
-        position = float(np.sqrt(np.mean(sd[:3] ** 2)))
-        rotation = float(np.degrees(np.sqrt(np.mean(sd[3:] ** 2))))
-        document['bodies'][poses.body] = {
-            'poses': int(np.count_nonzero(known)),
-            'sd_mm': position,
-            'sd_deg': rotation,
-            'condition_per_m': shape.condition,
-            'mean_error_mm': shape.mean_error_mm,
-        }
-        lines.append(
-            f'{poses.body}: {np.count_nonzero(known)} poses, sd {position:.3f} mm and '
-            f'{rotation:.3f} degrees (medians); condition number {shape.condition:.0f} per m, '
-            f'mean error of the rigid body {shape.mean_error_mm:.3f} mm'
-        )
-    for motion in outcome.joints:
-        angles = np.degrees(motion.angles[np.isfinite(motion.angles).all(axis=1)])
-        span = np.ptp(angles, axis=0) if len(angles) else np.full(3, np.nan)
-        sd = np.degrees(np.nanmedian(motion.sd[:, :3], axis=0))
-        document['joints'][motion.joint.name] = {
-            name: {'range_deg': float(a), 'sd_deg': float(s)}
-            for name, a, s in zip(motion.angle_names, span, sd)
-        }
-        lines += [
-            f'{motion.joint.name}: {name} over {a:.1f} degrees, sd {s:.3f} (median)'
-            for name, a, s in zip(motion.angle_names, span, sd)
-        ]
-    print_result(arguments, document, '\n'.join(lines))
+    lines += [
+        f'{name}: {one["poses"]} poses, sd {one["sd_mm"]:.3f} mm and {one["sd_deg"]:.3f} degrees '
+        f'(medians); condition number {one["condition_per_m"]:.0f} per m, mean error of the '
+        f'rigid body {one["mean_error_mm"]:.3f} mm'
+        for name, one in summary['bodies'].items()
+    ]
+    lines += [
+        f'{joint}: {name} over {one["range_deg"]:.1f} degrees, sd {one["sd_deg"]:.3f} (median)'
+        for joint, angles in summary['joints'].items()
+        for name, one in angles.items()
+    ]
+    print_result(arguments, {'out': str(arguments.out), **summary}, '\n'.join(lines))

@@ -22,7 +22,7 @@ from ..errors import DataError
 from ..estimation.calibrate import calibrate
 from ..estimation.result import CalibrationResult
 from ..exposures.collector import collect_recorded
-from ..io.access import write_text
+from ..io.access import make_folder, write_text
 from ..io.bags.reader import read_frames
 from ..io.phantom import read_phantom
 from ..nodes.demo_client import DemoClient, DemoError, demo_clients
@@ -30,12 +30,13 @@ from ..report.report_figures import write_figures
 from ..report.tables import markdown_table, summary_table
 from .assessment import image_errors, latencies_ms, space_figures
 from .image_twin import NAMESPACE, ImageTwin, calibrate_from_images, comparison_table
+from .live_knee import PLAYED, LiveKnee
 from .node_processes import NodeProcesses, isolate_ros_graph
 
 QUIET_S = 3.0  # after which no more messages are expected
 
 
-def run_graph(bags: Path, out: Path, client: DemoClient) -> int:
+def run_graph(bags: Path, out: Path, client: DemoClient, knee: LiveKnee) -> int:
     """Run the graph from the first exposure to the last corrected frame.
 
     Returns the number of corrected frames that were lost. Raises DemoError.
@@ -44,7 +45,7 @@ def run_graph(bags: Path, out: Path, client: DemoClient) -> int:
     recorded = _frame_counts(bags / 'calibration')
     tracked = _frame_counts(bags / 'tracking')
     with NodeProcesses(out) as nodes:
-        _start_nodes(nodes, bags, out, client.names)
+        _start_nodes(nodes, bags, out, names=client.names, knee=knee)
         print(
             f'1  player -> calibration node: {min(recorded.values())} exposures of '
             f'{" and ".join(client.names)}'
@@ -63,8 +64,15 @@ def run_graph(bags: Path, out: Path, client: DemoClient) -> int:
         print(f'    {message}')
         client.wait(lambda: client.is_correcting, 20, 'the correction node to use the calibration')
         client.wait(lambda: client.is_reconstructing, 20, 'the reconstruction node')
-        print('3  player -> correction node -> reconstruction node: markers in motion, live')
-        client.sent.clear()
+        print('3  player -> correction node -> reconstruction node: a knee that lands, live')
+        player = nodes.start(
+            'player_node', {'bag': knee.bag, 'rate': PLAYED, 'wait_for_readers': 2}
+        )
+        wait_for_stream(client, player, nodes, knee.frames)
+        _raise_if_failed(nodes, out)
+        print('4  the same: markers in motion')
+        for frames in (client.sent, client.corrected, client.points):
+            frames.clear()
         player = nodes.start('player_node', {'bag': bags / 'tracking', 'wait_for_readers': 3})
         wait_for_stream(client, player, nodes, tracked)
         _raise_if_failed(nodes, out)
@@ -105,7 +113,7 @@ def wait_for_stream(
 
 
 def report(
-    bags: Path, out: Path, client: DemoClient, lost: int, start: float, comparison: str
+    bags: Path, out: Path, client: DemoClient, lost: int, start: float, texts: Sequence[str]
 ) -> bool:
     """Write and print the table; returns whether live and offline calibration are identical.
 
@@ -120,10 +128,10 @@ def report(
         Number of corrected frames that did not arrive.
     start : float
         Monotonic time of the start of the demonstration [s].
-    comparison : str
-        Table of the calibrations from coordinates and from images.
+    texts : sequence of str
+        Line of the knee, and table of the calibrations from coordinates and from images.
     """
-    print('5  the same bag without ROS, figures and table')
+    print('6  the same bag without ROS, figures and table')
     frames, _ = collect_recorded(read_frames(bags / 'calibration').frames)
     job = calibrate(frames, read_phantom(bags / 'phantom.csv'))
     figures = write_figures(job, out / 'figures')
@@ -131,7 +139,8 @@ def report(
         name: job.calibrations[name].calibration_id == calibration.calibration_id
         for name, calibration in client.calibrations.items()
     }
-    lines = [*_image_lines(bags, client, job), '', _space_line(bags, client), '']
+    of_knee, comparison = texts
+    lines = [*_image_lines(bags, client, job), '', _space_line(bags, client), of_knee, '']
     lines += ['Calibrated from coordinates and from radiographs:', comparison, '']
     lines.append(
         'Calibration through the nodes and without ROS the same to the last bit: '
@@ -202,7 +211,9 @@ def _frame_counts(bag: Path) -> dict[str, int]:
     return {name: len(frames) for name, frames in read_frames(bag).frames.items()}
 
 
-def _start_nodes(nodes: NodeProcesses, bags: Path, out: Path, names: Sequence[str]) -> None:
+def _start_nodes(
+    nodes: NodeProcesses, bags: Path, out: Path, names: Sequence[str], knee: LiveKnee
+) -> None:
     fluoroscopes = f'[{",".join(names)}]'
     nodes.start(
         'calibration_node',
@@ -213,7 +224,7 @@ def _start_nodes(nodes: NodeProcesses, bags: Path, out: Path, names: Sequence[st
         },
     )
     nodes.start('correction_node', {'fluoroscopes': fluoroscopes})
-    nodes.start('reconstruction_node', {'fluoroscopes': fluoroscopes})
+    nodes.start('reconstruction_node', {'fluoroscopes': fluoroscopes, **knee.parameters})
 
 
 def _has_exposures(client: DemoClient, count: int) -> bool:
@@ -256,21 +267,24 @@ def main(arguments: Sequence[str] | None = None) -> None:
         options.out.mkdir(parents=True, exist_ok=True)
         twin = ImageTwin(options.bags, options.out / 'calibration_images', names)
         with demo_clients(names, '', NAMESPACE) as (client, of_images), twin:
-            lost = run_graph(options.bags, options.out, client)
-            print('4  the same from radiographs: player -> extraction node -> calibration node')
+            knee = LiveKnee(options.bags, options.out / 'knee', names)
+            lost = run_graph(options.bags, options.out, client, knee)
+            print('5  the same from radiographs: player -> extraction node -> calibration node')
             from_images = calibrate_from_images(twin, options.bags, options.out, of_images)
             comparison = comparison_table(
                 options.bags,
                 names,
                 {'coordinates': client.calibrations, 'images': from_images},
             )
+            make_folder(options.out / 'figures')
+            of_knee = knee.assess(client.joint_angles, options.out / 'figures' / 'knee_live.png')
             good = report(
                 options.bags,
                 options.out,
                 client=client,
                 lost=lost,
                 start=start,
-                comparison=comparison,
+                texts=(of_knee, comparison),
             )
     except (DemoError, DataError, OSError) as error:
         print(f'fluoro_calib_demo: {error}', file=sys.stderr)

@@ -5,7 +5,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -20,6 +21,7 @@ MATCHED = (80, 220, 60)
 OVERLAPPED = (230, 200, 40)
 REFUSED = (60, 60, 255)
 UNEXPLAINED = (0, 190, 255)
+TEXT = (235, 235, 235)
 TEXT_HEIGHT = 18
 
 
@@ -30,12 +32,7 @@ def draw_overlay(image: np.ndarray, extraction: Extraction | None, reason: str =
     beads without one, yellow squares what was found and is no bead of the phantom. Without an
     extraction, all that was found is yellow, and reason says why it was refused.
     """
-    low, high = np.percentile(image, [0.5, 99.8])
-    grey = np.clip((image - low) * (255 / max(high - low, 1)), 0, 255).astype(np.uint8)
-    factor = 2 if max(image.shape) <= 512 else 1
-    if factor > 1:
-        grey = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_NEAREST)
-    picture = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
+    picture, factor = _picture(image)
     if extraction is None:
         try:
             detections = detect_beads(image)
@@ -66,6 +63,16 @@ def draw_overlay(image: np.ndarray, extraction: Extraction | None, reason: str =
         (f'{unexplained} not of the phantom', UNEXPLAINED),
     ]
     return _labelled(picture, lines)
+
+
+def _picture(image: np.ndarray) -> tuple[np.ndarray, int]:
+    """Return an image as a picture of full contrast, small ones enlarged by a factor."""
+    low, high = np.percentile(image[::4, ::4], [0.5, 99.8])
+    grey = np.clip((image - low) * (255 / max(high - low, 1)), 0, 255).astype(np.uint8)
+    factor = 2 if max(image.shape) <= 512 else 1
+    if factor > 1:
+        grey = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_NEAREST)
+    return cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), factor
 
 
 def _place(uv: np.ndarray, factor: int) -> tuple[int, int]:
@@ -104,12 +111,7 @@ def draw_markers(
     is doubtful; red crosses are where markers that are not seen are believed to be.
     """
     target_names = target_names or {}
-    low, high = np.percentile(image[::4, ::4], [0.5, 99.8])
-    grey = np.clip((image - low) * (255 / max(high - low, 1)), 0, 255).astype(np.uint8)
-    factor = 2 if max(image.shape) <= 512 else 1
-    if factor > 1:
-        grey = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_NEAREST)
-    picture = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
+    picture, factor = _picture(image)
     size = cv2.getTextSize('0', cv2.FONT_HERSHEY_SIMPLEX, 0.35, 1)[0][1]
     marks = [
         (target, uv, UNEXPLAINED if doubtful else OVERLAPPED if overlapped else MATCHED, True)
@@ -121,7 +123,7 @@ def draw_markers(
     for target, uv, colour, seen in marks:
         if not np.isfinite(uv).all() or np.abs(uv).max() > 2**14:
             continue
-        u, v = np.rint((uv + 0.5) * factor - 0.5).astype(int).tolist()
+        u, v = _place(uv, factor)
         if seen:
             cv2.circle(picture, (u, v), RADIUS_PX, colour, 1, cv2.LINE_AA)
         else:
@@ -137,11 +139,51 @@ def draw_markers(
     ]
     if found.reason:
         lines.append((found.reason, REFUSED))
-    band = np.zeros((TEXT_HEIGHT * len(lines) + 8, picture.shape[1], 3), np.uint8)
-    for number, (text, colour) in enumerate(lines):
-        place = (6, TEXT_HEIGHT * (number + 1) - 2)
-        cv2.putText(band, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, 1, cv2.LINE_AA)
-    return np.vstack([picture, band])
+    return _labelled(picture, lines)
+
+
+# Pictures of bodies.
+
+AXIS_COLOURS = ((80, 80, 255), (80, 255, 80), (255, 160, 80))  # x red, y green, z blue
+
+
+@dataclass(frozen=True)
+class BodyView:
+    """A body in an image: its name and status, markers (n, 2), and centre and ends of axes (4, 2).
+
+    Pixels; NaN where the body has no pose.
+    """
+
+    name: str
+    status: str
+    markers: np.ndarray
+    axes: np.ndarray
+
+
+def draw_bodies(image: np.ndarray, title: str, bodies: Sequence[BodyView]) -> np.ndarray:
+    """Draw a picture (h, w, 3) of uint8, blue, green, red, of an image (h, w), of even size.
+
+    Circles are markers where the pose of their body puts them, green where markers were seen;
+    lines are the axes of the body, x red, y green, z blue.
+    """
+    picture, factor = _picture(image)
+    lines = [(title, TEXT)]
+    for body in bodies:
+        colour = MATCHED if body.status in ('OK', 'WEAK') else UNEXPLAINED
+        lines.append((f'{body.name}: {body.status}', colour))
+        places = np.vstack([body.markers, body.axes])
+        if not np.isfinite(places).all() or np.abs(places).max() > 2**14:
+            continue
+        for uv in body.markers:
+            cv2.circle(picture, _place(uv, factor), RADIUS_PX, colour, 1, cv2.LINE_AA)
+        centre, *ends = (_place(uv, factor) for uv in body.axes)
+        for end, axis in zip(ends, AXIS_COLOURS):
+            cv2.line(picture, centre, end, axis, 2, cv2.LINE_AA)
+        cv2.putText(
+            picture, body.name, centre, cv2.FONT_HERSHEY_SIMPLEX, 0.45, TEXT, 1, cv2.LINE_AA
+        )
+    whole = _labelled(picture, lines)
+    return whole[: len(whole) // 2 * 2, : whole.shape[1] // 2 * 2]
 
 
 COVERED = (60, 150, 70)  # RGB

@@ -119,7 +119,7 @@ def _open_video(
     out: Path, temporary: Path, image: np.ndarray, frame_rate: float
 ) -> cv2.VideoWriter:
     """Open a writer for images like this one."""
-    height, width = image.shape
+    height, width = image.shape[:2]
     is_16_bit = image.dtype == np.uint16
     codec = VIDEO_CODECS[suffix_of(out)]
     if width % 2 or height % 2:
@@ -140,7 +140,7 @@ def _open_video(
         cv2.VideoWriter_fourcc(*codec),
         frame_rate,
         (width, height),
-        [cv2.VIDEOWRITER_PROP_IS_COLOR, 0, *depth],
+        [cv2.VIDEOWRITER_PROP_IS_COLOR, int(image.ndim == 3), *depth],
     )
     if not video.isOpened() and is_16_bit and not SUPPORTS_16_BIT_VIDEOS:
         raise DataError(

@@ -5,12 +5,14 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from ..bodies.body import Body, BodyPoses, check_bodies, solvable_bodies
+from ..bodies.body import STATUS_NAMES, Body, BodyPoses, check_bodies, solvable_bodies
 from ..bodies.butterworth import filtered_poses
 from ..bodies.joints import JointMotion, joint_motion, with_neutral
 from ..bodies.shapes import EstimatedShape, estimate_shape, places_of
@@ -19,8 +21,8 @@ from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError
 from ..exposures.frame import Frame
 from ..exposures.pairing import RecordedPairing
-from ..findings import Finding, Kind, Place, Severity
-from ..io.access import PathLike
+from ..findings import Finding, Kind, Place, Severity, sentences
+from ..io.access import PathLike, write_text
 from ..io.bodies import write_bodies
 from ..io.folder import FolderKind, check_output_folder, replaced_folder
 from ..io.formats.opensim import write_joint_motion
@@ -36,15 +38,21 @@ from ..reconstruction.reconstruct import (
     orientation_of_recorded,
     pair_recording,
 )
+from .bodies_film import Film, write_films
 
 SMOOTH = ('auto', 'none', 'lag', 'butterworth')
 SHAPE_EXPOSURES = 600  # of a recording that shapes are estimated from, evenly spread
 NS_PER_S = 1_000_000_000
+EVERY_EXPOSURE = (0, 2**63 - 1)
 
 
 @dataclass(frozen=True)
 class BodiesOptions(RecordedPairing):
-    """Options of poses and joints. Raises ValueError for a value that an option cannot have."""
+    """Options of poses and joints. Raises ValueError for a value that an option cannot have.
+
+    neutral: frames by fluoroscope of another recording with all joints in neutral position, in
+    place of the exposures that the joints name.
+    """
 
     smooth: str = option(
         'auto',
@@ -67,6 +75,7 @@ class BodiesOptions(RecordedPairing):
     )
     estimate_shapes: bool = True
     rate: float | None = None
+    neutral: Mapping[str, Sequence[Frame]] | None = None
 
 
 @dataclass(frozen=True)
@@ -97,6 +106,32 @@ class BodiesOutcome:
     def bodies(self) -> tuple[Body, ...]:
         """The bodies with their estimated shapes."""
         return tuple(shape.body for shape in self.shapes)
+
+    def summary(self) -> dict[str, Any]:
+        """How well bodies and joints are known: medians of standard deviations."""
+        bodies: dict[str, Any] = {}
+        for poses, shape in zip(self.poses, self.shapes):
+            known = poses.known
+            sd = np.median(poses.sd[known], axis=0) if known.any() else np.full(6, np.nan)
+            status, count = np.unique(poses.status, return_counts=True)
+            bodies[poses.body] = {
+                'poses': int(np.count_nonzero(known)),
+                'status': {STATUS_NAMES[s]: int(n) for s, n in zip(status, count)},
+                'sd_mm': float(np.sqrt(np.mean(sd[:3] ** 2))),
+                'sd_deg': float(np.degrees(np.sqrt(np.mean(sd[3:] ** 2)))),
+                'condition_per_m': shape.condition,
+                'mean_error_mm': shape.mean_error_mm,
+            }
+        joints = {}
+        for motion in self.joints:
+            angles = np.degrees(motion.angles[np.isfinite(motion.angles).all(axis=1)])
+            span = np.ptp(angles, axis=0) if len(angles) else np.full(3, np.nan)
+            sd = np.degrees(np.nanmedian(motion.sd[:, :3], axis=0))
+            joints[motion.joint.name] = {
+                name: {'range_deg': float(a), 'sd_deg': float(s)}
+                for name, a, s in zip(motion.angle_names, span, sd)
+            }
+        return {'bodies': bodies, 'joints': joints}
 
 
 def track_bodies(
@@ -150,6 +185,10 @@ def track_bodies(
             progress(count, len(exposures))
     tracked = tracker.smoothed() if lag is None else tracked + tracker.flush()
     poses = _poses(usable, tracked, options)
+    at_rest = []
+    if options.neutral is not None:
+        at_rest = _poses_alone(options.neutral, calibrations, orientation, usable, options)
+        joints = [replace(one, neutral=EVERY_EXPOSURE) for one in joints]
     findings = [finding for shape in shapes for finding in shape.findings]
     named = {one.place for one in findings if one.kind is Kind.BODY_UNSEEN}
     unseen = [_unseen(one) for one in poses if not one.known.any()]
@@ -158,7 +197,7 @@ def track_bodies(
         tuple(shapes),
         tracked,
         poses=poses,
-        joints=_joints(joints, poses),
+        joints=_joints(joints, poses, at_rest or poses),
         unpaired=unpaired,
         findings=tuple(findings),
     )
@@ -219,9 +258,9 @@ def _split(exposure: IntersectedViews) -> dict[str, np.ndarray]:
     views = exposure.views
     points = exposure.points
     good = np.isin(points.status, (OK, OUTSIDE))
-    with np.errstate(invalid='ignore'):
-        share = np.nanmean((views.correction_sd / views.sigma) ** 2, axis=0, where=good)
-    share = np.where(good, np.clip(share, 0.0, 0.99), 0.0)[:, None, None]
+    seen = np.isfinite(views.sigma) & good
+    share = np.where(seen, (views.correction_sd / views.sigma) ** 2, 0.0).sum(axis=0)
+    share = np.clip(share / np.maximum(seen.sum(axis=0), 1), 0.0, 0.99)[:, None, None]
     covariance = points.covariance_noise
     return {
         'xyz_mm': np.where(good[:, None], points.xyz_mm, np.nan),
@@ -242,9 +281,26 @@ def _poses(
     return [filtered_poses(poses, options.cutoff) for poses in alone]
 
 
-def _joints(requests: Sequence[JointEntry], poses: Sequence[BodyPoses]) -> list[JointMotion]:
-    """Motion of joints, with their neutral position. Raises DataError."""
+def _poses_alone(
+    frames: Mapping[str, Sequence[Frame]],
+    calibrations: Mapping[str, FluoroscopeCalibration],
+    orientation: RigOrientation,
+    bodies: Sequence[Body],
+    options: BodiesOptions,
+) -> list[BodyPoses]:
+    """Poses that the exposures of another recording give alone. Raises DataError."""
+    exposures, _ = _intersected(frames, calibrations, orientation, options)
+    tracker = BodyTracker(orientation, bodies, options.reject)
+    tracked = [tracker.add(one.views, one.number, one.stamp_ns) for one in exposures]
+    return poses_alone(bodies, [one for one in tracked if one is not None])
+
+
+def _joints(
+    requests: Sequence[JointEntry], poses: Sequence[BodyPoses], at_rest: Sequence[BodyPoses]
+) -> list[JointMotion]:
+    """Motion of joints, with their neutral position by the poses at rest. Raises DataError."""
     by_name = {one.body: one for one in poses}
+    neutral = {one.body: one for one in at_rest}
     out = []
     for request in requests:
         joint = request.joint
@@ -252,8 +308,9 @@ def _joints(requests: Sequence[JointEntry], poses: Sequence[BodyPoses]) -> list[
         distal = by_name[joint.distal]
         if request.neutral is not None:
             first, last = request.neutral
-            rows = (proximal.number >= first) & (proximal.number <= last)
-            joint = with_neutral(joint, proximal.rows(rows), distal.rows(rows))
+            both = neutral[joint.proximal], neutral[joint.distal]
+            rows = (both[0].number >= first) & (both[0].number <= last)
+            joint = with_neutral(joint, both[0].rows(rows), both[1].rows(rows))
         out.append(joint_motion(joint, proximal, distal))
     return out
 
@@ -275,10 +332,10 @@ MOTION = 'motion.csv'
 SHAPES = 'shapes.csv'
 JOINTS = 'joints.csv'
 OPENSIM = 'joints.mot'
-FIGURES = 'figures'
+REPORT = 'report.html'
 BODIES_FOLDER = FolderKind(
     'a folder of bodies',
-    parts=(POSES, MOTION, SHAPES, JOINTS, OPENSIM, FIGURES),
+    parts=(POSES, MOTION, SHAPES, JOINTS, OPENSIM, REPORT, 'film_*.mp4'),
     marks=(POSES,),
 )
 
@@ -288,8 +345,10 @@ def check_bodies_folder(directory: PathLike, inputs: Iterable[PathLike]) -> None
     check_output_folder(directory, BODIES_FOLDER, inputs)
 
 
-def save_bodies(directory: PathLike, outcome: BodiesOutcome, figures: bool = False) -> None:
-    """Write poses, motion, shapes and joints, all or nothing; with pictures of them on request.
+def save_bodies(
+    directory: PathLike, outcome: BodiesOutcome, report: bool = False, film: Film | None = None
+) -> None:
+    """Write poses, motion, shapes and joints, all or nothing; with report and films on request.
 
     Raises DataError.
     """
@@ -302,10 +361,20 @@ def save_bodies(directory: PathLike, outcome: BodiesOutcome, figures: bool = Fal
             write_joints(folder / JOINTS, outcome.joints, start_ns)
         if _some_exposure_has_all(outcome.joints):
             write_joint_motion(folder / OPENSIM, outcome.joints, start_ns)
-        if figures:
-            from ..report.motion_figure import write_motion_figures
+        if report:
+            from ..report.bodies import bodies_html
 
-            write_motion_figures(folder / FIGURES, outcome.joints, outcome.poses)
+            title = os.path.basename(os.path.abspath(directory))
+            text = bodies_html(
+                title,
+                outcome.poses,
+                outcome.joints,
+                summary=outcome.summary(),
+                findings=sentences(outcome.findings),
+            )
+            write_text(folder / REPORT, text)
+        if film is not None:
+            write_films(folder, film, outcome.bodies, outcome.poses)
 
 
 def _some_exposure_has_all(joints: Sequence[JointMotion]) -> bool:

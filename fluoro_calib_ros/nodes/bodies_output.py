@@ -15,6 +15,7 @@ from sensor_msgs.msg import JointState
 from tf2_msgs.msg import TFMessage
 
 from .messages.bodies import (
+    FORMS,
     BodiesContent,
     joint_state,
     message_from_bodies,
@@ -52,6 +53,9 @@ class BodiesOutput:
         places = [f'reconstruction/bodies/{name}' for name in names]
         self._poses = [output(PoseWithCovarianceStamped, f'{place}/pose') for place in places]
         self._odometry = [output(Odometry, f'{place}/odometry') for place in places]
+        self._forms = [
+            (output(kind, f'reconstruction/{name}'), make) for name, (kind, make) in FORMS.items()
+        ]
         self._joints = output(JointAngles, 'reconstruction/joint_angles') if has_joints else None
         self._joint_states = (
             output(JointState, 'reconstruction/joint_states') if has_joints else None
@@ -64,13 +68,14 @@ class BodiesOutput:
         if self._transforms.get_subscription_count():
             transforms = transforms_of_bodies(content, message, self._rig_frame)
             self._transforms.publish(transforms)
-        for row, (pose, odometer) in enumerate(zip(self._poses, self._odometry)):
-            if not content.is_measured(row):
-                continue
-            if pose.get_subscription_count():
-                pose.publish(pose_with_covariance(message, row))
-            if odometer.get_subscription_count():
-                odometer.publish(odometry(content, message, row))
+        for row in content.measured:
+            if self._poses[row].get_subscription_count():
+                self._poses[row].publish(pose_with_covariance(message, row))
+            if self._odometry[row].get_subscription_count():
+                self._odometry[row].publish(odometry(content, message, row))
+        for form, make in self._forms:
+            if form.get_subscription_count():
+                form.publish(make(content, message))
         if self._joints is None or self._joint_states is None:
             return
         self._joints.publish(message_from_joints(content))

@@ -182,6 +182,7 @@ class BodyFollower:
             frame_number=found.number,
             orientation_id=self._rig.orientation_id,
             orientation=self._rig.orientation,
+            bodies=self.bodies,
             poses=poses,
             twist=twist,
             twist_covariance=twist_covariance,

@@ -19,6 +19,7 @@ from fluoro_calib_msgs.msg import (
     CalibrationStatus,
     CorrectedObservations,
     FluoroscopeCalibration,
+    JointAngles,
     ReconstructedPoints,
     RigOrientation,
     TargetObservations,
@@ -62,6 +63,8 @@ class DemoClient(Node):
         Frames and their source timestamps [ns] by (fluoroscope, frame number).
     points : list
         ReconstructedPoints messages and their source timestamps [ns].
+    joint_angles : list
+        JointAngles messages of exposures with bodies.
     """
 
     def __init__(self, names: Sequence[str], namespace: str = '') -> None:
@@ -72,6 +75,7 @@ class DemoClient(Node):
         self.sent: dict[tuple[str, int], tuple[ObservedFrame, int]] = {}
         self.corrected: dict[tuple[str, int], tuple[CorrectedFrame, int]] = {}
         self.points: list[tuple[ReconstructedPoints, int]] = []
+        self.joint_angles: list[JointAngles] = []
         self._calibrations: dict[str, FluoroscopeCalibration] = {}
         self._camera_infos: dict[str, CameraInfo] = {}
         self._orientations: list[RigOrientation] = []
@@ -153,6 +157,12 @@ class DemoClient(Node):
             lambda message, info: self.points.append((message, info['source_timestamp'])),
             observations_qos(),
         )
+        self._streams.subscribe(
+            JointAngles,
+            'reconstruction/joint_angles',
+            lambda message, info: self._add_joints(message),
+            observations_qos(),
+        )
         for name in self.names:
             self._streams.subscribe(
                 TargetObservations,
@@ -193,6 +203,11 @@ class DemoClient(Node):
                 lambda message, name=name: self._camera_infos.update({name: message}),
                 latched_qos(),
             )
+
+    def _add_joints(self, message: JointAngles) -> None:
+        """Keep motion of joints whose bodies are there."""
+        if message.status[0] != JointAngles.FAILED:
+            self.joint_angles.append(message)
 
     def _on_undecodable(self, topic: str) -> None:
         self.get_logger().error(f'topic {topic}: a message cannot be decoded')

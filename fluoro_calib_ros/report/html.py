@@ -69,13 +69,6 @@ class ReportInput:
 
 def report_html(given: ReportInput) -> str:
     """Return the report as HTML: pictures inside, no reference to anything outside."""
-    environment = Environment(
-        loader=FileSystemLoader(TEMPLATES),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     residuals = {name: _residuals(given, name) for name in given.calibrations}
     with style.context(['default', STYLE]):
         scale = common_scale(
@@ -83,7 +76,8 @@ def report_html(given: ReportInput) -> str:
         )
         pictures = {name: _pictures(given, name, residuals[name], scale) for name in residuals}
         beads = _bead_picture(given)
-    return environment.get_template('report.html').render(
+    return page(
+        'report.html',
         given=given,
         verdict=_verdict(given),
         fluoroscopes={name: _fluoroscope(given, name, residuals[name]) for name in residuals},
@@ -93,9 +87,19 @@ def report_html(given: ReportInput) -> str:
         outliers=_outliers(given),
         adjustments=given.result.get('adjustments', []),
         correlations=given.result.get('correlations', [])[:MAX_ROWS],
-        versions=versions(),
-        text=_text,
     )
+
+
+def page(template: str, **values: Any) -> str:
+    """Return a page of a template, with values, numbers for people (`text`) and `versions`."""
+    environment = Environment(
+        loader=FileSystemLoader(TEMPLATES),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(template).render(**values, versions=versions(), text=_text)
 
 
 def _verdict(given: ReportInput) -> dict[str, Any]:
@@ -217,10 +221,11 @@ def _pictures(
             ('RMS and number of beads by exposure', exposure_bars(residuals, name)),
             ('Distribution of the residuals', distribution(residuals, name)),
         ]
-    return [(title, _base64(figure)) for title, figure in figures]
+    return [(title, png_text(figure)) for title, figure in figures]
 
 
-def _base64(figure: Figure) -> str:
+def png_text(figure: Figure) -> str:
+    """Return a figure as PNG in base64."""
     return base64.b64encode(png_bytes(figure)).decode()
 
 
@@ -238,7 +243,7 @@ def _bead_picture(given: ReportInput) -> dict[str, Any] | None:
     order = np.argsort(-np.hypot(np.hypot(*shift.T[:2]), shift.T[2]) / sd)[:10]
     names = given.names.target_names()
     return {
-        'png': _base64(bead_shifts(shift, sd)),
+        'png': png_text(bead_shifts(shift, sd)),
         'rms': np.sqrt(np.mean(shift**2, axis=0)).tolist(),
         'largest': [
             (names.get(int(i), int(i)), shift[k].tolist(), float(sd[k]))

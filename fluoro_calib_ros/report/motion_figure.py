@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Sequence
 
 import matplotlib
 import numpy as np
@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from ..bodies.body import BodyPoses, PoseStatus
 from ..bodies.joints import JointMotion
 from ..photogrammetry.rotations import vector_from_matrix
-from .style import BLUE, GREY, RED, STYLE, new_figure, png_bytes
+from .style import BLUE, GREY, RED, STYLE, new_figure
 
 BAND = 2.0  # standard deviations, 95 %
 FILLED = 0.15  # opacity of the times without a marker
@@ -92,16 +92,26 @@ def _draw(axes: Axes, time_s: np.ndarray, values: np.ndarray, sd: np.ndarray) ->
     axes.plot(time_s, values, color=BLUE, linewidth=1.2)
 
 
-def write_motion_figures(
-    directory: Path, joints: list[JointMotion], poses: list[BodyPoses]
-) -> None:
-    """Write a picture of each joint and body into a folder, which is made."""
-    directory.mkdir(exist_ok=True)
-    for motion in joints:
-        _write(directory / f'joint_{motion.joint.name}.png', joint_figure(motion))
-    for one in poses:
-        _write(directory / f'body_{one.body}.png', body_figure(one))
-
-
-def _write(path: Path, figure: Figure) -> None:
-    path.write_bytes(png_bytes(figure))
+def paths_figure(poses: Sequence[BodyPoses]) -> Figure:
+    """Paths of the origins of bodies in space, and their axes at ten times."""
+    with matplotlib.rc_context(STYLE):
+        figure = new_figure(7, 6, 'Paths of the origins of the bodies')
+        axes = figure.add_subplot(projection='3d')
+        reach = 0.0
+        for one in poses:
+            known = np.flatnonzero(one.known)
+            if len(known):
+                axes.plot(*one.position_mm.T, linewidth=2.5, label=one.body)
+                reach = max(reach, float(np.ptp(one.position_mm[known], axis=0).max()))
+        for one in poses:
+            known = np.flatnonzero(one.known)
+            for row in known[np.linspace(0, len(known) - 1, 10).astype(int)] if len(known) else ():
+                origin = one.position_mm[row]
+                for axis, colour in zip(one.rotation[row].T, (RED, GREY, BLUE)):
+                    end = origin + (0.1 * reach + 5) * axis
+                    axes.plot(*np.stack([origin, end]).T, color=colour, linewidth=0.8)
+        axes.set(xlabel='x [mm]', ylabel='y [mm]', zlabel='z [mm]')
+        axes.set_aspect('equal')
+        axes.legend(loc='upper left')
+        figure.supxlabel('axes of the bodies: x red, y grey, z blue', fontsize=9)
+    return figure

@@ -5,11 +5,16 @@
 
 import csv
 import json
+import re
 import shutil
 
+import cv2
 import numpy as np
 import pytest
 from rigs import run
+
+from fluoro_calib_ros.images.overlay import draw_bodies
+from fluoro_calib_ros.io.bags.reader import read_frames
 
 pytestmark = pytest.mark.long
 
@@ -62,12 +67,76 @@ def test_poses_and_joints_with_their_deviations(knee, tmp_path, capsys):
     assert {row['status'] for row in found} == {'OK'}
 
 
-def test_pictures_of_joints_and_bodies(knee, tmp_path):
-    joints = ('--joints', knee / 'joints.toml', '--figures', '--smooth', 'lag')
+def test_report_of_joints_and_bodies_needs_nothing_else(knee, tmp_path):
+    joints = ('--joints', knee / 'joints.toml', '--report', '--smooth', 'lag')
     assert bodies(knee, tmp_path / 'motion', *joints) == 0
-    pictures = sorted((tmp_path / 'motion' / 'figures').iterdir())
-    assert [p.name for p in pictures] == ['body_femur.png', 'body_tibia.png', 'joint_knee.png']
-    assert all(p.read_bytes().startswith(b'\x89PNG') for p in pictures)
+    text = (tmp_path / 'motion' / 'report.html').read_text()
+    shown = re.findall('<figcaption>(.*?)</figcaption>', text)
+    assert shown == ['joint knee', 'paths in space', 'body femur', 'body tibia']
+    assert text.count('data:image/png;base64,') == 4
+    assert not re.search('https?:', re.sub('base64,[^"]+', '', text))
+    assert '<td>flexion</td>' in text and '60 OK' in text
+
+
+def test_neutral_position_of_another_recording(knee, tmp_path, capsys):
+    """The same recording as its own neutral trial: the mean rotation becomes zero."""
+    text = (knee / 'joints.toml').read_text()
+    whole = text.replace('[joint.proximal_frame', 'neutral = [1, 60]\n\n[joint.proximal_frame', 1)
+    (tmp_path / 'whole.toml').write_text(whole)
+    given = ('--smooth', 'none', '--joints')
+    own = (*given, knee / 'joints.toml', '--neutral', knee / 'walking')
+    assert bodies(knee, tmp_path / 'key', *given, tmp_path / 'whole.toml') == 0
+    assert bodies(knee, tmp_path / 'own', *own) == 0
+    angles, of_key = (
+        np.array([float(row['angle_1_deg']) for row in rows(tmp_path / name / 'joints.csv')])
+        for name in ('own', 'key')
+    )
+    assert angles == pytest.approx(of_key, abs=1e-9) and abs(angles.mean()) < 1
+    capsys.readouterr()
+    assert bodies(knee, tmp_path / 'none', '--neutral', knee / 'walking') == 1
+    assert 'give --joints' in capsys.readouterr().err
+
+
+def test_film_has_the_markers_where_they_were_observed(knee, tmp_path, monkeypatch):
+    """In the radiographs as they are, with their distortion."""
+    shown = (1, 30, 31)
+    for name in 'ab':
+        (tmp_path / 'images' / name).mkdir(parents=True)
+        for number in (*shown, 1000):
+            picture = np.random.default_rng(0).integers(0, 255, (1024, 1024), dtype=np.uint8)
+            cv2.imwrite(str(tmp_path / 'images' / name / f'{number:04d}.png'), picture)
+    views = []
+
+    def draw(image, title, bodies):
+        views.append(bodies)
+        return draw_bodies(image, title, bodies)
+
+    monkeypatch.setattr('fluoro_calib_ros.jobs.bodies_film.draw_bodies', draw)
+    film = ('--smooth', 'none', '--film', tmp_path / 'images')
+    assert bodies(knee, tmp_path / 'motion', *film) == 0
+    frames = read_frames(knee / 'walking').frames
+    seen = [{f.number: f for f in frames[name]}[number] for name in 'ab' for number in shown]
+    assert len(views) == len(seen)
+    for frame, of_image in zip(seen, views):
+        markers = np.concatenate([view.markers for view in of_image])
+        ids = np.array([3001, 3002, 3003, 3004, 3011, 3012, 3013, 3014])
+        distance = np.linalg.norm(
+            markers[np.searchsorted(ids, frame.target_id)] - frame.uv, axis=1
+        )
+        assert len(distance) > 5 and distance.max() < 5 * 0.25
+    for name in 'ab':
+        video = cv2.VideoCapture(str(tmp_path / 'motion' / f'film_{name}.mp4'))
+        assert video.get(cv2.CAP_PROP_FRAME_COUNT) == len(shown)
+        assert video.read()[1].shape[1] == 1024
+
+
+def test_film_without_images_of_a_fluoroscope_is_refused(knee, tmp_path, capsys):
+    (tmp_path / 'images' / 'a').mkdir(parents=True)
+    cv2.imwrite(str(tmp_path / 'images' / 'a' / '1.png'), np.zeros((1024, 1024), np.uint8))
+    film = ('--smooth', 'none', '--film', tmp_path / 'images')
+    assert bodies(knee, tmp_path / 'motion', *film) == 1
+    assert 'there is no folder b with images' in capsys.readouterr().err
+    assert not (tmp_path / 'motion').exists()
 
 
 def test_without_smoothing_and_with_a_lag(knee, tmp_path):

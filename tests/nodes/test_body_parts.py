@@ -17,7 +17,9 @@ from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.nodes.body_following import BodyFollower, BodyParameters, read_body_files
 from fluoro_calib_ros.nodes.body_health import statuses_of
 from fluoro_calib_ros.nodes.messages.bodies import (
+    AXIS_MM,
     BodiesContent,
+    body_markers,
     joint_state,
     message_from_bodies,
     odometry,
@@ -120,6 +122,7 @@ def content_of(rotation, position_mm=(0, 0, 0), covariance=None, status=PoseStat
         7,
         'rig-1',
         orientation(),
+        bodies=[BODIES[0]],
         poses=[poses],
         twist=twist,
         twist_covariance=np.diag([1e6, 4e6, 9e6, 1, 4, 9.0])[None],
@@ -168,7 +171,7 @@ def test_types_without_a_status_have_no_predicted_pose(status):
     content = content_of(np.eye(3), status=status)
     message = message_from_bodies(content)
     assert list(message.status) == [status]
-    assert not content.is_measured(0)
+    assert not content.measured
     assert not transforms_of_bodies(content, message, 'rig').transforms
     assert not joint_state(content).name
 
@@ -207,6 +210,25 @@ def test_covariance_of_the_twist_is_that_of_its_derivatives():
         jacobian[:, :, n] = (ends[0] - ends[1]) / 2e-6
     expected = jacobian @ found.covariance @ np.swapaxes(jacobian, 1, 2)
     assert np.allclose(covariance, expected, rtol=1e-6, atol=1e-9 * expected.max())
+
+
+def test_markers_of_a_body_are_where_its_pose_puts_them():
+    """For RViz: beads where they are, and axes of the body from their centre on."""
+    turn, origin = true_pose(60)
+    content = content_of(turn, origin)
+    axes, beads = body_markers(content, message_from_bodies(content)).markers
+    assert axes.ns == beads.ns == 'femur' and axes.header.frame_id == 'lab'
+    for marker, places in (
+        (beads, MARKERS),
+        (axes, MARKERS.mean(axis=0) + np.kron(AXIS_MM * np.eye(3), [[0], [1]])),
+    ):
+        q, p = marker.pose.orientation, marker.pose.position
+        points = np.array([[one.x, one.y, one.z] for one in marker.points])
+        found = Rotation.from_quat([q.x, q.y, q.z, q.w]).apply(points) + [p.x, p.y, p.z]
+        assert found == pytest.approx((places @ turn.T + origin) / 1000, abs=1e-12)
+    assert len(axes.colors) == len(axes.points) == 6
+    lost = content_of(turn, origin, status=PoseStatus.FILLED)
+    assert not body_markers(lost, message_from_bodies(lost)).markers
 
 
 def test_follower_gives_the_poses_of_the_tracker():

@@ -40,7 +40,7 @@ def folder(tmp_path_factory):
 @pytest.fixture
 def without_pictures(monkeypatch):
     """Pictures are drawn, but not rendered."""
-    monkeypatch.setattr(html_report, '_base64', lambda figure: '')
+    monkeypatch.setattr(html_report, 'png_text', lambda figure: '')
 
 
 class Page(html.parser.HTMLParser):

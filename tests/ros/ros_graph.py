@@ -53,6 +53,7 @@ from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import MarkerArray
 
 from fluoro_calib_ros.exposures.frame import Frame
+from fluoro_calib_ros.nodes.messages.bodies import FORMS
 from fluoro_calib_ros.nodes.messages.observations import message_from_frame
 from fluoro_calib_ros.nodes.runtime.streams import OBSERVATION_DEPTH, latched_qos, observations_qos
 
@@ -82,6 +83,7 @@ TOPICS = {
     'tf': (TFMessage, observations_qos()),
     'drift': (DriftStatus, 10),
     'tf_static': (TFMessage, latched_qos()),
+    **{name: (kind, observations_qos()) for name, (kind, _) in FORMS.items()},
 }
 
 SERVICES = {

@@ -17,6 +17,7 @@ from fluoro_calib_ros.io.calibration import load_orientation, orientation_path
 from fluoro_calib_ros.io.joints import joint_definition, read_joints
 from fluoro_calib_ros.jobs.bodies import BodiesOptions, track_bodies
 from fluoro_calib_ros.jobs.sources import read_calibrations
+from fluoro_calib_ros.nodes.messages.bodies import FORMS as OPTIONAL
 from fluoro_calib_ros.nodes.messages.observations import message_from_frame
 from fluoro_calib_ros.photogrammetry.rotations import vector_from_matrix
 from fluoro_calib_ros.simulation.knee import simulate_knee, virtual_knee, walking
@@ -35,6 +36,7 @@ FORMS = (
     'joint_states',
     'bodies/tibia/pose',
     'bodies/tibia/odometry',
+    *OPTIONAL,
 )
 
 
@@ -205,6 +207,19 @@ def test_types_without_a_status_have_measured_poses_only(live):
             assert message.header == source.header and message.pose.pose.position.x == source.x[1]
             assert np.array_equal(message.pose.covariance, source.covariance[36:])
     assert {m.child_frame_id for m in found} == {'tibia'}
+    for form, entries, name in (
+        ('body_markers', 'markers', 'ns'),
+        ('body_detections', 'detections', 'id'),
+        ('rigid_bodies', 'rigidbodies', 'rigid_body_name'),
+    ):
+        if form in FORMS:
+            found = received(live, form)
+            client.wait_until(lambda found=found: len(found) == EXPOSURES, what=form)
+            shown = [{getattr(one, name) for one in getattr(m, entries)} for m in found]
+            assert shown == [
+                {body for body, status in zip(m.body, m.status) if status <= BodyPoses.WEAK}
+                for m in messages
+            ]
     frames = [t for m in client.messages['/tf'] for t in m.transforms]
     assert {t.header.frame_id for t in frames} == {'rig'}
     assert sum(t.child_frame_id == 'tibia' for t in frames) == len(seen)
@@ -255,14 +270,20 @@ def test_diagnostics_tell_which_body_is_lost(live):
     assert live.lost.level == b'\1' and float(value_of(live.lost, 'since last seen [s]')) > 0.5
 
 
-def test_messages_are_recorded_as_they_were_published(live):
-    for form, kind in (('body_poses', BodyPoses), ('joint_angles', JointAngles)):
+def test_messages_are_recorded_and_replayed_as_they_were_published(live):
+    kinds = {'body_poses': BodyPoses, 'joint_angles': JointAngles}
+    published = {form: list(map(repr, received(live, form))) for form in kinds}
+    for form, kind in kinds.items():
         topic = f'{live.namespace}/reconstruction/{form}'
-        found = [
-            deserialize_message(message.data, kind)
-            for message in iterate_messages(live.bag, [topic])
-        ]
-        assert list(map(repr, found)) == list(map(repr, received(live, form)))
+        found = [deserialize_message(m.data, kind) for m in iterate_messages(live.bag, [topic])]
+        assert list(map(repr, found)) == published[form]
+    # The player puts the recorded names into its own namespace.
+    place = f'{live.namespace.strip("/")}/reconstruction'
+    again = {form: live.client.listen(f'{place}/{form}') for form in FORMS}
+    live.start('player_node', {'bag': live.bag, 'rate': 10.0}, wait=False)
+    for form, expected in published.items():
+        live.client.wait_until(lambda form=form: len(again[form]) == EXPOSURES, what=form)
+        assert list(map(repr, again[form])) == expected
 
 
 def test_damaged_file_of_bodies_ends_the_node_in_a_sentence(graph, by_command, tmp_path):

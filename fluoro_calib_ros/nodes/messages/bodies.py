@@ -14,25 +14,39 @@ from typing import NamedTuple
 
 import numpy as np
 from fluoro_calib_msgs.msg import BodyPoses, JointAngles
-from geometry_msgs.msg import Pose, PoseWithCovarianceStamped, TransformStamped
+from geometry_msgs.msg import Point, Pose, PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Header
+from std_msgs.msg import ColorRGBA, Header
 from tf2_msgs.msg import TFMessage
+from visualization_msgs.msg import Marker, MarkerArray
 
 from ...bodies import body as of_bodies
-from ...bodies.body import PoseStatus
+from ...bodies.body import Body, PoseStatus
 from ...bodies.joints import JointMotion, JointStatus
 from ...photogrammetry.rig_orientation import RigOrientation
 from ...photogrammetry.rotations import quaternion_from_matrix
 from .observations import float64_field, stamp_from_nanoseconds, uint8_field, uint32_field
+from .points import GREEN, LIFETIME_NS, YELLOW
+
+try:
+    from mocap4r2_msgs import msg as mocap
+except ImportError:
+    mocap = None
+try:
+    from vision_msgs import msg as vision
+except ImportError:
+    vision = None
 
 # Types without a status have measured poses only: nobody could tell a predicted one from them.
 MEASURED = (PoseStatus.OK, PoseStatus.WEAK)
 _TO_METRES = np.repeat([1e-3, 1.0], 3)  # position, then rotation
 _SCALE = _TO_METRES[:, None] * _TO_METRES
 _OF_JOINT = _SCALE[::-1, ::-1]  # angles, then translations
+AXES = [ColorRGBA(r=r, g=g, b=b, a=1.0) for r, g, b in np.eye(3).tolist()]  # as RViz draws them
+AXIS_MM = 20.0  # length of an axis, about the size of a cluster of markers in a bone
+MARKER_MM = 2.0
 
 
 class BodiesContent(NamedTuple):
@@ -45,6 +59,7 @@ class BodiesContent(NamedTuple):
     orientation_id : str
     orientation : RigOrientation
         Orientation with which the poses were found.
+    bodies : sequence of Body
     poses : sequence of BodyPoses
         Of this exposure.
     twist, twist_covariance : np.ndarray
@@ -57,6 +72,7 @@ class BodiesContent(NamedTuple):
     frame_number: int
     orientation_id: str
     orientation: RigOrientation
+    bodies: Sequence[Body]
     poses: Sequence[of_bodies.BodyPoses]
     twist: NDArray[np.float64]
     twist_covariance: NDArray[np.float64]
@@ -69,9 +85,10 @@ class BodiesContent(NamedTuple):
             frame_id=frame_id or self.orientation.frame_id,
         )
 
-    def is_measured(self, row: int) -> bool:
-        """Whether the exposure shows a body."""
-        return bool(self.poses[row].status[0] in MEASURED)
+    @property
+    def measured(self) -> list[int]:
+        """Rows of the bodies that the exposure shows."""
+        return [row for row, one in enumerate(self.poses) if one.status[0] in MEASURED]
 
 
 def message_from_bodies(content: BodiesContent) -> BodyPoses:
@@ -125,9 +142,8 @@ def odometry(content: BodiesContent, message: BodyPoses, row: int) -> Odometry:
 def transforms_of_bodies(content: BodiesContent, message: BodyPoses, parent: str) -> TFMessage:
     """Return the frames of the bodies that the exposure shows, as children of the rig frame."""
     out = TFMessage()
-    for row, name in enumerate(message.body):
-        if not content.is_measured(row):
-            continue
+    for row in content.measured:
+        name = message.body[row]
         stamped = TransformStamped(header=content.header(parent), child_frame_id=name)
         pose = pose_of(message, row)
         stamped.transform.rotation = pose.orientation
@@ -135,6 +151,81 @@ def transforms_of_bodies(content: BodiesContent, message: BodyPoses, parent: str
             setattr(stamped.transform.translation, axis, getattr(pose.position, axis))
         out.transforms.append(stamped)
     return out
+
+
+def _point(xyz_mm: NDArray[np.float64]) -> Point:
+    x, y, z = (xyz_mm / 1000).tolist()
+    return Point(x=x, y=y, z=z)
+
+
+def body_markers(content: BodiesContent, message: BodyPoses) -> MarkerArray:
+    """Return markers and axes of the bodies that the exposure shows, for RViz.
+
+    Axes are those of the body, from the centre of its markers on.
+    """
+    out = MarkerArray()
+    for row in content.measured:
+        body = content.bodies[row]
+        common = {'header': message.header, 'ns': body.name, 'pose': pose_of(message, row)}
+        axes = Marker(id=0, type=Marker.LINE_LIST, **common)
+        for axis, colour in zip(AXIS_MM * np.eye(3), AXES):
+            axes.points += [_point(body.centre), _point(body.centre + axis)]
+            axes.colors += [colour, colour]
+        axes.scale.x = MARKER_MM / 2000
+        beads = Marker(id=1, type=Marker.SPHERE_LIST, **common)
+        beads.points = [_point(xyz) for xyz in body.xyz_mm]
+        beads.scale.x = beads.scale.y = beads.scale.z = MARKER_MM / 1000
+        beads.color = GREEN if message.status[row] == PoseStatus.OK else YELLOW
+        for marker in (axes, beads):
+            marker.lifetime.nanosec = LIFETIME_NS
+            out.markers.append(marker)
+    return out
+
+
+def detections(content: BodiesContent, message: BodyPoses) -> vision.Detection3DArray:
+    """Return the bodies that the exposure shows; the boxes are those of their markers."""
+    out = vision.Detection3DArray(header=message.header)
+    for row in content.measured:
+        body = content.bodies[row]
+        one = vision.Detection3D(header=message.header, id=body.name)
+        result = vision.ObjectHypothesisWithPose()
+        result.hypothesis.class_id = body.name
+        result.hypothesis.score = 1.0
+        result.pose = pose_with_covariance(message, row).pose
+        one.results = [result]
+        low, high = body.xyz_mm.min(axis=0), body.xyz_mm.max(axis=0)
+        one.bbox.center = pose_of(message, row)
+        poses = content.poses[row]
+        middle = poses.rotation[0] @ ((low + high) / 2) + poses.position_mm[0]
+        one.bbox.center.position = _point(middle)
+        one.bbox.size.x, one.bbox.size.y, one.bbox.size.z = ((high - low) / 1000).tolist()
+        out.detections.append(one)
+    return out
+
+
+def rigid_bodies(content: BodiesContent, message: BodyPoses) -> mocap.RigidBodies:
+    """Return the bodies that the exposure shows, with their markers in the rig frame."""
+    out = mocap.RigidBodies(header=message.header, frame_number=message.frame_number)
+    for row in content.measured:
+        body, poses = content.bodies[row], content.poses[row]
+        places = body.xyz_mm @ poses.rotation[0].T + poses.position_mm[0]
+        markers = [
+            mocap.Marker(id_type=mocap.Marker.USE_INDEX, marker_index=k, translation=_point(xyz))
+            for k, xyz in zip(body.target_id.tolist(), places)
+        ]
+        pose = pose_of(message, row)
+        out.rigidbodies.append(
+            mocap.RigidBody(rigid_body_name=body.name, markers=markers, pose=pose)
+        )
+    return out
+
+
+# Forms of all bodies of an exposure that are published while they have subscribers.
+FORMS = {'body_markers': (MarkerArray, body_markers)}
+if vision is not None:
+    FORMS['body_detections'] = (vision.Detection3DArray, detections)
+if mocap is not None:
+    FORMS['rigid_bodies'] = (mocap.RigidBodies, rigid_bodies)
 
 
 def message_from_joints(content: BodiesContent) -> JointAngles:

@@ -41,7 +41,8 @@ from fluoro_calib_ros.estimation.initial_network import measured_network
 from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
 from fluoro_calib_ros.estimation.start_orientation import UNTILTED
 from fluoro_calib_ros.exposures.phantom import Phantom
-from fluoro_calib_ros.exposures.strays import without_repeats, without_strays
+from fluoro_calib_ros.exposures.repeats import without_repeats
+from fluoro_calib_ros.exposures.strays import without_strays
 from fluoro_calib_ros.findings import Finding, Kind, Place
 from fluoro_calib_ros.images import detection, extraction, lattice, matching
 from fluoro_calib_ros.images.codec import as_grey

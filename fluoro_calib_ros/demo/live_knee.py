@@ -8,9 +8,9 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from fluoro_calib_msgs.msg import JointAngles
 
 from ..bodies.joints import JointMotion
 from ..io.access import make_folder, write_bytes
@@ -50,8 +50,8 @@ class LiveKnee:
         write_knee(out, self._knee)
         write_bag(self.bag, frames)
 
-    def assess(self, messages: Sequence[JointAngles], picture: Path) -> str:
-        """Draw the live angles with their bands, and return how good they are in one line."""
+    def assess(self, messages: Sequence[Any], picture: Path) -> str:
+        """Draw the live angles of JointAngles, and return how good they are in one line."""
         number = np.array([message.frame_number for message in messages])
         stamps = [message.header.stamp for message in messages]
         metres = np.repeat([1.0, 1e3], 3)

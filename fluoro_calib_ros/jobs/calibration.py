@@ -43,7 +43,8 @@ from ..estimation.result import CalibrationResult
 from ..estimation.rounds import Round
 from ..exposures.frame import Frame
 from ..exposures.phantom import Phantom
-from ..exposures.strays import frames_without_strays, without_repeats
+from ..exposures.repeats import without_repeats
+from ..exposures.strays import frames_without_strays
 from ..findings import Finding, Kind, Place, Severity
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..processes import OF_JOB, WorkerProcess

@@ -27,7 +27,7 @@ from fluoro_calib_ros.estimation.rig_orientation import (
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.io.calibration import (
-    FIELDS,
+    ORIENTATION_FIELDS,
     load_orientation,
     save_calibration,
     save_orientation,
@@ -418,7 +418,7 @@ def test_file_round_trip_is_exact(tmp_path, found):
     assert Path(save_orientation(tmp_path, again)).read_bytes() == content
     with np.load(path, allow_pickle=False) as file:
         assert (
-            file.files == ['format_version', *(field.name for field in FIELDS)]
+            file.files == ['format_version', *(field.name for field in ORIENTATION_FIELDS)]
             and file['format_version'] == 1
         )
 

@@ -66,7 +66,7 @@ def run_graph(bags: Path, out: Path, client: DemoClient, knee: LiveKnee) -> int:
         client.wait(lambda: client.is_reconstructing, 20, 'the reconstruction node')
         print('3  player -> correction node -> reconstruction node: a knee that lands, live')
         player = nodes.start(
-            'player_node', {'bag': knee.bag, 'rate': PLAYED, 'wait_for_readers': 2}
+            'player_node', {'bag': knee.bag, 'rate': PLAYED, 'wait_for_readers': 3}
         )
         wait_for_stream(client, player, nodes, knee.frames)
         _raise_if_failed(nodes, out)

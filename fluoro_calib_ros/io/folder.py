@@ -119,9 +119,12 @@ def replaced_folder(path: PathLike, kind: FolderKind) -> Iterator[Path]:
     make_folder(parent)
     clean_up(target)
     in_place = _is_fixed(target, kind)
-    staging = ''
+    # Known before the folder is made: a signal may end the program right after that.
+    staging = _hidden(
+        os.path.join(target, os.path.basename(target)) if in_place else target, 'tmp'
+    )
     try:
-        staging, lock = _locked_folder(target if in_place else parent, os.path.basename(target))
+        lock = _make_locked(staging)
         try:
             if not in_place and os.path.isdir(target):
                 shutil.copymode(target, staging)
@@ -153,12 +156,12 @@ def temporary_folder(path: PathLike) -> Iterator[Path]:
     cannot be made, and for an OSError in the block.
     """
     parent, name = os.path.split(os.path.abspath(path))
-    folder = ''
+    folder = _hidden(os.path.join(parent, name), 'tmp')
     try:
         for leftover in _leftovers(parent, name):
             if leftover.endswith('.tmp') and not _is_locked(leftover):
                 shutil.rmtree(leftover)
-        folder, lock = _locked_folder(parent, name)
+        lock = _make_locked(folder)
         try:
             yield Path(folder)
         finally:
@@ -284,16 +287,15 @@ def _carry_over(old: str, new: str, kind: FolderKind) -> None:
             link(source, os.path.join(new, name))
 
 
-def _locked_folder(parent: str, name: str) -> tuple[str, int]:
-    """Make a hidden folder that is locked as long as this process lives; returns path and lock."""
+def _make_locked(path: str) -> int:
+    """Make a folder that is locked as long as this process lives, and return its lock."""
     while True:
-        path = os.path.join(parent, f'.{name[:100]}.{secrets.token_hex(8)}.tmp')
         os.mkdir(path)
         lock = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
         with suppress(OSError):  # a file system without locks; or another run cleans up just now
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         if os.path.isdir(path):
-            return path, lock
+            return lock
         os.close(lock)
 
 

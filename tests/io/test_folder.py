@@ -141,6 +141,19 @@ def test_terminated_command_leaves_nothing_unfinished(tmp_path):
     assert not os.listdir(tmp_path)
 
 
+def test_signal_right_after_the_folder_is_made_leaves_nothing(tmp_path, monkeypatch):
+    real = os.mkdir
+
+    def interrupted(path, *options):
+        real(path, *options)
+        raise SystemExit(143)
+
+    monkeypatch.setattr(folder_module.os, 'mkdir', interrupted)
+    with pytest.raises(SystemExit):
+        write(tmp_path / 'work', 'first')
+    assert not os.listdir(tmp_path)
+
+
 def test_previous_folder_and_files_of_the_user_are_kept(tmp_path, outcomes):
     path = tmp_path / 'result'
     save_outcome(path, outcomes[0])

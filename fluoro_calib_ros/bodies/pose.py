@@ -44,7 +44,7 @@ from .rigid import fitted_pose
 MAX_STEPS = 8
 # Square of the next step in standard deviations below which the iteration ends. A step of
 # Gauss-Newton leaves a share of about its own rotation, and of its shift over the distance.
-LAST_STEP = 1e-4  # a hundredth of a standard deviation
+LAST_STEP = 1e-8  # a ten-thousandth of a standard deviation
 # Rotation [rad] up to which derivatives hold: what they neglect of a marker's place is half of its
 # square, 0.1 % of the distance from the centre.
 LINEAR_RAD = 0.05

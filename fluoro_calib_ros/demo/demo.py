@@ -29,7 +29,7 @@ from ..nodes.demo_client import DemoClient, DemoError, demo_clients
 from ..report.report_figures import write_figures
 from ..report.tables import markdown_table, summary_table
 from .assessment import image_errors, latencies_ms, space_figures
-from .image_twin import NAMESPACE, ImageTwin, calibrate_from_images, comparison_table
+from .image_twin import NAMESPACE, ImageTwin, RecordedRig, calibrate_from_images, comparison_table
 from .live_knee import PLAYED, LiveKnee
 from .node_processes import NodeProcesses, isolate_ros_graph
 
@@ -265,9 +265,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         names = sorted(read_frames(options.bags / 'calibration').frames)
         options.out.mkdir(parents=True, exist_ok=True)
-        twin = ImageTwin(options.bags, options.out / 'calibration_images', names)
+        recorded = RecordedRig.of(options.bags, names)
+        twin = ImageTwin(recorded, options.out / 'calibration_images')
         with demo_clients(names, '', NAMESPACE) as (client, of_images), twin:
-            knee = LiveKnee(options.bags, options.out / 'knee', names)
+            knee = LiveKnee(recorded, options.out / 'knee')
             lost = run_graph(options.bags, options.out, client, knee)
             print('5  the same from radiographs: player -> extraction node -> calibration node')
             from_images = calibrate_from_images(twin, options.bags, options.out, of_images)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,25 +32,43 @@ START_NS = 1_700_000_000_000_000_000
 INTERVAL_NS = 500_000_000
 
 
+@dataclass(frozen=True)
+class RecordedRig:
+    """The virtual rig that the bags were made with."""
+
+    rig: VirtualRig
+    seed: int
+    noise_px: float  #: of an image coordinate
+    exposures: int
+
+    @classmethod
+    def of(cls, bags: Path, names: Sequence[str]) -> RecordedRig:
+        """Return the rig of fluoroscopes that the truth in a folder of bags names."""
+        made_with = json.loads((bags / 'truth' / 'rig.json').read_text())['made_with']
+        return cls(
+            virtual_rig(made_with['seed'], made_with['strength'], names),
+            seed=made_with['seed'],
+            noise_px=made_with['noise'],
+            exposures=made_with['exposures'],
+        )
+
+
 class ImageTwin:
     """Renders a twin of the calibration bag that is made of images, in a thread.
 
     Parameters
     ----------
-    bags : Path
-        Folder of the bags, whose truth names the virtual rig.
+    recorded : RecordedRig
+        The virtual rig of the bags.
     out : Path
         Bag to write.
-    names : sequence of str
-        Fluoroscopes.
     """
 
-    def __init__(self, bags: Path, out: Path, names: Sequence[str]) -> None:
-        made_with = json.loads((bags / 'truth' / 'rig.json').read_text())['made_with']
+    def __init__(self, recorded: RecordedRig, out: Path) -> None:
         self.bag = out
-        self._rig = virtual_rig(made_with['seed'], made_with['strength'], names)
-        exposures = made_with['exposures']
-        self._poses = simulate_exposures(self._rig, exposures, made_with['seed']).poses
+        self._rig = recorded.rig
+        exposures = recorded.exposures
+        self._poses = simulate_exposures(self._rig, exposures, recorded.seed).poses
         self.numbers = np.unique(np.linspace(0, exposures - 1, EXPOSURES).astype(int))
         # A point source is rendered in half the time.
         settings = replace(SETTINGS['clean'], bits=8, focal_spot_mm=0.0)

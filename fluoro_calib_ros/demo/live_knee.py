@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from ..jobs.simulation import BODIES, JOINTS, TRUTH, write_bag, write_knee
 from ..report.motion_figure import joint_figure
 from ..report.style import png_bytes
 from ..simulation.knee import LANDING_HZ, LANDING_S, landing, simulate_knee, virtual_knee
-from ..simulation.rig import virtual_rig
+from .image_twin import RecordedRig
 
 PLAYED = 0.2  # of the speed of the recording, for a machine with two cores
 
@@ -28,21 +27,17 @@ class LiveKnee:
 
     Parameters
     ----------
-    bags : Path
-        Folder of the bags, whose truth names the virtual rig.
+    recorded : RecordedRig
+        The virtual rig of the bags.
     out : Path
         Folder to write.
-    names : sequence of str
-        Fluoroscopes.
     """
 
-    def __init__(self, bags: Path, out: Path, names: Sequence[str]) -> None:
-        made_with = json.loads((bags / 'truth' / 'rig.json').read_text())['made_with']
-        rig = virtual_rig(made_with['seed'], made_with['strength'], names)
-        self._knee = virtual_knee(made_with['seed'])
+    def __init__(self, recorded: RecordedRig, out: Path) -> None:
+        self._knee = virtual_knee(recorded.seed)
         times_s = np.arange(round(LANDING_S * LANDING_HZ)) / LANDING_HZ
         self._truth = landing(self._knee, times_s)
-        frames = simulate_knee(rig, self._knee, self._truth, made_with['noise']).frames
+        frames = simulate_knee(recorded.rig, self._knee, self._truth, recorded.noise_px).frames
         self.bag = out / 'landing'
         self.parameters = {'bodies': out / BODIES, 'joints': out / JOINTS}
         self.frames = {name: len(of_view) for name, of_view in frames.items()}

@@ -34,11 +34,11 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtri, erfc
 
 from ..photogrammetry.rig_orientation import RigOrientation
-from ..photogrammetry.rotations import vector_from_matrix
+from ..photogrammetry.rotations import cross_matrix, vector_from_matrix
 from ..reconstruction.reconstruct import IntersectedViews
 from .body import POSE_SIZE, Body
 from .image_points import Cameras, ImagePoints, Linear
-from .motion import PoseInformation
+from .motion import PoseInformation, both_blocks, twist_between
 from .rigid import fitted_pose
 
 MAX_STEPS = 8
@@ -61,13 +61,15 @@ _EYE_6 = np.eye(POSE_SIZE)
 class Prediction:
     """Poses that are expected: rotations (B, 3, 3), centres (B, 3) [mm], covariances (B, 6, 6).
 
-    known (B,): whether there is one.
+    known (B,): whether there is one. weak (B,): exposures since one alone gave the pose, with the
+    one that is expected.
     """
 
     rotation: NDArray[np.float64]
     centre_mm: NDArray[np.float64]
     covariance: NDArray[np.float64]
     known: NDArray[np.bool_]
+    weak: NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -130,10 +132,7 @@ class _Marker:
 
 @dataclass(frozen=True)
 class _Solution:
-    """Poses of B bodies, whether (B,) the exposure alone gives them, parts of normal matrices.
-
-    prior (B, 6, 6): normal matrices of the predictions; away (B, 6): from pose to prediction.
-    """
+    """Poses of B bodies, whether (B,) the exposure alone gives them, parts of normal matrices."""
 
     rotation: np.ndarray
     centre: np.ndarray
@@ -141,8 +140,6 @@ class _Solution:
     parts: _Eigen
     linear: Linear
     marker: _Marker
-    prior: np.ndarray
-    away: np.ndarray
 
 
 class PoseSolver:
@@ -189,21 +186,18 @@ class PoseSolver:
         points = self.cameras.sorted(exposure)
         rotation, centre, started = self._start(exposure, points, prediction)
         used = points.seen.any(axis=2) & started[:, None]
-        prior = np.where(
-            prediction.known[:, None, None],
-            np.linalg.inv(prediction.covariance + 1e-12 * _EYE_6),
-            0.0,
-        )
+        normal = np.linalg.inv(prediction.covariance + 1e-12 * _EYE_6)
+        prior = prediction, np.where(prediction.known[:, None, None], normal, 0.0)
         test = np.full(used.shape, np.nan)
         for _ in range(self.xyz.shape[1]):
             solution = self._converge((rotation, centre), points, used, prior)
-            wrong, worst = self._false_markers(solution, points, used, test)
+            wrong, worst = self._false_markers(solution, (points, used), prior, test)
             if not len(wrong):
                 break
             used[wrong, worst] = False
             rotation, centre = solution.rotation, solution.centre
         ambiguous = self._ambiguous(solution, points, used, prediction)
-        return self._result(solution, points, used, test, ambiguous)
+        return self._result(solution, (points, used), prediction.weak, test, ambiguous)
 
     def _ambiguous(
         self, solution: _Solution, points: ImagePoints, used: np.ndarray, prediction: Prediction
@@ -227,7 +221,7 @@ class PoseSolver:
             centre = solution.centre.copy()
             centre[row] += (solution.rotation[row] - rotation[row]) @ markers.mean(axis=0)
             only = used & (np.arange(len(used)) == row)[:, None]
-            second = self._converge((rotation, centre), points, only, 0 * solution.prior)
+            second = self._converge((rotation, centre), points, only, None)
             squares = [self._own_squares(one.marker)[row].sum() for one in (solution, second)]
             turn = second.rotation[row] @ solution.rotation[row].T
             away = float(np.linalg.norm(vector_from_matrix(turn)))
@@ -269,14 +263,14 @@ class PoseSolver:
         pose: tuple[np.ndarray, np.ndarray],
         points: ImagePoints,
         used: np.ndarray,
-        prior: np.ndarray,
+        prior: tuple[Prediction, np.ndarray] | None,
     ) -> _Solution:
         """Iterate from rotations and centres.
 
-        Where an exposure alone does not give a pose, the prediction, with the normal matrix prior,
-        holds what is not seen.
+        Where an exposure alone does not give a pose, the prediction with its normal matrix (B, 6,
+        6) holds what is not seen.
         """
-        first_rotation, first_centre = rotation, centre = pose
+        rotation, centre = pose
         weight = _weight(points, used, points.noise + points.correction)
         for _ in range(MAX_STEPS):
             linear = self.cameras.linear(self.xyz, (rotation, centre), points)
@@ -284,10 +278,9 @@ class PoseSolver:
             normal, right = _sum(marker, linear.by_pose)
             parts = _eigen(normal)
             alone = _is_determined(parts)
-            turned = _small_vector(first_rotation @ np.swapaxes(rotation, 1, 2))
-            away = np.concatenate([first_centre - centre, turned], axis=1)
-            if not alone.all():
-                held = np.where(alone[:, None, None], 0.0, prior)
+            if prior is not None and not alone.all():
+                held, away = _pull_of(*prior, (rotation, centre))
+                held = np.where(alone[:, None, None], 0.0, held)
                 normal = normal + held
                 right = right + (held @ away[:, :, None])[:, :, 0]
                 parts = _eigen(normal)
@@ -314,8 +307,6 @@ class PoseSolver:
             parts=parts,
             linear=linear,
             marker=marker,
-            prior=prior,
-            away=away,
         )
 
     def _marker(self, linear: Linear, weight: np.ndarray) -> _Marker:
@@ -333,13 +324,20 @@ class PoseSolver:
         )
 
     def _false_markers(
-        self, solution: _Solution, points: ImagePoints, used: np.ndarray, test: np.ndarray
+        self,
+        solution: _Solution,
+        observed: tuple[ImagePoints, np.ndarray],
+        prior: tuple[Prediction, np.ndarray],
+        test: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Rows of bodies that contain a false marker, and its row in each; fill in the tests.
+
+        observed: image points, and whether (B, M) a marker is used.
 
         The sum of squares of a body is at least that which one of its markers adds: most bodies
         need no test of single markers.
         """
+        points, used = observed
         marker = solution.marker
         d = solution.linear.by_pose
         transposed = np.swapaxes(d, 2, 3)
@@ -375,8 +373,9 @@ class PoseSolver:
         test[suspect] = np.where(used[suspect], excess, test[suspect])
         # Of several that contradict each other, the one goes without which the rest agrees best,
         # with the prediction, too.
-        held = solution.prior[suspect]
-        pulled = (held @ solution.away[suspect, :, None])[:, None, :, 0] - gradient
+        held, away = _pull_of(*prior, (solution.rotation, solution.centre))
+        held = held[suspect]
+        pulled = (held @ away[suspect, :, None])[:, None, :, 0] - gradient
         rest = np.linalg.inv(others + held[:, None] + 1e-9 * _EYE_6)
         left = own[suspect] + np.sum(pulled * (rest @ pulled[..., None])[..., 0], axis=-1)
         worst = np.argmax(np.where(excess > 1, left, -np.inf), axis=1)
@@ -410,12 +409,13 @@ class PoseSolver:
     def _result(
         self,
         solution: _Solution,
-        points: ImagePoints,
-        used: np.ndarray,
+        observed: tuple[ImagePoints, np.ndarray],
+        weak: np.ndarray,
         test: np.ndarray,
         ambiguous: np.ndarray,
     ) -> FramePoses:
         """Return the poses with their covariances."""
+        points, used = observed
         alone = solution.alone
         seen = used.any(axis=1)
         inverse = _inverse(solution.parts, np.asarray(seen))
@@ -424,7 +424,13 @@ class PoseSolver:
         )
         # A filter takes shape and correction as they are: their errors stay.
         linear = solution.linear
-        s_matrix, s_vector = marker_sums(linear, _weight(points, used, points.noise))
+        variance = points.noise
+        held = np.flatnonzero(seen & ~alone)
+        if len(held):
+            squares = _curvature(linear.by_place[held], linear.by_pose[held], inverse[held])
+            variance = variance.copy()
+            variance[held] = _of_the_next(variance[held], squares, weak[held, None, None])
+        s_matrix, s_vector = marker_sums(linear, _weight(points, used, variance))
         transposed = np.swapaxes(linear.by_pose, 2, 3)
         information = (transposed @ s_matrix @ linear.by_pose).sum(axis=1)
         right = (transposed @ s_vector[..., None])[..., 0].sum(axis=1)
@@ -442,6 +448,39 @@ class PoseSolver:
             chi2=np.sum(self._own_squares(solution.marker), axis=1),
             freedom=2.0 * np.sum(points.seen & used[..., None], axis=(1, 2)) - POSE_SIZE,
         )
+
+
+def _of_the_next(noise: np.ndarray, fixed: np.ndarray, number: np.ndarray) -> np.ndarray:
+    """Variance of the last of `number` observations that have an error in common.
+
+    With a variance r of their noise and c of this error, n of them tell n / (r + n c), and the
+    last of them adds r / ((r + n c) (r + (n - 1) c)) to this.
+    """
+    return (noise + number * fixed) * (noise + (number - 1) * fixed) / noise
+
+
+def _curvature(
+    by_place: np.ndarray, by_pose: np.ndarray, covariance: np.ndarray
+) -> NDArray[np.float64]:
+    """Mean squares (B, M, F) of what derivatives neglect of image points, per coordinate.
+
+    Where few markers are seen, a turn is unsure by more than derivatives hold for. Exposures that
+    are linearised at different turns would seem to see it together, so what is neglected counts
+    as noise (second-order filter: Bar-Shalom, Li and Kirubarajan 2001, 10.3). A twist (s, w) moves
+    a marker p by u = s + w x p and, to second order, w x u / 2. With the derivatives a of an image
+    coordinate this is u'[a]x w / 2, whose mean square follows from Isserlis' theorem.
+    """
+    by_turn = covariance[:, None, 3:, :] @ np.swapaxes(by_pose, 2, 3)
+    by_move = (by_pose @ covariance[:, None] @ np.swapaxes(by_pose, 2, 3))[:, :, None, None]
+    cross = cross_matrix(by_place)  # (B, M, F, 2, 3, 3)
+    mixed = cross @ by_turn[:, :, None, None]
+    turned = cross @ covariance[:, None, None, None, 3:, 3:] @ np.swapaxes(cross, -1, -2)
+    squares = (
+        np.trace(mixed, axis1=-2, axis2=-1) ** 2
+        + np.trace(turned @ by_move, axis1=-2, axis2=-1)
+        + np.trace(mixed @ mixed, axis1=-2, axis2=-1)
+    )
+    return squares.mean(axis=-1) / 4
 
 
 def _covariances(
@@ -555,7 +594,14 @@ def _mirror(direction: np.ndarray) -> np.ndarray:
     return np.eye(3) - 2 * np.outer(unit, unit)
 
 
-def _small_vector(rotation: np.ndarray) -> np.ndarray:
-    """Rotation vectors (B, 3) of small rotations."""
-    skew = (rotation - np.swapaxes(rotation, 1, 2)) / 2
-    return np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=1)
+def _pull_of(
+    prediction: Prediction, normal: np.ndarray, pose: tuple[np.ndarray, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Normal matrices (B, 6, 6) of predictions at poses, and twists (B, 6) to the predictions.
+
+    Deviations from a prediction turn with the body, as those of the filter do.
+    """
+    axes = both_blocks(pose[0] @ np.swapaxes(prediction.rotation, 1, 2))
+    away = twist_between((prediction.rotation, prediction.centre_mm), pose)
+    held = axes @ normal @ np.swapaxes(axes, 1, 2)
+    return held, -(axes @ away[:, :, None])[:, :, 0]

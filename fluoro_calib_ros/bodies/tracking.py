@@ -106,6 +106,7 @@ class BodyTracker:
         self.filter = MotionFilter(count, lag)
         self._taken: list[_Taken] = []
         self._stamp_ns: int | None = None
+        self._weak = np.zeros(count, dtype=np.int64)  # exposures since one alone gave the pose
         columns = orientation.covariance.shape[0]
         self._fixed = np.full((count, POSE_SIZE, POSE_SIZE), np.nan)
         self._rig_root = np.full((count, POSE_SIZE, columns), np.nan)
@@ -127,6 +128,7 @@ class BodyTracker:
         expected = self.predict(stamp_ns)
         self._stamp_ns = stamp_ns
         frame = self.solver.solve(exposure, expected)
+        self._weak = np.where(frame.alone, 0, expected.weak)
         # A body that has just appeared is not expected anywhere yet: its speed is unknown.
         self.filter.lose(~expected.known & ~frame.alone)
         self.filter.update(frame.information, frame.alone & ~self.filter.alive)
@@ -142,14 +144,14 @@ class BodyTracker:
         rotation, centre, covariance = self.filter.prediction
         variance = np.diagonal(covariance, axis1=1, axis2=2)[:, 3:].max(axis=1)
         known = self.filter.alive & (variance < LOST_SD_RAD**2)
-        return Prediction(rotation, centre, covariance, known)
+        return Prediction(rotation, centre, covariance, known, self._weak + 1)
 
     def reshape(self, bodies: Sequence[Body]) -> None:
         """Take better shapes of the bodies, in the same frames."""
         before = self.solver.centre
         self.solver = PoseSolver(self.solver.orientation, bodies, self._reject)
         moved = self.filter.rotation @ (self.solver.centre - before)[:, :, None]
-        self.filter.mean[:, :3] += moved[:, :, 0]
+        self.filter.shift(moved[:, :, 0])
 
     def flush(self) -> list[TrackedExposure]:
         """Return the exposures that are not reported yet, at the end of a stream."""

@@ -13,10 +13,14 @@ from fluoro_calib_ros.bodies.motion import (
     PoseInformation,
     _smooth,
     _transition,
+    both_blocks,
     noise_factors,
+    pose_after,
     smooth_trial,
+    twist_between,
 )
 from fluoro_calib_ros.photogrammetry.rotations import (
+    cross_matrix,
     left_jacobian,
     matrix_from_vector,
     vector_from_matrix,
@@ -96,9 +100,13 @@ def best_butterworth(values, true):
 
 
 def test_smoother_is_least_squares_of_the_whole_trial():
-    """Positions, with given densities, against a dense solution of all states and noises."""
+    """Positions, with given densities, against a dense solution of all states and noises.
+
+    Rotations are known to a microradian: else they and positions are not independent.
+    """
     rng = np.random.default_rng(1)
     count = 12
+    sd = np.where(np.arange(6) < 3, SD, 1e-6)
     dt = 0.01
     log_q = np.column_stack([rng.uniform(8, 12, count), np.full(count, 5.0)])
     places = np.cumsum(rng.normal(0, 0.1, (count, 3)), axis=0)
@@ -106,13 +114,13 @@ def test_smoother_is_least_squares_of_the_whole_trial():
     for k in range(count):
         follower.predict(dt if k else 0.0, log_q[k][None])
         seen = PoseInformation(
-            np.eye(3)[None], places[k][None], np.diag(SD**-2)[None], np.zeros((1, 6))
+            np.eye(3)[None], places[k][None], np.diag(sd**-2)[None], np.zeros((1, 6))
         )
         follower.update(seen, np.array([k == 0]), adapt=False)
     follower.lag = None
     smoothed = follower.smoothed()
 
-    into = _transition(dt, np.zeros((1, 3)))[0][np.ix_([0, 6, 12], [0, 6, 12])]
+    into = _transition(dt, np.zeros((1, 6)), np.zeros((1, 3)))[0][np.ix_([0, 6, 12], [0, 6, 12])]
     first = follower.steps[0].covariance[0][np.ix_([0, 6, 12], [0, 6, 12])]
     normal = np.zeros((3 * count, 3 * count))
     right = np.zeros(3 * count)
@@ -165,20 +173,97 @@ def test_derivatives_by_the_densities_are_those_of_the_likelihood():
         assert score[k, kind] == pytest.approx(numeric, rel=0.02, abs=0.02)
 
 
-def test_transition_of_rotations_by_differences():
+def test_transition_by_differences():
+    """Deviations turn with the body; twists are about the centre before, and then after."""
     rng = np.random.default_rng(3)
     dt = 0.02
-    turn = rng.normal(0, 0.3, 3)
-    into = _transition(dt, turn[None])[0]
-    for axis in range(3):
-        d = np.zeros(3)
-        d[axis] = 1e-6
-        plain = matrix_from_vector(turn)
-        by_rotation = matrix_from_vector(turn) @ matrix_from_vector(d)
-        by_speed = matrix_from_vector(turn + dt * d)
-        for column, moved in ((3 + axis, by_rotation), (9 + axis, by_speed)):
-            change = vector_from_matrix(moved @ plain.T) / 1e-6
-            assert into[3:6, column] == pytest.approx(change, abs=1e-5)
+    rotation = Rotation.random(random_state=rng).as_matrix()[None]
+    centre = rng.normal(0, 20, (1, 3))
+    twist = rng.normal(0, 1, 6) * [300, 300, 300, 10, 10, 10]
+    change = rng.normal(0, 1, 6) * [3e3, 3e3, 3e3, 200, 200, 200]
+
+    def after(d):
+        """State after dt of one that deviates by d (18,)."""
+        pose = pose_after(rotation, centre, d[None, :6])
+        # Twists are about the centre that is not deviated.
+        moved = dt * (twist + d[6:12]) + dt**2 / 2 * (change + d[12:])
+        about = np.concatenate(
+            [moved[:3] + np.cross(moved[3:], pose[1][0] - centre[0]), moved[3:]]
+        )
+        pose = pose_after(*pose, about[None])
+        arm = start[1][0] - centre[0]
+        spin = twist[3:] + d[9:12] + dt * (change[3:] + d[15:])
+        turned = change[3:] + d[15:]
+        velocity = twist[:3] + d[6:9] + dt * (change[:3] + d[12:15]) + np.cross(spin, arm)
+        further = change[:3] + d[12:15] + np.cross(turned, arm)
+        return pose, np.concatenate([velocity, spin, further, turned])
+
+    moved = dt * twist + dt**2 / 2 * change
+    start = pose_after(rotation, centre, moved[None])
+    into = _transition(dt, moved[None], start[1] - centre)[0]
+    for column, size in enumerate(np.repeat([1e-4, 1e-6, 1e-2, 1e-4, 1, 1e-2], 3)):
+        d = np.zeros(18)
+        d[column] = size
+        (pose, rates), (_, plain) = after(d), after(0 * d)
+        numeric = np.concatenate([twist_between(start, pose)[0], rates - plain]) / size
+        expected = into[:, column].copy()
+        # A deviation turns with the body.
+        assert numeric == pytest.approx(expected, rel=2e-4, abs=2e-5 * np.abs(expected).max())
+
+
+def test_poses_follow_twists_and_back():
+    rng = np.random.default_rng(4)
+    first = Rotation.random(5, random_state=rng).as_matrix(), rng.normal(0, 20, (5, 3))
+    twist = rng.normal(0, 1, (5, 6)) * [20, 20, 20, 1, 1, 1]
+    assert twist_between(first, pose_after(*first, twist)) == pytest.approx(twist, abs=1e-9)
+    # A rotation about a line leaves the points on it where they are.
+    point = np.array([3.0, -8.0, 5.0])
+    line = np.array([0.3, 0.5, -0.4])
+    turn = np.concatenate([-np.cross(line, point), line])
+    rotation, centre = pose_after(np.eye(3)[None], np.zeros((1, 3)), turn[None])
+    for moved in (point, point + 4 * line):
+        assert rotation[0] @ moved + centre[0] == pytest.approx(moved, abs=1e-9)
+
+
+def test_where_exposures_are_linearised_does_not_matter_to_what_they_do_not_see():
+    """Two markers: exposures at any turn about their line tell the same, and not this turn."""
+    rng = np.random.default_rng(6)
+    truth = Rotation.random(random_state=rng).as_matrix()
+    markers = np.array([[8.0, -3, 2], [-5, 6, 4]]) @ truth.T
+    line = (markers[1] - markers[0]) / np.linalg.norm(markers[1] - markers[0])
+    derivatives = [np.hstack([np.eye(3), -cross_matrix(p)]) for p in markers]
+    normal = sum(d.T @ d for d in derivatives) / SD[0] ** 2
+    noise = rng.normal(0, 1 / SD[0], (40, 2, 3))
+    turns = rng.normal(0, 0.3, 40)
+
+    def follow_line(turns):
+        follower = MotionFilter(1, 0)
+        for k, angle in enumerate(turns):
+            follower.predict(1 / RATE if k else 0.0, np.array([[15.0, 8.0]]))
+            whole = k < 20
+            turn = np.eye(3) if whole else matrix_from_vector(angle * line)
+            axes = both_blocks(turn[None])[0]
+            told = normal + np.diag(SD**-2) if whole else normal
+            right = sum(d.T @ n for d, n in zip(derivatives, noise[k]))
+            follower.update(
+                PoseInformation(
+                    (turn @ truth)[None],
+                    (markers[0] - turn @ markers[0])[None],
+                    (axes @ told @ axes.T)[None],
+                    (axes @ right)[None],
+                ),
+                np.array([k == 0]),
+                adapt=False,
+            )
+        return follower.smoothed()
+
+    plain = follow_line(0 * turns)
+    turned = follow_line(turns)
+    sd = np.sqrt(np.diagonal(plain.covariance[0, 0]))
+    assert sd[3:6].max() > 5 * sd[3:6].min()
+    assert np.sqrt(np.diagonal(turned.covariance[0, 0])) == pytest.approx(sd, rel=0.02)
+    difference, _ = errors(turned, plain.centre_mm, plain.rotation)
+    assert (np.abs(difference[0, 0]) < 0.2 * sd[:6]).all()
 
 
 def test_left_jacobian_by_differences_at_small_and_large_angles():

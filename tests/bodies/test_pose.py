@@ -14,7 +14,13 @@ from fluoro_calib_ros.bodies.pose import PoseSolver, Prediction
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.photogrammetry.rotations import vector_from_matrix
 
-UNKNOWN = Prediction(np.eye(3)[None], np.zeros((1, 3)), np.eye(6)[None], np.zeros(1, dtype=bool))
+UNKNOWN = Prediction(
+    np.eye(3)[None],
+    np.zeros((1, 3)),
+    np.eye(6)[None],
+    known=np.zeros(1, dtype=bool),
+    weak=np.ones(1, dtype=int),
+)
 
 
 def random_pose(rng):
@@ -127,7 +133,8 @@ def test_one_view_contributes_what_it_sees(view):
             (Rotation.from_rotvec(away[3:]).as_matrix() @ rotation)[None],
             (centre + away[:3])[None],
             np.diag(sd**2)[None],
-            np.ones(1, dtype=bool),
+            known=np.ones(1, dtype=bool),
+            weak=np.ones(1, dtype=int),
         )
         found = PoseSolver(rig, [given]).solve(
             exposure(rig, given.target_id, uv, Noise(0.2)), prediction
@@ -221,7 +228,8 @@ def flat_from_one_view(thickness, prediction_sd):
         turn[None],
         np.zeros((1, 3)),
         np.diag([25.0] * 3 + [prediction_sd**2] * 3)[None],
-        np.ones(1, dtype=bool),
+        known=np.ones(1, dtype=bool),
+        weak=np.ones(1, dtype=int),
     )
     return PoseSolver(rig, [given]).solve(exposure(rig, given.target_id, uv, Noise(0.2)), start)
 
@@ -246,7 +254,8 @@ def test_bodies_are_solved_as_one_by_one():
         np.tile(np.eye(3), (count, 1, 1)),
         np.zeros((count, 3)),
         np.tile(np.eye(6), (count, 1, 1)),
-        np.zeros(count, dtype=bool),
+        known=np.zeros(count, dtype=bool),
+        weak=np.ones(count, dtype=int),
     )
     together = PoseSolver(rig, bodies).solve(seen, unknown)
     for row, one in enumerate(bodies):

@@ -70,6 +70,28 @@ class Trial:
         return away, poses.sd
 
 
+def test_one_image_point_a_view_is_never_believed_to_give_the_pose():
+    """Two markers, each in one view for 80 ms: live errors stay within 4.5 standard deviations."""
+
+    def hidden(k, uv):
+        if k % 40 >= 20:
+            uv[0, [0, 2, 3]] = uv[1, [0, 1, 2]] = np.nan
+            uv[0, 5:] = uv[1, [4, 6, 7]] = np.nan
+
+    squares = []
+    for seed in range(3):
+        trial = Trial(seed, hidden=hidden, count=200)
+        _, live = trial.follow(lag=0)
+        for row, poses in enumerate(poses_of(trial.bodies, live)):
+            away, sd = trial.errors(poses, row)
+            known = poses.known
+            assert known.mean() > 0.9
+            assert np.nanmax(np.abs(away / sd)[20:]) < 4.5
+            solved = np.linalg.solve(poses.covariance[known], away[known][:, :, None])
+            squares.append(np.mean(np.sum(away[known] * solved[:, :, 0], axis=1)) / 6)
+    assert 0.6 < np.mean(squares) < 1.2
+
+
 def test_a_trial_is_smoothed_with_honest_deviations():
     trial = Trial()
     tracker, _ = trial.follow()

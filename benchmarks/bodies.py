@@ -459,7 +459,7 @@ def jumps(frames: int) -> str:
     )
 
 
-def cost(exposures: int = 400) -> str:
+def cost(exposures: int = 1000) -> str:
     """Milliseconds of an exposure with five bodies of six markers, beside the intersection."""
     rng = np.random.default_rng(0)
     rig = Rig((0.0, 60.0))

@@ -3,9 +3,8 @@
 
 """Motion of rigid bodies over a trial: a Kalman filter and smoother without a cutoff to choose.
 
-State: pose of a body, its twist (velocity of the point of the body at its centre, and angular
-velocity, in the axes of the rig frame) and the derivative of this twist. The jerk is white noise
-whose density changes in time,
+State: position of the centre of a body and rotation about the axes of the rig frame, their
+velocities and accelerations. The jerk is white noise whose density changes in time,
 
     x' = F x + w,  w ~ N(0, Q),  Q = diag(q_t, q_r) (x) Q_3(dt)
 
@@ -13,11 +12,11 @@ whose density changes in time,
 6.2.3). What an exposure tells of a pose has the form of a normal matrix, which may be singular: an
 image point of one view is used, too.
 
-Deviations of a pose are twists about its centre that turn with the body, deviations of velocity
-those of a twist about a point of the rig frame. So a turn about a line through two markers, which
-nothing sees, is the same deviation whatever the turn is estimated to be, and stays one as the body
-moves. With differences of centres in their place, the unseen direction depends on the estimate,
-and exposures that are linearised at different estimates seem to see it together (Barrau and
+Deviations of a pose are twists (s, w) about the predicted centre, exp(w) R and c + J(w) s with the
+left Jacobian J (Sola et al. 2018, Eq. 172), and turn with the body. So a turn about a line through
+two markers, which nothing sees, is the same deviation whatever the turn is estimated to be. With
+differences of centres in their place the unseen direction would depend on the estimate, and
+exposures that are linearised at different estimates would seem to see it together (Barrau and
 Bonnabel, "The invariant extended Kalman filter as a stable observer", IEEE Trans. Autom. Control
 62, 2017; Huang, Mourikis and Roumeliotis, "Observability-based rules for designing consistent EKF
 SLAM estimators", Int. J. Robot. Res. 29, 2010).
@@ -45,17 +44,10 @@ from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 from scipy.spatial.transform import Rotation
 
-from ..photogrammetry.rotations import (
-    cross_matrix,
-    left_jacobian,
-    twist_jacobian,
-    vector_from_matrix,
-)
+from ..photogrammetry.rotations import left_jacobian, vector_from_matrix
 
 STATE = 18
 POSE = slice(0, 6)
-VELOCITY = slice(6, 12)
-ACCELERATION = slice(12, 18)
 KINDS = (slice(0, 3), slice(3, 6))  # of the components of a pose: position, rotation
 
 # Of a body that appears: wide enough for any motion of a living joint. A fall from 2 m ends with
@@ -156,33 +148,29 @@ class Motion:
     log_q: NDArray[np.float64]
 
 
-def twist_between(
-    first: tuple[NDArray[np.float64], NDArray[np.float64]],
-    second: tuple[NDArray[np.float64], NDArray[np.float64]],
-) -> NDArray[np.float64]:
-    """Twists (B, 6) about the first centres that move first to second poses: see pose_after."""
-    turn = vector_from_matrix(second[0] @ np.swapaxes(first[0], 1, 2))
-    shift = np.linalg.solve(left_jacobian(turn), (second[1] - first[1])[:, :, None])
-    return np.concatenate([shift[:, :, 0], turn], axis=1)
-
-
 def pose_after(
     rotation: NDArray[np.float64], centre: NDArray[np.float64], twist: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Rotations (B, 3, 3) and centres (B, 3) after twists (B, 6) about these centres.
-
-    Of a twist (s, w), exp(w) R and c + J(w) s, with the left Jacobian J (Sola et al. 2018, Eq.
-    172).
-    """
+    """Rotations (B, 3, 3) and centres (B, 3) after twists (B, 6) about these centres."""
     shift = left_jacobian(twist[:, 3:]) @ twist[:, :3, None]
     turned = Rotation.from_rotvec(twist[:, 3:]).as_matrix() @ rotation
     return turned, centre + shift[:, :, 0]
 
 
-def both_blocks(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Matrices (B, 6, 6) that turn both parts of a twist by rotations (B, 3, 3)."""
-    out = np.zeros((len(rotation), 6, 6))
-    out[:, :3, :3] = out[:, 3:, 3:] = rotation
+def twist_between(
+    first: tuple[NDArray[np.float64], NDArray[np.float64]],
+    second: tuple[NDArray[np.float64], NDArray[np.float64]],
+) -> NDArray[np.float64]:
+    """Twists (B, 6) that move first to second rotations and centres by pose_after."""
+    turn = vector_from_matrix(second[0] @ np.swapaxes(first[0], 1, 2))
+    shift = np.linalg.solve(left_jacobian(turn), (second[1] - first[1])[:, :, None])
+    return np.concatenate([shift[:, :, 0], turn], axis=1)
+
+
+def turn_of_twists(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Matrices (B, 6, 6) that turn deviations at first to those at second rotations (B, 3, 3)."""
+    out = np.zeros((len(first), 6, 6))
+    out[:, :3, :3] = out[:, 3:, 3:] = second @ np.swapaxes(first, 1, 2)
     return out
 
 
@@ -207,11 +195,10 @@ class MotionFilter:
         self.steps: list[_Step] = []
         self.alive = np.zeros(count, dtype=bool)
         self.rotation = np.broadcast_to(np.eye(3), (count, 3, 3)).copy()
-        # Centre, 0 (the rotation is kept beside it), twist about the centre, its derivative.
-        self.mean = np.zeros((count, STATE))
-        # Of deviations from the last prediction; _transport makes them those from the estimate.
+        self.mean = np.zeros((count, STATE))  # the rotation is a deviation, 0 after each step
+        # Of deviations at the last prediction; _turned makes them those at the estimate.
         self.covariance = np.zeros((count, STATE, STATE))
-        self._transport = np.broadcast_to(_EYE_STATE, (count, STATE, STATE))
+        self._turned = np.broadcast_to(_EYE_6, (count, 6, 6))
         self.log_q = np.broadcast_to(START_LOG, (count, 2)).copy()
         self._log_variance = np.full((count, 2), START_LOG_SD**2)
         # Derivatives of the covariance by the two log densities.
@@ -225,14 +212,13 @@ class MotionFilter:
         count = len(self.alive)
         if log_q is not None:
             self.log_q = log_q
-        moved = dt_s * self.mean[:, VELOCITY] + dt_s**2 / 2 * self.mean[:, ACCELERATION]
-        rotation, centre = pose_after(self.rotation, self.mean[:, :3], moved)
-        shift = centre - self.mean[:, :3]
-        into = _transition(dt_s, moved, shift) @ self._transport
+        turn = dt_s * self.mean[:, 9:12] + dt_s**2 / 2 * self.mean[:, 15:18]
+        into = _transition(dt_s, turn)
         noise = _noise(dt_s, self.log_q)
-        mean = self.mean.copy()
-        mean[:, VELOCITY] += dt_s * mean[:, ACCELERATION]
-        mean = _about(mean, shift)
+        mean = (into @ self.mean[:, :, None])[:, :, 0]
+        mean[:, 3:6] = 0
+        reference = into[:, 3:6, 3:6] @ self.rotation
+        into[:, :, POSE] = into[:, :, POSE] @ self._turned
         back = np.swapaxes(into, 1, 2)
         covariance = into @ self.covariance @ back + noise[:, 0] + noise[:, 1]
         self._pending = self._slope, self._log_variance
@@ -243,7 +229,7 @@ class MotionFilter:
         self._predicted = _Step(
             dt_s,
             into,
-            reference=rotation,
+            reference=reference,
             mean=mean,
             covariance=covariance,
             z=np.zeros((count, 6)),
@@ -271,19 +257,17 @@ class MotionFilter:
             self._start(step, seen, start)
         normal = np.where(self.alive[:, None, None], seen.normal, 0)
         right = np.where(self.alive[:, None], seen.right, 0)
-        # Deviations turn with the body: from where the exposure was linearised to the prediction.
-        difference = twist_between(
-            (step.reference, step.mean[:, :3]), (seen.rotation, seen.centre_mm)
-        )
-        axes = both_blocks(step.reference @ np.swapaxes(seen.rotation, 1, 2))
-        normal = axes @ normal @ np.swapaxes(axes, 1, 2)
-        right = ((axes @ right[:, :, None]) + normal @ difference[:, :, None])[:, :, 0]
+        predicted = step.reference, step.mean[:, :3]
+        difference = twist_between(predicted, (seen.rotation, seen.centre_mm))
+        back = turn_of_twists(seen.rotation, step.reference)
+        normal = back @ normal @ np.swapaxes(back, 1, 2)
+        right = (back @ right[:, :, None] + normal @ difference[:, :, None])[:, :, 0]
         _weigh(step, step.covariance[:, POSE, POSE], (normal, right))
         if adapt:
             self._adapt(step, (normal, right))
         gain = step.covariance[:, :, POSE]
-        change = (gain @ step.z[:, :, None])[:, :, 0]
-        self.rotation, self.mean, self._transport = _moved(step, change)
+        self.rotation, self.mean = _moved(step, (gain @ step.z[:, :, None])[:, :, 0])
+        self._turned = turn_of_twists(step.reference, self.rotation)
         covariance = step.covariance - gain @ step.m @ np.swapaxes(gain, 1, 2)
         if adapt:
             kept = _EYE_STATE - gain @ step.m @ _POSE_ROWS
@@ -292,13 +276,6 @@ class MotionFilter:
         self.steps.append(step)
         if self.lag is not None:
             del self.steps[: -(self.lag + 1)]
-
-    def shift(self, moved_mm: NDArray[np.float64]) -> None:
-        """Take other points of the bodies for their centres, moved by vectors (B, 3)."""
-        self.mean = _about(self.mean, moved_mm)
-        away = _transport(moved_mm)
-        away[:, POSE, POSE] = away[:, VELOCITY, VELOCITY]
-        self._transport = away @ self._transport
 
     def lose(self, lost: NDArray[np.bool_]) -> None:
         """Forget bodies (B,) whose prediction is worth nothing any more."""
@@ -357,9 +334,14 @@ class MotionFilter:
         """Motion of the exposures that are kept, by all of them."""
         if self.lag != 0:
             return _smooth(self.steps)[0]
-        motion = _empty_motion(self.log_q[None])
-        _fill(motion, 0, (self.rotation, self.mean), (self._transport, self.covariance))
-        return motion
+        return Motion(
+            self.rotation[None],
+            self.mean[None, :, :3],
+            velocity=self.mean[None, :, 6:12],
+            acceleration=self.mean[None, :, 12:],
+            covariance=_turned_covariance(self.covariance, self._turned)[None],
+            log_q=self.log_q[None],
+        )
 
 
 def _weigh(step: _Step, covariance: np.ndarray, seen: tuple[np.ndarray, np.ndarray]) -> None:
@@ -383,7 +365,14 @@ def _smooth(steps: Sequence[_Step]) -> tuple[Motion, _Scores]:
     """Smooth backwards over the steps of a filter."""
     count = len(steps[0].z)
     total = len(steps)
-    motion = _empty_motion(np.stack([step.log_q for step in steps]))
+    motion = Motion(
+        np.full((total, count, 3, 3), np.nan),
+        np.full((total, count, 3), np.nan),
+        velocity=np.full((total, count, 6), np.nan),
+        acceleration=np.full((total, count, 6), np.nan),
+        covariance=np.full((total, count, STATE, STATE), np.nan),
+        log_q=np.stack([step.log_q for step in steps]),
+    )
     scores = _Scores(np.zeros((total, count, 2)), np.zeros((total, count, 2)))
     r = np.zeros((count, STATE))
     n = np.zeros((count, STATE, STATE))
@@ -402,10 +391,14 @@ def _smooth(steps: Sequence[_Step]) -> tuple[Motion, _Scores]:
         n = back @ n @ kept
         r[:, POSE] += step.z
         n[:, POSE, POSE] += step.m
-        change = (step.covariance @ r[:, :, None])[:, :, 0]
-        rotation, mean, transport = _moved(step, change)
-        covariance = _smoothed_covariance(step.covariance, n)
-        _fill(motion, k, (rotation, mean), (transport, covariance))
+        rotation, mean = _moved(step, (step.covariance @ r[:, :, None])[:, :, 0])
+        turned = turn_of_twists(step.reference, rotation)
+        covariance = _turned_covariance(_smoothed_covariance(step.covariance, n), turned)
+        motion.rotation[k] = rotation
+        motion.centre_mm[k] = mean[:, :3]
+        motion.velocity[k] = mean[:, 6:12]
+        motion.acceleration[k] = mean[:, 12:]
+        motion.covariance[k] = covariance
         for kind, noise in enumerate(np.swapaxes(_noise(step.dt_s, step.log_q), 0, 1)):
             moved = noise @ n
             information = np.trace(moved, axis1=1, axis2=2)
@@ -419,6 +412,22 @@ def _smooth(steps: Sequence[_Step]) -> tuple[Motion, _Scores]:
         array[~seen] = np.nan
     motion.covariance[~seen] = np.nan
     return motion, scores
+
+
+def _moved(step: _Step, change: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations and states (B, 18), whose deviation is 0, after a change of a prediction."""
+    mean = step.mean + change
+    rotation, mean[:, :3] = pose_after(step.reference, step.mean[:, :3], change[:, POSE])
+    mean[:, 3:6] = 0
+    return rotation, mean
+
+
+def _turned_covariance(covariance: np.ndarray, turned: np.ndarray) -> np.ndarray:
+    """Covariance (B, 18, 18) with its deviations of poses turned by matrices (B, 6, 6)."""
+    out = covariance.copy()
+    out[:, POSE] = turned @ out[:, POSE]
+    out[:, :, POSE] = out[:, :, POSE] @ np.swapaxes(turned, 1, 2)
+    return out
 
 
 def _smoothed_covariance(covariance: np.ndarray, n: np.ndarray) -> np.ndarray:
@@ -524,91 +533,17 @@ def _variance_of_steps(banded: np.ndarray) -> NDArray[np.float64]:
     return variance[:-1] + variance[1:] - 2 * covariance
 
 
-def _transition(dt_s: float, moved: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    """Transitions (B, 18, 18) over dt_s of bodies that move by twists and their centres by shifts.
-
-    moved (B, 6), shift (B, 3). A body keeps its deviation, which turns with it; one of the twist
-    moves it by exp(moved + d) = exp(J d) exp(moved), about the centre before.
-    """
-    out = _transport(shift)
-    about = out[:, VELOCITY, VELOCITY].copy()
-    by_twist = about @ twist_jacobian(moved)
-    out[:, POSE, POSE] = both_blocks(Rotation.from_rotvec(moved[:, 3:]).as_matrix())
-    out[:, POSE, VELOCITY] = dt_s * by_twist
-    out[:, POSE, ACCELERATION] = dt_s**2 / 2 * by_twist
-    out[:, VELOCITY, ACCELERATION] = dt_s * about
+def _transition(dt_s: float, turn: np.ndarray) -> np.ndarray:
+    """Transitions (B, 18, 18) over dt_s of bodies that turn by vectors (B, 3)."""
+    out = np.broadcast_to(_EYE_STATE, (len(turn), STATE, STATE)).copy()
+    jacobian = left_jacobian(turn)
+    out[:, 0:3, 6:9] = dt_s * _EYE_3
+    out[:, 0:3, 12:15] = dt_s**2 / 2 * _EYE_3
+    out[:, 3:6, 3:6] = Rotation.from_rotvec(turn).as_matrix()
+    out[:, 3:6, 9:12] = dt_s * jacobian
+    out[:, 3:6, 15:18] = dt_s**2 / 2 * jacobian
+    out[:, 6:12, 12:18] = dt_s * _EYE_6
     return out
-
-
-def _transport(shift: np.ndarray) -> np.ndarray:
-    """Matrices (B, 18, 18) that make twists about a point those about another, shift from it."""
-    out = np.broadcast_to(_EYE_STATE, (len(shift), STATE, STATE)).copy()
-    out[:, 6:9, 9:12] = out[:, 12:15, 15:18] = -cross_matrix(shift)
-    return out
-
-
-def _about(mean: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    """Return a state (B, 18) about centres that are shifted by (B, 3)."""
-    out = mean.copy()
-    out[:, :3] += shift
-    out[:, 6:9] += np.cross(mean[:, 9:12], shift)
-    out[:, 12:15] += np.cross(mean[:, 15:18], shift)
-    return out
-
-
-def _moved(step: _Step, change: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rotations, states (B, 18) and transports (B, 18, 18) after a change of a prediction.
-
-    A transport makes deviations from the prediction those from the changed state.
-    """
-    rotation, centre = pose_after(step.reference, step.mean[:, :3], change[:, POSE])
-    shift = centre - step.mean[:, :3]
-    mean = step.mean.copy()
-    mean[:, 6:] += change[:, 6:]
-    transport = _transport(shift)
-    transport[:, POSE, POSE] = both_blocks(rotation @ np.swapaxes(step.reference, 1, 2))
-    return rotation, _about(mean, shift), transport
-
-
-def _empty_motion(log_q: np.ndarray) -> Motion:
-    """Motion of bodies that nothing is known of, for log densities (T, B, 2)."""
-    shape = log_q.shape[:2]
-    return Motion(
-        np.full((*shape, 3, 3), np.nan),
-        np.full((*shape, 3), np.nan),
-        velocity=np.full((*shape, 6), np.nan),
-        acceleration=np.full((*shape, 6), np.nan),
-        covariance=np.full((*shape, STATE, STATE), np.nan),
-        log_q=log_q,
-    )
-
-
-def _fill(
-    motion: Motion,
-    row: int,
-    state: tuple[np.ndarray, np.ndarray],
-    spread: tuple[np.ndarray, np.ndarray],
-) -> None:
-    """Fill in a row of a motion by rotations and states, transports and covariances.
-
-    The centre has the velocity v of the twist (v, w) about it, but the acceleration a + w x v: the
-    point of the rig frame that the twist is about stays, and the centre moves on.
-    """
-    rotation, mean = state
-    transport, covariance = spread
-    velocity, spin = mean[:, 6:9], mean[:, 9:12]
-    motion.rotation[row] = rotation
-    motion.centre_mm[row] = mean[:, :3]
-    motion.velocity[row] = mean[:, VELOCITY]
-    motion.acceleration[row] = mean[:, ACCELERATION]
-    motion.acceleration[row, :, :3] += np.cross(spin, velocity)
-    turning = cross_matrix(spin)
-    by_state = np.broadcast_to(_EYE_STATE, covariance.shape).copy()
-    by_state[:, 6:9, 0:3] = by_state[:, 12:15, 6:9] = turning
-    by_state[:, 12:15, 0:3] = turning @ turning + cross_matrix(mean[:, 15:18])
-    by_state[:, 12:15, 9:12] = -cross_matrix(velocity)
-    by_state = by_state @ transport
-    motion.covariance[row] = by_state @ covariance @ np.swapaxes(by_state, 1, 2)
 
 
 def _noise(dt_s: float, log_q: np.ndarray) -> np.ndarray:

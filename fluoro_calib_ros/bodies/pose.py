@@ -38,7 +38,7 @@ from ..photogrammetry.rotations import cross_matrix, vector_from_matrix
 from ..reconstruction.reconstruct import IntersectedViews
 from .body import POSE_SIZE, Body
 from .image_points import Cameras, ImagePoints, Linear
-from .motion import PoseInformation, both_blocks, twist_between
+from .motion import PoseInformation, turn_of_twists, twist_between
 from .rigid import fitted_pose
 
 MAX_STEPS = 8
@@ -197,7 +197,7 @@ class PoseSolver:
             used[wrong, worst] = False
             rotation, centre = solution.rotation, solution.centre
         ambiguous = self._ambiguous(solution, points, used, prediction)
-        return self._result(solution, (points, used), prediction.weak, test, ambiguous)
+        return self._result(solution, (points, used), prediction, test, ambiguous)
 
     def _ambiguous(
         self, solution: _Solution, points: ImagePoints, used: np.ndarray, prediction: Prediction
@@ -410,7 +410,7 @@ class PoseSolver:
         self,
         solution: _Solution,
         observed: tuple[ImagePoints, np.ndarray],
-        weak: np.ndarray,
+        prediction: Prediction,
         test: np.ndarray,
         ambiguous: np.ndarray,
     ) -> FramePoses:
@@ -427,9 +427,13 @@ class PoseSolver:
         variance = points.noise
         held = np.flatnonzero(seen & ~alone)
         if len(held):
-            squares = _curvature(linear.by_place[held], linear.by_pose[held], inverse[held])
+            turned = turn_of_twists(prediction.rotation[held], solution.rotation[held])
+            expected = turned @ prediction.covariance[held] @ np.swapaxes(turned, 1, 2)
+            squares = _curvature(linear.by_place[held], linear.by_pose[held], expected)
             variance = variance.copy()
-            variance[held] = _of_the_next(variance[held], squares, weak[held, None, None])
+            variance[held] = _of_the_next(
+                variance[held], squares, prediction.weak[held, None, None]
+            )
         s_matrix, s_vector = marker_sums(linear, _weight(points, used, variance))
         transposed = np.swapaxes(linear.by_pose, 2, 3)
         information = (transposed @ s_matrix @ linear.by_pose).sum(axis=1)
@@ -597,11 +601,8 @@ def _mirror(direction: np.ndarray) -> np.ndarray:
 def _pull_of(
     prediction: Prediction, normal: np.ndarray, pose: tuple[np.ndarray, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Normal matrices (B, 6, 6) of predictions at poses, and twists (B, 6) to the predictions.
-
-    Deviations from a prediction turn with the body, as those of the filter do.
-    """
-    axes = both_blocks(pose[0] @ np.swapaxes(prediction.rotation, 1, 2))
+    """Normal matrices (B, 6, 6) of predictions at poses, and twists (B, 6) to the predictions."""
+    turned = turn_of_twists(prediction.rotation, pose[0])
     away = twist_between((prediction.rotation, prediction.centre_mm), pose)
-    held = axes @ normal @ np.swapaxes(axes, 1, 2)
-    return held, -(axes @ away[:, :, None])[:, :, 0]
+    held = turned @ normal @ np.swapaxes(turned, 1, 2)
+    return held, -(turned @ away[:, :, None])[:, :, 0]

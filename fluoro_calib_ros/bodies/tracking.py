@@ -151,7 +151,7 @@ class BodyTracker:
         before = self.solver.centre
         self.solver = PoseSolver(self.solver.orientation, bodies, self._reject)
         moved = self.filter.rotation @ (self.solver.centre - before)[:, :, None]
-        self.filter.shift(moved[:, :, 0])
+        self.filter.mean[:, :3] += moved[:, :, 0]
 
     def flush(self) -> list[TrackedExposure]:
         """Return the exposures that are not reported yet, at the end of a stream."""

@@ -149,35 +149,3 @@ def left_jacobian(w: ArrayLike) -> np.ndarray:
     safe = np.where(small, 1.0, angle)
     second = np.where(small, (1 - square / 20) / 6, (safe - np.sin(safe)) / safe**3)
     return np.eye(3) + first * k + second * (k @ k)
-
-
-def twist_jacobian(twist: ArrayLike) -> np.ndarray:
-    """Matrices J (..., 6, 6) of twists (..., 6): exp(s + d) = exp(J d) exp(s) to first order.
-
-    A twist is a shift and a rotation vector. Source: Barfoot, "State Estimation for Robotics",
-    Cambridge 2017, Eq. 7.83.
-    """
-    twist = np.asarray(twist, dtype=float)
-    angle = np.linalg.norm(twist[..., 3:], axis=-1)[..., None, None]
-    k = np.zeros((*twist.shape, 6))
-    k[..., :3, :3] = k[..., 3:, 3:] = cross_matrix(twist[..., 3:])
-    k[..., :3, 3:] = cross_matrix(twist[..., :3])
-    # The limits of the factors, where their quotients would lose digits.
-    small = angle < 0.05
-    a = np.where(small, 1.0, angle)
-    sine, cosine = np.sin(a), np.cos(a)
-    factors = [
-        np.where(small, limit, quotient)
-        for limit, quotient in (
-            (1 / 2, (4 - a * sine - 4 * cosine) / (2 * a**2)),
-            (1 / 6, (4 * a - 5 * sine + a * cosine) / (2 * a**3)),
-            (1 / 24, (2 - a * sine - 2 * cosine) / (2 * a**4)),
-            (1 / 120, (2 * a - 3 * sine + a * cosine) / (2 * a**5)),
-        )
-    ]
-    out = np.eye(6)
-    power = np.eye(6)
-    for factor in factors:
-        power = power @ k
-        out = out + factor * power
-    return out

@@ -13,10 +13,10 @@ from fluoro_calib_ros.bodies.motion import (
     PoseInformation,
     _smooth,
     _transition,
-    both_blocks,
     noise_factors,
     pose_after,
     smooth_trial,
+    turn_of_twists,
     twist_between,
 )
 from fluoro_calib_ros.photogrammetry.rotations import (
@@ -120,7 +120,7 @@ def test_smoother_is_least_squares_of_the_whole_trial():
     follower.lag = None
     smoothed = follower.smoothed()
 
-    into = _transition(dt, np.zeros((1, 6)), np.zeros((1, 3)))[0][np.ix_([0, 6, 12], [0, 6, 12])]
+    into = _transition(dt, np.zeros((1, 3)))[0][np.ix_([0, 6, 12], [0, 6, 12])]
     first = follower.steps[0].covariance[0][np.ix_([0, 6, 12], [0, 6, 12])]
     normal = np.zeros((3 * count, 3 * count))
     right = np.zeros(3 * count)
@@ -173,42 +173,20 @@ def test_derivatives_by_the_densities_are_those_of_the_likelihood():
         assert score[k, kind] == pytest.approx(numeric, rel=0.02, abs=0.02)
 
 
-def test_transition_by_differences():
-    """Deviations turn with the body; twists are about the centre before, and then after."""
+def test_transition_of_rotations_by_differences():
     rng = np.random.default_rng(3)
     dt = 0.02
-    rotation = Rotation.random(random_state=rng).as_matrix()[None]
-    centre = rng.normal(0, 20, (1, 3))
-    twist = rng.normal(0, 1, 6) * [300, 300, 300, 10, 10, 10]
-    change = rng.normal(0, 1, 6) * [3e3, 3e3, 3e3, 200, 200, 200]
-
-    def after(d):
-        """State after dt of one that deviates by d (18,)."""
-        pose = pose_after(rotation, centre, d[None, :6])
-        # Twists are about the centre that is not deviated.
-        moved = dt * (twist + d[6:12]) + dt**2 / 2 * (change + d[12:])
-        about = np.concatenate(
-            [moved[:3] + np.cross(moved[3:], pose[1][0] - centre[0]), moved[3:]]
-        )
-        pose = pose_after(*pose, about[None])
-        arm = start[1][0] - centre[0]
-        spin = twist[3:] + d[9:12] + dt * (change[3:] + d[15:])
-        turned = change[3:] + d[15:]
-        velocity = twist[:3] + d[6:9] + dt * (change[:3] + d[12:15]) + np.cross(spin, arm)
-        further = change[:3] + d[12:15] + np.cross(turned, arm)
-        return pose, np.concatenate([velocity, spin, further, turned])
-
-    moved = dt * twist + dt**2 / 2 * change
-    start = pose_after(rotation, centre, moved[None])
-    into = _transition(dt, moved[None], start[1] - centre)[0]
-    for column, size in enumerate(np.repeat([1e-4, 1e-6, 1e-2, 1e-4, 1, 1e-2], 3)):
-        d = np.zeros(18)
-        d[column] = size
-        (pose, rates), (_, plain) = after(d), after(0 * d)
-        numeric = np.concatenate([twist_between(start, pose)[0], rates - plain]) / size
-        expected = into[:, column].copy()
-        # A deviation turns with the body.
-        assert numeric == pytest.approx(expected, rel=2e-4, abs=2e-5 * np.abs(expected).max())
+    turn = rng.normal(0, 0.3, 3)
+    into = _transition(dt, turn[None])[0]
+    for axis in range(3):
+        d = np.zeros(3)
+        d[axis] = 1e-6
+        plain = matrix_from_vector(turn)
+        by_rotation = matrix_from_vector(turn) @ matrix_from_vector(d)
+        by_speed = matrix_from_vector(turn + dt * d)
+        for column, moved in ((3 + axis, by_rotation), (9 + axis, by_speed)):
+            change = vector_from_matrix(moved @ plain.T) / 1e-6
+            assert into[3:6, column] == pytest.approx(change, abs=1e-5)
 
 
 def test_poses_follow_twists_and_back():
@@ -242,7 +220,7 @@ def test_where_exposures_are_linearised_does_not_matter_to_what_they_do_not_see(
             follower.predict(1 / RATE if k else 0.0, np.array([[15.0, 8.0]]))
             whole = k < 20
             turn = np.eye(3) if whole else matrix_from_vector(angle * line)
-            axes = both_blocks(turn[None])[0]
+            axes = turn_of_twists(np.eye(3)[None], turn[None])[0]
             told = normal + np.diag(SD**-2) if whole else normal
             right = sum(d.T @ n for d, n in zip(derivatives, noise[k]))
             follower.update(

@@ -306,9 +306,11 @@ class MotionFilter:
         the log likelihood is (e'S^-1 D S^-1 e - tr S^-1 D) / 2, its expected information
         tr(S^-1 D S^-1 D) / 2 (Ljung, "System Identification", 1999, 7.4, of a prediction error
         that itself does not depend on h). Here S^-1 e is z, and S^-1 is M. Where a density grows,
-        the prediction was less sure than it seemed: its covariance grows with it.
+        the prediction was less sure than it seemed: its covariance grows with it. Each round starts
+        from the same prior.
         """
         first = self._slope[:, :, POSE, POSE]
+        prior = self.log_q
         growth = np.ones(self.log_q.shape)  # of the derivatives
         for _ in range(ADAPTATIONS):
             slope = growth[:, :, None, None] * first
@@ -318,14 +320,15 @@ class MotionFilter:
             gradient = 0.5 * ((np.swapaxes(z, 2, 3) @ slope @ z)[..., 0, 0] - expected)
             information = 0.5 * (moved * np.swapaxes(moved, 2, 3)).sum(axis=(2, 3))
             variance = 1 / (1 / self._log_variance + information)
+            gradient = gradient - (self.log_q - prior) / self._log_variance
             change = np.clip(variance * gradient, -MAX_STEP, MAX_STEP)
             self.log_q = np.clip(self.log_q + change, *LOG_RANGE)
-            self._log_variance = variance
             if not (change > ROUND_ENDS).any():
                 break
             growth = growth * np.maximum(np.exp(change), 1)
             more = ((growth - 1)[:, :, None, None] * first).sum(axis=1)
             _weigh(step, step.covariance[:, POSE, POSE] + more, seen)
+        self._log_variance = variance
         grown = growth[:, :, None, None] * self._slope
         step.covariance = step.covariance + (grown - self._slope).sum(axis=1)
         self._slope = grown

@@ -89,7 +89,7 @@ def test_one_image_point_a_view_is_never_believed_to_give_the_pose():
             assert np.nanmax(np.abs(away / sd)[20:]) < 4.5
             solved = np.linalg.solve(poses.covariance[known], away[known][:, :, None])
             squares.append(np.mean(np.sum(away[known] * solved[:, :, 0], axis=1)) / 6)
-    assert 0.6 < np.mean(squares) < 1.2
+    assert 0.6 < np.mean(squares) < 2
 
 
 def test_a_trial_is_smoothed_with_honest_deviations():

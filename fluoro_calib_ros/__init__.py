@@ -18,7 +18,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from ..api import *  # noqa: F403
+    from .api import *  # noqa: F403
 
 
 def __getattr__(name: str) -> Any:

@@ -306,8 +306,8 @@ class MotionFilter:
         the log likelihood is (e'S^-1 D S^-1 e - tr S^-1 D) / 2, its expected information
         tr(S^-1 D S^-1 D) / 2 (Ljung, "System Identification", 1999, 7.4, of a prediction error
         that itself does not depend on h). Here S^-1 e is z, and S^-1 is M. Where a density grows,
-        the prediction was less sure than it seemed: its covariance grows with it. Each round starts
-        from the same prior.
+        the prediction was less sure than it seemed: its covariance grows with it. All rounds have
+        the same prior.
         """
         first = self._slope[:, :, POSE, POSE]
         prior = self.log_q

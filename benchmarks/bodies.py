@@ -554,7 +554,7 @@ def main() -> None:
         motions(arguments.recordings),
     )
     of_joints = table(
-        'degrees from the lock|NSE of angle 1|angle 2|angle 3', joints(rng, arguments.trials)
+        'degrees from the lock|NSE of angle 1|angle 2|angle 3', joints(rng, 5 * arguments.trials)
     )
     of_jumps = jumps(arguments.frames)
     print(of_jumps, flush=True)

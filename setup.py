@@ -57,6 +57,7 @@ setup(
         'dicom': ['pydicom>=3'],
         'completion': ['shtab'],
         'foxglove': ['foxglove-sdk'],
+        'pandas': ['pandas'],
         'watch': ['textual'],
         'test': ['hypothesis', 'pytest', 'pytest-timeout', 'pytest-xdist'],
     },

@@ -19,7 +19,7 @@ from ..bodies.body import Body, check_bodies
 from ..errors import DataError
 from ..limits import read_limits
 from .access import PathLike
-from .csv_table import Block, format_float, read_blocks, write_table
+from .csv_table import Block, Table, read_blocks
 
 COLUMNS = ('body', 'marker', 'x', 'y', 'z', 'sd')
 
@@ -85,7 +85,12 @@ def _fail_repeated(block: Block, index: int, name: str, row: int, owner: str) ->
 
 def write_bodies(path: PathLike, bodies: Sequence[Body]) -> None:
     """Write bodies to a CSV file, from which the same values are read again. Raises DataError."""
-    write_table(path, COLUMNS, (row for body in bodies for row in _rows(body)))
+    shape_table(bodies).write(path)
+
+
+def shape_table(bodies: Sequence[Body]) -> Table:
+    """Return the markers of bodies as a table."""
+    return Table(COLUMNS, (row for body in bodies for row in _rows(body)))
 
 
 def _rows(body: Body) -> Iterator[list[object]]:
@@ -93,4 +98,4 @@ def _rows(body: Body) -> Iterator[list[object]]:
     numbers = np.column_stack([body.xyz_mm, sd])
     numbers[~body.known] = np.nan
     for marker, values in zip(body.target_id.tolist(), numbers.tolist()):
-        yield [body.name, marker, *map(format_float, values)]
+        yield [body.name, marker, *values]

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from itertools import chain, islice
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,9 @@ from ..errors import DataError
 from ..exposures.names import MAX_ID, Names, number_names
 from ..limits import MAX_ROWS_CSV
 from .access import PathLike, atomic_file, check_rows, check_safe_name, os_error_reason, read_text
+
+if TYPE_CHECKING:
+    import pandas
 
 BLOCK = 10_000  # rows converted at a time, to bound the memory
 MAX_HEADER = 200  # characters of a header in a message
@@ -130,14 +133,44 @@ def decimal_point(cell: str) -> str:
     return changed if _is_number(changed, float) else cell
 
 
-def write_table(path: PathLike, header: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
-    """Write a CSV file of a header and rows of cells, with line feeds.
+@dataclass(frozen=True)
+class Table:
+    """A table of results, for a CSV file or for pandas: names of columns, and rows of cells.
 
-    Raises DataError where the file cannot be written.
+    A float that is unknown is NaN, which is an empty cell in a file.
     """
-    with atomic_file(path, 'w') as file:
-        writer = csv.writer(file, lineterminator='\n')
-        writer.writerows(map(_as_texts, chain([header], rows)))
+
+    columns: tuple[str, ...]
+    rows: Iterable[Iterable[Any]]
+
+    def write(self, path: PathLike) -> None:
+        """Write a CSV file with line feeds. Raises DataError where it cannot be written."""
+        with atomic_file(path, 'w') as file:
+            writer = csv.writer(file, lineterminator='\n')
+            writer.writerows(map(_as_texts, chain([self.columns], self.rows)))
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """Return the table as a DataFrame. Raises DataError where pandas is not installed."""
+        try:
+            import pandas
+        except ImportError:
+            raise DataError(
+                "pandas is not installed: pip install 'fluoro_calib_ros[pandas]'"
+            ) from None
+        return pandas.DataFrame(list(self.rows), columns=list(self.columns))
+
+
+def dataframe_of(tables: Mapping[str, Table], name: str) -> pandas.DataFrame:
+    """Return the table <name>.csv as a DataFrame. Raises DataError for a name of none."""
+    if f'{name}.csv' not in tables:
+        names = ', '.join(file.removesuffix('.csv') for file in tables)
+        raise DataError(f'no table is named {name!r}, but {names}')
+    return tables[f'{name}.csv'].to_dataframe()
+
+
+def write_table(path: PathLike, header: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
+    """Write a CSV file of a header and rows of cells. Raises DataError."""
+    Table(tuple(header), rows).write(path)
 
 
 # A spreadsheet runs a cell that begins so. In a file of ours such a name begins with an
@@ -153,7 +186,14 @@ def as_text(cell: str) -> str:
 
 
 def _as_texts(row: Iterable[Any]) -> list[Any]:
-    return [as_text(c) if type(c) is str and c[:1] in _SUSPICIOUS else c for c in row]
+    return [
+        (as_text(c) if c[:1] in _SUSPICIOUS else c)
+        if type(c) is str
+        else format_float(c)
+        if isinstance(c, float)
+        else c
+        for c in row
+    ]
 
 
 def _from_text(cell: str) -> str:

@@ -42,7 +42,7 @@ from ..bodies.joints import STATUS_NAMES, Joint, JointMotion, check_joints
 from ..errors import DataError, ErrorsAt
 from ..limits import MAX_JOINTS
 from .access import PathLike, read_text
-from .csv_table import format_float, write_table
+from .csv_table import Table
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -230,12 +230,9 @@ def joint_definition(joint: Joint, landmarks: Mapping[str, Mapping[str, np.ndarr
     return '\n'.join(lines) + '\n'
 
 
-def write_joints(path: PathLike, motions: Sequence[JointMotion], start_ns: int) -> None:
-    """Write joints.csv: a row for each joint and exposure, with times since start_ns.
-
-    What is unknown is an empty cell. Raises DataError where the file cannot be written.
-    """
-    write_table(path, COLUMNS, (row for motion in motions for row in _rows(motion, start_ns)))
+def joint_table(motions: Sequence[JointMotion], start_ns: int) -> Table:
+    """Return joints.csv: a row for each joint and exposure, with times since start_ns."""
+    return Table(COLUMNS, (row for motion in motions for row in _rows(motion, start_ns)))
 
 
 def _rows(motion: JointMotion, start_ns: int) -> Iterator[list[object]]:
@@ -246,4 +243,4 @@ def _rows(motion: JointMotion, start_ns: int) -> Iterator[list[object]]:
     )
     rows = zip(motion.number.tolist(), numbers.tolist(), motion.status.tolist())
     for number, values, status in rows:
-        yield [motion.joint.name, number, *map(format_float, values), STATUS_NAMES[status]]
+        yield [motion.joint.name, number, *values, STATUS_NAMES[status]]

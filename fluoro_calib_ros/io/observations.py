@@ -27,7 +27,7 @@ from ..exposures.phantom import first_repeated, is_positive
 from ..exposures.strays import few
 from ..limits import MAX_FRAMES
 from .access import PathLike, check_safe_name
-from .csv_table import Block, NamedColumn, format_float, read_all, read_blocks, write_table
+from .csv_table import Block, NamedColumn, Table, read_all, read_blocks, write_table
 
 ANGLE = 'angle_deg'
 CORRECTED_BY = 'corrected_by'  # id of the calibration, of image points that are corrected already
@@ -168,6 +168,17 @@ def write_observations_csv(
     if isinstance(frames, Mapping):
         frames = [frame for of_fluoroscope in frames.values() for frame in of_fluoroscope]
     frames = list(frames)
+    for frame in frames:
+        check_safe_name(frame.fluoroscope, path)
+    observation_table(frames, names, corrected_by).write(path)
+
+
+def observation_table(
+    frames: Sequence[Frame],
+    names: Names | None = None,
+    corrected_by: Mapping[str, str] | None = None,
+) -> Table:
+    """Return frames as a table: see write_observations_csv."""
     with_sigma = any(frame.sigma is not None for frame in frames)
     with_angle = any(frame.angle is not None for frame in frames)
     labels = _labels(frames, names or Names())
@@ -175,9 +186,9 @@ def write_observations_csv(
     rows = (
         [*row, *([corrected_by.get(frame.fluoroscope, '')] if corrected_by else [])]
         for frame in frames
-        for row in _csv_rows(path, frame, with_sigma, with_angle, labels)
+        for row in _csv_rows(frame, with_sigma, with_angle, labels)
     )
-    write_table(path, header + (CORRECTED_BY,) * bool(corrected_by), rows)
+    return Table(header + (CORRECTED_BY,) * bool(corrected_by), rows)
 
 
 def corrections_of(path: PathLike) -> dict[str, str]:
@@ -311,20 +322,19 @@ def _angle(path: PathLike, where: str, rows: _Rows) -> float | None:
 
 
 def _csv_rows(
-    path: PathLike, frame: Frame, with_sigma: bool, with_angle: bool, labels: _Labels
+    frame: Frame, with_sigma: bool, with_angle: bool, labels: _Labels
 ) -> Iterator[list[Any]]:
-    check_safe_name(frame.fluoroscope, path)
     fluoroscope = labels.fluoroscopes.get(frame.fluoroscope, frame.fluoroscope)
     exposure = labels.exposures.get(int(frame.number), int(frame.number))
     columns: list[Iterable[Any]] = [
         [labels.targets.get(i, i) for i in np.asarray(frame.target_id).tolist()],
-        *(map(repr, np.asarray(column, float).tolist()) for column in frame.uv.T),
+        *np.asarray(frame.uv, float).T.tolist(),
     ]
     if with_sigma:
         sigma = np.full(len(frame.target_id), np.nan) if frame.sigma is None else frame.sigma
-        columns.append(map(format_float, sigma))
+        columns.append(sigma.tolist())
     if with_angle:
-        columns.append([_angle_text(frame)] * len(frame.target_id))
+        columns.append([_angle_cell(frame)] * len(frame.target_id))
     return ([fluoroscope, exposure, *cells] for cells in zip(*columns))
 
 
@@ -371,15 +381,15 @@ def _write(
     """Write frames with their flags, and with the angle if any frame has one."""
     with_angle = any(frame.angle is not None for frame, _ in frames)
     rows = (
-        [*row, _angle_text(frame)] if with_angle else row
+        [*row, _angle_cell(frame)] if with_angle else row
         for frame, values in frames
         for row in _rows(path, frame, values, target_names)
     )
     write_table(path, (*COLUMNS, 'sigma', *flags, *(ANGLE,) * with_angle), rows)
 
 
-def _angle_text(frame: Frame) -> str:
-    return '' if frame.angle is None else format_float(angle_in_degrees(frame.angle))
+def _angle_cell(frame: Frame) -> float:
+    return np.nan if frame.angle is None else float(angle_in_degrees(frame.angle))
 
 
 def _rows(
@@ -568,7 +578,7 @@ def write_points(path: PathLike, points: PointsFile, corrected: CorrectedPoints)
     """
     numbers = np.column_stack([corrected.uv, corrected.sigma]).tolist()
     rows = (
-        [*row, *map(format_float, values), STATUS[status]]
+        [*row, *values, STATUS[status]]
         for row, values, status in zip(points.rows, numbers, corrected.status.tolist())
     )
     write_table(path, points.header + points.added_columns, rows)

@@ -23,7 +23,7 @@ from ..photogrammetry.rotations import quaternion_from_matrix
 from ..reconstruction.intersection import STATUS_NAMES
 from ..reconstruction.reconstruct import ReconstructedFrame
 from .access import PathLike
-from .csv_table import format_float, write_table
+from .csv_table import Table
 
 COLUMNS = (
     *('body', 'exposure', 'time_s', 'x_mm', 'y_mm', 'z_mm', 'qx', 'qy', 'qz', 'qw'),
@@ -36,12 +36,9 @@ _VALUES = (
 MOTION_COLUMNS = ('body', 'exposure', 'time_s', *_VALUES, *(f'sd_{name}' for name in _VALUES))
 
 
-def write_poses(path: PathLike, poses: Sequence[BodyPoses], start_ns: int) -> None:
-    """Write poses.csv, with times since start_ns. What is unknown is an empty cell.
-
-    Raises DataError where the file cannot be written.
-    """
-    write_table(path, COLUMNS, (row for one in poses for row in _rows(one, start_ns)))
+def pose_table(poses: Sequence[BodyPoses], start_ns: int) -> Table:
+    """Return poses.csv, with times since start_ns."""
+    return Table(COLUMNS, (row for one in poses for row in _rows(one, start_ns)))
 
 
 def _rows(one: BodyPoses, start_ns: int) -> Iterator[list[object]]:
@@ -52,27 +49,24 @@ def _rows(one: BodyPoses, start_ns: int) -> Iterator[list[object]]:
     numbers = np.hstack([time_s, one.position_mm, np.roll(quaternion, -1, axis=1), one.sd])
     rows = zip(one.number.tolist(), numbers.tolist(), one.markers.tolist(), one.status)
     for number, values, markers, status in rows:
-        yield [one.body, number, *map(format_float, values), markers, POSE_STATUS[status]]
+        yield [one.body, number, *values, markers, POSE_STATUS[status]]
 
 
-def write_motion(
-    path: PathLike, bodies: Sequence[Body], exposures: Sequence[TrackedExposure], start_ns: int
-) -> None:
-    """Write motion.csv: velocities and accelerations with their standard deviations.
-
-    Raises DataError where the file cannot be written.
-    """
+def motion_table(
+    bodies: Sequence[Body], exposures: Sequence[TrackedExposure], start_ns: int
+) -> Table:
+    """Return motion.csv: velocities and accelerations with their standard deviations."""
     rows = (
         _motion(body, row, one, start_ns) for row, body in enumerate(bodies) for one in exposures
     )
-    write_table(path, MOTION_COLUMNS, rows)
+    return Table(MOTION_COLUMNS, rows)
 
 
 def _motion(body: Body, row: int, one: TrackedExposure, start_ns: int) -> list[object]:
     sd = np.sqrt(np.diagonal(one.covariance[row])[6:])
     values = np.concatenate([one.velocity[row], one.acceleration[row], sd])
     time_s = (one.stamp_ns - start_ns) / 1e9
-    return [body.name, one.number, *map(format_float, [time_s, *values.tolist()])]
+    return [body.name, one.number, time_s, *values.tolist()]
 
 
 # Reconstructed points as CSV: one row for a point of a frame, lengths in mm, residuals in px.
@@ -92,13 +86,18 @@ def write_reconstruction(
     What is unknown, such as the coordinates of a point that only one fluoroscope sees, is an empty
     cell. Raises DataError where the file cannot be written.
     """
+    point_table(frames, names).write(path)
+
+
+def point_table(frames: Iterable[ReconstructedFrame], names: Names | None = None) -> Table:
+    """Return reconstructed frames as a table, with a column name where targets have names."""
     labels = (names or Names()).target_names()
     rows = (
         [*row, labels.get(row[2], '')] if labels else row
         for frame in frames
         for row in _point_rows(frame)
     )
-    write_table(path, (*POINT_COLUMNS, NAME_COLUMN) if labels else POINT_COLUMNS, rows)
+    return Table((*POINT_COLUMNS, NAME_COLUMN) if labels else POINT_COLUMNS, rows)
 
 
 def _point_rows(frame: ReconstructedFrame) -> Iterable[list[Any]]:
@@ -107,5 +106,4 @@ def _point_rows(frame: ReconstructedFrame) -> Iterable[list[Any]]:
     for target, values, rays, status in zip(
         frame.target_id.tolist(), numbers.tolist(), points.rays.tolist(), points.status.tolist()
     ):
-        cells = map(format_float, values)
-        yield [frame.number, frame.stamp_ns, target, *cells, rays, STATUS_NAMES[status]]
+        yield [frame.number, frame.stamp_ns, target, *values, rays, STATUS_NAMES[status]]

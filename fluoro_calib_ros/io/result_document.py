@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from ..photogrammetry.rotations import quaternion_from_matrix
 from ..records import Field
 from .access import PathLike, os_error_reason
 from .arrays import Layout, read_arrays, to_arrays, write_arrays
-from .csv_table import format_float, write_table
+from .csv_table import Table
 from .documents import write_json
 from .result_check import VALIDATION_NAME, with_digests
 
@@ -329,8 +329,8 @@ _INTERIOR_HEADER = (
 )
 
 
-def write_tables(directory: Path, result: CalibrationResult) -> None:
-    """Write the tables of a result into a folder. Raises DataError."""
+def result_tables(result: CalibrationResult) -> dict[str, Table]:
+    """Return the tables of a result by the names of their files."""
     tables = {
         EXPOSURES: (_EXPOSURES_HEADER, _exposures(result)),
         TARGETS: (_TARGETS_HEADER, _targets(result)),
@@ -338,12 +338,7 @@ def write_tables(directory: Path, result: CalibrationResult) -> None:
     }
     if result.residuals is not None:
         tables[RESIDUALS] = (_RESIDUALS_HEADER, _residuals(result.residuals))
-    for name, (header, rows) in tables.items():
-        write_table(directory / name, header.split(','), rows)
-
-
-def _floats(values: Iterable[float]) -> list[str]:
-    return [format_float(float(value)) for value in values]
+    return {name: Table(tuple(header.split(',')), rows) for name, (header, rows) in tables.items()}
 
 
 def _residuals(table: ResidualTable) -> Iterator[Sequence[Any]]:
@@ -353,7 +348,7 @@ def _residuals(table: ResidualTable) -> Iterator[Sequence[Any]]:
     for name, exposure, target, row, outlier in zip(
         table.fluoroscope, table.exposure, table.target_id, figures, table.outlier
     ):
-        yield [name, int(exposure), int(target), *_floats(row), int(outlier)]
+        yield [name, int(exposure), int(target), *row.tolist(), int(outlier)]
 
 
 def _exposures(result: CalibrationResult) -> Iterator[Sequence[Any]]:
@@ -363,7 +358,7 @@ def _exposures(result: CalibrationResult) -> Iterator[Sequence[Any]]:
             yield [
                 name,
                 e.exposure,
-                *_floats(orientation),
+                *orientation,
                 *_fit_of_exposure(result.residuals, name, e.exposure),
             ]
 
@@ -375,7 +370,7 @@ def _fit_of_exposure(table: ResidualTable | None, name: str, exposure: int) -> l
     own = (table.fluoroscope == name) & (table.exposure == exposure)
     core = own & ~table.outlier
     rmse = np.sqrt(np.mean(table.residual[core] ** 2, axis=0)) if core.any() else [np.nan] * 2
-    return [int(own.sum()), int(own.sum() - core.sum()), *_floats(rmse)]
+    return [int(own.sum()), int(own.sum() - core.sum()), *rmse]
 
 
 def _targets(result: CalibrationResult) -> Iterator[Sequence[Any]]:
@@ -387,20 +382,22 @@ def _targets(result: CalibrationResult) -> Iterator[Sequence[Any]]:
         if table is not None:
             own = table.target_id == target
             counts = [int(own.sum()), int((own & table.outlier).sum())]
-        yield [int(target), *_floats(xyz), *_floats(own_sd), *counts]
+        yield [int(target), *xyz.tolist(), *own_sd.tolist(), *counts]
 
 
 def _interior(result: CalibrationResult) -> Iterator[Sequence[Any]]:
     for name, figures in result.fluoroscopes.items():
         yield [
             name,
-            *_floats((*figures.interior, *figures.interior_sd)),
+            *figures.interior,
+            *figures.interior_sd,
             *figures.image_size,
             figures.model_kind,
             figures.k,
             figures.observations,
             figures.inliers,
-            *_floats((*figures.rmse_before, *figures.rmse_after)),
+            *figures.rmse_before,
+            *figures.rmse_after,
         ]
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,11 +23,12 @@ from ..exposures.frame import Frame
 from ..exposures.pairing import RecordedPairing
 from ..findings import Finding, Kind, Place, Severity, sentences
 from ..io.access import PathLike, write_text
-from ..io.bodies import write_bodies
+from ..io.bodies import shape_table
+from ..io.csv_table import Table, dataframe_of
 from ..io.folder import FolderKind, check_output_folder, replaced_folder
 from ..io.formats.opensim import write_joint_motion
-from ..io.joints import JointEntry, write_joints
-from ..io.poses import write_motion, write_poses
+from ..io.joints import JointEntry, joint_table
+from ..io.poses import motion_table, pose_table
 from ..options import option
 from ..photogrammetry.noise import ObservedScatter
 from ..photogrammetry.rig_orientation import RigOrientation
@@ -39,6 +40,10 @@ from ..reconstruction.reconstruct import (
     pair_recording,
 )
 from .bodies_film import Film, write_films
+
+if TYPE_CHECKING:
+    import pandas
+    from matplotlib.figure import Figure
 
 SMOOTH = ('auto', 'none', 'lag', 'butterworth')
 SHAPE_EXPOSURES = 600  # of a recording that shapes are estimated from, evenly spread
@@ -106,6 +111,41 @@ class BodiesOutcome:
     def bodies(self) -> tuple[Body, ...]:
         """The bodies with their estimated shapes."""
         return tuple(shape.body for shape in self.shapes)
+
+    def tables(self) -> dict[str, Table]:
+        """Return poses, motion, shapes and joints, by the names of their files."""
+        start_ns = int(self.exposures[0].stamp_ns)
+        tables = {
+            POSES: pose_table(self.poses, start_ns),
+            MOTION: motion_table(self.bodies, self.exposures, start_ns),
+            SHAPES: shape_table(self.bodies),
+        }
+        return {**tables, JOINTS: joint_table(self.joints, start_ns)} if self.joints else tables
+
+    def to_dataframe(self, name: str = 'poses') -> pandas.DataFrame:
+        """Return poses, motion, joints or shapes as a pandas DataFrame, as in their CSV files.
+
+        Raises DataError for another name, and where pandas is not installed.
+        """
+        return dataframe_of(self.tables(), name)
+
+    def plot(self, name: str | None = None) -> Figure:
+        """Return a matplotlib figure of a joint or a body, or else of all paths in space.
+
+        Raises DataError for a name that is none of them.
+        """
+        from ..report.motion_figure import body_figure, joint_figure, paths_figure
+
+        if name is None:
+            return paths_figure(self.poses)
+        for motion in self.joints:
+            if motion.joint.name == name:
+                return joint_figure(motion)
+        for poses in self.poses:
+            if poses.body == name:
+                return body_figure(poses)
+        names = [motion.joint.name for motion in self.joints] + [one.body for one in self.poses]
+        raise DataError(f'no joint or body is named {name!r}, but {", ".join(names)}')
 
     def summary(self) -> dict[str, Any]:
         """How well bodies and joints are known: medians of standard deviations."""
@@ -354,11 +394,8 @@ def save_bodies(
     """
     start_ns = int(outcome.exposures[0].stamp_ns)
     with replaced_folder(directory, BODIES_FOLDER) as folder:
-        write_poses(folder / POSES, outcome.poses, start_ns)
-        write_motion(folder / MOTION, outcome.bodies, outcome.exposures, start_ns)
-        write_bodies(folder / SHAPES, outcome.bodies)
-        if outcome.joints:
-            write_joints(folder / JOINTS, outcome.joints, start_ns)
+        for name, table in outcome.tables().items():
+            table.write(folder / name)
         if _some_exposure_has_all(outcome.joints):
             write_joint_motion(folder / OPENSIM, outcome.joints, start_ns)
         if report:

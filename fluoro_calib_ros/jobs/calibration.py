@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -46,9 +47,14 @@ from ..exposures.phantom import Phantom
 from ..exposures.repeats import without_repeats
 from ..exposures.strays import frames_without_strays
 from ..findings import Finding, Kind, Place, Severity
+from ..io.csv_table import dataframe_of
+from ..io.result_document import result_tables
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..processes import OF_JOB, WorkerProcess
 from .sources import select_calibrations
+
+if TYPE_CHECKING:
+    import pandas
 
 # The adjustment job: adjust exposures with calibrations fixed, an out-of-sample test.
 
@@ -145,6 +151,14 @@ class CalibrationOutcome:
     def calibrations(self) -> dict[str, FluoroscopeCalibration]:
         """Calibrations of all fluoroscopes of the rig, the new ones among them."""
         return {**self.rig.calibrations, **self.result.calibrations}
+
+    def to_dataframe(self, name: str = 'residuals') -> pandas.DataFrame:
+        """Return residuals, exposures, targets or interior as a pandas DataFrame.
+
+        The columns are those of the CSV file in the folder of the result. Raises DataError for
+        another name, and where pandas is not installed.
+        """
+        return dataframe_of(result_tables(self.result), name)
 
     def without_runs(self) -> CalibrationOutcome:
         """Return the outcome without the networks behind it, which only the figures need."""

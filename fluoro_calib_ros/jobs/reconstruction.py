@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,8 +16,10 @@ from ..checks.rig_watch import DriftVerdict, RecordingDriftWatch
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError
 from ..exposures.frame import Frame
+from ..exposures.names import Names
 from ..exposures.pairing import RecordedPairing, disagreement_of_recording
 from ..findings import Finding, Kind, Severity
+from ..io.poses import point_table
 from ..options import option
 from ..photogrammetry.noise import MAX_WIDENING, ObservedScatter
 from ..photogrammetry.rig_orientation import RigOrientation
@@ -27,6 +30,9 @@ from ..reconstruction.reconstruct import (
     orientation_of_recorded,
     reconstruct_recording,
 )
+
+if TYPE_CHECKING:
+    import pandas
 
 
 @dataclass(frozen=True)
@@ -80,6 +86,13 @@ class ReconstructionOutcome:
     disagreement: str = ''
     widening: float = 1.0
     cause: Finding | None = None
+
+    def to_dataframe(self, names: Names | None = None) -> pandas.DataFrame:
+        """Return the points as a pandas DataFrame, with a column name where targets have names.
+
+        Raises DataError where pandas is not installed.
+        """
+        return point_table(self.frames, names).to_dataframe()
 
     @property
     def incomplete(self) -> int:

@@ -39,7 +39,7 @@ from ..io.result_check import (
 from ..io.result_check import RESULT_NAME as RESULT
 from ..io.result_document import NAMES as TABLES
 from ..io.result_document import SUFFIX as COVARIANCE
-from ..io.result_document import result_document, write_covariance, write_tables, write_validation
+from ..io.result_document import result_document, result_tables, write_covariance, write_validation
 from ..photogrammetry.rig_orientation import RigOrientation
 from .calibration import CalibrationOutcome
 
@@ -157,7 +157,8 @@ def _write_result(folder: Path, result: CalibrationResult) -> None:
     for calibration in result.calibrations.values():
         save_calibration(folder, calibration)
     write_json(folder / RESULT, written_document(result))
-    write_tables(folder, result)
+    for name, table in result_tables(result).items():
+        table.write(folder / name)
 
 
 def written_document(result: CalibrationResult) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError, ErrorsAt
@@ -27,9 +28,18 @@ from ..io.csv_table import read_names
 from ..io.formats import registry
 from ..io.formats.content import PARTS, Content, FileSettings
 from ..io.formats.known_orientation import holds_known_orientations, read_known_orientations
-from ..io.observations import CORRECTED_BY, PointsFile, points_of_frames, read_points
+from ..io.observations import (
+    CORRECTED_BY,
+    PointsFile,
+    observation_table,
+    points_of_frames,
+    read_points,
+)
 from ..io.result_check import disagreements
 from ..photogrammetry.known_orientation import KnownOrientation
+
+if TYPE_CHECKING:
+    import pandas
 
 MAGIC = b'\x89MCAP'  # of a bag
 
@@ -58,6 +68,11 @@ class Recording:
     def __repr__(self) -> str:
         counts = ', '.join(f'{name}: {len(own)} frames' for name, own in self.frames.items())
         return f'<Recording {counts or "empty"}>'
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """Return the observations as a pandas DataFrame. Raises DataError without pandas."""
+        frames = [frame for own in self.frames.values() for frame in own]
+        return observation_table(frames, self.names).to_dataframe()
 
 
 @dataclass(frozen=True)

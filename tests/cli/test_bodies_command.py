@@ -7,12 +7,15 @@ import csv
 import json
 import re
 import shutil
+import sys
 
 import cv2
 import numpy as np
+import pandas
 import pytest
 from rigs import run
 
+import fluoro_calib_ros as fc
 from fluoro_calib_ros.images.overlay import draw_bodies
 from fluoro_calib_ros.io.bags.reader import read_frames
 
@@ -65,6 +68,33 @@ def test_poses_and_joints_with_their_deviations(knee, tmp_path, capsys):
         assert np.abs(error).max() < 4 * sd.max() < 2.0
         assert np.std(error) < 0.2
     assert {row['status'] for row in found} == {'OK'}
+
+
+def test_python_has_the_tables_of_the_command_and_its_figures(knee, tmp_path, monkeypatch):
+    recording = fc.read_source(knee / 'walking')
+    calibrations = fc.read_calibrations(knee / 'result')
+    orientation = fc.load_orientation(knee / 'result' / 'rig_orientation.npz')
+    known = fc.read_bodies(knee / 'bodies.csv')
+    joints = fc.read_joints(knee / 'joints.toml', [body.name for body in known])
+    outcome = fc.track_bodies(recording.frames, calibrations, orientation, known, joints=joints)
+    fc.save_bodies(tmp_path / 'motion', outcome)
+    for name in ('poses', 'motion', 'joints', 'shapes'):
+        table = outcome.to_dataframe(name)
+        saved = pandas.read_csv(tmp_path / 'motion' / f'{name}.csv')
+        pandas.testing.assert_frame_equal(table, saved, check_dtype=False, check_exact=True)
+    observed = recording.to_dataframe()
+    assert len(observed) == sum(len(f.target_id) for own in recording.frames.values() for f in own)
+    points = fc.reconstruct(recording.frames, calibrations, orientation).to_dataframe()
+    assert (points.query('status == "OK"')[['sd_x', 'sd_y', 'sd_z']] > 0).all(axis=None)
+    titles = [outcome.plot(name).get_suptitle() for name in ('knee', 'tibia', None)]
+    assert titles == ['knee', 'tibia', 'Paths of the origins of the bodies']
+    with pytest.raises(fc.DataError, match="no joint or body is named 'hip'"):
+        outcome.plot('hip')
+    with pytest.raises(fc.DataError, match="no table is named 'angles'"):
+        outcome.to_dataframe('angles')
+    monkeypatch.setitem(sys.modules, 'pandas', None)
+    with pytest.raises(fc.DataError, match='pandas is not installed'):
+        outcome.to_dataframe()
 
 
 def test_report_of_joints_and_bodies_needs_nothing_else(knee, tmp_path):

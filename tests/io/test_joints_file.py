@@ -11,7 +11,7 @@ import pytest
 from fluoro_calib_ros.bodies.anatomical_frames import BODY_FRAME
 from fluoro_calib_ros.bodies.joints import Joint, JointMotion, JointStatus
 from fluoro_calib_ros.errors import DataError
-from fluoro_calib_ros.io.joints import read_joints, write_joints
+from fluoro_calib_ros.io.joints import joint_table, read_joints
 from fluoro_calib_ros.limits import MAX_JOINTS
 
 BODIES = ('femur', 'tibia', 'talus')
@@ -158,7 +158,7 @@ def test_motion_of_joints_is_written(tmp_path):
         status=np.array([JointStatus.OK, JointStatus.FAILED, JointStatus.GIMBAL], np.uint8),
     )
     path = tmp_path / 'joints.csv'
-    write_joints(path, [motion, motion], 10**18)
+    joint_table([motion, motion], 10**18).write(path)
     text = path.read_text().splitlines()
     assert text[0] == (
         'joint,exposure,time_s,angle_1_deg,angle_2_deg,angle_3_deg,translation_1_mm,'

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from ...exposures.names import Names, without_trivial
-from ..csv_table import format_float, read_all, write_table
+from ..csv_table import read_all, write_table
 from ..observations import COLUMNS as OBSERVATIONS
 from ..observations import corrections_of, read_named_observations, write_observations_csv
 from ..phantom import COLUMNS as PHANTOM
@@ -129,8 +129,8 @@ def _point_rows(
             'frame': number,
             'stamp_ns': '' if rate is None else round((number - first) / rate * NS),
             'target_id': target,
-            **dict(zip('xyz', map(repr, points.xyz_mm[row, column].tolist()))),
-            'residual': format_float(points.residual_px[row, column]),
+            **dict(zip('xyz', points.xyz_mm[row, column].tolist())),
+            'residual': float(points.residual_px[row, column]),
         }
         yield [*cells.values(), named.get(target, '')]
 

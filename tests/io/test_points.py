@@ -8,11 +8,13 @@ import dataclasses
 import json
 import os
 import pathlib
+import re
 import subprocess
 import sys
 
 import ezc3d
 import numpy as np
+import pandas
 import pytest
 from scipy.spatial.transform import Rotation
 
@@ -130,6 +132,94 @@ def test_xmalab_points_return(tmp_path, one_based, y_up):
     content = registry.read(path, settings)
     assert_same_frames(content.observations, frames(), atol=2e-13 if one_based or y_up else 0)
     assert not content.names
+
+
+PREDICTED = """scorer,DLC_resnet50_kneeMay1shuffle1_50000,DLC,DLC,DLC,DLC,DLC
+bodyparts,tib lat,tib lat,tib lat,fem,fem,fem
+coords,x,y,likelihood,x,y,likelihood
+0,10.5,20.25,0.99,300,400,0.98
+1,11.5,21.25,0.59,301,401,0.98
+2,,,,302,402,0.1
+"""
+LABELLED = """scorer,,,anna,anna,anna,anna
+individuals,,,left,left,single,single
+bodyparts,,,fem,fem,scale,scale
+coords,,,x,y,x,y
+labeled-data,cam2_run1,img0007.png,10.5,20.25,1,2
+labeled-data,cam2_run1,img0012.png,,,3,4
+"""
+
+
+def test_points_predicted_by_deeplabcut(tmp_path):
+    """Frames from 0; what DeepLabCut itself takes for unseen is not used."""
+    path = tmp_path / 'camADLC_resnet50_kneeMay1shuffle1_50000.csv'
+    path.write_text(PREDICTED)
+    content = registry.read(path, SETTINGS)
+    (first, second) = content.observations['camA']
+    assert (first.number, second.number) == (0, 1)
+    assert content.names.targets == {'tib lat': 1, 'fem': 2}
+    assert first.uv.tolist() == [[10.5, 20.25], [300, 400]]
+    assert second.target_id.tolist() == [2]
+    assert '2 points with a likelihood below 0.6' in content.notes[0]
+    # As DeepLabCut itself reads it.
+    table = pandas.read_csv(path, header=[0, 1, 2], index_col=0)
+    assert table.iloc[0].xs('fem', level='bodyparts').tolist()[:2] == first.uv[1].tolist()
+
+
+def test_points_labelled_in_deeplabcut(tmp_path):
+    path = tmp_path / 'CollectedData_anna.csv'
+    path.write_text(LABELLED)
+    content = registry.read(path, FileSettings(image_size=SIZE, fluoroscopes=('a',)))
+    assert [frame.number for frame in content.observations['a']] == [7, 12]
+    assert content.names.targets == {'left fem': 1, 'scale': 2}
+    assert content.observations['a'][1].uv.tolist() == [[3, 4]]
+
+
+def test_a_folder_of_deeplabcut_returns(tmp_path):
+    names = Names({'tib lat': 7, 'tib med': 8, 'fem': 9, 'pat': 12})
+    given = Content(observations=frames(numbers=(0, 3)), names=names)
+    registry.write(tmp_path / 'points', 'deeplabcut', given, SETTINGS)
+    table = pandas.read_csv(tmp_path / 'points' / 'cam2.csv', header=[0, 1, 2], index_col=0)
+    assert table.columns.names == ['scorer', 'bodyparts', 'coords']
+    assert table.index.tolist() == [0, 3]
+    uv = given.observations['cam2'][1].uv
+    assert table.loc[3].xs('pat', level='bodyparts').tolist() == [*uv[2], 1.0]
+    content = registry.read(tmp_path / 'points', FileSettings(image_size=SIZE, names=names))
+    assert_same_frames(content.observations, given.observations)
+    # Without known ids, a name has one id in both files.
+    new = registry.read(tmp_path / 'points', SETTINGS)
+    assert sorted(new.names.targets) == sorted(names.targets)
+    for name, own in new.observations.items():
+        known = given.observations[name]
+        ids = {i: label for label, i in new.names.targets.items()}
+        old = {i: label for label, i in names.targets.items()}
+        for one, other in zip(own, known):
+            assert [ids[i] for i in one.target_id] == [old[i] for i in other.target_id]
+
+
+@pytest.mark.parametrize(
+    ('text', 'settings', 'cause'),
+    [
+        (PREDICTED, FileSettings(), '--image-size WxH is needed'),
+        (PREDICTED.replace('0.99', 'good'), SETTINGS, "row 4: column 4 is 'good'"),
+        (PREDICTED.replace('10.5', '1e9'), SETTINGS, 'row 4: a point is off the image'),
+        (PREDICTED.replace('fem', 'tib lat'), SETTINGS, "row 2: the body part 'tib lat' is"),
+        (
+            PREDICTED.replace('x,y,likelihood,x,y', 'x,y,likelihood,y,x'),
+            SETTINGS,
+            'row 3: the col',
+        ),
+        (PREDICTED.replace('\n1,', '\n0,'), SETTINGS, 'row 5: frame 0 is given twice'),
+        (PREDICTED.replace('\n1,', '\nimg,'), SETTINGS, "row 5: 'img' is neither a frame nor"),
+        (PREDICTED.replace(',0.98\n1', '\n1'), SETTINGS, 'row 4: 6 columns'),
+        (PREDICTED[: PREDICTED.index('0,10.5')], SETTINGS, 'row 1: a DeepLabCut table has rows'),
+    ],
+)
+def test_a_damaged_deeplabcut_table_is_refused(tmp_path, text, settings, cause):
+    path = tmp_path / 'camA.csv'
+    path.write_text(text)
+    with pytest.raises(DataError, match=re.escape(cause)):
+        registry.read(path, settings)
 
 
 def test_names_of_markers_return(tmp_path):

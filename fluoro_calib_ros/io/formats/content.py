@@ -231,6 +231,14 @@ class FileSettings:
     fluoroscopes: tuple[str, ...] = ()
     wanted: tuple[str, ...] = tuple(PARTS)
 
+    def image_size_of(self, where: object) -> tuple[int, int]:
+        """Return the image size of a file that does not say it. Raises DataError without."""
+        if self.image_size is None:
+            raise DataError(
+                f'{where}: this format does not contain the image size, --image-size WxH is needed'
+            )
+        return self.image_size
+
     def unit_read(self, where: object) -> float:
         """Return the mm of a unit of a file that does not say it. Raises DataError without."""
         if self.units is None:
@@ -297,6 +305,7 @@ class Format:
     write: Writer | None
     looks_like: str  #: how a file of the format begins, for messages
     says_units: bool = True  #: whether the format says the unit of its lengths, or has none
+    one_camera: bool = False  #: whether a file of image points is of one fluoroscope
 
 
 # What the formats of cameras have in common: one file a fluoroscope, in a folder.

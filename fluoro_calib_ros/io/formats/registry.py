@@ -9,14 +9,18 @@ from this module, and reads every source by it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from ...errors import DataError
+from ...exposures.frame import Frame
+from ...exposures.names import Names
 from ..access import PathLike, check_regular_file, os_error_reason
 from . import (
     bundle,
     c3d,
+    deeplabcut,
     known_orientation,
     native,
     opensim,
@@ -42,6 +46,7 @@ FORMATS: dict[str, Format] = {
         *native.FORMATS,
         known_orientation.FORMAT,
         xmalab_points.FORMAT,
+        deeplabcut.FORMAT,
         xmalab_project.FORMAT,
         FRAMESPEC,
         RIGIDBODY,
@@ -134,9 +139,12 @@ def _read_folder(folder: Path, settings: FileSettings, kind: str | None) -> Cont
         format_ = recognised(path)
         if format_ is None or format_.read is None or (kind and format_.kind != kind):
             continue
-        if format_.parts not in (('cameras',), ('lookups',)):
+        if format_.parts not in (('cameras',), ('lookups',)) and not format_.one_camera:
             continue
-        contents[path] = (format_.kind, format_.read(path, settings))
+        content = format_.read(path, settings)
+        # A target has the same id in all files.
+        settings = replace(settings, names=settings.names.merged(content.names))
+        contents[path] = (format_.kind, content)
     found = dict.fromkeys(name for name, _ in contents.values())
     if len(found) != 1:
         what = f'files of {" and ".join(found)}' if found else 'no file of cameras'
@@ -150,7 +158,22 @@ def _read_folder(folder: Path, settings: FileSettings, kind: str | None) -> Cont
     for camera in cameras:
         if sum(other.name == camera.name for other in cameras) > 1:
             raise DataError(f'{folder}: two cameras are called {camera.name!r}')
-    return Content(cameras=tuple(cameras), lookups=lookups, notes=notes)
+    observations: dict[str, Sequence[Frame]] = {}
+    for path, (_, content) in contents.items():
+        for name, frames in (content.observations or {}).items():
+            if name in observations:
+                raise DataError(f'{path}: another file is of fluoroscope {name}, too')
+            observations[name] = frames
+    names = {
+        name: i for _, content in contents.values() for name, i in content.names.targets.items()
+    }
+    return Content(
+        observations=observations or None,
+        cameras=tuple(cameras),
+        lookups=lookups,
+        names=Names(names),
+        notes=notes,
+    )
 
 
 def write(path: PathLike, kind: str, content: Content, settings: FileSettings) -> Written:

@@ -3,8 +3,8 @@
 
 """XMALab 2-D points: `name_cam1_X,name_cam1_Y,name_cam2_X,...`, one row a frame.
 
-The layout is that of `Trial::save2dPoints` and `load2dPoints` of XMALab 2.2.7, which DeepLabCut
-and DLTdv users know, too: pixel centres at integers from (0, 0), v downwards, NaN where a marker
+The layout is that of `Trial::save2dPoints` and `load2dPoints` of XMALab 2.2.7, which DLTdv
+users know, too: pixel centres at integers from (0, 0), v downwards, NaN where a marker
 is not seen. Variants, chosen in its dialogue and not visible in the file: pixels from 1
 (one_based), rows counted upwards (y_up). A further variant begins with the columns
 cam<n>_offset; XMALab writes their header without the separating commas. The row is the exposure,
@@ -44,7 +44,7 @@ def read(path: Path, settings: FileSettings) -> Content:
     frames: dict[str, list[Frame]] = {labels[camera]: [] for camera in cameras}
     column_camera = np.array([camera for _, camera in header[::2]])
     column_id = np.array([ids[name] for name, _ in header[::2]], dtype=np.int64)
-    size = _image_size(path, settings)
+    size = settings.image_size_of(path)
     for number, row in zip(frame_numbers(body, first), body):
         _check_offsets(row, first, offsets)
         uv = _pixels(row.numbers_or_nan(first + offsets), settings, size)
@@ -102,14 +102,6 @@ def _labels(cameras: Sequence[int], settings: FileSettings) -> dict[int, str]:
         return dict(zip(cameras, given))
     known = settings.names.fluoroscopes
     return {camera: known.get(name, name) for camera, name in plain.items()}
-
-
-def _image_size(path: Path, settings: FileSettings) -> tuple[int, int]:
-    if settings.image_size is None:
-        raise DataError(
-            f'{path}: XMALab points do not contain the image size, --image-size WxH is needed'
-        )
-    return settings.image_size
 
 
 def _check_offsets(row: Row, first: int, offsets: int) -> None:

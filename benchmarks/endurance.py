@@ -126,7 +126,7 @@ def run(hours: float, rate_hz: float) -> dict[str, Any]:
         )
 
     try:
-        reader.listen(NODES)
+        reader.listen(NODES, of_bodies=False)
         reader.ready.clear()
         reader.wait(lambda: len(reader.ready) == len(NAMES), 60, 'the correction node')
         wait_for_orientation(reader)

@@ -162,9 +162,21 @@ def twist_between(
     second: tuple[NDArray[np.float64], NDArray[np.float64]],
 ) -> NDArray[np.float64]:
     """Twists (B, 6) that move first to second rotations and centres by pose_after."""
-    turn = vector_from_matrix(second[0] @ np.swapaxes(first[0], 1, 2))
+    turn = _vector(second[0] @ np.swapaxes(first[0], 1, 2))
     shift = np.linalg.solve(left_jacobian(turn), (second[1] - first[1])[:, :, None])
     return np.concatenate([shift[:, :, 0], turn], axis=1)
+
+
+def _vector(rotation: np.ndarray) -> np.ndarray:
+    """Rotation vectors (B, 3) of rotations (B, 3, 3), most of them small."""
+    skew = (rotation - np.swapaxes(rotation, 1, 2)) / 2
+    vector = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=1)
+    sine = np.sqrt((vector * vector).sum(axis=1))
+    cosine = (rotation[:, 0, 0] + rotation[:, 1, 1] + rotation[:, 2, 2] - 1) / 2
+    if (cosine < 0).any():  # above 90 degrees the sine is that of a smaller angle, too
+        return vector_from_matrix(rotation)
+    angle = np.arctan2(sine, cosine)
+    return vector * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 1.0)[:, None]
 
 
 def turn_of_twists(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:

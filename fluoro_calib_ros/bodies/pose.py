@@ -186,12 +186,10 @@ class PoseSolver:
         points = self.cameras.sorted(exposure)
         rotation, centre, started = self._start(exposure, points, prediction)
         used = points.seen.any(axis=2) & started[:, None]
-        normal = np.linalg.inv(prediction.covariance + 1e-12 * _EYE_6)
-        prior = prediction, np.where(prediction.known[:, None, None], normal, 0.0)
         test = np.full(used.shape, np.nan)
         for _ in range(self.xyz.shape[1]):
-            solution = self._converge((rotation, centre), points, used, prior)
-            wrong, worst = self._false_markers(solution, (points, used), prior, test)
+            solution = self._converge((rotation, centre), points, used, prediction)
+            wrong, worst = self._false_markers(solution, (points, used), prediction, test)
             if not len(wrong):
                 break
             used[wrong, worst] = False
@@ -263,12 +261,11 @@ class PoseSolver:
         pose: tuple[np.ndarray, np.ndarray],
         points: ImagePoints,
         used: np.ndarray,
-        prior: tuple[Prediction, np.ndarray] | None,
+        prediction: Prediction | None,
     ) -> _Solution:
         """Iterate from rotations and centres.
 
-        Where an exposure alone does not give a pose, the prediction with its normal matrix (B, 6,
-        6) holds what is not seen.
+        Where an exposure alone does not give a pose, the prediction holds what is not seen.
         """
         rotation, centre = pose
         weight = _weight(points, used, points.noise + points.correction)
@@ -278,8 +275,8 @@ class PoseSolver:
             normal, right = _sum(marker, linear.by_pose)
             parts = _eigen(normal)
             alone = _is_determined(parts)
-            if prior is not None and not alone.all():
-                held, away = _pull_of(*prior, (rotation, centre))
+            if prediction is not None and not alone.all():
+                held, away = _pull_of(prediction, (rotation, centre))
                 held = np.where(alone[:, None, None], 0.0, held)
                 normal = normal + held
                 right = right + (held @ away[:, :, None])[:, :, 0]
@@ -327,7 +324,7 @@ class PoseSolver:
         self,
         solution: _Solution,
         observed: tuple[ImagePoints, np.ndarray],
-        prior: tuple[Prediction, np.ndarray],
+        prediction: Prediction,
         test: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Rows of bodies that contain a false marker, and its row in each; fill in the tests.
@@ -371,9 +368,11 @@ class PoseSolver:
         if (excess > 1).any():
             excess = excess / self._growth_by_rig(solution, points, normal, suspect)
         test[suspect] = np.where(used[suspect], excess, test[suspect])
+        if not (excess > 1).any():
+            return suspect[:0], suspect[:0]
         # Of several that contradict each other, the one goes without which the rest agrees best,
         # with the prediction, too.
-        held, away = _pull_of(*prior, (solution.rotation, solution.centre))
+        held, away = _pull_of(prediction, (solution.rotation, solution.centre))
         held = held[suspect]
         pulled = (held @ away[suspect, :, None])[:, None, :, 0] - gradient
         rest = np.linalg.inv(others + held[:, None] + 1e-9 * _EYE_6)
@@ -599,9 +598,11 @@ def _mirror(direction: np.ndarray) -> np.ndarray:
 
 
 def _pull_of(
-    prediction: Prediction, normal: np.ndarray, pose: tuple[np.ndarray, np.ndarray]
+    prediction: Prediction, pose: tuple[np.ndarray, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Normal matrices (B, 6, 6) of predictions at poses, and twists (B, 6) to the predictions."""
+    normal = np.linalg.inv(prediction.covariance + 1e-12 * _EYE_6)
+    normal = np.where(prediction.known[:, None, None], normal, 0.0)
     turned = turn_of_twists(prediction.rotation, pose[0])
     away = twist_between((prediction.rotation, prediction.centre_mm), pose)
     held = turned @ normal @ np.swapaxes(turned, 1, 2)

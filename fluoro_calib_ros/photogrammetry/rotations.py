@@ -140,12 +140,16 @@ def left_jacobian(w: ArrayLike) -> np.ndarray:
     Eq. 145.
     """
     w = np.asarray(w, dtype=float)
-    angle = np.linalg.norm(w, axis=-1)[..., None, None]
+    square = (w * w).sum(axis=-1)[..., None, None]
     k = cross_matrix(w)
-    first = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
-    # (a - sin a) / a^3; its series where the quotient would lose digits.
-    small = angle < 0.05
-    square = angle * angle
-    safe = np.where(small, 1.0, angle)
-    second = np.where(small, (1 - square / 20) / 6, (safe - np.sin(safe)) / safe**3)
-    return np.eye(3) + first * k + second * (k @ k)
+    # Their series where the quotients (1 - cos a) / a^2 and (a - sin a) / a^3 would lose digits.
+    small = square < 0.05**2
+    first = (1 - square / 12 * (1 - square / 30)) / 2
+    second = (1 - square / 20 * (1 - square / 42)) / 6
+    if not small.all():
+        a = np.sqrt(np.where(small, 1.0, square))
+        first = np.where(small, first, (1 - np.cos(a)) / a**2)
+        second = np.where(small, second, (a - np.sin(a)) / a**3)
+    out = first * k + second * (k @ k)
+    out[..., (0, 1, 2), (0, 1, 2)] += 1.0
+    return out

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import difflib
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -69,6 +70,71 @@ COMMANDS = (
 READ_NOTHING = (simulate, phantom, watch, bridge)
 
 
+# Groups of options that few need: --help names them, --help-all shows them.
+RARE = (
+    'bags',
+    'files of other programs',
+    'limits of what is read',
+    'adjustment',
+    'images on a cluster',
+)
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser of a command, with a short help, and a suggestion for a misspelt choice."""
+
+    def format_help(self) -> str:
+        """Return the help without the groups of RARE."""
+        hidden = [group for group in self._action_groups if group.title in RARE]
+        rare = [action for group in hidden for action in group._group_actions]
+        if not rare:
+            return super().format_help()
+        formatter = self._get_formatter()
+        exclusive = [
+            group
+            for group in self._mutually_exclusive_groups
+            if not any(action in rare for action in group._group_actions)
+        ]
+        shown = [action for action in self._actions if action not in rare]
+        formatter.add_usage(self.usage, shown, exclusive)
+        formatter.add_text(self.description)
+        for group in self._action_groups:
+            if group not in hidden:
+                formatter.start_section(group.title)
+                formatter.add_text(group.description)
+                formatter.add_arguments(group._group_actions)
+                formatter.end_section()
+        titles = ', '.join(str(group.title) for group in hidden)
+        formatter.add_text(f'--help-all shows {len(rare)} more options: {titles}')
+        formatter.add_text(self.epilog)
+        return formatter.format_help()
+
+    def format_whole_help(self) -> str:
+        """Return the help with all groups."""
+        return super().format_help()
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        try:
+            super()._check_value(action, value)
+        except argparse.ArgumentError as error:
+            names = [str(choice) for choice in action.choices or ()]
+            close = difflib.get_close_matches(str(value), names, 1)
+            if not close:
+                raise
+            raise argparse.ArgumentError(
+                action, f'{error.message}; did you mean {close[0]!r}?'
+            ) from None
+
+
+class _WholeHelp(argparse.Action):
+    """Prints the help with all options, and ends."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any, **__: Any) -> None:
+        assert isinstance(parser, _Parser)
+        print(parser.format_whole_help(), end='')
+        parser.exit()
+
+
 class _Version(argparse.Action):
     """Prints the versions, which are looked up only then."""
 
@@ -102,9 +168,7 @@ def make_parser(command: str | None = None, rig: RigFile | None = None) -> argpa
     Only the arguments of `command` are added, by default those of all commands: each command
     imports the modules that declare its options. rig: gives defaults of the arguments.
     """
-    parser = argparse.ArgumentParser(
-        prog='fluoro-calib', description='Self-calibration of X-ray fluoroscopes.'
-    )
+    parser = _Parser(prog='fluoro-calib', description='Self-calibration of X-ray fluoroscopes.')
     parser.add_argument('--version', action=_Version, nargs=0, help='print versions and exit')
     parser.add_argument(
         '--print-completion',
@@ -122,6 +186,9 @@ def make_parser(command: str | None = None, rig: RigFile | None = None) -> argpa
         )
         sub.set_defaults(module=module)
         if command in (None, module.NAME):
+            sub.add_argument(
+                '--help-all', action=_WholeHelp, nargs=0, help='show all options and exit'
+            )
             sub.add_argument(
                 '--json', action='store_true', help='print the result as JSON on standard output'
             )

@@ -378,9 +378,10 @@ def add_workers(parser: argparse._ActionsContainer) -> None:
     )
 
 
-def add_scheduler(parser: argparse._ActionsContainer, task: str = 'extract the images') -> None:
+def add_scheduler(parser: argparse.ArgumentParser, task: str = 'extract the images') -> None:
     """Add --scheduler, the address of a Dask cluster for images."""
-    parser.add_argument(
+    group = parser.add_argument_group('images on a cluster')
+    group.add_argument(
         '--scheduler',
         metavar='tls://HOST:PORT',
         help=f'Dask scheduler whose workers {task}, in place of processes of this machine '
@@ -392,10 +393,10 @@ def add_scheduler(parser: argparse._ActionsContainer, task: str = 'extract the i
         ('cert', 'certificate of this process'),
         ('key', 'its key'),
     ):
-        parser.add_argument(
+        group.add_argument(
             f'--tls-{name}', default='', metavar='FILE', help=f'with tls://: {what} (PEM)'
         )
-    parser.add_argument(
+    group.add_argument(
         '--trusted-network',
         action='store_true',
         help='allow tcp:// to another machine: whoever is in its network can run code here',

@@ -63,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_phantom(source)
     add_collect(source)
-    add_scheduler(source)
+    add_scheduler(parser)
     add_bag_options(parser)
     _add_adjustment(parser)
     result = parser.add_argument_group('result')

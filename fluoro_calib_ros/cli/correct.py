@@ -84,7 +84,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'ends the command and nothing is written',
     )
     add_workers(folders)
-    add_scheduler(folders, 'correct the files; they see the folders under the same names')
+    add_scheduler(parser, 'correct the files; they see the folders under the same names')
     add_file_options(parser)
 
 

@@ -425,6 +425,29 @@ def test_every_command_has_help_with_an_example_that_parses(command, capsys):
     assert make_parser().parse_args(command.EXAMPLE.split()[1:]).command == command.NAME
 
 
+def test_help_is_short_and_help_all_whole(capsys):
+    """What few need is named by its group, and required arguments are never hidden."""
+    from fluoro_calib_ros.cli import RARE, make_parser
+
+    texts = {}
+    for flag in ('--help', '--help-all'):
+        assert run('calibrate', flag) == 0
+        texts[flag] = capsys.readouterr().out
+    assert '--phantom' in texts['--help'] and '--max-file-mb' not in texts['--help']
+    assert '--help-all shows' in texts['--help'] and 'limits of what is read' in texts['--help']
+    assert '--max-file-mb' in texts['--help-all'] and '--known-orientation' in texts['--help-all']
+    assert texts['--help'].count('\n') < 0.6 * texts['--help-all'].count('\n')
+    for command in COMMANDS:
+        (commands,) = (a for a in make_parser(command.NAME)._actions if a.dest == 'command')
+        for group in commands.choices[command.NAME]._action_groups:
+            if group.title in RARE:
+                assert not any(action.required for action in group._group_actions)
+
+
+def test_a_misspelt_command_is_suggested(capsys):
+    assert "did you mean 'calibrate'?" in said(capsys, ('calibrte',), status=2)
+
+
 def test_missing_files_are_reported_by_name(rig, tmp_path, capsys):
     nowhere = tmp_path / 'nowhere'
     for arguments in (

@@ -430,7 +430,7 @@ class PoseSolver:
             expected = turned @ prediction.covariance[held] @ np.swapaxes(turned, 1, 2)
             squares = _curvature(linear.by_place[held], linear.by_pose[held], expected)
             variance = variance.copy()
-            variance[held] = _of_the_next(
+            variance[held] = _variance_of_last(
                 variance[held], squares, prediction.weak[held, None, None]
             )
         s_matrix, s_vector = marker_sums(linear, _weight(points, used, variance))
@@ -453,7 +453,7 @@ class PoseSolver:
         )
 
 
-def _of_the_next(noise: np.ndarray, fixed: np.ndarray, number: np.ndarray) -> np.ndarray:
+def _variance_of_last(noise: np.ndarray, fixed: np.ndarray, number: np.ndarray) -> np.ndarray:
     """Variance of the last of `number` observations that have an error in common.
 
     With a variance r of their noise and c of this error, n of them tell n / (r + n c), and the

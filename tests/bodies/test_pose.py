@@ -10,9 +10,14 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from fluoro_calib_ros.bodies.body import Body, check_bodies
-from fluoro_calib_ros.bodies.pose import PoseSolver, Prediction
+from fluoro_calib_ros.bodies.pose import (
+    PoseSolver,
+    Prediction,
+    _curvature,
+    _variance_of_last,
+)
 from fluoro_calib_ros.errors import DataError
-from fluoro_calib_ros.photogrammetry.rotations import vector_from_matrix
+from fluoro_calib_ros.photogrammetry.rotations import cross_matrix, vector_from_matrix
 
 UNKNOWN = Prediction(
     np.eye(3)[None],
@@ -286,3 +291,24 @@ def test_a_marker_of_two_bodies_is_refused():
         check_bodies([body(rng, 4, 'femur', 1), body(rng, 4, 'tibia', 4)])
     with pytest.raises(DataError, match='two bodies are called femur'):
         check_bodies([body(rng, 4, 'femur', 1), body(rng, 4, 'femur', 11)])
+
+
+def test_what_derivatives_neglect_by_monte_carlo():
+    rng = np.random.default_rng(12)
+    place = rng.normal(0, 10, 3)
+    by_place = rng.normal(0, 3, (1, 1, 1, 2, 3))
+    by_pose = np.hstack([np.eye(3), -cross_matrix(place)])[None, None]
+    root = rng.normal(size=(6, 6)) * np.repeat([0.5, 0.1], 3)[:, None]
+    twists = rng.normal(size=(200_000, 6)) @ root.T
+    moved = twists[:, :3] + np.cross(twists[:, 3:], place)
+    neglected = np.cross(twists[:, 3:], moved) / 2 @ by_place[0, 0, 0].T
+    found = _curvature(by_place, by_pose, (root @ root.T)[None])
+    assert found[0, 0, 0] == pytest.approx(np.mean(neglected**2), rel=0.03)
+
+
+def test_observations_with_an_error_in_common_tell_no_more_than_it_allows():
+    noise, common = 0.04, 0.1
+    number = np.arange(1, 21)
+    told = np.sum(1 / _variance_of_last(np.array(noise), np.array(common), number))
+    covariance = noise * np.eye(20) + common
+    assert told == pytest.approx(np.sum(np.linalg.inv(covariance)), rel=1e-9)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 from ..errors import ErrorsAt
@@ -34,6 +35,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
     add_oriented_source(parser, ReconstructionOptions, reject='S')
     add_out(parser, 'file to write', 'OUT.csv')
+    parser.add_argument(
+        '--figure',
+        type=Path,
+        metavar='FILE.png',
+        help='draw the paths in space, when each target was found, and its sd',
+    )
     add_clusters(
         parser,
         "rigid cluster of targets, such as 'tibia: 1001 1002 1003', whose distances the "
@@ -62,6 +69,7 @@ def check(arguments: argparse.Namespace, error: Callable[[str], NoReturn]) -> No
 
 def run(arguments: argparse.Namespace) -> None:
     """Write the points of a recording. Raises DataError."""
+    from ..io.access import write_bytes
     from ..io.calibration import orientation_path
     from ..io.folder import check_output_file
     from ..io.poses import write_reconstruction
@@ -70,6 +78,8 @@ def run(arguments: argparse.Namespace) -> None:
 
     path = arguments.orientation or orientation_path(arguments.calibration)
     check_output_file(arguments.out, (arguments.source, arguments.calibration, path))
+    if arguments.figure is not None:
+        check_output_file(arguments.figure, (arguments.source, arguments.out))
     recording, calibrations, orientation = read_oriented_source(arguments, path)
     print_notes(recording.notes)
     frames = recording.frames
@@ -83,6 +93,10 @@ def run(arguments: argparse.Namespace) -> None:
     with ErrorsAt(arguments.source):
         outcome = reconstruct(frames, calibrations, orientation, options)
     write_reconstruction(arguments.out, outcome.frames, recording.names)
+    if arguments.figure is not None:
+        from ..report.style import png_bytes
+
+        write_bytes(arguments.figure, png_bytes(outcome.plot(recording.names)))
     print_unpaired(arguments.source, outcome.unpaired)
     if outcome.disagreement:
         print_note(f'{arguments.source}: {outcome.disagreement}')

@@ -33,6 +33,7 @@ from ..reconstruction.reconstruct import (
 
 if TYPE_CHECKING:
     import pandas
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -93,6 +94,12 @@ class ReconstructionOutcome:
         Raises DataError where pandas is not installed.
         """
         return point_table(self.frames, names).to_dataframe()
+
+    def plot(self, names: Names | None = None) -> Figure:
+        """Return a matplotlib figure of the paths in space, the gaps and the sd of the targets."""
+        from ..report.motion_figure import points_figure
+
+        return points_figure(self.frames, (names or Names()).target_names())
 
     @property
     def incomplete(self) -> int:

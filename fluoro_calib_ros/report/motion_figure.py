@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Pictures of the motion of joints and bodies over time, with bands of two standard deviations."""
+"""Pictures of motion: joints and bodies over time with bands of two sd, and points in space."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import matplotlib
 import numpy as np
@@ -15,6 +15,8 @@ from matplotlib.figure import Figure
 from ..bodies.body import BodyPoses, PoseStatus
 from ..bodies.joints import JointMotion
 from ..photogrammetry.rotations import vector_from_matrix
+from ..reconstruction.intersection import OK
+from ..reconstruction.reconstruct import ReconstructedFrame
 from .style import BLUE, GREY, RED, STYLE, new_figure
 
 BAND = 2.0  # standard deviations, 95 %
@@ -115,3 +117,68 @@ def paths_figure(poses: Sequence[BodyPoses]) -> Figure:
         axes.legend(loc='upper left')
         figure.supxlabel('axes of the bodies: x red, y grey, z blue', fontsize=9)
     return figure
+
+
+MAX_NAMED = 30  # targets that are named beside their rows
+
+
+def points_figure(frames: Sequence[ReconstructedFrame], names: Mapping[int, str]) -> Figure:
+    """Paths of reconstructed points in space, when each was found, and how well it is known."""
+    ids = np.unique(np.concatenate([frame.target_id for frame in frames]))
+    xyz = np.full((len(frames), len(ids), 3), np.nan)
+    sd = np.full(xyz.shape, np.nan)
+    for row, frame in enumerate(frames):
+        column = np.searchsorted(ids, frame.target_id)
+        ok = frame.points.status == OK
+        xyz[row, column[ok]] = frame.points.xyz_mm[ok]
+        sd[row, column[ok]] = frame.points.sd_mm[ok]
+    found = np.isfinite(xyz[..., 0])
+    time_s = (np.array([frame.stamp_ns for frame in frames]) - frames[0].stamp_ns) / 1e9
+    when = time_s if np.all(np.diff(time_s) > 0) else np.array([f.number for f in frames])
+    labels = [names.get(int(i), str(i)) for i in ids]
+    with matplotlib.rc_context(STYLE):
+        figure = new_figure(14, 7, f'{len(ids)} targets in {len(frames)} frames')
+        left, right = figure.subfigures(1, 2, width_ratios=(1, 1.2))
+        _draw_paths(left.add_subplot(projection='3d'), xyz)
+        seen, known = right.subplots(1, 2, sharey=True, width_ratios=(3, 1))
+        _draw_gaps(seen, when, found, labels)
+        seen.set_xlabel('time [s]' if when is time_s else 'frame')
+        rows = np.arange(len(ids))
+        for axis, colour, shift in zip(range(3), (RED, GREY, BLUE), (-0.25, 0, 0.25)):
+            median = [
+                np.median(c[np.isfinite(c)]) if np.isfinite(c).any() else 0
+                for c in sd[..., axis].T
+            ]
+            known.barh(rows + shift, median, 0.25, color=colour, label='xyz'[axis])
+        known.set(xlabel='median sd [mm]', title='sd')
+        right.legend(loc='outside lower right', ncols=3)
+    return figure
+
+
+def _draw_paths(axes: Axes, xyz: np.ndarray) -> None:
+    """Draw the paths of points (T, n, 3), with a dot at the end of each."""
+    for path in np.swapaxes(xyz, 0, 1):
+        (line,) = axes.plot(*path.T, linewidth=1)
+        last = path[np.isfinite(path[:, 0])][-1:]
+        axes.scatter(*last.T, s=12, color=line.get_color())
+    axes.set(xlabel='x [mm]', ylabel='y [mm]', zlabel='z [mm]', title='paths in space')
+    axes.zaxis.labelpad = 10
+    if np.isfinite(xyz).any():
+        axes.set_aspect('equal')
+
+
+def _draw_gaps(axes: Axes, when: np.ndarray, found: np.ndarray, labels: Sequence[str]) -> None:
+    """Draw when targets (T, n) were found, a row each, with the share of the frames."""
+    for row, of_target in enumerate(found.T):
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], of_target.astype(int), [0]])))
+        step = float(np.median(np.diff(when))) if len(when) > 1 else 1.0
+        spans = [
+            (when[start], when[stop - 1] + step - when[start])
+            for start, stop in zip(edges[::2], edges[1::2])
+        ]
+        axes.broken_barh(spans, (row - 0.4, 0.8), color=BLUE, linewidth=0)
+    shares = 100 * found.mean(axis=0)
+    rows = np.arange(len(labels))
+    if len(labels) <= MAX_NAMED:
+        axes.set_yticks(rows, [f'{name}: {share:.0f} %' for name, share in zip(labels, shares)])
+    axes.set(title='found', ylim=(len(labels) - 0.5, -0.5))

@@ -84,7 +84,13 @@ def test_python_has_the_tables_of_the_command_and_its_figures(knee, tmp_path, mo
         pandas.testing.assert_frame_equal(table, saved, check_dtype=False, check_exact=True)
     observed = recording.to_dataframe()
     assert len(observed) == sum(len(f.target_id) for own in recording.frames.values() for f in own)
-    points = fc.reconstruct(recording.frames, calibrations, orientation).to_dataframe()
+    reconstructed = fc.reconstruct(recording.frames, calibrations, orientation)
+    points = reconstructed.to_dataframe()
+    paths, found, _ = reconstructed.plot().axes
+    assert len(paths.lines) == points.target_id.nunique() == 8
+    assert found.get_xlabel() == 'time [s]' and '3001: 100 %' in [
+        label.get_text() for label in found.get_yticklabels()
+    ]
     assert (points.query('status == "OK"')[['sd_x', 'sd_y', 'sd_z']] > 0).all(axis=None)
     titles = [outcome.plot(name).get_suptitle() for name in ('knee', 'tibia', None)]
     assert titles == ['knee', 'tibia', 'Paths of the origins of the bodies']

@@ -36,7 +36,7 @@ def jobs():
         way: calibrate(
             FRAMES,
             PHANTOM,
-            CalibrationOptions('local_linear', max_iterations=4, relative_orientation=way),
+            CalibrationOptions('local_linear', max_iterations=2, relative_orientation=way),
             joint=True,
         )
         for way in ('none', 'soft', 'hard')
@@ -108,7 +108,7 @@ def test_free_network_is_calibrated(model):
         FRAMES,
         PHANTOM,
         CalibrationOptions(
-            model=model, datum='inner', max_iterations=8, relative_orientation='soft'
+            model=model, datum='inner', max_iterations=4, relative_orientation='soft'
         ),
         joint=True,
     )

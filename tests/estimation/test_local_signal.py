@@ -215,7 +215,9 @@ def round_dent(uv):
 @functools.cache
 def dented():
     """Self-calibrations of a fluoroscope that has both dents and of the same without them."""
-    frames = [replace(f, uv=f.uv + shallow(f.uv) + round_dent(f.uv)) for f in rigs.exposures()['a']]
+    frames = [
+        replace(f, uv=f.uv + shallow(f.uv) + round_dent(f.uv)) for f in rigs.exposures()['a']
+    ]
     run = calibrate({'a': frames}, rigs.rig().phantom).runs['a']
     return run, rigs.calibrated('a').runs['a']
 

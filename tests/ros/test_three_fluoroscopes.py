@@ -23,7 +23,7 @@ from fluoro_calib_ros.simulation.streams import START_NS, StreamStart
 from fluoro_calib_ros.simulation.tracking import simulate_tracking
 
 THREE = ('a', 'b', 'c')
-POSES = 12
+POSES = 9
 RATE_HZ = 15.0
 PATIENCE = 8
 # markers; frames of c end there, and b drifts from there on
@@ -71,7 +71,7 @@ def calibrated(graph, of_rig):
         for frame in frames:
             client.publish(frame)
     client.wait_for_status(lambda s: s.exposures == POSES, 'c', 'all exposures')
-    answer = client.call(Calibrate, 'calibrate', model='parametric')
+    answer = client.call(Calibrate, 'calibrate', model='collocation')
     assert answer.success and list(answer.fluoroscope) == list(THREE), answer.message
     future = client.call_async(Orient, 'orient', timeout_sec=30.0)
     numbers = iter(range(100, 1000))

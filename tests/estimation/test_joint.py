@@ -43,6 +43,7 @@ def jobs():
     }
 
 
+@pytest.mark.long
 def test_result_contains_the_relative_orientation(jobs):
     found = {way: result_document(job)['relative_orientation'] for way, job in jobs.items()}
     a, b = rigs.rig().fluoroscopes
@@ -175,6 +176,7 @@ def test_false_matches_and_a_moved_bead_are_in_the_result(jobs):
     assert not any(p['target_id'] == wrong for p in points)
 
 
+@pytest.mark.long
 def test_correlations_are_in_the_result(jobs):
     found = result_document(jobs['hard'])['correlations']
     assert 0 < len(found) <= 20 and all(

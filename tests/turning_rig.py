@@ -24,10 +24,10 @@ def turned(uv, angle, size):
 
 @functools.cache
 def recording(known=True):
-    """Frames of 18 exposures at angles, 12 for the calibration and 6 for the test."""
+    """Frames of 22 exposures at angles, 14 for the calibration and 8 for the test."""
     rng = np.random.default_rng(5)
     out = []
-    for frame in exposures(18, seed=11)['a']:
+    for frame in exposures(22, seed=11)['a']:
         angle = float(rng.uniform(-1.4, 1.4))
         uv = frame.uv + turned(frame.uv, angle, frame.image_size)
         width, height = frame.image_size
@@ -41,7 +41,7 @@ def recording(known=True):
                 angle=angle if known else None,
             )
         )
-    return out[:12], out[12:]
+    return out[:14], out[14:]
 
 
 @functools.cache

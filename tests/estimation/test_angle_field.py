@@ -126,7 +126,7 @@ def test_calibration_with_angles_fits_exposures_at_other_angles():
     test = recording()[1]
     with_angle = rmse_of_test(turning().calibrations['a'], test)
     without = rmse_of_test(turning(False).calibrations['a'], recording(False)[1])
-    at_rest = rmse_of_test(calibrated('a').calibrations['a'], exposures(18, seed=11)['a'][12:])
+    at_rest = rmse_of_test(calibrated('a').calibrations['a'], exposures(22, seed=11)['a'][14:])
     assert with_angle < 1.1 * at_rest
     assert without > 1.2 * at_rest
 

@@ -5,6 +5,7 @@
 
 import gc
 import os
+import sys
 
 import pytest
 
@@ -18,6 +19,10 @@ except ImportError:  # without the plugin, one process runs all tests
 # for each other.
 for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS'):
     os.environ.setdefault(_name, '1')
+
+# Many tests start commands; without bytecode on disk each compiles what it loads.
+os.environ.pop('PYTHONDONTWRITEBYTECODE', None)
+sys.dont_write_bytecode = False
 
 # A third of the time to load the tests is that of the collector, and little of it is garbage.
 gc.disable()

@@ -14,8 +14,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import scipy  # loads scipy.signal, half a second, where it is used
 from numpy.typing import NDArray
-from scipy.signal import butter, fftconvolve, filtfilt
 
 from ..errors import DataError
 from ..photogrammetry.rotations import matrix_from_quaternion, quaternion_from_matrix
@@ -39,13 +39,13 @@ def filtered_poses(poses: BodyPoses, cutoff_hz: float) -> BodyPoses:
         raise DataError(
             f'a cutoff of {cutoff_hz:g} Hz is not between 0 and half of the rate, {rate / 2:g} Hz'
         )
-    b, a = butter(ORDER, cutoff_hz, fs=rate)
+    b, a = scipy.signal.butter(ORDER, cutoff_hz, fs=rate)
     time = np.arange(len(known))
 
     def smooth(values: np.ndarray) -> np.ndarray:
         flat = values.reshape(len(values), -1)
         whole = np.stack([np.interp(time, time[known], v[known]) for v in flat.T], axis=1)
-        return filtfilt(b, a, whole, axis=0).reshape(values.shape)
+        return scipy.signal.filtfilt(b, a, whole, axis=0).reshape(values.shape)
 
     quaternion = quaternion_from_matrix(np.where(known[:, None, None], poses.rotation, np.eye(3)))
     quaternion[known] = _continuous(quaternion[known])
@@ -87,13 +87,14 @@ def _propagated(
     size = len(covariance)
     impulse = np.zeros(2 * size + 1)
     impulse[size] = 1.0
-    response = filtfilt(*filter_, impulse) ** 2
+    response = scipy.signal.filtfilt(*filter_, impulse) ** 2
     wide = np.flatnonzero(response > SETTLED * response.max())
     half = size - int(wide[0])
     response = response[size - half : size + half + 1]
     filled = _nearest(covariance, known).reshape(size, -1)
     padded = np.pad(filled, ((half, half), (0, 0)), mode='edge')
-    return fftconvolve(padded, response[:, None], mode='valid', axes=0).reshape(covariance.shape)
+    filtered = scipy.signal.fftconvolve(padded, response[:, None], mode='valid', axes=0)
+    return filtered.reshape(covariance.shape)
 
 
 def _nearest(values: np.ndarray, known: np.ndarray) -> NDArray[np.float64]:

@@ -9,8 +9,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri
-from scipy.stats import binom
+from scipy.special import bdtrc, chdtri
 
 from ..estimation.diagnostics import ResidualTable
 from ..findings import Kind, Place, first_few
@@ -57,7 +56,7 @@ def rejected_beads(residuals: ResidualTable | None) -> NDArray[np.int64]:
     target_id, bead = np.unique(residuals.target_id, return_inverse=True)
     seen = np.bincount(bead)
     rejected = np.bincount(bead, residuals.outlier)
-    chance = binom.sf(rejected - 1, seen, np.mean(residuals.outlier))
+    chance = bdtrc(rejected - 1, seen, np.mean(residuals.outlier))
     doubted = (rejected > MOST * seen) & (chance * len(target_id) < FALSE_ALARM)
     return target_id[doubted]
 

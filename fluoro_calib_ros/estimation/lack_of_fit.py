@@ -22,8 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from scipy.special import log_ndtr
-from scipy.stats import binom
+from scipy.special import bdtrc, log_ndtr
 
 from ..correction.calibration_record import SD_GRID
 from ..correction.series import Series, sd_grid_pixels
@@ -330,7 +329,7 @@ def areas_of_rejected(
         chance = np.sqrt(np.sum(of_target**2)) / len(of_target)
         others = (inliers + 0.5) / cell - np.array(corner) / 2
         total = len(rows) + int(((others >= 0) & (others < 1)).all(axis=1).sum())
-        by_chance = (2 * CELLS - 1) ** 2 * binom.sf(len(number) - 1, total, rate)
+        by_chance = (2 * CELLS - 1) ** 2 * bdtrc(len(number) - 1, total, rate)
         alarm = CLUSTERED_FALSE_ALARM if by_chance < CLUSTERED else FALSE_ALARM
         size = float(np.linalg.norm(mean)) if agree else 0.0
         found.append((size, float(chance), alarm, rows))

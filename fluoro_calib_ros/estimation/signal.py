@@ -20,8 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack, solve_triangular
-from scipy.special import j0
-from scipy.stats import t as student
+from scipy.special import j0, stdtrit
 
 from ..correction.series import MARGIN, Functions
 from ..correction.terms import ABSENT_VARIANCE
@@ -163,7 +162,7 @@ def _are_common(
     first, second = np.triu_indices(len(sums), 1)
     if len(sums) < MIN_EXPOSURES:
         return np.zeros(len(bands), dtype=bool)
-    limit = student.isf(FALSE_ALARM, len(first) - 1)
+    limit = -stdtrit(len(first) - 1, FALSE_ALARM)
     out = []
     for band in bands:
         own = sums[:, functions.band == band].reshape(len(sums), -1)

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 from matplotlib import style
 from matplotlib.figure import Figure
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from ..estimation.result import CalibrationResult
 from ..estimation.rounds import SelfCalibration
@@ -109,9 +109,10 @@ def distribution(residuals: Residuals, name: str) -> Figure:
     limit = 5 * max(sd, 1e-9)
     left.hist(np.clip(values, -limit, limit), BINS, color=AFTER, alpha=0.6, density=True)
     x = np.linspace(-limit, limit, 200)
-    left.plot(x, norm.pdf(x, scale=max(sd, 1e-9)), color=BLACK, linewidth=1)
+    normal = np.exp(-((x / max(sd, 1e-9)) ** 2) / 2) / (np.sqrt(2 * np.pi) * max(sd, 1e-9))
+    left.plot(x, normal, color=BLACK, linewidth=1)
     left.set(xlabel='residual [px]', title=f'robust sd {sd:.3f} px')
-    quantile = norm.ppf((np.arange(len(values)) + 0.5) / len(values))
+    quantile = ndtri((np.arange(len(values)) + 0.5) / len(values))
     right.plot(quantile, np.sort(values), '.', color=AFTER, markersize=3)
     right.plot(quantile[[0, -1]], sd * quantile[[0, -1]], color=BLACK, linewidth=1)
     right.set(xlabel='standard normal', ylabel='residual [px]', title='quantiles')

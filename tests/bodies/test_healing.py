@@ -22,7 +22,7 @@ from fluoro_calib_ros.bodies.rig_adjustment import (
 
 NOISE_PX = 0.2
 SHAPE_SD_MM = 0.01
-EXPOSURES = 24
+EXPOSURES = 12
 BODIES = 3
 MARKERS = 5
 SIZE = (1024, 1024)

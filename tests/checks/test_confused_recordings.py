@@ -539,6 +539,7 @@ def test_what_is_doubtful_about_the_rig_stays_with_the_result(
     assert sentence in said if sentence else 'orientation of the rig' not in said
     note = json.loads((out / 'result.json').read_text())['rig_note']
     assert sentence in note and bool(note) == bool(sentence)
+    monkeypatch.setattr(verdict_module, 'SUBJECTS', (PRECISION,))
     assert run('validate', out) == status
     shown = ' '.join(capsys.readouterr().out.replace('\n  ', ' ').split())
     assert sentence in shown and 'takes on trust' in shown

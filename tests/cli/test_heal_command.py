@@ -42,7 +42,7 @@ def rig(tmp_path_factory):
         position_mm=b.position_mm + MOVED_MM,
     )
     knee = virtual_knee(SEED)
-    motion = walking(knee, np.arange(120) / 120)
+    motion = walking(knee, np.arange(60) / 60)
     write_knee_recording(
         folder, 'bumped', simulate_knee(replace(virtual, fluoroscopes=(a, moved)), knee, motion)
     )
@@ -75,13 +75,9 @@ def test_bumped_rig_is_healed_and_its_points_are_right_again(rig, tmp_path, caps
         np.abs(np.radians(change['rotation_deg']) - TURNED_RAD),
         4 * np.radians(change['rotation_sd_deg']),
     )
-    poses = {}
-    for name, folder in (('before', rig / 'result'), ('after', healed)):
-        bodies = ('bodies', rig / 'bumped', '--bodies', rig / 'learned' / 'shapes.csv', '--json')
-        out = ('--keep-shapes', '--calibration', folder, '--out', tmp_path / name)
-        assert run(*bodies, *out) == 0
-        poses[name] = json.loads(capsys.readouterr().out)['bodies']['femur']['poses']
-    assert poses['after'] == 120
+    bodies = ('bodies', rig / 'bumped', '--bodies', rig / 'learned' / 'shapes.csv', '--json')
+    assert run(*bodies, '--keep-shapes', '--calibration', healed, '--out', tmp_path / 'after') == 0
+    assert json.loads(capsys.readouterr().out)['bodies']['femur']['poses'] == 60
 
 
 def test_rig_that_has_not_changed_is_left_as_it_is(rig, tmp_path, capsys):

@@ -40,7 +40,7 @@ def added(tmp_path, monkeypatch):
 @pytest.mark.long
 def test_added_model_calibrates_saves_loads_and_looks_up(tmp_path):
     frames = {'a': rigs.exposures()['a'][:8]}
-    result = calibrate(frames, rigs.rig().phantom, CalibrationOptions(NAME))
+    result = calibrate(frames, rigs.rig().phantom, CalibrationOptions(NAME, max_iterations=4))
     calibration = result.calibrations['a']
     model = calibration.model
     without = rigs.calibrated('a', 8, model='none').calibrations['a']

@@ -456,24 +456,6 @@ def test_ripples_that_short_sines_have_followed_stand_out_of_their_bands():
     assert shown_ripples((1024, 1024), uv, field + noise, exposure, 12).alone() is None
 
 
-@pytest.mark.long
-def test_dent_whose_image_points_look_like_false_matches_is_followed():
-    """A dent of 6 px, 35 px wide: its image points agree with those of other exposures."""
-    middle = (400.0, 600.0)
-
-    def dent(uv):
-        square = np.sum((uv - middle) ** 2, axis=1, keepdims=True)
-        return np.exp(-square / (2 * 35.0**2)) * [3.0, 5.1]
-
-    frames = [replace(f, uv=f.uv + dent(f.uv)) for f in rigs.exposures()['a']]
-    options = CalibrationOptions('collocation')
-    run = calibrate({'a': frames}, rigs.rig().phantom, options).runs['a']
-    near = np.linalg.norm(run.measured.network.uv - middle, axis=1) < 70
-    assert near.sum() > 40
-    assert run.after.inliers[near].mean() > 0.97
-    assert run.after.inliers.mean() < 0.995  # false matches elsewhere stay out
-
-
 def test_prior_of_ripples_is_estimated():
     """A long field and a band of short waves: a covariance function that falls with the frequency
     has no such gap. The variances of the band within a fifth in the mean.
@@ -850,7 +832,7 @@ def test_errors_agree_with_standard_deviations():
     """
     from benchmarks.precision import normalised
 
-    results = [normalised(seed, exposures=10) for seed in range(3)]
+    results = [normalised(seed, exposures=8) for seed in range(3)]
     assert 0.9 < np.mean([r['object points'] for r in results]) < 1.1
     assert (
         0.3 < np.mean([r['T'] for r in results]) < 2.5

@@ -120,11 +120,11 @@ def test_the_adjustment_of_a_board_is_that_of_opencv():
 
 @pytest.mark.long
 def test_a_tilted_grid_calibrates_nearly_as_well_as_known_distortion_allows():
-    frames = exposures([12, 18, 24, 30, 36, 21, 27, 33])
+    frames = exposures([12, 18, 24, 30, 36, 27])
     found = calibrate({'a': frames}, SURVEY).calibrations['a']
     undistorted = without_distortion(frames, fluoroscope())
     known = calibrate({'a': undistorted}, SURVEY, PLAIN).calibrations['a']
-    test = simulate_exposures(rigs.rig(), 8, 51, Detection(false_matches=0.0)).frames['a']
+    test = simulate_exposures(rigs.rig(), 6, 51, Detection(false_matches=0.0)).frames['a']
     ours = points_rmse(rigs.rig(), test, found.interior, found.model.predict)
     best = points_rmse(
         rigs.rig(), without_distortion(test, fluoroscope()), known.interior, np.zeros_like

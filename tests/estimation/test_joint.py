@@ -36,13 +36,14 @@ def jobs():
         way: calibrate(
             FRAMES,
             PHANTOM,
-            CalibrationOptions('local_linear', max_iterations=4, relative_orientation=way),
+            CalibrationOptions('local_linear', max_iterations=2, relative_orientation=way),
             joint=True,
         )
         for way in ('none', 'soft', 'hard')
     }
 
 
+@pytest.mark.long
 def test_result_contains_the_relative_orientation(jobs):
     found = {way: result_document(job)['relative_orientation'] for way, job in jobs.items()}
     a, b = rigs.rig().fluoroscopes
@@ -108,7 +109,7 @@ def test_free_network_is_calibrated(model):
         FRAMES,
         PHANTOM,
         CalibrationOptions(
-            model=model, datum='inner', max_iterations=8, relative_orientation='soft'
+            model=model, datum='inner', max_iterations=4, relative_orientation='soft'
         ),
         joint=True,
     )
@@ -175,6 +176,7 @@ def test_false_matches_and_a_moved_bead_are_in_the_result(jobs):
     assert not any(p['target_id'] == wrong for p in points)
 
 
+@pytest.mark.long
 def test_correlations_are_in_the_result(jobs):
     found = result_document(jobs['hard'])['correlations']
     assert 0 < len(found) <= 20 and all(

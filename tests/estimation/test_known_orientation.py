@@ -41,8 +41,8 @@ def truth_of(one):
 
 @pytest.fixture(scope='module')
 def motion():
-    """60 exposures of 4 markers in motion, as one case."""
-    return known_orientation(rigs.rig(), 1, 60, 4)
+    """40 exposures of 4 markers in motion, as one case."""
+    return known_orientation(rigs.rig(), 1, 40, 4)
 
 
 @pytest.fixture(scope='module')

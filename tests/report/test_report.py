@@ -31,9 +31,9 @@ QUICK = {'model': 'local_linear', 'k': 30, 'max_iterations': 3}
 
 @pytest.fixture(scope='module')
 def scene():
-    """A phantom and eight exposures of it by fluoroscope."""
+    """A phantom and six exposures of it by fluoroscope."""
     rig = virtual_rig(1)
-    return rig.phantom, simulate_exposures(rig, 8, 1).frames
+    return rig.phantom, simulate_exposures(rig, 6, 1).frames
 
 
 @pytest.fixture(scope='module')

@@ -32,7 +32,7 @@ from fluoro_calib_ros.simulation.tracking import simulate_tracking
 
 SIZE = 400
 BEADS = np.random.default_rng(5).uniform(-60, 60, (48, 3))
-OTHER_BEADS = np.random.default_rng(6).uniform(-60, 60, (48, 3))
+OTHER_BEADS = np.random.default_rng(6).uniform(-60, 60, (24, 3))
 DISTANCE_PX = 1600.0
 POSES = 4
 START_NS = 10**18

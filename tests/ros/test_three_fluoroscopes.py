@@ -23,7 +23,7 @@ from fluoro_calib_ros.simulation.streams import START_NS, StreamStart
 from fluoro_calib_ros.simulation.tracking import simulate_tracking
 
 THREE = ('a', 'b', 'c')
-POSES = 12
+POSES = 9
 RATE_HZ = 15.0
 PATIENCE = 8
 # markers; frames of c end there, and b drifts from there on

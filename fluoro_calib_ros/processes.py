@@ -40,18 +40,10 @@ PROGRAM_END_S = 5  # in which a program ends that was interrupted
 
 @dataclass(frozen=True)
 class Resources:
-    """What a process may use of the machine.
+    """What a process may use of the machine."""
 
-    Attributes
-    ----------
-    nice : int
-        By how much its priority is lowered.
-    one_core : bool
-        Whether its libraries use a single thread each.
-    """
-
-    nice: int = 0
-    one_core: bool = True
+    nice: int = 0  #: by how much its priority is lowered
+    one_core: bool = True  #: whether its libraries use a single thread each
 
 
 OF_STREAM = Resources(nice=5)  # lower priority than the nodes, which must not wait for images

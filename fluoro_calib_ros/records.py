@@ -16,48 +16,25 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Field:
-    """A value of a record.
-
-    Attributes
-    ----------
-    name : str
-    dtype : {'text', 'int', 'float', 'bool'}
-    shape : tuple
-        A letter stands for any length.
-    unit, meaning : str
-        For the documentation.
-    minimum : float or None
-    maximum : float or None
-        Of the absolute value, where it is finite.
-    longest : int or None
-        Of the lengths that are letters.
-    lengths : mapping of str to int
-        The only length but 0 that a letter of the shape can stand for.
-    allowed : {'', 'inf', 'nan'}
-        Value that a float can have besides finite ones.
-    since : int
-        First version of the file that has the field.
-    before : object
-        Value of a record of an earlier version.
-    message : tuple of str
-        Fields of the message; several hold the parts along the axis of their number. Empty: one
-        of the same name.
-    identity : {'', 'correction', 'detail'}
-        Whether the identifier of the record depends on it: as what determines a correction, or as
-        what does not.
-    """
+    """A value of a record."""
 
     name: str
-    dtype: str
-    shape: tuple[int | str, ...] = ()
+    dtype: str  #: {'text', 'int', 'float', 'bool'}
+    shape: tuple[int | str, ...] = ()  #: a letter stands for any length
+    #: for the documentation
     unit: str = '-'
     meaning: str = ''
     minimum: float | None = None
-    maximum: float | None = None
-    longest: int | None = None
+    maximum: float | None = None  #: of the absolute value, where it is finite
+    longest: int | None = None  #: of the lengths that are letters
+    #: the only length but 0 that a letter of the shape can stand for
     lengths: Mapping[str, int] = field(default_factory=dict)
-    allowed: str = ''
-    since: int = 1
-    before: Any = None
+    allowed: str = ''  #: value that a float can have besides finite ones: {'', 'inf', 'nan'}
+    since: int = 1  #: first version of the file that has the field
+    before: Any = None  #: value of a record of an earlier version
+    #: fields of the message; several hold the parts along the axis of their number; empty: one of
+    #: the same name
     message: tuple[str, ...] = ()
+    #: whether the identifier of the record depends on it: as what determines a correction, or as
+    #: what does not: {'', 'correction', 'detail'}
     identity: str = ''

@@ -27,26 +27,14 @@ DAMPING = 1e-9  # [1/mm^2]: a bead that is seen once stays where it is along its
 
 @dataclass(frozen=True)
 class Beads:
-    """Beads intersected from images, and their survey.
+    """Beads intersected from images, and their survey."""
 
-    Attributes
-    ----------
-    target_id : (n,) ndarray of int
-    xyz_mm : (n, 3) ndarray
-    covariance : (n, 3, 3) ndarray
-        [mm^2]
-    views : (n,) ndarray of int
-        Number of image points that agree.
-    survey_mm : (n, 3) ndarray
-    survey_sd_mm : (n,) ndarray
-    """
-
-    target_id: NDArray[np.int64]
-    xyz_mm: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-    views: NDArray[np.int64]
-    survey_mm: NDArray[np.float64]
-    survey_sd_mm: NDArray[np.float64]
+    target_id: NDArray[np.int64]  #: (n,)
+    xyz_mm: NDArray[np.float64]  #: (n, 3)
+    covariance: NDArray[np.float64]  #: (n, 3, 3) [mm^2]
+    views: NDArray[np.int64]  #: (n,) number of image points that agree
+    survey_mm: NDArray[np.float64]  #: (n, 3)
+    survey_sd_mm: NDArray[np.float64]  #: (n,)
 
     def without(self, target_id: np.ndarray) -> Beads:
         """Return the beads except those with a target id."""
@@ -72,49 +60,30 @@ class Beads:
 
 @dataclass(frozen=True)
 class DistanceComparison:
-    """Distances between beads compared with the survey.
+    """Distances between beads compared with the survey."""
 
-    Attributes
-    ----------
-    rmse_mm, expected_mm : float
-        RMS difference from the survey, and its expectation [mm].
-    freedom : float
-        Degrees of freedom of the chi-square distribution that the squared RMS difference has,
-        nearly.
-    scale, scale_sd : float
-        Scale of the images relative to the survey - 1, and its standard deviation.
-    """
-
+    #: RMS difference from the survey, and its expectation [mm]
     rmse_mm: float
     expected_mm: float
+    #: degrees of freedom of the chi-square distribution that the squared RMS difference has,
+    #: nearly
     freedom: float
+    #: scale of the images relative to the survey - 1, and its standard deviation
     scale: float
     scale_sd: float
 
 
 @dataclass(frozen=True)
 class Rays:
-    """Image points with the orientation of their exposure.
+    """Image points with the orientation of their exposure."""
 
-    Attributes
-    ----------
-    rotation : (n, 3, 3) ndarray
-    position_mm : (n, 3) ndarray
-    interior : (n, 3) ndarray
-        xp, yp, c [px].
-    uv : (n, 2) ndarray
-        Corrected [px].
-    variance : (n,) ndarray
-        Of a coordinate, of observation and correction together [px^2].
-    target_id : (n,) ndarray of int
-    """
-
-    rotation: NDArray[np.float64]
-    position_mm: NDArray[np.float64]
-    interior: NDArray[np.float64]
-    uv: NDArray[np.float64]
+    rotation: NDArray[np.float64]  #: (n, 3, 3)
+    position_mm: NDArray[np.float64]  #: (n, 3)
+    interior: NDArray[np.float64]  #: (n, 3) xp, yp, c [px]
+    uv: NDArray[np.float64]  #: (n, 2) corrected [px]
+    #: (n,) of a coordinate, of observation and correction together [px^2]
     variance: NDArray[np.float64]
-    target_id: NDArray[np.int64]
+    target_id: NDArray[np.int64]  #: (n,)
 
 
 def intersect(

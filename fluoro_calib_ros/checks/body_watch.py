@@ -57,24 +57,16 @@ class BodyBlock:
     """Statistics of the bodies in a block.
 
     The 2F series are the drifts along u and v of the F fluoroscopes.
-
-    Attributes
-    ----------
-    score, information : ndarray
-        (B, 2F, A), of a drift of each area, by body [1/px, 1/px^2].
-    systematic : ndarray
-        (2F, A), systematic standard deviations of what all bodies show together [px].
-    enough : ndarray
-        (2F, A), whether enough pairs of markers are on both sides of the border of the area.
-    count : int
-        Number of places of markers.
     """
 
+    #: (B, 2F, A) of a drift of each area, by body [1/px, 1/px^2]
     score: NDArray[np.float64]
     information: NDArray[np.float64]
+    #: (2F, A) systematic standard deviations of what all bodies show together [px]
     systematic: NDArray[np.float64]
+    #: (2F, A) whether enough pairs of markers are on both sides of the border of the area
     enough: NDArray[np.bool_]
-    count: int
+    count: int  #: number of places of markers
 
 
 @dataclass(frozen=True)

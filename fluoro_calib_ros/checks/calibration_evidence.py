@@ -47,26 +47,16 @@ MIN_VARYING_EXPOSURES = 4  # with enough image points, to tell whether the disto
 
 @dataclass(frozen=True)
 class CommonTrend:
-    """Trend that the residuals of all exposures of a fluoroscope have in common.
+    """Trend that the residuals of all exposures of a fluoroscope have in common."""
 
-    Attributes
-    ----------
-    inliers : Residuals
-        Those in the core of the noise.
-    trend : ResidualTrend
-    claimed_sd : float
-        Standard deviation that the calibration claims for its correction [px]: an error of this
-        size is no fault.
-    rejected : RejectedTrend or None
-        What rejected image points have in common; None where they are few everywhere.
-    of_exposure : RejectedExposure or None
-        How far those of one exposure agree; None where they are few in all.
-    """
-
-    inliers: Residuals
+    inliers: Residuals  #: those in the core of the noise
     trend: ResidualTrend
+    #: standard deviation that the calibration claims for its correction [px]: an error of this
+    #: size is no fault
     claimed_sd: float
+    #: what rejected image points have in common; None where they are few everywhere
     rejected: RejectedTrend | None = None
+    #: how far those of one exposure agree; None where they are few in all
     of_exposure: RejectedExposure | None = None
 
     @property
@@ -82,22 +72,13 @@ class CommonTrend:
 
 @dataclass(frozen=True)
 class Evidence:
-    """A calibration, the exposures it was made from, and what a check may do with them.
+    """A calibration, the exposures it was made from, and what a check may do with them."""
 
-    Attributes
-    ----------
-    request : CalibrationRequest
-        With the frames that were used only, in the order of their numbers.
-    calibrations : mapping of str to FluoroscopeCalibration
-    result : CalibrationResult
-        Adjustment of the frames with the calibrations fixed.
-    report_step : callable
-        To be called with the name of a step before every step of a check.
-    """
-
+    #: with the frames that were used only, in the order of their numbers
     request: CalibrationRequest
     calibrations: Mapping[str, FluoroscopeCalibration]
-    result: CalibrationResult
+    result: CalibrationResult  #: adjustment of the frames with the calibrations fixed
+    #: to be called with the name of a step before every step of a check
     report_step: Callable[[str], None]
 
     @property
@@ -252,19 +233,10 @@ def _share_of_inliers(calibration: FluoroscopeCalibration, frames: Sequence[Fram
 
 @dataclass(frozen=True)
 class Subject:
-    """A subject of validation: one or more checks that are made together.
+    """A subject of validation: one or more checks that are made together."""
 
-    Attributes
-    ----------
-    run : callable
-        Called with the Evidence and the names of the fluoroscopes that are calibrated together;
-        returns their checks. With of_rig it is called once, with all fluoroscopes.
-    steps : int
-        How often run calls `Evidence.report_step`.
-    of_rig : bool
-        Whether the checks are of all fluoroscopes together.
-    """
-
+    #: called with the Evidence and the names of the fluoroscopes that are calibrated together;
+    #: returns their checks; with of_rig it is called once, with all fluoroscopes
     run: Callable[[Evidence, Sequence[str]], list[Check]]
-    steps: int = 0
-    of_rig: bool = False
+    steps: int = 0  #: how often run calls `Evidence.report_step`
+    of_rig: bool = False  #: whether the checks are of all fluoroscopes together

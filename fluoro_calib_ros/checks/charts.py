@@ -30,13 +30,6 @@ class ImageAreas:
     ----------
     n : int
         Number of cells across the image, even.
-
-    Attributes
-    ----------
-    member : ndarray
-        (areas, cells), 1 where a cell belongs to an area, else 0.
-    box : ndarray
-        (areas, 4), edges u0, v0, u1, v1 as fractions of the image.
     """
 
     def __init__(self, n: int) -> None:
@@ -47,10 +40,12 @@ class ImageAreas:
         boxes += [(i, j, i + half, j + half) for j in starts for i in starts]
         boxes += [(0, 0, half, n), (half, 0, n, n), (0, 0, n, half), (0, half, n, n), (0, 0, n, n)]
         self.n = n
+        #: (areas, 4), edges u0, v0, u1, v1 as fractions of the image
         self.box = np.array(boxes) / n
         row, column = np.divmod(np.arange(n * n), n)
         left, top, right, bottom = np.array(boxes).T[:, :, None]
         inside = (column >= left) & (column < right) & (row >= top) & (row < bottom)
+        #: (areas, cells), 1 where a cell belongs to an area, else 0
         self.member = inside.astype(float)
 
     def __len__(self) -> int:
@@ -110,23 +105,17 @@ class CusumCharts:
         Excess over the dead band to which the charts are most sensitive [px].
     cap : float
         Largest evidence.
-
-    Attributes
-    ----------
-    evidence : ndarray
-        (2, K, A), for drifts in the positive and in the negative direction.
-    begin : ndarray
-        (2, K, A), time at which the present run of each chart began [ns].
-    stretch : ndarray
-        (K, 1), variance of a long sum of blocks over that of their differences.
     """
 
     def __init__(self, series: int, areas: int, step_px: float, cap: float) -> None:
         shape = (series, areas)
         self._step = step_px
         self._cap = cap
+        #: (2, K, A), for drifts in the positive and in the negative direction
         self.evidence = np.zeros((2, *shape))
+        #: (2, K, A), time at which the present run of each chart began [ns]
         self.begin = np.zeros((2, *shape), dtype=np.int64)
+        #: (K, 1), variance of a long sum of blocks over that of their differences
         self.stretch = np.ones((series, 1))
         self._run = np.zeros((2, 2, *shape))  # score and information of the runs, by direction
         self._squares = np.zeros(shape)

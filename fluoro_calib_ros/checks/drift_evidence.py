@@ -47,37 +47,18 @@ class BlockRecord:
 
 @dataclass(frozen=True)
 class DriftEstimate:
-    """A drift as the newest blocks show it.
+    """A drift as the newest blocks show it."""
 
-    Attributes
-    ----------
-    fluoroscopes : tuple of str
-        The likeliest one first, then those that are about as likely.
-    area : int
-        Number of the area.
-    size, sd : float
-        Signed size along `direction` and its standard deviation [px].
-    direction : ndarray
-        (2,), unit vector in the image.
-    against : str
-        One of REFERENCES.
-    source : str
-        'epipolar' or 'cluster NAME'.
-    confirmed : bool
-        False where a single body shows it, in which a marker may have moved.
-    begin_ns : int
-        Estimated begin.
-    """
-
-    fluoroscopes: tuple[str, ...]
-    area: int
+    fluoroscopes: tuple[str, ...]  #: the likeliest one first, then those that are about as likely
+    area: int  #: number of the area
+    #: signed size along `direction` and its standard deviation [px]
     size: float
     sd: float
-    direction: NDArray[np.float64]
-    against: str
-    source: str
-    confirmed: bool
-    begin_ns: int
+    direction: NDArray[np.float64]  #: (2,) unit vector in the image
+    against: str  #: one of REFERENCES
+    source: str  #: 'epipolar' or 'cluster NAME'
+    confirmed: bool  #: False where a single body shows it, in which a marker may have moved
+    begin_ns: int  #: estimated begin
 
 
 @dataclass(frozen=True)

@@ -19,37 +19,26 @@ class EpipolarObservations:
     Rows with a value that is not finite are ignored. Residuals that are too large for a match
     belong here too: they are clipped, and a large drift has no others.
 
-    Attributes
-    ----------
-    target_id : ndarray
-        (n,)
-    uv_a, uv_b : ndarray
-        (n, 2), where the markers are in the images [px].
-    residual : ndarray
-        (n,), signed [px].
-    sd_noise, sd_systematic : ndarray
-        (n,), standard deviations of the residuals [px]: by the noise of the image points, which
-        is new in every frame, and by the correction and the orientation, which stay the same at a
-        place and do not average out.
-    normal_a, normal_b : ndarray
-        (n, 2), normals of the epipolar lines, as in EpipolarResiduals.
-    factor_a, factor_b : ndarray
-        (n,), change of the residual by a shift of one pixel along the normal.
-
     Raises
     ------
     ValueError
         For arrays whose shapes do not agree.
     """
 
-    target_id: NDArray[np.int64]
+    target_id: NDArray[np.int64]  #: (n,)
+    #: (n, 2) where the markers are in the images [px]
     uv_a: NDArray[np.float64]
     uv_b: NDArray[np.float64]
-    residual: NDArray[np.float64]
+    residual: NDArray[np.float64]  #: (n,) signed [px]
+    #: (n,) standard deviations of the residuals [px]: by the noise of the image points, which is
+    #: new in every frame, and by the correction and the orientation, which stay the same at a
+    #: place and do not average out
     sd_noise: NDArray[np.float64]
     sd_systematic: NDArray[np.float64]
+    #: (n, 2) normals of the epipolar lines, as in EpipolarResiduals
     normal_a: NDArray[np.float64]
     normal_b: NDArray[np.float64]
+    #: (n,) change of the residual by a shift of one pixel along the normal
     factor_a: NDArray[np.float64]
     factor_b: NDArray[np.float64]
 

@@ -24,56 +24,32 @@ NAN = float('nan')
 class DriftState:
     """Present state of the drift watch.
 
-    Attributes
-    ----------
-    finding : Finding
-        What the watch says; its severity is the level.
-    evidence : float
-        Largest log-likelihood ratio of all charts.
-    threshold_warn, threshold_error : float
-        Evidence at which the levels WARN and ERROR begin.
-    observations : int
-        Residuals and distances since the last reset.
-    learning : bool
-        Whether the reference is still being learned from the start of the stream.
-    fluoroscope : str
-        Name of the fluoroscope whose image has drifted, 'a or b' where the two cannot be
-        distinguished, '' without a drift.
-    area : tuple of float
-        Corners u0, v0, u1, v1 of the area that has drifted [px].
-    place : str
-        The same area in words.
-    size, sd : float
-        Size of the drift along `direction` and its standard deviation [px]. As residuals are
-        clipped, a size of more than a pixel is a lower bound.
-    direction : tuple of float
-        Unit vector (2,) in the image: the normal of the epipolar lines, or u or v where the drift
-        was found by bodies.
-    against : str
-        Reference of the drift: 'calibration' or 'start'.
-    source : str
-        'epipolar' or 'cluster NAME'.
-    since_s : float
-        Estimated time since the drift began [s].
-
     Without a drift, size, sd, since_s, area and direction are NaN.
     """
 
-    finding: Finding
-    evidence: float
+    finding: Finding  #: what the watch says; its severity is the level
+    evidence: float  #: largest log-likelihood ratio of all charts
+    #: evidence at which the levels WARN and ERROR begin
     threshold_warn: float
     threshold_error: float
-    observations: int
-    learning: bool
+    observations: int  #: residuals and distances since the last reset
+    learning: bool  #: whether the reference is still being learned from the start of the stream
+    #: name of the fluoroscope whose image has drifted, 'a or b' where the two cannot be
+    #: distinguished, '' without a drift
     fluoroscope: str = ''
+    #: corners u0, v0, u1, v1 of the area that has drifted [px]
     area: tuple[float, ...] = (NAN,) * 4
-    place: str = ''
+    place: str = ''  #: the same area in words
+    #: size of the drift along `direction` and its standard deviation [px]; as residuals are
+    #: clipped, a size of more than a pixel is a lower bound
     size: float = NAN
     sd: float = NAN
+    #: unit vector (2,) in the image: the normal of the epipolar lines, or u or v where the drift
+    #: was found by bodies
     direction: tuple[float, ...] = (NAN,) * 2
-    against: str = ''
-    source: str = ''
-    since_s: float = NAN
+    against: str = ''  #: reference of the drift: 'calibration' or 'start'
+    source: str = ''  #: 'epipolar' or 'cluster NAME'
+    since_s: float = NAN  #: estimated time since the drift began [s]
 
     @property
     def level(self) -> Severity:

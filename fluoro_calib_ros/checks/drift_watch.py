@@ -362,15 +362,10 @@ class BlockClock:
     ----------
     block_s : float
         Length of a block [s].
-
-    Attributes
-    ----------
-    newest_ns : int
-        Newest time [ns].
     """
 
     def __init__(self, block_s: float) -> None:
-        self.newest_ns = 0
+        self.newest_ns = 0  #: newest time [ns]
         self._length_ns = round(block_s * 1e9)
         self._begin_ns: int | None = None  # of the present block
         self._late = 0  # calls with a stamp before the newest one, since that came

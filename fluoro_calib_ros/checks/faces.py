@@ -32,30 +32,16 @@ IMPROVED = 2.0  # factor by which the median square of its beads falls
 
 @dataclass(frozen=True)
 class DisplacedLayer:
-    """A layer of beads that is out of place as a whole.
+    """A layer of beads that is out of place as a whole."""
 
-    Attributes
-    ----------
-    axis : int
-        0, 1 or 2: along which coordinate of the survey the layer is bounded.
-    low, high : float or None
-        Its bounds [mm]; None where the phantom ends, so that the layer is a face.
-    target_id : (k,) ndarray of int
-        Its beads.
-    shift_mm : (3,) ndarray
-        Images - survey of its centre, against the rest.
-    tilt_rad : float
-        Rotation against the rest.
-    size_mm, limit_mm : float
-        RMS displacement of its beads by this motion, and that which is not significant.
-    """
-
-    axis: int
+    axis: int  #: 0, 1 or 2: along which coordinate of the survey the layer is bounded
+    #: its bounds [mm]; None where the phantom ends, so that the layer is a face
     low: float | None
     high: float | None
-    target_id: NDArray[np.int64]
-    shift_mm: NDArray[np.float64]
-    tilt_rad: float
+    target_id: NDArray[np.int64]  #: (k,) its beads
+    shift_mm: NDArray[np.float64]  #: (3,) images - survey of its centre, against the rest
+    tilt_rad: float  #: rotation against the rest
+    #: RMS displacement of its beads by this motion, and that which is not significant
     size_mm: float
     limit_mm: float
 

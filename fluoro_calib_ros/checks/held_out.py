@@ -136,29 +136,18 @@ MIN_NOISE = 0.05  # part of the squared residuals in sample that is noise, whate
 
 
 class ExposureSums(NamedTuple):
-    """Sums of an exposure over its image points.
+    """Sums of an exposure over its image points."""
 
-    Attributes
-    ----------
-    number : int
-        Of the exposure.
-    points : int
-    outside, inside : float
-        Squared residuals [px^2] with a calibration that has not used the exposure, and with one
-        that has. The same exposures are adjusted in the same way, so that the adjustment absorbs
-        the same part of the residuals.
-    predicted : float
-        Predicted variance of the correction [px^2].
-    white : float
-        Half the squared differences of the residuals of nearest neighbours [px^2]: what is noise,
-        and no misfit of an area.
-    """
-
-    number: int
+    number: int  #: of the exposure
     points: int
+    #: squared residuals [px^2] with a calibration that has not used the exposure, and with one
+    #: that has; the same exposures are adjusted in the same way, so that the adjustment absorbs
+    #: the same part of the residuals
     outside: float
     inside: float
-    predicted: float
+    predicted: float  #: predicted variance of the correction [px^2]
+    #: half the squared differences of the residuals of nearest neighbours [px^2]: what is noise,
+    #: and no misfit of an area
     white: float
 
 

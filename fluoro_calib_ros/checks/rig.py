@@ -39,29 +39,16 @@ CAPTURE = 'orient the rig from a capture'
 
 @dataclass(frozen=True)
 class RigFindings:
-    """What the exposures say about the orientation of a rig.
+    """What the exposures say about the orientation of a rig."""
 
-    Attributes
-    ----------
-    fluoroscopes : tuple of str
-        Empty: they are no rig, or the rig is oriented otherwise.
-    orientation : RigOrientation or None
-        None where the exposures give none; the doubts say why.
-    doubts : tuple of Finding
-    scatter : tuple of PairScatter
-        Of every fluoroscope but the first; empty where it is not known.
-    noise_px : float
-        Standard deviation of an image coordinate, the largest of all [px].
-    trusted : tuple of Finding
-        What the exposures cannot show.
-    """
-
-    fluoroscopes: tuple[str, ...] = ()
+    fluoroscopes: tuple[str, ...] = ()  #: empty: they are no rig, or the rig is oriented otherwise
+    #: None where the exposures give none; the doubts say why
     orientation: RigOrientation | None = None
     doubts: tuple[Finding, ...] = ()
+    #: of every fluoroscope but the first; empty where it is not known
     scatter: tuple[PairScatter, ...] = ()
-    noise_px: float = 0.0
-    trusted: tuple[Finding, ...] = field(default=())
+    noise_px: float = 0.0  #: standard deviation of an image coordinate, the largest of all [px]
+    trusted: tuple[Finding, ...] = field(default=())  #: what the exposures cannot show
 
     @property
     def notes(self) -> tuple[Finding, ...]:

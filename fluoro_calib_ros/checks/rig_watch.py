@@ -124,30 +124,16 @@ class RigDriftWatch:
 
 @dataclass(frozen=True)
 class DriftVerdict:
-    """Verdict of the drift watch on a recording.
+    """Verdict of the drift watch on a recording."""
 
-    Attributes
-    ----------
-    finding : Finding
-        What the watch says of the recording.
-    state : DriftState or None
-        Where there was a drift: the state with the largest evidence.
-    found_ns : int or None
-        Stamp of the exposure at which the highest level was first reached [ns].
-    began_ns : int or None
-        Begin of the drift by the last estimate [ns].
-    level_at_end : str or None
-        'ok', 'warn' or 'error'.
-    watched_s : float
-        Time in which a drift could have been detected [s].
-    """
-
-    finding: Finding
+    finding: Finding  #: what the watch says of the recording
+    #: where there was a drift: the state with the largest evidence
     state: DriftState | None = None
+    #: stamp of the exposure at which the highest level was first reached [ns]
     found_ns: int | None = None
-    began_ns: int | None = None
-    level_at_end: str | None = None
-    watched_s: float = 0.0
+    began_ns: int | None = None  #: begin of the drift by the last estimate [ns]
+    level_at_end: str | None = None  #: 'ok', 'warn' or 'error'
+    watched_s: float = 0.0  #: time in which a drift could have been detected [s]
 
     @property
     def level(self) -> str:

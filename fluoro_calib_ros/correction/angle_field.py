@@ -39,39 +39,18 @@ def harmonics(angle: ArrayLike) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Change:
-    """What an angle adds to a correction.
+    """What an angle adds to a correction."""
 
-    Attributes
-    ----------
-    coefficients : (4, k, 2, 4) ndarray
-        Of x^i y^j, in the order i, field, u or v, j: the change, then fields of what is unknown.
-    variance : (33, 33) ndarray
-        On the grid of the standard deviation [px^2].
-    scatters : bool
-        Whether there are fields of what is unknown.
-    """
-
+    #: (4, k, 2, 4) of x^i y^j, in the order i, field, u or v, j: the change, then fields of what
+    #: is unknown
     coefficients: NDArray[np.float64]
-    variance: NDArray[np.float64]
-    scatters: bool
+    variance: NDArray[np.float64]  #: (33, 33) on the grid of the standard deviation [px^2]
+    scatters: bool  #: whether there are fields of what is unknown
 
 
 @dataclass(frozen=True)
 class AngleField:
     """Change of a correction with the angle, relative to its mean over the exposures.
-
-    Attributes
-    ----------
-    image_size : (int, int)
-        Width and height [px].
-    angles : (e,) ndarray
-        Angles of the exposures [rad].
-    coefficients : (4, 2, 10) ndarray
-        Of each harmonic less its mean: those of cubic polynomials of the pixel for u and v, in
-        the order and coordinates of `series.Functions` [px].
-    variances : (14, 33, 33) ndarray
-        On the grid of the standard deviation of a series [px^2]: covariances of the correction
-        without angle and each harmonic, then those of pairs of harmonics.
 
     Raises
     ------
@@ -79,9 +58,13 @@ class AngleField:
         For arrays of other shapes, or values that are not finite.
     """
 
-    image_size: tuple[int, int]
-    angles: NDArray[np.float64]
+    image_size: tuple[int, int]  #: width and height [px]
+    angles: NDArray[np.float64]  #: (e,) angles of the exposures [rad]
+    #: (4, 2, 10) of each harmonic less its mean: those of cubic polynomials of the pixel for u and
+    #: v, in the order and coordinates of `series.Functions` [px]
     coefficients: NDArray[np.float64]
+    #: (14, 33, 33) on the grid of the standard deviation of a series [px^2]: covariances of the
+    #: correction without angle and each harmonic, then those of pairs of harmonics
     variances: NDArray[np.float64]
 
     def __post_init__(self) -> None:

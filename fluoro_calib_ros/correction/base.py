@@ -55,21 +55,11 @@ class Smoothness(Enum):
 
 @dataclass(frozen=True)
 class Correction:
-    """A correction at n pixels.
+    """A correction at n pixels."""
 
-    Attributes
-    ----------
-    duv : (n, 2) ndarray
-        du, dv [px]; undistorted = observed - (du, dv).
-    sd : (n,) ndarray
-        Standard deviation of each coordinate [px].
-    outside : (n,) ndarray of bool
-        True beyond the calibrated area.
-    """
-
-    duv: NDArray[np.float64]
-    sd: NDArray[np.float64]
-    outside: NDArray[np.bool_]
+    duv: NDArray[np.float64]  #: (n, 2) du, dv [px]; undistorted = observed - (du, dv)
+    sd: NDArray[np.float64]  #: (n,) standard deviation of each coordinate [px]
+    outside: NDArray[np.bool_]  #: (n,) True beyond the calibrated area
 
 
 @dataclass(frozen=True)
@@ -78,21 +68,6 @@ class CorrectionModel(ABC):
 
     The fields are the whole content of a model: calibration files and messages carry them and
     nothing else, so a subclass derives everything it needs from them in `_prepare`.
-
-    Attributes
-    ----------
-    k : int
-        Number of neighbours; 0 for a model without.
-    train_uv : (N, 2) ndarray
-        Observed training pixels.
-    train_duv : (N, 2) ndarray
-        Corrections at the training pixels [px].
-    noise_px : float
-        Standard deviation of one training correction.
-    bias_px : float
-        Systematic error of a prediction, as a standard deviation.
-    series : Series or None
-        Terms that were estimated in the adjustment.
 
     Raises
     ------
@@ -110,12 +85,12 @@ class CorrectionModel(ABC):
     corrects: ClassVar[bool] = True  # False: it leaves every pixel as it is
     keeps_training_points: ClassVar[bool] = True  # train_uv are image points of exposures
 
-    k: int
-    train_uv: NDArray[np.float64]
-    train_duv: NDArray[np.float64]
-    noise_px: float = 0.0
-    bias_px: float = 0.0
-    series: Series | None = None
+    k: int  #: number of neighbours; 0 for a model without
+    train_uv: NDArray[np.float64]  #: (N, 2) observed training pixels
+    train_duv: NDArray[np.float64]  #: (N, 2) corrections at the training pixels [px]
+    noise_px: float = 0.0  #: standard deviation of one training correction
+    bias_px: float = 0.0  #: systematic error of a prediction, as a standard deviation
+    series: Series | None = None  #: terms that were estimated in the adjustment
     _hull: np.ndarray = field(init=False, repr=False, compare=False)
     _holes: Holes | None = field(init=False, repr=False, compare=False)
 

@@ -48,19 +48,6 @@ class LookupWorkspace:
         Numbers of rows and columns of cells on the image.
     image_size : (int, int)
         Width and height of the image [px].
-
-    Attributes
-    ----------
-    uv : (2, n) ndarray
-        Pixels.
-    place : (2, n) ndarray
-        Pixels in units of cells.
-    row : (n,) ndarray of int
-        Rows of their cells in the table.
-    result : (3, n) ndarray
-        du, dv and standard deviation [px].
-    status : (n,) ndarray of uint8
-        Status of their cells.
     """
 
     __slots__ = (
@@ -100,11 +87,11 @@ class LookupWorkspace:
         pixels = np.zeros((9, n))  # u three times, v six times
         self._u = pixels[:3]
         self._v = pixels[3:]
-        self.uv = pixels[2:4]
-        self.place = np.empty((2, n))
+        self.uv = pixels[2:4]  #: (2, n) pixels
+        self.place = np.empty((2, n))  #: (2, n) pixels in units of cells
         self._cell = np.empty((2, n), dtype=np.intp)
         self._column = self._cell[0]
-        self.row = self._cell[1]
+        self.row = self._cell[1]  #: (n,) rows of their cells in the table
         self._coefficients = np.empty((n, COEFFICIENTS))
         self._found = np.empty((COEFFICIENTS, n))
         self._constant = self._found[:6]
@@ -112,8 +99,8 @@ class LookupWorkspace:
         self._linear = np.empty((6, n))
         self._of_one = self._linear[:3]
         self._of_u = self._linear[3:]
-        self.result = np.empty((3, n))
-        self.status = np.empty(n, dtype=np.uint8)
+        self.result = np.empty((3, n))  #: (3, n) du, dv and standard deviation [px]
+        self.status = np.empty(n, dtype=np.uint8)  #: (n,) status of their cells
 
     def locate(self, u: np.ndarray, v: np.ndarray) -> None:
         """Find the cells of points u, v (m,) with m <= n: sets `uv`, `place` and `row`."""
@@ -168,41 +155,30 @@ class CorrectionGrid:
     model : CorrectionModel
     image_size : (int, int)
         Width and height [px].
-
-    Attributes
-    ----------
-    nodes : (w,) ndarray, (h,) ndarray
-        Columns and rows [px] of the corners of cells.
-    cell_px : float
-        Longer side of a cell.
-    divided : int
-        Number of cells that are divided further.
-    error_px : float
-        Largest difference of a coordinate from the exact model in the calibrated area, measured at
-        the centres of cells and of their edges. A kink between them may do half more.
-    error_outside_px : float
-        The same in the other cells.
-    sd_error_px : float
-        Largest difference of the standard deviation, everywhere.
     """
 
     def __init__(self, model: CorrectionModel, image_size: tuple[int, int]) -> None:
         width, height = image_size
         self.image_size = (int(width), int(height))
         cells = build_cells(model, self.image_size)
-        self.nodes = cells.nodes
+        self.nodes = cells.nodes  #: (w,) columns and rows [px] of the corners of cells
+        #: longer side of a cell
         self.cell_px = float(max(np.diff(axis).max() for axis in cells.nodes))
         self._set_tables(cells)
         self._workspaces: list[list[LookupWorkspace]] = _no_workspaces()
-        self.divided = 0
+        self.divided = 0  #: number of cells that are divided further
         errors = cells.errors
         if model.smoothness is not Smoothness.STEPPED:
             divided = divide_cells(model, cells)
             if divided is not None:
                 self._set_divided(divided)
                 errors[:, divided.row, divided.column] = self._errors_of_divided(model, divided)
+        #: largest difference of a coordinate from the exact model in the calibrated area, measured
+        #: at the centres of cells and of their edges; a kink between them may do half more
         self.error_px = float(np.nanmax(errors[0][~cells.outside], initial=0.0))
+        #: the same in the other cells
         self.error_outside_px = float(np.nanmax(errors[0][cells.outside], initial=0.0))
+        #: largest difference of the standard deviation, everywhere
         self.sd_error_px = float(np.nanmax(errors[1]))
 
     def _set_tables(self, cells: Cells) -> None:

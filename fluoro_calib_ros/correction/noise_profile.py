@@ -20,20 +20,14 @@ MAX_FACTOR = 10.0  # of the border over the middle, or the inverse
 
 @dataclass(frozen=True)
 class NoiseProfile:
-    """Factors of the standard deviation of image coordinates over an image.
+    """Factors of the standard deviation of image coordinates over an image."""
 
-    Attributes
-    ----------
-    middle, rim : float
-        Factors in the middle of the image, and at the border and beyond. The mean of their squares
-        over the image points is one.
-    reach : float
-        Distance of the border from the middle, in halves of the longer side: no image points are
-        known beyond.
-    """
-
+    #: factors in the middle of the image, and at the border and beyond; the mean of their squares
+    #: over the image points is one
     middle: float
     rim: float
+    #: distance of the border from the middle, in halves of the longer side: no image points are
+    #: known beyond
     reach: float
 
     def factors(

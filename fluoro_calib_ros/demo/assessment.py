@@ -26,25 +26,13 @@ IMAGE_SCALE = 512.0
 
 @dataclass(frozen=True)
 class SpaceFigures:
-    """Accuracy and latency of the points in space.
+    """Accuracy and latency of the points in space."""
 
-    Attributes
-    ----------
-    rmse_mm : float
-        Against the true markers, after the rotation and shift that fit best.
-    normalised : float
-        Mean square of a coordinate's error over its variance.
-    good_fraction : float
-        Part of the points that were intersected.
-    exposures : int
-    latency_ms : float
-        Median, from the publication of the frames by the player to that of the points.
-    """
-
-    rmse_mm: float
-    normalised: float
-    good_fraction: float
+    rmse_mm: float  #: against the true markers, after the rotation and shift that fit best
+    normalised: float  #: mean square of a coordinate's error over its variance
+    good_fraction: float  #: part of the points that were intersected
     exposures: int
+    #: median, from the publication of the frames by the player to that of the points
     latency_ms: float
 
 

@@ -154,38 +154,16 @@ class Regressions:
 
 @dataclass(frozen=True)
 class _Iterate:
-    """State of the iteration after a round.
+    """State of the iteration after a round."""
 
-    Attributes
-    ----------
-    values : (N, 2) ndarray
-        Values to which the models are fitted [px].
-    information : (N, 2, 2) ndarray
-        Inverse covariance of the residuals [1/px^2].
-    after : Adjustment
-        Adjustment of the round.
-    noise : Noise
-        Noise model that its residuals show.
-    """
-
-    values: NDArray[np.float64]
-    information: NDArray[np.float64]
-    after: Adjustment
-    noise: Noise
+    values: NDArray[np.float64]  #: (N, 2) values to which the models are fitted [px]
+    information: NDArray[np.float64]  #: (N, 2, 2) inverse covariance of the residuals [1/px^2]
+    after: Adjustment  #: adjustment of the round
+    noise: Noise  #: noise model that its residuals show
 
 
 class _Alternation:
-    """Rounds of regression and adjustment of one network.
-
-    Attributes
-    ----------
-    state : _Iterate
-        After the last round.
-    correction : (N, 2) ndarray
-        Fixed correction of the last round [px].
-    changed : bool
-        Whether inliers or k changed in the last round.
-    """
+    """Rounds of regression and adjustment of one network."""
 
     def __init__(
         self,
@@ -194,14 +172,16 @@ class _Alternation:
         regressions: Regressions,
         history: History,
     ) -> None:
+        #: (N, 2) fixed correction of the last round [px]
         self.correction = np.zeros_like(network.uv)
-        self.changed = False
+        self.changed = False  #: whether inliers or k changed in the last round
         self._network = network
         self._regressions = regressions
         self._history = history
         self._acceleration = Anderson()
         self._image = start.residuals
         information, _ = _information(network, start, self.correction)
+        #: after the last round
         self.state = _Iterate(start.residuals, information, start, start.noise)
 
     def advance(self) -> None:

@@ -32,81 +32,50 @@ from .rounds import SelfCalibration
 
 @dataclass(frozen=True)
 class AdjustmentStatistics:
-    """Statistics of one adjustment and of its network.
-
-    Attributes
-    ----------
-    fluoroscopes : tuple of str
-    loss : str
-        Noise model of the image points.
-    sigma0 : float
-        Scale of the noise: standard deviation of an image coordinate of weight one [px], or its
-        ratio to sigma where sigma is given.
-    nu : float
-        Degrees of freedom of the Student-t; infinite for other noise models.
-    variance_factor : float
-        Weighted square sum of all residuals over the degrees of freedom; expected: 1.
-    observations, unknowns : int
-        Scalar observations without priors, and unknowns.
-    degrees_of_freedom : float
-        Sum of the redundancy numbers. With priors, as those of a signal, it is more than
-        observations - unknowns.
-    image_points, outliers, exposures, targets : int
-    least_redundancy, mean_redundancy : float
-        Of the image coordinates of weight one half or more.
-    least_rays, mean_rays : float
-        Image points of a target.
-    """
+    """Statistics of one adjustment and of its network."""
 
     fluoroscopes: tuple[str, ...]
-    loss: str
+    loss: str  #: noise model of the image points
+    #: scale of the noise: standard deviation of an image coordinate of weight one [px], or its
+    #: ratio to sigma where sigma is given
     sigma0: float
-    nu: float
+    nu: float  #: degrees of freedom of the Student-t; infinite for other noise models
+    #: weighted square sum of all residuals over the degrees of freedom; expected: 1
     variance_factor: float
+    #: scalar observations without priors, and unknowns
     observations: int
     unknowns: int
+    #: sum of the redundancy numbers; with priors, as those of a signal, it is more than
+    #: observations - unknowns
     degrees_of_freedom: float
     image_points: int
     outliers: int
     exposures: int
     targets: int
+    #: of the image coordinates of weight one half or more
     least_redundancy: float
     mean_redundancy: float
+    #: image points of a target
     least_rays: float
     mean_rays: float
 
 
 @dataclass(frozen=True)
 class ResidualTable:
-    """Residuals of all image points of adjustments.
+    """Residuals of all image points of adjustments."""
 
-    Attributes
-    ----------
-    fluoroscope : (N,) ndarray of str
-    exposure, target_id : (N,) ndarray of int
-    uv : (N, 2) ndarray
-        Observed pixels.
-    correction : (N, 2) ndarray
-        Correction [px].
-    residual : (N, 2) ndarray
-        Observed - correction - projected [px].
-    redundancy : (N, 2) ndarray
-        Redundancy numbers: part of an error that the residual shows.
-    weight : (N,) ndarray
-        Robust weights, 0 to about 1.
-    outlier : (N,) ndarray of bool
-        Beyond the core of the noise: four standard deviations, more where the tails are heavy or
-        the image points of the exposure scatter more than those of others.
-    """
-
-    fluoroscope: np.ndarray
+    fluoroscope: np.ndarray  #: (N,)
+    #: (N,)
     exposure: NDArray[np.int64]
     target_id: NDArray[np.int64]
-    uv: NDArray[np.float64]
-    correction: NDArray[np.float64]
-    residual: NDArray[np.float64]
+    uv: NDArray[np.float64]  #: (N, 2) observed pixels
+    correction: NDArray[np.float64]  #: (N, 2) correction [px]
+    residual: NDArray[np.float64]  #: (N, 2) observed - correction - projected [px]
+    #: (N, 2) redundancy numbers: part of an error that the residual shows
     redundancy: NDArray[np.float64]
-    weight: NDArray[np.float64]
+    weight: NDArray[np.float64]  #: (N,) robust weights, 0 to about 1
+    #: (N,) beyond the core of the noise: four standard deviations, more where the tails are heavy
+    #: or the image points of the exposure scatter more than those of others
     outlier: NDArray[np.bool_]
 
     @classmethod

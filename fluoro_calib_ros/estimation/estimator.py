@@ -38,53 +38,28 @@ Model_co = TypeVar('Model_co', covariant=True)  # the correction model that a re
 
 @dataclass(frozen=True)
 class AdjustmentProblem:
-    """A network whose adjustment is to estimate terms of the correction.
+    """A network whose adjustment is to estimate terms of the correction."""
 
-    Attributes
-    ----------
-    network : Network
-        Network without additional parameters.
-    image_sizes : sequence of (int, int)
-        Width and height [px] of the image of each fluoroscope.
-    before : Adjustment
-        Adjustment of the network without correction.
-    gauges : sequence of GaugeKind
-        What the orientation of each fluoroscope can express.
-    angles : sequence of (e,) ndarray, optional
-        Angles of the C-arm [rad] in the exposures of each fluoroscope, in the order of the
-        network; NaN where unknown. None: all are unknown.
-    """
-
-    network: Network
+    network: Network  #: network without additional parameters
+    #: width and height [px] of the image of each fluoroscope
     image_sizes: Sequence[tuple[int, int]]
-    before: Adjustment
-    gauges: Sequence[GaugeKind]
+    before: Adjustment  #: adjustment of the network without correction
+    gauges: Sequence[GaugeKind]  #: what the orientation of each fluoroscope can express
+    #: (e,) angles of the C-arm [rad] in the exposures of each fluoroscope, in the order of the
+    #: network; NaN where unknown; None: all are unknown
     angles: Sequence[NDArray[np.float64]] | None = None
 
 
 @dataclass(frozen=True)
 class TrainingPoints:
-    """Image points of one fluoroscope to whose residuals a model is fitted.
+    """Image points of one fluoroscope to whose residuals a model is fitted."""
 
-    Attributes
-    ----------
-    uv : (N, 2) ndarray
-        Observed pixels; they do not change between rounds.
-    exposure : (N,) ndarray of int
-        Exposure of each image point.
-    image_size : (int, int)
-        Width and height of the image [px].
-    gauge : GaugeKind
-        What the orientation can express.
-    trend : (N, m) ndarray or None
-        Functions whose coefficients are estimated in the adjustment, the same for u and v; the
-        correction is then kept orthogonal to all of them instead of the gauge.
-    """
-
-    uv: NDArray[np.float64]
-    exposure: NDArray[np.int64]
-    image_size: tuple[int, int]
-    gauge: GaugeKind
+    uv: NDArray[np.float64]  #: (N, 2) observed pixels; they do not change between rounds
+    exposure: NDArray[np.int64]  #: (N,) exposure of each image point
+    image_size: tuple[int, int]  #: width and height of the image [px]
+    gauge: GaugeKind  #: what the orientation can express
+    #: (N, m) functions whose coefficients are estimated in the adjustment, the same for u and v;
+    #: the correction is then kept orthogonal to all of them instead of the gauge
     trend: NDArray[np.float64] | None = None
 
 
@@ -254,20 +229,13 @@ def no_regression(points: TrainingPoints, k: int | None) -> None:
 
 @dataclass(frozen=True)
 class Estimator:
-    """How a self-calibration obtains the models of a kind.
-
-    Attributes
-    ----------
-    kind : str
-    adjusted_terms : callable
-        Returns the terms that are unknowns of the adjustment; None: there are none.
-    regression : callable
-        Returns the regression of the residuals between adjustments for the number k of neighbours
-        that the user asks for (None: to be chosen); None: the model needs no regression.
-    """
+    """How a self-calibration obtains the models of a kind."""
 
     kind: str
+    #: returns the terms that are unknowns of the adjustment; None: there are none
     adjusted_terms: Callable[[AdjustmentProblem], AdjustedTerms | None] = no_terms
+    #: returns the regression of the residuals between adjustments for the number k of neighbours
+    #: that the user asks for (None: to be chosen); None: the model needs no regression
     regression: Callable[[TrainingPoints, int | None], RegressionStep[Any] | None] = no_regression
 
 

@@ -45,17 +45,10 @@ MIN_START_SD_PX = 0.1
 
 @dataclass(frozen=True)
 class SeriesEquations:
-    """Normal equations of the coefficients of a series, all other unknowns eliminated.
+    """Normal equations of the coefficients of a series, all other unknowns eliminated."""
 
-    Attributes
-    ----------
-    information : (2m, 2m) ndarray
-        Without a prior.
-    right : (2m,) ndarray
-    """
-
-    information: NDArray[np.float64]
-    right: NDArray[np.float64]
+    information: NDArray[np.float64]  #: (2m, 2m) without a prior
+    right: NDArray[np.float64]  #: (2m,)
 
 
 class FluoroscopeTerms:

@@ -182,20 +182,12 @@ def better_model(run: SelfCalibration, terms: AdjustedTerms) -> str | None:
 
 @dataclass(frozen=True)
 class _SeriesPrior:
-    """Prior precisions of the coefficients of a series, in parts.
+    """Prior precisions of the coefficients of a series, in parts."""
 
-    Attributes
-    ----------
-    trend : (2t, 2t) ndarray
-        Of the trend, u first.
-    signal : (s, s) ndarray
-        Of the sines, the same for u and v.
-    gauge : (2, g, t + s) ndarray
-        Products with the coefficients of u and of v whose sums have the precision of one.
-    """
-
-    trend: NDArray[np.float64]
-    signal: NDArray[np.float64]
+    trend: NDArray[np.float64]  #: (2t, 2t) of the trend, u first
+    signal: NDArray[np.float64]  #: (s, s) of the sines, the same for u and v
+    #: (2, g, t + s) products with the coefficients of u and of v whose sums have the precision of
+    #: one
     gauge: NDArray[np.float64]
 
 

@@ -35,54 +35,30 @@ ROUNDING = 1e-6  # of the information of object points, relative to that of the 
 
 @dataclass(frozen=True)
 class ExposureResult:
-    """Exterior orientation of an exposure.
+    """Exterior orientation of an exposure."""
 
-    Attributes
-    ----------
-    exposure : int
-        Its number.
-    position_mm : (3,) ndarray
-        Position of the source.
-    quaternion_wxyz : (4,) ndarray
-        Rotation phantom -> sensor.
-    sd_mm, sd_rad : (3,) ndarray
-        Standard deviations of the position, and of the rotation about the axes of the sensor.
-    """
-
-    exposure: int
-    position_mm: NDArray[np.float64]
-    quaternion_wxyz: NDArray[np.float64]
+    exposure: int  #: its number
+    position_mm: NDArray[np.float64]  #: (3,) position of the source
+    quaternion_wxyz: NDArray[np.float64]  #: (4,) rotation phantom -> sensor
+    #: (3,) standard deviations of the position, and of the rotation about the axes of the sensor
     sd_mm: NDArray[np.float64]
     sd_rad: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class FluoroscopeResult:
-    """Figures of one fluoroscope.
+    """Figures of one fluoroscope."""
 
-    Attributes
-    ----------
-    interior, interior_sd : (3,) ndarray
-        xp, yp, c and their standard deviations [px].
-    image_size : (int, int)
-        Width and height [px].
-    model_kind : str
-    k : int
-        Number of neighbours of the model.
-    rmse_before, rmse_after : (2,) ndarray
-        RMSE of the inlier residuals in u and v [px], without and with the correction.
-    observations, inliers : int
-        Numbers of image points.
-    exposures : tuple of ExposureResult
-    """
-
+    #: (3,) xp, yp, c and their standard deviations [px]
     interior: NDArray[np.float64]
     interior_sd: NDArray[np.float64]
-    image_size: tuple[int, int]
+    image_size: tuple[int, int]  #: width and height [px]
     model_kind: str
-    k: int
+    k: int  #: number of neighbours of the model
+    #: (2,) RMSE of the inlier residuals in u and v [px], without and with the correction
     rmse_before: NDArray[np.float64]
     rmse_after: NDArray[np.float64]
+    #: numbers of image points
     observations: int
     inliers: int
     exposures: tuple[ExposureResult, ...]
@@ -90,21 +66,12 @@ class FluoroscopeResult:
 
 @dataclass(frozen=True)
 class Targets:
-    """Object points.
+    """Object points."""
 
-    Attributes
-    ----------
-    target_id : (n,) ndarray
-    xyz_mm : (n, 3) ndarray
-    covariance : (n, 3, 3) ndarray
-        [mm^2]
-    joint_covariance : (3n, 3n) ndarray or None
-        Of all object points with each other [mm^2]; None where they are too many.
-    """
-
-    target_id: NDArray[np.int64]
-    xyz_mm: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    target_id: NDArray[np.int64]  #: (n,)
+    xyz_mm: NDArray[np.float64]  #: (n, 3)
+    covariance: NDArray[np.float64]  #: (n, 3, 3) [mm^2]
+    #: (3n, 3n) of all object points with each other [mm^2]; None where they are too many
     joint_covariance: NDArray[np.float64] | None = None
 
 

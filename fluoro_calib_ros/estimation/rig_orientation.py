@@ -134,25 +134,14 @@ ASSUMED_SD_PX = 1.0
 
 @dataclass(frozen=True)
 class _FixedAdjustment:
-    """An adjustment of m exposures with the calibrations of F fluoroscopes fixed.
-
-    Attributes
-    ----------
-    measured : Measured
-    after : Adjustment
-    by_interior : (m, 6, 3F) ndarray
-        Derivatives de/di of the exteriors by the interiors.
-    blocks : CovarianceBlocks
-        Of the adjustment with the interiors among the unknowns.
-    interiors : (3F, 3F) ndarray
-        Covariance of the interiors.
-    """
+    """An adjustment of m exposures with the calibrations of F fluoroscopes fixed."""
 
     measured: Measured
     after: Adjustment
+    #: (m, 6, 3F) derivatives de/di of the exteriors by the interiors
     by_interior: NDArray[np.float64]
-    blocks: CovarianceBlocks
-    interiors: NDArray[np.float64]
+    blocks: CovarianceBlocks  #: of the adjustment with the interiors among the unknowns
+    interiors: NDArray[np.float64]  #: (3F, 3F) covariance of the interiors
 
     def covariance(self, e: np.ndarray, f: np.ndarray) -> NDArray[np.float64]:
         """Covariances (k, 6, 6) of exposures e (k,) with others f (k,), the interiors known."""
@@ -173,22 +162,12 @@ class _FixedAdjustment:
 
 @dataclass(frozen=True)
 class _Exteriors:
-    """Exterior orientations of F fluoroscopes in the frame of a rig.
+    """Exterior orientations of F fluoroscopes in the frame of a rig."""
 
-    Attributes
-    ----------
-    rotation : (F, 3, 3) ndarray
-    position_mm : (F, 3) ndarray
-    covariance : (6F, 6F) ndarray
-        With the interiors known.
-    by_interior : (6F, 3F) ndarray
-        Derivatives by the interiors.
-    """
-
-    rotation: NDArray[np.float64]
-    position_mm: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-    by_interior: NDArray[np.float64]
+    rotation: NDArray[np.float64]  #: (F, 3, 3)
+    position_mm: NDArray[np.float64]  #: (F, 3)
+    covariance: NDArray[np.float64]  #: (6F, 6F) with the interiors known
+    by_interior: NDArray[np.float64]  #: (6F, 3F) derivatives by the interiors
 
 
 @dataclass(frozen=True)

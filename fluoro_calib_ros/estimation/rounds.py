@@ -22,77 +22,41 @@ SETTLED_PX = 2e-3  # RMS change of the correction below which a round is the las
 
 @dataclass(frozen=True)
 class Round:
-    """One round of a self-calibration.
+    """One round of a self-calibration."""
 
-    Attributes
-    ----------
-    iteration : int
-        Number of the round, from 1.
-    F : float
-        Negative log-likelihood of the adjustment.
-    G : float
-        Weighted square sum of the cross-validation; of the inlier residuals where the model is
-        estimated in the adjustment.
-    k : dict of str to int
-        Number of neighbours by fluoroscope; 0 for a model without.
-    rmse : dict of str to (2,) ndarray
-        RMSE of the inlier residuals in u and v [px], by fluoroscope.
-    quadratic : float
-        Robustly weighted square sum of the residuals [px^2].
-    change : float
-        RMS change of the correction that the next round would make [px].
-    """
-
-    iteration: int
-    F: float
+    iteration: int  #: number of the round, from 1
+    F: float  #: negative log-likelihood of the adjustment
+    #: weighted square sum of the cross-validation; of the inlier residuals where the model is
+    #: estimated in the adjustment
     G: float
-    k: Mapping[str, int]
+    k: Mapping[str, int]  #: number of neighbours by fluoroscope; 0 for a model without
+    #: (2,) RMSE of the inlier residuals in u and v [px], by fluoroscope
     rmse: Mapping[str, NDArray[np.float64]]
-    quadratic: float
-    change: float
+    quadratic: float  #: robustly weighted square sum of the residuals [px^2]
+    change: float  #: RMS change of the correction that the next round would make [px]
 
 
 @dataclass(frozen=True)
 class SelfCalibration:
-    """Result of a self-calibration.
+    """Result of a self-calibration."""
 
-    Attributes
-    ----------
-    measured : Measured
-        The network, with the additional parameters of the model.
-    before, after : Adjustment
-        Adjustments without correction and with the final one.
-    precision : Precision
-        Of the adjustment after.
-    correction : (N, 2) ndarray
-        Correction of the image points [px], additional parameters included.
-    trained : (N,) ndarray of bool
-        Image points to which the models were fitted.
-    models : dict of str to CorrectionModel
-        By fluoroscope.
-    history : tuple of Round
-    converged : bool
-        False where the largest number of rounds ended it.
-    stated : Precision or None
-        With the errors of the models (see `model_errors`); None: these are in the precision.
-    between_exposures : mapping of str to (i,) ndarray
-        Variances [px^2], at the inliers of a fluoroscope, by which its distortion differs between
-        exposures, without what orientations absorb.
-    angle_fields : mapping of str to AngleField
-        Of the fluoroscopes whose distortion changes with the angle of the C-arm.
-    """
-
-    measured: Measured
+    measured: Measured  #: the network, with the additional parameters of the model
+    #: adjustments without correction and with the final one
     before: Adjustment
     after: Adjustment
-    precision: Precision
+    precision: Precision  #: of the adjustment after
+    #: (N, 2) correction of the image points [px], additional parameters included
     correction: NDArray[np.float64]
-    trained: NDArray[np.bool_]
-    models: Mapping[str, CorrectionModel]
+    trained: NDArray[np.bool_]  #: (N,) image points to which the models were fitted
+    models: Mapping[str, CorrectionModel]  #: by fluoroscope
     history: tuple[Round, ...]
-    converged: bool
+    converged: bool  #: False where the largest number of rounds ended it
+    #: with the errors of the models (see `model_errors`); None: these are in the precision
     stated: Precision | None = None
+    #: (i,) variances [px^2], at the inliers of a fluoroscope, by which its distortion differs
+    #: between exposures, without what orientations absorb
     between_exposures: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
+    #: of the fluoroscopes whose distortion changes with the angle of the C-arm
     angle_fields: Mapping[str, AngleField] = field(default_factory=dict)
 
     @property

@@ -142,19 +142,10 @@ def _continued(
 
 @dataclass(frozen=True)
 class _Job:
-    """A network that is calibrated with one model or more.
-
-    Attributes
-    ----------
-    measured : Measured
-    before : Adjustment
-        Without correction.
-    gauges : sequence of GaugeKind
-    options : CalibrationOptions
-    """
+    """A network that is calibrated with one model or more."""
 
     measured: Measured
-    before: Adjustment
+    before: Adjustment  #: without correction
     gauges: Sequence[GaugeKind]
     options: CalibrationOptions
 

@@ -56,41 +56,23 @@ class MeasuredDistance:
 
 @dataclass(frozen=True)
 class SurveyedBeads:
-    """Beads found from the images of an adjustment.
+    """Beads found from the images of an adjustment."""
 
-    Attributes
-    ----------
-    target_id : (n,) ndarray of int
-    xyz_mm : (n, 3) ndarray
-    covariance : (n, 3, 3) ndarray
-        [mm^2]; with the uncertainty of the scale, which is common to all.
-    given_mm : (n, 3) ndarray
-    given_sd_mm : (n,) ndarray
-        The coordinates at the start.
-    rays : (n,) ndarray of int
-        Image points that agree.
-    angle_rad : (n,) ndarray
-        Largest angle between two of these rays.
-    scale, scale_sd : float
-        Factor on the given coordinates, and its standard deviation.
-    distances : tuple of MeasuredDistance
-    scaled : Scaled or None
-        How the distances agree; None without any.
-    joint_covariance : (3n, 3n) ndarray or None
-        Of all beads in the free network, without scale [mm^2]; None where they are too many.
-    """
-
-    target_id: NDArray[np.int64]
-    xyz_mm: NDArray[np.float64]
+    target_id: NDArray[np.int64]  #: (n,)
+    xyz_mm: NDArray[np.float64]  #: (n, 3)
+    #: (n, 3, 3) [mm^2]; with the uncertainty of the scale, which is common to all
     covariance: NDArray[np.float64]
-    given_mm: NDArray[np.float64]
-    given_sd_mm: NDArray[np.float64]
-    rays: NDArray[np.int64]
-    angle_rad: NDArray[np.float64]
+    given_mm: NDArray[np.float64]  #: (n, 3) coordinates at the start
+    given_sd_mm: NDArray[np.float64]  #: (n,)
+    rays: NDArray[np.int64]  #: (n,) image points that agree
+    angle_rad: NDArray[np.float64]  #: (n,) largest angle between two of these rays
+    #: factor on the given coordinates, and its standard deviation
     scale: float
     scale_sd: float
     distances: tuple[MeasuredDistance, ...] = ()
-    scaled: Scaled | None = None
+    scaled: Scaled | None = None  #: how the distances agree; None without any
+    #: (3n, 3n) of all beads in the free network, without scale [mm^2]; None where they are too
+    #: many
     joint_covariance: NDArray[np.float64] | None = None
 
     @property

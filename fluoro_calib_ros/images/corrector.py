@@ -84,20 +84,6 @@ class ImageCorrector:
         Where they are known; by default they are those of the calibration, of a correction that
         depends on an angle the mean (see `angle_maps`).
 
-    Attributes
-    ----------
-    calibration_id : str
-    image_size, shape : tuple of int
-        Width and height, and height and width [px].
-    source : ndarray
-        (2, h, w) of float32, columns and rows of the observed image at which the pixels of the
-        corrected one were seen [px]; NaN where there is none: off the image, or where the
-        correction folds it.
-    mask : ndarray
-        (h, w) of bool, where there is a source.
-    status : ndarray
-        (h, w) of uint8: OK, OUTSIDE of the calibrated area, or INVALID without a source.
-
     Raises
     ------
     DataError
@@ -121,6 +107,7 @@ class ImageCorrector:
                 f'have {MAX_IMAGE_SIDE} px'
             )
         self.calibration_id = calibration.calibration_id
+        #: width and height, and height and width [px]
         self.image_size = tuple(calibration.image_size)
         self.shape = self.image_size[::-1]
         self.interpolation = interpolation
@@ -142,17 +129,20 @@ class ImageCorrector:
 
     @property
     def source(self) -> np.ndarray:
-        """See above."""
+        """Pixels (2, h, w) of the observed image that the corrected one shows, columns first [px].
+
+        NaN where there is none: off the image, or where the correction folds it.
+        """
         return self._sources.source
 
     @property
     def status(self) -> np.ndarray:
-        """See above."""
+        """Status (h, w) uint8: OK, OUTSIDE of the calibrated area, or INVALID without a source."""
         return self._sources.status
 
     @cached_property
     def mask(self) -> np.ndarray:
-        """See above."""
+        """Whether there is a source (h, w)."""
         return ~np.isnan(self.source[0])
 
     @cached_property

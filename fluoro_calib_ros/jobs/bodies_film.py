@@ -28,20 +28,11 @@ AXIS_MM = 20.0  # length of an axis, about the size of a cluster of markers in a
 
 @dataclass(frozen=True)
 class Film:
-    """What films are made of.
+    """What films are made of."""
 
-    Attributes
-    ----------
-    source : Path
-        Bag of images, or folder with a folder for each fluoroscope.
-    calibrations : mapping of str to FluoroscopeCalibration
-    orientation : RigOrientation
-        Of the fluoroscopes of the recording.
-    """
-
-    source: Path
+    source: Path  #: bag of images, or folder with a folder for each fluoroscope
     calibrations: Mapping[str, FluoroscopeCalibration]
-    orientation: RigOrientation
+    orientation: RigOrientation  #: of the fluoroscopes of the recording
 
 
 def write_films(

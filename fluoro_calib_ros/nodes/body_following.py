@@ -79,22 +79,15 @@ def read_body_files(parameters: BodyParameters) -> tuple[tuple[Body, ...], tuple
 
 
 class BodiesState(NamedTuple):
-    """What the last published exposure tells of B bodies.
-
-    Attributes
-    ----------
-    stamp_ns : int
-    status, markers : (B,) ndarray
-    seen_ns : (B,) ndarray
-        Stamps of the last exposures that show each body; -1 for none.
-    misfit : (B,) ndarray
-        Mean of chi-squared over its expectation, of the last 100 exposures or so; NaN for none.
-    """
+    """What the last published exposure tells of B bodies."""
 
     stamp_ns: int
+    #: (B,)
     status: NDArray[np.uint8]
     markers: NDArray[np.int64]
+    #: (B,) stamps of the last exposures that show each body; -1 for none
     seen_ns: NDArray[np.int64]
+    #: (B,) mean of chi-squared over its expectation, of the last 100 exposures or so; NaN for none
     misfit: NDArray[np.float64]
 
 
@@ -108,14 +101,6 @@ class BodyFollower:
     bodies : sequence of Body
     joints : sequence of JointEntry
     lag : int
-
-    Attributes
-    ----------
-    joints : list of JointTracker
-    state : BodiesState or None
-        None before the first exposure.
-    untimed : int
-        Exposures that were not later than the one before, and were not taken.
     """
 
     def __init__(self, bodies: Sequence[Body], joints: Sequence[JointEntry], lag: int) -> None:
@@ -123,8 +108,8 @@ class BodyFollower:
         self._entries = tuple(joints)
         self._lag = lag
         self.joints = self._new_joints()
-        self.state: BodiesState | None = None
-        self.untimed = 0
+        self.state: BodiesState | None = None  #: None before the first exposure
+        self.untimed = 0  #: exposures that were not later than the one before, and were not taken
         self._rig: Rig | None = None
         self._tracker: BodyTracker | None = None
         self._last_ns = -1

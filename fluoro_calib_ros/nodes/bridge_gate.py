@@ -39,18 +39,11 @@ def hidden_address() -> str:
 
 @dataclass(frozen=True)
 class Admission:
-    """Who is let through.
+    """Who is let through."""
 
-    Attributes
-    ----------
-    token : str
-        What the address has to end with: ?token=...
-    origins : sequence of str
-        Web pages that may connect, such as https://app.foxglove.dev. Programs that are no web page
-        send no Origin, or none of http.
-    """
-
-    token: str
+    token: str  #: what the address has to end with: ?token=...
+    #: web pages that may connect, such as https://app.foxglove.dev; programs that are no web page
+    #: send no Origin, or none of http
     origins: Sequence[str]
 
     def refusal(self, head: bytes) -> str:
@@ -84,10 +77,6 @@ class Gate:
     admission : Admission
     on_refused : callable
         Called with the address of a client and the reason, in the thread.
-
-    Attributes
-    ----------
-    port : int
 
     Raises
     ------

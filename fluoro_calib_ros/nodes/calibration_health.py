@@ -25,22 +25,12 @@ from .runtime.streams import publisher_conflict
 
 @dataclass(frozen=True)
 class FluoroscopeState(StreamState):
-    """What the diagnostics of a fluoroscope are decided by.
-
-    Attributes
-    ----------
-    progress : FluoroscopeProgress
-    output : CalibrationOutput
-    disagreement : str
-        About frames with the same number that are far apart in time, else ''.
-    angle : Health or None
-        Where the angle of the C-arm is unknown.
-    """
+    """What the diagnostics of a fluoroscope are decided by."""
 
     progress: FluoroscopeProgress
     output: CalibrationOutput
-    disagreement: str
-    angle: Health | None
+    disagreement: str  #: about frames with the same number that are far apart in time, else ''
+    angle: Health | None  #: where the angle of the C-arm is unknown
 
 
 def several_nodes(state: FluoroscopeState) -> Health | None:

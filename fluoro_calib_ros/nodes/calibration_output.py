@@ -25,21 +25,12 @@ from .runtime.streams import latched_qos
 
 
 class CalibrationOutput:
-    """Publishers of a calibration node, what is in use, and what went wrong with the rest.
-
-    Attributes
-    ----------
-    orientation : RigOrientation or None
-        The one in use.
-    refused : dict of str to str
-        Why the last calibration of a fluoroscope was refused.
-    load_fault, save_fault : str
-        Why calibrations were not loaded at the start, or are not saved; '' where they are.
-    """
+    """Publishers of a calibration node, what is in use, and what went wrong with the rest."""
 
     def __init__(self, node: StreamNode, names: Sequence[str]) -> None:
-        self.orientation: rig_orientation.RigOrientation | None = None
-        self.refused: dict[str, str] = {}
+        self.orientation: rig_orientation.RigOrientation | None = None  #: the one in use
+        self.refused: dict[str, str] = {}  #: why the last calibration of a fluoroscope was refused
+        #: why calibrations were not loaded at the start, or are not saved; '' where they are
         self.load_fault = ''
         self.save_fault = ''
         self._node = node

@@ -132,27 +132,13 @@ def follow_settings(
 
 @dataclass(frozen=True)
 class RigSetup:
-    """The rig of a calibration node.
+    """The rig of a calibration node."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Fluoroscopes.
-    phantom : Phantom or None
-        Without one, the node only serves saved calibrations.
-    target_names : Names
-        Of the beads.
-    directory : Path
-        Folder of its calibrations.
-    settings : callable
-        Returns the present CalibrationSettings.
-    """
-
-    names: tuple[str, ...]
-    phantom: Phantom | None
-    target_names: Names
-    directory: Path
-    settings: Callable[[], CalibrationSettings]
+    names: tuple[str, ...]  #: fluoroscopes
+    phantom: Phantom | None  #: without one, the node only serves saved calibrations
+    target_names: Names  #: of the beads
+    directory: Path  #: folder of its calibrations
+    settings: Callable[[], CalibrationSettings]  #: returns the present CalibrationSettings
 
     def required_phantom(self) -> Phantom:
         """Return the phantom. Raises DataError where there is none."""

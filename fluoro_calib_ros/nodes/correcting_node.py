@@ -38,22 +38,13 @@ FILES = f'*{SUFFIX}'
 
 
 class CorrectedStream(Stream):
-    """Stream of a fluoroscope that is corrected.
-
-    Attributes
-    ----------
-    corrected : int
-        Number of frames or images.
-    waiting : int
-        Number of those that came before the first calibration.
-    beyond : (float, AngleField) or None
-        Angle [rad] of a message since the last diagnostics that is far from all calibrated ones.
-    """
+    """Stream of a fluoroscope that is corrected."""
 
     def __init__(self, name: str, refusals: RefusalLog) -> None:
         super().__init__(name, refusals)
-        self.corrected = 0
-        self.waiting = 0
+        self.corrected = 0  #: number of frames or images
+        self.waiting = 0  #: number of those that came before the first calibration
+        #: angle [rad] of a message since the last diagnostics that is far from all calibrated ones
         self.beyond: tuple[float, AngleField] | None = None
 
     def count_corrected(self, info: Mapping[str, int]) -> None:
@@ -64,22 +55,11 @@ class CorrectedStream(Stream):
 
 @dataclass(frozen=True)
 class CorrectingState(StreamState):
-    """What the diagnostics of a fluoroscope are decided by.
-
-    Attributes
-    ----------
-    stream : CorrectedStream
-    item : str
-        What is corrected: frame or image.
-    beyond : str
-        What becomes of the items at an angle far from all calibrated ones.
-    calibrations : CalibrationInput
-    angles : AngleInput
-    """
+    """What the diagnostics of a fluoroscope are decided by."""
 
     stream: CorrectedStream
-    item: str
-    beyond: str
+    item: str  #: what is corrected: frame or image
+    beyond: str  #: what becomes of the items at an angle far from all calibrated ones
     calibrations: CalibrationInput
     angles: AngleInput
 
@@ -136,27 +116,14 @@ class CorrectingNode(StreamNode):
     C-arm is that at the angle of the stamp, or the mean over the angles where that is unknown.
     Subclasses set the class attributes and override prepare(), on_calibration_ready(),
     make_stream(), make_angles() and extra_values().
-
-    Attributes
-    ----------
-    item : str
-        What is corrected: frame or image.
-    subject : str
-        What is subscribed to, in words.
-    refusal_kinds : tuple of str
-    beyond : str
-        What becomes of the items at an angle far from all calibrated ones.
-    topics : tuple of str
-        What is subscribed to, below each fluoroscope.
-    angles : dict of str to AngleInput
-        Angles of the C-arms, by fluoroscope.
     """
 
-    item: ClassVar[str] = ''
-    subject: ClassVar[str] = ''
+    item: ClassVar[str] = ''  #: what is corrected: frame or image
+    subject: ClassVar[str] = ''  #: what is subscribed to, in words
     refusal_kinds: ClassVar[tuple[str, ...]] = ()
+    #: what becomes of the items at an angle far from all calibrated ones
     beyond: ClassVar[str] = ''
-    topics: tuple[str, ...] = ()
+    topics: tuple[str, ...] = ()  #: what is subscribed to, below each fluoroscope
 
     def __init__(self, name: str) -> None:
         super().__init__(name)
@@ -164,7 +131,7 @@ class CorrectingNode(StreamNode):
         self._directory = ''
         self.streams: dict[str, Any] = {}
         self.angle_options = AngleOptions()
-        self.angles: dict[str, AngleInput] = {}
+        self.angles: dict[str, AngleInput] = {}  #: angles of the C-arms, by fluoroscope
 
     def use_parameters(self, parameters: CalibratedParameters, angles: AngleOptions) -> None:
         """Take the parameters that all these nodes have; subclasses call it in __init__."""

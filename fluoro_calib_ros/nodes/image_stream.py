@@ -29,34 +29,21 @@ from .runtime.stream import Stream
 
 
 class ImageStream(Stream):
-    """Stream of images that are extracted.
-
-    Attributes
-    ----------
-    extracted, followed, without, shed : int
-        Number of images with observations, of those that the image before gave the start of, of
-        those without observations, and of those that were never looked at.
-    last : Observations or None
-        Of the last image.
-    converter : ImageConverter
-    topic : str
-        One on which images come, for messages.
-    seconds : float
-        That images took.
-    rate_hz : float
-        Between the last two calls of measure(), and shed_now: images shed in this time.
-    """
+    """Stream of images that are extracted."""
 
     def __init__(self, name: str, refusals: RefusalLog, topic: str) -> None:
         super().__init__(name, refusals)
-        self.topic = topic
+        self.topic = topic  #: one on which images come, for messages
+        #: number of images with observations, of those that the image before gave the start of, of
+        #: those without observations, and of those that were never looked at
         self.extracted = 0
         self.followed = 0
         self.without = 0
         self.shed = 0
-        self.last: Observations | None = None
+        self.last: Observations | None = None  #: of the last image
         self.converter = ImageConverter(name)
-        self.seconds = 0.0
+        self.seconds = 0.0  #: that images took
+        #: between the last two calls of measure(), and shed_now: images shed in this time
         self.rate_hz = 0.0
         self.shed_now = 0
         self._first: tuple[tuple[int, int], str] | None = None  # image size and frame id

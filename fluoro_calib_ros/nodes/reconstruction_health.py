@@ -31,18 +31,9 @@ NO_ORIENTATION = (
 
 @dataclass(frozen=True)
 class ReconstructionState(InputState):
-    """What the diagnostics of the reconstruction are decided by.
+    """What the diagnostics of the reconstruction are decided by."""
 
-    Attributes
-    ----------
-    streams : mapping of str to Stream
-        By fluoroscope.
-    rigs : RigInput
-    pairer : Pairer
-    misses : RecentMisses
-    """
-
-    streams: Mapping[str, Stream]
+    streams: Mapping[str, Stream]  #: by fluoroscope
     rigs: RigInput
     pairer: Pairer
     misses: RecentMisses

@@ -44,15 +44,7 @@ class Cancelled(Exception):
 
 
 class SelfCalibration:
-    """Runs one self-calibration at a time, in a process of its own.
-
-    Attributes
-    ----------
-    running : tuple of str
-        Fluoroscopes of the running job.
-    last_round : dict of str to Round
-        Of the running or last job, by fluoroscope.
-    """
+    """Runs one self-calibration at a time, in a process of its own."""
 
     def __init__(
         self,
@@ -63,8 +55,8 @@ class SelfCalibration:
         files: CalibrationFiles,
         requests: Requests,
     ) -> None:
-        self.running: tuple[str, ...] = ()
-        self.last_round: dict[str, Round] = {}
+        self.running: tuple[str, ...] = ()  #: fluoroscopes of the running job
+        self.last_round: dict[str, Round] = {}  #: of the running or last job, by fluoroscope
         self._node = node
         self._rig = rig
         self._exposures = exposures

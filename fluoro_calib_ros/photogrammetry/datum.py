@@ -31,21 +31,12 @@ MIN_RAYS_IN_DATUM = 3  # inliers: two may be a false match and its accidental pa
 
 @dataclass(frozen=True)
 class Gauge:
-    """Directions that the images leave open.
+    """Directions that the images leave open."""
 
-    Attributes
-    ----------
-    exteriors : (m, 6, 7) ndarray
-    points : (n, 3, 7) ndarray
-    globals : (G, 7) ndarray
-        Changes of the unknowns along the directions.
-    constraint : (n, 3, 7) ndarray
-        B: the directions of the object points at the surveyed coordinates.
-    """
-
-    exteriors: NDArray[np.float64]
-    points: NDArray[np.float64]
-    globals: NDArray[np.float64]
+    exteriors: NDArray[np.float64]  #: (m, 6, 7)
+    points: NDArray[np.float64]  #: (n, 3, 7)
+    globals: NDArray[np.float64]  #: (G, 7) changes of the unknowns along the directions
+    #: (n, 3, 7) B: the directions of the object points at the surveyed coordinates
     constraint: NDArray[np.float64]
 
 

@@ -30,48 +30,29 @@ Between = Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.float64]]
 
 @dataclass(frozen=True)
 class Distances:
-    """Measured distances between object points.
+    """Measured distances between object points."""
 
-    Attributes
-    ----------
-    pairs : (k, 2) ndarray of int
-        Rows of the object points.
-    length_mm, sd_mm : (k,) ndarray
-    """
-
-    pairs: NDArray[np.int64]
+    pairs: NDArray[np.int64]  #: (k, 2) rows of the object points
+    #: (k,)
     length_mm: NDArray[np.float64]
     sd_mm: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Scaled:
-    """Object points at the scale of measured distances.
+    """Object points at the scale of measured distances."""
 
-    Attributes
-    ----------
-    xyz_mm : (n, 3) ndarray
-    covariance : (n, 3, 3) ndarray
-        [mm^2]
-    scale, scale_sd : float
-        Factor on the network, and its standard deviation.
-    error_mm : (k,) ndarray
-        Measured distances less those that the images and the other distances give; 0 where
-        nothing checks a distance.
-    normalised : (k,) ndarray
-        The same over their standard deviations (Baarda's test).
-    chi2 : float
-        Weighted square sum; expected: `freedom`.
-    freedom : int
-    """
-
-    xyz_mm: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    xyz_mm: NDArray[np.float64]  #: (n, 3)
+    covariance: NDArray[np.float64]  #: (n, 3, 3) [mm^2]
+    #: factor on the network, and its standard deviation
     scale: float
     scale_sd: float
+    #: (k,) measured distances less those that the images and the other distances give; 0 where
+    #: nothing checks a distance
     error_mm: NDArray[np.float64]
+    #: (k,) the same over their standard deviations (Baarda's test)
     normalised: NDArray[np.float64]
-    chi2: float
+    chi2: float  #: weighted square sum; expected: `freedom`
     freedom: int
 
 

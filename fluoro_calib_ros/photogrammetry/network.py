@@ -26,54 +26,34 @@ class Network:
     """Image points of one or more fluoroscopes, and what is known about their network.
 
     N image points, m exposures, n object points, F fluoroscopes.
-
-    Attributes
-    ----------
-    uv : (N, 2) ndarray
-        Observed image points [px].
-    sigma : (N,) ndarray
-        A-priori standard deviations of the image points [px], or ones.
-    exposure, point : (N,) ndarray of int
-        Rows of the exposure and of the object point of each image point. `exposure` ascends; each
-        pair occurs at most once.
-    fluoroscope : (m,) ndarray of int
-        Fluoroscope of each exposure.
-    survey_mm : (n, 3) ndarray
-        Surveyed coordinates of the object points.
-    survey_sd_mm : (n,) ndarray
-        Their standard deviations.
-    interior_free : (F,) ndarray of bool
-        Whether the interior orientation of a fluoroscope is estimated.
-    additional : tuple of AdditionalParameters or None
-        Additional parameters of each fluoroscope, or an empty tuple.
-    relative : tuple of RelativeConstraint
-        One constraint per constrained pair of fluoroscopes; the first fluoroscope of the pair is
-        the same in all of them.
-    interior_mean, interior_sd : (F, 3) ndarray, optional
-        Prior of the interior orientations [px]; an infinite standard deviation means no prior.
-    exterior : ExteriorPrior, optional
-        What is known of the exterior orientations.
-    datum : {'survey', 'inner'}
-        'survey': the surveyed coordinates are weighted observations. 'inner': they have no weight,
-        and inner constraints over the object points define the datum.
-    in_datum : (n,) ndarray of bool, optional
-        Object points that define the datum of a free network; by default all.
     """
 
-    uv: NDArray[np.float64]
+    uv: NDArray[np.float64]  #: (N, 2) observed image points [px]
+    #: (N,) a-priori standard deviations of the image points [px], or ones
     sigma: NDArray[np.float64]
+    #: (N,) rows of the exposure and of the object point of each image point. `exposure` ascends;
+    #: each pair occurs at most once
     exposure: NDArray[np.int64]
     point: NDArray[np.int64]
-    fluoroscope: NDArray[np.int64]
-    survey_mm: NDArray[np.float64]
-    survey_sd_mm: NDArray[np.float64]
+    fluoroscope: NDArray[np.int64]  #: (m,) fluoroscope of each exposure
+    survey_mm: NDArray[np.float64]  #: (n, 3) surveyed coordinates of the object points
+    survey_sd_mm: NDArray[np.float64]  #: (n,) their standard deviations
+    #: (F,) whether the interior orientation of a fluoroscope is estimated
     interior_free: NDArray[np.bool_]
+    #: additional parameters of each fluoroscope, or an empty tuple
     additional: tuple[AdditionalParameters | None, ...] = ()
+    #: one constraint per constrained pair of fluoroscopes; the first fluoroscope of the pair is
+    #: the same in all of them
     relative: tuple[RelativeConstraint, ...] = ()
+    #: (F, 3) prior of the interior orientations [px]; an infinite standard deviation means no
+    #: prior
     interior_mean: NDArray[np.float64] | None = None
     interior_sd: NDArray[np.float64] | None = None
-    exterior: ExteriorPrior | None = None
+    exterior: ExteriorPrior | None = None  #: what is known of the exterior orientations
+    #: 'survey': the surveyed coordinates are weighted observations. 'inner': they have no weight,
+    #: and inner constraints over the object points define the datum: {'survey', 'inner'}
     datum: str = 'survey'
+    #: (n,) object points that define the datum of a free network; by default all
     in_datum: NDArray[np.bool_] | None = None
 
     @property

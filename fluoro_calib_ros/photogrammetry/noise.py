@@ -84,12 +84,7 @@ def widening_by_group(size: np.ndarray, limit: float, group: np.ndarray) -> NDAr
 
 
 class ObservedScatter:
-    """Factor by which the latest errors of a recording scatter beyond what is stated.
-
-    Attributes
-    ----------
-    factor : float
-    """
+    """Factor by which the latest errors of a recording scatter beyond what is stated."""
 
     def __init__(self) -> None:
         self.factor = 1.0
@@ -151,21 +146,12 @@ class Noise:
     """Distribution of the image noise.
 
     Raises ValueError for an unknown loss.
-
-    Attributes
-    ----------
-    loss : {'student_t', 'huber', 'gaussian'}
-    scale : float
-        Scale [px], or a factor of sigma where sigma is given.
-    nu : float
-        Degrees of freedom of the Student-t; infinite for the others.
-    gross : float
-        Share of gross errors besides the Student-t. 0: there are none, and none are estimated.
     """
 
-    loss: str = 'student_t'
-    scale: float = 1.0
-    nu: float = 5.0
+    loss: str = 'student_t'  #: {'student_t', 'huber', 'gaussian'}
+    scale: float = 1.0  #: scale [px], or a factor of sigma where sigma is given
+    nu: float = 5.0  #: degrees of freedom of the Student-t; infinite for the others
+    #: share of gross errors besides the Student-t. 0: there are none, and none are estimated
     gross: float = 0.0
 
     def __post_init__(self) -> None:

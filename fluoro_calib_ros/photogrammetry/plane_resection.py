@@ -41,16 +41,10 @@ MIN_TILT = 1e-3
 
 @dataclass(frozen=True)
 class Plane:
-    """The plane of targets.
+    """The plane of targets."""
 
-    Attributes
-    ----------
-    centre_mm : (3,) ndarray
-    axes : (3, 3) ndarray
-        Right-handed axes as rows: two in the plane, and its normal.
-    """
-
-    centre_mm: NDArray[np.float64]
+    centre_mm: NDArray[np.float64]  #: (3,)
+    #: (3, 3) right-handed axes as rows: two in the plane, and its normal
     axes: NDArray[np.float64]
 
     def coordinates(self, xyz: np.ndarray) -> NDArray[np.float64]:

@@ -25,25 +25,15 @@ RIGID_SD_RAD = 1e-7
 
 @dataclass(frozen=True)
 class RelativeConstraint:
-    """Constraint that the relative orientation of two fluoroscopes is the same in all pairs.
+    """Constraint that the relative orientation of two fluoroscopes is the same in all pairs."""
 
-    Attributes
-    ----------
-    fluoroscopes : (int, int)
-        Numbers of the fluoroscopes a and b.
-    pairs : (k, 2) ndarray of int
-        Rows of the common exposures of a and of b.
-    sd_mm, sd_rad : float
-        Standard deviations of each component of translation and rotation.
-    length_mm : float, optional
-        Distance of the sources at which `sd_mm` holds. It makes the constraint follow the scale of
-        a free network; None where the scale is fixed.
-    """
-
-    fluoroscopes: tuple[int, int]
-    pairs: NDArray[np.int64]
+    fluoroscopes: tuple[int, int]  #: numbers of the fluoroscopes a and b
+    pairs: NDArray[np.int64]  #: (k, 2) rows of the common exposures of a and of b
+    #: standard deviations of each component of translation and rotation
     sd_mm: float
     sd_rad: float
+    #: distance of the sources at which `sd_mm` holds; it makes the constraint follow the scale of
+    #: a free network; None where the scale is fixed
     length_mm: float | None = None
 
     @property

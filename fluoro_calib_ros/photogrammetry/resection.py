@@ -48,23 +48,12 @@ TOLERANCE = 1e-4
 
 @dataclass(frozen=True)
 class Resection:
-    """Exterior orientation of one exposure.
+    """Exterior orientation of one exposure."""
 
-    Attributes
-    ----------
-    rotation : (3, 3) ndarray
-        Rotation phantom -> sensor.
-    position_mm : (3,) ndarray
-        Position of the source.
-    scale : float
-        Scale of the residuals [px].
-    inliers : (n,) ndarray of bool
-    """
-
-    rotation: NDArray[np.float64]
-    position_mm: NDArray[np.float64]
-    scale: float
-    inliers: NDArray[np.bool_]
+    rotation: NDArray[np.float64]  #: (3, 3) rotation phantom -> sensor
+    position_mm: NDArray[np.float64]  #: (3,) position of the source
+    scale: float  #: scale of the residuals [px]
+    inliers: NDArray[np.bool_]  #: (n,)
 
 
 def least_vectors(forms: np.ndarray) -> np.ndarray:

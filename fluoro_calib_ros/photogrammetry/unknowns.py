@@ -26,19 +26,12 @@ INTERIOR_SIZE = 3  # xp, yp, c [px]
 
 @dataclass(frozen=True)
 class ReducedLayout:
-    """Order of the unknowns after an elimination: blocks of one kind, then the free globals.
+    """Order of the unknowns after an elimination: blocks of one kind, then the free globals."""
 
-    Attributes
-    ----------
-    n_blocks, block_size : int
-        Number and size of the blocks: exposures or object points.
-    n_globals : int
-        Number of free global unknowns.
-    """
-
+    #: number and size of the blocks: exposures or object points
     n_blocks: int
     block_size: int
-    n_globals: int
+    n_globals: int  #: number of free global unknowns
 
     @property
     def blocks(self) -> slice:
@@ -63,32 +56,20 @@ class ReducedLayout:
 
 @dataclass(frozen=True)
 class UnknownLayout:
-    """Where the unknowns of a network stand.
+    """Where the unknowns of a network stand."""
 
-    Attributes
-    ----------
-    n_exposures, n_points : int
-        Numbers of the block unknowns.
-    interiors : tuple of slice
-        Columns of the interior orientation of each fluoroscope among the global unknowns.
-    relative : tuple of slice
-        Columns of each constrained relative orientation among the global unknowns.
-    additional : tuple of slice
-        Columns of the additional parameters of each fluoroscope among the global unknowns, empty
-        where there are none.
-    free : (G,) ndarray of bool
-        Which global unknowns are estimated.
-    datum_defect : int
-        Number of unknowns that the datum of a free network fixes.
-    """
-
+    #: numbers of the block unknowns
     n_exposures: int
     n_points: int
+    #: columns of the interior orientation of each fluoroscope among the global unknowns
     interiors: tuple[slice, ...]
+    #: columns of each constrained relative orientation among the global unknowns
     relative: tuple[slice, ...]
+    #: columns of the additional parameters of each fluoroscope among the global unknowns, empty
+    #: where there are none
     additional: tuple[slice, ...]
-    free: NDArray[np.bool_]
-    datum_defect: int
+    free: NDArray[np.bool_]  #: (G,) which global unknowns are estimated
+    datum_defect: int  #: number of unknowns that the datum of a free network fixes
 
     @classmethod
     def of(
@@ -182,48 +163,24 @@ class UnknownLayout:
 
 @dataclass(frozen=True)
 class UnknownVector:
-    """A vector, or columns of vectors, over the unknowns of a network, split by kind.
+    """A vector, or columns of vectors, over the unknowns of a network, split by kind."""
 
-    Attributes
-    ----------
-    exteriors : (m, 6, ...) ndarray
-        Of T [mm] and w [rad] of the exposures.
-    points : (n, 3, ...) ndarray
-        Of the object points [mm].
-    globals : (G, ...) ndarray
-        Of the global unknowns; zeros where fixed.
-    """
-
-    exteriors: NDArray[np.float64]
-    points: NDArray[np.float64]
-    globals: NDArray[np.float64]
+    exteriors: NDArray[np.float64]  #: (m, 6, ...) of T [mm] and w [rad] of the exposures
+    points: NDArray[np.float64]  #: (n, 3, ...) of the object points [mm]
+    globals: NDArray[np.float64]  #: (G, ...) of the global unknowns; zeros where fixed
 
 
 @dataclass(frozen=True)
 class Parameters:
-    """Values of the unknowns of a network.
+    """Values of the unknowns of a network."""
 
-    Attributes
-    ----------
-    interior : (F, 3) ndarray
-        xp, yp, c of the fluoroscopes [px].
-    rotation : (m, 3, 3) ndarray
-        Rotations phantom -> sensor of the exposures.
-    position_mm : (m, 3) ndarray
-        Positions of the source.
-    points_mm : (n, 3) ndarray
-        Object points.
-    additional : tuple of (p,) ndarray or None
-        Coefficients of the additional parameters of each fluoroscope.
-    relative : tuple of RelativePose
-        Relative orientation of each constraint of the network.
-    """
-
-    interior: NDArray[np.float64]
-    rotation: NDArray[np.float64]
-    position_mm: NDArray[np.float64]
-    points_mm: NDArray[np.float64]
+    interior: NDArray[np.float64]  #: (F, 3) xp, yp, c of the fluoroscopes [px]
+    rotation: NDArray[np.float64]  #: (m, 3, 3) rotations phantom -> sensor of the exposures
+    position_mm: NDArray[np.float64]  #: (m, 3) positions of the source
+    points_mm: NDArray[np.float64]  #: (n, 3) object points
+    #: (p,) coefficients of the additional parameters of each fluoroscope
     additional: tuple[NDArray[np.float64] | None, ...] = ()
+    #: relative orientation of each constraint of the network
     relative: tuple[RelativePose, ...] = ()
 
     def additional_of(self, f: int) -> NDArray[np.float64]:

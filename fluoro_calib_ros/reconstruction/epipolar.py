@@ -28,28 +28,18 @@ class EpipolarResiduals:
     """Distances of n pairs of image points from their epipolar constraint.
 
     NaN where an image point or its sigma is NaN.
-
-    Attributes
-    ----------
-    residual : ndarray
-        (n,), signed [px].
-    sd : ndarray
-        (n,), standard deviation of the residual by the image points alone (sigma) [px].
-    sd_total : ndarray
-        (n,), the same with the orientation of the rig [px].
-    normal_a, normal_b : ndarray
-        (n, 2), unit normals of the epipolar lines in both images, in the direction in which the
-        residual grows.
-    factor_a, factor_b : ndarray
-        (n,), change of the residual when an image point is shifted by one pixel along that
-        normal; factor_a^2 + factor_b^2 = 1.
     """
 
-    residual: NDArray[np.float64]
+    residual: NDArray[np.float64]  #: (n,) signed [px]
+    #: (n,) standard deviation of the residual by the image points alone (sigma) [px]
     sd: NDArray[np.float64]
-    sd_total: NDArray[np.float64]
+    sd_total: NDArray[np.float64]  #: (n,) the same with the orientation of the rig [px]
+    #: (n, 2) unit normals of the epipolar lines in both images, in the direction in which the
+    #: residual grows
     normal_a: NDArray[np.float64]
     normal_b: NDArray[np.float64]
+    #: (n,) change of the residual when an image point is shifted by one pixel along that normal;
+    #: factor_a^2 + factor_b^2 = 1
     factor_a: NDArray[np.float64]
     factor_b: NDArray[np.float64]
 
@@ -62,13 +52,6 @@ class EpipolarGeometry:
     orientation : RigOrientation
     a, b : str
         Names of the fluoroscopes.
-
-    Attributes
-    ----------
-    fluoroscopes : tuple of str
-        a and b.
-    essential : ndarray
-        (3, 3), the matrix E [mm].
 
     Raises
     ------
@@ -90,7 +73,7 @@ class EpipolarGeometry:
         self._interior = orientation.interior[rows]
         relative_rotation = r_b @ r_a.T
         shift = r_b @ (position_a - position_b)
-        self.essential = cross_matrix(shift) @ relative_rotation
+        self.essential = cross_matrix(shift) @ relative_rotation  #: (3, 3), the matrix E [mm]
         columns = orientation.covariance_rows(rows)
         covariance = orientation.covariance[np.ix_(columns, columns)]
         derivative = _essential_jacobian(relative_rotation, shift, r_b, self._interior[:, 2])

@@ -73,36 +73,21 @@ class IntersectedPoints:
     """Points in the rig frame.
 
     Coordinates and covariances are NaN unless the status is OK or OUTSIDE.
-
-    Attributes
-    ----------
-    xyz_mm : ndarray
-        (n, 3)
-    covariance : ndarray
-        (n, 3, 3), by the image points and the orientation of the rig [mm^2].
-    covariance_noise : ndarray
-        (n, 3, 3), by the image points alone, that is by noise and correction [mm^2]. It is the
-        one for positions of points relative to each other.
-    residual : ndarray
-        (n,), RMS of the image residuals [px].
-    rays : ndarray
-        (n,), number of rays used.
-    standardised : ndarray
-        (n,), root of the weighted square sum of the residuals over its expectation; for two rays
-        the epipolar distance over its standard deviation (sd_total).
-    status : ndarray
-        (n,), PointStatus as uint8.
-    dropped_view : ndarray
-        (n,), number of the fluoroscope whose ray was dropped as false, else -1.
     """
 
-    xyz_mm: NDArray[np.float64]
+    xyz_mm: NDArray[np.float64]  #: (n, 3)
+    #: (n, 3, 3) by the image points and the orientation of the rig [mm^2]
     covariance: NDArray[np.float64]
+    #: (n, 3, 3) by the image points alone, that is by noise and correction [mm^2]; it is the one
+    #: for positions of points relative to each other
     covariance_noise: NDArray[np.float64]
-    residual: NDArray[np.float64]
-    rays: NDArray[np.float64]
+    residual: NDArray[np.float64]  #: (n,) RMS of the image residuals [px]
+    rays: NDArray[np.float64]  #: (n,) number of rays used
+    #: (n,) root of the weighted square sum of the residuals over its expectation; for two rays
+    #: the epipolar distance over its standard deviation (sd_total)
     standardised: NDArray[np.float64]
-    status: np.ndarray
+    status: np.ndarray  #: (n,) PointStatus as uint8
+    #: (n,) number of the fluoroscope whose ray was dropped as false, else -1
     dropped_view: NDArray[np.float64]
 
     @property

@@ -30,25 +30,14 @@ from .intersection import IntersectedPoints, Intersector
 
 @dataclass(frozen=True)
 class CorrectedView:
-    """Corrected image points of one view of an exposure.
+    """Corrected image points of one view of an exposure."""
 
-    Attributes
-    ----------
-    target_id : ndarray
-        (n,), each once.
-    uv : ndarray
-        (n, 2), corrected pixels.
-    sigma, correction_sd : ndarray
-        (n,), standard deviations of the coordinates, and of the correction alone [px].
-    outside : ndarray
-        (n,), True beyond the calibrated area.
-    """
-
-    target_id: NDArray[np.int64]
-    uv: NDArray[np.float64]
+    target_id: NDArray[np.int64]  #: (n,) each once
+    uv: NDArray[np.float64]  #: (n, 2) corrected pixels
+    #: (n,) standard deviations of the coordinates, and of the correction alone [px]
     sigma: NDArray[np.float64]
     correction_sd: NDArray[np.float64]
-    outside: NDArray[np.float64]
+    outside: NDArray[np.float64]  #: (n,) True beyond the calibrated area
 
 
 @dataclass(frozen=True)
@@ -56,24 +45,15 @@ class MatchedViews:
     """Corrected image points of F views of an exposure, by target.
 
     Values are NaN, and `outside` False, where a view does not see a target.
-
-    Attributes
-    ----------
-    target_id : ndarray
-        (n,), ascending; or, where all views have the same ids in the same order, in that order.
-    uv : ndarray
-        (F, n, 2), corrected pixels.
-    sigma, correction_sd : ndarray
-        (F, n), standard deviations of the coordinates, and of the correction alone [px].
-    outside : ndarray
-        (F, n), True beyond the calibrated area.
     """
 
+    #: (n,) ascending; or, where all views have the same ids in the same order, in that order
     target_id: NDArray[np.int64]
-    uv: NDArray[np.float64]
+    uv: NDArray[np.float64]  #: (F, n, 2) corrected pixels
+    #: (F, n) standard deviations of the coordinates, and of the correction alone [px]
     sigma: NDArray[np.float64]
     correction_sd: NDArray[np.float64]
-    outside: NDArray[np.float64]
+    outside: NDArray[np.float64]  #: (F, n) True beyond the calibrated area
 
 
 def match_views(views: Sequence[CorrectedView | None]) -> MatchedViews:
@@ -141,24 +121,14 @@ class ExposureWatch(Protocol):
 
 @dataclass(frozen=True)
 class ReconstructedFrame:
-    """Points of one exposure.
+    """Points of one exposure."""
 
-    Attributes
-    ----------
-    number, stamp_ns : int
-        Those of the frame of its first fluoroscope.
-    target_id : ndarray
-        (n,)
-    points : IntersectedPoints
-    fluoroscopes : tuple of str
-        Those that have a frame of the exposure.
-    """
-
+    #: those of the frame of its first fluoroscope
     number: int
     stamp_ns: int
-    target_id: NDArray[np.int64]
+    target_id: NDArray[np.int64]  #: (n,)
     points: IntersectedPoints
-    fluoroscopes: tuple[str, ...]
+    fluoroscopes: tuple[str, ...]  #: those that have a frame of the exposure
 
 
 def intersect_exposure(

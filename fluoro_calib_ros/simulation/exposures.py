@@ -19,40 +19,21 @@ from .streams import DECIMALS, StreamStart
 
 @dataclass(frozen=True)
 class Detection:
-    """How beads are detected in an exposure.
+    """How beads are detected in an exposure."""
 
-    Attributes
-    ----------
-    noise_px : float
-        Standard deviation of an image coordinate.
-    false_matches : float
-        Fraction of the detected beads that get the id of a bead nearby.
-    beads : tuple of int
-        Smallest and largest number of detected beads.
-    """
-
-    noise_px: float = 0.25
-    false_matches: float = 0.01
-    beads: tuple[int, int] = (130, 160)
+    noise_px: float = 0.25  #: standard deviation of an image coordinate
+    false_matches: float = 0.01  #: fraction of the detected beads that get the id of a bead nearby
+    beads: tuple[int, int] = (130, 160)  #: smallest and largest number of detected beads
 
 
 @dataclass(frozen=True)
 class SimulatedExposures:
-    """Exposures of the phantom.
+    """Exposures of the phantom."""
 
-    Attributes
-    ----------
-    frames : mapping of str to sequence of Frame
-        By fluoroscope.
-    poses : list
-        Rotation and shift [mm] of the phantom in the rig frame.
-    undistorted : mapping of str to sequence of ndarray
-        By fluoroscope the undistorted image points (n, 2) of each frame, with noise and false
-        matches [px].
-    """
-
-    frames: Mapping[str, list[Frame]]
-    poses: Sequence[Pose]
+    frames: Mapping[str, list[Frame]]  #: by fluoroscope
+    poses: Sequence[Pose]  #: rotation and shift [mm] of the phantom in the rig frame
+    #: by fluoroscope the undistorted image points (n, 2) of each frame, with noise and false
+    #: matches [px]
     undistorted: Mapping[str, list[NDArray[np.float64]]]
 
 

@@ -72,22 +72,11 @@ LANDING_HZ = 500.0
 
 @dataclass(frozen=True)
 class VirtualKnee:
-    """The bones of a knee in the coordinates of their CT.
+    """The bones of a knee in the coordinates of their CT."""
 
-    Attributes
-    ----------
-    bodies : tuple of Body
-        Femur and tibia with their true markers; sd 0.
-    surveyed : tuple of Body
-        The same with the errors of CT.
-    landmarks : mapping of str to mapping of str to (3,) ndarray
-        By body [mm].
-    joint : Joint
-    """
-
-    bodies: tuple[Body, ...]
-    surveyed: tuple[Body, ...]
-    landmarks: Mapping[str, Mapping[str, NDArray[np.float64]]]
+    bodies: tuple[Body, ...]  #: femur and tibia with their true markers; sd 0
+    surveyed: tuple[Body, ...]  #: the same with the errors of CT
+    landmarks: Mapping[str, Mapping[str, NDArray[np.float64]]]  #: (3,) by body [mm]
     joint: Joint
 
 

@@ -32,28 +32,14 @@ Pose = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True)
 class VirtualFluoroscope:
-    """A fluoroscope of a virtual rig.
-
-    Attributes
-    ----------
-    name : str
-    interior : ndarray
-        (3,), xp, yp, c [px].
-    rotation : ndarray
-        (3, 3), rig frame -> sensor frame.
-    position_mm : ndarray
-        (3,), of the source in the rig frame.
-    distortion : DistortionField
-    image_size : tuple of int
-        Width and height [px].
-    """
+    """A fluoroscope of a virtual rig."""
 
     name: str
-    interior: NDArray[np.float64]
-    rotation: NDArray[np.float64]
-    position_mm: NDArray[np.float64]
+    interior: NDArray[np.float64]  #: (3,) xp, yp, c [px]
+    rotation: NDArray[np.float64]  #: (3, 3) rig frame -> sensor frame
+    position_mm: NDArray[np.float64]  #: (3,) of the source in the rig frame
     distortion: DistortionField
-    image_size: tuple[int, int] = IMAGE_SIZE
+    image_size: tuple[int, int] = IMAGE_SIZE  #: width and height [px]
 
     def exterior(self, pose: Pose) -> Pose:
         """Exterior orientation for a pose of the phantom.
@@ -168,24 +154,14 @@ RIPPLES = 14
 
 @dataclass(frozen=True)
 class DistortionField:
-    """Correction field: a function of pixels (n, 2) that returns corrections (n, 2) [px].
+    """Correction field: a function of pixels (n, 2) that returns corrections (n, 2) [px]."""
 
-    Attributes
-    ----------
-    centre : ndarray
-        (2,) [px].
-    pincushion, spiral : float
-        Size at the edge of the image [px].
-    s_shape : ndarray
-        (2,), size along u and v at the edge of the image [px].
-    ripples : ndarray
-        (k, 5), Gaussian bumps: centre u, v, width, and height along u and v [px].
-    """
-
-    centre: NDArray[np.float64]
+    centre: NDArray[np.float64]  #: (2,) [px]
+    #: size at the edge of the image [px]
     pincushion: float
-    s_shape: NDArray[np.float64]
+    s_shape: NDArray[np.float64]  #: (2,) size along u and v at the edge of the image [px]
     spiral: float
+    #: (k, 5), Gaussian bumps: centre u, v, width, and height along u and v [px]
     ripples: NDArray[np.float64]
 
     def __call__(self, uv: ArrayLike) -> np.ndarray:

@@ -36,23 +36,12 @@ GRID = (52, 39)  # points of a calibration grid across and down
 
 @dataclass(frozen=True)
 class SimulatedTracking:
-    """A recording of moving markers.
+    """A recording of moving markers."""
 
-    Attributes
-    ----------
-    frames : mapping of str to list of Frame
-        By fluoroscope.
-    marker_id : ndarray
-        (k,)
-    points_mm : ndarray
-        (frames, k, 3), positions in the rig frame.
-    ideal : mapping of str to ndarray
-        By fluoroscope the ideal image points (frames, k, 2) without noise [px].
-    """
-
-    frames: Mapping[str, list[Frame]]
-    marker_id: NDArray[np.int64]
-    points_mm: NDArray[np.float64]
+    frames: Mapping[str, list[Frame]]  #: by fluoroscope
+    marker_id: NDArray[np.int64]  #: (k,)
+    points_mm: NDArray[np.float64]  #: (frames, k, 3) positions in the rig frame
+    #: by fluoroscope the ideal image points (frames, k, 2) without noise [px]
     ideal: Mapping[str, NDArray[np.float64]]
 
 

@@ -25,50 +25,25 @@ RATE_WINDOW_S = 5.0
 
 @dataclass(frozen=True)
 class FluoroscopeState:
-    """One fluoroscope. NaN and '' stand for what is not known yet.
-
-    Attributes
-    ----------
-    name : str
-    state : str
-        'collecting', 'calibrating', 'calibrated'.
-    frames_hz, corrected_hz : float
-        Frames that arrive, and frames that are corrected, a second.
-    latency_p50_ms, latency_p99_ms : float
-        From the arrival of a frame to its correction.
-    rejected : int
-        Frames refused because their content was wrong.
-    exposures : int
-    coverage : float
-        Covered part of the image, 0 to 1.
-    next_pose : str
-        What the next exposure should show.
-    ready : bool
-        Whether the exposures suffice.
-    iteration : int
-        Round of the running or last calibration.
-    rmse_px : tuple of float
-        Of that round, in u and v.
-    calibration_id : str
-    age_s : float
-        Of the calibration.
-    """
+    """One fluoroscope. NaN and '' stand for what is not known yet."""
 
     name: str
-    state: str = ''
+    state: str = ''  #: 'collecting', 'calibrating', 'calibrated'
+    #: frames that arrive, and frames that are corrected, a second
     frames_hz: float = math.nan
     corrected_hz: float = math.nan
+    #: from the arrival of a frame to its correction
     latency_p50_ms: float = math.nan
     latency_p99_ms: float = math.nan
-    rejected: int = 0
+    rejected: int = 0  #: frames refused because their content was wrong
     exposures: int = 0
-    coverage: float = 0.0
-    next_pose: str = ''
-    ready: bool = False
-    iteration: int = 0
-    rmse_px: tuple[float, float] = (math.nan, math.nan)
+    coverage: float = 0.0  #: covered part of the image, 0 to 1
+    next_pose: str = ''  #: what the next exposure should show
+    ready: bool = False  #: whether the exposures suffice
+    iteration: int = 0  #: round of the running or last calibration
+    rmse_px: tuple[float, float] = (math.nan, math.nan)  #: of that round, in u and v
     calibration_id: str = ''
-    age_s: float = math.nan
+    age_s: float = math.nan  #: of the calibration
 
 
 @dataclass(frozen=True)
@@ -82,42 +57,21 @@ class NodeState:
 
 @dataclass(frozen=True)
 class SessionState:
-    """The whole session.
-
-    Attributes
-    ----------
-    namespace : str
-    fluoroscopes : tuple of FluoroscopeState
-    nodes : tuple of NodeState
-    points_hz : float
-        Exposures reconstructed a second.
-    points_latency_ms : tuple of float
-        Median and 99th percentile.
-    orientation : str
-        Source of the orientation of the rig, '' without one.
-    drift_level, drift : str
-        Of the drift watch.
-    verdict : str
-        Of the last calibration of this session that was validated.
-    findings : tuple of str
-    job : str
-        What runs at the moment, '' if nothing does.
-    log : tuple of str
-        What was asked for, and the answers; the newest last.
-    """
+    """The whole session."""
 
     namespace: str = '/'
     fluoroscopes: tuple[FluoroscopeState, ...] = ()
     nodes: tuple[NodeState, ...] = ()
-    points_hz: float = math.nan
-    points_latency_ms: tuple[float, float] = (math.nan, math.nan)
-    orientation: str = ''
+    points_hz: float = math.nan  #: exposures reconstructed a second
+    points_latency_ms: tuple[float, float] = (math.nan, math.nan)  #: median and 99th percentile
+    orientation: str = ''  #: source of the orientation of the rig, '' without one
+    #: of the drift watch
     drift_level: str = ''
     drift: str = ''
-    verdict: str = ''
+    verdict: str = ''  #: of the last calibration of this session that was validated
     findings: tuple[str, ...] = ()
-    job: str = ''
-    log: tuple[str, ...] = ()
+    job: str = ''  #: what runs at the moment, '' if nothing does
+    log: tuple[str, ...] = ()  #: what was asked for, and the answers; the newest last
 
 
 class Session(Protocol):

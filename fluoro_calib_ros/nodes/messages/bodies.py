@@ -50,33 +50,19 @@ MARKER_MM = 2.0
 
 
 class BodiesContent(NamedTuple):
-    """Poses of B bodies and motion of joints in one exposure.
+    """Poses of B bodies and motion of joints in one exposure."""
 
-    Attributes
-    ----------
-    stamp_ns, frame_number : int
-        Those of the exposure.
-    orientation_id : str
-    orientation : RigOrientation
-        Orientation with which the poses were found.
-    bodies : sequence of Body
-    poses : sequence of BodyPoses
-        Of this exposure.
-    twist, twist_covariance : np.ndarray
-        (B, 6), (B, 6, 6): see `bodies.tracking.twists_of`.
-    joints : sequence of JointMotion
-        Of this exposure.
-    """
-
+    #: those of the exposure
     stamp_ns: int
     frame_number: int
     orientation_id: str
-    orientation: RigOrientation
+    orientation: RigOrientation  #: orientation with which the poses were found
     bodies: Sequence[Body]
-    poses: Sequence[of_bodies.BodyPoses]
+    poses: Sequence[of_bodies.BodyPoses]  #: of this exposure
+    #: (B, 6), (B, 6, 6): see `bodies.tracking.twists_of`
     twist: NDArray[np.float64]
     twist_covariance: NDArray[np.float64]
-    joints: Sequence[JointMotion]
+    joints: Sequence[JointMotion]  #: of this exposure
 
     def header(self, frame_id: str = '') -> Header:
         """Return the header, by default with the frame of the orientation."""

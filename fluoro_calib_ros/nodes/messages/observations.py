@@ -65,33 +65,20 @@ _IMAGE = Struct('<IIII')  # frame number, width, height, number of target ids
 
 
 class ObservedFrame(NamedTuple):
-    """A TargetObservations message, read from its bytes; nothing is validated.
+    """A TargetObservations message, read from its bytes; nothing is validated."""
 
-    Attributes
-    ----------
-    sec, nanosec : int
-        Stamp.
-    frame_id : str
-    frame_number : int
-    image_size : (int, int)
-        Width and height [px].
-    target_id : bytes
-        The ids as uint32.
-    u, v, sigma : np.ndarray
-        Image points and their standard deviations [px], of any lengths.
-    start : bytes
-        The message up to the frame number: so a CorrectedObservations message begins, too.
-    """
-
+    #: stamp
     sec: int
     nanosec: int
     frame_id: str
     frame_number: int
-    image_size: tuple[int, int]
-    target_id: bytes
+    image_size: tuple[int, int]  #: width and height [px]
+    target_id: bytes  #: the ids as uint32
+    #: image points and their standard deviations [px], of any lengths
     u: np.ndarray
     v: np.ndarray
     sigma: np.ndarray
+    #: the message up to the frame number: so a CorrectedObservations message begins, too
     start: bytes
 
 
@@ -173,34 +160,21 @@ def set_number_and_stamp(message: TargetObservations, number: int, stamp_ns: int
 
 
 class CorrectedFrame(NamedTuple):
-    """A CorrectedObservations message, read from its bytes; nothing is validated.
+    """A CorrectedObservations message, read from its bytes; nothing is validated."""
 
-    Attributes
-    ----------
-    sec, nanosec : int
-        Stamp.
-    frame_id : str
-    frame_number : int
-    calibration_id : str
-    target_id : np.ndarray
-        uint32.
-    u, v, sigma, correction_sd : np.ndarray
-        Corrected points and standard deviations [px], of any lengths.
-    status : np.ndarray
-        uint8, of any length.
-    """
-
+    #: stamp
     sec: int
     nanosec: int
     frame_id: str
     frame_number: int
     calibration_id: str
-    target_id: np.ndarray
+    target_id: np.ndarray  #: uint32
+    #: corrected points and standard deviations [px], of any lengths
     u: np.ndarray
     v: np.ndarray
     sigma: np.ndarray
     correction_sd: np.ndarray
-    status: np.ndarray
+    status: np.ndarray  #: uint8, of any length
 
 
 def decode_corrected_observations(data: bytes) -> CorrectedFrame:

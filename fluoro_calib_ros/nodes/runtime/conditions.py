@@ -15,25 +15,13 @@ from .stream import Stream
 
 @dataclass(frozen=True)
 class InputState:
-    """What the diagnostics of an input are decided by.
-
-    Attributes
-    ----------
-    node : StreamNode
-    topics : tuple of str
-        What the node subscribes to.
-    refusals : RefusalLog
-    incompatible : mapping of str to str
-        Messages about publishers that are not received, by topic.
-    recent : mapping of str to int
-        What was counted within the last minute; see RecentCounts.
-    """
+    """What the diagnostics of an input are decided by."""
 
     node: StreamNode
-    topics: tuple[str, ...]
+    topics: tuple[str, ...]  #: what the node subscribes to
     refusals: RefusalLog
-    incompatible: Mapping[str, str]
-    recent: Mapping[str, int]
+    incompatible: Mapping[str, str]  #: messages about publishers that are not received, by topic
+    recent: Mapping[str, int]  #: what was counted within the last minute; see RecentCounts
 
 
 @dataclass(frozen=True)

@@ -38,24 +38,14 @@ class Refused(DataError):
 
 
 class RefusalLog:
-    """Counts the refused messages of one input and logs the reasons.
-
-    Attributes
-    ----------
-    counts : Counter
-        Refused messages by kind.
-    failures : int
-        Messages lost by an unexpected exception, that is, by a bug.
-    last_fault : str
-        The last reason; empty before the first.
-    """
+    """Counts the refused messages of one input and logs the reasons."""
 
     def __init__(self, item: str, logger: RateLimitedLogger) -> None:
         self._item = item
         self._logger = logger
-        self.counts: Counter[str] = Counter()
-        self.failures = 0
-        self.last_fault = ''
+        self.counts: Counter[str] = Counter()  #: refused messages by kind
+        self.failures = 0  #: messages lost by an unexpected exception, that is, by a bug
+        self.last_fault = ''  #: the last reason; empty before the first
         self._last_failure = ''
 
     @property
@@ -231,20 +221,10 @@ def health_of(state: State, conditions: Iterable[Condition[State]]) -> Health:
 
 @dataclass(frozen=True)
 class Status:
-    """One entry of the diagnostics of a node.
+    """One entry of the diagnostics of a node."""
 
-    Attributes
-    ----------
-    name : str
-        Fluoroscope or function that the status is about.
-    level : bytes
-        OK, WARN or ERROR.
-    message : str
-    values : mapping of str to object
-    """
-
-    name: str
-    level: bytes
+    name: str  #: fluoroscope or function that the status is about
+    level: bytes  #: OK, WARN or ERROR
     message: str
     values: Mapping[str, object] = field(default_factory=dict)
 

@@ -13,29 +13,16 @@ from .streams import FaultHandlers
 
 
 class Stream:
-    """Counts of the messages of one fluoroscope; nodes add what only they count.
-
-    Attributes
-    ----------
-    name : str
-        Fluoroscope.
-    received : int
-        Number of messages.
-    overrun : int
-        Number of messages that were lost at the input, because the queue was full.
-    refusals : RefusalLog
-        Streams whose messages are counted together share it.
-    stall : StallDetector
-    latencies : LatencyWindow
-        From the arrival of a message to the publication of what is made of it.
-    """
+    """Counts of the messages of one fluoroscope; nodes add what only they count."""
 
     def __init__(self, name: str, refusals: RefusalLog) -> None:
-        self.name = name
-        self.received = 0
+        self.name = name  #: fluoroscope
+        self.received = 0  #: number of messages
+        #: number of messages that were lost at the input, because the queue was full
         self.overrun = 0
-        self.refusals = refusals
+        self.refusals = refusals  #: streams whose messages are counted together share it
         self.stall = StallDetector()
+        #: from the arrival of a message to the publication of what is made of it
         self.latencies = LatencyWindow()
 
     def add_latency(self, received_ns: int) -> None:

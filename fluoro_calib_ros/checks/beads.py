@@ -84,18 +84,9 @@ def compare_with_survey(
 ) -> list[Check]:
     """Return the checks 'beads' and 'distances'.
 
-    Parameters
-    ----------
-    beads : Beads
-    has_trend : bool
-        Whether the residuals of a fluoroscope have a trend.
-    least_chi2 : callable, optional
-        Called with target ids; returns their smallest squared misclosures with any ray excluded.
-        A bead is out of place only if it is so by these, too.
-
-    Returns
-    -------
-    list of Check
+    has_trend: whether the residuals of a fluoroscope have a trend. least_chi2: called with target
+    ids; returns their smallest squared misclosures with any ray excluded; a bead is out of place
+    only if it is so by these, too.
     """
     count = len(beads.target_id)
     if count < MIN_BEADS:

@@ -26,10 +26,7 @@ from ..exposures.frame import cells_of
 class ImageAreas:
     """Overlapping areas of an image: n x n cells, windows of half its size, halves, and the whole.
 
-    Parameters
-    ----------
-    n : int
-        Number of cells across the image, even.
+    n: number of cells across the image, even.
     """
 
     def __init__(self, n: int) -> None:

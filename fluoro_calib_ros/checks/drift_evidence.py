@@ -73,12 +73,7 @@ class _Candidate:
 class Evidence(ABC):
     """Charts of one kind of observations and the newest blocks.
 
-    Parameters
-    ----------
-    charts : CusumCharts
-    fluoroscopes : sequence of str
-    window : int
-        Number of blocks from which a drift is estimated.
+    window: number of blocks from which a drift is estimated.
     """
 
     def __init__(self, charts: CusumCharts, fluoroscopes: Sequence[str], window: int) -> None:

@@ -19,10 +19,7 @@ class EpipolarObservations:
     Rows with a value that is not finite are ignored. Residuals that are too large for a match
     belong here too: they are clipped, and a large drift has no others.
 
-    Raises
-    ------
-    ValueError
-        For arrays whose shapes do not agree.
+    Raises ValueError for arrays whose shapes do not agree.
     """
 
     target_id: NDArray[np.int64]  #: (n,)

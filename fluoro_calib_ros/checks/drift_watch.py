@@ -358,10 +358,7 @@ MAX_LATE = 100
 class BlockClock:
     """Clock of a stream.
 
-    Parameters
-    ----------
-    block_s : float
-        Length of a block [s].
+    block_s: length of a block [s].
     """
 
     def __init__(self, block_s: float) -> None:

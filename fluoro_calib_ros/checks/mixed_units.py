@@ -50,13 +50,8 @@ def mixed_units(
 ) -> Finding | None:
     """Return a finding where a part of the targets is in another unit than the others.
 
-    Parameters
-    ----------
-    frames : mapping of str to sequence of Frame
-        Exposures by fluoroscope, valid on their own.
-    phantom : Phantom
-    is_suspicious : bool
-        Whether the exposures do not fit the phantom, so that there may be no majority.
+    frames: exposures by fluoroscope, valid on their own. is_suspicious: whether the exposures do
+    not fit the phantom, so that there may be no majority.
     """
     every = [_on_phantom(frame, phantom) for of_one in frames.values() for frame in of_one]
     every = [frame for frame in every if len(frame.target_id) >= MIN_TARGETS]

@@ -48,12 +48,7 @@ class PairBlock:
 class PairWatch:
     """Turns the epipolar residuals of one pair of views into statistics, block by block.
 
-    Parameters
-    ----------
-    sizes : sequence
-        (2, 2), width and height of both images [px].
-    areas : ImageAreas
-    options : DriftOptions
+    sizes: (2, 2), width and height of both images [px].
     """
 
     def __init__(
@@ -222,10 +217,7 @@ class SystematicErrorField:
     orientation. The values are estimated from the residuals of the start, by marker and block, by
     least-squares collocation.
 
-    Parameters
-    ----------
-    sizes : sequence
-        (2, 2), width and height of both images [px].
+    sizes: (2, 2), width and height of both images [px].
     """
 
     def __init__(self, sizes: Sequence[Sequence[int]]) -> None:

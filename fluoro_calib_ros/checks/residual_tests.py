@@ -159,13 +159,7 @@ class Joins:
 def residuals_of(job: CalibrationResult, name: str, frames: Sequence[Frame]) -> Residuals:
     """Return the residuals of the frames of a fluoroscope in an adjustment.
 
-    Parameters
-    ----------
-    job : CalibrationResult
-        Of an adjustment with a calibration fixed.
-    name : str
-        Fluoroscope.
-    frames : sequence of Frame
+    job: an adjustment with a calibration fixed. name: the fluoroscope.
     """
     figures = job.fluoroscopes[name]
     calibration = job.calibrations[name]
@@ -317,13 +311,7 @@ def _cell_sums(
     overlap: a cell consists of so many parts along each side, and there is one for each place of
     such a square of parts.
 
-    Returns
-    -------
-    sums : (c, m, 2) ndarray
-        [px]
-    counts : (c, m) ndarray
-    centres : (c, 2) ndarray
-        Of the cells [px].
+    Returns the sums (c, m, 2) [px], counts (c, m) and centres (c, 2) of the cells [px].
     """
     parts = CELLS * overlap
     size = np.asarray(image_size) / parts

@@ -52,10 +52,7 @@ class _Change:
 class AngleField:
     """Change of a correction with the angle, relative to its mean over the exposures.
 
-    Raises
-    ------
-    ValueError
-        For arrays of other shapes, or values that are not finite.
+    Raises ValueError for arrays of other shapes, or values that are not finite.
     """
 
     image_size: tuple[int, int]  #: width and height [px]
@@ -123,20 +120,10 @@ class AngleField:
     def change(self, uv: ArrayLike, angle: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Return what an angle adds to a correction and to its variance.
 
-        Parameters
-        ----------
-        uv : (n, 2) array_like
-            Observed pixels.
-        angle : float or (n,) array_like
-            Angle [rad]. NaN: it is unknown, the correction is the mean over the exposures, and
-            its variance holds what the angle changes.
-
-        Returns
-        -------
-        duv : (n, 2) ndarray
-            To be added to the correction [px].
-        variance : (n,) ndarray
-            To be added to the variance of each coordinate [px^2]; it can be negative.
+        uv: (n, 2) observed pixels. angle: one or (n,) [rad]; NaN: it is unknown, the correction is
+        the mean over the exposures, and its variance holds what the angle changes. Returns (n, 2)
+        to be added to the correction [px] and (n,) to be added to the variance of each coordinate
+        [px^2]; it can be negative.
         """
         uv = np.asarray(uv, dtype=float).reshape(-1, 2)
         angles = np.asarray(angle, dtype=float)

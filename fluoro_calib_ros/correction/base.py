@@ -69,11 +69,8 @@ class CorrectionModel(ABC):
     The fields are the whole content of a model: calibration files and messages carry them and
     nothing else, so a subclass derives everything it needs from them in `_prepare`.
 
-    Raises
-    ------
-    ValueError
-        If the arrays differ in length or are not finite, if a series is missing or not expected,
-        or if the training points do not allow k.
+    Raises ValueError if the arrays differ in length or are not finite, if a series is missing or
+    not expected, or if the training points do not allow k.
     """
 
     kind: ClassVar[str]

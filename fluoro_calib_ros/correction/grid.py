@@ -40,14 +40,8 @@ class LookupWorkspace:
     One thread uses it at a time. All calls of numpy are between whole arrays of one shape that
     exist already: the number of calls is what a frame of 30 points costs.
 
-    Parameters
-    ----------
-    n : int
-        Largest number of points.
-    shape : (int, int)
-        Numbers of rows and columns of cells on the image.
-    image_size : (int, int)
-        Width and height of the image [px].
+    n: largest number of points. shape: numbers of rows and columns of cells on the image.
+    image_size: width and height of the image [px].
     """
 
     __slots__ = (
@@ -150,11 +144,7 @@ class CorrectionGrid:
     model (knn) has the smallest cells; its lookups are between the values at the corners of the
     cell.
 
-    Parameters
-    ----------
-    model : CorrectionModel
-    image_size : (int, int)
-        Width and height [px].
+    image_size: width and height [px].
     """
 
     def __init__(self, model: CorrectionModel, image_size: tuple[int, int]) -> None:

@@ -194,14 +194,9 @@ class NeighbourTable:
 
     It is built once and then answers for changing subsets of the points.
 
-    Parameters
-    ----------
-    uv : (N, 2) ndarray
-    count : int
-        Number of neighbours that will be asked for. Some more are looked up, so that excluded
-        points can be skipped.
-    rows : (T,) ndarray of int, optional
-        Points whose neighbours will be asked for; by default all.
+    uv: (N, 2). count: number of neighbours that will be asked for; some more are looked up, so
+    that excluded points can be skipped. rows: (T,) points whose neighbours will be asked for; by
+    default all.
     """
 
     def __init__(self, uv: np.ndarray, count: int, rows: np.ndarray | None = None) -> None:

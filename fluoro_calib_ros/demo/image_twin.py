@@ -56,12 +56,7 @@ class RecordedRig:
 class ImageTwin:
     """Renders a twin of the calibration bag that is made of images, in a thread.
 
-    Parameters
-    ----------
-    recorded : RecordedRig
-        The virtual rig of the bags.
-    out : Path
-        Bag to write.
+    recorded: the virtual rig of the bags. out: bag to write.
     """
 
     def __init__(self, recorded: RecordedRig, out: Path) -> None:

@@ -25,12 +25,7 @@ PLAYED = 0.2  # of the speed of the recording, for a machine with two cores
 class LiveKnee:
     """Bodies, joint and recording of a knee in the rig of the bags.
 
-    Parameters
-    ----------
-    recorded : RecordedRig
-        The virtual rig of the bags.
-    out : Path
-        Folder to write.
+    recorded: the virtual rig of the bags. out: folder to write.
     """
 
     def __init__(self, recorded: RecordedRig, out: Path) -> None:

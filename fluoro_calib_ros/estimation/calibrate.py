@@ -178,23 +178,8 @@ def calibrate_part(
 ) -> dict[str, FluoroscopeCalibration]:
     """Self-calibrate with a part of the exposures of an earlier calibration.
 
-    Parameters
-    ----------
-    request : CalibrationRequest
-        With the frames of the part.
-    starts : StartValues
-        Of the earlier calibration.
-    whole : mapping of str to FluoroscopeCalibration
-        The earlier calibration, of all exposures, whose noise of image coordinates is taken over.
-
-    Returns
-    -------
-    dict of str to FluoroscopeCalibration
-
-    Raises
-    ------
-    DataError
-        If the exposures do not suffice.
+    request: with the frames of the part. starts, whole: of the calibration of all exposures, whose
+    noise of image coordinates is taken over. Raises DataError if the exposures do not suffice.
     """
     out: dict[str, FluoroscopeCalibration] = {}
     with threadpool_limits(1):

@@ -176,19 +176,9 @@ class RegressionStep(ABC, Generic[Model_co]):
     ) -> None:
         """Update the inliers, and choose k by its score.
 
-        Parameters
-        ----------
-        values : (N, 2) ndarray
-            Values to which the model is fitted [px].
-        q : (N,) ndarray
-            Normalised squared residuals.
-        information : (N, 2, 2) ndarray
-            Inverse of the residual covariance C_r [1/px^2].
-
-        Raises
-        ------
-        ValueError
-            If there are too few inliers.
+        values: (N, 2) values to which the model is fitted [px]. q: (N,) normalised squared
+        residuals. information: (N, 2, 2) inverse of the residual covariance C_r [1/px^2]. Raises
+        ValueError if there are too few inliers.
         """
 
     @abstractmethod

@@ -196,16 +196,7 @@ def sd_with_lack_of_fit(
 ) -> NDArray[np.float64]:
     """Standard deviations (33, 33) [px] of a series with what it cannot follow, on its grid.
 
-    Parameters
-    ----------
-    points : FittedPoints
-    series : Series
-        With the standard deviations of its coefficients alone.
-    left_out : LeftOut, optional
-
-    Returns
-    -------
-    (33, 33) ndarray
+    series: with the standard deviations of its coefficients alone.
     """
     products = _products(points)
     variance = series.sd**2

@@ -137,18 +137,7 @@ def with_likely_places(
 ) -> LocalSignal | None:
     """Return the windows and bands with those that raise the marginal likelihood.
 
-    Parameters
-    ----------
-    functions : Functions
-    estimates : SineEstimates
-        With the present places.
-    local : LocalSignal or None
-        Present places.
-
-    Returns
-    -------
-    LocalSignal or None
-        The present places where there are no more.
+    estimates: with the present places, local. Returns these where there are no more.
     """
     shown = _ShownBumps.of(functions, estimates)
     taken = np.zeros(len(shown.nodes), dtype=bool)

@@ -138,12 +138,7 @@ class NeighbourRegression(RegressionStep[NeighbourModel]):
 
     The image points do not move, so neighbours are looked up again only when the inliers change.
 
-    Parameters
-    ----------
-    model_type : type of NeighbourModel
-    points : TrainingPoints
-    k : int or None
-        Number of neighbours; None: chosen by cross-validation.
+    k: number of neighbours; None: chosen by cross-validation.
     """
 
     def __init__(

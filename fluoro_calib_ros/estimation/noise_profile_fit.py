@@ -34,18 +34,8 @@ def fitted_profile(
 ) -> NoiseProfile | None:
     """Return the profile that squares of errors show, None where they are the same everywhere.
 
-    Parameters
-    ----------
-    uv : (n, 2) ndarray
-        Image points [px].
-    squares : (n,) ndarray
-        Squared error of a coordinate of each [px^2], mean of both.
-    image_size : tuple of int
-        Width and height [px].
-
-    Returns
-    -------
-    NoiseProfile or None
+    uv: (n, 2) image points [px]. squares: (n,) squared error of a coordinate of each [px^2], mean
+    of both. image_size: width and height [px].
     """
     mean = float(np.mean(squares)) if len(squares) else 0.0
     if len(uv) < MIN_POINTS or not mean > 0:

@@ -51,17 +51,8 @@ def squared_error_of_kept(
 ) -> NDArray[np.float64]:
     """Expected squared errors (t,) of terms, in units of the variances of their estimates.
 
-    Parameters
-    ----------
-    ratio : (t,) ndarray
-        Estimates without a prior, over their standard deviations.
-    kept : (t,) ndarray
-        Parts of these estimates that are kept, 0 to 1.
-
-    Returns
-    -------
-    (t,) ndarray
-        Posterior variances about the kept values.
+    ratio: (t,) estimates without a prior, over their standard deviations. kept: (t,) parts of
+    these estimates that are kept, 0 to 1. Returns (t,) posterior variances about the kept values.
     """
     half = np.square(ratio) / 2
     x, weight = np.polynomial.legendre.leggauss(NODES)
@@ -266,18 +257,8 @@ class StepwiseTerms(AdjustedTerms):
 def _without_gauge(terms: np.ndarray, values: np.ndarray, gauge: np.ndarray) -> np.ndarray:
     """Terms (t, 2, m) less their part in the gauge.
 
-    Parameters
-    ----------
-    terms : (t, 2, m) ndarray
-        Coefficients of the polynomials in u and v.
-    values : (n, m) ndarray
-        Polynomials at the image points.
-    gauge : (n, 2, g) ndarray
-        Gauge at the image points.
-
-    Returns
-    -------
-    (t, 2, m) ndarray
+    terms: (t, 2, m) coefficients of the polynomials in u and v. values: (n, m) polynomials at the
+    image points. gauge: (n, 2, g) gauge at the image points. Returns (t, 2, m).
     """
     if not gauge.shape[2]:
         return terms

@@ -46,16 +46,7 @@ class AngleMaps:
 
     The corrector of the last angle is kept. One thread may use it.
 
-    Parameters
-    ----------
-    calibration : FluoroscopeCalibration
-    interpolation, border
-        See `ImageCorrector`.
-
-    Raises
-    ------
-    DataError
-        As ImageCorrector.
+    interpolation, border: see `ImageCorrector`. Raises DataError as ImageCorrector.
     """
 
     def __init__(

@@ -43,14 +43,8 @@ class BodyMarkers:
 class MarkerBodies:
     """All rigid bodies of markers.
 
-    Parameters
-    ----------
-    orientation : RigOrientation
-        Of the two fluoroscopes.
-    target_id : (n,) ndarray
-        Of all markers, ascending.
-    bodies : sequence of Body
-        Shapes that are not given are learned; bodies of too few markers are ignored.
+    orientation: of the two fluoroscopes. target_id: (n,) of all markers, ascending. bodies: shapes
+    that are not given are learned; bodies of too few markers are ignored.
     """
 
     def __init__(

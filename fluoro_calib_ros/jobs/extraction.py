@@ -161,20 +161,8 @@ def run_extraction(
     A damaged image, or one without the phantom, is passed over, and its result says why. Images
     whose pose is not found are tried again with the distortion that the others have.
 
-    Parameters
-    ----------
-    request : ExtractionRequest
-    progress : callable, optional
-        Called after every image with the number of images that are done, and their total.
-
-    Returns
-    -------
-    ExtractionOutcome
-
-    Raises
-    ------
-    DataError
-        For sources that cannot be read, and where no image gives observations.
+    progress: called after every image with the number of images that are done, and their total.
+    Raises DataError for sources that cannot be read, and where no image gives observations.
     """
     sources = open_sources(request.sources, request.fluoroscope, request.angles)
     if request.regular_grid and FlatGrid.of(request.phantom.xyz_mm) is None:

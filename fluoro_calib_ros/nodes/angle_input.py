@@ -35,17 +35,7 @@ class AngleInput:
 
     Without a joint it subscribes to nothing, and all angles are unknown.
 
-    Parameters
-    ----------
-    options : AngleOptions
-    names : iterable of str
-        Fluoroscopes.
-    logger : RateLimitedLogger
-
-    Raises
-    ------
-    StartError
-        For a joint of a fluoroscope that there is not.
+    names: fluoroscopes. Raises StartError for a joint of a fluoroscope that there is not.
     """
 
     def __init__(

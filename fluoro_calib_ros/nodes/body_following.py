@@ -95,12 +95,6 @@ class BodyFollower:
     """Follows bodies and joints through the exposures of a stream.
 
     The stream's thread adds exposures; the executor's reads `state`, which is replaced as a whole.
-
-    Parameters
-    ----------
-    bodies : sequence of Body
-    joints : sequence of JointEntry
-    lag : int
     """
 
     def __init__(self, bodies: Sequence[Body], joints: Sequence[JointEntry], lag: int) -> None:

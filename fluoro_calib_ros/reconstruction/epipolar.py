@@ -47,16 +47,8 @@ class EpipolarResiduals:
 class EpipolarGeometry:
     """Epipolar geometry of two fluoroscopes of a rig, built once for all frames.
 
-    Parameters
-    ----------
-    orientation : RigOrientation
-    a, b : str
-        Names of the fluoroscopes.
-
-    Raises
-    ------
-    DataError
-        For an unknown fluoroscope, and for two sources in one place.
+    a, b: names of the fluoroscopes. Raises DataError for an unknown fluoroscope, and for two
+    sources in one place.
     """
 
     def __init__(self, orientation: RigOrientation, a: str, b: str) -> None:

@@ -116,22 +116,11 @@ class _Solution:
 class Intersector:
     """Intersection of rays for one RigOrientation, built once for all frames.
 
-    Parameters
-    ----------
-    orientation : RigOrientation
-        Of two or more fluoroscopes.
-    reject : float or None
-        Standardised epipolar distance above which two rays do not belong together; None: accept
-        all. With more rays the limit is the quantile of chi-square of the same probability, and a
-        ray is dropped if the others agree without it. Where the points of a recording are seen to
-        scatter more than stated, it is wider.
-
-    Raises
-    ------
-    DataError
-        For a rig of one fluoroscope.
-    ValueError
-        If reject is not above 0.
+    orientation: of two or more fluoroscopes. reject: standardised epipolar distance above which
+    two rays do not belong together; None: accept all; with more rays the limit is the quantile of
+    chi-square of the same probability, and a ray is dropped if the others agree without it; where
+    the points of a recording are seen to scatter more than stated, it is wider. Raises DataError
+    for a rig of one fluoroscope, ValueError if reject is not above 0.
     """
 
     def __init__(self, orientation: RigOrientation, reject: float | None = 4.0) -> None:

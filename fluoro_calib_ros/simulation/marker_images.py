@@ -93,11 +93,7 @@ class _Disc:
 class MovingMarkers:
     """Rigid clusters of markers in motion.
 
-    Parameters
-    ----------
-    scene : MarkerScene
-    seed : int
-        The same seed gives the same motion.
+    seed: the same seed gives the same motion.
     """
 
     def __init__(self, scene: MarkerScene, seed: int = 0) -> None:

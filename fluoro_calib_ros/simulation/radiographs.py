@@ -60,13 +60,7 @@ HARD = RadiographSettings(photons=400.0, bits=8, glare=0.15, blur_px=1.0, clutte
 
 
 class Radiography:
-    """Takes radiographs with a virtual fluoroscope.
-
-    Parameters
-    ----------
-    fluoroscope : VirtualFluoroscope
-    settings : RadiographSettings, optional
-    """
+    """Takes radiographs with a virtual fluoroscope."""
 
     def __init__(
         self, fluoroscope: VirtualFluoroscope, settings: RadiographSettings | None = None

@@ -217,13 +217,8 @@ def encode_corrected_observations(
 ) -> bytes:
     """Return the bytes of the CorrectedObservations message of a frame.
 
-    Parameters
-    ----------
-    source : ObservedFrame
-        The observed frame with n target ids.
-    calibration_id : str
-    corrected : sequence of np.ndarray
-        u, v, sigma, correction_sd (n,) float64 [px] and status (n,) uint8.
+    source: the observed frame with n target ids. corrected: u, v, sigma, correction_sd (n,)
+    float64 [px] and status (n,) uint8.
     """
     *columns, status = corrected
     return columns_bytes(

@@ -15,12 +15,7 @@ PAUSED_WAIT_S = 0.02  # after which the end of a pause, or a step, is noticed
 class Pace:
     """Moments at which positions of a recording are due.
 
-    Parameters
-    ----------
-    rate : float
-        Speed relative to the recording.
-    paused : bool
-        Whether to begin with a pause.
+    rate: speed relative to the recording. paused: whether to begin with a pause.
     """
 
     def __init__(self, rate: float, paused: bool = False) -> None:

@@ -21,13 +21,7 @@ from .arguments import (
     bag_selection,
     file_settings,
 )
-from .output import (
-    print_findings,
-    print_notes,
-    print_result,
-    print_unpaired,
-    styled_verdict,
-)
+from .output import print_findings, print_notes, print_result, print_unpaired, styled_verdict
 
 CONTRADICTIONS = (Kind.CORRECTED_ALREADY, Kind.POOR_CALIBRATION_FIT)
 HOLDS = 'The calibration holds for these exposures; its interior orientation was fixed.'

@@ -14,13 +14,7 @@ from functools import partial
 import numpy as np
 
 from ..exposures.frame import MAX_ANGLE
-from ..limits import (
-    MAX_ANGLES,
-    MAX_IMAGE_SIDE,
-    MAX_NEIGHBOURS,
-    MAX_PRINCIPAL_DISTANCE_PX,
-    MAX_PX,
-)
+from ..limits import MAX_ANGLES, MAX_IMAGE_SIDE, MAX_NEIGHBOURS, MAX_PRINCIPAL_DISTANCE_PX, MAX_PX
 from ..records import Field
 from .terms import CUBIC
 

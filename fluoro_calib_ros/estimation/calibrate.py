@@ -54,13 +54,7 @@ from .initial_network import (
 )
 from .noise_profile_fit import fitted_profile
 from .options import CalibrationOptions, CalibrationRequest
-from .result import (
-    CalibrationResult,
-    ExposureResult,
-    FluoroscopeResult,
-    Targets,
-    combined_targets,
-)
+from .result import CalibrationResult, ExposureResult, FluoroscopeResult, Targets, combined_targets
 from .rounds import Round, SelfCalibration, rmse_of_inliers
 from .self_calibration import self_calibrate
 

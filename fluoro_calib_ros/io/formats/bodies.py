@@ -23,15 +23,7 @@ from ...photogrammetry.rotations import matrix_from_quaternion
 from ..access import atomic_file
 from ..csv_table import as_text, read_all
 from ..poses import COLUMNS as POSE_COLUMNS
-from .content import (
-    Bodies,
-    Content,
-    FileSettings,
-    Format,
-    Written,
-    from_units,
-    homogeneous,
-)
+from .content import Bodies, Content, FileSettings, Format, Written, from_units, homogeneous
 from .frames_of_points import NS, bodies_of, frames_of, rate_of
 from .text import Row, frame_numbers, joined, read_frames, require_width, write_frames
 

@@ -26,16 +26,7 @@ from ...exposures.names import Names, number_names
 from ...processes import run_module
 from ..access import read_bytes, write_bytes
 from . import c3d_process
-from .content import (
-    UNITS_MM,
-    Bodies,
-    Content,
-    FileSettings,
-    Format,
-    Points,
-    Written,
-    homogeneous,
-)
+from .content import UNITS_MM, Bodies, Content, FileSettings, Format, Points, Written, homogeneous
 from .frames_of_points import bodies_of, frames_of, labels, named_targets, points_of
 
 MISSING = -1.0

@@ -24,8 +24,14 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from fluoro_calib_ros.bodies.body import Body, declared_bodies
-from fluoro_calib_ros.checks.drift_observations import EpipolarObservations
-from fluoro_calib_ros.checks.drift_options import ERROR, OK, WARN, DriftOptions, DriftState
+from fluoro_calib_ros.checks.drift_options import (
+    ERROR,
+    OK,
+    WARN,
+    DriftOptions,
+    DriftState,
+    EpipolarObservations,
+)
 from fluoro_calib_ros.checks.drift_watch import DriftWatch
 from fluoro_calib_ros.correction.base import CorrectionStatus
 from fluoro_calib_ros.correction.fluoroscope_calibration import FluoroscopeCalibration

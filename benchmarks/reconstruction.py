@@ -30,9 +30,13 @@ from fluoro_calib_ros.estimation.rig_orientation import (
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.reconstruction.intersection import Intersector
 from fluoro_calib_ros.reconstruction.reconstruct import ReconstructedFrame, reconstruct_recording
-from fluoro_calib_ros.simulation.exposures import Detection, detect_beads, simulate_exposures
+from fluoro_calib_ros.simulation.exposures import (
+    Detection,
+    detect_beads,
+    simulate_exposures,
+    simulate_tracking,
+)
 from fluoro_calib_ros.simulation.rig import VirtualRig, virtual_rig
-from fluoro_calib_ros.simulation.tracking import simulate_tracking
 
 EXPOSURES = 15
 NOISE_PX = 0.25

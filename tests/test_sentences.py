@@ -20,25 +20,22 @@ from rigs import calibrated, exposures, rig, small_network, true_calibrations, t
 from fluoro_calib_ros.bodies.body import Body
 from fluoro_calib_ros.bodies.healing import Cause, Change
 from fluoro_calib_ros.bodies.shapes import BodyPlaces, _stability, _unseen, estimate_shape
-from fluoro_calib_ros.checks import given_interior, inputs, mixed_units
 from fluoro_calib_ros.checks import held_out as held_fit
+from fluoro_calib_ros.checks import inputs, mixed_units, verdict
 from fluoro_calib_ros.checks import inputs as plausibility
 from fluoro_calib_ros.checks import rig as rig_checks
 from fluoro_calib_ros.checks.drift_evidence import DriftEstimate
 from fluoro_calib_ros.checks.drift_options import ERROR, WARN
 from fluoro_calib_ros.checks.drift_watch import DriftWatch
+from fluoro_calib_ros.checks.rig import doubtful
 from fluoro_calib_ros.checks.rig_watch import RecordingDriftWatch
-from fluoro_calib_ros.checks.rigidity import doubtful
 from fluoro_calib_ros.checks.survey import unsurveyed
 from fluoro_calib_ros.checks.verdict import validate, validate_or_report
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.constraints import _without_targets_of_few_rays
-from fluoro_calib_ros.estimation.diagnostics import (
-    exposures_that_do_not_fit,
-    undetermined_unknowns,
-)
 from fluoro_calib_ros.estimation.initial_network import measured_network
 from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
+from fluoro_calib_ros.estimation.rounds import exposures_that_do_not_fit, undetermined_unknowns
 from fluoro_calib_ros.estimation.start_orientation import UNTILTED
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.exposures.repeats import without_repeats
@@ -114,7 +111,7 @@ def wrong_given_interior():
     evidence = Fake(
         calibrations={'a': held}, request=Fake(options=Fake(interior_sd=(1.0, 1.0, 1.0)))
     )
-    return given_interior._check(evidence, 'a', calibration, 3000.0)
+    return verdict._given_interior_check(evidence, 'a', calibration, 3000.0)
 
 
 def no_validation():

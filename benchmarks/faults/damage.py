@@ -23,9 +23,8 @@ from fluoro_calib_ros.io.bags.metadata import profile
 from fluoro_calib_ros.io.bags.reader import iterate_messages
 from fluoro_calib_ros.io.bags.recording import Recording, RecordingOptions, TopicToRecord
 from fluoro_calib_ros.io.bags.salvage import recover_bag
-from fluoro_calib_ros.simulation.rig import virtual_rig
-from fluoro_calib_ros.simulation.streams import StreamStart
-from fluoro_calib_ros.simulation.tracking import simulate_tracking
+from fluoro_calib_ros.simulation.exposures import simulate_tracking
+from fluoro_calib_ros.simulation.rig import StreamStart, virtual_rig
 
 from ..timing import section
 

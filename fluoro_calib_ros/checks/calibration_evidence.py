@@ -13,8 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
-from ..correction.models import CollocationModel
-from ..correction.registry import selectable_models
+from ..correction.registry import CollocationModel, selectable_models
 from ..errors import DataError
 from ..estimation.calibrate import adjust_with_calibrations, calibrate_part
 from ..estimation.exposure_terms import Variation, exposure_functions, is_determined, variation

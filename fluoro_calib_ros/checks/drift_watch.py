@@ -45,8 +45,15 @@ from .drift_evidence import (
     DriftEstimate,
     EpipolarEvidence,
 )
-from .drift_observations import EpipolarObservations
-from .drift_options import ERROR, LEVEL_NAMES, OK, WARN, DriftOptions, DriftState
+from .drift_options import (
+    ERROR,
+    LEVEL_NAMES,
+    OK,
+    WARN,
+    DriftOptions,
+    DriftState,
+    EpipolarObservations,
+)
 from .pair_watch import PairWatch
 
 BODY_STEP = 2.0  # times step_px in the charts of the bodies, which have less information

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
-from ..correction.models import no_correction
+from ..correction.registry import no_correction
 from ..errors import DataError
 from ..estimation.result import CalibrationResult
 from ..findings import Finding, Kind, Place

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .charts import MEMORY, ImageAreas
-from .drift_observations import EpipolarObservations
-from .drift_options import DriftOptions
+from .drift_options import DriftOptions, EpipolarObservations
 
 LAGS = (1, 2, 4)  # frames over which the noise of a marker is compared
 MIN_CORRELATION = 0.05

@@ -21,8 +21,15 @@ from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.epipolar import EpipolarGeometry
 from ..reconstruction.reconstruct import IntersectedViews
 from .charts import MIN_BLOCKS_TO_ALARM
-from .drift_observations import EpipolarObservations
-from .drift_options import ERROR, LEVEL_NAMES, OK, WARN, DriftOptions, DriftState
+from .drift_options import (
+    ERROR,
+    LEVEL_NAMES,
+    OK,
+    WARN,
+    DriftOptions,
+    DriftState,
+    EpipolarObservations,
+)
 from .drift_watch import DriftWatch
 
 # A residual above FALSE_MATCH_SD standard deviations and FALSE_MATCH_PX more is that of a false

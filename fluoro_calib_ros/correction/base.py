@@ -6,7 +6,7 @@
 A model is a subclass of `CorrectionModel` and one line in `registry`. It says how it predicts
 (`predict` and `standard_deviation`), and what a user and the lookup grid need to know
 (`description`, `smoothness`, `min_k`). How a self-calibration obtains it is not its business but
-that of `estimators`, which a program that only corrects does not load.
+that of `estimation.self_calibration`, which a program that only corrects does not load.
 
 docs/models.md shows how to add one.
 """

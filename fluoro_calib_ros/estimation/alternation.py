@@ -21,9 +21,8 @@ from numpy.typing import NDArray
 from ..correction.base import CorrectionModel
 from ..errors import DataError
 from ..photogrammetry.adjustment import Adjustment, SolverOptions, adjust
-from ..photogrammetry.datum import in_determined_datum
 from ..photogrammetry.elimination import factorize
-from ..photogrammetry.network import Network
+from ..photogrammetry.network import Network, in_determined_datum
 from ..photogrammetry.noise import Noise
 from ..photogrammetry.noise_estimation import SETTLED, estimate_noise
 from ..photogrammetry.normal_equations import normal_equations

@@ -15,8 +15,11 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from ..correction.base import CorrectionModel
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration, digest_of_sources
-from ..correction.noise_profile import NoiseProfile
+from ..correction.fluoroscope_calibration import (
+    FluoroscopeCalibration,
+    NoiseProfile,
+    digest_of_sources,
+)
 from ..exposures.frame import validate_frame
 from ..exposures.phantom import Phantom
 from ..findings import Finding
@@ -29,14 +32,6 @@ from ..photogrammetry.precision import (
 )
 from ..photogrammetry.rotations import quaternion_from_matrix
 from .constraints import relative_orientations
-from .diagnostics import (
-    ResidualTable,
-    correlations_of,
-    exposures_that_do_not_fit,
-    outliers_of,
-    residuals_of_adjustment,
-    statistics_of,
-)
 from .fixed_calibration import (
     SolvedNetwork,
     fixed_corrections,
@@ -52,10 +47,20 @@ from .initial_network import (
     adjusted_with_precision,
     measured_network,
 )
-from .noise_profile_fit import fitted_profile
+from .lack_of_fit import fitted_profile
 from .options import CalibrationOptions, CalibrationRequest
 from .result import CalibrationResult, ExposureResult, FluoroscopeResult, Targets, combined_targets
-from .rounds import Round, SelfCalibration, rmse_of_inliers
+from .rounds import (
+    ResidualTable,
+    Round,
+    SelfCalibration,
+    correlations_of,
+    exposures_that_do_not_fit,
+    outliers_of,
+    residuals_of_adjustment,
+    rmse_of_inliers,
+    statistics_of,
+)
 from .self_calibration import self_calibrate
 
 MAX_REPEATS = 3  # of a calibration, to exclude exposures that do not fit

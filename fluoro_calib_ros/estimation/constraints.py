@@ -24,12 +24,7 @@ from ..photogrammetry.relative_orientation import (
     discrepancies_with_jacobian,
     mean_pose,
 )
-from ..photogrammetry.relative_pose import (
-    RIGID_SD_MM,
-    RIGID_SD_RAD,
-    RelativeConstraint,
-    RelativePose,
-)
+from ..photogrammetry.unknowns import RIGID_SD_MM, RIGID_SD_RAD, RelativeConstraint, RelativePose
 from .gauge import GaugeKind
 from .initial_network import Measured
 from .options import CalibrationOptions

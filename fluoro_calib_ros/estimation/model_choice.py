@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from ..correction.base import CorrectionModel
-from ..correction.models import SeriesModel
 from ..correction.neighbours import KnnModel, LocalLinearModel, NeighbourModel, NeighbourTable
+from ..correction.registry import SeriesModel
 from ..correction.series import sd_grid_pixels
 from ..photogrammetry.precision import Precision
 from ..photogrammetry.rotations import vector_from_matrix

@@ -16,8 +16,8 @@ from ..exposures.names import Names
 from ..exposures.phantom import Phantom
 from ..limits import MAX_NEIGHBOURS
 from ..options import option, validate_options
-from ..photogrammetry.datum import DATUMS
 from ..photogrammetry.known_orientation import KnownOrientation
+from ..photogrammetry.network import DATUMS
 from ..photogrammetry.noise import LOSSES
 from .user_regressor import is_regressor, regressor_name
 

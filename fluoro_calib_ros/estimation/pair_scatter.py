@@ -25,8 +25,7 @@ from ..correction.calibration_record import HARMONICS
 from ..photogrammetry.collinearity import project
 from ..photogrammetry.network import Network
 from ..photogrammetry.relative_orientation import discrepancies, mean_pose
-from ..photogrammetry.relative_pose import RelativeConstraint, RelativePose
-from ..photogrammetry.unknowns import Parameters
+from ..photogrammetry.unknowns import Parameters, RelativeConstraint, RelativePose
 from .angle_fit import can_be_fitted
 
 # A pair of exposures is left out of the mean where its deviation is so many times its standard

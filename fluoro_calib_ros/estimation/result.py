@@ -18,10 +18,9 @@ from ..exposures.phantom import Phantom
 from ..findings import Finding
 from ..photogrammetry.rotations import matrix_from_quaternion
 from .constraints import RelativeOrientation
-from .diagnostics import AdjustmentStatistics, ResidualTable
 from .fixed_calibration import SolvedNetwork
 from .initial_network import StartValues
-from .rounds import Round, SelfCalibration
+from .rounds import AdjustmentStatistics, ResidualTable, Round, SelfCalibration
 
 ROUNDING = 1e-6  # of the information of object points, relative to that of the survey
 

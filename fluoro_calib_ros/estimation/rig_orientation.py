@@ -44,9 +44,9 @@ from ..photogrammetry.relative_orientation import (
     mean_pose,
     relative_poses,
 )
-from ..photogrammetry.relative_pose import RelativeConstraint, RelativePose
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation, with_datum_of_points
 from ..photogrammetry.rotations import matrix_from_quaternion
+from ..photogrammetry.unknowns import RelativeConstraint, RelativePose
 from .constraints import paired_exposures
 from .fixed_calibration import (
     fixed_corrections,

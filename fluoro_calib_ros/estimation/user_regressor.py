@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..correction.models import LookupModel, grid_nodes, hull_corners
+from ..correction.registry import LookupModel, grid_nodes, hull_corners
 from ..correction.series import Series
 from .estimator import Estimator, RegressionStep, TrainingPoints, require_training
 from .gauge import gauge_basis, gauge_coefficients

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 from ..options import option, validate_options
-from .stamp_agreement import StampAgreement, StampedFrame
+from .stamps import StampAgreement, StampedFrame
 
 PAIR_BY = ('frame_number', 'stamp')
 MIN_VIEWS = 2  # views of an exposure that can be intersected

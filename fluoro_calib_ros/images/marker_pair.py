@@ -19,11 +19,10 @@ from ..bodies.body import Body
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError
 from ..photogrammetry.rig_orientation import RigOrientation
-from .marker_bodies import MarkerBodies
 from .marker_decisions import BodyDecisions, DecidedView, Decision, RayDecisions, ViewCounts
 from .marker_ids import MAX_SHADOWS, CalibratedRig, find_bodies, identifiable
 from .marker_intensity import check_image
-from .marker_rays import PairExposure, PairRays
+from .marker_rays import MarkerBodies, PairExposure, PairRays
 from .marker_start import FIRST_SD_PX
 from .markers import FirstMarkers, MarkerFrame, MarkerOptions, MarkerTracker
 

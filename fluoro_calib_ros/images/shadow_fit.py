@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 
-from .light import Noise
-from .texture import Cosines
+from .light import Cosines, Noise
 
 MAX_SIGMA_PX = 0.3  # of a centre: a larger one is that of no shadow, or of one hardly seen
 MARGIN_PX = 2.0  # of background around the shadow

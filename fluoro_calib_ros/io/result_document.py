@@ -16,10 +16,9 @@ from ..checks.rig_watch import DriftVerdict
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError
 from ..estimation.constraints import RelativeOrientation
-from ..estimation.diagnostics import AdjustmentStatistics, ResidualTable
 from ..estimation.fixed_calibration import JointPrecision
 from ..estimation.result import CalibrationResult, FluoroscopeResult
-from ..estimation.rounds import Round
+from ..estimation.rounds import AdjustmentStatistics, ResidualTable, Round
 from ..findings import Finding, Severity, sentences
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import quaternion_from_matrix

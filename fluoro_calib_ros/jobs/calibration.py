@@ -32,8 +32,7 @@ from ..checks.inputs import (
     why_excluded,
 )
 from ..checks.mixed_units import mixed_units
-from ..checks.rig import RigFindings, rig_findings
-from ..checks.rigidity import interchanged
+from ..checks.rig import RigFindings, interchanged, rig_findings
 from ..checks.verdict import validate_or_report
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError

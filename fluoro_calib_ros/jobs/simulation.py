@@ -20,12 +20,11 @@ from ..exposures.phantom import Phantom
 from ..images.codec import encode
 from ..io.access import PathLike, make_folder, write_bytes, write_text
 from ..io.bags.writer import BagWriter
-from ..io.bodies import write_bodies
+from ..io.bodies import JOINT_COLUMNS as JOINT_COLUMNS
+from ..io.bodies import joint_definition, write_bodies
 from ..io.csv_table import write_table
 from ..io.documents import write_json
 from ..io.folder import FolderKind, replaced_folder
-from ..io.joints import COLUMNS as JOINT_COLUMNS
-from ..io.joints import joint_definition
 from ..io.observations import COLUMNS as OBSERVATION_COLUMNS
 from ..io.observations import write_observations_csv
 from ..io.phantom import write_phantom
@@ -33,7 +32,13 @@ from ..io.poses import COLUMNS as POSE_COLUMNS
 from ..options import option, validate_options
 from ..photogrammetry.rotations import quaternion_from_matrix
 from ..processes import OF_STREAM, WorkerProcess
-from ..simulation.exposures import Detection, SimulatedExposures, simulate_exposures
+from ..simulation.exposures import (
+    Detection,
+    SimulatedExposures,
+    SimulatedTracking,
+    simulate_exposures,
+    simulate_tracking,
+)
 from ..simulation.knee import JOINT as KNEE
 from ..simulation.knee import (
     LANDING_HZ,
@@ -53,9 +58,14 @@ from ..simulation.marker_images import (
     MovingMarkers,
 )
 from ..simulation.radiographs import CLEAN, HARD, RadiographSettings, Radiography
-from ..simulation.rig import Pose, VirtualFluoroscope, VirtualRig, virtual_rig
-from ..simulation.streams import START_NS, StreamStart
-from ..simulation.tracking import SimulatedTracking, simulate_tracking
+from ..simulation.rig import (
+    START_NS,
+    Pose,
+    StreamStart,
+    VirtualFluoroscope,
+    VirtualRig,
+    virtual_rig,
+)
 
 # A data set of the virtual rig on disk: bags, CSV files, phantom and truth.
 

@@ -17,8 +17,7 @@ from ..bodies.body import Body, solvable_bodies
 from ..bodies.joint_tracking import JointTracker
 from ..bodies.tracking import BodyTracker, TrackedExposure, poses_of, twists_of
 from ..errors import DataError
-from ..io.bodies import read_bodies
-from ..io.joints import JointEntry, read_joints
+from ..io.bodies import JointEntry, read_bodies, read_joints
 from ..options import option
 from ..reconstruction.reconstruct import IntersectedViews
 from .messages.bodies import BodiesContent

@@ -23,9 +23,9 @@ from ..jobs.result_folder import belongs_to, kept_orientation, save_calibrations
 from ..photogrammetry.rig_orientation import RigOrientation
 from .calibration_output import CalibrationOutput
 from .calibration_settings import RigSetup
+from .runtime.lifecycle import ServiceEntry
 from .runtime.logging import Logger
 from .runtime.parameters import expand_path
-from .runtime.services import ServiceEntry
 
 
 class CalibrationFiles:

@@ -21,9 +21,8 @@ from ..jobs.result_folder import belongs_to
 from .calibration_output import CalibrationOutput
 from .calibration_settings import RigSetup
 from .exposure_input import ExposureInput
-from .runtime.lifecycle import StreamNode
+from .runtime.lifecycle import Requests, ServiceEntry, StreamNode, in_thread, wake, within
 from .runtime.parameters import check_timeout
-from .runtime.services import Requests, ServiceEntry, in_thread, wake, within
 
 
 class _Capture:

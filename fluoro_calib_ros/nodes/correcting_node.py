@@ -17,7 +17,12 @@ from ..io.calibration import SUFFIX, load_calibrations
 from ..io.result_check import disagreements
 from .angle_input import AngleInput, beyond_text
 from .calibration_input import CalibrationInput
-from .runtime.conditions import (
+from .runtime.diagnostics import OK, Health, RefusalLog, Status, fault, health_of, warning
+from .runtime.lifecycle import StreamNode
+from .runtime.logging import one_line
+from .runtime.parameters import CalibratedParameters, expand_path
+from .runtime.stream import (
+    Stream,
     StreamState,
     inactive_node,
     incompatible_publisher,
@@ -26,12 +31,8 @@ from .runtime.conditions import (
     overrun_input,
     refused_messages,
     stalled_stream,
+    stream_faults,
 )
-from .runtime.diagnostics import OK, Health, RefusalLog, Status, fault, health_of, warning
-from .runtime.lifecycle import StreamNode
-from .runtime.logging import one_line
-from .runtime.parameters import CalibratedParameters, expand_path
-from .runtime.stream import Stream, stream_faults
 from .runtime.streams import FaultHandlers
 
 FILES = f'*{SUFFIX}'

@@ -19,14 +19,13 @@ from sensor_msgs.msg import CompressedImage, Image
 
 from ..exposures.angles import AngleOptions
 from ..exposures.frame import Frame
-from ..exposures.numbering import ExposureNumbers
+from ..exposures.stamps import ExposureNumbers
 from ..jobs.live_extraction import Observations
 from ..jobs.live_markers import MarkerSettings
 from .angle_input import AngleInput
 from .extraction_settings import PARAMETERS, declare_settings, read_followers
-from .extraction_workers import ExtractionWorkers, Task
 from .image_node import INPUTS
-from .image_stream import CONDITIONS, ImageState, ImageStream
+from .image_stream import CONDITIONS, ExtractionWorkers, ImageState, ImageStream, Task
 from .messages.image import message_from_image, use_single_thread
 from .messages.observations import NS_PER_S, message_from_frame
 from .runtime.diagnostics import RefusalLog, Status, health_of

@@ -24,17 +24,15 @@ from ..options import option
 from ..reconstruction.intersection import OUTSIDE
 from ..reconstruction.mismatch import RecentMisses
 from ..reconstruction.reconstruct import CorrectedView, intersect_exposure, watch_exposure
-from .bodies_output import BodiesOutput
 from .body_following import BodyFollower, BodyParameters, read_body_files
-from .body_health import statuses_of
 from .drift_monitor import DriftMonitor, DriftParameters
 from .frame_validation import CORRECTED_REFUSALS, validate_corrected, with_limit
 from .messages.fluoroscope_calibration import image_size_of
 from .messages.observations import NS_PER_S, CorrectedFrame, decode_corrected_observations
 from .messages.points import PointsContent
 from .messages.rig_orientation import transforms_of_orientation
-from .points_output import PointsCounter, PointsOutput
-from .reconstruction_health import CONDITIONS, ReconstructionState
+from .points_output import BodiesOutput, PointsCounter, PointsOutput
+from .reconstruction_health import CONDITIONS, ReconstructionState, statuses_of
 from .rig_input import Rig, RigInput
 from .runtime.diagnostics import LatencyWindow, RefusalLog, Refused, Status, health_of
 from .runtime.lifecycle import StreamNode

@@ -35,8 +35,7 @@ from .messages.self_calibration import (
     fill_verdict,
     options_of_request,
 )
-from .runtime.lifecycle import StreamNode
-from .runtime.services import Requests, ServiceEntry, in_thread
+from .runtime.lifecycle import Requests, ServiceEntry, StreamNode, in_thread
 
 
 class Cancelled(Exception):

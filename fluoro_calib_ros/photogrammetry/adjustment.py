@@ -18,7 +18,6 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from .datum import transform_to_datum
 from .elimination import (
     BorderedFactor,
     BorderedSystem,
@@ -26,7 +25,7 @@ from .elimination import (
     FactorizedNormalMatrix,
     choose_elimination,
 )
-from .network import Network
+from .network import Network, transform_to_datum
 from .noise import DEFAULT_NOISE, Noise, widening_by_group
 from .normal_equations import normal_equations, project_network, right_sides
 from .relative_orientation import discrepancies

@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import blas, cho_factor, cho_solve, lapack
 
-from .datum import Gauge, stabilising_factor
-from .network import Network
+from .network import Gauge, Network, stabilising_factor
 from .normal_equations import NormalEquations
 from .rotations import mirror_lower
 from .unknowns import EXTERIOR_SIZE, POINT_SIZE, ReducedLayout, UnknownVector

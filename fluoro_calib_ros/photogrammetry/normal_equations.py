@@ -16,12 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .datum import Gauge, open_gauge
-from .network import Network
+from .network import Gauge, Network, open_gauge
 from .noise import Noise
 from .relative_orientation import discrepancies_with_jacobian
-from .relative_pose import POSE_SIZE
-from .unknowns import EXTERIOR_SIZE, Parameters, UnknownVector
+from .unknowns import EXTERIOR_SIZE, POSE_SIZE, Parameters, UnknownVector
 
 # Image points that are linearised at once: their arrays stay in the cache.
 CHUNK = 8_000

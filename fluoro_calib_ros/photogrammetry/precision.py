@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from .additional_parameters import AdditionalParameters
 from .adjustment import Adjustment
 from .collinearity import project_with_jacobian
-from .datum import Gauge, STransformation
 from .elimination import CovarianceBlocks, Elimination, FactorizedNormalMatrix, factorize
-from .network import Network
+from .network import Gauge, Network, STransformation
 from .noise import Noise
 from .normal_equations import NormalEquations, normal_equations, right_sides
 from .relative_orientation import discrepancies_with_jacobian

@@ -19,9 +19,15 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .relative_pose import POSE_SIZE, RelativeConstraint, RelativePose
 from .rotations import cross_matrix, matrix_from_vector, vector_from_matrix
-from .unknowns import Parameters, UnknownLayout, UnknownVector
+from .unknowns import (
+    POSE_SIZE,
+    Parameters,
+    RelativeConstraint,
+    RelativePose,
+    UnknownLayout,
+    UnknownVector,
+)
 
 # Iterations of the mean pose, and the step [mm, rad] at which they end.
 MEAN_ITERATIONS = 10

@@ -18,7 +18,7 @@ from itertools import pairwise
 import numpy as np
 
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
-from ..correction.models import no_correction
+from ..correction.registry import no_correction
 from ..exposures.frame import Frame
 from ..findings import Finding, Kind
 from .intersection import (

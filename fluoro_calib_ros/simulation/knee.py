@@ -20,9 +20,8 @@ from ..bodies.body import Body
 from ..bodies.joints import Joint
 from ..exposures.frame import Frame
 from ..photogrammetry.rotations import matrix_from_vector
-from .rig import VirtualRig
-from .streams import StreamStart
-from .tracking import image_frames
+from .exposures import image_frames
+from .rig import StreamStart, VirtualRig
 
 CT_SD_MM = 0.1
 SIDE = 'right'

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The virtual rig: phantom, fluoroscopes and where they stand.
+"""The virtual rig: phantom, fluoroscopes and where they stand, and its streams of frames.
 
 Two fluoroscopes look across each other at the middle of the rig frame (z up, mm). Their sources
 are about 1.5 m from it and about 2 m apart. The phantom is a cube of 260 mm with 503 beads on its
@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..exposures.frame import Frame
 from ..exposures.phantom import Phantom
 from ..photogrammetry.collinearity import project
 from ..photogrammetry.rotations import matrix_from_vector
@@ -212,3 +213,40 @@ def random_field(
     s_shape = strength * sign[:2] * rng.uniform(1.2, 2.4, 2)
     spiral = strength * sign[2] * rng.uniform(1.2, 2.4)
     return DistortionField(centre, pincushion, s_shape, spiral, ripples)
+
+
+# Of an observed pixel, as target extraction writes it. It also hides differences between CPUs in
+# the last bit.
+DECIMALS = 4
+START_NS = 1_767_225_600_000_000_000  # stamp of the first frame
+
+
+@dataclass(frozen=True)
+class StreamStart:
+    """Stamp [ns] and number of the first frame of a stream."""
+
+    stamp_ns: int = START_NS
+    number: int = 1
+
+    def frame(
+        self,
+        fluoroscope: VirtualFluoroscope,
+        index: int,
+        time_s: float,
+        target_id: np.ndarray,
+        observed: np.ndarray,
+    ) -> Frame:
+        """Frame number `index`, counted from 0, at a time after the first one [s].
+
+        target_id (n,) and observed (n, 2) [px] are its image points.
+        """
+        return Frame(
+            fluoroscope=fluoroscope.name,
+            number=self.number + index,
+            target_id=target_id,
+            uv=observed,
+            image_size=fluoroscope.image_size,
+            sigma=None,
+            stamp_ns=self.stamp_ns + round(time_s * 1e9),
+            frame_id=f'{fluoroscope.name}_optical',
+        )

@@ -27,8 +27,7 @@ from fluoro_calib_ros.photogrammetry.rotations import (
     rotation_angle,
 )
 from fluoro_calib_ros.simulation.exposures import Detection, detect_beads, simulate_exposures
-from fluoro_calib_ros.simulation.rig import virtual_rig
-from fluoro_calib_ros.simulation.streams import StreamStart
+from fluoro_calib_ros.simulation.rig import StreamStart, virtual_rig
 
 OK, OUTSIDE, INVALID = CorrectionStatus
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from rigs import calibrated, exposures, rig, run
 
-from fluoro_calib_ros.correction.models import no_correction
+from fluoro_calib_ros.correction.registry import no_correction
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.result import Targets
 from fluoro_calib_ros.estimation.rig_orientation import (
@@ -47,9 +47,9 @@ from fluoro_calib_ros.simulation.exposures import (
     detect_beads,
     phantom_poses,
     simulate_exposures,
+    simulate_tracking,
 )
 from fluoro_calib_ros.simulation.rig import VirtualRig, virtual_rig
-from fluoro_calib_ros.simulation.tracking import simulate_tracking
 
 pytestmark = pytest.mark.long
 

@@ -19,9 +19,14 @@ from sklearn.preprocessing import PolynomialFeatures
 from sklearn.tree import DecisionTreeRegressor
 from sklearn.utils.estimator_checks import check_estimator
 
-from fluoro_calib_ros.correction.models import LookupModel, grid_nodes, hull_corners
 from fluoro_calib_ros.correction.neighbours import KnnModel, LocalLinearModel
-from fluoro_calib_ros.correction.registry import MODELS, model_from_values
+from fluoro_calib_ros.correction.registry import (
+    MODELS,
+    LookupModel,
+    grid_nodes,
+    hull_corners,
+    model_from_values,
+)
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.calibrate import calibrate
 from fluoro_calib_ros.estimation.gauge import gauge_coefficients

@@ -20,7 +20,7 @@ from rigs import run
 
 from fluoro_calib_ros.bodies.body import Body, declared_bodies
 from fluoro_calib_ros.correction.fluoroscope_calibration import FluoroscopeCalibration
-from fluoro_calib_ros.correction.models import no_correction
+from fluoro_calib_ros.correction.registry import no_correction
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.findings import Finding, Kind

@@ -11,7 +11,7 @@ import pytest
 from fluoro_calib_ros.bodies.anatomical_frames import BODY_FRAME
 from fluoro_calib_ros.bodies.joints import Joint, JointMotion, JointStatus
 from fluoro_calib_ros.errors import DataError
-from fluoro_calib_ros.io.joints import joint_table, read_joints
+from fluoro_calib_ros.io.bodies import joint_table, read_joints
 from fluoro_calib_ros.limits import MAX_JOINTS
 
 BODIES = ('femur', 'tibia', 'talus')

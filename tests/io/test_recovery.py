@@ -24,9 +24,8 @@ from fluoro_calib_ros.io.bags.reader import iterate_messages, read_frames
 from fluoro_calib_ros.io.bags.salvage import recover_bag
 from fluoro_calib_ros.io.bags.writer import BagWriter
 from fluoro_calib_ros.jobs.simulation import write_bag
-from fluoro_calib_ros.simulation.rig import virtual_rig
-from fluoro_calib_ros.simulation.streams import StreamStart
-from fluoro_calib_ros.simulation.tracking import simulate_tracking
+from fluoro_calib_ros.simulation.exposures import simulate_tracking
+from fluoro_calib_ros.simulation.rig import StreamStart, virtual_rig
 
 START = 10**18
 

@@ -29,16 +29,16 @@ from fluoro_calib_ros.photogrammetry.relative_orientation import (
     mean_pose,
     relative_poses,
 )
-from fluoro_calib_ros.photogrammetry.relative_pose import (
-    RIGID_SD_MM,
-    RIGID_SD_RAD,
-    RelativeConstraint,
-    RelativePose,
-)
 from fluoro_calib_ros.photogrammetry.rotations import (
     matrix_from_vector,
     rotation_angle,
     vector_from_matrix,
+)
+from fluoro_calib_ros.photogrammetry.unknowns import (
+    RIGID_SD_MM,
+    RIGID_SD_RAD,
+    RelativeConstraint,
+    RelativePose,
 )
 
 POSE = RelativePose(matrix_from_vector([0.03, -1.19, -0.02]), np.array([-1300.0, 30.0, 980.0]))

@@ -16,7 +16,7 @@ from rclpy.qos import qos_profile_sensor_data
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from fluoro_calib_ros.correction.models import no_correction
+from fluoro_calib_ros.correction.registry import no_correction
 from fluoro_calib_ros.images.codec import decode, encode
 from fluoro_calib_ros.images.corrector import ImageCorrector
 from fluoro_calib_ros.io.calibration import load_calibrations

@@ -19,17 +19,15 @@ from . import (
     c3d,
     known_orientation,
     native,
-    opensim,
-    xmalab_lookup,
     xmalab_points,
     xmalab_project,
 )
-from .bodies import AUTOSCOPER, POSES, RIGIDBODY
+from .bodies import AUTOSCOPER, OPENSIM, POSES, RIGIDBODY
 from .content import PARTS, Content, FileSettings, Format, Sample, Written, has_content
 from .opencv_cameras import ANIPOSE, CAMERA_INFO, OPENCV
 from .phantoms import COORDINATES, FRAMESPEC
 from .points import TRC, XMALAB3D
-from .xmalab_cameras import DLT, MAYACAM1, MAYACAM2
+from .xmalab_cameras import DLT, LOOKUP, MAYACAM1, MAYACAM2
 
 HEAD = 65536  # bytes by which a format is recognised
 LINES = 20
@@ -51,7 +49,7 @@ FORMATS: dict[str, Format] = {
         MAYACAM1,
         DLT,
         AUTOSCOPER,
-        xmalab_lookup.FORMAT,
+        LOOKUP,
         ANIPOSE,
         OPENCV,
         CAMERA_INFO,
@@ -59,7 +57,7 @@ FORMATS: dict[str, Format] = {
         bundle.FORMAT,
         c3d.FORMAT,
         TRC,
-        opensim.FORMAT,
+        OPENSIM,
     )
 }
 

@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Pictures of the motion of joints and bodies over time, with bands of two standard deviations."""
+"""The report of bodies and joints: one HTML file with pictures of their motion over time."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -15,6 +16,7 @@ from matplotlib.figure import Figure
 from ..bodies.body import BodyPoses, PoseStatus
 from ..bodies.joints import JointMotion
 from ..photogrammetry.rotations import vector_from_matrix
+from .html import page, png_text
 from .style import BLUE, GREY, RED, STYLE, new_figure
 
 BAND = 2.0  # standard deviations, 95 %
@@ -115,3 +117,27 @@ def paths_figure(poses: Sequence[BodyPoses]) -> Figure:
         axes.legend(loc='upper left')
         figure.supxlabel('axes of the bodies: x red, y grey, z blue', fontsize=9)
     return figure
+
+
+def bodies_html(
+    title: str,
+    poses: Sequence[BodyPoses],
+    joints: Sequence[JointMotion],
+    summary: Mapping[str, Any],
+    findings: Sequence[str],
+) -> str:
+    """Return the report as HTML: pictures inside, no reference to anything outside.
+
+    summary: as BodiesOutcome gives it.
+    """
+    figures = [(f'joint {one.joint.name}', joint_figure(one)) for one in joints]
+    figures.append(('paths in space', paths_figure(poses)))
+    figures += [(f'body {one.body}', body_figure(one)) for one in poses]
+    return page(
+        'bodies.html',
+        title=title,
+        exposures=len(poses[0].number),
+        findings=findings,
+        summary=summary,
+        pictures=[(name, png_text(figure)) for name, figure in figures],
+    )

@@ -28,7 +28,6 @@ Without a frame, the axes are those of the body. docs/joints.md describes both f
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NoReturn
@@ -48,8 +47,9 @@ from ..bodies.joint_conventions import Convention, convention
 from ..bodies.joints import STATUS_NAMES, Joint, JointMotion, check_joints
 from ..errors import DataError, ErrorsAt
 from ..limits import MAX_JOINTS, read_limits
-from .access import PathLike, read_text
+from .access import PathLike
 from .csv_table import Block, Table, read_blocks
+from .documents import read_toml
 
 BODY_COLUMNS = ('body', 'marker', 'x', 'y', 'z', 'sd')
 
@@ -131,11 +131,6 @@ def _marker_rows(body: Body) -> Iterator[list[object]]:
         yield [body.name, marker, *values]
 
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
-
 KEYS = (
     *('name', 'proximal', 'distal', 'convention', 'side', 'neutral'),
     *('proximal_frame', 'distal_frame'),
@@ -175,10 +170,7 @@ def read_joints(path: PathLike, bodies: Iterable[str]) -> tuple[JointEntry, ...]
 
     Raises DataError that names file and joint.
     """
-    try:
-        document = tomllib.loads(read_text(path))
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise DataError(f'{path}: this is no TOML ({error})') from None
+    document = read_toml(path)
     found = document.pop('joint', None)
     for key in document:
         raise DataError(f'{path}, key {key}: unknown, there are tables [[joint]]')

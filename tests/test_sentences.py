@@ -37,23 +37,23 @@ from fluoro_calib_ros.estimation.initial_network import measured_network
 from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
 from fluoro_calib_ros.estimation.rounds import exposures_that_do_not_fit, undetermined_unknowns
 from fluoro_calib_ros.estimation.start_orientation import UNTILTED
+from fluoro_calib_ros.exposures.collector import without_repeats
+from fluoro_calib_ros.exposures.frame import without_strays
 from fluoro_calib_ros.exposures.phantom import Phantom
-from fluoro_calib_ros.exposures.repeats import without_repeats
-from fluoro_calib_ros.exposures.strays import without_strays
 from fluoro_calib_ros.findings import Finding, Kind, Place
 from fluoro_calib_ros.images import detection, extraction, lattice, matching
 from fluoro_calib_ros.images.codec import as_grey
 from fluoro_calib_ros.images.growth import Seen
 from fluoro_calib_ros.images.marker_watch import doubt_in
+from fluoro_calib_ros.io.calibration import edited, exchanged
 from fluoro_calib_ros.io.formats import registry
 from fluoro_calib_ros.io.formats.content import FileSettings
-from fluoro_calib_ros.io.result_check import edited, exchanged
 from fluoro_calib_ros.jobs import healing, result_folder
 from fluoro_calib_ros.jobs import orientation as orienting
 from fluoro_calib_ros.jobs import reconstruction as reconstructing
 from fluoro_calib_ros.jobs import report as comparing
 from fluoro_calib_ros.jobs.calibration import _without_copies, _without_shared
-from fluoro_calib_ros.jobs.live_markers import MarkerFollower, _wrong_start
+from fluoro_calib_ros.jobs.followers import MarkerFollower, _wrong_start
 from fluoro_calib_ros.jobs.sources import read_content
 from fluoro_calib_ros.photogrammetry.known_orientation import KnownOrientation
 from fluoro_calib_ros.reconstruction import mismatch

@@ -57,8 +57,8 @@ def run(arguments: argparse.Namespace) -> bool:
 
     Raises DataError.
     """
+    from ..io.calibration import disagreements
     from ..io.csv_table import read_names
-    from ..io.result_check import disagreements
     from ..jobs.calibration import adjust
     from ..jobs.result_folder import check_result_folder, save_result, written_document
     from ..jobs.sources import read_calibrations, read_source, read_survey, select_calibrations

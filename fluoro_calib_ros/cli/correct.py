@@ -90,9 +90,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Correct image points or images. Raises DataError."""
+    from ..io.calibration import disagreements
     from ..io.folder import check_output_file
     from ..io.image_reading import READ_SUFFIXES, is_image_source, listed, suffix_of
-    from ..io.result_check import disagreements
     from ..jobs.sources import read_calibrations
 
     if arguments.source.is_file() or not arguments.out.is_dir():  # images can fill a folder

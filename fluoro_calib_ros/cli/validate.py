@@ -70,7 +70,7 @@ def run(arguments: argparse.Namespace) -> bool:
     """
     from ..checks.rig import RigFindings
     from ..checks.verdict import validate
-    from ..io.result_check import edited, exchanged, read_result, used_exposures
+    from ..io.calibration import edited, exchanged, read_result, used_exposures
     from ..io.result_document import write_validation
     from ..jobs.result_folder import saved_orientation
     from ..jobs.sources import read_calibrations
@@ -110,10 +110,10 @@ def _request(
 ) -> CalibrationRequest:
     """Read what the calibrations were made from, in the folder or where it is given."""
     from ..estimation.options import CalibrationRequest
+    from ..io.calibration import PHANTOM
     from ..io.calibration_request import read_request
     from ..io.csv_table import read_names
     from ..io.phantom import read_phantom
-    from ..io.result_check import PHANTOM
     from ..jobs.calibration import without_unusable
     from ..jobs.sources import BagSelection, read_source, read_survey
 

@@ -21,9 +21,8 @@ from ..errors import DataError
 from ..photogrammetry.rig_orientation import RigOrientation
 from .marker_decisions import BodyDecisions, DecidedView, Decision, RayDecisions, ViewCounts
 from .marker_ids import MAX_SHADOWS, CalibratedRig, find_bodies, identifiable
-from .marker_intensity import check_image
+from .marker_intensity import FIRST_SD_PX, check_image
 from .marker_rays import MarkerBodies, PairExposure, PairRays
-from .marker_start import FIRST_SD_PX
 from .markers import FirstMarkers, MarkerFrame, MarkerOptions, MarkerTracker
 
 

@@ -21,9 +21,16 @@ from ..errors import DataError
 from ..findings import Finding, Kind
 from ..options import option, validate_options
 from .marker_fit import MarkerMeasurement
-from .marker_intensity import LightWindows, MarkerLook, Shadows, check_image
+from .marker_intensity import (
+    NOWHERE_PX,
+    LightWindows,
+    MarkerLook,
+    MarkerSearch,
+    Shadows,
+    check_image,
+    learn_start,
+)
 from .marker_motion import MarkerStates, MeasuredMarkers
-from .marker_start import NOWHERE_PX, MarkerSearch, learn_start
 from .marker_watch import MarkerDoubts, MarkerWatch, follow_beside, shift_together
 from .shadow_fit import Profile
 

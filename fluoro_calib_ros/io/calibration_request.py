@@ -18,12 +18,12 @@ from ..estimation.options import CalibrationOptions, CalibrationRequest
 from ..exposures.frame import Frame, validate_frame
 from ..exposures.phantom import Phantom
 from .access import PathLike
+from .calibration import KNOWN_ORIENTATION, OBSERVATIONS, OPTIONS, PHANTOM
 from .csv_table import read_names, write_names
 from .documents import read_json, write_json
-from .formats.known_orientation import read_known_orientations, write_known_orientations
+from .formats.native import read_known_orientations, write_known_orientations
 from .observations import read_observations_csv, write_observations_csv
 from .phantom import read_phantom, write_phantom
-from .result_check import KNOWN_ORIENTATION, OBSERVATIONS, OPTIONS, PHANTOM
 from .result_document import delete_validation
 
 VERSION = 1  # of options.json

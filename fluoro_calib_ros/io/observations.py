@@ -21,10 +21,9 @@ from numpy.typing import NDArray
 from ..correction.base import CorrectionStatus
 from ..correction.fluoroscope_calibration import CorrectedPoints, FluoroscopeCalibration
 from ..errors import DataError
-from ..exposures.frame import MAX_ANGLE, Frame, angle_in_degrees, angles_of, points_on_image
+from ..exposures.frame import MAX_ANGLE, Frame, angle_in_degrees, angles_of, few, points_on_image
 from ..exposures.names import Names, safe_names, without_trivial
 from ..exposures.phantom import first_repeated, is_positive
-from ..exposures.strays import few
 from ..limits import MAX_FRAMES
 from .access import PathLike, check_safe_name
 from .csv_table import Block, NamedColumn, Table, read_all, read_blocks, write_table

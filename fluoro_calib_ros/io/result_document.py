@@ -25,9 +25,9 @@ from ..photogrammetry.rotations import quaternion_from_matrix
 from ..records import Field
 from .access import PathLike, os_error_reason
 from .arrays import Layout, read_arrays, to_arrays, write_arrays
+from .calibration import VALIDATION_NAME, with_digests
 from .csv_table import Table
 from .documents import write_json
-from .result_check import VALIDATION_NAME, with_digests
 
 # 1 had neither version, date, units nor adjustments; 2 no ids, no note on the rig and no digest.
 FORMAT_VERSION = 3

@@ -41,10 +41,9 @@ from ..estimation.initial_network import MIN_EXPOSURES
 from ..estimation.options import CalibrationRequest
 from ..estimation.result import CalibrationResult
 from ..estimation.rounds import Round
-from ..exposures.frame import Frame
+from ..exposures.collector import without_repeats
+from ..exposures.frame import Frame, frames_without_strays
 from ..exposures.phantom import Phantom
-from ..exposures.repeats import without_repeats
-from ..exposures.strays import frames_without_strays
 from ..findings import Finding, Kind, Place, Severity
 from ..io.csv_table import dataframe_of
 from ..io.result_document import result_tables

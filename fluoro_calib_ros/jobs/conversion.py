@@ -21,7 +21,15 @@ from ..exposures.frame import Frame
 from ..images.corrector import ImageCorrector
 from ..io.access import PathLike
 from ..io.bags.reader import read_frames, with_angles
-from ..io.calibration import SUFFIX, load_calibrations, load_orientation, orientation_path
+from ..io.calibration import (
+    OBSERVATIONS,
+    SUFFIX,
+    load_calibrations,
+    load_orientation,
+    orientation_path,
+)
+from ..io.calibration import PHANTOM as PHANTOM_FILE
+from ..io.calibration import RESULT_NAME as RESULT
 from ..io.csv_table import read_names
 from ..io.documents import read_json
 from ..io.formats import registry
@@ -37,9 +45,6 @@ from ..io.formats.content import (
 )
 from ..io.observations import read_observations_csv
 from ..io.phantom import read_phantom
-from ..io.result_check import OBSERVATIONS
-from ..io.result_check import PHANTOM as PHANTOM_FILE
-from ..io.result_check import RESULT_NAME as RESULT
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import matrix_from_quaternion
 from .result_folder import belongs_to

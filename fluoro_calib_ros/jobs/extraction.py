@@ -21,6 +21,7 @@ from ..images.lattice import NOT_MARKED, FlatGrid
 from ..images.view import Lens, assumed_lens, may_be_found, shared_lens
 from ..io.access import check_safe_name, make_folder, write_bytes
 from ..io.bags.reader import image_topics
+from .followers import Observations, PhantomSettings
 from .image_sources import (
     ImageAngles,
     ImageSources,
@@ -29,7 +30,6 @@ from .image_sources import (
     is_image_bag,
     open_sources,
 )
-from .live_extraction import Observations, PhantomSettings
 from .scheduling import Cluster, Workers, open_workers
 from .sources import Recording, Survey
 

@@ -33,6 +33,7 @@ from ..images.overlay import draw_markers
 from ..io.access import make_folder, write_bytes
 from ..photogrammetry.rig_orientation import RigOrientation
 from .extraction import Progress
+from .followers import MarkerFollower, MarkerSettings
 from .image_sources import (
     ImageAngles,
     ImageSources,
@@ -41,7 +42,6 @@ from .image_sources import (
     is_image_bag,
     open_sources,
 )
-from .live_markers import MarkerFollower, MarkerSettings
 
 MAX_TRIES = 30  # exposures in which markers are identified by their shapes
 AHEAD = 3  # images that are read before they are wanted

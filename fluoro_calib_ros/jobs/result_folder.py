@@ -15,28 +15,26 @@ from ..estimation.result import CalibrationResult
 from ..findings import Finding, Kind, Severity
 from ..io import csv_table as names
 from ..io.access import PathLike
-from ..io.calibration import ORIENTATION_NAME as ORIENTATION
 from ..io.calibration import (
-    SUFFIX,
-    load_calibrations,
-    load_orientation,
-    orientation_path,
-    save_calibration,
-    save_orientation,
-)
-from ..io.calibration_request import write_request
-from ..io.documents import write_json
-from ..io.folder import FolderKind, check_output_folder, replaced_folder
-from ..io.result_check import (
     KNOWN_ORIENTATION,
     OBSERVATIONS,
     OPTIONS,
     PHANTOM,
+    SUFFIX,
     VALIDATION_NAME,
+    load_calibrations,
+    load_orientation,
+    orientation_path,
     read_result,
+    save_calibration,
+    save_orientation,
     with_digest,
 )
-from ..io.result_check import RESULT_NAME as RESULT
+from ..io.calibration import ORIENTATION_NAME as ORIENTATION
+from ..io.calibration import RESULT_NAME as RESULT
+from ..io.calibration_request import write_request
+from ..io.documents import write_json
+from ..io.folder import FolderKind, check_output_folder, replaced_folder
 from ..io.result_document import NAMES as TABLES
 from ..io.result_document import SUFFIX as COVARIANCE
 from ..io.result_document import result_document, result_tables, write_covariance, write_validation

@@ -23,11 +23,11 @@ from ..exposures.phantom import Phantom, require_size
 from ..findings import Kind, sentences
 from ..io.access import PathLike, check_regular_file
 from ..io.bags.reader import joint_topics, read_frames, with_angles
-from ..io.calibration import load_calibrations
+from ..io.calibration import disagreements, load_calibrations
 from ..io.csv_table import read_names
 from ..io.formats import registry
 from ..io.formats.content import PARTS, Content, FileSettings
-from ..io.formats.known_orientation import holds_known_orientations, read_known_orientations
+from ..io.formats.native import holds_known_orientations, read_known_orientations
 from ..io.observations import (
     CORRECTED_BY,
     PointsFile,
@@ -35,7 +35,6 @@ from ..io.observations import (
     points_of_frames,
     read_points,
 )
-from ..io.result_check import disagreements
 from ..photogrammetry.known_orientation import KnownOrientation
 
 if TYPE_CHECKING:

@@ -25,11 +25,11 @@ from rclpy.lifecycle.node import LifecycleState
 
 from ..exposures.frame import Frame
 from .angle_input import AngleInput
-from .calibration_files import CalibrationFiles
 from .calibration_output import CONDITIONS, CalibrationOutput, FluoroscopeState
 from .calibration_services import CollectServices, OrientationService
 from .calibration_settings import (
     PARAMETERS,
+    CalibrationFiles,
     CalibrationSettings,
     declare_settings,
     follow_settings,

@@ -13,8 +13,7 @@ from ..correction.angle_field import AngleField
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError, printable
 from ..exposures.angles import AngleOptions
-from ..io.calibration import SUFFIX, load_calibrations
-from ..io.result_check import disagreements
+from ..io.calibration import SUFFIX, disagreements, load_calibrations
 from .angle_input import AngleInput, beyond_text
 from .calibration_input import CalibrationInput
 from .runtime.diagnostics import OK, Health, RefusalLog, Status, fault, health_of, warning

@@ -15,7 +15,7 @@ from typing import Generic, TypeVar
 import numpy as np
 from sensor_msgs.msg import CompressedImage, Image
 
-from ..jobs.live_extraction import MakeFollower, Observations, follower_process
+from ..jobs.followers import MakeFollower, Observations, follower_process
 from ..processes import WorkerProcess
 from .angle_input import AngleInput
 from .messages.image import IMAGE_REFUSALS, ImageConverter

@@ -12,8 +12,7 @@ from ..bodies.body import STATUS_NAMES, Body, PoseStatus
 from ..bodies.joint_tracking import JointTracker
 from ..exposures.pairing import Pairer
 from ..reconstruction.mismatch import RecentMisses
-from .body_following import BodiesState, BodyFollower
-from .rig_input import RigInput
+from .rig_input import BodiesState, BodyFollower, RigInput
 from .runtime.diagnostics import OK, WARN, Health, RecentCounts, Status, fault, health_of, warning
 from .runtime.stream import (
     InputState,

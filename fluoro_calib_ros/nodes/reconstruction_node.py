@@ -24,7 +24,6 @@ from ..options import option
 from ..reconstruction.intersection import OUTSIDE
 from ..reconstruction.mismatch import RecentMisses
 from ..reconstruction.reconstruct import CorrectedView, intersect_exposure, watch_exposure
-from .body_following import BodyFollower, BodyParameters, read_body_files
 from .drift_monitor import DriftMonitor, DriftParameters
 from .frame_validation import CORRECTED_REFUSALS, validate_corrected, with_limit
 from .messages.fluoroscope_calibration import image_size_of
@@ -33,7 +32,7 @@ from .messages.points import PointsContent
 from .messages.rig_orientation import transforms_of_orientation
 from .points_output import BodiesOutput, PointsCounter, PointsOutput
 from .reconstruction_health import CONDITIONS, ReconstructionState, statuses_of
-from .rig_input import Rig, RigInput
+from .rig_input import BodyFollower, BodyParameters, Rig, RigInput, read_body_files
 from .runtime.diagnostics import LatencyWindow, RefusalLog, Refused, Status, health_of
 from .runtime.lifecycle import StreamNode
 from .runtime.main import run

@@ -23,9 +23,8 @@ from ..estimation.rounds import Round
 from ..findings import Severity
 from ..jobs.calibration import CalibrationOutcome, Rig, run_in_worker_process
 from ..jobs.result_folder import check_result_folder
-from .calibration_files import CalibrationFiles
 from .calibration_output import CalibrationOutput
-from .calibration_settings import RigSetup
+from .calibration_settings import CalibrationFiles, RigSetup
 from .exposure_input import ExposureInput
 from .messages.self_calibration import (
     Request,

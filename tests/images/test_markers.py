@@ -37,7 +37,7 @@ from fluoro_calib_ros.io.bags.writer import BagWriter
 from fluoro_calib_ros.io.bodies import write_bodies
 from fluoro_calib_ros.io.calibration import save_calibration, save_orientation
 from fluoro_calib_ros.io.phantom import write_phantom
-from fluoro_calib_ros.jobs.live_markers import MarkerSettings
+from fluoro_calib_ros.jobs.followers import MarkerSettings
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.simulation.marker_images import (

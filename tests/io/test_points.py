@@ -33,7 +33,7 @@ from fluoro_calib_ros.io.formats.content import (
     Station,
     points_without_precision,
 )
-from fluoro_calib_ros.io.formats.frames_of_points import bodies_of_poses
+from fluoro_calib_ros.io.formats.tables import bodies_of_poses
 from fluoro_calib_ros.jobs.sources import read_source
 
 SIZE = (1024, 768)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from fluoro_calib_ros.exposures.stamps import ExposureNumbers
-from fluoro_calib_ros.jobs.live_extraction import Observations, follower_process
+from fluoro_calib_ros.jobs.followers import Observations, follower_process
 from fluoro_calib_ros.nodes.image_stream import ExposureQueue
 
 MS = 1_000_000

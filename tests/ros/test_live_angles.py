@@ -33,7 +33,7 @@ from fluoro_calib_ros.io.bags.definitions import (
 from fluoro_calib_ros.io.bags.writer import BagWriter
 from fluoro_calib_ros.io.calibration import load_calibrations, save_calibration
 from fluoro_calib_ros.io.phantom import read_phantom
-from fluoro_calib_ros.jobs.live_markers import MarkerSettings
+from fluoro_calib_ros.jobs.followers import MarkerSettings
 from fluoro_calib_ros.jobs.sources import BagSelection, read_calibrated_source
 from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import message_from_calibration
 from fluoro_calib_ros.nodes.messages.observations import stamp_from_nanoseconds

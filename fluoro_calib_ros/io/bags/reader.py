@@ -15,8 +15,7 @@ from mcap.records import Schema
 
 from ...errors import DataError, ErrorsAt
 from ...exposures.angles import AngleOptions, JointAngles
-from ...exposures.frame import Frame, validate_frame
-from ...exposures.strays import without_strays
+from ...exposures.frame import Frame, validate_frame, without_strays
 from ...limits import MAX_OBSERVATIONS
 from ..access import PathLike, check_safe_name
 from .definitions import (

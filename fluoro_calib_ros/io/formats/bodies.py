@@ -42,8 +42,18 @@ from .content import (
     homogeneous,
     in_units,
 )
-from .frames_of_points import NS, bodies_of, frames_of, rate_of
-from .text import Row, frame_numbers, joined, read_frames, require_width, write_frames
+from .tables import (
+    NS,
+    Row,
+    bodies_of,
+    frame_numbers,
+    frames_of,
+    joined,
+    rate_of,
+    read_frames,
+    require_width,
+    write_frames,
+)
 
 COLUMNS = (
     *('R11', 'R12', 'R13', '01', 'R21', 'R22', 'R23', '02', 'R31', 'R32', 'R33', '03'),

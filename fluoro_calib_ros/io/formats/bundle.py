@@ -39,7 +39,7 @@ from .content import (
     in_units,
     refuse_distortion,
 )
-from .text import Row, joined, read_table, require_width
+from .tables import Row, joined, read_table, require_width
 from .xmalab_points import camera_order
 
 NAME = 'bundle'  # of the files written

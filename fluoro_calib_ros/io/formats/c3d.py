@@ -27,7 +27,7 @@ from ...processes import run_module
 from ..access import read_bytes, write_bytes
 from . import c3d_process
 from .content import UNITS_MM, Bodies, Content, FileSettings, Format, Points, Written, homogeneous
-from .frames_of_points import bodies_of, frames_of, labels, named_targets, points_of
+from .tables import bodies_of, frames_of, labels, named_targets, points_of
 
 MISSING = -1.0
 STEPS = 255  # of the byte of a residual, in units of POINT:SCALE

@@ -32,8 +32,19 @@ from .content import (
     in_units,
     points_without_precision,
 )
-from .frames_of_points import frames_of, labels, named_targets, points_of
-from .text import Row, frame_numbers, joined, number_text, read_frames, require_width, write_frames
+from .tables import (
+    Row,
+    frame_numbers,
+    frames_of,
+    joined,
+    labels,
+    named_targets,
+    number_text,
+    points_of,
+    read_frames,
+    require_width,
+    write_frames,
+)
 
 _COLUMN = re.compile(r'(?P<target>.+)_(?P<axis>[XYZ])', re.IGNORECASE)
 

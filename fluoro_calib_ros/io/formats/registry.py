@@ -14,14 +14,7 @@ from pathlib import Path
 
 from ...errors import DataError
 from ..access import PathLike, check_regular_file, os_error_reason
-from . import (
-    bundle,
-    c3d,
-    known_orientation,
-    native,
-    xmalab_points,
-    xmalab_project,
-)
+from . import bundle, c3d, native, xmalab_points, xmalab_project
 from .bodies import AUTOSCOPER, OPENSIM, POSES, RIGIDBODY
 from .content import PARTS, Content, FileSettings, Format, Sample, Written, has_content
 from .opencv_cameras import ANIPOSE, CAMERA_INFO, OPENCV
@@ -38,7 +31,7 @@ FORMATS: dict[str, Format] = {
     format_.kind: format_
     for format_ in (
         *native.FORMATS,
-        known_orientation.FORMAT,
+        native.KNOWN_ORIENTATION,
         xmalab_points.FORMAT,
         xmalab_project.FORMAT,
         FRAMESPEC,

@@ -46,7 +46,7 @@ from .content import (
     refuse_distortion,
     write_cameras,
 )
-from .text import Row, joined, number_text, read_table, require_width, separator_of
+from .tables import Row, joined, number_text, read_table, require_width, separator_of
 
 _MAYACAM2 = '_MayaCam2.txt'
 _TITLES = {1: 'image size', 4: 'camera matrix', 9: 'rotation', 14: 'translation'}

@@ -17,11 +17,16 @@ from visualization_msgs.msg import Marker, MarkerArray
 from ...photogrammetry.rig_orientation import RigOrientation
 from ...photogrammetry.rotations import quaternion_from_matrix
 from ...reconstruction.intersection import IntersectedPoints
-from .cdr import ENCAPSULATION, TIME, UINT32, columns_bytes, string_bytes, string_sequence_bytes
 from .observations import (
+    ENCAPSULATION,
     NS_PER_S,
+    TIME,
+    UINT32,
+    columns_bytes,
     float64_field,
     stamp_from_nanoseconds,
+    string_bytes,
+    string_sequence_bytes,
     uint8_field,
     uint32_field,
 )

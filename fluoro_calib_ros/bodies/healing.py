@@ -120,11 +120,7 @@ class _Tried:
 class Diagnostician:
     """Decides what has changed.
 
-    Parameters
-    ----------
-    adjustment : RigAdjustment
-    shape_scale : float
-        Standard deviation of the scale of the shapes.
+    shape_scale: standard deviation of the scale of the shapes.
     """
 
     def __init__(self, adjustment: RigAdjustment, shape_scale: float) -> None:

@@ -185,14 +185,8 @@ class _Normal:
 class RigAdjustment:
     """Adjustment of one recording for any hypothesis.
 
-    Parameters
-    ----------
-    orientation : RigOrientation
-        As it was calibrated.
-    bodies : sequence of Body
-        With known places of all markers.
-    image_size : sequence of (int, int)
-        Of each fluoroscope [px].
+    orientation: as it was calibrated. bodies: with known places of all markers. image_size: of
+    each fluoroscope [px].
     """
 
     def __init__(

@@ -112,16 +112,7 @@ def least_chi2_without_a_ray(
     A false match that agrees with the other rays by chance displaces a bead; without it the bead
     is in place. Zero where too few rays are left.
 
-    Parameters
-    ----------
-    job, frames, phantom
-        As in `intersect`.
-    target_id : (n,) ndarray of int
-        Beads.
-
-    Returns
-    -------
-    (n,) ndarray
+    job, frames, phantom: as in `intersect`. target_id: (n,) beads. Returns (n,).
     """
     rays = _rays(job, frames)
     out = np.zeros(len(target_id))
@@ -144,20 +135,8 @@ def _beads(
 ) -> Beads:
     """Intersect beads from rays.
 
-    Parameters
-    ----------
-    rays : Rays
-    target_id : (n,) ndarray of int
-    bead : (N,) ndarray of int
-        Row of the bead of each ray.
-    start : (n, 3) ndarray
-        Start values [mm].
-    phantom : Phantom
-
-    Returns
-    -------
-    Beads
-        Those that are well determined.
+    target_id: (n,). bead: (N,) row of the bead of each ray. start: (n, 3) start values [mm].
+    Returns those that are well determined.
     """
     points = start.copy()
     for step in range(STEPS_L1 + STEPS_L2):

@@ -80,20 +80,9 @@ class _Seen:
 class BodyWatch:
     """Turns the image points of rigid bodies into statistics, block by block.
 
-    Parameters
-    ----------
-    bodies : sequence of Body
-        Shapes that are not given are learned at the start of a stream.
-    orientation : RigOrientation
-    sizes : sequence
-        (F, 2), width and height of the images [px].
-    areas : ImageAreas
-    options : DriftOptions
-
-    Raises
-    ------
-    DataError
-        For a marker of two bodies, and for two bodies of the same name.
+    bodies: shapes that are not given are learned at the start of a stream. sizes: (F, 2), width
+    and height of the images [px]. Raises DataError for a marker of two bodies, and for two bodies
+    of the same name.
     """
 
     def __init__(

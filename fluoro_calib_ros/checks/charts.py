@@ -94,14 +94,8 @@ MIN_INFORMATION = 1e-300  # avoids division by zero
 class CusumCharts:
     """CUSUM charts of K series in A areas and both directions, with estimated variances.
 
-    Parameters
-    ----------
-    series, areas : int
-        K and A.
-    step_px : float
-        Excess over the dead band to which the charts are most sensitive [px].
-    cap : float
-        Largest evidence.
+    series, areas: K and A. step_px: excess over the dead band to which the charts are most
+    sensitive [px]. cap: largest evidence.
     """
 
     def __init__(self, series: int, areas: int, step_px: float, cap: float) -> None:

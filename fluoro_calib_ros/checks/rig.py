@@ -282,14 +282,8 @@ def rig_findings(
 ) -> RigFindings:
     """Determine the orientation of a rig from exposures of the phantom.
 
-    Parameters
-    ----------
-    request : CalibrationRequest
-        With phantom and known orientations.
-    result : CalibrationResult
-        Adjustment of fluoroscopes of the rig.
-    frames, calibrations : mapping
-        Of all fluoroscopes of the rig, in their order.
+    request: with phantom and known orientations. result: adjustment of fluoroscopes of the rig.
+    frames, calibrations: of all fluoroscopes of the rig, in their order.
     """
     names = tuple(calibrations)
     if len(names) < 2:

@@ -41,22 +41,9 @@ FALSE_MATCH_PX = 3.0
 class RigDriftWatch:
     """Drift watch of one RigOrientation; a new orientation needs a new one.
 
-    Parameters
-    ----------
-    orientation : RigOrientation
-    image_sizes : mapping of str to tuple of int
-        Width and height of the images by fluoroscope [px].
-    options : DriftOptions, optional
-    bodies : sequence of Body
-    rate_hz : float
-        Largest number of exposures to examine per second.
-
-    Raises
-    ------
-    ValueError
-        As DriftWatch.
-    DataError
-        For a rig with two sources in one place.
+    image_sizes: width and height of the images by fluoroscope [px]. rate_hz: largest number of
+    exposures to examine per second. Raises ValueError as DriftWatch. Raises DataError for a rig
+    with two sources in one place.
     """
 
     def __init__(

@@ -220,19 +220,10 @@ class CorrectionGrid:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return correction, standard deviation and status at pixels.
 
-        Parameters
-        ----------
-        u, v : (n,) ndarray
-            Columns and rows [px].
-        values, status : (3, n) ndarray of float and (n,) ndarray of uint8, optional
-            Arrays for the results, both or none.
-
-        Returns
-        -------
-        values : (3, n) ndarray
-            du, dv and standard deviation [px]; NaN where the status is INVALID.
-        status : (n,) ndarray of uint8
-            `CorrectionStatus`; INVALID off the image and for what is not a number.
+        u, v: (n,) columns and rows [px]. values, status: (3, n) arrays for the results, both or
+        none. Returns values: (3, n) du, dv and standard deviation [px]; NaN where the status is
+        INVALID; status: (n,) `CorrectionStatus`; INVALID off the image and for what is not a
+        number.
         """
         n = len(u)
         if n <= CHUNK:

@@ -56,21 +56,10 @@ def errors_where_curved(
 ) -> np.ndarray:
     """Errors of cells, measured where second differences suggest that they may be too large.
 
-    Parameters
-    ----------
-    model : CorrectionModel
-    nodes : (w,) ndarray, (h,) ndarray
-        Columns and rows [px] of the corners of the cells.
-    values : (3, h, w) ndarray
-        du, dv and standard deviation there.
-    affordable : int
-        Number of exact values that do not take too long.
-
-    Returns
-    -------
-    (2, h - 1, w - 1) ndarray
-        Errors of correction and standard deviation [px]; NaN in cells that are not measured. At
-        least MIN_MEASURED cells are, if that is affordable.
+    nodes: (w,) columns and rows [px] of the corners of the cells. values: (3, h, w) du, dv and
+    standard deviation there. affordable: number of exact values that do not take too long.
+    Returns (2, h - 1, w - 1) errors of correction and standard deviation [px]; NaN in cells that
+    are not measured; at least MIN_MEASURED cells are, if that is affordable.
     """
     columns, rows = nodes
     curvature = _second_differences(values)

@@ -155,18 +155,9 @@ def plane_weights(
 
     The weights of a query sum to one and reproduce planes exactly but for the ridge.
 
-    Parameters
-    ----------
-    dx, dy : (n, k) ndarray
-        Offsets of the values from the origin.
-    kernel : (n, k) ndarray
-        Weights of the values in the fit; overwritten.
-    bandwidth2 : (n,) ndarray
-        Squared bandwidth, to which the ridge is relative.
-
-    Returns
-    -------
-    (n, k) ndarray
+    dx, dy: (n, k) offsets of the values from the origin. kernel: (n, k) weights of the values in
+    the fit; overwritten. bandwidth2: (n,) squared bandwidth, to which the ridge is relative.
+    Returns (n, k).
     """
     wx = kernel * dx
     wy = kernel * dy

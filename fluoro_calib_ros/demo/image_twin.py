@@ -144,20 +144,7 @@ def calibrate_from_images(
 ) -> Mapping[str, FluoroscopeCalibration]:
     """Play the twin through the extraction node into another calibration node, and calibrate.
 
-    Parameters
-    ----------
-    twin : ImageTwin
-    bags, out : Path
-    client : DemoClient
-        In the namespace of the images.
-
-    Returns
-    -------
-    mapping of str to FluoroscopeCalibration
-
-    Raises
-    ------
-    DemoError
+    client: in the namespace of the images. Raises DemoError.
     """
     twin.wait()
     count = len(twin.numbers)

@@ -86,19 +86,8 @@ def gauge_coefficients(
 ) -> NDArray[np.float64]:
     """Coefficients (g,) of the part of fitted corrections that is in the gauge.
 
-    Parameters
-    ----------
-    uv : (n, 2) array_like
-        Pixels.
-    fitted : (n, 2) ndarray
-        Corrections there [px].
-    interior : (3,) ndarray
-        xp, yp, c [px].
-    kind : GaugeKind
-
-    Returns
-    -------
-    (g,) ndarray
+    uv: (n, 2) pixels. fitted: (n, 2) corrections there [px]. interior: (3,) xp, yp, c [px].
+    Returns (g,).
     """
     basis = gauge_basis(uv, interior, kind)
     if kind is GaugeKind.TREND:

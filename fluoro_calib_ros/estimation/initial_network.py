@@ -270,26 +270,10 @@ def measured_network(
 ) -> Measured:
     """Return network and start values of the frames of fluoroscopes that are to be calibrated.
 
-    Parameters
-    ----------
-    frames : mapping of str to sequence of Frame
-    phantom : Phantom
-    principal_distance : float, optional
-        Start value [px]; by default it is taken from the observations.
-    known : mapping of str to KnownOrientation, optional
-        Orientations that are known beforehand, by fluoroscope.
-    starts : StartValues, optional
-        Used for a fluoroscope with start values of all its exposures.
-
-    Returns
-    -------
-    Measured
-
-    Raises
-    ------
-    DataError
-        If a frame is invalid, if exposures or targets are too few, or if all exposures show one
-        pose.
+    principal_distance: start value [px]; by default it is taken from the observations. known:
+    orientations that are known beforehand, by fluoroscope. starts: used for a fluoroscope with
+    start values of all its exposures. Raises DataError if a frame is invalid, if exposures or
+    targets are too few, or if all exposures show one pose.
     """
     task = _Task(
         phantom,

@@ -216,17 +216,7 @@ def _held_out(
 ) -> np.ndarray:
     """Predictions (N, 2) of values (N, 2) by functions fitted without the own fold.
 
-    Parameters
-    ----------
-    prior : _SeriesPrior
-    functions : (N, m) ndarray
-        Trend, then sines.
-    values : (N, 2) ndarray
-    weight, fold : (N,) ndarray
-
-    Returns
-    -------
-    (N, 2) ndarray
+    functions: (N, m) trend, then sines. values: (N, 2). weight, fold: (N,). Returns (N, 2).
     """
     out = np.empty_like(values)
     root = np.sqrt(weight)[:, None]

@@ -80,18 +80,8 @@ def covariance_with_uncertain_terms(
 
     Each term in turn, the prior variances of the others taken as known.
 
-    Parameters
-    ----------
-    to_terms : (t, p) ndarray
-        From coefficients to terms.
-    variance : (t,) ndarray
-        Prior variances of the terms.
-    mean, covariance : (p,) and (p, p) ndarray
-        Posterior of the coefficients with these variances.
-
-    Returns
-    -------
-    (p, p) ndarray
+    to_terms: (t, p) from coefficients to terms. variance: (t,) prior variances of the terms. mean,
+    covariance: (p, p) posterior of the coefficients with these variances. Returns (p, p).
     """
     mixed = covariance @ to_terms.T
     of_terms = np.einsum('tp,pt->t', to_terms, mixed)

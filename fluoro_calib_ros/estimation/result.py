@@ -191,18 +191,8 @@ def _combined_jointly(
     much in common: the datum, which is the same survey in every part. Information of single beads
     would count it once a part.
 
-    Parameters
-    ----------
-    parts : sequence of Targets
-    joint : sequence of ndarray
-        Their joint covariances [mm^2].
-    further : (n, 3, 3) ndarray
-        Information of the survey that is subtracted.
-    phantom : Phantom
-
-    Returns
-    -------
-    Targets
+    joint: their joint covariances [mm^2]. further: (n, 3, 3) information of the survey that is
+    subtracted.
     """
     target_id = np.unique(np.concatenate([p.target_id for p in parts]))
     n = len(target_id)

@@ -128,25 +128,10 @@ def self_calibrate(
     The standard deviations of models other than collocation hold their difference from it (see
     `model_errors`), so it is calibrated, too.
 
-    Parameters
-    ----------
-    measured : Measured
-        From `measured_network`.
-    options : CalibrationOptions, optional
-    progress : callable, optional
-        Called with the Round after every round.
-    earlier : EarlierCalibration, optional
-        By collocation, with these exposures and others; the network starts with its solution. The
-        adjustment without correction is then not made: its residuals are those of the start.
-
-    Returns
-    -------
-    SelfCalibration
-
-    Raises
-    ------
-    DataError
-        If the observations do not suffice.
+    measured: from `measured_network`. progress: called with the Round after every round. earlier:
+    by collocation, with these exposures and others; the network starts with its solution; the
+    adjustment without correction is then not made: its residuals are those of the start. Raises
+    DataError if the observations do not suffice.
     """
     options = options or CalibrationOptions()
     network = replace(measured.network, interior_free=interiors_to_estimate(measured, options))

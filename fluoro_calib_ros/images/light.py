@@ -194,13 +194,9 @@ class Cosines:
     ) -> NDArray[np.float64]:
         """Estimate the variances (g,) of the backgrounds of windows, 0 for none.
 
-        Parameters
-        ----------
-        relative : (g, m) ndarray
-            Light behind the beads, as a fraction of that without them.
-        jacobian : (g, u, m) ndarray
-            Derivatives of the light by the unknowns that are estimated with it.
-        weight, residual : (g, m) ndarray
+        relative: (g, m) light behind the beads, as a fraction of that without them. jacobian: (g,
+        u, m) derivatives of the light by the unknowns that are estimated with it. weight,
+        residual: (g, m).
         """
         waves = (relative[:, None] * self.waves) * np.sqrt(self.variance)[:, None]
         both = np.concatenate([jacobian, waves, residual[:, None]], axis=1).astype(float)

@@ -348,15 +348,9 @@ MAX_HALF = 48
 class MarkerSearch:
     """Finds shadows where markers may be.
 
-    Parameters
-    ----------
-    look : MarkerLook
-    gate : float
-        Half the width of a search window [standard deviations of the prediction].
-    lost_after : int
-        Images without a marker after which it is lost.
-    search_every : int
-        Images between searches of the whole image, where a marker is lost.
+    gate: half the width of a search window [standard deviations of the prediction]. lost_after:
+    images without a marker after which it is lost. search_every: images between searches of the
+    whole image, where a marker is lost.
     """
 
     def __init__(

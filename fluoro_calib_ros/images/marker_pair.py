@@ -38,21 +38,9 @@ class PairFrame:
 class MarkerPair:
     """Follows markers through the images of two calibrated fluoroscopes.
 
-    Parameters
-    ----------
-    calibrations : mapping of str to FluoroscopeCalibration
-    orientation : RigOrientation
-        That they belong to.
-    options : MarkerOptions, optional
-    first : mapping of str to FirstMarkers
-        Ids and places in the first images, of two fluoroscopes.
-    bodies : sequence of Body
-        Shapes that are not given are learned from the images.
-
-    Raises
-    ------
-    DataError
-        For other than two fluoroscopes, and for those without calibration.
+    orientation: that they belong to. first: ids and places in the first images, of two
+    fluoroscopes. bodies: shapes that are not given are learned from the images. Raises DataError
+    for other than two fluoroscopes, and for those without calibration.
     """
 
     def __init__(

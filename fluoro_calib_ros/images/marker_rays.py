@@ -68,15 +68,8 @@ class PairExposure:
 class PairRays:
     """Rays of markers in two calibrated views.
 
-    Parameters
-    ----------
-    calibrations : mapping of str to FluoroscopeCalibration
-    orientation : RigOrientation
-        That they belong to.
-    names : sequence of str
-        The two fluoroscopes.
-    target_id : (n,) ndarray
-        Of all markers, ascending.
+    orientation: that they belong to. names: the two fluoroscopes. target_id: (n,) of all markers,
+    ascending.
     """
 
     def __init__(

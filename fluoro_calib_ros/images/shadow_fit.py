@@ -122,17 +122,8 @@ class FineGrid:
 class ShadowFit(ABC):
     """Gauss-Newton fit of windows, each with the neighbours of its bead.
 
-    Parameters
-    ----------
-    settings : FitSettings
-    profile : Profile
-    noise : Noise
-    uv : (n, 2) ndarray
-        Centres to start from [px].
-    depth : (n,) ndarray
-        Of the shadows, also what is expected of them.
-    window_px : float
-        Radius of the windows.
+    uv: (n, 2) centres to start from [px]. depth: (n,) of the shadows, also what is expected of
+    them. window_px: radius of the windows.
     """
 
     def __init__(

@@ -84,20 +84,9 @@ class Admission:
 class Gate:
     """A TCP server that passes the connections of admitted clients on, in a thread of its own.
 
-    Parameters
-    ----------
-    host, port : str and int
-        Where it listens; port 0 is any free one.
-    inner : (str, int)
-        Host and port of the server behind it.
-    admission : Admission
-    on_refused : callable
-        Called with the address of a client and the reason, in the thread.
-
-    Raises
-    ------
-    OSError
-        Where it cannot listen.
+    host, port: where it listens; port 0 is any free one. inner: host and port of the server behind
+    it. on_refused: called with the address of a client and the reason, in the thread. Raises
+    OSError where it cannot listen.
     """
 
     def __init__(

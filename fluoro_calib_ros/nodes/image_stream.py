@@ -287,15 +287,9 @@ class Task:
 class ExtractionWorkers:
     """A process for each follower, and the thread that gives it images.
 
-    Parameters
-    ----------
-    streams : mapping of str to ImageStream
-    queue_size : int
-        Images of a fluoroscope that may wait.
-    wanted : callable
-        Called with a fluoroscope; returns whether its overlay is wanted.
-    finish : callable
-        Called with stream, task, image and what was found in it, in the threads.
+    queue_size: images of a fluoroscope that may wait. wanted: called with a fluoroscope; returns
+    whether its overlay is wanted. finish: called with stream, task, image and what was found in
+    it, in the threads.
     """
 
     def __init__(

@@ -116,14 +116,7 @@ class PointsOutput:
 class BodiesOutput:
     """Publishers of bodies and joints.
 
-    Parameters
-    ----------
-    node : StreamNode
-    names : sequence of str
-        Bodies.
-    has_joints : bool
-    rig_frame : str
-        Parent of the frames of the bodies.
+    names: bodies. rig_frame: parent of the frames of the bodies.
     """
 
     def __init__(

@@ -56,15 +56,8 @@ class RigInput:
 
     The executor's thread replaces them as a whole, and the thread of the streams reads them.
 
-    Parameters
-    ----------
-    names : sequence of str
-        Fluoroscopes.
-    reject : float
-        Epipolar distance above which image points do not belong together [standard deviations].
-    drift : DriftMonitor
-    refusals : RefusalLog
-    logger : Logger
+    names: fluoroscopes. reject: epipolar distance above which image points do not belong together
+    [standard deviations].
     """
 
     def __init__(

@@ -265,19 +265,9 @@ def precision(
     the residuals and the redundancy numbers belong to the weighted least-squares problem at the
     solution.
 
-    Parameters
-    ----------
-    network : Network
-    adjustment : Adjustment
-    correction : (N, 2) ndarray, optional
-        Correction of the image points [px] in the adjustment.
-    elimination : type of Elimination, optional
-        As in SolverOptions.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        Where the network does not determine the unknowns.
+    correction: (N, 2) correction of the image points [px] in the adjustment. elimination: as in
+    SolverOptions. Raises numpy.linalg.LinAlgError where the network does not determine the
+    unknowns.
     """
     correction = np.zeros_like(network.uv) if correction is None else correction
 

@@ -183,15 +183,8 @@ def exposures_after_step(
     already, but a stiff constraint is curved, and a straight step would leave it by more than its
     standard deviation.
 
-    Parameters
-    ----------
-    constraints : sequence of RelativeConstraint
-        The constraints of the network.
-    layout : UnknownLayout
-        Layout of its unknowns.
-    before, after : Parameters
-        Parameters before and after the straight step.
-    step : UnknownVector
+    constraints: the constraints of the network. before, after: parameters before and after the
+    straight step.
     """
     rotation = after.rotation.copy()
     position = after.position_mm.copy()

@@ -156,23 +156,8 @@ def epipolar_residuals(
 
     For many frames of one orientation, build one EpipolarGeometry.
 
-    Parameters
-    ----------
-    orientation : RigOrientation
-    a, b : str
-        Names of the fluoroscopes.
-    uv_a, uv_b : array_like
-        (n, 2), corrected pixels.
-    sigma_a, sigma_b : array_like
-        (n,) or a number, standard deviations of their coordinates [px].
-
-    Returns
-    -------
-    EpipolarResiduals
-
-    Raises
-    ------
-    DataError
-        As EpipolarGeometry.
+    a, b: names of the fluoroscopes. uv_a, uv_b: (n, 2), corrected pixels. sigma_a, sigma_b: (n,)
+    or a number, standard deviations of their coordinates [px]. Raises DataError as
+    EpipolarGeometry.
     """
     return EpipolarGeometry(orientation, a, b).residuals(uv_a, uv_b, sigma_a, sigma_b)

@@ -167,25 +167,9 @@ def reconstruct_exposure(
 ) -> ReconstructedFrame:
     """Correct and intersect the observed image points of one exposure.
 
-    Parameters
-    ----------
-    exposure : mapping of str to Frame
-        Frames by fluoroscope, of two or more fluoroscopes of the orientation.
-    calibrations : mapping of str to FluoroscopeCalibration
-    intersector : Intersector
-    watch : ExposureWatch, optional
-        Examines the exposure.
-    scatter : ObservedScatter, optional
-        Scatter of the recording so far.
-
-    Returns
-    -------
-    ReconstructedFrame
-
-    Raises
-    ------
-    DataError
-        For an image whose size is not that of the calibration, and for a repeated target.
+    exposure: frames by fluoroscope, of two or more fluoroscopes of the orientation. watch:
+    examines the exposure. scatter: scatter of the recording so far. Raises DataError for an image
+    whose size is not that of the calibration, and for a repeated target.
     """
     found, present = intersect_frames(exposure, calibrations, intersector, scatter)
     if watch is not None:

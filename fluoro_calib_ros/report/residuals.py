@@ -62,19 +62,8 @@ def residuals_of(
 ) -> Residuals:
     """Return the residuals of the frames of a fluoroscope.
 
-    Parameters
-    ----------
-    calibration : FluoroscopeCalibration
-    frames : sequence of Frame
-    poses : mapping of int to (rotation, position_mm)
-        Exterior orientation by exposure; frames of other exposures were not used.
-    points_mm : mapping of int to (3,) ndarray
-        Adjusted object points by target.
-    outliers : set of (exposure, target)
-
-    Returns
-    -------
-    Residuals
+    poses: exterior orientation by exposure; frames of other exposures were not used. points_mm:
+    (3,) adjusted object points by target.
     """
     exposure = []
     target_id = []

@@ -57,21 +57,8 @@ def simulate_exposures(
 ) -> SimulatedExposures:
     """Simulate exposures of the phantom in different poses.
 
-    Parameters
-    ----------
-    rig : VirtualRig
-    count : int
-        Number of poses.
-    seed : int
-        The same seed gives the same exposures.
-    detection : Detection, optional
-    start : StreamStart, optional
-    interval_s : float
-        Time between exposures.
-
-    Returns
-    -------
-    SimulatedExposures
+    count: number of poses. seed: the same seed gives the same exposures. interval_s: time between
+    exposures.
     """
     detection = detection or Detection()
     start = start or StreamStart()
@@ -100,22 +87,8 @@ def detect_beads(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Simulate the detection of beads in one image.
 
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-    fluoroscope : VirtualFluoroscope
-    points_mm : ndarray
-        (k, 3), beads in the rig frame.
-    target_id : ndarray
-        (k,)
-    detection : Detection, optional
-
-    Returns
-    -------
-    target_id : ndarray
-        (n,), ids of the detected beads.
-    observed : ndarray
-        (n, 2) [px].
+    points_mm: (k, 3), beads in the rig frame. target_id: (k,). Returns target_id: (n,), ids of the
+    detected beads; observed: (n, 2) [px].
     """
     detection = detection or Detection()
     ideal = fluoroscope.ideal(points_mm)

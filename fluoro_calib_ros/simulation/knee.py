@@ -259,21 +259,8 @@ def simulate_knee(
 ) -> SimulatedKnee:
     """Simulate a recording of a knee: image points of the markers that are on the image.
 
-    Parameters
-    ----------
-    rig : VirtualRig
-    knee : VirtualKnee
-    motion : KneeMotion
-        Such as walking(knee, times) returns it.
-    noise_px : float
-        Standard deviation of an image coordinate.
-    seed : int
-        The same seed gives the same noise.
-    start : StreamStart, optional
-
-    Returns
-    -------
-    SimulatedKnee
+    motion: such as walking(knee, times) returns it. noise_px: standard deviation of an image
+    coordinate. seed: the same seed gives the same noise.
     """
     ids = np.concatenate([body.target_id for body in knee.bodies])
     points = np.concatenate(

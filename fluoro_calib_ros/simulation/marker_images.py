@@ -152,14 +152,7 @@ def _spread(rng: np.random.Generator, scene: MarkerScene) -> np.ndarray:
 class MarkerRadiography(Radiography):
     """Takes radiographs of moving markers with one fluoroscope.
 
-    Parameters
-    ----------
-    fluoroscope : VirtualFluoroscope
-    markers : MovingMarkers
-    settings : RadiographSettings, optional
-    frames : int
-        Length of the sequence, over which markers are hidden.
-    seed : int
+    frames: length of the sequence, over which markers are hidden.
     """
 
     def __init__(

@@ -181,18 +181,8 @@ class BagWriter:
     ) -> None:
         """Write a Frame as TargetObservations.
 
-        Parameters
-        ----------
-        frame : Frame
-        topic : str, optional
-            By default <namespace>/<fluoroscope>/target_observations.
-        namespace : str
-        log_time_ns : int, optional
-            By default the stamp of the frame.
-
-        Raises
-        ------
-        DataError
+        topic: by default <namespace>/<fluoroscope>/target_observations. log_time_ns: by default
+        the stamp of the frame. Raises DataError.
         """
         topic = topic or observations_topic(frame.fluoroscope, namespace)
         time = frame.stamp_ns if log_time_ns is None else log_time_ns

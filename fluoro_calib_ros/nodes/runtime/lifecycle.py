@@ -238,16 +238,8 @@ class StreamNode(ManagedNode):
     ) -> None:
         """Subscribe to a slow topic, while configured; an exception in the callback is logged.
 
-        Parameters
-        ----------
-        kind : type
-            Message type.
-        topic : str
-        callback : callable
-            Called with every message.
-        qos : QoSProfile
-        refusals : RefusalLog
-            Counts the messages at which the callback raises.
+        kind: message type. callback: called with every message. refusals: counts the messages at
+        which the callback raises.
         """
 
         def guarded(message: Any) -> None:

@@ -151,10 +151,6 @@ def validate(
     rig : RigFindings, optional
         What is known of the orientation of the rig; by default it is determined.
 
-    Returns
-    -------
-    Validation
-
     Raises
     ------
     DataError

@@ -246,10 +246,6 @@ def calibrate_by_regression(
     progress : callable, optional
         Called with the Round after every round.
 
-    Returns
-    -------
-    SelfCalibration
-
     Raises
     ------
     DataError

@@ -94,10 +94,6 @@ def calibrate(
     progress : callable, optional
         Called with the name of the fluoroscope and the Round after every round; may raise to stop.
 
-    Returns
-    -------
-    CalibrationResult
-
     Raises
     ------
     DataError
@@ -332,10 +328,6 @@ def adjust_with_calibrations(
         Of an earlier adjustment of the frames, for its residuals: the residuals without correction
         are then not computed again, their RMSE is NaN, and covariances are without the
         uncertainty of the interior orientations.
-
-    Returns
-    -------
-    CalibrationResult
 
     Raises
     ------

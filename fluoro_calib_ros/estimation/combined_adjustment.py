@@ -59,10 +59,6 @@ def calibrate_by_adjustment(
     progress : callable, optional
         Called with the Round after every adjustment.
 
-    Returns
-    -------
-    SelfCalibration
-
     Raises
     ------
     DataError

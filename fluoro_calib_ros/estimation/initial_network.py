@@ -85,10 +85,6 @@ def adjusted_with_precision(
     noise_fixed : bool
         True where the noise model is not to be estimated.
 
-    Returns
-    -------
-    Adjustment, Precision
-
     Raises
     ------
     DataError

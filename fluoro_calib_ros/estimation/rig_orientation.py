@@ -204,10 +204,6 @@ def orientation_of_capture(
     loss : str
         Noise model of the image points.
 
-    Returns
-    -------
-    RigOrientation
-
     Raises
     ------
     DataError
@@ -264,10 +260,6 @@ def orientation_of_exposures(
         Noise model of the image points.
     starts : StartValues, optional
         Of an earlier adjustment of the frames.
-
-    Returns
-    -------
-    RigOrientation
 
     Raises
     ------

@@ -87,10 +87,6 @@ def scaled_by_distances(
     distances : Distances
     centre_mm : (3,) ndarray
         Centre of the datum, which the scale leaves in place.
-
-    Returns
-    -------
-    Scaled
     """
     first, second = distances.pairs.T
     offset = xyz_mm[second] - xyz_mm[first]

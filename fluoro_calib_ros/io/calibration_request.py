@@ -70,10 +70,6 @@ def read_request(
     phantom : Phantom, optional
         Used instead of phantom.csv.
 
-    Returns
-    -------
-    CalibrationRequest
-
     Raises
     ------
     DataError

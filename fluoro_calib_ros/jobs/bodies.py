@@ -285,10 +285,6 @@ def track_bodies(
     progress : callable, optional
         Called with the number of exposures that are solved, and of all.
 
-    Returns
-    -------
-    BodiesOutcome
-
     Raises
     ------
     DataError

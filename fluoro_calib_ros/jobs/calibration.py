@@ -194,10 +194,6 @@ def run_calibration(
     report_step : callable, optional
         Called as the progress of `checks.verdict.validate`.
 
-    Returns
-    -------
-    CalibrationOutcome
-
     Raises
     ------
     DataError

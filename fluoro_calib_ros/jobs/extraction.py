@@ -286,10 +286,6 @@ def recording_of_images(
     angles : ImageAngles, optional
         Angles of the C-arms.
 
-    Returns
-    -------
-    Recording
-
     Raises
     ------
     DataError

@@ -107,10 +107,6 @@ def heal_rig(
     progress : callable, optional
         Called with the number of the steps that are done, and of all.
 
-    Returns
-    -------
-    HealingOutcome
-
     Raises
     ------
     DataError

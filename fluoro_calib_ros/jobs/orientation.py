@@ -74,10 +74,6 @@ def orient(
     present : RigOrientation, optional
         The orientation so far, with which the new one is compared.
 
-    Returns
-    -------
-    OrientationOutcome
-
     Raises
     ------
     DataError

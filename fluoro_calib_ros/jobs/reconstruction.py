@@ -123,10 +123,6 @@ def reconstruct(
     orientation : RigOrientation
     options : ReconstructionOptions, optional
 
-    Returns
-    -------
-    ReconstructionOutcome
-
     Raises
     ------
     DataError

@@ -235,10 +235,6 @@ def read_source(
     selection : BagSelection, optional
         Time window and pairing; pairing by stamp also numbers the frames anew, by exposure.
 
-    Returns
-    -------
-    Recording
-
     Raises
     ------
     DataError

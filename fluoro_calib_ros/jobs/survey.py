@@ -116,10 +116,6 @@ def survey(
         Called after every round with the names of the fluoroscopes and the Round; may raise to
         stop.
 
-    Returns
-    -------
-    SurveyOutcome
-
     Raises
     ------
     DataError

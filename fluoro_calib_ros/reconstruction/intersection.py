@@ -176,10 +176,6 @@ class Intersector:
         scatter : ObservedScatter, optional
             Scatter of the recording, which these points add to. It widens the limit.
 
-        Returns
-        -------
-        IntersectedPoints
-
         Raises
         ------
         ValueError

@@ -68,10 +68,6 @@ def distortion_figure(
         Whether the interior orientation was estimated with the model.
     scale : Scale, optional
         That of the figures of all fluoroscopes; by default that of the model.
-
-    Returns
-    -------
-    Figure
     """
     scale = scale or common_scale([(model, image_size)])
     width, height = np.asarray(image_size) + np.array([2, 3]) * MARGIN * max(image_size)

@@ -157,10 +157,6 @@ def simulate_tracking(
     start : StreamStart, optional
     clusters : int
         Number of rigid clusters of six markers, up to eight.
-
-    Returns
-    -------
-    SimulatedTracking
     """
     start = start or StreamStart()
     rng = np.random.default_rng([seed, 3])

@@ -119,10 +119,6 @@ def virtual_rig(
     between_deg : float
         Angle between neighbouring fluoroscopes. At 84 degrees their sources are some 2 m apart;
         with three fluoroscopes, 60 degrees leave every two of them a good base.
-
-    Returns
-    -------
-    VirtualRig
     """
     rng = np.random.default_rng([seed, 1])
     true_mm = bead_coordinates(rng)

@@ -45,7 +45,7 @@ from sensor_msgs.msg import CameraInfo
 from fluoro_calib_ros.correction.fluoroscope_calibration import (
     FluoroscopeCalibration as Calibration,
 )
-from fluoro_calib_ros.demo.node_processes import isolate_ros_graph
+from fluoro_calib_ros.demo.assessment import isolate_ros_graph
 from fluoro_calib_ros.estimation.calibrate import calibrate
 from fluoro_calib_ros.estimation.rig_orientation import orientation_of_exposures
 from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import message_from_calibration

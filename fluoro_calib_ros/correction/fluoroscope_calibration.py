@@ -23,10 +23,9 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import DataError
 from ..exposures.frame import Frame, points_on_image
 from ..exposures.phantom import Phantom
-from ..records import Field
 from .angle_field import AngleField, packed_angles, unpacked_angles
 from .base import Correction, CorrectionModel, CorrectionStatus
-from .calibration_record import FIELDS
+from .calibration_record import FIELDS, Field
 from .grid import CorrectionGrid
 from .registry import MODEL_FIELDS, model_from_values
 from .series import Functions, Series

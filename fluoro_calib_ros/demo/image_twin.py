@@ -17,7 +17,7 @@ import numpy as np
 from ..bodies.joints import JointMotion
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..io.access import make_folder, write_bytes
-from ..io.bags.definitions import message_class
+from ..io.bags.metadata import message_class
 from ..io.bags.reader import IMAGE
 from ..io.bags.writer import BagWriter
 from ..jobs.simulation import (
@@ -31,14 +31,13 @@ from ..jobs.simulation import (
     write_knee,
 )
 from ..nodes.demo_client import DemoClient, DemoError
+from ..report.figures import png_bytes
 from ..report.motion import joint_figure
-from ..report.style import png_bytes
 from ..report.tables import markdown_table
 from ..simulation.exposures import simulate_exposures
 from ..simulation.knee import LANDING_HZ, LANDING_S, landing, simulate_knee, virtual_knee
 from ..simulation.rig import VirtualRig, virtual_rig
-from .assessment import calibration_errors
-from .node_processes import NodeProcesses
+from .assessment import NodeProcesses, calibration_errors
 
 NAMESPACE = 'images'
 EXPOSURES = 6  # of those of the bag

@@ -49,10 +49,9 @@ from .gauge import GaugeKind
 from .initial_network import EarlierCalibration, Measured, adjusted_with_precision, start_noise
 from .model_choice import START_MODEL, better_model, with_errors_by
 from .neighbour_regression import NeighbourRegression
-from .options import AUTO, CalibrationOptions
+from .options import AUTO, CalibrationOptions, user_estimator
 from .parametric import StepwiseTerms
 from .rounds import Round, SelfCalibration, raise_if_undetermined, undetermined_unknowns
-from .user_regressor import user_estimator
 
 
 class NoRegression(RegressionStep[NoCorrection]):

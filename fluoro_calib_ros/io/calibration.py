@@ -22,14 +22,13 @@ from typing import Any
 
 import numpy as np
 
-from ..correction.calibration_record import FIELDS, VERSION
+from ..correction.calibration_record import FIELDS, VERSION, Field
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError, ErrorsAt
 from ..exposures.frame import Frame
 from ..findings import Finding, Kind, Place, Severity
 from ..limits import MAX_COINCIDENT, read_limits
 from ..photogrammetry.rig_orientation import RigOrientation
-from ..records import Field
 from .access import PathLike, check_safe_name, make_folder, os_error_reason, read_bytes
 from .arrays import Layout, read_arrays, to_arrays, to_values, write_arrays
 from .csv_table import NAMES_FILE

@@ -13,6 +13,7 @@ import numpy as np
 
 from ..checks.check import Check, Validation
 from ..checks.rig_watch import DriftVerdict
+from ..correction.calibration_record import Field
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError
 from ..estimation.constraints import RelativeOrientation
@@ -22,7 +23,6 @@ from ..estimation.rounds import AdjustmentStatistics, ResidualTable, Round
 from ..findings import Finding, Severity, sentences
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import quaternion_from_matrix
-from ..records import Field
 from .access import PathLike, os_error_reason
 from .arrays import Layout, read_arrays, to_arrays, write_arrays
 from .calibration import VALIDATION_NAME, with_digests

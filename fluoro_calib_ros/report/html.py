@@ -25,7 +25,7 @@ from ..exposures.phantom import Phantom
 from ..findings import Finding, sentences
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import matrix_from_quaternion
-from .distortion_figure import Scale, common_scale, distortion_figure
+from .figures import STYLE, Scale, common_scale, distortion_figure, png_bytes
 from .report_figures import (
     bead_shifts,
     covered_cells,
@@ -35,7 +35,6 @@ from .report_figures import (
     residual_map,
 )
 from .residuals import Residuals, residuals_of
-from .style import STYLE, png_bytes
 from .tables import model_text
 
 TEMPLATES = Path(__file__).parent / 'templates'

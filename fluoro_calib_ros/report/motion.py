@@ -16,8 +16,8 @@ from matplotlib.figure import Figure
 from ..bodies.body import BodyPoses, PoseStatus
 from ..bodies.joints import JointMotion
 from ..photogrammetry.rotations import vector_from_matrix
+from .figures import BLUE, GREY, RED, STYLE, new_figure
 from .html import page, png_text
-from .style import BLUE, GREY, RED, STYLE, new_figure
 
 BAND = 2.0  # standard deviations, 95 %
 FILLED = 0.15  # opacity of the times without a marker

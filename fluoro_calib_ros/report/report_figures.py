@@ -22,9 +22,21 @@ from ..exposures.collector import CELLS, Coverage
 from ..io.access import check_safe_name, make_folder, write_bytes
 from ..photogrammetry.noise import MIN_REDUNDANCY
 from ..photogrammetry.precision import geometric_redundancy
-from .distortion_figure import Scale, common_scale, distortion_figure
+from .figures import (
+    AFTER,
+    BEFORE,
+    BLACK,
+    BLUE,
+    GREY,
+    RED,
+    STYLE,
+    Scale,
+    common_scale,
+    distortion_figure,
+    new_figure,
+    png_bytes,
+)
 from .residuals import Residuals, histogram_figure, position_figure
-from .style import AFTER, BEFORE, BLACK, BLUE, GREY, RED, STYLE, new_figure, png_bytes
 
 MARKER: dict[str, Any] = {'marker': 'o', 'markersize': 4}
 

@@ -18,7 +18,7 @@ from ..estimation.rounds import SelfCalibration
 from ..exposures.frame import Frame
 from ..photogrammetry.adjustment import Adjustment
 from ..photogrammetry.collinearity import project
-from .style import AFTER, BEFORE, BLACK, GREY, new_figure
+from .figures import AFTER, BEFORE, BLACK, GREY, new_figure
 from .tables import model_text
 
 Pose = tuple[np.ndarray, np.ndarray]

@@ -31,7 +31,7 @@ from fluoro_calib_ros.images.marker_pair import MarkerPair, PairFrame
 from fluoro_calib_ros.images.marker_rays import project_observed
 from fluoro_calib_ros.images.markers import FirstMarkers, MarkerFrame, MarkerOptions, MarkerTracker
 from fluoro_calib_ros.images.overlay import draw_markers
-from fluoro_calib_ros.io.bags.definitions import message_class
+from fluoro_calib_ros.io.bags.metadata import message_class
 from fluoro_calib_ros.io.bags.reader import COMPRESSED_IMAGE, JOINT_STATE
 from fluoro_calib_ros.io.bags.writer import BagWriter
 from fluoro_calib_ros.io.bodies import write_bodies

@@ -16,7 +16,7 @@ from sensor_msgs.msg import JointState
 from fluoro_calib_ros.correction.angle_field import packed_angles
 from fluoro_calib_ros.correction.fluoroscope_calibration import NoiseProfile
 from fluoro_calib_ros.errors import DataError
-from fluoro_calib_ros.io.bags.definitions import (
+from fluoro_calib_ros.io.bags.metadata import (
     ADDED,
     FLUOROSCOPE_CALIBRATION,
     earlier_text,

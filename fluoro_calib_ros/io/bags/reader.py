@@ -18,15 +18,6 @@ from ...exposures.angles import AngleOptions, JointAngles
 from ...exposures.frame import Frame, validate_frame, without_strays
 from ...limits import MAX_OBSERVATIONS
 from ..access import PathLike, check_safe_name
-from .definitions import (
-    TARGET_OBSERVATIONS,
-    fields_of,
-    fluoroscope_of_topic,
-    frame_from_message,
-    from_cdr,
-    type_hash,
-    typestore,
-)
 from .mcap_file import (
     BagMessage,
     ChannelInfo,
@@ -37,7 +28,16 @@ from .mcap_file import (
     messages_of_file,
     storage_files,
 )
-from .metadata import parse_profiles
+from .metadata import (
+    TARGET_OBSERVATIONS,
+    fields_of,
+    fluoroscope_of_topic,
+    frame_from_message,
+    from_cdr,
+    parse_profiles,
+    type_hash,
+    typestore,
+)
 
 
 class TopicInfo(NamedTuple):

@@ -23,15 +23,20 @@ from mcap.writer import CompressionType, Writer
 from ...errors import DataError
 from ...exposures.frame import Frame
 from ..access import PathLike, os_error_reason, sync_folder, write_text
-from .definitions import (
+from .metadata import (
+    NO_MESSAGE_NS,
+    PROFILES,
     TARGET_OBSERVATIONS,
+    BagTopic,
     Definition,
+    FileSpan,
+    bag_metadata,
     known_definition,
     message_from_frame,
     observations_topic,
     to_cdr,
+    to_yaml,
 )
-from .metadata import NO_MESSAGE_NS, PROFILES, BagTopic, FileSpan, bag_metadata, to_yaml
 
 LIBRARY = 'fluoro_calib_ros'
 CHUNK_SIZE = 768 * 1024  # that of rosbag2 [bytes]

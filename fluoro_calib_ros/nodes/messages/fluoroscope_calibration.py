@@ -18,12 +18,11 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo
 
 from ...correction import fluoroscope_calibration as calibration_result
-from ...correction.calibration_record import FIELDS
+from ...correction.calibration_record import FIELDS, Field
 from ...errors import DataError
 from ...io.arrays import to_values
-from ...io.bags.definitions import FLUOROSCOPE_CALIBRATION, present_cdr
+from ...io.bags.metadata import FLUOROSCOPE_CALIBRATION, present_cdr
 from ...io.calibration import validated_arrays
-from ...records import Field
 from ..runtime.streams import DECODING_ERRORS
 from .observations import (
     float64_field,

@@ -54,7 +54,7 @@ from rclpy.type_support import check_for_type_support
 
 from ...errors import DataError
 from ...io.access import read_text
-from ...io.bags.definitions import SEPARATOR, Definition, fields_of, known_definition, nested_types
+from ...io.bags.metadata import SEPARATOR, Definition, fields_of, known_definition, nested_types
 from ...limits import read_limits
 
 # Finding topics, and waiting for their other end.

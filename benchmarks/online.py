@@ -47,7 +47,7 @@ from fluoro_calib_ros.correction.fluoroscope_calibration import (
 )
 from fluoro_calib_ros.demo.assessment import isolate_ros_graph
 from fluoro_calib_ros.estimation.calibrate import calibrate
-from fluoro_calib_ros.estimation.rig_orientation import orientation_of_exposures
+from fluoro_calib_ros.estimation.rig_orientation import orientation_and_scatter
 from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import message_from_calibration
 from fluoro_calib_ros.nodes.messages.rig_orientation import message_from_orientation
 from fluoro_calib_ros.nodes.runtime.streams import (
@@ -325,7 +325,7 @@ def rig_of_the_simulator() -> tuple[dict[str, Calibration], Orientation]:
     rig = virtual_rig(1)
     frames = simulate_exposures(rig, 15, 1).frames
     job = calibrate(frames, rig.phantom)
-    return job.calibrations, orientation_of_exposures(frames, rig.phantom, job.calibrations)
+    return job.calibrations, orientation_and_scatter(frames, rig.phantom, job.calibrations)[0]
 
 
 def run(seconds: float, only: str = '') -> dict[str, list[dict[str, Any]]]:

@@ -13,6 +13,7 @@ exposures, each with a field of its own (see `angle_fit`).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -233,3 +234,20 @@ def unpacked_angles(
     if not (np.size(angles) or np.size(coefficients) or np.size(variances)):
         return None
     return AngleField(image_size, angles, coefficients, variances)
+
+
+def note_on_angles(
+    name: str,
+    field: AngleField | None,
+    angles: Sequence[float | None],
+    items: str = 'frames',
+    consequence: str = 'they get the mean over the angles, with its larger standard deviation',
+) -> str:
+    """Return what follows from angles of a fluoroscope that are unknown (None), '' if nothing."""
+    unknown = sum(angle is None for angle in angles)
+    if field is None or not unknown:
+        return ''
+    return (
+        f'the correction of fluoroscope {name} depends on the angle of the C-arm, which is '
+        f'unknown for {unknown} of {len(angles)} {items}: {consequence}'
+    )

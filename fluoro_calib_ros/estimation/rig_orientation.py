@@ -235,46 +235,6 @@ def orientation_of_capture(
     return _orientation(fixed, exteriors, calibrations, origin)
 
 
-def orientation_of_exposures(
-    frames: Frames,
-    phantom: Phantom,
-    calibrations: Calibrations,
-    loss: str = 'student_t',
-    starts: StartValues | None = None,
-) -> RigOrientation:
-    """Orientation in the optical frame of the first fluoroscope, from exposures of the phantom.
-
-    The relative orientation is the weighted mean of those of the exposures, a few of which are
-    left out where they contradict the others. Where these scatter more than their standard
-    deviations, its covariance is enlarged accordingly. The frame is the estimated one of the
-    sensor, and its covariance is given a datum where the phantom was (`with_datum_of_points`).
-
-    Parameters
-    ----------
-    frames : mapping of str to sequence of Frame
-        Those of the same number belong together.
-    phantom : Phantom
-    calibrations : mapping of str to FluoroscopeCalibration
-        Fixed.
-    loss : str
-        Noise model of the image points.
-    starts : StartValues, optional
-        Of an earlier adjustment of the frames.
-
-    Raises
-    ------
-    DataError
-        As `orientation_of_capture`, and if no exposures can be paired.
-    """
-    return orientation_and_scatter(
-        frames,
-        phantom,
-        calibrations=calibrations,
-        loss=loss,
-        starts=starts,
-    )[0]
-
-
 def orientation_and_scatter(
     frames: Frames,
     phantom: Phantom,
@@ -282,9 +242,17 @@ def orientation_and_scatter(
     loss: str = 'student_t',
     starts: StartValues | None = None,
 ) -> tuple[RigOrientation, tuple[PairScatter, ...]]:
-    """Return `orientation_of_exposures`, and how the exposures scatter about it.
+    """Orientation in the optical frame of the first fluoroscope, from exposures of the phantom.
 
-    There is one PairScatter for every fluoroscope but the first. Raises DataError.
+    The relative orientation is the weighted mean of those of the exposures, a few of which are
+    left out where they contradict the others. Where these scatter more than their standard
+    deviations, its covariance is enlarged accordingly. The frame is the estimated one of the
+    sensor, and its covariance is given a datum where the phantom was (`with_datum_of_points`).
+
+    frames: those of the same number belong together. calibrations: fixed. starts: of an earlier
+    adjustment of the frames. Returns also how the exposures scatter about the orientation, a
+    PairScatter for every fluoroscope but the first. Raises DataError as `orientation_of_capture`,
+    and if no exposures can be paired.
     """
     _validate(frames, phantom, calibrations)
     paired = _paired(frames)

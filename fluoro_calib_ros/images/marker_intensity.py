@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from ..errors import DataError
 from ..findings import Kind
-from .detection import BLOB_RADIUS, MIN_SIZE, SCALES, field_of_view
+from .detection import BLOB_RADIUS, MIN_SIZE, SCALES, field_of_view, vertex
 from .light import Light, Noise, estimate_noise
 from .marker_motion import MarkerStates, Motion, assign
 from .measurement import estimate_profile
@@ -264,18 +264,11 @@ def _peaks(response: np.ndarray, look: MarkerLook, share: float) -> Shadows:
     at = response[row, column]
     uv = np.column_stack(
         [
-            column + _vertex(response[row, column - 1], at, response[row, column + 1]),
-            row + _vertex(response[row - 1, column], at, response[row + 1, column]),
+            column + vertex(response[row, column - 1], at, response[row, column + 1]),
+            row + vertex(response[row - 1, column], at, response[row + 1, column]),
         ]
     )
     return Shadows(uv, at)
-
-
-def _vertex(before: np.ndarray, at: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Places (n,) of the vertices of parabolas through three samples, relative to the middle."""
-    curvature = before - 2 * at + after
-    shift = 0.5 * (before - after) / np.where(curvature < 0, curvature, -1.0)
-    return np.clip(np.where(curvature < 0, shift, 0), -0.5, 0.5)
 
 
 FIRST_SD_PX = 1.5  # of a given place of the first frame

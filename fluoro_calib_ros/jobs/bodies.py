@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..bodies.body import STATUS_NAMES, Body, BodyPoses, check_bodies, solvable_bodies
+from ..bodies.body import AXIS_MM, STATUS_NAMES, Body, BodyPoses, check_bodies, solvable_bodies
 from ..bodies.butterworth import filtered_poses
 from ..bodies.joints import JointMotion, joint_motion, with_neutral
 from ..bodies.shapes import EstimatedShape, estimate_shape, places_of
@@ -47,7 +47,6 @@ from ..reconstruction.reconstruct import (
 from .image_sources import fluoroscope_folders, is_image_bag, open_sources
 
 FILM_HZ = 25.0  # slow motion: players show no 250 images a second
-AXIS_MM = 20.0  # length of an axis, about the size of a cluster of markers in a bone
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from ..correction.angle_field import note_on_angles
 from ..correction.base import CorrectionStatus
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError
@@ -265,13 +266,10 @@ def _corrected(
                 f'{", ".join(calibrations)}'
             )
         out[name] = []
-        unknown = sum(frame.angle is None for frame in frames)
-        if calibrations[name].angle_field is not None and unknown and request.angle is None:
-            notes.append(
-                f'{request.source}: the correction of fluoroscope {name} depends on the angle of '
-                f'the C-arm, which is unknown for {unknown} of {len(frames)} frames: they get the '
-                'mean over the angles, with its larger standard deviation'
-            )
+        angles = [frame.angle for frame in frames]
+        note = note_on_angles(name, calibrations[name].angle_field, angles)
+        if note and request.angle is None:
+            notes.append(f'{request.source}: {note}')
         for frame in frames:
             angle = request.angle if frame.angle is None else frame.angle
             points = calibrations[name].correct(frame.uv, frame.sigma, angle=angle)

@@ -21,6 +21,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from ..bodies.body import Body
+from ..correction.angle_field import note_on_angles
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError
 from ..exposures.frame import Frame
@@ -390,15 +391,12 @@ class _Recording:
             angles = [result.angle for result in results]
             yield from request.angles.note(name, angles)
             calibration = request.calibrations.get(name)
-            if calibration is None or calibration.angle_field is None:
-                continue
-            unknown = angles.count(None)
-            if unknown:
-                yield (
-                    f'the correction of fluoroscope {name} depends on the angle of the C-arm, '
-                    f'which is unknown for {unknown} of {len(angles)} images: markers are '
-                    'predicted by the mean over the angles'
-                )
+            field = None if calibration is None else calibration.angle_field
+            note = note_on_angles(
+                name, field, angles, 'images', 'markers are predicted by the mean over the angles'
+            )
+            if note:
+                yield note
 
 
 def _angles_of(images: Mapping[str, SourceImage]) -> dict[str, float | None]:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..correction.angle_field import note_on_angles
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError, ErrorsAt
 from ..exposures.angles import AngleOptions
@@ -385,19 +386,16 @@ def _unknown_angles(
 ) -> Iterable[str]:
     """Yield a sentence for each fluoroscope whose correction needs angles that are unknown."""
     for name, each in frames.items():
-        count = sum(frame.angle is None for frame in each)
-        if calibrations[name].angle_field is None or not count:
+        angles = [frame.angle for frame in each]
+        note = note_on_angles(name, calibrations[name].angle_field, angles)
+        if not note:
             continue
         hint = ''
         if not (selection and selection.angles.angle_joint) and is_bag(path):
             topics = joint_topics(path)
             if topics:
                 hint = f'; name the joint on {", ".join(topics)} with --angle-joint'
-        yield (
-            f'{path}: the correction of fluoroscope {name} depends on the angle of the C-arm, '
-            f'which is unknown for {count} of {len(each)} frames: they get the mean over the '
-            f'angles, with its larger standard deviation{hint}'
-        )
+        yield f'{path}: {note}{hint}'
 
 
 def read_point_table(

@@ -73,6 +73,22 @@ def least_vectors_with_last_one(forms: np.ndarray) -> np.ndarray:
     return np.concatenate([found[..., 0], np.ones_like(found[..., :1, 0])], axis=-1)
 
 
+def dlt_rows(x: np.ndarray, u: np.ndarray, weights: np.ndarray | None) -> np.ndarray:
+    """Rows (..., 2n, 3 (k + 1)) of u ~ P (x, 1) in P, row by row: x (..., n, k), u (..., n, 2)."""
+    x1 = np.concatenate([x, np.ones_like(x[..., :1])], axis=-1)
+    zero = np.zeros_like(x1)
+    rows = np.concatenate(
+        [
+            np.concatenate([x1, zero, -u[..., :1] * x1], axis=-1),
+            np.concatenate([zero, x1, -u[..., 1:] * x1], axis=-1),
+        ],
+        axis=-2,
+    )
+    if weights is not None:
+        rows = rows * np.sqrt(np.concatenate([weights, weights], axis=-1))[..., None]
+    return rows
+
+
 def direct_linear_transformation(
     xyz: np.ndarray,
     uv: np.ndarray,
@@ -91,17 +107,7 @@ def direct_linear_transformation(
     scale_u = np.sqrt(2 / np.mean(np.sum((uv - mean_u) ** 2, axis=-1), axis=-1))[..., None, None]
     x = (xyz - mean_x) * scale_x
     u = (uv - mean_u) * scale_u
-    x1 = np.concatenate([x, np.ones_like(x[..., :1])], axis=-1)
-    zero = np.zeros_like(x1)
-    rows = np.concatenate(
-        [
-            np.concatenate([x1, zero, -u[..., :1] * x1], axis=-1),
-            np.concatenate([zero, x1, -u[..., 1:] * x1], axis=-1),
-        ],
-        axis=-2,
-    )
-    if weights is not None:
-        rows = rows * np.sqrt(np.concatenate([weights, weights], axis=-1))[..., None]
+    rows = dlt_rows(x, u, weights)
     vectors = least(np.swapaxes(rows, -1, -2) @ rows)
     normalised = vectors.reshape(vectors.shape[:-1] + (3, 4))
     to_x = np.zeros(normalised.shape[:-2] + (4, 4))

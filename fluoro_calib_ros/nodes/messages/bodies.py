@@ -23,7 +23,7 @@ from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import Marker, MarkerArray
 
 from ...bodies import body as of_bodies
-from ...bodies.body import Body, PoseStatus
+from ...bodies.body import AXIS_MM, Body, PoseStatus
 from ...bodies.joints import JointMotion, JointStatus
 from ...photogrammetry.rig_orientation import RigOrientation
 from ...photogrammetry.rotations import quaternion_from_matrix
@@ -45,7 +45,6 @@ _TO_METRES = np.repeat([1e-3, 1.0], 3)  # position, then rotation
 _SCALE = _TO_METRES[:, None] * _TO_METRES
 _OF_JOINT = _SCALE[::-1, ::-1]  # angles, then translations
 AXES = [ColorRGBA(r=r, g=g, b=b, a=1.0) for r, g, b in np.eye(3).tolist()]  # as RViz draws them
-AXIS_MM = 20.0  # length of an axis, about the size of a cluster of markers in a bone
 MARKER_MM = 2.0
 
 

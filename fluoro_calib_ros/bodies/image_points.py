@@ -39,7 +39,7 @@ class Linear:
 class Cameras:
     """The fluoroscopes of a rig, as they see the markers of bodies.
 
-    target_id: (B, M) Markers of B bodies, -1 where a body has fewer.
+    target_id: (B, M) markers of B bodies, -1 where a body has fewer.
     """
 
     def __init__(self, orientation: RigOrientation, target_id: np.ndarray) -> None:

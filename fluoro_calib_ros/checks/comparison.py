@@ -25,7 +25,7 @@ from scipy.special import chdtri
 from ..correction.base import Correction
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration, at_common_angle
 from ..errors import DataError
-from ..estimation.gauge import interior_about
+from ..estimation.estimator import interior_about
 from ..exposures.frame import cells_of
 
 # Comparison of two independent calibrations of one fluoroscope, and names of image areas.

@@ -22,7 +22,7 @@ import numpy as np
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..correction.series import sd_grid_pixels
 from ..errors import DataError
-from ..estimation.gauge import interior_about
+from ..estimation.estimator import interior_about
 from ..estimation.options import CalibrationRequest
 from ..estimation.result import CalibrationResult, FluoroscopeResult
 from ..exposures.frame import Frame, validate_frame

@@ -19,13 +19,16 @@ from ..findings import Finding, Kind, Place, Severity, first_few
 from ..photogrammetry.elimination import factorize
 from ..photogrammetry.normal_equations import normal_equations
 from ..photogrammetry.precision import covariance_blocks
-from ..photogrammetry.relative_orientation import (
+from ..photogrammetry.unknowns import (
+    RIGID_SD_MM,
+    RIGID_SD_RAD,
+    RelativeConstraint,
+    RelativePose,
     discrepancies,
     discrepancies_with_jacobian,
     mean_pose,
 )
-from ..photogrammetry.unknowns import RIGID_SD_MM, RIGID_SD_RAD, RelativeConstraint, RelativePose
-from .gauge import GaugeKind
+from .estimator import GaugeKind
 from .initial_network import Measured
 from .options import CalibrationOptions
 from .rounds import SelfCalibration

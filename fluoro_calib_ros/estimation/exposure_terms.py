@@ -38,7 +38,7 @@ from ..photogrammetry.noise import Noise
 from ..photogrammetry.normal_equations import normal_equations
 from ..photogrammetry.precision import information_of_additional, solved_additional
 from ..photogrammetry.unknowns import EXTERIOR_SIZE, INTERIOR_SIZE
-from .gauge import GaugeKind, gauge_basis
+from .estimator import GaugeKind, gauge_basis
 
 TERMS = len(cubic_terms())  # of the cubic trend without the gauge
 # Square sum of the terms over its expectation for independent residuals from which distortion is

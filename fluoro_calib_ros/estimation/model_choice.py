@@ -19,8 +19,14 @@ from ..correction.series import sd_grid_pixels
 from ..photogrammetry.precision import Precision
 from ..photogrammetry.rotations import vector_from_matrix
 from .collocation import CollocationTerms
-from .estimator import AdjustedTerms, AdjustmentProblem, exposure_folds
-from .gauge import GaugeKind, gauge_basis, gauge_rows
+from .estimator import (
+    AdjustedTerms,
+    AdjustmentProblem,
+    GaugeKind,
+    exposure_folds,
+    gauge_basis,
+    gauge_rows,
+)
 from .neighbour_regression import CrossValidation
 from .parametric import StepwiseTerms
 from .priors import GAUGE_SD_PX, prior_precision

@@ -38,8 +38,14 @@ from ..options import option, validate_options
 from ..photogrammetry.known_orientation import KnownOrientation
 from ..photogrammetry.network import DATUMS
 from ..photogrammetry.noise import LOSSES
-from .estimator import Estimator, RegressionStep, TrainingPoints, require_training
-from .gauge import gauge_basis, gauge_coefficients
+from .estimator import (
+    Estimator,
+    RegressionStep,
+    TrainingPoints,
+    gauge_basis,
+    gauge_coefficients,
+    require_training,
+)
 from .neighbour_regression import weighted_square_sum
 
 if TYPE_CHECKING:

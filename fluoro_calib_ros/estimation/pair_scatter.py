@@ -24,8 +24,13 @@ from ..correction.angle_field import harmonics
 from ..correction.calibration_record import HARMONICS
 from ..photogrammetry.collinearity import project
 from ..photogrammetry.network import Network
-from ..photogrammetry.relative_orientation import discrepancies, mean_pose
-from ..photogrammetry.unknowns import Parameters, RelativeConstraint, RelativePose
+from ..photogrammetry.unknowns import (
+    Parameters,
+    RelativeConstraint,
+    RelativePose,
+    discrepancies,
+    mean_pose,
+)
 from .angle_fit import can_be_fitted
 
 # A pair of exposures is left out of the mean where its deviation is so many times its standard

@@ -24,8 +24,14 @@ from ..correction.terms import HIGHEST, expert_terms
 from ..photogrammetry.additional_parameters import AdditionalParameters
 from ..photogrammetry.noise_estimation import LOOSE
 from ..photogrammetry.precision import information_of_additional
-from .estimator import AdjustedTerms, AdjustmentProblem, coefficients_of, prior_of_additional
-from .gauge import GaugeKind, gauge_basis
+from .estimator import (
+    AdjustedTerms,
+    AdjustmentProblem,
+    GaugeKind,
+    coefficients_of,
+    gauge_basis,
+    prior_of_additional,
+)
 
 if TYPE_CHECKING:
     from ..photogrammetry.adjustment import Adjustment

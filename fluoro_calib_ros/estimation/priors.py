@@ -20,7 +20,7 @@ from scipy.linalg import block_diag, cho_factor, cho_solve
 
 from ..correction.series import Functions
 from ..correction.terms import ABSENT_VARIANCE, trend_transformation
-from .gauge import GaugeKind, gauge_rows
+from .estimator import GaugeKind, gauge_rows
 from .local_signal import LocalSignal, SineEstimates, bumps, largest_gain, with_likely_places
 from .parametric import covariance_with_uncertain_terms
 from .signal import Signal, SignalEquations, most_likely_signal, starting_signal

@@ -39,14 +39,15 @@ from ..photogrammetry.known_orientation import HELD_SD_MM, HELD_SD_RAD
 from ..photogrammetry.network import Network
 from ..photogrammetry.normal_equations import normal_equations
 from ..photogrammetry.precision import covariance_blocks
-from ..photogrammetry.relative_orientation import (
+from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation, with_datum_of_points
+from ..photogrammetry.rotations import matrix_from_quaternion
+from ..photogrammetry.unknowns import (
+    RelativeConstraint,
+    RelativePose,
     discrepancies_with_jacobian,
     mean_pose,
     relative_poses,
 )
-from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation, with_datum_of_points
-from ..photogrammetry.rotations import matrix_from_quaternion
-from ..photogrammetry.unknowns import RelativeConstraint, RelativePose
 from .constraints import paired_exposures
 from .fixed_calibration import (
     fixed_corrections,

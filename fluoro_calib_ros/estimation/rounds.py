@@ -25,7 +25,7 @@ from ..photogrammetry.diagnosis import (
 )
 from ..photogrammetry.outliers import find_outliers
 from ..photogrammetry.precision import Precision
-from ..photogrammetry.relative_orientation import discrepancies
+from ..photogrammetry.unknowns import discrepancies
 from .initial_network import Measured
 
 SETTLED_PX = 2e-3  # RMS change of the correction below which a round is the last

@@ -42,10 +42,10 @@ from .estimator import (
     AdjustedTerms,
     AdjustmentProblem,
     Estimator,
+    GaugeKind,
     RegressionStep,
     TrainingPoints,
 )
-from .gauge import GaugeKind
 from .initial_network import EarlierCalibration, Measured, adjusted_with_precision, start_noise
 from .model_choice import START_MODEL, better_model, with_errors_by
 from .neighbour_regression import NeighbourRegression

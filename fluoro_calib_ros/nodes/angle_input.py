@@ -14,9 +14,8 @@ from sensor_msgs.msg import JointState
 
 from ..exposures.angles import AngleOptions
 from .messages.observations import JointStates, decode_joint_state
-from .runtime.diagnostics import WARN, Health
+from .runtime.diagnostics import WARN, Health, RateLimitedLogger, StartError
 from .runtime.lifecycle import StreamNode
-from .runtime.logging import RateLimitedLogger, StartError
 from .runtime.streams import FaultHandlers, StreamReader, observations_qos
 
 TOPIC = 'joint_states'

@@ -30,7 +30,7 @@ from rclpy.subscription import Subscription
 
 from ..options import option
 from .recorder_node import adapted_qos, type_hash_text
-from .runtime.logging import RateLimitedLogger, StartError
+from .runtime.diagnostics import RateLimitedLogger, StartError
 from .runtime.main import run
 from .runtime.parameters import ParameterGroup, ParameterNode
 from .runtime.streams import TopicDiscovery, definition_of, installed_type

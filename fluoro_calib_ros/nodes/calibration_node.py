@@ -26,7 +26,7 @@ from rclpy.lifecycle.node import LifecycleState
 from ..exposures.frame import Frame
 from .angle_input import AngleInput
 from .calibration_output import CONDITIONS, CalibrationOutput, FluoroscopeState
-from .calibration_services import CollectServices, OrientationService
+from .calibration_services import CollectServices, OrientationService, SelfCalibration
 from .calibration_settings import (
     PARAMETERS,
     CalibrationFiles,
@@ -45,7 +45,6 @@ from .runtime.main import run
 from .runtime.parameters import declare_read_limits
 from .runtime.stream import stream_faults
 from .runtime.streams import observations_qos
-from .self_calibration import SelfCalibration
 
 __all__ = ['PARAMETERS', 'CalibrationNode', 'main']
 

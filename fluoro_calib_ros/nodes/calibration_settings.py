@@ -38,8 +38,8 @@ from ..limits import CollectLimits
 from ..options import option
 from ..photogrammetry.rig_orientation import RigOrientation
 from .calibration_output import CalibrationOutput
+from .runtime.diagnostics import Logger, StartError
 from .runtime.lifecycle import ServiceEntry
-from .runtime.logging import Logger, StartError
 from .runtime.parameters import (
     READ_LIMITS,
     ManagedParameters,

@@ -16,9 +16,17 @@ from ..exposures.angles import AngleOptions
 from ..io.calibration import SUFFIX, disagreements, load_calibrations
 from .angle_input import AngleInput, beyond_text
 from .calibration_input import CalibrationInput
-from .runtime.diagnostics import OK, Health, RefusalLog, Status, fault, health_of, warning
+from .runtime.diagnostics import (
+    OK,
+    Health,
+    RefusalLog,
+    Status,
+    fault,
+    health_of,
+    one_line,
+    warning,
+)
 from .runtime.lifecycle import StreamNode
-from .runtime.logging import one_line
 from .runtime.parameters import CalibratedParameters, expand_path
 from .runtime.stream import (
     Stream,

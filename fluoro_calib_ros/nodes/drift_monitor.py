@@ -18,8 +18,7 @@ from ..checks.rig_watch import RigDriftWatch
 from ..options import option
 from ..photogrammetry.rig_orientation import RigOrientation
 from .messages.status import ALARM, message_from_drift_state
-from .runtime.diagnostics import ERROR, OK, WARN, Status
-from .runtime.logging import Logger
+from .runtime.diagnostics import ERROR, OK, WARN, Logger, Status
 
 LEVELS = (OK, WARN, ERROR)  # of the diagnostics, by the level of a DriftState
 

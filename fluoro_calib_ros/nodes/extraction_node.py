@@ -37,9 +37,8 @@ from .image_node import INPUTS
 from .image_stream import CONDITIONS, ExtractionWorkers, ImageState, ImageStream, Task
 from .messages.image import message_from_image, use_single_thread
 from .messages.observations import NS_PER_S, message_from_frame
-from .runtime.diagnostics import RefusalLog, Status, health_of
+from .runtime.diagnostics import Logger, RefusalLog, StartError, Status, health_of
 from .runtime.lifecycle import StreamNode
-from .runtime.logging import Logger, StartError
 from .runtime.main import run
 from .runtime.parameters import (
     READ_LIMITS,

@@ -21,8 +21,8 @@ from std_srvs.srv import SetBool, Trigger
 from ..errors import DataError
 from ..io.bags.reader import TopicInfo, iterate_messages, topics_of
 from ..options import option
+from .runtime.diagnostics import StartError, Trace, one_line
 from .runtime.lifecycle import ServiceEntry, create_services
-from .runtime.logging import StartError, Trace, one_line
 from .runtime.main import run
 from .runtime.parameters import READ_LIMITS, ParameterGroup, ParameterNode, declare_read_limits
 from .runtime.streams import (

@@ -30,8 +30,14 @@ from .messages.fluoroscope_calibration import image_size_of
 from .messages.observations import NS_PER_S, CorrectedFrame, decode_corrected_observations
 from .messages.points import PointsContent
 from .messages.rig_orientation import transforms_of_orientation
-from .points_output import BodiesOutput, PointsCounter, PointsOutput
-from .reconstruction_health import CONDITIONS, ReconstructionState, statuses_of
+from .reconstruction_output import (
+    CONDITIONS,
+    BodiesOutput,
+    PointsCounter,
+    PointsOutput,
+    ReconstructionState,
+    statuses_of,
+)
 from .rig_input import BodyFollower, BodyParameters, Rig, RigInput, read_body_files
 from .runtime.diagnostics import LatencyWindow, RefusalLog, Refused, Status, health_of
 from .runtime.lifecycle import StreamNode

@@ -34,8 +34,7 @@ from .messages.rig_orientation import (
     message_from_orientation,
     orientation_from_message,
 )
-from .runtime.diagnostics import RefusalLog
-from .runtime.logging import Logger
+from .runtime.diagnostics import Logger, RefusalLog
 from .runtime.parameters import expand_path
 
 MAX_ORIENTATIONS = 4  # frames of the previous calibrations may still come

@@ -33,7 +33,7 @@ from ..simulation.exposures import (
 from ..simulation.rig import virtual_rig
 from .messages.image import message_from_image
 from .messages.observations import message_from_frame, set_number_and_stamp, stamp_from_nanoseconds
-from .runtime.logging import StartError, Trace
+from .runtime.diagnostics import StartError, Trace
 from .runtime.main import run
 from .runtime.parameters import ParameterGroup, ParameterNode, RigParameters
 from .runtime.streams import (

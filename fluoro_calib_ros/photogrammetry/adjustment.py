@@ -28,8 +28,7 @@ from .elimination import (
 from .network import Network, transform_to_datum
 from .noise import DEFAULT_NOISE, Noise, widening_by_group
 from .normal_equations import normal_equations, project_network, right_sides
-from .relative_orientation import discrepancies
-from .unknowns import Parameters
+from .unknowns import Parameters, discrepancies
 
 # Relative increase of the cost that rounding errors can cause.
 ROUNDING = 1e-12

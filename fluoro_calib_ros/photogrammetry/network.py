@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 
 from .additional_parameters import AdditionalParameters
 from .known_orientation import ExteriorPrior
-from .relative_orientation import exposures_after_step
 from .rotations import cross_matrix, matrix_from_vector
 from .unknowns import (
     INTERIOR_SIZE,
@@ -34,6 +33,7 @@ from .unknowns import (
     RelativePose,
     UnknownLayout,
     UnknownVector,
+    exposures_after_step,
 )
 
 DATUM_DEFECT = 7  # unknowns that the datum of a free network fixes: shift, turn and scale
@@ -158,7 +158,7 @@ class Network:
         """Parameters after a step; rotations are varied on the left, R -> exp([w]x) R.
 
         The second exposures of constrained pairs follow their constraint (see
-        relative_orientation.exposures_after_step).
+        unknowns.exposures_after_step).
         """
         layout = self.layout
         interior_step = step.globals[layout.all_interiors].reshape(-1, INTERIOR_SIZE)

@@ -18,8 +18,13 @@ from numpy.typing import NDArray
 
 from .network import Gauge, Network, open_gauge
 from .noise import Noise
-from .relative_orientation import discrepancies_with_jacobian
-from .unknowns import EXTERIOR_SIZE, POSE_SIZE, Parameters, UnknownVector
+from .unknowns import (
+    EXTERIOR_SIZE,
+    POSE_SIZE,
+    Parameters,
+    UnknownVector,
+    discrepancies_with_jacobian,
+)
 
 # Image points that are linearised at once: their arrays stay in the cache.
 CHUNK = 8_000

@@ -22,9 +22,8 @@ from .elimination import CovarianceBlocks, Elimination, FactorizedNormalMatrix, 
 from .network import Gauge, Network, STransformation
 from .noise import Noise
 from .normal_equations import NormalEquations, normal_equations, right_sides
-from .relative_orientation import discrepancies_with_jacobian
 from .rotations import square_of_lower
-from .unknowns import Parameters, UnknownVector
+from .unknowns import Parameters, UnknownVector, discrepancies_with_jacobian
 
 # Smallest weight of a gross error, so that its variance stays finite.
 MIN_WEIGHT = 1e-9

@@ -38,9 +38,8 @@ from fluoro_calib_ros.correction.terms import (
 from fluoro_calib_ros.estimation.calibrate import adjust_with_calibrations, calibrate
 from fluoro_calib_ros.estimation.collocation import CollocationTerms, EarlierTerms
 from fluoro_calib_ros.estimation.combined_adjustment import calibrate_by_adjustment
-from fluoro_calib_ros.estimation.estimator import AdjustmentProblem
+from fluoro_calib_ros.estimation.estimator import AdjustmentProblem, GaugeKind, gauge_basis
 from fluoro_calib_ros.estimation.fluoroscope_terms import FluoroscopeTerms
-from fluoro_calib_ros.estimation.gauge import GaugeKind, gauge_basis
 from fluoro_calib_ros.estimation.initial_network import (
     adjusted_with_precision,
     measured_network,

@@ -21,9 +21,10 @@ from fluoro_calib_ros.correction.neighbours import (
     least_squares_map,
 )
 from fluoro_calib_ros.correction.registry import MODELS, create_model, no_correction
-from fluoro_calib_ros.estimation.estimator import TrainingPoints, exposure_folds
-from fluoro_calib_ros.estimation.gauge import (
+from fluoro_calib_ros.estimation.estimator import (
     GaugeKind,
+    TrainingPoints,
+    exposure_folds,
     gauge_basis,
     gauge_coefficients,
     interior_about,

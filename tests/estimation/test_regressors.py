@@ -29,7 +29,7 @@ from fluoro_calib_ros.correction.registry import (
 )
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.calibrate import calibrate
-from fluoro_calib_ros.estimation.gauge import gauge_coefficients
+from fluoro_calib_ros.estimation.estimator import gauge_coefficients
 from fluoro_calib_ros.estimation.neighbour_regression import CrossValidation
 from fluoro_calib_ros.estimation.options import CalibrationOptions, regressor_name, resolve_model
 from fluoro_calib_ros.estimation.regressors import KnnRegressor, LocalLinearRegressor

@@ -24,7 +24,7 @@ from fluoro_calib_ros.nodes.messages.bodies import (
     pose_with_covariance,
     transforms_of_bodies,
 )
-from fluoro_calib_ros.nodes.reconstruction_health import statuses_of
+from fluoro_calib_ros.nodes.reconstruction_output import statuses_of
 from fluoro_calib_ros.nodes.rig_input import BodyFollower, BodyParameters, Rig, read_body_files
 from fluoro_calib_ros.nodes.runtime.diagnostics import OK, WARN, RecentCounts
 from fluoro_calib_ros.photogrammetry.noise import ObservedScatter

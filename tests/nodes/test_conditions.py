@@ -11,19 +11,19 @@ import pytest
 from fluoro_calib_msgs.srv import Reset
 
 from fluoro_calib_ros.nodes import calibration_output, correcting_node, image_stream
-from fluoro_calib_ros.nodes import reconstruction_health as reconstruction
+from fluoro_calib_ros.nodes import reconstruction_output as reconstruction
 from fluoro_calib_ros.nodes.runtime.diagnostics import (
     ERROR,
     OK,
     WARN,
     Health,
+    RateLimitedLogger,
     RefusalLog,
     Refused,
     fault,
     health_of,
 )
 from fluoro_calib_ros.nodes.runtime.lifecycle import Requests, ServiceEntry, create_services
-from fluoro_calib_ros.nodes.runtime.logging import RateLimitedLogger
 from fluoro_calib_ros.nodes.runtime.stream import Stream, stream_faults
 
 LOGGER = SimpleNamespace(warning=lambda text: None, error=lambda text: None)

@@ -27,7 +27,7 @@ from fluoro_calib_ros.nodes.messages.rig_orientation import (
     message_from_orientation,
     orientation_from_message,
 )
-from fluoro_calib_ros.nodes.runtime.logging import MAX_LINE, PrintableLogger, RateLimitedLogger
+from fluoro_calib_ros.nodes.runtime.diagnostics import MAX_LINE, PrintableLogger, RateLimitedLogger
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 
 FORGED = 'a\n[FATAL] forged\x1b[2J'

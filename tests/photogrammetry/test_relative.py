@@ -22,13 +22,6 @@ from fluoro_calib_ros.photogrammetry.elimination import EliminateExposures, Elim
 from fluoro_calib_ros.photogrammetry.noise import LOSSES, Noise
 from fluoro_calib_ros.photogrammetry.noise_estimation import adjust_and_estimate_noise
 from fluoro_calib_ros.photogrammetry.precision import precision
-from fluoro_calib_ros.photogrammetry.relative_orientation import (
-    discrepancies,
-    discrepancies_with_jacobian,
-    exposures_from_pose,
-    mean_pose,
-    relative_poses,
-)
 from fluoro_calib_ros.photogrammetry.rotations import (
     matrix_from_vector,
     rotation_angle,
@@ -39,6 +32,11 @@ from fluoro_calib_ros.photogrammetry.unknowns import (
     RIGID_SD_RAD,
     RelativeConstraint,
     RelativePose,
+    discrepancies,
+    discrepancies_with_jacobian,
+    exposures_from_pose,
+    mean_pose,
+    relative_poses,
 )
 
 POSE = RelativePose(matrix_from_vector([0.03, -1.19, -0.02]), np.array([-1300.0, 30.0, 980.0]))

@@ -14,12 +14,12 @@ from pathlib import Path
 
 from ...errors import DataError
 from ..access import PathLike, check_regular_file, os_error_reason
-from . import bundle, c3d, native, xmalab_points, xmalab_project
+from . import bundle, native, xmalab_points, xmalab_project
 from .bodies import AUTOSCOPER, OPENSIM, POSES, RIGIDBODY
 from .content import PARTS, Content, FileSettings, Format, Sample, Written, has_content
 from .opencv_cameras import ANIPOSE, CAMERA_INFO, OPENCV
 from .phantoms import COORDINATES, FRAMESPEC
-from .points import TRC, XMALAB3D
+from .points import C3D, TRC, XMALAB3D
 from .xmalab_cameras import DLT, LOOKUP, MAYACAM1, MAYACAM2
 
 HEAD = 65536  # bytes by which a format is recognised
@@ -48,7 +48,7 @@ FORMATS: dict[str, Format] = {
         CAMERA_INFO,
         COORDINATES,
         bundle.FORMAT,
-        c3d.FORMAT,
+        C3D,
         TRC,
         OPENSIM,
     )

@@ -25,8 +25,17 @@ from rclpy.service import Service
 from rclpy.task import Future
 
 from ...limits import MAX_TEXT
-from .diagnostics import DiagnosticsPublisher, RecentCounts, RefusalLog, Status
-from .logging import USER_ERRORS, RateLimitedLogger, StartError, Trace, one_line
+from .diagnostics import (
+    USER_ERRORS,
+    DiagnosticsPublisher,
+    RateLimitedLogger,
+    RecentCounts,
+    RefusalLog,
+    StartError,
+    Status,
+    Trace,
+    one_line,
+)
 from .parameters import ParameterNode
 from .streams import FaultHandlers, StreamReader, best_effort_message, qos_overrides, services_qos
 

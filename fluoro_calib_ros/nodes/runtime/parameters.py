@@ -35,7 +35,7 @@ from ...errors import DataError, printable, shortened
 from ...io.documents import read_yaml
 from ...limits import MAX_TEXT, ReadLimits, use_read_limits
 from ...options import Option, declared, option
-from .logging import PrintableLogger, StartError
+from .diagnostics import PrintableLogger, StartError
 
 MAX_TIMEOUT_S = 86400.0  # longest time that a request may ask a node to wait
 MAX_INTEGER = 2**63 - 1

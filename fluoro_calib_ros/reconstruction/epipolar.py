@@ -141,23 +141,3 @@ def _essential_jacobian(
     by_interior_b = -m.transpose(0, 2, 1) @ essential / c[1]
     rows = [by_position, by_rotation_a, by_interior_a, -by_position, by_rotation_b, by_interior_b]
     return np.concatenate(rows).reshape(2 * ORIENTATION_SIZE, 9).T
-
-
-def epipolar_residuals(
-    orientation: RigOrientation,
-    a: str,
-    b: str,
-    uv_a: ArrayLike,
-    uv_b: ArrayLike,
-    sigma_a: ArrayLike,
-    sigma_b: ArrayLike,
-) -> EpipolarResiduals:
-    """Epipolar residuals of image points of two fluoroscopes.
-
-    For many frames of one orientation, build one EpipolarGeometry.
-
-    a, b: names of the fluoroscopes. uv_a, uv_b: (n, 2), corrected pixels. sigma_a, sigma_b: (n,)
-    or a number, standard deviations of their coordinates [px]. Raises DataError as
-    EpipolarGeometry.
-    """
-    return EpipolarGeometry(orientation, a, b).residuals(uv_a, uv_b, sigma_a, sigma_b)

@@ -24,7 +24,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from fluoro_calib_ros.bodies.body import Body, declared_bodies
-from fluoro_calib_ros.checks.drift_options import (
+from fluoro_calib_ros.checks.drift_charts import (
     ERROR,
     OK,
     WARN,

@@ -24,8 +24,8 @@ from fluoro_calib_ros.checks import held_out as held_fit
 from fluoro_calib_ros.checks import inputs, mixed_units, verdict
 from fluoro_calib_ros.checks import inputs as plausibility
 from fluoro_calib_ros.checks import rig as rig_checks
+from fluoro_calib_ros.checks.drift_charts import ERROR, WARN
 from fluoro_calib_ros.checks.drift_evidence import DriftEstimate
-from fluoro_calib_ros.checks.drift_options import ERROR, WARN
 from fluoro_calib_ros.checks.drift_watch import DriftWatch
 from fluoro_calib_ros.checks.rig import doubtful
 from fluoro_calib_ros.checks.rig_watch import RecordingDriftWatch
@@ -56,7 +56,7 @@ from fluoro_calib_ros.jobs.calibration import _without_copies, _without_shared
 from fluoro_calib_ros.jobs.followers import MarkerFollower, _wrong_start
 from fluoro_calib_ros.jobs.sources import read_content
 from fluoro_calib_ros.photogrammetry.known_orientation import KnownOrientation
-from fluoro_calib_ros.reconstruction import mismatch
+from fluoro_calib_ros.reconstruction import epipolar
 
 PHANTOM = rig().phantom
 CORNERS = np.array([[-15.0, -12, -3], [14, -10, 5], [2, 16, -8], [-6, 3, 15], [11, 8, 10]])
@@ -200,8 +200,8 @@ def moved_rig():
 def trial(kind):
     """What a trial of the reconstruction says is confused."""
     both = {name: list(of_one[:2]) for name, of_one in exposures().items()}
-    found = [why for why, _ in mismatch._trials(both, 'ab', {1, 2})]
-    return mismatch._missing(0.9, next(one for one in found if one.kind is kind))
+    found = [why for why, _ in epipolar._trials(both, 'ab', {1, 2})]
+    return epipolar._missing(0.9, next(one for one in found if one.kind is kind))
 
 
 def bead(**changes):
@@ -457,10 +457,10 @@ MAKERS = {
         Fake(fluoroscopes={'a': Fake(rmse_after=(2.0, 2.0), rmse_before=(2.0, 2.0))}),
         {'a': Fake(image_sd=0.25)},
     )[0],
-    Kind.NO_COMMON_TARGETS: lambda: mismatch.UNMATCHED,
+    Kind.NO_COMMON_TARGETS: lambda: epipolar.UNMATCHED,
     Kind.PAIRS_CONTRADICT: lambda: about_pairs(unexplained=20.0),
     Kind.PAIRS_EXCLUDED: lambda: about_pairs(used=np.arange(8) != 4),
-    Kind.RAYS_DO_NOT_MEET: lambda: mismatch._missing(0.9, mismatch.UNKNOWN),
+    Kind.RAYS_DO_NOT_MEET: lambda: epipolar._missing(0.9, epipolar.UNKNOWN),
     Kind.RIG_DEPENDS_ON_ANGLE: lambda: about_pairs(angle_px=1.5),
     Kind.RIG_MOVED: moved_rig,
     Kind.RIG_NOTE: saved_note,

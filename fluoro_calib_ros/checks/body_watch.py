@@ -36,8 +36,7 @@ from ..bodies.rigid import fitted_pose
 from ..bodies.shapes import learned_shape
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.reconstruct import IntersectedViews
-from .charts import ImageAreas
-from .drift_options import DriftOptions
+from .drift_charts import DriftOptions, ImageAreas
 
 COMPONENTS = 2  # of a shift in an image, u and v
 # Fraction of the systematic standard deviation that markers in an area have in common. Measured:

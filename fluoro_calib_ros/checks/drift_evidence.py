@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .body_watch import COMPONENTS
-from .charts import MIN_INFORMATION, CusumCharts
+from .drift_charts import MIN_INFORMATION, CusumCharts
 
 WINDOW_S = 30.0  # newest blocks from which place and size of a drift are estimated
 # Log-likelihood of another fluoroscope, over that of the likeliest one, from which both are named.

@@ -35,7 +35,18 @@ from ..findings import Finding, Kind, Place, Severity
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.reconstruct import IntersectedViews
 from .body_watch import COMPONENTS, BodyWatch
-from .charts import EVIDENCE_CAP, CusumCharts, ImageAreas
+from .drift_charts import (
+    ERROR,
+    EVIDENCE_CAP,
+    LEVEL_NAMES,
+    OK,
+    WARN,
+    CusumCharts,
+    DriftOptions,
+    DriftState,
+    EpipolarObservations,
+    ImageAreas,
+)
 from .drift_evidence import (
     EPIPOLAR,
     SERIES_OF_PAIR,
@@ -44,15 +55,6 @@ from .drift_evidence import (
     BodyEvidence,
     DriftEstimate,
     EpipolarEvidence,
-)
-from .drift_options import (
-    ERROR,
-    LEVEL_NAMES,
-    OK,
-    WARN,
-    DriftOptions,
-    DriftState,
-    EpipolarObservations,
 )
 from .pair_watch import PairWatch
 

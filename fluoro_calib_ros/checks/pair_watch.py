@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .charts import MEMORY, ImageAreas
-from .drift_options import DriftOptions, EpipolarObservations
+from .drift_charts import MEMORY, DriftOptions, EpipolarObservations, ImageAreas
 
 LAGS = (1, 2, 4)  # frames over which the noise of a marker is compared
 MIN_CORRELATION = 0.05

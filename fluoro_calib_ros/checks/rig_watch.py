@@ -20,10 +20,10 @@ from ..findings import Finding, Kind
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.epipolar import EpipolarGeometry
 from ..reconstruction.reconstruct import IntersectedViews
-from .charts import MIN_BLOCKS_TO_ALARM
-from .drift_options import (
+from .drift_charts import (
     ERROR,
     LEVEL_NAMES,
+    MIN_BLOCKS_TO_ALARM,
     OK,
     WARN,
     DriftOptions,

@@ -23,8 +23,8 @@ from ..io.poses import point_table
 from ..options import option
 from ..photogrammetry.noise import MAX_WIDENING, ObservedScatter
 from ..photogrammetry.rig_orientation import RigOrientation
+from ..reconstruction.epipolar import cause_of_misses, mismatch
 from ..reconstruction.intersection import STATUS_NAMES, Intersector
-from ..reconstruction.mismatch import cause_of_misses, mismatch
 from ..reconstruction.reconstruct import (
     ReconstructedFrame,
     orientation_of_recorded,

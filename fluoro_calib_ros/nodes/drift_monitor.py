@@ -13,7 +13,7 @@ from rclpy.client import Client
 from rclpy.publisher import Publisher
 
 from ..bodies.body import Body, declared_bodies
-from ..checks.drift_options import DriftOptions, DriftState
+from ..checks.drift_charts import DriftOptions, DriftState
 from ..checks.rig_watch import RigDriftWatch
 from ..options import option
 from ..photogrammetry.rig_orientation import RigOrientation

@@ -16,13 +16,13 @@ from fluoro_calib_msgs.srv import Reset
 from sensor_msgs.msg import CameraInfo
 from tf2_msgs.msg import TFMessage
 
-from ..checks.drift_options import DriftOptions
+from ..checks.drift_charts import DriftOptions
 from ..errors import DataError
 from ..exposures.pairing import PairingOptions, exposure_pairer
 from ..limits import StreamLimits
 from ..options import option
+from ..reconstruction.epipolar import RecentMisses
 from ..reconstruction.intersection import OUTSIDE
-from ..reconstruction.mismatch import RecentMisses
 from ..reconstruction.reconstruct import CorrectedView, intersect_exposure, watch_exposure
 from .drift_monitor import DriftMonitor, DriftParameters
 from .frame_validation import CORRECTED_REFUSALS, validate_corrected, with_limit

@@ -22,8 +22,8 @@ from visualization_msgs.msg import MarkerArray
 from ..bodies.body import STATUS_NAMES, Body, PoseStatus
 from ..bodies.joint_tracking import JointTracker
 from ..exposures.pairing import Pairer
+from ..reconstruction.epipolar import RecentMisses
 from ..reconstruction.intersection import FAILED, OUTSIDE, REJECTED, SINGLE_VIEW, IntersectedPoints
-from ..reconstruction.mismatch import RecentMisses
 from .messages.bodies import (
     FORMS,
     BodiesContent,

@@ -31,8 +31,8 @@ from fluoro_calib_ros.jobs.calibration import adjust
 from fluoro_calib_ros.jobs.orientation import orient
 from fluoro_calib_ros.jobs.reconstruction import ReconstructionOptions, reconstruct
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
+from fluoro_calib_ros.reconstruction.epipolar import RecentMisses
 from fluoro_calib_ros.reconstruction.intersection import Intersector
-from fluoro_calib_ros.reconstruction.mismatch import RecentMisses
 from fluoro_calib_ros.reconstruction.reconstruct import reconstruct_recording
 from fluoro_calib_ros.report import html as html_report
 from fluoro_calib_ros.simulation.exposures import Detection, detect_beads, phantom_poses

@@ -15,13 +15,14 @@ from scipy.spatial.distance import pdist
 
 from fluoro_calib_ros.bodies.body import Body, declared_bodies
 from fluoro_calib_ros.checks.body_watch import BodyWatch
-from fluoro_calib_ros.checks.charts import CusumCharts, ImageAreas
-from fluoro_calib_ros.checks.drift_options import (
+from fluoro_calib_ros.checks.drift_charts import (
     ERROR,
     OK,
     WARN,
+    CusumCharts,
     DriftOptions,
     EpipolarObservations,
+    ImageAreas,
 )
 from fluoro_calib_ros.checks.drift_watch import DriftWatch
 from fluoro_calib_ros.checks.pair_watch import SystematicErrorField

@@ -13,7 +13,7 @@ import pytest
 from rigs import run, true_calibrations, true_orientation
 
 from fluoro_calib_ros.bodies.body import declared_bodies
-from fluoro_calib_ros.checks.drift_options import ERROR, DriftOptions
+from fluoro_calib_ros.checks.drift_charts import ERROR, DriftOptions
 from fluoro_calib_ros.checks.rig_watch import RecordingDriftWatch, RigDriftWatch
 from fluoro_calib_ros.findings import Kind, Severity
 from fluoro_calib_ros.io.calibration import save_calibration, save_orientation

@@ -13,7 +13,7 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from fluoro_calib_msgs.msg import CalibrationStatus, DriftStatus
 
-from ...checks.drift_options import DriftState
+from ...checks.drift_charts import DriftState
 from ...correction.fluoroscope_calibration import FluoroscopeCalibration
 from ...photogrammetry.rig_orientation import RigOrientation
 from .observations import stamp_from_nanoseconds

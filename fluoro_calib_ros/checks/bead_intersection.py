@@ -5,14 +5,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..estimation.result import CalibrationResult
-from ..exposures.frame import Frame
+from ..exposures.frame import Frames
 from ..exposures.phantom import Phantom
 from ..photogrammetry.collinearity import project_with_jacobian
 from ..photogrammetry.noise import INLIER_Q
@@ -86,9 +85,7 @@ class Rays:
     target_id: NDArray[np.int64]  #: (n,)
 
 
-def intersect(
-    job: CalibrationResult, frames: Mapping[str, Sequence[Frame]], phantom: Phantom
-) -> Beads:
+def intersect(job: CalibrationResult, frames: Frames, phantom: Phantom) -> Beads:
     """Intersect the beads of an adjustment from the images of all its fluoroscopes.
 
     The survey only takes part through the orientations, which depend on all beads together. The
@@ -102,10 +99,7 @@ def intersect(
 
 
 def least_chi2_without_a_ray(
-    job: CalibrationResult,
-    frames: Mapping[str, Sequence[Frame]],
-    phantom: Phantom,
-    target_id: NDArray[np.int64],
+    job: CalibrationResult, frames: Frames, phantom: Phantom, target_id: NDArray[np.int64]
 ) -> NDArray[np.float64]:
     """Smallest squared misclosures (n,) of beads with any one of their rays excluded.
 
@@ -212,7 +206,7 @@ def _degrees_of_freedom(
     return float(np.sum(variance) ** 2 / squares)
 
 
-def _rays(job: CalibrationResult, frames: Mapping[str, Sequence[Frame]]) -> Rays:
+def _rays(job: CalibrationResult, frames: Frames) -> Rays:
     """Return the image points of all exposures of an adjustment."""
     parts = []
     for name, figures in job.fluoroscopes.items():

@@ -6,13 +6,13 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
 from ..correction.registry import CollocationModel, selectable_models
 from ..errors import DataError
 from ..estimation.calibrate import adjust_with_calibrations, calibrate_part
@@ -21,7 +21,7 @@ from ..estimation.fixed_calibration import noise_of_calibrations
 from ..estimation.initial_network import EarlierCalibration, StartValues
 from ..estimation.options import AUTO, CalibrationRequest
 from ..estimation.result import CalibrationResult
-from ..exposures.frame import Frame
+from ..exposures.frame import Frame, Frames
 from ..exposures.phantom import Phantom
 from .check import Check
 from .residual_tests import (
@@ -75,13 +75,13 @@ class Evidence:
 
     #: with the frames that were used only, in the order of their numbers
     request: CalibrationRequest
-    calibrations: Mapping[str, FluoroscopeCalibration]
+    calibrations: Calibrations
     result: CalibrationResult  #: adjustment of the frames with the calibrations fixed
     #: to be called with the name of a step before every step of a check
     report_step: Callable[[str], None]
 
     @property
-    def frames(self) -> Mapping[str, Sequence[Frame]]:
+    def frames(self) -> Frames:
         """Frames by fluoroscope."""
         return self.request.frames
 
@@ -166,9 +166,7 @@ class Evidence:
             name: [f for i, f in enumerate(self.frames[name]) if is_chosen(i)] for name in names
         }
 
-    def calibrate(
-        self, frames: Mapping[str, Sequence[Frame]]
-    ) -> Mapping[str, FluoroscopeCalibration]:
+    def calibrate(self, frames: Frames) -> Calibrations:
         """Calibrate with a part of the frames. Raises DataError where they do not suffice."""
         options = self.request.options
         distance = self.request.principal_distance
@@ -189,7 +187,7 @@ class Evidence:
         # where the distortion is large.
         return calibrate_part(part, self.starts, self.calibrations)
 
-    def calibrate_free(self, names: Sequence[str]) -> Mapping[str, FluoroscopeCalibration]:
+    def calibrate_free(self, names: Sequence[str]) -> Calibrations:
         """Calibrate all frames of some fluoroscopes without a given interior orientation.
 
         Raises DataError.
@@ -197,11 +195,7 @@ class Evidence:
         request = replace(self.request, options=replace(self.request.options, interior_sd=None))
         return replace(self, request=request).calibrate(self.part(names, lambda i: True))
 
-    def _has_lost_points(
-        self,
-        found: Mapping[str, FluoroscopeCalibration],
-        frames: Mapping[str, Sequence[Frame]],
-    ) -> bool:
+    def _has_lost_points(self, found: Calibrations, frames: Frames) -> bool:
         """Whether a part rejects clearly more image points than the whole."""
         for name, calibration in found.items():
             kept = _share_of_inliers(calibration, frames[name])
@@ -210,11 +204,7 @@ class Evidence:
                 return True
         return False
 
-    def adjust(
-        self,
-        frames: Mapping[str, Sequence[Frame]],
-        calibrations: Mapping[str, FluoroscopeCalibration],
-    ) -> CalibrationResult:
+    def adjust(self, frames: Frames, calibrations: Calibrations) -> CalibrationResult:
         """Adjust frames with calibrations fixed. Raises DataError."""
         return adjust_with_calibrations(
             frames,

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
 from ..correction.registry import no_correction
 from ..errors import DataError
 from ..estimation.result import CalibrationResult
@@ -33,9 +33,7 @@ MAX_NOISE = 2.0  # RMSE over the noise of an image coordinate of the calibration
 CORRECTED = 0.6  # RMSE without the correction over that with it, of points that are corrected
 
 
-def uncorrected(
-    calibrations: Mapping[str, FluoroscopeCalibration],
-) -> dict[str, FluoroscopeCalibration]:
+def uncorrected(calibrations: Calibrations) -> dict[str, FluoroscopeCalibration]:
     """Return calibrations without their corrections, to try image points that are corrected."""
     return {
         name: replace(
@@ -48,9 +46,7 @@ def uncorrected(
     }
 
 
-def misfits(
-    result: CalibrationResult, calibrations: Mapping[str, FluoroscopeCalibration]
-) -> dict[str, float]:
+def misfits(result: CalibrationResult, calibrations: Calibrations) -> dict[str, float]:
     """Return the RMSE over the noise of each fluoroscope whose exposures a calibration misfits."""
     ratios = {
         name: _rmse(figures.rmse_after) / calibrations[name].image_sd
@@ -60,9 +56,7 @@ def misfits(
 
 
 def corrected_already(
-    result: CalibrationResult,
-    without: CalibrationResult,
-    calibrations: Mapping[str, FluoroscopeCalibration],
+    result: CalibrationResult, without: CalibrationResult, calibrations: Calibrations
 ) -> Finding | None:
     """Return a finding on the fluoroscopes whose image points are corrected already.
 
@@ -90,9 +84,7 @@ def _rmse(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def poor_fits(
-    result: CalibrationResult, calibrations: Mapping[str, FluoroscopeCalibration]
-) -> list[Finding]:
+def poor_fits(result: CalibrationResult, calibrations: Calibrations) -> list[Finding]:
     """Return a finding for every fluoroscope whose exposures its calibration does not fit."""
     out = []
     for name, figures in result.fluoroscopes.items():

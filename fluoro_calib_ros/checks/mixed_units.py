@@ -12,13 +12,13 @@ least median residual of the better versions is refined.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from ..errors import DataError
-from ..exposures.frame import Frame
+from ..exposures.frame import Frame, Frames
 from ..exposures.phantom import Phantom
 from ..findings import Finding, Kind, Place, first_few
 from ..photogrammetry.resection import (
@@ -43,11 +43,7 @@ SAMPLES = 1500
 STEPS = 10
 
 
-def mixed_units(
-    frames: Mapping[str, Sequence[Frame]],
-    phantom: Phantom,
-    is_suspicious: bool = False,
-) -> Finding | None:
+def mixed_units(frames: Frames, phantom: Phantom, is_suspicious: bool = False) -> Finding | None:
     """Return a finding where a part of the targets is in another unit than the others.
 
     frames: exposures by fluoroscope, valid on their own. is_suspicious: whether the exposures do

@@ -16,19 +16,19 @@ trust.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
 
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import Calibrations
 from ..errors import DataError
 from ..estimation.options import CalibrationRequest
 from ..estimation.pair_scatter import MOVED_SHARE, PairScatter, steps_of
 from ..estimation.result import CalibrationResult, ExposureResult, FluoroscopeResult
 from ..estimation.rig_orientation import orientation_and_scatter, orientation_of_known
-from ..exposures.frame import Frame
+from ..exposures.frame import Frame, Frames
 from ..findings import Finding, Kind, Place, Severity
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import matrix_from_quaternion, rotation_angle, vector_from_matrix
@@ -246,9 +246,6 @@ def _squares(values: np.ndarray, columns: np.ndarray) -> tuple[float, np.ndarray
     coefficients = np.linalg.lstsq(columns, values, rcond=None)[0]
     return float(np.sum((values - columns @ coefficients) ** 2)), coefficients
 
-
-Frames = Mapping[str, Sequence[Frame]]
-Calibrations = Mapping[str, FluoroscopeCalibration]
 
 MIN_COMMON = 8  # targets of two frames whose displacement is known
 CAPTURE = 'orient the rig from a capture'

@@ -21,18 +21,18 @@ halves and four folds of the exposures, which takes about twice as long as the c
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
 from ..errors import DataError
 from ..estimation.calibrate import adjust_with_calibrations
 from ..estimation.initial_network import nominal_interior
 from ..estimation.options import CalibrationRequest
 from ..estimation.result import CalibrationResult
-from ..exposures.frame import Frame
+from ..exposures.frame import Frame, Frames
 from ..findings import Kind, Place
 from .beads import BEADS
 from .calibration_evidence import Evidence
@@ -134,7 +134,7 @@ SUBJECTS = (BEADS, SHAPE, HALVES, TRENDS, VARIATION, HELD_OUT, PRECISION)
 
 def validate(
     request: CalibrationRequest,
-    calibrations: Mapping[str, FluoroscopeCalibration],
+    calibrations: Calibrations,
     progress: Progress | None = None,
     rig: RigFindings | None = None,
 ) -> Validation:
@@ -209,7 +209,7 @@ def _achieved_sd(evidence: Evidence, name: str, checks: Sequence[Check]) -> floa
 
 def validate_or_report(
     request: CalibrationRequest,
-    calibrations: Mapping[str, FluoroscopeCalibration],
+    calibrations: Calibrations,
     progress: Progress | None = None,
     rig: RigFindings | None = None,
 ) -> Validation:
@@ -240,9 +240,7 @@ def _count_steps(groups: int) -> int:
     return sum(subject.steps * (1 if subject.of_rig else groups) for subject in SUBJECTS)
 
 
-def _used_frames(
-    frames: Mapping[str, Sequence[Frame]], result: CalibrationResult
-) -> dict[str, list[Frame]]:
+def _used_frames(frames: Frames, result: CalibrationResult) -> dict[str, list[Frame]]:
     """Return the frames that an adjustment used, in the order of their numbers."""
     out = {}
     for name, of_fluoroscope in frames.items():
@@ -256,5 +254,5 @@ def _by_fluoroscope(checks: Sequence[Check], names: Sequence[str]) -> list[Check
     return [check for name in (*names, '') for check in checks if check.place.fluoroscope == name]
 
 
-def _identities(calibrations: Mapping[str, FluoroscopeCalibration]) -> dict[str, str]:
+def _identities(calibrations: Calibrations) -> dict[str, str]:
     return {name: calibration.calibration_id for name, calibration in calibrations.items()}

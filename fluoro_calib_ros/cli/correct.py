@@ -6,10 +6,10 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..correction.fluoroscope_calibration import Calibrations
 from ..errors import DataError
 from ..findings import first_few
 from .arguments import (
@@ -112,9 +112,7 @@ def run(arguments: argparse.Namespace) -> None:
         )
 
 
-def _correct_points(
-    arguments: argparse.Namespace, calibrations: Mapping[str, FluoroscopeCalibration]
-) -> None:
+def _correct_points(arguments: argparse.Namespace, calibrations: Calibrations) -> None:
     from ..io.observations import correct_points, write_points
     from ..jobs.sources import read_point_table
 
@@ -138,9 +136,7 @@ def _correct_points(
     )
 
 
-def _correct_images(
-    arguments: argparse.Namespace, calibrations: Mapping[str, FluoroscopeCalibration]
-) -> None:
+def _correct_images(arguments: argparse.Namespace, calibrations: Calibrations) -> None:
     from ..images.corrector import ImageCorrector
     from ..jobs.image_correction import ImageCorrectionRequest, run_image_correction
 

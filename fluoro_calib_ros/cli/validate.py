@@ -6,12 +6,14 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
+from ..correction.fluoroscope_calibration import Calibrations
 from ..errors import DataError
+from ..exposures.frame import Frames
 from .arguments import (
     add_angle_options,
     add_collect,
@@ -28,9 +30,7 @@ from .arguments import (
 from .output import print_notes, print_result, print_step, print_unpaired
 
 if TYPE_CHECKING:
-    from ..correction.fluoroscope_calibration import FluoroscopeCalibration
     from ..estimation.options import CalibrationRequest
-    from ..exposures.frame import Frame
 
 NAME = 'validate'
 HELP = 'Validate a calibration: pass, fail or cannot tell, and what to do.'
@@ -105,9 +105,7 @@ def run(arguments: argparse.Namespace) -> bool:
     return passed
 
 
-def _request(
-    arguments: argparse.Namespace, calibrations: Mapping[str, FluoroscopeCalibration]
-) -> CalibrationRequest:
+def _request(arguments: argparse.Namespace, calibrations: Calibrations) -> CalibrationRequest:
     """Read what the calibrations were made from, in the folder or where it is given."""
     from ..estimation.options import CalibrationRequest
     from ..io.calibration import PHANTOM
@@ -117,7 +115,7 @@ def _request(
     from ..jobs.calibration import without_unusable
     from ..jobs.sources import BagSelection, read_source, read_survey
 
-    frames: Mapping[str, Sequence[Frame]] | None = None
+    frames: Frames | None = None
     phantom = None
     known = read_names(arguments.directory)
     if arguments.source is not None:

@@ -445,3 +445,6 @@ def digest_of_sources(frames: Iterable[Frame], phantom: Phantom) -> str:
         + phantom.sd_mm.tobytes()
     )
     return digest.hexdigest()
+
+
+Calibrations = Mapping[str, FluoroscopeCalibration]  # by fluoroscope

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import Calibrations
 from ..photogrammetry.collinearity import project
 from ..photogrammetry.rotations import matrix_from_quaternion
 from ..processes import Programs
@@ -135,9 +135,7 @@ def image_errors(
     return errors
 
 
-def calibration_errors(
-    bags: Path, calibrations: Mapping[str, FluoroscopeCalibration]
-) -> dict[str, float]:
+def calibration_errors(bags: Path, calibrations: Calibrations) -> dict[str, float]:
     """Return the RMSE of the true markers, observed without noise and corrected [px].
 
     By fluoroscope, after the best projective map, as for image_errors().

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..bodies.joints import JointMotion
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import Calibrations
 from ..io.access import make_folder, write_bytes
 from ..io.bags.metadata import message_class
 from ..io.bags.reader import IMAGE
@@ -140,7 +140,7 @@ def _write_images(
 
 def calibrate_from_images(
     twin: ImageTwin, bags: Path, out: Path, client: DemoClient
-) -> Mapping[str, FluoroscopeCalibration]:
+) -> Calibrations:
     """Play the twin through the extraction node into another calibration node, and calibrate.
 
     client: in the namespace of the images. Raises DemoError.
@@ -171,11 +171,7 @@ def calibrate_from_images(
     return client.calibrations
 
 
-def comparison_table(
-    bags: Path,
-    names: Sequence[str],
-    ways: Mapping[str, Mapping[str, FluoroscopeCalibration]],
-) -> str:
+def comparison_table(bags: Path, names: Sequence[str], ways: Mapping[str, Calibrations]) -> str:
     """Return a table of the calibrations by coordinates and by images, with the truth."""
     head = [
         'fluoroscope',

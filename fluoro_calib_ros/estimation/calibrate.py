@@ -16,11 +16,12 @@ from threadpoolctl import threadpool_limits
 
 from ..correction.base import CorrectionModel
 from ..correction.fluoroscope_calibration import (
+    Calibrations,
     FluoroscopeCalibration,
     NoiseProfile,
     digest_of_sources,
 )
-from ..exposures.frame import validate_frame
+from ..exposures.frame import Frames, validate_frame
 from ..exposures.phantom import Phantom
 from ..findings import Finding
 from ..photogrammetry.adjustment import Adjustment
@@ -41,7 +42,6 @@ from .fixed_calibration import (
 )
 from .initial_network import (
     MIN_EXPOSURES,
-    Frames,
     Measured,
     StartValues,
     adjusted_with_precision,
@@ -167,9 +167,7 @@ def calibrate_request(
 
 
 def calibrate_part(
-    request: CalibrationRequest,
-    starts: StartValues,
-    whole: Mapping[str, FluoroscopeCalibration],
+    request: CalibrationRequest, starts: StartValues, whole: Calibrations
 ) -> dict[str, FluoroscopeCalibration]:
     """Self-calibrate with a part of the exposures of an earlier calibration.
 
@@ -219,10 +217,7 @@ def _figures_of_run(run: SelfCalibration) -> dict[str, FluoroscopeResult]:
 
 
 def _calibrations_of_run(
-    run: SelfCalibration,
-    frames: Frames,
-    phantom: Phantom,
-    seconds: float,
+    run: SelfCalibration, frames: Frames, phantom: Phantom, seconds: float
 ) -> dict[str, FluoroscopeCalibration]:
     """Calibrations of the fluoroscopes of a self-calibration that took some seconds."""
     return {
@@ -304,7 +299,7 @@ def _outliers_of_all(runs: Iterable[SelfCalibration]) -> tuple[tuple[Any, ...], 
 def adjust_with_calibrations(
     frames: Frames,
     phantom: Phantom,
-    calibrations: Mapping[str, FluoroscopeCalibration],
+    calibrations: Calibrations,
     loss: str = 'student_t',
     known: Mapping[str, KnownOrientation] | None = None,
     starts: StartValues | None = None,

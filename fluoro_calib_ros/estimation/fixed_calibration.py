@@ -5,14 +5,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
-from ..exposures.frame import Frame, angles_of
+from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
+from ..exposures.frame import Frame, Frames, angles_of
 from ..exposures.phantom import Phantom
 from ..photogrammetry.adjustment import Adjustment
 from ..photogrammetry.diagnosis import global_names
@@ -27,7 +27,6 @@ from ..photogrammetry.precision import (
     joint_covariance,
 )
 from .initial_network import (
-    Frames,
     Known,
     KnownSensor,
     Measured,
@@ -164,7 +163,7 @@ MIN_RAYS_FOR_NOISE = 3
 def network_of_calibrations(
     frames: Frames,
     phantom: Phantom,
-    calibrations: Mapping[str, FluoroscopeCalibration],
+    calibrations: Calibrations,
     known: Known | None = None,
     starts: StartValues | None = None,
 ) -> Measured:
@@ -201,7 +200,7 @@ def _angles(measured: Measured, rows: np.ndarray) -> np.ndarray:
 
 
 def fixed_corrections(
-    measured: Measured, calibrations: Mapping[str, FluoroscopeCalibration]
+    measured: Measured, calibrations: Calibrations
 ) -> tuple[np.ndarray, Network]:
     """Corrections (N, 2) [px] by calibrations, and the network with their uncertainty in sigma.
 

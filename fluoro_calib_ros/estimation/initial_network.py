@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..correction.series import Series
 from ..errors import DataError
-from ..exposures.frame import Frame, angles_of, validate_frame
+from ..exposures.frame import Frame, Frames, angles_of, validate_frame
 from ..exposures.phantom import Phantom
 from ..findings import Finding, Kind, Place, Severity
 from ..photogrammetry.adjustment import Adjustment, SolverOptions, adjust
@@ -141,7 +141,6 @@ MIN_POSE_MM = 20.0
 AXIAL_FACTOR = 10.0
 MAX_MISFIT = 8.0  # residuals of a resection relative to the median of the exposures
 
-Frames = Mapping[str, Sequence[Frame]]  # by fluoroscope
 Known = Mapping[str, KnownOrientation]  # by fluoroscope
 
 

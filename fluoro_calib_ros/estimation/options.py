@@ -15,7 +15,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 from collections import deque
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Container, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +30,7 @@ from ..correction.registry import (
     selectable_models,
 )
 from ..correction.series import Series
-from ..exposures.frame import Frame
+from ..exposures.frame import Frames
 from ..exposures.names import Names
 from ..exposures.phantom import Phantom
 from ..limits import MAX_NEIGHBOURS
@@ -354,7 +354,7 @@ class CalibrationRequest:
         their frame.
     """
 
-    frames: Mapping[str, Sequence[Frame]]
+    frames: Frames
     phantom: Phantom
     options: CalibrationOptions = field(default_factory=CalibrationOptions)
     joint: bool = False

@@ -27,10 +27,10 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
 from ..errors import DataError
 from ..exposures.collector import displacement
-from ..exposures.frame import Frame, angles_of, validate_frame
+from ..exposures.frame import Frame, Frames, angles_of, validate_frame
 from ..exposures.phantom import Phantom
 from ..photogrammetry.adjustment import Adjustment
 from ..photogrammetry.collinearity import to_sensor
@@ -57,7 +57,6 @@ from .fixed_calibration import (
 )
 from .initial_network import (
     MIN_TARGETS_OF_EXPOSURE,
-    Frames,
     Known,
     Measured,
     StartValues,
@@ -72,9 +71,7 @@ FRAME_ID = 'lab'
 
 
 def orientation_of_known(
-    known: Known,
-    figures: Mapping[str, FluoroscopeResult],
-    calibrations: Mapping[str, FluoroscopeCalibration],
+    known: Known, figures: Mapping[str, FluoroscopeResult], calibrations: Calibrations
 ) -> RigOrientation:
     """Return the orientation of the rig in the frame in which its fluoroscopes are known.
 
@@ -117,8 +114,6 @@ def _mean_rotation(figures: FluoroscopeResult) -> np.ndarray:
     u, _, vt = np.linalg.svd(total)
     return u @ vt
 
-
-Calibrations = Mapping[str, FluoroscopeCalibration]
 
 # Exposures that are used: with more of them the interior orientations remain the uncertainty.
 MAX_PAIRS = 30
@@ -439,10 +434,7 @@ def _unpaired(names: Sequence[str], b: int) -> str:
 
 
 def _adjusted(
-    measured: Measured,
-    calibrations: Calibrations,
-    loss: str,
-    noise_fixed: bool,
+    measured: Measured, calibrations: Calibrations, loss: str, noise_fixed: bool
 ) -> _FixedAdjustment:
     """Adjust a network with the calibrations fixed.
 

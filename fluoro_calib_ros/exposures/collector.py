@@ -22,7 +22,7 @@ from scipy.ndimage import binary_dilation
 from ..errors import DataError
 from ..findings import Finding, Kind, Place, Severity
 from ..options import option
-from .frame import Frame, cells_of
+from .frame import Frame, Frames, cells_of
 from .pairing import CompletePairer, PairingOptions, recording_options
 
 MIN_COMMON_TARGETS = 8  # with fewer targets in common two frames cannot be compared
@@ -202,7 +202,7 @@ class ExposureCollector:
 
 
 def collect_recorded(
-    frames: Mapping[str, Sequence[Frame]],
+    frames: Frames,
     mode: str = 'auto',
     pair_by: str = 'frame_number',
     still: StillOptions | None = None,
@@ -342,8 +342,6 @@ class Coverage:
 STILL_PX = StillOptions().still_px  # median displacement of the targets
 SHARE = 0.5  # of the targets of a frame that another one of the same pose has
 SAME_ANGLE_RAD = 1e-3  # of the C-arm
-
-Frames = Mapping[str, Sequence[Frame]]
 
 
 def without_repeats(

@@ -290,9 +290,7 @@ class MovingPoints:
         """
         return np.asarray(exposure, dtype=np.int64) * self.base + np.asarray(target_id)
 
-    def as_phantom(
-        self, frames: Mapping[str, Sequence[Frame]]
-    ) -> tuple[dict[str, list[Frame]], Phantom]:
+    def as_phantom(self, frames: Frames) -> tuple[dict[str, list[Frame]], Phantom]:
         """Return frames and phantom in which each target of each exposure has an id of its own.
 
         Raises DataError for a target whose coordinates in an exposure are missing, and for
@@ -378,7 +376,7 @@ def without_strays(frame: Frame, phantom: Phantom | None = None) -> tuple[Frame,
 
 
 def frames_without_strays(
-    frames: Mapping[str, Sequence[Frame]], phantom: Phantom
+    frames: Frames, phantom: Phantom
 ) -> tuple[dict[str, list[Frame]], list[Finding]]:
     """Return the frames by fluoroscope without their few stray points, and findings on these."""
     findings = []
@@ -396,3 +394,6 @@ def _together(uv: np.ndarray) -> np.ndarray:
         return np.zeros(len(uv), dtype=bool)
     _, place, count = np.unique(uv, axis=0, return_inverse=True, return_counts=True)
     return count[place.reshape(-1)] >= max(MIN_TOGETHER, MIN_SHARE_TOGETHER * len(uv))
+
+
+Frames = Mapping[str, Sequence[Frame]]  # by fluoroscope

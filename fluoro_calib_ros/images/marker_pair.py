@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..bodies.body import Body
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import Calibrations
 from ..errors import DataError
 from ..photogrammetry.rig_orientation import RigOrientation
 from .marker_decisions import BodyDecisions, DecidedView, Decision, RayDecisions, ViewCounts
@@ -45,7 +45,7 @@ class MarkerPair:
 
     def __init__(
         self,
-        calibrations: Mapping[str, FluoroscopeCalibration],
+        calibrations: Calibrations,
         orientation: RigOrientation,
         options: MarkerOptions | None = None,
         *,

@@ -16,7 +16,7 @@ from ..bodies.motion import POSE
 from ..bodies.rigid import by_pose
 from ..bodies.shapes import learned_shape
 from ..bodies.tracking import BodyTracker
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.intersection import Intersector
 from ..reconstruction.reconstruct import IntersectedViews, MatchedViews
@@ -74,7 +74,7 @@ class PairRays:
 
     def __init__(
         self,
-        calibrations: Mapping[str, FluoroscopeCalibration],
+        calibrations: Calibrations,
         orientation: RigOrientation,
         names: Sequence[str],
         target_id: np.ndarray,

@@ -14,7 +14,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -23,9 +23,9 @@ from typing import Any
 import numpy as np
 
 from ..correction.calibration_record import FIELDS, VERSION, Field
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
 from ..errors import DataError, ErrorsAt
-from ..exposures.frame import Frame
+from ..exposures.frame import Frames
 from ..findings import Finding, Kind, Place, Severity
 from ..limits import MAX_COINCIDENT, read_limits
 from ..photogrammetry.rig_orientation import RigOrientation
@@ -266,8 +266,6 @@ def _present_ids(path: PathLike, orientation: RigOrientation) -> tuple[str, ...]
     return tuple(out)
 
 
-Frames = Mapping[str, Sequence[Frame]]
-
 RESULT_NAME = 'result.json'
 VALIDATION_NAME = 'validation.json'  # the verdict
 OBSERVATIONS = 'observations.csv'
@@ -285,9 +283,7 @@ def with_digest(document: Mapping[str, Any]) -> dict[str, Any]:
     return {**document, DIGEST: _digest(document)}
 
 
-def disagreements(
-    directory: PathLike, calibrations: Mapping[str, FluoroscopeCalibration]
-) -> list[Finding]:
+def disagreements(directory: PathLike, calibrations: Calibrations) -> list[Finding]:
     """Return a finding for everything in result.json and the verdict that contradicts the files.
 
     There are none without result.json. A file that cannot be read is one.
@@ -362,9 +358,7 @@ def _digest_of_file(path: Path) -> str:
 
 
 def exchanged(
-    directory: PathLike,
-    document: Mapping[str, Any],
-    calibrations: Mapping[str, FluoroscopeCalibration],
+    directory: PathLike, document: Mapping[str, Any], calibrations: Calibrations
 ) -> Finding | None:
     """Return a finding where calibrations of a folder are not those of its result.json.
 

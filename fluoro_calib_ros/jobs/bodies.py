@@ -18,9 +18,9 @@ from ..bodies.butterworth import filtered_poses
 from ..bodies.joints import JointMotion, joint_motion, with_neutral
 from ..bodies.shapes import EstimatedShape, estimate_shape, places_of
 from ..bodies.tracking import BodyTracker, TrackedExposure, poses_alone, poses_of
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
 from ..errors import DataError
-from ..exposures.frame import Frame
+from ..exposures.frame import Frames
 from ..exposures.pairing import RecordedPairing
 from ..findings import Finding, Kind, Place, Severity, sentences
 from ..images.corrector import iterated
@@ -54,7 +54,7 @@ class Film:
     """What films are made of."""
 
     source: Path  #: bag of images, or folder with a folder for each fluoroscope
-    calibrations: Mapping[str, FluoroscopeCalibration]
+    calibrations: Calibrations
     orientation: RigOrientation  #: of the fluoroscopes of the recording
 
 
@@ -166,7 +166,7 @@ class BodiesOptions(RecordedPairing):
     )
     estimate_shapes: bool = True
     rate: float | None = None
-    neutral: Mapping[str, Sequence[Frame]] | None = None
+    neutral: Frames | None = None
 
 
 @dataclass(frozen=True)
@@ -261,8 +261,8 @@ class BodiesOutcome:
 
 
 def track_bodies(
-    frames: Mapping[str, Sequence[Frame]],
-    calibrations: Mapping[str, FluoroscopeCalibration],
+    frames: Frames,
+    calibrations: Calibrations,
     orientation: RigOrientation,
     bodies: Sequence[Body],
     joints: Sequence[JointEntry] = (),
@@ -333,10 +333,7 @@ class _Exposure:
 
 
 def _intersected(
-    frames: Mapping[str, Sequence[Frame]],
-    calibrations: Mapping[str, FluoroscopeCalibration],
-    orientation: RigOrientation,
-    options: BodiesOptions,
+    frames: Frames, calibrations: Calibrations, orientation: RigOrientation, options: BodiesOptions
 ) -> tuple[list[_Exposure], dict[str, int]]:
     """Pair and intersect the frames of a recording. Raises DataError."""
     names = orientation.fluoroscopes
@@ -404,8 +401,8 @@ def _poses(
 
 
 def _poses_alone(
-    frames: Mapping[str, Sequence[Frame]],
-    calibrations: Mapping[str, FluoroscopeCalibration],
+    frames: Frames,
+    calibrations: Calibrations,
     orientation: RigOrientation,
     bodies: Sequence[Body],
     options: BodiesOptions,

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..bodies.body import Body
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import Calibrations
 from ..errors import DataError
 from ..exposures.phantom import Phantom
 from ..findings import Finding, Kind, Place
@@ -258,7 +258,7 @@ class MarkerSettings:
     first: Mapping[str, FirstMarkers]
     options: MarkerOptions = field(default_factory=MarkerOptions)
     #: of two fluoroscopes
-    calibrations: Mapping[str, FluoroscopeCalibration] = field(default_factory=dict)
+    calibrations: Calibrations = field(default_factory=dict)
     orientation: RigOrientation | None = None  #: of two fluoroscopes
     bodies: tuple[Body, ...] = ()  #: markers that are rigid together, of two fluoroscopes
 

@@ -22,9 +22,9 @@ from threadpoolctl import threadpool_limits
 
 from ..bodies.body import Body
 from ..correction.angle_field import note_on_angles
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import Calibrations
 from ..errors import DataError
-from ..exposures.frame import Frame
+from ..exposures.frame import Frame, Frames
 from ..exposures.phantom import Phantom
 from ..findings import Finding
 from ..images.marker_decisions import Decision, revise
@@ -55,10 +55,10 @@ class MarkerRequest:
     sources: Mapping[str, Sequence[Path]]  #: images by fluoroscope
     #: markers of one or more exposures, by fluoroscope; following begins with the first image that
     #: has one
-    first: Mapping[str, Sequence[Frame]]
+    first: Frames
     options: MarkerOptions = field(default_factory=MarkerOptions)
     #: of two fluoroscopes
-    calibrations: Mapping[str, FluoroscopeCalibration] = field(default_factory=dict)
+    calibrations: Calibrations = field(default_factory=dict)
     orientation: RigOrientation | None = None  #: of two fluoroscopes
     #: markers that are rigid together, of two fluoroscopes; known shapes give the ids where no
     #: markers are given

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -13,9 +13,9 @@ import numpy as np
 
 from ..bodies.body import Body
 from ..checks.rig_watch import DriftVerdict, RecordingDriftWatch
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import Calibrations
 from ..errors import DataError
-from ..exposures.frame import Frame
+from ..exposures.frame import Frames
 from ..exposures.names import Names
 from ..exposures.pairing import RecordedPairing, disagreement_of_recording
 from ..findings import Finding, Kind, Severity
@@ -108,8 +108,8 @@ class ReconstructionOutcome:
 
 
 def reconstruct(
-    frames: Mapping[str, Sequence[Frame]],
-    calibrations: Mapping[str, FluoroscopeCalibration],
+    frames: Frames,
+    calibrations: Calibrations,
     orientation: RigOrientation,
     options: ReconstructionOptions | None = None,
 ) -> ReconstructionOutcome:
@@ -171,9 +171,7 @@ def reconstruct(
     )
 
 
-def check_orientation(
-    orientation: RigOrientation, calibrations: Mapping[str, FluoroscopeCalibration]
-) -> None:
+def check_orientation(orientation: RigOrientation, calibrations: Calibrations) -> None:
     """Raise DataError unless an orientation was determined with these calibrations."""
     orientation.check_calibrations(
         {name: calibration.calibration_id for name, calibration in calibrations.items()}
@@ -181,9 +179,7 @@ def check_orientation(
 
 
 def _drift_watch(
-    orientation: RigOrientation,
-    calibrations: Mapping[str, FluoroscopeCalibration],
-    options: ReconstructionOptions,
+    orientation: RigOrientation, calibrations: Calibrations, options: ReconstructionOptions
 ) -> tuple[RecordingDriftWatch | None, DriftVerdict | None]:
     """Return the drift watch of a recording, or the verdict that explains why there is none."""
     if not options.drift_watch:

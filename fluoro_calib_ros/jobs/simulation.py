@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..exposures.frame import Frame
+from ..exposures.frame import Frame, Frames
 from ..exposures.phantom import Phantom
 from ..images.codec import encode
 from ..io.access import PathLike, make_folder, write_bytes, write_text
@@ -79,7 +79,7 @@ TRUTH = 'truth'  # folder of what a data set was made with
 TRUE_SD_MM = 1e-6  # the file of the true coordinates has to contain a standard deviation
 
 
-def write_bag(path: PathLike, frames: Mapping[str, Sequence[Frame]]) -> None:
+def write_bag(path: PathLike, frames: Frames) -> None:
     """Write frames as a bag folder, in the order of their stamps. Raises DataError."""
     recorded = [frame for of_fluoroscope in frames.values() for frame in of_fluoroscope]
     with BagWriter(path, overwrite=True) as bag:

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..correction.angle_field import note_on_angles
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
 from ..errors import DataError, ErrorsAt
 from ..exposures.angles import AngleOptions
 from ..exposures.collector import collect_recorded
-from ..exposures.frame import Frame
+from ..exposures.frame import Frame, Frames
 from ..exposures.names import Names
 from ..exposures.pairing import PairingOptions, disagreement_of_recording
 from ..exposures.phantom import Phantom, require_size
@@ -101,7 +101,7 @@ class BagSelection:
                 'angle_deg'
             )
 
-    def frames(self, path: object, found: Mapping[str, Sequence[Frame]]) -> dict[str, list[Frame]]:
+    def frames(self, path: object, found: Frames) -> dict[str, list[Frame]]:
         """Return the frames in the time window. Raises DataError where there are none."""
         origin = min(frame.stamp_ns for each in found.values() for frame in each)
         low = -math.inf if self.start_s is None else self.start_s
@@ -277,9 +277,7 @@ def read_source(
 
 
 def select_calibrations(
-    calibrations: Mapping[str, FluoroscopeCalibration],
-    fluoroscopes: Iterable[str],
-    where: PathLike = '',
+    calibrations: Calibrations, fluoroscopes: Iterable[str], where: PathLike = ''
 ) -> dict[str, FluoroscopeCalibration]:
     """Return the calibrations of some fluoroscopes.
 
@@ -297,7 +295,7 @@ def select_calibrations(
     return {name: calibrations[name] for name in fluoroscopes}
 
 
-def _numbered_hint(name: str, calibrations: Mapping[str, FluoroscopeCalibration]) -> str:
+def _numbered_hint(name: str, calibrations: Calibrations) -> str:
     """Return what to do about a camera that its file only numbers."""
     if not re.fullmatch(r'cam\d+', name):
         return ''
@@ -379,10 +377,7 @@ def read_calibrated_source(
 
 
 def _unknown_angles(
-    path: PathLike,
-    frames: Mapping[str, Sequence[Frame]],
-    calibrations: Mapping[str, FluoroscopeCalibration],
-    selection: BagSelection | None,
+    path: PathLike, frames: Frames, calibrations: Calibrations, selection: BagSelection | None
 ) -> Iterable[str]:
     """Yield a sentence for each fluoroscope whose correction needs angles that are unknown."""
     for name, each in frames.items():

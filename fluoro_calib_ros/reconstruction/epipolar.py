@@ -25,10 +25,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import Calibrations
 from ..correction.registry import no_correction
 from ..errors import DataError
-from ..exposures.frame import Frame
+from ..exposures.frame import Frame, Frames
 from ..findings import Finding, Kind
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
 from ..photogrammetry.rotations import cross_matrix
@@ -188,7 +188,6 @@ RECENT = 100  # exposures of a stream
 BETTER = 0.3
 CLOSER = 0.6
 
-Frames = Mapping[str, Sequence[Frame]]
 Trial = tuple[Finding, dict[str, list[Frame]]]
 
 
@@ -235,7 +234,7 @@ def _counts(status: np.ndarray) -> tuple[int, int, int]:
 def mismatch(
     found: Sequence[ReconstructedFrame],
     frames: Frames,
-    calibrations: Mapping[str, FluoroscopeCalibration],
+    calibrations: Calibrations,
     intersector: Intersector,
     pair_by: str,
 ) -> Finding | None:
@@ -258,7 +257,7 @@ def mismatch(
 def cause_of_misses(
     found: Sequence[ReconstructedFrame],
     frames: Frames,
-    calibrations: Mapping[str, FluoroscopeCalibration],
+    calibrations: Calibrations,
     intersector: Intersector,
     pair_by: str,
 ) -> Finding | None:

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..correction.base import CorrectionStatus
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
 from ..errors import DataError
-from ..exposures.frame import Frame, image_size_error, repeated_target_error
+from ..exposures.frame import Frame, Frames, image_size_error, repeated_target_error
 from ..exposures.pairing import PairingOptions, recorded_pairer
 from ..photogrammetry.noise import ObservedScatter
 from ..photogrammetry.rig_orientation import RigOrientation
@@ -160,7 +160,7 @@ def watch_exposure(watch: ExposureWatch, stamp_ns: int, exposure: IntersectedVie
 
 def reconstruct_exposure(
     exposure: Mapping[str, Frame],
-    calibrations: Mapping[str, FluoroscopeCalibration],
+    calibrations: Calibrations,
     intersector: Intersector,
     watch: ExposureWatch | None = None,
     scatter: ObservedScatter | None = None,
@@ -185,7 +185,7 @@ def reconstruct_exposure(
 
 def intersect_frames(
     exposure: Mapping[str, Frame],
-    calibrations: Mapping[str, FluoroscopeCalibration],
+    calibrations: Calibrations,
     intersector: Intersector,
     scatter: ObservedScatter | None = None,
 ) -> tuple[IntersectedViews, list[Frame]]:
@@ -219,8 +219,8 @@ def _corrected_view(frame: Frame, calibration: FluoroscopeCalibration) -> Correc
 
 
 def reconstruct_recording(
-    frames: Mapping[str, Sequence[Frame]],
-    calibrations: Mapping[str, FluoroscopeCalibration],
+    frames: Frames,
+    calibrations: Calibrations,
     intersector: Intersector,
     pair_by: str = 'frame_number',
     watch: ExposureWatch | None = None,
@@ -269,9 +269,7 @@ def reconstruct_recording(
     return out, unpaired
 
 
-def orientation_of_recorded(
-    frames: Mapping[str, Sequence[Frame]], orientation: RigOrientation
-) -> RigOrientation:
+def orientation_of_recorded(frames: Frames, orientation: RigOrientation) -> RigOrientation:
     """Return the orientation of the recorded fluoroscopes. Raises DataError for less than two."""
     names = [name for name in orientation.fluoroscopes if name in frames]
     if len(names) < 2:
@@ -283,10 +281,7 @@ def orientation_of_recorded(
 
 
 def pair_recording(
-    frames: Mapping[str, Sequence[Frame]],
-    names: Sequence[str],
-    pair_by: str,
-    tolerance_s: float,
+    frames: Frames, names: Sequence[str], pair_by: str, tolerance_s: float
 ) -> tuple[list[dict[str, Frame]], dict[str, int]]:
     """Pair the frames of a recording to exposures, in the order of time.
 

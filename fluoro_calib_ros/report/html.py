@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import base64
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -18,8 +18,8 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matplotlib import style
 from matplotlib.figure import Figure
 
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
-from ..exposures.frame import Frame
+from ..correction.fluoroscope_calibration import Calibrations
+from ..exposures.frame import Frames
 from ..exposures.names import Names
 from ..exposures.phantom import Phantom
 from ..findings import Finding, sentences
@@ -53,8 +53,8 @@ class ReportInput:
 
     title: str
     result: Mapping[str, Any]  #: content of result.json
-    calibrations: Mapping[str, FluoroscopeCalibration]
-    frames: Mapping[str, Sequence[Frame]]  #: exposures of the calibration
+    calibrations: Calibrations
+    frames: Frames  #: exposures of the calibration
     phantom: Phantom
     settings: Mapping[str, Any]  #: content of options.json
     validation: Mapping[str, Any] | None = None  #: content of validation.json

@@ -16,7 +16,7 @@ LOSES_THE_EXCEPTION = """
 import os
 import signal
 import sys
-from fluoro_calib_ros.cli.termination import terminated_by_signals
+from fluoro_calib_ros.cli.output import terminated_by_signals
 
 class Sender:
     def __del__(self):

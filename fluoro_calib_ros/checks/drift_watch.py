@@ -65,26 +65,9 @@ HYSTERESIS = 0.5  # times the threshold of WARN: an alarm ends below it
 class DriftWatch:
     """The drift watch of a rig.
 
-    Parameters
-    ----------
-    image_sizes : mapping of str to tuple of int
-        Width and height of the images by fluoroscope [px], in the order of the orientation.
-    options : DriftOptions, optional
-    bodies : sequence of Body
-        Shapes that are not given are learned.
-    orientation : RigOrientation, optional
-        Needed for bodies only.
-
-    Attributes
-    ----------
-    thresholds : tuple of float
-        Evidence at which the levels WARN and ERROR begin.
-    state : DriftState
-
-    Raises
-    ------
-    ValueError
-        For fewer than two fluoroscopes, for bodies without orientation, and as BodyWatch.
+    image_sizes: width and height of the images by fluoroscope [px], in the order of the
+    orientation. bodies: shapes that are not given are learned; they need the orientation. Raises
+    ValueError for fewer than two fluoroscopes, for bodies without orientation, and as BodyWatch.
     """
 
     def __init__(
@@ -112,6 +95,7 @@ class DriftWatch:
         if bodies:
             series += COMPONENTS * len(self._names)
         charts = 2 * series * len(self._areas)
+        #: evidence at which the levels WARN and ERROR begin
         self.thresholds = tuple(
             float(np.log(charts * hours * 3600 / options.block_s))
             for hours in (options.warn_interval_h, options.error_interval_h)

@@ -227,23 +227,14 @@ class TrainingPoints:
 
 
 class AdjustedTerms(ABC):
-    """Terms of the correction, of all fluoroscopes of a network, that the adjustment estimates.
+    """Terms of the correction, of all fluoroscopes of a network, that the adjustment estimates."""
 
-    Attributes
-    ----------
-    intermediate_tolerance : float
-        Decrease of the cost at which an adjustment before the last may stop.
-    final_tolerance : float
-        Decrease of the cost that the last adjustment may leave.
-    noise_tolerance : float
-        Relative change of the scale of the noise at which the terms may settle.
-    needs_solution : bool
-        Whether terms are renewed with the normal matrix at a solution, not with one near it.
-    """
-
+    #: decrease of the cost at which an adjustment before the last may stop
     intermediate_tolerance: float
-    final_tolerance = FINAL_TOLERANCE
+    final_tolerance = FINAL_TOLERANCE  #: decrease of the cost that the last adjustment may leave
+    #: relative change of the scale of the noise at which the terms may settle
     noise_tolerance = SETTLED
+    #: whether terms are renewed with the normal matrix at a solution, not with one near it
     needs_solution = False
 
     @property
@@ -308,30 +299,16 @@ class AdjustedTerms(ABC):
 
 
 class RegressionStep(ABC, Generic[Model_co]):
-    """Correction model of one fluoroscope through the rounds of a self-calibration.
+    """Correction model of one fluoroscope through the rounds of a self-calibration."""
 
-    Attributes
-    ----------
-    k : int
-        Number of neighbours chosen; 0 for a model without.
-    score : float
-        G, weighted square sum of the errors of cross-validation.
-    inliers : (N,) ndarray of bool
-        Image points to which the model is fitted.
-    changed : bool
-        Whether inliers or k differ from the last round.
-    iterates : bool
-        Whether a second round can give another correction than the first.
-    """
-
-    iterates = True
+    iterates = True  #: whether a second round can give another correction than the first
 
     def __init__(self, points: TrainingPoints) -> None:
         self.points = points
-        self.k = 0
-        self.score = 0.0
-        self.changed = False
-        self.inliers: np.ndarray | None = None
+        self.k = 0  #: number of neighbours chosen; 0 for a model without
+        self.score = 0.0  #: G, weighted square sum of the errors of cross-validation
+        self.changed = False  #: whether inliers or k differ from the last round
+        self.inliers: np.ndarray | None = None  #: (N,) image points to which the model is fitted
 
     @abstractmethod
     def choose(

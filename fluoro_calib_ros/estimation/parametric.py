@@ -106,15 +106,7 @@ NEIGHBOURS = 8  # of an image point, whose mean residual shows the trend
 
 
 class StepwiseTerms(AdjustedTerms):
-    """The 31 terms of every fluoroscope of a network, and which of them are in the model.
-
-    Attributes
-    ----------
-    names : list of str
-        Names of the terms.
-    selected : list of (31,) ndarray of bool
-        Terms in the model, by fluoroscope.
-    """
+    """The 31 terms of every fluoroscope of a network, and which of them are in the model."""
 
     intermediate_tolerance = LOOSE  # the tests of significance need a solution
     needs_solution = True
@@ -141,6 +133,7 @@ class StepwiseTerms(AdjustedTerms):
             self._values.append(np.einsum('nm,tam->nat', values, terms_f))
             count = min(NEIGHBOURS + 1, len(uv))
             self._near.append(cKDTree(uv).query(uv, k=np.arange(2, count + 1))[1])
+        #: by fluoroscope, which terms (31,) are in the model
         self.selected = [np.zeros(len(terms), dtype=bool) for _ in self.functions]
         self._rejected = [np.zeros(len(terms), dtype=bool) for _ in self.functions]
 

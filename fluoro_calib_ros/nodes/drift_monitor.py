@@ -56,13 +56,7 @@ class DriftParameters:
 
 
 class DriftMonitor:
-    """Makes the drift watches of orientations, and publishes the state of the newest one.
-
-    Attributes
-    ----------
-    newest : (RigDriftWatch or None, RigOrientation, int) or None
-        Watch, orientation and stamp [ns] of the newest exposure; the stream's thread sets it.
-    """
+    """Makes the drift watches of orientations, and publishes the state of the newest one."""
 
     def __init__(
         self,
@@ -92,6 +86,7 @@ class DriftMonitor:
     def reset(self) -> None:
         """Forget image sizes, exposures and alarms."""
         self._sizes: dict[str, tuple[int, int]] = {}
+        #: watch, orientation and stamp [ns] of the newest exposure; the stream's thread sets it
         self.newest: tuple[RigDriftWatch | None, RigOrientation, int] | None = None
         self._alarmed = False
 

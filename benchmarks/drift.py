@@ -24,15 +24,21 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from fluoro_calib_ros.bodies.body import Body, declared_bodies
-from fluoro_calib_ros.checks.drift_observations import EpipolarObservations
-from fluoro_calib_ros.checks.drift_options import ERROR, OK, WARN, DriftOptions, DriftState
+from fluoro_calib_ros.checks.drift_charts import (
+    ERROR,
+    OK,
+    WARN,
+    DriftOptions,
+    DriftState,
+    EpipolarObservations,
+)
 from fluoro_calib_ros.checks.drift_watch import DriftWatch
 from fluoro_calib_ros.correction.base import CorrectionStatus
 from fluoro_calib_ros.correction.fluoroscope_calibration import FluoroscopeCalibration
 from fluoro_calib_ros.estimation.calibrate import calibrate
 from fluoro_calib_ros.estimation.rig_orientation import (
+    orientation_and_scatter,
     orientation_of_capture,
-    orientation_of_exposures,
 )
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
@@ -145,7 +151,7 @@ def scene(seed: int, source: str = 'exposures') -> Scene:
         still = simulate_exposures(rig, 1, seed + 10_000).frames
         orientation = orientation_of_capture(still, rig.phantom, calibrations)
     else:
-        orientation = orientation_of_exposures(exposures, rig.phantom, calibrations)
+        orientation = orientation_and_scatter(exposures, rig.phantom, calibrations)[0]
     rng = np.random.default_rng([seed, 4])
     beads = rng.uniform(-22, 22, (CLUSTERS, BEADS, 3))
     points = np.concatenate([markers(rng, beads, PERIOD_S) for _ in range(MOTIONS)])

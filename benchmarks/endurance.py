@@ -28,11 +28,11 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from fluoro_calib_msgs.msg import TargetObservations
 
-from fluoro_calib_ros.demo.node_processes import isolate_ros_graph
+from fluoro_calib_ros.demo.assessment import isolate_ros_graph
 from fluoro_calib_ros.nodes.messages.observations import message_from_frame
 from fluoro_calib_ros.nodes.runtime.streams import OBSERVATION_DEPTH, observations_qos
+from fluoro_calib_ros.simulation.exposures import simulate_tracking
 from fluoro_calib_ros.simulation.rig import virtual_rig
-from fluoro_calib_ros.simulation.tracking import simulate_tracking
 
 from .online import NAMES, Reader, _command, rig_of_the_simulator
 

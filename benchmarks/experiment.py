@@ -41,7 +41,7 @@ from fluoro_calib_ros.photogrammetry.noise_estimation import adjust_and_estimate
 from fluoro_calib_ros.photogrammetry.precision import geometric_redundancy
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.photogrammetry.unknowns import Parameters
-from fluoro_calib_ros.report.cost_figure import relative_costs
+from fluoro_calib_ros.report.report_figures import relative_costs
 from fluoro_calib_ros.simulation.exposures import Detection, SimulatedExposures, simulate_exposures
 from fluoro_calib_ros.simulation.rig import DistortionField, virtual_rig
 

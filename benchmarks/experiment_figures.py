@@ -17,7 +17,7 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from PIL import Image
 
 from fluoro_calib_ros.io.access import write_bytes
-from fluoro_calib_ros.report.style import BLACK, BLUE, GREY, RED, STYLE, new_figure, png_bytes
+from fluoro_calib_ros.report.figures import BLACK, BLUE, GREY, RED, STYLE, new_figure, png_bytes
 from fluoro_calib_ros.simulation.rig import IMAGE_SIZE
 
 from .experiment import BEFORE, GRID_PX, HELD, KNOWN, Residuals

@@ -34,7 +34,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
-from fluoro_calib_ros.demo.node_processes import NodeProcesses, isolate_ros_graph
+from fluoro_calib_ros.demo.assessment import NodeProcesses, isolate_ros_graph
 from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.images.codec import encode

@@ -25,6 +25,7 @@ from rclpy.node import Node
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Image
 
+from benchmarks.bead_images import bead_image
 from fluoro_calib_ros.nodes.runtime.lifecycle import ManagedNode
 from fluoro_calib_ros.nodes.runtime.main import run
 from fluoro_calib_ros.nodes.runtime.parameters import ParameterGroup
@@ -35,7 +36,6 @@ from fluoro_calib_ros.nodes.runtime.streams import (
     wait_until_acknowledged,
 )
 from fluoro_calib_ros.options import option
-from fluoro_calib_ros.simulation.bead_images import bead_image
 from fluoro_calib_ros.simulation.exposures import simulate_exposures
 from fluoro_calib_ros.simulation.rig import virtual_rig
 

@@ -35,11 +35,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from scipy.ndimage import map_coordinates
 
+from benchmarks.bead_images import bead_image
 from fluoro_calib_ros.correction.fluoroscope_calibration import FluoroscopeCalibration
 from fluoro_calib_ros.estimation.calibrate import calibrate
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.images.corrector import ImageCorrector
-from fluoro_calib_ros.simulation.bead_images import bead_image
 from fluoro_calib_ros.simulation.exposures import simulate_exposures
 from fluoro_calib_ros.simulation.rig import virtual_rig
 from tools.sections import show_section
@@ -269,7 +269,7 @@ def live(
     """Results by case, of those whose name contains `only`, with the current transports."""
     import rclpy
 
-    from fluoro_calib_ros.demo.node_processes import isolate_ros_graph
+    from fluoro_calib_ros.demo.assessment import isolate_ros_graph
 
     isolate_ros_graph()
     rclpy.init(args=[])

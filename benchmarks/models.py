@@ -24,13 +24,12 @@ from sklearn.svm import SVR
 
 from fluoro_calib_ros.correction.neighbours import KnnModel
 from fluoro_calib_ros.estimation.calibrate import adjust_with_calibrations, calibrate
-from fluoro_calib_ros.estimation.gauge import gauge_basis, gauge_coefficients
+from fluoro_calib_ros.estimation.estimator import gauge_basis, gauge_coefficients
 from fluoro_calib_ros.estimation.options import CalibrationOptions
 from fluoro_calib_ros.estimation.result import CalibrationResult
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.simulation.exposures import SimulatedExposures, simulate_exposures
-from fluoro_calib_ros.simulation.rig import VirtualRig, virtual_rig
-from fluoro_calib_ros.simulation.streams import StreamStart
+from fluoro_calib_ros.simulation.rig import StreamStart, VirtualRig, virtual_rig
 from tools.sections import write_section
 
 from .timing import section, timed

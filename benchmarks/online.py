@@ -49,9 +49,9 @@ from fluoro_calib_ros.bodies.body import Body
 from fluoro_calib_ros.correction.fluoroscope_calibration import (
     FluoroscopeCalibration as Calibration,
 )
-from fluoro_calib_ros.demo.node_processes import isolate_ros_graph
+from fluoro_calib_ros.demo.assessment import isolate_ros_graph
 from fluoro_calib_ros.estimation.calibrate import calibrate
-from fluoro_calib_ros.estimation.rig_orientation import orientation_of_exposures
+from fluoro_calib_ros.estimation.rig_orientation import orientation_and_scatter
 from fluoro_calib_ros.io.bodies import write_bodies
 from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import message_from_calibration
 from fluoro_calib_ros.nodes.messages.rig_orientation import message_from_orientation
@@ -62,9 +62,8 @@ from fluoro_calib_ros.nodes.runtime.streams import (
     observations_qos,
 )
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation as Orientation
-from fluoro_calib_ros.simulation.exposures import simulate_exposures
+from fluoro_calib_ros.simulation.exposures import simulate_exposures, simulate_tracking
 from fluoro_calib_ros.simulation.rig import virtual_rig
-from fluoro_calib_ros.simulation.tracking import simulate_tracking
 from tools.sections import show_section
 
 from .timing import table
@@ -333,7 +332,7 @@ def rig_of_the_simulator() -> tuple[dict[str, Calibration], Orientation]:
     rig = virtual_rig(1)
     frames = simulate_exposures(rig, 15, 1).frames
     job = calibrate(frames, rig.phantom)
-    return job.calibrations, orientation_of_exposures(frames, rig.phantom, job.calibrations)
+    return job.calibrations, orientation_and_scatter(frames, rig.phantom, job.calibrations)[0]
 
 
 def write_clusters(folder: Path) -> Path:

@@ -17,7 +17,7 @@ import pycolmap
 from sklearn.model_selection import GridSearchCV, PredefinedSplit
 from sklearn.neighbors import KNeighborsRegressor
 
-from fluoro_calib_ros.estimation.gauge import gauge_basis
+from fluoro_calib_ros.estimation.estimator import gauge_basis
 from fluoro_calib_ros.photogrammetry.collinearity import project
 from fluoro_calib_ros.photogrammetry.network import Network
 from fluoro_calib_ros.photogrammetry.noise import INLIER_Q, Noise

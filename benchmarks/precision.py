@@ -23,7 +23,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from fluoro_calib_ros.estimation.calibrate import calibrate
-from fluoro_calib_ros.estimation.gauge import gauge_coefficients
+from fluoro_calib_ros.estimation.estimator import gauge_coefficients
 from fluoro_calib_ros.estimation.options import CalibrationOptions
 from fluoro_calib_ros.estimation.result import CalibrationResult
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_quaternion, matrix_from_vector

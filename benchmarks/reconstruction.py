@@ -24,15 +24,19 @@ from numpy.typing import ArrayLike
 from fluoro_calib_ros.estimation.calibrate import calibrate
 from fluoro_calib_ros.estimation.options import CalibrationOptions
 from fluoro_calib_ros.estimation.rig_orientation import (
+    orientation_and_scatter,
     orientation_of_capture,
-    orientation_of_exposures,
 )
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.reconstruction.intersection import Intersector
 from fluoro_calib_ros.reconstruction.reconstruct import ReconstructedFrame, reconstruct_recording
-from fluoro_calib_ros.simulation.exposures import Detection, detect_beads, simulate_exposures
+from fluoro_calib_ros.simulation.exposures import (
+    Detection,
+    detect_beads,
+    simulate_exposures,
+    simulate_tracking,
+)
 from fluoro_calib_ros.simulation.rig import VirtualRig, virtual_rig
-from fluoro_calib_ros.simulation.tracking import simulate_tracking
 
 EXPOSURES = 15
 NOISE_PX = 0.25
@@ -144,7 +148,10 @@ def measure(
         calibrations = calibrate(training, rig.phantom, CalibrationOptions(WAYS[way])).calibrations
         for label, orientation in (
             (way, orientation_of_capture(still, rig.phantom, calibrations)),
-            (way + FROM_EXPOSURES, orientation_of_exposures(training, rig.phantom, calibrations)),
+            (
+                way + FROM_EXPOSURES,
+                orientation_and_scatter(training, rig.phantom, calibrations)[0],
+            ),
         ):
             found, _ = reconstruct_recording(moving, calibrations, Intersector(orientation))
             out[label] = _outcome(found, tracking.points_mm, orientation.source == 'capture')

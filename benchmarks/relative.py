@@ -21,8 +21,7 @@ from fluoro_calib_ros.estimation.calibrate import adjust_with_calibrations, cali
 from fluoro_calib_ros.estimation.options import CalibrationOptions
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.simulation.exposures import SimulatedExposures, simulate_exposures
-from fluoro_calib_ros.simulation.rig import VirtualRig, virtual_rig
-from fluoro_calib_ros.simulation.streams import StreamStart
+from fluoro_calib_ros.simulation.rig import StreamStart, VirtualRig, virtual_rig
 
 METHODS = {
     'separate': (False, 'none'),

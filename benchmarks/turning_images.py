@@ -35,11 +35,11 @@ from typing import IO, Any
 import cv2
 import numpy as np
 
+from benchmarks.bead_images import bead_image
 from fluoro_calib_ros.correction.fluoroscope_calibration import FluoroscopeCalibration
 from fluoro_calib_ros.estimation.calibrate import calibrate
 from fluoro_calib_ros.images.angle_maps import AngleMaps
 from fluoro_calib_ros.jobs.image_correction import ImageCorrectionRequest, run_image_correction
-from fluoro_calib_ros.simulation.bead_images import bead_image
 from fluoro_calib_ros.simulation.exposures import simulate_exposures
 from fluoro_calib_ros.simulation.rig import virtual_rig
 from tools.sections import show_section
@@ -425,7 +425,7 @@ def live(
     """Results of the cases whose name contains `only`, at a constant angle and turning."""
     import rclpy
 
-    from fluoro_calib_ros.demo.node_processes import isolate_ros_graph
+    from fluoro_calib_ros.demo.assessment import isolate_ros_graph
 
     isolate_ros_graph()
     out = {}

@@ -23,7 +23,7 @@ from fluoro_calib_msgs.msg import CorrectedObservations, TargetObservations
 from rclpy.serialization import deserialize_message, serialize_message
 
 from fluoro_calib_ros.exposures.frame import Frame
-from fluoro_calib_ros.io.bags.definitions import message_class, typestore
+from fluoro_calib_ros.io.bags.metadata import message_class, typestore
 from fluoro_calib_ros.nodes.messages.observations import (
     decode_corrected_observations,
     decode_target_observations,

@@ -28,11 +28,10 @@ from .exposures.names import Names
 from .exposures.phantom import Phantom
 from .findings import Finding, Kind, Severity
 from .io.access import PathLike
-from .io.bodies import read_bodies, write_bodies
+from .io.bodies import JointEntry, read_bodies, read_joints, write_bodies
 from .io.calibration import load_orientation, save_orientation
 from .io.calibration_request import read_request
 from .io.formats.content import FileSettings
-from .io.joints import JointEntry, read_joints
 from .io.phantom import read_moving_points, read_phantom, write_phantom
 from .io.poses import write_reconstruction
 from .jobs.bodies import BodiesOptions, BodiesOutcome, save_bodies, track_bodies

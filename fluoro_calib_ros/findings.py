@@ -166,25 +166,14 @@ class Kind(str, Enum):
 
 @dataclass(frozen=True)
 class Place:
-    """What a finding is about.
-
-    Attributes
-    ----------
-    fluoroscopes : tuple of str
-    exposures : tuple of int
-        Their numbers.
-    target_id : tuple of int
-    pixel : (float, float) or None
-        (u, v).
-    name : str or None
-        What the place is called in a sentence; None: fluoroscopes and exposures; '': the cause
-        names it.
-    """
+    """What a finding is about."""
 
     fluoroscopes: tuple[str, ...] = ()
-    exposures: tuple[int, ...] = ()
+    exposures: tuple[int, ...] = ()  #: their numbers
     target_id: tuple[int, ...] = ()
-    pixel: tuple[float, float] | None = None
+    pixel: tuple[float, float] | None = None  #: (u, v)
+    #: what the place is called in a sentence; None: fluoroscopes and exposures; '': the cause
+    #: names it
     name: str | None = None
 
     @classmethod

@@ -40,18 +40,10 @@ PROGRAM_END_S = 5  # in which a program ends that was interrupted
 
 @dataclass(frozen=True)
 class Resources:
-    """What a process may use of the machine.
+    """What a process may use of the machine."""
 
-    Attributes
-    ----------
-    nice : int
-        By how much its priority is lowered.
-    one_core : bool
-        Whether its libraries use a single thread each.
-    """
-
-    nice: int = 0
-    one_core: bool = True
+    nice: int = 0  #: by how much its priority is lowered
+    one_core: bool = True  #: whether its libraries use a single thread each
 
 
 OF_STREAM = Resources(nice=5)  # lower priority than the nodes, which must not wait for images
@@ -68,13 +60,8 @@ class WorkerProcess:
     One thread calls it, any may close it. After its process has ended, the next call starts a new
     one. Interrupts from the keyboard do not reach the process.
 
-    Parameters
-    ----------
-    make : callable
-        Returns the function, in the process; it can be pickled.
-    what : str
-        What it is, for errors: 'the process of ...'.
-    resources : Resources
+    make: returns the function, in the process; it can be pickled. what: what it is, for errors:
+    'the process of ...'.
     """
 
     def __init__(
@@ -113,21 +100,10 @@ class WorkerProcess:
     ) -> Any:
         """Return the result of a call.
 
-        Parameters
-        ----------
-        *arguments
-            Of the function; they can be pickled.
-        progress : callable, optional
-            Given to the function as such: what is called there is called here.
-        raise_if_cancelled : callable, optional
-            Called again and again; where it raises, the process is ended.
-
-        Raises
-        ------
-        ValueError, OSError
-            Where the function raises them: what a user can cause.
-        RuntimeError
-            Where the function fails otherwise; ProcessEnded where the process ends.
+        The arguments can be pickled. progress is given to the function as such: what is called
+        there is called here. raise_if_cancelled is called again and again; where it raises, the
+        process is ended. Raises ValueError and OSError where the function does, which a user can
+        cause, RuntimeError where it fails otherwise, and ProcessEnded where the process ends.
         """
         self.send(*arguments, progress=progress is not None)
         return self.receive(progress, raise_if_cancelled)

@@ -20,7 +20,7 @@ from fluoro_calib_ros.correction.fluoroscope_calibration import FluoroscopeCalib
 from fluoro_calib_ros.estimation.calibrate import calibrate
 from fluoro_calib_ros.estimation.options import CalibrationOptions
 from fluoro_calib_ros.exposures.frame import Frame
-from fluoro_calib_ros.io.bags.definitions import known_definition, message_from_frame
+from fluoro_calib_ros.io.bags.metadata import known_definition, message_from_frame
 from fluoro_calib_ros.io.bags.writer import BagWriter
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 from fluoro_calib_ros.simulation.exposures import simulate_exposures
@@ -90,8 +90,7 @@ def bag_content(storage: str = 'mcap') -> bytes:
     """Return a bag file of the frames, without compression and checksums."""
     from mcap.writer import CompressionType, Writer
 
-    from fluoro_calib_ros.io.bags.definitions import TARGET_OBSERVATIONS, to_cdr
-    from fluoro_calib_ros.io.bags.metadata import PROFILES, to_yaml
+    from fluoro_calib_ros.io.bags.metadata import PROFILES, TARGET_OBSERVATIONS, to_cdr, to_yaml
 
     buffer = io.BytesIO()
     writer = Writer(

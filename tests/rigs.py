@@ -13,8 +13,7 @@ import pytest
 from fluoro_calib_ros.cli import main
 from fluoro_calib_ros.correction.angle_field import PACKED_SHAPES, AngleField
 from fluoro_calib_ros.correction.fluoroscope_calibration import FluoroscopeCalibration
-from fluoro_calib_ros.correction.models import no_correction
-from fluoro_calib_ros.correction.registry import create_model
+from fluoro_calib_ros.correction.registry import create_model, no_correction
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.calibrate import calibrate
 from fluoro_calib_ros.estimation.options import CalibrationOptions

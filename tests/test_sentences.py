@@ -20,46 +20,43 @@ from rigs import calibrated, exposures, rig, small_network, true_calibrations, t
 from fluoro_calib_ros.bodies.body import Body
 from fluoro_calib_ros.bodies.healing import Cause, Change
 from fluoro_calib_ros.bodies.shapes import BodyPlaces, _stability, _unseen, estimate_shape
-from fluoro_calib_ros.checks import given_interior, inputs, mixed_units
 from fluoro_calib_ros.checks import held_out as held_fit
+from fluoro_calib_ros.checks import inputs, mixed_units, verdict
 from fluoro_calib_ros.checks import inputs as plausibility
 from fluoro_calib_ros.checks import rig as rig_checks
+from fluoro_calib_ros.checks.drift_charts import ERROR, WARN
 from fluoro_calib_ros.checks.drift_evidence import DriftEstimate
-from fluoro_calib_ros.checks.drift_options import ERROR, WARN
 from fluoro_calib_ros.checks.drift_watch import DriftWatch
+from fluoro_calib_ros.checks.rig import doubtful
 from fluoro_calib_ros.checks.rig_watch import RecordingDriftWatch
-from fluoro_calib_ros.checks.rigidity import doubtful
 from fluoro_calib_ros.checks.survey import unsurveyed
 from fluoro_calib_ros.checks.verdict import validate, validate_or_report
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.constraints import _without_targets_of_few_rays
-from fluoro_calib_ros.estimation.diagnostics import (
-    exposures_that_do_not_fit,
-    undetermined_unknowns,
-)
 from fluoro_calib_ros.estimation.initial_network import measured_network
 from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
+from fluoro_calib_ros.estimation.rounds import exposures_that_do_not_fit, undetermined_unknowns
 from fluoro_calib_ros.estimation.start_orientation import UNTILTED
+from fluoro_calib_ros.exposures.collector import without_repeats
+from fluoro_calib_ros.exposures.frame import without_strays
 from fluoro_calib_ros.exposures.phantom import Phantom
-from fluoro_calib_ros.exposures.repeats import without_repeats
-from fluoro_calib_ros.exposures.strays import without_strays
 from fluoro_calib_ros.findings import Finding, Kind, Place
 from fluoro_calib_ros.images import detection, extraction, lattice, matching
 from fluoro_calib_ros.images.codec import as_grey
 from fluoro_calib_ros.images.growth import Seen
 from fluoro_calib_ros.images.marker_watch import doubt_in
+from fluoro_calib_ros.io.calibration import edited, exchanged
 from fluoro_calib_ros.io.formats import registry
 from fluoro_calib_ros.io.formats.content import FileSettings
-from fluoro_calib_ros.io.result_check import edited, exchanged
 from fluoro_calib_ros.jobs import healing, result_folder
 from fluoro_calib_ros.jobs import orientation as orienting
 from fluoro_calib_ros.jobs import reconstruction as reconstructing
 from fluoro_calib_ros.jobs import report as comparing
 from fluoro_calib_ros.jobs.calibration import _without_copies, _without_shared
-from fluoro_calib_ros.jobs.live_markers import MarkerFollower, _wrong_start
+from fluoro_calib_ros.jobs.followers import MarkerFollower, _wrong_start
 from fluoro_calib_ros.jobs.sources import read_content
 from fluoro_calib_ros.photogrammetry.known_orientation import KnownOrientation
-from fluoro_calib_ros.reconstruction import mismatch
+from fluoro_calib_ros.reconstruction import epipolar
 
 PHANTOM = rig().phantom
 CORNERS = np.array([[-15.0, -12, -3], [14, -10, 5], [2, 16, -8], [-6, 3, 15], [11, 8, 10]])
@@ -114,7 +111,7 @@ def wrong_given_interior():
     evidence = Fake(
         calibrations={'a': held}, request=Fake(options=Fake(interior_sd=(1.0, 1.0, 1.0)))
     )
-    return given_interior._check(evidence, 'a', calibration, 3000.0)
+    return verdict._given_interior_check(evidence, 'a', calibration, 3000.0)
 
 
 def no_validation():
@@ -203,8 +200,8 @@ def moved_rig():
 def trial(kind):
     """What a trial of the reconstruction says is confused."""
     both = {name: list(of_one[:2]) for name, of_one in exposures().items()}
-    found = [why for why, _ in mismatch._trials(both, 'ab', {1, 2})]
-    return mismatch._missing(0.9, next(one for one in found if one.kind is kind))
+    found = [why for why, _ in epipolar._trials(both, 'ab', {1, 2})]
+    return epipolar._missing(0.9, next(one for one in found if one.kind is kind))
 
 
 def bead(**changes):
@@ -460,10 +457,10 @@ MAKERS = {
         Fake(fluoroscopes={'a': Fake(rmse_after=(2.0, 2.0), rmse_before=(2.0, 2.0))}),
         {'a': Fake(image_sd=0.25)},
     )[0],
-    Kind.NO_COMMON_TARGETS: lambda: mismatch.UNMATCHED,
+    Kind.NO_COMMON_TARGETS: lambda: epipolar.UNMATCHED,
     Kind.PAIRS_CONTRADICT: lambda: about_pairs(unexplained=20.0),
     Kind.PAIRS_EXCLUDED: lambda: about_pairs(used=np.arange(8) != 4),
-    Kind.RAYS_DO_NOT_MEET: lambda: mismatch._missing(0.9, mismatch.UNKNOWN),
+    Kind.RAYS_DO_NOT_MEET: lambda: epipolar._missing(0.9, epipolar.UNKNOWN),
     Kind.RIG_DEPENDS_ON_ANGLE: lambda: about_pairs(angle_px=1.5),
     Kind.RIG_MOVED: moved_rig,
     Kind.RIG_NOTE: saved_note,

@@ -13,7 +13,7 @@ import os
 import tempfile
 from pathlib import Path
 
-from fluoro_calib_ros.demo.node_processes import isolate_ros_graph
+from fluoro_calib_ros.demo.assessment import isolate_ros_graph
 
 from . import damage, hosts, kills, signals
 

@@ -13,19 +13,18 @@ from pathlib import Path
 from mcap.reader import make_reader
 
 from fluoro_calib_ros.errors import DataError
-from fluoro_calib_ros.io.bags.definitions import (
+from fluoro_calib_ros.io.bags.metadata import (
     TARGET_OBSERVATIONS,
     known_definition,
     message_from_frame,
+    profile,
     to_cdr,
 )
-from fluoro_calib_ros.io.bags.metadata import profile
 from fluoro_calib_ros.io.bags.reader import iterate_messages
 from fluoro_calib_ros.io.bags.recording import Recording, RecordingOptions, TopicToRecord
 from fluoro_calib_ros.io.bags.salvage import recover_bag
-from fluoro_calib_ros.simulation.rig import virtual_rig
-from fluoro_calib_ros.simulation.streams import StreamStart
-from fluoro_calib_ros.simulation.tracking import simulate_tracking
+from fluoro_calib_ros.simulation.exposures import simulate_tracking
+from fluoro_calib_ros.simulation.rig import StreamStart, virtual_rig
 
 from ..timing import section
 

@@ -6,7 +6,7 @@
 import numpy as np
 from scipy.optimize import least_squares
 
-from fluoro_calib_ros.estimation.gauge import GaugeKind, gauge_coefficients
+from fluoro_calib_ros.estimation.estimator import GaugeKind, gauge_coefficients
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 
 TURN_SCALE = 1e-3  # rad

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 import fluoro_calib_ros as fc
-from fluoro_calib_ros.correction.models import CollocationModel
+from fluoro_calib_ros.correction.registry import CollocationModel
 from fluoro_calib_ros.exposures.frame import Frame
 
 from .claims import expected_square

@@ -35,16 +35,11 @@ class AnatomicalFrame:
     """Axes of a bone in the coordinates of its body.
 
     Raises DataError for axes that are not finite, not perpendicular or left-handed.
-
-    Attributes
-    ----------
-    rotation : (3, 3) ndarray
-        Columns are the x, y and z axis; unit lengths and right angles to AXES_TOLERANCE.
-    origin_mm : (3,) ndarray
     """
 
+    #: (3, 3) columns are the x, y and z axis; unit lengths and right angles to AXES_TOLERANCE
     rotation: NDArray[np.float64]
-    origin_mm: NDArray[np.float64]
+    origin_mm: NDArray[np.float64]  #: (3,)
 
     def __post_init__(self) -> None:
         rotation = np.array(self.rotation, dtype=float)
@@ -112,20 +107,11 @@ class Direction:
 
 @dataclass(frozen=True)
 class LandmarkFrame:
-    """How landmarks make a frame.
+    """How landmarks make a frame."""
 
-    Attributes
-    ----------
-    origin : tuple of str
-        Landmarks with this mean.
-    first : Direction
-        An axis of the frame.
-    second : Direction
-        Spans a plane with the first; its part that is perpendicular to the first is an axis.
-    """
-
-    origin: tuple[str, ...]
-    first: Direction
+    origin: tuple[str, ...]  #: landmarks with this mean
+    first: Direction  #: an axis of the frame
+    #: spans a plane with the first; its part that is perpendicular to the first is an axis
     second: Direction
 
     @property

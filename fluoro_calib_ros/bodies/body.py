@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..errors import DataError
 
+AXIS_MM = 20.0  # length of a drawn axis, about the size of a cluster of markers in a bone
 POSE_SIZE = 6  # position [mm], then rotation about the axes of the rig frame [rad]
 
 

@@ -74,34 +74,16 @@ class Change:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What has changed.
+    """What has changed."""
 
-    Attributes
-    ----------
-    changes : tuple of Change
-        In the order of their evidence; none where nothing has changed.
-    probability : tuple of float
-        Of each against the causes that might stand in its place.
-    rivals : tuple of (Change or None)
-        The most likely of these, None where there is none.
-    observed : ObservedBodies
-        With the exchanged ids put right.
-    prior : Prior
-    solution : RigSolution
-    noise : float
-        Factor by which image points scatter more than claimed, at least 1.
-    rest : float
-        Probability that nothing else has changed.
-    """
-
-    changes: tuple[Change, ...]
-    probability: tuple[float, ...]
-    rivals: tuple[Change | None, ...]
-    observed: ObservedBodies
+    changes: tuple[Change, ...]  #: in the order of their evidence; none where nothing has changed
+    probability: tuple[float, ...]  #: of each against the causes that might stand in its place
+    rivals: tuple[Change | None, ...]  #: the most likely of these, None where there is none
+    observed: ObservedBodies  #: with the exchanged ids put right
     prior: Prior
     solution: RigSolution
-    noise: float
-    rest: float
+    noise: float  #: factor by which image points scatter more than claimed, at least 1
+    rest: float  #: probability that nothing else has changed
 
     @property
     def sure(self) -> bool:
@@ -120,11 +102,7 @@ class _Tried:
 class Diagnostician:
     """Decides what has changed.
 
-    Parameters
-    ----------
-    adjustment : RigAdjustment
-    shape_scale : float
-        Standard deviation of the scale of the shapes.
+    shape_scale: standard deviation of the scale of the shapes.
     """
 
     def __init__(self, adjustment: RigAdjustment, shape_scale: float) -> None:
@@ -353,27 +331,15 @@ def _probabilities(tried: Sequence[_Tried], causes: int) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class HealedRig:
-    """The orientation of a rig as it is now, and the drifts of its images.
+    """The orientation of a rig as it is now, and the drifts of its images."""
 
-    Attributes
-    ----------
-    orientation : RigOrientation
-        With the ids of the calibrations as they were.
-    drift : mapping of int to (Functions, coefficients (2, n), covariance (2n, 2n))
-        By fluoroscope; to be added to its correction.
-    changes : (F, 9) ndarray
-        Of T [mm], w [rad], xp, yp, c [px].
-    sd : (F, 9) ndarray
-        Their standard deviations.
-    weakest : float
-        Standard deviation of the direction of the changes that is known worst, over that of a
-        large change as it may be: 1 where the data tell nothing of it.
-    """
-
-    orientation: RigOrientation
+    orientation: RigOrientation  #: with the ids of the calibrations as they were
+    #: by fluoroscope; to be added to its correction
     drift: Mapping[int, tuple[Functions, NDArray[np.float64], NDArray[np.float64]]]
-    changes: NDArray[np.float64]
-    sd: NDArray[np.float64]
+    changes: NDArray[np.float64]  #: (F, 9) of T [mm], w [rad], xp, yp, c [px]
+    sd: NDArray[np.float64]  #: (F, 9) their standard deviations
+    #: standard deviation of the direction of the changes that is known worst, over that of a large
+    #: change as it may be: 1 where the data tell nothing of it
     weakest: float
 
 

@@ -39,11 +39,7 @@ class Linear:
 class Cameras:
     """The fluoroscopes of a rig, as they see the markers of bodies.
 
-    Parameters
-    ----------
-    orientation : RigOrientation
-    target_id : (B, M) ndarray
-        Markers of B bodies, -1 where a body has fewer.
+    target_id: (B, M) markers of B bodies, -1 where a body has fewer.
     """
 
     def __init__(self, orientation: RigOrientation, target_id: np.ndarray) -> None:

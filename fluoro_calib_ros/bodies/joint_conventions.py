@@ -24,38 +24,24 @@ from .anatomical_frames import AXES, SIDES
 
 @dataclass(frozen=True)
 class Convention:
-    """How the motion of a joint is expressed.
-
-    Attributes
-    ----------
-    name : str
-    sequence : str
-        Axes of the rotations, such as 'zxy'.
-    angles, translations : tuple of str
-        Names; each says which direction is positive.
-    angle_signs, translation_signs : tuple of int
-        Of the named quantities, of a right limb.
-    lateral : int or None
-        Number of the axis that points to the right of the person: a left limb is mirrored along
-        it. None where sides do not differ.
-    along_axes : bool
-        Whether translations are along the three axes of rotation, or else along x, y and z of the
-        proximal frame.
-    branch : int
-        Sign of the second angle of an Euler sequence.
-    proximal_landmarks, distal_landmarks : str
-        Kinds of landmark frames, empty where there are none.
-    """
+    """How the motion of a joint is expressed."""
 
     name: str
-    sequence: str
+    sequence: str  #: axes of the rotations, such as 'zxy'
+    #: names; each says which direction is positive
     angles: tuple[str, str, str]
     translations: tuple[str, str, str]
+    #: of the named quantities, of a right limb
     angle_signs: tuple[int, int, int] = (1, 1, 1)
     translation_signs: tuple[int, int, int] = (1, 1, 1)
+    #: number of the axis that points to the right of the person: a left limb is mirrored along it;
+    #: None where sides do not differ
     lateral: int | None = None
+    #: whether translations are along the three axes of rotation, or else along x, y and z of the
+    #: proximal frame
     along_axes: bool = True
-    branch: int = 1
+    branch: int = 1  #: sign of the second angle of an Euler sequence
+    #: kinds of landmark frames, empty where there are none
     proximal_landmarks: str = ''
     distal_landmarks: str = ''
 

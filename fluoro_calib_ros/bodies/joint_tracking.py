@@ -31,13 +31,6 @@ class JointTracker:
     joint : Joint
     neutral : (int, int) or None
         First and last exposure in neutral position. Raises DataError for more than MAX_NEUTRAL.
-
-    Attributes
-    ----------
-    needs_neutral : bool
-        Whether the neutral trial has not passed yet.
-    error : DataError or None
-        Why a neutral trial that has passed gave no neutral position.
     """
 
     def __init__(self, joint: Joint, neutral: tuple[int, int] | None = None) -> None:
@@ -50,7 +43,8 @@ class JointTracker:
         self._neutral = neutral
         self._collected: list[tuple[BodyPoses, BodyPoses]] = []
         self._last: NDArray[np.float64] | None = None
-        self.needs_neutral = neutral is not None
+        self.needs_neutral = neutral is not None  #: whether the neutral trial has not passed yet
+        #: why a neutral trial that has passed gave no neutral position
         self.error: DataError | None = None
 
     def add(self, proximal: BodyPoses, distal: BodyPoses) -> JointMotion:

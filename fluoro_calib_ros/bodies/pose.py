@@ -74,40 +74,22 @@ class Prediction:
 
 @dataclass(frozen=True)
 class FramePoses:
-    """Poses of B bodies in one exposure, of the centres of their markers.
+    """Poses of B bodies in one exposure, of the centres of their markers."""
 
-    Attributes
-    ----------
-    rotation : (B, 3, 3) ndarray
-        NaN where the exposure alone gives no pose.
-    centre_mm : (B, 3) ndarray
-    alone : (B,) ndarray of bool
-        Whether the exposure alone gives the pose.
-    ambiguous : (B,) ndarray of bool
-        Whether a second pose fits as well, and the prediction does not tell which is right.
-    covariance_noise, covariance_fixed : (B, 6, 6) ndarray
-        See BodyPoses. Where the exposure alone does not give the pose, by its prediction, too.
-    rig_root : (B, 6, k) ndarray
-    information : PoseInformation
-        For a filter, by the random errors.
-    used : (B, M) ndarray of bool
-        Markers, by their row in the body.
-    test : (B, M) ndarray
-        Test of a marker over its limit; NaN where it needs none.
-    chi2, freedom : (B,) ndarray
-        Weighted sum of squares of the used image points, and its expectation.
-    """
-
-    rotation: NDArray[np.float64]
-    centre_mm: NDArray[np.float64]
-    alone: NDArray[np.bool_]
+    rotation: NDArray[np.float64]  #: (B, 3, 3) NaN where the exposure alone gives no pose
+    centre_mm: NDArray[np.float64]  #: (B, 3)
+    alone: NDArray[np.bool_]  #: (B,) whether the exposure alone gives the pose
+    #: (B,) whether a second pose fits as well, and the prediction does not tell which is right
     ambiguous: NDArray[np.bool_]
+    #: (B, 6, 6) see BodyPoses; where the exposure alone does not give the pose, by its prediction,
+    #: too
     covariance_noise: NDArray[np.float64]
     covariance_fixed: NDArray[np.float64]
-    rig_root: NDArray[np.float64]
-    information: PoseInformation
-    used: NDArray[np.bool_]
-    test: NDArray[np.float64]
+    rig_root: NDArray[np.float64]  #: (B, 6, k)
+    information: PoseInformation  #: for a filter, by the random errors
+    used: NDArray[np.bool_]  #: (B, M) markers, by their row in the body
+    test: NDArray[np.float64]  #: (B, M) test of a marker over its limit; NaN where it needs none
+    #: (B,) weighted sum of squares of the used image points, and its expectation
     chi2: NDArray[np.float64]
     freedom: NDArray[np.float64]
 

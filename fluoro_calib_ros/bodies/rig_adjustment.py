@@ -57,26 +57,13 @@ _BY_EXPOSURE = ('uv', 'pixel', 'variance', 'seen')
 
 @dataclass(frozen=True)
 class ObservedBodies:
-    """Image points of the markers (B, M) of bodies in T exposures and F views.
+    """Image points of the markers (B, M) of bodies in T exposures and F views."""
 
-    Attributes
-    ----------
-    uv : (T, B, M, F, 2) ndarray
-        Corrected [px].
-    pixel : (T, B, M, F, 2) ndarray
-        As observed [px].
-    variance : (T, B, M, F) ndarray
-        Of the noise [px^2].
-    correction : (B, M, F) ndarray
-        Of the errors of the correction that stay [px^2].
-    seen : (T, B, M, F) ndarray of bool
-    """
-
-    uv: NDArray[np.float64]
-    pixel: NDArray[np.float64]
-    variance: NDArray[np.float64]
-    correction: NDArray[np.float64]
-    seen: NDArray[np.bool_]
+    uv: NDArray[np.float64]  #: (T, B, M, F, 2) corrected [px]
+    pixel: NDArray[np.float64]  #: (T, B, M, F, 2) as observed [px]
+    variance: NDArray[np.float64]  #: (T, B, M, F) of the noise [px^2]
+    correction: NDArray[np.float64]  #: (B, M, F) of the errors of the correction that stay [px^2]
+    seen: NDArray[np.bool_]  #: (T, B, M, F)
 
     def exposures(self, chosen: NDArray[np.int64]) -> ObservedBodies:
         """Return some exposures."""
@@ -122,20 +109,13 @@ class Poses:
 
 @dataclass(frozen=True)
 class Prior:
-    """Prior of the unknowns.
+    """Prior of the unknowns."""
 
-    Attributes
-    ----------
-    orientation : (9F, 9F) ndarray
-        Covariance of the orientation, as it was calibrated.
-    sd : (K,) ndarray
-        Standard deviations of changes in addition, and of the other unknowns.
-    inflation : (B, M) ndarray
-        Factor of the standard deviations of the image points of a marker.
-    """
-
+    #: (9F, 9F) covariance of the orientation, as it was calibrated
     orientation: NDArray[np.float64]
+    #: (K,) standard deviations of changes in addition, and of the other unknowns
     sd: NDArray[np.float64]
+    #: (B, M) factor of the standard deviations of the image points of a marker
     inflation: NDArray[np.float64]
 
     def widened(self, sd: NDArray[np.float64]) -> Prior:
@@ -145,31 +125,19 @@ class Prior:
 
 @dataclass(frozen=True)
 class RigSolution:
-    """Solution of a hypothesis.
+    """Solution of a hypothesis."""
 
-    Attributes
-    ----------
-    values : (K,) ndarray
-        Changes of the unknowns.
-    covariance : (K, K) ndarray
-    poses : Poses
-    evidence : float
-        Logarithm, up to a constant that all hypotheses share.
-    squares, freedom : (B, M) ndarray
-        Weighted squares of the residuals of the inliers of each marker, and their expectation.
-    inliers : (B, M) ndarray
-        Mean probability of the image points of a marker to be inliers; NaN for an unseen one.
-    inliers_of_pose : (T, B) ndarray
-        The same of the image points of a body in an exposure.
-    """
-
-    values: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    values: NDArray[np.float64]  #: (K,) changes of the unknowns
+    covariance: NDArray[np.float64]  #: (K, K)
     poses: Poses
-    evidence: float
+    evidence: float  #: logarithm, up to a constant that all hypotheses share
+    #: (B, M) weighted squares of the residuals of the inliers of each marker, and their
+    #: expectation
     squares: NDArray[np.float64]
     freedom: NDArray[np.float64]
+    #: (B, M) mean probability of the image points of a marker to be inliers; NaN for an unseen one
     inliers: NDArray[np.float64]
+    #: (T, B) the same of the image points of a body in an exposure
     inliers_of_pose: NDArray[np.float64]
 
 
@@ -185,14 +153,8 @@ class _Normal:
 class RigAdjustment:
     """Adjustment of one recording for any hypothesis.
 
-    Parameters
-    ----------
-    orientation : RigOrientation
-        As it was calibrated.
-    bodies : sequence of Body
-        With known places of all markers.
-    image_size : sequence of (int, int)
-        Of each fluoroscope [px].
+    orientation: as it was calibrated. bodies: with known places of all markers. image_size: of
+    each fluoroscope [px].
     """
 
     def __init__(
@@ -635,18 +597,10 @@ def _moved(poses: Poses, normal: _Normal, step: np.ndarray) -> Poses:
 
 @dataclass(frozen=True)
 class RigErrors:
-    """Errors of points by those of a rig, relative to each other.
+    """Errors of points by those of a rig, relative to each other."""
 
-    Attributes
-    ----------
-    scale : float
-        Standard deviation of the scale.
-    place_mm : float
-        Of a coordinate, where all points move together freely.
-    """
-
-    scale: float
-    place_mm: float
+    scale: float  #: standard deviation of the scale
+    place_mm: float  #: of a coordinate, where all points move together freely
 
 
 def rig_errors(orientation: RigOrientation, points_mm: NDArray[np.float64]) -> RigErrors:

@@ -49,20 +49,11 @@ UNITS = {10.0: 'cm', 1000.0: 'm', 25.4: 'inches'}
 
 @dataclass(frozen=True)
 class BodyPlaces:
-    """Places of the markers of a body in T exposures, as points in space.
+    """Places of the markers of a body in T exposures, as points in space."""
 
-    Attributes
-    ----------
-    xyz_mm : (T, m, 3) ndarray
-        NaN where a marker is not known in space.
-    covariance : (T, m, 3, 3) ndarray
-        Of the random errors.
-    fixed : (T, m, 3, 3) ndarray
-        Of the errors that stay while a marker stands still, by the corrections.
-    """
-
-    xyz_mm: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    xyz_mm: NDArray[np.float64]  #: (T, m, 3) NaN where a marker is not known in space
+    covariance: NDArray[np.float64]  #: (T, m, 3, 3) of the random errors
+    #: (T, m, 3, 3) of the errors that stay while a marker stands still, by the corrections
     fixed: NDArray[np.float64]
 
     @property
@@ -73,26 +64,14 @@ class BodyPlaces:
 
 @dataclass(frozen=True)
 class EstimatedShape:
-    """The shape of a body.
+    """The shape of a body."""
 
-    Attributes
-    ----------
-    body : Body
-        Coordinates in its frame, their standard deviations relative to each other, and the
-        covariance of the frame by CT.
-    condition : float
-        Condition number [1/m].
-    mean_error_mm : float
-        Mean error of rigid-body fitting, over all exposures.
-    exposures : int
-        Exposures that contributed.
-    findings : tuple of Finding
-    """
-
+    #: coordinates in its frame, their standard deviations relative to each other, and the
+    #: covariance of the frame by CT
     body: Body
-    condition: float
-    mean_error_mm: float
-    exposures: int
+    condition: float  #: condition number [1/m]
+    mean_error_mm: float  #: mean error of rigid-body fitting, over all exposures
+    exposures: int  #: exposures that contributed
     findings: tuple[Finding, ...]
 
 

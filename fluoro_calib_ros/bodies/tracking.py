@@ -32,39 +32,21 @@ NS_PER_S = 1e9
 
 @dataclass(frozen=True)
 class TrackedExposure:
-    """Poses of B bodies in one exposure.
-
-    Attributes
-    ----------
-    number, stamp_ns : int
-    rotation : (B, 3, 3) ndarray
-        Body -> rig; NaN where a body is lost.
-    centre_mm : (B, 3) ndarray
-        Centres of the markers.
-    velocity, acceleration : (B, 6) ndarray
-        [mm/s, rad/s] and [mm/s^2, rad/s^2]; NaN without a filter.
-    covariance : (B, 18, 18) ndarray
-        Of the random errors of pose, velocity and acceleration.
-    fixed : (B, 6, 6) ndarray
-        Of the errors of the pose that stay.
-    rig_root : (B, 6, k) ndarray
-    frame : FramePoses
-        What the exposure alone tells.
-    status : (B,) ndarray
-        PoseStatus as uint8.
-    """
+    """Poses of B bodies in one exposure."""
 
     number: int
     stamp_ns: int
-    rotation: NDArray[np.float64]
-    centre_mm: NDArray[np.float64]
+    rotation: NDArray[np.float64]  #: (B, 3, 3) body -> rig; NaN where a body is lost
+    centre_mm: NDArray[np.float64]  #: (B, 3) centres of the markers
+    #: (B, 6) [mm/s, rad/s] and [mm/s^2, rad/s^2]; NaN without a filter
     velocity: NDArray[np.float64]
     acceleration: NDArray[np.float64]
+    #: (B, 18, 18) of the random errors of pose, velocity and acceleration
     covariance: NDArray[np.float64]
-    fixed: NDArray[np.float64]
-    rig_root: NDArray[np.float64]
-    frame: FramePoses
-    status: NDArray[np.uint8]
+    fixed: NDArray[np.float64]  #: (B, 6, 6) of the errors of the pose that stay
+    rig_root: NDArray[np.float64]  #: (B, 6, k)
+    frame: FramePoses  #: what the exposure alone tells
+    status: NDArray[np.uint8]  #: (B,) PoseStatus as uint8
 
 
 @dataclass(frozen=True)

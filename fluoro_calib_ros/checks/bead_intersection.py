@@ -5,14 +5,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..estimation.result import CalibrationResult
-from ..exposures.frame import Frame
+from ..exposures.frame import Frames
 from ..exposures.phantom import Phantom
 from ..photogrammetry.collinearity import project_with_jacobian
 from ..photogrammetry.noise import INLIER_Q
@@ -27,26 +26,14 @@ DAMPING = 1e-9  # [1/mm^2]: a bead that is seen once stays where it is along its
 
 @dataclass(frozen=True)
 class Beads:
-    """Beads intersected from images, and their survey.
+    """Beads intersected from images, and their survey."""
 
-    Attributes
-    ----------
-    target_id : (n,) ndarray of int
-    xyz_mm : (n, 3) ndarray
-    covariance : (n, 3, 3) ndarray
-        [mm^2]
-    views : (n,) ndarray of int
-        Number of image points that agree.
-    survey_mm : (n, 3) ndarray
-    survey_sd_mm : (n,) ndarray
-    """
-
-    target_id: NDArray[np.int64]
-    xyz_mm: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-    views: NDArray[np.int64]
-    survey_mm: NDArray[np.float64]
-    survey_sd_mm: NDArray[np.float64]
+    target_id: NDArray[np.int64]  #: (n,)
+    xyz_mm: NDArray[np.float64]  #: (n, 3)
+    covariance: NDArray[np.float64]  #: (n, 3, 3) [mm^2]
+    views: NDArray[np.int64]  #: (n,) number of image points that agree
+    survey_mm: NDArray[np.float64]  #: (n, 3)
+    survey_sd_mm: NDArray[np.float64]  #: (n,)
 
     def without(self, target_id: np.ndarray) -> Beads:
         """Return the beads except those with a target id."""
@@ -72,54 +59,33 @@ class Beads:
 
 @dataclass(frozen=True)
 class DistanceComparison:
-    """Distances between beads compared with the survey.
+    """Distances between beads compared with the survey."""
 
-    Attributes
-    ----------
-    rmse_mm, expected_mm : float
-        RMS difference from the survey, and its expectation [mm].
-    freedom : float
-        Degrees of freedom of the chi-square distribution that the squared RMS difference has,
-        nearly.
-    scale, scale_sd : float
-        Scale of the images relative to the survey - 1, and its standard deviation.
-    """
-
+    #: RMS difference from the survey, and its expectation [mm]
     rmse_mm: float
     expected_mm: float
+    #: degrees of freedom of the chi-square distribution that the squared RMS difference has,
+    #: nearly
     freedom: float
+    #: scale of the images relative to the survey - 1, and its standard deviation
     scale: float
     scale_sd: float
 
 
 @dataclass(frozen=True)
 class Rays:
-    """Image points with the orientation of their exposure.
+    """Image points with the orientation of their exposure."""
 
-    Attributes
-    ----------
-    rotation : (n, 3, 3) ndarray
-    position_mm : (n, 3) ndarray
-    interior : (n, 3) ndarray
-        xp, yp, c [px].
-    uv : (n, 2) ndarray
-        Corrected [px].
-    variance : (n,) ndarray
-        Of a coordinate, of observation and correction together [px^2].
-    target_id : (n,) ndarray of int
-    """
-
-    rotation: NDArray[np.float64]
-    position_mm: NDArray[np.float64]
-    interior: NDArray[np.float64]
-    uv: NDArray[np.float64]
+    rotation: NDArray[np.float64]  #: (n, 3, 3)
+    position_mm: NDArray[np.float64]  #: (n, 3)
+    interior: NDArray[np.float64]  #: (n, 3) xp, yp, c [px]
+    uv: NDArray[np.float64]  #: (n, 2) corrected [px]
+    #: (n,) of a coordinate, of observation and correction together [px^2]
     variance: NDArray[np.float64]
-    target_id: NDArray[np.int64]
+    target_id: NDArray[np.int64]  #: (n,)
 
 
-def intersect(
-    job: CalibrationResult, frames: Mapping[str, Sequence[Frame]], phantom: Phantom
-) -> Beads:
+def intersect(job: CalibrationResult, frames: Frames, phantom: Phantom) -> Beads:
     """Intersect the beads of an adjustment from the images of all its fluoroscopes.
 
     The survey only takes part through the orientations, which depend on all beads together. The
@@ -133,26 +99,14 @@ def intersect(
 
 
 def least_chi2_without_a_ray(
-    job: CalibrationResult,
-    frames: Mapping[str, Sequence[Frame]],
-    phantom: Phantom,
-    target_id: NDArray[np.int64],
+    job: CalibrationResult, frames: Frames, phantom: Phantom, target_id: NDArray[np.int64]
 ) -> NDArray[np.float64]:
     """Smallest squared misclosures (n,) of beads with any one of their rays excluded.
 
     A false match that agrees with the other rays by chance displaces a bead; without it the bead
     is in place. Zero where too few rays are left.
 
-    Parameters
-    ----------
-    job, frames, phantom
-        As in `intersect`.
-    target_id : (n,) ndarray of int
-        Beads.
-
-    Returns
-    -------
-    (n,) ndarray
+    job, frames, phantom: as in `intersect`. target_id: (n,) beads. Returns (n,).
     """
     rays = _rays(job, frames)
     out = np.zeros(len(target_id))
@@ -175,20 +129,8 @@ def _beads(
 ) -> Beads:
     """Intersect beads from rays.
 
-    Parameters
-    ----------
-    rays : Rays
-    target_id : (n,) ndarray of int
-    bead : (N,) ndarray of int
-        Row of the bead of each ray.
-    start : (n, 3) ndarray
-        Start values [mm].
-    phantom : Phantom
-
-    Returns
-    -------
-    Beads
-        Those that are well determined.
+    target_id: (n,). bead: (N,) row of the bead of each ray. start: (n, 3) start values [mm].
+    Returns those that are well determined.
     """
     points = start.copy()
     for step in range(STEPS_L1 + STEPS_L2):
@@ -264,7 +206,7 @@ def _degrees_of_freedom(
     return float(np.sum(variance) ** 2 / squares)
 
 
-def _rays(job: CalibrationResult, frames: Mapping[str, Sequence[Frame]]) -> Rays:
+def _rays(job: CalibrationResult, frames: Frames) -> Rays:
     """Return the image points of all exposures of an adjustment."""
     parts = []
     for name, figures in job.fluoroscopes.items():

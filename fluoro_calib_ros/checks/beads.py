@@ -1,22 +1,263 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Checks 'beads' and 'distances': beads found from the images alone agree with their survey."""
+"""Checks 'beads' and 'distances': beads found from the images alone agree with their survey.
+
+A face or plate of a phantom that is not where its survey says, as a whole. The misclosures of the
+beads, from images alone, are fitted by one rigid motion of the phantom and by two: one of a layer
+of beads, one of the rest. The layer with the largest decrease of the weighted square sum is
+displaced if the decrease is significant (F-test of a general linear hypothesis with known
+variance: Foerstner and Wrobel, "Photogrammetric Computer Vision", Springer 2016, 3.1), explains
+most of what is wrong, and brings the beads of the layer into place. Where the square sum is no
+larger than expected, nothing is wrong: neighbouring beads have errors of the correction in common,
+which the test takes to be independent.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import bdtrc, chdtri
 
-from ..estimation.diagnostics import ResidualTable
+from ..estimation.rounds import ResidualTable
 from ..findings import Kind, Place, first_few
 from .bead_intersection import Beads, distances, intersect, least_chi2_without_a_ray
 from .calibration_evidence import Evidence, Subject
 from .check import Check
-from .faces import displaced_layer
+
+MIN_LAYER = 8  # of a layer, and of the rest
+BORDERS = 40  # between layers that are tried along each axis
+FALSE_ALARM_LAYER = 1e-3
+MOTION = 6  # unknowns
+EXPLAINED = 0.5  # part of the excess of the square sum that a displaced layer explains
+IMPROVED = 2.0  # factor by which the median square of its beads falls
+
+
+@dataclass(frozen=True)
+class DisplacedLayer:
+    """A layer of beads that is out of place as a whole."""
+
+    axis: int  #: 0, 1 or 2: along which coordinate of the survey the layer is bounded
+    #: its bounds [mm]; None where the phantom ends, so that the layer is a face
+    low: float | None
+    high: float | None
+    target_id: NDArray[np.int64]  #: (k,) its beads
+    shift_mm: NDArray[np.float64]  #: (3,) images - survey of its centre, against the rest
+    tilt_rad: float  #: rotation against the rest
+    #: RMS displacement of its beads by this motion, and that which is not significant
+    size_mm: float
+    limit_mm: float
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """Size of its motion."""
+        shift = float(np.linalg.norm(self.shift_mm))
+        return {'shift_mm': shift, 'tilt_deg': float(np.rad2deg(self.tilt_rad))}
+
+    @property
+    def cause(self) -> str:
+        """What is wrong with the layer, in words."""
+        name = 'xyz'[self.axis]
+        if self.low is None:
+            where = f'the face of the phantom with {name} < {self.high:.0f} mm'
+        elif self.high is None:
+            where = f'the face of the phantom with {name} > {self.low:.0f} mm'
+        else:
+            where = (
+                f'the layer of the phantom with {name} from {self.low:.0f} to {self.high:.0f} mm'
+            )
+        x, y, z = self.shift_mm
+        return (
+            f'{where} ({len(self.target_id)} beads) is displaced as a whole against its survey: '
+            f'by {np.linalg.norm(self.shift_mm):.1f} mm ({x:.1f}, {y:.1f}, {z:.1f}) and tilted by '
+            f'{np.rad2deg(self.tilt_rad):.2f} deg'
+        )
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """A layer to try: the beads order[start:stop] along an axis; gain of its own motion."""
+
+    axis: int
+    order: np.ndarray
+    start: int
+    stop: int
+    gain: float
+
+    @property
+    def own(self) -> np.ndarray:
+        """Rows of its beads."""
+        return self.order[self.start : self.stop]
+
+    def halves(self) -> list[_Candidate]:
+        """Return the layer and, of two faces with as many beads, the other one."""
+        count = len(self.order)
+        if 2 * (self.stop - self.start) != count or (self.start and self.stop < count):
+            return [self]
+        other = (self.stop, count) if self.start == 0 else (0, self.start)
+        return [self, replace(self, start=other[0], stop=other[1])]
+
+
+def displaced_layer(beads: Beads) -> DisplacedLayer | None:
+    """Return the layer of beads that is out of place as a whole, None if there is none."""
+    if len(beads.target_id) < 2 * MIN_LAYER:
+        return None
+    fit = _Fit(beads)
+    tried = [candidate for axis in range(3) for candidate in fit.candidates(axis)]
+    if not tried:
+        return None
+    best = max(tried, key=lambda candidate: candidate.gain)
+    critical = float(chdtri(MOTION, FALSE_ALARM_LAYER / len(tried)))
+    if (
+        best.gain < critical
+        or fit.excess <= 0
+        or best.gain < EXPLAINED * fit.excess
+        or fit.improvement(best) < IMPROVED
+    ):
+        return None
+    # Of two plates, either moved against the other: by the smaller motion.
+    found = [fit.described(candidate, critical) for candidate in best.halves()]
+    return min(found, key=lambda layer: float(np.linalg.norm(layer.shift_mm)))
+
+
+class _Fit:
+    """Motions of layers of beads that fit their misclosures."""
+
+    def __init__(self, beads: Beads) -> None:
+        self._beads = beads
+        self._centre = beads.survey_mm.mean(axis=0)
+        self._design = _motions(beads.survey_mm - self._centre)
+        self._information = np.linalg.inv(beads.total_covariance)
+        half = self._information @ self._design
+        self._normals = np.einsum('nai,naj->nij', self._design, half)
+        self._rights = np.einsum('nai,na->ni', half, beads.misclosure)
+        self._all = _Equations(self._normals.sum(axis=0), self._rights.sum(axis=0))
+
+    @property
+    def excess(self) -> float:
+        """Weighted square sum without a motion of all beads, less its expectation."""
+        left = self._beads.misclosure - self._design @ self._all.motion
+        return float(self._squares(left, slice(None)).sum() - 3 * len(left))
+
+    def candidates(self, axis: int) -> list[_Candidate]:
+        """Layers along an axis, with what their own motion gains."""
+        coordinate = self._beads.survey_mm[:, axis]
+        order = np.argsort(coordinate, kind='stable')
+        start, stop = _layers(coordinate[order]).T
+        own = _Equations(
+            _sums(self._normals[order], start, stop), _sums(self._rights[order], start, stop)
+        )
+        gain = own.decrease + self._all.without(own).decrease - self._all.decrease
+        return [
+            _Candidate(axis, order, *bounds)
+            for bounds in zip(start.tolist(), stop.tolist(), gain.tolist())
+        ]
+
+    def improvement(self, candidate: _Candidate) -> float:
+        """Factor by which the median square of the beads of a layer falls by its own motion."""
+        own = candidate.own
+        motions = self._motion_and_rest(own)
+        after, before = (
+            np.median(self._squares(self._beads.misclosure[own] - self._design[own] @ motion, own))
+            for motion in motions
+        )
+        return float(before / after)
+
+    def described(self, candidate: _Candidate, critical: float) -> DisplacedLayer:
+        """Return a layer with its motion against the rest; critical: gain of no significance."""
+        own = candidate.own
+        survey = self._beads.survey_mm
+        coordinate = survey[candidate.order, candidate.axis]
+
+        def border(at: int) -> float | None:
+            if at in (0, len(coordinate)):
+                return None
+            return float(coordinate[at - 1 : at + 1].mean())
+
+        motion, rest = self._motion_and_rest(own)
+        relative = motion - rest
+        moved = self._design[own] @ relative
+        size = float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
+        middle = _motions((survey[own].mean(axis=0) - self._centre)[None])[0]
+        return DisplacedLayer(
+            candidate.axis,
+            border(candidate.start),
+            high=border(candidate.stop),
+            target_id=self._beads.target_id[own],
+            shift_mm=middle @ relative,
+            tilt_rad=float(np.linalg.norm(relative[3:])),
+            size_mm=size,
+            limit_mm=size * float(np.sqrt(critical / candidate.gain)),
+        )
+
+    def _motion_and_rest(self, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Motions (6,) of beads and of the rest."""
+        layer = _Equations(self._normals[own].sum(axis=0), self._rights[own].sum(axis=0))
+        return layer.motion, self._all.without(layer).motion
+
+    def _squares(self, left: np.ndarray, rows: np.ndarray | slice) -> np.ndarray:
+        """Weighted squares (k,) of misclosures left (k, 3) of beads."""
+        return np.einsum('na,nab,nb->n', left, self._information[rows], left)
+
+
+def _motions(x: np.ndarray) -> np.ndarray:
+    """Derivatives (n, 3, 6) of points x (n, 3) by translation and rotation."""
+    out = np.zeros((len(x), 3, MOTION))
+    out[:, :, :3] = np.eye(3)
+    out[:, 0, 4] = x[:, 2]
+    out[:, 0, 5] = -x[:, 1]
+    out[:, 1, 3] = -x[:, 2]
+    out[:, 1, 5] = x[:, 0]
+    out[:, 2, 3] = x[:, 1]
+    out[:, 2, 4] = -x[:, 0]
+    return out
+
+
+def _layers(coordinate: np.ndarray) -> np.ndarray:
+    """Starts and stops (k, 2) of the layers to try, from coordinates (n,) in order.
+
+    Borders are where the gaps are largest. Of a face and the rest, the smaller one is tried.
+    """
+    count = len(coordinate)
+    gaps = np.argsort(-np.diff(coordinate), kind='stable')[:BORDERS] + 1
+    regular = np.linspace(0, count, BORDERS // 2).astype(int)
+    borders = np.unique(np.concatenate([[0, count], gaps, regular]))
+    pairs = borders[np.stack(np.triu_indices(len(borders), 1), axis=1)]
+    size = pairs[:, 1] - pairs[:, 0]
+    return pairs[(size >= MIN_LAYER) & (size <= count // 2)]
+
+
+def _sums(values: np.ndarray, start: np.ndarray, stop: np.ndarray) -> np.ndarray:
+    """Sums (k, ...) of values (n, ...) from start (k,) to before stop (k,)."""
+    sums = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)])
+    return sums[stop] - sums[start]
+
+
+@dataclass(frozen=True)
+class _Equations:
+    """Normal equations of motions: normal (..., 6, 6) and right (..., 6)."""
+
+    normal: np.ndarray
+    right: np.ndarray
+
+    def without(self, part: _Equations) -> _Equations:
+        """Return those of the beads that are not in a part."""
+        return _Equations(self.normal - part.normal, self.right - part.right)
+
+    @property
+    def motion(self) -> np.ndarray:
+        """Motions (..., 6); beads on a line do not determine all of them."""
+        inverse = np.linalg.pinv(self.normal, hermitian=True, rcond=1e-9)
+        return (inverse @ self.right[..., None])[..., 0]
+
+    @property
+    def decrease(self) -> np.ndarray:
+        """Decrease (...) of the weighted square sum by a motion."""
+        return np.einsum('...i,...i->...', self.right, self.motion)
+
 
 MIN_BEADS = 10  # for distances
 FALSE_ALARM = 2e-3  # chance that any bead of a good phantom is reported
@@ -83,18 +324,9 @@ def compare_with_survey(
 ) -> list[Check]:
     """Return the checks 'beads' and 'distances'.
 
-    Parameters
-    ----------
-    beads : Beads
-    has_trend : bool
-        Whether the residuals of a fluoroscope have a trend.
-    least_chi2 : callable, optional
-        Called with target ids; returns their smallest squared misclosures with any ray excluded.
-        A bead is out of place only if it is so by these, too.
-
-    Returns
-    -------
-    list of Check
+    has_trend: whether the residuals of a fluoroscope have a trend. least_chi2: called with target
+    ids; returns their smallest squared misclosures with any ray excluded; a bead is out of place
+    only if it is so by these, too.
     """
     count = len(beads.target_id)
     if count < MIN_BEADS:

@@ -36,8 +36,7 @@ from ..bodies.rigid import fitted_pose
 from ..bodies.shapes import learned_shape
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.reconstruct import IntersectedViews
-from .charts import ImageAreas
-from .drift_options import DriftOptions
+from .drift_charts import DriftOptions, ImageAreas
 
 COMPONENTS = 2  # of a shift in an image, u and v
 # Fraction of the systematic standard deviation that markers in an area have in common. Measured:
@@ -57,24 +56,16 @@ class BodyBlock:
     """Statistics of the bodies in a block.
 
     The 2F series are the drifts along u and v of the F fluoroscopes.
-
-    Attributes
-    ----------
-    score, information : ndarray
-        (B, 2F, A), of a drift of each area, by body [1/px, 1/px^2].
-    systematic : ndarray
-        (2F, A), systematic standard deviations of what all bodies show together [px].
-    enough : ndarray
-        (2F, A), whether enough pairs of markers are on both sides of the border of the area.
-    count : int
-        Number of places of markers.
     """
 
+    #: (B, 2F, A) of a drift of each area, by body [1/px, 1/px^2]
     score: NDArray[np.float64]
     information: NDArray[np.float64]
+    #: (2F, A) systematic standard deviations of what all bodies show together [px]
     systematic: NDArray[np.float64]
+    #: (2F, A) whether enough pairs of markers are on both sides of the border of the area
     enough: NDArray[np.bool_]
-    count: int
+    count: int  #: number of places of markers
 
 
 @dataclass(frozen=True)
@@ -88,20 +79,9 @@ class _Seen:
 class BodyWatch:
     """Turns the image points of rigid bodies into statistics, block by block.
 
-    Parameters
-    ----------
-    bodies : sequence of Body
-        Shapes that are not given are learned at the start of a stream.
-    orientation : RigOrientation
-    sizes : sequence
-        (F, 2), width and height of the images [px].
-    areas : ImageAreas
-    options : DriftOptions
-
-    Raises
-    ------
-    DataError
-        For a marker of two bodies, and for two bodies of the same name.
+    bodies: shapes that are not given are learned at the start of a stream. sizes: (F, 2), width
+    and height of the images [px]. Raises DataError for a marker of two bodies, and for two bodies
+    of the same name.
     """
 
     def __init__(

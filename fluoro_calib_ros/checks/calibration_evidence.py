@@ -6,15 +6,14 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
-from ..correction.models import CollocationModel
-from ..correction.registry import selectable_models
+from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
+from ..correction.registry import CollocationModel, selectable_models
 from ..errors import DataError
 from ..estimation.calibrate import adjust_with_calibrations, calibrate_part
 from ..estimation.exposure_terms import Variation, exposure_functions, is_determined, variation
@@ -22,7 +21,7 @@ from ..estimation.fixed_calibration import noise_of_calibrations
 from ..estimation.initial_network import EarlierCalibration, StartValues
 from ..estimation.options import AUTO, CalibrationRequest
 from ..estimation.result import CalibrationResult
-from ..exposures.frame import Frame
+from ..exposures.frame import Frame, Frames
 from ..exposures.phantom import Phantom
 from .check import Check
 from .residual_tests import (
@@ -47,26 +46,16 @@ MIN_VARYING_EXPOSURES = 4  # with enough image points, to tell whether the disto
 
 @dataclass(frozen=True)
 class CommonTrend:
-    """Trend that the residuals of all exposures of a fluoroscope have in common.
+    """Trend that the residuals of all exposures of a fluoroscope have in common."""
 
-    Attributes
-    ----------
-    inliers : Residuals
-        Those in the core of the noise.
-    trend : ResidualTrend
-    claimed_sd : float
-        Standard deviation that the calibration claims for its correction [px]: an error of this
-        size is no fault.
-    rejected : RejectedTrend or None
-        What rejected image points have in common; None where they are few everywhere.
-    of_exposure : RejectedExposure or None
-        How far those of one exposure agree; None where they are few in all.
-    """
-
-    inliers: Residuals
+    inliers: Residuals  #: those in the core of the noise
     trend: ResidualTrend
+    #: standard deviation that the calibration claims for its correction [px]: an error of this
+    #: size is no fault
     claimed_sd: float
+    #: what rejected image points have in common; None where they are few everywhere
     rejected: RejectedTrend | None = None
+    #: how far those of one exposure agree; None where they are few in all
     of_exposure: RejectedExposure | None = None
 
     @property
@@ -82,26 +71,17 @@ class CommonTrend:
 
 @dataclass(frozen=True)
 class Evidence:
-    """A calibration, the exposures it was made from, and what a check may do with them.
+    """A calibration, the exposures it was made from, and what a check may do with them."""
 
-    Attributes
-    ----------
-    request : CalibrationRequest
-        With the frames that were used only, in the order of their numbers.
-    calibrations : mapping of str to FluoroscopeCalibration
-    result : CalibrationResult
-        Adjustment of the frames with the calibrations fixed.
-    report_step : callable
-        To be called with the name of a step before every step of a check.
-    """
-
+    #: with the frames that were used only, in the order of their numbers
     request: CalibrationRequest
-    calibrations: Mapping[str, FluoroscopeCalibration]
-    result: CalibrationResult
+    calibrations: Calibrations
+    result: CalibrationResult  #: adjustment of the frames with the calibrations fixed
+    #: to be called with the name of a step before every step of a check
     report_step: Callable[[str], None]
 
     @property
-    def frames(self) -> Mapping[str, Sequence[Frame]]:
+    def frames(self) -> Frames:
         """Frames by fluoroscope."""
         return self.request.frames
 
@@ -186,9 +166,7 @@ class Evidence:
             name: [f for i, f in enumerate(self.frames[name]) if is_chosen(i)] for name in names
         }
 
-    def calibrate(
-        self, frames: Mapping[str, Sequence[Frame]]
-    ) -> Mapping[str, FluoroscopeCalibration]:
+    def calibrate(self, frames: Frames) -> Calibrations:
         """Calibrate with a part of the frames. Raises DataError where they do not suffice."""
         options = self.request.options
         distance = self.request.principal_distance
@@ -209,7 +187,7 @@ class Evidence:
         # where the distortion is large.
         return calibrate_part(part, self.starts, self.calibrations)
 
-    def calibrate_free(self, names: Sequence[str]) -> Mapping[str, FluoroscopeCalibration]:
+    def calibrate_free(self, names: Sequence[str]) -> Calibrations:
         """Calibrate all frames of some fluoroscopes without a given interior orientation.
 
         Raises DataError.
@@ -217,11 +195,7 @@ class Evidence:
         request = replace(self.request, options=replace(self.request.options, interior_sd=None))
         return replace(self, request=request).calibrate(self.part(names, lambda i: True))
 
-    def _has_lost_points(
-        self,
-        found: Mapping[str, FluoroscopeCalibration],
-        frames: Mapping[str, Sequence[Frame]],
-    ) -> bool:
+    def _has_lost_points(self, found: Calibrations, frames: Frames) -> bool:
         """Whether a part rejects clearly more image points than the whole."""
         for name, calibration in found.items():
             kept = _share_of_inliers(calibration, frames[name])
@@ -230,11 +204,7 @@ class Evidence:
                 return True
         return False
 
-    def adjust(
-        self,
-        frames: Mapping[str, Sequence[Frame]],
-        calibrations: Mapping[str, FluoroscopeCalibration],
-    ) -> CalibrationResult:
+    def adjust(self, frames: Frames, calibrations: Calibrations) -> CalibrationResult:
         """Adjust frames with calibrations fixed. Raises DataError."""
         return adjust_with_calibrations(
             frames,
@@ -252,19 +222,10 @@ def _share_of_inliers(calibration: FluoroscopeCalibration, frames: Sequence[Fram
 
 @dataclass(frozen=True)
 class Subject:
-    """A subject of validation: one or more checks that are made together.
+    """A subject of validation: one or more checks that are made together."""
 
-    Attributes
-    ----------
-    run : callable
-        Called with the Evidence and the names of the fluoroscopes that are calibrated together;
-        returns their checks. With of_rig it is called once, with all fluoroscopes.
-    steps : int
-        How often run calls `Evidence.report_step`.
-    of_rig : bool
-        Whether the checks are of all fluoroscopes together.
-    """
-
+    #: called with the Evidence and the names of the fluoroscopes that are calibrated together;
+    #: returns their checks; with of_rig it is called once, with all fluoroscopes
     run: Callable[[Evidence, Sequence[str]], list[Check]]
-    steps: int = 0
-    of_rig: bool = False
+    steps: int = 0  #: how often run calls `Evidence.report_step`
+    of_rig: bool = False  #: whether the checks are of all fluoroscopes together

@@ -25,7 +25,7 @@ from scipy.special import chdtri
 from ..correction.base import Correction
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration, at_common_angle
 from ..errors import DataError
-from ..estimation.gauge import interior_about
+from ..estimation.estimator import interior_about
 from ..exposures.frame import cells_of
 
 # Comparison of two independent calibrations of one fluoroscope, and names of image areas.
@@ -41,21 +41,11 @@ MIN_SD_PX = 1e-3  # of a prediction: a model without uncertainty would cause a d
 
 @dataclass(frozen=True)
 class FieldDifference:
-    """Difference of the predictions of two calibrations.
+    """Difference of the predictions of two calibrations."""
 
-    Attributes
-    ----------
-    uv : (n, 2) ndarray
-        Observed pixels.
-    duv : (n, 2) ndarray
-        Difference [px], without what orientations absorb.
-    sd : (n,) ndarray
-        Its predicted standard deviation [px].
-    """
-
-    uv: NDArray[np.float64]
-    duv: NDArray[np.float64]
-    sd: NDArray[np.float64]
+    uv: NDArray[np.float64]  #: (n, 2) observed pixels
+    duv: NDArray[np.float64]  #: (n, 2) difference [px], without what orientations absorb
+    sd: NDArray[np.float64]  #: (n,) its predicted standard deviation [px]
 
     @property
     def normalised(self) -> float:
@@ -157,33 +147,19 @@ CHANCE = 2 * (1 - LEVEL)
 
 @dataclass(frozen=True)
 class Comparison:
-    """Difference of two calibrations of a fluoroscope, the second minus the first.
-
-    Attributes
-    ----------
-    fluoroscope : str
-    image_size : (int, int)
-    interior, interior_sd : (3,) ndarray
-        Difference of xp, yp, c [px], both in one gauge, and its standard deviation.
-    interior_test, interior_limit : float
-        Weighted square sum of the difference, and its 99 % quantile; NaN where both were fixed.
-    uv : (n, 2) ndarray
-        Pixels that both calibrations cover.
-    duv : (n, 2) ndarray
-        Difference of the corrections there, without gauge [px].
-    sd : (n,) ndarray
-        Its standard deviation in each coordinate [px].
-    """
+    """Difference of two calibrations of a fluoroscope, the second minus the first."""
 
     fluoroscope: str
     image_size: tuple[int, int]
+    #: (3,) difference of xp, yp, c [px], both in one gauge, and its standard deviation
     interior: NDArray[np.float64]
     interior_sd: NDArray[np.float64]
+    #: weighted square sum of the difference, and its 99 % quantile; NaN where both were fixed
     interior_test: float
     interior_limit: float
-    uv: NDArray[np.float64]
-    duv: NDArray[np.float64]
-    sd: NDArray[np.float64]
+    uv: NDArray[np.float64]  #: (n, 2) pixels that both calibrations cover
+    duv: NDArray[np.float64]  #: (n, 2) difference of the corrections there, without gauge [px]
+    sd: NDArray[np.float64]  #: (n,) its standard deviation in each coordinate [px]
 
     @property
     def size(self) -> NDArray[np.float64]:

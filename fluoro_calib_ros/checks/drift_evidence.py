@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .body_watch import COMPONENTS
-from .charts import MIN_INFORMATION, CusumCharts
+from .drift_charts import MIN_INFORMATION, CusumCharts
 
 WINDOW_S = 30.0  # newest blocks from which place and size of a drift are estimated
 # Log-likelihood of another fluoroscope, over that of the likeliest one, from which both are named.
@@ -47,37 +47,18 @@ class BlockRecord:
 
 @dataclass(frozen=True)
 class DriftEstimate:
-    """A drift as the newest blocks show it.
+    """A drift as the newest blocks show it."""
 
-    Attributes
-    ----------
-    fluoroscopes : tuple of str
-        The likeliest one first, then those that are about as likely.
-    area : int
-        Number of the area.
-    size, sd : float
-        Signed size along `direction` and its standard deviation [px].
-    direction : ndarray
-        (2,), unit vector in the image.
-    against : str
-        One of REFERENCES.
-    source : str
-        'epipolar' or 'cluster NAME'.
-    confirmed : bool
-        False where a single body shows it, in which a marker may have moved.
-    begin_ns : int
-        Estimated begin.
-    """
-
-    fluoroscopes: tuple[str, ...]
-    area: int
+    fluoroscopes: tuple[str, ...]  #: the likeliest one first, then those that are about as likely
+    area: int  #: number of the area
+    #: signed size along `direction` and its standard deviation [px]
     size: float
     sd: float
-    direction: NDArray[np.float64]
-    against: str
-    source: str
-    confirmed: bool
-    begin_ns: int
+    direction: NDArray[np.float64]  #: (2,) unit vector in the image
+    against: str  #: one of REFERENCES
+    source: str  #: 'epipolar' or 'cluster NAME'
+    confirmed: bool  #: False where a single body shows it, in which a marker may have moved
+    begin_ns: int  #: estimated begin
 
 
 @dataclass(frozen=True)
@@ -92,12 +73,7 @@ class _Candidate:
 class Evidence(ABC):
     """Charts of one kind of observations and the newest blocks.
 
-    Parameters
-    ----------
-    charts : CusumCharts
-    fluoroscopes : sequence of str
-    window : int
-        Number of blocks from which a drift is estimated.
+    window: number of blocks from which a drift is estimated.
     """
 
     def __init__(self, charts: CusumCharts, fluoroscopes: Sequence[str], window: int) -> None:

@@ -35,7 +35,18 @@ from ..findings import Finding, Kind, Place, Severity
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.reconstruct import IntersectedViews
 from .body_watch import COMPONENTS, BodyWatch
-from .charts import EVIDENCE_CAP, CusumCharts, ImageAreas
+from .drift_charts import (
+    ERROR,
+    EVIDENCE_CAP,
+    LEVEL_NAMES,
+    OK,
+    WARN,
+    CusumCharts,
+    DriftOptions,
+    DriftState,
+    EpipolarObservations,
+    ImageAreas,
+)
 from .drift_evidence import (
     EPIPOLAR,
     SERIES_OF_PAIR,
@@ -45,8 +56,6 @@ from .drift_evidence import (
     DriftEstimate,
     EpipolarEvidence,
 )
-from .drift_observations import EpipolarObservations
-from .drift_options import ERROR, LEVEL_NAMES, OK, WARN, DriftOptions, DriftState
 from .pair_watch import PairWatch
 
 BODY_STEP = 2.0  # times step_px in the charts of the bodies, which have less information
@@ -56,26 +65,9 @@ HYSTERESIS = 0.5  # times the threshold of WARN: an alarm ends below it
 class DriftWatch:
     """The drift watch of a rig.
 
-    Parameters
-    ----------
-    image_sizes : mapping of str to tuple of int
-        Width and height of the images by fluoroscope [px], in the order of the orientation.
-    options : DriftOptions, optional
-    bodies : sequence of Body
-        Shapes that are not given are learned.
-    orientation : RigOrientation, optional
-        Needed for bodies only.
-
-    Attributes
-    ----------
-    thresholds : tuple of float
-        Evidence at which the levels WARN and ERROR begin.
-    state : DriftState
-
-    Raises
-    ------
-    ValueError
-        For fewer than two fluoroscopes, for bodies without orientation, and as BodyWatch.
+    image_sizes: width and height of the images by fluoroscope [px], in the order of the
+    orientation. bodies: shapes that are not given are learned; they need the orientation. Raises
+    ValueError for fewer than two fluoroscopes, for bodies without orientation, and as BodyWatch.
     """
 
     def __init__(
@@ -103,6 +95,7 @@ class DriftWatch:
         if bodies:
             series += COMPONENTS * len(self._names)
         charts = 2 * series * len(self._areas)
+        #: evidence at which the levels WARN and ERROR begin
         self.thresholds = tuple(
             float(np.log(charts * hours * 3600 / options.block_s))
             for hours in (options.warn_interval_h, options.error_interval_h)
@@ -358,19 +351,11 @@ MAX_LATE = 100
 class BlockClock:
     """Clock of a stream.
 
-    Parameters
-    ----------
-    block_s : float
-        Length of a block [s].
-
-    Attributes
-    ----------
-    newest_ns : int
-        Newest time [ns].
+    block_s: length of a block [s].
     """
 
     def __init__(self, block_s: float) -> None:
-        self.newest_ns = 0
+        self.newest_ns = 0  #: newest time [ns]
         self._length_ns = round(block_s * 1e9)
         self._begin_ns: int | None = None  # of the present block
         self._late = 0  # calls with a stamp before the newest one, since that came

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
-from ..correction.models import no_correction
+from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
+from ..correction.registry import no_correction
 from ..errors import DataError
 from ..estimation.result import CalibrationResult
 from ..findings import Finding, Kind, Place
@@ -33,9 +33,7 @@ MAX_NOISE = 2.0  # RMSE over the noise of an image coordinate of the calibration
 CORRECTED = 0.6  # RMSE without the correction over that with it, of points that are corrected
 
 
-def uncorrected(
-    calibrations: Mapping[str, FluoroscopeCalibration],
-) -> dict[str, FluoroscopeCalibration]:
+def uncorrected(calibrations: Calibrations) -> dict[str, FluoroscopeCalibration]:
     """Return calibrations without their corrections, to try image points that are corrected."""
     return {
         name: replace(
@@ -48,9 +46,7 @@ def uncorrected(
     }
 
 
-def misfits(
-    result: CalibrationResult, calibrations: Mapping[str, FluoroscopeCalibration]
-) -> dict[str, float]:
+def misfits(result: CalibrationResult, calibrations: Calibrations) -> dict[str, float]:
     """Return the RMSE over the noise of each fluoroscope whose exposures a calibration misfits."""
     ratios = {
         name: _rmse(figures.rmse_after) / calibrations[name].image_sd
@@ -60,9 +56,7 @@ def misfits(
 
 
 def corrected_already(
-    result: CalibrationResult,
-    without: CalibrationResult,
-    calibrations: Mapping[str, FluoroscopeCalibration],
+    result: CalibrationResult, without: CalibrationResult, calibrations: Calibrations
 ) -> Finding | None:
     """Return a finding on the fluoroscopes whose image points are corrected already.
 
@@ -90,9 +84,7 @@ def _rmse(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def poor_fits(
-    result: CalibrationResult, calibrations: Mapping[str, FluoroscopeCalibration]
-) -> list[Finding]:
+def poor_fits(result: CalibrationResult, calibrations: Calibrations) -> list[Finding]:
     """Return a finding for every fluoroscope whose exposures its calibration does not fit."""
     out = []
     for name, figures in result.fluoroscopes.items():
@@ -136,29 +128,18 @@ MIN_NOISE = 0.05  # part of the squared residuals in sample that is noise, whate
 
 
 class ExposureSums(NamedTuple):
-    """Sums of an exposure over its image points.
+    """Sums of an exposure over its image points."""
 
-    Attributes
-    ----------
-    number : int
-        Of the exposure.
-    points : int
-    outside, inside : float
-        Squared residuals [px^2] with a calibration that has not used the exposure, and with one
-        that has. The same exposures are adjusted in the same way, so that the adjustment absorbs
-        the same part of the residuals.
-    predicted : float
-        Predicted variance of the correction [px^2].
-    white : float
-        Half the squared differences of the residuals of nearest neighbours [px^2]: what is noise,
-        and no misfit of an area.
-    """
-
-    number: int
+    number: int  #: of the exposure
     points: int
+    #: squared residuals [px^2] with a calibration that has not used the exposure, and with one
+    #: that has; the same exposures are adjusted in the same way, so that the adjustment absorbs
+    #: the same part of the residuals
     outside: float
     inside: float
-    predicted: float
+    predicted: float  #: predicted variance of the correction [px^2]
+    #: half the squared differences of the residuals of nearest neighbours [px^2]: what is noise,
+    #: and no misfit of an area
     white: float
 
 

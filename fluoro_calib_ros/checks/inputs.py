@@ -22,10 +22,10 @@ import numpy as np
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..correction.series import sd_grid_pixels
 from ..errors import DataError
-from ..estimation.gauge import interior_about
+from ..estimation.estimator import interior_about
 from ..estimation.options import CalibrationRequest
 from ..estimation.result import CalibrationResult, FluoroscopeResult
-from ..exposures.frame import Frame, validate_frame
+from ..exposures.frame import Frame, Frames, validate_frame
 from ..exposures.phantom import Phantom
 from ..findings import Finding, Kind, Place, first_few
 from ..photogrammetry.collinearity import project
@@ -108,7 +108,7 @@ class Fit:
     distance_mm: float | None
 
 
-def validate_magnitudes(frames: Mapping[str, Sequence[Frame]], phantom: Phantom) -> None:
+def validate_magnitudes(frames: Frames, phantom: Phantom) -> None:
     """Raise DataError for numbers that no measurement has, and that spoil every calculation."""
     large = np.abs(phantom.xyz_mm).max(axis=1) > MAX_COORDINATE_MM
     if large.any():
@@ -161,7 +161,7 @@ def why_excluded(frame: Frame, phantom: Phantom) -> Finding | None:
     return None if cause is None or cause.kind is Kind.OTHER_PHANTOM else cause
 
 
-def find_wrong_phantom(frames: Mapping[str, Sequence[Frame]], phantom: Phantom) -> list[Finding]:
+def find_wrong_phantom(frames: Frames, phantom: Phantom) -> list[Finding]:
     """Return a finding for every kind of targets in frames whose coordinates cannot be right."""
     every = [frame.target_id for exposures in frames.values() for frame in exposures]
     seen = np.isin(phantom.target_id, np.concatenate(every or [np.empty(0, int)]))
@@ -259,7 +259,7 @@ def _fit_of_plane(xyz: np.ndarray, uv: np.ndarray) -> Fit | None:
     return Fit(float(np.sqrt(np.median(squared))), 1, None)
 
 
-def find_wrong_input(frames: Mapping[str, Sequence[Frame]], phantom: Phantom) -> list[Finding]:
+def find_wrong_input(frames: Frames, phantom: Phantom) -> list[Finding]:
     """Return a finding for every fluoroscope whose exposures cannot be of the phantom as given.
 
     frames are exposures by fluoroscope, valid on their own. Those with the most targets are tested
@@ -274,7 +274,7 @@ def find_wrong_input(frames: Mapping[str, Sequence[Frame]], phantom: Phantom) ->
     return out
 
 
-def valid_frames(frames: Mapping[str, Sequence[Frame]]) -> dict[str, list[Frame]]:
+def valid_frames(frames: Frames) -> dict[str, list[Frame]]:
     """Return the frames that are valid on their own, by fluoroscope."""
     out: dict[str, list[Frame]] = {}
     for name, exposures in frames.items():
@@ -288,7 +288,7 @@ def valid_frames(frames: Mapping[str, Sequence[Frame]]) -> dict[str, list[Frame]
     return out
 
 
-def require_phantom(frames: Mapping[str, Sequence[Frame]], phantom: Phantom) -> None:
+def require_phantom(frames: Frames, phantom: Phantom) -> None:
     """Raise DataError where exposures of a calibrated fluoroscope cannot be of the phantom.
 
     Exposures with fewer than MIN_TESTED targets are not tested, nor those that are not valid.
@@ -305,9 +305,7 @@ def require_phantom(frames: Mapping[str, Sequence[Frame]], phantom: Phantom) -> 
 
 
 def find_wrong_orientation(
-    frames: Mapping[str, Sequence[Frame]],
-    phantom: Phantom,
-    known: Mapping[str, KnownOrientation],
+    frames: Frames, phantom: Phantom, known: Mapping[str, KnownOrientation]
 ) -> list[Finding]:
     """Return a finding for every fluoroscope whose known orientation its exposures contradict."""
     out = []

@@ -12,13 +12,13 @@ least median residual of the better versions is refined.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from ..errors import DataError
-from ..exposures.frame import Frame
+from ..exposures.frame import Frame, Frames
 from ..exposures.phantom import Phantom
 from ..findings import Finding, Kind, Place, first_few
 from ..photogrammetry.resection import (
@@ -43,20 +43,11 @@ SAMPLES = 1500
 STEPS = 10
 
 
-def mixed_units(
-    frames: Mapping[str, Sequence[Frame]],
-    phantom: Phantom,
-    is_suspicious: bool = False,
-) -> Finding | None:
+def mixed_units(frames: Frames, phantom: Phantom, is_suspicious: bool = False) -> Finding | None:
     """Return a finding where a part of the targets is in another unit than the others.
 
-    Parameters
-    ----------
-    frames : mapping of str to sequence of Frame
-        Exposures by fluoroscope, valid on their own.
-    phantom : Phantom
-    is_suspicious : bool
-        Whether the exposures do not fit the phantom, so that there may be no majority.
+    frames: exposures by fluoroscope, valid on their own. is_suspicious: whether the exposures do
+    not fit the phantom, so that there may be no majority.
     """
     every = [_on_phantom(frame, phantom) for of_one in frames.values() for frame in of_one]
     every = [frame for frame in every if len(frame.target_id) >= MIN_TARGETS]

@@ -11,9 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .charts import MEMORY, ImageAreas
-from .drift_observations import EpipolarObservations
-from .drift_options import DriftOptions
+from .drift_charts import MEMORY, DriftOptions, EpipolarObservations, ImageAreas
 
 LAGS = (1, 2, 4)  # frames over which the noise of a marker is compared
 MIN_CORRELATION = 0.05
@@ -27,23 +25,14 @@ class PairBlock:
 
     The four series are: image a and image b against the calibration, image a and image b against
     the start.
-
-    Attributes
-    ----------
-    score, information : ndarray
-        (4, A), of a drift of each area [1/px, 1/px^2].
-    systematic : ndarray
-        (4, A), systematic standard deviations [px].
-    enough : ndarray
-        (4, A), whether there are enough markers in the area.
-    normals : ndarray
-        (2, A, 2), sums of the normals of the epipolar lines in both images.
     """
 
+    #: (4, A) of a drift of each area [1/px, 1/px^2]
     score: NDArray[np.float64]
     information: NDArray[np.float64]
-    systematic: NDArray[np.float64]
-    enough: np.ndarray
+    systematic: NDArray[np.float64]  #: (4, A) systematic standard deviations [px]
+    enough: np.ndarray  #: (4, A) whether there are enough markers in the area
+    #: (2, A, 2) sums of the normals of the epipolar lines in both images
     normals: NDArray[np.float64]
 
     @classmethod
@@ -57,12 +46,7 @@ class PairBlock:
 class PairWatch:
     """Turns the epipolar residuals of one pair of views into statistics, block by block.
 
-    Parameters
-    ----------
-    sizes : sequence
-        (2, 2), width and height of both images [px].
-    areas : ImageAreas
-    options : DriftOptions
+    sizes: (2, 2), width and height of both images [px].
     """
 
     def __init__(
@@ -231,15 +215,7 @@ class SystematicErrorField:
     orientation. The values are estimated from the residuals of the start, by marker and block, by
     least-squares collocation.
 
-    Parameters
-    ----------
-    sizes : sequence
-        (2, 2), width and height of both images [px].
-
-    Attributes
-    ----------
-    mean, covariance : ndarray or None
-        (m,) [px] and (m, m) [px^2] of the nodes; None until `estimate` is called.
+    sizes: (2, 2), width and height of both images [px].
     """
 
     def __init__(self, sizes: Sequence[Sequence[int]]) -> None:
@@ -249,6 +225,7 @@ class SystematicErrorField:
         self._right = np.zeros(2 * self._nodes)
         self._square_sum = 0.0
         self._count = 0
+        #: (m,) [px] and (m, m) [px^2] of the nodes; None until `estimate` is called
         self.mean: np.ndarray | None = None
         self.covariance: np.ndarray | None = None
 

@@ -58,29 +58,14 @@ CHANGE = _TestPlan(16, 2, 1e-4, 1e-3)
 
 @dataclass(frozen=True)
 class Residuals:
-    """Residuals of one fluoroscope.
+    """Residuals of one fluoroscope."""
 
-    Attributes
-    ----------
-    uv : (n, 2) ndarray
-        Observed pixels.
-    r : (n, 2) ndarray
-        Observed - correction - projected [px].
-    exposure : (n,) ndarray of int
-        Exposure of a residual, 0 to m - 1 in order.
-    target_id : (n,) ndarray of int
-    numbers : (m,) ndarray of int
-        Numbers of the exposures.
-    angles : (m,) ndarray
-        Angles of the C-arm [rad], NaN where they are unknown.
-    """
-
-    uv: NDArray[np.float64]
-    r: NDArray[np.float64]
-    exposure: NDArray[np.int64]
-    target_id: NDArray[np.int64]
-    numbers: NDArray[np.int64]
-    angles: NDArray[np.float64]
+    uv: NDArray[np.float64]  #: (n, 2) observed pixels
+    r: NDArray[np.float64]  #: (n, 2) observed - correction - projected [px]
+    exposure: NDArray[np.int64]  #: (n,) exposure of a residual, 0 to m - 1 in order
+    target_id: NDArray[np.int64]  #: (n,)
+    numbers: NDArray[np.int64]  #: (m,) numbers of the exposures
+    angles: NDArray[np.float64]  #: (m,) angles of the C-arm [rad], NaN where they are unknown
 
     @property
     def angle(self) -> NDArray[np.float64]:
@@ -116,98 +101,57 @@ class Residuals:
 
 
 class CellTrend(NamedTuple):
-    """Trend in the cell of the image where it is most significant.
+    """Trend in the cell of the image where it is most significant."""
 
-    Attributes
-    ----------
-    size, limit : float
-        [px]
-    place : (2,) ndarray
-        Centre of the cell [px].
-    """
-
+    #: [px]
     size: float
     limit: float
-    place: NDArray[np.float64]
+    place: NDArray[np.float64]  #: (2,) centre of the cell [px]
 
 
 class RejectedTrend(NamedTuple):
-    """What the rejected image points about one place have in common.
+    """What the rejected image points about one place have in common."""
 
-    Attributes
-    ----------
-    size, limit : float
-        Length of their mean residual; that which chance hardly exceeds [px].
-    place : (2,) ndarray
-        Their mean place [px].
-    points : int
-        Number of them.
-    """
-
+    #: length of their mean residual; that which chance hardly exceeds [px]
     size: float
     limit: float
-    place: NDArray[np.float64]
-    points: int
+    place: NDArray[np.float64]  #: (2,) their mean place [px]
+    points: int  #: number of them
 
 
 class RejectedExposure(NamedTuple):
-    """How far the rejected image points of one exposure agree with their neighbours.
+    """How far the rejected image points of one exposure agree with their neighbours."""
 
-    Attributes
-    ----------
-    number : int
-        Of the exposure.
-    points, of : int
-        Rejected image points, and all.
-    agreement, limit : float
-        Sum of the products of neighbours, in its standard deviations if they have any direction;
-        what chance exceeds with FALSE_ALARM in any of the exposures.
-    """
-
-    number: int
+    number: int  #: of the exposure
+    #: rejected image points, and all
     points: int
     of: int
+    #: sum of the products of neighbours, in its standard deviations if they have any direction;
+    #: what chance exceeds with FALSE_ALARM in any of the exposures
     agreement: float
     limit: float
 
 
 @dataclass(frozen=True)
 class ResidualTrend:
-    """A trend in residuals; without one, a limit is exceeded with the chance of its test.
+    """A trend in residuals; without one, a limit is exceeded with the chance of its test."""
 
-    Attributes
-    ----------
-    size, limit : float
-        Of the whole image [px].
-    cell_size, cell_limit : float
-        Of the cell where the trend is most significant [px].
-    place : (2,) ndarray
-        Centre of that cell [px].
-    """
-
+    #: of the whole image [px]
     size: float
     limit: float
+    #: of the cell where the trend is most significant [px]
     cell_size: float
     cell_limit: float
-    place: NDArray[np.float64]
+    place: NDArray[np.float64]  #: (2,) centre of that cell [px]
 
 
 @dataclass(frozen=True)
 class Joins:
-    """Products of neighbouring residuals of two exposures, by pair of exposures.
+    """Products of neighbouring residuals of two exposures, by pair of exposures."""
 
-    Attributes
-    ----------
-    mean : (p,) ndarray
-        Mean product [px^2].
-    count : (p,) ndarray
-        Number of joins.
-    earlier, later : (p,) ndarray of int
-        Rows of the exposures.
-    """
-
-    mean: NDArray[np.float64]
-    count: NDArray[np.int64]
+    mean: NDArray[np.float64]  #: (p,) mean product [px^2]
+    count: NDArray[np.int64]  #: (p,) number of joins
+    #: (p,) rows of the exposures
     earlier: NDArray[np.int64]
     later: NDArray[np.int64]
 
@@ -215,13 +159,7 @@ class Joins:
 def residuals_of(job: CalibrationResult, name: str, frames: Sequence[Frame]) -> Residuals:
     """Return the residuals of the frames of a fluoroscope in an adjustment.
 
-    Parameters
-    ----------
-    job : CalibrationResult
-        Of an adjustment with a calibration fixed.
-    name : str
-        Fluoroscope.
-    frames : sequence of Frame
+    job: an adjustment with a calibration fixed. name: the fluoroscope.
     """
     figures = job.fluoroscopes[name]
     calibration = job.calibrations[name]
@@ -373,13 +311,7 @@ def _cell_sums(
     overlap: a cell consists of so many parts along each side, and there is one for each place of
     such a square of parts.
 
-    Returns
-    -------
-    sums : (c, m, 2) ndarray
-        [px]
-    counts : (c, m) ndarray
-    centres : (c, 2) ndarray
-        Of the cells [px].
+    Returns the sums (c, m, 2) [px], counts (c, m) and centres (c, 2) of the cells [px].
     """
     parts = CELLS * overlap
     size = np.asarray(image_size) / parts

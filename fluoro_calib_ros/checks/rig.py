@@ -3,6 +3,10 @@
 
 """Check 'orientation': the exposures of a rig agree on how its fluoroscopes stand to each other.
 
+Fluoroscopes of a rig do not move against each other while the phantom is moved. Where frames of
+different exposures have the same number, the relative orientations of the pairs contradict each
+other, however well each fluoroscope is calibrated.
+
 Points in space depend on the orientation of the rig as much as on the corrections. What two
 fluoroscopes see in exposures of one number shows frames of different exposures while the phantom
 moves, but not where the motion between them is the same each time, as on a turntable: such a
@@ -12,26 +16,236 @@ trust.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
 
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import Calibrations
 from ..errors import DataError
 from ..estimation.options import CalibrationRequest
-from ..estimation.pair_scatter import PairScatter
-from ..estimation.result import CalibrationResult
+from ..estimation.pair_scatter import MOVED_SHARE, PairScatter, steps_of
+from ..estimation.result import CalibrationResult, ExposureResult, FluoroscopeResult
 from ..estimation.rig_orientation import orientation_and_scatter, orientation_of_known
-from ..exposures.frame import Frame
+from ..exposures.frame import Frame, Frames
 from ..findings import Finding, Kind, Place, Severity
 from ..photogrammetry.rig_orientation import RigOrientation
+from ..photogrammetry.rotations import matrix_from_quaternion, rotation_angle, vector_from_matrix
 from .check import Check
-from .rigidity import DOUBTFUL_GROWTH, NOT_ORIENTED, ORIENTED, contradiction, doubtful
 
-Frames = Mapping[str, Sequence[Frame]]
-Calibrations = Mapping[str, FluoroscopeCalibration]
+MIN_PAIRS = 3
+# Distance, in radians and relative shift, from which a pair is not one of the rig.
+INTERCHANGED = 0.4
+# Median deviation of the pairs from their median, far above that of a rig whose mounting gives.
+MAX_SHIFT_MM = 10.0
+MAX_SHIFT = 0.01  # the same over the distance of the sources; the larger of both holds
+MAX_TURN_RAD = np.deg2rad(1.0)
+# Scatter of the pairs over their standard deviations above which they are doubtful; of honest rigs
+# it is 1.0 to 1.4, and 3 where the model does not follow the distortion at all.
+DOUBTFUL_GROWTH = 2.0
+MAX_GROWTH = 8.0  # above which there is no orientation, where the displacement is large as well
+MAX_OFF = 0.0025  # median displacement of image points over the longer side of the image
+MIN_PAIRS_MOVED = 6
+# What findings on the orientation of a rig are about.
+ORIENTED = 'orientation of the rig'
+NOT_ORIENTED = 'no orientation of the rig'
+
+
+def interchanged(
+    names: tuple[str, str], one: FluoroscopeResult, other: FluoroscopeResult
+) -> Finding | None:
+    """Return a finding where frames of two fluoroscopes are interchanged in some exposures.
+
+    The relative orientation of such a pair is far from the others, and its inverse is near them.
+    """
+    pairs = _pairs(one, other)
+    if len(pairs) < MIN_PAIRS:
+        return None
+    turn, shift = _relative(pairs)
+    numbers = [a.exposure for a, _ in pairs]
+    middle = int(np.argmin(np.median(_distances(turn, shift, turn, shift), axis=1)))
+    there = turn[middle : middle + 1]
+    base = shift[middle : middle + 1]
+    far = _distances(turn, shift, there, base)[:, 0] > INTERCHANGED
+    inverse_turn = turn.transpose(0, 2, 1)
+    inverse_shift = -(turn @ shift[..., None])[..., 0]
+    near = _distances(inverse_turn, inverse_shift, there, base)[:, 0] < INTERCHANGED / 2
+    wrong = tuple(int(number) for number, is_wrong in zip(numbers, far & near) if is_wrong)
+    if not wrong:
+        return None
+    a, b = names
+    cause = (
+        f'the frames of fluoroscopes {a} and {b} are interchanged in exposure'
+        f'{"s" * (len(wrong) > 1)} {", ".join(map(str, wrong))}'
+    )
+    return Finding(Kind.FLUOROSCOPES_INTERCHANGED, cause, Place(names, wrong, name=''))
+
+
+def _pairs(
+    one: FluoroscopeResult, other: FluoroscopeResult
+) -> list[tuple[ExposureResult, ExposureResult]]:
+    """Return the exposures of the same number."""
+    by_number = {e.exposure: e for e in other.exposures}
+    return [(e, by_number[e.exposure]) for e in one.exposures if e.exposure in by_number]
+
+
+def _relative(
+    pairs: Sequence[tuple[ExposureResult, ExposureResult]],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return rotations (k, 3, 3) from sensor to sensor, and shifts (k, 3) [mm] in the first."""
+    r_a = matrix_from_quaternion([a.quaternion_wxyz for a, _ in pairs])
+    r_b = matrix_from_quaternion([b.quaternion_wxyz for _, b in pairs])
+    base = np.array([b.position_mm - a.position_mm for a, b in pairs])
+    return r_b @ r_a.transpose(0, 2, 1), (r_a @ base[..., None])[..., 0]
+
+
+def _distances(
+    turn: np.ndarray, shift: np.ndarray, other_turn: np.ndarray, other_shift: np.ndarray
+) -> np.ndarray:
+    """Return how far (k, l) relative orientations are apart: angle [rad] and relative shift."""
+    angle = rotation_angle(turn[:, None] @ other_turn[None].transpose(0, 1, 3, 2))
+    length = np.linalg.norm(other_shift, axis=-1)[None]
+    apart = np.linalg.norm(shift[:, None] - other_shift[None], axis=-1)
+    return angle + apart / np.maximum(length, 1e-9)
+
+
+def contradiction(
+    names: tuple[str, str], one: FluoroscopeResult, other: FluoroscopeResult
+) -> Finding | None:
+    """Return a finding where the exposures of two fluoroscopes contradict each other.
+
+    Exposures of the same number belong together. Fewer than three pairs cannot contradict.
+    """
+    pairs = _pairs(one, other)
+    if len(pairs) < MIN_PAIRS:
+        return None
+    turn, shift = _relative(pairs)
+    deviation = np.linalg.norm(shift - np.median(shift, axis=0), axis=1)
+    middle = int(np.argmin(deviation))
+    off_mm = float(np.median(deviation))
+    off_rad = float(np.median(rotation_angle(turn @ turn[middle].T)))
+    limit = max(MAX_SHIFT_MM, MAX_SHIFT * float(np.median(np.linalg.norm(shift, axis=1))))
+    if off_mm <= limit and off_rad <= MAX_TURN_RAD:
+        return None
+    a, b = names
+    turn_deg = float(np.rad2deg(off_rad))
+    return Finding(
+        Kind.PAIRS_CONTRADICT,
+        f'the exposures of fluoroscopes {a} and {b} contradict each other: their relative '
+        f'orientation differs by {off_mm:.0f} mm and {turn_deg:.1f} degrees between '
+        'them; frames with the same number are not of the same exposure, or a fluoroscope was '
+        'moved',
+        Place(names, name=NOT_ORIENTED),
+        severity=Severity.WARNING,
+        numbers={
+            'shift_mm': off_mm,
+            'turn_deg': turn_deg,
+            'ratio': max(off_mm / limit, off_rad / MAX_TURN_RAD),
+        },
+    )
+
+
+def doubtful(scatter: PairScatter, side_px: int, noise_px: float) -> tuple[bool, list[Finding]]:
+    """Return whether exposures give an orientation of a rig, and what is doubtful about it.
+
+    side_px is the longer side of the image. noise_px: less displaces no point by more than its
+    noise does. Without an orientation the finding says why.
+    """
+    a, b = scatter.fluoroscopes
+    off = float(np.median(scatter.off_px[scatter.used]))
+    place = Place((a, b), name=ORIENTED)
+    if scatter.unexplained > DOUBTFUL_GROWTH and off >= noise_px:
+        usable = off <= MAX_OFF * side_px or scatter.unexplained <= MAX_GROWTH
+        kind, moved, why = _cause(scatter)
+        found = Finding(
+            kind,
+            'the exposures contradict each other: the relative orientation of fluoroscopes '
+            f'{a} and {b} differs between them by {off:.1f} px, {scatter.unexplained:.0f} times '
+            f'its standard deviation; {why}',
+            Place((a, b), moved, name=ORIENTED if usable else NOT_ORIENTED),
+            severity=Severity.WARNING,
+            numbers={'off_px': off, 'ratio': float(scatter.unexplained)},
+        )
+        return usable, [found]
+    out = []
+    if not scatter.used.all():
+        excluded = tuple(scatter.exposures[~scatter.used].tolist())
+        found = Finding(
+            Kind.PAIRS_EXCLUDED,
+            f'not from exposure {", ".join(map(str, excluded))}, in which fluoroscopes {a} and '
+            f'{b} stand otherwise to each other by {_size(scatter.off_px[~scatter.used])}',
+            place=replace(place, exposures=excluded),
+            advice='the frames are not of one exposure, or the phantom moved between them',
+            severity=Severity.WARNING,
+            numbers={'off_px': float(np.max(scatter.off_px[~scatter.used]))},
+        )
+        out.append(found)
+    if not scatter.corrected and scatter.angle_px >= noise_px:
+        found = Finding(
+            Kind.RIG_DEPENDS_ON_ANGLE,
+            f'the relative orientation of fluoroscopes {a} and {b} changes with the angle of the '
+            f'C-arm, by {scatter.angle_px:.1f} px',
+            place=place,
+            advice='it is that of the mean angle; orient the rig from a capture at the angle '
+            'that is used',
+            severity=Severity.WARNING,
+            numbers={'angle_px': float(scatter.angle_px)},
+        )
+        out.append(found)
+    return True, out
+
+
+def _size(off_px: np.ndarray) -> str:
+    """Return the displacements of image points as text."""
+    low, high = float(np.min(off_px)), float(np.max(off_px))
+    if not np.isfinite(high):
+        return f'{low:.1f} px and more' if np.isfinite(low) else 'more than the image shows'
+    return f'{low:.1f} px' if high - low < 0.05 else f'{low:.1f} to {high:.1f} px'
+
+
+def _cause(scatter: PairScatter) -> tuple[Kind, tuple[int, ...], str]:
+    """Return why the pairs scatter: one move of the rig, where that explains nearly all.
+
+    Returns the kind of finding, the exposures between which the rig was moved, and the cause.
+    """
+    count = len(scatter.exposures)
+    order = np.argsort(scatter.exposures)
+    turn = scatter.turn[order]
+    columns = scatter.columns[order]
+    # Rotations about the first pair [rad], and shifts over the distance of the sources.
+    base = float(np.median(np.linalg.norm(scatter.shift_mm, axis=1)))
+    place = np.hstack(
+        [vector_from_matrix(turn @ turn[0].T), scatter.shift_mm[order] / max(base, 1e-9)]
+    )
+    steps = steps_of(count)
+    fits = [_squares(place, np.hstack([columns, step])) for step in steps]
+    left = [squares for squares, _ in fits]
+    if count < MIN_PAIRS_MOVED or min(left) > MOVED_SHARE * _squares(place, columns)[0]:
+        cause = (
+            'frames with the same number are not of the same exposure, the phantom moved between '
+            'them, the fluoroscopes or their images do not stand still, or the corrections do not '
+            'hold in all of them'
+        )
+        return Kind.PAIRS_CONTRADICT, (), cause
+    best = int(np.argmin(left))
+    split = 2 + best
+    numbers = scatter.exposures[order]
+    step = fits[best][1][-1]
+    before, after = numbers[split - 1 : split + 1].tolist()
+    cause = (
+        f'a fluoroscope was moved between exposures {before} and {after}, by '
+        f'about {np.linalg.norm(step[3:]) * base:.1f} mm and '
+        f'{np.rad2deg(np.linalg.norm(step[:3])):.2f} degrees: orient the rig from a capture'
+    )
+    return Kind.RIG_MOVED, (before, after), cause
+
+
+def _squares(values: np.ndarray, columns: np.ndarray) -> tuple[float, np.ndarray]:
+    """Fit functions (k, p) to values (k, 6); return the squares left, and coefficients (p, 6)."""
+    coefficients = np.linalg.lstsq(columns, values, rcond=None)[0]
+    return float(np.sum((values - columns @ coefficients) ** 2)), coefficients
+
 
 MIN_COMMON = 8  # targets of two frames whose displacement is known
 CAPTURE = 'orient the rig from a capture'
@@ -39,29 +253,16 @@ CAPTURE = 'orient the rig from a capture'
 
 @dataclass(frozen=True)
 class RigFindings:
-    """What the exposures say about the orientation of a rig.
+    """What the exposures say about the orientation of a rig."""
 
-    Attributes
-    ----------
-    fluoroscopes : tuple of str
-        Empty: they are no rig, or the rig is oriented otherwise.
-    orientation : RigOrientation or None
-        None where the exposures give none; the doubts say why.
-    doubts : tuple of Finding
-    scatter : tuple of PairScatter
-        Of every fluoroscope but the first; empty where it is not known.
-    noise_px : float
-        Standard deviation of an image coordinate, the largest of all [px].
-    trusted : tuple of Finding
-        What the exposures cannot show.
-    """
-
-    fluoroscopes: tuple[str, ...] = ()
+    fluoroscopes: tuple[str, ...] = ()  #: empty: they are no rig, or the rig is oriented otherwise
+    #: None where the exposures give none; the doubts say why
     orientation: RigOrientation | None = None
     doubts: tuple[Finding, ...] = ()
+    #: of every fluoroscope but the first; empty where it is not known
     scatter: tuple[PairScatter, ...] = ()
-    noise_px: float = 0.0
-    trusted: tuple[Finding, ...] = field(default=())
+    noise_px: float = 0.0  #: standard deviation of an image coordinate, the largest of all [px]
+    trusted: tuple[Finding, ...] = field(default=())  #: what the exposures cannot show
 
     @property
     def notes(self) -> tuple[Finding, ...]:
@@ -78,14 +279,8 @@ def rig_findings(
 ) -> RigFindings:
     """Determine the orientation of a rig from exposures of the phantom.
 
-    Parameters
-    ----------
-    request : CalibrationRequest
-        With phantom and known orientations.
-    result : CalibrationResult
-        Adjustment of fluoroscopes of the rig.
-    frames, calibrations : mapping
-        Of all fluoroscopes of the rig, in their order.
+    request: with phantom and known orientations. result: adjustment of fluoroscopes of the rig.
+    frames, calibrations: of all fluoroscopes of the rig, in their order.
     """
     names = tuple(calibrations)
     if len(names) < 2:

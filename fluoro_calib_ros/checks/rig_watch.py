@@ -20,9 +20,16 @@ from ..findings import Finding, Kind
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.epipolar import EpipolarGeometry
 from ..reconstruction.reconstruct import IntersectedViews
-from .charts import MIN_BLOCKS_TO_ALARM
-from .drift_observations import EpipolarObservations
-from .drift_options import ERROR, LEVEL_NAMES, OK, WARN, DriftOptions, DriftState
+from .drift_charts import (
+    ERROR,
+    LEVEL_NAMES,
+    MIN_BLOCKS_TO_ALARM,
+    OK,
+    WARN,
+    DriftOptions,
+    DriftState,
+    EpipolarObservations,
+)
 from .drift_watch import DriftWatch
 
 # A residual above FALSE_MATCH_SD standard deviations and FALSE_MATCH_PX more is that of a false
@@ -34,22 +41,9 @@ FALSE_MATCH_PX = 3.0
 class RigDriftWatch:
     """Drift watch of one RigOrientation; a new orientation needs a new one.
 
-    Parameters
-    ----------
-    orientation : RigOrientation
-    image_sizes : mapping of str to tuple of int
-        Width and height of the images by fluoroscope [px].
-    options : DriftOptions, optional
-    bodies : sequence of Body
-    rate_hz : float
-        Largest number of exposures to examine per second.
-
-    Raises
-    ------
-    ValueError
-        As DriftWatch.
-    DataError
-        For a rig with two sources in one place.
+    image_sizes: width and height of the images by fluoroscope [px]. rate_hz: largest number of
+    exposures to examine per second. Raises ValueError as DriftWatch. Raises DataError for a rig
+    with two sources in one place.
     """
 
     def __init__(
@@ -124,30 +118,16 @@ class RigDriftWatch:
 
 @dataclass(frozen=True)
 class DriftVerdict:
-    """Verdict of the drift watch on a recording.
+    """Verdict of the drift watch on a recording."""
 
-    Attributes
-    ----------
-    finding : Finding
-        What the watch says of the recording.
-    state : DriftState or None
-        Where there was a drift: the state with the largest evidence.
-    found_ns : int or None
-        Stamp of the exposure at which the highest level was first reached [ns].
-    began_ns : int or None
-        Begin of the drift by the last estimate [ns].
-    level_at_end : str or None
-        'ok', 'warn' or 'error'.
-    watched_s : float
-        Time in which a drift could have been detected [s].
-    """
-
-    finding: Finding
+    finding: Finding  #: what the watch says of the recording
+    #: where there was a drift: the state with the largest evidence
     state: DriftState | None = None
+    #: stamp of the exposure at which the highest level was first reached [ns]
     found_ns: int | None = None
-    began_ns: int | None = None
-    level_at_end: str | None = None
-    watched_s: float = 0.0
+    began_ns: int | None = None  #: begin of the drift by the last estimate [ns]
+    level_at_end: str | None = None  #: 'ok', 'warn' or 'error'
+    watched_s: float = 0.0  #: time in which a drift could have been detected [s]
 
     @property
     def level(self) -> str:

@@ -51,31 +51,17 @@ MIN_INFORMATION = 1e-9  # of a strain that the survey could show, relative to th
 
 @dataclass(frozen=True)
 class Strain:
-    """Strain of the survey against the images.
+    """Strain of the survey against the images."""
 
-    Attributes
-    ----------
-    tensor : (3, 3) ndarray
-        Surveyed - true coordinates over the distance from the centre, without common scale.
-    rms_mm : float
-        RMS displacement of the beads by it [mm].
-    test, critical : float
-        Statistic, and what chance exceeds with FALSE_ALARM.
-    nse : float
-        Increase of the NSE of the adjusted beads by it.
-    hidden_nse : float
-        The largest increase by a strain whose statistic would be critical.
-    hidden : (3, 3) ndarray
-        The tensor of that strain.
-    """
-
+    #: (3, 3) surveyed - true coordinates over the distance from the centre, without common scale
     tensor: NDArray[np.float64]
-    rms_mm: float
+    rms_mm: float  #: RMS displacement of the beads by it [mm]
+    #: statistic, and what chance exceeds with FALSE_ALARM
     test: float
     critical: float
-    nse: float
-    hidden_nse: float
-    hidden: NDArray[np.float64]
+    nse: float  #: increase of the NSE of the adjusted beads by it
+    hidden_nse: float  #: the largest increase by a strain whose statistic would be critical
+    hidden: NDArray[np.float64]  #: (3, 3) the tensor of that strain
 
 
 def strain_of_survey(evidence: Evidence) -> Strain | None:

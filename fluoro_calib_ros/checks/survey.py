@@ -14,7 +14,7 @@ from scipy.special import chdtri
 
 from ..estimation.survey import SurveyedBeads
 from ..findings import Finding, Kind, Place, Severity, first_few
-from ..photogrammetry.datum import similarity_directions
+from ..photogrammetry.network import similarity_directions
 from .check import Check
 
 MIN_RAYS = 3  # that agree: two determine a bead, but nothing would check them

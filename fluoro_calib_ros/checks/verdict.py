@@ -3,6 +3,16 @@
 
 """The verdict on a calibration from the exposures it was made from: pass, fail or cannot tell.
 
+Whether a given interior orientation is why a calibration fails. An interior orientation that is
+given with a small standard deviation holds the adjustment where the exposures contradict it: their
+lack of fit looks like a trend of the residuals, or like a distortion that differs between
+exposures. Where checks fail, the fluoroscope is calibrated again without what was given. If the
+residuals are then clearly smaller, and the interior orientation is clearly another one, that is
+the cause, and a check of its own says so.
+
+The interior orientation of an image with distortion depends on what is called distortion, so that
+a given one which the exposures move away from, with good residuals, is no fault.
+
 Every check is a number with a limit. How the limits were found, how often good calibrations exceed
 them and how large a fault must be to be found is in docs/verdict.md. `validate` recalibrates two
 halves and four folds of the exposures, which takes about twice as long as the calibration.
@@ -11,29 +21,110 @@ halves and four folds of the exposures, which takes about twice as long as the c
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
 from ..errors import DataError
 from ..estimation.calibrate import adjust_with_calibrations
+from ..estimation.initial_network import nominal_interior
 from ..estimation.options import CalibrationRequest
 from ..estimation.result import CalibrationResult
-from ..exposures.frame import Frame
-from ..findings import Kind
+from ..exposures.frame import Frame, Frames
+from ..findings import Kind, Place
 from .beads import BEADS
 from .calibration_evidence import Evidence
 from .check import Check, Validation, verdict_of
-from .exposure_variation import VARIATION
-from .given_interior import with_given_interior
-from .halves import HALVES
+from .field_checks import HALVES, PRECISION, TRENDS, VARIATION
 from .held_out import HELD_OUT
-from .precision import PRECISION
-from .residual_trends import TRENDS
 from .rig import RigFindings, check_rig, rig_findings
 from .shape import SHAPE, trusted_shape
+
+REPAIR_FIRST = 'check this again when the given interior orientation fits the exposures'
+MAX_SD = 4.0  # by which what the exposures show may deviate from what was given
+# RMSE with what was given over that without, from which it is the cause; without a correction
+# model, the distortion is a better one.
+MIN_GAIN = 1.05
+MIN_GAIN_UNCORRECTED = 2.0
+LABELS = ('xp', 'yp', 'c')
+
+
+def with_given_interior(evidence: Evidence, checks: Sequence[Check]) -> list[Check]:
+    """Return the checks, with one more for every given interior orientation that is contradicted.
+
+    The estimated noise can take the misfit up, so that no other check fails. The advice of those
+    that fail is then to repair that first.
+    """
+    request = evidence.request
+    distance = request.principal_distance
+    if request.options.interior_sd is None or distance is None:
+        return list(checks)
+    found: list[Check] = []
+    for names in request.groups:
+        names = tuple(name for name in names if name not in request.known_orientations)
+        if names:
+            found += _contradictions(evidence, names, distance)
+    if not found:
+        return list(checks)
+    wrong = {'', *(check.place.fluoroscope for check in found)}
+    others = [
+        replace(check, advice=REPAIR_FIRST)
+        if check.passed is False and check.place.fluoroscope in wrong
+        else check
+        for check in checks
+    ]
+    return [*found, *others]
+
+
+def _contradictions(evidence: Evidence, names: Sequence[str], distance: float) -> list[Check]:
+    """Return a failed check for every fluoroscope whose exposures contradict what was given."""
+    evidence.report_step(f'{"+".join(names)}: interior orientation without what was given')
+    try:
+        free = evidence.calibrate_free(names)
+    except DataError:
+        return []
+    checks = [_given_interior_check(evidence, name, free[name], distance) for name in names]
+    return [check for check in checks if check is not None]
+
+
+def _given_interior_check(
+    evidence: Evidence, name: str, free: FluoroscopeCalibration, distance: float
+) -> Check | None:
+    present = evidence.calibrations[name]
+    gain = _rmse(present) / _rmse(free)
+    given = nominal_interior(present.image_size, distance)
+    given_sd = np.asarray(evidence.request.options.interior_sd)
+    sd = np.sqrt(np.diag(free.interior_covariance))
+    off = np.abs(free.interior - given) / np.hypot(given_sd, sd)
+    least = MIN_GAIN if present.model.corrects else MIN_GAIN_UNCORRECTED
+    if not gain > least or not off.max() > MAX_SD:
+        return None
+    wrong = [i for i in np.argsort(-off) if off[i] > MAX_SD]
+    stated = ', '.join(f'{LABELS[i]} = {given[i]:.1f} (sd {given_sd[i]:g})' for i in wrong)
+    shown = ', '.join(f'{LABELS[i]} = {free.interior[i]:.1f} (sd {sd[i]:.1f})' for i in wrong)
+    return Check(
+        Kind.GIVEN_INTERIOR,
+        f'the given interior orientation, {stated} px, contradicts the '
+        f'exposures, which show {shown} px: the residuals are {_rmse(present):.2f} px with what '
+        f'was given and {_rmse(free):.2f} px without',
+        Place((name,)),
+        'give the right value, a larger --interior-sd, or none',
+        numbers={
+            **{f'{label}_px': float(x) for label, x in zip(LABELS, free.interior)},
+            **{f'sd_{label}_px': float(x) for label, x in zip(LABELS, sd)},
+        },
+        value=off.max(),
+        limit=MAX_SD,
+        unit='sd',
+    )
+
+
+def _rmse(calibration: FluoroscopeCalibration) -> float:
+    """RMSE of the inlier residuals of a coordinate after the correction [px]."""
+    return float(np.sqrt(np.mean(np.square(calibration.rmse_after))))
+
 
 Progress = Callable[[str, int, int], None]
 
@@ -43,7 +134,7 @@ SUBJECTS = (BEADS, SHAPE, HALVES, TRENDS, VARIATION, HELD_OUT, PRECISION)
 
 def validate(
     request: CalibrationRequest,
-    calibrations: Mapping[str, FluoroscopeCalibration],
+    calibrations: Calibrations,
     progress: Progress | None = None,
     rig: RigFindings | None = None,
 ) -> Validation:
@@ -59,10 +150,6 @@ def validate(
         Called with the name of a step, the number of steps done and their total before each step.
     rig : RigFindings, optional
         What is known of the orientation of the rig; by default it is determined.
-
-    Returns
-    -------
-    Validation
 
     Raises
     ------
@@ -122,7 +209,7 @@ def _achieved_sd(evidence: Evidence, name: str, checks: Sequence[Check]) -> floa
 
 def validate_or_report(
     request: CalibrationRequest,
-    calibrations: Mapping[str, FluoroscopeCalibration],
+    calibrations: Calibrations,
     progress: Progress | None = None,
     rig: RigFindings | None = None,
 ) -> Validation:
@@ -153,9 +240,7 @@ def _count_steps(groups: int) -> int:
     return sum(subject.steps * (1 if subject.of_rig else groups) for subject in SUBJECTS)
 
 
-def _used_frames(
-    frames: Mapping[str, Sequence[Frame]], result: CalibrationResult
-) -> dict[str, list[Frame]]:
+def _used_frames(frames: Frames, result: CalibrationResult) -> dict[str, list[Frame]]:
     """Return the frames that an adjustment used, in the order of their numbers."""
     out = {}
     for name, of_fluoroscope in frames.items():
@@ -169,5 +254,5 @@ def _by_fluoroscope(checks: Sequence[Check], names: Sequence[str]) -> list[Check
     return [check for name in (*names, '') for check in checks if check.place.fluoroscope == name]
 
 
-def _identities(calibrations: Mapping[str, FluoroscopeCalibration]) -> dict[str, str]:
+def _identities(calibrations: Calibrations) -> dict[str, str]:
     return {name: calibration.calibration_id for name, calibration in calibrations.items()}

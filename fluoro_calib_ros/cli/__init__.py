@@ -35,9 +35,8 @@ from . import (
     watch,
 )
 from .arguments import add_read_limits, set_read_limits
-from .output import print_note, styled
+from .output import print_note, styled, terminated_by_signals
 from .rig import add_rig, find_rig
-from .termination import terminated_by_signals
 
 if TYPE_CHECKING:
     from ..io.rig_file import RigFile

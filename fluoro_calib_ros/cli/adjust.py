@@ -21,13 +21,7 @@ from .arguments import (
     bag_selection,
     file_settings,
 )
-from .output import (
-    print_findings,
-    print_notes,
-    print_result,
-    print_unpaired,
-    styled_verdict,
-)
+from .output import print_findings, print_notes, print_result, print_unpaired, styled_verdict
 
 CONTRADICTIONS = (Kind.CORRECTED_ALREADY, Kind.POOR_CALIBRATION_FIT)
 HOLDS = 'The calibration holds for these exposures; its interior orientation was fixed.'
@@ -63,8 +57,8 @@ def run(arguments: argparse.Namespace) -> bool:
 
     Raises DataError.
     """
+    from ..io.calibration import disagreements
     from ..io.csv_table import read_names
-    from ..io.result_check import disagreements
     from ..jobs.calibration import adjust
     from ..jobs.result_folder import check_result_folder, save_result, written_document
     from ..jobs.sources import read_calibrations, read_source, read_survey, select_calibrations

@@ -75,11 +75,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Write poses and joints of a recording. Raises DataError."""
-    from ..io.bodies import read_bodies
+    from ..io.bodies import read_bodies, read_joints
     from ..io.calibration import orientation_path
-    from ..io.joints import read_joints
-    from ..jobs.bodies import BodiesOptions, check_bodies_folder, save_bodies, track_bodies
-    from ..jobs.bodies_film import Film
+    from ..jobs.bodies import BodiesOptions, Film, check_bodies_folder, save_bodies, track_bodies
     from ..jobs.sources import is_bag
 
     path = arguments.orientation or orientation_path(arguments.calibration)

@@ -126,7 +126,7 @@ def _add_model(parser: argparse._ArgumentGroup, option: Option) -> None:
     """Add --model: the name of a model, or the user's own regressor."""
 
     def convert(text: str) -> Any:
-        from ..estimation.user_regressor import resolve_model
+        from ..estimation.options import resolve_model
 
         if ':' not in text:
             if text in option.choices:

@@ -6,10 +6,10 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..correction.fluoroscope_calibration import Calibrations
 from ..errors import DataError
 from ..findings import first_few
 from .arguments import (
@@ -90,9 +90,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Correct image points or images. Raises DataError."""
+    from ..io.calibration import disagreements
     from ..io.folder import check_output_file
     from ..io.image_reading import READ_SUFFIXES, is_image_source, listed, suffix_of
-    from ..io.result_check import disagreements
     from ..jobs.sources import read_calibrations
 
     if arguments.source.is_file() or not arguments.out.is_dir():  # images can fill a folder
@@ -112,9 +112,7 @@ def run(arguments: argparse.Namespace) -> None:
         )
 
 
-def _correct_points(
-    arguments: argparse.Namespace, calibrations: Mapping[str, FluoroscopeCalibration]
-) -> None:
+def _correct_points(arguments: argparse.Namespace, calibrations: Calibrations) -> None:
     from ..io.observations import correct_points, write_points
     from ..jobs.sources import read_point_table
 
@@ -138,9 +136,7 @@ def _correct_points(
     )
 
 
-def _correct_images(
-    arguments: argparse.Namespace, calibrations: Mapping[str, FluoroscopeCalibration]
-) -> None:
+def _correct_images(arguments: argparse.Namespace, calibrations: Calibrations) -> None:
     from ..images.corrector import ImageCorrector
     from ..jobs.image_correction import ImageCorrectionRequest, run_image_correction
 

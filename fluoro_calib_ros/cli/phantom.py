@@ -124,7 +124,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..exposures.phantom import Drawing, require_size
     from ..io.access import write_bytes
     from ..io.phantom import write_phantom
-    from ..report.phantom_figure import phantom_figure, picture_bytes
+    from ..report.figures import phantom_figure, picture_bytes
 
     picture = arguments.picture or arguments.out.with_suffix('.svg')
     if picture.suffix.lower() not in PICTURES:

@@ -94,7 +94,7 @@ def run(arguments: argparse.Namespace) -> None:
         outcome = reconstruct(frames, calibrations, orientation, options)
     write_reconstruction(arguments.out, outcome.frames, recording.names)
     if arguments.figure is not None:
-        from ..report.style import png_bytes
+        from ..report.figures import png_bytes
 
         write_bytes(arguments.figure, png_bytes(outcome.plot(recording.names)))
     print_unpaired(arguments.source, outcome.unpaired)

@@ -6,12 +6,14 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
+from ..correction.fluoroscope_calibration import Calibrations
 from ..errors import DataError
+from ..exposures.frame import Frames
 from .arguments import (
     add_angle_options,
     add_collect,
@@ -28,9 +30,7 @@ from .arguments import (
 from .output import print_notes, print_result, print_step, print_unpaired
 
 if TYPE_CHECKING:
-    from ..correction.fluoroscope_calibration import FluoroscopeCalibration
     from ..estimation.options import CalibrationRequest
-    from ..exposures.frame import Frame
 
 NAME = 'validate'
 HELP = 'Validate a calibration: pass, fail or cannot tell, and what to do.'
@@ -70,7 +70,7 @@ def run(arguments: argparse.Namespace) -> bool:
     """
     from ..checks.rig import RigFindings
     from ..checks.verdict import validate
-    from ..io.result_check import edited, exchanged, read_result, used_exposures
+    from ..io.calibration import edited, exchanged, read_result, used_exposures
     from ..io.result_document import write_validation
     from ..jobs.result_folder import saved_orientation
     from ..jobs.sources import read_calibrations
@@ -105,19 +105,17 @@ def run(arguments: argparse.Namespace) -> bool:
     return passed
 
 
-def _request(
-    arguments: argparse.Namespace, calibrations: Mapping[str, FluoroscopeCalibration]
-) -> CalibrationRequest:
+def _request(arguments: argparse.Namespace, calibrations: Calibrations) -> CalibrationRequest:
     """Read what the calibrations were made from, in the folder or where it is given."""
     from ..estimation.options import CalibrationRequest
+    from ..io.calibration import PHANTOM
     from ..io.calibration_request import read_request
     from ..io.csv_table import read_names
     from ..io.phantom import read_phantom
-    from ..io.result_check import PHANTOM
     from ..jobs.calibration import without_unusable
     from ..jobs.sources import BagSelection, read_source, read_survey
 
-    frames: Mapping[str, Sequence[Frame]] | None = None
+    frames: Frames | None = None
     phantom = None
     known = read_names(arguments.directory)
     if arguments.source is not None:

@@ -13,6 +13,7 @@ exposures, each with a field of its own (see `angle_fit`).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -39,49 +40,29 @@ def harmonics(angle: ArrayLike) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Change:
-    """What an angle adds to a correction.
+    """What an angle adds to a correction."""
 
-    Attributes
-    ----------
-    coefficients : (4, k, 2, 4) ndarray
-        Of x^i y^j, in the order i, field, u or v, j: the change, then fields of what is unknown.
-    variance : (33, 33) ndarray
-        On the grid of the standard deviation [px^2].
-    scatters : bool
-        Whether there are fields of what is unknown.
-    """
-
+    #: (4, k, 2, 4) of x^i y^j, in the order i, field, u or v, j: the change, then fields of what
+    #: is unknown
     coefficients: NDArray[np.float64]
-    variance: NDArray[np.float64]
-    scatters: bool
+    variance: NDArray[np.float64]  #: (33, 33) on the grid of the standard deviation [px^2]
+    scatters: bool  #: whether there are fields of what is unknown
 
 
 @dataclass(frozen=True)
 class AngleField:
     """Change of a correction with the angle, relative to its mean over the exposures.
 
-    Attributes
-    ----------
-    image_size : (int, int)
-        Width and height [px].
-    angles : (e,) ndarray
-        Angles of the exposures [rad].
-    coefficients : (4, 2, 10) ndarray
-        Of each harmonic less its mean: those of cubic polynomials of the pixel for u and v, in
-        the order and coordinates of `series.Functions` [px].
-    variances : (14, 33, 33) ndarray
-        On the grid of the standard deviation of a series [px^2]: covariances of the correction
-        without angle and each harmonic, then those of pairs of harmonics.
-
-    Raises
-    ------
-    ValueError
-        For arrays of other shapes, or values that are not finite.
+    Raises ValueError for arrays of other shapes, or values that are not finite.
     """
 
-    image_size: tuple[int, int]
-    angles: NDArray[np.float64]
+    image_size: tuple[int, int]  #: width and height [px]
+    angles: NDArray[np.float64]  #: (e,) angles of the exposures [rad]
+    #: (4, 2, 10) of each harmonic less its mean: those of cubic polynomials of the pixel for u and
+    #: v, in the order and coordinates of `series.Functions` [px]
     coefficients: NDArray[np.float64]
+    #: (14, 33, 33) on the grid of the standard deviation of a series [px^2]: covariances of the
+    #: correction without angle and each harmonic, then those of pairs of harmonics
     variances: NDArray[np.float64]
 
     def __post_init__(self) -> None:
@@ -140,20 +121,10 @@ class AngleField:
     def change(self, uv: ArrayLike, angle: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Return what an angle adds to a correction and to its variance.
 
-        Parameters
-        ----------
-        uv : (n, 2) array_like
-            Observed pixels.
-        angle : float or (n,) array_like
-            Angle [rad]. NaN: it is unknown, the correction is the mean over the exposures, and
-            its variance holds what the angle changes.
-
-        Returns
-        -------
-        duv : (n, 2) ndarray
-            To be added to the correction [px].
-        variance : (n,) ndarray
-            To be added to the variance of each coordinate [px^2]; it can be negative.
+        uv: (n, 2) observed pixels. angle: one or (n,) [rad]; NaN: it is unknown, the correction is
+        the mean over the exposures, and its variance holds what the angle changes. Returns (n, 2)
+        to be added to the correction [px] and (n,) to be added to the variance of each coordinate
+        [px^2]; it can be negative.
         """
         uv = np.asarray(uv, dtype=float).reshape(-1, 2)
         angles = np.asarray(angle, dtype=float)
@@ -263,3 +234,20 @@ def unpacked_angles(
     if not (np.size(angles) or np.size(coefficients) or np.size(variances)):
         return None
     return AngleField(image_size, angles, coefficients, variances)
+
+
+def note_on_angles(
+    name: str,
+    field: AngleField | None,
+    angles: Sequence[float | None],
+    items: str = 'frames',
+    consequence: str = 'they get the mean over the angles, with its larger standard deviation',
+) -> str:
+    """Return what follows from angles of a fluoroscope that are unknown (None), '' if nothing."""
+    unknown = sum(angle is None for angle in angles)
+    if field is None or not unknown:
+        return ''
+    return (
+        f'the correction of fluoroscope {name} depends on the angle of the C-arm, which is '
+        f'unknown for {unknown} of {len(angles)} {items}: {consequence}'
+    )

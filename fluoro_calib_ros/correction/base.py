@@ -6,7 +6,7 @@
 A model is a subclass of `CorrectionModel` and one line in `registry`. It says how it predicts
 (`predict` and `standard_deviation`), and what a user and the lookup grid need to know
 (`description`, `smoothness`, `min_k`). How a self-calibration obtains it is not its business but
-that of `estimators`, which a program that only corrects does not load.
+that of `estimation.self_calibration`, which a program that only corrects does not load.
 
 docs/models.md shows how to add one.
 """
@@ -55,21 +55,11 @@ class Smoothness(Enum):
 
 @dataclass(frozen=True)
 class Correction:
-    """A correction at n pixels.
+    """A correction at n pixels."""
 
-    Attributes
-    ----------
-    duv : (n, 2) ndarray
-        du, dv [px]; undistorted = observed - (du, dv).
-    sd : (n,) ndarray
-        Standard deviation of each coordinate [px].
-    outside : (n,) ndarray of bool
-        True beyond the calibrated area.
-    """
-
-    duv: NDArray[np.float64]
-    sd: NDArray[np.float64]
-    outside: NDArray[np.bool_]
+    duv: NDArray[np.float64]  #: (n, 2) du, dv [px]; undistorted = observed - (du, dv)
+    sd: NDArray[np.float64]  #: (n,) standard deviation of each coordinate [px]
+    outside: NDArray[np.bool_]  #: (n,) True beyond the calibrated area
 
 
 @dataclass(frozen=True)
@@ -79,26 +69,8 @@ class CorrectionModel(ABC):
     The fields are the whole content of a model: calibration files and messages carry them and
     nothing else, so a subclass derives everything it needs from them in `_prepare`.
 
-    Attributes
-    ----------
-    k : int
-        Number of neighbours; 0 for a model without.
-    train_uv : (N, 2) ndarray
-        Observed training pixels.
-    train_duv : (N, 2) ndarray
-        Corrections at the training pixels [px].
-    noise_px : float
-        Standard deviation of one training correction.
-    bias_px : float
-        Systematic error of a prediction, as a standard deviation.
-    series : Series or None
-        Terms that were estimated in the adjustment.
-
-    Raises
-    ------
-    ValueError
-        If the arrays differ in length or are not finite, if a series is missing or not expected,
-        or if the training points do not allow k.
+    Raises ValueError if the arrays differ in length or are not finite, if a series is missing or
+    not expected, or if the training points do not allow k.
     """
 
     kind: ClassVar[str]
@@ -110,12 +82,12 @@ class CorrectionModel(ABC):
     corrects: ClassVar[bool] = True  # False: it leaves every pixel as it is
     keeps_training_points: ClassVar[bool] = True  # train_uv are image points of exposures
 
-    k: int
-    train_uv: NDArray[np.float64]
-    train_duv: NDArray[np.float64]
-    noise_px: float = 0.0
-    bias_px: float = 0.0
-    series: Series | None = None
+    k: int  #: number of neighbours; 0 for a model without
+    train_uv: NDArray[np.float64]  #: (N, 2) observed training pixels
+    train_duv: NDArray[np.float64]  #: (N, 2) corrections at the training pixels [px]
+    noise_px: float = 0.0  #: standard deviation of one training correction
+    bias_px: float = 0.0  #: systematic error of a prediction, as a standard deviation
+    series: Series | None = None  #: terms that were estimated in the adjustment
     _hull: np.ndarray = field(init=False, repr=False, compare=False)
     _holes: Holes | None = field(init=False, repr=False, compare=False)
 

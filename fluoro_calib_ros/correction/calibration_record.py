@@ -3,26 +3,53 @@
 
 """The record of a calibration: every value that its file, its message and its id hold.
 
+Fields of records: what files, messages, identifiers and documentation have in common. A value is
+declared once, by a `Field`. The arrays of a file and their limits, what earlier versions did not
+have, the fields of a message and the table in the documentation follow from it.
+
 A new value is one line here and an attribute of `FluoroscopeCalibration`. Those that determine a
 correction come first, in the order in which the id depends on them.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import partial
+from typing import Any
 
 import numpy as np
 
 from ..exposures.frame import MAX_ANGLE
-from ..limits import (
-    MAX_ANGLES,
-    MAX_IMAGE_SIDE,
-    MAX_NEIGHBOURS,
-    MAX_PRINCIPAL_DISTANCE_PX,
-    MAX_PX,
-)
-from ..records import Field
+from ..limits import MAX_ANGLES, MAX_IMAGE_SIDE, MAX_NEIGHBOURS, MAX_PRINCIPAL_DISTANCE_PX, MAX_PX
 from .terms import CUBIC
+
+
+@dataclass(frozen=True)
+class Field:
+    """A value of a record."""
+
+    name: str
+    dtype: str  #: {'text', 'int', 'float', 'bool'}
+    shape: tuple[int | str, ...] = ()  #: a letter stands for any length
+    #: for the documentation
+    unit: str = '-'
+    meaning: str = ''
+    minimum: float | None = None
+    maximum: float | None = None  #: of the absolute value, where it is finite
+    longest: int | None = None  #: of the lengths that are letters
+    #: the only length but 0 that a letter of the shape can stand for
+    lengths: Mapping[str, int] = field(default_factory=dict)
+    allowed: str = ''  #: value that a float can have besides finite ones: {'', 'inf', 'nan'}
+    since: int = 1  #: first version of the file that has the field
+    before: Any = None  #: value of a record of an earlier version
+    #: fields of the message; several hold the parts along the axis of their number; empty: one of
+    #: the same name
+    message: tuple[str, ...] = ()
+    #: whether the identifier of the record depends on it: as what determines a correction, or as
+    #: what does not: {'', 'correction', 'detail'}
+    identity: str = ''
+
 
 VERSION = 4  # of the file
 MAX_DEGREE = 15  # of a series that is read

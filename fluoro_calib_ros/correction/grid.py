@@ -40,27 +40,8 @@ class LookupWorkspace:
     One thread uses it at a time. All calls of numpy are between whole arrays of one shape that
     exist already: the number of calls is what a frame of 30 points costs.
 
-    Parameters
-    ----------
-    n : int
-        Largest number of points.
-    shape : (int, int)
-        Numbers of rows and columns of cells on the image.
-    image_size : (int, int)
-        Width and height of the image [px].
-
-    Attributes
-    ----------
-    uv : (2, n) ndarray
-        Pixels.
-    place : (2, n) ndarray
-        Pixels in units of cells.
-    row : (n,) ndarray of int
-        Rows of their cells in the table.
-    result : (3, n) ndarray
-        du, dv and standard deviation [px].
-    status : (n,) ndarray of uint8
-        Status of their cells.
+    n: largest number of points. shape: numbers of rows and columns of cells on the image.
+    image_size: width and height of the image [px].
     """
 
     __slots__ = (
@@ -100,11 +81,11 @@ class LookupWorkspace:
         pixels = np.zeros((9, n))  # u three times, v six times
         self._u = pixels[:3]
         self._v = pixels[3:]
-        self.uv = pixels[2:4]
-        self.place = np.empty((2, n))
+        self.uv = pixels[2:4]  #: (2, n) pixels
+        self.place = np.empty((2, n))  #: (2, n) pixels in units of cells
         self._cell = np.empty((2, n), dtype=np.intp)
         self._column = self._cell[0]
-        self.row = self._cell[1]
+        self.row = self._cell[1]  #: (n,) rows of their cells in the table
         self._coefficients = np.empty((n, COEFFICIENTS))
         self._found = np.empty((COEFFICIENTS, n))
         self._constant = self._found[:6]
@@ -112,8 +93,8 @@ class LookupWorkspace:
         self._linear = np.empty((6, n))
         self._of_one = self._linear[:3]
         self._of_u = self._linear[3:]
-        self.result = np.empty((3, n))
-        self.status = np.empty(n, dtype=np.uint8)
+        self.result = np.empty((3, n))  #: (3, n) du, dv and standard deviation [px]
+        self.status = np.empty(n, dtype=np.uint8)  #: (n,) status of their cells
 
     def locate(self, u: np.ndarray, v: np.ndarray) -> None:
         """Find the cells of points u, v (m,) with m <= n: sets `uv`, `place` and `row`."""
@@ -163,46 +144,31 @@ class CorrectionGrid:
     model (knn) has the smallest cells; its lookups are between the values at the corners of the
     cell.
 
-    Parameters
-    ----------
-    model : CorrectionModel
-    image_size : (int, int)
-        Width and height [px].
-
-    Attributes
-    ----------
-    nodes : (w,) ndarray, (h,) ndarray
-        Columns and rows [px] of the corners of cells.
-    cell_px : float
-        Longer side of a cell.
-    divided : int
-        Number of cells that are divided further.
-    error_px : float
-        Largest difference of a coordinate from the exact model in the calibrated area, measured at
-        the centres of cells and of their edges. A kink between them may do half more.
-    error_outside_px : float
-        The same in the other cells.
-    sd_error_px : float
-        Largest difference of the standard deviation, everywhere.
+    image_size: width and height [px].
     """
 
     def __init__(self, model: CorrectionModel, image_size: tuple[int, int]) -> None:
         width, height = image_size
         self.image_size = (int(width), int(height))
         cells = build_cells(model, self.image_size)
-        self.nodes = cells.nodes
+        self.nodes = cells.nodes  #: (w,) columns and rows [px] of the corners of cells
+        #: longer side of a cell
         self.cell_px = float(max(np.diff(axis).max() for axis in cells.nodes))
         self._set_tables(cells)
         self._workspaces: list[list[LookupWorkspace]] = _no_workspaces()
-        self.divided = 0
+        self.divided = 0  #: number of cells that are divided further
         errors = cells.errors
         if model.smoothness is not Smoothness.STEPPED:
             divided = divide_cells(model, cells)
             if divided is not None:
                 self._set_divided(divided)
                 errors[:, divided.row, divided.column] = self._errors_of_divided(model, divided)
+        #: largest difference of a coordinate from the exact model in the calibrated area, measured
+        #: at the centres of cells and of their edges; a kink between them may do half more
         self.error_px = float(np.nanmax(errors[0][~cells.outside], initial=0.0))
+        #: the same in the other cells
         self.error_outside_px = float(np.nanmax(errors[0][cells.outside], initial=0.0))
+        #: largest difference of the standard deviation, everywhere
         self.sd_error_px = float(np.nanmax(errors[1]))
 
     def _set_tables(self, cells: Cells) -> None:
@@ -254,19 +220,10 @@ class CorrectionGrid:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return correction, standard deviation and status at pixels.
 
-        Parameters
-        ----------
-        u, v : (n,) ndarray
-            Columns and rows [px].
-        values, status : (3, n) ndarray of float and (n,) ndarray of uint8, optional
-            Arrays for the results, both or none.
-
-        Returns
-        -------
-        values : (3, n) ndarray
-            du, dv and standard deviation [px]; NaN where the status is INVALID.
-        status : (n,) ndarray of uint8
-            `CorrectionStatus`; INVALID off the image and for what is not a number.
+        u, v: (n,) columns and rows [px]. values, status: (3, n) arrays for the results, both or
+        none. Returns values: (3, n) du, dv and standard deviation [px]; NaN where the status is
+        INVALID; status: (n,) `CorrectionStatus`; INVALID off the image and for what is not a
+        number.
         """
         n = len(u)
         if n <= CHUNK:

@@ -56,21 +56,10 @@ def errors_where_curved(
 ) -> np.ndarray:
     """Errors of cells, measured where second differences suggest that they may be too large.
 
-    Parameters
-    ----------
-    model : CorrectionModel
-    nodes : (w,) ndarray, (h,) ndarray
-        Columns and rows [px] of the corners of the cells.
-    values : (3, h, w) ndarray
-        du, dv and standard deviation there.
-    affordable : int
-        Number of exact values that do not take too long.
-
-    Returns
-    -------
-    (2, h - 1, w - 1) ndarray
-        Errors of correction and standard deviation [px]; NaN in cells that are not measured. At
-        least MIN_MEASURED cells are, if that is affordable.
+    nodes: (w,) columns and rows [px] of the corners of the cells. values: (3, h, w) du, dv and
+    standard deviation there. affordable: number of exact values that do not take too long.
+    Returns (2, h - 1, w - 1) errors of correction and standard deviation [px]; NaN in cells that
+    are not measured; at least MIN_MEASURED cells are, if that is affordable.
     """
     columns, rows = nodes
     curvature = _second_differences(values)
@@ -119,50 +108,28 @@ Nodes = tuple[np.ndarray, np.ndarray]  # columns (w,) and rows (h,) [px] of the 
 
 @dataclass(frozen=True)
 class Cells:
-    """Cells of a lookup grid.
+    """Cells of a lookup grid."""
 
-    Attributes
-    ----------
-    nodes : (w,) ndarray, (h,) ndarray
-        Columns and rows [px] of their corners.
-    values : (3, h, w) ndarray
-        du, dv and standard deviation [px] there.
-    errors : (2, h - 1, w - 1) ndarray
-        Errors [px] of correction and standard deviation in the cells; NaN where not measured.
-    outside : (h - 1, w - 1) ndarray of bool
-        True for cells with a corner beyond the calibrated area.
-    work : float
-        Of a value, on average.
-    """
-
-    nodes: Nodes
-    values: NDArray[np.float64]
+    nodes: Nodes  #: (w,) columns and rows [px] of their corners
+    values: NDArray[np.float64]  #: (3, h, w) du, dv and standard deviation [px] there
+    #: (2, h - 1, w - 1) errors [px] of correction and standard deviation in the cells; NaN where
+    #: not measured
     errors: NDArray[np.float64]
+    #: (h - 1, w - 1) True for cells with a corner beyond the calibrated area
     outside: NDArray[np.bool_]
-    work: float
+    work: float  #: of a value, on average
 
 
 @dataclass(frozen=True)
 class DividedCells:
-    """Cells that are divided further, as they are not accurate enough.
+    """Cells that are divided further, as they are not accurate enough."""
 
-    Attributes
-    ----------
-    row, column : (d,) ndarray of int
-        Their place among the cells.
-    parts : (d,) ndarray of int
-        Number of parts along a side.
-    first : (d,) ndarray of int
-        Row of the first part in the table.
-    table : (p, 12) ndarray
-        Coefficients of all parts.
-    """
-
+    #: (d,) their place among the cells
     row: NDArray[np.int64]
     column: NDArray[np.int64]
-    parts: NDArray[np.int64]
-    first: NDArray[np.int64]
-    table: np.ndarray
+    parts: NDArray[np.int64]  #: (d,) number of parts along a side
+    first: NDArray[np.int64]  #: (d,) row of the first part in the table
+    table: np.ndarray  #: (p, 12) coefficients of all parts
 
 
 def build_cells(model: CorrectionModel, image_size: tuple[int, int]) -> Cells:

@@ -155,18 +155,9 @@ def plane_weights(
 
     The weights of a query sum to one and reproduce planes exactly but for the ridge.
 
-    Parameters
-    ----------
-    dx, dy : (n, k) ndarray
-        Offsets of the values from the origin.
-    kernel : (n, k) ndarray
-        Weights of the values in the fit; overwritten.
-    bandwidth2 : (n,) ndarray
-        Squared bandwidth, to which the ridge is relative.
-
-    Returns
-    -------
-    (n, k) ndarray
+    dx, dy: (n, k) offsets of the values from the origin. kernel: (n, k) weights of the values in
+    the fit; overwritten. bandwidth2: (n,) squared bandwidth, to which the ridge is relative.
+    Returns (n, k).
     """
     wx = kernel * dx
     wy = kernel * dy
@@ -194,14 +185,9 @@ class NeighbourTable:
 
     It is built once and then answers for changing subsets of the points.
 
-    Parameters
-    ----------
-    uv : (N, 2) ndarray
-    count : int
-        Number of neighbours that will be asked for. Some more are looked up, so that excluded
-        points can be skipped.
-    rows : (T,) ndarray of int, optional
-        Points whose neighbours will be asked for; by default all.
+    uv: (N, 2). count: number of neighbours that will be asked for; some more are looked up, so
+    that excluded points can be skipped. rows: (T,) points whose neighbours will be asked for; by
+    default all.
     """
 
     def __init__(self, uv: np.ndarray, count: int, rows: np.ndarray | None = None) -> None:

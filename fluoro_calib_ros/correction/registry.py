@@ -1,11 +1,15 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The registry of the correction models: the only place that lists them.
+"""The registry of the correction models: the only place that lists them; the model `lookup`.
 
-A new model is a subclass of `CorrectionModel` and one line here; `estimators` says how a
-self-calibration obtains it. The options of a calibration, the command line, the node's parameters,
-calibration files and messages take the names from this module.
+The model `lookup`: corrections at the nodes of a regular grid, bilinear between them. The
+calibration of a user's own regressor is saved as this model, so that neither files nor messages
+hold anything that is executed.
+
+A new model is a subclass of `CorrectionModel` and one line here; `estimation.self_calibration`
+says how a self-calibration obtains it. The options of a calibration, the command line, the node's
+parameters, calibration files and messages take the names from this module.
 """
 
 from __future__ import annotations
@@ -14,11 +18,150 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import map_coordinates
+from scipy.spatial import ConvexHull, QhullError
 
 from .base import CorrectionModel
-from .models import CollocationModel, LookupModel, NoCorrection, ParametricModel, no_correction
 from .neighbours import HybridModel, KnnModel, LocalLinearModel
 from .series import Series, series_from_values
+
+# The model `none`: it corrects nothing.
+
+
+class NoCorrection(CorrectionModel):
+    """The model that corrects nothing: zero everywhere, and nothing is outside."""
+
+    kind = 'none'
+    description = 'no correction'
+    corrects = False
+    keeps_training_points = False
+
+    def predict(self, uv: ArrayLike) -> NDArray[np.float64]:
+        """Zeros (n, 2)."""
+        return np.zeros_like(np.asarray(uv, dtype=float).reshape(-1, 2))
+
+    def outside(self, uv: ArrayLike) -> NDArray[np.float64]:
+        """False (n,): there is no calibrated area to leave."""
+        return np.zeros(len(np.asarray(uv)), dtype=bool)
+
+
+def no_correction() -> NoCorrection:
+    """Return the model that corrects nothing."""
+    return NoCorrection(0, np.zeros((0, 2)), np.zeros((0, 2)))
+
+
+# Models that are a series alone, estimated as a whole in the adjustment.
+
+
+class SeriesModel(CorrectionModel):
+    """A series of functions; the training points only bound the calibrated area."""
+
+    has_series = True
+    series: Series
+
+    def predict(self, uv: ArrayLike) -> NDArray[np.float64]:
+        """Corrections (n, 2) [px] at pixels uv (n, 2)."""
+        return self.series.predict_in_chunks(np.asarray(uv, dtype=float).reshape(-1, 2))
+
+
+class ParametricModel(SeriesModel):
+    """Polynomial terms of lens and image-intensifier distortion, selected by significance."""
+
+    kind = 'parametric'
+    description = 'physical terms in the adjustment, selected stepwise'
+
+
+class CollocationModel(SeriesModel):
+    """Cubic polynomials and a random field of sines, estimated in the adjustment."""
+
+    kind = 'collocation'
+    description = 'cubic trend and random field in the adjustment'
+
+
+CELL_PX = 8  # largest side of a cell, as the largest cells of the run-time grid
+MAX_CELLS = 128  # along a side of the image, to bound the size of files and messages
+MIN_NODES = 2  # along a side
+
+
+class LookupModel(CorrectionModel):
+    """Corrections at grid nodes, bilinear between them.
+
+    The training points are the nodes, row by row from edge to edge of the image, followed by the
+    corners of the convex hull of the calibrated area with the corrections there.
+    """
+
+    kind = 'lookup'
+    description = "lookup grid, as which the calibration of a user's regressor is saved"
+    selectable = False
+    keeps_training_points = False
+
+    def _prepare(self) -> None:
+        columns, rows = _grid_shape(self.train_uv)
+        nodes = columns * rows
+        low = self.train_uv[0]
+        self._set(
+            _low=low,
+            _per_px=(np.array([columns, rows]) - 1) / (self.train_uv[nodes - 1] - low),
+            _du=self.train_duv[:nodes, 0].reshape(rows, columns),
+            _dv=self.train_duv[:nodes, 1].reshape(rows, columns),
+        )
+
+    def _calibrated_points(self, uv: np.ndarray) -> np.ndarray:
+        columns, rows = _grid_shape(uv)
+        return uv[columns * rows :]
+
+    def predict(self, uv: ArrayLike) -> np.ndarray:
+        """Corrections (n, 2) [px] at pixels uv (n, 2); off the image those at its edge."""
+        uv = np.asarray(uv, dtype=float).reshape(-1, 2)
+        place = ((uv - self._low) * self._per_px)[:, ::-1].T
+        values = [
+            map_coordinates(grid, place, order=1, mode='nearest') for grid in (self._du, self._dv)
+        ]
+        return np.stack(values, axis=1)
+
+    _low: np.ndarray
+    _per_px: np.ndarray
+    _du: np.ndarray
+    _dv: np.ndarray
+
+
+def grid_nodes(image_size: tuple[int, int]) -> np.ndarray:
+    """Nodes (n, 2) [px] of the lookup grid of an image (width, height), row by row."""
+    size = max(CELL_PX, max(image_size) / MAX_CELLS)
+    u, v = (
+        np.linspace(-0.5, length - 0.5, max(MIN_NODES, int(np.ceil(length / size)) + 1))
+        for length in image_size
+    )
+    return np.stack([np.tile(u, len(v)), np.repeat(v, len(u))], axis=1)
+
+
+def hull_corners(uv: np.ndarray) -> NDArray[np.float64]:
+    """Corners (h, 2) of the convex hull of uv (N, 2); all points where they enclose no area."""
+    try:
+        return uv[ConvexHull(uv).vertices]
+    except (QhullError, ValueError):
+        return uv
+
+
+def _grid_shape(uv: np.ndarray) -> tuple[int, int]:
+    """Numbers of columns and rows of the grid with which uv (N, 2) begins.
+
+    Raises ValueError where it does not begin with a grid.
+    """
+    in_first_row = np.cumprod(uv[:, 1] == uv[:1, 1])
+    columns = int(in_first_row.sum())
+    whole = uv[: len(uv) - len(uv) % columns] if columns else uv[:0]
+    table = whole.reshape(-1, max(columns, 1), 2)
+    same_columns = (table[:, :, 0] == table[:1, :, 0]).all(axis=1)
+    same_row = (table[:, :, 1] == table[:, :1, 1]).all(axis=1)
+    rows = int(np.cumprod(same_columns & same_row).sum())
+    steps = np.diff(uv[:columns, 0]), np.diff(table[:rows, 0, 1]) if columns else np.zeros(0)
+    regular = all(len(step) and step.min() > 0 and np.ptp(step) < 1e-6 for step in steps)
+    if columns < MIN_NODES or rows < MIN_NODES or not regular:
+        raise ValueError('the training points of the model lookup do not begin with a grid')
+    return columns, rows
+
 
 # The order is that of messages and help texts.
 MODELS: dict[str, type[CorrectionModel]] = {

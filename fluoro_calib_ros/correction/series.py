@@ -36,27 +36,16 @@ class Functions:
     """The functions of a series for an image.
 
     Their coordinates are relative to the centre of the image, in units of half its longer side.
-
-    Attributes
-    ----------
-    image_size : (int, int)
-        Width and height [px].
-    degree : int
-        Highest degree of the polynomials; -1: there are none.
-    modes : int
-        Number of sines along the longer side of the image; 0: there are none.
-    rings : int
-        Number of radial polynomials R of the degrees 5, 7, ... (see `terms.ring_coefficients`),
-        each with the functions x R(r) / r and y R(r) / r; r is 1 at the corners of the image.
-    absent : tuple of int
-        Bands whose sines are left out. The band of a sine is its frequency over that of one half
-        wave along the longer side, rounded.
     """
 
-    image_size: tuple[int, int]
-    degree: int
-    modes: int = 0
+    image_size: tuple[int, int]  #: width and height [px]
+    degree: int  #: highest degree of the polynomials; -1: there are none
+    modes: int = 0  #: number of sines along the longer side of the image; 0: there are none
+    #: number of radial polynomials R of the degrees 5, 7, ... (see `terms.ring_coefficients`),
+    #: each with the functions x R(r) / r and y R(r) / r; r is 1 at the corners of the image
     rings: int = 0
+    #: bands whose sines are left out; the band of a sine is its frequency over that of one half
+    #: wave along the longer side, rounded
     absent: tuple[int, ...] = ()
 
     @cached_property

@@ -1,11 +1,14 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""How good the live results of the demonstration are, against the truth of the virtual rig."""
+"""Processes of the demonstration, and how good its live results are against the true rig."""
 
 from __future__ import annotations
 
 import json
+import os
+import socket
+import subprocess
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,10 +16,68 @@ from typing import Any
 
 import numpy as np
 
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import Calibrations
 from ..photogrammetry.collinearity import project
 from ..photogrammetry.rotations import matrix_from_quaternion
+from ..processes import Programs
 from ..simulation.rig import DistortionField
+
+# UDP port of the first participant of a ROS domain (DDSI-RTPS 2.5, section 9.6.1.1).
+DISCOVERY_PORT = 7400
+PORTS_PER_DOMAIN = 250
+FIRST_PARTICIPANT = 10
+
+
+class NodeProcesses(Programs):
+    """Node processes that end together; a context manager.
+
+    log_directory: the output of each node goes to NAME.log in it. namespace: of the nodes; with
+    one, the log is NAMESPACE_NAME.log.
+    """
+
+    def __init__(self, log_directory: Path, namespace: str = '') -> None:
+        super().__init__()
+        self._directory = log_directory
+        self._namespace = namespace
+
+    def start(
+        self, name: str, parameters: Mapping[str, object] | None = None
+    ) -> subprocess.Popen[Any]:
+        """Start the node fluoro_calib_ros.nodes.NAME with parameters; returns the process."""
+        arguments = ['--ros-args']
+        for key, value in (parameters or {}).items():
+            arguments += ['-p', f'{key}:={value}']
+        if self._namespace:
+            arguments += ['-r', f'__ns:=/{self._namespace}']
+        log_name = '_'.join(filter(None, (self._namespace, name)))
+        return self.run(
+            f'fluoro_calib_ros.nodes.{name}',
+            *arguments,
+            log=self._directory / f'{log_name}.log',
+        )
+
+
+def isolate_ros_graph() -> None:
+    """Keep this process and its children on this machine and in a free ROS domain.
+
+    Environment variables that are set already are left as they are.
+    """
+    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    if 'ROS_DOMAIN_ID' not in os.environ:
+        domains = [1 + (os.getpid() + i) % 100 for i in range(100)]
+        free = next((domain for domain in domains if _is_free(domain)), domains[0])
+        os.environ['ROS_DOMAIN_ID'] = str(free)
+
+
+def _is_free(domain: int) -> bool:
+    """Return whether nobody on this machine uses a ROS domain."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as port:
+        try:
+            port.bind(('', DISCOVERY_PORT + PORTS_PER_DOMAIN * domain + FIRST_PARTICIPANT))
+        except OSError:
+            return False
+    return True
+
 
 # Frames and source timestamps [ns] by (fluoroscope, frame number); frames have target_id, u and v.
 Frames = Mapping[tuple[str, int], tuple[Any, int]]
@@ -26,25 +87,13 @@ IMAGE_SCALE = 512.0
 
 @dataclass(frozen=True)
 class SpaceFigures:
-    """Accuracy and latency of the points in space.
+    """Accuracy and latency of the points in space."""
 
-    Attributes
-    ----------
-    rmse_mm : float
-        Against the true markers, after the rotation and shift that fit best.
-    normalised : float
-        Mean square of a coordinate's error over its variance.
-    good_fraction : float
-        Part of the points that were intersected.
-    exposures : int
-    latency_ms : float
-        Median, from the publication of the frames by the player to that of the points.
-    """
-
-    rmse_mm: float
-    normalised: float
-    good_fraction: float
+    rmse_mm: float  #: against the true markers, after the rotation and shift that fit best
+    normalised: float  #: mean square of a coordinate's error over its variance
+    good_fraction: float  #: part of the points that were intersected
     exposures: int
+    #: median, from the publication of the frames by the player to that of the points
     latency_ms: float
 
 
@@ -86,9 +135,7 @@ def image_errors(
     return errors
 
 
-def calibration_errors(
-    bags: Path, calibrations: Mapping[str, FluoroscopeCalibration]
-) -> dict[str, float]:
+def calibration_errors(bags: Path, calibrations: Calibrations) -> dict[str, float]:
     """Return the RMSE of the true markers, observed without noise and corrected [px].
 
     By fluoroscope, after the best projective map, as for image_errors().

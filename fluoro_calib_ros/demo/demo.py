@@ -28,10 +28,16 @@ from ..io.phantom import read_phantom
 from ..nodes.demo_client import DemoClient, DemoError, demo_clients
 from ..report.report_figures import write_figures
 from ..report.tables import markdown_table, summary_table
-from .assessment import image_errors, latencies_ms, space_figures
-from .image_twin import NAMESPACE, ImageTwin, RecordedRig, calibrate_from_images, comparison_table
-from .live_knee import PLAYED, LiveKnee
-from .node_processes import NodeProcesses, isolate_ros_graph
+from .assessment import NodeProcesses, image_errors, isolate_ros_graph, latencies_ms, space_figures
+from .image_twin import (
+    NAMESPACE,
+    PLAYED,
+    ImageTwin,
+    LiveKnee,
+    RecordedRig,
+    calibrate_from_images,
+    comparison_table,
+)
 
 QUIET_S = 3.0  # after which no more messages are expected
 

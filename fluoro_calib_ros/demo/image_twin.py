@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The way from images: radiographs of some of the exposures are extracted and calibrated with."""
+"""Twins of the recorded rig: its radiographs are extracted, and a virtual knee lands in it."""
 
 from __future__ import annotations
 
@@ -14,17 +14,30 @@ from typing import Any
 
 import numpy as np
 
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
-from ..io.bags.definitions import message_class
+from ..bodies.joints import JointMotion
+from ..correction.fluoroscope_calibration import Calibrations
+from ..io.access import make_folder, write_bytes
+from ..io.bags.metadata import message_class
 from ..io.bags.reader import IMAGE
 from ..io.bags.writer import BagWriter
-from ..jobs.simulation import SETTINGS, RenderedScene, Renderers
+from ..jobs.simulation import (
+    BODIES,
+    JOINTS,
+    SETTINGS,
+    TRUTH,
+    RenderedScene,
+    Renderers,
+    write_bag,
+    write_knee,
+)
 from ..nodes.demo_client import DemoClient, DemoError
+from ..report.figures import png_bytes
+from ..report.motion import joint_figure
 from ..report.tables import markdown_table
 from ..simulation.exposures import simulate_exposures
+from ..simulation.knee import LANDING_HZ, LANDING_S, landing, simulate_knee, virtual_knee
 from ..simulation.rig import VirtualRig, virtual_rig
-from .assessment import calibration_errors
-from .node_processes import NodeProcesses
+from .assessment import NodeProcesses, calibration_errors
 
 NAMESPACE = 'images'
 EXPOSURES = 6  # of those of the bag
@@ -56,12 +69,7 @@ class RecordedRig:
 class ImageTwin:
     """Renders a twin of the calibration bag that is made of images, in a thread.
 
-    Parameters
-    ----------
-    recorded : RecordedRig
-        The virtual rig of the bags.
-    out : Path
-        Bag to write.
+    recorded: the virtual rig of the bags. out: bag to write.
     """
 
     def __init__(self, recorded: RecordedRig, out: Path) -> None:
@@ -132,23 +140,10 @@ def _write_images(
 
 def calibrate_from_images(
     twin: ImageTwin, bags: Path, out: Path, client: DemoClient
-) -> Mapping[str, FluoroscopeCalibration]:
+) -> Calibrations:
     """Play the twin through the extraction node into another calibration node, and calibrate.
 
-    Parameters
-    ----------
-    twin : ImageTwin
-    bags, out : Path
-    client : DemoClient
-        In the namespace of the images.
-
-    Returns
-    -------
-    mapping of str to FluoroscopeCalibration
-
-    Raises
-    ------
-    DemoError
+    client: in the namespace of the images. Raises DemoError.
     """
     twin.wait()
     count = len(twin.numbers)
@@ -176,11 +171,7 @@ def calibrate_from_images(
     return client.calibrations
 
 
-def comparison_table(
-    bags: Path,
-    names: Sequence[str],
-    ways: Mapping[str, Mapping[str, FluoroscopeCalibration]],
-) -> str:
+def comparison_table(bags: Path, names: Sequence[str], ways: Mapping[str, Calibrations]) -> str:
     """Return a table of the calibrations by coordinates and by images, with the truth."""
     head = [
         'fluoroscope',
@@ -208,3 +199,55 @@ def comparison_table(
                 ]
             )
     return markdown_table(head, sorted(rows))
+
+
+PLAYED = 0.2  # of the speed of the recording, for a machine with two cores
+
+
+class LiveKnee:
+    """Bodies, joint and recording of a knee in the rig of the bags.
+
+    recorded: the virtual rig of the bags. out: folder to write.
+    """
+
+    def __init__(self, recorded: RecordedRig, out: Path) -> None:
+        self._knee = virtual_knee(recorded.seed)
+        times_s = np.arange(round(LANDING_S * LANDING_HZ)) / LANDING_HZ
+        self._truth = landing(self._knee, times_s)
+        frames = simulate_knee(recorded.rig, self._knee, self._truth, recorded.noise_px).frames
+        self.bag = out / 'landing'
+        self.parameters = {'bodies': out / BODIES, 'joints': out / JOINTS}
+        self.frames = {name: len(of_view) for name, of_view in frames.items()}
+        make_folder(out / TRUTH)
+        write_knee(out, self._knee)
+        write_bag(self.bag, frames)
+
+    def assess(self, messages: Sequence[Any], picture: Path) -> str:
+        """Draw the live angles of JointAngles, and return how good they are in one line."""
+        number = np.array([message.frame_number for message in messages])
+        stamps = [message.header.stamp for message in messages]
+        metres = np.repeat([1.0, 1e3], 3)
+        covariance = np.array([message.covariance for message in messages]).reshape(-1, 6, 6)
+        motion = JointMotion(
+            self._knee.joint,
+            number,
+            np.array([10**9 * stamp.sec + stamp.nanosec for stamp in stamps]),
+            angles=np.array([message.angle for message in messages]),
+            translations=1e3 * np.array([message.translation for message in messages]),
+            covariance=covariance * metres * metres[:, None],
+            status=np.array([message.status[0] for message in messages]),
+        )
+        write_bytes(picture, png_bytes(joint_figure(motion)))
+        known = np.isfinite(motion.angles).all(axis=1)
+        error = motion.angles[known] - self._truth.angles[number[known] - 1]
+        normalised = np.mean((error / motion.sd[known, :3]) ** 2)
+        rmse = np.degrees(np.sqrt(np.mean(error**2, axis=0)))
+        named = ', '.join(
+            f'{name.replace("_", " ")} {value:.2f}'
+            for name, value in zip(motion.angle_names, rmse)
+        )
+        return (
+            f'Knee that lands, live: {np.count_nonzero(known)} of {len(self._truth.angles)} '
+            f'exposures; RMSE against the truth [degrees]: {named}; squared error over its '
+            f'variance {normalised:.2f}; picture {picture}'
+        )

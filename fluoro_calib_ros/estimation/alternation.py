@@ -21,9 +21,8 @@ from numpy.typing import NDArray
 from ..correction.base import CorrectionModel
 from ..errors import DataError
 from ..photogrammetry.adjustment import Adjustment, SolverOptions, adjust
-from ..photogrammetry.datum import in_determined_datum
 from ..photogrammetry.elimination import factorize
-from ..photogrammetry.network import Network
+from ..photogrammetry.network import Network, in_determined_datum
 from ..photogrammetry.noise import Noise
 from ..photogrammetry.noise_estimation import SETTLED, estimate_noise
 from ..photogrammetry.normal_equations import normal_equations
@@ -154,38 +153,16 @@ class Regressions:
 
 @dataclass(frozen=True)
 class _Iterate:
-    """State of the iteration after a round.
+    """State of the iteration after a round."""
 
-    Attributes
-    ----------
-    values : (N, 2) ndarray
-        Values to which the models are fitted [px].
-    information : (N, 2, 2) ndarray
-        Inverse covariance of the residuals [1/px^2].
-    after : Adjustment
-        Adjustment of the round.
-    noise : Noise
-        Noise model that its residuals show.
-    """
-
-    values: NDArray[np.float64]
-    information: NDArray[np.float64]
-    after: Adjustment
-    noise: Noise
+    values: NDArray[np.float64]  #: (N, 2) values to which the models are fitted [px]
+    information: NDArray[np.float64]  #: (N, 2, 2) inverse covariance of the residuals [1/px^2]
+    after: Adjustment  #: adjustment of the round
+    noise: Noise  #: noise model that its residuals show
 
 
 class _Alternation:
-    """Rounds of regression and adjustment of one network.
-
-    Attributes
-    ----------
-    state : _Iterate
-        After the last round.
-    correction : (N, 2) ndarray
-        Fixed correction of the last round [px].
-    changed : bool
-        Whether inliers or k changed in the last round.
-    """
+    """Rounds of regression and adjustment of one network."""
 
     def __init__(
         self,
@@ -194,14 +171,16 @@ class _Alternation:
         regressions: Regressions,
         history: History,
     ) -> None:
+        #: (N, 2) fixed correction of the last round [px]
         self.correction = np.zeros_like(network.uv)
-        self.changed = False
+        self.changed = False  #: whether inliers or k changed in the last round
         self._network = network
         self._regressions = regressions
         self._history = history
         self._acceleration = Anderson()
         self._image = start.residuals
         information, _ = _information(network, start, self.correction)
+        #: after the last round
         self.state = _Iterate(start.residuals, information, start, start.noise)
 
     def advance(self) -> None:
@@ -266,10 +245,6 @@ def calibrate_by_regression(
         What fits the rest of the correction.
     progress : callable, optional
         Called with the Round after every round.
-
-    Returns
-    -------
-    SelfCalibration
 
     Raises
     ------

@@ -32,66 +32,33 @@ MIN_SHARE = 0.05  # of what differs between exposures that the angle explains, e
 
 @dataclass(frozen=True)
 class Effects:
-    """Coefficients of the harmonics of all terms of exposures, harmonic by harmonic.
+    """Coefficients of the harmonics of all terms of exposures, harmonic by harmonic."""
 
-    Attributes
-    ----------
-    mean : (q,) ndarray
-        [px]
-    covariance : (q, q) ndarray
-    mixed : (c, q) ndarray
-        Covariance of the coefficients of the series with these.
-    """
-
-    mean: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-    mixed: NDArray[np.float64]
+    mean: NDArray[np.float64]  #: (q,) [px]
+    covariance: NDArray[np.float64]  #: (q, q)
+    mixed: NDArray[np.float64]  #: (c, q) covariance of the coefficients of the series with these
 
 
 @dataclass(frozen=True)
 class AngleFit:
-    """A series and the terms of exposures, once these are a function of the angle.
-
-    Attributes
-    ----------
-    field : AngleField
-    coefficients : (c,) ndarray
-        Of the series, those of u first [px].
-    covariance : (c, c) ndarray
-    remaining : float
-        Share of the variance between exposures that the angle does not explain.
-    effects : Effects
-        Of which the field is made.
-    """
+    """A series and the terms of exposures, once these are a function of the angle."""
 
     field: AngleField
-    coefficients: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-    remaining: float
-    effects: Effects
+    coefficients: NDArray[np.float64]  #: (c,) of the series, those of u first [px]
+    covariance: NDArray[np.float64]  #: (c, c)
+    remaining: float  #: share of the variance between exposures that the angle does not explain
+    effects: Effects  #: of which the field is made
 
 
 @dataclass(frozen=True)
 class SeriesWithExposures:
-    """Estimated coefficients of a series, and after them those of terms of exposures.
+    """Estimated coefficients of a series, and after them those of terms of exposures."""
 
-    Attributes
-    ----------
-    functions : Functions
-        Of the series.
-    uv : (N, 2) ndarray
-        Image points to whose exposures the terms belong [px].
-    terms : ExposureTerms
-    coefficients : (p,) ndarray
-        [px]
-    covariance : (p, p) ndarray
-    """
-
-    functions: Functions
-    uv: NDArray[np.float64]
+    functions: Functions  #: of the series
+    uv: NDArray[np.float64]  #: (N, 2) image points to whose exposures the terms belong [px]
     terms: ExposureTerms
-    coefficients: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    coefficients: NDArray[np.float64]  #: (p,) [px]
+    covariance: NDArray[np.float64]  #: (p, p)
 
 
 def can_be_fitted(angles: np.ndarray) -> bool:

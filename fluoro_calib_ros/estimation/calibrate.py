@@ -15,9 +15,13 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from ..correction.base import CorrectionModel
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration, digest_of_sources
-from ..correction.noise_profile import NoiseProfile
-from ..exposures.frame import validate_frame
+from ..correction.fluoroscope_calibration import (
+    Calibrations,
+    FluoroscopeCalibration,
+    NoiseProfile,
+    digest_of_sources,
+)
+from ..exposures.frame import Frames, validate_frame
 from ..exposures.phantom import Phantom
 from ..findings import Finding
 from ..photogrammetry.adjustment import Adjustment
@@ -29,14 +33,6 @@ from ..photogrammetry.precision import (
 )
 from ..photogrammetry.rotations import quaternion_from_matrix
 from .constraints import relative_orientations
-from .diagnostics import (
-    ResidualTable,
-    correlations_of,
-    exposures_that_do_not_fit,
-    outliers_of,
-    residuals_of_adjustment,
-    statistics_of,
-)
 from .fixed_calibration import (
     SolvedNetwork,
     fixed_corrections,
@@ -46,22 +42,25 @@ from .fixed_calibration import (
 )
 from .initial_network import (
     MIN_EXPOSURES,
-    Frames,
     Measured,
     StartValues,
     adjusted_with_precision,
     measured_network,
 )
-from .noise_profile_fit import fitted_profile
+from .lack_of_fit import fitted_profile
 from .options import CalibrationOptions, CalibrationRequest
-from .result import (
-    CalibrationResult,
-    ExposureResult,
-    FluoroscopeResult,
-    Targets,
-    combined_targets,
+from .result import CalibrationResult, ExposureResult, FluoroscopeResult, Targets, combined_targets
+from .rounds import (
+    ResidualTable,
+    Round,
+    SelfCalibration,
+    correlations_of,
+    exposures_that_do_not_fit,
+    outliers_of,
+    residuals_of_adjustment,
+    rmse_of_inliers,
+    statistics_of,
 )
-from .rounds import Round, SelfCalibration, rmse_of_inliers
 from .self_calibration import self_calibrate
 
 MAX_REPEATS = 3  # of a calibration, to exclude exposures that do not fit
@@ -94,10 +93,6 @@ def calibrate(
         Start value [px]; by default it is taken from the observations.
     progress : callable, optional
         Called with the name of the fluoroscope and the Round after every round; may raise to stop.
-
-    Returns
-    -------
-    CalibrationResult
 
     Raises
     ------
@@ -172,29 +167,12 @@ def calibrate_request(
 
 
 def calibrate_part(
-    request: CalibrationRequest,
-    starts: StartValues,
-    whole: Mapping[str, FluoroscopeCalibration],
+    request: CalibrationRequest, starts: StartValues, whole: Calibrations
 ) -> dict[str, FluoroscopeCalibration]:
     """Self-calibrate with a part of the exposures of an earlier calibration.
 
-    Parameters
-    ----------
-    request : CalibrationRequest
-        With the frames of the part.
-    starts : StartValues
-        Of the earlier calibration.
-    whole : mapping of str to FluoroscopeCalibration
-        The earlier calibration, of all exposures, whose noise of image coordinates is taken over.
-
-    Returns
-    -------
-    dict of str to FluoroscopeCalibration
-
-    Raises
-    ------
-    DataError
-        If the exposures do not suffice.
+    request: with the frames of the part. starts, whole: of the calibration of all exposures, whose
+    noise of image coordinates is taken over. Raises DataError if the exposures do not suffice.
     """
     out: dict[str, FluoroscopeCalibration] = {}
     with threadpool_limits(1):
@@ -239,10 +217,7 @@ def _figures_of_run(run: SelfCalibration) -> dict[str, FluoroscopeResult]:
 
 
 def _calibrations_of_run(
-    run: SelfCalibration,
-    frames: Frames,
-    phantom: Phantom,
-    seconds: float,
+    run: SelfCalibration, frames: Frames, phantom: Phantom, seconds: float
 ) -> dict[str, FluoroscopeCalibration]:
     """Calibrations of the fluoroscopes of a self-calibration that took some seconds."""
     return {
@@ -324,7 +299,7 @@ def _outliers_of_all(runs: Iterable[SelfCalibration]) -> tuple[tuple[Any, ...], 
 def adjust_with_calibrations(
     frames: Frames,
     phantom: Phantom,
-    calibrations: Mapping[str, FluoroscopeCalibration],
+    calibrations: Calibrations,
     loss: str = 'student_t',
     known: Mapping[str, KnownOrientation] | None = None,
     starts: StartValues | None = None,
@@ -348,10 +323,6 @@ def adjust_with_calibrations(
         Of an earlier adjustment of the frames, for its residuals: the residuals without correction
         are then not computed again, their RMSE is NaN, and covariances are without the
         uncertainty of the interior orientations.
-
-    Returns
-    -------
-    CalibrationResult
 
     Raises
     ------

@@ -70,21 +70,11 @@ CONTINUED_TOLERANCE = 1e-3
 
 @dataclass(frozen=True)
 class EarlierTerms:
-    """Terms of an earlier calibration with more exposures.
+    """Terms of an earlier calibration with more exposures."""
 
-    Attributes
-    ----------
-    series : sequence of Series
-        By fluoroscope.
-    priors : sequence of Prior or None
-        Priors by fluoroscope; None: to be estimated from the series.
-    is_varying : bool
-        Whether the distortion differs between exposures.
-    """
-
-    series: Sequence[Series]
-    priors: Sequence[Prior | None]
-    is_varying: bool
+    series: Sequence[Series]  #: by fluoroscope
+    priors: Sequence[Prior | None]  #: priors by fluoroscope; None: to be estimated from the series
+    is_varying: bool  #: whether the distortion differs between exposures
 
 
 class CollocationTerms(AdjustedTerms):
@@ -92,11 +82,6 @@ class CollocationTerms(AdjustedTerms):
 
     modes: number of sines along the image to start with; 0: there is no signal, and the trend has
     no rings (see `series.Functions`). earlier: what to start with instead.
-
-    Attributes
-    ----------
-    parts : list of FluoroscopeTerms
-        By fluoroscope.
     """
 
     intermediate_tolerance = 1.0  # noise and prior still change

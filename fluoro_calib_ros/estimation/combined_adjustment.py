@@ -19,9 +19,8 @@ import numpy as np
 from ..correction.base import CorrectionModel
 from ..errors import DataError
 from ..photogrammetry.adjustment import Adjustment, SolverOptions, adjust_with_matrix
-from ..photogrammetry.datum import in_determined_datum
 from ..photogrammetry.elimination import factorize
-from ..photogrammetry.network import Network
+from ..photogrammetry.network import Network, in_determined_datum
 from ..photogrammetry.noise_estimation import estimate_noise
 from ..photogrammetry.normal_equations import normal_equations
 from ..photogrammetry.precision import Precision, covariance_blocks, precision
@@ -59,10 +58,6 @@ def calibrate_by_adjustment(
     max_rounds : int
     progress : callable, optional
         Called with the Round after every adjustment.
-
-    Returns
-    -------
-    SelfCalibration
 
     Raises
     ------

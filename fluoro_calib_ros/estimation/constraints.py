@@ -19,18 +19,16 @@ from ..findings import Finding, Kind, Place, Severity, first_few
 from ..photogrammetry.elimination import factorize
 from ..photogrammetry.normal_equations import normal_equations
 from ..photogrammetry.precision import covariance_blocks
-from ..photogrammetry.relative_orientation import (
-    discrepancies,
-    discrepancies_with_jacobian,
-    mean_pose,
-)
-from ..photogrammetry.relative_pose import (
+from ..photogrammetry.unknowns import (
     RIGID_SD_MM,
     RIGID_SD_RAD,
     RelativeConstraint,
     RelativePose,
+    discrepancies,
+    discrepancies_with_jacobian,
+    mean_pose,
 )
-from .gauge import GaugeKind
+from .estimator import GaugeKind
 from .initial_network import Measured
 from .options import CalibrationOptions
 from .rounds import SelfCalibration
@@ -43,31 +41,17 @@ MIN_PAIRS = 2  # of exposures for a constraint of the relative orientation
 
 @dataclass(frozen=True)
 class RelativeOrientation:
-    """Relative orientation of two fluoroscopes.
+    """Relative orientation of two fluoroscopes."""
 
-    Attributes
-    ----------
-    fluoroscopes : (str, str)
-        Names of fluoroscopes a and b.
-    pose : RelativePose
-        Q = R_b R_a^T and t = R_a (T_b - T_a) [mm].
-    covariance : (6, 6) ndarray
-        Of t [mm] and of Q [rad] about the axes of b's sensor.
-    scatter_mm, scatter_rad : (3,) ndarray
-        Standard deviations of the exposures about it.
-    exposures : int
-        Number of pairs of exposures.
-    constraint : str
-        'none', 'soft' or 'hard'.
-    """
-
-    fluoroscopes: tuple[str, str]
-    pose: RelativePose
+    fluoroscopes: tuple[str, str]  #: names of fluoroscopes a and b
+    pose: RelativePose  #: Q = R_b R_a^T and t = R_a (T_b - T_a) [mm]
+    #: (6, 6) of t [mm] and of Q [rad] about the axes of b's sensor
     covariance: NDArray[np.float64]
+    #: (3,) standard deviations of the exposures about it
     scatter_mm: NDArray[np.float64]
     scatter_rad: NDArray[np.float64]
-    exposures: int
-    constraint: str
+    exposures: int  #: number of pairs of exposures
+    constraint: str  #: 'none', 'soft' or 'hard'
 
     @property
     def sd_mm(self) -> NDArray[np.float64]:

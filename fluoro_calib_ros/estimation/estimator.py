@@ -1,21 +1,44 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""How a self-calibration obtains a correction model: terms in the adjustment, and regression."""
+"""How a self-calibration obtains a correction model, and the gauge between it and orientations.
+
+The gauge between a free correction and the orientation of the sensor. A correction that can
+reproduce what a change of interior and exterior orientation does to the image competes with them.
+To first order these changes move an image point (x, y) = (u - xp, v - yp) by
+
+    (1, 0), (0, 1)                    principal point,
+    (x, y)                            principal distance,
+    (-y, x)                           turn of the sensor about its axis,
+    (x x, x y)/c, (x y, y y)/c        turn of the sensor about its rows and columns, less a shift
+
+(derivatives of the collinearity condition; the last three are common to all exposures and leave
+sources and object points where they are). The fitted correction is kept orthogonal to them. Where
+the interior orientation is fixed, only the turns are left, with their shifts: (-y, x), (c + x x/c,
+x y/c), (x y/c, c + y y/c). Where the exterior orientations are known too, nothing competes.
+
+Flat targets parallel to the image show neither principal distance nor principal point, and any
+distance of the source takes up a scale. Where these are given, they are those of a distortion
+without shift, scale and tilt, such as that of Brown: the part in the gauge vanishes of the cubic
+polynomial that fits the correction best, not of the correction as a whole.
+"""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from enum import Enum
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import least_squares
 
+from ..correction.terms import CUBIC, cubic_terms, polynomial_coefficients, polynomial_powers
 from ..photogrammetry.noise import INLIER_Q
 from ..photogrammetry.noise_estimation import SETTLED
-from .gauge import GaugeKind
+from ..photogrammetry.rotations import matrix_from_vector
 from .lack_of_fit import LeftOut
 
 if TYPE_CHECKING:
@@ -25,6 +48,146 @@ if TYPE_CHECKING:
     from ..photogrammetry.elimination import FactorizedNormalMatrix
     from ..photogrammetry.network import Network
     from ..photogrammetry.precision import Precision
+
+
+class GaugeKind(Enum):
+    """What the orientation can express, and a correction must not.
+
+    FULL: interior orientation and turns. TREND: the same, where the interior orientation is given
+    as that of a cubic distortion, and the exposures do not show it. TURNS: the interior
+    orientation is fixed, and its errors are learned by the correction. NONE: the exterior
+    orientations are known too.
+    """
+
+    FULL = 'full'
+    TREND = 'trend'
+    TURNS = 'turns'
+    NONE = 'none'
+
+
+UNIT_PX = 512.0  # of the image coordinates in the basis; any fixed length would do
+TURN_STEP = 1e-3  # rad, as large as a pixel of the principal point for the search of both
+
+
+def gauge_basis(
+    uv: ArrayLike, interior: np.ndarray, kind: GaugeKind = GaugeKind.FULL
+) -> NDArray[np.float64]:
+    """Basis (n, 2, g) of the gauge at pixels uv (n, 2), scaled to about one; interior (3,) [px].
+
+    g is 3 for the turns, 0 for none, else 6.
+    """
+    x, y = (np.asarray(uv) - interior[:2]).T / UNIT_PX
+    one = np.ones_like(x)
+    zero = np.zeros_like(x)
+    if kind is GaugeKind.NONE:
+        return np.zeros((len(x), 2, 0))
+    if kind is GaugeKind.TURNS:
+        square = (UNIT_PX / interior[2]) ** 2
+        columns = [
+            (-y, x),
+            (one + square * x * x, square * x * y),
+            (square * x * y, one + square * y * y),
+        ]
+    else:
+        columns = [(one, zero), (zero, one), (x, y), (-y, x), (x * x, x * y), (x * y, y * y)]
+    return np.stack([np.stack(column, axis=1) for column in columns], axis=2)
+
+
+def gauge_coefficients(
+    uv: ArrayLike,
+    fitted: NDArray[np.float64],
+    interior: NDArray[np.float64],
+    kind: GaugeKind = GaugeKind.FULL,
+) -> NDArray[np.float64]:
+    """Coefficients (g,) of the part of fitted corrections that is in the gauge.
+
+    uv: (n, 2) pixels. fitted: (n, 2) corrections there [px]. interior: (3,) xp, yp, c [px].
+    Returns (g,).
+    """
+    basis = gauge_basis(uv, interior, kind)
+    if kind is GaugeKind.TREND:
+        basis = np.concatenate([basis, _cubic_terms(uv, interior)], axis=2)
+    count = 6 if kind is GaugeKind.TREND else basis.shape[2]
+    flat = basis.reshape(-1, basis.shape[2])
+    coefficients = np.linalg.lstsq(flat, fitted.reshape(-1), rcond=None)[0][:count]
+    return np.asarray(coefficients, dtype=np.float64)
+
+
+def gauge_rows(
+    values: np.ndarray, uv: np.ndarray, interior: np.ndarray, kind: GaugeKind = GaugeKind.FULL
+) -> np.ndarray:
+    """Rows (g, 2m) whose products with the coefficients of a series vanish without a gauge part.
+
+    values (n, m): functions of the series at pixels uv (n, 2); interior (3,) [px]. The
+    coefficients are those of u, then those of v.
+    """
+    basis = gauge_basis(uv, interior, kind)
+    count = basis.shape[2]
+    if kind is GaugeKind.TREND:
+        basis = np.concatenate([basis, _cubic_terms(uv, interior)], axis=2)
+        flat = basis.reshape(-1, basis.shape[2])
+        solved = np.linalg.solve(flat.T @ flat, flat.T)[:count]
+        basis = solved.T.reshape(len(uv), 2, count) * len(uv)
+    rows = [basis[:, axis].T @ values for axis in (0, 1)]
+    return np.concatenate(rows, axis=1) / len(uv)
+
+
+def _cubic_terms(uv: ArrayLike, interior: np.ndarray) -> np.ndarray:
+    """Terms (n, 2, 14) that complete the gauge to all cubic polynomials about (xp, yp)."""
+    x, y = (np.asarray(uv) - interior[:2]).T / UNIT_PX
+    powers = np.stack([x**i * y**j for i, j in polynomial_powers(CUBIC)], axis=1)
+    terms = [polynomial_coefficients(CUBIC, parts) for parts in cubic_terms().values()]
+    return np.stack([powers @ term.T for term in terms], axis=2)
+
+
+def interior_about(
+    centre: NDArray[np.float64],
+    uv: NDArray[np.float64],
+    correction: NDArray[np.float64],
+    interior: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Interior orientation (3,) [px] in the gauge about another principal point.
+
+    A sensor that is turned by R and has another camera matrix K' sees the same rays where the
+    corrected image is that of the homography K' R K^-1 (Hartley and Zisserman, "Multiple View
+    Geometry", 2003, 8.4). To second order, a turn with its shift d of the principal point
+    stretches the image by d^2/c^2: a correction with a large affine part is orthogonal to the
+    gauge about a near principal point, and about far ones, with which it may be smaller.
+
+    Parameters
+    ----------
+    centre : (2,) ndarray
+        The other principal point [px].
+    uv : (n, 2) ndarray
+        Pixels.
+    correction : (n, 2) ndarray
+        Corrections there [px].
+    interior : (3,) ndarray
+        xp, yp, c [px] that belong to these corrections.
+
+    Returns
+    -------
+    (3,) ndarray
+
+    Raises
+    ------
+    ValueError
+        If there is none: the corrections are no numbers, or image points come to lie behind.
+    """
+    rays = np.column_stack([(uv - correction - interior[:2]) / interior[2], np.ones(len(uv))])
+    reference = np.array([*centre, interior[2]])
+
+    def misclosure(x: np.ndarray) -> np.ndarray:
+        turned = rays @ matrix_from_vector(x[3:]).T
+        if not (turned[:, 2] > 0).all():
+            raise ValueError('no orientation about this principal point')
+        ideal = x[:2] + x[2] * turned[:, :2] / turned[:, 2:]
+        return gauge_coefficients(uv, uv - ideal, reference)
+
+    start = np.concatenate([interior, np.zeros(3)])
+    scale = [1.0, 1.0, 1.0, TURN_STEP, TURN_STEP, TURN_STEP]
+    return least_squares(misclosure, start, x_scale=scale).x[:3]
+
 
 MIN_TRAINING = 60  # inliers of a fluoroscope that a correction model needs
 # An inlier becomes an outlier above STAY_IN times the limit (five sigma of each coordinate), an
@@ -38,74 +201,40 @@ Model_co = TypeVar('Model_co', covariant=True)  # the correction model that a re
 
 @dataclass(frozen=True)
 class AdjustmentProblem:
-    """A network whose adjustment is to estimate terms of the correction.
+    """A network whose adjustment is to estimate terms of the correction."""
 
-    Attributes
-    ----------
-    network : Network
-        Network without additional parameters.
-    image_sizes : sequence of (int, int)
-        Width and height [px] of the image of each fluoroscope.
-    before : Adjustment
-        Adjustment of the network without correction.
-    gauges : sequence of GaugeKind
-        What the orientation of each fluoroscope can express.
-    angles : sequence of (e,) ndarray, optional
-        Angles of the C-arm [rad] in the exposures of each fluoroscope, in the order of the
-        network; NaN where unknown. None: all are unknown.
-    """
-
-    network: Network
+    network: Network  #: network without additional parameters
+    #: width and height [px] of the image of each fluoroscope
     image_sizes: Sequence[tuple[int, int]]
-    before: Adjustment
-    gauges: Sequence[GaugeKind]
+    before: Adjustment  #: adjustment of the network without correction
+    gauges: Sequence[GaugeKind]  #: what the orientation of each fluoroscope can express
+    #: (e,) angles of the C-arm [rad] in the exposures of each fluoroscope, in the order of the
+    #: network; NaN where unknown; None: all are unknown
     angles: Sequence[NDArray[np.float64]] | None = None
 
 
 @dataclass(frozen=True)
 class TrainingPoints:
-    """Image points of one fluoroscope to whose residuals a model is fitted.
+    """Image points of one fluoroscope to whose residuals a model is fitted."""
 
-    Attributes
-    ----------
-    uv : (N, 2) ndarray
-        Observed pixels; they do not change between rounds.
-    exposure : (N,) ndarray of int
-        Exposure of each image point.
-    image_size : (int, int)
-        Width and height of the image [px].
-    gauge : GaugeKind
-        What the orientation can express.
-    trend : (N, m) ndarray or None
-        Functions whose coefficients are estimated in the adjustment, the same for u and v; the
-        correction is then kept orthogonal to all of them instead of the gauge.
-    """
-
-    uv: NDArray[np.float64]
-    exposure: NDArray[np.int64]
-    image_size: tuple[int, int]
-    gauge: GaugeKind
+    uv: NDArray[np.float64]  #: (N, 2) observed pixels; they do not change between rounds
+    exposure: NDArray[np.int64]  #: (N,) exposure of each image point
+    image_size: tuple[int, int]  #: width and height of the image [px]
+    gauge: GaugeKind  #: what the orientation can express
+    #: (N, m) functions whose coefficients are estimated in the adjustment, the same for u and v;
+    #: the correction is then kept orthogonal to all of them instead of the gauge
     trend: NDArray[np.float64] | None = None
 
 
 class AdjustedTerms(ABC):
-    """Terms of the correction, of all fluoroscopes of a network, that the adjustment estimates.
+    """Terms of the correction, of all fluoroscopes of a network, that the adjustment estimates."""
 
-    Attributes
-    ----------
-    intermediate_tolerance : float
-        Decrease of the cost at which an adjustment before the last may stop.
-    final_tolerance : float
-        Decrease of the cost that the last adjustment may leave.
-    noise_tolerance : float
-        Relative change of the scale of the noise at which the terms may settle.
-    needs_solution : bool
-        Whether terms are renewed with the normal matrix at a solution, not with one near it.
-    """
-
+    #: decrease of the cost at which an adjustment before the last may stop
     intermediate_tolerance: float
-    final_tolerance = FINAL_TOLERANCE
+    final_tolerance = FINAL_TOLERANCE  #: decrease of the cost that the last adjustment may leave
+    #: relative change of the scale of the noise at which the terms may settle
     noise_tolerance = SETTLED
+    #: whether terms are renewed with the normal matrix at a solution, not with one near it
     needs_solution = False
 
     @property
@@ -170,30 +299,16 @@ class AdjustedTerms(ABC):
 
 
 class RegressionStep(ABC, Generic[Model_co]):
-    """Correction model of one fluoroscope through the rounds of a self-calibration.
+    """Correction model of one fluoroscope through the rounds of a self-calibration."""
 
-    Attributes
-    ----------
-    k : int
-        Number of neighbours chosen; 0 for a model without.
-    score : float
-        G, weighted square sum of the errors of cross-validation.
-    inliers : (N,) ndarray of bool
-        Image points to which the model is fitted.
-    changed : bool
-        Whether inliers or k differ from the last round.
-    iterates : bool
-        Whether a second round can give another correction than the first.
-    """
-
-    iterates = True
+    iterates = True  #: whether a second round can give another correction than the first
 
     def __init__(self, points: TrainingPoints) -> None:
         self.points = points
-        self.k = 0
-        self.score = 0.0
-        self.changed = False
-        self.inliers: np.ndarray | None = None
+        self.k = 0  #: number of neighbours chosen; 0 for a model without
+        self.score = 0.0  #: G, weighted square sum of the errors of cross-validation
+        self.changed = False  #: whether inliers or k differ from the last round
+        self.inliers: np.ndarray | None = None  #: (N,) image points to which the model is fitted
 
     @abstractmethod
     def choose(
@@ -201,19 +316,9 @@ class RegressionStep(ABC, Generic[Model_co]):
     ) -> None:
         """Update the inliers, and choose k by its score.
 
-        Parameters
-        ----------
-        values : (N, 2) ndarray
-            Values to which the model is fitted [px].
-        q : (N,) ndarray
-            Normalised squared residuals.
-        information : (N, 2, 2) ndarray
-            Inverse of the residual covariance C_r [1/px^2].
-
-        Raises
-        ------
-        ValueError
-            If there are too few inliers.
+        values: (N, 2) values to which the model is fitted [px]. q: (N,) normalised squared
+        residuals. information: (N, 2, 2) inverse of the residual covariance C_r [1/px^2]. Raises
+        ValueError if there are too few inliers.
         """
 
     @abstractmethod
@@ -254,20 +359,13 @@ def no_regression(points: TrainingPoints, k: int | None) -> None:
 
 @dataclass(frozen=True)
 class Estimator:
-    """How a self-calibration obtains the models of a kind.
-
-    Attributes
-    ----------
-    kind : str
-    adjusted_terms : callable
-        Returns the terms that are unknowns of the adjustment; None: there are none.
-    regression : callable
-        Returns the regression of the residuals between adjustments for the number k of neighbours
-        that the user asks for (None: to be chosen); None: the model needs no regression.
-    """
+    """How a self-calibration obtains the models of a kind."""
 
     kind: str
+    #: returns the terms that are unknowns of the adjustment; None: there are none
     adjusted_terms: Callable[[AdjustmentProblem], AdjustedTerms | None] = no_terms
+    #: returns the regression of the residuals between adjustments for the number k of neighbours
+    #: that the user asks for (None: to be chosen); None: the model needs no regression
     regression: Callable[[TrainingPoints, int | None], RegressionStep[Any] | None] = no_regression
 
 

@@ -38,7 +38,7 @@ from ..photogrammetry.noise import Noise
 from ..photogrammetry.normal_equations import normal_equations
 from ..photogrammetry.precision import information_of_additional, solved_additional
 from ..photogrammetry.unknowns import EXTERIOR_SIZE, INTERIOR_SIZE
-from .gauge import GaugeKind, gauge_basis
+from .estimator import GaugeKind, gauge_basis
 
 TERMS = len(cubic_terms())  # of the cubic trend without the gauge
 # Square sum of the terms over its expectation for independent residuals from which distortion is
@@ -53,21 +53,12 @@ MIN_POINTS = 30  # of an exposure whose terms are tested
 
 @dataclass(frozen=True)
 class Variation:
-    """Change of a distortion between exposures.
+    """Change of a distortion between exposures."""
 
-    Attributes
-    ----------
-    chi2_per_dof : float
-        Square sum of the terms of all exposures over its expectation for independent residuals.
-    size_px : float
-        RMS of a coordinate of the change [px], without what the noise contributes.
-    noise_px : float
-        Standard deviation of a coordinate of what the terms leave [px].
-    """
-
+    #: square sum of the terms of all exposures over its expectation for independent residuals
     chi2_per_dof: float
-    size_px: float
-    noise_px: float
+    size_px: float  #: RMS of a coordinate of the change [px], without what the noise contributes
+    noise_px: float  #: standard deviation of a coordinate of what the terms leave [px]
 
     @property
     def is_varying(self) -> bool:
@@ -143,21 +134,16 @@ class ExposureTerms:
 
     The coefficients of one exposure stand after those of the one before. size_px: RMS of a
     coordinate of the change to start with [px].
-
-    Attributes
-    ----------
-    functions : GroupedFunctions
-        At the image points; the groups are the exposures.
-    variance : (t,) ndarray
-        Variance of the coefficients of each term over the exposures [px^2]; t: 14, or 17 with a
-        change of the interior orientation.
     """
 
     def __init__(self, functions: np.ndarray, exposure: np.ndarray, size_px: float) -> None:
         numbers, place = np.unique(exposure, return_inverse=True)
         self.exposures = len(numbers)
+        #: at the image points; the groups are the exposures
         self.functions = GroupedFunctions(functions, place)
         count = functions.shape[2]
+        #: (t,) variance of the coefficients of each term over the exposures [px^2]; t: 14, or 17
+        #: with a change of the interior orientation
         self.variance = np.full(count, max(size_px**2 / count, ABSENT_VARIANCE))
 
     @property

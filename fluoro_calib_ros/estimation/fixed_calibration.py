@@ -5,14 +5,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
-from ..exposures.frame import Frame, angles_of
+from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
+from ..exposures.frame import Frame, Frames, angles_of
 from ..exposures.phantom import Phantom
 from ..photogrammetry.adjustment import Adjustment
 from ..photogrammetry.diagnosis import global_names
@@ -27,7 +27,6 @@ from ..photogrammetry.precision import (
     joint_covariance,
 )
 from .initial_network import (
-    Frames,
     Known,
     KnownSensor,
     Measured,
@@ -44,46 +43,27 @@ EXTERIOR = ('x', 'y', 'z', 'turn x', 'turn y', 'turn z')
 
 @dataclass(frozen=True)
 class JointPrecision:
-    """Covariance matrix of all unknowns of an adjustment.
+    """Covariance matrix of all unknowns of an adjustment."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Of the unknowns: x, y, z of the source [mm] and its turns about the axes of the sensor
-        [rad] of each exposure; x, y, z [mm] of each target; xp, yp, c [px] of each fluoroscope;
-        relative orientations and coefficients of the correction, where they were estimated.
-    values : (u,) ndarray
-        NaN for rotations, which have no value.
-    covariance : (u, u) ndarray
-        Zeros for what was fixed.
-    """
-
+    #: of the unknowns: x, y, z of the source [mm] and its turns about the axes of the sensor [rad]
+    #: of each exposure; x, y, z [mm] of each target; xp, yp, c [px] of each fluoroscope; relative
+    #: orientations and coefficients of the correction, where they were estimated
     names: tuple[str, ...]
-    values: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    values: NDArray[np.float64]  #: (u,) NaN for rotations, which have no value
+    covariance: NDArray[np.float64]  #: (u, u) zeros for what was fixed
 
 
 @dataclass(frozen=True)
 class SolvedNetwork:
-    """A network and its adjustment.
-
-    Attributes
-    ----------
-    measured : Measured
-    adjustment : Adjustment
-    correction : (N, 2) ndarray
-        Correction that was fixed [px].
-    fixed : (F, 3, 3) ndarray or None
-        Covariances of interior orientations that were fixed [px^2].
-    stated : Precision or None
-        What the unknowns claim where that is not the precision of the network: the matrix then
-        has these standard deviations, and the correlations of the network.
-    """
+    """A network and its adjustment."""
 
     measured: Measured
     adjustment: Adjustment
-    correction: NDArray[np.float64]
+    correction: NDArray[np.float64]  #: (N, 2) correction that was fixed [px]
+    #: (F, 3, 3) covariances of interior orientations that were fixed [px^2]
     fixed: NDArray[np.float64] | None = None
+    #: what the unknowns claim where that is not the precision of the network: the matrix then has
+    #: these standard deviations, and the correlations of the network
     stated: Precision | None = None
 
     def joint_precision(self) -> JointPrecision:
@@ -183,7 +163,7 @@ MIN_RAYS_FOR_NOISE = 3
 def network_of_calibrations(
     frames: Frames,
     phantom: Phantom,
-    calibrations: Mapping[str, FluoroscopeCalibration],
+    calibrations: Calibrations,
     known: Known | None = None,
     starts: StartValues | None = None,
 ) -> Measured:
@@ -220,7 +200,7 @@ def _angles(measured: Measured, rows: np.ndarray) -> np.ndarray:
 
 
 def fixed_corrections(
-    measured: Measured, calibrations: Mapping[str, FluoroscopeCalibration]
+    measured: Measured, calibrations: Calibrations
 ) -> tuple[np.ndarray, Network]:
     """Corrections (N, 2) [px] by calibrations, and the network with their uncertainty in sigma.
 

@@ -45,61 +45,34 @@ MIN_START_SD_PX = 0.1
 
 @dataclass(frozen=True)
 class SeriesEquations:
-    """Normal equations of the coefficients of a series, all other unknowns eliminated.
+    """Normal equations of the coefficients of a series, all other unknowns eliminated."""
 
-    Attributes
-    ----------
-    information : (2m, 2m) ndarray
-        Without a prior.
-    right : (2m,) ndarray
-    """
-
-    information: NDArray[np.float64]
-    right: NDArray[np.float64]
+    information: NDArray[np.float64]  #: (2m, 2m) without a prior
+    right: NDArray[np.float64]  #: (2m,)
 
 
 class FluoroscopeTerms:
-    """Trend and signal of one fluoroscope, and the terms of its exposures.
-
-    Attributes
-    ----------
-    number : int
-        Of the fluoroscope in the network.
-    uv : (n, 2) ndarray
-        Image points [px].
-    image_size : (int, int)
-        Width and height [px].
-    gauge_kind : GaugeKind
-    angles : (e,) ndarray
-        Angles of the C-arm [rad]; empty where unknown.
-    interior : (3,) ndarray
-        xp, yp, c [px] at the last solution.
-    functions : Functions
-    values : (n, m) ndarray
-        Functions at the image points.
-    prior : Prior
-    gauge : (2m, 2m) ndarray
-        Precision matrix of the gauge.
-    own : ExposureTerms or None
-        Terms of the exposures; None: the distortion does not vary.
-    """
+    """Trend and signal of one fluoroscope, and the terms of its exposures."""
 
     prior: Prior
 
     def __init__(self, problem: AdjustmentProblem, number: int, functions: Functions) -> None:
         network = problem.network
-        self.number = number
+        self.number = number  #: of the fluoroscope in the network
         self.rows = network.rows(number)
-        self.uv = network.uv[self.rows]
+        self.uv = network.uv[self.rows]  #: (n, 2) image points [px]
         self.sigma = network.sigma[self.rows]
         self.exposure = network.exposure[self.rows]
         self.point = network.point[self.rows]
-        self.image_size = problem.image_sizes[number]
+        self.image_size = problem.image_sizes[number]  #: width and height [px]
         self.gauge_kind = problem.gauges[number]
+        #: (e,) angles of the C-arm [rad]; empty where unknown
         self.angles = np.zeros(0) if problem.angles is None else problem.angles[number]
+        #: (3,) xp, yp, c [px] at the last solution
         self.interior = problem.before.parameters.interior[number]
         self._offset = np.zeros(3)  # of the interior orientation estimated last from this one
         self._relaxation = 1.0
+        #: terms of the exposures; None: the distortion does not vary
         self.own: ExposureTerms | None = None
         self._angle_fit: AngleFit | None = None
         self._use(functions)
@@ -153,8 +126,8 @@ class FluoroscopeTerms:
     def _use(self, functions: Functions) -> None:
         """Use these functions."""
         self.functions = functions
-        self.values = functions(self.uv)
-        self.gauge = self.gauge_of(self.values)
+        self.values = functions(self.uv)  #: (n, m) functions at the image points
+        self.gauge = self.gauge_of(self.values)  #: (2m, 2m) precision matrix of the gauge
 
     def gauge_of(self, values: np.ndarray) -> NDArray[np.float64]:
         """Precision matrix (2m, 2m) of the gauge for values (n, m) of functions."""

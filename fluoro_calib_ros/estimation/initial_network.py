@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..correction.series import Series
 from ..errors import DataError
-from ..exposures.frame import Frame, angles_of, validate_frame
+from ..exposures.frame import Frame, Frames, angles_of, validate_frame
 from ..exposures.phantom import Phantom
 from ..findings import Finding, Kind, Place, Severity
 from ..photogrammetry.adjustment import Adjustment, SolverOptions, adjust
@@ -85,10 +85,6 @@ def adjusted_with_precision(
     noise_fixed : bool
         True where the noise model is not to be estimated.
 
-    Returns
-    -------
-    Adjustment, Precision
-
     Raises
     ------
     DataError
@@ -145,43 +141,23 @@ MIN_POSE_MM = 20.0
 AXIAL_FACTOR = 10.0
 MAX_MISFIT = 8.0  # residuals of a resection relative to the median of the exposures
 
-Frames = Mapping[str, Sequence[Frame]]  # by fluoroscope
 Known = Mapping[str, KnownOrientation]  # by fluoroscope
 
 
 @dataclass(frozen=True)
 class Measured:
-    """A network and what it was made from.
-
-    Attributes
-    ----------
-    network : Network
-    start : Parameters
-        Start values.
-    fluoroscopes : tuple of str
-        Names, in the order of the network.
-    image_size : tuple of (int, int)
-        Width and height [px] by fluoroscope.
-    frames : tuple of Frame
-        The frame of every exposure of the network.
-    target_id : (n,) ndarray of int
-        Of the object points.
-    excluded : tuple of Finding
-        One for every frame that is not used.
-    untilted : tuple of bool
-        By fluoroscope, whether all exposures show flat targets parallel to the image.
-    known : mapping of str to KnownOrientation
-        Orientations that are known beforehand, by fluoroscope.
-    """
+    """A network and what it was made from."""
 
     network: Network
-    start: Parameters
-    fluoroscopes: tuple[str, ...]
-    image_size: tuple[tuple[int, int], ...]
-    frames: tuple[Frame, ...]
-    target_id: NDArray[np.int64]
-    excluded: tuple[Finding, ...]
+    start: Parameters  #: start values
+    fluoroscopes: tuple[str, ...]  #: names, in the order of the network
+    image_size: tuple[tuple[int, int], ...]  #: width and height [px] by fluoroscope
+    frames: tuple[Frame, ...]  #: the frame of every exposure of the network
+    target_id: NDArray[np.int64]  #: (n,) of the object points
+    excluded: tuple[Finding, ...]  #: one for every frame that is not used
+    #: by fluoroscope, whether all exposures show flat targets parallel to the image
     untilted: tuple[bool, ...] = ()
+    #: orientations that are known beforehand, by fluoroscope
     known: Known = field(default_factory=dict)
 
     @property
@@ -207,28 +183,15 @@ class KnownSensor:
 
 @dataclass(frozen=True)
 class EarlierCalibration:
-    """What a calibration with some exposures can take over from one with more of them.
+    """What a calibration with some exposures can take over from one with more of them."""
 
-    Attributes
-    ----------
-    series : mapping of str to Series
-        Corrections by fluoroscope.
-    varying : frozenset of str
-        Fluoroscopes whose distortion differs between exposures.
-    noise : Noise
-    target_id : (n,) ndarray of int
-        Targets with object points, ascending.
-    points_mm : (n, 3) ndarray
-    priors : dict of str to Prior
-        Of the corrections by fluoroscope: those that the last of several such calibrations has
-        found, with which the next one starts.
-    """
-
-    series: Mapping[str, Series]
-    varying: frozenset[str]
+    series: Mapping[str, Series]  #: corrections by fluoroscope
+    varying: frozenset[str]  #: fluoroscopes whose distortion differs between exposures
     noise: Noise
-    target_id: NDArray[np.int64]
-    points_mm: NDArray[np.float64]
+    target_id: NDArray[np.int64]  #: (n,) targets with object points, ascending
+    points_mm: NDArray[np.float64]  #: (n, 3)
+    #: of the corrections by fluoroscope: those that the last of several such calibrations has
+    #: found, with which the next one starts
     priors: dict[str, Prior] = field(default_factory=dict)
 
     def points(self, target_id: np.ndarray) -> NDArray[np.float64]:
@@ -238,20 +201,12 @@ class EarlierCalibration:
 
 @dataclass(frozen=True)
 class StartValues:
-    """Start values from an earlier adjustment of the same exposures, instead of resections.
+    """Start values from an earlier adjustment of the same exposures, instead of resections."""
 
-    Attributes
-    ----------
-    interior : mapping of str to (3,) ndarray
-        xp, yp, c [px] by fluoroscope.
-    exterior : mapping of (str, int) to ((3, 3) ndarray, (3,) ndarray)
-        Rotation and position [mm] by fluoroscope and exposure.
-    earlier : EarlierCalibration, optional
-        That of the same exposures and others; the orientations are those with its corrections.
-    """
-
-    interior: Mapping[str, NDArray[np.float64]]
+    interior: Mapping[str, NDArray[np.float64]]  #: (3,) xp, yp, c [px] by fluoroscope
+    #: (3, 3) rotation and position [mm] by fluoroscope and exposure
     exterior: Mapping[tuple[str, int], tuple[NDArray[np.float64], NDArray[np.float64]]]
+    #: that of the same exposures and others; the orientations are those with its corrections
     earlier: EarlierCalibration | None = None
 
 
@@ -310,26 +265,10 @@ def measured_network(
 ) -> Measured:
     """Return network and start values of the frames of fluoroscopes that are to be calibrated.
 
-    Parameters
-    ----------
-    frames : mapping of str to sequence of Frame
-    phantom : Phantom
-    principal_distance : float, optional
-        Start value [px]; by default it is taken from the observations.
-    known : mapping of str to KnownOrientation, optional
-        Orientations that are known beforehand, by fluoroscope.
-    starts : StartValues, optional
-        Used for a fluoroscope with start values of all its exposures.
-
-    Returns
-    -------
-    Measured
-
-    Raises
-    ------
-    DataError
-        If a frame is invalid, if exposures or targets are too few, or if all exposures show one
-        pose.
+    principal_distance: start value [px]; by default it is taken from the observations. known:
+    orientations that are known beforehand, by fluoroscope. starts: used for a fluoroscope with
+    start values of all its exposures. Raises DataError if a frame is invalid, if exposures or
+    targets are too few, or if all exposures show one pose.
     """
     task = _Task(
         phantom,

@@ -51,20 +51,11 @@ MIN_LEVEL = 1e-30  # of the evidence of a bump that no image point shows
 
 @dataclass(frozen=True)
 class LocalSignal:
-    """Bumps of the windows and bands where the signal varies more.
+    """Bumps of the windows and bands where the signal varies more."""
 
-    Attributes
-    ----------
-    nodes : (n, 2) ndarray
-        Middles of the bumps [px].
-    window : (n,) ndarray of int
-        Window or band of each bump.
-    variances : (w,) ndarray
-        Variances of the heights of the bumps of each of them [px^2], the same for u and v.
-    """
-
-    nodes: NDArray[np.float64]
-    window: NDArray[np.int64]
+    nodes: NDArray[np.float64]  #: (n, 2) middles of the bumps [px]
+    window: NDArray[np.int64]  #: (n,) window or band of each bump
+    #: (w,) variances of the heights of the bumps of each of them [px^2], the same for u and v
     variances: NDArray[np.float64]
 
     @property
@@ -109,17 +100,11 @@ class SineEstimates:
 
     Both times (s, 2) and (2, s, s), with K the prior covariance matrix of the coefficients of one
     coordinate.
-
-    Attributes
-    ----------
-    pull : (s, 2) ndarray
-        Inverse of K times their estimates.
-    evidence : (k, s, s) ndarray
-        Inverse of K less that of K times their covariance times that of K: for u and v, or one
-        for both.
     """
 
-    pull: NDArray[np.float64]
+    pull: NDArray[np.float64]  #: (s, 2) inverse of K times their estimates
+    #: (k, s, s) inverse of K less that of K times their covariance times that of K: for u and v,
+    #: or one for both
     evidence: NDArray[np.float64]
 
     @classmethod
@@ -152,18 +137,7 @@ def with_likely_places(
 ) -> LocalSignal | None:
     """Return the windows and bands with those that raise the marginal likelihood.
 
-    Parameters
-    ----------
-    functions : Functions
-    estimates : SineEstimates
-        With the present places.
-    local : LocalSignal or None
-        Present places.
-
-    Returns
-    -------
-    LocalSignal or None
-        The present places where there are no more.
+    estimates: with the present places, local. Returns these where there are no more.
     """
     shown = _ShownBumps.of(functions, estimates)
     taken = np.zeros(len(shown.nodes), dtype=bool)

@@ -13,14 +13,20 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from ..correction.base import CorrectionModel
-from ..correction.models import SeriesModel
 from ..correction.neighbours import KnnModel, LocalLinearModel, NeighbourModel, NeighbourTable
+from ..correction.registry import SeriesModel
 from ..correction.series import sd_grid_pixels
 from ..photogrammetry.precision import Precision
 from ..photogrammetry.rotations import vector_from_matrix
 from .collocation import CollocationTerms
-from .estimator import AdjustedTerms, AdjustmentProblem, exposure_folds
-from .gauge import GaugeKind, gauge_basis, gauge_rows
+from .estimator import (
+    AdjustedTerms,
+    AdjustmentProblem,
+    GaugeKind,
+    exposure_folds,
+    gauge_basis,
+    gauge_rows,
+)
 from .neighbour_regression import CrossValidation
 from .parametric import StepwiseTerms
 from .priors import GAUGE_SD_PX, prior_precision
@@ -182,20 +188,12 @@ def better_model(run: SelfCalibration, terms: AdjustedTerms) -> str | None:
 
 @dataclass(frozen=True)
 class _SeriesPrior:
-    """Prior precisions of the coefficients of a series, in parts.
+    """Prior precisions of the coefficients of a series, in parts."""
 
-    Attributes
-    ----------
-    trend : (2t, 2t) ndarray
-        Of the trend, u first.
-    signal : (s, s) ndarray
-        Of the sines, the same for u and v.
-    gauge : (2, g, t + s) ndarray
-        Products with the coefficients of u and of v whose sums have the precision of one.
-    """
-
-    trend: NDArray[np.float64]
-    signal: NDArray[np.float64]
+    trend: NDArray[np.float64]  #: (2t, 2t) of the trend, u first
+    signal: NDArray[np.float64]  #: (s, s) of the sines, the same for u and v
+    #: (2, g, t + s) products with the coefficients of u and of v whose sums have the precision of
+    #: one
     gauge: NDArray[np.float64]
 
 
@@ -224,17 +222,7 @@ def _held_out(
 ) -> np.ndarray:
     """Predictions (N, 2) of values (N, 2) by functions fitted without the own fold.
 
-    Parameters
-    ----------
-    prior : _SeriesPrior
-    functions : (N, m) ndarray
-        Trend, then sines.
-    values : (N, 2) ndarray
-    weight, fold : (N,) ndarray
-
-    Returns
-    -------
-    (N, 2) ndarray
+    functions: (N, m) trend, then sines. values: (N, 2). weight, fold: (N,). Returns (N, 2).
     """
     out = np.empty_like(values)
     root = np.sqrt(weight)[:, None]

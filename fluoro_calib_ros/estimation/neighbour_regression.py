@@ -18,8 +18,14 @@ from ..correction.neighbours import (
     least_squares_map,
 )
 from ..correction.series import Series
-from .estimator import RegressionStep, TrainingPoints, exposure_folds, require_training
-from .gauge import gauge_basis, gauge_coefficients
+from .estimator import (
+    RegressionStep,
+    TrainingPoints,
+    exposure_folds,
+    gauge_basis,
+    gauge_coefficients,
+    require_training,
+)
 
 # Choice of k by cross-validation with whole exposures held out (Eq. 2 of Chow et al.).
 
@@ -138,12 +144,7 @@ class NeighbourRegression(RegressionStep[NeighbourModel]):
 
     The image points do not move, so neighbours are looked up again only when the inliers change.
 
-    Parameters
-    ----------
-    model_type : type of NeighbourModel
-    points : TrainingPoints
-    k : int or None
-        Number of neighbours; None: chosen by cross-validation.
+    k: number of neighbours; None: chosen by cross-validation.
     """
 
     def __init__(

@@ -24,9 +24,13 @@ from ..correction.angle_field import harmonics
 from ..correction.calibration_record import HARMONICS
 from ..photogrammetry.collinearity import project
 from ..photogrammetry.network import Network
-from ..photogrammetry.relative_orientation import discrepancies, mean_pose
-from ..photogrammetry.relative_pose import RelativeConstraint, RelativePose
-from ..photogrammetry.unknowns import Parameters
+from ..photogrammetry.unknowns import (
+    Parameters,
+    RelativeConstraint,
+    RelativePose,
+    discrepancies,
+    mean_pose,
+)
 from .angle_fit import can_be_fitted
 
 # A pair of exposures is left out of the mean where its deviation is so many times its standard
@@ -44,69 +48,37 @@ MOVED_SHARE = 0.2  # of the variance about a trend that is left when the rig was
 
 @dataclass(frozen=True)
 class PairScatter:
-    """How the relative orientations of k pairs of exposures scatter about the one of the rig.
-
-    Attributes
-    ----------
-    fluoroscopes : (str, str)
-    exposures : (k,) ndarray of int
-    off_px : (k,) ndarray
-        RMS displacement of a coordinate of the image points of the second fluoroscope [px], less
-        what the angle of a C-arm explains.
-    off_sd : (k,) ndarray
-        Deviation over its standard deviation, also less that.
-    used : (k,) ndarray of bool
-        Whether the pair has part in the mean.
-    growth : float
-        Factor, at least 1, by which the used pairs scatter more than their standard deviations.
-    unexplained : float
-        The same, less what the angle of a C-arm explains.
-    angle_px : float
-        RMS displacement that the angle explains [px], 0 where there is none.
-    columns : (k, p) ndarray
-        Functions of the angle, the first of them 1.
-    corrected : bool
-        Whether the correction of one of them changes with the angle.
-    turn : (k, 3, 3) ndarray
-        Rotations from the sensor of the first fluoroscope to that of the second.
-    shift_mm : (k, 3) ndarray
-        Of the second source in the sensor frame of the first.
-    """
+    """How the relative orientations of k pairs of exposures scatter about the one of the rig."""
 
     fluoroscopes: tuple[str, str]
-    exposures: NDArray[np.int64]
+    exposures: NDArray[np.int64]  #: (k,)
+    #: (k,) RMS displacement of a coordinate of the image points of the second fluoroscope [px],
+    #: less what the angle of a C-arm explains
     off_px: NDArray[np.float64]
-    off_sd: NDArray[np.float64]
-    used: NDArray[np.bool_]
+    off_sd: NDArray[np.float64]  #: (k,) deviation over its standard deviation, also less that
+    used: NDArray[np.bool_]  #: (k,) whether the pair has part in the mean
+    #: factor, at least 1, by which the used pairs scatter more than their standard deviations
     growth: float
-    unexplained: float
-    angle_px: float
-    columns: NDArray[np.float64]
-    corrected: bool
+    unexplained: float  #: the same, less what the angle of a C-arm explains
+    angle_px: float  #: RMS displacement that the angle explains [px], 0 where there is none
+    columns: NDArray[np.float64]  #: (k, p) functions of the angle, the first of them 1
+    corrected: bool  #: whether the correction of one of them changes with the angle
+    #: (k, 3, 3) rotations from the sensor of the first fluoroscope to that of the second
     turn: NDArray[np.float64]
-    shift_mm: NDArray[np.float64]
+    shift_mm: NDArray[np.float64]  #: (k, 3) of the second source in the sensor frame of the first
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """Which pairs agree on the relative orientation of a rig.
+    """Which pairs agree on the relative orientation of a rig."""
 
-    Attributes
-    ----------
-    used : (k,) ndarray of bool
-    off_sd : (k,) ndarray
-        Deviations of all pairs over their standard deviations, less the trend.
-    growth, unexplained : float
-        See `PairScatter`.
-    trend : (k, 6) ndarray
-        What the angle explains: translation [mm], rotation [rad].
-    """
-
-    used: NDArray[np.bool_]
+    used: NDArray[np.bool_]  #: (k,)
+    #: (k,) deviations of all pairs over their standard deviations, less the trend
     off_sd: NDArray[np.float64]
+    #: see `PairScatter`
     growth: float
     unexplained: float
-    trend: NDArray[np.float64]
+    trend: NDArray[np.float64]  #: (k, 6) what the angle explains: translation [mm], rotation [rad]
 
 
 def functions_of_angles(angles: Sequence[np.ndarray]) -> NDArray[np.float64]:

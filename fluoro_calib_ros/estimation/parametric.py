@@ -24,8 +24,14 @@ from ..correction.terms import HIGHEST, expert_terms
 from ..photogrammetry.additional_parameters import AdditionalParameters
 from ..photogrammetry.noise_estimation import LOOSE
 from ..photogrammetry.precision import information_of_additional
-from .estimator import AdjustedTerms, AdjustmentProblem, coefficients_of, prior_of_additional
-from .gauge import GaugeKind, gauge_basis
+from .estimator import (
+    AdjustedTerms,
+    AdjustmentProblem,
+    GaugeKind,
+    coefficients_of,
+    gauge_basis,
+    prior_of_additional,
+)
 
 if TYPE_CHECKING:
     from ..photogrammetry.adjustment import Adjustment
@@ -51,17 +57,8 @@ def squared_error_of_kept(
 ) -> NDArray[np.float64]:
     """Expected squared errors (t,) of terms, in units of the variances of their estimates.
 
-    Parameters
-    ----------
-    ratio : (t,) ndarray
-        Estimates without a prior, over their standard deviations.
-    kept : (t,) ndarray
-        Parts of these estimates that are kept, 0 to 1.
-
-    Returns
-    -------
-    (t,) ndarray
-        Posterior variances about the kept values.
+    ratio: (t,) estimates without a prior, over their standard deviations. kept: (t,) parts of
+    these estimates that are kept, 0 to 1. Returns (t,) posterior variances about the kept values.
     """
     half = np.square(ratio) / 2
     x, weight = np.polynomial.legendre.leggauss(NODES)
@@ -89,18 +86,8 @@ def covariance_with_uncertain_terms(
 
     Each term in turn, the prior variances of the others taken as known.
 
-    Parameters
-    ----------
-    to_terms : (t, p) ndarray
-        From coefficients to terms.
-    variance : (t,) ndarray
-        Prior variances of the terms.
-    mean, covariance : (p,) and (p, p) ndarray
-        Posterior of the coefficients with these variances.
-
-    Returns
-    -------
-    (p, p) ndarray
+    to_terms: (t, p) from coefficients to terms. variance: (t,) prior variances of the terms. mean,
+    covariance: (p, p) posterior of the coefficients with these variances. Returns (p, p).
     """
     mixed = covariance @ to_terms.T
     of_terms = np.einsum('tp,pt->t', to_terms, mixed)
@@ -119,15 +106,7 @@ NEIGHBOURS = 8  # of an image point, whose mean residual shows the trend
 
 
 class StepwiseTerms(AdjustedTerms):
-    """The 31 terms of every fluoroscope of a network, and which of them are in the model.
-
-    Attributes
-    ----------
-    names : list of str
-        Names of the terms.
-    selected : list of (31,) ndarray of bool
-        Terms in the model, by fluoroscope.
-    """
+    """The 31 terms of every fluoroscope of a network, and which of them are in the model."""
 
     intermediate_tolerance = LOOSE  # the tests of significance need a solution
     needs_solution = True
@@ -154,6 +133,7 @@ class StepwiseTerms(AdjustedTerms):
             self._values.append(np.einsum('nm,tam->nat', values, terms_f))
             count = min(NEIGHBOURS + 1, len(uv))
             self._near.append(cKDTree(uv).query(uv, k=np.arange(2, count + 1))[1])
+        #: by fluoroscope, which terms (31,) are in the model
         self.selected = [np.zeros(len(terms), dtype=bool) for _ in self.functions]
         self._rejected = [np.zeros(len(terms), dtype=bool) for _ in self.functions]
 
@@ -266,18 +246,8 @@ class StepwiseTerms(AdjustedTerms):
 def _without_gauge(terms: np.ndarray, values: np.ndarray, gauge: np.ndarray) -> np.ndarray:
     """Terms (t, 2, m) less their part in the gauge.
 
-    Parameters
-    ----------
-    terms : (t, 2, m) ndarray
-        Coefficients of the polynomials in u and v.
-    values : (n, m) ndarray
-        Polynomials at the image points.
-    gauge : (n, 2, g) ndarray
-        Gauge at the image points.
-
-    Returns
-    -------
-    (t, 2, m) ndarray
+    terms: (t, 2, m) coefficients of the polynomials in u and v. values: (n, m) polynomials at the
+    image points. gauge: (n, 2, g) gauge at the image points. Returns (t, 2, m).
     """
     if not gauge.shape[2]:
         return terms

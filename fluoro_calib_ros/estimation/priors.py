@@ -20,7 +20,7 @@ from scipy.linalg import block_diag, cho_factor, cho_solve
 
 from ..correction.series import Functions
 from ..correction.terms import ABSENT_VARIANCE, trend_transformation
-from .gauge import GaugeKind, gauge_rows
+from .estimator import GaugeKind, gauge_rows
 from .local_signal import LocalSignal, SineEstimates, bumps, largest_gain, with_likely_places
 from .parametric import covariance_with_uncertain_terms
 from .signal import Signal, SignalEquations, most_likely_signal, starting_signal
@@ -127,16 +127,7 @@ def covariance_of_series(
 
     Whether a ring exists is the result of a test, and taken as known.
 
-    Parameters
-    ----------
-    functions : Functions
-    prior : Prior
-    coefficients, covariance : (2m,) and (2m, 2m) ndarray
-        Posterior with this prior.
-
-    Returns
-    -------
-    (2m, 2m) ndarray
+    coefficients, covariance: (2m, 2m) posterior with this prior. Returns (2m, 2m).
     """
     to_terms, count = trend_transformation(functions.degree, functions.rings)
     rows = np.arange(count - 4 * functions.rings)
@@ -153,19 +144,8 @@ def gauge_precision(
 ) -> np.ndarray:
     """Precision matrix that keeps a series orthogonal to the gauge at image points.
 
-    Parameters
-    ----------
-    values : (n, m) ndarray
-        Functions of the series at the image points.
-    uv : (n, 2) ndarray
-        Image points [px].
-    interior : (3,) ndarray
-        xp, yp, c [px].
-    kind : GaugeKind
-
-    Returns
-    -------
-    (2m, 2m) ndarray
+    values: (n, m) functions of the series at the image points. uv: (n, 2) image points [px].
+    interior: (3,) xp, yp, c [px]. Returns (2m, 2m).
     """
     rows = gauge_rows(values, uv, interior, kind)
     return rows.T @ rows / GAUGE_SD_PX**2
@@ -182,19 +162,8 @@ def most_likely_prior(
 
     It is to be repeated until the prior does not change.
 
-    Parameters
-    ----------
-    functions : Functions
-    information, right : (2m, 2m) and (2m,) ndarray
-        Normal equations of the coefficients without a prior, all other unknowns eliminated.
-    gauge : (2m, 2m) ndarray
-        Precision matrix of the gauge.
-    prior : Prior
-        Present prior.
-
-    Returns
-    -------
-    Prior
+    information, right: (2m,) normal equations of the coefficients without a prior, all other
+    unknowns eliminated. gauge: (2m, 2m) precision matrix of the gauge. prior: present prior.
     """
     if functions.modes:
         prior = _most_likely_signal(functions, information + gauge, right, prior)
@@ -262,18 +231,8 @@ def with_shown_places(
     Orientations are taken to be known, and the trend to have no prior, so that u and v have the
     same matrices. The signal is estimated anew only where a place may be found.
 
-    Parameters
-    ----------
-    functions : Functions
-    values : (n, m) ndarray
-        Functions at the image points, divided by the standard deviation of their noise.
-    observed : (n, 2) ndarray
-        Corrections that they show, divided likewise.
-    prior : Prior
-
-    Returns
-    -------
-    Prior
+    values: (n, m) functions at the image points, divided by the standard deviation of their noise.
+    observed: (n, 2) corrections that they show, divided likewise.
     """
     t = functions.trend
     matrix = values.T @ values

@@ -47,23 +47,12 @@ MAX_VARYING_EXPOSURES = 60  # of a fluoroscope that can have terms of their own,
 
 @dataclass(frozen=True)
 class Solution:
-    """A solution of the adjustment, with the priors renewed.
-
-    Attributes
-    ----------
-    parts : sequence of FluoroscopeTerms
-        By fluoroscope.
-    adjustment : Adjustment
-    equations : sequence of SeriesEquations
-        By fluoroscope, linearised at the solution.
-    is_steady : bool
-        Whether the renewal changed no prior visibly.
-    """
+    """A solution of the adjustment, with the priors renewed."""
 
     parts: Sequence[FluoroscopeTerms]
     adjustment: Adjustment
-    equations: Sequence[SeriesEquations]
-    is_steady: bool
+    equations: Sequence[SeriesEquations]  #: by fluoroscope, linearised at the solution
+    is_steady: bool  #: whether the renewal changed no prior visibly
 
     @property
     def coefficients(self) -> tuple[np.ndarray, ...]:
@@ -78,23 +67,14 @@ class Solution:
 
 @dataclass(frozen=True)
 class Change:
-    """Terms with which the network is to be adjusted again.
+    """Terms with which the network is to be adjusted again."""
 
-    Attributes
-    ----------
-    modes : sequence of int
-        Modes up to which each fluoroscope gets all sines.
-    priors : mapping of int to Prior
-        By number of the fluoroscope, where it changes.
-    exposure_terms : mapping of int to ExposureTerms
-        Of fluoroscopes whose distortion varies.
-    coefficients : mapping of int to (p,) ndarray
-        With which to continue, where they are not those of the solution.
-    """
-
-    modes: Sequence[int]
+    modes: Sequence[int]  #: modes up to which each fluoroscope gets all sines
+    #: by number of the fluoroscope, where it changes
     priors: Mapping[int, Prior] = field(default_factory=dict)
+    #: of fluoroscopes whose distortion varies
     exposure_terms: Mapping[int, ExposureTerms] = field(default_factory=dict)
+    #: (p,) with which to continue, where they are not those of the solution
     coefficients: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
 
 

@@ -96,12 +96,8 @@ class KnnRegressor(KNeighborsRegressor):
 class LocalLinearRegressor(RegressorMixin, BaseEstimator):
     """The model `local_linear`: a polynomial trend, and planes fitted to the nearest remainders.
 
-    Parameters
-    ----------
-    n_neighbors : int
-        Number of neighbours; at most the number of samples is used.
-    trend_degree : int or None
-        Degree of the trend; None: there is none, as in the model `hybrid`.
+    n_neighbors: number of neighbours; at most the number of samples is used. trend_degree: degree
+    of the trend; None: there is none, as in the model `hybrid`.
     """
 
     def __init__(self, n_neighbors: int = 30, trend_degree: int | None = 3) -> None:

@@ -18,71 +18,39 @@ from ..exposures.phantom import Phantom
 from ..findings import Finding
 from ..photogrammetry.rotations import matrix_from_quaternion
 from .constraints import RelativeOrientation
-from .diagnostics import (
-    AdjustmentStatistics,
-    ResidualTable,
-)
-from .fixed_calibration import (
-    SolvedNetwork,
-)
-from .initial_network import (
-    StartValues,
-)
-from .rounds import Round, SelfCalibration
+from .fixed_calibration import SolvedNetwork
+from .initial_network import StartValues
+from .rounds import AdjustmentStatistics, ResidualTable, Round, SelfCalibration
 
 ROUNDING = 1e-6  # of the information of object points, relative to that of the survey
 
 
 @dataclass(frozen=True)
 class ExposureResult:
-    """Exterior orientation of an exposure.
+    """Exterior orientation of an exposure."""
 
-    Attributes
-    ----------
-    exposure : int
-        Its number.
-    position_mm : (3,) ndarray
-        Position of the source.
-    quaternion_wxyz : (4,) ndarray
-        Rotation phantom -> sensor.
-    sd_mm, sd_rad : (3,) ndarray
-        Standard deviations of the position, and of the rotation about the axes of the sensor.
-    """
-
-    exposure: int
-    position_mm: NDArray[np.float64]
-    quaternion_wxyz: NDArray[np.float64]
+    exposure: int  #: its number
+    position_mm: NDArray[np.float64]  #: (3,) position of the source
+    quaternion_wxyz: NDArray[np.float64]  #: (4,) rotation phantom -> sensor
+    #: (3,) standard deviations of the position, and of the rotation about the axes of the sensor
     sd_mm: NDArray[np.float64]
     sd_rad: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class FluoroscopeResult:
-    """Figures of one fluoroscope.
+    """Figures of one fluoroscope."""
 
-    Attributes
-    ----------
-    interior, interior_sd : (3,) ndarray
-        xp, yp, c and their standard deviations [px].
-    image_size : (int, int)
-        Width and height [px].
-    model_kind : str
-    k : int
-        Number of neighbours of the model.
-    rmse_before, rmse_after : (2,) ndarray
-        RMSE of the inlier residuals in u and v [px], without and with the correction.
-    observations, inliers : int
-        Numbers of image points.
-    exposures : tuple of ExposureResult
-    """
-
+    #: (3,) xp, yp, c and their standard deviations [px]
     interior: NDArray[np.float64]
     interior_sd: NDArray[np.float64]
-    image_size: tuple[int, int]
+    image_size: tuple[int, int]  #: width and height [px]
     model_kind: str
-    k: int
+    k: int  #: number of neighbours of the model
+    #: (2,) RMSE of the inlier residuals in u and v [px], without and with the correction
     rmse_before: NDArray[np.float64]
     rmse_after: NDArray[np.float64]
+    #: numbers of image points
     observations: int
     inliers: int
     exposures: tuple[ExposureResult, ...]
@@ -90,21 +58,12 @@ class FluoroscopeResult:
 
 @dataclass(frozen=True)
 class Targets:
-    """Object points.
+    """Object points."""
 
-    Attributes
-    ----------
-    target_id : (n,) ndarray
-    xyz_mm : (n, 3) ndarray
-    covariance : (n, 3, 3) ndarray
-        [mm^2]
-    joint_covariance : (3n, 3n) ndarray or None
-        Of all object points with each other [mm^2]; None where they are too many.
-    """
-
-    target_id: NDArray[np.int64]
-    xyz_mm: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    target_id: NDArray[np.int64]  #: (n,)
+    xyz_mm: NDArray[np.float64]  #: (n, 3)
+    covariance: NDArray[np.float64]  #: (n, 3, 3) [mm^2]
+    #: (3n, 3n) of all object points with each other [mm^2]; None where they are too many
     joint_covariance: NDArray[np.float64] | None = None
 
 
@@ -232,18 +191,8 @@ def _combined_jointly(
     much in common: the datum, which is the same survey in every part. Information of single beads
     would count it once a part.
 
-    Parameters
-    ----------
-    parts : sequence of Targets
-    joint : sequence of ndarray
-        Their joint covariances [mm^2].
-    further : (n, 3, 3) ndarray
-        Information of the survey that is subtracted.
-    phantom : Phantom
-
-    Returns
-    -------
-    Targets
+    joint: their joint covariances [mm^2]. further: (n, 3, 3) information of the survey that is
+    subtracted.
     """
     target_id = np.unique(np.concatenate([p.target_id for p in parts]))
     n = len(target_id)

@@ -27,10 +27,10 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
 from ..errors import DataError
 from ..exposures.collector import displacement
-from ..exposures.frame import Frame, angles_of, validate_frame
+from ..exposures.frame import Frame, Frames, angles_of, validate_frame
 from ..exposures.phantom import Phantom
 from ..photogrammetry.adjustment import Adjustment
 from ..photogrammetry.collinearity import to_sensor
@@ -39,14 +39,15 @@ from ..photogrammetry.known_orientation import HELD_SD_MM, HELD_SD_RAD
 from ..photogrammetry.network import Network
 from ..photogrammetry.normal_equations import normal_equations
 from ..photogrammetry.precision import covariance_blocks
-from ..photogrammetry.relative_orientation import (
+from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation, with_datum_of_points
+from ..photogrammetry.rotations import matrix_from_quaternion
+from ..photogrammetry.unknowns import (
+    RelativeConstraint,
+    RelativePose,
     discrepancies_with_jacobian,
     mean_pose,
     relative_poses,
 )
-from ..photogrammetry.relative_pose import RelativeConstraint, RelativePose
-from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation, with_datum_of_points
-from ..photogrammetry.rotations import matrix_from_quaternion
 from .constraints import paired_exposures
 from .fixed_calibration import (
     fixed_corrections,
@@ -56,7 +57,6 @@ from .fixed_calibration import (
 )
 from .initial_network import (
     MIN_TARGETS_OF_EXPOSURE,
-    Frames,
     Known,
     Measured,
     StartValues,
@@ -71,9 +71,7 @@ FRAME_ID = 'lab'
 
 
 def orientation_of_known(
-    known: Known,
-    figures: Mapping[str, FluoroscopeResult],
-    calibrations: Mapping[str, FluoroscopeCalibration],
+    known: Known, figures: Mapping[str, FluoroscopeResult], calibrations: Calibrations
 ) -> RigOrientation:
     """Return the orientation of the rig in the frame in which its fluoroscopes are known.
 
@@ -117,8 +115,6 @@ def _mean_rotation(figures: FluoroscopeResult) -> np.ndarray:
     return u @ vt
 
 
-Calibrations = Mapping[str, FluoroscopeCalibration]
-
 # Exposures that are used: with more of them the interior orientations remain the uncertainty.
 MAX_PAIRS = 30
 # The phantom moves where the median displacement between two frames of a capture exceeds both
@@ -134,25 +130,14 @@ ASSUMED_SD_PX = 1.0
 
 @dataclass(frozen=True)
 class _FixedAdjustment:
-    """An adjustment of m exposures with the calibrations of F fluoroscopes fixed.
-
-    Attributes
-    ----------
-    measured : Measured
-    after : Adjustment
-    by_interior : (m, 6, 3F) ndarray
-        Derivatives de/di of the exteriors by the interiors.
-    blocks : CovarianceBlocks
-        Of the adjustment with the interiors among the unknowns.
-    interiors : (3F, 3F) ndarray
-        Covariance of the interiors.
-    """
+    """An adjustment of m exposures with the calibrations of F fluoroscopes fixed."""
 
     measured: Measured
     after: Adjustment
+    #: (m, 6, 3F) derivatives de/di of the exteriors by the interiors
     by_interior: NDArray[np.float64]
-    blocks: CovarianceBlocks
-    interiors: NDArray[np.float64]
+    blocks: CovarianceBlocks  #: of the adjustment with the interiors among the unknowns
+    interiors: NDArray[np.float64]  #: (3F, 3F) covariance of the interiors
 
     def covariance(self, e: np.ndarray, f: np.ndarray) -> NDArray[np.float64]:
         """Covariances (k, 6, 6) of exposures e (k,) with others f (k,), the interiors known."""
@@ -173,22 +158,12 @@ class _FixedAdjustment:
 
 @dataclass(frozen=True)
 class _Exteriors:
-    """Exterior orientations of F fluoroscopes in the frame of a rig.
+    """Exterior orientations of F fluoroscopes in the frame of a rig."""
 
-    Attributes
-    ----------
-    rotation : (F, 3, 3) ndarray
-    position_mm : (F, 3) ndarray
-    covariance : (6F, 6F) ndarray
-        With the interiors known.
-    by_interior : (6F, 3F) ndarray
-        Derivatives by the interiors.
-    """
-
-    rotation: NDArray[np.float64]
-    position_mm: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-    by_interior: NDArray[np.float64]
+    rotation: NDArray[np.float64]  #: (F, 3, 3)
+    position_mm: NDArray[np.float64]  #: (F, 3)
+    covariance: NDArray[np.float64]  #: (6F, 6F) with the interiors known
+    by_interior: NDArray[np.float64]  #: (6F, 3F) derivatives by the interiors
 
 
 @dataclass(frozen=True)
@@ -225,10 +200,6 @@ def orientation_of_capture(
     loss : str
         Noise model of the image points.
 
-    Returns
-    -------
-    RigOrientation
-
     Raises
     ------
     DataError
@@ -260,50 +231,6 @@ def orientation_of_capture(
     return _orientation(fixed, exteriors, calibrations, origin)
 
 
-def orientation_of_exposures(
-    frames: Frames,
-    phantom: Phantom,
-    calibrations: Calibrations,
-    loss: str = 'student_t',
-    starts: StartValues | None = None,
-) -> RigOrientation:
-    """Orientation in the optical frame of the first fluoroscope, from exposures of the phantom.
-
-    The relative orientation is the weighted mean of those of the exposures, a few of which are
-    left out where they contradict the others. Where these scatter more than their standard
-    deviations, its covariance is enlarged accordingly. The frame is the estimated one of the
-    sensor, and its covariance is given a datum where the phantom was (`with_datum_of_points`).
-
-    Parameters
-    ----------
-    frames : mapping of str to sequence of Frame
-        Those of the same number belong together.
-    phantom : Phantom
-    calibrations : mapping of str to FluoroscopeCalibration
-        Fixed.
-    loss : str
-        Noise model of the image points.
-    starts : StartValues, optional
-        Of an earlier adjustment of the frames.
-
-    Returns
-    -------
-    RigOrientation
-
-    Raises
-    ------
-    DataError
-        As `orientation_of_capture`, and if no exposures can be paired.
-    """
-    return orientation_and_scatter(
-        frames,
-        phantom,
-        calibrations=calibrations,
-        loss=loss,
-        starts=starts,
-    )[0]
-
-
 def orientation_and_scatter(
     frames: Frames,
     phantom: Phantom,
@@ -311,9 +238,17 @@ def orientation_and_scatter(
     loss: str = 'student_t',
     starts: StartValues | None = None,
 ) -> tuple[RigOrientation, tuple[PairScatter, ...]]:
-    """Return `orientation_of_exposures`, and how the exposures scatter about it.
+    """Orientation in the optical frame of the first fluoroscope, from exposures of the phantom.
 
-    There is one PairScatter for every fluoroscope but the first. Raises DataError.
+    The relative orientation is the weighted mean of those of the exposures, a few of which are
+    left out where they contradict the others. Where these scatter more than their standard
+    deviations, its covariance is enlarged accordingly. The frame is the estimated one of the
+    sensor, and its covariance is given a datum where the phantom was (`with_datum_of_points`).
+
+    frames: those of the same number belong together. calibrations: fixed. starts: of an earlier
+    adjustment of the frames. Returns also how the exposures scatter about the orientation, a
+    PairScatter for every fluoroscope but the first. Raises DataError as `orientation_of_capture`,
+    and if no exposures can be paired.
     """
     _validate(frames, phantom, calibrations)
     paired = _paired(frames)
@@ -499,10 +434,7 @@ def _unpaired(names: Sequence[str], b: int) -> str:
 
 
 def _adjusted(
-    measured: Measured,
-    calibrations: Calibrations,
-    loss: str,
-    noise_fixed: bool,
+    measured: Measured, calibrations: Calibrations, loss: str, noise_fixed: bool
 ) -> _FixedAdjustment:
     """Adjust a network with the calibrations fixed.
 

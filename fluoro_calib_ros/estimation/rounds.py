@@ -1,20 +1,31 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The rounds of a self-calibration, and its result."""
+"""The rounds of a self-calibration, its result, and the diagnostics of its adjustments."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..correction.angle_field import AngleField
 from ..correction.base import CorrectionModel
+from ..errors import DataError
+from ..findings import Finding, Kind, Severity
 from ..photogrammetry.adjustment import Adjustment
+from ..photogrammetry.diagnosis import (
+    describe_directions,
+    high_correlations,
+    undetermined_directions,
+    undetermined_interiors,
+)
+from ..photogrammetry.outliers import find_outliers
 from ..photogrammetry.precision import Precision
+from ..photogrammetry.unknowns import discrepancies
 from .initial_network import Measured
 
 SETTLED_PX = 2e-3  # RMS change of the correction below which a round is the last
@@ -22,77 +33,41 @@ SETTLED_PX = 2e-3  # RMS change of the correction below which a round is the las
 
 @dataclass(frozen=True)
 class Round:
-    """One round of a self-calibration.
+    """One round of a self-calibration."""
 
-    Attributes
-    ----------
-    iteration : int
-        Number of the round, from 1.
-    F : float
-        Negative log-likelihood of the adjustment.
-    G : float
-        Weighted square sum of the cross-validation; of the inlier residuals where the model is
-        estimated in the adjustment.
-    k : dict of str to int
-        Number of neighbours by fluoroscope; 0 for a model without.
-    rmse : dict of str to (2,) ndarray
-        RMSE of the inlier residuals in u and v [px], by fluoroscope.
-    quadratic : float
-        Robustly weighted square sum of the residuals [px^2].
-    change : float
-        RMS change of the correction that the next round would make [px].
-    """
-
-    iteration: int
-    F: float
+    iteration: int  #: number of the round, from 1
+    F: float  #: negative log-likelihood of the adjustment
+    #: weighted square sum of the cross-validation; of the inlier residuals where the model is
+    #: estimated in the adjustment
     G: float
-    k: Mapping[str, int]
+    k: Mapping[str, int]  #: number of neighbours by fluoroscope; 0 for a model without
+    #: (2,) RMSE of the inlier residuals in u and v [px], by fluoroscope
     rmse: Mapping[str, NDArray[np.float64]]
-    quadratic: float
-    change: float
+    quadratic: float  #: robustly weighted square sum of the residuals [px^2]
+    change: float  #: RMS change of the correction that the next round would make [px]
 
 
 @dataclass(frozen=True)
 class SelfCalibration:
-    """Result of a self-calibration.
+    """Result of a self-calibration."""
 
-    Attributes
-    ----------
-    measured : Measured
-        The network, with the additional parameters of the model.
-    before, after : Adjustment
-        Adjustments without correction and with the final one.
-    precision : Precision
-        Of the adjustment after.
-    correction : (N, 2) ndarray
-        Correction of the image points [px], additional parameters included.
-    trained : (N,) ndarray of bool
-        Image points to which the models were fitted.
-    models : dict of str to CorrectionModel
-        By fluoroscope.
-    history : tuple of Round
-    converged : bool
-        False where the largest number of rounds ended it.
-    stated : Precision or None
-        With the errors of the models (see `model_errors`); None: these are in the precision.
-    between_exposures : mapping of str to (i,) ndarray
-        Variances [px^2], at the inliers of a fluoroscope, by which its distortion differs between
-        exposures, without what orientations absorb.
-    angle_fields : mapping of str to AngleField
-        Of the fluoroscopes whose distortion changes with the angle of the C-arm.
-    """
-
-    measured: Measured
+    measured: Measured  #: the network, with the additional parameters of the model
+    #: adjustments without correction and with the final one
     before: Adjustment
     after: Adjustment
-    precision: Precision
+    precision: Precision  #: of the adjustment after
+    #: (N, 2) correction of the image points [px], additional parameters included
     correction: NDArray[np.float64]
-    trained: NDArray[np.bool_]
-    models: Mapping[str, CorrectionModel]
+    trained: NDArray[np.bool_]  #: (N,) image points to which the models were fitted
+    models: Mapping[str, CorrectionModel]  #: by fluoroscope
     history: tuple[Round, ...]
-    converged: bool
+    converged: bool  #: False where the largest number of rounds ended it
+    #: with the errors of the models (see `model_errors`); None: these are in the precision
     stated: Precision | None = None
+    #: (i,) variances [px^2], at the inliers of a fluoroscope, by which its distortion differs
+    #: between exposures, without what orientations absorb
     between_exposures: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
+    #: of the fluoroscopes whose distortion changes with the angle of the C-arm
     angle_fields: Mapping[str, AngleField] = field(default_factory=dict)
 
     @property
@@ -156,3 +131,232 @@ def rmse_of_inliers(adjustment: Adjustment, rows: np.ndarray) -> np.ndarray:
     """RMSE (2,) [px] in u and v of the raw inlier residuals of the image points rows."""
     r = adjustment.residuals[rows][adjustment.inliers[rows]]
     return np.sqrt(np.mean(r * r, axis=0)) if len(r) else np.full(2, np.nan)
+
+
+# Statistics and residuals of adjustments, as they are reported.
+
+
+@dataclass(frozen=True)
+class AdjustmentStatistics:
+    """Statistics of one adjustment and of its network."""
+
+    fluoroscopes: tuple[str, ...]
+    loss: str  #: noise model of the image points
+    #: scale of the noise: standard deviation of an image coordinate of weight one [px], or its
+    #: ratio to sigma where sigma is given
+    sigma0: float
+    nu: float  #: degrees of freedom of the Student-t; infinite for other noise models
+    #: weighted square sum of all residuals over the degrees of freedom; expected: 1
+    variance_factor: float
+    #: scalar observations without priors, and unknowns
+    observations: int
+    unknowns: int
+    #: sum of the redundancy numbers; with priors, as those of a signal, it is more than
+    #: observations - unknowns
+    degrees_of_freedom: float
+    image_points: int
+    outliers: int
+    exposures: int
+    targets: int
+    #: of the image coordinates of weight one half or more
+    least_redundancy: float
+    mean_redundancy: float
+    #: image points of a target
+    least_rays: float
+    mean_rays: float
+
+
+@dataclass(frozen=True)
+class ResidualTable:
+    """Residuals of all image points of adjustments."""
+
+    fluoroscope: np.ndarray  #: (N,)
+    #: (N,)
+    exposure: NDArray[np.int64]
+    target_id: NDArray[np.int64]
+    uv: NDArray[np.float64]  #: (N, 2) observed pixels
+    correction: NDArray[np.float64]  #: (N, 2) correction [px]
+    residual: NDArray[np.float64]  #: (N, 2) observed - correction - projected [px]
+    #: (N, 2) redundancy numbers: part of an error that the residual shows
+    redundancy: NDArray[np.float64]
+    weight: NDArray[np.float64]  #: (N,) robust weights, 0 to about 1
+    #: (N,) beyond the core of the noise: four standard deviations, more where the tails are heavy
+    #: or the image points of the exposure scatter more than those of others
+    outlier: NDArray[np.bool_]
+
+    @classmethod
+    def joined(cls, parts: Sequence[ResidualTable]) -> ResidualTable:
+        """Return one table from several."""
+        return cls(
+            *(
+                np.concatenate([getattr(part, name) for part in parts])
+                for name in cls.__dataclass_fields__
+            )
+        )
+
+
+def statistics_of(
+    measured: Measured, adjustment: Adjustment, precise: Precision
+) -> AdjustmentStatistics:
+    """Return the statistics of an adjustment."""
+    network = measured.network
+    noise = adjustment.noise
+    weight = noise.weight(adjustment.q)
+    square = float(np.sum(weight * adjustment.q)) + _square_of_others(measured, adjustment)
+    redundancy = float(
+        precise.redundancy.sum()
+        + precise.survey_redundancy.sum()
+        + sum(part.sum() for part in precise.relative_redundancy)
+    )
+    good = precise.redundancy[weight >= 0.5]
+    rays = np.bincount(network.point, minlength=network.n_points)
+    return AdjustmentStatistics(
+        fluoroscopes=tuple(measured.fluoroscopes),
+        loss=noise.loss,
+        sigma0=float(noise.scale),
+        nu=float(noise.nu),
+        variance_factor=square / redundancy if redundancy > 0 else float('nan'),
+        observations=network.n_observations,
+        unknowns=network.n_unknowns,
+        degrees_of_freedom=redundancy,
+        image_points=network.n_image_points,
+        outliers=int((~adjustment.inliers).sum()),
+        exposures=network.n_exposures,
+        targets=network.n_points,
+        least_redundancy=float(good.min()) if len(good) else float('nan'),
+        mean_redundancy=float(good.mean()) if len(good) else float('nan'),
+        least_rays=float(rays.min()),
+        mean_rays=float(rays.mean()),
+    )
+
+
+def _square_of_others(measured: Measured, adjustment: Adjustment) -> float:
+    """Weighted square sum of the residuals of survey and relative orientation constraints."""
+    network = measured.network
+    parameters = adjustment.parameters
+    out = 0.0
+    if network.datum == 'survey':
+        difference = (parameters.points_mm - network.survey_mm) / network.survey_sd_mm[:, None]
+        out += float(np.sum(difference**2))
+    for constraint, pose in zip(network.relative, parameters.relative):
+        out += float(np.sum(discrepancies(constraint, pose, parameters) ** 2 @ constraint.weights))
+    return out
+
+
+def residuals_of_adjustment(
+    measured: Measured, adjustment: Adjustment, precise: Precision, correction: np.ndarray
+) -> ResidualTable:
+    """Return the residuals of an adjustment; correction (N, 2) [px], all parts of it."""
+    network = measured.network
+    frames = measured.frames
+    name = np.array([frame.fluoroscope for frame in frames])
+    number = np.array([frame.number for frame in frames], dtype=np.int64)
+    return ResidualTable(
+        fluoroscope=name[network.exposure],
+        exposure=number[network.exposure],
+        target_id=measured.target_id[network.point],
+        uv=network.uv,
+        correction=correction,
+        residual=adjustment.residuals,
+        redundancy=precise.redundancy,
+        weight=adjustment.noise.weight(adjustment.q),
+        outlier=~adjustment.inliers,
+    )
+
+
+MIN_FITTING = 0.5  # share of the image points of an exposure that is used
+
+
+def undetermined_unknowns(measured: Measured) -> Finding | None:
+    """Return the unknowns that a network leaves undetermined at its start values, if any."""
+    found = undetermined_directions(
+        measured.network, measured.start, measured.fluoroscopes, _exposure_numbers(measured)
+    )
+    if not found:
+        return None
+    return Finding(
+        Kind.UNDETERMINED,
+        f'the exposures do not determine the unknowns: {describe_directions(found)}; '
+        'add exposures with the phantom turned and moved, with more targets',
+        numbers={'directions': len(found)},
+    )
+
+
+def raise_if_undetermined(measured: Measured, adjustment: Adjustment, precise: Precision) -> None:
+    """Raise DataError, one finding a fluoroscope, for undetermined interior orientations."""
+    scale = adjustment.noise.scale
+    found = undetermined_interiors(
+        measured.network, adjustment.parameters, precise, measured.fluoroscopes, scale
+    )
+    if found:
+        raise DataError(*found)
+
+
+def correlations_of(run: SelfCalibration) -> tuple[tuple[str, str, float], ...]:
+    """High correlations between unknowns of a self-calibration: ((name, name, value), ...)."""
+    return high_correlations(
+        run.measured.network,
+        run.after.parameters,
+        run.precision,
+        run.measured.fluoroscopes,
+        _exposure_numbers(run.measured),
+    )
+
+
+def outliers_of(run: SelfCalibration) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Outliers of a self-calibration: image points and targets, with their test statistics."""
+    measured = run.measured
+    found = find_outliers(measured.network, run.after, run.precision)
+    exposures = measured.network.exposure[found.image_point]
+    points = [
+        {
+            'fluoroscope': measured.frames[j].fluoroscope,
+            'exposure': measured.frames[j].number,
+            'target_id': int(measured.target_id[measured.network.point[row]]),
+            'value': float(value),
+            'critical': found.critical_image,
+        }
+        for row, j, value in zip(found.image_point, exposures, found.value)
+    ]
+    targets = [
+        {
+            'target_id': int(measured.target_id[row]),
+            'offset_mm': offset,
+            'value': float(value),
+            'critical': found.critical_target,
+        }
+        for row, offset, value in zip(found.target, found.offset_mm, found.target_value)
+    ]
+    return points, targets
+
+
+def exposures_that_do_not_fit(run: SelfCalibration) -> dict[tuple[str, int], Finding]:
+    """Return a finding for every exposure of which less than half fits, by name and number.
+
+    Where most exposures of a fluoroscope are like that, none of them stands out, and the whole
+    calibration is to be judged instead.
+    """
+    network = run.measured.network
+    count = np.bincount(network.exposure, minlength=network.n_exposures)
+    # By the core of the noise: the false matches of such an exposure make its tails heavy, and so
+    # the limit of gross errors wide.
+    fits = run.after.noise.inliers(run.after.q)
+    fitting = np.bincount(network.exposure, fits, network.n_exposures)
+    share = fitting / count
+    out = {}
+    for row, frame in enumerate(run.measured.frames):
+        own = network.fluoroscope == network.fluoroscope[row]
+        if share[row] < MIN_FITTING and np.median(share[own]) >= MIN_FITTING:
+            out[frame.fluoroscope, frame.number] = Finding(
+                Kind.FALSE_MATCHES,
+                f'only {100 * share[row]:.0f} % of the image points fit, the others are false '
+                'matches',
+                frame.place,
+                severity=Severity.NOTE,
+                numbers={'share': float(share[row])},
+            )
+    return out
+
+
+def _exposure_numbers(measured: Measured) -> list[int]:
+    return [frame.number for frame in measured.frames]

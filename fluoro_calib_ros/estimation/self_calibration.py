@@ -3,41 +3,115 @@
 
 """The self-calibration of a network: a robust bundle adjustment and a model of the distortion.
 
-How a model is obtained is up to the model: by regression of the residuals between adjustments (see
-`alternation`), in the adjustment itself (see `combined_adjustment`), or both.
+How a model is obtained is up to the model. Its coefficients are unknowns of the adjustment
+(`adjusted_terms`, see `combined_adjustment`), or it is fitted to the residuals between adjustments
+(`regression`, see `alternation`), or both. `ESTIMATORS` is the only place that lists them; a model
+over the k nearest residuals needs no entry there, `NeighbourRegression` fits it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..correction.base import CorrectionModel
-from ..correction.models import CollocationModel, NoCorrection, SeriesModel
-from ..correction.registry import model_type
+from ..correction.neighbours import HybridModel, NeighbourModel
+from ..correction.registry import (
+    CollocationModel,
+    NoCorrection,
+    ParametricModel,
+    SeriesModel,
+    model_type,
+    no_correction,
+    selectable_models,
+)
+from ..correction.series import Series
 from ..errors import DataError
 from ..photogrammetry.adjustment import Adjustment, residuals_and_q
 from .alternation import Regressions, calibrate_by_regression
 from .collocation import CollocationTerms, EarlierTerms
 from .combined_adjustment import calibrate_by_adjustment
 from .constraints import gauges_of, interiors_to_estimate, with_constraints
-from .diagnostics import raise_if_undetermined, undetermined_unknowns
 from .estimator import (
     FINAL_TOLERANCE,
     AdjustedTerms,
     AdjustmentProblem,
     Estimator,
+    GaugeKind,
     RegressionStep,
     TrainingPoints,
 )
-from .estimators import estimator_of
-from .gauge import GaugeKind
 from .initial_network import EarlierCalibration, Measured, adjusted_with_precision, start_noise
 from .model_choice import START_MODEL, better_model, with_errors_by
-from .options import AUTO, CalibrationOptions
-from .rounds import Round, SelfCalibration
+from .neighbour_regression import NeighbourRegression
+from .options import AUTO, CalibrationOptions, user_estimator
+from .parametric import StepwiseTerms
+from .rounds import Round, SelfCalibration, raise_if_undetermined, undetermined_unknowns
+
+
+class NoRegression(RegressionStep[NoCorrection]):
+    """The regression step of the model that corrects nothing."""
+
+    iterates = False
+
+    def choose(self, values: np.ndarray, q: np.ndarray, information: np.ndarray) -> None:
+        """Update the inliers and sum up their weighted residuals."""
+        self.inliers = self._updated_inliers(q)
+        inside = values[self.inliers]
+        self.score = float(np.einsum('na,nab,nb', inside, information[self.inliers], inside))
+
+    def without_gauge(self, values: np.ndarray, interior: np.ndarray) -> np.ndarray:
+        """Return the values."""
+        return values
+
+    def smooth(self, values: np.ndarray) -> NDArray[np.float64]:
+        """Return zeros (N, 2)."""
+        return np.zeros_like(values)
+
+    def model(self, values: np.ndarray, series: Series | None = None) -> NoCorrection:
+        """Return the model that corrects nothing."""
+        return no_correction()
+
+
+ESTIMATORS = {
+    estimator.kind: estimator
+    for estimator in (
+        Estimator(NoCorrection.kind, regression=lambda points, k: NoRegression(points)),
+        Estimator(ParametricModel.kind, StepwiseTerms),
+        Estimator(
+            HybridModel.kind,
+            partial(CollocationTerms, modes=0),
+            partial(NeighbourRegression, HybridModel),
+        ),
+        Estimator(CollocationModel.kind, CollocationTerms),
+    )
+}
+
+
+def estimator_of(model: Any) -> Estimator:
+    """Return the estimator of a model.
+
+    model: the name of a model, or a scikit-learn regressor. Raises ValueError for a name that a
+    user cannot ask for.
+    """
+    if not isinstance(model, str):
+        return user_estimator(model)
+    if model not in selectable_models():
+        raise ValueError(
+            f'correction model is one of {", ".join(selectable_models())}, not {model!r}'
+        )
+    if model in ESTIMATORS:
+        return ESTIMATORS[model]
+    kind = model_type(model)
+    if not issubclass(kind, NeighbourModel):
+        raise ValueError(f'correction model {model} has no estimator')
+    return Estimator(model, regression=partial(NeighbourRegression, kind))
+
 
 TOLERANCE = 1e-8  # decrease of F that an adjustment that is a result may leave
 
@@ -53,25 +127,10 @@ def self_calibrate(
     The standard deviations of models other than collocation hold their difference from it (see
     `model_errors`), so it is calibrated, too.
 
-    Parameters
-    ----------
-    measured : Measured
-        From `measured_network`.
-    options : CalibrationOptions, optional
-    progress : callable, optional
-        Called with the Round after every round.
-    earlier : EarlierCalibration, optional
-        By collocation, with these exposures and others; the network starts with its solution. The
-        adjustment without correction is then not made: its residuals are those of the start.
-
-    Returns
-    -------
-    SelfCalibration
-
-    Raises
-    ------
-    DataError
-        If the observations do not suffice.
+    measured: from `measured_network`. progress: called with the Round after every round. earlier:
+    by collocation, with these exposures and others; the network starts with its solution; the
+    adjustment without correction is then not made: its residuals are those of the start. Raises
+    DataError if the observations do not suffice.
     """
     options = options or CalibrationOptions()
     network = replace(measured.network, interior_free=interiors_to_estimate(measured, options))
@@ -142,19 +201,10 @@ def _continued(
 
 @dataclass(frozen=True)
 class _Job:
-    """A network that is calibrated with one model or more.
-
-    Attributes
-    ----------
-    measured : Measured
-    before : Adjustment
-        Without correction.
-    gauges : sequence of GaugeKind
-    options : CalibrationOptions
-    """
+    """A network that is calibrated with one model or more."""
 
     measured: Measured
-    before: Adjustment
+    before: Adjustment  #: without correction
     gauges: Sequence[GaugeKind]
     options: CalibrationOptions
 

@@ -317,21 +317,13 @@ def _slopes(signal: Signal, frequency: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class SignalEquations:
-    """Normal equations of all coefficients of a series, with every prior but that of the signal.
+    """Normal equations of all coefficients of a series, every prior but the signal's included."""
 
-    Attributes
-    ----------
-    frequency : (s,) ndarray
-        Frequencies of the sines [1/px].
-    information, right : (p, p) and (p,) ndarray
-    columns : (2 s,) ndarray of int
-        Places of the coefficients of the sines, those of u first.
-    """
-
-    frequency: NDArray[np.float64]
+    frequency: NDArray[np.float64]  #: (s,) frequencies of the sines [1/px]
+    #: (p,)
     information: NDArray[np.float64]
     right: NDArray[np.float64]
-    columns: NDArray[np.int64]
+    columns: NDArray[np.int64]  #: (2 s,) places of the coefficients of the sines, those of u first
 
 
 @dataclass(frozen=True)

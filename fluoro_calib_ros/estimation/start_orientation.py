@@ -64,32 +64,16 @@ UNTILTED = Finding(
 
 @dataclass(frozen=True)
 class View:
-    """The targets of an exposure, and what is known of it before any orientation.
-
-    Attributes
-    ----------
-    frame : Frame
-    xyz : (n, 3) ndarray
-        Targets [mm].
-    uv : (n, 2) ndarray
-        Image points without distortion, as far as that is known [px].
-    projection : (3, 4) ndarray or None
-        Where the targets are not in a plane.
-    plane : Plane or None
-        Where the targets are nearly in a plane.
-    plane_image : (3, 3) ndarray or None
-        Homography of the plane.
-    error : Finding or None
-        Why neither is known.
-    """
+    """The targets of an exposure, and what is known of it before any orientation."""
 
     frame: Frame
-    xyz: NDArray[np.float64]
+    xyz: NDArray[np.float64]  #: (n, 3) targets [mm]
+    #: (n, 2) image points without distortion, as far as that is known [px]
     uv: NDArray[np.float64]
-    projection: NDArray[np.float64] | None = None
-    plane: Plane | None = None
-    plane_image: np.ndarray | None = None
-    error: Finding | None = None
+    projection: NDArray[np.float64] | None = None  #: (3, 4) where the targets are not in a plane
+    plane: Plane | None = None  #: where the targets are nearly in a plane
+    plane_image: np.ndarray | None = None  #: (3, 3) homography of the plane
+    error: Finding | None = None  #: why neither is known
 
     @property
     def is_flat(self) -> bool:

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 from ..options import option, validate_options
-from .stamp_agreement import StampAgreement, StampedFrame
+from .stamps import StampAgreement, StampedFrame
 
 PAIR_BY = ('frame_number', 'stamp')
 MIN_VIEWS = 2  # views of an exposure that can be intersected
@@ -95,29 +95,14 @@ class RecordedPairing:
 
 
 class Pairer(Protocol):
-    """Combines frames into exposures.
-
-    Attributes
-    ----------
-    fluoroscopes : tuple of str
-    unpaired : dict of str to int
-        Number of frames that are in no exposure, by fluoroscope.
-    late : dict of str to int
-        Number of those that arrived too late for their exposure.
-    incomplete : int
-        Number of exposures without a frame of every fluoroscope.
-    silent : frozenset of str
-        Fluoroscopes that are no longer waited for.
-    stamps : StampAgreement
-        Times of the frames that were paired by number.
-    """
+    """Combines frames into exposures."""
 
     fluoroscopes: tuple[str, ...]
-    unpaired: dict[str, int]
-    late: dict[str, int]
-    incomplete: int
-    silent: frozenset[str]
-    stamps: StampAgreement
+    unpaired: dict[str, int]  #: number of frames that are in no exposure, by fluoroscope
+    late: dict[str, int]  #: number of those that arrived too late for their exposure
+    incomplete: int  #: number of exposures without a frame of every fluoroscope
+    silent: frozenset[str]  #: fluoroscopes that are no longer waited for
+    stamps: StampAgreement  #: times of the frames that were paired by number
 
     def add(self, frame: PairableFrame) -> Sequence[Exposure]:
         """Add a frame; returns the exposures that are ready now."""

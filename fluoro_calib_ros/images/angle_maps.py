@@ -46,32 +46,16 @@ class AngleMaps:
 
     The corrector of the last angle is kept. One thread may use it.
 
-    Parameters
-    ----------
-    calibration : FluoroscopeCalibration
-    interpolation, border
-        See `ImageCorrector`.
-
-    Attributes
-    ----------
-    mean : ImageCorrector
-        By the mean over the angles: where the angle is unknown, and where it changes nothing.
-    step : float
-        To which angles are rounded [rad]; infinite where the correction has no change.
-    built : int
-        Number of maps that were made for angles.
-
-    Raises
-    ------
-    DataError
-        As ImageCorrector.
+    interpolation, border: see `ImageCorrector`. Raises DataError as ImageCorrector.
     """
 
     def __init__(
         self, calibration: FluoroscopeCalibration, interpolation: str = 'linear', border: int = 0
     ) -> None:
+        #: by the mean over the angles: where the angle is unknown, and where it changes nothing
         self.mean = ImageCorrector(calibration, interpolation, border)
-        self.built = 0
+        self.built = 0  #: number of maps that were made for angles
+        #: to which angles are rounded [rad]; infinite where the correction has no change
         self.step = np.inf
         self._calibration = calibration
         self._last: tuple[float, ImageCorrector] | None = None

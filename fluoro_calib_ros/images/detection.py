@@ -390,8 +390,8 @@ def _found(
     relative = response / background
     uv = np.column_stack(
         [
-            u + _vertex(relative[v, u - 1], relative[v, u], relative[v, u + 1]),
-            v + _vertex(relative[v - 1, u], relative[v, u], relative[v + 1, u]),
+            u + vertex(relative[v, u - 1], relative[v, u], relative[v, u + 1]),
+            v + vertex(relative[v - 1, u], relative[v, u], relative[v + 1, u]),
         ]
     )
     return _Blobs(factor * (uv + 0.5) - 0.5, response[v, u], relative[v, u])
@@ -417,7 +417,7 @@ def _strengths(light: np.ndarray, uv: NDArray[np.float64], scale: float) -> NDAr
     return np.asarray(relative / max(float(np.median(relative)), 1e-9), dtype=float)
 
 
-def _vertex(before: np.ndarray, at: np.ndarray, after: np.ndarray) -> np.ndarray:
+def vertex(before: np.ndarray, at: np.ndarray, after: np.ndarray) -> np.ndarray:
     """Places (n,) of the vertices of parabolas through three samples, relative to the middle."""
     curvature = before - 2 * at + after
     shift = 0.5 * (before - after) / np.where(curvature < 0, curvature, -1.0)

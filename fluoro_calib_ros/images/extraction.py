@@ -100,23 +100,9 @@ def extract_beads(
 ) -> Extraction:
     """Extract the beads of a phantom from a radiograph.
 
-    Parameters
-    ----------
-    image : (h, w) ndarray of uint8 or uint16
-    model : PhantomModel
-    lens : Lens
-    near : Nearby, optional
-        The exposure before. Where the phantom has moved little since then, this is several times
-        faster; elsewhere its pose is searched for as without it.
-
-    Returns
-    -------
-    Extraction
-
-    Raises
-    ------
-    DataError
-        Where there is no phantom in the image, or its pose is not sure, with the reason.
+    image: (h, w). near: the exposure before; where the phantom has moved little since then, this
+    is several times faster; elsewhere its pose is searched for as without it. Raises DataError
+    where there is no phantom in the image, or its pose is not sure, with the reason.
     """
     # Small matrices take three times the time on several threads.
     with _threads().limit(limits=1):

@@ -43,20 +43,9 @@ def follow(
 ) -> Match | None:
     """Match what was found in an image from a pose nearby.
 
-    Parameters
-    ----------
-    seen : Seen
-    model : PhantomModel
-    near : View
-    scale_px : float
-        Robust standard deviation of the residuals of the image nearby [px].
-    far : Far, optional
-        Where images were left out in between: the pose is searched for farther away.
-
-    Returns
-    -------
-    Match or None
-        None where the pose is too far, or not sure.
+    scale_px: robust standard deviation of the residuals of the image nearby [px]. far: where
+    images were left out in between: the pose is searched for farther away. Returns None where the
+    pose is too far, or not sure.
     """
     if len(seen.uv) < MIN_BEADS:
         return None
@@ -94,18 +83,8 @@ def moved_on(
 ) -> View | None:
     """Return the view after a further motion like that from one view to the next.
 
-    Parameters
-    ----------
-    before, last : View
-    centre_mm : (3,) ndarray
-        Of the phantom, which moves on a straight line while it turns about a fixed axis.
-    factor : float
-        On the motion.
-
-    Returns
-    -------
-    View or None
-        None where the motion is not small.
+    centre_mm: (3,) of the phantom, which moves on a straight line while it turns about a fixed
+    axis. factor: on the motion. Returns None where the motion is not small.
     """
     turn = vector_from_matrix(last.rotation @ before.rotation.T)
     if factor * np.linalg.norm(turn) > FAR_TURN_RAD:

@@ -258,15 +258,9 @@ SAME_PLACE = 0.35  # of the radius, at which two markers are one shadow
 class MarkerMeasurement:
     """Measures markers in shadows that were found near them.
 
-    Parameters
-    ----------
-    profile : Profile
-        Shadow of a typical marker.
-    noise : Noise
-    gate : float
-        Distance from its prediction within which a marker is looked for [standard deviations].
-    shutter : float
-        Share of the time between two images during which the light is on.
+    profile: shadow of a typical marker. gate: distance from its prediction within which a marker
+    is looked for [standard deviations]. shutter: share of the time between two images during which
+    the light is on.
     """
 
     def __init__(self, profile: Profile, noise: Noise, *, gate: float, shutter: float) -> None:

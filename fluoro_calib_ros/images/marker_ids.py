@@ -24,7 +24,7 @@ from scipy.spatial.distance import pdist
 
 from ..bodies.body import Body
 from ..bodies.rigid import fitted_pose
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import Calibrations
 from ..errors import DataError
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.epipolar import EpipolarGeometry
@@ -50,7 +50,7 @@ class CalibratedRig:
     """Orientation and calibrations of two fluoroscopes, and the angles of their C-arms [rad]."""
 
     orientation: RigOrientation
-    calibrations: Mapping[str, FluoroscopeCalibration]
+    calibrations: Calibrations
     angles: Mapping[str, float | None]
 
 
@@ -68,7 +68,7 @@ class _Fit:
 
 def identify_markers(
     images: Mapping[str, np.ndarray],
-    calibrations: Mapping[str, FluoroscopeCalibration],
+    calibrations: Calibrations,
     orientation: RigOrientation,
     bodies: Sequence[Body],
     angles: Mapping[str, float | None] | None = None,

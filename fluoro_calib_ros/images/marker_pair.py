@@ -16,15 +16,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..bodies.body import Body
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import Calibrations
 from ..errors import DataError
 from ..photogrammetry.rig_orientation import RigOrientation
-from .marker_bodies import MarkerBodies
 from .marker_decisions import BodyDecisions, DecidedView, Decision, RayDecisions, ViewCounts
 from .marker_ids import MAX_SHADOWS, CalibratedRig, find_bodies, identifiable
-from .marker_intensity import check_image
-from .marker_rays import PairExposure, PairRays
-from .marker_start import FIRST_SD_PX
+from .marker_intensity import FIRST_SD_PX, check_image
+from .marker_rays import MarkerBodies, PairExposure, PairRays
 from .markers import FirstMarkers, MarkerFrame, MarkerOptions, MarkerTracker
 
 
@@ -40,26 +38,14 @@ class PairFrame:
 class MarkerPair:
     """Follows markers through the images of two calibrated fluoroscopes.
 
-    Parameters
-    ----------
-    calibrations : mapping of str to FluoroscopeCalibration
-    orientation : RigOrientation
-        That they belong to.
-    options : MarkerOptions, optional
-    first : mapping of str to FirstMarkers
-        Ids and places in the first images, of two fluoroscopes.
-    bodies : sequence of Body
-        Shapes that are not given are learned from the images.
-
-    Raises
-    ------
-    DataError
-        For other than two fluoroscopes, and for those without calibration.
+    orientation: that they belong to. first: ids and places in the first images, of two
+    fluoroscopes. bodies: shapes that are not given are learned from the images. Raises DataError
+    for other than two fluoroscopes, and for those without calibration.
     """
 
     def __init__(
         self,
-        calibrations: Mapping[str, FluoroscopeCalibration],
+        calibrations: Calibrations,
         orientation: RigOrientation,
         options: MarkerOptions | None = None,
         *,

@@ -21,9 +21,16 @@ from ..errors import DataError
 from ..findings import Finding, Kind
 from ..options import option, validate_options
 from .marker_fit import MarkerMeasurement
-from .marker_intensity import LightWindows, MarkerLook, Shadows, check_image
+from .marker_intensity import (
+    NOWHERE_PX,
+    LightWindows,
+    MarkerLook,
+    MarkerSearch,
+    Shadows,
+    check_image,
+    learn_start,
+)
 from .marker_motion import MarkerStates, MeasuredMarkers
-from .marker_start import NOWHERE_PX, MarkerSearch, learn_start
 from .marker_watch import MarkerDoubts, MarkerWatch, follow_beside, shift_together
 from .shadow_fit import Profile
 
@@ -251,13 +258,8 @@ class MarkerTracker:
     ) -> None:
         """Offer predictions for the next image, such as those from another view.
 
-        Parameters
-        ----------
-        target_id : (k,) ndarray
-        uv, velocity : (k, 2) ndarray
-            [px], [px a frame].
-        sd_px : (k,) ndarray
-            Where it is smaller than that of the own prediction, this one is used.
+        target_id: (k,). uv, velocity: (k, 2) [px], [px a frame]. sd_px: (k,) where it is smaller
+        than that of the own prediction, this one is used.
         """
         rows = np.array([self._row(int(i)) for i in target_id], dtype=int)
         self._suggested.append((rows, np.asarray(uv), np.asarray(velocity), np.asarray(sd_px)))

@@ -61,15 +61,8 @@ def estimate_profile(
 ) -> Profile:
     """Estimate the shadow of a typical bead from those that stand alone.
 
-    Parameters
-    ----------
-    light : Light
-    uv : (n, 2) ndarray
-        Beads [px].
-    relative_radius : (n,) ndarray
-        1 for a typical bead.
-    radius_px : float
-        First value of its radius.
+    uv: (n, 2) beads [px]. relative_radius: (n,) 1 for a typical bead. radius_px: first value of
+    its radius.
     """
     profile = Profile(radius_px * 0.95, START_BLUR_PX, START_ATTENUATION, START_SCATTER)
     noise = Noise(0.0, 1.0, np.ones((1, 1)))

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 
-from .light import Noise
-from .texture import Cosines
+from .light import Cosines, Noise
 
 MAX_SIGMA_PX = 0.3  # of a centre: a larger one is that of no shadow, or of one hardly seen
 MARGIN_PX = 2.0  # of background around the shadow
@@ -123,17 +122,8 @@ class FineGrid:
 class ShadowFit(ABC):
     """Gauss-Newton fit of windows, each with the neighbours of its bead.
 
-    Parameters
-    ----------
-    settings : FitSettings
-    profile : Profile
-    noise : Noise
-    uv : (n, 2) ndarray
-        Centres to start from [px].
-    depth : (n,) ndarray
-        Of the shadows, also what is expected of them.
-    window_px : float
-        Radius of the windows.
+    uv: (n, 2) centres to start from [px]. depth: (n,) of the shadows, also what is expected of
+    them. window_px: radius of the windows.
     """
 
     def __init__(

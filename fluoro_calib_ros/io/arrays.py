@@ -23,9 +23,9 @@ from typing import Any
 
 import numpy as np
 
+from ..correction.calibration_record import Field
 from ..errors import DataError
 from ..limits import read_limits
-from ..records import Field
 from .access import PathLike, atomic_file, read_bytes
 
 _DATE = (1980, 1, 1, 0, 0, 0)  # of every member, so that the same arrays give the same bytes

@@ -1,27 +1,57 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Bodies as CSV `body,marker,x,y,z,sd`, in millimetres; marker is the id of a target.
+"""Bodies as CSV, joints as TOML and their motion as CSV.
 
-A marker whose place is unknown has empty x, y, z and sd, one without a standard deviation an
-empty sd.
+Bodies as CSV `body,marker,x,y,z,sd`, in millimetres; marker is the id of a target. A marker whose
+place is unknown has empty x, y, z and sd, one without a standard deviation an empty sd.
+
+Joints: joints.toml, which defines them, and joints.csv, their motion.
+
+    [[joint]]
+    name = "knee"
+    proximal = "femur"                  # bodies
+    distal = "tibia"
+    convention = "grood_suntay_knee"
+    side = "right"
+    neutral = [1, 100]                  # first and last exposure of the neutral trial
+
+    [joint.proximal_frame]              # in the coordinates of the body [mm]
+    landmarks = {femoral_head = [12.1, 3.4, 801.0], ...}
+
+    [joint.distal_frame]
+    axes = {x = [1, 0, 0], z = [0, 0, 1]}   # or quaternion_wxyz = [1, 0, 0, 0]
+    origin = [0, 0, 0]                      # or matrix = [[...], [...], [...], [0, 0, 0, 1]]
+
+Without a frame, the axes are those of the body. docs/joints.md describes both files.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import NoReturn
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..bodies.anatomical_frames import (
+    BODY_FRAME,
+    AnatomicalFrame,
+    frame_of_axes,
+    frame_of_landmarks,
+    frame_of_quaternion,
+)
 from ..bodies.body import Body, check_bodies
-from ..errors import DataError
-from ..limits import read_limits
+from ..bodies.joint_conventions import Convention, convention
+from ..bodies.joints import STATUS_NAMES, Joint, JointMotion, check_joints
+from ..errors import DataError, ErrorsAt
+from ..limits import MAX_JOINTS, read_limits
 from .access import PathLike
 from .csv_table import Block, Table, read_blocks
+from .documents import read_toml
 
-COLUMNS = ('body', 'marker', 'x', 'y', 'z', 'sd')
+BODY_COLUMNS = ('body', 'marker', 'x', 'y', 'z', 'sd')
 
 
 def read_bodies(path: PathLike) -> tuple[Body, ...]:
@@ -29,11 +59,11 @@ def read_bodies(path: PathLike) -> tuple[Body, ...]:
     rows: dict[str, list[tuple[int, list[float]]]] = {}
     first_rows: dict[int, tuple[int, str]] = {}
     most = read_limits().max_targets
-    for block in read_blocks(path, COLUMNS):
-        unknown = [name for name in block.header if name not in COLUMNS]
+    for block in read_blocks(path, BODY_COLUMNS):
+        unknown = [name for name in block.header if name not in BODY_COLUMNS]
         if unknown:
             raise DataError(
-                f'{path}: the column {unknown[0]!r} is unknown, there are {",".join(COLUMNS)}'
+                f'{path}: the column {unknown[0]!r} is unknown, there are {",".join(BODY_COLUMNS)}'
             )
         names = block.strings('body')
         markers = block.ids('marker').tolist()
@@ -59,7 +89,7 @@ def read_bodies(path: PathLike) -> tuple[Body, ...]:
 def _numbers(block: Block) -> NDArray[np.float64]:
     """Return x, y, z, sd (n, 4), NaN and an infinite sd where unknown. Raises DataError."""
     columns = []
-    for name in COLUMNS[2:]:
+    for name in BODY_COLUMNS[2:]:
         values = block.floats_or_nan(name)
         empty = np.array([not cell for cell in block.strings(name)])
         block.require(name, empty | np.isfinite(values), 'not a finite number')
@@ -90,12 +120,207 @@ def write_bodies(path: PathLike, bodies: Sequence[Body]) -> None:
 
 def shape_table(bodies: Sequence[Body]) -> Table:
     """Return the markers of bodies as a table."""
-    return Table(COLUMNS, (row for body in bodies for row in _rows(body)))
+    return Table(BODY_COLUMNS, (row for body in bodies for row in _marker_rows(body)))
 
 
-def _rows(body: Body) -> Iterator[list[object]]:
+def _marker_rows(body: Body) -> Iterator[list[object]]:
     sd = np.where(np.isfinite(body.sd_mm), body.sd_mm, np.nan)
     numbers = np.column_stack([body.xyz_mm, sd])
     numbers[~body.known] = np.nan
     for marker, values in zip(body.target_id.tolist(), numbers.tolist()):
         yield [body.name, marker, *values]
+
+
+KEYS = (
+    *('name', 'proximal', 'distal', 'convention', 'side', 'neutral'),
+    *('proximal_frame', 'distal_frame'),
+)
+REQUIRED = KEYS[:4]
+FRAME_KEYS = ('landmarks', 'axes', 'quaternion_wxyz', 'matrix', 'origin')
+MAX_EXPOSURE = 2**53
+JOINT_COLUMNS = (
+    'joint',
+    'exposure',
+    'time_s',
+    *(f'angle_{n}_deg' for n in (1, 2, 3)),
+    *(f'translation_{n}_mm' for n in (1, 2, 3)),
+    *(f'sd_angle_{n}_deg' for n in (1, 2, 3)),
+    *(f'sd_translation_{n}_mm' for n in (1, 2, 3)),
+    'status',
+)
+
+
+@dataclass(frozen=True)
+class JointEntry:
+    """A joint of a joints.toml.
+
+    Attributes
+    ----------
+    joint : Joint
+    neutral : (int, int) or None
+        First and last exposure in neutral position; None: angles are those of the axes.
+    """
+
+    joint: Joint
+    neutral: tuple[int, int] | None = None
+
+
+def read_joints(path: PathLike, bodies: Iterable[str]) -> tuple[JointEntry, ...]:
+    """Read a joints.toml with joints between bodies of these names.
+
+    Raises DataError that names file and joint.
+    """
+    document = read_toml(path)
+    found = document.pop('joint', None)
+    for key in document:
+        raise DataError(f'{path}, key {key}: unknown, there are tables [[joint]]')
+    if not isinstance(found, list) or not found:
+        raise DataError(f'{path}: the file has no table [[joint]]')
+    if len(found) > MAX_JOINTS:
+        raise DataError(f'{path}: {len(found)} joints, more than {MAX_JOINTS} are not read')
+    entries = tuple(_entry(path, n, table) for n, table in enumerate(found, 1))
+    with ErrorsAt(path):
+        check_joints([entry.joint for entry in entries], bodies)
+    return entries
+
+
+def _entry(path: PathLike, number: int, table: Any) -> JointEntry:
+    """Return a joint of the file. Raises DataError."""
+    where = f'{path}, joint {number}'
+    if not isinstance(table, Mapping):
+        raise DataError(f'{where}: this is not a table')
+    if isinstance(table.get('name'), str) and table['name']:
+        where = f'{path}, joint {table["name"]}'
+    for key in table:
+        if key not in KEYS:
+            raise DataError(f'{where}, key {key}: unknown, there are {", ".join(KEYS)}')
+    texts: dict[str, str] = {}
+    for key in (*REQUIRED, 'side'):
+        value = table.get(key, '' if key == 'side' else None)
+        if not isinstance(value, str) or (not value and key != 'side'):
+            raise DataError(f'{where}, key {key}: a text is expected')
+        texts[key] = value
+    try:
+        of = convention(texts['convention'])
+        of.check_side(texts['side'])
+        frames = {
+            end: _frame(of, end, table.get(f'{end}_frame'), texts['side'])
+            for end in ('proximal', 'distal')
+        }
+        joint = Joint(
+            texts['name'],
+            texts['proximal'],
+            texts['distal'],
+            texts['convention'],
+            proximal_frame=frames['proximal'],
+            distal_frame=frames['distal'],
+            side=texts['side'],
+        )
+    except DataError as error:
+        raise DataError(f'{where}: {error}') from None
+    return JointEntry(joint, _neutral(where, table.get('neutral')))
+
+
+def _neutral(where: str, value: Any) -> tuple[int, int] | None:
+    if value is None:
+        return None
+    whole = isinstance(value, list) and all(type(v) is int for v in value)
+    if not whole or len(value) != 2 or not 0 <= value[0] <= value[1] <= MAX_EXPOSURE:
+        raise DataError(f'{where}, key neutral: first and last exposure, such as [1, 100]')
+    return value[0], value[1]
+
+
+def _frame(of: Convention, end: str, table: Any, side: str) -> AnatomicalFrame:
+    """Return the frame of one end of a joint. Raises DataError that names the end."""
+    if table is None:
+        return BODY_FRAME
+    try:
+        if not isinstance(table, Mapping):
+            raise DataError('this is not a table')
+        for key in table:
+            if key not in FRAME_KEYS:
+                raise DataError(f'the key {key} is unknown, there are {", ".join(FRAME_KEYS)}')
+        given = [key for key in FRAME_KEYS[:4] if key in table]
+        if len(given) != 1:
+            raise DataError(f'one of {", ".join(FRAME_KEYS[:4])} is needed, not {len(given)}')
+        return _frame_of(of, end, table, side)
+    except DataError as error:
+        raise DataError(f'{end}_frame: {error}') from None
+
+
+def _frame_of(of: Convention, end: str, table: Mapping[str, Any], side: str) -> AnatomicalFrame:
+    """Return the frame that a table describes in one of four ways. Raises DataError."""
+    has_origin = 'matrix' not in table and 'landmarks' not in table
+    if has_origin != ('origin' in table):
+        raise DataError(f'the key origin is {"missing" if has_origin else "given twice"}')
+    if 'landmarks' in table:
+        kind = of.proximal_landmarks if end == 'proximal' else of.distal_landmarks
+        if not kind:
+            raise DataError(f'{of.name} has no landmarks for it, give axes or a neutral trial')
+        points = _table(table, 'landmarks')
+        return frame_of_landmarks(kind, {n: _array(n, x, (3,)) for n, x in points.items()}, side)
+    if 'matrix' in table:
+        matrix = _array('matrix', table['matrix'], (4, 4))
+        if (matrix[3] != [0, 0, 0, 1]).any():
+            raise DataError('the last row of the matrix is not 0, 0, 0, 1')
+        return AnatomicalFrame(matrix[:3, :3], matrix[:3, 3])
+    origin = _array('origin', table['origin'], (3,))
+    if 'axes' in table:
+        axes = _table(table, 'axes')
+        return frame_of_axes({n: _array(n, x, (3,)) for n, x in axes.items()}, origin)
+    return frame_of_quaternion(_array('quaternion_wxyz', table['quaternion_wxyz'], (4,)), origin)
+
+
+def _table(table: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    if not isinstance(table[key], Mapping):
+        raise DataError(f'{key} is not a table of names and coordinates')
+    return table[key]
+
+
+def _array(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Return finite numbers of this shape. Raises DataError that names the key."""
+
+    def is_array(part: Any, size: Sequence[int]) -> bool:
+        if not size:
+            return type(part) in (int, float)
+        if not isinstance(part, list) or len(part) != size[0]:
+            return False
+        return all(is_array(one, size[1:]) for one in part)
+
+    if not is_array(value, shape):
+        raise DataError(f'{name} does not have {" x ".join(map(str, shape))} numbers')
+    try:
+        array = np.array(value, dtype=float)
+    except OverflowError:
+        array = np.array(np.inf)
+    if not np.isfinite(array).all():
+        raise DataError(f'{name} has a number that is not finite')
+    return array
+
+
+def joint_definition(joint: Joint, landmarks: Mapping[str, Mapping[str, np.ndarray]]) -> str:
+    """Return the text of a joints.toml with one joint, from landmarks (3,) by body [mm]."""
+    keys = {name: getattr(joint, name) for name in (*REQUIRED, 'side') if getattr(joint, name)}
+    lines = ['[[joint]]', *(f'{key} = "{value}"' for key, value in keys.items())]
+    for end in ('proximal', 'distal'):
+        lines += ['', f'[joint.{end}_frame.landmarks]']
+        points = landmarks[getattr(joint, end)]
+        lines += [f'{name} = {np.asarray(x).tolist()!r}' for name, x in points.items()]
+    return '\n'.join(lines) + '\n'
+
+
+def joint_table(motions: Sequence[JointMotion], start_ns: int) -> Table:
+    """Return joints.csv: a row for each joint and exposure, with times since start_ns."""
+    rows = (row for motion in motions for row in _motion_rows(motion, start_ns))
+    return Table(JOINT_COLUMNS, rows)
+
+
+def _motion_rows(motion: JointMotion, start_ns: int) -> Iterator[list[object]]:
+    time_s = (motion.stamp_ns - start_ns)[:, None] / 1e9
+    sd_deg = np.rad2deg(motion.sd[:, :3])
+    numbers = np.hstack(
+        [time_s, np.rad2deg(motion.angles), motion.translations, sd_deg, motion.sd[:, 3:]]
+    )
+    rows = zip(motion.number.tolist(), numbers.tolist(), motion.status.tolist())
+    for number, values, status in rows:
+        yield [motion.joint.name, number, *values, STATUS_NAMES[status]]

@@ -8,22 +8,24 @@ A validation reads them; see docs/verdict.md.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration, digest_of_sources
+from ..correction.fluoroscope_calibration import (
+    Calibrations,
+    digest_of_sources,
+)
 from ..errors import DataError, ErrorsAt
 from ..estimation.options import CalibrationOptions, CalibrationRequest
-from ..exposures.frame import Frame, validate_frame
+from ..exposures.frame import Frame, Frames, validate_frame
 from ..exposures.phantom import Phantom
 from .access import PathLike
+from .calibration import KNOWN_ORIENTATION, OBSERVATIONS, OPTIONS, PHANTOM
 from .csv_table import read_names, write_names
 from .documents import read_json, write_json
-from .formats.known_orientation import read_known_orientations, write_known_orientations
+from .formats.native import read_known_orientations, write_known_orientations
 from .observations import read_observations_csv, write_observations_csv
 from .phantom import read_phantom, write_phantom
-from .result_check import KNOWN_ORIENTATION, OBSERVATIONS, OPTIONS, PHANTOM
 from .result_document import delete_validation
 
 VERSION = 1  # of options.json
@@ -54,8 +56,8 @@ def write_request(directory: PathLike, request: CalibrationRequest) -> None:
 
 def read_request(
     directory: PathLike,
-    calibrations: Mapping[str, FluoroscopeCalibration],
-    frames: Mapping[str, Sequence[Frame]] | None = None,
+    calibrations: Calibrations,
+    frames: Frames | None = None,
     phantom: Phantom | None = None,
 ) -> CalibrationRequest:
     """Read the request that the calibrations in a folder were made from.
@@ -69,10 +71,6 @@ def read_request(
         Used instead of observations.csv.
     phantom : Phantom, optional
         Used instead of phantom.csv.
-
-    Returns
-    -------
-    CalibrationRequest
 
     Raises
     ------
@@ -126,9 +124,7 @@ def _require_file(path: Path, option: str = '') -> Path:
     return path
 
 
-def _read_frames(
-    path: Path, calibrations: Mapping[str, FluoroscopeCalibration]
-) -> dict[str, list[Frame]]:
+def _read_frames(path: Path, calibrations: Calibrations) -> dict[str, list[Frame]]:
     """Read the frames of the calibrated fluoroscopes, with the image sizes of the calibrations."""
     widths, heights = zip(*(c.image_size for c in calibrations.values()))
     found = read_observations_csv(_require_file(path, '--source'), (max(widths), max(heights)))

@@ -22,9 +22,8 @@ from ..errors import DataError, ErrorsAt
 from ..exposures.frame import MAX_ANGLE
 from ..images.codec import as_grey, check_size, decode
 from .access import PathLike, os_error_reason, read_bytes
-from .cine import read_cine_header, read_cine_images
 from .csv_table import read_blocks
-from .dicom import read_dicom_header, read_dicom_images
+from .recordings import read_cine_header, read_cine_images, read_dicom_header, read_dicom_images
 
 # Angles of a C-arm in the images of a stack or video, as CSV: `image,angle_deg`.
 #

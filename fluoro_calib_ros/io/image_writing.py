@@ -193,24 +193,11 @@ def correct_images(
 ) -> CorrectedImages:
     """Correct an image file, a stack or a video.
 
-    Parameters
-    ----------
-    source, out : path
-    corrector : ImageCorrector or callable
-        Of all images, or that gives the one of each image from its number, the first being 1.
-    progress : callable, optional
-        Called after every image with the number of images that are done, and their total.
-
-    Returns
-    -------
-    CorrectedImages
-
-    Raises
-    ------
-    DataError
-        If the source cannot be read, is damaged, or is no grey image of the size of the
-        calibration; if `out` cannot be written, or its format cannot hold the images. `out` is
-        left as it was.
+    corrector: of all images, or that gives the one of each image from its number, the first being
+    1. progress: called after every image with the number of images that are done, and their total.
+    Raises DataError if the source cannot be read, is damaged, or is no grey image of the size of
+    the calibration; if `out` cannot be written, or its format cannot hold the images. `out` is
+    left as it was.
     """
     source = Path(source)
     out = Path(out)

@@ -19,12 +19,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..correction.base import CorrectionStatus
-from ..correction.fluoroscope_calibration import CorrectedPoints, FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import (
+    Calibrations,
+    CorrectedPoints,
+)
 from ..errors import DataError
-from ..exposures.frame import MAX_ANGLE, Frame, angle_in_degrees, angles_of, points_on_image
+from ..exposures.frame import (
+    MAX_ANGLE,
+    Frame,
+    Frames,
+    angle_in_degrees,
+    angles_of,
+    few,
+    points_on_image,
+)
 from ..exposures.names import Names, safe_names, without_trivial
 from ..exposures.phantom import first_repeated, is_positive
-from ..exposures.strays import few
 from ..limits import MAX_FRAMES
 from .access import PathLike, check_safe_name
 from .csv_table import Block, NamedColumn, Table, read_all, read_blocks, write_table
@@ -154,7 +164,7 @@ def _on_image(
 
 def write_observations_csv(
     path: PathLike,
-    frames: Mapping[str, Sequence[Frame]] | Iterable[Frame],
+    frames: Frames | Iterable[Frame],
     names: Names | None = None,
     corrected_by: Mapping[str, str] | None = None,
 ) -> None:
@@ -437,9 +447,7 @@ class PointsFile:
         ]
 
 
-def points_of_frames(
-    path: PathLike, frames: Mapping[str, Sequence[Frame]], names: Names
-) -> PointsFile:
+def points_of_frames(path: PathLike, frames: Frames, names: Names) -> PointsFile:
     """Return the image points of frames as the rows of a CSV file; path is for messages.
 
     Targets and exposures have their names where they have some.
@@ -520,9 +528,7 @@ def _image_angle(block: Block) -> np.ndarray:
 
 
 def correct_points(
-    points: PointsFile,
-    calibrations: Mapping[str, FluoroscopeCalibration],
-    angle: float | None = None,
+    points: PointsFile, calibrations: Calibrations, angle: float | None = None
 ) -> CorrectedPoints:
     """Correct image points with the calibrations of their fluoroscopes.
 

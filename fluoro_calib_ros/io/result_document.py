@@ -13,22 +13,21 @@ import numpy as np
 
 from ..checks.check import Check, Validation
 from ..checks.rig_watch import DriftVerdict
+from ..correction.calibration_record import Field
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError
 from ..estimation.constraints import RelativeOrientation
-from ..estimation.diagnostics import AdjustmentStatistics, ResidualTable
 from ..estimation.fixed_calibration import JointPrecision
 from ..estimation.result import CalibrationResult, FluoroscopeResult
-from ..estimation.rounds import Round
+from ..estimation.rounds import AdjustmentStatistics, ResidualTable, Round
 from ..findings import Finding, Severity, sentences
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import quaternion_from_matrix
-from ..records import Field
 from .access import PathLike, os_error_reason
 from .arrays import Layout, read_arrays, to_arrays, write_arrays
+from .calibration import VALIDATION_NAME, with_digests
 from .csv_table import Table
 from .documents import write_json
-from .result_check import VALIDATION_NAME, with_digests
 
 # 1 had neither version, date, units nor adjustments; 2 no ids, no note on the rig and no digest.
 FORMAT_VERSION = 3

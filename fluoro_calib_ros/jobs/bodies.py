@@ -1,35 +1,40 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The job of the bodies: shapes, poses and joints from a recording of markers."""
+"""The job of the bodies: shapes, poses and joints from a recording of markers, and films."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..bodies.body import STATUS_NAMES, Body, BodyPoses, check_bodies, solvable_bodies
+from ..bodies.body import AXIS_MM, STATUS_NAMES, Body, BodyPoses, check_bodies, solvable_bodies
 from ..bodies.butterworth import filtered_poses
 from ..bodies.joints import JointMotion, joint_motion, with_neutral
 from ..bodies.shapes import EstimatedShape, estimate_shape, places_of
 from ..bodies.tracking import BodyTracker, TrackedExposure, poses_alone, poses_of
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
 from ..errors import DataError
-from ..exposures.frame import Frame
+from ..exposures.frame import Frames
 from ..exposures.pairing import RecordedPairing
 from ..findings import Finding, Kind, Place, Severity, sentences
+from ..images.corrector import iterated
+from ..images.overlay import BodyView, draw_bodies
 from ..io.access import PathLike, write_text
-from ..io.bodies import shape_table
+from ..io.bodies import JointEntry, joint_table, shape_table
 from ..io.csv_table import Table, dataframe_of
 from ..io.folder import FolderKind, check_output_folder, replaced_folder
-from ..io.formats.opensim import write_joint_motion
-from ..io.joints import JointEntry, joint_table
+from ..io.formats.bodies import write_joint_motion
+from ..io.image_reading import ImageSource
+from ..io.image_writing import write_video
 from ..io.poses import motion_table, pose_table
 from ..options import option
+from ..photogrammetry.collinearity import project
 from ..photogrammetry.noise import ObservedScatter
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.intersection import OK, OUTSIDE, Intersector
@@ -39,7 +44,88 @@ from ..reconstruction.reconstruct import (
     orientation_of_recorded,
     pair_recording,
 )
-from .bodies_film import Film, write_films
+from .image_sources import fluoroscope_folders, is_image_bag, open_sources
+
+FILM_HZ = 25.0  # slow motion: players show no 250 images a second
+
+
+@dataclass(frozen=True)
+class Film:
+    """What films are made of."""
+
+    source: Path  #: bag of images, or folder with a folder for each fluoroscope
+    calibrations: Calibrations
+    orientation: RigOrientation  #: of the fluoroscopes of the recording
+
+
+def write_films(
+    folder: Path, film: Film, bodies: Sequence[Body], poses: Sequence[BodyPoses]
+) -> None:
+    """Write folder/film_<fluoroscope>.mp4 of the exposures that have an image.
+
+    Raises DataError for images that cannot be read, or are of other exposures.
+    """
+    folders = fluoroscope_folders(film.source)
+    if not folders and not is_image_bag(film.source):
+        raise DataError(
+            f'{film.source}: this is neither a bag with images nor a folder with a folder of '
+            'images for each fluoroscope'
+        )
+    for name in film.orientation.fluoroscopes:
+        if folders and name not in folders:
+            raise DataError(f'{film.source}: there is no folder {name} with images')
+        source = folders.get(name, film.source)
+        frames = _frames(source, film, name, bodies=bodies, poses=poses)
+        first = next(frames, None)
+        if first is None:
+            raise DataError(f'{source}: there is no image of an exposure with poses')
+        images = ImageSource('video', 0, _chained(first, frames), FILM_HZ)
+        write_video(folder / f'film_{name}.mp4', images, lambda done, total: None)
+
+
+def _chained(
+    first: tuple[str, np.ndarray], rest: Iterator[tuple[str, np.ndarray]]
+) -> Iterator[tuple[str, np.ndarray]]:
+    yield first
+    yield from rest
+
+
+def _frames(
+    source: Path, film: Film, name: str, bodies: Sequence[Body], poses: Sequence[BodyPoses]
+) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield the pictures of a fluoroscope. Raises DataError for an image that cannot be read."""
+    rows = {number: row for row, number in enumerate(poses[0].number.tolist())}
+    for image in open_sources([source], name).images():
+        if isinstance(image.image, DataError):
+            raise image.image.at(image.place)
+        row = rows.get(image.exposure)
+        if row is not None:
+            calibration = film.calibrations[name].at_angle(image.angle)
+            views = [
+                _view(body, one.rows(one.number == image.exposure), film.orientation, calibration)
+                for body, one in zip(bodies, poses)
+            ]
+            yield image.place, draw_bodies(image.image, f'exposure {image.exposure}', views)
+
+
+def _view(
+    body: Body, pose: BodyPoses, orientation: RigOrientation, calibration: FluoroscopeCalibration
+) -> BodyView:
+    """Return a body where it is in the observed image of a fluoroscope."""
+    row = orientation.fluoroscopes.index(calibration.fluoroscope)
+    ends = body.centre + np.vstack([np.zeros(3), AXIS_MM * np.eye(3)])
+    points = np.vstack([body.xyz_mm, ends]) @ pose.rotation[0].T + pose.position_mm[0]
+    count = len(points)
+    uv = project(
+        np.broadcast_to(orientation.rotation[row], (count, 3, 3)),
+        np.broadcast_to(orientation.position_mm[row], (count, 3)),
+        points,
+        orientation.interior[row],
+    )
+    if np.isfinite(uv).all():
+        uv = iterated(calibration.grid, uv.T.copy()).T
+    return BodyView(body.name, STATUS_NAMES[pose.status[0]], uv[:-4], uv[-4:])
+
 
 if TYPE_CHECKING:
     import pandas
@@ -80,7 +166,7 @@ class BodiesOptions(RecordedPairing):
     )
     estimate_shapes: bool = True
     rate: float | None = None
-    neutral: Mapping[str, Sequence[Frame]] | None = None
+    neutral: Frames | None = None
 
 
 @dataclass(frozen=True)
@@ -134,7 +220,7 @@ class BodiesOutcome:
 
         Raises DataError for a name that is none of them.
         """
-        from ..report.motion_figure import body_figure, joint_figure, paths_figure
+        from ..report.motion import body_figure, joint_figure, paths_figure
 
         if name is None:
             return paths_figure(self.poses)
@@ -175,8 +261,8 @@ class BodiesOutcome:
 
 
 def track_bodies(
-    frames: Mapping[str, Sequence[Frame]],
-    calibrations: Mapping[str, FluoroscopeCalibration],
+    frames: Frames,
+    calibrations: Calibrations,
     orientation: RigOrientation,
     bodies: Sequence[Body],
     joints: Sequence[JointEntry] = (),
@@ -197,10 +283,6 @@ def track_bodies(
     options : BodiesOptions, optional
     progress : callable, optional
         Called with the number of exposures that are solved, and of all.
-
-    Returns
-    -------
-    BodiesOutcome
 
     Raises
     ------
@@ -251,10 +333,7 @@ class _Exposure:
 
 
 def _intersected(
-    frames: Mapping[str, Sequence[Frame]],
-    calibrations: Mapping[str, FluoroscopeCalibration],
-    orientation: RigOrientation,
-    options: BodiesOptions,
+    frames: Frames, calibrations: Calibrations, orientation: RigOrientation, options: BodiesOptions
 ) -> tuple[list[_Exposure], dict[str, int]]:
     """Pair and intersect the frames of a recording. Raises DataError."""
     names = orientation.fluoroscopes
@@ -322,8 +401,8 @@ def _poses(
 
 
 def _poses_alone(
-    frames: Mapping[str, Sequence[Frame]],
-    calibrations: Mapping[str, FluoroscopeCalibration],
+    frames: Frames,
+    calibrations: Calibrations,
     orientation: RigOrientation,
     bodies: Sequence[Body],
     options: BodiesOptions,
@@ -399,7 +478,7 @@ def save_bodies(
         if _some_exposure_has_all(outcome.joints):
             write_joint_motion(folder / OPENSIM, outcome.joints, start_ns)
         if report:
-            from ..report.bodies import bodies_html
+            from ..report.motion import bodies_html
 
             title = os.path.basename(os.path.abspath(directory))
             text = bodies_html(

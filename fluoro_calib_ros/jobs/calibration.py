@@ -9,7 +9,7 @@ The command line, the calibration node, its worker process and Python users all 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import TYPE_CHECKING
@@ -32,20 +32,18 @@ from ..checks.inputs import (
     why_excluded,
 )
 from ..checks.mixed_units import mixed_units
-from ..checks.rig import RigFindings, rig_findings
-from ..checks.rigidity import interchanged
+from ..checks.rig import RigFindings, interchanged, rig_findings
 from ..checks.verdict import validate_or_report
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
 from ..errors import DataError
 from ..estimation.calibrate import adjust_with_calibrations, calibrate_request
 from ..estimation.initial_network import MIN_EXPOSURES
 from ..estimation.options import CalibrationRequest
 from ..estimation.result import CalibrationResult
 from ..estimation.rounds import Round
-from ..exposures.frame import Frame
+from ..exposures.collector import without_repeats
+from ..exposures.frame import Frame, Frames, frames_without_strays
 from ..exposures.phantom import Phantom
-from ..exposures.repeats import without_repeats
-from ..exposures.strays import frames_without_strays
 from ..findings import Finding, Kind, Place, Severity
 from ..io.csv_table import dataframe_of
 from ..io.result_document import result_tables
@@ -60,10 +58,7 @@ if TYPE_CHECKING:
 
 
 def adjust(
-    frames: Mapping[str, Sequence[Frame]],
-    phantom: Phantom,
-    calibrations: Mapping[str, FluoroscopeCalibration],
-    loss: str = 'student_t',
+    frames: Frames, phantom: Phantom, calibrations: Calibrations, loss: str = 'student_t'
 ) -> CalibrationResult:
     """Adjust exposures of the phantom with interior orientations and corrections fixed.
 
@@ -104,7 +99,6 @@ def adjust(
 
 MAX_SHARED = 1 / 3  # of the exposures of a fluoroscope that another one has as well
 
-Frames = Mapping[str, Sequence[Frame]]
 Progress = Callable[[str, Round], None]
 
 
@@ -115,9 +109,9 @@ class Rig:
     #: names of all fluoroscopes of the rig in their order; empty: those of the request
     fluoroscopes: Sequence[str] = ()
     #: exposures of the other fluoroscopes
-    frames: Mapping[str, Sequence[Frame]] = field(default_factory=dict)
+    frames: Frames = field(default_factory=dict)
     #: present calibrations of the other fluoroscopes
-    calibrations: Mapping[str, FluoroscopeCalibration] = field(default_factory=dict)
+    calibrations: Calibrations = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -195,10 +189,6 @@ def run_calibration(
         stop.
     report_step : callable, optional
         Called as the progress of `checks.verdict.validate`.
-
-    Returns
-    -------
-    CalibrationOutcome
 
     Raises
     ------

@@ -13,15 +13,24 @@ from typing import Any
 
 import numpy as np
 
+from ..correction.angle_field import note_on_angles
 from ..correction.base import CorrectionStatus
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
 from ..errors import DataError
 from ..exposures.angles import AngleOptions
-from ..exposures.frame import Frame
+from ..exposures.frame import Frame, Frames
 from ..images.corrector import ImageCorrector
 from ..io.access import PathLike
 from ..io.bags.reader import read_frames, with_angles
-from ..io.calibration import SUFFIX, load_calibrations, load_orientation, orientation_path
+from ..io.calibration import (
+    OBSERVATIONS,
+    SUFFIX,
+    load_calibrations,
+    load_orientation,
+    orientation_path,
+)
+from ..io.calibration import PHANTOM as PHANTOM_FILE
+from ..io.calibration import RESULT_NAME as RESULT
 from ..io.csv_table import read_names
 from ..io.documents import read_json
 from ..io.formats import registry
@@ -37,9 +46,6 @@ from ..io.formats.content import (
 )
 from ..io.observations import read_observations_csv
 from ..io.phantom import read_phantom
-from ..io.result_check import OBSERVATIONS
-from ..io.result_check import PHANTOM as PHANTOM_FILE
-from ..io.result_check import RESULT_NAME as RESULT
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import matrix_from_quaternion
 from .result_folder import belongs_to
@@ -116,7 +122,7 @@ def convert(request: ConversionRequest) -> Written:
     and where it cannot be written.
     """
     known = request.settings
-    calibrations: Mapping[str, FluoroscopeCalibration] = {}
+    calibrations: Calibrations = {}
     if request.calibration is not None:
         calibrations = load_calibrations(request.calibration)
         size = known.image_size or next(iter(calibrations.values())).image_size
@@ -173,9 +179,7 @@ def _bag_content(source: Path, angles: AngleOptions) -> Content:
     return Content(observations=frames, notes=(*contents.notes, *notes))
 
 
-def _lost_angles(
-    request: ConversionRequest, observations: Mapping[str, Sequence[Frame]]
-) -> tuple[str, ...]:
+def _lost_angles(request: ConversionRequest, observations: Frames) -> tuple[str, ...]:
     """Return a note where angles of the C-arm are not in what was written."""
     has_angle = any(frame.angle is not None for each in observations.values() for frame in each)
     own = request.kind == 'observations'
@@ -246,9 +250,7 @@ def _write(request: ConversionRequest, content: Content, is_own: bool) -> Writte
 
 
 def _corrected(
-    content: Content,
-    calibrations: Mapping[str, FluoroscopeCalibration],
-    request: ConversionRequest,
+    content: Content, calibrations: Calibrations, request: ConversionRequest
 ) -> tuple[dict[str, list[Frame]], tuple[str, ...]]:
     """Return the frames of a content with the image points that could be corrected, and notes."""
     out: dict[str, list[Frame]] = {}
@@ -260,13 +262,10 @@ def _corrected(
                 f'{", ".join(calibrations)}'
             )
         out[name] = []
-        unknown = sum(frame.angle is None for frame in frames)
-        if calibrations[name].angle_field is not None and unknown and request.angle is None:
-            notes.append(
-                f'{request.source}: the correction of fluoroscope {name} depends on the angle of '
-                f'the C-arm, which is unknown for {unknown} of {len(frames)} frames: they get the '
-                'mean over the angles, with its larger standard deviation'
-            )
+        angles = [frame.angle for frame in frames]
+        note = note_on_angles(name, calibrations[name].angle_field, angles)
+        if note and request.angle is None:
+            notes.append(f'{request.source}: {note}')
         for frame in frames:
             angle = request.angle if frame.angle is None else frame.angle
             points = calibrations[name].correct(frame.uv, frame.sigma, angle=angle)
@@ -327,9 +326,7 @@ def result_content(
     return Content(**found)
 
 
-def _orientation(
-    directory: Path, calibrations: Mapping[str, FluoroscopeCalibration]
-) -> RigOrientation | None:
+def _orientation(directory: Path, calibrations: Calibrations) -> RigOrientation | None:
     """Return the orientation of the rig if it is there. Raises DataError for a foreign one."""
     path = Path(orientation_path(directory))
     if not path.exists():
@@ -397,9 +394,7 @@ def _lookup(calibration: FluoroscopeCalibration) -> np.ndarray:
     return np.where(corrector.status == CorrectionStatus.OK, corrector.source, np.float32(np.nan))
 
 
-def _observations(
-    directory: Path, calibrations: Mapping[str, FluoroscopeCalibration]
-) -> dict[str, list[Frame]]:
+def _observations(directory: Path, calibrations: Calibrations) -> dict[str, list[Frame]]:
     """Return the frames that the calibrations were made from."""
     sizes = [c.image_size for c in calibrations.values()]
     largest = (max(w for w, _ in sizes), max(h for _, h in sizes))

@@ -21,6 +21,7 @@ from ..images.lattice import NOT_MARKED, FlatGrid
 from ..images.view import Lens, assumed_lens, may_be_found, shared_lens
 from ..io.access import check_safe_name, make_folder, write_bytes
 from ..io.bags.reader import image_topics
+from .followers import Observations, PhantomSettings
 from .image_sources import (
     ImageAngles,
     ImageSources,
@@ -29,7 +30,6 @@ from .image_sources import (
     is_image_bag,
     open_sources,
 )
-from .live_extraction import Observations, PhantomSettings
 from .scheduling import Cluster, Workers, open_workers
 from .sources import Recording, Survey
 
@@ -161,20 +161,8 @@ def run_extraction(
     A damaged image, or one without the phantom, is passed over, and its result says why. Images
     whose pose is not found are tried again with the distortion that the others have.
 
-    Parameters
-    ----------
-    request : ExtractionRequest
-    progress : callable, optional
-        Called after every image with the number of images that are done, and their total.
-
-    Returns
-    -------
-    ExtractionOutcome
-
-    Raises
-    ------
-    DataError
-        For sources that cannot be read, and where no image gives observations.
+    progress: called after every image with the number of images that are done, and their total.
+    Raises DataError for sources that cannot be read, and where no image gives observations.
     """
     sources = open_sources(request.sources, request.fluoroscope, request.angles)
     if request.regular_grid and FlatGrid.of(request.phantom.xyz_mm) is None:
@@ -297,10 +285,6 @@ def recording_of_images(
     progress : callable, optional
     angles : ImageAngles, optional
         Angles of the C-arms.
-
-    Returns
-    -------
-    Recording
 
     Raises
     ------

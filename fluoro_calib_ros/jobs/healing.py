@@ -21,10 +21,10 @@ from ..bodies.rig_adjustment import ObservedBodies, Poses, RigAdjustment, RigErr
 from ..bodies.rigid import fitted_pose
 from ..checks.check import Check, verdict_of
 from ..correction.base import CorrectionStatus
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration, with_drift
+from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration, with_drift
 from ..correction.series import sd_over_image
 from ..errors import DataError
-from ..exposures.frame import Frame
+from ..exposures.frame import Frame, Frames
 from ..exposures.pairing import RecordedPairing
 from ..findings import Finding, Kind, Place, Severity
 from ..io.access import PathLike
@@ -74,7 +74,7 @@ class HealingOutcome:
 
     diagnosis: Diagnosis
     healed: HealedRig | None
-    calibrations: Mapping[str, FluoroscopeCalibration]
+    calibrations: Calibrations
     orientation: RigOrientation
     before: RigErrors
     after: RigErrors
@@ -85,8 +85,8 @@ class HealingOutcome:
 
 
 def heal_rig(
-    frames: Mapping[str, Sequence[Frame]],
-    calibrations: Mapping[str, FluoroscopeCalibration],
+    frames: Frames,
+    calibrations: Calibrations,
     orientation: RigOrientation,
     bodies: Sequence[Body],
     options: HealingOptions | None = None,
@@ -106,10 +106,6 @@ def heal_rig(
     options : HealingOptions, optional
     progress : callable, optional
         Called with the number of the steps that are done, and of all.
-
-    Returns
-    -------
-    HealingOutcome
 
     Raises
     ------
@@ -182,7 +178,7 @@ def _chosen(count: int) -> tuple[list[int], list[int]]:
 class _Rig:
     """A rig at a time, and the bodies that it sees."""
 
-    calibrations: Mapping[str, FluoroscopeCalibration]
+    calibrations: Calibrations
     orientation: RigOrientation
     bodies: tuple[Body, ...]
 

@@ -21,9 +21,10 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from ..bodies.body import Body
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..correction.angle_field import note_on_angles
+from ..correction.fluoroscope_calibration import Calibrations
 from ..errors import DataError
-from ..exposures.frame import Frame
+from ..exposures.frame import Frame, Frames
 from ..exposures.phantom import Phantom
 from ..findings import Finding
 from ..images.marker_decisions import Decision, revise
@@ -33,6 +34,7 @@ from ..images.overlay import draw_markers
 from ..io.access import make_folder, write_bytes
 from ..photogrammetry.rig_orientation import RigOrientation
 from .extraction import Progress
+from .followers import MarkerFollower, MarkerSettings
 from .image_sources import (
     ImageAngles,
     ImageSources,
@@ -41,7 +43,6 @@ from .image_sources import (
     is_image_bag,
     open_sources,
 )
-from .live_markers import MarkerFollower, MarkerSettings
 
 MAX_TRIES = 30  # exposures in which markers are identified by their shapes
 AHEAD = 3  # images that are read before they are wanted
@@ -54,10 +55,10 @@ class MarkerRequest:
     sources: Mapping[str, Sequence[Path]]  #: images by fluoroscope
     #: markers of one or more exposures, by fluoroscope; following begins with the first image that
     #: has one
-    first: Mapping[str, Sequence[Frame]]
+    first: Frames
     options: MarkerOptions = field(default_factory=MarkerOptions)
     #: of two fluoroscopes
-    calibrations: Mapping[str, FluoroscopeCalibration] = field(default_factory=dict)
+    calibrations: Calibrations = field(default_factory=dict)
     orientation: RigOrientation | None = None  #: of two fluoroscopes
     #: markers that are rigid together, of two fluoroscopes; known shapes give the ids where no
     #: markers are given
@@ -390,15 +391,12 @@ class _Recording:
             angles = [result.angle for result in results]
             yield from request.angles.note(name, angles)
             calibration = request.calibrations.get(name)
-            if calibration is None or calibration.angle_field is None:
-                continue
-            unknown = angles.count(None)
-            if unknown:
-                yield (
-                    f'the correction of fluoroscope {name} depends on the angle of the C-arm, '
-                    f'which is unknown for {unknown} of {len(angles)} images: markers are '
-                    'predicted by the mean over the angles'
-                )
+            field = None if calibration is None else calibration.angle_field
+            note = note_on_angles(
+                name, field, angles, 'images', 'markers are predicted by the mean over the angles'
+            )
+            if note:
+                yield note
 
 
 def _angles_of(images: Mapping[str, SourceImage]) -> dict[str, float | None]:

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,10 +12,10 @@ from scipy.special import chdtri
 
 from ..checks.held_out import uncorrected
 from ..checks.inputs import require_phantom
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import Calibrations
 from ..errors import DataError
 from ..estimation.rig_orientation import orientation_of_capture, standing_frames
-from ..exposures.frame import Frame
+from ..exposures.frame import Frames
 from ..exposures.phantom import Phantom
 from ..findings import Finding, Kind, Place, Severity
 from ..photogrammetry.rig_orientation import RigOrientation
@@ -55,9 +54,9 @@ class OrientationOutcome:
 
 
 def orient(
-    frames: Mapping[str, Sequence[Frame]],
+    frames: Frames,
     phantom: Phantom,
-    calibrations: Mapping[str, FluoroscopeCalibration],
+    calibrations: Calibrations,
     frame_id: str = 'rig',
     present: RigOrientation | None = None,
 ) -> OrientationOutcome:
@@ -73,10 +72,6 @@ def orient(
         Name of the rig frame.
     present : RigOrientation, optional
         The orientation so far, with which the new one is compared.
-
-    Returns
-    -------
-    OrientationOutcome
 
     Raises
     ------
@@ -123,9 +118,7 @@ class _Met:
 
 
 def _intersected(
-    frames: Mapping[str, Sequence[Frame]],
-    calibrations: Mapping[str, FluoroscopeCalibration],
-    orientation: RigOrientation,
+    frames: Frames, calibrations: Calibrations, orientation: RigOrientation
 ) -> ReconstructedFrame:
     """Return the targets of a capture, intersected again."""
     standing = standing_frames(frames, calibrations)
@@ -149,10 +142,7 @@ def _met(found: ReconstructedFrame, phantom: Phantom) -> _Met:
 
 
 def _fits_uncorrected(
-    frames: Mapping[str, Sequence[Frame]],
-    phantom: Phantom,
-    calibrations: Mapping[str, FluoroscopeCalibration],
-    frame_id: str,
+    frames: Frames, phantom: Phantom, calibrations: Calibrations, frame_id: str
 ) -> bool:
     """Whether a capture fits the calibrations without their corrections."""
     if not any(calibrations[name].model.corrects for name in frames):

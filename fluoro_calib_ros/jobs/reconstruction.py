@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -13,9 +13,9 @@ import numpy as np
 
 from ..bodies.body import Body
 from ..checks.rig_watch import DriftVerdict, RecordingDriftWatch
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import Calibrations
 from ..errors import DataError
-from ..exposures.frame import Frame
+from ..exposures.frame import Frames
 from ..exposures.names import Names
 from ..exposures.pairing import RecordedPairing, disagreement_of_recording
 from ..findings import Finding, Kind, Severity
@@ -23,8 +23,8 @@ from ..io.poses import point_table
 from ..options import option
 from ..photogrammetry.noise import MAX_WIDENING, ObservedScatter
 from ..photogrammetry.rig_orientation import RigOrientation
+from ..reconstruction.epipolar import cause_of_misses, mismatch
 from ..reconstruction.intersection import STATUS_NAMES, Intersector
-from ..reconstruction.mismatch import cause_of_misses, mismatch
 from ..reconstruction.reconstruct import (
     ReconstructedFrame,
     orientation_of_recorded,
@@ -97,7 +97,7 @@ class ReconstructionOutcome:
 
     def plot(self, names: Names | None = None) -> Figure:
         """Return a matplotlib figure of the paths in space, the gaps and the sd of the targets."""
-        from ..report.motion_figure import points_figure
+        from ..report.motion import points_figure
 
         return points_figure(self.frames, (names or Names()).target_names())
 
@@ -115,8 +115,8 @@ class ReconstructionOutcome:
 
 
 def reconstruct(
-    frames: Mapping[str, Sequence[Frame]],
-    calibrations: Mapping[str, FluoroscopeCalibration],
+    frames: Frames,
+    calibrations: Calibrations,
     orientation: RigOrientation,
     options: ReconstructionOptions | None = None,
 ) -> ReconstructionOutcome:
@@ -129,10 +129,6 @@ def reconstruct(
     calibrations : mapping of str to FluoroscopeCalibration
     orientation : RigOrientation
     options : ReconstructionOptions, optional
-
-    Returns
-    -------
-    ReconstructionOutcome
 
     Raises
     ------
@@ -182,9 +178,7 @@ def reconstruct(
     )
 
 
-def check_orientation(
-    orientation: RigOrientation, calibrations: Mapping[str, FluoroscopeCalibration]
-) -> None:
+def check_orientation(orientation: RigOrientation, calibrations: Calibrations) -> None:
     """Raise DataError unless an orientation was determined with these calibrations."""
     orientation.check_calibrations(
         {name: calibration.calibration_id for name, calibration in calibrations.items()}
@@ -192,9 +186,7 @@ def check_orientation(
 
 
 def _drift_watch(
-    orientation: RigOrientation,
-    calibrations: Mapping[str, FluoroscopeCalibration],
-    options: ReconstructionOptions,
+    orientation: RigOrientation, calibrations: Calibrations, options: ReconstructionOptions
 ) -> tuple[RecordingDriftWatch | None, DriftVerdict | None]:
     """Return the drift watch of a recording, or the verdict that explains why there is none."""
     if not options.drift_watch:

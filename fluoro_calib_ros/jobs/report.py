@@ -17,19 +17,19 @@ from ..checks.comparison import Comparison, compare_calibrations
 from ..errors import DataError
 from ..findings import Finding, Kind, Place, Severity
 from ..io.access import PathLike, write_text
-from ..io.calibration import load_calibrations
-from ..io.calibration_request import read_request
-from ..io.csv_table import read_names
-from ..io.documents import read_json
-from ..io.result_check import (
+from ..io.calibration import (
     OPTIONS,
     VALIDATION_NAME,
     changed_since_verdict,
     edited,
     exchanged,
+    load_calibrations,
     read_result,
 )
-from ..io.result_check import RESULT_NAME as RESULT
+from ..io.calibration import RESULT_NAME as RESULT
+from ..io.calibration_request import read_request
+from ..io.csv_table import read_names
+from ..io.documents import read_json
 from ..report.html import ReportInput, report_html
 from .conversion import stations_of
 from .result_folder import REPORT, belongs_to, saved_orientation, saved_rig_note

@@ -5,38 +5,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import Calibrations
 from ..errors import DataError
 from ..estimation.result import CalibrationResult
 from ..findings import Finding, Kind, Severity
 from ..io import csv_table as names
 from ..io.access import PathLike
-from ..io.calibration import ORIENTATION_NAME as ORIENTATION
 from ..io.calibration import (
-    SUFFIX,
-    load_calibrations,
-    load_orientation,
-    orientation_path,
-    save_calibration,
-    save_orientation,
-)
-from ..io.calibration_request import write_request
-from ..io.documents import write_json
-from ..io.folder import FolderKind, check_output_folder, replaced_folder
-from ..io.result_check import (
     KNOWN_ORIENTATION,
     OBSERVATIONS,
     OPTIONS,
     PHANTOM,
+    SUFFIX,
     VALIDATION_NAME,
+    load_calibrations,
+    load_orientation,
+    orientation_path,
     read_result,
+    save_calibration,
+    save_orientation,
     with_digest,
 )
-from ..io.result_check import RESULT_NAME as RESULT
+from ..io.calibration import ORIENTATION_NAME as ORIENTATION
+from ..io.calibration import RESULT_NAME as RESULT
+from ..io.calibration_request import write_request
+from ..io.documents import write_json
+from ..io.folder import FolderKind, check_output_folder, replaced_folder
 from ..io.result_document import NAMES as TABLES
 from ..io.result_document import SUFFIX as COVARIANCE
 from ..io.result_document import result_document, result_tables, write_covariance, write_validation
@@ -127,9 +125,7 @@ def write_covariances(folder: Path, result: CalibrationResult) -> None:
 
 
 def save_calibrations(
-    directory: PathLike,
-    calibrations: Mapping[str, FluoroscopeCalibration],
-    orientation: RigOrientation | None,
+    directory: PathLike, calibrations: Calibrations, orientation: RigOrientation | None
 ) -> None:
     """Write calibrations and the orientation of the rig as a result folder.
 
@@ -166,9 +162,7 @@ def written_document(result: CalibrationResult) -> dict[str, Any]:
     return with_digest(result_document(result))
 
 
-def _saved_ids(
-    directory: PathLike, calibrations: Mapping[str, FluoroscopeCalibration]
-) -> list[str]:
+def _saved_ids(directory: PathLike, calibrations: Calibrations) -> list[str]:
     """Return the ids of the calibrations of these fluoroscopes in a folder, none for a fault."""
     try:
         saved = load_calibrations(directory)
@@ -199,9 +193,7 @@ def saved_rig_note(directory: PathLike) -> Finding | None:
     return Finding(Kind.RIG_NOTE, note, severity=Severity.WARNING)
 
 
-def belongs_to(
-    orientation: RigOrientation, calibrations: Mapping[str, FluoroscopeCalibration]
-) -> bool:
+def belongs_to(orientation: RigOrientation, calibrations: Calibrations) -> bool:
     """Return whether an orientation was determined with these calibrations."""
     return orientation.calibration_ids == tuple(
         calibrations[name].calibration_id if name in calibrations else ''
@@ -210,9 +202,7 @@ def belongs_to(
 
 
 def kept_orientation(
-    present: RigOrientation | None,
-    new: RigOrientation | None,
-    calibrations: Mapping[str, FluoroscopeCalibration],
+    present: RigOrientation | None, new: RigOrientation | None, calibrations: Calibrations
 ) -> RigOrientation | None:
     """Choose between the present orientation of a rig and that of new calibrations.
 

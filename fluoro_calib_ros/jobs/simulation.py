@@ -15,17 +15,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..exposures.frame import Frame
+from ..exposures.frame import Frame, Frames
 from ..exposures.phantom import Phantom
 from ..images.codec import encode
 from ..io.access import PathLike, make_folder, write_bytes, write_text
 from ..io.bags.writer import BagWriter
-from ..io.bodies import write_bodies
+from ..io.bodies import JOINT_COLUMNS as JOINT_COLUMNS
+from ..io.bodies import joint_definition, write_bodies
 from ..io.csv_table import write_table
 from ..io.documents import write_json
 from ..io.folder import FolderKind, replaced_folder
-from ..io.joints import COLUMNS as JOINT_COLUMNS
-from ..io.joints import joint_definition
 from ..io.observations import COLUMNS as OBSERVATION_COLUMNS
 from ..io.observations import write_observations_csv
 from ..io.phantom import write_phantom
@@ -33,7 +32,13 @@ from ..io.poses import COLUMNS as POSE_COLUMNS
 from ..options import option, validate_options
 from ..photogrammetry.rotations import quaternion_from_matrix
 from ..processes import OF_STREAM, WorkerProcess
-from ..simulation.exposures import Detection, SimulatedExposures, simulate_exposures
+from ..simulation.exposures import (
+    Detection,
+    SimulatedExposures,
+    SimulatedTracking,
+    simulate_exposures,
+    simulate_tracking,
+)
 from ..simulation.knee import JOINT as KNEE
 from ..simulation.knee import (
     LANDING_HZ,
@@ -53,9 +58,14 @@ from ..simulation.marker_images import (
     MovingMarkers,
 )
 from ..simulation.radiographs import CLEAN, HARD, RadiographSettings, Radiography
-from ..simulation.rig import Pose, VirtualFluoroscope, VirtualRig, virtual_rig
-from ..simulation.streams import START_NS, StreamStart
-from ..simulation.tracking import SimulatedTracking, simulate_tracking
+from ..simulation.rig import (
+    START_NS,
+    Pose,
+    StreamStart,
+    VirtualFluoroscope,
+    VirtualRig,
+    virtual_rig,
+)
 
 # A data set of the virtual rig on disk: bags, CSV files, phantom and truth.
 
@@ -69,7 +79,7 @@ TRUTH = 'truth'  # folder of what a data set was made with
 TRUE_SD_MM = 1e-6  # the file of the true coordinates has to contain a standard deviation
 
 
-def write_bag(path: PathLike, frames: Mapping[str, Sequence[Frame]]) -> None:
+def write_bag(path: PathLike, frames: Frames) -> None:
     """Write frames as a bag folder, in the order of their stamps. Raises DataError."""
     recorded = [frame for of_fluoroscope in frames.values() for frame in of_fluoroscope]
     with BagWriter(path, overwrite=True) as bag:

@@ -12,22 +12,23 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..correction.angle_field import note_on_angles
+from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
 from ..errors import DataError, ErrorsAt
 from ..exposures.angles import AngleOptions
 from ..exposures.collector import collect_recorded
-from ..exposures.frame import Frame
+from ..exposures.frame import Frame, Frames
 from ..exposures.names import Names
 from ..exposures.pairing import PairingOptions, disagreement_of_recording
 from ..exposures.phantom import Phantom, require_size
 from ..findings import Kind, sentences
 from ..io.access import PathLike, check_regular_file
 from ..io.bags.reader import joint_topics, read_frames, with_angles
-from ..io.calibration import load_calibrations
+from ..io.calibration import disagreements, load_calibrations
 from ..io.csv_table import read_names
 from ..io.formats import registry
 from ..io.formats.content import PARTS, Content, FileSettings
-from ..io.formats.known_orientation import holds_known_orientations, read_known_orientations
+from ..io.formats.native import holds_known_orientations, read_known_orientations
 from ..io.observations import (
     CORRECTED_BY,
     PointsFile,
@@ -35,7 +36,6 @@ from ..io.observations import (
     points_of_frames,
     read_points,
 )
-from ..io.result_check import disagreements
 from ..photogrammetry.known_orientation import KnownOrientation
 
 if TYPE_CHECKING:
@@ -101,7 +101,7 @@ class BagSelection:
                 'angle_deg'
             )
 
-    def frames(self, path: object, found: Mapping[str, Sequence[Frame]]) -> dict[str, list[Frame]]:
+    def frames(self, path: object, found: Frames) -> dict[str, list[Frame]]:
         """Return the frames in the time window. Raises DataError where there are none."""
         origin = min(frame.stamp_ns for each in found.values() for frame in each)
         low = -math.inf if self.start_s is None else self.start_s
@@ -236,10 +236,6 @@ def read_source(
     selection : BagSelection, optional
         Time window and pairing; pairing by stamp also numbers the frames anew, by exposure.
 
-    Returns
-    -------
-    Recording
-
     Raises
     ------
     DataError
@@ -281,9 +277,7 @@ def read_source(
 
 
 def select_calibrations(
-    calibrations: Mapping[str, FluoroscopeCalibration],
-    fluoroscopes: Iterable[str],
-    where: PathLike = '',
+    calibrations: Calibrations, fluoroscopes: Iterable[str], where: PathLike = ''
 ) -> dict[str, FluoroscopeCalibration]:
     """Return the calibrations of some fluoroscopes.
 
@@ -301,7 +295,7 @@ def select_calibrations(
     return {name: calibrations[name] for name in fluoroscopes}
 
 
-def _numbered_hint(name: str, calibrations: Mapping[str, FluoroscopeCalibration]) -> str:
+def _numbered_hint(name: str, calibrations: Calibrations) -> str:
     """Return what to do about a camera that its file only numbers."""
     if not re.fullmatch(r'cam\d+', name):
         return ''
@@ -383,26 +377,20 @@ def read_calibrated_source(
 
 
 def _unknown_angles(
-    path: PathLike,
-    frames: Mapping[str, Sequence[Frame]],
-    calibrations: Mapping[str, FluoroscopeCalibration],
-    selection: BagSelection | None,
+    path: PathLike, frames: Frames, calibrations: Calibrations, selection: BagSelection | None
 ) -> Iterable[str]:
     """Yield a sentence for each fluoroscope whose correction needs angles that are unknown."""
     for name, each in frames.items():
-        count = sum(frame.angle is None for frame in each)
-        if calibrations[name].angle_field is None or not count:
+        angles = [frame.angle for frame in each]
+        note = note_on_angles(name, calibrations[name].angle_field, angles)
+        if not note:
             continue
         hint = ''
         if not (selection and selection.angles.angle_joint) and is_bag(path):
             topics = joint_topics(path)
             if topics:
                 hint = f'; name the joint on {", ".join(topics)} with --angle-joint'
-        yield (
-            f'{path}: the correction of fluoroscope {name} depends on the angle of the C-arm, '
-            f'which is unknown for {count} of {len(each)} frames: they get the mean over the '
-            f'angles, with its larger standard deviation{hint}'
-        )
+        yield f'{path}: {note}{hint}'
 
 
 def read_point_table(

@@ -10,7 +10,7 @@ centimetres for a phantom of some decimetres. The self-calibration does the rest
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -30,7 +30,7 @@ from ..estimation.options import CalibrationOptions, CalibrationRequest
 from ..estimation.result import CalibrationResult
 from ..estimation.rounds import Round
 from ..estimation.survey import MeasuredDistance, SurveyedBeads, surveyed_beads
-from ..exposures.frame import Frame
+from ..exposures.frame import Frames
 from ..exposures.phantom import MIN_TARGETS, Phantom
 from ..findings import Finding, Kind, Severity
 from .calibration import run_calibration
@@ -59,16 +59,14 @@ class SurveyRequest:
         Whether beads that cannot be surveyed keep their given coordinates; else they are left out.
     """
 
-    frames: Mapping[str, Sequence[Frame]]
+    frames: Frames
     given: Phantom
     distances: Sequence[MeasuredDistance] = ()
     options: CalibrationOptions = field(default_factory=CalibrationOptions)
     principal_distance: float | None = None
     keep_given: bool = False
 
-    def calibration_of(
-        self, frames: Mapping[str, Sequence[Frame]], phantom: Phantom
-    ) -> CalibrationRequest:
+    def calibration_of(self, frames: Frames, phantom: Phantom) -> CalibrationRequest:
         """Return the request of the free network of some exposures."""
         return CalibrationRequest(
             frames,
@@ -115,10 +113,6 @@ def survey(
     progress : callable, optional
         Called after every round with the names of the fluoroscopes and the Round; may raise to
         stop.
-
-    Returns
-    -------
-    SurveyOutcome
 
     Raises
     ------

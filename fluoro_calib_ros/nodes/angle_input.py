@@ -14,9 +14,8 @@ from sensor_msgs.msg import JointState
 
 from ..exposures.angles import AngleOptions
 from .messages.observations import JointStates, decode_joint_state
-from .runtime.diagnostics import WARN, Health
+from .runtime.diagnostics import WARN, Health, RateLimitedLogger, StartError
 from .runtime.lifecycle import StreamNode
-from .runtime.logging import RateLimitedLogger, StartError
 from .runtime.streams import FaultHandlers, StreamReader, observations_qos
 
 TOPIC = 'joint_states'
@@ -35,17 +34,7 @@ class AngleInput:
 
     Without a joint it subscribes to nothing, and all angles are unknown.
 
-    Parameters
-    ----------
-    options : AngleOptions
-    names : iterable of str
-        Fluoroscopes.
-    logger : RateLimitedLogger
-
-    Raises
-    ------
-    StartError
-        For a joint of a fluoroscope that there is not.
+    names: fluoroscopes. Raises StartError for a joint of a fluoroscope that there is not.
     """
 
     def __init__(

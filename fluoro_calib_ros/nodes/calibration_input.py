@@ -20,7 +20,7 @@ from .messages.fluoroscope_calibration import (
     decode_fluoroscope_calibration,
     message_from_calibration,
 )
-from .runtime.logging import one_line
+from .runtime.diagnostics import one_line
 from .runtime.streams import DECODING_ERRORS, latched_qos, publisher_conflict
 
 # Calls of release() after which an undisputed calibration is used, in case a second node that is

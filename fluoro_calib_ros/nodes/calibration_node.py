@@ -25,12 +25,11 @@ from rclpy.lifecycle.node import LifecycleState
 
 from ..exposures.frame import Frame
 from .angle_input import AngleInput
-from .calibration_files import CalibrationFiles
-from .calibration_health import CONDITIONS, FluoroscopeState
-from .calibration_output import CalibrationOutput
-from .calibration_services import CollectServices, OrientationService
+from .calibration_output import CONDITIONS, CalibrationOutput, FluoroscopeState
+from .calibration_services import CollectServices, OrientationService, SelfCalibration
 from .calibration_settings import (
     PARAMETERS,
+    CalibrationFiles,
     CalibrationSettings,
     declare_settings,
     follow_settings,
@@ -41,13 +40,11 @@ from .frame_validation import with_limit
 from .messages.observations import NS_PER_S, ObservedFrame, decode_target_observations
 from .messages.status import FluoroscopeProgress
 from .runtime.diagnostics import Status, health_of
-from .runtime.lifecycle import StreamNode
+from .runtime.lifecycle import Requests, StreamNode, create_services, wake
 from .runtime.main import run
 from .runtime.parameters import declare_read_limits
-from .runtime.services import Requests, create_services, wake
 from .runtime.stream import stream_faults
 from .runtime.streams import observations_qos
-from .self_calibration import SelfCalibration
 
 __all__ = ['PARAMETERS', 'CalibrationNode', 'main']
 

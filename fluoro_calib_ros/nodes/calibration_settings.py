@@ -1,26 +1,45 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Parameters of the calibration node, and the rig that they describe."""
+"""Parameters of the calibration node, the rig they describe, and the calibrations on disk."""
 
 from __future__ import annotations
 
+import itertools
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
-from ..errors import DataError
+from fluoro_calib_msgs.srv import LoadCalibration, SaveCalibration
+
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..errors import DataError, printable
 from ..estimation.options import CalibrationOptions
 from ..exposures.angles import AngleOptions
 from ..exposures.collector import StillOptions
 from ..exposures.names import Names
 from ..exposures.pairing import PairingOptions
 from ..exposures.phantom import Phantom
-from ..io.calibration import SUFFIX
+from ..io.calibration import PHANTOM as PHANTOM_FILE
+from ..io.calibration import (
+    SUFFIX,
+    disagreements,
+    load_calibrations,
+    load_orientation,
+    orientation_path,
+)
+from ..io.phantom import read_phantom
+from ..jobs.calibration import CalibrationOutcome
+from ..jobs.result_folder import belongs_to, kept_orientation, save_calibrations, save_outcome
 from ..jobs.sources import read_survey
 from ..limits import CollectLimits
 from ..options import option
-from .runtime.logging import StartError
+from ..photogrammetry.rig_orientation import RigOrientation
+from .calibration_output import CalibrationOutput
+from .runtime.diagnostics import Logger, StartError
+from .runtime.lifecycle import ServiceEntry
 from .runtime.parameters import (
     READ_LIMITS,
     ManagedParameters,
@@ -132,27 +151,13 @@ def follow_settings(
 
 @dataclass(frozen=True)
 class RigSetup:
-    """The rig of a calibration node.
+    """The rig of a calibration node."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Fluoroscopes.
-    phantom : Phantom or None
-        Without one, the node only serves saved calibrations.
-    target_names : Names
-        Of the beads.
-    directory : Path
-        Folder of its calibrations.
-    settings : callable
-        Returns the present CalibrationSettings.
-    """
-
-    names: tuple[str, ...]
-    phantom: Phantom | None
-    target_names: Names
-    directory: Path
-    settings: Callable[[], CalibrationSettings]
+    names: tuple[str, ...]  #: fluoroscopes
+    phantom: Phantom | None  #: without one, the node only serves saved calibrations
+    target_names: Names  #: of the beads
+    directory: Path  #: folder of its calibrations
+    settings: Callable[[], CalibrationSettings]  #: returns the present CalibrationSettings
 
     def required_phantom(self) -> Phantom:
         """Return the phantom. Raises DataError where there is none."""
@@ -187,3 +192,148 @@ def read_rig(node: ParameterNode, settings: Callable[[], CalibrationSettings]) -
             f'only serves saved calibrations, and there are none in {directory}'
         )
     return RigSetup(parameters.fluoroscopes, phantom, names, directory, settings)
+
+
+class CalibrationFiles:
+    """The services save_calibration and load_calibration, and the folder behind them."""
+
+    def __init__(self, rig: RigSetup, output: CalibrationOutput, logger: Logger) -> None:
+        self._rig = rig
+        self._output = output
+        self._logger = logger
+        self.services = (
+            ServiceEntry('save_calibration', SaveCalibration, self._on_save),
+            ServiceEntry('load_calibration', LoadCalibration, self._on_load),
+        )
+
+    def load_at_start(self) -> None:
+        """Use what the folder contains; a fault is logged and told by the diagnostics."""
+        directory = self._rig.directory
+        if not any(directory.glob('*' + SUFFIX)):
+            return
+        try:
+            loaded, orientation = self._load(directory)
+            self._check_phantom()
+        except (DataError, OSError) as error:
+            self._output.load_fault = str(error)
+            self._logger.error(f'no calibration loaded: {error}')
+            return
+        if loaded:
+            self._output.publish(loaded, orientation)
+            self._logger.info(f'calibration of {", ".join(loaded)} loaded from {directory}')
+
+    def save_outcome(self, outcome: CalibrationOutcome) -> tuple[RigOrientation | None, str]:
+        """Save the outcome of a job; returns the orientation to use, and why it is not saved.
+
+        What a calibration has cost is not lost where its folder cannot be written any more: the
+        outcome is used and published all the same.
+        """
+        present = self._output.orientation
+        try:
+            return save_outcome(self._rig.directory, outcome, present), ''
+        except DataError as error:
+            orientation = kept_orientation(present, outcome.orientation, outcome.calibrations)
+            return orientation, (
+                f'the calibration is in use but not saved: {error}; save it by the service '
+                'save_calibration'
+            )
+
+    def _on_save(
+        self, request: SaveCalibration.Request, response: SaveCalibration.Response
+    ) -> SaveCalibration.Response:
+        calibrations = self._output.calibrations
+        try:
+            directory = self._directory_of(request)
+            if not calibrations:
+                raise DataError('there is no calibration to save')
+            check_folders(directory, self._rig.directory, self._rig.settings().limits.max_folders)
+            save_calibrations(directory, calibrations, self._output.orientation)
+        except (DataError, OSError) as error:
+            response.message = f'not saved: {error}'
+            self._logger.error(response.message)
+            return response
+        if directory == self._rig.directory:
+            self._output.save_fault = ''
+        response.success = True
+        response.message = f'{", ".join(calibrations)} saved to {directory}'
+        return response
+
+    def _on_load(
+        self, request: LoadCalibration.Request, response: LoadCalibration.Response
+    ) -> LoadCalibration.Response:
+        try:
+            directory = self._directory_of(request)
+            loaded, orientation = self._load(directory)
+            if not loaded:
+                raise DataError(
+                    f'{directory}: there is no calibration of {", ".join(self._rig.names)}'
+                )
+        except (DataError, OSError) as error:
+            response.message = f'not loaded, the calibration in use stays: {error}'
+            self._logger.error(response.message)
+            return response
+        self._output.publish(loaded, orientation)
+        response.success = True
+        response.message = f'{", ".join(loaded)} loaded from {directory}'
+        return response
+
+    def _directory_of(self, request: Any) -> Path:
+        """Return the folder of a request. Raises DataError."""
+        if not request.directory:
+            return self._rig.directory
+        directory = self._rig.directory / expand_path(request.directory)
+        base = self._rig.directory.resolve()
+        is_allowed = self._rig.settings().node.any_directory
+        if not is_allowed and not directory.resolve().is_relative_to(base):
+            raise DataError(
+                f'{directory}: this folder is not below the calibration_directory {base}; the '
+                'parameter any_directory allows it'
+            )
+        return directory
+
+    def _load(
+        self, directory: Path
+    ) -> tuple[dict[str, FluoroscopeCalibration], RigOrientation | None]:
+        """Return the calibrations of the node's fluoroscopes in a folder, and their orientation.
+
+        Raises DataError and OSError.
+        """
+        names = self._rig.names
+        loaded = {n: c for n, c in load_calibrations(directory).items() if n in names}
+        for found in disagreements(directory, loaded):
+            self._logger.warning(printable(str(found)))
+        path = Path(orientation_path(directory))
+        if not loaded or not path.exists():
+            return loaded, None
+        orientation = load_orientation(path)
+        if belongs_to(orientation, loaded):
+            return loaded, orientation
+        self._logger.warning(
+            f'{path}: the orientation of the rig belongs to other calibrations, it is not used'
+        )
+        return loaded, None
+
+    def _check_phantom(self) -> None:
+        """Raise DataError where the saved calibrations were made with another phantom."""
+        directory = self._rig.directory
+        phantom = self._rig.phantom
+        path = directory / PHANTOM_FILE
+        if phantom is None or not path.exists() or phantom.equals(read_phantom(path)):
+            return
+        raise DataError(
+            f'{directory}: its calibrations were made with another phantom than '
+            f'{self._rig.settings().node.phantom}; use another calibration_directory, or load '
+            'them by the service load_calibration'
+        )
+
+
+def check_folders(directory: Path, base: Path, limit: int) -> None:
+    """Raise DataError where a folder would be one too many below the base, which peers name."""
+    target = directory.resolve()
+    if target.exists() or not target.is_relative_to(base.resolve()):
+        return
+    new = sum(not path.exists() for path in (target, *target.parents))
+    # The first one is the base itself.
+    present = sum(1 for _ in itertools.islice(os.walk(base.resolve()), limit + 2)) - 1
+    if max(present, 0) + new > limit:
+        raise DataError(f'{directory}: {base} has as many folders as max_folders allows')

@@ -13,11 +13,23 @@ from ..correction.angle_field import AngleField
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError, printable
 from ..exposures.angles import AngleOptions
-from ..io.calibration import SUFFIX, load_calibrations
-from ..io.result_check import disagreements
+from ..io.calibration import SUFFIX, disagreements, load_calibrations
 from .angle_input import AngleInput, beyond_text
 from .calibration_input import CalibrationInput
-from .runtime.conditions import (
+from .runtime.diagnostics import (
+    OK,
+    Health,
+    RefusalLog,
+    Status,
+    fault,
+    health_of,
+    one_line,
+    warning,
+)
+from .runtime.lifecycle import StreamNode
+from .runtime.parameters import CalibratedParameters, expand_path
+from .runtime.stream import (
+    Stream,
     StreamState,
     inactive_node,
     incompatible_publisher,
@@ -26,34 +38,21 @@ from .runtime.conditions import (
     overrun_input,
     refused_messages,
     stalled_stream,
+    stream_faults,
 )
-from .runtime.diagnostics import OK, Health, RefusalLog, Status, fault, health_of, warning
-from .runtime.lifecycle import StreamNode
-from .runtime.logging import one_line
-from .runtime.parameters import CalibratedParameters, expand_path
-from .runtime.stream import Stream, stream_faults
 from .runtime.streams import FaultHandlers
 
 FILES = f'*{SUFFIX}'
 
 
 class CorrectedStream(Stream):
-    """Stream of a fluoroscope that is corrected.
-
-    Attributes
-    ----------
-    corrected : int
-        Number of frames or images.
-    waiting : int
-        Number of those that came before the first calibration.
-    beyond : (float, AngleField) or None
-        Angle [rad] of a message since the last diagnostics that is far from all calibrated ones.
-    """
+    """Stream of a fluoroscope that is corrected."""
 
     def __init__(self, name: str, refusals: RefusalLog) -> None:
         super().__init__(name, refusals)
-        self.corrected = 0
-        self.waiting = 0
+        self.corrected = 0  #: number of frames or images
+        self.waiting = 0  #: number of those that came before the first calibration
+        #: angle [rad] of a message since the last diagnostics that is far from all calibrated ones
         self.beyond: tuple[float, AngleField] | None = None
 
     def count_corrected(self, info: Mapping[str, int]) -> None:
@@ -64,22 +63,11 @@ class CorrectedStream(Stream):
 
 @dataclass(frozen=True)
 class CorrectingState(StreamState):
-    """What the diagnostics of a fluoroscope are decided by.
-
-    Attributes
-    ----------
-    stream : CorrectedStream
-    item : str
-        What is corrected: frame or image.
-    beyond : str
-        What becomes of the items at an angle far from all calibrated ones.
-    calibrations : CalibrationInput
-    angles : AngleInput
-    """
+    """What the diagnostics of a fluoroscope are decided by."""
 
     stream: CorrectedStream
-    item: str
-    beyond: str
+    item: str  #: what is corrected: frame or image
+    beyond: str  #: what becomes of the items at an angle far from all calibrated ones
     calibrations: CalibrationInput
     angles: AngleInput
 
@@ -136,27 +124,14 @@ class CorrectingNode(StreamNode):
     C-arm is that at the angle of the stamp, or the mean over the angles where that is unknown.
     Subclasses set the class attributes and override prepare(), on_calibration_ready(),
     make_stream(), make_angles() and extra_values().
-
-    Attributes
-    ----------
-    item : str
-        What is corrected: frame or image.
-    subject : str
-        What is subscribed to, in words.
-    refusal_kinds : tuple of str
-    beyond : str
-        What becomes of the items at an angle far from all calibrated ones.
-    topics : tuple of str
-        What is subscribed to, below each fluoroscope.
-    angles : dict of str to AngleInput
-        Angles of the C-arms, by fluoroscope.
     """
 
-    item: ClassVar[str] = ''
-    subject: ClassVar[str] = ''
+    item: ClassVar[str] = ''  #: what is corrected: frame or image
+    subject: ClassVar[str] = ''  #: what is subscribed to, in words
     refusal_kinds: ClassVar[tuple[str, ...]] = ()
+    #: what becomes of the items at an angle far from all calibrated ones
     beyond: ClassVar[str] = ''
-    topics: tuple[str, ...] = ()
+    topics: tuple[str, ...] = ()  #: what is subscribed to, below each fluoroscope
 
     def __init__(self, name: str) -> None:
         super().__init__(name)
@@ -164,7 +139,7 @@ class CorrectingNode(StreamNode):
         self._directory = ''
         self.streams: dict[str, Any] = {}
         self.angle_options = AngleOptions()
-        self.angles: dict[str, AngleInput] = {}
+        self.angles: dict[str, AngleInput] = {}  #: angles of the C-arms, by fluoroscope
 
     def use_parameters(self, parameters: CalibratedParameters, angles: AngleOptions) -> None:
         """Take the parameters that all these nodes have; subclasses call it in __init__."""

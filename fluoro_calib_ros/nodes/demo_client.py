@@ -47,35 +47,20 @@ class DemoError(RuntimeError):
 
 
 class DemoClient(Node):
-    """User of the graph.
-
-    Attributes
-    ----------
-    names : sequence of str
-        Fluoroscopes.
-    namespace : str
-        Of the graph.
-    exposures : dict of str to int
-        Number of collected exposures by fluoroscope.
-    corrected_readers : dict of str to int
-        Subscriptions to the corrected observations that the correction node knows.
-    sent, corrected : dict
-        Frames and their source timestamps [ns] by (fluoroscope, frame number).
-    points : list
-        ReconstructedPoints messages and their source timestamps [ns].
-    joint_angles : list
-        JointAngles messages of exposures with bodies.
-    """
+    """User of the graph."""
 
     def __init__(self, names: Sequence[str], namespace: str = '') -> None:
         super().__init__('demo_client', namespace=namespace)
-        self.names = tuple(names)
-        self.exposures: dict[str, int] = {}
+        self.names = tuple(names)  #: fluoroscopes
+        self.exposures: dict[str, int] = {}  #: number of collected exposures by fluoroscope
+        #: subscriptions to the corrected observations that the correction node knows
         self.corrected_readers: dict[str, int] = {}
+        #: frames and their source timestamps [ns] by (fluoroscope, frame number)
         self.sent: dict[tuple[str, int], tuple[ObservedFrame, int]] = {}
         self.corrected: dict[tuple[str, int], tuple[CorrectedFrame, int]] = {}
+        #: messages and their source timestamps [ns]
         self.points: list[tuple[ReconstructedPoints, int]] = []
-        self.joint_angles: list[JointAngles] = []
+        self.joint_angles: list[JointAngles] = []  #: of exposures with bodies
         self._calibrations: dict[str, FluoroscopeCalibration] = {}
         self._camera_infos: dict[str, CameraInfo] = {}
         self._orientations: list[RigOrientation] = []

@@ -13,13 +13,12 @@ from rclpy.client import Client
 from rclpy.publisher import Publisher
 
 from ..bodies.body import Body, declared_bodies
-from ..checks.drift_options import DriftOptions, DriftState
+from ..checks.drift_charts import DriftOptions, DriftState
 from ..checks.rig_watch import RigDriftWatch
 from ..options import option
 from ..photogrammetry.rig_orientation import RigOrientation
 from .messages.status import ALARM, message_from_drift_state
-from .runtime.diagnostics import ERROR, OK, WARN, Status
-from .runtime.logging import Logger
+from .runtime.diagnostics import ERROR, OK, WARN, Logger, Status
 
 LEVELS = (OK, WARN, ERROR)  # of the diagnostics, by the level of a DriftState
 
@@ -57,13 +56,7 @@ class DriftParameters:
 
 
 class DriftMonitor:
-    """Makes the drift watches of orientations, and publishes the state of the newest one.
-
-    Attributes
-    ----------
-    newest : (RigDriftWatch or None, RigOrientation, int) or None
-        Watch, orientation and stamp [ns] of the newest exposure; the stream's thread sets it.
-    """
+    """Makes the drift watches of orientations, and publishes the state of the newest one."""
 
     def __init__(
         self,
@@ -93,6 +86,7 @@ class DriftMonitor:
     def reset(self) -> None:
         """Forget image sizes, exposures and alarms."""
         self._sizes: dict[str, tuple[int, int]] = {}
+        #: watch, orientation and stamp [ns] of the newest exposure; the stream's thread sets it
         self.newest: tuple[RigDriftWatch | None, RigOrientation, int] | None = None
         self._alarmed = False
 

@@ -21,8 +21,7 @@ from ..exposures.phantom import Phantom
 from .calibration_settings import CalibrationSettings
 from .messages.observations import ObservedFrame, frame_from_observed
 from .messages.status import Collected
-from .runtime.diagnostics import RefusalLog
-from .runtime.logging import Logger, RateLimitedLogger
+from .runtime.diagnostics import Logger, RateLimitedLogger, RefusalLog
 from .runtime.stream import Stream
 
 

@@ -1,20 +1,27 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Stream of the images of a fluoroscope, and its diagnostics in the extraction node."""
+"""Streams of images: their diagnostics, the queue of exposures, and workers that extract them."""
 
 from __future__ import annotations
 
+import threading
 import time
+from collections import OrderedDict, deque
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import numpy as np
 from sensor_msgs.msg import CompressedImage, Image
 
-from ..jobs.live_extraction import Observations
+from ..jobs.followers import MakeFollower, Observations, follower_process
+from ..processes import WorkerProcess
 from .angle_input import AngleInput
 from .messages.image import IMAGE_REFUSALS, ImageConverter
-from .runtime.conditions import (
+from .runtime.diagnostics import OK, Health, RefusalLog, Refused, warning
+from .runtime.stream import (
+    Stream,
     StreamState,
     inactive_node,
     incompatible_publisher,
@@ -24,39 +31,24 @@ from .runtime.conditions import (
     refused_messages,
     stalled_stream,
 )
-from .runtime.diagnostics import OK, Health, RefusalLog, warning
-from .runtime.stream import Stream
 
 
 class ImageStream(Stream):
-    """Stream of images that are extracted.
-
-    Attributes
-    ----------
-    extracted, followed, without, shed : int
-        Number of images with observations, of those that the image before gave the start of, of
-        those without observations, and of those that were never looked at.
-    last : Observations or None
-        Of the last image.
-    converter : ImageConverter
-    topic : str
-        One on which images come, for messages.
-    seconds : float
-        That images took.
-    rate_hz : float
-        Between the last two calls of measure(), and shed_now: images shed in this time.
-    """
+    """Stream of images that are extracted."""
 
     def __init__(self, name: str, refusals: RefusalLog, topic: str) -> None:
         super().__init__(name, refusals)
-        self.topic = topic
+        self.topic = topic  #: one on which images come, for messages
+        #: number of images with observations, of those that the image before gave the start of, of
+        #: those without observations, and of those that were never looked at
         self.extracted = 0
         self.followed = 0
         self.without = 0
         self.shed = 0
-        self.last: Observations | None = None
+        self.last: Observations | None = None  #: of the last image
         self.converter = ImageConverter(name)
-        self.seconds = 0.0
+        self.seconds = 0.0  #: that images took
+        #: between the last two calls of measure(), and shed_now: images shed in this time
         self.rate_hz = 0.0
         self.shed_now = 0
         self._first: tuple[tuple[int, int], str] | None = None  # image size and frame id
@@ -182,3 +174,191 @@ CONDITIONS = (
     refused_messages,
     extracting,
 )
+
+
+T = TypeVar('T')
+
+REMEMBERED = 1000  # numbers of exposures that were begun or shed
+
+
+class ExposureQueue(Generic[T]):
+    """Items of each fluoroscope that wait for its thread, at most `size` of them.
+
+    Where more would wait, the oldest exposure that no thread has begun is shed with the items of
+    all fluoroscopes: views of different exposures are of no use to a reconstruction.
+    """
+
+    def __init__(self, fluoroscopes: Iterable[str], size: int) -> None:
+        self._size = size
+        self._waiting: dict[str, OrderedDict[int, T]] = {n: OrderedDict() for n in fluoroscopes}
+        self._begun: deque[int] = deque(maxlen=REMEMBERED)
+        self._shed: deque[int] = deque(maxlen=REMEMBERED)
+        self._changed = threading.Condition()
+        self._closed = False
+
+    def put(self, fluoroscope: str, number: int, item: T) -> list[str]:
+        """Add an item; returns the fluoroscopes that have lost one."""
+        with self._changed:
+            waiting = self._waiting[fluoroscope]
+            if number in self._shed:
+                return [fluoroscope]
+            lost = [fluoroscope] if number in waiting else []  # a number that is used again
+            waiting[number] = item
+            if len(waiting) > self._size:
+                lost += self._shed_one(waiting)
+            self._changed.notify_all()
+            return lost
+
+    def get(
+        self, fluoroscopes: Collection[str], patience_s: float = 0.0
+    ) -> tuple[int, dict[str, T]] | None:
+        """Wait for the items of an exposure, the lowest number that waits; None once it is closed.
+
+        Items of the other fluoroscopes are waited for while they may still come, at most so long.
+        """
+        views = {name: self._waiting[name] for name in fluoroscopes}
+        with self._changed:
+            self._changed.wait_for(lambda: self._closed or any(views.values()))
+            self._changed.wait_for(lambda: self._closed or _is_complete(views), patience_s)
+            if self._closed:
+                return None
+            number = _lowest(views)
+            self._begun.append(number)
+            return number, {n: items.pop(number) for n, items in views.items() if number in items}
+
+    @property
+    def closed(self) -> bool:
+        """Whether the queue is closed."""
+        return self._closed
+
+    def waiting(self, fluoroscope: str) -> int:
+        """Return how many items of a fluoroscope wait."""
+        return len(self._waiting[fluoroscope])
+
+    def close(self) -> None:
+        """End all waits; what is waiting is lost."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+    def _shed_one(self, full: OrderedDict[int, T]) -> list[str]:
+        """Remove an exposure; returns the fluoroscopes that have lost an item."""
+        fresh = [number for number in full if number not in self._begun]
+        if not fresh:
+            full.popitem(last=False)
+            return [name for name, items in self._waiting.items() if items is full]
+        self._shed.append(fresh[0])
+        lost = [name for name, items in self._waiting.items() if fresh[0] in items]
+        for name in lost:
+            del self._waiting[name][fresh[0]]
+        return lost
+
+
+def _lowest(views: Mapping[str, Mapping[int, object]]) -> int:
+    """Return the lowest number that waits."""
+    return min(number for items in views.values() for number in items)
+
+
+def _is_complete(views: Mapping[str, Mapping[int, object]]) -> bool:
+    """Return whether the lowest exposure that waits has all items that it will have."""
+    number = _lowest(views)
+    # A fluoroscope with a later exposure has lost this one, and one that is an exposure late is
+    # not waited for.
+    overdue = any(number in items and len(items) > 1 for items in views.values())
+    return overdue or all(number in items or items for items in views.values())
+
+
+PATIENCE_S = 5.0  # with the other view of an exposure, unless the next one comes before
+
+
+@dataclass(frozen=True)
+class Task:
+    """An image that waits.
+
+    Its number, message, when it has arrived [ns, system clock], and the angle of the C-arm [rad].
+    """
+
+    number: int
+    message: Image | CompressedImage
+    received_ns: int
+    angle: float | None = None
+
+
+class ExtractionWorkers:
+    """A process for each follower, and the thread that gives it images.
+
+    queue_size: images of a fluoroscope that may wait. wanted: called with a fluoroscope; returns
+    whether its overlay is wanted. finish: called with stream, task, image and what was found in
+    it, in the threads.
+    """
+
+    def __init__(
+        self,
+        streams: Mapping[str, ImageStream],
+        queue_size: int,
+        wanted: Callable[[str], bool],
+        finish: Callable[[ImageStream, Task, np.ndarray, Observations], None],
+    ) -> None:
+        self._streams = streams
+        self._wanted = wanted
+        self._finish = finish
+        self._queue: ExposureQueue[Task] = ExposureQueue(streams, queue_size)
+        self._threads: list[threading.Thread] = []
+        self._processes: list[WorkerProcess] = []
+
+    def start(self, followers: Sequence[MakeFollower]) -> None:
+        """Start the processes, and the threads."""
+        for make in followers:
+            process = follower_process(make)
+            process.start()
+            thread = threading.Thread(
+                target=self._serve, args=(make.names, process), name=make.names[0], daemon=True
+            )
+            thread.start()
+            self._processes.append(process)
+            self._threads.append(thread)
+
+    def put(self, name: str, task: Task) -> None:
+        """Let an image wait; the oldest exposure is shed where too many do."""
+        for loser in self._queue.put(name, task.number, task):
+            self._streams[loser].shed += 1
+
+    def waiting(self, name: str) -> int:
+        """Return how many images of a fluoroscope wait."""
+        return self._queue.waiting(name)
+
+    def close(self) -> None:
+        """End threads and processes; what is waiting is lost."""
+        self._queue.close()
+        for process in self._processes:
+            process.close()
+        for thread in self._threads:
+            thread.join()
+
+    def _serve(self, names: Collection[str], process: WorkerProcess) -> None:
+        """Extract the images of some fluoroscopes, exposure by exposure."""
+        while (exposure := self._queue.get(names, PATIENCE_S)) is not None:
+            number, tasks = exposure
+            try:
+                self._extract(number, tasks, process)
+            except Exception as error:  # this exposure is lost, the next ones are not
+                if self._queue.closed:
+                    return  # the process has been ended
+                for name in tasks:
+                    stream = self._streams[name]
+                    stream.refusals.fail(stream.topic, error)
+
+    def _extract(self, number: int, tasks: Mapping[str, Task], process: WorkerProcess) -> None:
+        """Extract the images of an exposure in a process."""
+        images = {}
+        for name, task in tasks.items():
+            try:
+                images[name] = self._streams[name].decoded(task.message)
+            except Refused as error:
+                self._streams[name].refusals.refuse(error)
+        if not images:
+            return
+        wanted = [name for name in images if self._wanted(name)]
+        angles = {name: tasks[name].angle for name in images}
+        for name, found in process(images, number, wanted, angles).items():
+            self._finish(self._streams[name], tasks[name], images[name], found)

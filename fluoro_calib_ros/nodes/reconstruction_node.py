@@ -16,26 +16,29 @@ from fluoro_calib_msgs.srv import Reset
 from sensor_msgs.msg import CameraInfo
 from tf2_msgs.msg import TFMessage
 
-from ..checks.drift_options import DriftOptions
+from ..checks.drift_charts import DriftOptions
 from ..errors import DataError
 from ..exposures.pairing import PairingOptions, exposure_pairer
 from ..limits import StreamLimits
 from ..options import option
+from ..reconstruction.epipolar import RecentMisses
 from ..reconstruction.intersection import OUTSIDE
-from ..reconstruction.mismatch import RecentMisses
 from ..reconstruction.reconstruct import CorrectedView, intersect_exposure, watch_exposure
-from .bodies_output import BodiesOutput
-from .body_following import BodyFollower, BodyParameters, read_body_files
-from .body_health import statuses_of
 from .drift_monitor import DriftMonitor, DriftParameters
 from .frame_validation import CORRECTED_REFUSALS, validate_corrected, with_limit
 from .messages.fluoroscope_calibration import image_size_of
 from .messages.observations import NS_PER_S, CorrectedFrame, decode_corrected_observations
 from .messages.points import PointsContent
 from .messages.rig_orientation import transforms_of_orientation
-from .points_output import PointsCounter, PointsOutput
-from .reconstruction_health import CONDITIONS, ReconstructionState
-from .rig_input import Rig, RigInput
+from .reconstruction_output import (
+    CONDITIONS,
+    BodiesOutput,
+    PointsCounter,
+    PointsOutput,
+    ReconstructionState,
+    statuses_of,
+)
+from .rig_input import BodyFollower, BodyParameters, Rig, RigInput, read_body_files
 from .runtime.diagnostics import LatencyWindow, RefusalLog, Refused, Status, health_of
 from .runtime.lifecycle import StreamNode
 from .runtime.main import run

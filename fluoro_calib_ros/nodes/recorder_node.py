@@ -22,12 +22,13 @@ from .runtime.diagnostics import (
     OK,
     DiagnosticsPublisher,
     Health,
+    RateLimitedLogger,
+    StartError,
     Status,
     fault,
     health_of,
     warning,
 )
-from .runtime.logging import RateLimitedLogger, StartError
 from .runtime.main import run
 from .runtime.parameters import ParameterGroup, ParameterNode, expand_path
 from .runtime.streams import (

@@ -1,31 +1,40 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Orientations of the rig that arrive at the reconstruction node, ready for use."""
+"""Orientations of the rig that arrive, and bodies and joints that are followed in it."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from fluoro_calib_msgs.msg import RigOrientation
+from numpy.typing import NDArray
 
+from ..bodies.body import Body, solvable_bodies
+from ..bodies.joint_tracking import JointTracker
+from ..bodies.tracking import BodyTracker, TrackedExposure, poses_of, twists_of
 from ..checks.rig_watch import RigDriftWatch
 from ..errors import DataError
+from ..io.bodies import JointEntry, read_bodies, read_joints
 from ..io.calibration import load_orientation, orientation_path
+from ..options import option
 from ..photogrammetry import rig_orientation
 from ..photogrammetry.noise import ObservedScatter
 from ..reconstruction.intersection import Intersector
+from ..reconstruction.reconstruct import IntersectedViews
 from .drift_monitor import DriftMonitor
+from .messages.bodies import BodiesContent
 from .messages.rig_orientation import (
     description_of,
     message_from_orientation,
     orientation_from_message,
 )
-from .runtime.diagnostics import RefusalLog
-from .runtime.logging import Logger
+from .runtime.diagnostics import Logger, RefusalLog
 from .runtime.parameters import expand_path
 
 MAX_ORIENTATIONS = 4  # frames of the previous calibrations may still come
@@ -46,15 +55,8 @@ class RigInput:
 
     The executor's thread replaces them as a whole, and the thread of the streams reads them.
 
-    Parameters
-    ----------
-    names : sequence of str
-        Fluoroscopes.
-    reject : float
-        Epipolar distance above which image points do not belong together [standard deviations].
-    drift : DriftMonitor
-    refusals : RefusalLog
-    logger : Logger
+    names: fluoroscopes. reject: epipolar distance above which image points do not belong together
+    [standard deviations].
     """
 
     def __init__(
@@ -150,3 +152,167 @@ class RigInput:
         except ValueError as error:  # DataError among them
             self._refusals.last_fault = f'no drift watch: {error}'
             self._logger.error(self._refusals.last_fault)
+
+
+# A body's name is part of topics, and the name of a TF frame.
+BODY_NAME = re.compile('[A-Za-z][A-Za-z0-9_]*')
+FORGETTING = 0.01  # share of the newest exposure in the mean misfit
+
+
+@dataclass(frozen=True)
+class BodyParameters:
+    """Parameters of bodies and joints."""
+
+    bodies: str = option(
+        '', 'bodies.csv: rigid bodies and their markers, whose poses are published; empty: none'
+    )
+    joints: str = option('', 'joints.toml: joints between these bodies; empty: none')
+    body_lag: int = option(
+        0,
+        'exposures after which a pose is published, smoothed by those that came meanwhile',
+        minimum=0,
+        maximum=100,
+        unit='exposures',
+    )
+
+    def __post_init__(self) -> None:
+        if self.joints and not self.bodies:
+            raise ValueError('joints: the parameter bodies, which they are between, is not set')
+
+
+def read_body_files(parameters: BodyParameters) -> tuple[tuple[Body, ...], tuple[JointEntry, ...]]:
+    """Return the bodies and joints of files. Raises DataError that names the file."""
+    if not parameters.bodies:
+        return (), ()
+    path = expand_path(parameters.bodies)
+    try:
+        bodies = solvable_bodies(read_bodies(path))
+        for body in bodies:
+            if not BODY_NAME.fullmatch(body.name):
+                raise DataError(
+                    f'body {body.name!r}: a name in topics has letters, digits and _, and begins '
+                    'with a letter'
+                )
+    except DataError as error:
+        raise error.at(path) from None
+    if not parameters.joints:
+        return bodies, ()
+    path = expand_path(parameters.joints)
+    joints = read_joints(path, [body.name for body in bodies])
+    for entry in joints:
+        try:
+            JointTracker(entry.joint, entry.neutral)
+        except DataError as error:
+            raise error.at(path) from None
+    return bodies, joints
+
+
+class BodiesState(NamedTuple):
+    """What the last published exposure tells of B bodies."""
+
+    stamp_ns: int
+    #: (B,)
+    status: NDArray[np.uint8]
+    markers: NDArray[np.int64]
+    #: (B,) stamps of the last exposures that show each body; -1 for none
+    seen_ns: NDArray[np.int64]
+    #: (B,) mean of chi-squared over its expectation, of the last 100 exposures or so; NaN for none
+    misfit: NDArray[np.float64]
+
+
+class BodyFollower:
+    """Follows bodies and joints through the exposures of a stream.
+
+    The stream's thread adds exposures; the executor's reads `state`, which is replaced as a whole.
+    """
+
+    def __init__(self, bodies: Sequence[Body], joints: Sequence[JointEntry], lag: int) -> None:
+        self.bodies = tuple(bodies)
+        self._entries = tuple(joints)
+        self._lag = lag
+        self.joints = self._new_joints()
+        self.state: BodiesState | None = None  #: None before the first exposure
+        self.untimed = 0  #: exposures that were not later than the one before, and were not taken
+        self._rig: Rig | None = None
+        self._tracker: BodyTracker | None = None
+        self._last_ns = -1
+        self._squares = np.zeros((2, len(self.bodies)))  # chi-squared and expectation
+
+    def add(
+        self, exposure: IntersectedViews, rig: Rig, number: int, stamp_ns: int
+    ) -> list[BodiesContent]:
+        """Take an exposure; return what is known of those whose turn it is.
+
+        An orientation, or another limit of false markers, starts a new tracker. So does a stamp
+        that is earlier than the last one: a recording begins anew.
+        """
+        begins_anew = stamp_ns < self._last_ns
+        out = []
+        if self._tracker is None or begins_anew or not self._is_same(rig):
+            out = self._flushed()
+            self._tracker = BodyTracker(
+                rig.orientation, self.bodies, rig.intersector.reject or np.inf, self._lag
+            )
+            if begins_anew:
+                self.joints = self._new_joints()
+        self._rig = rig
+        self.untimed += stamp_ns == self._last_ns
+        self._last_ns = stamp_ns
+        found = self._tracker.add(exposure, number, stamp_ns)
+        return out if found is None else [*out, self._content(found)]
+
+    def _is_same(self, rig: Rig) -> bool:
+        """Whether the tracker fits a rig."""
+        known = self._rig
+        return known is not None and (known.orientation_id, known.intersector.reject) == (
+            rig.orientation_id,
+            rig.intersector.reject,
+        )
+
+    def _new_joints(self) -> list[JointTracker]:
+        return [JointTracker(entry.joint, entry.neutral) for entry in self._entries]
+
+    def _flushed(self) -> list[BodiesContent]:
+        """What is known of exposures that wait for later ones, which do not come."""
+        if self._tracker is None:
+            return []
+        return [self._content(one) for one in self._tracker.flush()]
+
+    def _content(self, found: TrackedExposure) -> BodiesContent:
+        """Return poses and joints of an exposure, and note its state."""
+        assert self._rig is not None
+        poses = poses_of(self.bodies, [found])
+        by_name = {one.body: one for one in poses}
+        self._note(found)
+        twist, twist_covariance = twists_of(self.bodies, found)
+        return BodiesContent(
+            stamp_ns=found.stamp_ns,
+            frame_number=found.number,
+            orientation_id=self._rig.orientation_id,
+            orientation=self._rig.orientation,
+            bodies=self.bodies,
+            poses=poses,
+            twist=twist,
+            twist_covariance=twist_covariance,
+            joints=[
+                one.add(by_name[one.joint.proximal], by_name[one.joint.distal])
+                for one in self.joints
+            ],
+        )
+
+    def _note(self, found: TrackedExposure) -> None:
+        """Update the state by an exposure."""
+        frame = found.frame
+        known = frame.alone & (frame.freedom > 0)
+        newest = np.where(known, [frame.chi2, frame.freedom], 0.0)
+        self._squares = (1 - FORGETTING * known) * self._squares + FORGETTING * newest
+        before = np.full(len(self.bodies), -1) if self.state is None else self.state.seen_ns
+        chi2, expected = self._squares
+        markers = frame.markers
+        self.state = BodiesState(
+            found.stamp_ns,
+            found.status,
+            markers,
+            seen_ns=np.where(markers > 0, found.stamp_ns, before),
+            misfit=np.where(expected > 0, chi2 / np.where(expected > 0, expected, 1.0), np.nan),
+        )

@@ -22,12 +22,18 @@ from ..exposures.frame import Frame
 from ..jobs.simulation import MARKER_ATTENUATION, MARKER_MM, SETTINGS, RenderedScene, Renderers
 from ..options import option
 from ..photogrammetry.rotations import matrix_from_vector, vector_from_matrix
-from ..simulation.exposures import Detection, detect_beads, phantom_poses
+from ..simulation.exposures import (
+    CLUSTER_MARKERS,
+    Detection,
+    detect_beads,
+    phantom_poses,
+    simulate_grid,
+    simulate_tracking,
+)
 from ..simulation.rig import virtual_rig
-from ..simulation.tracking import CLUSTER_MARKERS, simulate_grid, simulate_tracking
 from .messages.image import message_from_image
 from .messages.observations import message_from_frame, set_number_and_stamp, stamp_from_nanoseconds
-from .runtime.logging import StartError, Trace
+from .runtime.diagnostics import StartError, Trace
 from .runtime.main import run
 from .runtime.parameters import ParameterGroup, ParameterNode, RigParameters
 from .runtime.streams import (

@@ -58,23 +58,15 @@ class _Ordered:
 
 @dataclass(frozen=True)
 class AdditionalParameters:
-    """Functions and prior of the additional parameters of one fluoroscope.
+    """Functions and prior of the additional parameters of one fluoroscope."""
 
-    Attributes
-    ----------
-    functions : (N, k) or (N, 2, p) ndarray
-        Values of the functions at the N image points of the fluoroscope. (N, k): the same
-        functions for u and v with separate coefficients, p = 2 k, those of u first. (N, 2, p):
-        coefficients shared by u and v.
-    prior : (P, P) ndarray
-        Precision matrix of the coefficients; zeros for no prior.
-    own : GroupedFunctions, optional
-        With functions (N, k): functions of groups of image points; their coefficients are the
-        last ones.
-    """
-
+    #: (N, 2, p) values of the functions at the N image points of the fluoroscope. (N, k): the same
+    #: functions for u and v with separate coefficients, p = 2 k, those of u first. (N, 2, p):
+    #: coefficients shared by u and v
     functions: NDArray[np.float64]
-    prior: NDArray[np.float64]
+    prior: NDArray[np.float64]  #: (P, P) precision matrix of the coefficients; zeros for no prior
+    #: with functions (N, k): functions of groups of image points; their coefficients are the last
+    #: ones
     own: GroupedFunctions | None = None
 
     @property

@@ -18,7 +18,6 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from .datum import transform_to_datum
 from .elimination import (
     BorderedFactor,
     BorderedSystem,
@@ -26,11 +25,10 @@ from .elimination import (
     FactorizedNormalMatrix,
     choose_elimination,
 )
-from .network import Network
+from .network import Network, transform_to_datum
 from .noise import DEFAULT_NOISE, Noise, widening_by_group
 from .normal_equations import normal_equations, project_network, right_sides
-from .relative_orientation import discrepancies
-from .unknowns import Parameters
+from .unknowns import Parameters, discrepancies
 
 # Relative increase of the cost that rounding errors can cause.
 ROUNDING = 1e-12
@@ -55,21 +53,12 @@ REPEATED_DECREASE = 0.01
 
 @dataclass(frozen=True)
 class SolverOptions:
-    """Options of the adjustment.
+    """Options of the adjustment."""
 
-    Attributes
-    ----------
-    tolerance : float
-        Predicted decrease of the cost F at which the iteration ends.
-    max_steps : int
-        Largest number of steps, refused ones included.
-    elimination : type of Elimination, optional
-        What the solution of the normal equations eliminates; by default what leaves the smaller
-        system.
-    """
-
-    tolerance: float = 1e-8
-    max_steps: int = 100
+    tolerance: float = 1e-8  #: predicted decrease of the cost F at which the iteration ends
+    max_steps: int = 100  #: largest number of steps, refused ones included
+    #: what the solution of the normal equations eliminates; by default what leaves the smaller
+    #: system
     elimination: type[Elimination] | None = None
 
 
@@ -78,34 +67,16 @@ DEFAULT_OPTIONS = SolverOptions()
 
 @dataclass(frozen=True)
 class Adjustment:
-    """Result of an adjustment.
-
-    Attributes
-    ----------
-    parameters : Parameters
-    residuals : (N, 2) ndarray
-        Observed - correction - projected [px].
-    q : (N,) ndarray
-        Normalised squared residuals.
-    noise : Noise
-        Noise model of the adjustment.
-    cost : float
-        F, the negative log-likelihood.
-    steps : int
-        Number of steps, refused ones included.
-    converged : bool
-    exposure : (N,) ndarray of int
-        Exposures of the image points.
-    """
+    """Result of an adjustment."""
 
     parameters: Parameters
-    residuals: NDArray[np.float64]
-    q: NDArray[np.float64]
-    noise: Noise
-    cost: float
-    steps: int
+    residuals: NDArray[np.float64]  #: (N, 2) observed - correction - projected [px]
+    q: NDArray[np.float64]  #: (N,) normalised squared residuals
+    noise: Noise  #: noise model of the adjustment
+    cost: float  #: F, the negative log-likelihood
+    steps: int  #: number of steps, refused ones included
     converged: bool
-    exposure: NDArray[np.int64]
+    exposure: NDArray[np.int64]  #: (N,) exposures of the image points
 
     @cached_property
     def inliers(self) -> np.ndarray:

@@ -81,20 +81,8 @@ def high_correlations(
     """Correlations above 0.95 of interior and relative orientations with all global unknowns and
     exterior orientations.
 
-    Parameters
-    ----------
-    network : Network
-    parameters : Parameters
-    precision : Precision
-    fluoroscopes : sequence of str
-        Names of the fluoroscopes.
-    numbers : sequence of int
-        Numbers of the exposures.
-
-    Returns
-    -------
-    tuple of (str, str, float)
-        Two unknowns and their correlation, the largest first, 20 at most.
+    fluoroscopes: names of the fluoroscopes. numbers: numbers of the exposures. Returns two
+    unknowns and their correlation, the largest first, 20 at most.
     """
     orientations = network.layout.all_orientations
     count = orientations.stop
@@ -142,16 +130,8 @@ def undetermined_interiors(
 ) -> tuple[Finding, ...]:
     """One finding for every fluoroscope whose interior orientation is not determined.
 
-    Parameters
-    ----------
-    network : Network
-    parameters : Parameters
-    precision : Precision
-        It is judged at an image noise of one pixel at most.
-    fluoroscopes : sequence of str
-        Names of the fluoroscopes.
-    scale : float
-        Scale of the noise model of the precision.
+    precision: it is judged at an image noise of one pixel at most. fluoroscopes: names of the
+    fluoroscopes. scale: scale of the noise model of the precision.
     """
     out = []
     correlations = _distance_correlations(network, parameters, precision)

@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import blas, cho_factor, cho_solve, lapack
 
-from .datum import Gauge, stabilising_factor
-from .network import Network
+from .network import Gauge, Network, stabilising_factor
 from .normal_equations import NormalEquations
 from .rotations import mirror_lower
 from .unknowns import EXTERIOR_SIZE, POINT_SIZE, ReducedLayout, UnknownVector
@@ -29,26 +28,13 @@ from .unknowns import EXTERIOR_SIZE, POINT_SIZE, ReducedLayout, UnknownVector
 
 @dataclass(frozen=True)
 class BorderedSystem:
-    """Normal equations [B C; C^T D] (x_b, x_r) = (b, r) with a block-diagonal part B.
+    """Normal equations [B C; C^T D] (x_b, x_r) = (b, r) with a block-diagonal part B."""
 
-    Attributes
-    ----------
-    blocks : (k, s, s) ndarray
-        B: blocks of the unknowns that are eliminated.
-    border : (k, s, q) ndarray
-        C: their mixed blocks with the remaining unknowns.
-    rest : (q, q) ndarray
-        D: normal matrix of the remaining unknowns.
-    block_right : (k, s) ndarray
-    rest_right : (q,) ndarray
-        Right sides b and r.
-    """
-
-    blocks: NDArray[np.float64]
-    border: NDArray[np.float64]
-    rest: NDArray[np.float64]
-    block_right: NDArray[np.float64]
-    rest_right: NDArray[np.float64]
+    blocks: NDArray[np.float64]  #: (k, s, s) B: blocks of the unknowns that are eliminated
+    border: NDArray[np.float64]  #: (k, s, q) C: their mixed blocks with the remaining unknowns
+    rest: NDArray[np.float64]  #: (q, q) D: normal matrix of the remaining unknowns
+    block_right: NDArray[np.float64]  #: (k, s) right side b
+    rest_right: NDArray[np.float64]  #: (q,) right side r
 
     def damped(self, mu: float) -> BorderedSystem:
         """A copy with the diagonal multiplied by 1 + mu."""
@@ -95,20 +81,12 @@ class BorderedSystem:
 
 @dataclass(frozen=True)
 class BorderedFactor:
-    """Cholesky factors of a BorderedSystem.
+    """Cholesky factors of a BorderedSystem."""
 
-    Attributes
-    ----------
-    inverse : (k, s, s) ndarray
-        Inverse Cholesky factors L^-1 of the blocks.
-    half_border : (k s, q) ndarray
-        H = L^-1 C.
-    schur : (q, q) ndarray
-        Lower Cholesky factor of the Schur complement D - H^T H; its upper triangle is undefined.
-    """
-
-    inverse: NDArray[np.float64]
-    half_border: NDArray[np.float64]
+    inverse: NDArray[np.float64]  #: (k, s, s) inverse Cholesky factors L^-1 of the blocks
+    half_border: NDArray[np.float64]  #: (k s, q) H = L^-1 C
+    #: (q, q) lower Cholesky factor of the Schur complement D - H^T H; its upper triangle is
+    #: undefined
     schur: NDArray[np.float64]
 
     def solve(
@@ -137,54 +115,32 @@ class BorderedFactor:
 
 @dataclass(frozen=True)
 class BorderedCovariance:
-    """Blocks of the inverse of a bordered matrix.
+    """Blocks of the inverse of a bordered matrix."""
 
-    Attributes
-    ----------
-    blocks : (k, s, s) ndarray
-    border : (k, s, q) ndarray
-    rest : (q, q) ndarray
-        The inverse; of the part between two different blocks, see `conditional` and `gain`.
-    conditional : (k, s, s) ndarray
-        B^-1: covariances of the blocks with the rest fixed.
-    gain : (k, s, q) ndarray
-        B^-1 C. The inverse between blocks i and j is (i = j) B^-1 - border[i] gain[j]^T.
-    """
-
-    blocks: NDArray[np.float64]
-    border: NDArray[np.float64]
+    blocks: NDArray[np.float64]  #: (k, s, s)
+    border: NDArray[np.float64]  #: (k, s, q)
+    #: (q, q) the inverse; of the part between two different blocks, see `conditional` and `gain`
     rest: NDArray[np.float64]
+    #: (k, s, s) B^-1: covariances of the blocks with the rest fixed
     conditional: NDArray[np.float64]
+    #: (k, s, q) B^-1 C. The inverse between blocks i and j is (i = j) B^-1 - border[i] gain[j]^T
     gain: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class CovarianceBlocks:
-    """Blocks of the inverse normal matrix; zeros where a global unknown is fixed.
+    """Blocks of the inverse normal matrix; zeros where a global unknown is fixed."""
 
-    Attributes
-    ----------
-    ee : (m, 6, 6) ndarray
-    pp : (n, 3, 3) ndarray
-    gg : (G, G) ndarray
-    eg : (m, 6, G) ndarray
-    pg : (n, 3, G) ndarray
-        Exposures e, object points p and global unknowns g.
-    pe : callable
-        pe(e, p): blocks (k, 3, 6) of object points p (k,) with exposures e (k,).
-    between : callable
-        between(e, f): blocks (k, 6, 6) of exposures e (k,) with exposures f (k,).
-    points_between : callable
-        points_between(p, q): blocks (k, 3, 3) of object points p (k,) with object points q (k,).
-    """
-
-    ee: NDArray[np.float64]
-    pp: NDArray[np.float64]
-    gg: NDArray[np.float64]
-    eg: NDArray[np.float64]
-    pg: NDArray[np.float64]
+    ee: NDArray[np.float64]  #: (m, 6, 6) of exposures e
+    pp: NDArray[np.float64]  #: (n, 3, 3) of object points p
+    gg: NDArray[np.float64]  #: (G, G) of global unknowns g
+    eg: NDArray[np.float64]  #: (m, 6, G)
+    pg: NDArray[np.float64]  #: (n, 3, G)
+    #: pe(e, p): blocks (k, 3, 6) of object points p (k,) with exposures e (k,)
     pe: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    #: between(e, f): blocks (k, 6, 6) of exposures e (k,) with exposures f (k,)
     between: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    #: points_between(p, q): blocks (k, 3, 3) of object points p (k,) with object points q (k,)
     points_between: Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 

@@ -29,21 +29,12 @@ HELD_SD_RAD = 1e-7
 
 @dataclass(frozen=True)
 class ExteriorPrior:
-    """Exterior orientations of m exposures as observed.
+    """Exterior orientations of m exposures as observed."""
 
-    Attributes
-    ----------
-    rotation : (m, 3, 3) ndarray
-        Rotations phantom -> sensor.
-    position_mm : (m, 3) ndarray
-        Positions of the sources.
-    sd : (m, 6) ndarray
-        Standard deviations of the positions [mm] and of the rotations about the axes of the
-        sensor [rad].
-    """
-
-    rotation: NDArray[np.float64]
-    position_mm: NDArray[np.float64]
+    rotation: NDArray[np.float64]  #: (m, 3, 3) rotations phantom -> sensor
+    position_mm: NDArray[np.float64]  #: (m, 3) positions of the sources
+    #: (m, 6) standard deviations of the positions [mm] and of the rotations about the axes of the
+    #: sensor [rad]
     sd: NDArray[np.float64]
 
     @property

@@ -1,11 +1,22 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The data of a bundle adjustment: image points, what they connect, survey and constraints."""
+"""The data of a bundle adjustment: image points, what they connect, survey, constraints, datum.
+
+Datum of a free network: inner constraints over the object points. Without surveyed coordinates the
+images leave seven directions open: the network can be shifted, turned and scaled. The datum makes
+the least-squares similarity transformation between object points and surveyed coordinates the
+identity: B^T (P - P0) = 0, where B holds the seven directions at the surveyed coordinates. The
+adjustment itself fixes other seven directions, which changes neither residuals nor estimable
+quantities; parameters and covariances are transformed into the datum afterwards (S-transformation:
+Baarda, "S-transformations and criterion matrices", Netherlands Geodetic Commission 1973; inner
+constraints in photogrammetry: Granshaw, "Bundle adjustment methods in engineering photogrammetry",
+Photogrammetric Record 10, 1980).
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -13,10 +24,17 @@ from numpy.typing import NDArray
 
 from .additional_parameters import AdditionalParameters
 from .known_orientation import ExteriorPrior
-from .relative_orientation import exposures_after_step
-from .relative_pose import POSE_SIZE, RelativeConstraint
-from .rotations import matrix_from_vector
-from .unknowns import INTERIOR_SIZE, Parameters, UnknownLayout, UnknownVector
+from .rotations import cross_matrix, matrix_from_vector
+from .unknowns import (
+    INTERIOR_SIZE,
+    POSE_SIZE,
+    Parameters,
+    RelativeConstraint,
+    RelativePose,
+    UnknownLayout,
+    UnknownVector,
+    exposures_after_step,
+)
 
 DATUM_DEFECT = 7  # unknowns that the datum of a free network fixes: shift, turn and scale
 
@@ -26,54 +44,34 @@ class Network:
     """Image points of one or more fluoroscopes, and what is known about their network.
 
     N image points, m exposures, n object points, F fluoroscopes.
-
-    Attributes
-    ----------
-    uv : (N, 2) ndarray
-        Observed image points [px].
-    sigma : (N,) ndarray
-        A-priori standard deviations of the image points [px], or ones.
-    exposure, point : (N,) ndarray of int
-        Rows of the exposure and of the object point of each image point. `exposure` ascends; each
-        pair occurs at most once.
-    fluoroscope : (m,) ndarray of int
-        Fluoroscope of each exposure.
-    survey_mm : (n, 3) ndarray
-        Surveyed coordinates of the object points.
-    survey_sd_mm : (n,) ndarray
-        Their standard deviations.
-    interior_free : (F,) ndarray of bool
-        Whether the interior orientation of a fluoroscope is estimated.
-    additional : tuple of AdditionalParameters or None
-        Additional parameters of each fluoroscope, or an empty tuple.
-    relative : tuple of RelativeConstraint
-        One constraint per constrained pair of fluoroscopes; the first fluoroscope of the pair is
-        the same in all of them.
-    interior_mean, interior_sd : (F, 3) ndarray, optional
-        Prior of the interior orientations [px]; an infinite standard deviation means no prior.
-    exterior : ExteriorPrior, optional
-        What is known of the exterior orientations.
-    datum : {'survey', 'inner'}
-        'survey': the surveyed coordinates are weighted observations. 'inner': they have no weight,
-        and inner constraints over the object points define the datum.
-    in_datum : (n,) ndarray of bool, optional
-        Object points that define the datum of a free network; by default all.
     """
 
-    uv: NDArray[np.float64]
+    uv: NDArray[np.float64]  #: (N, 2) observed image points [px]
+    #: (N,) a-priori standard deviations of the image points [px], or ones
     sigma: NDArray[np.float64]
+    #: (N,) rows of the exposure and of the object point of each image point. `exposure` ascends;
+    #: each pair occurs at most once
     exposure: NDArray[np.int64]
     point: NDArray[np.int64]
-    fluoroscope: NDArray[np.int64]
-    survey_mm: NDArray[np.float64]
-    survey_sd_mm: NDArray[np.float64]
+    fluoroscope: NDArray[np.int64]  #: (m,) fluoroscope of each exposure
+    survey_mm: NDArray[np.float64]  #: (n, 3) surveyed coordinates of the object points
+    survey_sd_mm: NDArray[np.float64]  #: (n,) their standard deviations
+    #: (F,) whether the interior orientation of a fluoroscope is estimated
     interior_free: NDArray[np.bool_]
+    #: additional parameters of each fluoroscope, or an empty tuple
     additional: tuple[AdditionalParameters | None, ...] = ()
+    #: one constraint per constrained pair of fluoroscopes; the first fluoroscope of the pair is
+    #: the same in all of them
     relative: tuple[RelativeConstraint, ...] = ()
+    #: (F, 3) prior of the interior orientations [px]; an infinite standard deviation means no
+    #: prior
     interior_mean: NDArray[np.float64] | None = None
     interior_sd: NDArray[np.float64] | None = None
-    exterior: ExteriorPrior | None = None
+    exterior: ExteriorPrior | None = None  #: what is known of the exterior orientations
+    #: 'survey': the surveyed coordinates are weighted observations. 'inner': they have no weight,
+    #: and inner constraints over the object points define the datum: {'survey', 'inner'}
     datum: str = 'survey'
+    #: (n,) object points that define the datum of a free network; by default all
     in_datum: NDArray[np.bool_] | None = None
 
     @property
@@ -160,7 +158,7 @@ class Network:
         """Parameters after a step; rotations are varied on the left, R -> exp([w]x) R.
 
         The second exposures of constrained pairs follow their constraint (see
-        relative_orientation.exposures_after_step).
+        unknowns.exposures_after_step).
         """
         layout = self.layout
         interior_step = step.globals[layout.all_interiors].reshape(-1, INTERIOR_SIZE)
@@ -181,3 +179,137 @@ class Network:
             relative=relative,
         )
         return exposures_after_step(self.relative, layout, parameters, moved, step)
+
+
+DATUMS = ('survey', 'inner')
+MIN_RAYS_IN_DATUM = 3  # inliers: two may be a false match and its accidental partner
+
+
+@dataclass(frozen=True)
+class Gauge:
+    """Directions that the images leave open."""
+
+    exteriors: NDArray[np.float64]  #: (m, 6, 7)
+    points: NDArray[np.float64]  #: (n, 3, 7)
+    globals: NDArray[np.float64]  #: (G, 7) changes of the unknowns along the directions
+    #: (n, 3, 7) B: the directions of the object points at the surveyed coordinates
+    constraint: NDArray[np.float64]
+
+
+def similarity_directions(points: np.ndarray, centre: np.ndarray) -> NDArray[np.float64]:
+    """Changes (n, 3, 7) of points (n, 3) [mm] by shift, turn and scale about a centre (3,)."""
+    offset = points - centre
+    shift = np.broadcast_to(np.eye(3), (len(points), 3, 3))
+    return np.concatenate([shift, -cross_matrix(offset), offset[:, :, None]], axis=2)
+
+
+def open_gauge(network: Network, parameters: Parameters) -> Gauge | None:
+    """Gauge of a network at some parameters; None where the survey defines the datum."""
+    if network.datum == 'survey':
+        return None
+    centre = network.survey_mm.mean(axis=0)
+    e = np.zeros((network.n_exposures, 6, DATUM_DEFECT))
+    e[:, :3] = similarity_directions(parameters.position_mm, centre)
+    e[:, 3:, 3:6] = -parameters.rotation
+    constraint = similarity_directions(network.survey_mm, centre)
+    if network.in_datum is not None:
+        constraint *= network.in_datum[:, None, None]
+    g = np.zeros((network.layout.n_globals, DATUM_DEFECT))
+    for columns, pose in zip(network.layout.relative, parameters.relative):
+        g[columns][:3, 6] = pose.translation_mm
+    return Gauge(
+        e,
+        similarity_directions(parameters.points_mm, centre),
+        g,
+        constraint,
+    )
+
+
+def in_determined_datum(
+    network: Network, parameters: Parameters, inliers: NDArray[np.bool_]
+) -> tuple[Network, Parameters]:
+    """Free network whose datum is that of the object points that enough inliers (N,) show.
+
+    A point with one ray is anywhere along it. Among those that define the datum, it would shift,
+    turn and scale all others by its own uncertainty.
+    """
+    if network.datum == 'survey':
+        return network, parameters
+    rays = np.bincount(network.point[inliers], minlength=network.n_points)
+    network = replace(network, in_datum=rays >= MIN_RAYS_IN_DATUM)
+    return network, transform_to_datum(network, parameters)
+
+
+def stabilising_factor(directions: np.ndarray, diagonal: np.ndarray) -> NDArray[np.float64]:
+    """Matrix D (q, 7) such that adding D D^T to a normal matrix fixes its open directions.
+
+    directions (q, 7) are open; diagonal (q,) is that of the normal matrix. D D^T is a projector in
+    the unknowns scaled by the diagonal, so that it is as large as the matrix itself.
+    """
+    scaled = diagonal[:, None] * directions
+    return np.linalg.solve(np.linalg.cholesky(directions.T @ scaled), scaled.T).T
+
+
+def transform_to_datum(network: Network, parameters: Parameters) -> Parameters:
+    """Parameters of a free network in its datum; unchanged where the survey defines the datum.
+
+    Least-squares rotation: Horn, Hilden and Negahdaripour, JOSA A 5, 1988. The scale is the one at
+    which the survey fits the points.
+    """
+    if network.datum == 'survey':
+        return parameters
+    used = slice(None) if network.in_datum is None else network.in_datum
+    centre = parameters.points_mm[used].mean(axis=0)
+    survey_centre = network.survey_mm[used].mean(axis=0)
+    found = parameters.points_mm[used] - centre
+    wanted = network.survey_mm[used] - survey_centre
+    u, _, vt = np.linalg.svd(wanted.T @ found)
+    turn = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
+    scale = np.sum(wanted**2) / np.sum(wanted * (found @ turn.T))
+
+    def transform(points: np.ndarray) -> np.ndarray:
+        return survey_centre + scale * (points - centre) @ turn.T
+
+    return replace(
+        parameters,
+        rotation=parameters.rotation @ turn.T,
+        position_mm=transform(parameters.position_mm),
+        points_mm=transform(parameters.points_mm),
+        relative=tuple(
+            RelativePose(p.rotation, scale * p.translation_mm) for p in parameters.relative
+        ),
+    )
+
+
+class STransformation:
+    """Covariances in the datum of a free network: S C S^T with S = 1 - E (B^T E)^-1 B^T.
+
+    gauge: directions E and constraint B; covariance_times_b: the products C B of the covariance C
+    at hand. Blocks are transformed one by one: each side of a block is a pair (H, V) of rows of
+    E (B^T E)^-1 and of C B, from `exteriors`, `points` or `globals`.
+    """
+
+    def __init__(self, gauge: Gauge, covariance_times_b: UnknownVector) -> None:
+        inverse = np.linalg.inv(np.einsum('nia,nib->ab', gauge.constraint, gauge.points))
+        self.exteriors = (gauge.exteriors @ inverse, covariance_times_b.exteriors)
+        self.points = (gauge.points @ inverse, covariance_times_b.points)
+        self.globals = (gauge.globals @ inverse, covariance_times_b.globals)
+        self._middle = np.einsum('nia,nib->ab', gauge.constraint, covariance_times_b.points)
+
+    def transform(
+        self,
+        covariance: np.ndarray,
+        left: tuple[np.ndarray, np.ndarray],
+        right: tuple[np.ndarray, np.ndarray],
+    ) -> np.ndarray:
+        """Covariances (..., i, j) in the new datum; left and right are the sides of the block."""
+        h_left, v_left = left
+        h_right, v_right = right
+        h_right_t = np.swapaxes(h_right, -1, -2)
+        v_right_t = np.swapaxes(v_right, -1, -2)
+        return (
+            covariance
+            - h_left @ v_right_t
+            - v_left @ h_right_t
+            + h_left @ self._middle @ h_right_t
+        )

@@ -48,15 +48,9 @@ RENEWED = 0.1  # part of them after which the factor is calculated anew
 def widening(size: NDArray[np.float64], limit: float, common: float = 0.0) -> float:
     """Factor of 1 or more by which errors scatter beyond what is stated and beyond chance.
 
-    Parameters
-    ----------
-    size : (n,) ndarray
-        Absolute errors over the median that is expected of them.
-    limit : float
-        Size beyond which an error is gross.
-    common : float
-        Part of the stated variance that all errors have in common: it may be far off in all of
-        them, and still as stated.
+    size: (n,) absolute errors over the median that is expected of them. limit: size beyond which
+    an error is gross. common: part of the stated variance that all errors have in common: it may
+    be far off in all of them, and still as stated.
     """
     size = size[np.isfinite(size)]
     scale = 1.0
@@ -84,12 +78,7 @@ def widening_by_group(size: np.ndarray, limit: float, group: np.ndarray) -> NDAr
 
 
 class ObservedScatter:
-    """Factor by which the latest errors of a recording scatter beyond what is stated.
-
-    Attributes
-    ----------
-    factor : float
-    """
+    """Factor by which the latest errors of a recording scatter beyond what is stated."""
 
     def __init__(self) -> None:
         self.factor = 1.0
@@ -151,21 +140,12 @@ class Noise:
     """Distribution of the image noise.
 
     Raises ValueError for an unknown loss.
-
-    Attributes
-    ----------
-    loss : {'student_t', 'huber', 'gaussian'}
-    scale : float
-        Scale [px], or a factor of sigma where sigma is given.
-    nu : float
-        Degrees of freedom of the Student-t; infinite for the others.
-    gross : float
-        Share of gross errors besides the Student-t. 0: there are none, and none are estimated.
     """
 
-    loss: str = 'student_t'
-    scale: float = 1.0
-    nu: float = 5.0
+    loss: str = 'student_t'  #: {'student_t', 'huber', 'gaussian'}
+    scale: float = 1.0  #: scale [px], or a factor of sigma where sigma is given
+    nu: float = 5.0  #: degrees of freedom of the Student-t; infinite for the others
+    #: share of gross errors besides the Student-t. 0: there are none, and none are estimated
     gross: float = 0.0
 
     def __post_init__(self) -> None:
@@ -268,13 +248,9 @@ class Noise:
         Method: ECME, started from this model. The unknowns of the adjustment are missing data, so
         the expected squared error is that of the residual plus what the unknowns leave unresolved.
 
-        Parameters
-        ----------
-        squared : (n,) array_like
-            Squared residuals r^T r / sigma^2 of the image points.
-        unresolved : (n,) array_like or float
-            tr(A C A^T) / (scale * sigma)^2 of each image point. For a point of weight one it is
-            two minus twice its redundancy number.
+        squared: (n,) squared residuals r^T r / sigma^2 of the image points. unresolved: (n,) tr(A
+        C A^T) / (scale * sigma)^2 of each image point; for a point of weight one it is two minus
+        twice its redundancy number.
         """
         values: np.ndarray = np.maximum(np.asarray(squared, dtype=float), 1e-300)
         missing = np.broadcast_to(np.asarray(unresolved, dtype=float), values.shape)

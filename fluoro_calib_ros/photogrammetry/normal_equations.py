@@ -16,12 +16,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .datum import Gauge, open_gauge
-from .network import Network
+from .network import Gauge, Network, open_gauge
 from .noise import Noise
-from .relative_orientation import discrepancies_with_jacobian
-from .relative_pose import POSE_SIZE
-from .unknowns import EXTERIOR_SIZE, Parameters, UnknownVector
+from .unknowns import (
+    EXTERIOR_SIZE,
+    POSE_SIZE,
+    Parameters,
+    UnknownVector,
+    discrepancies_with_jacobian,
+)
 
 # Image points that are linearised at once: their arrays stay in the cache.
 CHUNK = 8_000
@@ -36,41 +39,21 @@ class NormalEquations:
     """Blocks of the normal matrix and of its right side.
 
     e stands for exposures, p for object points and g for the global unknowns (see unknowns).
-
-    Attributes
-    ----------
-    ee : (m, 6, 6) ndarray
-    pp : (n, 3, 3) ndarray
-    gg : (G, G) ndarray
-        Diagonal blocks.
-    eg : (m, 6, G) ndarray
-    pg : (n, 3, G) ndarray
-        Mixed blocks with the global unknowns.
-    pe : (N, 3, 6) ndarray
-        Mixed block of object point and exposure of each image point.
-    e : (m, 6) ndarray
-    p : (n, 3) ndarray
-    g : (G,) ndarray
-        Right sides.
-    coupled_pairs : (k, 2) ndarray of int
-    coupled : (k, 6, 6) ndarray
-        Pairs of exposures coupled by a relative orientation, and their mixed blocks.
-    gauge : Gauge, optional
-        Directions that a free network leaves open.
     """
 
-    ee: NDArray[np.float64]
-    pp: NDArray[np.float64]
-    gg: NDArray[np.float64]
-    eg: NDArray[np.float64]
-    pg: NDArray[np.float64]
+    ee: NDArray[np.float64]  #: (m, 6, 6) diagonal blocks: exposures
+    pp: NDArray[np.float64]  #: (n, 3, 3) object points
+    gg: NDArray[np.float64]  #: (G, G) global unknowns
+    eg: NDArray[np.float64]  #: (m, 6, G) mixed blocks with the global unknowns
+    pg: NDArray[np.float64]  #: (n, 3, G)
+    #: (N, 3, 6) mixed block of object point and exposure of each image point
     pe: NDArray[np.float64]
-    e: NDArray[np.float64]
-    p: NDArray[np.float64]
-    g: NDArray[np.float64]
-    coupled_pairs: NDArray[np.int64]
-    coupled: NDArray[np.float64]
-    gauge: Gauge | None = None
+    e: NDArray[np.float64]  #: (m, 6) right sides
+    p: NDArray[np.float64]  #: (n, 3)
+    g: NDArray[np.float64]  #: (G,)
+    coupled_pairs: NDArray[np.int64]  #: (k, 2) exposures coupled by a relative orientation
+    coupled: NDArray[np.float64]  #: (k, 6, 6) their mixed blocks
+    gauge: Gauge | None = None  #: directions that a free network leaves open
 
 
 def _by_component(values: np.ndarray, index: np.ndarray | None = None) -> np.ndarray:
@@ -127,22 +110,14 @@ def project_network(network: Network, parameters: Parameters) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Linearised:
-    """Weighted derivatives of k image points, by component.
+    """Weighted derivatives of k image points, by component."""
 
-    Attributes
-    ----------
-    root : (k,) ndarray
-        Square roots of the weights.
-    u, v : (10, k) ndarray
-        Derivatives of u and v by T in the sensor frame (3), w (3) and the interior orientation
-        (3), and the residual.
-    pu, pv : (3, k) ndarray
-        Derivatives of u and v by the object point.
-    """
-
-    root: NDArray[np.float64]
+    root: NDArray[np.float64]  #: (k,) square roots of the weights
+    #: (10, k) derivatives of u and v by T in the sensor frame (3), w (3) and the interior
+    #: orientation (3), and the residual
     u: NDArray[np.float64]
     v: NDArray[np.float64]
+    #: (3, k) derivatives of u and v by the object point
     pu: NDArray[np.float64]
     pv: NDArray[np.float64]
 

@@ -42,57 +42,28 @@ CONTRADICTION_SIGNIFICANCE = 1e-3
 
 @dataclass(frozen=True)
 class Outliers:
-    """Observations that fail the test.
+    """Observations that fail the test."""
 
-    Attributes
-    ----------
-    image_point : (k,) ndarray of int
-        Rows of image points.
-    value : (k,) ndarray
-        Their statistics.
-    critical_image : float
-        Critical value of the image points.
-    target : (l,) ndarray of int
-        Rows of object points.
-    target_value : (l,) ndarray
-        Their statistics.
-    critical_target : float
-        Critical value of the targets.
-    offset_mm : (l, 3) ndarray
-        Position of the targets in the images minus their survey.
-    tested : (int, int)
-        Numbers of image points and of targets that could be tested.
-    """
-
-    image_point: NDArray[np.int64]
-    value: NDArray[np.float64]
-    critical_image: float
-    target: NDArray[np.int64]
-    target_value: NDArray[np.float64]
-    critical_target: float
+    image_point: NDArray[np.int64]  #: (k,) rows of image points
+    value: NDArray[np.float64]  #: (k,) their statistics
+    critical_image: float  #: critical value of the image points
+    target: NDArray[np.int64]  #: (l,) rows of object points
+    target_value: NDArray[np.float64]  #: (l,) their statistics
+    critical_target: float  #: critical value of the targets
+    #: (l, 3) position of the targets in the images minus their survey
     offset_mm: NDArray[np.float64]
-    tested: tuple[int, int]
+    tested: tuple[int, int]  #: numbers of image points and of targets that could be tested
 
 
 @dataclass(frozen=True)
 class TargetTest:
-    """Test of the surveyed coordinates of all targets.
+    """Test of the surveyed coordinates of all targets."""
 
-    Attributes
-    ----------
-    value : (n,) ndarray
-        Statistics; NaN where a target cannot be tested.
-    critical : float
-        Critical value.
-    offset_mm : (n, 3) ndarray
-        Position of the targets in the images minus their survey; zeros where not tested.
-    ray_square : (N,) ndarray
-        Statistics of the image points at the intersected targets.
-    """
-
-    value: NDArray[np.float64]
-    critical: float
+    value: NDArray[np.float64]  #: (n,) statistics; NaN where a target cannot be tested
+    critical: float  #: critical value
+    #: (n, 3) position of the targets in the images minus their survey; zeros where not tested
     offset_mm: NDArray[np.float64]
+    #: (N,) statistics of the image points at the intersected targets
     ray_square: NDArray[np.float64]
 
 

@@ -29,6 +29,7 @@ from .resection import (
     MIN_TARGETS,
     NU,
     SAMPLES,
+    dlt_rows,
     robust_variance,
     squared_residuals,
 )
@@ -41,16 +42,10 @@ MIN_TILT = 1e-3
 
 @dataclass(frozen=True)
 class Plane:
-    """The plane of targets.
+    """The plane of targets."""
 
-    Attributes
-    ----------
-    centre_mm : (3,) ndarray
-    axes : (3, 3) ndarray
-        Right-handed axes as rows: two in the plane, and its normal.
-    """
-
-    centre_mm: NDArray[np.float64]
+    centre_mm: NDArray[np.float64]  #: (3,)
+    #: (3, 3) right-handed axes as rows: two in the plane, and its normal
     axes: NDArray[np.float64]
 
     def coordinates(self, xyz: np.ndarray) -> NDArray[np.float64]:
@@ -84,17 +79,7 @@ def homography(
     """
     x, from_x = _normalised(xy)
     u, from_u = _normalised(uv)
-    x1 = np.concatenate([x, np.ones_like(x[..., :1])], axis=-1)
-    zero = np.zeros_like(x1)
-    rows = np.concatenate(
-        [
-            np.concatenate([x1, zero, -u[..., :1] * x1], axis=-1),
-            np.concatenate([zero, x1, -u[..., 1:] * x1], axis=-1),
-        ],
-        axis=-2,
-    )
-    if weights is not None:
-        rows = rows * np.sqrt(np.concatenate([weights, weights], axis=-1))[..., None]
+    rows = dlt_rows(x, u, weights)
     _, vectors = np.linalg.eigh(np.swapaxes(rows, -1, -2) @ rows)
     normalised = vectors[..., 0].reshape(vectors.shape[:-2] + (3, 3))
     return from_u @ normalised @ np.linalg.inv(from_x)

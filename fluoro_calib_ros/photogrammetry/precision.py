@@ -18,14 +18,12 @@ from numpy.typing import NDArray
 from .additional_parameters import AdditionalParameters
 from .adjustment import Adjustment
 from .collinearity import project_with_jacobian
-from .datum import Gauge, STransformation
 from .elimination import CovarianceBlocks, Elimination, FactorizedNormalMatrix, factorize
-from .network import Network
+from .network import Gauge, Network, STransformation
 from .noise import Noise
 from .normal_equations import NormalEquations, normal_equations, right_sides
-from .relative_orientation import discrepancies_with_jacobian
 from .rotations import square_of_lower
-from .unknowns import Parameters, UnknownVector
+from .unknowns import Parameters, UnknownVector, discrepancies_with_jacobian
 
 # Smallest weight of a gross error, so that its variance stays finite.
 MIN_WEIGHT = 1e-9
@@ -42,46 +40,25 @@ class Precision:
 
     The redundancy numbers sum to the number of observations less that of the unknowns, where no
     prior adds to them.
-
-    Attributes
-    ----------
-    interior : (F, 3, 3) ndarray
-        Of the interior orientations [px^2]; zeros where fixed.
-    exterior : (m, 6, 6) ndarray
-        Of T [mm] and w [rad] of the exposures.
-    points : (n, 3, 3) ndarray
-        Of the object points [mm^2].
-    residual : (N, 2, 2) ndarray
-        Of the residuals [px^2].
-    redundancy : (N, 2) ndarray
-        Redundancy numbers of the image coordinates.
-    survey_redundancy : (n, 3) ndarray
-        Redundancy numbers of the surveyed coordinates.
-    additional : tuple of (p, p) ndarray or None
-        Of the additional parameters of each fluoroscope.
-    relative : tuple of (6, 6) ndarray
-        Of translation [mm] and rotation [rad] of each constrained relative orientation.
-    relative_redundancy : tuple of (k, 6) ndarray
-        Redundancy numbers of the pairs of each relative orientation constraint.
-    all_global : (G, G) ndarray
-        Of all global unknowns.
-    exterior_global : (m, 6, G) ndarray
-        Of the exposures with the global unknowns.
-    joint_points : (3n, 3n) ndarray or None
-        Of all object points with each other; None where they are too many.
     """
 
+    #: (F, 3, 3) of the interior orientations [px^2]; zeros where fixed
     interior: NDArray[np.float64]
-    exterior: NDArray[np.float64]
-    points: NDArray[np.float64]
-    residual: NDArray[np.float64]
-    redundancy: NDArray[np.float64]
+    exterior: NDArray[np.float64]  #: (m, 6, 6) of T [mm] and w [rad] of the exposures
+    points: NDArray[np.float64]  #: (n, 3, 3) of the object points [mm^2]
+    residual: NDArray[np.float64]  #: (N, 2, 2) of the residuals [px^2]
+    redundancy: NDArray[np.float64]  #: (N, 2) redundancy numbers of the image coordinates
+    #: (n, 3) redundancy numbers of the surveyed coordinates
     survey_redundancy: NDArray[np.float64]
+    #: (p, p) of the additional parameters of each fluoroscope
     additional: tuple[NDArray[np.float64] | None, ...]
+    #: (6, 6) of translation [mm] and rotation [rad] of each constrained relative orientation
     relative: tuple[NDArray[np.float64], ...]
+    #: (k, 6) redundancy numbers of the pairs of each relative orientation constraint
     relative_redundancy: tuple[NDArray[np.float64], ...]
-    all_global: NDArray[np.float64]
-    exterior_global: NDArray[np.float64]
+    all_global: NDArray[np.float64]  #: (G, G) of all global unknowns
+    exterior_global: NDArray[np.float64]  #: (m, 6, G) of the exposures with the global unknowns
+    #: (3n, 3n) of all object points with each other; None where they are too many
     joint_points: NDArray[np.float64] | None = None
 
 
@@ -287,19 +264,9 @@ def precision(
     the residuals and the redundancy numbers belong to the weighted least-squares problem at the
     solution.
 
-    Parameters
-    ----------
-    network : Network
-    adjustment : Adjustment
-    correction : (N, 2) ndarray, optional
-        Correction of the image points [px] in the adjustment.
-    elimination : type of Elimination, optional
-        As in SolverOptions.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        Where the network does not determine the unknowns.
+    correction: (N, 2) correction of the image points [px] in the adjustment. elimination: as in
+    SolverOptions. Raises numpy.linalg.LinAlgError where the network does not determine the
+    unknowns.
     """
     correction = np.zeros_like(network.uv) if correction is None else correction
 
@@ -344,19 +311,12 @@ def precision(
 
 @dataclass(frozen=True)
 class JointCovariance:
-    """Covariances of all unknowns with each other.
+    """Covariances of all unknowns with each other."""
 
-    Attributes
-    ----------
-    exteriors : (6m, 6m) ndarray
-    points : (3n, 3n) ndarray
-    points_exteriors : (3n, 6m) ndarray
-    globals, exteriors_globals, points_globals : (G, G), (6m, G) and (3n, G) ndarray
-    """
-
-    exteriors: NDArray[np.float64]
-    points: NDArray[np.float64]
-    points_exteriors: NDArray[np.float64]
+    exteriors: NDArray[np.float64]  #: (6m, 6m)
+    points: NDArray[np.float64]  #: (3n, 3n)
+    points_exteriors: NDArray[np.float64]  #: (3n, 6m)
+    #: (3n, G)
     globals: NDArray[np.float64]
     exteriors_globals: NDArray[np.float64]
     points_globals: NDArray[np.float64]

@@ -48,23 +48,12 @@ TOLERANCE = 1e-4
 
 @dataclass(frozen=True)
 class Resection:
-    """Exterior orientation of one exposure.
+    """Exterior orientation of one exposure."""
 
-    Attributes
-    ----------
-    rotation : (3, 3) ndarray
-        Rotation phantom -> sensor.
-    position_mm : (3,) ndarray
-        Position of the source.
-    scale : float
-        Scale of the residuals [px].
-    inliers : (n,) ndarray of bool
-    """
-
-    rotation: NDArray[np.float64]
-    position_mm: NDArray[np.float64]
-    scale: float
-    inliers: NDArray[np.bool_]
+    rotation: NDArray[np.float64]  #: (3, 3) rotation phantom -> sensor
+    position_mm: NDArray[np.float64]  #: (3,) position of the source
+    scale: float  #: scale of the residuals [px]
+    inliers: NDArray[np.bool_]  #: (n,)
 
 
 def least_vectors(forms: np.ndarray) -> np.ndarray:
@@ -82,6 +71,22 @@ def least_vectors_with_last_one(forms: np.ndarray) -> np.ndarray:
     ridge = TINY * np.trace(forms, axis1=-2, axis2=-1)[..., None, None] * np.eye(k)
     found = np.linalg.solve(forms[..., :k, :k] + ridge, -forms[..., :k, k:])
     return np.concatenate([found[..., 0], np.ones_like(found[..., :1, 0])], axis=-1)
+
+
+def dlt_rows(x: np.ndarray, u: np.ndarray, weights: np.ndarray | None) -> np.ndarray:
+    """Rows (..., 2n, 3 (k + 1)) of u ~ P (x, 1) in P, row by row: x (..., n, k), u (..., n, 2)."""
+    x1 = np.concatenate([x, np.ones_like(x[..., :1])], axis=-1)
+    zero = np.zeros_like(x1)
+    rows = np.concatenate(
+        [
+            np.concatenate([x1, zero, -u[..., :1] * x1], axis=-1),
+            np.concatenate([zero, x1, -u[..., 1:] * x1], axis=-1),
+        ],
+        axis=-2,
+    )
+    if weights is not None:
+        rows = rows * np.sqrt(np.concatenate([weights, weights], axis=-1))[..., None]
+    return rows
 
 
 def direct_linear_transformation(
@@ -102,17 +107,7 @@ def direct_linear_transformation(
     scale_u = np.sqrt(2 / np.mean(np.sum((uv - mean_u) ** 2, axis=-1), axis=-1))[..., None, None]
     x = (xyz - mean_x) * scale_x
     u = (uv - mean_u) * scale_u
-    x1 = np.concatenate([x, np.ones_like(x[..., :1])], axis=-1)
-    zero = np.zeros_like(x1)
-    rows = np.concatenate(
-        [
-            np.concatenate([x1, zero, -u[..., :1] * x1], axis=-1),
-            np.concatenate([zero, x1, -u[..., 1:] * x1], axis=-1),
-        ],
-        axis=-2,
-    )
-    if weights is not None:
-        rows = rows * np.sqrt(np.concatenate([weights, weights], axis=-1))[..., None]
+    rows = dlt_rows(x, u, weights)
     vectors = least(np.swapaxes(rows, -1, -2) @ rows)
     normalised = vectors.reshape(vectors.shape[:-1] + (3, 4))
     to_x = np.zeros(normalised.shape[:-2] + (4, 4))

@@ -1,23 +1,77 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The unknowns of a bundle adjustment: their layout, their values and a step of the values.
+"""The unknowns of a bundle adjustment; relative orientations that are the same in all exposures.
 
 Unknowns that belong to one exposure or to one object point form small blocks. All others are
 global, as they touch many image points: interior orientations, relative orientations, additional
 parameters, in this order.
+
+Where the relative orientation of two fluoroscopes is the same in every common exposure, Q = R_b
+R_a^T and t = R_a (T_b - T_a) [mm, sensor frame of a] are unknowns of the adjustment, six for each
+pair of fluoroscopes. Each common exposure observes them: R_a (T_b - T_a) - t = 0 and log(R_b R_a^T
+Q^T) = 0, with standard deviations. A rigid mounting is the limit of small standard deviations.
+Relative orientation constraints: Lerma, Navarro, Cabrelles and Seguí, "Camera calibration with
+baseline distance constraints", Photogrammetric Record 25, 2010. Derivatives of rotations: Barfoot,
+"State Estimation for Robotics", Cambridge 2017, 7.1.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .relative_pose import POSE_SIZE, RelativePose
+from .rotations import cross_matrix, matrix_from_vector, vector_from_matrix
+
+POSE_SIZE = 6  # translation [mm], rotation vector [rad]
+# Standard deviations that stand for a rigid mounting: a thousandth of what one pair of exposures
+# determines from images of 0.25 px noise. The solution is that of the limit within some 1e-5
+# standard deviations, and rounding errors are still far away.
+RIGID_SD_MM = 3e-4
+RIGID_SD_RAD = 1e-7
+
+
+@dataclass(frozen=True)
+class RelativeConstraint:
+    """Constraint that the relative orientation of two fluoroscopes is the same in all pairs."""
+
+    fluoroscopes: tuple[int, int]  #: numbers of the fluoroscopes a and b
+    pairs: NDArray[np.int64]  #: (k, 2) rows of the common exposures of a and of b
+    #: standard deviations of each component of translation and rotation
+    sd_mm: float
+    sd_rad: float
+    #: distance of the sources at which `sd_mm` holds; it makes the constraint follow the scale of
+    #: a free network; None where the scale is fixed
+    length_mm: float | None = None
+
+    @property
+    def weights(self) -> NDArray[np.float64]:
+        """Weights (6,) of the components of the constraint."""
+        return np.repeat([self.sd_mm**-2.0, self.sd_rad**-2.0], 3)
+
+
+@dataclass(frozen=True)
+class RelativePose:
+    """Relative orientation of fluoroscope b with respect to a.
+
+    rotation (3, 3) from the sensor frame of a to that of b; translation_mm (3,) of the source of b
+    in the sensor frame of a.
+    """
+
+    rotation: np.ndarray
+    translation_mm: np.ndarray
+
+    def updated(self, step: np.ndarray) -> RelativePose:
+        """The pose after a step (6,): translation [mm], rotation [rad] on the left."""
+        step = np.asarray(step)
+        return RelativePose(
+            matrix_from_vector(step[3:]) @ self.rotation, self.translation_mm + step[:3]
+        )
+
 
 EXTERIOR_SIZE = 6  # source T [mm], rotation vector w [rad]
 POINT_SIZE = 3
@@ -26,19 +80,12 @@ INTERIOR_SIZE = 3  # xp, yp, c [px]
 
 @dataclass(frozen=True)
 class ReducedLayout:
-    """Order of the unknowns after an elimination: blocks of one kind, then the free globals.
+    """Order of the unknowns after an elimination: blocks of one kind, then the free globals."""
 
-    Attributes
-    ----------
-    n_blocks, block_size : int
-        Number and size of the blocks: exposures or object points.
-    n_globals : int
-        Number of free global unknowns.
-    """
-
+    #: number and size of the blocks: exposures or object points
     n_blocks: int
     block_size: int
-    n_globals: int
+    n_globals: int  #: number of free global unknowns
 
     @property
     def blocks(self) -> slice:
@@ -63,32 +110,20 @@ class ReducedLayout:
 
 @dataclass(frozen=True)
 class UnknownLayout:
-    """Where the unknowns of a network stand.
+    """Where the unknowns of a network stand."""
 
-    Attributes
-    ----------
-    n_exposures, n_points : int
-        Numbers of the block unknowns.
-    interiors : tuple of slice
-        Columns of the interior orientation of each fluoroscope among the global unknowns.
-    relative : tuple of slice
-        Columns of each constrained relative orientation among the global unknowns.
-    additional : tuple of slice
-        Columns of the additional parameters of each fluoroscope among the global unknowns, empty
-        where there are none.
-    free : (G,) ndarray of bool
-        Which global unknowns are estimated.
-    datum_defect : int
-        Number of unknowns that the datum of a free network fixes.
-    """
-
+    #: numbers of the block unknowns
     n_exposures: int
     n_points: int
+    #: columns of the interior orientation of each fluoroscope among the global unknowns
     interiors: tuple[slice, ...]
+    #: columns of each constrained relative orientation among the global unknowns
     relative: tuple[slice, ...]
+    #: columns of the additional parameters of each fluoroscope among the global unknowns, empty
+    #: where there are none
     additional: tuple[slice, ...]
-    free: NDArray[np.bool_]
-    datum_defect: int
+    free: NDArray[np.bool_]  #: (G,) which global unknowns are estimated
+    datum_defect: int  #: number of unknowns that the datum of a free network fixes
 
     @classmethod
     def of(
@@ -182,48 +217,24 @@ class UnknownLayout:
 
 @dataclass(frozen=True)
 class UnknownVector:
-    """A vector, or columns of vectors, over the unknowns of a network, split by kind.
+    """A vector, or columns of vectors, over the unknowns of a network, split by kind."""
 
-    Attributes
-    ----------
-    exteriors : (m, 6, ...) ndarray
-        Of T [mm] and w [rad] of the exposures.
-    points : (n, 3, ...) ndarray
-        Of the object points [mm].
-    globals : (G, ...) ndarray
-        Of the global unknowns; zeros where fixed.
-    """
-
-    exteriors: NDArray[np.float64]
-    points: NDArray[np.float64]
-    globals: NDArray[np.float64]
+    exteriors: NDArray[np.float64]  #: (m, 6, ...) of T [mm] and w [rad] of the exposures
+    points: NDArray[np.float64]  #: (n, 3, ...) of the object points [mm]
+    globals: NDArray[np.float64]  #: (G, ...) of the global unknowns; zeros where fixed
 
 
 @dataclass(frozen=True)
 class Parameters:
-    """Values of the unknowns of a network.
+    """Values of the unknowns of a network."""
 
-    Attributes
-    ----------
-    interior : (F, 3) ndarray
-        xp, yp, c of the fluoroscopes [px].
-    rotation : (m, 3, 3) ndarray
-        Rotations phantom -> sensor of the exposures.
-    position_mm : (m, 3) ndarray
-        Positions of the source.
-    points_mm : (n, 3) ndarray
-        Object points.
-    additional : tuple of (p,) ndarray or None
-        Coefficients of the additional parameters of each fluoroscope.
-    relative : tuple of RelativePose
-        Relative orientation of each constraint of the network.
-    """
-
-    interior: NDArray[np.float64]
-    rotation: NDArray[np.float64]
-    position_mm: NDArray[np.float64]
-    points_mm: NDArray[np.float64]
+    interior: NDArray[np.float64]  #: (F, 3) xp, yp, c of the fluoroscopes [px]
+    rotation: NDArray[np.float64]  #: (m, 3, 3) rotations phantom -> sensor of the exposures
+    position_mm: NDArray[np.float64]  #: (m, 3) positions of the source
+    points_mm: NDArray[np.float64]  #: (n, 3) object points
+    #: (p,) coefficients of the additional parameters of each fluoroscope
     additional: tuple[NDArray[np.float64] | None, ...] = ()
+    #: relative orientation of each constraint of the network
     relative: tuple[RelativePose, ...] = ()
 
     def additional_of(self, f: int) -> NDArray[np.float64]:
@@ -231,3 +242,175 @@ class Parameters:
         coefficients = self.additional[f]
         assert coefficients is not None
         return coefficients
+
+
+# Iterations of the mean pose, and the step [mm, rad] at which they end.
+MEAN_ITERATIONS = 10
+MEAN_TOLERANCE = 1e-12
+
+
+def inverse_left_jacobian(w: np.ndarray) -> np.ndarray:
+    """Derivatives (..., 3, 3) of log(exp(v) exp(w)) with respect to v at v = 0.
+
+    w (..., 3) are rotation vectors [rad] (Barfoot 7.1.3).
+    """
+    half = np.linalg.norm(w, axis=-1)[..., None, None] / 2
+    k = cross_matrix(w)
+    # (1 - h cot h) / (4 h^2) is 0/0 at zero, where its limit is 1/12.
+    small = half < 1e-3
+    safe = np.where(small, 1.0, half)
+    factor = np.where(small, 1 / 12 + half**2 / 180, (1 - safe / np.tan(safe)) / (4 * safe**2))
+    return np.eye(3) - k / 2 + factor * (k @ k)
+
+
+def relative_poses(parameters: Parameters, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations (k, 3, 3) and translations (k, 3) [mm] of b relative to a in pairs of exposures.
+
+    pairs (k, 2) are rows of exposures.
+    """
+    a, b = pairs.T
+    r_a = parameters.rotation[a]
+    shift = parameters.position_mm[b] - parameters.position_mm[a]
+    return parameters.rotation[b] @ r_a.transpose(0, 2, 1), (r_a @ shift[..., None])[..., 0]
+
+
+def discrepancies(
+    constraint: RelativeConstraint, pose: RelativePose, parameters: Parameters
+) -> NDArray[np.float64]:
+    """Discrepancies (k, 6) of the pairs from a pose: translation [mm], rotation [rad]."""
+    turn, shift = relative_poses(parameters, constraint.pairs)
+    scale, _ = _translation_scale(constraint, pose)
+    return np.concatenate(
+        [scale * (shift - pose.translation_mm), vector_from_matrix(turn @ pose.rotation.T)], axis=1
+    )
+
+
+def _translation_scale(
+    constraint: RelativeConstraint, pose: RelativePose
+) -> tuple[float, np.ndarray]:
+    """Factor of the translations, and its derivative (3,) by the translation of the pose."""
+    if constraint.length_mm is None:
+        return 1.0, np.zeros(3)
+    length = np.linalg.norm(pose.translation_mm)
+    derivative = -constraint.length_mm / length**3 * pose.translation_mm
+    return constraint.length_mm / length, derivative
+
+
+def discrepancies_with_jacobian(
+    constraint: RelativeConstraint, pose: RelativePose, parameters: Parameters
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Discrepancies (k, 6) and their derivatives.
+
+    Returns the discrepancies and their derivatives (k, 6, 6) by the exposure of a, by the exposure
+    of b (T [mm] and w [rad] each), and by the pose (as in RelativePose.updated).
+    """
+    a, _ = constraint.pairs.T
+    turn, shift = relative_poses(parameters, constraint.pairs)
+    scale, d_scale = _translation_scale(constraint, pose)
+    w = vector_from_matrix(turn @ pose.rotation.T)
+    back = inverse_left_jacobian(w)
+    d_a = np.zeros((len(a), POSE_SIZE, POSE_SIZE))
+    d_b = np.zeros_like(d_a)
+    d_pose = np.zeros_like(d_a)
+    d_a[:, :3, :3] = -scale * parameters.rotation[a]
+    d_b[:, :3, :3] = scale * parameters.rotation[a]
+    d_a[:, :3, 3:] = -scale * cross_matrix(shift)
+    d_a[:, 3:, 3:] = -back @ turn
+    d_b[:, 3:, 3:] = back
+    d_pose[:, :3, :3] = -scale * np.eye(3) + (shift - pose.translation_mm)[:, :, None] * d_scale
+    d_pose[:, 3:, 3:] = -inverse_left_jacobian(-w)
+    return np.concatenate([scale * (shift - pose.translation_mm), w], axis=1), d_a, d_b, d_pose
+
+
+def mean_pose(
+    parameters: Parameters, pairs: np.ndarray, weights: np.ndarray | None = None
+) -> RelativePose:
+    """Mean relative orientation of pairs (k, 2) of exposures.
+
+    With weights (k, 6, 6) of translation and rotation of each pair, the weighted mean. Without
+    them the component-wise median: a start value that is robust to single pairs.
+    """
+    turn, shift = relative_poses(parameters, pairs)
+    median = np.median(shift, axis=0)
+    start = int(np.argmin(np.sum((shift - median) ** 2, axis=1)))
+    pose = RelativePose(turn[start], median)
+    for _ in range(MEAN_ITERATIONS):
+        difference = np.concatenate(
+            [shift - pose.translation_mm, vector_from_matrix(turn @ pose.rotation.T)], axis=1
+        )
+        if weights is None:
+            step = np.median(difference, axis=0)
+        else:
+            step = np.linalg.solve(
+                weights.sum(axis=0), (weights @ difference[..., None]).sum(axis=0)[:, 0]
+            )
+        pose = pose.updated(step)
+        if np.max(np.abs(step)) < MEAN_TOLERANCE:
+            break
+    return pose
+
+
+def exposures_from_pose(
+    parameters: Parameters,
+    constraint: RelativeConstraint,
+    pose: RelativePose,
+    offset: NDArray[np.float64] | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Exterior orientations of b's exposures from those of a and a relative orientation.
+
+    Parameters
+    ----------
+    parameters : Parameters
+        Exterior orientations of a's exposures.
+    constraint : RelativeConstraint
+        The pairs of exposures.
+    pose : RelativePose
+        Relative orientation of b with respect to a.
+    offset : (k, 6) ndarray, optional
+        Discrepancies from the pose that the result has; zeros by default.
+
+    Returns
+    -------
+    rotation : (k, 3, 3) ndarray
+    position_mm : (k, 3) ndarray
+    """
+    if offset is None:
+        offset = np.zeros((len(constraint.pairs), POSE_SIZE))
+    scale, _ = _translation_scale(constraint, pose)
+    a = constraint.pairs[:, 0]
+    r_a = parameters.rotation[a]
+    translation = pose.translation_mm + offset[:, :3] / scale
+    shift = (r_a.transpose(0, 2, 1) @ translation[..., None])[..., 0]
+    rotation = matrix_from_vector(offset[:, 3:]) @ pose.rotation @ r_a
+    return rotation, parameters.position_mm[a] + shift
+
+
+def exposures_after_step(
+    constraints: Sequence[RelativeConstraint],
+    layout: UnknownLayout,
+    before: Parameters,
+    after: Parameters,
+    step: UnknownVector,
+) -> Parameters:
+    """Parameters after a step, with b's exposures moved along their constraints.
+
+    Their discrepancies become what the linearised constraint predicts. To first order they are so
+    already, but a stiff constraint is curved, and a straight step would leave it by more than its
+    standard deviation.
+
+    constraints: the constraints of the network. before, after: parameters before and after the
+    straight step.
+    """
+    rotation = after.rotation.copy()
+    position = after.position_mm.copy()
+    for number, (constraint, columns) in enumerate(zip(constraints, layout.relative)):
+        a, b = constraint.pairs.T
+        offset, d_a, d_b, d_pose = discrepancies_with_jacobian(
+            constraint, before.relative[number], before
+        )
+        by_exposures = d_a @ step.exteriors[a][..., None] + d_b @ step.exteriors[b][..., None]
+        offset = offset + by_exposures[..., 0] + d_pose @ step.globals[columns]
+        rotation[b], position[b] = exposures_from_pose(
+            after, constraint, after.relative[number], offset
+        )
+    return replace(after, rotation=rotation, position_mm=position)

@@ -73,36 +73,21 @@ class IntersectedPoints:
     """Points in the rig frame.
 
     Coordinates and covariances are NaN unless the status is OK or OUTSIDE.
-
-    Attributes
-    ----------
-    xyz_mm : ndarray
-        (n, 3)
-    covariance : ndarray
-        (n, 3, 3), by the image points and the orientation of the rig [mm^2].
-    covariance_noise : ndarray
-        (n, 3, 3), by the image points alone, that is by noise and correction [mm^2]. It is the
-        one for positions of points relative to each other.
-    residual : ndarray
-        (n,), RMS of the image residuals [px].
-    rays : ndarray
-        (n,), number of rays used.
-    standardised : ndarray
-        (n,), root of the weighted square sum of the residuals over its expectation; for two rays
-        the epipolar distance over its standard deviation (sd_total).
-    status : ndarray
-        (n,), PointStatus as uint8.
-    dropped_view : ndarray
-        (n,), number of the fluoroscope whose ray was dropped as false, else -1.
     """
 
-    xyz_mm: NDArray[np.float64]
+    xyz_mm: NDArray[np.float64]  #: (n, 3)
+    #: (n, 3, 3) by the image points and the orientation of the rig [mm^2]
     covariance: NDArray[np.float64]
+    #: (n, 3, 3) by the image points alone, that is by noise and correction [mm^2]; it is the one
+    #: for positions of points relative to each other
     covariance_noise: NDArray[np.float64]
-    residual: NDArray[np.float64]
-    rays: NDArray[np.float64]
+    residual: NDArray[np.float64]  #: (n,) RMS of the image residuals [px]
+    rays: NDArray[np.float64]  #: (n,) number of rays used
+    #: (n,) root of the weighted square sum of the residuals over its expectation; for two rays
+    #: the epipolar distance over its standard deviation (sd_total)
     standardised: NDArray[np.float64]
-    status: np.ndarray
+    status: np.ndarray  #: (n,) PointStatus as uint8
+    #: (n,) number of the fluoroscope whose ray was dropped as false, else -1
     dropped_view: NDArray[np.float64]
 
     @property
@@ -131,22 +116,11 @@ class _Solution:
 class Intersector:
     """Intersection of rays for one RigOrientation, built once for all frames.
 
-    Parameters
-    ----------
-    orientation : RigOrientation
-        Of two or more fluoroscopes.
-    reject : float or None
-        Standardised epipolar distance above which two rays do not belong together; None: accept
-        all. With more rays the limit is the quantile of chi-square of the same probability, and a
-        ray is dropped if the others agree without it. Where the points of a recording are seen to
-        scatter more than stated, it is wider.
-
-    Raises
-    ------
-    DataError
-        For a rig of one fluoroscope.
-    ValueError
-        If reject is not above 0.
+    orientation: of two or more fluoroscopes. reject: standardised epipolar distance above which
+    two rays do not belong together; None: accept all; with more rays the limit is the quantile of
+    chi-square of the same probability, and a ray is dropped if the others agree without it; where
+    the points of a recording are seen to scatter more than stated, it is wider. Raises DataError
+    for a rig of one fluoroscope, ValueError if reject is not above 0.
     """
 
     def __init__(self, orientation: RigOrientation, reject: float | None = 4.0) -> None:
@@ -201,10 +175,6 @@ class Intersector:
             (F, n), True for image points beyond the calibrated area.
         scatter : ObservedScatter, optional
             Scatter of the recording, which these points add to. It widens the limit.
-
-        Returns
-        -------
-        IntersectedPoints
 
         Raises
         ------

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..correction.base import CorrectionStatus
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
 from ..errors import DataError
-from ..exposures.frame import Frame, image_size_error, repeated_target_error
+from ..exposures.frame import Frame, Frames, image_size_error, repeated_target_error
 from ..exposures.pairing import PairingOptions, recorded_pairer
 from ..photogrammetry.noise import ObservedScatter
 from ..photogrammetry.rig_orientation import RigOrientation
@@ -30,25 +30,14 @@ from .intersection import IntersectedPoints, Intersector
 
 @dataclass(frozen=True)
 class CorrectedView:
-    """Corrected image points of one view of an exposure.
+    """Corrected image points of one view of an exposure."""
 
-    Attributes
-    ----------
-    target_id : ndarray
-        (n,), each once.
-    uv : ndarray
-        (n, 2), corrected pixels.
-    sigma, correction_sd : ndarray
-        (n,), standard deviations of the coordinates, and of the correction alone [px].
-    outside : ndarray
-        (n,), True beyond the calibrated area.
-    """
-
-    target_id: NDArray[np.int64]
-    uv: NDArray[np.float64]
+    target_id: NDArray[np.int64]  #: (n,) each once
+    uv: NDArray[np.float64]  #: (n, 2) corrected pixels
+    #: (n,) standard deviations of the coordinates, and of the correction alone [px]
     sigma: NDArray[np.float64]
     correction_sd: NDArray[np.float64]
-    outside: NDArray[np.float64]
+    outside: NDArray[np.float64]  #: (n,) True beyond the calibrated area
 
 
 @dataclass(frozen=True)
@@ -56,24 +45,15 @@ class MatchedViews:
     """Corrected image points of F views of an exposure, by target.
 
     Values are NaN, and `outside` False, where a view does not see a target.
-
-    Attributes
-    ----------
-    target_id : ndarray
-        (n,), ascending; or, where all views have the same ids in the same order, in that order.
-    uv : ndarray
-        (F, n, 2), corrected pixels.
-    sigma, correction_sd : ndarray
-        (F, n), standard deviations of the coordinates, and of the correction alone [px].
-    outside : ndarray
-        (F, n), True beyond the calibrated area.
     """
 
+    #: (n,) ascending; or, where all views have the same ids in the same order, in that order
     target_id: NDArray[np.int64]
-    uv: NDArray[np.float64]
+    uv: NDArray[np.float64]  #: (F, n, 2) corrected pixels
+    #: (F, n) standard deviations of the coordinates, and of the correction alone [px]
     sigma: NDArray[np.float64]
     correction_sd: NDArray[np.float64]
-    outside: NDArray[np.float64]
+    outside: NDArray[np.float64]  #: (F, n) True beyond the calibrated area
 
 
 def match_views(views: Sequence[CorrectedView | None]) -> MatchedViews:
@@ -141,24 +121,14 @@ class ExposureWatch(Protocol):
 
 @dataclass(frozen=True)
 class ReconstructedFrame:
-    """Points of one exposure.
+    """Points of one exposure."""
 
-    Attributes
-    ----------
-    number, stamp_ns : int
-        Those of the frame of its first fluoroscope.
-    target_id : ndarray
-        (n,)
-    points : IntersectedPoints
-    fluoroscopes : tuple of str
-        Those that have a frame of the exposure.
-    """
-
+    #: those of the frame of its first fluoroscope
     number: int
     stamp_ns: int
-    target_id: NDArray[np.int64]
+    target_id: NDArray[np.int64]  #: (n,)
     points: IntersectedPoints
-    fluoroscopes: tuple[str, ...]
+    fluoroscopes: tuple[str, ...]  #: those that have a frame of the exposure
 
 
 def intersect_exposure(
@@ -190,32 +160,16 @@ def watch_exposure(watch: ExposureWatch, stamp_ns: int, exposure: IntersectedVie
 
 def reconstruct_exposure(
     exposure: Mapping[str, Frame],
-    calibrations: Mapping[str, FluoroscopeCalibration],
+    calibrations: Calibrations,
     intersector: Intersector,
     watch: ExposureWatch | None = None,
     scatter: ObservedScatter | None = None,
 ) -> ReconstructedFrame:
     """Correct and intersect the observed image points of one exposure.
 
-    Parameters
-    ----------
-    exposure : mapping of str to Frame
-        Frames by fluoroscope, of two or more fluoroscopes of the orientation.
-    calibrations : mapping of str to FluoroscopeCalibration
-    intersector : Intersector
-    watch : ExposureWatch, optional
-        Examines the exposure.
-    scatter : ObservedScatter, optional
-        Scatter of the recording so far.
-
-    Returns
-    -------
-    ReconstructedFrame
-
-    Raises
-    ------
-    DataError
-        For an image whose size is not that of the calibration, and for a repeated target.
+    exposure: frames by fluoroscope, of two or more fluoroscopes of the orientation. watch:
+    examines the exposure. scatter: scatter of the recording so far. Raises DataError for an image
+    whose size is not that of the calibration, and for a repeated target.
     """
     found, present = intersect_frames(exposure, calibrations, intersector, scatter)
     if watch is not None:
@@ -231,7 +185,7 @@ def reconstruct_exposure(
 
 def intersect_frames(
     exposure: Mapping[str, Frame],
-    calibrations: Mapping[str, FluoroscopeCalibration],
+    calibrations: Calibrations,
     intersector: Intersector,
     scatter: ObservedScatter | None = None,
 ) -> tuple[IntersectedViews, list[Frame]]:
@@ -265,8 +219,8 @@ def _corrected_view(frame: Frame, calibration: FluoroscopeCalibration) -> Correc
 
 
 def reconstruct_recording(
-    frames: Mapping[str, Sequence[Frame]],
-    calibrations: Mapping[str, FluoroscopeCalibration],
+    frames: Frames,
+    calibrations: Calibrations,
     intersector: Intersector,
     pair_by: str = 'frame_number',
     watch: ExposureWatch | None = None,
@@ -315,9 +269,7 @@ def reconstruct_recording(
     return out, unpaired
 
 
-def orientation_of_recorded(
-    frames: Mapping[str, Sequence[Frame]], orientation: RigOrientation
-) -> RigOrientation:
+def orientation_of_recorded(frames: Frames, orientation: RigOrientation) -> RigOrientation:
     """Return the orientation of the recorded fluoroscopes. Raises DataError for less than two."""
     names = [name for name in orientation.fluoroscopes if name in frames]
     if len(names) < 2:
@@ -329,10 +281,7 @@ def orientation_of_recorded(
 
 
 def pair_recording(
-    frames: Mapping[str, Sequence[Frame]],
-    names: Sequence[str],
-    pair_by: str,
-    tolerance_s: float,
+    frames: Frames, names: Sequence[str], pair_by: str, tolerance_s: float
 ) -> tuple[list[dict[str, Frame]], dict[str, int]]:
     """Pair the frames of a recording to exposures, in the order of time.
 

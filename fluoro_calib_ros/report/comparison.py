@@ -13,7 +13,7 @@ from matplotlib import style
 from matplotlib.figure import Figure
 
 from ..checks.comparison import Comparison
-from .style import BLACK, STYLE, new_figure, png_bytes
+from .figures import BLACK, STYLE, new_figure, png_bytes
 
 ARROWS = 16  # along the longer side of the image
 

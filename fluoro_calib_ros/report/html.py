@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import base64
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -18,14 +18,14 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matplotlib import style
 from matplotlib.figure import Figure
 
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
-from ..exposures.frame import Frame
+from ..correction.fluoroscope_calibration import Calibrations
+from ..exposures.frame import Frames
 from ..exposures.names import Names
 from ..exposures.phantom import Phantom
 from ..findings import Finding, sentences
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import matrix_from_quaternion
-from .distortion_figure import Scale, common_scale, distortion_figure
+from .figures import STYLE, Scale, common_scale, distortion_figure, png_bytes
 from .report_figures import (
     bead_shifts,
     covered_cells,
@@ -35,7 +35,6 @@ from .report_figures import (
     residual_map,
 )
 from .residuals import Residuals, residuals_of
-from .style import STYLE, png_bytes
 from .tables import model_text
 
 TEMPLATES = Path(__file__).parent / 'templates'
@@ -54,8 +53,8 @@ class ReportInput:
 
     title: str
     result: Mapping[str, Any]  #: content of result.json
-    calibrations: Mapping[str, FluoroscopeCalibration]
-    frames: Mapping[str, Sequence[Frame]]  #: exposures of the calibration
+    calibrations: Calibrations
+    frames: Frames  #: exposures of the calibration
     phantom: Phantom
     settings: Mapping[str, Any]  #: content of options.json
     validation: Mapping[str, Any] | None = None  #: content of validation.json

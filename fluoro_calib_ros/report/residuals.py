@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Residuals of a calibration, computed again from what its result folder contains."""
+"""Residuals of a calibration, computed again from its result folder, and their figures."""
 
 from __future__ import annotations
 
@@ -9,11 +9,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..estimation.rounds import SelfCalibration
 from ..exposures.frame import Frame
+from ..photogrammetry.adjustment import Adjustment
 from ..photogrammetry.collinearity import project
+from .figures import AFTER, BEFORE, BLACK, GREY, new_figure
+from .tables import model_text
 
 Pose = tuple[np.ndarray, np.ndarray]
 
@@ -56,19 +62,8 @@ def residuals_of(
 ) -> Residuals:
     """Return the residuals of the frames of a fluoroscope.
 
-    Parameters
-    ----------
-    calibration : FluoroscopeCalibration
-    frames : sequence of Frame
-    poses : mapping of int to (rotation, position_mm)
-        Exterior orientation by exposure; frames of other exposures were not used.
-    points_mm : mapping of int to (3,) ndarray
-        Adjusted object points by target.
-    outliers : set of (exposure, target)
-
-    Returns
-    -------
-    Residuals
+    poses: exterior orientation by exposure; frames of other exposures were not used. points_mm:
+    (3,) adjusted object points by target.
     """
     exposure = []
     target_id = []
@@ -112,3 +107,185 @@ def residuals_of(
         inlier=inlier.astype(bool),
         angle=angles,
     )
+
+
+MIN_HISTOGRAM_SD = 5.0  # standard deviations to either side
+MAX_HISTOGRAM_SD = 15.0
+BIN_SD = 0.25
+STRIPES = 16  # of the image, for the running median
+COORDINATES = ('u', 'v')
+
+
+def normalised_residuals(
+    run: SelfCalibration, rows: NDArray[np.int64], redundancy: NDArray[np.float64]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Inlier residuals in units of their standard deviation, before (n, 2) and after (m, 2).
+
+    rows (k,) are image points, redundancy (k,) their redundancy numbers. The standard deviation of
+    a residual is s0 sigma sqrt(redundancy number): it is smaller than that of the image noise by
+    what the unknowns absorb. s0 is estimated from the inliers after the calibration and used for
+    both, so that remaining distortion shows as width. The root of diag C_r would not do: it
+    contains the robust weight of each point, which depends on that very residual, and every tail
+    would vanish.
+    """
+    sd = run.measured.network.sigma[rows] * np.sqrt(redundancy)
+    inliers = run.after.inliers[rows]
+    after = run.after.residuals[rows][inliers] / sd[inliers, None]
+    # A residual of low redundancy says little about the noise and counts accordingly.
+    s0 = np.sqrt(np.average(np.mean(after**2, axis=1), weights=redundancy[inliers]))
+    inliers_before = run.before.inliers[rows]
+    before = run.before.residuals[rows][inliers_before] / sd[inliers_before, None]
+    return before / s0, after / s0
+
+
+def histogram_figure(
+    run: SelfCalibration, name: str, rows: np.ndarray, redundancy: np.ndarray
+) -> Figure:
+    """Histograms of the normalised residuals of one fluoroscope, with the standard normal.
+
+    rows (k,): its image points; redundancy (k,): their redundancy numbers.
+    """
+    before, after = normalised_residuals(run, rows, redundancy)
+    figure = new_figure(
+        13,
+        6.3,
+        f'Fluoroscope {name}: normalised residuals before and after the calibration '
+        f'({model_text(run.models[name])})',
+    )
+    limit = float(np.clip(2.5 * before.std(), MIN_HISTOGRAM_SD, MAX_HISTOGRAM_SD))
+    for axis, axes in enumerate(figure.subplots(1, 2, sharey=True)):
+        _plot_histogram(axes, before[:, axis], limit, 'before')
+        _plot_histogram(axes, after[:, axis], limit, 'after')
+        x = np.linspace(-limit, limit, 400)
+        axes.plot(
+            x,
+            np.exp(-x * x / 2) / np.sqrt(2 * np.pi),
+            color=BLACK,
+            linewidth=2,
+            label='standard normal: 99.7 % within ±3',
+        )
+        coordinate = COORDINATES[axis]
+        axes.set(
+            title=f'{coordinate} ({("column", "row")[axis]})',
+            xlim=(-limit, limit),
+            xlabel=f'{coordinate} residual / its standard deviation from image noise [-]',
+        )
+        axes.legend(loc='upper center', bbox_to_anchor=(0.5, -0.12))
+    figure.axes[0].set_ylabel('probability density [-]')
+    figure.supxlabel(
+        f'Inliers only: {len(before)} of the {len(rows)} image points before, {len(after)} after.',
+        fontsize=11,
+    )
+    return figure
+
+
+def _plot_histogram(axes: Axes, values: np.ndarray, limit: float, when: str) -> None:
+    """Histogram of values (n,) from -limit to limit; when: 'before' or 'after'."""
+    colour, alpha = (BEFORE, 0.45) if when == 'before' else (AFTER, 0.5)
+    edges = np.linspace(-limit, limit, 2 * round(limit / BIN_SD) + 1)
+    beyond = 100 - _percent_within(values, limit)
+    label = f'{when}: standard deviation {values.std():.1f}, {_percent_within(values, 3):.1f} % '
+    label += 'within ±3'
+    if beyond >= 0.05:
+        label += f', {beyond:.1f} % beyond the panel'
+    axes.hist(
+        values,
+        edges.tolist(),
+        weights=np.full(len(values), 1 / (len(values) * (edges[1] - edges[0]))),
+        color=colour,
+        alpha=alpha,
+        histtype='stepfilled',
+        edgecolor=colour,
+        label=label,
+    )
+
+
+def _percent_within(values: np.ndarray, limit: float) -> float:
+    return 100 * np.mean(np.abs(values) <= limit)
+
+
+def position_figure(
+    run: SelfCalibration, name: str, rows: np.ndarray, image_size: tuple[int, int]
+) -> Figure:
+    """Residuals of one fluoroscope over the image, before and after the calibration.
+
+    Those after it are shown to the scale of those before, and to their own. rows (k,): its image
+    points.
+    """
+    figure = new_figure(
+        15, 8.4, f'Fluoroscope {name}: residuals over the image ({model_text(run.models[name])})'
+    )
+    uv = run.measured.network.uv[rows]
+    grid = figure.subplots(2, 3)
+    for axis, coordinate in enumerate(COORDINATES):
+        limit_before = _residual_limit(run.before, rows, axis)
+        limit_after = _residual_limit(run.after, rows, axis)
+        limit = max(limit_before, limit_after)
+        for axes, adjustment, own_limit, colour, when in zip(
+            grid[axis],
+            (run.before, run.after, run.after),
+            (limit, limit, limit_after),
+            (BEFORE, AFTER, AFTER),
+            ('before', 'after, same scale', 'after, own scale'),
+        ):
+            inliers = adjustment.inliers[rows]
+            residual = adjustment.residuals[rows, axis]
+            _plot_residuals(
+                axes,
+                uv[:, axis],
+                residual=residual,
+                inliers=inliers,
+                limit=own_limit,
+                colour=colour,
+            )
+            _plot_running_median(axes, uv[inliers, axis], residual[inliers], image_size[axis])
+            axes.set(xlim=(-0.5, image_size[axis] - 0.5), ylim=(-own_limit, own_limit))
+            rmse = np.sqrt(np.mean(residual[inliers] ** 2))
+            outliers = f'{np.sum(~inliers)} of {len(rows)} outliers'
+            axes.set(
+                title=f'{coordinate} {when}:\nRMSE {rmse:.3f} px, {outliers}',
+                xlabel=('column u [px]', 'row v [px]')[axis],
+                ylabel=f'{coordinate} residual [px]',
+            )
+    figure.supxlabel(
+        'Dots: inliers. Crosses: outliers, not in the RMSE; those at the upper and lower edge '
+        'are beyond the panel. Line: running median of the inliers.',
+        fontsize=11,
+    )
+    return figure
+
+
+def _residual_limit(adjustment: Adjustment, rows: np.ndarray, axis: int) -> float:
+    """Limit of a panel in which nearly all inlier residuals lie [px]."""
+    residual = adjustment.residuals[rows][adjustment.inliers[rows], axis]
+    return 1.1 * np.quantile(np.abs(residual), 0.999)
+
+
+def _plot_residuals(
+    axes: Axes,
+    position: np.ndarray,
+    residual: np.ndarray,
+    inliers: np.ndarray,
+    limit: float,
+    colour: str,
+) -> None:
+    """Residuals (n,) over positions (n,): dots, and crosses for outliers.
+
+    Outliers beyond the limit are drawn at the border of the panel.
+    """
+    axes.plot(position[inliers], residual[inliers], '.', color=colour, markersize=3, alpha=0.6)
+    outliers = np.clip(residual[~inliers], -0.97 * limit, 0.97 * limit)
+    axes.plot(position[~inliers], outliers, 'x', color=GREY, markersize=5)
+
+
+def _plot_running_median(
+    axes: Axes, position: np.ndarray, residual: np.ndarray, size: int
+) -> None:
+    """Running median of residuals (n,) over positions (n,) in an image of this size."""
+    edges = np.linspace(-0.5, size - 0.5, STRIPES + 1)
+    stripe = np.digitize(position, edges) - 1
+    medians = [
+        np.median(residual[stripe == s]) if np.any(stripe == s) else np.nan for s in range(STRIPES)
+    ]
+    axes.plot((edges[:-1] + edges[1:]) / 2, medians, '-', color=BLACK, linewidth=2)
+    axes.axhline(0, color=BLACK, linewidth=0.6)

@@ -20,9 +20,8 @@ from ..bodies.body import Body
 from ..bodies.joints import Joint
 from ..exposures.frame import Frame
 from ..photogrammetry.rotations import matrix_from_vector
-from .rig import VirtualRig
-from .streams import StreamStart
-from .tracking import image_frames
+from .exposures import image_frames
+from .rig import StreamStart, VirtualRig
 
 CT_SD_MM = 0.1
 SIDE = 'right'
@@ -72,22 +71,11 @@ LANDING_HZ = 500.0
 
 @dataclass(frozen=True)
 class VirtualKnee:
-    """The bones of a knee in the coordinates of their CT.
+    """The bones of a knee in the coordinates of their CT."""
 
-    Attributes
-    ----------
-    bodies : tuple of Body
-        Femur and tibia with their true markers; sd 0.
-    surveyed : tuple of Body
-        The same with the errors of CT.
-    landmarks : mapping of str to mapping of str to (3,) ndarray
-        By body [mm].
-    joint : Joint
-    """
-
-    bodies: tuple[Body, ...]
-    surveyed: tuple[Body, ...]
-    landmarks: Mapping[str, Mapping[str, NDArray[np.float64]]]
+    bodies: tuple[Body, ...]  #: femur and tibia with their true markers; sd 0
+    surveyed: tuple[Body, ...]  #: the same with the errors of CT
+    landmarks: Mapping[str, Mapping[str, NDArray[np.float64]]]  #: (3,) by body [mm]
     joint: Joint
 
 
@@ -271,21 +259,8 @@ def simulate_knee(
 ) -> SimulatedKnee:
     """Simulate a recording of a knee: image points of the markers that are on the image.
 
-    Parameters
-    ----------
-    rig : VirtualRig
-    knee : VirtualKnee
-    motion : KneeMotion
-        Such as walking(knee, times) returns it.
-    noise_px : float
-        Standard deviation of an image coordinate.
-    seed : int
-        The same seed gives the same noise.
-    start : StreamStart, optional
-
-    Returns
-    -------
-    SimulatedKnee
+    motion: such as walking(knee, times) returns it. noise_px: standard deviation of an image
+    coordinate. seed: the same seed gives the same noise.
     """
     ids = np.concatenate([body.target_id for body in knee.bodies])
     points = np.concatenate(

@@ -46,40 +46,21 @@ FIRST_ID = 1001
 
 @dataclass(frozen=True)
 class MarkerScene:
-    """What moves in front of the fluoroscopes.
+    """What moves in front of the fluoroscopes."""
 
-    Attributes
-    ----------
-    clusters, markers : int
-        Number of rigid clusters, and of markers of each.
-    diameters_mm : tuple of float
-        Of markers, drawn at random.
-    attenuation : float
-        Linear attenuation coefficient of a marker [1/mm]; 7 is tantalum at 55 keV (NIST XCOM).
-    spread_mm : float
-        Half the size of a cluster.
-    apart_mm : float
-        Half the size of the volume in which the middles of the clusters move.
-    speed_mm : float
-        Typical way of a cluster from one image to the next.
-    hidden : float
-        Share of images in which a marker is hidden.
-    bones : bool
-        Whether each cluster is in a bone.
-    shutter : float
-        Share of the time between two images during which the light is on.
-    """
-
+    #: number of rigid clusters, and of markers of each
     clusters: int = 5
     markers: int = 6
-    diameters_mm: tuple[float, ...] = (0.8, 1.0)
+    diameters_mm: tuple[float, ...] = (0.8, 1.0)  #: of markers, drawn at random
+    #: linear attenuation coefficient of a marker [1/mm]; 7 is tantalum at 55 keV (NIST XCOM)
     attenuation: float = 7.0
-    spread_mm: float = 20.0
+    spread_mm: float = 20.0  #: half the size of a cluster
+    #: half the size of the volume in which the middles of the clusters move
     apart_mm: float = 110.0
-    speed_mm: float = 0.6
-    hidden: float = 0.05
-    bones: bool = True
-    shutter: float = 0.4
+    speed_mm: float = 0.6  #: typical way of a cluster from one image to the next
+    hidden: float = 0.05  #: share of images in which a marker is hidden
+    bones: bool = True  #: whether each cluster is in a bone
+    shutter: float = 0.4  #: share of the time between two images during which the light is on
 
 
 MARKER_SETTINGS = RadiographSettings(photons=1500.0, bits=16, glare=0.08)
@@ -90,20 +71,11 @@ HARD_MARKER_SETTINGS = RadiographSettings(
 
 @dataclass(frozen=True)
 class MarkerImage:
-    """A radiograph of moving markers, with its truth.
+    """A radiograph of moving markers, with its truth."""
 
-    Attributes
-    ----------
-    image : (h, w) ndarray of uint8 or uint16
-    uv : (n, 2) ndarray
-        True centres in the middle of the exposure [px].
-    seen : (n,) ndarray of bool
-        False for markers that are hidden or out of the field.
-    """
-
-    image: np.ndarray
-    uv: NDArray[np.float64]
-    seen: NDArray[np.bool_]
+    image: np.ndarray  #: (h, w)
+    uv: NDArray[np.float64]  #: (n, 2) True centres in the middle of the exposure [px]
+    seen: NDArray[np.bool_]  #: (n,) False for markers that are hidden or out of the field
 
 
 @dataclass(frozen=True)
@@ -121,28 +93,17 @@ class _Disc:
 class MovingMarkers:
     """Rigid clusters of markers in motion.
 
-    Parameters
-    ----------
-    scene : MarkerScene
-    seed : int
-        The same seed gives the same motion.
-
-    Attributes
-    ----------
-    target_id : (n,) ndarray
-    cluster : (n,) ndarray
-        Number of the cluster of a marker.
-    local_mm : (n, 3) ndarray
-        Markers in the frame of their cluster.
+    seed: the same seed gives the same motion.
     """
 
     def __init__(self, scene: MarkerScene, seed: int = 0) -> None:
         self.scene = scene
         rng = np.random.default_rng([seed, 21])
         n = scene.clusters * scene.markers
-        self.target_id = np.arange(FIRST_ID, FIRST_ID + n)
+        self.target_id = np.arange(FIRST_ID, FIRST_ID + n)  #: (n,)
+        #: (n,) number of the cluster of a marker
         self.cluster = np.repeat(np.arange(scene.clusters), scene.markers)
-        self.local_mm = _spread(rng, scene)
+        self.local_mm = _spread(rng, scene)  #: (n, 3) Markers in the frame of their cluster
         self.diameter_mm = rng.choice(scene.diameters_mm, n)
         # Sums of three sinusoids for each coordinate and angle: (cluster, 6, 3).
         shape = (scene.clusters, 6, 3)
@@ -191,14 +152,7 @@ def _spread(rng: np.random.Generator, scene: MarkerScene) -> np.ndarray:
 class MarkerRadiography(Radiography):
     """Takes radiographs of moving markers with one fluoroscope.
 
-    Parameters
-    ----------
-    fluoroscope : VirtualFluoroscope
-    markers : MovingMarkers
-    settings : RadiographSettings, optional
-    frames : int
-        Length of the sequence, over which markers are hidden.
-    seed : int
+    frames: length of the sequence, over which markers are hidden.
     """
 
     def __init__(
@@ -414,16 +368,7 @@ def _discs(
 
 @dataclass(frozen=True)
 class MarkerSequence:
-    """Radiographs of moving markers with all fluoroscopes of a rig, taken one after the other.
-
-    Attributes
-    ----------
-    rig : VirtualRig
-    markers : MovingMarkers
-    settings : RadiographSettings
-    frames : int
-    seed : int
-    """
+    """Radiographs of moving markers with all fluoroscopes of a rig, taken one after the other."""
 
     rig: VirtualRig
     markers: MovingMarkers

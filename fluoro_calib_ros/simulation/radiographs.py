@@ -34,51 +34,24 @@ MARGIN_PX = 3  # around the shadow of a bead
 
 @dataclass(frozen=True)
 class RadiographSettings:
-    """How radiographs are taken.
+    """How radiographs are taken."""
 
-    Attributes
-    ----------
-    photons : float
-        Photons that a pixel of the open beam counts.
-    bits : int
-        8 or 16, of a grey value.
-    bead_mm : float
-        Diameter of the beads [mm], where the phantom gives none.
-    bead_attenuation : float
-        Linear attenuation coefficient of a bead [1/mm]; 1.5 is steel at 50 keV (NIST XCOM).
-    plate_mm, plate_attenuation : float
-        Thickness of the plates that hold the beads [mm] and their coefficient [1/mm].
-    focal_spot_mm : float
-        Diameter of the focal spot [mm]; 0 for a point, which is faster.
-    detector_mm : float
-        Distance from the source to the detector [mm].
-    blur_px : float
-        Standard deviation of the detector's blur [px].
-    glare : float
-        Fraction of the light that is scattered widely.
-    round_field : bool
-        Round field of an image intensifier, else a rectangle.
-    clutter : int
-        Number of things in the image that are not the phantom.
-    inverted : bool
-        Beads are brighter than their surroundings.
-    noise_blur_px : float
-        Standard deviation of a blur of the quantum noise [px], which correlates it.
-    """
-
-    photons: float = 1500.0
-    bits: int = 16
-    bead_mm: float = 2.0
+    photons: float = 1500.0  #: photons that a pixel of the open beam counts
+    bits: int = 16  #: 8 or 16, of a grey value
+    bead_mm: float = 2.0  #: diameter of the beads [mm], where the phantom gives none
+    #: linear attenuation coefficient of a bead [1/mm]; 1.5 is steel at 50 keV (NIST XCOM)
     bead_attenuation: float = 1.5
+    #: thickness of the plates that hold the beads [mm] and their coefficient [1/mm]
     plate_mm: float = 3.0
     plate_attenuation: float = 0.006
-    focal_spot_mm: float = 0.6
-    detector_mm: float = 2000.0
-    blur_px: float = 0.8
-    glare: float = 0.08
-    round_field: bool = True
-    clutter: int = 0
-    inverted: bool = False
+    focal_spot_mm: float = 0.6  #: diameter of the focal spot [mm]; 0 for a point, which is faster
+    detector_mm: float = 2000.0  #: distance from the source to the detector [mm]
+    blur_px: float = 0.8  #: standard deviation of the detector's blur [px]
+    glare: float = 0.08  #: fraction of the light that is scattered widely
+    round_field: bool = True  #: round field of an image intensifier, else a rectangle
+    clutter: int = 0  #: number of things in the image that are not the phantom
+    inverted: bool = False  #: beads are brighter than their surroundings
+    #: standard deviation of a blur of the quantum noise [px], which correlates it
     noise_blur_px: float = 0.0
 
 
@@ -87,13 +60,7 @@ HARD = RadiographSettings(photons=400.0, bits=8, glare=0.15, blur_px=1.0, clutte
 
 
 class Radiography:
-    """Takes radiographs with a virtual fluoroscope.
-
-    Parameters
-    ----------
-    fluoroscope : VirtualFluoroscope
-    settings : RadiographSettings, optional
-    """
+    """Takes radiographs with a virtual fluoroscope."""
 
     def __init__(
         self, fluoroscope: VirtualFluoroscope, settings: RadiographSettings | None = None

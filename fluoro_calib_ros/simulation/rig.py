@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The virtual rig: phantom, fluoroscopes and where they stand.
+"""The virtual rig: phantom, fluoroscopes and where they stand, and its streams of frames.
 
 Two fluoroscopes look across each other at the middle of the rig frame (z up, mm). Their sources
 are about 1.5 m from it and about 2 m apart. The phantom is a cube of 260 mm with 503 beads on its
@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..exposures.frame import Frame
 from ..exposures.phantom import Phantom
 from ..photogrammetry.collinearity import project
 from ..photogrammetry.rotations import matrix_from_vector
@@ -32,28 +33,14 @@ Pose = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True)
 class VirtualFluoroscope:
-    """A fluoroscope of a virtual rig.
-
-    Attributes
-    ----------
-    name : str
-    interior : ndarray
-        (3,), xp, yp, c [px].
-    rotation : ndarray
-        (3, 3), rig frame -> sensor frame.
-    position_mm : ndarray
-        (3,), of the source in the rig frame.
-    distortion : DistortionField
-    image_size : tuple of int
-        Width and height [px].
-    """
+    """A fluoroscope of a virtual rig."""
 
     name: str
-    interior: NDArray[np.float64]
-    rotation: NDArray[np.float64]
-    position_mm: NDArray[np.float64]
+    interior: NDArray[np.float64]  #: (3,) xp, yp, c [px]
+    rotation: NDArray[np.float64]  #: (3, 3) rig frame -> sensor frame
+    position_mm: NDArray[np.float64]  #: (3,) of the source in the rig frame
     distortion: DistortionField
-    image_size: tuple[int, int] = IMAGE_SIZE
+    image_size: tuple[int, int] = IMAGE_SIZE  #: width and height [px]
 
     def exterior(self, pose: Pose) -> Pose:
         """Exterior orientation for a pose of the phantom.
@@ -132,10 +119,6 @@ def virtual_rig(
     between_deg : float
         Angle between neighbouring fluoroscopes. At 84 degrees their sources are some 2 m apart;
         with three fluoroscopes, 60 degrees leave every two of them a good base.
-
-    Returns
-    -------
-    VirtualRig
     """
     rng = np.random.default_rng([seed, 1])
     true_mm = bead_coordinates(rng)
@@ -168,24 +151,14 @@ RIPPLES = 14
 
 @dataclass(frozen=True)
 class DistortionField:
-    """Correction field: a function of pixels (n, 2) that returns corrections (n, 2) [px].
+    """Correction field: a function of pixels (n, 2) that returns corrections (n, 2) [px]."""
 
-    Attributes
-    ----------
-    centre : ndarray
-        (2,) [px].
-    pincushion, spiral : float
-        Size at the edge of the image [px].
-    s_shape : ndarray
-        (2,), size along u and v at the edge of the image [px].
-    ripples : ndarray
-        (k, 5), Gaussian bumps: centre u, v, width, and height along u and v [px].
-    """
-
-    centre: NDArray[np.float64]
+    centre: NDArray[np.float64]  #: (2,) [px]
+    #: size at the edge of the image [px]
     pincushion: float
-    s_shape: NDArray[np.float64]
+    s_shape: NDArray[np.float64]  #: (2,) size along u and v at the edge of the image [px]
     spiral: float
+    #: (k, 5), Gaussian bumps: centre u, v, width, and height along u and v [px]
     ripples: NDArray[np.float64]
 
     def __call__(self, uv: ArrayLike) -> np.ndarray:
@@ -238,3 +211,40 @@ def random_field(
     s_shape = strength * sign[:2] * rng.uniform(1.2, 2.4, 2)
     spiral = strength * sign[2] * rng.uniform(1.2, 2.4)
     return DistortionField(centre, pincushion, s_shape, spiral, ripples)
+
+
+# Of an observed pixel, as target extraction writes it. It also hides differences between CPUs in
+# the last bit.
+DECIMALS = 4
+START_NS = 1_767_225_600_000_000_000  # stamp of the first frame
+
+
+@dataclass(frozen=True)
+class StreamStart:
+    """Stamp [ns] and number of the first frame of a stream."""
+
+    stamp_ns: int = START_NS
+    number: int = 1
+
+    def frame(
+        self,
+        fluoroscope: VirtualFluoroscope,
+        index: int,
+        time_s: float,
+        target_id: np.ndarray,
+        observed: np.ndarray,
+    ) -> Frame:
+        """Frame number `index`, counted from 0, at a time after the first one [s].
+
+        target_id (n,) and observed (n, 2) [px] are its image points.
+        """
+        return Frame(
+            fluoroscope=fluoroscope.name,
+            number=self.number + index,
+            target_id=target_id,
+            uv=observed,
+            image_size=fluoroscope.image_size,
+            sigma=None,
+            stamp_ns=self.stamp_ns + round(time_s * 1e9),
+            frame_id=f'{fluoroscope.name}_optical',
+        )

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
-from fluoro_calib_ros.io.bags.definitions import known_definition, message_class, to_cdr
+from fluoro_calib_ros.io.bags.metadata import known_definition, message_class, to_cdr
 from fluoro_calib_ros.io.bags.reader import COMPRESSED_IMAGE, IMAGE
 from fluoro_calib_ros.jobs.image_sources import open_sources
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from rosbags.rosbag2 import StoragePlugin, Writer
 
-from fluoro_calib_ros.io.bags.definitions import (
+from fluoro_calib_ros.io.bags.metadata import (
     TARGET_OBSERVATIONS,
     message_from_frame,
     to_cdr,

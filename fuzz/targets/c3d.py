@@ -18,7 +18,8 @@ from unittest import mock
 import ezc3d
 import numpy as np
 
-from fluoro_calib_ros.io.formats import c3d, c3d_process
+from fluoro_calib_ros.io.formats import c3d_process
+from fluoro_calib_ros.io.formats import points as of_points
 from fluoro_calib_ros.io.formats.content import Content, FileSettings, points_without_precision
 
 from ..harness import Target
@@ -69,15 +70,15 @@ def _work(path: str) -> NoReturn:
 
 
 def _read(path: Path) -> None:
-    with mock.patch.object(c3d, 'run_module', _run):
-        c3d.read(path, SETTINGS)
+    with mock.patch.object(of_points, 'run_module', _run):
+        of_points.read_c3d(path, SETTINGS)
 
 
 def _write(path: Path, frames: int) -> None:
     xyz = np.arange(6.0 * frames).reshape(frames, 2, 3)
     xyz[-1, 0] = np.nan
     points = points_without_precision(np.arange(1, frames + 1), np.array([1, 2]), xyz, 100.0)
-    c3d.write(path, Content(points=points), SETTINGS)
+    of_points.write_c3d(path, Content(points=points), SETTINGS)
 
 
 TARGET = Target(

@@ -12,7 +12,7 @@ from pathlib import Path
 from unittest import mock
 
 from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
-from fluoro_calib_ros.io.result_check import RESULT_NAME as RESULT
+from fluoro_calib_ros.io.calibration import RESULT_NAME as RESULT
 from fluoro_calib_ros.jobs.calibration import run_calibration
 from fluoro_calib_ros.jobs.conversion import stations_of
 from fluoro_calib_ros.jobs.report import write_report

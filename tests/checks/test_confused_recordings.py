@@ -16,9 +16,8 @@ import pytest
 from rigs import calibrated, kinds, refused, run, true_calibrations, true_orientation, turning
 
 from fluoro_calib_ros.checks import verdict as verdict_module
-from fluoro_calib_ros.checks.precision import PRECISION
-from fluoro_calib_ros.checks.rig import RigFindings, check_rig, rig_findings
-from fluoro_calib_ros.checks.rigidity import doubtful
+from fluoro_calib_ros.checks.field_checks import PRECISION
+from fluoro_calib_ros.checks.rig import RigFindings, check_rig, doubtful, rig_findings
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.options import CalibrationRequest
 from fluoro_calib_ros.estimation.rig_orientation import orientation_and_scatter
@@ -32,8 +31,8 @@ from fluoro_calib_ros.jobs.calibration import adjust
 from fluoro_calib_ros.jobs.orientation import orient
 from fluoro_calib_ros.jobs.reconstruction import ReconstructionOptions, reconstruct
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
+from fluoro_calib_ros.reconstruction.epipolar import RecentMisses
 from fluoro_calib_ros.reconstruction.intersection import Intersector
-from fluoro_calib_ros.reconstruction.mismatch import RecentMisses
 from fluoro_calib_ros.reconstruction.reconstruct import reconstruct_recording
 from fluoro_calib_ros.report import html as html_report
 from fluoro_calib_ros.simulation.exposures import Detection, detect_beads, phantom_poses

@@ -15,9 +15,15 @@ from scipy.spatial.distance import pdist
 
 from fluoro_calib_ros.bodies.body import Body, declared_bodies
 from fluoro_calib_ros.checks.body_watch import BodyWatch
-from fluoro_calib_ros.checks.charts import CusumCharts, ImageAreas
-from fluoro_calib_ros.checks.drift_observations import EpipolarObservations
-from fluoro_calib_ros.checks.drift_options import ERROR, OK, WARN, DriftOptions
+from fluoro_calib_ros.checks.drift_charts import (
+    ERROR,
+    OK,
+    WARN,
+    CusumCharts,
+    DriftOptions,
+    EpipolarObservations,
+    ImageAreas,
+)
 from fluoro_calib_ros.checks.drift_watch import DriftWatch
 from fluoro_calib_ros.checks.pair_watch import SystematicErrorField
 from fluoro_calib_ros.errors import DataError

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from fluoro_calib_ros.checks.bead_intersection import Beads
-from fluoro_calib_ros.checks.beads import compare_with_survey
-from fluoro_calib_ros.checks.faces import displaced_layer
+from fluoro_calib_ros.checks.beads import compare_with_survey, displaced_layer
 from fluoro_calib_ros.checks.held_out import EXPOSURE_LIMIT, exposure_limits
 
 SD_MM = 0.15

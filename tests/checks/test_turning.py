@@ -11,7 +11,7 @@ from rigs import rig
 from turning_rig import recording, turning
 
 from fluoro_calib_ros.checks import verdict as verdict_module
-from fluoro_calib_ros.checks.exposure_variation import VARIATION
+from fluoro_calib_ros.checks.field_checks import VARIATION
 from fluoro_calib_ros.checks.verdict import validate
 from fluoro_calib_ros.estimation.options import CalibrationRequest
 from fluoro_calib_ros.findings import Kind

@@ -25,8 +25,7 @@ from fluoro_calib_ros.checks.beads import compare_with_survey, rejected_beads
 from fluoro_calib_ros.checks.calibration_evidence import Evidence, Subject
 from fluoro_calib_ros.checks.check import Check, Validation, verdict_of
 from fluoro_calib_ros.checks.comparison import difference, orientation_fields, place_name
-from fluoro_calib_ros.checks.given_interior import REPAIR_FIRST
-from fluoro_calib_ros.checks.precision import PRECISION
+from fluoro_calib_ros.checks.field_checks import PRECISION, TRENDS
 from fluoro_calib_ros.checks.residual_tests import (
     FALSE_ALARM,
     Residuals,
@@ -36,8 +35,7 @@ from fluoro_calib_ros.checks.residual_tests import (
     rejected_trend,
     residuals_of,
 )
-from fluoro_calib_ros.checks.residual_trends import TRENDS
-from fluoro_calib_ros.checks.verdict import validate, validate_or_report
+from fluoro_calib_ros.checks.verdict import REPAIR_FIRST, validate, validate_or_report
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.calibrate import (
     adjust_with_calibrations,

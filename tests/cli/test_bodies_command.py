@@ -147,7 +147,7 @@ def test_film_has_the_markers_where_they_were_observed(knee, tmp_path, monkeypat
         views.append(bodies)
         return draw_bodies(image, title, bodies)
 
-    monkeypatch.setattr('fluoro_calib_ros.jobs.bodies_film.draw_bodies', draw)
+    monkeypatch.setattr('fluoro_calib_ros.jobs.bodies.draw_bodies', draw)
     film = ('--smooth', 'none', '--film', tmp_path / 'images')
     assert bodies(knee, tmp_path / 'motion', *film) == 0
     frames = read_frames(knee / 'walking').frames

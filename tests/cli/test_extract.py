@@ -15,12 +15,13 @@ import cv2
 import numpy as np
 import pytest
 
+from benchmarks.bead_images import bead_image
 from fluoro_calib_ros.cli import main
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.angles import AngleOptions
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.images.codec import encode
-from fluoro_calib_ros.io.bags.definitions import message_class, to_cdr
+from fluoro_calib_ros.io.bags.metadata import message_class, to_cdr
 from fluoro_calib_ros.io.bags.reader import COMPRESSED_IMAGE, IMAGE, JOINT_STATE
 from fluoro_calib_ros.io.bags.writer import BagWriter
 from fluoro_calib_ros.io.observations import read_observations_csv
@@ -29,7 +30,6 @@ from fluoro_calib_ros.jobs.extraction import recording_of_images
 from fluoro_calib_ros.jobs.image_sources import ImageAngles, contains_images, open_sources
 from fluoro_calib_ros.jobs.sources import read_survey
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
-from fluoro_calib_ros.simulation.bead_images import bead_image
 
 pytestmark = pytest.mark.long
 

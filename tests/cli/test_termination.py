@@ -16,7 +16,7 @@ LOSES_THE_EXCEPTION = """
 import os
 import signal
 import sys
-from fluoro_calib_ros.cli.termination import terminated_by_signals
+from fluoro_calib_ros.cli.output import terminated_by_signals
 
 class Sender:
     def __del__(self):
@@ -36,10 +36,10 @@ CLEANS_UP = """
 import os
 import signal
 import time
-from fluoro_calib_ros.cli import termination
-termination.AGAIN_S = 0.01
+from fluoro_calib_ros.cli import output
+output.AGAIN_S = 0.01
 
-with termination.terminated_by_signals():
+with output.terminated_by_signals():
     try:
         os.kill(os.getpid(), signal.SIGTERM)
         signal.pause()

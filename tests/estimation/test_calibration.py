@@ -15,7 +15,7 @@ from fluoro_calib_ros.correction.fluoroscope_calibration import digest_of_source
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.alternation import Anderson
 from fluoro_calib_ros.estimation.calibrate import adjust_with_calibrations, calibrate
-from fluoro_calib_ros.estimation.gauge import gauge_basis, gauge_coefficients
+from fluoro_calib_ros.estimation.estimator import gauge_basis, gauge_coefficients
 from fluoro_calib_ros.estimation.initial_network import measured_network, nominal_interior
 from fluoro_calib_ros.estimation.options import CalibrationOptions
 from fluoro_calib_ros.estimation.result import Targets, combined_targets
@@ -27,8 +27,7 @@ from fluoro_calib_ros.photogrammetry.rotations import (
     rotation_angle,
 )
 from fluoro_calib_ros.simulation.exposures import Detection, detect_beads, simulate_exposures
-from fluoro_calib_ros.simulation.rig import virtual_rig
-from fluoro_calib_ros.simulation.streams import StreamStart
+from fluoro_calib_ros.simulation.rig import StreamStart, virtual_rig
 
 OK, OUTSIDE, INVALID = CorrectionStatus
 

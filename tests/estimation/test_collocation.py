@@ -38,10 +38,8 @@ from fluoro_calib_ros.correction.terms import (
 from fluoro_calib_ros.estimation.calibrate import adjust_with_calibrations, calibrate
 from fluoro_calib_ros.estimation.collocation import CollocationTerms, EarlierTerms
 from fluoro_calib_ros.estimation.combined_adjustment import calibrate_by_adjustment
-from fluoro_calib_ros.estimation.estimator import AdjustmentProblem
-from fluoro_calib_ros.estimation.estimators import estimator_of
+from fluoro_calib_ros.estimation.estimator import AdjustmentProblem, GaugeKind, gauge_basis
 from fluoro_calib_ros.estimation.fluoroscope_terms import FluoroscopeTerms
-from fluoro_calib_ros.estimation.gauge import GaugeKind, gauge_basis
 from fluoro_calib_ros.estimation.initial_network import (
     adjusted_with_precision,
     measured_network,
@@ -57,6 +55,7 @@ from fluoro_calib_ros.estimation.priors import (
     starting_prior,
 )
 from fluoro_calib_ros.estimation.refinements import START_MODES
+from fluoro_calib_ros.estimation.self_calibration import estimator_of
 from fluoro_calib_ros.estimation.signal import (
     Ripples,
     Signal,
@@ -92,8 +91,7 @@ from fluoro_calib_ros.photogrammetry.precision import (
     variance_of_projection,
 )
 from fluoro_calib_ros.simulation.exposures import simulate_exposures
-from fluoro_calib_ros.simulation.rig import DistortionField, virtual_rig
-from fluoro_calib_ros.simulation.streams import StreamStart
+from fluoro_calib_ros.simulation.rig import DistortionField, StreamStart, virtual_rig
 
 sys.path.append(str(Path(__file__).resolve().parents[2]))  # benchmarks are not installed
 

@@ -12,7 +12,6 @@ from scipy.spatial import ConvexHull, Delaunay
 from sklearn.model_selection import GridSearchCV, GroupKFold, PredefinedSplit
 from sklearn.neighbors import KNeighborsRegressor
 
-from fluoro_calib_ros.correction.models import no_correction
 from fluoro_calib_ros.correction.neighbours import (
     KnnModel,
     LocalLinearModel,
@@ -21,10 +20,11 @@ from fluoro_calib_ros.correction.neighbours import (
     Trend,
     least_squares_map,
 )
-from fluoro_calib_ros.correction.registry import MODELS, create_model
-from fluoro_calib_ros.estimation.estimator import TrainingPoints, exposure_folds
-from fluoro_calib_ros.estimation.gauge import (
+from fluoro_calib_ros.correction.registry import MODELS, create_model, no_correction
+from fluoro_calib_ros.estimation.estimator import (
     GaugeKind,
+    TrainingPoints,
+    exposure_folds,
     gauge_basis,
     gauge_coefficients,
     interior_about,

@@ -18,7 +18,7 @@ from fluoro_calib_ros.exposures.frame import Frame, MovingPoints
 from fluoro_calib_ros.findings import Kind
 from fluoro_calib_ros.io.calibration import load_calibrations
 from fluoro_calib_ros.io.calibration_request import read_request
-from fluoro_calib_ros.io.formats.known_orientation import write_known_orientations
+from fluoro_calib_ros.io.formats.native import write_known_orientations
 from fluoro_calib_ros.io.observations import write_observations_csv
 from fluoro_calib_ros.jobs.calibration import run_calibration
 from fluoro_calib_ros.jobs.result_folder import save_outcome

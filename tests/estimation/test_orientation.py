@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 from rigs import calibrated, exposures, rig, run
 
-from fluoro_calib_ros.correction.models import no_correction
+from fluoro_calib_ros.correction.registry import no_correction
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.result import Targets
 from fluoro_calib_ros.estimation.rig_orientation import (
     MAX_PAIRS,
     _paired,
+    orientation_and_scatter,
     orientation_of_capture,
-    orientation_of_exposures,
     phantom_of,
     standing_frames,
 )
@@ -47,9 +47,9 @@ from fluoro_calib_ros.simulation.exposures import (
     detect_beads,
     phantom_poses,
     simulate_exposures,
+    simulate_tracking,
 )
 from fluoro_calib_ros.simulation.rig import VirtualRig, virtual_rig
-from fluoro_calib_ros.simulation.tracking import simulate_tracking
 
 pytestmark = pytest.mark.long
 
@@ -279,7 +279,7 @@ def test_covariance_of_a_relative_orientation_against_monte_carlo():
         still = without_distortion(seed)
         held = drawn_calibrations(still, seed)
         frames = simulate_exposures(still, 4, seed, detection=Detection(false_matches=0.0)).frames
-        found = orientation_of_exposures(frames, still.phantom, held)
+        found = orientation_and_scatter(frames, still.phantom, held)[0]
         a, b = still.fluoroscopes
         step = np.concatenate(
             [
@@ -306,7 +306,7 @@ def test_datum_removes_only_the_common_motion_of_points():
     """Distances keep their variances, centre and attitude of the points have none; a second
     transformation changes nothing.
     """
-    found = orientation_of_exposures(exposures(), rig().phantom, calibrations())
+    found = orientation_and_scatter(exposures(), rig().phantom, calibrations())[0]
     rng = np.random.default_rng(1)
     points = rng.uniform(-80, 80, (40, 3)) + [0, 0, 1500]
     s = datum_transformation(found, points)
@@ -347,7 +347,7 @@ def moved_orientation(orientation, step):
 
 def test_orientation_of_the_exposures_of_a_calibration():
     """The scale is that of the phantom, and the rays of both views meet."""
-    found = orientation_of_exposures(exposures(), rig().phantom, calibrations())
+    found = orientation_and_scatter(exposures(), rig().phantom, calibrations())[0]
     assert (
         found.source == 'joint calibration'
         and found.frame_id == 'a_optical'
@@ -376,7 +376,7 @@ def test_exposures_that_do_not_belong_together_are_refused():
         match='fluoroscopes a and b: no exposures have the same number, so that their '
         'relative orientation is not known',
     ):
-        orientation_of_exposures(apart, rig().phantom, calibrations())
+        orientation_and_scatter(apart, rig().phantom, calibrations())[0]
 
 
 def test_many_exposures_are_thinned_evenly():
@@ -506,7 +506,7 @@ def folder(tmp_path_factory):
     for calibration in calibrations().values():
         save_calibration(path / 'result', calibration)
     save_orientation(
-        path / 'result', orientation_of_exposures(exposures(), rig().phantom, calibrations())
+        path / 'result', orientation_and_scatter(exposures(), rig().phantom, calibrations())[0]
     )
     write_bag(path / 'capture', capture(count=3))
     return path

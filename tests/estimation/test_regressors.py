@@ -19,16 +19,20 @@ from sklearn.preprocessing import PolynomialFeatures
 from sklearn.tree import DecisionTreeRegressor
 from sklearn.utils.estimator_checks import check_estimator
 
-from fluoro_calib_ros.correction.models import LookupModel, grid_nodes, hull_corners
 from fluoro_calib_ros.correction.neighbours import KnnModel, LocalLinearModel
-from fluoro_calib_ros.correction.registry import MODELS, model_from_values
+from fluoro_calib_ros.correction.registry import (
+    MODELS,
+    LookupModel,
+    grid_nodes,
+    hull_corners,
+    model_from_values,
+)
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.calibrate import calibrate
-from fluoro_calib_ros.estimation.gauge import gauge_coefficients
+from fluoro_calib_ros.estimation.estimator import gauge_coefficients
 from fluoro_calib_ros.estimation.neighbour_regression import CrossValidation
-from fluoro_calib_ros.estimation.options import CalibrationOptions
+from fluoro_calib_ros.estimation.options import CalibrationOptions, regressor_name, resolve_model
 from fluoro_calib_ros.estimation.regressors import KnnRegressor, LocalLinearRegressor
-from fluoro_calib_ros.estimation.user_regressor import regressor_name, resolve_model
 from fluoro_calib_ros.io.calibration import load_calibration, save_calibration
 from fluoro_calib_ros.io.calibration_request import read_options
 from fluoro_calib_ros.io.observations import write_observations_csv

@@ -20,7 +20,12 @@ from fluoro_calib_ros.checks.survey import (
 )
 from fluoro_calib_ros.estimation.calibrate import adjust_with_calibrations, calibrate
 from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
-from fluoro_calib_ros.estimation.survey import MeasuredDistance, surveyed_beads
+from fluoro_calib_ros.estimation.survey import (
+    Distances,
+    MeasuredDistance,
+    scaled_by_distances,
+    surveyed_beads,
+)
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.findings import Kind
 from fluoro_calib_ros.io.observations import write_observations_csv
@@ -28,7 +33,6 @@ from fluoro_calib_ros.io.phantom import read_phantom, write_phantom
 from fluoro_calib_ros.jobs import survey as surveying
 from fluoro_calib_ros.jobs.calibration import run_calibration
 from fluoro_calib_ros.jobs.survey import SurveyRequest, survey
-from fluoro_calib_ros.photogrammetry.measured_distances import Distances, scaled_by_distances
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.simulation import exposures as simulated
 from fluoro_calib_ros.simulation.rig import virtual_rig

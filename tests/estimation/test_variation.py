@@ -9,6 +9,7 @@ from scipy.special import j0
 
 from fluoro_calib_ros.correction.calibration_record import SD_GRID
 from fluoro_calib_ros.correction.series import Functions, Series
+from fluoro_calib_ros.estimation.estimator import gauge_basis
 from fluoro_calib_ros.estimation.exposure_terms import (
     VARYING,
     ExposureTerms,
@@ -16,7 +17,6 @@ from fluoro_calib_ros.estimation.exposure_terms import (
     variation,
     without_exposure_terms,
 )
-from fluoro_calib_ros.estimation.gauge import gauge_basis
 from fluoro_calib_ros.estimation.lack_of_fit import (
     FittedPoints,
     LeftOut,

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from fluoro_calib_ros.exposures.collector import without_repeats
 from fluoro_calib_ros.exposures.frame import Frame
-from fluoro_calib_ros.exposures.repeats import without_repeats
 from fluoro_calib_ros.findings import Kind
 
 SIZE = (1024, 1024)

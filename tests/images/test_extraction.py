@@ -14,6 +14,7 @@ import pytest
 from rigs import refused
 from scipy.spatial import cKDTree
 
+from benchmarks.bead_images import bead_image
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.findings import Kind
 from fluoro_calib_ros.images.detection import detect_beads
@@ -26,7 +27,6 @@ from fluoro_calib_ros.images.measurement import measure_beads
 from fluoro_calib_ros.images.shadow_fit import Profile
 from fluoro_calib_ros.images.view import Lens, View, exponents, fit_view, may_be_found
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
-from fluoro_calib_ros.simulation.bead_images import bead_image
 from fluoro_calib_ros.simulation.exposures import phantom_poses
 from fluoro_calib_ros.simulation.radiographs import HARD, Radiography
 from fluoro_calib_ros.simulation.rig import VirtualRig, virtual_rig

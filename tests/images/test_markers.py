@@ -20,7 +20,7 @@ from rigs import run
 
 from fluoro_calib_ros.bodies.body import Body, declared_bodies
 from fluoro_calib_ros.correction.fluoroscope_calibration import FluoroscopeCalibration
-from fluoro_calib_ros.correction.models import no_correction
+from fluoro_calib_ros.correction.registry import no_correction
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.findings import Finding, Kind
@@ -31,13 +31,13 @@ from fluoro_calib_ros.images.marker_pair import MarkerPair, PairFrame
 from fluoro_calib_ros.images.marker_rays import project_observed
 from fluoro_calib_ros.images.markers import FirstMarkers, MarkerFrame, MarkerOptions, MarkerTracker
 from fluoro_calib_ros.images.overlay import draw_markers
-from fluoro_calib_ros.io.bags.definitions import message_class
+from fluoro_calib_ros.io.bags.metadata import message_class
 from fluoro_calib_ros.io.bags.reader import COMPRESSED_IMAGE, JOINT_STATE
 from fluoro_calib_ros.io.bags.writer import BagWriter
 from fluoro_calib_ros.io.bodies import write_bodies
 from fluoro_calib_ros.io.calibration import save_calibration, save_orientation
 from fluoro_calib_ros.io.phantom import write_phantom
-from fluoro_calib_ros.jobs.live_markers import MarkerSettings
+from fluoro_calib_ros.jobs.followers import MarkerSettings
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.simulation.marker_images import (

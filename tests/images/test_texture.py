@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fluoro_calib_ros.images.light import Cosines
 from fluoro_calib_ros.images.shadow_fit import window_offsets
-from fluoro_calib_ros.images.texture import Cosines
 
 OFFSET = window_offsets(8.0)
 COSINES = Cosines(OFFSET, np.float64)

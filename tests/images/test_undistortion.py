@@ -12,11 +12,11 @@ import pytest
 import rigs
 from scipy.ndimage import map_coordinates
 
+from benchmarks.bead_images import BEAD_PX, background, bead_image
 from fluoro_calib_ros.correction.base import CorrectionStatus
 from fluoro_calib_ros.correction.registry import create_model
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.images.corrector import LIMIT_PX, ImageCorrector
-from fluoro_calib_ros.simulation.bead_images import BEAD_PX, background, bead_image
 
 OK, OUTSIDE, INVALID = CorrectionStatus
 

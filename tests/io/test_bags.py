@@ -21,7 +21,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.frame import Frame
-from fluoro_calib_ros.io.bags.definitions import (
+from fluoro_calib_ros.io.bags.mcap_file import storage_files
+from fluoro_calib_ros.io.bags.metadata import (
     TARGET_OBSERVATIONS,
     frame_from_message,
     from_cdr,
@@ -32,7 +33,6 @@ from fluoro_calib_ros.io.bags.definitions import (
     type_hash,
     typestore,
 )
-from fluoro_calib_ros.io.bags.mcap_file import storage_files
 from fluoro_calib_ros.io.bags.reader import iterate_messages, read_frames, topics_of
 from fluoro_calib_ros.io.bags.writer import BagWriter
 

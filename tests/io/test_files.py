@@ -15,10 +15,11 @@ import pytest
 
 from fluoro_calib_ros.correction.angle_field import AngleField, packed_angles
 from fluoro_calib_ros.correction.calibration_record import FIELDS
-from fluoro_calib_ros.correction.fluoroscope_calibration import FluoroscopeCalibration
-from fluoro_calib_ros.correction.models import no_correction
-from fluoro_calib_ros.correction.noise_profile import NoiseProfile
-from fluoro_calib_ros.correction.registry import create_model
+from fluoro_calib_ros.correction.fluoroscope_calibration import (
+    FluoroscopeCalibration,
+    NoiseProfile,
+)
+from fluoro_calib_ros.correction.registry import create_model, no_correction
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.exposures.phantom import Phantom

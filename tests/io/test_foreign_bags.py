@@ -12,7 +12,7 @@ from rigs import exposures, run
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from fluoro_calib_ros.errors import DataError
-from fluoro_calib_ros.io.bags.definitions import (
+from fluoro_calib_ros.io.bags.metadata import (
     TARGET_OBSERVATIONS,
     message_from_frame,
     to_cdr,

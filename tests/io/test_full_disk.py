@@ -13,8 +13,7 @@ from rigs import run
 from small_disk import Disk
 
 from fluoro_calib_ros.errors import DataError
-from fluoro_calib_ros.io.bags.definitions import known_definition, to_cdr, typestore
-from fluoro_calib_ros.io.bags.metadata import profile
+from fluoro_calib_ros.io.bags.metadata import known_definition, profile, to_cdr, typestore
 from fluoro_calib_ros.io.bags.reader import iterate_messages
 from fluoro_calib_ros.io.bags.recording import Recording, RecordingOptions, TopicToRecord
 from fluoro_calib_ros.io.bags.salvage import recover_bag

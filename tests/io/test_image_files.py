@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import rigs
 
+from benchmarks.bead_images import bead_image
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.images.angle_maps import AngleMaps
 from fluoro_calib_ros.images.codec import decode, encode
@@ -23,7 +24,6 @@ from fluoro_calib_ros.io import image_reading as tiff
 from fluoro_calib_ros.io.calibration import save_calibration
 from fluoro_calib_ros.io.image_reading import IMAGE_SUFFIXES, SUPPORTS_16_BIT_VIDEOS, ImageSource
 from fluoro_calib_ros.io.image_writing import correct_images, list_images, write_video
-from fluoro_calib_ros.simulation.bead_images import bead_image
 
 SIZE = (128, 96)
 BEADS = [[30.2, 20.9], [60.5, 50.1], [100.0, 80.4], [20.3, 75.7]]

@@ -12,7 +12,7 @@ import tests.rigs as rigs
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.rig_orientation import standing_frames
 from fluoro_calib_ros.exposures.angles import AngleOptions
-from fluoro_calib_ros.io.bags.definitions import message_class
+from fluoro_calib_ros.io.bags.metadata import message_class
 from fluoro_calib_ros.io.bags.reader import JOINT_STATE
 from fluoro_calib_ros.io.bags.writer import BagWriter
 from fluoro_calib_ros.io.calibration import save_calibration

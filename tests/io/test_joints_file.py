@@ -11,8 +11,8 @@ import pytest
 from fluoro_calib_ros.bodies.anatomical_frames import BODY_FRAME
 from fluoro_calib_ros.bodies.joints import Joint, JointMotion, JointStatus
 from fluoro_calib_ros.errors import DataError
-from fluoro_calib_ros.io.joints import joint_table, read_joints
-from fluoro_calib_ros.limits import MAX_JOINTS
+from fluoro_calib_ros.io.bodies import joint_table, read_joints
+from fluoro_calib_ros.limits import DOCUMENT_BYTES, MAX_DEPTH, MAX_JOINTS
 
 BODIES = ('femur', 'tibia', 'talus')
 KNEE = """
@@ -86,7 +86,9 @@ def test_joints_are_read(tmp_path):
         (('[3, 40]', '[3.5, 40]'), 'key neutral'),
         (('side =', 'sides ='), 'key sides: unknown'),
         (('[0, 0, 400]', '[0, 0, nan]'), 'femoral_head has a number that is not finite'),
-        (('[0, 0, 400]', f'[0, 0, 1{"0" * 400}]'), 'femoral_head has a number that is not'),
+        (('[0, 0, 400]', f'[0, 0, 1{"0" * 400}]'), 'a whole number is too large'),
+        (('[0, 0, 400]', '[' * (MAX_DEPTH + 1) + ']' * (MAX_DEPTH + 1)), 'nested too deeply'),
+        (('landmarks]', 'a.' * MAX_DEPTH + 'landmarks]'), 'nested too deeply'),
         (('[0, 0, 400]', '[0, 400]'), 'femoral_head does not have 3 numbers'),
         (('[0, 0, 400]', '[0, 0, "400"]'), 'femoral_head does not have 3 numbers'),
         (('[0, 0, 400]', '[0, 0, true]'), 'femoral_head does not have 3 numbers'),
@@ -100,7 +102,7 @@ def test_joints_are_read(tmp_path):
         (('axes = {x = [2, 0, 0], z = [0, 0, 1.0]}', 'axes = 1'), 'axes is not a table'),
         (('axes = {x', 'quaternion_wxyz = [1, 0, 0, 0]\naxes = {x'), 'one of'),
         (('[joint.distal_frame]', '[joint.distal_frame]\n[joint.other]'), 'other'),
-        (('[[joint]]', '[[joint]'), 'no TOML'),
+        (('[[joint]]', '[[joint]'), 'not TOML'),
         (('[[joint]]', 'version = 2\n[[joint]]'), 'key version: unknown'),
     ],
 )
@@ -112,6 +114,12 @@ def test_faults_are_named(tmp_path, change, cause):
         read_joints(path, BODIES)
     assert cause in str(caught.value) and str(path) in str(caught.value)
     assert '\n' not in str(caught.value)
+
+
+def test_a_file_beyond_the_budget_of_documents_is_not_parsed(tmp_path):
+    path = written(tmp_path, KNEE + '#' * DOCUMENT_BYTES['TOML'])
+    with pytest.raises(DataError, match=r'the TOML text has .* MB are not read'):
+        read_joints(path, BODIES)
 
 
 @pytest.mark.parametrize(

@@ -7,10 +7,7 @@ import numpy as np
 import pytest
 
 from fluoro_calib_ros.errors import DataError
-from fluoro_calib_ros.io.formats.known_orientation import (
-    read_known_orientations,
-    write_known_orientations,
-)
+from fluoro_calib_ros.io.formats.native import read_known_orientations, write_known_orientations
 from fluoro_calib_ros.photogrammetry.collinearity import project
 from fluoro_calib_ros.photogrammetry.known_orientation import KnownOrientation
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector

@@ -25,6 +25,7 @@ from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.exposures.names import Names, number_names, safe_names
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.io.formats import registry
+from fluoro_calib_ros.io.formats.bodies import write_joint_motion
 from fluoro_calib_ros.io.formats.content import (
     Bodies,
     Camera,
@@ -34,8 +35,7 @@ from fluoro_calib_ros.io.formats.content import (
     Station,
     points_without_precision,
 )
-from fluoro_calib_ros.io.formats.frames_of_points import bodies_of_poses
-from fluoro_calib_ros.io.formats.opensim import write_joint_motion
+from fluoro_calib_ros.io.formats.tables import bodies_of_poses
 from fluoro_calib_ros.jobs.sources import read_source
 
 SIZE = (1024, 768)

@@ -11,8 +11,7 @@ from rosbags.rosbag2 import Reader
 
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.io.bags import writer as writer_module
-from fluoro_calib_ros.io.bags.definitions import known_definition, to_cdr, typestore
-from fluoro_calib_ros.io.bags.metadata import profile
+from fluoro_calib_ros.io.bags.metadata import known_definition, profile, to_cdr, typestore
 from fluoro_calib_ros.io.bags.reader import iterate_messages
 from fluoro_calib_ros.io.bags.recording import Recording, RecordingOptions, TopicToRecord
 

@@ -10,8 +10,8 @@ import pydicom
 import pytest
 
 from fluoro_calib_ros.errors import DataError
-from fluoro_calib_ros.io.cine import read_cine_header
 from fluoro_calib_ros.io.image_reading import open_images
+from fluoro_calib_ros.io.recordings import read_cine_header
 from fluoro_calib_ros.jobs.image_sources import contains_images, open_sources
 
 LITTLE = '1.2.840.10008.1.2.1'

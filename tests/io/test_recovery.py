@@ -19,14 +19,13 @@ from rosbags.rosbag2 import Reader
 
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.io.bags import writer as writer_module
-from fluoro_calib_ros.io.bags.definitions import TARGET_OBSERVATIONS, message_from_frame
+from fluoro_calib_ros.io.bags.metadata import TARGET_OBSERVATIONS, message_from_frame
 from fluoro_calib_ros.io.bags.reader import iterate_messages, read_frames
 from fluoro_calib_ros.io.bags.salvage import recover_bag
 from fluoro_calib_ros.io.bags.writer import BagWriter
 from fluoro_calib_ros.jobs.simulation import write_bag
-from fluoro_calib_ros.simulation.rig import virtual_rig
-from fluoro_calib_ros.simulation.streams import StreamStart
-from fluoro_calib_ros.simulation.tracking import simulate_tracking
+from fluoro_calib_ros.simulation.exposures import simulate_tracking
+from fluoro_calib_ros.simulation.rig import StreamStart, virtual_rig
 
 START = 10**18
 
@@ -165,7 +164,7 @@ def test_split_bag_with_a_lost_file(tmp_path, frames):
 
 def test_types_that_are_not_known_are_recovered_with_their_definition(tmp_path, frames):
     """A lab's own messages: definition and hash come from the bag."""
-    from fluoro_calib_ros.io.bags.definitions import Definition
+    from fluoro_calib_ros.io.bags.metadata import Definition
 
     with BagWriter(tmp_path / 'bag') as bag:
         bag.add_topic('/own', 'lab_msgs/msg/Trigger', 'latched', Definition('uint32 n', 'ros2msg'))

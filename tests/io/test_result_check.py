@@ -12,9 +12,8 @@ from rigs import calibrated, exposures, rig, run
 from fluoro_calib_ros.checks.check import Check, Validation
 from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
 from fluoro_calib_ros.findings import Kind
-from fluoro_calib_ros.io.calibration import load_calibrations
+from fluoro_calib_ros.io.calibration import disagreements, load_calibrations
 from fluoro_calib_ros.io.calibration_request import write_request
-from fluoro_calib_ros.io.result_check import disagreements
 from fluoro_calib_ros.io.result_document import write_validation
 from fluoro_calib_ros.jobs.result_folder import save_result
 from fluoro_calib_ros.report import html as html_report

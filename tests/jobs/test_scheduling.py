@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 import rigs
 
+from benchmarks.bead_images import bead_image
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.jobs import scheduling
@@ -26,7 +27,6 @@ from fluoro_calib_ros.jobs.extraction import ExtractionRequest, run_extraction
 from fluoro_calib_ros.jobs.image_correction import ImageCorrectionRequest, run_image_correction
 from fluoro_calib_ros.jobs.scheduling import Cluster, LocalWorkers, open_workers
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
-from fluoro_calib_ros.simulation.bead_images import bead_image
 
 SIZE = 400
 COUNT = 60

@@ -14,9 +14,9 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from sensor_msgs.msg import JointState
 
 from fluoro_calib_ros.correction.angle_field import packed_angles
-from fluoro_calib_ros.correction.noise_profile import NoiseProfile
+from fluoro_calib_ros.correction.fluoroscope_calibration import NoiseProfile
 from fluoro_calib_ros.errors import DataError
-from fluoro_calib_ros.io.bags.definitions import (
+from fluoro_calib_ros.io.bags.metadata import (
     ADDED,
     FLUOROSCOPE_CALIBRATION,
     earlier_text,

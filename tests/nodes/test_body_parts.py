@@ -14,8 +14,6 @@ from scipy.spatial.transform import Rotation
 from fluoro_calib_ros.bodies.body import Body, BodyPoses, PoseStatus
 from fluoro_calib_ros.bodies.tracking import BodyTracker, poses_of, twists_of
 from fluoro_calib_ros.errors import DataError
-from fluoro_calib_ros.nodes.body_following import BodyFollower, BodyParameters, read_body_files
-from fluoro_calib_ros.nodes.body_health import statuses_of
 from fluoro_calib_ros.nodes.messages.bodies import (
     AXIS_MM,
     BodiesContent,
@@ -26,7 +24,8 @@ from fluoro_calib_ros.nodes.messages.bodies import (
     pose_with_covariance,
     transforms_of_bodies,
 )
-from fluoro_calib_ros.nodes.rig_input import Rig
+from fluoro_calib_ros.nodes.reconstruction_output import statuses_of
+from fluoro_calib_ros.nodes.rig_input import BodyFollower, BodyParameters, Rig, read_body_files
 from fluoro_calib_ros.nodes.runtime.diagnostics import OK, WARN, RecentCounts
 from fluoro_calib_ros.photogrammetry.noise import ObservedScatter
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation

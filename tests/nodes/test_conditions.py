@@ -10,20 +10,20 @@ from types import SimpleNamespace
 import pytest
 from fluoro_calib_msgs.srv import Reset
 
-from fluoro_calib_ros.nodes import calibration_health, correcting_node, image_stream
-from fluoro_calib_ros.nodes import reconstruction_health as reconstruction
+from fluoro_calib_ros.nodes import calibration_output, correcting_node, image_stream
+from fluoro_calib_ros.nodes import reconstruction_output as reconstruction
 from fluoro_calib_ros.nodes.runtime.diagnostics import (
     ERROR,
     OK,
     WARN,
     Health,
+    RateLimitedLogger,
     RefusalLog,
     Refused,
     fault,
     health_of,
 )
-from fluoro_calib_ros.nodes.runtime.logging import RateLimitedLogger
-from fluoro_calib_ros.nodes.runtime.services import Requests, ServiceEntry, create_services
+from fluoro_calib_ros.nodes.runtime.lifecycle import Requests, ServiceEntry, create_services
 from fluoro_calib_ros.nodes.runtime.stream import Stream, stream_faults
 
 LOGGER = SimpleNamespace(warning=lambda text: None, error=lambda text: None)
@@ -56,7 +56,7 @@ def test_the_first_condition_that_holds_is_told_and_the_rest_is_not_asked():
 @pytest.mark.parametrize(
     'conditions',
     [
-        calibration_health.CONDITIONS,
+        calibration_output.CONDITIONS,
         correcting_node.CONDITIONS,
         image_stream.CONDITIONS,
         reconstruction.CONDITIONS,

@@ -10,13 +10,14 @@ import pytest
 from rich.console import Console
 from textual.widgets import Static
 
-from fluoro_calib_ros.nodes.dashboard.state import (
+from fluoro_calib_ros.nodes.dashboard.view import (
+    Dashboard,
     FluoroscopeState,
     NodeState,
     RateMeter,
     SessionState,
+    session_text,
 )
-from fluoro_calib_ros.nodes.dashboard.view import Dashboard, session_text
 
 STATE = SessionState(
     fluoroscopes=(

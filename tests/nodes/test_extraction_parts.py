@@ -11,9 +11,9 @@ import threading
 import numpy as np
 import pytest
 
-from fluoro_calib_ros.exposures.numbering import ExposureNumbers
-from fluoro_calib_ros.jobs.live_extraction import Observations, follower_process
-from fluoro_calib_ros.nodes.runtime.exposure_queue import ExposureQueue
+from fluoro_calib_ros.exposures.stamps import ExposureNumbers
+from fluoro_calib_ros.jobs.followers import Observations, follower_process
+from fluoro_calib_ros.nodes.image_stream import ExposureQueue
 
 MS = 1_000_000
 

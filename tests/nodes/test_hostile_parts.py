@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from fluoro_calib_ros.correction.registry import create_model
 from fluoro_calib_ros.errors import DataError
-from fluoro_calib_ros.nodes.calibration_files import check_folders
+from fluoro_calib_ros.nodes.calibration_settings import check_folders
 from fluoro_calib_ros.nodes.exposure_input import ExposureInput
 from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import (
     calibration_from_message,
@@ -27,7 +27,7 @@ from fluoro_calib_ros.nodes.messages.rig_orientation import (
     message_from_orientation,
     orientation_from_message,
 )
-from fluoro_calib_ros.nodes.runtime.logging import MAX_LINE, PrintableLogger, RateLimitedLogger
+from fluoro_calib_ros.nodes.runtime.diagnostics import MAX_LINE, PrintableLogger, RateLimitedLogger
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 
 FORGED = 'a\n[FATAL] forged\x1b[2J'

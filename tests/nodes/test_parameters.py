@@ -16,7 +16,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from fluoro_calib_ros.estimation.options import CalibrationOptions
-from fluoro_calib_ros.nodes.runtime.logging import StartError
+from fluoro_calib_ros.nodes.runtime.diagnostics import StartError
 from fluoro_calib_ros.nodes.runtime.parameters import (
     MAX_INTEGER,
     MAX_TIMEOUT_S,

@@ -14,7 +14,7 @@ from fluoro_calib_msgs.msg import CorrectedObservations, ReconstructedPoints, Ta
 from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import Header
 
-from fluoro_calib_ros.io.bags.definitions import from_cdr, typestore
+from fluoro_calib_ros.io.bags.metadata import from_cdr, typestore
 from fluoro_calib_ros.nodes.messages.observations import (
     decode_corrected_observations,
     decode_target_observations,

@@ -8,12 +8,12 @@ import pytest
 from scipy.stats import binom
 from sklearn.linear_model import GammaRegressor
 
-from fluoro_calib_ros.correction.noise_profile import (
+from fluoro_calib_ros.correction.fluoroscope_calibration import (
     NoiseProfile,
     packed_profile,
     unpacked_profile,
 )
-from fluoro_calib_ros.estimation.noise_profile_fit import fitted_profile
+from fluoro_calib_ros.estimation.lack_of_fit import fitted_profile
 
 SIZE = (1024, 768)
 

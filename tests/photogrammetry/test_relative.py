@@ -22,23 +22,21 @@ from fluoro_calib_ros.photogrammetry.elimination import EliminateExposures, Elim
 from fluoro_calib_ros.photogrammetry.noise import LOSSES, Noise
 from fluoro_calib_ros.photogrammetry.noise_estimation import adjust_and_estimate_noise
 from fluoro_calib_ros.photogrammetry.precision import precision
-from fluoro_calib_ros.photogrammetry.relative_orientation import (
+from fluoro_calib_ros.photogrammetry.rotations import (
+    matrix_from_vector,
+    rotation_angle,
+    vector_from_matrix,
+)
+from fluoro_calib_ros.photogrammetry.unknowns import (
+    RIGID_SD_MM,
+    RIGID_SD_RAD,
+    RelativeConstraint,
+    RelativePose,
     discrepancies,
     discrepancies_with_jacobian,
     exposures_from_pose,
     mean_pose,
     relative_poses,
-)
-from fluoro_calib_ros.photogrammetry.relative_pose import (
-    RIGID_SD_MM,
-    RIGID_SD_RAD,
-    RelativeConstraint,
-    RelativePose,
-)
-from fluoro_calib_ros.photogrammetry.rotations import (
-    matrix_from_vector,
-    rotation_angle,
-    vector_from_matrix,
 )
 
 POSE = RelativePose(matrix_from_vector([0.03, -1.19, -0.02]), np.array([-1300.0, 30.0, 980.0]))

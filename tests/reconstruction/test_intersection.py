@@ -17,7 +17,7 @@ from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.photogrammetry.noise import ObservedScatter
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
-from fluoro_calib_ros.reconstruction.epipolar import EpipolarGeometry, epipolar_residuals
+from fluoro_calib_ros.reconstruction.epipolar import EpipolarGeometry
 from fluoro_calib_ros.reconstruction.intersection import (
     FAILED,
     OK,
@@ -242,7 +242,7 @@ def test_covariance_against_monte_carlo():
             np.einsum('ni,nij,nj->n', error, np.linalg.inv(found.covariance), error) / 3
         )
         tests.append(found.standardised**2)
-        distance = epipolar_residuals(wrong, 'a', 'b', *noisy, SIGMA, SIGMA)
+        distance = EpipolarGeometry(wrong, 'a', 'b').residuals(*noisy, SIGMA, SIGMA)
         distances.append((distance.residual / distance.sd_total) ** 2)
         error = known.intersect(noisy, sigma).xyz_mm - xyz
         noise_only.append(
@@ -285,7 +285,9 @@ def test_epipolar_distance_and_its_standard_deviations():
         found.sd, np.hypot(found.factor_a * sigma[0], found.factor_b * sigma[1])
     )
     by_rig = central(
-        lambda step: epipolar_residuals(moved(orientation, step), 'a', 'b', *uv, *sigma).residual,
+        lambda step: (
+            EpipolarGeometry(moved(orientation, step), 'a', 'b').residuals(*uv, *sigma).residual
+        ),
         18,
         STEPS,
     )
@@ -297,13 +299,13 @@ def test_epipolar_distance_is_the_smallest_shift_that_makes_the_rays_meet():
     """For two views of equal sigma it is the length of the residuals, also standardised."""
     orientation = orientation_of()
     _, uv, sigma = seen(orientation, 8)
-    distance = epipolar_residuals(orientation, 'b', 'a', *uv[::-1], SIGMA, SIGMA)
+    distance = EpipolarGeometry(orientation, 'b', 'a').residuals(*uv[::-1], SIGMA, SIGMA)
     points = Intersector(orientation, reject=None).intersect(uv, sigma)
     np.testing.assert_allclose(np.abs(distance.residual), 2 * points.residual, rtol=1e-3)
     np.testing.assert_allclose(
         np.abs(distance.residual) / distance.sd_total, points.standardised, rtol=1e-3
     )
-    other = epipolar_residuals(orientation, 'a', 'b', *uv, SIGMA, SIGMA)
+    other = EpipolarGeometry(orientation, 'a', 'b').residuals(*uv, SIGMA, SIGMA)
     np.testing.assert_allclose(np.abs(other.residual), np.abs(distance.residual), rtol=1e-9)
 
 
@@ -312,7 +314,7 @@ def test_epipolar_nan_stays_nan():
     _, uv, sigma = seen(orientation, 4)
     uv[0, 1] = np.nan
     sigma[1, 2] = np.nan
-    found = epipolar_residuals(orientation, 'a', 'b', *uv, *sigma)
+    found = EpipolarGeometry(orientation, 'a', 'b').residuals(*uv, *sigma)
     assert np.isnan(found.residual).tolist() == [False, True, False, False]
     assert np.isnan(found.sd_total).tolist() == [False, True, True, False]
 
@@ -321,7 +323,7 @@ def test_false_match_of_two_views_is_rejected():
     """A shift across the epipolar line is seen, one along it is not."""
     orientation = orientation_of()
     xyz, uv, sigma = seen(orientation)
-    normal = epipolar_residuals(orientation, 'a', 'b', *uv, SIGMA, SIGMA).normal_b
+    normal = EpipolarGeometry(orientation, 'a', 'b').residuals(*uv, SIGMA, SIGMA).normal_b
     uv[1, 4] += 8 * normal[4]
     uv[1, 7] += 8 * normal[7, ::-1] * (1, -1)
     found = Intersector(orientation).intersect(uv, sigma)

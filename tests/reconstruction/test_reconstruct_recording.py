@@ -13,7 +13,7 @@ import pytest
 from rigs import run, true_calibrations, true_orientation
 
 from fluoro_calib_ros.bodies.body import declared_bodies
-from fluoro_calib_ros.checks.drift_options import ERROR, DriftOptions
+from fluoro_calib_ros.checks.drift_charts import ERROR, DriftOptions
 from fluoro_calib_ros.checks.rig_watch import RecordingDriftWatch, RigDriftWatch
 from fluoro_calib_ros.findings import Kind, Severity
 from fluoro_calib_ros.io.calibration import save_calibration, save_orientation
@@ -27,8 +27,8 @@ from fluoro_calib_ros.reconstruction.reconstruct import (
     reconstruct_recording,
     watch_exposure,
 )
+from fluoro_calib_ros.simulation.exposures import simulate_tracking
 from fluoro_calib_ros.simulation.rig import virtual_rig
-from fluoro_calib_ros.simulation.tracking import simulate_tracking
 
 NOISE_PX = 0.25
 CLUSTERS = ('tibia: 1001 1002 1003 1004 1005 1006', 'femur: 1013 1014 1015 1016 1017 1018')

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from fluoro_calib_ros.correction.models import no_correction
+from fluoro_calib_ros.correction.registry import no_correction
 from fluoro_calib_ros.estimation.calibrate import adjust_with_calibrations, calibrate
 from fluoro_calib_ros.simulation.rig import random_field
 

@@ -17,10 +17,9 @@ from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.calibrate import adjust_with_calibrations, calibrate
 from fluoro_calib_ros.estimation.options import CalibrationOptions
 from fluoro_calib_ros.findings import Finding, Kind, Place, Severity
-from fluoro_calib_ros.report.cost_figure import relative_costs
-from fluoro_calib_ros.report.report_figures import write_figures
-from fluoro_calib_ros.report.residual_figures import normalised_residuals
-from fluoro_calib_ros.report.style import STYLE
+from fluoro_calib_ros.report.figures import STYLE
+from fluoro_calib_ros.report.report_figures import relative_costs, write_figures
+from fluoro_calib_ros.report.residuals import normalised_residuals
 from fluoro_calib_ros.report.tables import markdown_table, summary_table
 from fluoro_calib_ros.simulation.exposures import simulate_exposures
 from fluoro_calib_ros.simulation.rig import virtual_rig

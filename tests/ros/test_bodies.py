@@ -12,9 +12,8 @@ from rclpy.serialization import deserialize_message
 from ros_graph import NAMES, value_of
 
 from fluoro_calib_ros.io.bags.reader import iterate_messages
-from fluoro_calib_ros.io.bodies import read_bodies, write_bodies
+from fluoro_calib_ros.io.bodies import joint_definition, read_bodies, read_joints, write_bodies
 from fluoro_calib_ros.io.calibration import load_orientation, orientation_path
-from fluoro_calib_ros.io.joints import joint_definition, read_joints
 from fluoro_calib_ros.jobs.bodies import BodiesOptions, track_bodies
 from fluoro_calib_ros.jobs.sources import read_calibrations
 from fluoro_calib_ros.nodes.messages.bodies import FORMS as OPTIONAL

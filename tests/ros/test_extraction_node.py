@@ -14,6 +14,7 @@ from rclpy.serialization import serialize_message
 from ros_graph import NAMES
 from sensor_msgs.msg import CompressedImage, Image
 
+from benchmarks.bead_images import bead_image
 from fluoro_calib_ros.bodies.body import Body
 from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
 from fluoro_calib_ros.exposures.phantom import Phantom
@@ -26,9 +27,8 @@ from fluoro_calib_ros.jobs.extraction import ExtractionRequest, run_extraction
 from fluoro_calib_ros.nodes.messages.observations import stamp_from_nanoseconds
 from fluoro_calib_ros.nodes.runtime.streams import images_qos
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
-from fluoro_calib_ros.simulation.bead_images import bead_image
+from fluoro_calib_ros.simulation.exposures import simulate_tracking
 from fluoro_calib_ros.simulation.rig import virtual_rig
-from fluoro_calib_ros.simulation.tracking import simulate_tracking
 
 SIZE = 400
 BEADS = np.random.default_rng(5).uniform(-60, 60, (48, 3))

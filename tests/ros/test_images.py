@@ -16,7 +16,8 @@ from rclpy.qos import qos_profile_sensor_data
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from fluoro_calib_ros.correction.models import no_correction
+from benchmarks.bead_images import bead_image
+from fluoro_calib_ros.correction.registry import no_correction
 from fluoro_calib_ros.images.codec import decode, encode
 from fluoro_calib_ros.images.corrector import ImageCorrector
 from fluoro_calib_ros.io.calibration import load_calibrations
@@ -26,7 +27,6 @@ from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import (
 )
 from fluoro_calib_ros.nodes.messages.observations import stamp_from_nanoseconds
 from fluoro_calib_ros.nodes.runtime.streams import images_qos, latched_qos
-from fluoro_calib_ros.simulation.bead_images import bead_image
 
 SIZE = (1024, 1024)
 DEPTHS = {'mono8': np.uint8, 'mono16': np.uint16}

@@ -18,12 +18,13 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from sensor_msgs.msg import Image, JointState
 
 import tests.images.test_markers as markers
+from benchmarks.bead_images import bead_image
 from fluoro_calib_ros.correction.fluoroscope_calibration import digest_of_sources
 from fluoro_calib_ros.exposures.angles import AngleOptions
 from fluoro_calib_ros.exposures.frame import angle_in_degrees
 from fluoro_calib_ros.images.angle_maps import AngleMaps
 from fluoro_calib_ros.images.markers import FirstMarkers
-from fluoro_calib_ros.io.bags.definitions import (
+from fluoro_calib_ros.io.bags.metadata import (
     ADDED,
     FLUOROSCOPE_CALIBRATION,
     Definition,
@@ -33,12 +34,11 @@ from fluoro_calib_ros.io.bags.definitions import (
 from fluoro_calib_ros.io.bags.writer import BagWriter
 from fluoro_calib_ros.io.calibration import load_calibrations, save_calibration
 from fluoro_calib_ros.io.phantom import read_phantom
-from fluoro_calib_ros.jobs.live_markers import MarkerSettings
+from fluoro_calib_ros.jobs.followers import MarkerSettings
 from fluoro_calib_ros.jobs.sources import BagSelection, read_calibrated_source
 from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import message_from_calibration
 from fluoro_calib_ros.nodes.messages.observations import stamp_from_nanoseconds
 from fluoro_calib_ros.nodes.runtime.streams import FaultHandlers, StreamReader, images_qos
-from fluoro_calib_ros.simulation.bead_images import bead_image
 
 START_NS = 10**18
 STEP_NS = 50_000_000  # between frames, and between states

@@ -10,7 +10,7 @@ from ros_graph import NAMES, Process, entry_point, value_of
 from rosbags.rosbag2 import Reader
 from std_msgs.msg import String
 
-from fluoro_calib_ros.io.bags.definitions import type_hash
+from fluoro_calib_ros.io.bags.metadata import type_hash
 from fluoro_calib_ros.io.bags.reader import read_frames, topics_of
 from fluoro_calib_ros.io.bags.salvage import inspect_bag, recover_bag
 from fluoro_calib_ros.nodes.runtime.streams import latched_qos

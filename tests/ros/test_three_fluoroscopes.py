@@ -17,10 +17,12 @@ from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.jobs.simulation import write_bag
 from fluoro_calib_ros.nodes.messages.observations import message_from_frame
 from fluoro_calib_ros.nodes.runtime.streams import observations_qos
-from fluoro_calib_ros.simulation.exposures import detect_beads, simulate_exposures
-from fluoro_calib_ros.simulation.rig import virtual_rig
-from fluoro_calib_ros.simulation.streams import START_NS, StreamStart
-from fluoro_calib_ros.simulation.tracking import simulate_tracking
+from fluoro_calib_ros.simulation.exposures import (
+    detect_beads,
+    simulate_exposures,
+    simulate_tracking,
+)
+from fluoro_calib_ros.simulation.rig import START_NS, StreamStart, virtual_rig
 
 THREE = ('a', 'b', 'c')
 POSES = 9

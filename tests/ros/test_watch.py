@@ -7,7 +7,7 @@ import numpy as np
 from ros_graph import NAMES, standing
 from sensor_msgs.msg import Image
 
-from fluoro_calib_ros.nodes.dashboard.client import SessionClient
+from fluoro_calib_ros.nodes.dashboard.watch import SessionClient
 from fluoro_calib_ros.nodes.runtime.streams import latched_qos
 
 

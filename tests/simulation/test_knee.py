@@ -13,8 +13,7 @@ from fluoro_calib_ros.bodies.body import BodyPoses
 from fluoro_calib_ros.bodies.joints import joint_motion
 from fluoro_calib_ros.cli import main
 from fluoro_calib_ros.io.bags.reader import read_frames
-from fluoro_calib_ros.io.bodies import read_bodies
-from fluoro_calib_ros.io.joints import read_joints
+from fluoro_calib_ros.io.bodies import read_bodies, read_joints
 from fluoro_calib_ros.jobs.simulation import SimulationOptions
 from fluoro_calib_ros.simulation.knee import (
     CYCLE_S,

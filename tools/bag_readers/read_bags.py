@@ -31,14 +31,14 @@ from rosbags.highlevel import AnyReader
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parents[1]))
 
-from fluoro_calib_ros.io.bags.definitions import (  # noqa: E402
+from fluoro_calib_ros.io.bags.metadata import (  # noqa: E402
     TARGET_OBSERVATIONS,
     known_definition,
     message_from_frame,
+    profile,
     to_cdr,
     typestore,
 )
-from fluoro_calib_ros.io.bags.metadata import profile  # noqa: E402
 from fluoro_calib_ros.io.bags.reader import read_frames  # noqa: E402
 from fluoro_calib_ros.io.bags.recording import Recording, RecordingOptions, TopicToRecord  # noqa: E402
 from fluoro_calib_ros.io.bags.salvage import recover_bag  # noqa: E402

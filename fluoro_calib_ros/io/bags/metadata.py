@@ -1,19 +1,302 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The metadata of a bag as rosbag2 writes it, version 9 (rosbag2_storage/yaml.hpp)."""
+"""Message definitions without ROS, and the metadata of a bag as rosbag2 writes it."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import cache
+from importlib.resources import files
 from typing import Any
 
+import numpy as np
 import yaml
+from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
 
-from ...errors import DataError
+from ...correction.calibration_record import FIELDS, VERSION
+from ...errors import DataError, ErrorsAt
+from ...exposures.frame import Frame, stack_image_points
 from ..documents import parse_yaml
-from .definitions import Definition
+
+PACKAGE = 'fluoro_calib_msgs'
+TARGET_OBSERVATIONS = f'{PACKAGE}/msg/TargetObservations'
+FLUOROSCOPE_CALIBRATION = f'{PACKAGE}/msg/FluoroscopeCalibration'
+# Fields that were added at the end of a message, one change after the other: those of an earlier
+# definition do not have them, or only the first of them. Series came before there were bags.
+ADDED = {
+    FLUOROSCOPE_CALIBRATION: tuple(
+        tuple(field.name for field in FIELDS if field.since == version)
+        for version in range(3, VERSION + 1)
+    )
+}
+PADDING = 4  # bytes at the end of a message that Fast DDS reserves for an empty float64[]
+MAX_PADDING = 10 * PADDING  # of a message with ten of them
+SEPARATOR = '=' * 80  # between the definitions of a schema
+
+
+@dataclasses.dataclass(frozen=True)
+class Definition:
+    """Definition of a message type in a bag: text, its encoding, and hash, '' where unknown."""
+
+    text: str
+    encoding: str = 'ros2msg'
+    type_hash: str = ''
+
+
+def known_definition(msg_type: str) -> Definition:
+    """Return the definition of a type in the typestore. Raises DataError for an unknown one."""
+    return Definition(full_text(msg_type), 'ros2msg', type_hash(msg_type))
+
+
+@cache
+def typestore() -> Typestore:
+    """Return the rosbags typestore of Jazzy with the messages of fluoro_calib_msgs."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for name, text in _package_texts().items():
+        store.register(get_types_from_msg(text, name))
+    return store
+
+
+def message_class(msg_type: str) -> type[Any]:
+    """Return the dataclass of a message type such as 'std_msgs/msg/Header'.
+
+    Raises DataError for an unknown type.
+    """
+    types = typestore().types
+    if msg_type not in types:
+        raise DataError(f'the message type {msg_type!r} is not known')
+    return types[msg_type]
+
+
+@cache
+def type_hash(msg_type: str) -> str:
+    """Return the hash ``RIHS01_...`` of a message type (REP-2016)."""
+    message_class(msg_type)
+    return typestore().hash_rihs01(msg_type)
+
+
+@cache
+def full_text(msg_type: str) -> str:
+    """Return the definition of a message type as the schema of a bag contains it.
+
+    The definitions of all types it depends on follow, each after a line of 80 '=' and a line
+    'MSG: package/Type', in the order in which rosbag2 finds them.
+    """
+    message_class(msg_type)
+    return _with_dependencies(msg_type, set())
+
+
+def to_cdr(message: Any, msg_type: str) -> bytes:
+    """Return a message dataclass as CDR. Raises DataError for a value that a field cannot have."""
+    message_class(msg_type)
+    try:
+        return bytes(typestore().serialize_cdr(message, msg_type, little_endian=True))
+    except Exception as error:  # generated code raises almost anything for a wrong value
+        raise DataError(f'this is not a message of type {msg_type} ({error})') from None
+
+
+def from_cdr(data: bytes, msg_type: str) -> Any:
+    """Return CDR as a message dataclass. Raises DataError for other bytes.
+
+    Fields that a message of an earlier definition does not have are empty.
+
+    Fast DDS reserves four bytes for the alignment of each empty sequence of float64, such as a
+    sigma that is not given, and leaves them at the end. rosbags takes that for another message.
+    """
+    kind = message_class(msg_type)
+    try:
+        return _read_cdr(typestore(), data, msg_type)
+    except DataError as error:
+        last = error
+    for changes in reversed(range(len(ADDED.get(msg_type, ())))):
+        try:
+            earlier = _read_cdr(_earlier_typestore(changes), data, msg_type)
+        except DataError as error:
+            last = error
+            continue
+        added = {name: np.zeros(0) for name in _added(msg_type, changes)}
+        known = [f.name for f in dataclasses.fields(earlier) if f.init]
+        return kind(**{name: getattr(earlier, name) for name in known}, **added)
+    raise last
+
+
+def present_cdr(data: bytes, msg_type: str) -> bytes:
+    """Return a message, also one of an earlier definition, as CDR of the present definition.
+
+    Raises DataError for other bytes.
+    """
+    return to_cdr(from_cdr(data, msg_type), msg_type)
+
+
+def earlier_text(msg_type: str, changes: int = 0) -> str:
+    """Return the definition of a type after so many of the changes that added fields."""
+    lines = _package_texts()[msg_type].splitlines(keepends=True)
+    added = _added(msg_type, changes)
+    return ''.join(line for line in lines if (line.split() + ['', ''])[1] not in added)
+
+
+def _added(msg_type: str, changes: int) -> list[str]:
+    """Return the fields of a type that were added after so many changes."""
+    return [name for names in ADDED[msg_type][changes:] for name in names]
+
+
+@cache
+def _earlier_typestore(changes: int) -> Typestore:
+    """Return the typestore with the types in ADDED after so many changes."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for name, text in _package_texts().items():
+        earlier = name in ADDED and changes < len(ADDED[name])
+        text = earlier_text(name, changes) if earlier else text
+        store.register(get_types_from_msg(text, name))
+    return store
+
+
+def _read_cdr(store: Typestore, data: bytes, msg_type: str) -> Any:
+    """Return CDR as a message dataclass of a typestore. Raises DataError for other bytes."""
+    try:
+        return store.deserialize_cdr(data, msg_type)
+    except Exception as error:  # generated code raises almost anything for damaged bytes
+        for padding in range(PADDING, MAX_PADDING + 1, PADDING):
+            with suppress(Exception):
+                message = store.deserialize_cdr(data[:-padding], msg_type)
+                if padding <= PADDING * _count_empty(message):
+                    return message
+        raise DataError(f'the content is not a {msg_type} ({error})') from None
+
+
+def _count_empty(message: Any) -> int:
+    """Return the number of empty sequences of float64 among the fields of a message."""
+    values = (getattr(message, field.name) for field in dataclasses.fields(message))
+    return sum(isinstance(v, np.ndarray) and v.dtype == np.float64 and not len(v) for v in values)
+
+
+def fields_of(msg_type: str, text: str, encoding: str) -> dict[str, Any]:
+    """Return the fields of a message type and of those it depends on, by type.
+
+    text is the definition in the schema of a bag, encoding 'ros2msg' or 'ros2idl'. Raises
+    DataError for a definition that cannot be read.
+    """
+    try:
+        if encoding == 'ros2msg':
+            parsed = get_types_from_msg(text, msg_type)
+        elif encoding == 'ros2idl':
+            parsed = get_types_from_idl(text)
+        else:
+            raise DataError(
+                f'the definition of {msg_type} has the encoding {encoding!r}, ros2msg is expected'
+            )
+    except DataError:
+        raise
+    except Exception as error:  # the parser raises almost anything for a damaged text
+        raise DataError(
+            f'the definition of {msg_type} cannot be read ({type(error).__name__})'
+        ) from None
+    return {name: fields for name, (_, fields) in parsed.items()}
+
+
+def _package_texts() -> dict[str, str]:
+    """Return the definitions of fluoro_calib_msgs by message type."""
+    folder = files(__package__) / 'msg'
+    return {
+        f'{PACKAGE}/msg/{file.name[:-4]}': file.read_text(encoding='utf-8')
+        for file in sorted(folder.iterdir(), key=lambda f: f.name)
+        if file.name.endswith('.msg')
+    }
+
+
+def _with_dependencies(msg_type: str, seen: set[str]) -> str:
+    """Return the definition of a type and of those it depends on, unless they were seen."""
+    store = typestore()
+    text = _package_texts().get(msg_type) or store.gendefhash(msg_type, {}, ros_version=2)[0]
+    for name in sorted(nested_types(store.fielddefs[msg_type][1])):
+        if name not in seen:
+            seen.add(name)
+            heading = f'\n{SEPARATOR}\nMSG: {name.replace("/msg/", "/")}\n'
+            text += heading + _with_dependencies(name, seen)
+    return text
+
+
+def nested_types(fields: Iterable[Any]) -> set[str]:
+    """Return the names of the message types of fields, including those of array elements."""
+    names = set()
+    for _, description in fields:
+        while isinstance(description[1][0], tuple):  # an array or a sequence
+            description = description[1][0]
+        if isinstance(description[1], str):
+            names.add(description[1])
+    return names
+
+
+# Frames and TargetObservations messages, as dataclasses of the rosbags typestore.
+
+TOPIC_NAME = 'target_observations'
+
+
+def frame_from_message(message: Any, fluoroscope: str) -> Frame:
+    """Return the Frame of a TargetObservations message.
+
+    Raises DataError for arrays of different lengths; nothing else is validated.
+    """
+    with ErrorsAt(f'frame {message.frame_number}'):
+        target_id, uv, sigma = stack_image_points(
+            message.target_id, message.u, message.v, message.sigma
+        )
+    stamp = message.header.stamp
+    return Frame(
+        fluoroscope=fluoroscope,
+        number=int(message.frame_number),
+        target_id=target_id,
+        uv=uv,
+        image_size=(int(message.image_width), int(message.image_height)),
+        sigma=sigma,
+        stamp_ns=stamp.sec * 10**9 + stamp.nanosec,
+        frame_id=message.header.frame_id,
+    )
+
+
+def message_from_frame(frame: Frame) -> Any:
+    """Return the TargetObservations message of a Frame."""
+    uv = np.asarray(frame.uv, dtype=np.float64).reshape(-1, 2)
+    stamp = message_class('builtin_interfaces/msg/Time')(*divmod(int(frame.stamp_ns), 10**9))
+    sigma: Any = [] if frame.sigma is None else frame.sigma
+    return message_class(TARGET_OBSERVATIONS)(
+        header=message_class('std_msgs/msg/Header')(stamp, frame.frame_id),
+        frame_number=int(frame.number),
+        image_width=int(frame.image_size[0]),
+        image_height=int(frame.image_size[1]),
+        target_id=np.asarray(frame.target_id).astype(np.uint32),
+        u=np.ascontiguousarray(uv[:, 0]),
+        v=np.ascontiguousarray(uv[:, 1]),
+        sigma=np.asarray(sigma, dtype=np.float64),
+    )
+
+
+def observations_topic(fluoroscope: str, namespace: str = '') -> str:
+    """Return the absolute topic of the observations of a fluoroscope.
+
+    namespace is that of the rig, such as '/rig'.
+    """
+    parts = [*namespace.strip('/').split('/'), fluoroscope, TOPIC_NAME]
+    return '/' + '/'.join(parts).lstrip('/')
+
+
+def fluoroscope_of_topic(topic: str) -> str:
+    """Return the fluoroscope of a topic, which is the part of its name before the last.
+
+    Raises DataError for a name of one part.
+    """
+    parts = [part for part in topic.split('/') if part]
+    if len(parts) < 2:
+        raise DataError(
+            f'topic {topic} does not name the fluoroscope, <fluoroscope>/{TOPIC_NAME} is expected'
+        )
+    return parts[-2]
+
 
 # QoS profiles as bags contain them: YAML in a channel's metadata and in metadata.yaml.
 
@@ -102,7 +385,7 @@ _Dumper.add_representer(
 )
 
 
-VERSION = 9
+BAG_VERSION = 9
 NO_MESSAGE_NS = 2**63 - 1  # starting time of a bag without messages [ns]
 
 
@@ -150,7 +433,7 @@ def bag_metadata(
 ) -> dict[str, Any]:
     """Return the content of rosbag2_bagfile_information; the order of the keys counts."""
     return {
-        'version': VERSION,
+        'version': BAG_VERSION,
         'storage_identifier': 'mcap',
         'duration': total.duration,
         'starting_time': total.starting_time,

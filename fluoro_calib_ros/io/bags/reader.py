@@ -15,19 +15,9 @@ from mcap.records import Schema
 
 from ...errors import DataError, ErrorsAt
 from ...exposures.angles import AngleOptions, JointAngles
-from ...exposures.frame import Frame, validate_frame
-from ...exposures.strays import without_strays
+from ...exposures.frame import Frame, Frames, validate_frame, without_strays
 from ...limits import MAX_OBSERVATIONS
 from ..access import PathLike, check_safe_name
-from .definitions import (
-    TARGET_OBSERVATIONS,
-    fields_of,
-    fluoroscope_of_topic,
-    frame_from_message,
-    from_cdr,
-    type_hash,
-    typestore,
-)
 from .mcap_file import (
     BagMessage,
     ChannelInfo,
@@ -38,7 +28,16 @@ from .mcap_file import (
     messages_of_file,
     storage_files,
 )
-from .metadata import parse_profiles
+from .metadata import (
+    TARGET_OBSERVATIONS,
+    fields_of,
+    fluoroscope_of_topic,
+    frame_from_message,
+    from_cdr,
+    parse_profiles,
+    type_hash,
+    typestore,
+)
 
 
 class TopicInfo(NamedTuple):
@@ -127,7 +126,7 @@ def _is_restart(last: Frame, frame: Frame) -> bool:
 
 
 def _renumbered(
-    frames: Mapping[str, Sequence[Frame]], segments: Mapping[str, Sequence[int]]
+    frames: Frames, segments: Mapping[str, Sequence[int]]
 ) -> tuple[dict[str, list[Frame]], int]:
     """Return frames with numbers that differ between segments of their streams, and the step."""
     largest = max(frame.number for each in frames.values() for frame in each)
@@ -322,7 +321,7 @@ def joint_topics(source: PathLike) -> list[str]:
 
 
 def with_angles(
-    source: PathLike, frames: Mapping[str, Sequence[Frame]], options: AngleOptions
+    source: PathLike, frames: Frames, options: AngleOptions
 ) -> tuple[dict[str, list[Frame]], tuple[str, ...]]:
     """Return frames of a bag with the angles that the nodes give them, and notes about them.
 
@@ -387,9 +386,7 @@ def _read_states(source: PathLike, angles: JointAngles) -> None:
             )
 
 
-def _notes(
-    source: PathLike, frames: Mapping[str, Sequence[Frame]], angles: JointAngles
-) -> Iterable[str]:
+def _notes(source: PathLike, frames: Frames, angles: JointAngles) -> Iterable[str]:
     """Yield a sentence for each fluoroscope with frames whose angle is unknown."""
     for name, each in frames.items():
         unknown = [frame for frame in each if frame.angle is None]

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 from ...errors import DataError
 from ...options import option, validate_options
 from ..access import PathLike
-from .definitions import Definition
+from .metadata import Definition
 from .writer import BagWriter
 
 MEGABYTE = 10**6

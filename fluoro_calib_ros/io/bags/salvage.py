@@ -33,9 +33,16 @@ from ...errors import DataError
 from ...limits import MAX_CHUNK
 from ..access import PathLike, check_regular_file, os_error_reason
 from ..documents import read_yaml
-from .definitions import PACKAGE, TARGET_OBSERVATIONS, Definition, fluoroscope_of_topic, typestore
 from .mcap_file import FOOTER, MAGIC, RECORD, candidate_files
-from .metadata import parse_profiles, profile
+from .metadata import (
+    PACKAGE,
+    TARGET_OBSERVATIONS,
+    Definition,
+    fluoroscope_of_topic,
+    parse_profiles,
+    profile,
+    typestore,
+)
 from .writer import BagWriter
 
 _CHUNK = struct.Struct('<QQQI')  # of a chunk: first and last time, size, checksum

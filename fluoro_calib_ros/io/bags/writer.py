@@ -15,7 +15,6 @@ import secrets
 import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
-from types import TracebackType
 from typing import Any, BinaryIO
 
 from mcap.writer import CompressionType, Writer
@@ -23,15 +22,20 @@ from mcap.writer import CompressionType, Writer
 from ...errors import DataError
 from ...exposures.frame import Frame
 from ..access import PathLike, os_error_reason, sync_folder, write_text
-from .definitions import (
+from .metadata import (
+    NO_MESSAGE_NS,
+    PROFILES,
     TARGET_OBSERVATIONS,
+    BagTopic,
     Definition,
+    FileSpan,
+    bag_metadata,
     known_definition,
     message_from_frame,
     observations_topic,
     to_cdr,
+    to_yaml,
 )
-from .metadata import NO_MESSAGE_NS, PROFILES, BagTopic, FileSpan, bag_metadata, to_yaml
 
 LIBRARY = 'fluoro_calib_ros'
 CHUNK_SIZE = 768 * 1024  # that of rosbag2 [bytes]
@@ -101,12 +105,7 @@ class BagWriter:
             raise
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: object, error: object, traceback: object) -> None:
         if kind is not None and not self._live:
             self._abandon()
             return
@@ -181,18 +180,8 @@ class BagWriter:
     ) -> None:
         """Write a Frame as TargetObservations.
 
-        Parameters
-        ----------
-        frame : Frame
-        topic : str, optional
-            By default <namespace>/<fluoroscope>/target_observations.
-        namespace : str
-        log_time_ns : int, optional
-            By default the stamp of the frame.
-
-        Raises
-        ------
-        DataError
+        topic: by default <namespace>/<fluoroscope>/target_observations. log_time_ns: by default
+        the stamp of the frame. Raises DataError.
         """
         topic = topic or observations_topic(frame.fluoroscope, namespace)
         time = frame.stamp_ns if log_time_ns is None else log_time_ns

@@ -24,7 +24,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ...errors import DataError, ErrorsAt
-from ...exposures.frame import Frame, points_on_image
+from ...exposures.frame import Frame, Frames, points_on_image
 from ...exposures.phantom import Phantom, first_repeated
 from ..access import make_folder, write_text
 from .content import (
@@ -39,7 +39,7 @@ from .content import (
     in_units,
     refuse_distortion,
 )
-from .text import Row, joined, read_table, require_width
+from .tables import Row, joined, read_table, require_width
 from .xmalab_points import camera_order
 
 NAME = 'bundle'  # of the files written
@@ -267,7 +267,7 @@ class _Numbering:
         return self.camera[fluoroscope] * self._base + exposure
 
 
-def _pho(observations: Mapping[str, Sequence[Frame]], numbering: _Numbering) -> list[str]:
+def _pho(observations: Frames, numbering: _Numbering) -> list[str]:
     lines = []
     for name, frames in observations.items():
         for frame in frames:

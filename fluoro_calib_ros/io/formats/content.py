@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import DataError
-from ...exposures.frame import Frame
+from ...exposures.frame import Frames
 from ...exposures.names import Names
 from ...exposures.phantom import Phantom
 from ..access import PathLike, check_safe_name, make_folder, write_text
@@ -167,7 +167,7 @@ def homogeneous(bodies: Bodies, mm: float = 1.0) -> NDArray[np.float64]:
 class Content:
     """What a file contains; a part that it does not have is None or empty."""
 
-    observations: Mapping[str, Sequence[Frame]] | None = None  #: image points by fluoroscope
+    observations: Frames | None = None  #: image points by fluoroscope
     survey: Phantom | None = None
     cameras: tuple[Camera, ...] = ()
     stations: tuple[Station, ...] = ()

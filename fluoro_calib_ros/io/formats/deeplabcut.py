@@ -22,8 +22,7 @@ from ...exposures.names import Names, number_names
 from ..access import atomic_file, check_safe_name, make_folder
 from ..csv_table import as_text
 from .content import Content, FileSettings, Format, Written
-from .frames_of_points import default_name, named_targets
-from .text import Row, number_text, read_table, require_width
+from .tables import Row, default_name, named_targets, number_text, read_table, require_width
 
 HEADER = ('scorer', 'individuals', 'bodyparts', 'coords')
 SCORER = 'fluoro_calib_ros'

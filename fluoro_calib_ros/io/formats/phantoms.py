@@ -25,7 +25,7 @@ from ...limits import read_limits
 from ..access import read_text, write_text
 from ..csv_table import decimal_point
 from .content import UNITS_MM, Content, FileSettings, Format, Sample, Written, from_units, in_units
-from .text import MAX_SHOWN, Row, joined, separator_of, table_of
+from .tables import MAX_SHOWN, Row, joined, separator_of, table_of
 
 _COLUMN = re.compile(r'"?([a-z]+)(?:[ _]*[\[(]?(mm|cm|m)[\])]?)?"?')
 # Names of columns that mean the same.

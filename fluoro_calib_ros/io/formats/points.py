@@ -1,7 +1,13 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Points in space: files of XMALab, and TRC.
+"""Points in space: files of XMALab, C3D (c3d.org) and TRC.
+
+C3D is read and written with ezc3d: points in mm, rotations, rate and names. The residual of a C3D
+point is in the unit of the points, and negative where there is no point. It is written as the
+standard deviation of the position, the root of the sum of its variances in x, y and z [mm]; 0
+where that is unknown. C3D holds coordinates as float32, and residuals in 255 steps. Poses of
+bodies are the 4 x 4 matrices, body -> world, of the group ROTATION.
 
 XMALab: `[Frame,]name_X,name_Y,name_Z,...`, one row a frame, NaN where not seen. The layout is that
 of `Trial::save3dPoints` of XMALab 2.2.7. The unit is that of the calibration object, and the file
@@ -11,29 +17,252 @@ cut-off frequency to the names, which then belongs to them.
 
 from __future__ import annotations
 
+import io
 import math
+import os
 import re
+import struct
+from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
 from ...errors import DataError
 from ...exposures.names import Names, number_names
-from ..access import atomic_file, read_text
+from ...processes import run_module
+from ..access import atomic_file, read_bytes, read_text, write_bytes
 from ..csv_table import as_text
+from . import c3d_process
 from .content import (
     UNITS_MM,
+    Bodies,
     Content,
     FileSettings,
     Format,
+    Points,
     Sample,
     Written,
     from_units,
+    homogeneous,
     in_units,
     points_without_precision,
 )
-from .frames_of_points import frames_of, labels, named_targets, points_of
-from .text import Row, frame_numbers, joined, number_text, read_frames, require_width, write_frames
+from .tables import (
+    Row,
+    bodies_of,
+    frame_numbers,
+    frames_of,
+    joined,
+    labels,
+    named_targets,
+    number_text,
+    points_of,
+    read_frames,
+    require_width,
+    write_frames,
+)
+
+MISSING = -1.0
+STEPS = 255  # of the byte of a residual, in units of POINT:SCALE
+# Of the process that reads: to start, for each byte of the file, and at most.
+BASE_SECONDS = 10
+SECONDS_OF_BYTE = 1e-6
+MAX_SECONDS = 60
+MAX_FRAME = 65535  # the header counts in uint16
+_MAGIC = 0x50
+_INTEL = 84  # processor type
+BLOCK = 512  # bytes
+ROTATION_TOLERANCE = 1e-4  # float32, and programs that compute in it
+
+
+def _ezc3d() -> Any:
+    try:
+        import ezc3d
+    except ImportError:
+        raise DataError(
+            'C3D files need the package ezc3d, which is not installed: pip install ezc3d'
+        ) from None
+    return ezc3d
+
+
+def read_c3d(path: Path, settings: FileSettings) -> Content:
+    """Read points in space. Raises DataError."""
+    _check_size(path, read_bytes(path))
+    _ezc3d()
+    arrays = _arrays(path)
+    if not arrays['xyz'].size and not arrays['rotations'].size:
+        raise DataError(f'{path}: the file has no points')
+    content = _points(path, arrays, settings) if arrays['xyz'].size else Content()
+    if arrays['rotations'].size:
+        content = replace(content, bodies=_bodies(path, arrays, settings))
+    return content
+
+
+def _points(path: Path, arrays: dict[str, np.ndarray], settings: FileSettings) -> Content:
+    """Return the points of a file. Raises DataError."""
+    names = arrays['labels'].tolist()
+    xyz = arrays['xyz']
+    residual = arrays['residual']
+    mm = _unit(path, str(arrays['unit']), settings)
+    names = names[: xyz.shape[1]]
+    if len(set(names)) < xyz.shape[1]:
+        raise DataError(f'{path}: {xyz.shape[1]} points, but {len(set(names))} different names')
+    ids = number_names(names, settings.names.targets)
+    xyz = np.where((residual < 0)[..., None], np.nan, xyz * mm)
+    xyz[np.isnan(xyz).any(axis=2)] = np.nan
+    sd = np.where(residual > 0, residual * mm, np.nan)
+    points = Points(
+        int(arrays['first']) + np.arange(len(xyz)),
+        np.array([ids[name] for name in names], dtype=np.int64),
+        xyz_mm=xyz,
+        sd_mm=sd,
+        residual_px=np.full(sd.shape, np.nan),
+        rate_hz=float(arrays['rate']),
+    )
+    return Content(points=points, names=Names(named_targets({n: ids[n] for n in names})))
+
+
+def _bodies(path: Path, arrays: dict[str, np.ndarray], settings: FileSettings) -> Bodies:
+    """Return the rotations of a file, of the frames of its points. Raises DataError."""
+    matrices = arrays['rotations']
+    names = arrays['rotation_labels'].tolist()[: matrices.shape[1]]
+    if len(set(names)) < matrices.shape[1]:
+        raise DataError(
+            f'{path}: {matrices.shape[1]} rotations, but {len(set(names))} different names'
+        )
+    mm = _unit(path, str(arrays['rotation_unit'] or arrays['unit']), settings)
+    rotation = matrices[..., :3, :3].copy()
+    translation = matrices[..., :3, 3] * mm
+    missing = np.isnan(matrices).any(axis=(2, 3))
+    turn = np.where(missing[..., None, None], np.eye(3), rotation)
+    error = np.abs(turn @ np.swapaxes(turn, 2, 3) - np.eye(3)).max(axis=(2, 3))
+    wrong = (error > ROTATION_TOLERANCE) | (np.linalg.det(turn) < 0)
+    first = int(arrays['first'])
+    if wrong.any():
+        row, column = np.argwhere(wrong)[0]
+        raise DataError(
+            f'{path}, frame {first + row}: the matrix of {names[column]} is not a rotation'
+        )
+    rotation[missing] = np.nan
+    translation[missing] = np.nan
+    return Bodies(
+        tuple(names),
+        first + np.arange(len(matrices)),
+        rotation,
+        translation,
+        rate_hz=float(arrays['rotation_rate']),
+    )
+
+
+def _unit(path: Path, unit: str, settings: FileSettings) -> float:
+    """Return the mm of the unit of a file. Raises DataError for an unknown one."""
+    mm = UNITS_MM[settings.units] if settings.units else UNITS_MM.get(unit)
+    if mm is None:
+        raise DataError(f'{path}: the unit of the points is {unit!r}, give it with --units')
+    return mm
+
+
+def _check_size(path: Path, content: bytes) -> None:
+    """Raise DataError for a file that is no C3D file or shorter than its header says.
+
+    The header is that of c3d.org, of a file with the numbers of Intel processors.
+    """
+    if content[1:2] != bytes([_MAGIC]):
+        raise DataError(f'{path}: this is not a C3D file')
+    if len(content) < BLOCK:
+        raise DataError(f'{path}: this C3D file is truncated')
+    start = (content[0] - 1) * BLOCK
+    if content[start + 3 : start + 4] != bytes([_INTEL]):
+        return
+    points, analog, first, last = struct.unpack_from('<4H', content, 2)
+    (scale,) = struct.unpack_from('<f', content, 12)
+    (data,) = struct.unpack_from('<H', content, 16)
+    values = (last - first + 1) * (4 * points + analog)
+    if last < MAX_FRAME and (data - 1) * BLOCK + values * (4 if scale < 0 else 2) > len(content):
+        raise DataError(f'{path}: this C3D file is truncated, or its header is damaged')
+
+
+def _arrays(path: Path) -> dict[str, np.ndarray]:
+    """Return the arrays of `c3d_process`. Raises DataError for a file that ezc3d cannot read."""
+    seconds = min(BASE_SECONDS + SECONDS_OF_BYTE * path.stat().st_size, MAX_SECONDS)
+    try:
+        done = run_module(c3d_process.__name__, os.fspath(path.resolve()), timeout_s=seconds)
+    except TimeoutError:
+        raise DataError(f'{path}: this C3D file cannot be read, it is damaged') from None
+    if done.returncode:
+        cause = done.stderr.decode('utf-8', 'replace').strip() if done.returncode == 1 else ''
+        raise DataError(
+            f'{path}: this C3D file cannot be read ({cause or "it is damaged"})'
+        ) from None
+    with np.load(io.BytesIO(done.stdout), allow_pickle=False) as arrays:
+        return dict(arrays)
+
+
+def write_c3d(path: Path, content: Content, settings: FileSettings) -> Written:
+    """Write points in space and poses of bodies. Raises DataError."""
+    frames = frames_of(path, [p for p in (content.points, content.bodies) if p], settings)
+    last = frames.first + frames.count - 1
+    if not 1 <= frames.first <= last <= MAX_FRAME:
+        raise DataError(
+            f'{path}: frames {frames.first} to {last}, but C3D counts from 1 to {MAX_FRAME}'
+        )
+    unit = settings.units or 'mm'
+    file = _ezc3d().c3d()
+    parameters = file['parameters']['POINT']
+    parameters['UNITS']['value'] = [unit]
+    parameters['RATE']['value'] = [frames.rate_hz]
+    file['header']['points']['first_frame'] = frames.first - 1
+    file['data']['points'] = np.zeros((4, 0, frames.count))
+    if content.points is not None:
+        parameters['LABELS']['value'] = labels(content)
+        _add_points(file, points_of(content.points, frames), UNITS_MM[unit])
+    if content.bodies is not None:
+        matrices = homogeneous(bodies_of(content.bodies, frames), UNITS_MM[unit])
+        file.add_parameter('ROTATION', 'LABELS', list(content.bodies.names))
+        file.add_parameter('ROTATION', 'RATE', [frames.rate_hz])
+        file.add_parameter('ROTATION', 'UNITS', [unit])
+        file['data']['rotations'] = matrices.transpose(2, 3, 1, 0)
+    write_bytes(path, _bytes_of(file, path))
+    return Written((str(path),))
+
+
+def _add_points(file: Any, points: Points, mm: float) -> None:
+    """Add points of all frames to a file, in units of mm, with their residuals."""
+    missing = np.asarray(np.isnan(points.xyz_mm).any(axis=2))
+    xyz = np.where(missing[..., None], 0.0, points.xyz_mm / mm)
+    with_one = np.concatenate([xyz, np.ones((*xyz.shape[:2], 1))], axis=2)
+    sd = np.nan_to_num(points.sd_mm / mm)
+    step = max(float(sd.max(initial=0.0)) / STEPS, 1e-6)
+    # The byte of a residual is cut off, not rounded.
+    residual = np.where(missing, MISSING, (np.round(sd / step) + 0.01) * step)
+    file['parameters']['POINT']['SCALE']['value'] = [-step]
+    file['data']['points'] = with_one.transpose(2, 1, 0)
+    file['data']['meta_points']['residuals'] = residual.T[None]
+
+
+def _bytes_of(file: Any, path: Path) -> bytes:
+    """Return a C3D file as bytes; ezc3d writes only to files, and its errors have no type."""
+    with TemporaryDirectory() as folder:
+        temporary = Path(folder) / 'points.c3d'
+        try:
+            file.write(os.fspath(temporary))
+            return temporary.read_bytes()
+        except Exception as error:
+            raise DataError(f'{path}: cannot be written ({error})') from None
+
+
+C3D = Format(
+    'c3d',
+    'C3D',
+    parts=('points', 'bodies'),
+    recognise=lambda sample: sample.suffix == '.c3d' and sample.head[1:2] == bytes([_MAGIC]),
+    read=read_c3d,
+    write=write_c3d,
+    looks_like='a binary file of c3d.org',
+)
+
 
 _COLUMN = re.compile(r'(?P<target>.+)_(?P<axis>[XYZ])', re.IGNORECASE)
 

@@ -17,23 +17,13 @@ from ...errors import DataError
 from ...exposures.frame import Frame
 from ...exposures.names import Names
 from ..access import PathLike, check_regular_file, os_error_reason
-from . import (
-    bundle,
-    c3d,
-    deeplabcut,
-    known_orientation,
-    native,
-    opensim,
-    xmalab_lookup,
-    xmalab_points,
-    xmalab_project,
-)
-from .bodies import AUTOSCOPER, POSES, RIGIDBODY
+from . import bundle, deeplabcut, native, xmalab_points, xmalab_project
+from .bodies import AUTOSCOPER, OPENSIM, POSES, RIGIDBODY
 from .content import PARTS, Content, FileSettings, Format, Sample, Written, has_content
 from .opencv_cameras import ANIPOSE, CAMERA_INFO, OPENCV
 from .phantoms import COORDINATES, FRAMESPEC
-from .points import TRC, XMALAB3D
-from .xmalab_cameras import DLT, MAYACAM1, MAYACAM2
+from .points import C3D, TRC, XMALAB3D
+from .xmalab_cameras import DLT, LOOKUP, MAYACAM1, MAYACAM2
 
 HEAD = 65536  # bytes by which a format is recognised
 LINES = 20
@@ -44,7 +34,7 @@ FORMATS: dict[str, Format] = {
     format_.kind: format_
     for format_ in (
         *native.FORMATS,
-        known_orientation.FORMAT,
+        native.KNOWN_ORIENTATION,
         xmalab_points.FORMAT,
         deeplabcut.FORMAT,
         xmalab_project.FORMAT,
@@ -56,15 +46,15 @@ FORMATS: dict[str, Format] = {
         MAYACAM1,
         DLT,
         AUTOSCOPER,
-        xmalab_lookup.FORMAT,
+        LOOKUP,
         ANIPOSE,
         OPENCV,
         CAMERA_INFO,
         COORDINATES,
         bundle.FORMAT,
-        c3d.FORMAT,
+        C3D,
         TRC,
-        opensim.FORMAT,
+        OPENSIM,
     )
 }
 

@@ -25,8 +25,16 @@ from ...exposures.names import Names, number_names
 from ..access import atomic_file
 from ..csv_table import as_text
 from .content import Content, FileSettings, Format, Written
-from .frames_of_points import MAX_FRAMES, default_name, named_targets
-from .text import Row, frame_numbers, joined, read_frames, require_width
+from .tables import (
+    MAX_FRAMES,
+    Row,
+    default_name,
+    frame_numbers,
+    joined,
+    named_targets,
+    read_frames,
+    require_width,
+)
 
 COLUMN = re.compile(r'(?P<target>.+)_cam(?P<camera>\d+)_(?P<axis>[XY])', re.IGNORECASE)
 _OFFSET = re.compile(r'cam\d+_offset', re.IGNORECASE)

@@ -30,18 +30,9 @@ from ...images.codec import check_size, declared_size
 from ...limits import MAX_MEMBER, read_limits
 from ..access import os_error_reason
 from ..documents import parse_xml
-from .content import (
-    Camera,
-    Content,
-    FileSettings,
-    Format,
-    Station,
-    check_matrix,
-    check_rotation,
-)
-from .frames_of_points import default_name, named_targets
+from .content import Camera, Content, FileSettings, Format, Station, check_matrix, check_rotation
 from .phantoms import content_of
-from .text import Row, table_of
+from .tables import Row, default_name, named_targets, table_of
 
 _SEEN = 0  # a marker is seen where its status is above
 _INLIER = 1

@@ -1,16 +1,310 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The dashboard as a program: fluoro-calib watch."""
+"""The dashboard as a program, fluoro-calib watch: listens to nodes and calls their services."""
 
 from __future__ import annotations
 
 import sys
+import threading
 import time
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from functools import partial
+from typing import Any
 
-from .client import SessionClient, session_client
-from .view import Dashboard, session_text
+import rclpy
+from action_msgs.msg import GoalStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from fluoro_calib_msgs.action import SelfCalibrate
+from fluoro_calib_msgs.msg import CalibrationStatus
+from fluoro_calib_msgs.srv import Capture, Orient, Reset
+from rclpy.action import ActionClient
+from rclpy.context import Context
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
+
+from ..messages.self_calibration import feedback_text
+from .view import (
+    CALIBRATE,
+    CALIBRATE_FAST,
+    CANCEL,
+    CAPTURE,
+    LEVELS,
+    ORIENT,
+    RESET,
+    Dashboard,
+    FluoroscopeState,
+    NodeState,
+    RateMeter,
+    SessionState,
+    session_text,
+)
+
+NODES = ('calibration_node', 'correction_node', 'reconstruction_node', 'image_node')
+SILENT_S = 5.0  # a node reports once a second
+ORIENT_FRAMES = 10
+LOG_LINES = 50
+STATES = {
+    CalibrationStatus.COLLECTING: 'collecting',
+    CalibrationStatus.CALIBRATING: 'calibrating',
+    CalibrationStatus.CALIBRATED: 'calibrated',
+}
+
+
+class SessionClient(Node):
+    """Listens to the nodes of a namespace; implements the Session of the view.
+
+    Callbacks run in the executor's thread, state() and request() in that of the view: a lock keeps
+    them apart.
+    """
+
+    def __init__(self, namespace: str | None = None, context: Context | None = None) -> None:
+        super().__init__('watch', namespace=namespace, context=context)
+        self._lock = threading.RLock()
+        self._fluoroscopes: dict[str, FluoroscopeState] = {}
+        self._followed: set[str] = set()
+        self._functions: dict[str, dict[str, NodeState]] = {}  # by node, then by function
+        self._heard_at: dict[str, float] = {}
+        self._meters: dict[tuple[str, str], RateMeter] = {}
+        self._log: deque[str] = deque(maxlen=LOG_LINES)
+        self._goal: Any = None
+        self._session = SessionState(self.get_namespace())
+        self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 50)
+        self._callers = {
+            CAPTURE: self.create_client(Capture, 'capture'),
+            ORIENT: self.create_client(Orient, 'orient'),
+            RESET: self.create_client(Reset, 'reset'),
+        }
+        self._action = ActionClient(self, SelfCalibrate, 'self_calibrate')
+
+    # -- the view's thread
+
+    def state(self) -> SessionState:
+        """Return the present state."""
+        with self._lock:
+            return replace(
+                self._session,
+                fluoroscopes=tuple(v for _, v in sorted(self._fluoroscopes.items())),
+                nodes=tuple(self._node_states()),
+                log=tuple(self._log),
+            )
+
+    def request(self, action: str) -> None:
+        """Start one of REQUESTS; the answer comes into the log."""
+        with self._lock:
+            if action in (CALIBRATE, CALIBRATE_FAST):
+                self._calibrate(validate=action == CALIBRATE)
+            elif action == CANCEL:
+                self._cancel()
+            else:
+                self._call(action)
+
+    def _call(self, action: str) -> None:
+        client = self._callers[action]
+        if not client.service_is_ready():
+            self._say(f'{action}: no calibration node answers in {self.get_namespace()}')
+            return
+        requests = {
+            CAPTURE: Capture.Request,
+            ORIENT: lambda: Orient.Request(frames=ORIENT_FRAMES),
+            RESET: Reset.Request,
+        }
+        self._say(f'{action} ...')
+        future = client.call_async(requests[action]())
+        future.add_done_callback(partial(self._on_answer, action))
+
+    def _calibrate(self, validate: bool) -> None:
+        if not self._action.server_is_ready():
+            self._say(f'calibrate: no calibration node answers in {self.get_namespace()}')
+            return
+        if self._session.job:
+            self._say(f'calibrate: {self._session.job} already')
+            return
+        self._set(job='calibrating')
+        self._say('calibrate, with verdict ...' if validate else 'calibrate, without verdict ...')
+        sent = self._action.send_goal_async(
+            SelfCalibrate.Goal(validate=validate),
+            feedback_callback=lambda m: self._set(job=feedback_text(m.feedback)),
+        )
+        sent.add_done_callback(self._on_goal)
+
+    def _cancel(self) -> None:
+        if self._goal is None:
+            self._say('cancel: nothing runs that was started here')
+            return
+        self._goal.cancel_goal_async()
+        self._say('cancel ...')
+
+    # -- the executor's thread
+
+    def _on_answer(self, action: str, future: Future) -> None:
+        answer = future.result()
+        failed = '' if answer.success else ' failed'
+        self._say(f'{action}{failed}: {answer.message}')
+
+    def _on_goal(self, future: Future) -> None:
+        handle = future.result()
+        with self._lock:
+            self._goal = handle
+        handle.get_result_async().add_done_callback(self._on_result)
+
+    def _on_result(self, future: Future) -> None:
+        answer = future.result()
+        result = answer.result
+        with self._lock:
+            self._goal = None
+            self._set(job='')
+            if answer.status == GoalStatus.STATUS_SUCCEEDED:
+                self._set(verdict=result.verdict, findings=tuple(result.findings))
+                self._say(f'calibrate: {result.message}')
+            else:
+                self._say(f'calibrate failed: {result.message}')
+
+    def _on_status(self, message: CalibrationStatus) -> None:
+        rmse = (message.rmse_u, message.rmse_v)
+        with self._lock:
+            self._update(
+                message.fluoroscope,
+                state=STATES.get(message.state, ''),
+                exposures=message.exposures,
+                coverage=message.coverage,
+                rejected=message.frames_rejected,
+                iteration=message.iteration,
+                rmse_px=rmse if message.iteration else (float('nan'),) * 2,
+                calibration_id=message.calibration_id,
+                age_s=message.calibration_age,
+            )
+
+    def _on_diagnostics(self, array: DiagnosticArray) -> None:
+        now = time.monotonic()
+        stamp_s = array.header.stamp.sec + 1e-9 * array.header.stamp.nanosec
+        prefix = self.get_namespace().rstrip('/') + '/'
+        with self._lock:
+            for status in array.status:
+                node, _, function = status.name.removeprefix(prefix).partition(': ')
+                if not status.name.startswith(prefix) or node not in NODES:
+                    continue
+                level = LEVELS[min(int.from_bytes(status.level, 'little'), 2)]
+                self._heard_at[node] = now
+                functions = self._functions.setdefault(node, {})
+                functions[function] = NodeState(function, level, status.message)
+                values = {value.key: value.value for value in status.values}
+                self._read(node, function, values, stamp_s, status)
+
+    def _read(
+        self,
+        node: str,
+        function: str,
+        values: dict[str, str],
+        stamp_s: float,
+        status: DiagnosticStatus,
+    ) -> None:
+        """Take over the values of a status."""
+        if node == 'calibration_node':
+            self._follow(function)
+            self._update(
+                function,
+                frames_hz=self._rate(node, function, values.get('frames received'), stamp_s),
+                next_pose=values.get('next pose', ''),
+                ready=values.get('ready') == 'True',
+            )
+        elif node == 'correction_node':
+            self._update(
+                function,
+                corrected_hz=self._rate(node, function, values.get('frames corrected'), stamp_s),
+                latency_p50_ms=_number(values.get('latency p50 [ms]')),
+                latency_p99_ms=_number(values.get('latency p99 [ms]')),
+            )
+        elif function == 'reconstruction':
+            count = values.get('exposures reconstructed')
+            self._set(
+                points_hz=self._rate(node, function, count, stamp_s),
+                points_latency_ms=(
+                    _number(values.get('latency p50 [ms]')),
+                    _number(values.get('latency p99 [ms]')),
+                ),
+                orientation=values.get('source of the orientation', ''),
+            )
+        elif function == 'drift':
+            level = LEVELS[min(int.from_bytes(status.level, 'little'), 2)]
+            self._set(drift_level=level, drift=status.message)
+
+    def _follow(self, name: str) -> None:
+        """Subscribe to the status of a fluoroscope, once."""
+        if name not in self._followed:
+            self._followed.add(name)
+            self.create_subscription(
+                CalibrationStatus, f'{name}/calibration_status', self._on_status, 10
+            )
+
+    def _rate(self, node: str, function: str, count: str | None, stamp_s: float) -> float:
+        meter = self._meters.setdefault((node, function), RateMeter())
+        if count is not None:
+            meter.add(stamp_s, int(count))
+        return meter.hz
+
+    def _update(self, name: str, **changes: Any) -> None:
+        known = self._fluoroscopes.get(name, FluoroscopeState(name))
+        self._fluoroscopes[name] = replace(known, **changes)
+
+    def _set(self, **changes: Any) -> None:
+        with self._lock:
+            self._session = replace(self._session, **changes)
+
+    def _say(self, text: str) -> None:
+        with self._lock:
+            self._log.append(f'{time.strftime("%H:%M:%S")}  {text}')
+
+    def _node_states(self) -> Iterator[NodeState]:
+        """Yield the worst level of every node, and its message."""
+        now = time.monotonic()
+        for node, functions in sorted(self._functions.items()):
+            silent_s = now - self._heard_at[node]
+            if silent_s > SILENT_S:
+                yield NodeState(node, 'silent', f'nothing heard for {silent_s:.0f} s')
+                continue
+            worst = max(functions.values(), key=lambda f: LEVELS.index(f.level))
+            several = len(functions) > 1 and worst.level != 'ok'
+            message = f'{worst.name}: {worst.message}' if several else worst.message
+            yield NodeState(node, worst.level, message)
+
+
+def _number(text: str | None) -> float:
+    with suppress(TypeError, ValueError):
+        return float(text)  # type: ignore[arg-type]
+    return float('nan')
+
+
+@contextmanager
+def session_client(arguments: list[str]) -> Iterator[SessionClient]:
+    """Run a SessionClient in a thread. arguments: of ROS, such as a namespace."""
+    rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+    client = SessionClient()
+    executor = SingleThreadedExecutor()
+    executor.add_node(client)
+    thread = threading.Thread(target=_until_shutdown(executor.spin), daemon=True)
+    thread.start()
+    try:
+        yield client
+    finally:
+        executor.shutdown()
+        thread.join(2.0)
+        client.destroy_node()
+        rclpy.try_shutdown()
+
+
+def _until_shutdown(spin: Callable[[], None]) -> Callable[[], None]:
+    def run() -> None:
+        with suppress(ExternalShutdownException):
+            spin()
+
+    return run
+
 
 ONCE = '--once'
 FIRST_REPORT_S = 5.0  # nodes report once a second, and have to be discovered first

@@ -23,7 +23,7 @@ from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import Marker, MarkerArray
 
 from ...bodies import body as of_bodies
-from ...bodies.body import Body, PoseStatus
+from ...bodies.body import AXIS_MM, Body, PoseStatus
 from ...bodies.joints import JointMotion, JointStatus
 from ...photogrammetry.rig_orientation import RigOrientation
 from ...photogrammetry.rotations import quaternion_from_matrix
@@ -45,38 +45,23 @@ _TO_METRES = np.repeat([1e-3, 1.0], 3)  # position, then rotation
 _SCALE = _TO_METRES[:, None] * _TO_METRES
 _OF_JOINT = _SCALE[::-1, ::-1]  # angles, then translations
 AXES = [ColorRGBA(r=r, g=g, b=b, a=1.0) for r, g, b in np.eye(3).tolist()]  # as RViz draws them
-AXIS_MM = 20.0  # length of an axis, about the size of a cluster of markers in a bone
 MARKER_MM = 2.0
 
 
 class BodiesContent(NamedTuple):
-    """Poses of B bodies and motion of joints in one exposure.
+    """Poses of B bodies and motion of joints in one exposure."""
 
-    Attributes
-    ----------
-    stamp_ns, frame_number : int
-        Those of the exposure.
-    orientation_id : str
-    orientation : RigOrientation
-        Orientation with which the poses were found.
-    bodies : sequence of Body
-    poses : sequence of BodyPoses
-        Of this exposure.
-    twist, twist_covariance : np.ndarray
-        (B, 6), (B, 6, 6): see `bodies.tracking.twists_of`.
-    joints : sequence of JointMotion
-        Of this exposure.
-    """
-
+    #: those of the exposure
     stamp_ns: int
     frame_number: int
     orientation_id: str
-    orientation: RigOrientation
+    orientation: RigOrientation  #: orientation with which the poses were found
     bodies: Sequence[Body]
-    poses: Sequence[of_bodies.BodyPoses]
+    poses: Sequence[of_bodies.BodyPoses]  #: of this exposure
+    #: (B, 6), (B, 6, 6): see `bodies.tracking.twists_of`
     twist: NDArray[np.float64]
     twist_covariance: NDArray[np.float64]
-    joints: Sequence[JointMotion]
+    joints: Sequence[JointMotion]  #: of this exposure
 
     def header(self, frame_id: str = '') -> Header:
         """Return the header, by default with the frame of the orientation."""

@@ -17,11 +17,16 @@ from visualization_msgs.msg import Marker, MarkerArray
 from ...photogrammetry.rig_orientation import RigOrientation
 from ...photogrammetry.rotations import quaternion_from_matrix
 from ...reconstruction.intersection import IntersectedPoints
-from .cdr import ENCAPSULATION, TIME, UINT32, columns_bytes, string_bytes, string_sequence_bytes
 from .observations import (
+    ENCAPSULATION,
     NS_PER_S,
+    TIME,
+    UINT32,
+    columns_bytes,
     float64_field,
     stamp_from_nanoseconds,
+    string_bytes,
+    string_sequence_bytes,
     uint8_field,
     uint32_field,
 )
@@ -43,27 +48,15 @@ _SYMMETRIC = (
 
 
 class PointsContent(NamedTuple):
-    """Content of a ReconstructedPoints message.
+    """Content of a ReconstructedPoints message."""
 
-    Attributes
-    ----------
-    stamp_ns, frame_number : int
-        Those of the exposure.
-    orientation_id : str
-    orientation : RigOrientation
-        Orientation with which the points were intersected.
-    target_id : np.ndarray
-        (n,)
-    points : IntersectedPoints
-        n points.
-    """
-
+    #: those of the exposure
     stamp_ns: int
     frame_number: int
     orientation_id: str
-    orientation: RigOrientation
-    target_id: np.ndarray
-    points: IntersectedPoints
+    orientation: RigOrientation  #: orientation with which the points were intersected
+    target_id: np.ndarray  #: (n,)
+    points: IntersectedPoints  #: n points
 
 
 def message_from_points(content: PointsContent) -> ReconstructedPoints:
@@ -119,26 +112,13 @@ def covariance_of(message: ReconstructedPoints) -> np.ndarray:
 
 
 class GoodPoints(NamedTuple):
-    """The intersected points of a ReconstructedPoints message.
-
-    Attributes
-    ----------
-    frame_number : int
-    total : int
-        Number of all points of the message, the ones that failed among them.
-    target_id : np.ndarray
-        (n,)
-    xyz_mm : np.ndarray
-        (n, 3)
-    covariance : np.ndarray
-        (n, 3, 3) [mm^2]
-    """
+    """The intersected points of a ReconstructedPoints message."""
 
     frame_number: int
-    total: int
-    target_id: np.ndarray
-    xyz_mm: np.ndarray
-    covariance: np.ndarray
+    total: int  #: number of all points of the message, the ones that failed among them
+    target_id: np.ndarray  #: (n,)
+    xyz_mm: np.ndarray  #: (n, 3)
+    covariance: np.ndarray  #: (n, 3, 3) [mm^2]
 
 
 def good_points_of(message: ReconstructedPoints) -> GoodPoints:

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -13,7 +12,7 @@ import numpy as np
 from fluoro_calib_msgs.action import SelfCalibrate
 
 from ...checks.check import Validation
-from ...correction.fluoroscope_calibration import FluoroscopeCalibration
+from ...correction.fluoroscope_calibration import Calibrations
 from ...estimation.options import CalibrationOptions
 from ...estimation.result import CalibrationResult
 from ...estimation.rounds import Round
@@ -63,9 +62,7 @@ def feedback_text(feedback: SelfCalibrate.Feedback) -> str:
     )
 
 
-def fill_result(
-    result: Result, job: CalibrationResult, calibrations: Mapping[str, FluoroscopeCalibration]
-) -> None:
+def fill_result(result: Result, job: CalibrationResult, calibrations: Calibrations) -> None:
     """Fill in the result of a calibration that succeeded."""
     result.success = True
     result.seconds = job.seconds

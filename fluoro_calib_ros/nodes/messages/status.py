@@ -13,7 +13,7 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from fluoro_calib_msgs.msg import CalibrationStatus, DriftStatus
 
-from ...checks.drift_options import DriftState
+from ...checks.drift_charts import DriftState
 from ...correction.fluoroscope_calibration import FluoroscopeCalibration
 from ...photogrammetry.rig_orientation import RigOrientation
 from .observations import stamp_from_nanoseconds
@@ -52,28 +52,17 @@ def message_from_drift_state(
 
 @dataclass(frozen=True)
 class Collected:
-    """What is collected of one fluoroscope.
+    """What is collected of one fluoroscope."""
 
-    Attributes
-    ----------
-    received, rejected, unpaired : int
-        Number of frames.
-    exposures, observations : int
-        Collected exposures, and the image points in them.
-    coverage : float
-        Covered part of the image, 0 to 1.
-    covered : ndarray or None
-        Whether cells (rows, columns) of the image are covered; None before the first exposure.
-    image_size : tuple of int or None
-    readiness : Readiness
-    """
-
+    #: number of frames
     received: int
     rejected: int
     unpaired: int
+    #: collected exposures, and the image points in them
     exposures: int
     observations: int
-    coverage: float
+    coverage: float  #: covered part of the image, 0 to 1
+    #: whether cells (rows, columns) of the image are covered; None before the first exposure
     covered: np.ndarray | None
     image_size: tuple[int, int] | None
     readiness: Readiness
@@ -93,23 +82,12 @@ class Collected:
 
 @dataclass(frozen=True)
 class FluoroscopeProgress:
-    """What the calibration node knows of one fluoroscope.
-
-    Attributes
-    ----------
-    fluoroscope : str
-    collected : Collected
-    is_calibrating : bool
-    last_round : Round or None
-        Last round of the running or last self-calibration.
-    calibration : FluoroscopeCalibration or None
-    calibration_age_s : float
-    """
+    """What the calibration node knows of one fluoroscope."""
 
     fluoroscope: str
     collected: Collected
     is_calibrating: bool = False
-    last_round: Round | None = None
+    last_round: Round | None = None  #: last round of the running or last self-calibration
     calibration: FluoroscopeCalibration | None = None
     calibration_age_s: float = math.nan
 

@@ -1,31 +1,43 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Managed nodes, and what the nodes that work on streams have in common."""
+"""Managed nodes, their services, and what the nodes that work on streams have in common."""
 
 from __future__ import annotations
 
 import inspect
+import threading
 import traceback
-from collections.abc import Callable, Iterable
-from contextlib import ExitStack
-from typing import Any, TypeVar
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any, NamedTuple, TypeVar
 
 import rclpy
 from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from rclpy.callback_groups import CallbackGroup
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.lifecycle.node import LifecycleState
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.service import Service
+from rclpy.task import Future
 
 from ...limits import MAX_TEXT
-from .diagnostics import DiagnosticsPublisher, RecentCounts, RefusalLog, Status
-from .logging import USER_ERRORS, RateLimitedLogger, StartError, Trace, one_line
+from .diagnostics import (
+    USER_ERRORS,
+    DiagnosticsPublisher,
+    RateLimitedLogger,
+    RecentCounts,
+    RefusalLog,
+    StartError,
+    Status,
+    Trace,
+    one_line,
+)
 from .parameters import ParameterNode
-from .streams import FaultHandlers, StreamReader, best_effort_message, qos_overrides
+from .streams import FaultHandlers, StreamReader, best_effort_message, qos_overrides, services_qos
 
 # Services that answer a request that cannot be handled, instead of ending the node.
 #
@@ -235,16 +247,8 @@ class StreamNode(ManagedNode):
     ) -> None:
         """Subscribe to a slow topic, while configured; an exception in the callback is logged.
 
-        Parameters
-        ----------
-        kind : type
-            Message type.
-        topic : str
-        callback : callable
-            Called with every message.
-        qos : QoSProfile
-        refusals : RefusalLog
-            Counts the messages at which the callback raises.
+        kind: message type. callback: called with every message. refusals: counts the messages at
+        which the callback raises.
         """
 
         def guarded(message: Any) -> None:
@@ -325,3 +329,80 @@ class StreamNode(ManagedNode):
         self._resources.close()
         self.recent = RecentCounts()
         self.reset()
+
+
+class ServiceEntry(NamedTuple):
+    """A service: name, type, and a handler (request, response) -> response, also a coroutine."""
+
+    name: str
+    kind: type
+    handler: Callable[[Any, Any], Any]
+
+
+def create_services(
+    node: Node, table: Iterable[ServiceEntry], group: CallbackGroup | None = None
+) -> list[Service]:
+    """Make the services of a table; one whose handler raises says so in its answer.
+
+    Handlers that are coroutines need a reentrant group, or they keep others from being answered.
+    """
+    services = [
+        node.create_service(
+            entry.kind,
+            entry.name,
+            entry.handler,
+            qos_profile=services_qos(),
+            callback_group=group,
+        )
+        for entry in table
+    ]
+    guard_services(node, services)
+    return services
+
+
+class Requests:
+    """Counts the requests whose answers wait for something."""
+
+    def __init__(self) -> None:
+        self.waiting = 0
+
+    @contextmanager
+    def one(self) -> Iterator[None]:
+        """Count a request while it is being answered."""
+        self.waiting += 1
+        try:
+            yield
+        finally:
+            self.waiting -= 1
+
+
+async def within(
+    node: ParameterNode, timeout_s: float, future: Future, give_up: Callable[[], object]
+) -> Any:
+    """Return the result of a Future; give_up() is called when the time is up and has to set it."""
+    timer = node.create_timer(timeout_s, give_up)
+    result = await future
+    node.destroy_timer(timer)
+    return result
+
+
+def in_thread(node: Node, function: Callable[[], Any]) -> tuple[Future, threading.Thread]:
+    """Run a function in a thread of its own; returns the Future of its result, and the thread."""
+    done = Future()
+
+    def work() -> None:
+        try:
+            done.set_result(function())
+        except Exception as error:  # for the one who awaits it
+            done.set_exception(error)
+        wake(node)
+
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    return done, thread
+
+
+def wake(node: Node) -> None:
+    """Make the executor of a node continue what awaits a result of another thread."""
+    if node.executor is not None:
+        node.executor.wake()

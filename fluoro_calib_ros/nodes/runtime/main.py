@@ -28,8 +28,8 @@ from rclpy.signals import SignalHandlerOptions
 
 from ...errors import DataError
 from ...io.access import check_regular_file
+from .diagnostics import USER_ERRORS, StartError, log_line, one_line
 from .lifecycle import guard_services
-from .logging import USER_ERRORS, StartError, log_line, one_line
 from .parameters import asks_for_help, help_text, unknown_parameters
 
 MAX_FAILURES = 100  # of callbacks within a second: nothing else works

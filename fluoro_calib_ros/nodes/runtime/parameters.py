@@ -35,7 +35,7 @@ from ...errors import DataError, printable, shortened
 from ...io.documents import read_yaml
 from ...limits import MAX_TEXT, ReadLimits, use_read_limits
 from ...options import Option, declared, option
-from .logging import PrintableLogger, StartError
+from .diagnostics import PrintableLogger, StartError
 
 MAX_TIMEOUT_S = 86400.0  # longest time that a request may ask a node to wait
 MAX_INTEGER = 2**63 - 1
@@ -140,21 +140,13 @@ class ParameterNode(Node):
 
 @dataclass(frozen=True)
 class ParameterGroup(Generic[T]):
-    """Options of a dataclass that are parameters of a node.
+    """Options of a dataclass that are parameters of a node."""
 
-    Attributes
-    ----------
-    options : type
-        Frozen dataclass that declares them.
-    names : mapping of str to str
-        Parameter names by option name; empty: all options under their own names.
-    settable : sequence of str
-        Names of the parameters that may change while the node runs; see follow(). All others are
-        read-only.
-    """
-
-    options: type[T]
+    options: type[T]  #: frozen dataclass that declares them
+    #: parameter names by option name; empty: all options under their own names
     names: Mapping[str, str] = field(default_factory=dict)
+    #: names of the parameters that may change while the node runs; see follow(); all others are
+    #: read-only
     settable: Sequence[str] = ()
 
     @property

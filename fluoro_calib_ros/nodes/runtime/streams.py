@@ -54,7 +54,7 @@ from rclpy.type_support import check_for_type_support
 
 from ...errors import DataError
 from ...io.access import read_text
-from ...io.bags.definitions import SEPARATOR, Definition, fields_of, known_definition, nested_types
+from ...io.bags.metadata import SEPARATOR, Definition, fields_of, known_definition, nested_types
 from ...limits import read_limits
 
 # Finding topics, and waiting for their other end.
@@ -317,28 +317,19 @@ class _Route(NamedTuple):
 
 @dataclass(frozen=True)
 class FaultHandlers:
-    """What a StreamReader calls when something goes wrong.
+    """What a StreamReader calls when something goes wrong."""
 
-    Attributes
-    ----------
-    undecodable : callable
-        Called with the topic of a message that cannot be decoded.
-    callback_error : callable
-        Called with topic and exception where a callback raises: that message is lost.
-    reader_error : callable
-        Called with a traceback where the thread itself fails and ends.
-    too_large : callable or None
-        Called with the topic of a message that is too large, and its size [bytes]; None:
-        undecodable is called.
-    overrun : callable or None
-        Called with a topic and the number of its messages that were lost before they were taken:
-        by their sequence numbers, where the topic has one publisher and is not latched.
-    """
-
+    #: called with the topic of a message that cannot be decoded
     undecodable: Callable[[str], None]
+    #: called with topic and exception where a callback raises: that message is lost
     callback_error: Callable[[str, Exception], None]
+    #: called with a traceback where the thread itself fails and ends
     reader_error: Callable[[str], None]
+    #: called with the topic of a message that is too large, and its size [bytes]; None:
+    #: undecodable is called
     too_large: Callable[[str, int], None] | None = None
+    #: called with a topic and the number of its messages that were lost before they were taken: by
+    #: their sequence numbers, where the topic has one publisher and is not latched
     overrun: Callable[[str, int], None] | None = None
 
 

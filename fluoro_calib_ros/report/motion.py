@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Pictures of motion: joints and bodies over time with bands of two sd, and points in space."""
+"""Pictures and the report of motion: joints and bodies over time, points in space."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -17,7 +18,8 @@ from ..bodies.joints import JointMotion
 from ..photogrammetry.rotations import vector_from_matrix
 from ..reconstruction.intersection import OK
 from ..reconstruction.reconstruct import ReconstructedFrame
-from .style import BLUE, GREY, RED, STYLE, new_figure
+from .figures import BLUE, GREY, RED, STYLE, new_figure
+from .html import page, png_text
 
 BAND = 2.0  # standard deviations, 95 %
 FILLED = 0.15  # opacity of the times without a marker
@@ -182,3 +184,27 @@ def _draw_gaps(axes: Axes, when: np.ndarray, found: np.ndarray, labels: Sequence
     if len(labels) <= MAX_NAMED:
         axes.set_yticks(rows, [f'{name}: {share:.0f} %' for name, share in zip(labels, shares)])
     axes.set(title='found', ylim=(len(labels) - 0.5, -0.5))
+
+
+def bodies_html(
+    title: str,
+    poses: Sequence[BodyPoses],
+    joints: Sequence[JointMotion],
+    summary: Mapping[str, Any],
+    findings: Sequence[str],
+) -> str:
+    """Return the report as HTML: pictures inside, no reference to anything outside.
+
+    summary: as BodiesOutcome gives it.
+    """
+    figures = [(f'joint {one.joint.name}', joint_figure(one)) for one in joints]
+    figures.append(('paths in space', paths_figure(poses)))
+    figures += [(f'body {one.body}', body_figure(one)) for one in poses]
+    return page(
+        'bodies.html',
+        title=title,
+        exposures=len(poses[0].number),
+        findings=findings,
+        summary=summary,
+        pictures=[(name, png_text(figure)) for name, figure in figures],
+    )

@@ -1,21 +1,27 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Recordings of Phantom high-speed cameras: cine files, uncompressed and grey.
+"""Recordings of other devices: radiographs in DICOM files, cine files of Phantom cameras.
 
-The layout is that of the manufacturer's description "Cine file format" (Vision Research), little
-endian throughout: a file header (44 bytes), a BITMAPINFOHEADER (40 bytes), a SETUP with the frame
-rate, and a table of 64-bit offsets, one an image. In front of the pixels of an image are an
-annotation, whose size includes its own eight bytes, and the size of the pixels. Rows of 8 and 16
-bits are stored from the bottom, as in a BMP file, unless the height is negative; packed rows of 10
-bits from the top. Grey values are returned as they are stored: packed ones are on the camera's
-curve, not linear.
+Radiographs and cine loops in DICOM files: grey, uncompressed or with run lengths (RLE). pydicom
+(extra dicom) reads and decodes them frame by frame; sizes are checked by the header first. Grey
+values rise with brightness: MONOCHROME1, in which they fall, is inverted (PS3.3, C.7.6.3.1.2).
+Signed values are shifted to begin at zero.
+
+Recordings of Phantom high-speed cameras: cine files, uncompressed and grey. The layout is that of
+the manufacturer's description "Cine file format" (Vision Research), little endian throughout: a
+file header (44 bytes), a BITMAPINFOHEADER (40 bytes), a SETUP with the frame rate, and a table of
+64-bit offsets, one an image. In front of the pixels of an image are an annotation, whose size
+includes its own eight bytes, and the size of the pixels. Rows of 8 and 16 bits are stored from the
+bottom, as in a BMP file, unless the height is negative; packed rows of 10 bits from the top. Grey
+values are returned as they are stored: packed ones are on the camera's curve, not linear.
 """
 
 from __future__ import annotations
 
 import os
 import struct
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,13 +34,141 @@ from ..errors import DataError, ErrorsAt
 from ..images.codec import check_size
 from .access import check_regular_file, os_error_reason
 
+# Transfer syntaxes (PS3.5, annex A) that are read: implicit and explicit little endian, explicit
+# big endian, RLE. A deflated file could be of any size when it is decompressed.
+NATIVE = ('1.2.840.10008.1.2', '1.2.840.10008.1.2.1', '1.2.840.10008.1.2.2')
+RUN_LENGTHS = '1.2.840.10008.1.2.5'
+DICOM_GREY = ('MONOCHROME1', 'MONOCHROME2')
+
+
+@dataclass(frozen=True)
+class DicomHeader:
+    """What the header of a DICOM file says of its images."""
+
+    count: int  #: number of frames
+    bits: int  #: used of a pixel
+    #: whether grey values can be negative, and whether they fall with brightness
+    signed: bool
+    inverted: bool
+    shape: tuple[int, int]  #: rows and columns
+    frame_rate: float | None  #: [Hz]
+
+
+def read_dicom_header(path: Path) -> DicomHeader:
+    """Read the header of a DICOM file.
+
+    Raises DataError for a file that cannot be read, is no DICOM file, is cut off, or holds what is
+    no grey image of 8 or 16 bits without compression or with run lengths.
+    """
+    pydicom = _pydicom()
+    check_regular_file(path)
+    if not os.path.isfile(path):
+        raise DataError('there is no such file', at=path)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter('ignore')
+            dataset = pydicom.dcmread(path, stop_before_pixels=True)
+            header = _dicom_header(dataset, os.path.getsize(path))
+    except DataError as error:
+        raise error.at(path) from None
+    except OSError as error:
+        raise DataError(f'cannot be read ({error.strerror or error})', at=path) from None
+    except Exception:  # pydicom raises what its parsing stumbles over
+        raise DataError('this is no DICOM file, or it is damaged', at=path) from None
+    return header
+
+
+def read_dicom_images(path: Path, header: DicomHeader) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield place and image (h, w) of uint8 or uint16, one after the other. Raises DataError."""
+    frames = _pydicom().pixels.iter_pixels(path, raw=True)
+    for number in range(1, header.count + 1):
+        where = f'{path}, frame {number}' if header.count > 1 else str(path)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter('ignore')
+                frame = next(frames)
+            image = _grey(np.asarray(frame), header)
+        except Exception:  # StopIteration, and what the decoders raise
+            raise DataError('the frame is damaged or cut off', at=where) from None
+        yield where, image
+
+
+def _pydicom() -> Any:
+    """Import pydicom. Raises DataError where it is not installed."""
+    try:
+        import pydicom
+        import pydicom.pixels
+
+        return pydicom
+    except ImportError:
+        raise DataError(
+            'DICOM files need pydicom 3, which is not installed: pip install "pydicom>=3"'
+        ) from None
+
+
+def _dicom_header(dataset: Any, file_size: int) -> DicomHeader:
+    """Return the header of a data set. Raises DataError."""
+    syntax = dataset.file_meta.TransferSyntaxUID
+    if syntax not in (*NATIVE, RUN_LENGTHS):
+        raise DataError(
+            f'the images are compressed ({syntax.name}); save them uncompressed or with run '
+            'lengths (RLE)'
+        )
+    rows, columns = int(dataset.get('Rows') or 0), int(dataset.get('Columns') or 0)
+    count = int(dataset.get('NumberOfFrames') or 1)
+    if not rows or not columns or count < 1:
+        raise DataError('the DICOM file contains no image')
+    check_size(columns, rows)
+    allocated, stored = int(dataset.BitsAllocated), int(dataset.BitsStored)
+    kind = str(dataset.PhotometricInterpretation)
+    if int(dataset.get('SamplesPerPixel') or 1) != 1 or kind not in DICOM_GREY:
+        raise DataError(f'the images are not grey ({kind})')
+    if allocated not in (8, 16) or not 1 <= stored <= allocated or dataset.HighBit != stored - 1:
+        raise DataError(
+            f'pixels of {stored} bits in {allocated}, up to bit {dataset.HighBit}, are not read, '
+            'only 8 and 16 bits with the lowest ones used'
+        )
+    if syntax in NATIVE and rows * columns * count * allocated // 8 > file_size:
+        raise DataError(f'the file is cut off: it claims {count} frames of {columns} x {rows} px')
+    return DicomHeader(
+        count,
+        stored,
+        signed=bool(dataset.PixelRepresentation),
+        inverted=kind == 'MONOCHROME1',
+        shape=(rows, columns),
+        frame_rate=_dicom_rate(dataset),
+    )
+
+
+def _dicom_rate(dataset: Any) -> float | None:
+    """Return the frame rate [Hz], None where it is not stated."""
+    interval_ms = float(dataset.get('FrameTime') or 0)
+    rate = 1e3 / interval_ms if interval_ms > 0 else float(dataset.get('CineRate') or 0)
+    rate = rate or float(dataset.get('RecommendedDisplayFrameRate') or 0)
+    return rate if 0 < rate < 1e6 else None
+
+
+def _grey(frame: np.ndarray, header: DicomHeader) -> np.ndarray:
+    """Return grey values that begin at 0 and rise with brightness."""
+    if frame.shape != header.shape:
+        raise ValueError
+    full = 2**header.bits - 1
+    values = frame.astype(np.int32)
+    if header.signed:
+        values += (full + 1) // 2
+    values &= full  # unused bits may hold an overlay
+    if header.inverted:
+        values = full - values
+    return values.astype(np.uint8 if header.bits <= 8 else np.uint16)
+
+
 SIGNATURE = b'CI'
 FILE_HEADER = struct.Struct('<2sHHHiIiIIIIQ')
 BITMAP_HEADER = struct.Struct('<IiiHHIIiiII')
 SETUP_MARK = 140  # offset in SETUP of the letters ST, which newer files have, and of its length
 FRAME_RATE = 768  # offset in SETUP, 32 bits; SETUP begins with a frame rate of 16 bits
 ANNOTATION = 8  # bytes at least
-GREY = 0  # compression of the file header; 1: JPEG, 2: mosaic of a colour sensor
+CINE_GREY = 0  # compression of the file header; 1: JPEG, 2: mosaic of a colour sensor
 UNPACKED = 0  # biCompression
 PACKED_10 = 0x100
 PACKED_12 = 0x400
@@ -68,7 +202,7 @@ def read_cine_header(path: Path) -> CineHeader:
     check_regular_file(path)
     try:
         with open(path, 'rb') as file:
-            return _header(file, os.fstat(file.fileno()).st_size)
+            return _cine_header(file, os.fstat(file.fileno()).st_size)
     except DataError as error:
         raise error.at(path) from None
     except FileNotFoundError:
@@ -91,13 +225,13 @@ def read_cine_images(path: Path, header: CineHeader) -> Iterator[tuple[str, np.n
         raise DataError(f'cannot be read ({os_error_reason(error)})', at=path) from None
 
 
-def _header(file: BinaryIO, size: int) -> CineHeader:
+def _cine_header(file: BinaryIO, size: int) -> CineHeader:
     """Return the header of a file of a size [bytes]. Raises DataError."""
     fields = _unpack(file, 0, FILE_HEADER)
     signature, _, compression, _, _, _, _, count, at_bitmap, at_setup, at_offsets, _ = fields
     if signature != SIGNATURE:
         raise DataError('this is no cine file: it does not begin with CI')
-    if compression != GREY:
+    if compression != CINE_GREY:
         kind = {1: 'JPEG images', 2: 'the mosaic of a colour sensor'}.get(
             compression, 'an unknown kind of images'
         )
@@ -112,7 +246,7 @@ def _header(file: BinaryIO, size: int) -> CineHeader:
         raise DataError(f'the cine file is damaged or cut off: it claims {count} images')
     file.seek(at_offsets)
     offsets = np.frombuffer(file.read(8 * count), '<i8')
-    rate = _frame_rate(file, at_setup)
+    rate = _cine_rate(file, at_setup)
     header = CineHeader(
         width,
         abs(height),
@@ -149,7 +283,7 @@ def _bits(bit_count: int, compression: int) -> int:
     )
 
 
-def _frame_rate(file: BinaryIO, at_setup: int) -> float:
+def _cine_rate(file: BinaryIO, at_setup: int) -> float:
     """Return the frame rate [Hz]. Raises DataError."""
     rate = _unpack(file, at_setup, struct.Struct('<H'))[0]
     mark, length = _unpack(file, at_setup + SETUP_MARK, struct.Struct('<2sH'))

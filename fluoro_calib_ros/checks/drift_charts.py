@@ -1,0 +1,431 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Options, input, state and CUSUM control charts of the drift watch.
+
+CUSUM control charts of the drift watch. In every area and in both directions a CUSUM (Page,
+Biometrika 41, 1954) sums the log-likelihood ratio of a drift beyond the dead band against one at
+its edge. The expectation of every factor of the likelihood ratio is at most 1 for all means within
+the band, so the mean number of blocks to a false alarm of a chart is at least exp(threshold)
+(Lorden, Annals of Mathematical Statistics 42, 1971; for composite hypotheses Shin, Ramdas and
+Rinaldo, "E-detectors", New England Journal of Statistics in Data Science 2, 2024). With M charts
+it is at least an M-th of that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..exposures.frame import cells_of
+from ..findings import Finding, Severity
+from ..options import option, validate_options
+
+# What the drift watch reports: its level and the drift it has found.
+
+# Levels of an alarm; the values are those of the message DriftStatus.
+OK = Severity.NOTE
+WARN = Severity.WARNING
+ERROR = Severity.ERROR
+LEVEL_NAMES = {OK: 'ok', WARN: 'warn', ERROR: 'error'}
+NAN = float('nan')
+
+
+@dataclass(frozen=True)
+class DriftState:
+    """Present state of the drift watch.
+
+    Without a drift, size, sd, since_s, area and direction are NaN.
+    """
+
+    finding: Finding  #: what the watch says; its severity is the level
+    evidence: float  #: largest log-likelihood ratio of all charts
+    #: evidence at which the levels WARN and ERROR begin
+    threshold_warn: float
+    threshold_error: float
+    observations: int  #: residuals and distances since the last reset
+    learning: bool  #: whether the reference is still being learned from the start of the stream
+    #: name of the fluoroscope whose image has drifted, 'a or b' where the two cannot be
+    #: distinguished, '' without a drift
+    fluoroscope: str = ''
+    #: corners u0, v0, u1, v1 of the area that has drifted [px]
+    area: tuple[float, ...] = (NAN,) * 4
+    place: str = ''  #: the same area in words
+    #: size of the drift along `direction` and its standard deviation [px]; as residuals are
+    #: clipped, a size of more than a pixel is a lower bound
+    size: float = NAN
+    sd: float = NAN
+    #: unit vector (2,) in the image: the normal of the epipolar lines, or u or v where the drift
+    #: was found by bodies
+    direction: tuple[float, ...] = (NAN,) * 2
+    against: str = ''  #: reference of the drift: 'calibration' or 'start'
+    source: str = ''  #: 'epipolar' or 'cluster NAME'
+    since_s: float = NAN  #: estimated time since the drift began [s]
+
+    @property
+    def level(self) -> Severity:
+        """Level of the alarm."""
+        return self.finding.severity
+
+    @property
+    def message(self) -> str:
+        """The finding in a sentence."""
+        return self.finding.sentence
+
+
+@dataclass(frozen=True)
+class DriftOptions:
+    """Options of the drift watch.
+
+    The dead band of a chart is the root of the sum of the squares of the tolerance and of
+    band_calibration or band_start systematic standard deviations. Raises ValueError for values out
+    of their range, and for combinations that make no sense.
+    """
+
+    error_interval_h: float = option(
+        1000.0,
+        'mean time between false alarms of level ERROR',
+        minimum=1e-3,
+        maximum=1e9,
+        unit='h of stream',
+    )
+    warn_interval_h: float = option(
+        10.0,
+        'mean time between false alarms of level WARN',
+        minimum=1e-3,
+        maximum=1e9,
+        unit='h of stream',
+    )
+    learn_s: float = option(
+        10.0,
+        'length of the start, the reference of all that follows',
+        minimum=1.0,
+        maximum=3600.0,
+        unit='s',
+    )
+    block_s: float = option(
+        0.25,
+        'time over which observations are collected before they are tested',
+        minimum=0.01,
+        maximum=10.0,
+        unit='s',
+    )
+    cells: int = option(4, 'cells across an image, an even number', minimum=2, maximum=16)
+    tolerance_px: float = option(
+        0.15,
+        'drift that does not matter, part of every dead band',
+        minimum=0.0,
+        maximum=100.0,
+        unit='px',
+    )
+    step_px: float = option(
+        0.1,
+        'excess over the dead band to which a chart is most sensitive',
+        minimum=1e-3,
+        maximum=100.0,
+        unit='px',
+    )
+    band_calibration: float = option(
+        4.0,
+        'dead band against the calibration',
+        minimum=1.0,
+        maximum=20.0,
+        unit='systematic standard deviations',
+    )
+    band_start: float = option(
+        3.0,
+        'dead band against the start',
+        minimum=1.0,
+        maximum=20.0,
+        unit='systematic standard deviations',
+    )
+    clip: float = option(
+        3.0,
+        'size at which residuals are clipped',
+        minimum=1.0,
+        maximum=10.0,
+        unit='standard deviations of the noise',
+    )
+    min_markers: int = option(
+        3,
+        'different markers that an area needs in a block to be tested',
+        minimum=1,
+        maximum=1000,
+    )
+
+    def __post_init__(self) -> None:
+        validate_options(self)
+        if int(self.cells) != self.cells or self.cells % 2:
+            raise ValueError(f'cells must be an even number, not {self.cells}')
+        if self.warn_interval_h > self.error_interval_h:
+            raise ValueError(
+                'warn_interval_h must not exceed error_interval_h, but they are '
+                f'{self.warn_interval_h:g} and {self.error_interval_h:g}'
+            )
+        if self.learn_s < 4 * self.block_s:
+            raise ValueError(
+                f'learn_s must be at least 4 blocks of {self.block_s:g} s, not {self.learn_s:g} s'
+            )
+
+
+@dataclass(frozen=True)
+class EpipolarObservations:
+    """Epipolar residuals of n markers in one pair of views, a and b.
+
+    Rows with a value that is not finite are ignored. Residuals that are too large for a match
+    belong here too: they are clipped, and a large drift has no others.
+
+    Raises ValueError for arrays whose shapes do not agree.
+    """
+
+    target_id: NDArray[np.int64]  #: (n,)
+    #: (n, 2) where the markers are in the images [px]
+    uv_a: NDArray[np.float64]
+    uv_b: NDArray[np.float64]
+    residual: NDArray[np.float64]  #: (n,) signed [px]
+    #: (n,) standard deviations of the residuals [px]: by the noise of the image points, which is
+    #: new in every frame, and by the correction and the orientation, which stay the same at a
+    #: place and do not average out
+    sd_noise: NDArray[np.float64]
+    sd_systematic: NDArray[np.float64]
+    #: (n, 2) normals of the epipolar lines, as in EpipolarResiduals
+    normal_a: NDArray[np.float64]
+    normal_b: NDArray[np.float64]
+    #: (n,) change of the residual by a shift of one pixel along the normal
+    factor_a: NDArray[np.float64]
+    factor_b: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        n = len(self.target_id)
+        for name, expected in (
+            ('uv_a', (n, 2)),
+            ('uv_b', (n, 2)),
+            ('residual', (n,)),
+            ('sd_noise', (n,)),
+            ('sd_systematic', (n,)),
+            ('normal_a', (n, 2)),
+            ('normal_b', (n, 2)),
+            ('factor_a', (n,)),
+            ('factor_b', (n,)),
+        ):
+            shape = getattr(self, name).shape
+            if shape != expected:
+                raise ValueError(f'{name} must have the shape {expected}, not {shape}')
+
+    def __len__(self) -> int:
+        return len(self.target_id)
+
+    @property
+    def uv(self) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels of both images."""
+        return self.uv_a, self.uv_b
+
+    @property
+    def normal(self) -> tuple[np.ndarray, np.ndarray]:
+        """Normals of the epipolar lines in both images."""
+        return self.normal_a, self.normal_b
+
+    @property
+    def factor(self) -> tuple[np.ndarray, np.ndarray]:
+        """Factors of both images."""
+        return self.factor_a, self.factor_b
+
+    def swapped(self) -> EpipolarObservations:
+        """The same residuals with the views in the other order."""
+        return EpipolarObservations(
+            self.target_id,
+            self.uv_b,
+            uv_b=self.uv_a,
+            residual=self.residual,
+            sd_noise=self.sd_noise,
+            sd_systematic=self.sd_systematic,
+            normal_a=self.normal_b,
+            normal_b=self.normal_a,
+            factor_a=self.factor_b,
+            factor_b=self.factor_a,
+        )
+
+    def usable(self) -> EpipolarObservations:
+        """The rows that are finite and have positive standard deviations and factors."""
+        good = (self.sd_noise > 0) & (self.factor_a > 0) & (self.factor_b > 0)
+        for field in fields(self):
+            finite = np.isfinite(getattr(self, field.name))
+            good &= finite if finite.ndim == 1 else finite.all(axis=1)
+        return EpipolarObservations(*(getattr(self, field.name)[good] for field in fields(self)))
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[EpipolarObservations]) -> EpipolarObservations:
+        """All rows of one or more observations, in their order."""
+        return cls(
+            *(
+                np.concatenate([getattr(part, field.name) for part in parts])
+                for field in fields(cls)
+            )
+        )
+
+
+# The areas of an image in which the drift watch looks for a drift.
+
+
+class ImageAreas:
+    """Overlapping areas of an image: n x n cells, windows of half its size, halves, and the whole.
+
+    n: number of cells across the image, even.
+    """
+
+    def __init__(self, n: int) -> None:
+        half = n // 2
+        step = max(1, n // 4)
+        starts = range(0, half + 1, step) if n % 4 == 0 else (0, half)
+        boxes = [(i, j, i + 1, j + 1) for j in range(n) for i in range(n)] if n > 2 else []
+        boxes += [(i, j, i + half, j + half) for j in starts for i in starts]
+        boxes += [(0, 0, half, n), (half, 0, n, n), (0, 0, n, half), (0, half, n, n), (0, 0, n, n)]
+        self.n = n
+        #: (areas, 4), edges u0, v0, u1, v1 as fractions of the image
+        self.box = np.array(boxes) / n
+        row, column = np.divmod(np.arange(n * n), n)
+        left, top, right, bottom = np.array(boxes).T[:, :, None]
+        inside = (column >= left) & (column < right) & (row >= top) & (row < bottom)
+        #: (areas, cells), 1 where a cell belongs to an area, else 0
+        self.member = inside.astype(float)
+
+    def __len__(self) -> int:
+        return len(self.member)
+
+    def cell(self, uv: np.ndarray, size: Sequence[float] | np.ndarray) -> np.ndarray:
+        """Cells (n,) of pixels uv (n, 2) of an image of size (width, height) [px].
+
+        Pixels off the image belong to the nearest cell.
+        """
+        column, row = cells_of(uv, size, self.n).T
+        return column + self.n * row
+
+    def describe(self, area: int, size: Sequence[float]) -> tuple[tuple[float, ...], str]:
+        """Corners (u0, v0, u1, v1) [px] of an area of an image of that size, and its name."""
+        u0, v0, u1, v1 = self.box[area]
+        corners = tuple(float(x) for x in self.box[area] * np.tile(size, 2) - 0.5)
+        across = _side(u0 + u1, 'left', 'right')
+        down = _side(v0 + v1, 'upper', 'lower')
+        width = u1 - u0
+        height = v1 - v0
+        if width == 1 and height == 1:
+            return corners, 'whole image'
+        if width == 1 or height == 1:
+            return corners, f'{across if height == 1 else down} half'
+        if width < 0.5:
+            middle = self.box[area].reshape(2, 2).mean(axis=0) * size - 0.5
+            return corners, f'{down} {across} quarter, about ({middle[0]:.0f}, {middle[1]:.0f}) px'
+        if 'middle' in (across, down):
+            return corners, 'middle' if across == down else f'{down} {across}'
+        return corners, f'{down} {across} quarter'
+
+
+def _side(edges: float, low: str, high: str) -> str:
+    """Name of the side of the image on which an interval lies whose edges have this sum."""
+    if edges == 1:
+        return 'middle'
+    return low if edges < 1 else high
+
+
+MEMORY = 160  # blocks over which the variance is estimated
+PRIOR_DIFFERENCES = 20  # weight of the pooled variance in that of one area, in pairs of blocks
+VARIANCE_MARGIN = 1.25  # estimated from 100 differences, a variance has a relative sd of 15 %
+MIN_BLOCKS_TO_ALARM = 4
+EVIDENCE_CAP = 1.5  # times the threshold of ERROR, so that evidence falls once a drift has ended
+MIN_INFORMATION = 1e-300  # avoids division by zero
+
+
+class CusumCharts:
+    """CUSUM charts of K series in A areas and both directions, with estimated variances.
+
+    series, areas: K and A. step_px: excess over the dead band to which the charts are most
+    sensitive [px]. cap: largest evidence.
+    """
+
+    def __init__(self, series: int, areas: int, step_px: float, cap: float) -> None:
+        shape = (series, areas)
+        self._step = step_px
+        self._cap = cap
+        #: (2, K, A), for drifts in the positive and in the negative direction
+        self.evidence = np.zeros((2, *shape))
+        #: (2, K, A), time at which the present run of each chart began [ns]
+        self.begin = np.zeros((2, *shape), dtype=np.int64)
+        #: (K, 1), variance of a long sum of blocks over that of their differences
+        self.stretch = np.ones((series, 1))
+        self._run = np.zeros((2, 2, *shape))  # score and information of the runs, by direction
+        self._squares = np.zeros(shape)
+        self._count = np.zeros(shape)
+        self._last = np.full((2, *shape), np.nan)  # mean and variance of the last block
+        self._decay = 1 - 1 / MEMORY
+
+    def variance_factor(self) -> NDArray[np.float64]:
+        """Variance of sums of blocks over the predicted one (K, A).
+
+        It is the estimate, never below 1, times VARIANCE_MARGIN.
+        """
+        pooled = (1 + self._squares.sum(axis=1)) / (1 + self._count.sum(axis=1))
+        pooled = np.maximum(pooled, 1)[:, None]
+        total = (PRIOR_DIFFERENCES * pooled + self._squares) / (PRIOR_DIFFERENCES + self._count)
+        return VARIANCE_MARGIN * np.maximum(total, 1) * self.stretch
+
+    def update(
+        self,
+        score: NDArray[np.float64],
+        information: NDArray[np.float64],
+        band: NDArray[np.float64],
+        testing: np.ndarray,
+        stamp_ns: int,
+    ) -> None:
+        """Add one block.
+
+        Parameters
+        ----------
+        score, information : ndarray
+            (K, A), of the drifts [1/px, 1/px^2].
+        band : ndarray
+            (K, A), dead bands [px].
+        testing : ndarray
+            (K, A), where the block counts as evidence.
+        stamp_ns : int
+            Time at which the block began.
+        """
+        seen = information > 0
+        factor = self._update_variance(score, information, seen)
+        step = self._step
+        sign = np.array([1.0, -1.0])[:, None, None]
+        with np.errstate(invalid='ignore'):
+            gain = step * (sign * score - band * information - step / 2 * information) / factor
+        max_gain = self._cap / EVIDENCE_CAP / MIN_BLOCKS_TO_ALARM
+        gain = np.where(seen & testing, np.minimum(gain, max_gain), 0.0)
+        fresh = (self.evidence <= 0) & (gain > 0)
+        self.begin[fresh] = stamp_ns
+        self._run[:, fresh] = 0
+        self._run += np.where(seen & testing, np.stack([score, information]), 0)[:, None]
+        self.evidence = np.clip(self.evidence + gain, 0, self._cap)
+
+    def _update_variance(
+        self, score: np.ndarray, information: np.ndarray, seen: np.ndarray
+    ) -> np.ndarray:
+        """Add the differences from the last block; return the factor (K, A) as it was before."""
+        factor = self.variance_factor()
+        with np.errstate(divide='ignore', invalid='ignore'):
+            now = np.stack([score / information, 1 / information])
+            square = (now[0] - self._last[0]) ** 2 / (now[1] + self._last[1])
+        both = np.isfinite(square)
+        decay = np.where(both, self._decay, 1)
+        self._squares *= decay
+        self._count *= decay
+        # The onset of a drift is one large difference. It must not raise the variance by which
+        # the drift is tested.
+        self._squares[both] += np.minimum(square, 9 * factor)[both]
+        self._count[both] += 1
+        self._last = np.where(seen, now, self._last)
+        return factor
+
+    def log_likelihood(self) -> NDArray[np.float64]:
+        """Log-likelihood (2, K, A) of a drift of any size in the present runs."""
+        score, information = self._run
+        return score**2 / (2 * np.maximum(information, MIN_INFORMATION) * self.variance_factor())

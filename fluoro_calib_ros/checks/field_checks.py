@@ -1,0 +1,281 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Checks of a correction: 'precision', 'variation', 'halves', 'whiteness', 'worst_area', 'drift'.
+
+Checks 'whiteness', 'worst_area' and 'drift': residuals have no trend, and it did not change. An
+area also fails where image points of different exposures were rejected though they agree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..correction.base import CorrectionModel
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..errors import DataError
+from ..estimation.exposure_terms import VARYING
+from ..estimation.initial_network import MIN_EXPOSURES
+from ..estimation.options import AUTO
+from ..exposures.frame import angles_of
+from ..findings import Kind, Place
+from .calibration_evidence import CommonTrend, Evidence, Subject
+from .check import Check, more_exposures, too_little_data
+from .comparison import describe_place, difference
+from .residual_tests import RejectedTrend, change_of_trend
+
+# Standard deviation of the correction over that of an image coordinate. Independent errors add in
+# square: with this ratio, those of corrected points are 1.14 times those with known distortion.
+MAX_RATIO = 0.55
+
+
+def check_precision(evidence: Evidence, names: Sequence[str]) -> list[Check]:
+    """Compare the claimed precision of the correction with the noise, for each fluoroscope."""
+    return [_precision(evidence, name) for name in names]
+
+
+def _precision(evidence: Evidence, name: str) -> Check:
+    common = evidence.trends[name]
+    # Residuals are smaller than the noise: orientations, object points and correction follow it.
+    noise = evidence.calibrations[name].image_sd
+    count = len(evidence.frames[name])
+    advice = f'{more_exposures(count)}, or a phantom with more beads'
+    if common.trend.size > common.trend.limit:
+        # What a model cannot follow is in its residuals, and in its claim.
+        misfit = common.trend.size**2 / _redundancy(evidence, name)
+        noise = float(np.sqrt(max(noise**2 - misfit, 0.0)))
+        if evidence.request.options.model_name != AUTO:
+            advice = f'choose another model (--model auto), or {advice}'
+    ratio = common.claimed_sd / noise if noise > 0 else np.inf
+    growth = 100 * (np.sqrt(1 + ratio**2) - 1)
+    return Check(
+        Kind.PRECISION,
+        f'the correction has a standard deviation of {common.claimed_sd:.2f} px, at an image '
+        f'noise of {noise:.2f} px: it makes the errors of corrected points {growth:.0f} % larger',
+        Place((name,)),
+        advice,
+        numbers={'sd_px': common.claimed_sd, 'noise_px': noise, 'exposures': count},
+        value=ratio,
+        limit=MAX_RATIO,
+        unit='noise sd',
+    )
+
+
+def _redundancy(evidence: Evidence, name: str) -> float:
+    """Mean redundancy number of the inliers, by which residuals are enlarged to noise."""
+    table = evidence.result.residuals
+    if table is None:
+        return 1.0
+    return float(np.mean(table.redundancy[(table.fluoroscope == name) & ~table.outlier]))
+
+
+PRECISION = Subject(check_precision)
+
+
+# Size of a change, over the standard deviation of residuals, up to which it is no fault. A later
+# exposure has it as an error beside its noise, which is larger than residuals: the errors of its
+# points are then up to 8 % larger.
+HARMLESS = 0.45
+# Range [rad] of angles in degrees that is not larger than a full turn in radians.
+LARGEST_RADIANS = np.deg2rad(2 * np.pi)
+
+
+def check_variation(evidence: Evidence, names: Sequence[str]) -> list[Check]:
+    """Fit low-order terms to the residuals of each exposure; a check for each fluoroscope."""
+    return [_variation(evidence, name) for name in names]
+
+
+def _variation(evidence: Evidence, name: str) -> Check:
+    count = len(evidence.frames[name])
+    found = evidence.variations[name]
+    if found is None:
+        reason = 'too few exposures have enough image points'
+        return too_little_data(Kind.VARIATION, name, reason, count)
+    return Check(
+        Kind.VARIATION,
+        f'the distortion differs between exposures by {found.size_px:.2f} px '
+        f'(chi2/dof {found.chi2_per_dof:.2f}, constant up to {VARYING:.2f})',
+        Place((name,)),
+        f'{_angles(evidence, name)}, a lens that was focused or zoomed, a source or detector '
+        'that is not rigid, or a phantom that moved, was bent or is surveyed wrongly; '
+        f'{more_exposures(count)} at the angle and setting that are used, or calibrate each'
+        + _how_to_give_angles(evidence, name),
+        numbers={
+            'chi2_per_dof': found.chi2_per_dof,
+            'noise_px': found.noise_px,
+            'angle_range_deg': float(np.rad2deg(np.ptp(angles_of(evidence.frames[name])))),
+        },
+        value=found.size_px,
+        limit=HARMLESS * found.noise_px,
+        unit='px',
+    ).after_trend(evidence.trends[name].is_significant)
+
+
+def _angles(evidence: Evidence, name: str) -> str:
+    """What may be wrong with the angles of the C-arm."""
+    angles = angles_of(evidence.frames[name])
+    if not np.isfinite(angles).all() or np.ptp(angles) == 0:
+        return 'a C-arm at another angle'
+    if np.ptp(angles) < LARGEST_RADIANS:
+        return 'angles of the C-arm that are in radians, not in degrees'
+    return 'angles of the C-arm that are not those of these exposures'
+
+
+def _how_to_give_angles(evidence: Evidence, name: str) -> str:
+    """What else helps where the angles of the C-arm are unknown."""
+    if np.isfinite(angles_of(evidence.frames[name])).all():
+        return ''
+    return '; or give the angle of the C-arm with each exposure (angle_deg, or joint_states)'
+
+
+VARIATION = Subject(check_variation)
+
+
+LIMIT = 1.9  # from simulated rigs: docs/verdict.md, benchmarks/verdict.py
+
+
+def check_halves(evidence: Evidence, names: Sequence[str]) -> list[Check]:
+    """Compare the calibrations of two halves of the exposures, a check for each fluoroscope."""
+    evidence.report_step(f'{"+".join(names)}: two halves')
+    fewest = evidence.fewest_exposures(names)
+    if fewest < 2 * MIN_EXPOSURES:
+        reason = f'{fewest} exposures are too few for two halves of {MIN_EXPOSURES} or more'
+        return [too_little_data(Kind.HALVES, name, reason, fewest) for name in names]
+    try:
+        even = evidence.calibrate(evidence.part(names, lambda i: i % 2 == 0))
+        odd = evidence.calibrate(evidence.part(names, lambda i: i % 2 == 1))
+    except DataError as error:
+        reason = f'half of the exposures cannot be calibrated ({error})'
+        return [too_little_data(Kind.HALVES, name, reason, fewest) for name in names]
+    return [_agreement(name, even[name], odd[name], len(evidence.frames[name])) for name in names]
+
+
+def _agreement(
+    name: str, one: FluoroscopeCalibration, other: FluoroscopeCalibration, count: int
+) -> Check:
+    found = difference(one, other)
+    if found is None:
+        reason = 'two halves of the exposures cover too little of the image in common'
+        return too_little_data(Kind.HALVES, name, reason, count)
+    expected = float(np.sqrt(np.mean(found.sd**2)))
+    return Check(
+        Kind.HALVES,
+        'two halves of the exposures give corrections that differ by '
+        f'{found.rms_px:.2f} px, where {expected:.2f} px is predicted, most at '
+        f'{describe_place(found.worst, one.image_size)}',
+        Place.at(name, found.worst),
+        f'{more_exposures(count)} that show beads there, and see that phantom and fluoroscope '
+        'stand still in each',
+        numbers={'difference_px': found.rms_px, 'predicted_px': expected},
+        value=found.normalised,
+        limit=LIMIT,
+        unit='predicted sd',
+    )
+
+
+HALVES = Subject(check_halves, steps=1)
+
+
+# Standard deviations of the correction by which the mean residual of an area may be off.
+CLAIMED_SD = 3.0
+
+
+def check_trends(evidence: Evidence, names: Sequence[str]) -> list[Check]:
+    """Test the residuals of all exposures for a common trend, and for a change of it."""
+    checks = []
+    for name in names:
+        common = evidence.trends[name]
+        checks += [
+            _whiteness(evidence, name, common),
+            _worst_area(evidence, name, common),
+            _drift(evidence, name, common),
+        ]
+    return checks
+
+
+def _whiteness(evidence: Evidence, name: str, common: CommonTrend) -> Check:
+    trend = common.trend
+    model = evidence.calibrations[name].model
+    where = describe_place(trend.place, evidence.calibrations[name].image_size)
+    return Check(
+        Kind.WHITENESS,
+        f'the residuals have a trend of {trend.size:.2f} px, most at {where}',
+        Place.at(name, trend.place),
+        _advice(evidence.request.options.model_name, model, len(evidence.frames[name])),
+        value=trend.size,
+        limit=common.limit,
+        unit='px',
+    )
+
+
+def _advice(requested: str, model: CorrectionModel, count: int) -> str:
+    """Return what to do about a trend: requested is the model option, model the one in use."""
+    if not model.corrects:
+        return 'calibrate with a correction model (--model auto), it was made without one'
+    other = '' if requested == 'auto' else ', or choose another model (--model auto)'
+    return (
+        f'the correction model {model.kind} does not follow the distortion there; '
+        f'{more_exposures(count)} that show beads there{other}'
+    )
+
+
+def _worst_area(evidence: Evidence, name: str, common: CommonTrend) -> Check:
+    rejected = common.rejected
+    if rejected is not None and rejected.size > rejected.limit:
+        return _rejected_area(evidence, name, rejected)
+    trend = common.trend
+    calibration = evidence.calibrations[name]
+    claimed = max(float(calibration.model.evaluate(trend.place[None]).sd[0]), common.claimed_sd)
+    return Check(
+        Kind.WORST_AREA,
+        f'the worst mean residual of an area, {trend.cell_size:.2f} px, is at '
+        f'{describe_place(trend.place, calibration.image_size)}',
+        Place.at(name, trend.place),
+        f'{more_exposures(len(evidence.frames[name]))} that show beads there, or choose '
+        'another model',
+        value=trend.cell_size,
+        limit=np.hypot(trend.cell_limit, CLAIMED_SD * claimed),
+        unit='px',
+    )
+
+
+def _rejected_area(evidence: Evidence, name: str, rejected: RejectedTrend) -> Check:
+    """Check that fails because image points are rejected though they agree."""
+    size = evidence.calibrations[name].image_size
+    return Check(
+        Kind.WORST_AREA,
+        f'{rejected.points} image points of different exposures were '
+        f'rejected as false matches, but agree: {rejected.size:.2f} px on average at '
+        f'{describe_place(rejected.place, size)}',
+        Place.at(name, rejected.place),
+        'the correction model does not follow the distortion there; '
+        f'{more_exposures(len(evidence.frames[name]))} that show beads there, or choose a '
+        'model with neighbours (--model hybrid)',
+        numbers={'rejected_points': rejected.points},
+        value=rejected.size,
+        limit=rejected.limit,
+        unit='px',
+    )
+
+
+def _drift(evidence: Evidence, name: str, common: CommonTrend) -> Check:
+    size = evidence.calibrations[name].image_size
+    change = change_of_trend(common.inliers, size)
+    # The whole image decides, unless only the worst area has changed.
+    whole = change.size > change.limit or change.cell_size <= change.cell_limit
+    return Check(
+        Kind.DRIFT,
+        f'earlier and later exposures differ by {change.size:.2f} px, '
+        f'most at {describe_place(change.place, size)} by {change.cell_size:.2f} px',
+        Place.at(name, change.place),
+        'the distortion has changed between the exposures; take all of them again in one '
+        'session, with nothing switched, moved or warming up',
+        value=change.size if whole else change.cell_size,
+        limit=change.limit if whole else change.cell_limit,
+        unit='px',
+    ).after_trend(common.is_significant)
+
+
+TRENDS = Subject(check_trends)

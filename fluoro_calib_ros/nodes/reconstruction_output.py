@@ -1,0 +1,399 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Points, bodies and joints, published in all their forms, and diagnostics, the gravest first."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from fluoro_calib_msgs.msg import BodyPoses, JointAngles, ReconstructedPoints
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from rclpy.publisher import Publisher
+from sensor_msgs.msg import JointState, PointCloud2
+from tf2_msgs.msg import TFMessage
+from visualization_msgs.msg import MarkerArray
+
+from ..bodies.body import STATUS_NAMES, Body, PoseStatus
+from ..bodies.joint_tracking import JointTracker
+from ..exposures.pairing import Pairer
+from ..reconstruction.epipolar import RecentMisses
+from ..reconstruction.intersection import FAILED, OUTSIDE, REJECTED, SINGLE_VIEW, IntersectedPoints
+from .messages.bodies import (
+    FORMS,
+    BodiesContent,
+    joint_state,
+    message_from_bodies,
+    message_from_joints,
+    odometry,
+    pose_with_covariance,
+    transforms_of_bodies,
+)
+from .messages.points import (
+    MOCAP_MARKERS,
+    PointsContent,
+    ellipsoid_markers,
+    encode_reconstructed_points,
+    message_from_points,
+    mocap_markers,
+    point_cloud,
+)
+from .rig_input import BodiesState, BodyFollower, RigInput
+from .runtime.diagnostics import OK, WARN, Health, RecentCounts, Status, fault, health_of, warning
+from .runtime.lifecycle import StreamNode
+from .runtime.stream import (
+    InputState,
+    Stream,
+    inactive_node,
+    incompatible_publisher,
+    lost_messages,
+    overrun_input,
+    refused_messages,
+    unpaired_frames,
+)
+from .runtime.streams import observations_qos
+
+COUNTED_STATUSES = {
+    'outside': OUTSIDE,
+    'rejected': REJECTED,
+    'failed': FAILED,
+    'in a single view': SINGLE_VIEW,
+}
+POINT_FORMS = ('points', 'markers', 'mocap_markers')  # beside the points with covariance
+
+
+class PointsCounter:
+    """Counts points by status."""
+
+    def __init__(self) -> None:
+        self._counts: Counter[str] = Counter()
+
+    def add(self, points: IntersectedPoints) -> None:
+        """Count points."""
+        self._counts['points'] += len(points.status)
+        if points.status.any():
+            for name, status in COUNTED_STATUSES.items():
+                self._counts[name] += int(np.count_nonzero(points.status == status))
+
+    def values(self) -> dict[str, object]:
+        """Return the counts for the diagnostics."""
+        return {
+            'points': self._counts['points'],
+            **{f'points {name}': self._counts[name] for name in COUNTED_STATUSES},
+        }
+
+
+class PointsOutput:
+    """Publishers of reconstructed points."""
+
+    def __init__(self, node: StreamNode) -> None:
+        kinds = {
+            'points_with_covariance': ReconstructedPoints,
+            'points': PointCloud2,
+            'markers': MarkerArray,
+        }
+        if MOCAP_MARKERS is not None:
+            kinds['mocap_markers'] = MOCAP_MARKERS
+        self._outputs = {
+            name: node.create_output(kind, f'reconstruction/{name}', observations_qos())
+            for name, kind in kinds.items()
+        }
+        self._markers_published_ns = 0
+
+    def publish(self, content: PointsContent) -> None:
+        """Publish points with their covariance."""
+        self._outputs['points_with_covariance'].publish(encode_reconstructed_points(content))
+
+    def publish_forms(self, content: PointsContent, sigmas: float, rate_hz: float) -> None:
+        """Publish the other forms that have subscribers: ellipsoids of so many sigmas."""
+        wanted = [
+            name
+            for name in POINT_FORMS
+            if name in self._outputs and self._outputs[name].get_subscription_count()
+        ]
+        if not wanted:
+            return
+        message = message_from_points(content)
+        good = np.flatnonzero(content.points.status <= OUTSIDE)
+        if 'points' in wanted:
+            self._outputs['points'].publish(point_cloud(message, good))
+        if 'mocap_markers' in wanted:
+            self._outputs['mocap_markers'].publish(mocap_markers(message, good))
+        now = time.monotonic_ns()
+        if 'markers' in wanted and now - self._markers_published_ns >= round(1e9 / rate_hz):
+            self._markers_published_ns = now
+            self._outputs['markers'].publish(ellipsoid_markers(message, good, sigmas))
+
+
+class BodiesOutput:
+    """Publishers of bodies and joints.
+
+    names: bodies. rig_frame: parent of the frames of the bodies.
+    """
+
+    def __init__(
+        self, node: StreamNode, names: Sequence[str], has_joints: bool, rig_frame: str
+    ) -> None:
+        def output(kind: type, topic: str) -> Publisher:
+            return node.create_output(kind, topic, observations_qos())
+
+        self._rig_frame = rig_frame
+        self._bodies = output(BodyPoses, 'reconstruction/body_poses')
+        self._transforms = output(TFMessage, '/tf')
+        places = [f'reconstruction/bodies/{name}' for name in names]
+        self._poses = [output(PoseWithCovarianceStamped, f'{place}/pose') for place in places]
+        self._odometry = [output(Odometry, f'{place}/odometry') for place in places]
+        self._forms = [
+            (output(kind, f'reconstruction/{name}'), make) for name, (kind, make) in FORMS.items()
+        ]
+        self._joints = output(JointAngles, 'reconstruction/joint_angles') if has_joints else None
+        self._joint_states = (
+            output(JointState, 'reconstruction/joint_states') if has_joints else None
+        )
+
+    def publish(self, content: BodiesContent) -> None:
+        """Publish an exposure; standard types only while they have subscribers."""
+        message = message_from_bodies(content)
+        self._bodies.publish(message)
+        if self._transforms.get_subscription_count():
+            transforms = transforms_of_bodies(content, message, self._rig_frame)
+            self._transforms.publish(transforms)
+        for row in content.measured:
+            if self._poses[row].get_subscription_count():
+                self._poses[row].publish(pose_with_covariance(message, row))
+            if self._odometry[row].get_subscription_count():
+                self._odometry[row].publish(odometry(content, message, row))
+        for form, make in self._forms:
+            if form.get_subscription_count():
+                form.publish(make(content, message))
+        if self._joints is None or self._joint_states is None:
+            return
+        self._joints.publish(message_from_joints(content))
+        if self._joint_states.get_subscription_count():
+            self._joint_states.publish(joint_state(content))
+
+
+NO_ORIENTATION = (
+    'no orientation of the rig yet: calibrate with all fluoroscopes, '
+    'or capture the phantom with the service orient'
+)
+
+
+@dataclass(frozen=True)
+class ReconstructionState(InputState):
+    """What the diagnostics of the reconstruction are decided by."""
+
+    streams: Mapping[str, Stream]  #: by fluoroscope
+    rigs: RigInput
+    pairer: Pairer
+    misses: RecentMisses
+
+
+def no_orientation(state: ReconstructionState) -> Health | None:
+    """The orientation of the rig is not known yet."""
+    if state.rigs.newest is not None:
+        return None
+    return warning(state.refusals.last_fault or NO_ORIENTATION)
+
+
+def stalled_streams(state: ReconstructionState) -> Health | None:
+    """Streams have stopped; what else is wrong with the streams follows."""
+    found = {name: stream.stalled() for name, stream in state.streams.items()}
+    stalled = [f'{name}: {message}' for name, message in found.items() if message]
+    if not stalled:
+        return None
+    level, message = health_of(state, STREAM_CONDITIONS)
+    more = [] if level == OK else [message]
+    return Health(max(level, WARN), '; '.join([*stalled, *more]))
+
+
+def missing_publishers(state: ReconstructionState) -> Health | None:
+    """Nobody publishes the frames of a fluoroscope."""
+    published = map(state.node.has_publisher, state.topics)
+    missing = ', '.join(name for name, there in zip(state.streams, published) if not there)
+    return warning(missing and f'no publisher of corrected observations of {missing}')
+
+
+def missed_rays(state: ReconstructionState) -> Health | None:
+    """The rays of the views do not meet."""
+    misses = state.misses.message()
+    disagreement = state.pairer.stamps.disagreement()
+    return fault('; '.join(filter(None, (misses, disagreement))) if misses else '')
+
+
+def silent_fluoroscopes(state: ReconstructionState) -> Health | None:
+    """Fluoroscopes have stopped, and are not waited for any more."""
+    silent = ', '.join(sorted(state.pairer.silent))
+    return warning(
+        silent and f'no frames of {silent}, points are reconstructed from the other fluoroscopes'
+    )
+
+
+def foreign_calibrations(state: ReconstructionState) -> Health | None:
+    """Views were corrected with calibrations of no known orientation."""
+    count = state.recent['without_orientation']
+    corrected = (
+        f'{count} exposures in the last minute were corrected with calibrations to which no '
+        'orientation of the rig belongs'
+    )
+    return warning(corrected if count else '')
+
+
+def distant_stamps(state: ReconstructionState) -> Health | None:
+    """Frames of the same number are far apart in time."""
+    return warning(state.pairer.stamps.disagreement())
+
+
+def incomplete_exposures(state: ReconstructionState) -> Health | None:
+    """Exposures have some of the views only."""
+    count = state.recent['incomplete']
+    text = f'{count} exposures without all fluoroscopes in the last minute'
+    return warning(text if count else '')
+
+
+def reconstructing(state: ReconstructionState) -> Health:
+    """Nothing is wrong."""
+    return Health(OK, 'reconstructing')
+
+
+STREAM_CONDITIONS = (
+    missing_publishers,
+    missed_rays,
+    silent_fluoroscopes,
+    foreign_calibrations,
+    refused_messages,
+    distant_stamps,
+    overrun_input,
+    unpaired_frames,
+    incomplete_exposures,
+    reconstructing,
+)
+CONDITIONS = (
+    lost_messages,
+    incompatible_publisher,
+    no_orientation,
+    inactive_node,
+    stalled_streams,
+    *STREAM_CONDITIONS,
+)
+
+
+@dataclass(frozen=True)
+class BodyState:
+    """What the diagnostics of a body are decided by: its row in the state of all bodies."""
+
+    body: Body
+    state: BodiesState
+    row: int
+    untimed: int
+    untimed_recently: int
+
+    @property
+    def status(self) -> PoseStatus:
+        """How its last pose was obtained."""
+        return PoseStatus(self.state.status[self.row])
+
+    @property
+    def unseen_s(self) -> float | None:
+        """Time of the stream since an exposure showed a marker of it [s], None before."""
+        seen = int(self.state.seen_ns[self.row])
+        return None if seen < 0 else (self.state.stamp_ns - seen) * 1e-9
+
+
+def exposures_without_time(state: BodyState) -> Health | None:
+    """Exposures have the stamp of the one before."""
+    count = state.untimed_recently
+    text = f'{count} exposures in the last minute have the stamp of the one before'
+    return warning(text if count else '')
+
+
+def unseen_body(state: BodyState) -> Health | None:
+    """No exposure has shown the body."""
+    return warning('' if state.unseen_s is not None else 'not seen yet')
+
+
+def lost_body(state: BodyState) -> Health | None:
+    """The body is lost."""
+    text = f'lost, its markers were last seen {state.unseen_s or 0:.1f} s ago'
+    return warning(text if state.status == PoseStatus.FAILED else '')
+
+
+def predicted_body(state: BodyState) -> Health | None:
+    """No marker is seen, but the body is not lost yet."""
+    text = f'no marker is seen for {state.unseen_s or 0:.2f} s: the pose is predicted'
+    return warning(text if state.status == PoseStatus.FILLED else '')
+
+
+def ambiguous_body(state: BodyState) -> Health | None:
+    """Its markers fit in a second pose."""
+    text = 'its markers fit in a second pose, too'
+    return warning(text if state.status == PoseStatus.AMBIGUOUS else '')
+
+
+def tracked_body(state: BodyState) -> Health:
+    """Nothing is wrong."""
+    return Health(OK, 'tracked')
+
+
+BODY_CONDITIONS = (
+    exposures_without_time,
+    unseen_body,
+    lost_body,
+    predicted_body,
+    ambiguous_body,
+    tracked_body,
+)
+
+
+def failed_neutral(joint: JointTracker) -> Health | None:
+    """The neutral trial has passed without a neutral position."""
+    return warning('' if joint.error is None else f'no angles: {joint.error}')
+
+
+def awaited_neutral(joint: JointTracker) -> Health | None:
+    """The neutral trial has not passed."""
+    return warning('no angles before the end of the neutral trial' if joint.needs_neutral else '')
+
+
+def followed_joint(joint: JointTracker) -> Health:
+    """Nothing is wrong."""
+    return Health(OK, 'followed')
+
+
+JOINT_CONDITIONS = (failed_neutral, awaited_neutral, followed_joint)
+
+
+def statuses_of(follower: BodyFollower, counts: RecentCounts) -> list[Status]:
+    """Return a status for each body and each joint, nothing before the first exposure."""
+    state = follower.state
+    if state is None:
+        return []
+    untimed = follower.untimed, counts.growth('bodies', untimed=follower.untimed)['untimed']
+    bodies = [BodyState(body, state, row, *untimed) for row, body in enumerate(follower.bodies)]
+    return [
+        *(
+            Status(f'body {one.body.name}', *health_of(one, BODY_CONDITIONS), _values(one))
+            for one in bodies
+        ),
+        *(
+            Status(f'joint {one.joint.name}', *health_of(one, JOINT_CONDITIONS))
+            for one in follower.joints
+        ),
+    ]
+
+
+def _values(body: BodyState) -> dict[str, object]:
+    unseen = body.unseen_s
+    return {
+        'status': STATUS_NAMES[body.status],
+        'markers seen': int(body.state.markers[body.row]),
+        'markers of the body': len(body.body.target_id),
+        'chi-squared over expectation': f'{body.state.misfit[body.row]:.2f}',
+        'since last seen [s]': '' if unseen is None else f'{unseen:.3f}',
+        'exposures without a later stamp': body.untimed,
+    }

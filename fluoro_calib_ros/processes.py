@@ -293,11 +293,18 @@ class Programs:
     def __init__(self) -> None:
         self._processes: list[subprocess.Popen[Any]] = []
 
-    def run(self, name: str, *arguments: str, log: Path) -> subprocess.Popen[Any]:
-        """Start a module, whose output is added to a file; returns its process."""
-        with open(log, 'ab') as out:
+    def run(
+        self, name: str, *arguments: str, log: Path, out: Path | None = None
+    ) -> subprocess.Popen[Any]:
+        """Start a module, whose output is added to a file; returns its process.
+
+        out: file of its standard output, by default the log.
+        """
+        with ExitStack() as stack:
+            errors = stack.enter_context(open(log, 'ab'))
+            output = errors if out is None else stack.enter_context(open(out, 'wb'))
             process = subprocess.Popen(
-                _command(name, arguments), stdout=out, stderr=out, start_new_session=True
+                _command(name, arguments), stdout=output, stderr=errors, start_new_session=True
             )
         self._processes.append(process)
         return process

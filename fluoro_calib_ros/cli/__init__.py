@@ -9,9 +9,9 @@ import argparse
 import contextlib
 import difflib
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from ..errors import DataError, printable, shortened
 from . import (
@@ -27,6 +27,7 @@ from . import (
     heal,
     orient,
     phantom,
+    process,
     reconstruct,
     report,
     simulate,
@@ -61,12 +62,13 @@ COMMANDS = (
     bodies,
     heal,
     convert,
+    process,
     bag,
     watch,
     bridge,
 )
 
-READ_NOTHING = (simulate, phantom, watch, bridge)
+READ_NOTHING = (simulate, phantom, process, watch, bridge)
 
 
 # Groups of options that few need: --help names them, --help-all shows them.
@@ -161,13 +163,16 @@ class _Completion(argparse.Action):
         parser.exit()
 
 
-def make_parser(command: str | None = None, rig: RigFile | None = None) -> argparse.ArgumentParser:
+def make_parser(
+    command: str | None = None, rig: RigFile | None = None, kind: type[_Parser] = _Parser
+) -> argparse.ArgumentParser:
     """Return the parser of the command line.
 
     Only the arguments of `command` are added, by default those of all commands: each command
-    imports the modules that declare its options. rig: gives defaults of the arguments.
+    imports the modules that declare its options. rig: gives defaults of the arguments. kind: its
+    class.
     """
-    parser = _Parser(prog='fluoro-calib', description='Self-calibration of X-ray fluoroscopes.')
+    parser = kind(prog='fluoro-calib', description='Self-calibration of X-ray fluoroscopes.')
     parser.add_argument('--version', action=_Version, nargs=0, help='print versions and exit')
     parser.add_argument(
         '--print-completion',
@@ -183,7 +188,7 @@ def make_parser(command: str | None = None, rig: RigFile | None = None) -> argpa
             description=module.HELP,
             epilog=f'example: {module.EXAMPLE}',
         )
-        sub.set_defaults(module=module)
+        sub.set_defaults(module=module, parse=parse_words)
         if command in (None, module.NAME):
             sub.add_argument(
                 '--help-all', action=_WholeHelp, nargs=0, help='show all options and exit'
@@ -196,6 +201,35 @@ def make_parser(command: str | None = None, rig: RigFile | None = None) -> argpa
                 add_read_limits(sub)
             add_rig(sub, module.NAME, rig)
     return parser
+
+
+def parse_words(
+    words: Sequence[str], error: Callable[[str], NoReturn] | None = None
+) -> argparse.Namespace:
+    """Return the arguments of a command line, checked.
+
+    error is called with a sentence for a wrong one; by default it is printed, and the process
+    exits with 2. Raises DataError for a rig.toml that is wrong.
+    """
+
+    class Parser(_Parser):
+        def error(self, message: str) -> NoReturn:
+            if error is not None:
+                error(message)
+            super().error(message)
+
+    command = _command_of(words)
+    rig = find_rig(words, command)
+    parser = make_parser(command, rig, Parser)
+    options = parser.parse_args(words)
+    if hasattr(options.module, 'check'):
+        options.module.check(options, parser.error)
+    options.rig_file = rig
+    return options
+
+
+def _command_of(words: Sequence[str]) -> str:
+    return next((word for word in words if not word.startswith('-')), '')
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -213,16 +247,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _run(words: list[str]) -> None:
     """Run the command of these words, and exit with its status if it fails."""
-    command = next((word for word in words if not word.startswith('-')), '')
+    command = _command_of(words)
     try:
-        rig = find_rig(words, command)
-        parser = make_parser(command, rig)
-        options = parser.parse_args(words)
-        if hasattr(options.module, 'check'):
-            options.module.check(options, parser.error)
+        options = parse_words(words)
         set_read_limits(options)
-        if rig is not None:
-            print_note(f'defaults of {rig.path}')
+        if options.rig_file is not None:
+            print_note(f'defaults of {options.rig_file.path}')
         passed = options.module.run(options)
     except (DataError, OSError) as error:
         known = command if command in [module.NAME for module in COMMANDS] else ''

@@ -127,6 +127,8 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _print(arguments: argparse.Namespace, outcome: BodiesOutcome) -> None:
     """Print how well poses and joints are known."""
+    from ..io.result_document import finding_document
+
     summary = outcome.summary()
     lines = [f'{len(outcome.exposures)} exposures, written to {arguments.out}']
     lines += [
@@ -140,4 +142,9 @@ def _print(arguments: argparse.Namespace, outcome: BodiesOutcome) -> None:
         for joint, angles in summary['joints'].items()
         for name, one in angles.items()
     ]
-    print_result(arguments, {'out': str(arguments.out), **summary}, '\n'.join(lines))
+    document = {
+        'out': str(arguments.out),
+        **summary,
+        'findings': [finding_document(found) for found in outcome.findings],
+    }
+    print_result(arguments, document, '\n'.join(lines))

@@ -67,6 +67,11 @@ def print_note(note: object) -> None:
     print(styled(printable(str(note)), 'yellow', sys.stderr), file=sys.stderr)
 
 
+def print_status(text: str) -> None:
+    """Print what a long command is doing on standard error."""
+    print(styled(printable(text), 'dim', sys.stderr), file=sys.stderr)
+
+
 def print_notes(notes: Iterable[object]) -> None:
     """Print texts and findings on standard error, each once."""
     for text in dict.fromkeys(map(str, notes)):

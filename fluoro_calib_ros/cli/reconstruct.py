@@ -128,6 +128,7 @@ def _print(arguments: argparse.Namespace, outcome: ReconstructionOutcome) -> Non
         'points': total,
         'status': counts,
         'unpaired': outcome.unpaired,
+        'widening': outcome.widening,
         'drift': drift_document(outcome.drift, outcome.frames[0].stamp_ns),
         'orientation': orientation_document(outcome.orientation),
     }

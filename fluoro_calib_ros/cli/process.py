@@ -1,0 +1,472 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""fluoro-calib process: calibrate, and process all trials of a study.
+
+Each step is a command of fluoro-calib as it could be typed in the folder of the study. A step is
+done again only where its options, its inputs or the program have changed. The trials run in
+processes of their own, and a trial that fails does not stop the others.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import os
+import shlex
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from ..errors import DataError, shortened
+from ..io.study_file import NAME as STUDY
+from .output import print_result, print_status
+
+if TYPE_CHECKING:
+    import subprocess
+
+    from ..io.study_file import Options, StudyFile, Trial
+    from ..processes import Programs
+
+NAME = 'process'
+HELP = 'Calibrate, and process all trials of a study: one file in, one table out.'
+EXAMPLE = 'fluoro-calib process knee_study'
+STATE = 'study.json'  # which steps are done, with the digest of what they were done with
+TABLE = 'trials.csv'
+LOG = 'log.txt'
+POLL_S = 0.05
+NOT_PASSED = 3  # exit status of a step whose verdict is not pass
+SOURCE = 'source'
+OF_PROCESS = ('out', 'calibration', 'json', 'help', 'help_all', SOURCE)
+WRONG_DRIFT = ('warn', 'error')
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    from .arguments import add_exit_zero, number_in
+
+    parser.add_argument(
+        'study', type=Path, metavar='STUDY', help=f'folder with a {STUDY}, or the file'
+    )
+    parser.add_argument(
+        '--workers',
+        type=number_in(1, 256, int),
+        default=os.cpu_count() or 1,
+        metavar='N',
+        help='trials that are processed at a time (default: as many as there are cores)',
+    )
+    parser.add_argument('--again', action='store_true', help='do all steps again')
+    parser.add_argument(
+        '--dry-run', action='store_true', help='print the commands of the study, and do nothing'
+    )
+    add_exit_zero(parser)
+
+
+@dataclass(frozen=True)
+class Step:
+    """A command of a study."""
+
+    trial: str  #: '' for the calibration
+    words: tuple[str, ...]  #: as typed in the folder of the study
+    inputs: tuple[Path, ...]  #: what it reads
+    out: Path
+
+    @property
+    def command(self) -> str:
+        """The name of the command."""
+        return self.words[0]
+
+    @property
+    def name(self) -> str:
+        """The name of the step in its trial: of several conversions, with the format."""
+        suffix = self.out.suffix if self.command == 'convert' else ''
+        return f'{self.command}{suffix.replace(".", " ")}'
+
+    @property
+    def key(self) -> str:
+        """The name of the step in the study."""
+        return f'{self.trial}: {self.name}'.removeprefix(': ')
+
+    @property
+    def document(self) -> Path:
+        """Where what it prints with --json is written."""
+        return self.out.parent / f'{self.name.replace(" ", "_")}.json'
+
+
+@dataclass(frozen=True)
+class Done:
+    """What a step has given."""
+
+    status: int  #: exit status
+    document: Mapping[str, Any]  #: what it prints with --json
+    message: str  #: why it failed, '' where it has not
+    seconds: float
+    kept: bool = False  #: whether it was done earlier, with the same input
+
+    @property
+    def ok(self) -> bool:
+        """Whether there is a result."""
+        return self.status in (0, NOT_PASSED)
+
+
+Parse = Callable[[Sequence[str], Callable[[str], NoReturn]], argparse.Namespace]
+
+
+def run(arguments: argparse.Namespace) -> bool:
+    """Process a study; return whether all its verdicts are pass. Raises DataError."""
+    from ..io.study_file import read_study
+
+    study = read_study(arguments.study)
+    with working_directory(study.folder):
+        calibration, trials = study_steps(study, arguments.parse)
+        if arguments.dry_run:
+            steps = [*calibration, *(step for steps in trials.values() for step in steps)]
+            commands = [shlex.join(('fluoro-calib', *step.words)) for step in steps]
+            print_result(arguments, {'commands': commands}, '\n'.join(commands))
+            return True
+        return _process(arguments, study, calibration, trials)
+
+
+@contextmanager
+def working_directory(folder: Path) -> Iterator[None]:
+    """Change the working directory until the block ends."""
+    before = Path.cwd()
+    os.chdir(folder)
+    try:
+        yield
+    finally:
+        os.chdir(before)
+
+
+def _process(
+    arguments: argparse.Namespace,
+    study: StudyFile,
+    calibration: Sequence[Step],
+    trials: Mapping[str, Sequence[Step]],
+) -> bool:
+    """Do all steps in the working directory, write the table and print it. Raises DataError."""
+    from ..processes import Programs
+
+    with Programs() as programs:
+        work = _Work(study.out, programs, again=arguments.again)
+        work.run([calibration], 1)
+        failed = [work.done[step.key] for step in calibration if not work.done[step.key].ok]
+        if failed:
+            raise DataError(
+                f'no calibration: {failed[0].message} ({study.folder / study.out / LOG})'
+            )
+        verdict = calibration_verdict(study.calibration)
+        if verdict == 'fail':
+            raise DataError(
+                f'the verdict of the calibration is fail, the trials are not processed: '
+                f'fluoro-calib report {study.folder / study.calibration} says why'
+            )
+        work.run(trials.values(), arguments.workers)
+    rows = [
+        trial_row(name, verdict, [(step, work.done.get(step.key)) for step in steps])
+        for name, steps in trials.items()
+    ]
+    path = study.folder / _write_table(study.out, rows)
+    counts = ', '.join(f'{sum(r["verdict"] == v for r in rows)} {v}' for v in _verdicts(rows))
+    lines = [
+        f'{row["trial"]}: {row["verdict"]}' + (f', {row["cause"]}' if row['cause'] else '')
+        for row in rows
+    ]
+    lines.append(f'calibration: {verdict}; {len(rows)} trials: {counts}; table: {path}')
+    print_result(
+        arguments,
+        {'calibration': verdict, 'trials': rows, 'table': str(path)},
+        '\n'.join(lines),
+    )
+    refused = sum(row['verdict'] == 'refused' for row in rows)
+    if refused:
+        raise DataError(f'{refused} of {len(rows)} trials failed; {path} names the causes')
+    return verdict == 'pass' and all(row['verdict'] == 'pass' for row in rows)
+
+
+def study_steps(study: StudyFile, parse: Parse) -> tuple[list[Step], dict[str, list[Step]]]:
+    """Return the steps of the calibration, and those of each trial; the options are checked.
+
+    The working directory is the folder of the study. Raises DataError for an option that is wrong.
+    """
+    make = _StepMaker(study, parse)
+    first = []
+    if study.calibrate is not None:
+        source = str(study.calibrate[SOURCE])
+        first.append(make('', 'calibrate', study.calibrate, (source,), study.calibration))
+    return first, {trial.name: list(_trial_steps(study, trial, make)) for trial in study.trials}
+
+
+def _trial_steps(study: StudyFile, trial: Trial, make: _StepMaker) -> Iterator[Step]:
+    """Yield the steps of a trial."""
+    folder = study.out / trial.name
+    calibration = ('--calibration', str(study.calibration))
+    source = str(trial.path)
+    for command, name in (
+        ('extract', 'observations.csv'),
+        ('reconstruct', 'points.csv'),
+        ('bodies', 'motion'),
+    ):
+        if command not in study.commands:
+            continue
+        words = (source, *calibration)
+        yield make(trial.name, command, study.commands[command], words, folder / name)
+        if command == 'extract':
+            source = str(folder / name)
+    for kind, options in study.convert.items():
+        words = (str(folder / 'points.csv'), '--to', kind)
+        yield make(trial.name, 'convert', options, words, folder / f'points.{kind}')
+
+
+class _StepMaker:
+    """Makes steps of the options of a study, and checks them by the parser of the command."""
+
+    def __init__(self, study: StudyFile, parse: Parse) -> None:
+        self._study = study
+        self._parse = parse
+
+    def __call__(
+        self, trial: str, command: str, options: Options, words: Sequence[str], out: Path
+    ) -> Step:
+        """Return a step; words: those that the options do not give. Raises DataError."""
+        where = f'{self._study.path}, table {command}'
+
+        def error(message: str) -> NoReturn:
+            raise DataError(f'{where}: {message}')
+
+        all_words = [command, *words, '--out', str(out)]
+        for key, value in options.items():
+            name = key.replace('-', '_')
+            if name in OF_PROCESS and (command, name) != ('calibrate', SOURCE):
+                error(f'the key {key} follows from the study')
+            if name != SOURCE:
+                all_words += _option_words(key, value, error)
+        values = vars(self._parse(all_words, error))
+        paths = [
+            path
+            for key, value in values.items()
+            if key != 'out'
+            for path in (value if isinstance(value, list) else [value])
+            if isinstance(path, Path)
+        ]
+        return Step(trial, tuple(all_words), tuple(paths), out)
+
+
+def _option_words(key: str, value: Any, error: Callable[[str], NoReturn]) -> list[str]:
+    """Return the words of an option on the command line."""
+    word = '--' + key.replace('_', '-')
+    if isinstance(value, bool):
+        return [word] if value else []
+    if isinstance(value, list):
+        return [part for one in value for part in _option_words(key, one, error)]
+    if not isinstance(value, str | int | float):
+        error(f'the key {key} is neither a text nor a number, true, false or a list')
+    return [f'{word}={value}']
+
+
+@dataclass(frozen=True)
+class _Started:
+    """A step that runs."""
+
+    step: Step
+    digest: str  #: of what it was started with
+    process: subprocess.Popen[Any]
+    begin_s: float
+
+
+class _Work:
+    """Runs steps as programs, and knows those that were done earlier."""
+
+    def __init__(self, out: Path, programs: Programs, again: bool) -> None:
+        from ..io.access import make_folder
+        from ..io.documents import read_json
+
+        self.done: dict[str, Done] = {}
+        self._out = out
+        self._programs = programs
+        make_folder(out)
+        path = out / STATE
+        self._state: dict[str, Any] = read_json(path) if path.exists() and not again else {}
+
+    def run(self, chains: Iterable[Sequence[Step]], workers: int) -> None:
+        """Do chains of steps, some at a time; a chain ends at a step that fails."""
+        waiting = deque(deque(chain) for chain in chains)
+        total = len(waiting)
+        running: list[tuple[deque[Step], _Started]] = []
+        while waiting or running:
+            while waiting and len(running) < workers:
+                chain = waiting.popleft()
+                place = f'{total - len(waiting)} of {total}'
+                started = self._next(chain, place)
+                if started is not None:
+                    running.append((chain, started))
+            for one in list(running):
+                chain, started = one
+                if started.process.poll() is None:
+                    continue
+                running.remove(one)
+                if self._ended(started).ok:
+                    waiting.appendleft(chain)
+            time.sleep(POLL_S if running else 0)
+
+    def _next(self, chain: deque[Step], place: str) -> _Started | None:
+        """Start the first step of a chain that is not done yet; None where there is none."""
+        from ..io.access import make_folder
+
+        while chain:
+            step = chain.popleft()
+            digest = digest_of(step)
+            kept = self._kept(step, digest)
+            if kept is not None:
+                self.done[step.key] = kept
+                continue
+            folder = step.out.parent
+            make_folder(folder)
+            print_status(f'{step.key} ({place})')
+            with open(folder / LOG, 'a', encoding='utf-8') as log:
+                log.write(f'$ {shlex.join(("fluoro-calib", *step.words))}\n')
+            process = self._programs.run(
+                'fluoro_calib_ros.cli',
+                *step.words,
+                '--json',
+                log=folder / LOG,
+                out=step.document,
+            )
+            return _Started(step, digest, process, time.monotonic())
+        return None
+
+    def _kept(self, step: Step, digest: str) -> Done | None:
+        """Return what a step gave earlier, with the same options, inputs and program."""
+        from ..io.documents import read_json
+
+        entry = self._state.get(step.key)
+        if not isinstance(entry, dict) or entry.get('digest') != digest:
+            return None
+        if not step.out.exists() or not step.document.exists():
+            return None
+        return Done(int(entry['status']), read_json(step.document), '', 0.0, kept=True)
+
+    def _ended(self, started: _Started) -> Done:
+        """Note that a step has ended; return what it gave."""
+        from ..io.documents import read_json, write_json
+
+        step = started.step
+        status = int(started.process.returncode)
+        seconds = time.monotonic() - started.begin_s
+        ok = status in (0, NOT_PASSED)
+        document = read_json(step.document) if ok else {}
+        message = '' if ok else _last_line(step.out.parent / LOG)
+        self.done[step.key] = done = Done(status, document, message, seconds)
+        if ok:
+            self._state[step.key] = {'digest': started.digest, 'status': status}
+        else:
+            self._state.pop(step.key, None)
+            print_status(f'{step.key}: {message}')
+        write_json(self._out / STATE, self._state)
+        return done
+
+
+def _last_line(path: Path) -> str:
+    """Return the last line of a log: what a command says at its end."""
+    lines = path.read_text(errors='replace').strip().splitlines()
+    return shortened(lines[-1]) if lines else 'it ended without a message'
+
+
+def digest_of(step: Step) -> str:
+    """Return a digest of what a step is done with: version, words, and the state of its inputs.
+
+    The state of a file is its size and the time of its last change, as for make.
+    """
+    program = version('fluoro_calib_ros')
+    digest = hashlib.sha256('\0'.join((program, *step.words)).encode())
+    for path in step.inputs:
+        files = sorted(path.rglob('*')) if path.is_dir() else [path]
+        for file in files:
+            if file.is_file():
+                state = file.stat()
+                digest.update(f'\0{file}\0{state.st_size}\0{state.st_mtime_ns}'.encode())
+    return digest.hexdigest()
+
+
+def calibration_verdict(folder: Path) -> str:
+    """Return the verdict of a result folder, 'cannot tell' where it is not about its files."""
+    from ..io.calibration import VALIDATION_NAME, changed_since_verdict, read_result
+
+    document = read_result(folder, VALIDATION_NAME)
+    if not document or changed_since_verdict(folder, document) is not None:
+        return 'cannot tell'
+    return str(document.get('verdict', 'cannot tell'))
+
+
+def trial_row(
+    name: str, calibration: str, steps: Iterable[tuple[Step, Done | None]]
+) -> dict[str, Any]:
+    """Return the row of a trial in the table; calibration: the verdict that holds for it.
+
+    The verdict is 'refused' where a command failed, 'fail' where the trial contradicts its
+    calibration, else that of the calibration.
+    """
+    row: dict[str, Any] = {'trial': name, 'verdict': calibration, 'cause': ''}
+    for step, done in steps:
+        if done is None:  # an earlier step has failed
+            continue
+        if not done.ok:
+            row |= {'verdict': 'refused', 'cause': done.message}
+        elif step.command == 'reconstruct':
+            row |= _reconstruction_cells(row, done.document)
+        elif step.command == 'bodies':
+            row |= _bodies_cells(row, done.document)
+    return row
+
+
+def _reconstruction_cells(row: Mapping[str, Any], document: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a reconstruction adds to the row of a trial."""
+    drift = document.get('drift') or {}
+    cells = {
+        'frames': document['frames'],
+        'points': document['points'],
+        'points_ok': document['status']['OK'],
+        'widening': document['widening'],
+        'drift': drift.get('kind', ''),
+    }
+    if drift.get('level') in WRONG_DRIFT:
+        return cells | {'verdict': 'fail', 'cause': drift['message']}
+    if document['widening'] > 1:
+        return cells | {
+            'verdict': 'fail',
+            'cause': 'the rays miss each other by more than their standard deviations allow',
+        }
+    return cells
+
+
+def _bodies_cells(row: Mapping[str, Any], document: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what poses and joints add to the row of a trial."""
+    cells: dict[str, Any] = {}
+    for name, body in document['bodies'].items():
+        cells |= {f'{name}_{key}': body[key] for key in ('poses', 'sd_mm', 'sd_deg')}
+    for joint, angles in document['joints'].items():
+        for name, angle in angles.items():
+            cells |= {f'{joint}_{name}_{key}': angle[key] for key in ('range_deg', 'sd_deg')}
+    doubtful = [found['sentence'] for found in document['findings']]
+    if doubtful and row['verdict'] == 'pass':
+        cells |= {'verdict': 'cannot tell', 'cause': '; '.join(doubtful)}
+    return cells
+
+
+def _verdicts(rows: Iterable[Mapping[str, Any]]) -> list[str]:
+    return sorted({row['verdict'] for row in rows})
+
+
+def _write_table(out: Path, rows: Sequence[Mapping[str, Any]]) -> Path:
+    """Write the table of all trials; return its path. Raises DataError."""
+    from ..io.csv_table import write_table
+
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    path = out / TABLE
+    write_table(path, columns, ([row.get(column, '') for column in columns] for row in rows))
+    return path

@@ -1,0 +1,226 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""fluoro-calib process: a study of trials, done once, resumed, and judged trial by trial."""
+
+import csv
+import json
+import os
+import shutil
+
+import pytest
+from rigs import run
+
+from fluoro_calib_ros.cli.process import STATE, trial_row
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.io.csv_table import write_table
+from fluoro_calib_ros.io.study_file import read_study
+
+STUDY = """
+trials = ["trials/*.csv"]
+calibration = "result"
+[reconstruct]
+drift_watch = false
+[convert.trc]
+rate = 100
+"""
+
+
+def write_study(folder, text):
+    folder.mkdir(exist_ok=True)
+    (folder / 'study.toml').write_text(text)
+    return folder
+
+
+@pytest.fixture(scope='module')
+def rig(tmp_path_factory):
+    """A rig, calibrated from its bag, and two trials: image points of ten exposures each."""
+    folder = tmp_path_factory.mktemp('study') / 'rig'
+    more = ('--exposures', 8, '--test-exposures', 10, '--seconds', 0.05)
+    assert run('simulate', '--out', folder, *more) == 0
+    calibrate = ('calibrate', folder / 'calibration', '--phantom', folder / 'phantom.csv')
+    fast = ('--model', 'parametric', '--fast', '--max-iterations', 2)
+    assert run(*calibrate, '--out', folder / 'result', *fast) == 0
+    return folder
+
+
+@pytest.fixture
+def study(rig, tmp_path):
+    """A study of two trials with a calibration that nobody has validated."""
+    folder = write_study(tmp_path / 'study', STUDY.replace('drift_watch = false\n', ''))
+    shutil.copytree(rig / 'result', folder / 'result')
+    (folder / 'trials').mkdir()
+    for name in ('walk', 'run'):
+        shutil.copy(rig / 'test.csv', folder / 'trials' / f'{name}.csv')
+    return folder
+
+
+def rows_of(study):
+    with open(study / 'results' / 'trials.csv', newline='') as file:
+        return {row['trial']: row for row in csv.DictReader(file)}
+
+
+def changed_by(study, *more):
+    """The files that a run of the study has written anew, and its exit status."""
+    results = study / 'results'
+    before = {p: p.stat().st_mtime_ns for p in results.rglob('*') if p.is_file()}
+    status = run('process', study, '--workers', 2, *more)
+    after = {p: p.stat().st_mtime_ns for p in results.rglob('*') if p.is_file()}
+    ends = ('.csv', '.trc')
+    changed = [p for p in after if after[p] != before.get(p) and p.suffix in ends]
+    return {str(p.relative_to(results)) for p in changed} - {'trials.csv'}, status
+
+
+def test_trials_are_processed_once_and_again_where_something_changed(study):
+    everything = {
+        f'trials/{name}/points.{kind}' for name in ('walk', 'run') for kind in ('csv', 'trc')
+    }
+    assert changed_by(study) == (everything, 3)  # nobody has validated the calibration
+    for row in rows_of(study).values():
+        assert row['verdict'] == 'cannot tell' and row['frames'] == '10'
+        assert 0 < int(row['points_ok']) < int(row['points'])
+    assert changed_by(study) == (set(), 3)
+    os.utime(study / 'trials' / 'walk.csv')
+    walk = {'trials/walk/points.csv', 'trials/walk/points.trc'}
+    assert changed_by(study, '--exit-zero') == (walk, 0)
+    text = (study / 'study.toml').read_text()
+    (study / 'study.toml').write_text(text.replace('rate = 100', 'rate = 50'))
+    trc = {'trials/walk/points.trc', 'trials/run/points.trc'}
+    assert changed_by(study) == (trc, 3)
+    assert changed_by(study, '--again') == (everything, 3)
+
+
+def test_a_trial_that_fails_does_not_stop_the_others(study, capsys):
+    (study / 'trials' / 'walk.csv').write_text('fluoroscope,exposure,target_id,u,v\na,1,x\n')
+    assert run('process', study) == 1
+    err = capsys.readouterr().err
+    assert 'Traceback' not in err and '1 of 2 trials failed' in err
+    rows = rows_of(study)
+    assert rows['trials/walk']['verdict'] == 'refused'
+    assert 'trials/walk.csv' in rows['trials/walk']['cause']
+    assert rows['trials/run']['verdict'] == 'cannot tell'
+    assert not (study / 'results/trials/walk/points.trc').exists()
+    shutil.copy(study / 'trials' / 'run.csv', study / 'trials' / 'walk.csv')
+    walk = {'trials/walk/points.csv', 'trials/walk/points.trc'}
+    assert changed_by(study) == (walk, 3)  # what has failed is tried again
+
+
+def test_a_trial_of_a_rig_that_has_moved_fails(study):
+    """As one that was recorded after a knock: the rays of its points miss each other."""
+    path = study / 'trials' / 'walk.csv'
+    with open(path, newline='') as file:
+        rows = list(csv.DictReader(file))
+    for row in rows:
+        if row['fluoroscope'] == 'b':
+            row['v'] = float(row['v']) + 10
+    write_table(path, rows[0], (row.values() for row in rows))
+    assert run('process', study) == 3
+    rows = rows_of(study)
+    assert rows['trials/walk']['verdict'] == 'fail' and 'rays' in rows['trials/walk']['cause']
+    assert rows['trials/run']['verdict'] == 'cannot tell'
+
+
+@pytest.mark.long
+def test_calibration_and_trials_from_one_file(rig, tmp_path, capsys):
+    text = STUDY.replace('calibration = "result"\n', '').replace('drift_watch = false\n', '')
+    calibrate = '[calibrate]\nsource = "calibration"\nphantom = "phantom.csv"\n'
+    folder = write_study(tmp_path / 'study', text + calibrate)
+    shutil.copytree(rig / 'calibration', folder / 'calibration')
+    shutil.copy(rig / 'phantom.csv', folder)
+    (folder / 'trials').mkdir()
+    shutil.copy(rig / 'test.csv', folder / 'trials' / 'walk.csv')
+    assert run('process', folder, '--json') in (0, 3)
+    document = json.loads(capsys.readouterr().out)
+    assert document['calibration'] in ('pass', 'cannot tell')
+    assert [row['verdict'] for row in document['trials']] == [document['calibration']]
+    assert (folder / 'results/calibration/report.html').exists()
+
+
+def test_dry_run_prints_the_commands_and_writes_nothing(study, capsys):
+    assert run('process', study, '--dry-run') == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 4
+    assert lines[0] == (
+        'fluoro-calib reconstruct trials/run.csv --calibration result '
+        '--out results/trials/run/points.csv'
+    )
+    assert not (study / 'results').exists()
+
+
+def test_radiographs_are_extracted_first(study, capsys):
+    text = (study / 'study.toml').read_text().replace('"trials/*.csv"', '"films/*"')
+    clusters = 'cluster = ["tibia: 1 2 3", "femur: 4 5 6"]\n'
+    extract = '[extract]\nmarkers = "m.csv"\nfluoroscope = "a,b"\n' + clusters
+    (study / 'study.toml').write_text(text + extract)
+    (study / 'films' / 'walk').mkdir(parents=True)
+    assert run('process', study, '--dry-run') == 0
+    first, then, _ = capsys.readouterr().out.splitlines()
+    for word in ('extract films/walk', '--cluster=tibia: 1 2 3', '--cluster=femur: 4 5 6'):
+        assert word in first
+    assert 'reconstruct results/films/walk/observations.csv --calibration result' in then
+
+
+@pytest.mark.parametrize(
+    ('text', 'words'),
+    [
+        ('trials = ["*"]\n', ['[calibrate]', 'calibration']),
+        ('trials = ["*"]\ncalibration = "r"\n[calibrate]\n', ['[calibrate]', 'calibration']),
+        ('calibration = "r"\n', ['trials', 'patterns']),
+        ('trials = ["none/*"]\ncalibration = "r"\n', ['none/*', 'matches']),
+        ('trials = ["x*"]\ncalibration = "r"\n', ['x.csv', 'x.mcap', 'same results']),
+        ('trials = ["*"]\ncalibration = 3\n', ['calibration', 'text']),
+        ('trials = ["*"]\ncalibration = "r"\nbodys = 1\n', ['bodys', 'unknown', 'bodies']),
+        ('trials = ["*"]\ncalibration = "r"\nbodies = 1\n', ['bodies', 'table']),
+        ('trials = ["x.csv"]\n[calibrate]\nphantom = "p"\n', ['source', 'missing']),
+        ('trials = ["x.csv"]\ncalibration = "r"\n[convert.c3d]\n', ['convert', 'points']),
+        ('trials = ["/x"]\ncalibration = "r"\n', ['/x', 'pattern']),
+    ],
+)
+def test_wrong_study_is_named_with_its_key(tmp_path, text, words):
+    write_study(tmp_path, text)
+    for name in ('x.csv', 'x.mcap'):
+        (tmp_path / name).touch()
+    with pytest.raises(DataError) as caught:
+        read_study(tmp_path)
+    assert str(caught.value).startswith(str(tmp_path / 'study.toml'))
+    for word in words:
+        assert word in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ('table', 'words'),
+    [
+        ('[reconstruct]\nreject = "x"\n', ['table reconstruct', '--reject', "'x'"]),
+        ('[reconstruct]\nrejct = 3\n', ['table reconstruct', '--rejct']),
+        ('[reconstruct]\nout = "here"\n', ['table reconstruct', 'out', 'follows']),
+        ('[reconstruct]\nreject = {a = 1}\n', ['table reconstruct', 'reject']),
+        ('[bodies]\njoints = "j"\n', ['table bodies', '--bodies']),
+    ],
+)
+def test_wrong_option_is_named_before_anything_runs(tmp_path, capsys, table, words):
+    folder = write_study(tmp_path / 'study', f'trials = ["x"]\ncalibration = "result"\n{table}')
+    (folder / 'x').touch()
+    assert run('process', folder) == 1
+    out, err = capsys.readouterr()
+    assert out == '' and err.count('\n') == 1
+    for word in words:
+        assert word in err
+    assert not (folder / 'results' / STATE).exists()
+
+
+def test_doubt_about_a_body_makes_a_trial_doubtful():
+    class Bodies:
+        command = 'bodies'
+
+    class Given:
+        ok = True
+        document = {
+            'bodies': {'tibia': {'poses': 5, 'sd_mm': 0.1, 'sd_deg': 0.2}},
+            'joints': {'knee': {'flexion': {'range_deg': 30.0, 'sd_deg': 0.1}}},
+            'findings': [{'sentence': 'marker 3 has moved'}],
+        }
+
+    row = trial_row('walk', 'pass', [(Bodies, Given)])
+    assert row['verdict'] == 'cannot tell' and row['cause'] == 'marker 3 has moved'
+    assert row['tibia_poses'] == 5 and row['knee_flexion_range_deg'] == 30.0
+    assert trial_row('walk', 'fail', [(Bodies, Given)])['verdict'] == 'fail'

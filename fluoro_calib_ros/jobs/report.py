@@ -14,7 +14,9 @@ import numpy as np
 from jinja2 import UndefinedError
 
 from ..checks.comparison import Comparison, compare_calibrations
+from ..correction.fluoroscope_calibration import Calibrations
 from ..errors import DataError
+from ..estimation.options import CalibrationRequest
 from ..findings import Finding, Kind, Place, Severity
 from ..io.access import PathLike, write_text
 from ..io.calibration import (
@@ -30,8 +32,11 @@ from ..io.calibration import RESULT_NAME as RESULT
 from ..io.calibration_request import read_request
 from ..io.csv_table import read_names
 from ..io.documents import read_json
+from ..photogrammetry.rig_orientation import RigOrientation
 from ..report.html import ReportInput, report_html
+from ..report.rig_geometry import SpaceAccuracy, accuracy_in_space
 from .conversion import stations_of
+from .reconstruction import ReconstructionOptions, reconstruct
 from .result_folder import REPORT, belongs_to, saved_orientation, saved_rig_note
 
 # The comparison job: what changed between two result folders.
@@ -153,4 +158,19 @@ def read_report_input(directory: PathLike) -> ReportInput:
         written=when.strftime('%Y-%m-%d %H:%M UTC'),
         rig_note=saved_rig_note(directory),
         edited=edited(directory, result) or changed,
+        space=_accuracy_in_space(request, present, orientation),
     )
+
+
+def _accuracy_in_space(
+    request: CalibrationRequest, calibrations: Calibrations, orientation: RigOrientation | None
+) -> SpaceAccuracy | None:
+    """Return how well the beads of the exposures are known in space, None where they are not."""
+    if orientation is None or not set(orientation.fluoroscopes) <= set(calibrations):
+        return None
+    options = ReconstructionOptions(drift_watch=False)
+    try:
+        found = reconstruct(request.frames, calibrations, orientation, options)
+    except DataError:  # such as exposures without partner: the verdict says what is wrong
+        return None
+    return accuracy_in_space(found.frames, request.phantom)

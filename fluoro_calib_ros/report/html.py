@@ -35,6 +35,7 @@ from .report_figures import (
     residual_map,
 )
 from .residuals import Residuals, residuals_of
+from .rig_geometry import SpaceAccuracy, beams, drawing, phantom_distance, uncalibrated_share
 from .tables import model_text
 
 TEMPLATES = Path(__file__).parent / 'templates'
@@ -45,6 +46,7 @@ VERDICTS = {
     None: 'This calibration has not been validated.',
 }
 MAX_ROWS = 40  # of the lists of outliers and correlations
+MAX_ARROWS = 30_000  # residuals of all exposures: a megabyte
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,8 @@ class ReportInput:
     #: why the rig has no orientation, or what is doubtful about it
     rig_note: Finding | None = None
     edited: Finding | None = None  #: what is wrong with result.json itself
+    #: how well the beads of the exposures are known in space, None for a single fluoroscope
+    space: SpaceAccuracy | None = None
 
 
 def report_html(given: ReportInput) -> str:
@@ -82,8 +86,11 @@ def report_html(given: ReportInput) -> str:
         fluoroscopes={name: _fluoroscope(given, name, residuals[name]) for name in residuals},
         pictures=pictures,
         beads=beads,
-        rig=_rig(given),
-        outliers=_outliers(given),
+        rig=drawing(given.result, given.calibrations, given.orientation),
+        beams=beams(given.orientation) if given.orientation else [],
+        outliers=_outliers(given, residuals),
+        arrows=_arrows(given, residuals),
+        space=given.space,
         adjustments=given.result.get('adjustments', []),
         correlations=given.result.get('correlations', [])[:MAX_ROWS],
     )
@@ -119,8 +126,29 @@ def _verdict(given: ReportInput) -> dict[str, Any]:
         'class': (verdict or 'none').replace(' ', '-'),
         'sentence': VERDICTS.get(verdict, VERDICTS['cannot tell']),
         'findings': findings,
-        'checks': given.validation.get('checks', []) if given.validation else [],
+        'checks': [
+            {'sentence': '', 'advice': '', **check, 'mm': _check_mm(given, check)}
+            for check in (given.validation.get('checks', []) if given.validation else [])
+        ],
     }
+
+
+def _check_mm(given: ReportInput, check: Mapping[str, Any]) -> float | None:
+    """Return what a check found, in mm at the phantom; None where it is no length."""
+    if check.get('value') is None:
+        return None
+    if check.get('unit') == 'mm':
+        return float(check['value'])
+    name = str(check.get('fluoroscope'))
+    if check.get('unit') != 'px' or name not in given.calibrations:
+        return None
+    return float(check['value']) * _mm_per_px(given, name)
+
+
+def _mm_per_px(given: ReportInput, name: str) -> float:
+    """Return the size of a pixel at the median distance of the phantom [mm]."""
+    distance = phantom_distance(given.result['fluoroscopes'][name]['exposures'])
+    return distance / float(given.calibrations[name].interior[2])
 
 
 def _residuals(given: ReportInput, name: str) -> Residuals:
@@ -145,8 +173,15 @@ def _outlying_points(given: ReportInput) -> list[Mapping[str, Any]]:
     return list((given.result.get('outliers') or {}).get('image_points', []))
 
 
-def _outliers(given: ReportInput) -> dict[str, Any]:
-    """Return the largest outliers, with names, and their number."""
+def _outliers(given: ReportInput, residuals: Mapping[str, Residuals]) -> dict[str, Any]:
+    """Return the largest outliers, with names and residuals [px], and their number."""
+    length = {
+        (name, exposure, target): px
+        for name, one in residuals.items()
+        for exposure, target, px in zip(
+            one.exposure.tolist(), one.target_id.tolist(), np.hypot(*one.after.T).tolist()
+        )
+    }
     points = sorted(_outlying_points(given), key=lambda o: -float(o['value']))
     targets = given.names.target_names()
     exposures = given.names.exposure_names()
@@ -155,10 +190,29 @@ def _outliers(given: ReportInput) -> dict[str, Any]:
             **o,
             'target': targets.get(int(o['target_id']), o['target_id']),
             'exposure_name': exposures.get(int(o['exposure']), o['exposure']),
+            'px': length.get((o['fluoroscope'], int(o['exposure']), int(o['target_id']))),
         }
         for o in points[:MAX_ROWS]
     ]
-    return {'count': len(points), 'rows': rows}
+    return {'count': len(points), 'of': sum(len(r.uv) for r in residuals.values()), 'rows': rows}
+
+
+def _arrows(given: ReportInput, residuals: Mapping[str, Residuals]) -> dict[str, Any]:
+    """Return the residuals of every exposure, to be looked at one by one; {} for too many.
+
+    Rows u, v, du, dv and whether the point was used, by fluoroscope and number of the exposure.
+    """
+    if sum(len(r.uv) for r in residuals.values()) > MAX_ARROWS:
+        return {}
+    out: dict[str, Any] = {}
+    for name, one in residuals.items():
+        rows = np.column_stack([one.uv.round(1), one.after.round(2), one.inlier])
+        exposures = {
+            int(number): rows[one.exposure == number].tolist()
+            for number in np.unique(one.exposure)
+        }
+        out[name] = {'size': list(given.calibrations[name].image_size), 'exposures': exposures}
+    return out
 
 
 def _fluoroscope(given: ReportInput, name: str, residuals: Residuals) -> dict[str, Any]:
@@ -185,8 +239,12 @@ def _fluoroscope(given: ReportInput, name: str, residuals: Residuals) -> dict[st
             for e in given.result['fluoroscopes'][name]['exposures']
         ],
         'exposures': [
-            (exposures.get(number, number), *rest) for number, *rest in residuals.of_exposures()
+            (number, exposures.get(number, number), *rest)
+            for number, *rest in residuals.of_exposures()
         ],
+        'mm_per_px': _mm_per_px(given, name),
+        'distance_mm': phantom_distance(given.result['fluoroscopes'][name]['exposures']),
+        'uncalibrated': uncalibrated_share(calibration),
     }
 
 
@@ -216,6 +274,7 @@ def _pictures(
         figures.append(('Distortion and its standard deviation', field_figure))
     if residuals.inlier.any():
         figures += [
+            ('Residuals by column and row', residuals.by_position(name, size)),
             ('Residuals and coverage', residual_map(residuals, name, size)),
             ('RMS and number of beads by exposure', exposure_bars(residuals, name)),
             ('Distribution of the residuals', distribution(residuals, name)),
@@ -249,52 +308,6 @@ def _bead_picture(given: ReportInput) -> dict[str, Any] | None:
             for i, k in zip(ids[known][order], order)
         ],
     }
-
-
-def _rig(given: ReportInput) -> dict[str, Any]:
-    """Return what the drawing of the rig shows, in mm: in the frame of the rig, else per exposure.
-
-    Sources, corners of the images on a plane behind the phantom, and the places of the phantom.
-    """
-    entries = given.result['fluoroscopes']
-    fluoroscopes = []
-    places: list[list[float]] = []
-    names = [
-        n for n in (given.orientation.fluoroscopes if given.orientation else ()) if n in entries
-    ]
-    for name in names or list(entries)[:1]:
-        calibration = given.calibrations[name]
-        turn = np.eye(3)
-        origin = np.zeros(3)
-        if given.orientation is not None:
-            index = given.orientation.fluoroscopes.index(name)
-            turn = given.orientation.rotation[index]
-            origin = given.orientation.position_mm[index]
-        distances = [_in_sensor(e)[2] for e in entries[name]['exposures']] or [1000.0]
-        depth = 1.3 * float(np.median(distances))
-        xp, yp, c = calibration.interior
-        width, height = calibration.image_size
-        corners = [(0, 0), (width, 0), (width, height), (0, height)]
-        rays = np.array([((u - xp) / c, (v - yp) / c, 1.0) for u, v in corners]) * depth
-        fluoroscopes.append(
-            {
-                'name': name,
-                'source': origin.tolist(),
-                'corners': (rays @ turn + origin).tolist(),
-            }
-        )
-        if not places:
-            places = [
-                (turn.T @ _in_sensor(entry) + origin).tolist()
-                for entry in entries[name]['exposures']
-            ]
-    return {'fluoroscopes': fluoroscopes, 'places': places}
-
-
-def _in_sensor(entry: Mapping[str, Any]) -> np.ndarray:
-    """Return the origin of the phantom in the sensor frame of an exposure [mm]."""
-    rotation = matrix_from_quaternion(np.array(entry['quaternion_wxyz'], dtype=float))
-    return -rotation @ np.array(entry['position_mm'], dtype=float)
 
 
 def _text(value: Any, digits: int = 3) -> str:

@@ -37,6 +37,7 @@ from .figures import (
     png_bytes,
 )
 from .residuals import Residuals, histogram_figure, position_figure
+from .tables import model_text
 
 MARKER: dict[str, Any] = {'marker': 'o', 'markersize': 4}
 
@@ -306,7 +307,13 @@ def _figures_of_run(
         image_size = run.measured.image_size[number]
         histogram = histogram_figure(run, name, rows, redundancy[rows])
         yield f'residuals_histogram_{name}.png', histogram
-        yield f'residuals_position_{name}.png', position_figure(run, name, rows, image_size)
+        title = f'Fluoroscope {name}: residuals over the image ({model_text(run.models[name])})'
+        before, after = (
+            (adjustment.residuals[rows], adjustment.inliers[rows])
+            for adjustment in (run.before, run.after)
+        )
+        position = position_figure(title, network.uv[rows], before, after, image_size)
+        yield f'residuals_position_{name}.png', position
         model = run.models[name]
         if model.corrects:
             interior_estimated = bool(network.interior_free[number])

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..estimation.rounds import SelfCalibration
 from ..exposures.frame import Frame
-from ..photogrammetry.adjustment import Adjustment
 from ..photogrammetry.collinearity import project
 from .figures import AFTER, BEFORE, BLACK, GREY, new_figure
 from .tables import model_text
@@ -47,6 +46,12 @@ class Residuals:
                 (int(number), int(rows.sum()), _rms(self.before[rows]), _rms(self.after[rows]))
             )
         return out
+
+    def by_position(self, name: str, image_size: tuple[int, int]) -> Figure:
+        """Return the figure of the residuals over the columns and rows of the image."""
+        title = f'{name}: residuals over the image'
+        before = (self.before, self.inlier)
+        return position_figure(title, self.uv, before, (self.after, self.inlier), image_size)
 
 
 def _rms(values: np.ndarray) -> float:
@@ -204,32 +209,33 @@ def _percent_within(values: np.ndarray, limit: float) -> float:
     return 100 * np.mean(np.abs(values) <= limit)
 
 
+Residual = tuple[NDArray[np.float64], NDArray[np.bool_]]  # (n, 2) [px], and (n,) inliers
+
+
 def position_figure(
-    run: SelfCalibration, name: str, rows: np.ndarray, image_size: tuple[int, int]
+    title: str,
+    uv: NDArray[np.float64],
+    before: Residual,
+    after: Residual,
+    image_size: tuple[int, int],
 ) -> Figure:
     """Residuals of one fluoroscope over the image, before and after the calibration.
 
-    Those after it are shown to the scale of those before, and to their own. rows (k,): its image
-    points.
+    Those after it are shown to the scale of those before, and to their own. uv (n, 2): pixels.
     """
-    figure = new_figure(
-        15, 8.4, f'Fluoroscope {name}: residuals over the image ({model_text(run.models[name])})'
-    )
-    uv = run.measured.network.uv[rows]
+    figure = new_figure(15, 8.4, title)
     grid = figure.subplots(2, 3)
     for axis, coordinate in enumerate(COORDINATES):
-        limit_before = _residual_limit(run.before, rows, axis)
-        limit_after = _residual_limit(run.after, rows, axis)
-        limit = max(limit_before, limit_after)
-        for axes, adjustment, own_limit, colour, when in zip(
+        limit_after = _residual_limit(after, axis)
+        limit = max(_residual_limit(before, axis), limit_after)
+        for axes, (residuals, inliers), own_limit, colour, when in zip(
             grid[axis],
-            (run.before, run.after, run.after),
+            (before, after, after),
             (limit, limit, limit_after),
             (BEFORE, AFTER, AFTER),
             ('before', 'after, same scale', 'after, own scale'),
         ):
-            inliers = adjustment.inliers[rows]
-            residual = adjustment.residuals[rows, axis]
+            residual = residuals[:, axis]
             _plot_residuals(
                 axes,
                 uv[:, axis],
@@ -241,7 +247,7 @@ def position_figure(
             _plot_running_median(axes, uv[inliers, axis], residual[inliers], image_size[axis])
             axes.set(xlim=(-0.5, image_size[axis] - 0.5), ylim=(-own_limit, own_limit))
             rmse = np.sqrt(np.mean(residual[inliers] ** 2))
-            outliers = f'{np.sum(~inliers)} of {len(rows)} outliers'
+            outliers = f'{np.sum(~inliers)} of {len(uv)} outliers'
             axes.set(
                 title=f'{coordinate} {when}:\nRMSE {rmse:.3f} px, {outliers}',
                 xlabel=('column u [px]', 'row v [px]')[axis],
@@ -255,10 +261,10 @@ def position_figure(
     return figure
 
 
-def _residual_limit(adjustment: Adjustment, rows: np.ndarray, axis: int) -> float:
+def _residual_limit(residuals: Residual, axis: int) -> float:
     """Limit of a panel in which nearly all inlier residuals lie [px]."""
-    residual = adjustment.residuals[rows][adjustment.inliers[rows], axis]
-    return 1.1 * np.quantile(np.abs(residual), 0.999)
+    values, inliers = residuals
+    return float(1.1 * np.quantile(np.abs(values[inliers, axis]), 0.999)) or 1.0
 
 
 def _plot_residuals(

@@ -16,9 +16,11 @@ from rigs import calibrated, exposures, rig, run, turning
 from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
 from fluoro_calib_ros.exposures.names import Names
 from fluoro_calib_ros.io.calibration_request import write_request
+from fluoro_calib_ros.jobs.calibration import run_calibration
 from fluoro_calib_ros.jobs.report import read_report_input
-from fluoro_calib_ros.jobs.result_folder import save_result
+from fluoro_calib_ros.jobs.result_folder import save_outcome, save_result
 from fluoro_calib_ros.report import html as html_report
+from fluoro_calib_ros.report.rig_geometry import beams, phantom_distance
 
 OPTIONS = {'model': 'parametric', 'max_iterations': 3}
 MAX_BYTES = 5_000_000
@@ -167,3 +169,101 @@ def test_folder_without_calibration_is_refused(folder, tmp_path, without_picture
     assert run('report', copy) == 1
     assert 'this is not the result of a calibration' in capsys.readouterr().err
     assert (copy / 'report.html').read_text() == 'earlier'
+
+
+def test_first_screen_is_in_mm(tmp_path, without_pictures):
+    """Points in space, distances, beams and fields of view."""
+    frames = {name: exposures()[name][:6] for name in 'ab'}
+    request = CalibrationRequest(frames, rig().phantom, CalibrationOptions(**OPTIONS))
+    save_outcome(tmp_path / 'result', run_calibration(request))
+    given = read_report_input(tmp_path / 'result')
+    page = Page()
+    page.feed(html_report.report_html(given))
+    text = ' '.join(''.join(page.text).split())
+    space = given.space
+    assert 0 < space.sd_point_mm < 1 and np.all(space.sd_mm < space.sd_point_mm)
+    assert 0.5 < space.distance_rms_mm / space.distance_sd_mm < 1.5
+    for value in (*space.sd_mm, space.sd_point_mm, space.distance_rms_mm):
+        assert f'{value:.3f}' in text
+    ((_, degrees, between),) = beams(given.orientation)
+    assert f'{degrees:.1f}, {between:.0f}' in text
+    for name, calibration in given.calibrations.items():
+        entry = given.result['fluoroscopes'][name]
+        true = np.median([np.linalg.norm(e['position_mm']) for e in entry['exposures']])
+        distance = phantom_distance(entry['exposures'])
+        assert distance == pytest.approx(true, rel=0.02)
+        width = calibration.image_size[0] * distance / calibration.interior[2]
+        assert f'{width:.0f} ×' in text
+        rmse = entry['rmse_px']['before'][0]
+        assert f'{rmse:.3f} ({rmse * distance / calibration.interior[2]:.3f})' in text
+
+
+def test_checks_have_their_sentence_and_mm(folder, tmp_path, without_pictures):
+    copy = shutil.copytree(folder, tmp_path / 'copy')
+    write_verdict(copy, 'fail', 'two halves differ')
+    given = read_report_input(copy)
+    (check,) = html_report._verdict(given)['checks']
+    distance = phantom_distance(given.result['fluoroscopes']['a']['exposures'])
+    assert check['mm'] == pytest.approx(2.0 * distance / given.calibrations['a'].interior[2])
+    assert check['sentence'] == 'two halves differ'
+
+
+def test_exposures_are_there_to_be_looked_at_one_by_one(folder):
+    given = read_report_input(folder)
+    residuals = {'a': html_report._residuals(given, 'a')}
+    of_one = html_report._arrows(given, residuals)['a']['exposures']
+    assert len(of_one) == 6 and sum(map(len, of_one.values())) == len(residuals['a'].uv)
+    number = int(residuals['a'].exposure[0])
+    u, v, du, dv, used = of_one[number][0]
+    np.testing.assert_allclose((u, v), residuals['a'].uv[0], atol=0.051)
+    np.testing.assert_allclose((du, dv), residuals['a'].after[0], atol=0.0051)
+    assert bool(used) == residuals['a'].inlier[0]
+
+
+def test_beads_are_compared_with_their_survey(folder, without_pictures):
+    """Their shift is the adjusted place minus the surveyed one, the largest first, by name."""
+    given = read_report_input(folder)
+    beads = html_report._bead_picture(given)
+    survey = dict(zip(given.phantom.target_id.tolist(), given.phantom.xyz_mm))
+    names = given.names.target_names()
+    shifts = {
+        names[t['target_id']]: np.array(t['xyz_mm']) - survey[t['target_id']]
+        for t in given.result['targets']
+    }
+    for name, shift, _ in beads['largest']:
+        np.testing.assert_allclose(shift, shifts[name])
+    lengths = [np.linalg.norm(shift) for _, shift, _ in beads['largest']]
+    assert lengths == sorted(lengths, reverse=True)
+    assert lengths[0] == pytest.approx(max(np.linalg.norm(s) for s in shifts.values()))
+
+
+def test_outliers_have_names_and_residuals(folder):
+    given = read_report_input(folder)
+    all_used = html_report._residuals(given, 'a')
+    exposure, target = int(all_used.exposure[7]), int(all_used.target_id[7])
+    point = {'exposure': exposure, 'target_id': target}
+    point |= {'fluoroscope': 'a', 'value': 9.0, 'critical': 3.0}
+    result = {**given.result, 'outliers': {'image_points': [point]}}
+    given = replace(given, result=result)
+    residuals = {'a': html_report._residuals(given, 'a')}
+    (row,) = html_report._outliers(given, residuals)['rows']
+    assert row['target'] == f'<bead> {point["target_id"]}'
+    assert np.flatnonzero(~residuals['a'].inlier).tolist() == [7]
+    assert row['px'] == pytest.approx(np.hypot(*residuals['a'].after[7]))
+
+
+def test_sides_without_beads_are_named(folder):
+    given = read_report_input(folder)
+    residuals = html_report._residuals(given, 'a')
+    width, _ = given.calibrations['a'].image_size
+    left = residuals.uv[:, 0] < width / 2
+    half = replace(
+        residuals,
+        **{
+            name: getattr(residuals, name)[left]
+            for name in ('exposure', 'target_id', 'uv', 'before', 'after', 'inlier', 'angle')
+        },
+    )
+    missing = html_report._fluoroscope(given, 'a', half)['missing']
+    assert {'upper right', 'middle right', 'lower right'} <= set(missing)
+    assert not any('left' in side for side in missing)

@@ -1,0 +1,158 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The rig of a calibration in mm: where sources, images and phantom are, and how well points are
+known in space.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..correction.base import CorrectionStatus
+from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
+from ..exposures.phantom import Phantom
+from ..photogrammetry.rig_orientation import RigOrientation
+from ..photogrammetry.rotations import matrix_from_quaternion
+from ..reconstruction.intersection import OK
+from ..reconstruction.reconstruct import ReconstructedFrame
+
+BEHIND = 1.3  # of the distance of the phantom: where the images are drawn
+GRID = 64  # places in each direction of an image
+
+
+@dataclass(frozen=True)
+class SpaceAccuracy:
+    """How well points in space are known that two or more fluoroscopes see."""
+
+    points: int  #: beads that were intersected, in all exposures
+    sd_mm: NDArray[
+        np.float64
+    ]  #: (3,) median standard deviations of x, y, z in the frame of the rig
+    sd_point_mm: float  #: median root of the sum of their squares
+    distances: int  #: between beads of one exposure
+    distance_mm: float  #: mean distance
+    distance_rms_mm: float  #: RMS of their differences from the survey
+    distance_sd_mm: float  #: RMS of what is expected for these
+
+
+def accuracy_in_space(
+    frames: Sequence[ReconstructedFrame], phantom: Phantom
+) -> SpaceAccuracy | None:
+    """Return how well the beads of exposures are known, None without two in an exposure.
+
+    In each exposure, the distances are those between the first and the second half of its beads.
+    """
+    sd = []
+    measured = []
+    surveyed = []
+    expected = []
+    for frame in frames:
+        row = phantom.index(frame.target_id)
+        ok = (frame.points.status == OK) & (row >= 0)
+        sd.append(frame.points.sd_mm[ok])
+        half = np.count_nonzero(ok) // 2
+        one, other = np.flatnonzero(ok)[: 2 * half].reshape(2, half)
+        along = frame.points.xyz_mm[other] - frame.points.xyz_mm[one]
+        length = np.linalg.norm(along, axis=1)
+        covariance = frame.points.covariance_noise[one] + frame.points.covariance_noise[other]
+        unit = along / length[:, None]
+        measured.append(length)
+        there = phantom.xyz_mm[row]
+        surveyed.append(np.linalg.norm(there[other] - there[one], axis=1))
+        expected.append(
+            np.einsum('ni,nij,nj->n', unit, covariance, unit)
+            + phantom.sd_mm[row[one]] ** 2
+            + phantom.sd_mm[row[other]] ** 2
+        )
+    if not sum(map(len, measured)):
+        return None
+    sds = np.concatenate(sd)
+    lengths = np.concatenate(measured)
+    difference = lengths - np.concatenate(surveyed)
+    return SpaceAccuracy(
+        len(sds),
+        np.median(sds, axis=0),
+        sd_point_mm=float(np.median(np.linalg.norm(sds, axis=1))),
+        distances=len(lengths),
+        distance_mm=float(lengths.mean()),
+        distance_rms_mm=float(np.sqrt(np.mean(difference**2))),
+        distance_sd_mm=float(np.sqrt(np.mean(np.concatenate(expected)))),
+    )
+
+
+def beams(orientation: RigOrientation) -> list[tuple[str, float, float]]:
+    """Return pairs of fluoroscopes: names, angle of their beams [degrees], and mm between sources.
+
+    A beam is the ray through the principal point.
+    """
+    out = []
+    for i, j in combinations(range(len(orientation.fluoroscopes)), 2):
+        cosine = float(orientation.rotation[i][2] @ orientation.rotation[j][2])
+        between = orientation.position_mm[i] - orientation.position_mm[j]
+        names = f'{orientation.fluoroscopes[i]} and {orientation.fluoroscopes[j]}'
+        out.append((names, float(np.degrees(np.arccos(cosine))), float(np.linalg.norm(between))))
+    return out
+
+
+def phantom_in_sensor(entry: Mapping[str, Any]) -> np.ndarray:
+    """Return the origin of the phantom in the sensor frame of an exposure of result.json [mm]."""
+    rotation = matrix_from_quaternion(np.array(entry['quaternion_wxyz'], dtype=float))
+    return -rotation @ np.array(entry['position_mm'], dtype=float)
+
+
+def phantom_distance(exposures: Sequence[Mapping[str, Any]]) -> float:
+    """Return the median distance of the phantom from the source [mm], NaN without exposures."""
+    if not exposures:
+        return float('nan')
+    return float(np.median([phantom_in_sensor(entry)[2] for entry in exposures]))
+
+
+def uncalibrated_share(calibration: FluoroscopeCalibration) -> float:
+    """Return the share of the pixels beyond the calibrated area, 0 to 1."""
+    ticks = ((np.arange(GRID) + 0.5) / GRID * side - 0.5 for side in calibration.image_size)
+    uv = np.stack(np.meshgrid(*ticks), axis=-1).reshape(-1, 2)
+    return float(np.mean(calibration.correct(uv).status != CorrectionStatus.OK))
+
+
+def drawing(
+    result: Mapping[str, Any], calibrations: Calibrations, orientation: RigOrientation | None
+) -> dict[str, Any]:
+    """Return what the drawing of the rig shows, in mm: in the frame of the rig, else per exposure.
+
+    Sources, corners of the images on a plane behind the phantom, and the places of the phantom.
+    """
+    entries = result['fluoroscopes']
+    fluoroscopes = []
+    places: list[list[float]] = []
+    names = [n for n in (orientation.fluoroscopes if orientation else ()) if n in entries]
+    for name in names or list(entries)[:1]:
+        calibration = calibrations[name]
+        turn = np.eye(3)
+        origin = np.zeros(3)
+        if orientation is not None:
+            index = orientation.fluoroscopes.index(name)
+            turn = orientation.rotation[index]
+            origin = orientation.position_mm[index]
+        exposures = entries[name]['exposures']
+        depth = BEHIND * (phantom_distance(exposures) if exposures else 1000.0)
+        xp, yp, c = calibration.interior
+        width, height = calibration.image_size
+        corners = [(0, 0), (width, 0), (width, height), (0, height)]
+        rays = np.array([((u - xp) / c, (v - yp) / c, 1.0) for u, v in corners]) * depth
+        fluoroscopes.append(
+            {
+                'name': name,
+                'source': origin.tolist(),
+                'corners': (rays @ turn + origin).tolist(),
+            }
+        )
+        if not places:
+            places = [(turn.T @ phantom_in_sensor(entry) + origin).tolist() for entry in exposures]
+    return {'fluoroscopes': fluoroscopes, 'places': places}

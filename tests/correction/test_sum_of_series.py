@@ -38,6 +38,8 @@ def test_calibration_with_a_drift_corrects_by_it_too():
     before = calibration.correct(uv, exact=True)
     after = changed.correct(uv, exact=True)
     np.testing.assert_allclose(before.uv - after.uv, drift.predict(uv), atol=1e-8)
+    learned = changed.model.train_duv - calibration.model.train_duv
+    np.testing.assert_allclose(learned, drift.predict(calibration.model.train_uv), atol=1e-12)
     assert changed.calibration_id != calibration.calibration_id
     assert (after.sigma > before.sigma).all()
     without = true_calibrations(rig().fluoroscopes)['a']

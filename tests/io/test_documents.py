@@ -109,7 +109,7 @@ def test_document_beyond_the_limit_is_not_parsed(kind):
     ],
 )
 def test_what_grows_or_overflows_is_refused(kind, text, sentence):
-    with pytest.raises(DataError, match=sentence):
+    with pytest.raises(DataError, match=f'^f(, |: ).*{sentence}'):
         PARSE[kind](text, 'f')
 
 

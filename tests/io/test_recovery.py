@@ -11,6 +11,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+import zstandard
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType
@@ -21,9 +22,10 @@ from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.io.bags import writer as writer_module
 from fluoro_calib_ros.io.bags.metadata import TARGET_OBSERVATIONS, message_from_frame
 from fluoro_calib_ros.io.bags.reader import iterate_messages, read_frames
-from fluoro_calib_ros.io.bags.salvage import recover_bag
+from fluoro_calib_ros.io.bags.salvage import _decompressed, recover_bag
 from fluoro_calib_ros.io.bags.writer import BagWriter
 from fluoro_calib_ros.jobs.simulation import write_bag
+from fluoro_calib_ros.limits import MAX_CHUNK
 from fluoro_calib_ros.simulation.exposures import simulate_tracking
 from fluoro_calib_ros.simulation.rig import StreamStart, virtual_rig
 
@@ -68,6 +70,21 @@ def chunks_of(path):
 
 def held(path):
     return Counter((m.topic, m.log_time_ns, m.data) for m in iterate_messages(path))
+
+
+def test_chunk_that_claims_more_than_a_chunk_has_is_not_decompressed():
+    """By its frame, whatever the chunk says; and by the chunk, where the frame says nothing."""
+    content = b'observations' * 100
+    known = zstandard.ZstdCompressor().compress(content)
+    unknown = zstandard.ZstdCompressor(write_content_size=False).compress(content)
+    assert _decompressed(b'zstd', memoryview(known), 1) == content
+    assert _decompressed(b'zstd', memoryview(unknown), len(content)) == content
+    for size in (0, MAX_CHUNK + 1):
+        assert _decompressed(b'zstd', memoryview(unknown), size) is None
+    # RFC 8878, 3.1.1.1: magic number, a descriptor with eight bytes of size, a terabyte
+    claimed = known[:4] + bytes([0b11100000]) + (2**40).to_bytes(8, 'little') + known[6:]
+    assert zstandard.frame_content_size(claimed) == 2**40
+    assert _decompressed(b'zstd', memoryview(claimed), len(content)) is None
 
 
 def test_bag_cut_off_anywhere_gives_the_complete_chunks(tmp_path, bag):

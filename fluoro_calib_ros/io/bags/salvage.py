@@ -336,9 +336,9 @@ def _decompressed(compression: bytes, data: memoryview, size: int) -> bytes | No
     try:
         if compression == b'zstd':
             held = zstandard.frame_content_size(data)
-            if not 0 <= held <= MAX_CHUNK and not 0 < size <= MAX_CHUNK:
+            limit = size if held < 0 else held  # the frame need not tell its size
+            if not 0 < limit <= MAX_CHUNK:
                 return None
-            limit = held if held >= 0 else size
             return zstandard.ZstdDecompressor().decompress(data, max_output_size=limit)
         if compression == b'lz4':
             return lz4.frame.decompress(bytes(data)) if 0 < size <= MAX_CHUNK else None

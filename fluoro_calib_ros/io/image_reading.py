@@ -80,9 +80,43 @@ def suffix_of(path: PathLike) -> str:
     return Path(path).suffix.lower()
 
 
+# How files begin: PNG, TIFF, JPEG, BMP and PGM; DICOM has a preamble (PS3.10, 7.1).
+_BEGINNINGS = (
+    (0, b'\x89PNG\r\n\x1a\n', '.png'),
+    (0, b'II*\0', '.tif'),
+    (0, b'MM\0*', '.tif'),
+    (0, b'\xff\xd8\xff', '.jpg'),
+    (0, b'BM', '.bmp'),
+    (0, b'P5', '.pgm'),
+    (128, b'DICM', '.dcm'),
+)
+_BEGINNING_BYTES = 132
+_DIRECTORY = 'DICOMDIR'  # a DICOM file that lists others
+
+
+def image_suffix_of(path: PathLike) -> str:
+    """Suffix of a file that is read as images, '' for another file.
+
+    That of its name, or, where the name has none or one that means nothing, that of its content:
+    scanners call a file IM000001, or 1.2.840 and so on.
+    """
+    suffix = suffix_of(path)
+    if suffix in READ_SUFFIXES:
+        return suffix
+    known = suffix and not suffix[1:].isdigit()
+    if known or not os.path.isfile(path) or Path(path).name == _DIRECTORY:
+        return ''
+    try:
+        with open(path, 'rb') as file:
+            begin = file.read(_BEGINNING_BYTES)
+    except OSError:
+        return ''
+    return next((s for at, mark, s in _BEGINNINGS if begin[at:].startswith(mark)), '')
+
+
 def is_image_source(path: PathLike) -> bool:
-    """Whether a path is a folder, or a file with the suffix of an image or a video."""
-    return os.path.isdir(path) or suffix_of(path) in READ_SUFFIXES
+    """Whether a path is a folder, or a file with images or a video."""
+    return os.path.isdir(path) or bool(image_suffix_of(path))
 
 
 def listed(suffixes: Iterable[str]) -> str:
@@ -191,7 +225,7 @@ class ImageSource:
 
 def open_images(path: Path) -> ImageSource:
     """Open an image file, a stack or a video. Raises DataError if it cannot be read."""
-    suffix = suffix_of(path)
+    suffix = image_suffix_of(path)
     if suffix in VIDEO_CODECS:
         return _open_video(path)
     if suffix in CINE_SUFFIXES:
@@ -202,7 +236,7 @@ def open_images(path: Path) -> ImageSource:
         return _open_dicom(path)
     if suffix not in IMAGE_SUFFIXES:
         raise DataError(
-            f'the ending {suffix or "(none)"} is none of an image or a video '
+            f'the ending {suffix_of(path) or "(none)"} is none of an image or a video '
             f'({listed(READ_SUFFIXES)})',
             at=path,
         )

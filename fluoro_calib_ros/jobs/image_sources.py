@@ -18,8 +18,8 @@ from ..exposures.angles import AngleOptions, JointAngles
 from ..io.bags.reader import angles_in, image_topics, images_of_topic, topics_of
 from ..io.image_reading import (
     EXPOSURE_SUFFIXES,
-    READ_SUFFIXES,
     VIDEO_SUFFIXES,
+    image_suffix_of,
     listed,
     open_images,
     suffix_of,
@@ -114,7 +114,7 @@ def open_sources(
     def images() -> Iterator[SourceImage]:
         exposure = 0
         for path, (_, read), number in zip(files, readers, numbers):
-            video = suffix_of(path) in VIDEO_SUFFIXES
+            video = image_suffix_of(path) in VIDEO_SUFFIXES
             for frame, (place, image, angle) in enumerate(read()):
                 exposure = number if numbered and number is not None else exposure + 1
                 yield SourceImage(exposure, place, image, frame if video else None, angle)
@@ -137,16 +137,17 @@ def fluoroscope_folders(source: Path) -> dict[str, Path]:
     return {
         path.name: path
         for path in sorted(source.iterdir())
-        if path.is_dir() and any(suffix_of(file) in EXPOSURE_SUFFIXES for file in path.iterdir())
+        if path.is_dir()
+        and any(image_suffix_of(file) in EXPOSURE_SUFFIXES for file in path.iterdir())
     }
 
 
 def contains_images(source: Path) -> bool:
     """Return whether a source is an image, a folder of images, a video, or a bag of images."""
-    if suffix_of(source) in READ_SUFFIXES and not source.is_dir():
+    if not source.is_dir() and image_suffix_of(source):
         return True
     if source.is_dir() and not (source / 'metadata.yaml').exists():
-        direct = any(suffix_of(path) in EXPOSURE_SUFFIXES for path in source.iterdir())
+        direct = any(image_suffix_of(path) in EXPOSURE_SUFFIXES for path in source.iterdir())
         return direct or bool(fluoroscope_folders(source))
     if source.is_dir() or suffix_of(source) in BAG_SUFFIXES:
         observations = 'fluoro_calib_msgs/msg/TargetObservations'
@@ -160,7 +161,7 @@ def contains_images(source: Path) -> bool:
 
 def _images_in(folder: Path) -> list[Path]:
     """Return the images of a folder in the order of their names. Raises DataError for none."""
-    found = [path for path in folder.iterdir() if suffix_of(path) in EXPOSURE_SUFFIXES]
+    found = [path for path in folder.iterdir() if image_suffix_of(path) in EXPOSURE_SUFFIXES]
     if not found:
         raise DataError(
             f'{folder}: there are no images in this folder ({listed(EXPOSURE_SUFFIXES)})'
@@ -170,7 +171,7 @@ def _images_in(folder: Path) -> list[Path]:
 
 def _number(path: Path) -> int | None:
     """Return the last number in the name of a file, None for none."""
-    numbers = re.findall(r'\d+', path.stem)
+    numbers = re.findall(r'\d+', path.name if path.suffix[1:].isdigit() else path.stem)
     return int(numbers[-1][-9:]) if numbers else None
 
 

@@ -373,3 +373,13 @@ def test_calibrate_takes_the_angles_of_images_in_a_bag(folder, monkeypatch):
     assert angles_in_table(folder) == [5.7296, 11.4592, 11.4592]
     with pytest.raises(SystemExit):
         main([*words, 'table'])
+
+
+def test_files_without_ending_have_the_numbers_of_their_names(folder):
+    for number in (1, 2, 3):
+        path = folder / 'a' / f'image_{number:04d}.png'
+        path.rename(folder / 'a' / f'1.2.840.{10 * number}')
+    (folder / 'a' / 'notes').write_text('of the operator')
+    extract(folder, 'a')
+    frames = read_observations_csv(folder / 'out.csv', (SIZE, SIZE))['a']
+    assert [frame.number for frame in frames] == [10, 20, 30]

@@ -5,12 +5,13 @@
 
 import struct
 
+import cv2
 import numpy as np
 import pydicom
 import pytest
 
 from fluoro_calib_ros.errors import DataError
-from fluoro_calib_ros.io.image_reading import open_images
+from fluoro_calib_ros.io.image_reading import image_suffix_of, is_image_source, open_images
 from fluoro_calib_ros.io.recordings import read_cine_header
 from fluoro_calib_ros.jobs.image_sources import contains_images, open_sources
 
@@ -227,3 +228,31 @@ def test_missing_pydicom_is_told(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__('sys').modules, 'pydicom', None)
     with pytest.raises(DataError, match='need pydicom 3, which is not installed: pip install'):
         open_images(path)
+
+
+@pytest.mark.parametrize('name', ['IM000007', '1.2.840.113619.7', 'loop.IMA'])
+def test_dicom_is_recognised_by_its_content(tmp_path, name):
+    frames = np.full((1, 40, 60), 7, np.uint8)
+    path = dicom(tmp_path / name, frames)
+    assert is_image_source(path)
+    np.testing.assert_array_equal(images_of(path)[0], frames[0])
+
+
+@pytest.mark.parametrize('suffix', ['.png', '.tif', '.jpg', '.bmp', '.pgm'])
+def test_image_without_ending_is_recognised_by_its_content(tmp_path, suffix):
+    image = np.full((40, 60), 90, np.uint8)
+    cv2.imwrite(str(tmp_path / f'image{suffix}'), image)
+    path = (tmp_path / f'image{suffix}').rename(tmp_path / 'image')
+    assert image_suffix_of(path) == suffix
+    np.testing.assert_allclose(images_of(path)[0], image, atol=1)  # JPEG
+
+
+@pytest.mark.parametrize('name', ['notes', 'notes.txt', 'points.csv', 'DICOMDIR', 'folder'])
+def test_other_files_are_no_images(tmp_path, name):
+    """Neither text, nor the list of the files of a DICOM medium, nor what says it is another."""
+    (tmp_path / 'folder').mkdir()
+    if name != 'folder':
+        content = bytes(128) + b'DICM' if name == 'DICOMDIR' else b'P6 is not read'
+        (tmp_path / name).write_bytes(content)
+    assert image_suffix_of(tmp_path / name) == ''
+    assert image_suffix_of(tmp_path / 'missing') == ''

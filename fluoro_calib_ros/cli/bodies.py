@@ -84,8 +84,7 @@ def run(arguments: argparse.Namespace) -> None:
     inputs = [arguments.source, arguments.calibration, path, arguments.bodies]
     check_bodies_folder(arguments.out, [*inputs, arguments.joints or path])
     bodies = read_bodies(arguments.bodies)
-    names = [body.name for body in bodies]
-    joints = read_joints(arguments.joints, names) if arguments.joints else ()
+    joints = read_joints(arguments.joints, bodies) if arguments.joints else ()
     recording, calibrations, orientation = read_oriented_source(arguments, path)
     print_notes(recording.notes)
     if arguments.rate is None and not is_bag(arguments.source):

@@ -165,8 +165,8 @@ class JointEntry:
     neutral: tuple[int, int] | None = None
 
 
-def read_joints(path: PathLike, bodies: Iterable[str]) -> tuple[JointEntry, ...]:
-    """Read a joints.toml with joints between bodies of these names.
+def read_joints(path: PathLike, bodies: Iterable[Body | str]) -> tuple[JointEntry, ...]:
+    """Read a joints.toml with joints between these bodies, or bodies of these names.
 
     Raises DataError that names file and joint.
     """
@@ -180,7 +180,8 @@ def read_joints(path: PathLike, bodies: Iterable[str]) -> tuple[JointEntry, ...]
         raise DataError(f'{path}: {len(found)} joints, more than {MAX_JOINTS} are not read')
     entries = tuple(_entry(path, n, table) for n, table in enumerate(found, 1))
     with ErrorsAt(path):
-        check_joints([entry.joint for entry in entries], bodies)
+        names = [body if isinstance(body, str) else body.name for body in bodies]
+        check_joints([entry.joint for entry in entries], names)
     return entries
 
 

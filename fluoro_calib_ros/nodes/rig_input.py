@@ -198,7 +198,7 @@ def read_body_files(parameters: BodyParameters) -> tuple[tuple[Body, ...], tuple
     if not parameters.joints:
         return bodies, ()
     path = expand_path(parameters.joints)
-    joints = read_joints(path, [body.name for body in bodies])
+    joints = read_joints(path, bodies)
     for entry in joints:
         try:
             JointTracker(entry.joint, entry.neutral)

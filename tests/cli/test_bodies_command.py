@@ -75,7 +75,7 @@ def test_python_has_the_tables_of_the_command_and_its_figures(knee, tmp_path, mo
     calibrations = fc.read_calibrations(knee / 'result')
     orientation = fc.load_orientation(knee / 'result' / 'rig_orientation.npz')
     known = fc.read_bodies(knee / 'bodies.csv')
-    joints = fc.read_joints(knee / 'joints.toml', [body.name for body in known])
+    joints = fc.read_joints(knee / 'joints.toml', known)
     outcome = fc.track_bodies(recording.frames, calibrations, orientation, known, joints=joints)
     fc.save_bodies(tmp_path / 'motion', outcome)
     for name in ('poses', 'motion', 'joints', 'shapes'):

@@ -126,7 +126,7 @@ def live(module_graph, by_command, tmp_path_factory):
 def offline(live, by_command):
     """The same exposures by the job of the command."""
     bodies = read_bodies(live.files['bodies'])
-    joints = read_joints(live.files['joints'], [body.name for body in bodies])
+    joints = read_joints(live.files['joints'], bodies)
     calibrations = read_calibrations(by_command)
     orientation = load_orientation(orientation_path(by_command))
     options = BodiesOptions(smooth='lag', lag=0, estimate_shapes=False)

@@ -87,7 +87,7 @@ def test_the_files_belong_together(folder, name):
     """Poses, joint and joint angles; bodies, poses and image points, through the written rig."""
     bodies = read_bodies(folder / 'bodies.csv')
     true = read_bodies(folder / 'truth' / 'bodies.csv')
-    (entry,) = read_joints(folder / 'joints.toml', [body.name for body in bodies])
+    (entry,) = read_joints(folder / 'joints.toml', bodies)
     poses = {}
     for body, exact in zip(bodies, true):
         assert body.name == exact.name and (body.sd_mm == 0.1).all()

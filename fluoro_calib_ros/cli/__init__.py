@@ -188,7 +188,7 @@ def make_parser(
             description=module.HELP,
             epilog=f'example: {module.EXAMPLE}',
         )
-        sub.set_defaults(module=module, parse=parse_words)
+        sub.set_defaults(module=module, parse=parse_words, rig_file=rig)
         if command in (None, module.NAME):
             sub.add_argument(
                 '--help-all', action=_WholeHelp, nargs=0, help='show all options and exit'
@@ -224,7 +224,6 @@ def parse_words(
     options = parser.parse_args(words)
     if hasattr(options.module, 'check'):
         options.module.check(options, parser.error)
-    options.rig_file = rig
     return options
 
 

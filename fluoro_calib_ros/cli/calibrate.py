@@ -236,6 +236,11 @@ def _request(arguments: argparse.Namespace) -> CalibrationRequest:
         principal_distance=arguments.principal_distance,
         names=names,
         known_orientations=known,
+        about={
+            'observations': str(arguments.source),
+            'phantom': str(arguments.phantom),
+            **((arguments.rig_file and arguments.rig_file.about) or {}),
+        },
     )
 
 

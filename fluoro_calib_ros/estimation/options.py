@@ -352,6 +352,8 @@ class CalibrationRequest:
     known_orientations : mapping of str to KnownOrientation
         Orientations that are known beforehand, by fluoroscope; the phantom is then surveyed in
         their frame.
+    about : mapping of str to str
+        What the report says of rig and input, such as site and operator; no calculation uses it.
     """
 
     frames: Frames
@@ -361,6 +363,7 @@ class CalibrationRequest:
     principal_distance: float | None = None
     names: Names = field(default_factory=Names)
     known_orientations: Mapping[str, KnownOrientation] = field(default_factory=dict)
+    about: Mapping[str, str] = field(default_factory=dict)
 
     def with_exposures(self, numbers: Mapping[str, Container[int]]) -> CalibrationRequest:
         """Return the request with the exposures of these numbers, by fluoroscope, only."""

@@ -45,6 +45,7 @@ def write_request(directory: PathLike, request: CalibrationRequest) -> None:
         'options': request.options.to_document(),
         'joint': bool(request.joint),
         'principal_distance': request.principal_distance,
+        'about': dict(request.about),
     }
     write_json(directory / OPTIONS, document)
     write_names(directory, request.names)

@@ -10,6 +10,10 @@
     angle_joint = "carm"          # joint of the C-arm; or {a = "frontal", b = "lateral"}
     angle_max_age = 0.5           # longest time from its last state to an exposure [s]
 
+    [about]                       # shown in the report of a calibration, used by nothing
+    site = "gait laboratory"
+    kV = 80
+
 All keys are optional; paths are relative to the folder of the file.
 """
 
@@ -23,6 +27,8 @@ from ..errors import DataError
 from .documents import read_toml
 
 NAME = 'rig.toml'
+MAX_ABOUT = 100  # entries
+MAX_ABOUT_TEXT = 1000
 
 
 @dataclass(frozen=True)
@@ -39,6 +45,8 @@ class RigFile:
     angle_joint: str | None = None
     #: longest time from the last state of the joint to an exposure [s]
     angle_max_age: float | None = None
+    #: what the report says of the rig, such as site, operator, kV and mA
+    about: dict[str, str] | None = None
 
 
 KEYS = tuple(field.name for field in fields(RigFile)[1:])
@@ -59,6 +67,7 @@ def read_rig_file(path: Path) -> RigFile:
         calibration=_path(path, 'calibration', document.get('calibration')),
         angle_joint=_joint(path, document.get('angle_joint'), names),
         angle_max_age=_max_age(path, document.get('angle_max_age')),
+        about=_about(path, document.get('about')),
     )
 
 
@@ -119,6 +128,21 @@ def _max_age(path: Path, value: Any) -> float | None:
         return AngleOptions(angle_max_age=float(value)).angle_max_age
     except (ValueError, OverflowError):
         raise DataError(f'{path}, key angle_max_age: a time [s], such as 0.5') from None
+
+
+def _about(path: Path, value: Any) -> dict[str, str] | None:
+    """Return texts that the report shows, by name."""
+    if value is None:
+        return None
+    if not isinstance(value, dict) or len(value) > MAX_ABOUT:
+        raise DataError(f'{path}, key about: a table of at most {MAX_ABOUT} texts and numbers')
+    for key, text in value.items():
+        if not isinstance(text, str | int | float) or len(f'{key}{text}') > MAX_ABOUT_TEXT:
+            raise DataError(
+                f'{path}, key about.{key}: a text or a number, of at most {MAX_ABOUT_TEXT} '
+                'characters with its name'
+            )
+    return {key: str(text) for key, text in value.items()}
 
 
 def _path(path: Path, key: str, value: Any) -> Path | None:

@@ -91,6 +91,7 @@ def report_html(given: ReportInput) -> str:
         outliers=_outliers(given, residuals),
         arrows=_arrows(given, residuals),
         space=given.space,
+        about=given.settings.get('about') or {},
         adjustments=given.result.get('adjustments', []),
         correlations=given.result.get('correlations', [])[:MAX_ROWS],
     )

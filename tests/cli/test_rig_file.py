@@ -8,6 +8,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from rigs import run
 
 from fluoro_calib_ros.cli import COMMANDS, main, make_parser
 from fluoro_calib_ros.cli.arguments import angle_options
@@ -105,9 +106,25 @@ def test_what_the_rig_file_does_not_say_is_required_as_before(rig, capsys):
     assert '--phantom, --out' in capsys.readouterr().err
 
 
+def test_what_the_file_says_about_the_rig_is_in_the_report(rig, tmp_path):
+    folder = tmp_path / 'data'
+    assert run('simulate', '--out', folder, '--exposures', 6, '--seconds', 0.05) == 0
+    file = rig('[about]\nsite = "<gait> laboratory"\nkV = 80\n')
+    calibrate = ('calibrate', folder / 'calibration', '--phantom', folder / 'phantom.csv')
+    fast = ('--model', 'none', '--fast', '--rig', file, '--out', tmp_path / 'result')
+    assert run(*calibrate, *fast) == 0 and run('report', tmp_path / 'result') == 0
+    text = (tmp_path / 'result' / 'report.html').read_text()
+    for key, value in (('site', '&lt;gait&gt; laboratory'), ('kV', '80')):
+        assert f'<tr><td>{key}</td><td class="text">{value}</td></tr>' in text
+    assert str(folder / 'phantom.csv') in text
+
+
 @pytest.mark.parametrize(
     'text, cause',
     [
+        ('about = "x"', 'about: a table'),
+        ('[about]\nsite = ["x"]', 'about.site: a text or a number'),
+        (f'[about]\nsite = "{"x" * 1000}"', 'about.site: a text or a number'),
         ('phantm = "p.csv"', 'key phantm: unknown, there are fluoroscopes, image_size, phantom'),
         ('image_size = [1024]', 'key image_size: width and height'),
         ('image_size = "1024x1024"', 'key image_size: width and height'),

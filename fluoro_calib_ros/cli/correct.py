@@ -27,6 +27,7 @@ from .output import ProgressBar, print_note, print_notes, print_result
 
 if TYPE_CHECKING:
     from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+    from ..io.image_writing import CorrectedImages
 
 NAME = 'correct'
 HELP = 'Correct image points (CSV file) or images (image, TIFF stack, folder or video).'
@@ -137,7 +138,7 @@ def _correct_points(arguments: argparse.Namespace, calibrations: Calibrations) -
 
 
 def _correct_images(arguments: argparse.Namespace, calibrations: Calibrations) -> None:
-    from ..images.corrector import ImageCorrector
+    """Correct images and videos. Raises DataError."""
     from ..jobs.image_correction import ImageCorrectionRequest, run_image_correction
 
     source = arguments.source
@@ -170,12 +171,6 @@ def _correct_images(arguments: argparse.Namespace, calibrations: Calibrations) -
     )
     with ProgressBar(source.name) as progress:
         done = run_image_correction(request, progress)
-    if done.passed_over:
-        print_note(
-            f'{source}: files that are not images were skipped: {first_few(done.passed_over)}'
-        )
-    if done.failed:
-        print_note(f'not corrected: {first_few(done.failed, "; ")}')
     if angles is not None:
         unknown = sum(number not in angles for number in range(1, done.images + 1))
         if unknown:
@@ -183,6 +178,22 @@ def _correct_images(arguments: argparse.Namespace, calibrations: Calibrations) -
                 f'{source}: {unknown} of {done.images} images have no angle in '
                 f'{arguments.angles}, they are corrected with the mean over the angles'
             )
+    _print_images(arguments, calibration, done)
+
+
+def _print_images(
+    arguments: argparse.Namespace, calibration: FluoroscopeCalibration, done: CorrectedImages
+) -> None:
+    """Print what was corrected."""
+    from ..images.corrector import ImageCorrector
+
+    if done.passed_over:
+        print_note(
+            f'{arguments.source}: files that are not images were skipped: '
+            f'{first_few(done.passed_over)}'
+        )
+    if done.failed:
+        print_note(f'not corrected: {first_few(done.failed, "; ")}')
     corrector = ImageCorrector(calibration, arguments.interpolation)
     size = 'x'.join(map(str, calibration.image_size))
     empty = int((~corrector.mask).sum())

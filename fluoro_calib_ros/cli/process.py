@@ -104,9 +104,7 @@ class Done:
 
     status: int  #: exit status
     document: Mapping[str, Any]  #: what it prints with --json
-    message: str  #: why it failed, '' where it has not
-    seconds: float
-    kept: bool = False  #: whether it was done earlier, with the same input
+    message: str = ''  #: why it failed, '' where it has not
 
     @property
     def ok(self) -> bool:
@@ -276,7 +274,6 @@ class _Started:
     step: Step
     digest: str  #: of what it was started with
     process: subprocess.Popen[Any]
-    begin_s: float
 
 
 class _Work:
@@ -337,7 +334,7 @@ class _Work:
                 log=folder / LOG,
                 out=step.document,
             )
-            return _Started(step, digest, process, time.monotonic())
+            return _Started(step, digest, process)
         return None
 
     def _kept(self, step: Step, digest: str) -> Done | None:
@@ -349,7 +346,7 @@ class _Work:
             return None
         if not step.out.exists() or not step.document.exists():
             return None
-        return Done(int(entry['status']), read_json(step.document), '', 0.0, kept=True)
+        return Done(int(entry['status']), read_json(step.document))
 
     def _ended(self, started: _Started) -> Done:
         """Note that a step has ended; return what it gave."""
@@ -357,11 +354,10 @@ class _Work:
 
         step = started.step
         status = int(started.process.returncode)
-        seconds = time.monotonic() - started.begin_s
         ok = status in (0, NOT_PASSED)
         document = read_json(step.document) if ok else {}
         message = '' if ok else _last_line(step.out.parent / LOG)
-        self.done[step.key] = done = Done(status, document, message, seconds)
+        self.done[step.key] = done = Done(status, document, message)
         if ok:
             self._state[step.key] = {'digest': started.digest, 'status': status}
         else:

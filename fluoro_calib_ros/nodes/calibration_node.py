@@ -189,11 +189,14 @@ class CalibrationNode(StreamNode):
             disagreement=self._exposures.disagreement(),
             angle=self._angles.health(name, incompatible),
         )
+        orientation = self._output.orientation
         values = {
             **progress.collected.values(),
             'lost at the input': stream.overrun,
             'last fault': stream.refusals.last_fault,
             'calibration': progress.calibration_id,
+            'orientation': orientation.orientation_id if orientation else '',
+            'source of the orientation': orientation.source if orientation else '',
             **self._angles.values(name),
         }
         return Status(name, *health_of(state, CONDITIONS), values)

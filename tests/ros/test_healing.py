@@ -64,7 +64,8 @@ class Rig:
         write_bag(self.bag, bumped.frames)
         self.frames = bumped.frames
         self.first = 0
-        graph.whole_chain(self.folder, learned_shapes=self.shapes)
+        nodes = graph.whole_chain(self.folder, learned_shapes=self.shapes)
+        self.reconstruction = nodes['reconstruction_node']
         self.points = self.client.listen('reconstruction/points_with_covariance')
         self.orientations = self.client.listen('rig_orientation')
         self.client.wait_until(
@@ -180,6 +181,11 @@ def test_bumped_rig_is_healed_accepted_and_rolled_back(rig, tmp_path, capsys):
     accepted = rig.client.call(Reset, 'accept_healing')
     assert accepted.success, accepted.message
     rig.wait_for_orientation(result.orientation_id)
+    rig.client.wait_for_diagnostics(
+        'calibration_node', lambda s: value_of(s, 'source of the orientation') == 'healing'
+    )
+    shift = np.linalg.norm(result.change[:3])
+    assert f'transforms of the rig jump: b by {shift:.2f} mm and ' in rig.reconstruction.log
     saved = load_orientation(orientation_path(rig.folder))
     assert (saved.orientation_id, saved.source) == (result.orientation_id, 'healing')
     versions = {path.name for path in (rig.folder / 'versions').iterdir()}
@@ -280,18 +286,53 @@ def test_healed_rig_accepted_by_the_parameter_outlives_the_node(rig, graph, cali
     assert load_orientation(orientation_path(calibrated)).orientation_id == before
 
 
+def stream_of(rig, virtual, motion):
+    """Yield pairs of frames of a knee in a virtual rig."""
+    frames = simulate_knee(virtual, rig.knee, motion, seed=3).frames
+    for pair in zip(*(frames[n] for n in NAMES)):
+        yield [replace(f, stamp_ns=10**18 + f.number * 10**7) for f in pair]
+
+
 def test_healthy_rig_is_left_as_it_is(rig, graph, calibrated):
     client = graph.client
     graph.calibration_node(calibrated, learned_shapes=rig.shapes, heal_accept=True)
     answer = client.heal(seconds=1.0).get_result_async()
-    motion = walking(rig.knee, np.full(EXPOSURES, 0.2))
-    frames = simulate_knee(virtual_rig(SEED), rig.knee, motion, seed=3).frames
-    pairs = (
-        [replace(f, stamp_ns=10**18 + f.number * 10**7) for f in pair]
-        for pair in zip(*(frames[n] for n in NAMES))
-    )
-    client.stream(pairs, RATE_HZ)
+    client.stream(stream_of(rig, virtual_rig(SEED), rig.motion), RATE_HZ)
     result = client.result_of(answer, JOB_DEADLINE).result
     client.end_stream()
     assert result.success and not result.orientation_id, result.message
     assert 'no healed rig to accept' in client.call(Reset, 'accept_healing').message
+
+
+def test_rig_that_moves_while_it_is_recorded_is_not_accepted(rig, graph, calibrated):
+    client = graph.client
+    before = load_orientation(orientation_path(calibrated)).orientation_id
+    graph.calibration_node(calibrated, learned_shapes=rig.shapes, heal_accept=True)
+    answer = client.heal(seconds=1.5).get_result_async()
+    healthy = stream_of(rig, virtual_rig(SEED), rig.motion)
+    bumped = stream_of(rig, bumped_rig(), rig.motion)
+    half = EXPOSURES // 2
+    client.stream(
+        itertools.chain(itertools.islice(healthy, half), itertools.islice(bumped, half, None)),
+        RATE_HZ,
+    )
+    result = client.result_of(answer, JOB_DEADLINE).result
+    client.end_stream()
+    assert result.success and result.verdict == 'fail' and result.checks, result.message
+    refused = client.call(Reset, 'accept_healing')
+    assert not refused.success
+    assert result.orientation_id
+    assert refused.message.startswith('not accepted: the verdict on the healed rig is fail: ')
+    assert load_orientation(orientation_path(calibrated)).orientation_id == before
+
+
+def test_too_few_exposures_are_refused(rig, graph, calibrated):
+    client = graph.client
+    graph.calibration_node(calibrated, learned_shapes=rig.shapes)
+    answer = client.heal(seconds=1.0).get_result_async()
+    few = itertools.islice(stream_of(rig, bumped_rig(), rig.motion), 8)
+    client.stream(few, RATE_HZ)
+    refused = client.result_of(answer, JOB_DEADLINE)
+    client.end_stream()
+    assert refused.status == ABORTED
+    assert refused.result.message.endswith('two views, 10 are needed')

@@ -183,7 +183,10 @@ class Healing:
             goal.succeed()
         except Cancelled:
             result.message = 'cancelled, nothing was changed'
-            goal.canceled()
+            if goal.is_cancel_requested:
+                goal.canceled()
+            else:  # the node ends
+                goal.abort()
         except (DataError, ValueError, OSError) as error:
             result.message = str(error)
             self._logger.error(result.message)

@@ -17,6 +17,7 @@ from test_reconstruction import coordinates
 
 from fluoro_calib_ros.io.bodies import write_bodies
 from fluoro_calib_ros.io.calibration import load_orientation, orientation_path
+from fluoro_calib_ros.jobs.healing import BLOCKS
 from fluoro_calib_ros.jobs.simulation import write_bag
 from fluoro_calib_ros.nodes.messages.observations import message_from_frame
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
@@ -309,13 +310,11 @@ def test_rig_that_moves_while_it_is_recorded_is_not_accepted(rig, graph, calibra
     before = load_orientation(orientation_path(calibrated)).orientation_id
     graph.calibration_node(calibrated, learned_shapes=rig.shapes, heal_accept=True)
     answer = client.heal(seconds=1.5).get_result_async()
-    healthy = stream_of(rig, virtual_rig(SEED), rig.motion)
-    bumped = stream_of(rig, bumped_rig(), rig.motion)
-    half = EXPOSURES // 2
-    client.stream(
-        itertools.chain(itertools.islice(healthy, half), itertools.islice(bumped, half, None)),
-        RATE_HZ,
+    # The blocks that the diagnosis does not use show the rig as it was.
+    rigs = zip(
+        stream_of(rig, bumped_rig(), rig.motion), stream_of(rig, virtual_rig(SEED), rig.motion)
     )
+    client.stream((pair[row * BLOCKS // EXPOSURES % 2] for row, pair in enumerate(rigs)), RATE_HZ)
     result = client.result_of(answer, JOB_DEADLINE).result
     client.end_stream()
     assert result.success and result.verdict == 'fail' and result.checks, result.message
@@ -336,3 +335,10 @@ def test_too_few_exposures_are_refused(rig, graph, calibrated):
     client.end_stream()
     assert refused.status == ABORTED
     assert refused.result.message.endswith('two views, 10 are needed')
+
+
+def test_node_ends_while_it_heals(rig, graph, calibrated):
+    node = graph.calibration_node(calibrated, learned_shapes=rig.shapes)
+    graph.client.heal(seconds=60.0)
+    assert node.end() == 0
+    assert 'Traceback' not in node.log

@@ -10,7 +10,7 @@ and again until it has started, which on a busy machine costs so much time that 
 
 The parts: parameters and rig (calibration_settings), exposures (exposure_input), what is published
 (calibration_output), and the services that collect and orient the rig
-(calibration_services), calibrate (self_calibration), save and load (calibration_files).
+(calibration_services), calibrate, heal (healing_services), save and load (calibration_settings).
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ from .calibration_settings import (
 )
 from .exposure_input import ExposureInput
 from .frame_validation import with_limit
+from .healing_services import Healing
 from .messages.observations import NS_PER_S, ObservedFrame, decode_target_observations
 from .messages.status import FluoroscopeProgress
 from .runtime.diagnostics import Status, health_of
@@ -94,6 +95,7 @@ class CalibrationNode(StreamNode):
         self._calibrating = SelfCalibration(
             self, rig, self._exposures, output=output, files=files, requests=self._requests
         )
+        self._healing = Healing(self, rig, output, files, self._requests)
         # Services that await must not keep others from being answered.
         group = ReentrantCallbackGroup()
         table = [
@@ -101,12 +103,14 @@ class CalibrationNode(StreamNode):
             *collecting.services,
             *files.services,
             *self._orienting.services,
+            *self._healing.services,
         ]
         for service in create_services(self, table, group):
             self.own(service, self.destroy_service, service)
-        action = self._calibrating.create_action(group)
-        self.own(action, action.destroy)
-        self.own(self._calibrating, self._calibrating.end)
+        for job in (self._calibrating, self._healing):
+            action = job.create_action(group)
+            self.own(action, action.destroy)
+            self.own(job, job.end)
         files.load_at_start()
 
     def create_readers(self) -> None:
@@ -137,6 +141,7 @@ class CalibrationNode(StreamNode):
         if not self._requests.waiting:
             return super().on_shutdown(state)
         self._calibrating.stop()
+        self._healing.stop()
         self.deactivate()
         return TransitionCallbackReturn.SUCCESS
 
@@ -145,9 +150,12 @@ class CalibrationNode(StreamNode):
     def _on_frame(self, name: str, frame: ObservedFrame, _: Mapping[str, int]) -> None:
         stamp_ns = NS_PER_S * frame.sec + frame.nanosec
         needed = bool(self._settings.angles.angle_joint)
-        self._exposures.add(
-            name, frame, lambda: self._angles.of_frame(name, stamp_ns, needed=needed)
-        )
+
+        def angle() -> float | None:
+            return self._angles.of_frame(name, stamp_ns, needed=needed)
+
+        self._exposures.add(name, frame, angle)
+        self._healing.add(name, frame, angle)
 
     def _on_pair(self, pair: Mapping[str, Frame]) -> None:
         self._orienting.add(pair)
@@ -181,11 +189,14 @@ class CalibrationNode(StreamNode):
             disagreement=self._exposures.disagreement(),
             angle=self._angles.health(name, incompatible),
         )
+        orientation = self._output.orientation
         values = {
             **progress.collected.values(),
             'lost at the input': stream.overrun,
             'last fault': stream.refusals.last_fault,
             'calibration': progress.calibration_id,
+            'orientation': orientation.orientation_id if orientation else '',
+            'source of the orientation': orientation.source if orientation else '',
             **self._angles.values(name),
         }
         return Status(name, *health_of(state, CONDITIONS), values)

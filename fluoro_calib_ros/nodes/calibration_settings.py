@@ -89,11 +89,27 @@ class CalibrationParameters(ManagedParameters):
         maximum=600.0,
         unit='s',
     )
+    learned_shapes: str = option(
+        '',
+        'shapes.csv of fluoro-calib bodies: shapes of bodies that were learned while the rig was '
+        'healthy, for the action heal; empty: heal is refused',
+    )
+    heal_time: float = option(
+        5.0,
+        'how long heal collects frames where the goal leaves it open',
+        minimum=0.1,
+        maximum=60.0,
+        unit='s',
+    )
+    heal_accept: bool = option(
+        False, 'whether a healed rig with the verdict pass is used without accept_healing'
+    )
 
 
 _OF_REQUESTS = ('model', 'interior', 'loss', 'max_iterations', 'relative_orientation', 'datum')
 _NODE = ParameterGroup(
-    CalibrationParameters, settable=('collect', 'joint', 'rig_frame', 'capture_timeout')
+    CalibrationParameters,
+    settable=('collect', 'joint', 'rig_frame', 'capture_timeout', 'heal_time', 'heal_accept'),
 )
 _STILL = ParameterGroup(
     StillOptions,
@@ -212,7 +228,7 @@ class CalibrationFiles:
         if not any(directory.glob('*' + SUFFIX)):
             return
         try:
-            loaded, orientation = self._load(directory)
+            loaded, orientation = self.load(directory)
             self._check_phantom()
         except (DataError, OSError) as error:
             self._output.load_fault = str(error)
@@ -263,7 +279,7 @@ class CalibrationFiles:
     ) -> LoadCalibration.Response:
         try:
             directory = self._directory_of(request)
-            loaded, orientation = self._load(directory)
+            loaded, orientation = self.load(directory)
             if not loaded:
                 raise DataError(
                     f'{directory}: there is no calibration of {", ".join(self._rig.names)}'
@@ -291,7 +307,7 @@ class CalibrationFiles:
             )
         return directory
 
-    def _load(
+    def load(
         self, directory: Path
     ) -> tuple[dict[str, FluoroscopeCalibration], RigOrientation | None]:
         """Return the calibrations of the node's fluoroscopes in a folder, and their orientation.

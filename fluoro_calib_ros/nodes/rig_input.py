@@ -31,6 +31,7 @@ from .drift_monitor import DriftMonitor
 from .messages.bodies import BodiesContent
 from .messages.rig_orientation import (
     description_of,
+    jump_text,
     message_from_orientation,
     orientation_from_message,
 )
@@ -115,11 +116,20 @@ class RigInput:
             self._refusals.last_fault = str(error)
             self._logger.error(f'orientation refused, the current one stays in use: {error}')
             return False
+        self._tell_jump(orientation)
         ids = orientation.calibration_ids
         newest = list(self._rigs.items())[-(MAX_ORIENTATIONS - 1) :]
         self._rigs = {**{i: old for i, old in newest if i != ids}, ids: rig}
         self._logger.info(f'{description_of(message)}, in use')
         return True
+
+    def _tell_jump(self, orientation: rig_orientation.RigOrientation) -> None:
+        """Log how far the transforms of the rig jump by another orientation."""
+        if self.newest is None:
+            return
+        jump = jump_text(self.newest.orientation, orientation)
+        if jump:
+            self._logger.warning(f'the transforms of the rig jump: {jump}')
 
     def saved(self, file: str, folder: str) -> RigOrientation | None:
         """Return the orientation of a file, or else of a folder, None where there is none."""

@@ -20,7 +20,7 @@ import numpy as np
 import rclpy
 from action_msgs.msg import GoalStatus
 from diagnostic_msgs.msg import DiagnosticArray
-from fluoro_calib_msgs.action import SelfCalibrate
+from fluoro_calib_msgs.action import Heal, SelfCalibrate
 from fluoro_calib_msgs.msg import (
     BodyPoses,
     CalibrationStatus,
@@ -90,9 +90,11 @@ SERVICES = {
     'calibrate': Calibrate,
     'capture': Capture,
     'collect_anew': Reset,
+    'accept_healing': Reset,
     'load_calibration': LoadCalibration,
     'orient': Orient,
     'reset': Reset,
+    'roll_back_healing': Reset,
     'save_calibration': SaveCalibration,
 }
 
@@ -356,6 +358,7 @@ class Client(Node):
             self.listen(f'{name}/calibration_status')
         self.published = 0
         self._action = ActionClient(self, SelfCalibrate, 'self_calibrate')
+        self._heal = ActionClient(self, Heal, 'heal')
 
     # -- waiting
 
@@ -393,6 +396,7 @@ class Client(Node):
                 return (
                     self.subscriptions_matched('calibration_node')
                     and self._action.server_is_ready()
+                    and self._heal.server_is_ready()
                     and all(self.count_publishers(f'{n}/calibration_status') for n in NAMES)
                 )
             if node == 'correction_node':
@@ -521,13 +525,17 @@ class Client(Node):
 
     def goal(self, **fields):
         """Return the handle of an accepted goal; its feedback is collected in .feedback."""
+        return self._sent(self._action, SelfCalibrate.Goal(**fields))
+
+    def heal(self, **fields):
+        """As goal(), of the action heal."""
+        return self._sent(self._heal, Heal.Goal(**fields))
+
+    def _sent(self, action, goal):
         self.feedback = []
         feedback = self.feedback
         handle = self.result_of(
-            self._action.send_goal_async(
-                SelfCalibrate.Goal(**fields),
-                feedback_callback=lambda m: feedback.append(m.feedback),
-            )
+            action.send_goal_async(goal, feedback_callback=lambda m: feedback.append(m.feedback))
         )
         assert handle.accepted
         return handle

@@ -13,8 +13,16 @@ from tf2_msgs.msg import TFMessage
 from ...errors import DataError
 from ...limits import read_limits
 from ...photogrammetry import rig_orientation as rig
-from ...photogrammetry.rotations import matrix_from_quaternion, quaternion_from_matrix
+from ...photogrammetry.rotations import (
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    vector_from_matrix,
+)
 from .observations import float64_field, nanoseconds_from_stamp, stamp_from_nanoseconds
+
+# Of an orientation that goes through a message and back.
+ROUNDING_MM = 1e-6
+ROUNDING_RAD = 1e-7
 
 # Static transforms of the optical frames of a rig.
 
@@ -146,6 +154,22 @@ def description_of(message: RigOrientation) -> str:
         f'orientation {message.orientation_id} by {message.source} '
         f'({message.exposures} exposures), in frame {message.header.frame_id}'
     )
+
+
+def jump_text(before: rig.RigOrientation, after: rig.RigOrientation) -> str:
+    """Return how far fluoroscopes are displaced between orientations, '' where none is."""
+    if before.frame_id != after.frame_id:
+        return f'the rig frame is {after.frame_id} instead of {before.frame_id}'
+    parts = []
+    for f, name in enumerate(after.fluoroscopes):
+        if name not in before.fluoroscopes:
+            continue
+        old = before.fluoroscopes.index(name)
+        shift = np.linalg.norm(after.position_mm[f] - before.position_mm[old])
+        turn = np.linalg.norm(vector_from_matrix(after.rotation[f] @ before.rotation[old].T))
+        if shift > ROUNDING_MM or turn > ROUNDING_RAD:
+            parts.append(f'{name} by {shift:.2f} mm and {np.degrees(turn):.3f} degrees')
+    return ', '.join(parts)
 
 
 def _metre_scale(count: int) -> np.ndarray:

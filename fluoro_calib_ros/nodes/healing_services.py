@@ -1,0 +1,366 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The action heal of a calibration node, and the services that accept or take back what it finds.
+
+The calibration node has all that is needed: the image points as they were observed, before any
+correction that may have become wrong, the calibrations and the orientation in use.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from fluoro_calib_msgs.action import Heal
+from fluoro_calib_msgs.srv import Reset
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.callback_groups import CallbackGroup
+from rclpy.task import Future
+
+from ..bodies.body import Body
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..errors import DataError
+from ..exposures.frame import Frame, validate_frame
+from ..io.bodies import read_bodies
+from ..jobs.healing import HealingOptions, HealingOutcome
+from ..jobs.healing_versions import (
+    heal_in_worker_process,
+    parent_folder,
+    save_healed_version,
+    version_folder,
+)
+from ..jobs.result_folder import save_calibrations
+from ..photogrammetry.rig_orientation import RigOrientation
+from .calibration_output import CalibrationOutput
+from .calibration_services import NOT_ACTIVE, Cancelled
+from .calibration_settings import CalibrationFiles, RigSetup, check_folders
+from .messages.healing import fill_healing
+from .messages.observations import ObservedFrame, frame_from_observed
+from .runtime.lifecycle import Requests, ServiceEntry, StreamNode, in_thread, wake, within
+from .runtime.parameters import expand_path
+
+MAX_FRAMES = 20_000  # of a fluoroscope that are collected, whatever its rate
+MAX_SECONDS = 60.0
+FEEDBACK_S = 0.5
+RUNNING = 'refused: a healing is already running'
+CHANGED = 'the rig in use has changed meanwhile, heal it again'
+
+
+class _Rig(NamedTuple):
+    """What is healed."""
+
+    bodies: tuple[Body, ...]
+    calibrations: dict[str, FluoroscopeCalibration]
+    orientation: RigOrientation
+
+
+class _Collection:
+    """Frames of markers, collected in the thread of the streams until finish()."""
+
+    def __init__(self, rig: _Rig) -> None:
+        self.frames: dict[str, list[Frame]] = {}
+        self.refused: deque[str] = deque(maxlen=1)  # why the last invalid frame was left out
+        self.done = Future()
+        self._rig = rig
+        self._markers = np.concatenate([body.target_id for body in rig.bodies])
+        self._lock = threading.Lock()
+
+    @property
+    def count(self) -> int:
+        """Number of the frames of all fluoroscopes."""
+        return sum(map(len, list(self.frames.values())))
+
+    def add(self, name: str, observed: ObservedFrame, angle: float | None) -> None:
+        """Keep a valid frame, without what is no marker of the bodies."""
+        calibration = self._rig.calibrations.get(name)
+        if calibration is None or len(self.frames.get(name, ())) >= MAX_FRAMES:
+            return
+        try:
+            frame = frame_from_observed(observed, name, angle).sorted()
+            validate_frame(frame, image_size=calibration.image_size)
+        except DataError as error:
+            self.refused.append(str(error))
+            return
+        keep = np.isin(frame.target_id, self._markers)
+        frame = replace(
+            frame,
+            target_id=frame.target_id[keep],
+            uv=frame.uv[keep],
+            sigma=None if frame.sigma is None else frame.sigma[keep],
+        )
+        with self._lock:
+            if not self.done.done():
+                self.frames.setdefault(name, []).append(frame)
+
+    def finish(self) -> None:
+        """End the collection: time, a cancellation and the end of the node may all do so."""
+        with self._lock:
+            if not self.done.done():
+                self.done.set_result(None)
+
+
+class Healing:
+    """Runs one healing at a time, in a process of its own, and keeps its outcome."""
+
+    def __init__(
+        self,
+        node: StreamNode,
+        rig: RigSetup,
+        output: CalibrationOutput,
+        files: CalibrationFiles,
+        requests: Requests,
+    ) -> None:
+        self._node = node
+        self._rig = rig
+        self._output = output
+        self._files = files
+        self._requests = requests
+        self._logger = node.get_logger()
+        self._stopping = threading.Event()
+        self._running = False
+        self._thread: threading.Thread | None = None  # waits for the process of the job
+        self._collection: _Collection | None = None
+        self._healed: tuple[HealingOutcome, _Rig] | None = None  # to be accepted
+        self.services = (
+            ServiceEntry('accept_healing', Reset, self._on_accept),
+            ServiceEntry('roll_back_healing', Reset, self._on_roll_back),
+        )
+
+    def create_action(self, group: CallbackGroup) -> ActionServer:
+        """Return the action server."""
+        return ActionServer(
+            self._node,
+            Heal,
+            'heal',
+            self._on_action,
+            goal_callback=lambda _: GoalResponse.ACCEPT,
+            cancel_callback=self._on_cancel,
+            callback_group=group,
+        )
+
+    def add(self, name: str, observed: ObservedFrame, angle: Callable[[], float | None]) -> None:
+        """Give a frame to the collection, if any. Called in the thread of the streams."""
+        collection = self._collection
+        if collection is not None:
+            collection.add(name, observed, angle())
+
+    def stop(self) -> None:
+        """Cancel the running job."""
+        self._stopping.set()
+        if self._collection is not None:
+            self._collection.finish()
+
+    def end(self) -> None:
+        """Cancel the running job, and wait for its end."""
+        self.stop()
+        if self._thread is not None:
+            self._thread.join()
+
+    # -- the action
+
+    def _on_cancel(self, goal: Any) -> CancelResponse:
+        """Cancel a goal; while frames are collected, that ends at once."""
+        if self._collection is not None:
+            self._collection.finish()
+        return CancelResponse.ACCEPT
+
+    async def _on_action(self, goal: Any) -> Heal.Result:
+        result = Heal.Result()
+        if self._running:
+            result.message = RUNNING
+            self._logger.warning(result.message)
+            goal.abort()
+            return result
+        self._running = True
+        try:
+            with self._requests.one():
+                await self._heal(goal, result)
+            goal.succeed()
+        except Cancelled:
+            result.message = 'cancelled, nothing was changed'
+            if goal.is_cancel_requested:
+                goal.canceled()
+            else:  # the node ends
+                goal.abort()
+        except (DataError, ValueError, OSError) as error:
+            result.message = str(error)
+            self._logger.error(result.message)
+            goal.abort()
+        except Exception as error:  # a bug must reach the caller, and must not end the node
+            result.message = f'the healing failed unexpectedly: {error}'
+            self._logger.error(result.message)
+            goal.abort()
+        finally:
+            self._running = False
+            self._thread = None
+        return result
+
+    async def _heal(self, goal: Any, result: Heal.Result) -> None:
+        """Collect frames, find out what has changed, and keep it. Raises DataError, Cancelled."""
+        seconds = goal.request.seconds or self._rig.settings().node.heal_time
+        if not 0 < seconds <= MAX_SECONDS:
+            raise DataError(f'seconds is above 0 and at most {MAX_SECONDS:g}, not {seconds:g}')
+        rig = self._present_rig()
+        self._healed = None
+
+        def raise_if_cancelled() -> None:
+            if goal.is_cancel_requested or self._stopping.is_set():
+                raise Cancelled
+
+        frames = await self._collected(goal, rig, seconds)
+        raise_if_cancelled()
+        if not frames:
+            raise DataError(f'no frame of any fluoroscope came within {seconds:g} s')
+        pairing = self._rig.settings().pairing
+        options = HealingOptions(pairing.pair_by, pairing.tolerance_s)
+        count = sum(map(len, frames.values()))
+
+        def progress(step: int, steps: int) -> None:
+            goal.publish_feedback(
+                Heal.Feedback(stage='diagnosing', frames=count, step=step, steps=steps)
+            )
+
+        done, self._thread = in_thread(
+            self._node,
+            lambda: heal_in_worker_process(
+                frames,
+                rig.calibrations,
+                rig.orientation,
+                rig.bodies,
+                options,
+                progress=progress,
+                raise_if_cancelled=raise_if_cancelled,
+            ),
+        )
+        outcome = await done
+        self._check_unchanged(rig)
+        fill_healing(result, outcome, rig.orientation)
+        self._logger.info(result.message)
+        if outcome.healed is not None:
+            self._healed = outcome, rig
+            if self._rig.settings().node.heal_accept and outcome.verdict == 'pass':
+                result.message += f'; {self._accept()}'
+
+    async def _collected(self, goal: Any, rig: _Rig, seconds: float) -> dict[str, list[Frame]]:
+        """Return the frames of the next seconds, or fewer where the goal is cancelled."""
+        collection = _Collection(rig)
+
+        def tell() -> None:
+            goal.publish_feedback(Heal.Feedback(stage='collecting', frames=collection.count))
+
+        tell()
+        timer = self._node.create_timer(FEEDBACK_S, tell)
+        self._collection = collection
+        try:
+            await within(self._node, seconds, collection.done, collection.finish)
+        finally:
+            self._collection = None
+            self._node.destroy_timer(timer)
+        for reason in collection.refused:
+            self._logger.warning(
+                f'invalid frames are not used for healing, the last one: {reason}'
+            )
+        return collection.frames
+
+    def _present_rig(self) -> _Rig:
+        """Return what is to be healed. Raises DataError where something is missing."""
+        path = self._rig.settings().node.learned_shapes
+        if not path:
+            raise DataError(
+                'parameter learned_shapes is not set: it names the shapes of bodies that were '
+                'learned while the rig was healthy'
+            )
+        if not self._node.readers:
+            raise DataError(NOT_ACTIVE)
+        calibrations = self._output.calibrations
+        missing = [name for name in self._rig.names if name not in calibrations]
+        if missing:
+            raise DataError(f'fluoroscope {missing[0]} is not calibrated yet')
+        if self._output.orientation is None:
+            raise DataError('the rig is not oriented yet')
+        try:
+            bodies = tuple(read_bodies(expand_path(path)))
+        except DataError as error:
+            raise error.at(path) from None
+        return _Rig(bodies, calibrations, self._output.orientation)
+
+    def _check_unchanged(self, rig: _Rig) -> None:
+        """Raise DataError where another rig is in use than the one that was healed."""
+        if rig.orientation is not self._output.orientation or _ids(rig.calibrations) != _ids(
+            self._output.calibrations
+        ):
+            raise DataError(CHANGED)
+
+    # -- versions
+
+    def _on_accept(self, _: Reset.Request, response: Reset.Response) -> Reset.Response:
+        return self._answer(response, 'not accepted', self._accept)
+
+    def _on_roll_back(self, _: Reset.Request, response: Reset.Response) -> Reset.Response:
+        return self._answer(response, 'not rolled back', self._roll_back)
+
+    def _answer(
+        self, response: Reset.Response, refused: str, act: Callable[[], str]
+    ) -> Reset.Response:
+        try:
+            response.message = act()
+        except (DataError, OSError) as error:
+            response.message = f'{refused}: {error}'
+            self._logger.error(response.message)
+            return response
+        response.success = True
+        self._logger.info(response.message)
+        return response
+
+    def _accept(self) -> str:
+        """Save, use and publish the healed rig; returns what was done. Raises DataError."""
+        if self._healed is None:
+            raise DataError('there is no healed rig to accept')
+        outcome, rig = self._healed
+        if outcome.verdict != 'pass':
+            reasons = [check.sentence for check in outcome.checks if not check.passed]
+            raise DataError(
+                f'the verdict on the healed rig is {outcome.verdict}: {"; ".join(reasons)}'
+            )
+        self._check_unchanged(rig)
+        directory = self._rig.directory
+        limit = self._rig.settings().limits.max_folders
+        for orientation in (rig.orientation, outcome.orientation):
+            check_folders(version_folder(directory, orientation.orientation_id), directory, limit)
+        save_healed_version(directory, outcome, rig.calibrations, rig.orientation)
+        self._use(outcome.calibrations, outcome.orientation)
+        return (
+            f'{outcome.orientation.orientation_id} accepted and in use, its parent is '
+            f'{rig.orientation.orientation_id}'
+        )
+
+    def _roll_back(self) -> str:
+        """Return to the parent of the healed rig in use. Raises DataError."""
+        directory = self._rig.directory
+        healed = self._output.orientation
+        folder = parent_folder(directory, healed)
+        calibrations, orientation = self._files.load(folder)
+        if orientation is None:
+            raise DataError(f'{folder}: there is no orientation that belongs to the calibrations')
+        save_calibrations(directory, {**self._output.calibrations, **calibrations}, orientation)
+        self._use(calibrations, orientation)
+        return f'{orientation.orientation_id} is in use again'
+
+    def _use(
+        self, calibrations: Mapping[str, FluoroscopeCalibration], orientation: RigOrientation
+    ) -> None:
+        """Publish the orientation, and the calibrations that are not in use already."""
+        self._healed = None
+        present = _ids(self._output.calibrations)
+        others = {n: c for n, c in calibrations.items() if c.calibration_id != present.get(n)}
+        self._output.publish(others, orientation)
+        wake(self._node)
+
+
+def _ids(calibrations: Mapping[str, FluoroscopeCalibration]) -> dict[str, str]:
+    return {name: one.calibration_id for name, one in calibrations.items()}

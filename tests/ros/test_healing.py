@@ -1,0 +1,344 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""A rig is bumped and healed live, with the numbers of the command; versions come and go."""
+
+import itertools
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fluoro_calib_msgs.srv import Reset
+from rigs import run
+from ros_graph import ABORTED, CANCELED, JOB_DEADLINE, NAMES, SUCCEEDED, value_of
+from test_reconstruction import coordinates
+
+from fluoro_calib_ros.io.bodies import write_bodies
+from fluoro_calib_ros.io.calibration import load_orientation, orientation_path
+from fluoro_calib_ros.jobs.healing import BLOCKS
+from fluoro_calib_ros.jobs.simulation import write_bag
+from fluoro_calib_ros.nodes.messages.observations import message_from_frame
+from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
+from fluoro_calib_ros.simulation.knee import simulate_knee, virtual_knee, walking
+from fluoro_calib_ros.simulation.rig import virtual_rig
+
+SEED = 1  # of the bags
+EXPOSURES = 60
+RATE_HZ = 120.0
+MOVED_MM = np.array([3.0, -2.0, 3.5])  # 5 mm
+TURNED_RAD = np.radians([0.35, -0.28, 0.22])  # 0.5 degrees
+FAULTS = ('accept_healing', 'roll_back_healing')
+
+
+def bumped_rig():
+    """The rig of the bags after b was bumped."""
+    rig = virtual_rig(SEED)
+    a, b = rig.fluoroscopes
+    moved = replace(
+        b,
+        rotation=matrix_from_vector(TURNED_RAD) @ b.rotation,
+        position_mm=b.position_mm + MOVED_MM,
+    )
+    return replace(rig, fluoroscopes=(a, moved))
+
+
+class Rig:
+    """All nodes with a calibration, learned shapes, and a knee that walks in a bumped rig."""
+
+    def __init__(self, graph, folder, by_command):
+        self.graph = graph
+        self.client = graph.client
+        self.calibrated = by_command
+        self.folder = shutil.copytree(by_command, folder / 'calibrations')
+        self.knee = virtual_knee(SEED)
+        self.motion = walking(self.knee, np.arange(EXPOSURES) / 60)
+        write_bodies(folder / 'bodies.csv', self.knee.surveyed)
+        healthy = simulate_knee(virtual_rig(SEED), self.knee, self.motion)
+        write_bag(folder / 'walking', healthy.frames)
+        given = ('--bodies', folder / 'bodies.csv', '--calibration', by_command)
+        assert run('bodies', folder / 'walking', *given, '--out', folder / 'learned') == 0
+        self.shapes = folder / 'learned' / 'shapes.csv'
+        bumped = simulate_knee(bumped_rig(), self.knee, self.motion)
+        self.bag = folder / 'bumped'
+        write_bag(self.bag, bumped.frames)
+        self.frames = bumped.frames
+        self.first = 0
+        nodes = graph.whole_chain(self.folder, learned_shapes=self.shapes)
+        self.reconstruction = nodes['reconstruction_node']
+        self.points = self.client.listen('reconstruction/points_with_covariance')
+        self.orientations = self.client.listen('rig_orientation')
+        self.client.wait_until(
+            lambda: (
+                self.orientations
+                and self.client.count_publishers('reconstruction/points_with_covariance')
+            ),
+            what='the first orientation',
+        )
+        graph.wait_for_readers(1)
+
+    def pairs(self):
+        """Yield (fluoroscope, message) of the exposures, in their order."""
+        for pair in zip(*(self.frames[name] for name in NAMES)):
+            yield from ((frame.fluoroscope, message_from_frame(frame)) for frame in pair)
+
+    def publish(self):
+        """Publish all exposures; returns the points (T, n, 3) [mm] found in them."""
+        before = len(self.points)
+        self.client.publish_in_step(list(self.pairs()), lambda: 2 * (len(self.points) - before))
+        self.client.wait_until(
+            lambda: len(self.points) == before + EXPOSURES, what='points of all exposures'
+        )
+        markers = np.concatenate([body.target_id for body in self.knee.bodies])
+        out = np.full((EXPOSURES, len(markers), 3), np.nan)
+        for row, message in enumerate(self.points[before:]):
+            found = dict(zip(message.target_id, coordinates(message)[0]))
+            for k, marker in enumerate(markers.tolist()):
+                out[row, k] = found.get(marker, np.nan)
+        return out
+
+    def healed(self, **fields):
+        """Heal the rig from exactly the exposures; returns the answer of the action."""
+        answer = self.client.heal(**fields).get_result_async()
+        self.client.wait_until(lambda: self.client.feedback or answer.done(), what='the start')
+        self.publish()
+        return self.client.result_of(answer, JOB_DEADLINE)
+
+    def stream(self):
+        """Yield pairs of frames of a knee that walks on and on."""
+        pairs = list(zip(*(self.frames[name] for name in NAMES)))
+        step_ns = round(1e9 / RATE_HZ)
+        for number in itertools.count(10**6):
+            pair = pairs[number % EXPOSURES]
+            yield [replace(f, number=number, stamp_ns=10**18 + number * step_ns) for f in pair]
+
+    def by_command(self, tmp_path, capsys):
+        """Return healing.json of the same exposures by the command."""
+        capsys.readouterr()
+        given = ('--bodies', self.shapes, '--calibration', self.calibrated)
+        assert run('heal', self.bag, *given, '--out', tmp_path / 'healed', '--json') == 0
+        return json.loads(capsys.readouterr().out)
+
+    def wait_for_orientation(self, orientation_id):
+        self.client.wait_for_diagnostics(
+            'reconstruction_node',
+            lambda s: value_of(s, 'orientation') == orientation_id,
+            'reconstruction',
+        )
+
+    def shape_error_mm(self, points):
+        """RMS error of points relative to each other [mm], after the best rigid motion."""
+        true = np.concatenate(
+            [
+                body.xyz_mm @ np.swapaxes(self.motion.rotation[body.name], 1, 2)
+                + self.motion.position_mm[body.name][:, None]
+                for body in self.knee.bodies
+            ],
+            axis=1,
+        )
+        errors = []
+        for found, truth in zip(points, true):
+            good = np.isfinite(found).all(axis=1)
+            one, other = found[good] - found[good].mean(0), truth[good] - truth[good].mean(0)
+            u, _, v = np.linalg.svd(one.T @ other)
+            turn = u @ np.diag([1, 1, np.linalg.det(u @ v)]) @ v
+            errors.append(one @ turn - other)
+        return float(np.sqrt((np.concatenate(errors) ** 2).sum(axis=1).mean()))
+
+
+def found_share(points):
+    return np.isfinite(points).all(axis=2).mean()
+
+
+@pytest.fixture(scope='module')
+def rig(module_graph, by_command, tmp_path_factory):
+    return Rig(module_graph, tmp_path_factory.mktemp('healing'), by_command)
+
+
+def test_bumped_rig_is_healed_accepted_and_rolled_back(rig, tmp_path, capsys):
+    """Live numbers are those of the command, points are right again, and the parent is kept."""
+    before = load_orientation(orientation_path(rig.folder))
+    for service in FAULTS:
+        refused = rig.client.call(Reset, service)
+        assert not refused.success
+    assert 'was not healed, there is nothing to roll back' in refused.message
+    bumped = rig.publish()
+    answer = rig.healed(seconds=3.0)
+    assert answer.status == SUCCEEDED, answer.result.message
+    result = answer.result
+    expected = rig.by_command(tmp_path, capsys)
+    assert {f.stage for f in rig.client.feedback} == {'collecting', 'diagnosing'}
+    assert result.exposures == expected['exposures'] and result.verdict == 'pass'
+    assert result.orientation_id == expected['orientation_id']
+    assert result.findings == [one['sentence'] for one in expected['findings']]
+    assert list(result.fluoroscope) == ['b']
+    change = expected['changes']['b']
+    assert list(result.change[:3]) == change['position_mm']
+    assert list(result.sd[:3]) == change['position_sd_mm']
+    np.testing.assert_allclose(np.degrees(result.change[3:6]), change['rotation_deg'], rtol=1e-12)
+    assert rig.orientations[-1].orientation_id == before.orientation_id, 'nothing is changed yet'
+
+    accepted = rig.client.call(Reset, 'accept_healing')
+    assert accepted.success, accepted.message
+    rig.wait_for_orientation(result.orientation_id)
+    rig.client.wait_for_diagnostics(
+        'calibration_node', lambda s: value_of(s, 'source of the orientation') == 'healing'
+    )
+    shift = np.linalg.norm(result.change[:3])
+    assert f'transforms of the rig jump: b by {shift:.2f} mm and ' in rig.reconstruction.log
+    saved = load_orientation(orientation_path(rig.folder))
+    assert (saved.orientation_id, saved.source) == (result.orientation_id, 'healing')
+    versions = {path.name for path in (rig.folder / 'versions').iterdir()}
+    assert versions == {before.orientation_id, result.orientation_id}
+    points = rig.publish()
+    assert rig.points[-1].orientation_id == result.orientation_id
+    assert found_share(bumped) < 0.1, 'views that do not fit give no points'
+    assert found_share(points) > 0.9
+    assert rig.shape_error_mm(points) < 0.2
+    assert not rig.client.call(Reset, 'accept_healing').success
+
+    back = rig.client.call(Reset, 'roll_back_healing')
+    assert back.success, back.message
+    rig.wait_for_orientation(before.orientation_id)
+    assert load_orientation(orientation_path(rig.folder)).orientation_id == before.orientation_id
+    assert not rig.client.call(Reset, 'roll_back_healing').success
+
+
+def test_stream_goes_on_while_a_rig_is_healed(rig):
+    before = len(rig.points)
+
+    def came():
+        return len(rig.points) - before
+
+    answer = rig.client.heal(seconds=1.0).get_result_async()
+    rig.client.stream(rig.stream(), RATE_HZ, came)
+    rig.client.wait_until(answer.done, JOB_DEADLINE, 'the healing')
+    published = rig.client.published
+    rig.client.end_stream()
+    assert answer.result().status == SUCCEEDED, answer.result().result.message
+    assert published > RATE_HZ
+    rig.client.wait_until(lambda: came() == published, what='points of all exposures')
+    numbers = [m.frame_number for m in rig.points[before:]]
+    assert numbers == list(range(10**6, 10**6 + published))
+
+
+def test_cancelled_healing_changes_nothing_and_a_second_one_is_refused(rig):
+    handle = rig.client.heal(seconds=60.0)
+    answer = handle.get_result_async()
+    second = rig.client.result_of(rig.client.heal().get_result_async())
+    assert second.status == ABORTED
+    assert second.result.message == 'refused: a healing is already running'
+    rig.client.result_of(handle.cancel_goal_async())
+    cancelled = rig.client.result_of(answer)
+    assert cancelled.status == CANCELED and 'cancelled' in cancelled.result.message
+    assert 'no healed rig' in rig.client.call(Reset, 'accept_healing').message
+
+
+@pytest.mark.parametrize(
+    'fields, message',
+    [
+        ({'seconds': -1.0}, 'seconds is above 0 and at most 60, not -1'),
+        ({'seconds': float('nan')}, 'seconds is above 0 and at most 60, not nan'),
+        ({'seconds': 0.2}, 'no frame of any fluoroscope came within 0.2 s'),
+    ],
+)
+def test_refused_healing_gives_the_reason(rig, fields, message):
+    answer = rig.client.result_of(rig.client.heal(**fields).get_result_async())
+    assert answer.status == ABORTED and answer.result.message == message
+
+
+def test_what_is_missing_is_told(graph, tmp_path, calibrated, rig):
+    for directory, parameters, message in (
+        (calibrated, {}, 'parameter learned_shapes is not set'),
+        (tmp_path / 'empty', {'learned_shapes': rig.shapes}, 'fluoroscope a is not calibrated'),
+    ):
+        node = graph.calibration_node(directory, **parameters)
+        answer = graph.client.result_of(graph.client.heal().get_result_async())
+        assert answer.status == ABORTED and message in answer.result.message
+        assert node.end() == 0
+        graph.client.wait_until(
+            lambda: not graph.client.count_publishers('rig_orientation'), what='its end'
+        )
+
+
+def test_healed_rig_accepted_by_the_parameter_outlives_the_node(rig, graph, calibrated):
+    before = load_orientation(orientation_path(calibrated)).orientation_id
+    client = graph.client
+    published = client.listen('rig_orientation')
+    node = graph.calibration_node(calibrated, learned_shapes=rig.shapes, heal_accept=True)
+    answer = client.heal(seconds=1.0).get_result_async()
+    client.stream(rig.stream(), RATE_HZ)
+    result = client.result_of(answer, JOB_DEADLINE).result
+    client.end_stream()
+    assert result.verdict == 'pass' and 'accepted and in use' in result.message
+    client.wait_until(
+        lambda: published[-1].orientation_id == result.orientation_id, what='the healed rig'
+    )
+    assert node.end() == 0
+    client.wait_until(lambda: not client.count_publishers('rig_orientation'), what='its end')
+    published.clear()
+    graph.calibration_node(calibrated)
+    client.wait_until(lambda: published, what='the saved rig')
+    assert published[-1].orientation_id == result.orientation_id
+    back = client.call(Reset, 'roll_back_healing')
+    assert back.success, back.message
+    client.wait_until(lambda: published[-1].orientation_id == before, what='the parent')
+    assert load_orientation(orientation_path(calibrated)).orientation_id == before
+
+
+def stream_of(rig, virtual, motion):
+    """Yield pairs of frames of a knee in a virtual rig."""
+    frames = simulate_knee(virtual, rig.knee, motion, seed=3).frames
+    for pair in zip(*(frames[n] for n in NAMES)):
+        yield [replace(f, stamp_ns=10**18 + f.number * 10**7) for f in pair]
+
+
+def test_healthy_rig_is_left_as_it_is(rig, graph, calibrated):
+    client = graph.client
+    graph.calibration_node(calibrated, learned_shapes=rig.shapes, heal_accept=True)
+    answer = client.heal(seconds=1.0).get_result_async()
+    client.stream(stream_of(rig, virtual_rig(SEED), rig.motion), RATE_HZ)
+    result = client.result_of(answer, JOB_DEADLINE).result
+    client.end_stream()
+    assert result.success and not result.orientation_id, result.message
+    assert 'no healed rig to accept' in client.call(Reset, 'accept_healing').message
+
+
+def test_rig_that_moves_while_it_is_recorded_is_not_accepted(rig, graph, calibrated):
+    client = graph.client
+    before = load_orientation(orientation_path(calibrated)).orientation_id
+    graph.calibration_node(calibrated, learned_shapes=rig.shapes, heal_accept=True)
+    answer = client.heal(seconds=1.5).get_result_async()
+    # The blocks that the diagnosis does not use show the rig as it was.
+    rigs = zip(
+        stream_of(rig, bumped_rig(), rig.motion), stream_of(rig, virtual_rig(SEED), rig.motion)
+    )
+    client.stream((pair[row * BLOCKS // EXPOSURES % 2] for row, pair in enumerate(rigs)), RATE_HZ)
+    result = client.result_of(answer, JOB_DEADLINE).result
+    client.end_stream()
+    assert result.success and result.verdict == 'fail' and result.checks, result.message
+    refused = client.call(Reset, 'accept_healing')
+    assert not refused.success
+    assert result.orientation_id
+    assert refused.message.startswith('not accepted: the verdict on the healed rig is fail: ')
+    assert load_orientation(orientation_path(calibrated)).orientation_id == before
+
+
+def test_too_few_exposures_are_refused(rig, graph, calibrated):
+    client = graph.client
+    graph.calibration_node(calibrated, learned_shapes=rig.shapes)
+    answer = client.heal(seconds=1.0).get_result_async()
+    few = itertools.islice(stream_of(rig, bumped_rig(), rig.motion), 8)
+    client.stream(few, RATE_HZ)
+    refused = client.result_of(answer, JOB_DEADLINE)
+    client.end_stream()
+    assert refused.status == ABORTED
+    assert refused.result.message.endswith('two views, 10 are needed')
+
+
+def test_node_ends_while_it_heals(rig, graph, calibrated):
+    node = graph.calibration_node(calibrated, learned_shapes=rig.shapes)
+    graph.client.heal(seconds=60.0)
+    assert node.end() == 0
+    assert 'Traceback' not in node.log

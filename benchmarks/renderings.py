@@ -84,6 +84,10 @@ class Row:
         Any place on the lattice will do.
     tilt_deg : float
         Largest angle between the axis of the target and that of the fluoroscope; 180: any.
+    anatomy : str
+        'hand' or 'spine' in the beam.
+    wanted : callable, optional
+        The phantom that is looked for, where it is another one than the target.
     """
 
     target: Callable[[np.random.Generator], Target]
@@ -99,6 +103,8 @@ class Row:
     regular: bool = False
     distortion_px: float = 8.0
     tilt_deg: float = 180.0
+    anatomy: str = ''
+    wanted: Callable[[np.random.Generator], Target] | None = None
 
 
 def cube(beads: int, side: float = 60.0, diameter: float = 3.0) -> Callable[..., Target]:
@@ -204,8 +210,22 @@ ROWS: dict[str, Row] = {
             (45, 4.5, 2),
         )
     },
-    'nothing': Row(nothing),
-    'bone without phantom': Row(nothing, bone=True),
+    'nothing': Row(nothing, wanted=cube(36)),
+    'nothing at 3 % dose': Row(nothing, photons=45.0, wanted=cube(36)),
+    'empty and clipped': Row(nothing, gain=420.0, wanted=cube(36)),
+    'nothing for frame-503': Row(nothing, wanted=frame(503)),
+    'bone without phantom': Row(nothing, bone=True, wanted=cube(36)),
+    'hand': Row(nothing, anatomy='hand', wanted=cube(36)),
+    'spine': Row(nothing, anatomy='spine', wanted=cube(36)),
+    'spine for sheet': Row(nothing, anatomy='spine', wanted=sheet(20, 6.0, False, 1)),
+    'cube-48 for cube-36': Row(cube(48), wanted=cube(36)),
+    'lego-48 for cube-36': Row(lego(48), wanted=cube(36)),
+    'cube-64 for lego-64': Row(cube(64), wanted=lego(64)),
+    'cube-64 for frame-503': Row(cube(64), wanted=frame(503)),
+    'frame-503 for cube-64': Row(frame(503), wanted=cube(64)),
+    'other frame-503': Row(frame(503), wanted=frame(503)),
+    'sheet for cube-36': Row(sheet(20, 6.0, False, 1), holes=True, tilt_deg=15.0, wanted=cube(36)),
+    'cube-48 for sheet': Row(cube(48), wanted=sheet(20, 6.0, False, 1)),
 }
 
 
@@ -237,6 +257,8 @@ def render(row: Row, rng: np.random.Generator) -> Scene:
         depth += ACRYLIC_PER_MM * _plate(bend, rotation, source, (middle, half))
     if row.bone:
         depth += BONE_PER_MM * _bone(rng)
+    if row.anatomy:
+        depth += BONE_PER_MM * _skeleton(row.anatomy, rng)
     light = light * np.exp(-depth) * _vignetting(rng)
     grey = _detected(light, row, rng)
     inside = ((uv > 15) & (uv < SIZE - 16)).all(axis=1)
@@ -390,6 +412,52 @@ def _bone(rng: np.random.Generator) -> np.ndarray:
     return shaft - 0.7 * hollow + 0.5 * texture * (shaft > 0)
 
 
+def _skeleton(part: str, rng: np.random.Generator) -> np.ndarray:
+    """Lengths (h, w) [mm] of rays in the bones of a hand or a spine.
+
+    Bones are ellipses with a dense border: fingers of four and a wrist of eight, or vertebrae with
+    pedicles.
+    """
+    bones = _hand(rng) if part == 'hand' else _spine(rng)
+    turn = rng.uniform(0, 2 * np.pi)
+    scale = rng.uniform(0.7, 1.2)
+    v, u = np.mgrid[:SIZE, :SIZE] - (SIZE - 1) / 2
+    x = (u * np.cos(turn) + v * np.sin(turn)) / scale
+    y = (v * np.cos(turn) - u * np.sin(turn)) / scale
+    depth = np.zeros((SIZE, SIZE))
+    for middle_x, middle_y, half_x, half_y, mm in bones:
+        inside = 1 - ((x - middle_x) / half_x) ** 2 - ((y - middle_y) / half_y) ** 2
+        marrow = np.maximum(inside - 0.3, 0)
+        depth += mm * (np.sqrt(np.maximum(inside, 0)) - 0.7 * np.sqrt(marrow))
+    texture = cv2.GaussianBlur(rng.normal(size=(SIZE, SIZE)), (0, 0), 2.5)
+    return depth * (1 + 0.15 * texture / texture.std())
+
+
+def _hand(rng: np.random.Generator) -> Iterator[tuple[float, float, float, float, float]]:
+    """Yield the bones of a hand: middle and half axes [px], thickness [mm]."""
+    for finger in range(5):
+        x = 110.0 * (finger - 2)
+        y = 180.0
+        for length in (110.0, 75.0, 50.0, 35.0)[: 4 if finger else 3]:
+            yield x, y - length, 22.0 + rng.uniform(-4, 4), length, 12.0
+            y -= 2 * length + 8
+    for row in range(2):
+        for place in range(4):
+            x = 90.0 * (place - 1.5) + rng.uniform(-8, 8)
+            yield x, 235.0 + 85 * row, 40.0, 38.0, 14.0
+
+
+def _spine(rng: np.random.Generator) -> Iterator[tuple[float, float, float, float, float]]:
+    """Yield the bones of a spine: middle and half axes [px], thickness [mm]."""
+    for vertebra in range(-4, 5):
+        y = 130.0 * vertebra + rng.uniform(-5, 5)
+        yield 0.0, y, 105.0, 52.0, 25.0
+        yield 0.0, y + 30, 14.0, 40.0, 12.0
+        for side in (-1, 1):
+            yield side * 62.0, y - 8, 15.0, 20.0, 14.0
+            yield side * 150.0, y, 60.0, 14.0, 6.0
+
+
 def _vignetting(rng: np.random.Generator) -> np.ndarray:
     v, u = np.mgrid[:SIZE, :SIZE] / SIZE - 0.5
     return 1 - rng.uniform(0.1, 0.4) * (u * u + v * v)
@@ -434,6 +502,7 @@ class Tally:
     over_half_px: int = 0
     normalised: float = 0.0
     seconds: float = 0.0
+    slowest: float = 0.0
     refusals: tuple[str, ...] = ()
 
     def add(
@@ -442,6 +511,7 @@ class Tally:
         """Count an image; with any_place, an observation belongs to the nearest target."""
         self.images += 1
         self.seconds += seconds
+        self.slowest = max(self.slowest, seconds)
         self.visible += int(scene.visible.sum())
         if isinstance(result, DataError):
             self.refusals += (result.finding.kind.value,)
@@ -466,7 +536,7 @@ class Tally:
             f'| {name} | {self.found}/{self.images} | {self.beads}/{self.visible} | {self.wrong} '
             f'| {self.largest_px:.2f} | {self.over_half_px} | {self.over_5_sd} '
             f'| {self.normalised / max(done, 1):.2f} '
-            f'| {self.seconds / self.images:.1f} | {causes or ""} |'
+            f'| {self.seconds / self.images:.1f} | {self.slowest:.1f} | {causes or ""} |'
         )
 
 
@@ -474,11 +544,6 @@ def scenes(name: str, images: int, first: int) -> Iterator[Scene]:
     """Yield the scenes of a row, by seeds from the first on."""
     for number in range(first, first + images):
         yield render(ROWS[name], np.random.default_rng([number, *name.encode()]))
-
-
-def other_phantom(rng: np.random.Generator) -> Target:
-    """Return what is looked for in images without a phantom."""
-    return cube(36)(rng)
 
 
 def main() -> None:
@@ -492,16 +557,17 @@ def main() -> None:
     names = [name.strip() for name in options.rows.split(',') if name.strip()] or list(ROWS)
     print(
         '| target | found | beads seen | wrong ids | error up to [px] | > 0.5 px | > 5 sd '
-        '| normalised | s | refused |'
+        '| normalised | s | slowest | refused |'
     )
-    print('| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |')
+    print('| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |')
     lens = Lens((SIZE, SIZE), PRINCIPAL_PX * 1.05)
     for name in names:
         tally = Tally()
         for number, scene in enumerate(scenes(name, options.images, options.first)):
             wanted = scene.target
-            if not len(wanted.xyz):
-                wanted = other_phantom(np.random.default_rng(number))
+            other = ROWS[name].wanted
+            if other is not None:
+                wanted = other(np.random.default_rng(number))
             told = wanted.diameter if ROWS[name].told else None
             model = PhantomModel.of(wanted.xyz, told, ROWS[name].regular)
             began = time.process_time()

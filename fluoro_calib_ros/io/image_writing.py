@@ -28,13 +28,13 @@ from .image_reading import (
     DICOM_SUFFIXES,
     IMAGE_SUFFIXES,
     LOSSLESS_CODEC,
-    READ_SUFFIXES,
     STACK_SUFFIXES,
     SUPPORTS_16_BIT_VIDEOS,
     VIDEO_CODECS,
     ImageSource,
     StackWriter,
     check_name,
+    image_suffix_of,
     listed,
     open_images,
     suffix_of,
@@ -252,9 +252,14 @@ class ImageFolder:
     @property
     def written(self) -> tuple[Path, ...]:
         """Names of new files for `files`."""
-        return tuple(
-            path.with_suffix(_WRITTEN_AS.get(suffix_of(path), path.suffix)) for path in self.files
-        )
+        return tuple(self._written(path) for path in self.files)
+
+    def _written(self, path: Path) -> Path:
+        suffix = image_suffix_of(self.path / path)
+        new = _WRITTEN_AS.get(suffix, suffix)
+        if suffix_of(path) == suffix:
+            return path.with_suffix(new if suffix in _WRITTEN_AS else path.suffix)
+        return path.with_name(path.name + new)  # recognised by its content
 
 
 def list_images(folder: Path, recursive: bool = False) -> ImageFolder:
@@ -264,7 +269,7 @@ def list_images(folder: Path, recursive: bool = False) -> ImageFolder:
     """
     found = (path for path in folder.rglob('*')) if recursive else folder.iterdir()
     files = sorted(path.relative_to(folder) for path in found if path.is_file())
-    images = tuple(path for path in files if suffix_of(path) in READ_SUFFIXES)
+    images = tuple(path for path in files if image_suffix_of(folder / path))
     if not images:
         raise DataError(
             f'{folder}: there are no images in this folder ({listed(IMAGE_SUFFIXES)}), and no '

@@ -12,6 +12,7 @@ import pytest
 
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.io.image_reading import image_suffix_of, is_image_source, open_images
+from fluoro_calib_ros.io.image_writing import list_images
 from fluoro_calib_ros.io.recordings import read_cine_header
 from fluoro_calib_ros.jobs.image_sources import contains_images, open_sources
 
@@ -256,3 +257,21 @@ def test_other_files_are_no_images(tmp_path, name):
         (tmp_path / name).write_bytes(content)
     assert image_suffix_of(tmp_path / name) == ''
     assert image_suffix_of(tmp_path / 'missing') == ''
+
+
+def test_folder_of_a_scanner_is_read_in_the_order_of_its_numbers(tmp_path):
+    frames = np.random.default_rng(1).integers(0, 200, (2, 40, 60)).astype(np.uint8)
+    for name, frame in zip(('1.3.12.0007', '1.3.12.0012'), frames):
+        dicom(tmp_path / name, frame[None])
+    (tmp_path / 'notes').write_text('no image')
+    (tmp_path / 'DICOMDIR').write_bytes(bytes(128) + b'DICM')
+    assert contains_images(tmp_path)
+    read = list(open_sources([tmp_path]).images())
+    assert [one.exposure for one in read] == [7, 12]
+    for one, frame in zip(read, frames):
+        np.testing.assert_array_equal(one.image, frame)
+    listed = list_images(tmp_path)
+    assert [str(path) for path in listed.written] == ['1.3.12.0007.tif', '1.3.12.0012.tif']
+    assert listed.passed_over == ('DICOMDIR', 'notes')
+    with pytest.raises(DataError, match='none of an image'):
+        open_images(tmp_path / 'DICOMDIR')

@@ -107,8 +107,9 @@ def live(module_graph, by_command, tmp_path_factory):
     ]
     client.publish_in_step(pairs, lambda: 2 * len(came))
     client.wait_until(lambda: len(came) == EXPOSURES, what='the last poses')
+    # Statuses of once a second: the last one before may be of the neutral trial.
     graph.statuses = {
-        name: client.wait_for_diagnostics('reconstruction_node', lambda s: True, name)
+        name: client.wait_for_diagnostics('reconstruction_node', lambda s: s.level == b'\0', name)
         for name in ('body femur', 'joint knee')
     }
     graph.lost = client.wait_for_diagnostics(

@@ -82,12 +82,15 @@ def run(arguments: argparse.Namespace) -> bool:
 
 def _lines(arguments: argparse.Namespace, outcome: HealingOutcome) -> list[str]:
     """Return what has changed by how much, and what that is good for."""
+    from ..jobs.healing import CHANGED_MEANWHILE
+
     lines = []
     healed = outcome.healed
+    if outcome.changed_meanwhile:
+        lines.append(CHANGED_MEANWHILE)
     if healed is None:
-        lines.append(
-            'no change of the rig is evident: it stays as it was calibrated, nothing is written'
-        )
+        evident = '' if outcome.changed_meanwhile else 'no change of the rig is evident: '
+        lines.append(f'{evident}it stays as it was calibrated, nothing is written')
     else:
         for f, name in enumerate(outcome.orientation.fluoroscopes):
             if healed.changes[f].any():

@@ -42,6 +42,7 @@ MIN_EXPOSURES = 10
 # Standard deviation of a direction of a change, relative to that of a change as it may be, above
 # which the data do not identify it: they have told less than half of it.
 IDENTIFIED = 0.5
+CHANGED_MEANWHILE = 'the rig changed during the recording'
 
 
 @dataclass(frozen=True)
@@ -82,6 +83,13 @@ class HealingOutcome:
     checks: tuple[Check, ...]
     findings: tuple[Finding, ...]
     exposures: int
+
+    @property
+    def changed_meanwhile(self) -> bool:
+        """Whether exposures that were not used contradict: the rig changed as it was recorded."""
+        return any(
+            check.kind is Kind.UNUSED_EXPOSURES and check.passed is False for check in self.checks
+        )
 
 
 def heal_rig(
@@ -263,16 +271,34 @@ class _Rig:
         if len(exposures) < MIN_EXPOSURES:
             return None
         observed, poses = self.observe(exposures)
-        left_out = np.zeros(observed.seen.shape[1:3], dtype=bool)
         for change in known.changes:
             if change.cause is Cause.EXCHANGED:
                 observed = observed.exchanged(change.body, *change.markers)
-            elif change.cause not in OF_RIG:
-                left_out[change.body, list(change.markers) or slice(None)] = True
+        target_id = self.adjustment().target_id
+        left_out = _left_out(known.changes, target_id)
         observed = observed.without(left_out)
-        if poses.known.any(axis=1).sum() < MIN_EXPOSURES:
+        told = poses.known[:, _solvable(target_id, left_out)]
+        if told.any(axis=1).sum() < MIN_EXPOSURES:
             return None
         return Diagnostician(self.adjustment(), shape_scale).diagnose(observed, poses)
+
+
+def _left_out(changes: Sequence[Change], target_id: np.ndarray) -> np.ndarray:
+    """Return the markers (B, M) that have changed, or whose bodies have.
+
+    Where no body would remain, they are kept: a rig that changes during the recording makes all
+    bodies look soft.
+    """
+    out = np.zeros(target_id.shape, dtype=bool)
+    for change in changes:
+        if change.cause not in OF_RIG and change.cause is not Cause.EXCHANGED:
+            out[change.body, list(change.markers) or slice(None)] = True
+    return out & _solvable(target_id, out).any()
+
+
+def _solvable(target_id: np.ndarray, left_out: np.ndarray) -> np.ndarray:
+    """Return which bodies (B,) have three markers that are not left out (B, M)."""
+    return np.asarray(((target_id >= 0) & ~left_out).sum(axis=1) >= 3)
 
 
 def _corrected(

@@ -43,9 +43,13 @@ def rig(tmp_path_factory):
     )
     knee = virtual_knee(SEED)
     motion = walking(knee, np.arange(60) / 60)
-    write_knee_recording(
-        folder, 'bumped', simulate_knee(replace(virtual, fluoroscopes=(a, moved)), knee, motion)
-    )
+    bumped = simulate_knee(replace(virtual, fluoroscopes=(a, moved)), knee, motion)
+    write_knee_recording(folder, 'bumped', bumped)
+    healthy = simulate_knee(virtual, knee, motion)
+    halfway = {
+        name: [*frames[:30], *bumped.frames[name][30:]] for name, frames in healthy.frames.items()
+    }
+    write_knee_recording(folder, 'halfway', replace(healthy, frames=halfway))
     return folder
 
 
@@ -84,6 +88,13 @@ def test_rig_that_has_not_changed_is_left_as_it_is(rig, tmp_path, capsys):
     assert heal(rig, 'walking', tmp_path / 'healed') == 0
     assert 'as it was calibrated' in capsys.readouterr().out
     assert not (tmp_path / 'healed').exists()
+
+
+def test_rig_that_is_bumped_during_the_recording_is_told(rig, tmp_path, capsys):
+    assert heal(rig, 'halfway', tmp_path / 'healed') == 3
+    out = capsys.readouterr().out
+    assert 'the rig changed during the recording' in out and 'Verdict: fail' in out
+    assert 'no change of the rig is evident' not in out
 
 
 def test_what_cannot_be_healed_is_refused(rig, tmp_path, capsys):

@@ -8,7 +8,7 @@ from __future__ import annotations
 from fluoro_calib_msgs.action import Heal
 
 from ...findings import sentences
-from ...jobs.healing import HealingOutcome
+from ...jobs.healing import CHANGED_MEANWHILE, HealingOutcome
 from ...photogrammetry.rig_orientation import RigOrientation
 
 
@@ -24,8 +24,12 @@ def fill_healing(result: Heal.Result, outcome: HealingOutcome, parent: RigOrient
     result.place_sd_mm = float(outcome.after.place_mm)
     result.scale_sd = float(outcome.after.scale)
     _fill_changes(result, outcome)
-    what = '; '.join(result.findings) or 'no change is evident'
-    result.message = f'{what}; verdict: {outcome.verdict}'
+    what = list(result.findings)
+    if outcome.changed_meanwhile:
+        what.insert(0, CHANGED_MEANWHILE)
+    result.message = '; '.join(
+        [*(what or ['no change is evident']), f'verdict: {outcome.verdict}']
+    )
 
 
 def _fill_changes(result: Heal.Result, outcome: HealingOutcome) -> None:

@@ -1,0 +1,70 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""A rig that changes while it is recorded: it does not pass, and the command says why."""
+
+from argparse import Namespace
+from types import SimpleNamespace
+
+import numpy as np
+
+from fluoro_calib_ros.bodies.healing import Cause, Change
+from fluoro_calib_ros.bodies.rig_adjustment import RigErrors
+from fluoro_calib_ros.checks.check import verdict_of
+from fluoro_calib_ros.cli.heal import _lines
+from fluoro_calib_ros.jobs import healing
+
+TARGET_ID = np.array([[0, 1, 2, 3], [10, 11, 12, -1]])
+SOFT = [Change(Cause.SOFT, body=row) for row in range(2)]
+RIG = SimpleNamespace(orientation=SimpleNamespace(fluoroscopes=('a', 'b')), bodies=())
+
+
+def outcome(*changes):
+    """Outcome without a healed rig; the second half of what was kept back tells of changes."""
+    checks = [
+        healing._unused(SimpleNamespace(changes=()), 1, RIG),
+        healing._unused(SimpleNamespace(changes=changes), 2, RIG),
+    ]
+    diagnosis = SimpleNamespace(changes=(), probability=())
+    errors = RigErrors(1e-4, 0.01)
+    return healing.HealingOutcome(
+        diagnosis,
+        healed=None,
+        calibrations={},
+        orientation=RIG.orientation,
+        before=errors,
+        after=errors,
+        verdict=verdict_of(checks),
+        checks=tuple(checks),
+        findings=(),
+        exposures=20,
+    )
+
+
+def test_bodies_that_have_changed_are_left_out_while_another_one_remains():
+    np.testing.assert_array_equal(
+        healing._left_out(SOFT[:1], TARGET_ID), [[True] * 4, [False] * 4]
+    )
+    one = Change(Cause.MIGRATED, body=0, markers=(2,))
+    assert np.argwhere(healing._left_out([one], TARGET_ID)).tolist() == [[0, 2]]
+    of_rig = Change(Cause.ORIENTATION, fluoroscope=1)
+    exchanged = Change(Cause.EXCHANGED, body=1, markers=(0, 1))
+    assert not healing._left_out([of_rig, exchanged], TARGET_ID).any()
+
+
+def test_unused_exposures_of_soft_bodies_alone_are_still_diagnosed():
+    """Else nothing would be left to tell that the rig, not all the bodies, has changed."""
+    assert not healing._left_out(SOFT, TARGET_ID).any()
+    loose = Change(Cause.LOOSE, body=1, markers=(0,))  # two of three markers give no pose
+    assert not healing._left_out([SOFT[0], loose], TARGET_ID).any()
+
+
+def test_rig_that_changed_during_the_recording_is_told():
+    changed = outcome(Change(Cause.ORIENTATION, fluoroscope=1))
+    assert changed.changed_meanwhile and changed.verdict == 'fail'
+    lines = _lines(Namespace(out='healed'), changed)
+    assert lines[0] == healing.CHANGED_MEANWHILE
+    assert not any('no change' in line for line in lines)
+    steady = outcome()
+    assert not steady.changed_meanwhile and steady.verdict == 'pass'
+    assert 'no change of the rig is evident' in _lines(Namespace(out='healed'), steady)[0]

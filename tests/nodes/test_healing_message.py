@@ -1,0 +1,34 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""What the result of Heal says of a rig that changes while it is recorded."""
+
+from types import SimpleNamespace
+
+import pytest
+from fluoro_calib_msgs.action import Heal
+
+from fluoro_calib_ros.nodes.messages.healing import fill_healing
+
+
+@pytest.mark.parametrize(
+    'meanwhile, message',
+    [
+        (True, 'the rig changed during the recording; verdict: fail'),
+        (False, 'no change is evident; verdict: fail'),
+    ],
+)
+def test_message_tells_that_the_rig_changed_during_the_recording(meanwhile, message):
+    outcome = SimpleNamespace(
+        verdict='fail',
+        findings=(),
+        diagnosis=SimpleNamespace(probability=()),
+        checks=(),
+        exposures=20,
+        after=SimpleNamespace(place_mm=0.01, scale=1e-4),
+        healed=None,
+        changed_meanwhile=meanwhile,
+    )
+    result = Heal.Result()
+    fill_healing(result, outcome, SimpleNamespace(orientation_id='rig-0'))
+    assert result.message == message

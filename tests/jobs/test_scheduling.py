@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import asyncio
 import os
-import select
 import shutil
 import signal
 import subprocess
 import sys
+from multiprocessing.connection import wait
 from pathlib import Path
 
 import cv2
@@ -251,5 +251,5 @@ def test_workers_end_with_their_caller(tmp_path, number):
         workers = [os.pidfd_open(int(caller.stdout.readline())) for _ in range(2)]
         caller.send_signal(number)
         for worker in workers:  # readable once it has ended
-            assert select.select([worker], [], [], 30)[0]
+            assert wait([worker], 30)
             os.close(worker)

@@ -52,6 +52,7 @@ def _graph(request, directory):
             patch.setenv(name, value)
         yield graph
     graph.close()
+    request.node.graphs.remove(graph)  # a context is freed with its last reference
 
 
 @pytest.fixture

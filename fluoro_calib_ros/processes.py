@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import pickle
 import signal
 import subprocess
 import sys
@@ -28,6 +27,7 @@ from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
+from .errors import DataError
 from .limits import ReadLimits, read_limits, use_read_limits
 
 Started = TypeVar('Started', bound='Programs')
@@ -139,10 +139,10 @@ class WorkerProcess:
             raise
         if not isinstance(message, _Failure):
             return message
-        if isinstance(message.error, (ValueError, OSError)):
+        if message.error is not None:
             raise message.error
         trace = RuntimeError(message.trace)
-        raise RuntimeError(f'{self._what} failed: {message.error!r}') from trace
+        raise RuntimeError(f'{self._what} failed: {message.text}') from trace
 
     def _received(self, connection: Connection) -> Any:
         """Return the next message of the process. Raises ProcessEnded."""
@@ -192,7 +192,8 @@ class _Progress:
 class _Failure:
     """What a function has raised, and where."""
 
-    error: BaseException
+    error: ValueError | OSError | None  #: to be raised again; None for a bug
+    text: str
     trace: str
 
 
@@ -227,13 +228,21 @@ def _answer(
         raise  # the caller has gone
     except Exception as error:
         trace = ''.join(traceback.format_exception(error))
-        # The pipe pickles what these two processes exchange, in memory only. An error whose
-        # arguments are its own would fail at the receiver, so that is tried here.
-        try:
-            pickle.loads(pickle.dumps(error))
-        except Exception:
-            return _Failure(RuntimeError(repr(error)), trace)
-        return _Failure(error, trace)
+        return _Failure(_portable(error), repr(error), trace)
+
+
+def _portable(error: Exception) -> ValueError | OSError | None:
+    """Return an error that survives the way to the caller, None for one that means a bug.
+
+    Errors of other packages may have arguments of their own, by which they cannot be made anew.
+    """
+    if isinstance(error, DataError):
+        return error
+    if isinstance(error, OSError):
+        if error.errno is None:
+            return OSError(str(error))
+        return OSError(error.errno, error.strerror, error.filename)
+    return ValueError(str(error)) if isinstance(error, ValueError) else None
 
 
 @contextmanager

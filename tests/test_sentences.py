@@ -7,7 +7,7 @@
 """
 
 import functools
-import pickle
+import multiprocessing
 import re
 from dataclasses import replace
 from types import SimpleNamespace as Fake
@@ -905,7 +905,9 @@ def test_places_in_a_sentence():
 def test_an_error_keeps_its_findings_on_its_way():
     """Through a process, and with a place in front."""
     given = Finding(Kind.POOR_FIT, 'cause', Place(('a',)), numbers={'residual_px': 9.0})
-    error = pickle.loads(pickle.dumps(DataError(given, 'line\nend')))
+    here, there = multiprocessing.Pipe()
+    there.send(DataError(given, 'line\nend'))
+    error = here.recv()
     assert error.findings[0] == given and error.findings[1].kind is Kind.DATA
     assert str(error) == 'fluoroscope a: cause. line\\nend'
     assert error.at('x').finding.numbers == given.numbers

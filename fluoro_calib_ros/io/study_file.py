@@ -138,9 +138,11 @@ def _trials(path: Path, patterns: Any, out: Path) -> tuple[Trial, ...]:
 def _matching(path: Path, pattern: str, out: Path) -> Sequence[Trial]:
     """Return the recordings of a pattern; results are none, and hidden files neither."""
     folder = path.parent
+    if Path(pattern).is_absolute():
+        raise DataError(f'{path}, key trials: {pattern!r} is not relative to the study')
     try:
         paths = sorted(folder.glob(pattern))
-    except (ValueError, NotImplementedError, OSError) as error:
+    except (ValueError, OSError) as error:
         raise DataError(f'{path}, key trials: {pattern!r} is no pattern ({error})') from None
     trials = []
     for one in paths:

@@ -173,7 +173,7 @@ def test_radiographs_are_extracted_first(study, capsys):
         ('trials = ["*"]\ncalibration = "r"\nbodies = 1\n', ['bodies', 'table']),
         ('trials = ["x.csv"]\n[calibrate]\nphantom = "p"\n', ['source', 'missing']),
         ('trials = ["x.csv"]\ncalibration = "r"\n[convert.c3d]\n', ['convert', 'points']),
-        ('trials = ["/x"]\ncalibration = "r"\n', ['/x', 'pattern']),
+        ('trials = ["/x"]\ncalibration = "r"\n', ['/x', 'relative']),
     ],
 )
 def test_wrong_study_is_named_with_its_key(tmp_path, text, words):

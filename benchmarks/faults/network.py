@@ -13,16 +13,11 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import heapq
-import itertools
 import multiprocessing
 import os
-import random
-import select
 import struct
 import subprocess
 import sys
-import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -32,12 +27,11 @@ from types import TracebackType
 from typing import Any
 
 TUNSETIFF = 0x400454CA
-TUNSETCARRIER = 0x400454E2
 IFF_TAP = 0x0002
 IFF_NO_PI = 0x1000
-FRAME_BYTES = 65536
 PREFIX = 'fluoro'
 SUBNET = '10.77.0'
+SWITCH = Path(__file__).with_name('switch.py')
 
 
 @dataclass(frozen=True)
@@ -60,7 +54,7 @@ class Network:
         self.profile = profile
         self._seed = seed
         self._made: list[str] = []
-        self._process: Any = None
+        self._process: subprocess.Popen[bytes] | None = None
         self._pipe: Connection
 
     def namespace(self, host: str) -> str:
@@ -73,12 +67,13 @@ class Network:
         try:
             for number, host in enumerate(self.hosts):
                 descriptors.append(self._make(host, number + 1))
-            context = multiprocessing.get_context('fork')  # inherits the devices
-            self._pipe, other = context.Pipe()
-            self._process = context.Process(
-                target=_switch, args=(descriptors, other, self._seed, os.getpid()), daemon=True
+            self._pipe, other = multiprocessing.Pipe()
+            passed = [other.fileno(), *descriptors]
+            # A program of its own: a fork of a process with ROS contexts crashes when it
+            # collects them as garbage.
+            self._process = subprocess.Popen(
+                [sys.executable, SWITCH, str(self._seed), *map(str, passed)], pass_fds=passed
             )
-            self._process.start()
             other.close()
         except BaseException:
             self._remove()
@@ -124,7 +119,8 @@ class Network:
     def _remove(self) -> None:
         if self._process is not None:
             self._process.kill()
-            self._process.join()
+            self._process.wait()
+            self._pipe.close()
         for namespace in self._made:
             with contextlib.suppress(OSError):
                 _ip('netns', 'delete', namespace)
@@ -142,7 +138,7 @@ class Network:
 
     def set_quality(self, quality: Quality) -> None:
         """Lose and delay frames from now on."""
-        self._ask('quality', quality)
+        self._ask('quality', (quality.loss, quality.delay_s))
 
     def cut_off(self, host: str, is_off: bool = True) -> None:
         """Pull the cable of a host, or plug it in again."""
@@ -174,76 +170,3 @@ def _ip(*words: str) -> None:
     done = subprocess.run(['ip', *words], capture_output=True, text=True, check=False)
     if done.returncode:
         raise OSError(f'ip {" ".join(words)}: {done.stderr.strip()}')
-
-
-class _Switch:
-    """Forwards frames between devices."""
-
-    def __init__(self, devices: Sequence[int], seed: int) -> None:
-        self._devices = devices
-        self._rng = random.Random(seed)
-        self._quality = Quality()
-        self._off: set[int] = set()  # ports without cable
-        self._port_of: dict[bytes, int] = {}  # port by Ethernet address
-        self._waiting: list[tuple[float, int, int, int, bytes]] = []
-        self._numbers = itertools.count()
-        self._counts: Counter[tuple[int, int]] = Counter()
-
-    def run(self, pipe: Connection, parent: int) -> None:
-        """Forward frames, and answer the parent, until it has gone."""
-        ports = {device: port for port, device in enumerate(self._devices)}
-        while os.getppid() == parent:
-            timeout = 0.5
-            if self._waiting:
-                timeout = min(max(self._waiting[0][0] - time.monotonic(), 0.0), timeout)
-            sources: list[Any] = [*self._devices, pipe]
-            readable, _, _ = select.select(sources, [], [], timeout)
-            for source in readable:
-                if isinstance(source, int):
-                    self._receive(ports[source])
-                else:
-                    try:
-                        pipe.send(self._answer(*pipe.recv()))
-                    except EOFError:
-                        return
-            while self._waiting and self._waiting[0][0] <= time.monotonic():
-                _, _, source_port, port, frame = heapq.heappop(self._waiting)
-                self._deliver(source_port, port, frame)
-
-    def _receive(self, source: int) -> None:
-        """Take all frames of a port."""
-        while True:
-            try:
-                frame = os.read(self._devices[source], FRAME_BYTES)
-            except OSError:  # none is left, or the device is down
-                return
-            self._port_of[frame[6:12]] = source
-            known = self._port_of.get(frame[:6])
-            others = [known] if known is not None else range(len(self._devices))
-            for port in others:
-                if port != source and self._rng.random() >= self._quality.loss:
-                    due = time.monotonic() + self._quality.delay_s
-                    heapq.heappush(self._waiting, (due, next(self._numbers), source, port, frame))
-
-    def _deliver(self, source: int, port: int, frame: bytes) -> None:
-        if source in self._off or port in self._off:
-            return
-        with contextlib.suppress(OSError):  # its queue is full, or it is down
-            os.write(self._devices[port], frame)
-            self._counts[source, port] += 1
-
-    def _answer(self, what: str, content: Any) -> Any:
-        if what == 'quality':
-            self._quality = content
-        elif what == 'carrier':
-            port, is_off = content
-            (self._off.add if is_off else self._off.discard)(port)
-            fcntl.ioctl(self._devices[port], TUNSETCARRIER, struct.pack('i', not is_off))
-        return Counter(self._counts)
-
-
-def _switch(devices: Sequence[int], pipe: Connection, seed: int, parent: int) -> None:
-    try:
-        _Switch(devices, seed).run(pipe, parent)
-    except KeyboardInterrupt:
-        sys.exit(0)

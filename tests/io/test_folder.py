@@ -3,6 +3,7 @@
 
 """Folders that are replaced as a whole: result folders and data sets, killed at any moment."""
 
+import gc
 import json
 import os
 import random
@@ -50,9 +51,18 @@ def outcomes():
     return made
 
 
+def fork():
+    """Fork; the child never collects what other tests have left, such as contexts of ROS."""
+    gc.freeze()
+    child = os.fork()
+    if child:
+        gc.unfreeze()
+    return child
+
+
 def killed(work, seconds):
     """Run work() in a process of its own, again and again, and kill it after a time."""
-    child = os.fork()
+    child = fork()
     if not child:
         try:
             while True:
@@ -183,7 +193,7 @@ def test_run_killed_between_two_renames_is_finished_by_the_next(tmp_path, monkey
         if str(source) == str(path):  # the old folder has just been moved away
             os._exit(9)
 
-    child = os.fork()
+    child = fork()
     if not child:
         folder_module.os.rename = rename
         folder_module._keep_as_previous = lambda *_: os._exit(9)

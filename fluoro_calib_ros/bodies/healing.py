@@ -28,6 +28,8 @@ from .rig_adjustment import ObservedBodies, Poses, Prior, RigAdjustment, RigSolu
 MAX_CAUSES = 3
 # Probability below which a cause is not believed: another one explains the data, too.
 SURE = 0.95
+# Share of inliers of a pose below which it does not fit: most of its image points are false.
+FITS = 0.5
 # Markers that are tried in full, of those that their derivatives make most likely.
 TRIED = 3
 
@@ -167,13 +169,16 @@ class Diagnostician:
         """Return the changes of rig and shapes that may have evidence.
 
         If one is expected to have some, they are all changes of the rig, which may be far from
-        where the derivatives hold, and the likeliest ones of markers. Of unknowns with the
+        where the derivatives hold, and the likeliest ones of markers. So they are where the
+        solution takes most image points of a pose for false matches: these have no weight in the
+        derivatives. Of unknowns with the
         additional variances V, gradient g and information S without the others, the evidence is
         expected to be 1/2 g'(S + V^-1)^-1 g - 1/2 log det(I + SV).
         """
         adjustment = self.adjustment
         normal, right = adjustment.normal_at(best.observed, best.prior, best.solution)
         covariance = best.solution.covariance
+        lost = (best.solution.inliers_of_pose < FITS).any()  # by a change, hardly by chance
         places = self._of_rig()
         places += [Change(Cause.MIGRATED, body=b, markers=(m,)) for b, m in self._markers]
         gains: list[tuple[float, Change]] = []
@@ -181,7 +186,8 @@ class Diagnostician:
             if place in best.changes or _is_told(place, best.changes):
                 continue
             of_sizes = []
-            for size in SIZES_OF_INTERIOR if place.cause is Cause.INTERIOR else SIZES:
+            sizes = SIZES_OF_INTERIOR if place.cause is Cause.INTERIOR else SIZES
+            for size in SIZES[:1] if lost else sizes:
                 change = replace(place, size=size)
                 sd = self.sd_of(change)
                 rows = np.flatnonzero(sd)
@@ -196,7 +202,7 @@ class Diagnostician:
                 of_sizes.append((float(gain), change))
             gains.append(max(of_sizes, key=lambda one: one[0]))
         gains.sort(key=lambda one: -one[0])
-        if not gains or gains[0][0] <= 0:
+        if not gains or (gains[0][0] <= 0 and not lost):
             return []
         of_rig = [change for _, change in gains if change.cause in OF_RIG]
         of_markers = [one for one in gains if one[1].cause is Cause.MIGRATED][:TRIED]
@@ -250,7 +256,7 @@ class Diagnostician:
         start = np.zeros(self.adjustment.size), first
         if best.changes:  # else a rig that is wrong may have led values and poses astray
             found = best.solution
-            start = found.values, found.poses.or_else(first, found.inliers_of_pose > 0.5)
+            start = found.values, found.poses.or_else(first, found.inliers_of_pose > FITS)
         solution = self.adjustment.solve(observed, prior, start)
         return _Tried((*best.changes, change), observed, prior, solution)
 
@@ -346,7 +352,11 @@ class HealedRig:
 def healed_rig(
     diagnostician: Diagnostician, diagnosis: Diagnosis, stamp_ns: int, exposures: int
 ) -> HealedRig:
-    """Estimate what has changed, with the rest of the rig held as it was calibrated."""
+    """Estimate what has changed, with the rest of the rig held as it was calibrated.
+
+    A change of orientation or interior may be as large as any. The size with the largest evidence
+    is that of the directions that are known well; it would pull the others towards no change.
+    """
     adjustment = diagnostician.adjustment
     changed = np.zeros(adjustment.size)
     largest = np.zeros(adjustment.size)
@@ -354,9 +364,9 @@ def healed_rig(
         if change.cause in OF_RIG:
             changed = np.hypot(changed, diagnostician.sd_of(change))
             largest = np.hypot(largest, diagnostician.sd_of(replace(change, size=SIZES[0])))
-    solution = adjustment.with_fixed(
-        diagnosis.observed, diagnosis.prior, diagnosis.solution, changed > 0
-    )
+    largest[adjustment.drift] = 0.0
+    prior = diagnosis.prior.widened(largest)
+    solution = adjustment.with_fixed(diagnosis.observed, prior, diagnosis.solution, changed > 0)
     covariance = solution.covariance[adjustment.rig, adjustment.rig]
     views = len(adjustment.functions)
     orientation = replace(

@@ -5,10 +5,14 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ..photogrammetry.rotations import cross_matrix
+
+MAX_TRIPLES = 84  # of points that are tried: all of nine points
 
 
 def fitted_pose(
@@ -28,6 +32,27 @@ def fitted_pose(
     back[..., 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
     rotation = back @ np.swapaxes(u, -1, -2)
     return rotation, (b - a @ np.swapaxes(rotation, -1, -2))[..., 0, :]
+
+
+def robust_pose(
+    source: np.ndarray, target: np.ndarray
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rotation (3, 3) and shift (3,) that take most of at least three points (k, 3) to others.
+
+    Of the motions of three points, the one with the least median of the distances, then of all
+    points within three of these medians. Rousseeuw, "Least median of squares regression", J. Am.
+    Stat. Assoc. 79, 1984.
+    """
+    count = len(source)
+    triples = np.array(list(combinations(range(count), 3)))
+    triples = triples[np.linspace(0, len(triples) - 1, MAX_TRIPLES).astype(int)]
+    rotation, shift = fitted_pose(source[triples], target[triples])
+    away = np.linalg.norm(source @ np.swapaxes(rotation, 1, 2) + shift[:, None] - target, axis=2)
+    middle = max(count // 2, 2)
+    median = np.partition(away, middle, axis=1)[:, middle]
+    best = int(np.argmin(median))
+    near = away[best] <= 3 * median[best]
+    return fitted_pose(source[near], target[near])
 
 
 def by_pose(arm: np.ndarray) -> NDArray[np.float64]:

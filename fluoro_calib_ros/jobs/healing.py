@@ -18,7 +18,7 @@ import numpy as np
 from ..bodies.body import Body, check_bodies, solvable_bodies
 from ..bodies.healing import OF_RIG, Cause, Change, Diagnosis, Diagnostician, HealedRig, healed_rig
 from ..bodies.rig_adjustment import ObservedBodies, Poses, RigAdjustment, RigErrors, rig_errors
-from ..bodies.rigid import fitted_pose
+from ..bodies.rigid import robust_pose
 from ..checks.check import Check, verdict_of
 from ..correction.base import CorrectionStatus
 from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration, with_drift
@@ -232,12 +232,7 @@ class _Rig:
         own = self.adjustment().xyz
         for t, b in np.argwhere(known):
             rows = np.flatnonzero(good[t, b])
-            pose = fitted_pose(own[b, rows], xyz[t, b, rows])
-            misfit = np.linalg.norm(own[b, rows] @ pose[0].T + pose[1] - xyz[t, b, rows], axis=1)
-            near = misfit <= 3 * np.median(misfit)
-            if near.sum() >= 3:
-                pose = fitted_pose(own[b, rows[near]], xyz[t, b, rows[near]])
-            rotation[t, b], centre[t, b] = pose
+            rotation[t, b], centre[t, b] = robust_pose(own[b, rows], xyz[t, b, rows])
         return Poses(rotation, centre, known)
 
     def healed(self, healed: HealedRig) -> _Rig:

@@ -11,7 +11,7 @@ from body_views import orientation, project
 from scipy.spatial.transform import Rotation
 
 from fluoro_calib_ros.bodies.body import Body
-from fluoro_calib_ros.bodies.healing import Cause, Diagnostician, healed_rig
+from fluoro_calib_ros.bodies.healing import SIZES, Cause, Diagnostician, healed_rig
 from fluoro_calib_ros.bodies.rig_adjustment import (
     ObservedBodies,
     Poses,
@@ -144,6 +144,33 @@ def test_moved_fluoroscope_is_found_and_estimated_with_its_deviations():
         )
     # chi-square with 18 degrees of freedom: 0.5 % are beyond each limit
     assert 6.3 < np.sum(squares) < 37.2
+
+
+@pytest.mark.long
+def test_estimate_does_not_depend_on_the_size_that_was_likeliest():
+    """Of bodies that stand still, which tell little of some directions of the change."""
+    scene = Scene(8)
+    scene.rotation = np.repeat(scene.rotation[:1], EXPOSURES, axis=0)
+    scene.centre = np.repeat(scene.centre[:1], EXPOSURES, axis=0)
+    moved = np.zeros(18)
+    moved[9:15] = [4.0, -3.0, 2.0, 0.006, -0.004, 0.005]
+    diagnostician = scene.diagnostician()
+    observed = scene.observe(moved)
+    found = diagnostician.diagnose(observed, scene.poses())
+    assert [one.cause for one in found.changes] == [Cause.ORIENTATION]
+    healthy = diagnostician.adjustment.healthy_prior(observed, 1e-4)
+    estimated = []
+    for size in SIZES:
+        change = replace(found.changes[0], size=size)
+        prior = healthy.widened(diagnostician.sd_of(change))
+        diagnosis = replace(found, changes=(change,), prior=prior)
+        estimated.append(healed_rig(diagnostician, diagnosis, 7, EXPOSURES))
+    large, small = estimated
+    np.testing.assert_allclose(small.sd[1, :6], large.sd[1, :6], rtol=0.02)
+    difference = np.abs(small.changes - large.changes)[1, :6]
+    assert (difference < 0.02 * large.sd[1, :6]).all()
+    error = (large.changes[1] - moved[9:] - scene.errors[9:])[:6]
+    assert (np.abs(error) < 4 * large.sd[1, :6]).all()
 
 
 @pytest.mark.long

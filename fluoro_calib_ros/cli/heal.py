@@ -82,6 +82,7 @@ def run(arguments: argparse.Namespace) -> bool:
 
 def _lines(arguments: argparse.Namespace, outcome: HealingOutcome) -> list[str]:
     """Return what has changed by how much, and what that is good for."""
+    from ..bodies.healing import OF_RIG
     from ..jobs.healing import CHANGED_MEANWHILE
 
     lines = []
@@ -89,7 +90,9 @@ def _lines(arguments: argparse.Namespace, outcome: HealingOutcome) -> list[str]:
     if outcome.changed_meanwhile:
         lines.append(CHANGED_MEANWHILE)
     if healed is None:
-        evident = '' if outcome.changed_meanwhile else 'no change of the rig is evident: '
+        is_changed = any(one.cause in OF_RIG for one in outcome.diagnosis.changes)
+        is_changed = is_changed or outcome.changed_meanwhile
+        evident = '' if is_changed else 'no change of the rig is evident: '
         lines.append(f'{evident}it stays as it was calibrated, nothing is written')
     else:
         for f, name in enumerate(outcome.orientation.fluoroscopes):

@@ -147,15 +147,17 @@ def heal_rig(
     healed = None
     after = before
     now = rig
-    if changed:
+    fixed = rig.with_fixed_correction(changed)
+    if changed and not fixed:
         stamp_ns = max(frame.stamp_ns for frame in paired[used[-1]].values())
         healed = healed_rig(diagnostician, diagnosis, stamp_ns, len(used))
         now = rig.healed(healed)
         after = rig_errors(now.orientation, places)
     step(3, 4)
     kept_back = [paired[row] for row in unused]
-    checks = [_identified(healed), _sure(diagnosis, rig)]
-    checks += _unused_exposures(now, kept_back, diagnosis, before.scale)
+    checks = [_correctable(fixed) if fixed else _identified(healed), _sure(diagnosis, rig)]
+    if not fixed:  # else they tell of the same change
+        checks += _unused_exposures(now, kept_back, diagnosis, before.scale)
     step(4, 4)
     return HealingOutcome(
         diagnosis,
@@ -234,6 +236,12 @@ class _Rig:
             rows = np.flatnonzero(good[t, b])
             rotation[t, b], centre[t, b] = robust_pose(own[b, rows], xyz[t, b, rows])
         return Poses(rotation, centre, known)
+
+    def with_fixed_correction(self, changes: Iterable[Change]) -> list[str]:
+        """Fluoroscopes whose distortion has changed and whose model takes no change."""
+        names = self.orientation.fluoroscopes
+        distorted = [names[one.fluoroscope] for one in changes if one.cause is Cause.DISTORTION]
+        return [name for name in distorted if self.calibrations[name].model.series is None]
 
     def healed(self, healed: HealedRig) -> _Rig:
         """Return the rig with what was healed."""
@@ -369,6 +377,18 @@ def _identified(healed: HealedRig | None) -> Check:
         f'{100 * (healed.weakest if healed else 0.0):.0f} % of what such a change may be',
         advice='record bodies that move through more of the field of view',
         value=healed.weakest if healed else 0.0,
+        limit=IDENTIFIED,
+    )
+
+
+def _correctable(fixed: Sequence[str]) -> Check:
+    """Return the failed check of a change of the distortion that models do not take."""
+    return Check(
+        Kind.CHANGE_IDENTIFIED,
+        'its model of the distortion has no field of standard deviations, and takes no change',
+        place=Place(tuple(fixed)),
+        advice='calibrate with the phantom; the collocation can be healed',
+        value=1.0,
         limit=IDENTIFIED,
     )
 

@@ -4,6 +4,7 @@
 """A rig that changes while it is recorded: it does not pass, and the command says why."""
 
 from argparse import Namespace
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -68,3 +69,24 @@ def test_rig_that_changed_during_the_recording_is_told():
     steady = outcome()
     assert not steady.changed_meanwhile and steady.verdict == 'pass'
     assert 'no change of the rig is evident' in _lines(Namespace(out='healed'), steady)[0]
+
+
+def test_distortion_that_a_model_cannot_take_is_diagnosed_and_does_not_pass():
+    models = {'a': None, 'b': object()}
+    rig = healing._Rig(
+        {name: SimpleNamespace(model=SimpleNamespace(series=one)) for name, one in models.items()},
+        RIG.orientation,
+        (),
+    )
+    changes = [Change(cause, fluoroscope=f) for cause in (Cause.DISTORTION,) for f in (0, 1)]
+    assert rig.with_fixed_correction(changes) == ['a']
+    assert not rig.with_fixed_correction([Change(Cause.ORIENTATION, fluoroscope=0)])
+    check = healing._correctable(['a'])
+    assert check.passed is False and check.place.fluoroscopes == ('a',)
+    found = replace(
+        outcome(),
+        checks=(check,),
+        diagnosis=SimpleNamespace(changes=changes[:1], probability=(1,)),
+    )
+    lines = _lines(Namespace(out='out'), found)
+    assert lines[0] == 'it stays as it was calibrated, nothing is written'

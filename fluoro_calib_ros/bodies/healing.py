@@ -26,8 +26,11 @@ from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
 from .rig_adjustment import ObservedBodies, Poses, Prior, RigAdjustment, RigSolution
 
 MAX_CAUSES = 3
-# Probability below which a cause is not believed: another one explains the data, too.
+# Probability that nothing more has changed, from 1 - SURE on no further cause is looked for.
 SURE = 0.95
+# Probability below which a cause is not believed: another one explains the data, too. Sizes of
+# changes are known to a factor of eight, and two causes differ by up to three unknowns.
+SURE_OF_CAUSE = 1 - 8.0**-3
 # Share of inliers of a pose below which it does not fit: most of its image points are false.
 FITS = 0.5
 # Markers that are tried in full, of those that their derivatives make most likely.
@@ -90,7 +93,7 @@ class Diagnosis:
     @property
     def sure(self) -> bool:
         """Whether no other cause explains the data nearly as well."""
-        return all(one > SURE for one in self.probability)
+        return all(one > SURE_OF_CAUSE for one in self.probability)
 
 
 @dataclass(frozen=True)

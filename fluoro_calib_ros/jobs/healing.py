@@ -16,7 +16,16 @@ from typing import Any
 import numpy as np
 
 from ..bodies.body import Body, check_bodies, solvable_bodies
-from ..bodies.healing import OF_RIG, Cause, Change, Diagnosis, Diagnostician, HealedRig, healed_rig
+from ..bodies.healing import (
+    OF_RIG,
+    SURE_OF_CAUSE,
+    Cause,
+    Change,
+    Diagnosis,
+    Diagnostician,
+    HealedRig,
+    healed_rig,
+)
 from ..bodies.rig_adjustment import ObservedBodies, Poses, RigAdjustment, RigErrors, rig_errors
 from ..bodies.rigid import robust_pose
 from ..checks.check import Check, verdict_of
@@ -396,7 +405,7 @@ def _correctable(fixed: Sequence[str]) -> Check:
 def _sure(diagnosis: Diagnosis, rig: _Rig) -> Check:
     """Check that no other cause explains the data nearly as well."""
     doubt = max([1 - one for one in diagnosis.probability], default=0.0)
-    limit = 0.05
+    limit = 1 - SURE_OF_CAUSE
     text = 'no other cause explains the recording as well'
     if doubt > limit:
         worst = int(np.argmin(diagnosis.probability))

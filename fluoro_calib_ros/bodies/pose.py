@@ -202,7 +202,9 @@ class PoseSolver:
             centre[row] += (solution.rotation[row] - rotation[row]) @ markers.mean(axis=0)
             only = used & (np.arange(len(used)) == row)[:, None]
             second = self._converge((rotation, centre), points, only, None)
-            squares = [self._own_squares(one.marker)[row].sum() for one in (solution, second)]
+            squares = [
+                _own_squares(one.marker, self.variance)[row].sum() for one in (solution, second)
+            ]
             turn = second.rotation[row] @ solution.rotation[row].T
             away = float(np.linalg.norm(vector_from_matrix(turn)))
             fits = squares[1] - squares[0] < self._limit[1] and away > LINEAR_RAD
@@ -325,7 +327,7 @@ class PoseSolver:
         # Markers are compared with each other. A prediction that they contradict is no reason to
         # reject them: the body may have been hit.
         normal = by_marker.sum(axis=1)
-        own = self._own_squares(marker)
+        own = _own_squares(marker, self.variance)
         if not solution.alone.all():
             away = _solved(_eigen(normal), gradient.sum(axis=1))[:, None, :, None]
             change = (by_marker @ away)[..., 0]
@@ -348,7 +350,7 @@ class PoseSolver:
         excess = (own[suspect] + np.where(predicted, gain, 0.0)) / limit
         excess = np.where(used[suspect], excess, 0.0)
         if (excess > 1).any():
-            excess = excess / self._growth_by_rig(solution, points, normal, suspect)
+            excess = excess / _growth_by_rig(self.cameras, solution, points, normal, suspect)
         test[suspect] = np.where(used[suspect], excess, test[suspect])
         if not (excess > 1).any():
             return suspect[:0], suspect[:0]
@@ -362,30 +364,6 @@ class PoseSolver:
         worst = np.argmax(np.where(excess > 1, left, -np.inf), axis=1)
         wrong = np.flatnonzero((excess > 1).any(axis=1))
         return suspect[wrong], worst[wrong]
-
-    def _growth_by_rig(
-        self, solution: _Solution, points: ImagePoints, normal: np.ndarray, rows: np.ndarray
-    ) -> np.ndarray:
-        """Factor (S, M) of the expected squares of markers by errors of the rig's orientation.
-
-        What the pose takes up of these errors is no part of it. rows (S,): bodies.
-        """
-        linear = solution.linear
-        weight = solution.marker.weight[rows]
-        by_place = linear.by_place[rows]
-        by_rig = self.cameras.by_orientation(linear)[rows] @ self.cameras.root  # (S, M, F, 2, k)
-        pulled = (np.swapaxes(by_place * weight[..., None, None], 3, 4) @ by_rig).sum(axis=2)
-        d = linear.by_pose[rows]
-        right = (np.swapaxes(d, 2, 3) @ solution.marker.m[rows] @ pulled).sum(axis=1)
-        regular = normal[rows] + 1e-9 * _EYE_6
-        taken = by_place @ (d @ np.linalg.solve(regular, right)[:, None])[:, :, None]
-        squares = np.sum((by_rig - taken) ** 2, axis=(3, 4)) * weight
-        return 1 + squares.sum(axis=2) / np.maximum(2 * points.seen[rows].sum(axis=2), 1)
-
-    def _own_squares(self, marker: _Marker) -> np.ndarray:
-        """Weighted sum of squares (B, M) of each marker, its shape being unsure."""
-        shape = self.variance * np.sum(marker.s_vector * marker.ms_vector, axis=-1)
-        return np.maximum(marker.squares - shape, 0.0)
 
     def _result(
         self,
@@ -430,9 +408,39 @@ class PoseSolver:
             information=PoseInformation(solution.rotation, solution.centre, information, right),
             used=used,
             test=test,
-            chi2=np.sum(self._own_squares(solution.marker), axis=1),
+            chi2=np.sum(_own_squares(solution.marker, self.variance), axis=1),
             freedom=2.0 * np.sum(points.seen & used[..., None], axis=(1, 2)) - POSE_SIZE,
         )
+
+
+def _growth_by_rig(
+    cameras: Cameras,
+    solution: _Solution,
+    points: ImagePoints,
+    normal: np.ndarray,
+    rows: np.ndarray,
+) -> np.ndarray:
+    """Factor (S, M) of the expected squares of markers by errors of the rig's orientation.
+
+    What the pose takes up of these errors is no part of it. rows (S,): bodies.
+    """
+    linear = solution.linear
+    weight = solution.marker.weight[rows]
+    by_place = linear.by_place[rows]
+    by_rig = cameras.by_orientation(linear)[rows] @ cameras.root  # (S, M, F, 2, k)
+    pulled = (np.swapaxes(by_place * weight[..., None, None], 3, 4) @ by_rig).sum(axis=2)
+    d = linear.by_pose[rows]
+    right = (np.swapaxes(d, 2, 3) @ solution.marker.m[rows] @ pulled).sum(axis=1)
+    regular = normal[rows] + 1e-9 * _EYE_6
+    taken = by_place @ (d @ np.linalg.solve(regular, right)[:, None])[:, :, None]
+    squares = np.sum((by_rig - taken) ** 2, axis=(3, 4)) * weight
+    return 1 + squares.sum(axis=2) / np.maximum(2 * points.seen[rows].sum(axis=2), 1)
+
+
+def _own_squares(marker: _Marker, variance: np.ndarray) -> np.ndarray:
+    """Weighted sum of squares (B, M) of each marker, its shape having a variance (B, M)."""
+    shape = variance * np.sum(marker.s_vector * marker.ms_vector, axis=-1)
+    return np.maximum(marker.squares - shape, 0.0)
 
 
 def _variance_of_last(noise: np.ndarray, fixed: np.ndarray, number: np.ndarray) -> np.ndarray:

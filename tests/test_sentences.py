@@ -338,7 +338,8 @@ HEALED = Fake(orientation=Fake(fluoroscopes=('a', 'b')), bodies=())
 def changed_rig(cause):
     """Diagnosis of a rig with a changed fluoroscope a, or perhaps a moved b."""
     rival = Change(Cause.ORIENTATION, fluoroscope=1)
-    return Fake(changes=(Change(cause, fluoroscope=0),), probability=(0.7,), rivals=(rival,))
+    changes = (Change(cause, fluoroscope=0),)
+    return Fake(changes=changes, probability=(0.7,), rivals=(rival,), complete=True)
 
 
 def changed(cause):

@@ -88,12 +88,17 @@ class Diagnosis:
     prior: Prior
     solution: RigSolution
     noise: float  #: factor by which image points scatter more than claimed, at least 1
-    rest: float  #: probability that nothing else has changed
+    rest: float  #: probability that nothing else has changed; 0 where more causes were not tried
+
+    @property
+    def complete(self) -> bool:
+        """Whether nothing else has to be looked for."""
+        return self.rest > 1 - SURE
 
     @property
     def sure(self) -> bool:
-        """Whether no other cause explains the data nearly as well."""
-        return all(one > SURE_OF_CAUSE for one in self.probability)
+        """Whether the causes explain the data, and no other cause nearly as well."""
+        return self.complete and all(one > SURE_OF_CAUSE for one in self.probability)
 
 
 @dataclass(frozen=True)
@@ -143,6 +148,7 @@ class Diagnostician:
             rivals.append(tried[rival].changes[-1] if rival >= 0 else None)
             best = tried[winner]
             probability.append(float(chances[1:][winner]))
+            rest = 0.0
         return Diagnosis(
             best.changes,
             tuple(probability),

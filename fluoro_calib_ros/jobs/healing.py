@@ -415,6 +415,9 @@ def _sure(diagnosis: Diagnosis, rig: _Rig) -> Check:
         if rival is not None:
             text += f'; or {_place_of(rival, rig)}: {_cause_text(rival, rig)}'
         text += '; the recording does not tell which'
+    if not diagnosis.complete:
+        doubt = 1.0
+        text = f'{len(diagnosis.changes)} changes do not explain the recording'
     return Check(
         Kind.CAUSE_SURE,
         text,
@@ -449,12 +452,14 @@ def _unused(rest: Diagnosis | None, half: int, rig: _Rig) -> Check:
     text = f'{part} tells of no further change'
     if changes:
         text = f'{part}: {_place_of(changes[0], rig)}: {_cause_text(changes[0], rig)}'
+    elif not rest.complete:
+        text = f'{len(rest.changes)} changes do not explain {part}'
     return Check(
         Kind.UNUSED_EXPOSURES,
         text,
         advice='the rig changes while it is recorded: take another recording, or calibrate with '
         'the phantom',
-        value=float(len(changes)),
+        value=float(len(changes) + (not rest.complete)),
         limit=0.0,
     )
 

@@ -8,13 +8,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from fluoro_calib_msgs.action import Heal
 from fluoro_calib_msgs.srv import Reset
+from rclpy.action import ActionClient
 from rclpy.client import Client
 from rclpy.publisher import Publisher
 
 from ..bodies.body import Body, declared_bodies
 from ..checks.drift_charts import DriftOptions, DriftState
 from ..checks.rig_watch import RigDriftWatch
+from ..findings import Finding, Severity
 from ..options import option
 from ..photogrammetry.rig_orientation import RigOrientation
 from .messages.status import ALARM, message_from_drift_state
@@ -42,6 +45,10 @@ class DriftParameters:
     collect_on_drift: bool = option(
         False,
         'whether drift of level ERROR calls the service collect_anew of the calibration node',
+    )
+    heal_on_drift: bool = option(
+        False,
+        'whether drift of level ERROR starts the action heal of the calibration node',
     )
 
     def __post_init__(self) -> None:
@@ -77,7 +84,8 @@ class DriftMonitor:
         old = self._parameters
         self._parameters = parameters
         self._bodies = parameters.rigid_bodies()
-        return replace(old, collect_on_drift=parameters.collect_on_drift) != parameters
+        asked = {name: getattr(parameters, name) for name in ('collect_on_drift', 'heal_on_drift')}
+        return replace(old, **asked) != parameters
 
     def use_options(self, options: DriftOptions) -> None:
         """Use other options for the watches that are made from now on."""
@@ -90,10 +98,11 @@ class DriftMonitor:
         self.newest: tuple[RigDriftWatch | None, RigOrientation, int] | None = None
         self._alarmed = False
 
-    def connect(self, publisher: Publisher, collect_anew: Client) -> None:
-        """Set where the state is published, and the service that an alarm may call."""
+    def connect(self, publisher: Publisher, collect_anew: Client, heal: ActionClient) -> None:
+        """Set where the state is published, and what an alarm may ask the calibration node for."""
         self._publisher = publisher
         self._collect_anew = collect_anew
+        self._heal = heal
 
     def set_image_size(self, name: str, size: tuple[int, int]) -> bool:
         """Set the image size of a fluoroscope; returns whether it has changed."""
@@ -117,8 +126,12 @@ class DriftMonitor:
             self._parameters.drift_rate,
         )
 
-    def publish_state(self) -> list[Status]:
-        """Publish the state of the watch; returns its diagnostics, nothing without exposures."""
+    def publish_state(self, misses: Finding | None) -> list[Status]:
+        """Publish the state of the watch; returns its diagnostics, nothing without exposures.
+
+        misses: what is wrong with rays that miss each other. The watch excludes such rays as false
+        matches; where rays of this orientation have met before, a fluoroscope was knocked.
+        """
         newest = self.newest
         if not self._parameters.drift_watch or newest is None:
             return []
@@ -127,6 +140,8 @@ class DriftMonitor:
             missing = ', '.join(self._missing_sizes())
             return [Status('drift', WARN, f'drift is not watched: no camera_info of {missing}')]
         state = watch.state
+        if misses is not None and state.observations:
+            state = replace(state, finding=replace(misses, severity=Severity.ERROR))
         message = message_from_drift_state(state, stamp_ns, orientation)
         self._publisher.publish(message)
         is_alarm = state.level == ALARM
@@ -140,14 +155,18 @@ class DriftMonitor:
 
     def _raise_alarm(self, state: DriftState) -> None:
         self._logger.error(state.message)
-        if not self._parameters.collect_on_drift:
-            return
-        if self._collect_anew.service_is_ready():
-            self._collect_anew.call_async(Reset.Request())
-        else:
-            self._logger.error(
-                'the service collect_anew is not available: no new exposures are collected'
-            )
+        if self._parameters.collect_on_drift:
+            if self._collect_anew.service_is_ready():
+                self._collect_anew.call_async(Reset.Request())
+            else:
+                self._logger.error(
+                    'the service collect_anew is not available: no new exposures are collected'
+                )
+        if self._parameters.heal_on_drift:
+            if self._heal.server_is_ready():
+                self._heal.send_goal_async(Heal.Goal())
+            else:
+                self._logger.error('the action heal is not available: the rig is not healed')
 
 
 def _values(state: DriftState) -> dict[str, object]:

@@ -11,8 +11,10 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
+from fluoro_calib_msgs.action import Heal
 from fluoro_calib_msgs.msg import CorrectedObservations, DriftStatus, RigOrientation
 from fluoro_calib_msgs.srv import Reset
+from rclpy.action import ActionClient
 from sensor_msgs.msg import CameraInfo
 from tf2_msgs.msg import TFMessage
 
@@ -98,7 +100,8 @@ _PAIRING = ParameterGroup(
     settable=('pair_tolerance', 'waiting', 'patience'),
 )
 _DRIFT = ParameterGroup(
-    DriftParameters, settable=('drift_watch', 'drift_rate', 'clusters', 'collect_on_drift')
+    DriftParameters,
+    settable=('drift_watch', 'drift_rate', 'clusters', 'collect_on_drift', 'heal_on_drift'),
 )
 _DRIFT_OPTIONS = ParameterGroup(
     DriftOptions,
@@ -190,7 +193,9 @@ class ReconstructionNode(StreamNode):
         self.own(drift, self.destroy_publisher, drift)
         collect_anew = self.create_client(Reset, 'collect_anew')
         self.own(collect_anew, self.destroy_client, collect_anew)
-        self._drift.connect(drift, collect_anew)
+        heal = ActionClient(self, Heal, 'heal')
+        self.own(heal, heal.destroy)
+        self._drift.connect(drift, collect_anew, heal)
         self._transforms = self.create_publisher(TFMessage, '/tf_static', latched_qos())
         self.own(self._transforms, self.destroy_publisher, self._transforms)
         self._create_inputs()
@@ -323,7 +328,7 @@ class ReconstructionNode(StreamNode):
         )
         status = Status('reconstruction', *health_of(state, CONDITIONS), self._values())
         bodies = [] if self._follower is None else statuses_of(self._follower, self.recent)
-        return [status, *bodies, *self._drift.publish_state()]
+        return [status, *bodies, *self._drift.publish_state(self._misses.finding())]
 
     def _recent(self) -> dict[str, int]:
         return self.recent.growth(

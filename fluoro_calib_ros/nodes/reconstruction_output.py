@@ -221,7 +221,8 @@ def missing_publishers(state: ReconstructionState) -> Health | None:
 
 def missed_rays(state: ReconstructionState) -> Health | None:
     """The rays of the views do not meet."""
-    misses = state.misses.message()
+    finding = state.misses.finding()
+    misses = '' if finding is None else finding.sentence
     disagreement = state.pairer.stamps.disagreement()
     return fault('; '.join(filter(None, (misses, disagreement))) if misses else '')
 

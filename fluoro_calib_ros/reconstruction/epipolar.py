@@ -201,14 +201,14 @@ class RecentMisses:
         """Add the points of an exposure."""
         self._recent.append(_counts(points.status))
 
-    def message(self) -> str:
-        """Return a sentence where points of the recent exposures cannot be right, else ''."""
+    def finding(self) -> Finding | None:
+        """Return what is wrong where points of the recent exposures cannot be right."""
         bad, total, single = (sum(column) for column in zip(*list(self._recent) or [(0, 0, 0)]))
         if not total and single >= MIN_POINTS:
-            return UNMATCHED.sentence
+            return UNMATCHED
         if total < MIN_POINTS or bad <= MAX_REJECTED * total:
-            return ''
-        return _missing(bad / total, UNKNOWN).sentence
+            return None
+        return _missing(bad / total, UNKNOWN)
 
 
 def _missing(share: float, why: Finding) -> Finding:

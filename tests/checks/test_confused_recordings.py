@@ -372,18 +372,18 @@ def test_a_stream_whose_rays_miss_each_other_is_noticed_and_forgotten():
         return found
 
     misses = RecentMisses()
-    assert misses.message() == ''
+    assert misses.finding() is None
     for found in of(frames()):
         misses.add(found.points)
-    assert misses.message() == ''
+    assert misses.finding() is None
     for _ in range(3):
         for found in of(exchanged(frames())):
             misses.add(found.points)
-    assert '% of the rays miss each other' in misses.message()
+    assert misses.finding().kind is Kind.RAYS_DO_NOT_MEET
     for _ in range(10):
         for found in of(frames()):
             misses.add(found.points)
-    assert misses.message() == ''
+    assert misses.finding() is None
 
 
 # ---- orientation from a capture, and adjustment

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from fluoro_calib_ros.bodies.body import Body
 from fluoro_calib_ros.bodies.healing import Cause, Change
 from fluoro_calib_ros.bodies.rig_adjustment import RigErrors
 from fluoro_calib_ros.checks.check import verdict_of
@@ -23,8 +24,8 @@ RIG = SimpleNamespace(orientation=SimpleNamespace(fluoroscopes=('a', 'b')), bodi
 def outcome(*changes):
     """Outcome without a healed rig; the second half of what was kept back tells of changes."""
     checks = [
-        healing._unused(SimpleNamespace(changes=()), 1, RIG),
-        healing._unused(SimpleNamespace(changes=changes), 2, RIG),
+        healing._unused(SimpleNamespace(changes=(), complete=True), 1, RIG),
+        healing._unused(SimpleNamespace(changes=changes, complete=True), 2, RIG),
     ]
     diagnosis = SimpleNamespace(changes=(), probability=())
     errors = RigErrors(1e-4, 0.01)
@@ -90,3 +91,18 @@ def test_distortion_that_a_model_cannot_take_is_diagnosed_and_does_not_pass():
     )
     lines = _lines(Namespace(out='out'), found)
     assert lines[0] == 'it stays as it was calibrated, nothing is written'
+
+
+def test_recording_that_three_changes_do_not_explain_does_not_pass():
+    """A rig that creeps looks like a distortion and bodies that are soft."""
+    changes = [Change(Cause.DISTORTION, fluoroscope=0), *SOFT]
+    bodies = [Body(name, np.arange(4), np.eye(4, 3), np.ones(4)) for name in ('one', 'other')]
+    rig = SimpleNamespace(orientation=RIG.orientation, bodies=bodies)
+    found = SimpleNamespace(
+        changes=changes, probability=(1.0, 1.0, 1.0), rivals=(None,) * 3, complete=False
+    )
+    assert healing._sure(found, rig).passed is False
+    assert healing._unused(SimpleNamespace(changes=SOFT, complete=False), 1, rig).passed is False
+    assert healing._unused(SimpleNamespace(changes=SOFT, complete=True), 1, rig).passed
+    found.complete = True
+    assert healing._sure(found, rig).passed

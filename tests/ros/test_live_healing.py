@@ -337,6 +337,46 @@ def test_too_few_exposures_are_refused(rig, graph, calibrated):
     assert refused.result.message.endswith('two views, 10 are needed')
 
 
+def test_alarm_of_the_drift_watch_heals_the_rig(rig, graph, calibrated):
+    """From the bump on, nobody asks: the watch, the healing and its acceptance follow."""
+    client = graph.client
+    before = load_orientation(orientation_path(calibrated)).orientation_id
+    orientations = client.listen('rig_orientation')
+    graph.whole_chain(
+        calibrated,
+        {'heal_on_drift': True},
+        learned_shapes=rig.shapes,
+        heal_accept=True,
+        heal_time=1.0,
+    )
+    points = client.listen('reconstruction/points_with_covariance')
+    healthy, bumped = (
+        list(stream_of(rig, virtual, rig.motion)) for virtual in (virtual_rig(SEED), bumped_rig())
+    )
+    is_bumped = False
+
+    def stream():
+        for number in itertools.count(10**6):
+            pair = (bumped if is_bumped else healthy)[number % EXPOSURES]
+            stamp_ns = 10**18 + number * 2 * 10**7
+            yield [replace(f, number=number, stamp_ns=stamp_ns) for f in pair]
+
+    client.stream(stream(), 2 * RATE_HZ)
+    learned = client.wait_for_diagnostics
+    learned('reconstruction_node', lambda s: int(value_of(s, 'observations') or 0) > 4500, 'drift')
+    assert {one.orientation_id for one in orientations} == {before}
+    is_bumped = True
+    client.wait_until(lambda: orientations[-1].orientation_id != before, JOB_DEADLINE, 'healing')
+    healed = orientations[-1].orientation_id
+    client.wait_until(
+        lambda: points[-1].orientation_id == healed and len(points[-1].target_id) == 8,
+        what='points of the healed rig',
+    )
+    client.end_stream()
+    assert orientations[-1].source == 'healing'
+    assert load_orientation(orientation_path(calibrated)).orientation_id == healed
+
+
 def test_node_ends_while_it_heals(rig, graph, calibrated):
     node = graph.calibration_node(calibrated, learned_shapes=rig.shapes)
     graph.client.heal(seconds=60.0)

@@ -156,8 +156,11 @@ def test_frames_of_other_exposures_fail_and_frames_without_partner_cannot_tell()
 
     found, check = of_rig(numbered(1))
     assert found.orientation is None and check.passed is False
+    assert check.kind is Kind.ORIENTATION and check.value == check.numbers['ratio'] > check.limit
     found, check = of_rig(numbered(100))
     assert found.orientation is None and check.passed is None
+    assert check.kind is Kind.ORIENTATION and np.isnan([check.value, check.limit]).all()
+    assert check.place.fluoroscopes == ('a', 'b') and check.advice
 
 
 @pytest.mark.parametrize('late, trusted', [(0.0, 0), (0.2, 1)])

@@ -307,3 +307,13 @@ def test_panels_of_residuals_are_two_coordinates_by_three_scales():
             assert crosses.get_ydata()[0] == pytest.approx(0.97 * limits[row, column])
         rmse = np.sqrt(np.mean(shown[good] ** 2))
         assert f'{rmse:.3f} px, 1 of 200' in axes.get_title()
+
+
+@pytest.mark.parametrize('count', [0, 1, 2, 3])
+def test_picture_of_beads_needs_two_of_them(folder, without_pictures, count):
+    given = read_report_input(folder)
+    few = replace(given, result={**given.result, 'targets': given.result['targets'][:count]})
+    beads = html_report._bead_picture(few)
+    assert (beads is None) is (count < 2)
+    if beads is not None:
+        assert len(beads['largest']) == count

@@ -12,7 +12,9 @@ input (of the last view, for points) to the publication of the output, from the 
 the stamp of the simulator, set just before it publishes, to the time stamp that DDS gives the
 output when it is published, which includes the transfer by DDS. Bodies are the five rigid clusters
 of six markers, whose poses are the output in place of the points. The calibration node publishes
-nothing for the frames of markers, which it ignores: only its CPU time is measured.
+nothing for the frames of markers, which it ignores: only its CPU time is measured. A flood is that
+of tests/ros/flooder.py, on the input of fluoroscope a or, as the same load without messages, on
+a topic that nobody reads.
 """
 
 from __future__ import annotations
@@ -25,7 +27,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
@@ -69,6 +72,7 @@ from tools.sections import show_section
 from .timing import table
 
 NAMES = ('a', 'b')
+CHAIN_250 = ('markers', 250, ('correction_node', 'reconstruction_node'))
 CASES = {  # name: (scene, rate, nodes under test)
     'markers 250 Hz': ('markers', 250, ('correction_node', 'relay_plain')),
     'grid 30 Hz': ('grid', 30, ('correction_node', 'relay_plain')),
@@ -77,20 +81,32 @@ CASES = {  # name: (scene, rate, nodes under test)
     'markers 1000 Hz, relay': ('markers', 1000, ('relay_plain',)),
     'markers 1000 Hz, streams': ('markers', 1000, ('relay_streams',)),
     'grid 30 Hz, streams': ('grid', 30, ('relay_streams',)),
-    'whole chain 250 Hz': ('markers', 250, ('correction_node', 'reconstruction_node')),
-    'bodies 250 Hz': ('markers', 250, ('correction_node', 'reconstruction_node')),
+    'whole chain 250 Hz': CHAIN_250,
+    'bodies 250 Hz': CHAIN_250,
     'whole chain 700 Hz': ('markers', 700, ('correction_node', 'reconstruction_node')),
     'whole chain 1000 Hz': ('markers', 1000, ('correction_node', 'reconstruction_node')),
     'whole chain 1000 Hz, deep': ('markers', 1000, ('correction_node', 'reconstruction_node')),
+    'whole chain 250 Hz, flood elsewhere': CHAIN_250,
+    'whole chain 250 Hz, flood of a': CHAIN_250,
+    'whole chain 250 Hz, flood of a, shed': CHAIN_250,
 }
 DEEP = {
     f'qos_overrides./{name}/corrected_observations.{end}.depth': 1000
     for name in 'ab'
     for end in ('publisher', 'subscription')
 }  # queues of a second instead of a tenth
+# As config/shed_floods.xml says, which limits what such a reader keeps.
+SHED = {
+    f'qos_overrides./{name}/{topic}.subscription.history': 'keep_all'
+    for name in NAMES
+    for topic in ('target_observations', 'corrected_observations')
+} | {'waiting': 200}
+ROOT = Path(__file__).parents[1]
+FLOODER = ROOT / 'tests' / 'ros' / 'flooder.py'
+FLOOD_STARTS_S = 3.0
 OWN_PARAMETERS = {
     'calibration_node': {
-        'phantom': Path(__file__).parents[1] / 'bags' / 'phantom.csv',
+        'phantom': ROOT / 'bags' / 'phantom.csv',
         'calibration_directory': Path(os.devnull) / 'none',
     }
 }
@@ -348,6 +364,44 @@ def write_clusters(folder: Path) -> Path:
     return path
 
 
+def parameters_of(case: str, bodies: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Parameters of the nodes in a case."""
+    of_kind = {'deep': DEEP, 'bodies': bodies, 'shed': SHED}
+    return next((given for kind, given in of_kind.items() if kind in case), {})
+
+
+@contextmanager
+def flood(case: str, log: IO[bytes]) -> Iterator[None]:
+    """A hostile peer publishes, or one on a topic that nobody reads, where the case says so."""
+    if 'flood' not in case:
+        yield
+        return
+    topic = 'elsewhere' if 'elsewhere' in case else 'a/target_observations'
+    remap = f'a/target_observations:={topic}'
+    command = [sys.executable, str(FLOODER), '/', '--ros-args', '-r', remap]
+    with subprocess.Popen(command, stdout=log, stderr=log) as peer:
+        time.sleep(FLOOD_STARTS_S)
+        try:
+            yield
+        finally:
+            peer.kill()
+
+
+@contextmanager
+def shedding(on: bool) -> Iterator[None]:
+    """The nodes that are started read config/shed_floods.xml."""
+    variable = 'FASTRTPS_DEFAULT_PROFILES_FILE'
+    before = os.environ.get(variable)
+    if on:
+        os.environ[variable] = str(ROOT / 'config' / 'shed_floods.xml')
+    try:
+        yield
+    finally:
+        os.environ.pop(variable, None)
+        if before is not None:
+            os.environ[variable] = before
+
+
 def run(seconds: float, only: str = '') -> dict[str, list[dict[str, Any]]]:
     """Results of the nodes by case."""
     isolate_ros_graph()
@@ -360,7 +414,9 @@ def run(seconds: float, only: str = '') -> dict[str, list[dict[str, Any]]]:
     ):
         bodies = {'bodies': write_clusters(Path(folder))}
         for case, (scene, rate, nodes) in CASES.items():
-            if only in case:
+            if only not in case:
+                continue
+            with flood(case, log), shedding('shed' in case):
                 out[case] = measured(
                     reader,
                     scene,
@@ -368,20 +424,20 @@ def run(seconds: float, only: str = '') -> dict[str, list[dict[str, Any]]]:
                     nodes,
                     seconds=seconds,
                     log=log,
-                    parameters=DEEP if 'deep' in case else bodies if 'bodies' in case else {},
+                    parameters=parameters_of(case, bodies),
                 )
-                print(
-                    case,
-                    *(
-                        ' '.join(
-                            f'{k} {v:.3f}' if isinstance(v, float) else f'{k} {v}'
-                            for k, v in f.items()
-                        )
-                        for f in out[case]
-                    ),
-                    sep='\n   ',
-                    flush=True,
-                )
+            print(
+                case,
+                *(
+                    ' '.join(
+                        f'{k} {v:.3f}' if isinstance(v, float) else f'{k} {v}'
+                        for k, v in f.items()
+                    )
+                    for f in out[case]
+                ),
+                sep='\n   ',
+                flush=True,
+            )
     reader.destroy_node()
     rclpy.shutdown()
     return out

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 from importlib import import_module
@@ -92,10 +93,18 @@ def missing_module_message(program: str, module: str) -> str:
 
 
 def _run(module: str) -> None:
-    """Import a module and call its main(). An interrupt during the import ends the process."""
+    """Import a module and call its main(). An interrupt during the import ends the process.
+
+    A node then ends with status 0, as it does later: launch calls anything else a node that died.
+    """
     program = module.rpartition('.')[2]
     program = COMMANDS.get(program, program)
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # the import takes a second: no traceback
+    # The import takes a second: no traceback.
+    if program.endswith('_node'):
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: os._exit(0))
+    else:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
     try:
         main = import_module(f'{__package__}.{module}').main
     except ModuleNotFoundError as error:

@@ -7,8 +7,10 @@ import configparser
 import fnmatch
 import importlib.metadata
 import importlib.util
+import os
 import pathlib
 import re
+import signal
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
@@ -190,3 +192,21 @@ def test_node_without_a_module_says_what_to_install(node, blocked, said):
     (line,) = done.stderr.strip().splitlines()
     assert line.startswith(f'{node}: the Python module {blocked} is missing: ')
     assert said in line
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_node_that_is_interrupted_during_its_import_ends_with_status_0(tmp_path, number):
+    """The import of rclpy, which comes first, waits here."""
+    (tmp_path / 'rclpy.py').write_text('import time\nprint(flush=True)\ntime.sleep(60)\n')
+    code = 'from fluoro_calib_ros.entry_points import correction_node; correction_node()'
+    with subprocess.Popen(
+        [sys.executable, '-c', code],
+        cwd=ROOT,
+        env={**os.environ, 'PYTHONPATH': str(tmp_path)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    ) as process:
+        assert process.stdout.read(1)
+        process.send_signal(number)
+        assert process.wait(10) == 0
+        assert not process.stderr.read()

@@ -20,12 +20,15 @@ import sys
 MARK = '_ROS_WHEELS_BOOTSTRAP_COMPLETE'  # the wheels' own: set, their bootstrap does nothing
 IS_FIRST = os.environ.get(MARK) != sys.prefix
 
-# An interrupt before a program can handle it is to end it without a traceback: the first process
-# only starts the second one, and the nodes set handlers of their own.
-if _signal.getsignal(_signal.SIGINT) is _signal.default_int_handler and (
-    IS_FIRST or any(word.endswith('_node') for word in sys.orig_argv[1:2])
-):
-    _signal.signal(_signal.SIGINT, _signal.SIG_DFL)
+# An interrupt before a program can handle it is to end it without a traceback, and a node with
+# status 0, as later: launch calls anything else a node that died.
+_IS_NODE = any(word.endswith('_node') for word in sys.orig_argv[1:2])
+if _signal.getsignal(_signal.SIGINT) is _signal.default_int_handler:
+    if _IS_NODE:
+        for _number in (_signal.SIGINT, _signal.SIGTERM):
+            _signal.signal(_number, lambda *_: os._exit(0))
+    elif IS_FIRST:
+        _signal.signal(_signal.SIGINT, _signal.SIG_DFL)
 
 
 def environment(old: dict[str, str], prefix: str) -> dict[str, str]:

@@ -46,7 +46,9 @@ HARMLESS_NSE = 0.25
 TRUSTED_NSE = 1.0
 TINY = 1e-12
 HIDDEN = ('hidden_x', 'hidden_y', 'hidden_z')  # direction of the strain that is hidden
-MIN_INFORMATION = 1e-9  # of a strain that the survey could show, relative to the largest
+# Square of the displacements by a strain, relative to the largest, from which it is one: those of
+# a flat phantom along its normal turn or enlarge it, which no image shows.
+MIN_DISPLACEMENT = 1e-4
 
 
 @dataclass(frozen=True)
@@ -74,9 +76,9 @@ def strain_of_survey(evidence: Evidence) -> Strain | None:
     if len(survey) < MIN_BEADS or solved.measured.network.datum != 'survey':
         return None
     tensors, displacement = _strains(survey)
+    displacement = _without_similarity(displacement, survey, solved.measured.network.survey_sd_mm)
     score = _score(evidence, solved, displacement)
-    values, vectors = np.linalg.eigh(score.information)
-    shown = vectors[:, values > MIN_INFORMATION * values.max()]
+    shown = _strains_that_show(displacement)
     information = shown.T @ score.information @ shown
     t = np.linalg.solve(information, shown.T @ score.pull)
     critical = SD_FACTOR**2 * _dispersion(evidence) * float(chdtri(len(t), FALSE_ALARM))
@@ -163,6 +165,29 @@ def _strains(survey_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         tensor[i, j] = tensor[j, i] = 1 / np.sqrt(2)
     offset = survey_mm - survey_mm.mean(axis=0)
     return tensors, np.einsum('tab,nb->nat', tensors, offset)
+
+
+def _without_similarity(
+    displacement: np.ndarray, survey_mm: np.ndarray, sd_mm: np.ndarray
+) -> np.ndarray:
+    """Displacements (n, 3, 5) less their shift, rotation and scale, which the poses take up."""
+    offset = survey_mm - survey_mm.mean(axis=0)
+    similarity = np.zeros((len(offset), 3, 7))
+    similarity[:, :, :3] = np.eye(3)
+    similarity[:, :, 3:6] = np.cross(np.eye(3)[None], offset[:, None]).transpose(0, 2, 1)
+    similarity[:, :, 6] = offset
+    weight = 1 / sd_mm[:, None, None]
+    rows = 3 * len(offset)
+    left = (weight * similarity).reshape(rows, 7)
+    right = (weight * displacement).reshape(rows, STRAINS)
+    return displacement - similarity @ np.linalg.lstsq(left, right, rcond=None)[0]
+
+
+def _strains_that_show(displacement: np.ndarray) -> np.ndarray:
+    """Strains (5, k) that displace beads (n, 3, 5), as columns of unit length."""
+    of_beads = displacement.reshape(-1, STRAINS)
+    values, vectors = np.linalg.eigh(of_beads.T @ of_beads)
+    return vectors[:, values > MIN_DISPLACEMENT * values[-1]]
 
 
 def check_shape(evidence: Evidence, names: Sequence[str]) -> list[Check]:

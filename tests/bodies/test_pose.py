@@ -219,16 +219,16 @@ def test_markers_on_a_line_give_no_rotation_about_it():
     assert not found.alone[0]
 
 
-def flat_from_one_view(thickness, prediction_sd):
-    """A body of four markers near a plane, tilted by 20 degrees, as one view sees it."""
+def flat_from_one_view(thickness, prediction_sd, blind=1):
+    """A body of four markers near a plane, tilted by 20 degrees to the view that sees it."""
     rng = np.random.default_rng(11)
     rig = orientation()
     corners = np.array([[-10.0, -10, 0], [10, -9, 0], [9, 11, 0], [-11, 8, 0]])
     corners[:, 2] = thickness * np.array([1, -1, 1, -1])
     given = Body('patella', np.arange(4), corners - corners.mean(axis=0), np.zeros(4))
-    turn = Rotation.from_rotvec([0.35, 0.1, 0]).as_matrix()
+    turn = rig.rotation[1 - blind].T @ Rotation.from_rotvec([0.35, 0.1, 0]).as_matrix()
     uv = project(rig, given.xyz_mm @ turn.T) + rng.normal(0, 0.2, (2, 4, 2))
-    uv[1] = np.nan
+    uv[blind] = np.nan
     start = Prediction(
         turn[None],
         np.zeros((1, 3)),
@@ -243,6 +243,8 @@ def test_a_flat_body_that_one_view_sees_is_ambiguous_unless_the_prediction_tells
     assert flat_from_one_view(0.0, 0.5).ambiguous[0]
     assert not flat_from_one_view(0.0, 0.03).ambiguous[0]
     assert not flat_from_one_view(8.0, 0.5).ambiguous[0]
+    # The second pose is the reflection at the line of sight of the view that sees it.
+    assert flat_from_one_view(0.0, 0.5, blind=0).ambiguous[0]
 
 
 def test_bodies_are_solved_as_one_by_one():

@@ -10,6 +10,7 @@ the input. What is right must pass without a word.
 import functools
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -31,8 +32,20 @@ from fluoro_calib_ros.jobs.calibration import adjust
 from fluoro_calib_ros.jobs.orientation import orient
 from fluoro_calib_ros.jobs.reconstruction import ReconstructionOptions, reconstruct
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
-from fluoro_calib_ros.reconstruction.epipolar import RecentMisses
-from fluoro_calib_ros.reconstruction.intersection import Intersector
+from fluoro_calib_ros.reconstruction.epipolar import (
+    RecentMisses,
+    cause_of_misses,
+    mismatch,
+    share_rejected,
+)
+from fluoro_calib_ros.reconstruction.intersection import (
+    FAILED,
+    OK,
+    OUTSIDE,
+    REJECTED,
+    SINGLE_VIEW,
+    Intersector,
+)
 from fluoro_calib_ros.reconstruction.reconstruct import reconstruct_recording
 from fluoro_calib_ros.report import html as html_report
 from fluoro_calib_ros.simulation.exposures import Detection, detect_beads, phantom_poses
@@ -156,8 +169,11 @@ def test_frames_of_other_exposures_fail_and_frames_without_partner_cannot_tell()
 
     found, check = of_rig(numbered(1))
     assert found.orientation is None and check.passed is False
+    assert check.kind is Kind.ORIENTATION and check.value == check.numbers['ratio'] > check.limit
     found, check = of_rig(numbered(100))
     assert found.orientation is None and check.passed is None
+    assert check.kind is Kind.ORIENTATION and np.isnan([check.value, check.limit]).all()
+    assert check.place.fluoroscopes == ('a', 'b') and check.advice
 
 
 @pytest.mark.parametrize('late, trusted', [(0.0, 0), (0.2, 1)])
@@ -322,6 +338,38 @@ def test_rays_that_do_not_meet_are_refused_with_their_cause(case):
     make, kind = CONFUSED[case]
     with refused(kind):
         reconstruct(make(), calibrations(), orientation(), FROM_FILE)
+
+
+@pytest.mark.parametrize('step', [1, -1])
+@pytest.mark.parametrize('field', ['number', 'target_id'])
+def test_shift_that_is_found_is_the_one_that_was_made(field, step):
+    shifted = changed(lambda f: replace(f, **{field: getattr(f, field) + step}), 'b')
+    found = reconstruct_recording(
+        shifted, calibrations(), Intersector(orientation()), 'frame_number'
+    )[0]
+    given = (found, shifted, calibrations(), Intersector(orientation()), 'frame_number')
+    why = mismatch(*given)
+    assert why.kind is (Kind.FRAMES_SHIFTED if field == 'number' else Kind.IDS_SHIFTED)
+    assert why.numbers['shift'] == step
+    share, total = share_rejected(found)
+    assert why.numbers['share'] == share > 0.5 and total >= 20
+    assert cause_of_misses(*given).kind is why.kind
+
+
+def test_share_of_rejected_points_is_of_points_of_two_views():
+    """A single view has no second ray, and a point that failed is as bad as a rejected one."""
+    status = np.array([OK] * 3 + [OUTSIDE] + [REJECTED] * 2 + [FAILED] * 4 + [SINGLE_VIEW] * 7)
+    found = [SimpleNamespace(points=SimpleNamespace(status=part)) for part in (status, status[:4])]
+    assert share_rejected(found) == (6 / 14, 14)
+    assert share_rejected([]) == (0.0, 0)
+    misses = RecentMisses()
+    misses.add(SimpleNamespace(status=status))
+    assert misses.message() == ''  # 10 points are few
+    misses.add(SimpleNamespace(status=status))
+    assert '60 %' in misses.message()
+    alone = RecentMisses()
+    alone.add(SimpleNamespace(status=np.full(20, SINGLE_VIEW)))
+    assert alone.message()
 
 
 def test_some_false_matches_do_not_refuse_a_reconstruction():

@@ -3,21 +3,27 @@
 """A survey that is strained as a whole is found; what the exposures cannot tell is said."""
 
 import functools
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from fluoro_calib_ros.checks.calibration_evidence import Evidence
 from fluoro_calib_ros.checks.check import Check
-from fluoro_calib_ros.checks.shape import check_shape, strain_of_survey, trusted_shape
+from fluoro_calib_ros.checks.shape import (
+    _strains,
+    _strains_that_show,
+    _without_similarity,
+    check_shape,
+    strain_of_survey,
+    trusted_shape,
+)
 from fluoro_calib_ros.estimation.calibrate import adjust_with_calibrations, calibrate
 from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.findings import Kind, Severity
 from fluoro_calib_ros.simulation.exposures import simulate_exposures
 from fluoro_calib_ros.simulation.rig import virtual_rig
-
-pytestmark = pytest.mark.long
 
 
 @functools.cache
@@ -27,21 +33,35 @@ def rig():
     return out, simulate_exposures(out, 15, 1).frames
 
 
+def with_targets(frame, ids):
+    """A frame of these targets only."""
+    used = np.isin(frame.target_id, ids)
+    return replace(frame, target_id=frame.target_id[used], uv=frame.uv[used])
+
+
 @functools.cache
-def evidence(shrunk=0.0, seed=0):
-    """Evidence on a calibration with a survey that is too short in z, with errors of its own."""
+def evidence(shrunk=0.0, seed=0, small=False):
+    """Evidence on a calibration with a survey that is too short in z, with errors of its own.
+
+    small: of every sixth bead in six exposures, without a correction.
+    """
     rng = np.random.default_rng(seed)
     here, frames = rig()
-    sd = here.phantom.sd_mm
-    survey = here.true_mm * [1, 1, 1 - shrunk] + rng.normal(0, sd[:, None], (len(sd), 3))
-    phantom = Phantom(here.phantom.target_id, survey, sd)
     options = CalibrationOptions(model='parametric', max_iterations=4)
+    ids, true, sd = here.phantom.target_id, here.true_mm, here.phantom.sd_mm
+    if small:
+        options = CalibrationOptions(model='none')
+        ids, true, sd = ids[::6], true[::6], sd[::6]
+        frames = {'a': [with_targets(frame, ids) for frame in frames['a'][:6]]}
+    survey = true * [1, 1, 1 - shrunk] + rng.normal(0, sd[:, None], (len(sd), 3))
+    phantom = Phantom(ids, survey, sd)
     request = CalibrationRequest(frames, phantom, options)
     calibrations = calibrate(request.frames, phantom, options).calibrations
     result = adjust_with_calibrations(request.frames, phantom, calibrations)
     return Evidence(request, calibrations, result, lambda step: None)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('seed', [1, 2, 3])
 def test_an_honest_survey_has_no_strain(seed):
     """The statistic is chi-square with five degrees of freedom, nearly."""
@@ -51,6 +71,7 @@ def test_an_honest_survey_has_no_strain(seed):
     assert trusted_shape([check]) == []
 
 
+@pytest.mark.long
 def test_a_phantom_that_is_short_in_one_axis_is_found_with_axis_and_size():
     """By 0.2 %, where no bead is off by more than three times the sd of its survey."""
     found = strain_of_survey(evidence(0.002))
@@ -70,3 +91,32 @@ def test_a_strain_that_nobody_would_see_is_taken_on_trust():
         found = trusted_shape([check])
         assert [one.kind for one in found] == [Kind.TAKEN_ON_TRUST] * expected
         assert all(one.severity is Severity.NOTE for one in found)
+
+
+def test_strain_of_a_small_set_has_axis_and_size():
+    """0.4 % in one axis, less the third of it that is a common scale."""
+    found = strain_of_survey(evidence(0.004, small=True))
+    values, vectors = np.linalg.eigh(found.tensor)
+    assert abs(vectors[2, 0]) > 0.99
+    assert values == pytest.approx([-0.00267, 0.00133, 0.00133], abs=4e-4)
+    assert np.trace(found.tensor) == pytest.approx(0.0, abs=1e-9)
+    honest = strain_of_survey(evidence(small=True))
+    assert found.test > 10 * honest.test and honest.test < 18  # chi-square, five degrees: 0.3 %
+    (check,) = check_shape(evidence(small=True), ('a',))
+    assert check.kind is Kind.SHAPE and check.passed and check.value < check.limit
+
+
+def test_a_flat_phantom_has_two_strains():
+    """A strain along its normal turns or enlarges it, which no image shows."""
+    rng = np.random.default_rng(3)
+    survey = np.column_stack([rng.uniform(-90, 90, (40, 2)), np.zeros(40)])
+    tilt = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    for beads, count in ((survey, 2), (survey @ tilt.T + 500, 2), (rng.normal(size=(40, 3)), 5)):
+        displacement = _without_similarity(_strains(beads)[1], beads, np.full(40, 0.1))
+        assert _strains_that_show(displacement).shape == (5, count)
+        # Nothing is left of a shift, a turn and a scale.
+        offset = beads - beads.mean(axis=0)
+        assert np.einsum('nai->ai', displacement) == pytest.approx(0.0, abs=1e-9)
+        assert np.einsum('nai,na->i', displacement, offset) == pytest.approx(0.0, abs=1e-6)
+        turns = np.cross(offset[:, :, None], displacement, axisa=1, axisb=1)
+        assert turns.sum(axis=0) == pytest.approx(0.0, abs=1e-6)

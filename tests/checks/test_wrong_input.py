@@ -8,11 +8,13 @@ must pass.
 """
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from rigs import exposures, kinds, refused, rig, run
 
+from fluoro_calib_ros.checks import inputs
 from fluoro_calib_ros.checks.inputs import (
     copied_exposures,
     find_wrong_input,
@@ -617,3 +619,18 @@ def test_the_command_refuses_wrong_input_and_writes_it_only_when_forced(tmp_path
     assert run(*arguments, '--force') == 3
     assert 'this cannot be right: fluoroscope a: ' in capsys.readouterr().err
     assert '"doubts": [\n    "fluoroscope a: ' in (tmp_path / 'result' / 'result.json').read_text()
+
+
+def test_largest_exposures_are_tried_for_a_cause_first(monkeypatch):
+    """Where these have none, the others are not tried; where most have one, all are."""
+    shown = [SimpleNamespace(target_id=range(n)) for n in range(1, 3 * inputs.MAX_TESTED)]
+    for found, tried in (('', inputs.MAX_TESTED), ('mirrored', len(shown))):
+        sizes = []
+
+        def cause(frame, phantom, found=found, sizes=sizes):
+            sizes.append(len(frame.target_id))
+            return found or None
+
+        monkeypatch.setattr(inputs, '_cause', cause)
+        assert inputs._wrong_exposures(shown, None) == (found or None)
+        assert sizes == list(range(len(shown), 0, -1))[:tried]

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from rigs import calibrated, rig, true_calibrations
 
+from fluoro_calib_ros.correction.base import CorrectionModel
 from fluoro_calib_ros.correction.calibration_record import SD_GRID
 from fluoro_calib_ros.correction.fluoroscope_calibration import with_drift
+from fluoro_calib_ros.correction.registry import create_model
 from fluoro_calib_ros.correction.series import Functions, Series
 from fluoro_calib_ros.errors import DataError
 
@@ -45,3 +47,15 @@ def test_calibration_with_a_drift_corrects_by_it_too():
     without = true_calibrations(rig().fluoroscopes)['a']
     with pytest.raises(DataError, match='has no field of standard deviations'):
         with_drift(without, drift.functions, drift.coefficients, drift.sd)
+
+
+def test_work_grows_with_points_and_functions():
+    calibration = calibrated().calibrations['a']
+    drift = random_series(4, Functions(SIZE, 3, 4), 0.2)
+    changed = with_drift(calibration, drift.functions, drift.coefficients, drift.sd).model
+    plain = create_model('local_linear', 6, changed.train_uv, changed.train_duv, 0.2, 0.0)
+    uv = np.random.default_rng(5).uniform(300, 700, (40, 2))
+    count = len(changed.series.functions)
+    assert count > 1
+    assert CorrectionModel.bulk_work(changed, uv, np.inf) == 40 * count
+    assert CorrectionModel.bulk_work(plain, uv, np.inf) == 40

@@ -3,6 +3,7 @@
 
 """Calibrations with known orientations: only the distortion is estimated."""
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -236,3 +237,10 @@ def test_the_command_takes_markers_in_motion(motion, tmp_path, capsys):
     (tmp_path / 'points.csv').write_text(repeated + '\n')
     assert rigs.run(*arguments, '--known-orientation', tmp_path / 'known.yaml') == 1
     assert 'row 3: target 0 of exposure 1 is already given in row 2' in capsys.readouterr().err
+
+
+def test_seconds_of_a_calibration_are_those_that_it_took(motion):
+    request = motion.request(motion.frames[:20])
+    start = time.perf_counter()
+    calibration = calibrate_request(request).calibrations['a']
+    assert 0 < calibration.seconds < time.perf_counter() - start

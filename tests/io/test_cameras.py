@@ -5,6 +5,7 @@
 
 import json
 import sys
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -97,6 +98,16 @@ def test_cameras_return_from_every_format(tmp_path, kind, tolerance, units):
     # A translation of 17 digits is rounded once more when its decimal point moves.
     tolerance = tolerance if units == 'mm' else max(tolerance, 1e-15)
     assert_same(registry.read(path, settings).cameras, cameras(), tolerance)
+
+
+@pytest.mark.parametrize('name', ['lab "2"', 'C:\\left', '\\"', 'plain'])
+def test_names_of_cameras_return_from_toml(tmp_path, name):
+    """Quotes and backslashes are escaped, once."""
+    given = (replace(cameras()[0], name=name), cameras()[1])
+    path = tmp_path / 'calibration.toml'
+    registry.write(path, 'anipose', Content(cameras=given), MM)
+    assert tomllib.loads(path.read_text())['cam_0']['name'] == name
+    assert [c.name for c in registry.read(path, MM).cameras] == [name, 'b']
 
 
 def autoscoper_mayacam2(path):

@@ -5,6 +5,7 @@
 
 import csv
 import json
+import os
 
 import cv2
 import numpy as np
@@ -251,6 +252,18 @@ def test_wrong_conversion_says_why(lab, result, capsys, arguments, sentence):
     _, err = capsys.readouterr()
     assert status == 1 and sentence in err and err.count('\n') == 1
     assert not out.exists()
+
+
+def test_output_that_is_no_file_is_refused_before_anything_is_written(lab, result, tmp_path):
+    pipe = tmp_path / 'pipe.csv'
+    os.mkfifo(pipe)
+    arguments = ('convert', lab / 'points.csv', *IMAGE, '--to')
+    assert run(*arguments, 'observations', '--out', pipe) == 1
+    assert pipe.is_fifo()
+    # Formats of several files fill a folder.
+    (tmp_path / 'folder').mkdir()
+    assert run('convert', result, '--to', 'mayacam2', '--out', tmp_path / 'folder') == 0
+    assert len(list((tmp_path / 'folder').iterdir())) == 2
 
 
 def test_source_of_another_kind_says_what_it_is(lab, result, capsys):

@@ -5,6 +5,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -13,10 +14,11 @@ from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.rig_orientation import standing_frames
 from fluoro_calib_ros.exposures.angles import AngleOptions
 from fluoro_calib_ros.io.bags.metadata import message_class
-from fluoro_calib_ros.io.bags.reader import JOINT_STATE
+from fluoro_calib_ros.io.bags.reader import COMPRESSED_IMAGE, JOINT_STATE
 from fluoro_calib_ros.io.bags.writer import BagWriter
 from fluoro_calib_ros.io.calibration import save_calibration
 from fluoro_calib_ros.io.observations import read_observations_csv, write_observations_csv
+from fluoro_calib_ros.jobs.image_sources import ImageAngles, open_sources
 from fluoro_calib_ros.jobs.sources import BagSelection, read_calibrated_source, read_source
 
 START_NS = 10**18
@@ -242,3 +244,28 @@ def test_command_line_reads_the_angles_of_a_bag(tmp_path, capsys):
     bad = ['calibrate', str(bag), '--phantom', 'p', '--out', 'o', '--angle-joint', 'a:']
     assert rigs.run(*bad) == 2
     assert 'is not like a:joint,b:joint' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ('joint', 'angles'),
+    [('carm', [0.1, 0.2, 0.2]), ('a:carm', [0.1, 0.2, 0.2]), ('', [None] * 3)],
+)
+def test_images_of_a_bag_get_the_position_of_the_last_state(tmp_path, joint, angles):
+    """Of the joint of their fluoroscope."""
+    header = message_class('std_msgs/msg/Header')
+    time = message_class('builtin_interfaces/msg/Time')
+    grey = np.full((4, 6), 7, np.uint8)
+    with BagWriter(tmp_path / 'bag') as bag:
+        for k in (1, 2, 3):
+            data = np.frombuffer(cv2.imencode('.png', grey + k)[1], np.uint8)
+            image = message_class(COMPRESSED_IMAGE)(header(time(k, 0), ''), 'png', data)
+            bag.write('/a/image_raw/compressed', COMPRESSED_IMAGE, image, k * 10**9)
+            if k < 3:
+                state = joint_state(k * 10**9 - 10**8, ['carm'], [0.1 * k])
+                bag.write('/joint_states', JOINT_STATE, state, k * 10**9)
+    options = AngleOptions(joint, angle_max_age=2.0)
+    sources = open_sources([tmp_path / 'bag'], 'a', ImageAngles(options))
+    images = list(sources.images())
+    assert sources.count == 3 and [one.exposure for one in images] == [1, 2, 3]
+    assert [one.angle for one in images] == pytest.approx(angles)
+    assert [int(one.image[0, 0]) for one in images] == [8, 9, 10]

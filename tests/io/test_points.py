@@ -35,7 +35,7 @@ from fluoro_calib_ros.io.formats.content import (
     Station,
     points_without_precision,
 )
-from fluoro_calib_ros.io.formats.tables import bodies_of_poses
+from fluoro_calib_ros.io.formats.tables import bodies_of_poses, table_of
 from fluoro_calib_ros.jobs.sources import read_source
 
 SIZE = (1024, 768)
@@ -839,6 +839,29 @@ def test_pipe_is_refused(tmp_path):
         assert 'this is a pipe, device or socket' in refused(tmp_path / name)
         with pytest.raises(DataError, match='this is a pipe'):
             read_source(tmp_path / name, image_size=SIZE)
+
+
+@pytest.mark.parametrize('text', ['', '\n \n', ',,\n , \n'])
+@pytest.mark.parametrize('separator', [None, ' ', ','])
+def test_table_without_rows_is_refused(text, separator):
+    if separator == ' ' and text.strip():
+        return  # there these are words
+    with pytest.raises(DataError, match='no rows'):
+        table_of('x.csv', text, separator)
+
+
+@pytest.mark.parametrize(
+    ('text', 'separator', 'cells'),
+    [
+        ('a;b\n1,5;2\n', None, [['a', 'b'], ['1.5', '2']]),
+        ('\na\tb\n\n1\t2\n', None, [['a', 'b'], ['1', '2']]),
+        ('a,b\n1.5,2\n', None, [['a', 'b'], ['1.5', '2']]),
+        ('a  b\n1 2', ' ', [['a', 'b'], ['1', '2']]),
+    ],
+)
+def test_separator_of_a_table_is_that_of_its_first_row(text, separator, cells):
+    rows = table_of('x.csv', text, separator)
+    assert [[str(cell) for cell in row.cells] for row in rows] == cells
 
 
 @pytest.mark.filterwarnings('error')

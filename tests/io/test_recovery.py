@@ -12,6 +12,7 @@ from types import SimpleNamespace
 
 import pytest
 import zstandard
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType
@@ -20,9 +21,10 @@ from rosbags.rosbag2 import Reader
 
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.io.bags import writer as writer_module
+from fluoro_calib_ros.io.bags.mcap_file import RECORD
 from fluoro_calib_ros.io.bags.metadata import TARGET_OBSERVATIONS, message_from_frame
 from fluoro_calib_ros.io.bags.reader import iterate_messages, read_frames
-from fluoro_calib_ros.io.bags.salvage import _decompressed, recover_bag
+from fluoro_calib_ros.io.bags.salvage import FileSalvage, _decompressed, recover_bag
 from fluoro_calib_ros.io.bags.writer import BagWriter
 from fluoro_calib_ros.jobs.simulation import write_bag
 from fluoro_calib_ros.limits import MAX_CHUNK
@@ -85,6 +87,25 @@ def test_chunk_that_claims_more_than_a_chunk_has_is_not_decompressed():
     claimed = known[:4] + bytes([0b11100000]) + (2**40).to_bytes(8, 'little') + known[6:]
     assert zstandard.frame_content_size(claimed) == 2**40
     assert _decompressed(b'zstd', memoryview(claimed), len(content)) is None
+
+
+@pytest.mark.parametrize(
+    ('opcode', 'length', 'end'),
+    [
+        (Opcode.MESSAGE, 11, 20),
+        (Opcode.MESSAGE, 12, None),  # one byte too long
+        (Opcode.DATA_END, 0, 9),
+        (Opcode.DATA_END + 1, 0, None),
+        (0, 0, None),
+        (0, 2**40, None),
+        (Opcode.MESSAGE, 2**40, None),
+    ],
+)
+def test_record_ends_within_the_file_and_has_a_known_opcode(opcode, length, end):
+    data = RECORD.pack(opcode, length) + bytes(11)
+    salvage = FileSalvage('bag.mcap')
+    assert salvage._end_of_record(data, 0) == end
+    assert salvage._end_of_record(data, len(data) - RECORD.size + 1) is None
 
 
 def test_bag_cut_off_anywhere_gives_the_complete_chunks(tmp_path, bag):

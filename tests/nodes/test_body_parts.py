@@ -3,6 +3,7 @@
 
 """Bodies and joints of the reconstruction node without a graph: messages, files, who follows."""
 
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -266,6 +267,10 @@ def test_exposure_with_the_stamp_of_the_one_before_is_counted():
     assert statuses_of(follower, RecentCounts())[0].level == WARN
 
 
+def numbers_in(sentence):
+    return [float(number) for number in re.findall(r'\d+\.\d+', sentence)]
+
+
 def test_diagnostics_of_a_body_from_unseen_to_lost():
     follower = BodyFollower(BODIES, (), lag=0)
     assert statuses_of(follower, RecentCounts()) == []
@@ -281,9 +286,11 @@ def test_diagnostics_of_a_body_from_unseen_to_lost():
     assert tibia().values['markers seen'] == 4
     follow(follower, [30], visible=('femur',))
     assert (tibia().level, tibia().values['status']) == (WARN, 'FILLED')
+    assert numbers_in(tibia().message) == [round(1 / RATE_HZ, 2)]
     follow(follower, [30 + 250], visible=('femur',))
     assert (tibia().level, tibia().values['status']) == (WARN, 'FAILED')
     assert float(tibia().values['since last seen [s]']) == pytest.approx(251 / RATE_HZ)
+    assert numbers_in(tibia().message) == [round(251 / RATE_HZ, 1)]
 
 
 FAULTS = {

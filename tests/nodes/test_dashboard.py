@@ -16,6 +16,9 @@ from fluoro_calib_ros.nodes.dashboard.view import (
     NodeState,
     RateMeter,
     SessionState,
+    _calibration,
+    _coverage,
+    _duration,
     session_text,
 )
 
@@ -124,3 +127,31 @@ def test_rate_is_that_of_the_last_seconds_and_survives_a_restart():
     meter.add(10, 0)
     meter.add(11, 30)
     assert meter.hz == pytest.approx(30.0)
+
+
+def test_cell_of_a_calibration_has_its_round_or_age_and_residuals():
+    none = FluoroscopeState('a', 'calibrated')
+    named = replace(none, calibration_id='a-77')
+    assert _calibration(none) == 'none'
+    assert _calibration(named) == 'a-77'
+    full = replace(named, age_s=300.0, rmse_px=(0.25, 0.5))
+    assert _calibration(full).split() == ['5', 'min', 'ago', 'RMSE', '0.250', '0.500', 'px']
+    running = replace(full, state='calibrating', iteration=3)
+    assert _calibration(running).split()[:2] == ['round', '3']
+    assert _calibration(replace(running, rmse_px=(float('nan'),) * 2)).split() == ['round', '3']
+
+
+@pytest.mark.parametrize(
+    ('seconds', 'text'),
+    [(59, '59 s'), (119, '119 s'), (120, '2 min'), (7200, '2 h'), (172800, '2 d'), (0.4, '0 s')],
+)
+def test_duration_has_the_largest_unit_of_which_there_are_two(seconds, text):
+    assert _duration(seconds) == text
+
+
+@pytest.mark.parametrize('share', [0.0, 0.3, 1.0])
+def test_bar_of_the_coverage_is_as_long_as_it(share):
+    text = _coverage(FluoroscopeState('a', coverage=share)).plain
+    bar, percent, _ = text.split()
+    assert len(bar) == 20 and bar.count('#') == round(20 * share)
+    assert int(percent) == round(100 * share)

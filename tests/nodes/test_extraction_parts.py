@@ -7,13 +7,14 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 
 import numpy as np
 import pytest
 
 from fluoro_calib_ros.exposures.stamps import ExposureNumbers
 from fluoro_calib_ros.jobs.followers import Observations, follower_process
-from fluoro_calib_ros.nodes.image_stream import ExposureQueue
+from fluoro_calib_ros.nodes.image_stream import ExposureQueue, _is_complete
 
 MS = 1_000_000
 
@@ -81,6 +82,30 @@ def test_an_exposure_is_given_out_whole_or_when_its_partner_is_lost():
     assert queue.get('ab', forever) == (4, {'a': ('a', 4)})  # b is an exposure late
     queue.close()
     assert queue.get('ab', forever) is None
+
+
+@pytest.mark.parametrize(
+    ('a', 'b', 'complete'),
+    [
+        ([1], [1], True),
+        ([1], [], False),  # b may still come
+        ([1, 2], [], True),  # b is an exposure late
+        ([1], [2], True),  # b has lost it
+        ([], [3], False),
+        ([], [3, 4], True),
+        ([2], [1], True),
+    ],
+)
+def test_exposure_is_complete_when_nothing_is_to_come(a, b, complete):
+    assert _is_complete({'a': dict.fromkeys(a), 'b': dict.fromkeys(b)}) is complete
+
+
+def test_exposure_waits_for_a_partner_as_long_as_told():
+    queue = ExposureQueue('ab', 4)
+    queue.put('a', 1, 'image')
+    start = time.monotonic()
+    assert queue.get('ab', 0.2) == (1, {'a': 'image'})
+    assert 0.19 < time.monotonic() - start < 5
 
 
 def test_closing_a_queue_ends_the_wait():

@@ -6,7 +6,8 @@
 import importlib
 import subprocess
 import sys
-from types import SimpleNamespace
+from importlib.machinery import ModuleSpec
+from types import ModuleType, SimpleNamespace
 
 import pytest
 
@@ -64,3 +65,15 @@ def test_unknown_parameters_are_told_with_what_was_meant():
         'there is no parameter phantm, it has no effect; did you mean phantom?',
         'there is no parameter zzz, it has no effect; --help lists the parameters',
     ]
+
+
+@pytest.mark.parametrize(
+    ('name', 'shown'),
+    [('__main__', 'other_node'), ('fluoro_calib_ros.nodes.own_node', 'own_node')],
+)
+def test_help_has_the_name_that_is_typed(name, shown):
+    """A module that runs as __main__ has its name in its specification only."""
+    module = ModuleType(name, 'Node that does nothing.')
+    module.__spec__ = ModuleSpec('fluoro_calib_ros.nodes.other_node', None)
+    module.PARAMETERS = ()
+    assert help_text(module).split()[:2] == ['usage:', shown]

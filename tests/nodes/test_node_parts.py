@@ -21,7 +21,7 @@ from sensor_msgs.msg import Image
 from fluoro_calib_ros.correction.registry import create_model
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.images.corrector import ImageCorrector
-from fluoro_calib_ros.nodes import calibration_services
+from fluoro_calib_ros.nodes import calibration_input, calibration_services
 from fluoro_calib_ros.nodes.calibration_input import CalibrationInput
 from fluoro_calib_ros.nodes.calibration_services import OrientationService
 from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import (
@@ -188,6 +188,25 @@ def test_calibration_that_cannot_be_prepared_is_refused(calibration, fault):
         and not inbox.taken
         and inbox.calibrations.current('a') is None
     )
+
+
+def test_calibration_message_that_is_too_large_is_refused_undecoded(calibration, monkeypatch):
+    """By a byte; one of that size is read, and a damaged one is refused by itself."""
+    message = message_from_calibration(calibration)
+    size = len(serialize_message(message))
+    for most, sentences in ((size - 1, 1), (size, 0)):
+        monkeypatch.setattr(
+            calibration_input,
+            'read_limits',
+            lambda most=most: SimpleNamespace(max_calibration_bytes=most),
+        )
+        inbox = Inbox()
+        inbox.go.set()
+        inbox.put(message)
+        assert inbox.ended.acquire(timeout=60)
+        assert len(inbox.refused) == sentences and len(inbox.taken) == 1 - sentences
+    inbox.calibrations._on_data('a', b'\0\1\0\0damaged')
+    assert len(inbox.refused) == 1 and len(inbox.taken) == 1
 
 
 # ---- orientation, and what requests may ask

@@ -20,6 +20,7 @@ from fluoro_calib_ros.jobs.calibration import run_calibration
 from fluoro_calib_ros.jobs.report import read_report_input
 from fluoro_calib_ros.jobs.result_folder import save_outcome, save_result
 from fluoro_calib_ros.report import html as html_report
+from fluoro_calib_ros.report.residuals import position_figure
 from fluoro_calib_ros.report.rig_geometry import beams, phantom_distance
 
 OPTIONS = {'model': 'parametric', 'max_iterations': 3}
@@ -267,3 +268,52 @@ def test_sides_without_beads_are_named(folder):
     missing = html_report._fluoroscope(given, 'a', half)['missing']
     assert {'upper right', 'middle right', 'lower right'} <= set(missing)
     assert not any('left' in side for side in missing)
+
+
+def test_exterior_orientations_have_the_names_of_their_exposures(folder):
+    """Whether the result holds their numbers as numbers or as texts."""
+    given = read_report_input(folder)
+    entry = given.result['fluoroscopes']['a']
+    listed = [e['exposure'] for e in entry['exposures']]
+    names = Names({}, {f'pose <{n}>': int(n) for n in listed[1:]})
+    as_text = [{**e, 'exposure': str(e['exposure'])} for e in entry['exposures']]
+    for listed_so in (entry['exposures'], as_text):
+        result = {**given.result, 'fluoroscopes': {'a': {**entry, 'exposures': listed_so}}}
+        one = replace(given, result=result, names=names)
+        numbers = html_report._fluoroscope(one, 'a', html_report._residuals(given, 'a'))
+        shown = [name for name, _ in numbers['exterior']]
+        assert shown == [listed_so[0]['exposure'], *(f'pose <{n}>' for n in listed[1:])]
+        assert [e for _, e in numbers['exterior']] == listed_so
+
+
+def test_panels_of_residuals_are_two_coordinates_by_three_scales():
+    rng = np.random.default_rng(1)
+    uv = rng.uniform(0, 1000, (200, 2))
+    before, after = (rng.normal(0, sd, (200, 2)) for sd in (2.0, 0.1))
+    after[0] = 50.0
+    good = np.arange(200) > 0
+    figure = position_figure('', uv, (before, good), (after, good), (1000, 800))
+    assert len(figure.axes) == 6
+    limits = np.array([axes.get_ylim()[1] for axes in figure.axes]).reshape(2, 3)
+    assert (limits[:, 0] == limits[:, 1]).all() and (limits[:, 2] < limits[:, 1] / 5).all()
+    for k, axes in enumerate(figure.axes):
+        row, column = divmod(k, 3)
+        assert axes.get_xlim() == (-0.5, (1000, 800)[row] - 0.5)
+        dots, crosses = axes.lines[:2]
+        shown = (before, after, after)[column][:, row]
+        np.testing.assert_array_equal(dots.get_ydata(), shown[good])
+        np.testing.assert_array_equal(dots.get_xdata(), uv[good, row])
+        if column:  # beyond the panel: at its border
+            assert crosses.get_ydata()[0] == pytest.approx(0.97 * limits[row, column])
+        rmse = np.sqrt(np.mean(shown[good] ** 2))
+        assert f'{rmse:.3f} px, 1 of 200' in axes.get_title()
+
+
+@pytest.mark.parametrize('count', [0, 1, 2, 3])
+def test_picture_of_beads_needs_two_of_them(folder, without_pictures, count):
+    given = read_report_input(folder)
+    few = replace(given, result={**given.result, 'targets': given.result['targets'][:count]})
+    beads = html_report._bead_picture(few)
+    assert (beads is None) is (count < 2)
+    if beads is not None:
+        assert len(beads['largest']) == count

@@ -136,7 +136,7 @@ class Reader:
         from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import (
             message_from_calibration,
         )
-        from fluoro_calib_ros.nodes.runtime.streams import latched_qos
+        from fluoro_calib_ros.nodes.runtime.topics import latched_qos
 
         self.node = rclpy.create_node('reader')
         self._latched = self.node.create_publisher(
@@ -150,7 +150,8 @@ class Reader:
         """Collect (stamp, latency) [ns] of a topic, without decoding the images."""
         from sensor_msgs.msg import Image
 
-        from fluoro_calib_ros.nodes.runtime.streams import StreamReader, images_qos
+        from fluoro_calib_ros.nodes.runtime.streams import StreamReader
+        from fluoro_calib_ros.nodes.runtime.topics import images_qos
 
         from .online import logged
 

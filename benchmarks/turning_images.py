@@ -220,8 +220,8 @@ def camera(show: _Show) -> None:
     from sensor_msgs.msg import CameraInfo, Image, JointState
 
     from fluoro_calib_ros.nodes.messages.observations import stamp_from_nanoseconds
-    from fluoro_calib_ros.nodes.runtime.streams import (
-        StreamReader,
+    from fluoro_calib_ros.nodes.runtime.streams import StreamReader
+    from fluoro_calib_ros.nodes.runtime.topics import (
         images_qos,
         observations_qos,
         wait_for_readers,
@@ -321,7 +321,7 @@ class _Reader:
         from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import (
             message_from_calibration,
         )
-        from fluoro_calib_ros.nodes.runtime.streams import latched_qos
+        from fluoro_calib_ros.nodes.runtime.topics import latched_qos
 
         self.node = rclpy.create_node('reader')
         self._latched = []
@@ -338,7 +338,8 @@ class _Reader:
         from rclpy.qos import QoSProfile
         from sensor_msgs.msg import Image
 
-        from fluoro_calib_ros.nodes.runtime.streams import StreamReader, images_qos
+        from fluoro_calib_ros.nodes.runtime.streams import StreamReader
+        from fluoro_calib_ros.nodes.runtime.topics import images_qos
 
         from .online import logged
 

@@ -184,9 +184,9 @@ def validate(
         verdict_of(checks),
         tuple(checks),
         _identities(calibrations),
-        time.perf_counter() - began,
-        {name: _achieved_sd(evidence, name, checks) for name in request.frames},
-        (*rig.notes, *trusted_shape(checks)),
+        seconds=time.perf_counter() - began,
+        achieved_sd_px={name: _achieved_sd(evidence, name, checks) for name in request.frames},
+        notes=(*rig.notes, *trusted_shape(checks)),
     )
 
 

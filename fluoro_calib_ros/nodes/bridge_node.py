@@ -33,7 +33,7 @@ from .recorder_node import adapted_qos, type_hash_text
 from .runtime.diagnostics import RateLimitedLogger, StartError
 from .runtime.main import run
 from .runtime.parameters import ParameterGroup, ParameterNode
-from .runtime.streams import TopicDiscovery, definition_of, installed_type
+from .runtime.topics import TopicDiscovery, definition_of, installed_type
 
 MAX_HEAD = 16_384  # bytes of a request
 HEAD_S = 5.0  # in which it has to come

@@ -9,8 +9,8 @@ process of its own. rclpy's MultiThreadedExecutor is no alternative: it schedule
 and again until it has started, which on a busy machine costs so much time that frames are lost.
 
 The parts: parameters and rig (calibration_settings), exposures (exposure_input), what is published
-(calibration_output), and the services that collect and orient the rig
-(calibration_services), calibrate, heal (healing_services), save and load (calibration_settings).
+(calibration_output), and the services that collect (exposure_input), orient the rig and calibrate
+(calibration_services), heal (healing_services), save and load (calibration_settings).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from rclpy.lifecycle.node import LifecycleState
 from ..exposures.frame import Frame
 from .angle_input import AngleInput
 from .calibration_output import CONDITIONS, CalibrationOutput, FluoroscopeState
-from .calibration_services import CollectServices, OrientationService, SelfCalibration
+from .calibration_services import OrientationService, SelfCalibration
 from .calibration_settings import (
     PARAMETERS,
     CalibrationFiles,
@@ -35,17 +35,18 @@ from .calibration_settings import (
     follow_settings,
     read_rig,
 )
-from .exposure_input import ExposureInput
+from .exposure_input import CollectServices, ExposureInput
 from .frame_validation import with_limit
 from .healing_services import Healing
 from .messages.observations import NS_PER_S, ObservedFrame, decode_target_observations
 from .messages.status import FluoroscopeProgress
 from .runtime.diagnostics import Status, health_of
-from .runtime.lifecycle import Requests, StreamNode, create_services, wake
+from .runtime.lifecycle import StreamNode
 from .runtime.main import run
 from .runtime.parameters import declare_read_limits
+from .runtime.services import Requests, create_services, wake
 from .runtime.stream import stream_faults
-from .runtime.streams import observations_qos
+from .runtime.topics import observations_qos
 
 __all__ = ['PARAMETERS', 'CalibrationNode', 'main']
 

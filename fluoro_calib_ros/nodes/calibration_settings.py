@@ -39,7 +39,6 @@ from ..options import option
 from ..photogrammetry.rig_orientation import RigOrientation
 from .calibration_output import CalibrationOutput
 from .runtime.diagnostics import Logger, StartError
-from .runtime.lifecycle import ServiceEntry
 from .runtime.parameters import (
     READ_LIMITS,
     ManagedParameters,
@@ -48,7 +47,9 @@ from .runtime.parameters import (
     default_calibration_directory,
     expand_path,
 )
+from .runtime.services import ServiceEntry
 
+NOT_ACTIVE = 'the node is not active, so no frames come in'
 COLLECT_MODES = ('still', 'request')
 
 

@@ -49,7 +49,7 @@ from .runtime.parameters import (
     expand_path,
 )
 from .runtime.stream import stream_faults
-from .runtime.streams import images_qos, observations_qos
+from .runtime.topics import images_qos, observations_qos
 
 MODES = ('phantom', 'markers')
 LARGEST_PX = 2**14  # of an image, for points whose image is not known yet

@@ -165,7 +165,9 @@ def simulate_tracking(
     times_s = [index / rate_hz for index in range(round(seconds * rate_hz))]
     points = np.array([_markers_at(time_s, shapes) for time_s in times_s])
     points = points.reshape(len(times_s), len(ids), 3)
-    frames, ideal = image_frames(rig, points, ids, times_s, noise_px, rng, start)
+    frames, ideal = image_frames(
+        rig, points, ids, times_s, noise_px=noise_px, rng=rng, start=start
+    )
     return SimulatedTracking(frames, ids, points, ideal)
 
 

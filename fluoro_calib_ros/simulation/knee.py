@@ -273,7 +273,13 @@ def simulate_knee(
     )
     rng = np.random.default_rng([seed, 12])
     frames, _ = image_frames(
-        rig, points, ids, motion.times_s.tolist(), noise_px, rng, start or StreamStart()
+        rig,
+        points,
+        ids,
+        motion.times_s.tolist(),
+        noise_px=noise_px,
+        rng=rng,
+        start=start or StreamStart(),
     )
     return SimulatedKnee(frames, motion)
 

@@ -11,7 +11,7 @@ Camera, node and the reader (this process, or one of its own for another transpo
 machine. An image without an output is lost; latency is from the stamp of the camera, set
 just before it publishes, to the time stamp that DDS gives the output. A segment of shared memory
 of Fast DDS is smaller than an image by default: the cases `wide` use one of 32 MB, as described in
-docs/images.md.
+docs/extraction.md.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ Camera, image node and the reader (this process) share the machine. Cases at 30 
 fluoroscopes; in cases `fast` the camera sends an image as soon as one of three in flight is
 corrected. The arm turns by 30 degrees a second, there and back: each image needs another map. A
 state of its joint comes with each image. Segments of shared memory of Fast DDS are large, as
-described in docs/images.md. `correct` corrects a video and a stack, in this process.
+described in docs/extraction.md. `correct` corrects a video and a stack, in this process.
 """
 
 from __future__ import annotations

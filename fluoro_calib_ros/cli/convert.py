@@ -29,7 +29,7 @@ from .output import print_notes, print_result
 NAME = 'convert'
 HELP = 'Convert between this program and others: XMALab, Autoscoper, Anipose, OpenCV, C3D, TRC ...'
 EXAMPLE = 'fluoro-calib convert result --to mayacam2 --out mayacam'
-MAX_RATE = 1e6
+MAX_RATE = 1e6  # [Hz] no camera is faster
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

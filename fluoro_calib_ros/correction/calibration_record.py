@@ -53,7 +53,7 @@ class Field:
 
 VERSION = 4  # of the file
 MAX_DEGREE = 15  # of a series that is read
-MAX_MODES = 100
+MAX_MODES = 100  # of a series that is read
 SD_GRID = 33  # nodes of the standard deviation along each side of the image
 ORDERS = 2  # harmonics of the angle
 HARMONICS = 2 * ORDERS

@@ -26,6 +26,7 @@ from ..exposures.phantom import Phantom
 from ..findings import Finding
 from ..photogrammetry.adjustment import Adjustment
 from ..photogrammetry.known_orientation import KnownOrientation
+from ..photogrammetry.noise import MIN_REDUNDANCY
 from ..photogrammetry.precision import (
     Precision,
     geometric_redundancy,
@@ -64,7 +65,6 @@ from .rounds import (
 from .self_calibration import self_calibrate
 
 MAX_REPEATS = 3  # of a calibration, to exclude exposures that do not fit
-MIN_REDUNDANCY = 0.05  # of a coordinate, for the square of its residual to be divided by
 EQUAL_WEIGHTS_NU = 100.0  # degrees of freedom from which weights of inliers hardly differ
 TOLERANCE_WITHOUT_CORRECTION = 1e-4  # its residuals are only reported
 

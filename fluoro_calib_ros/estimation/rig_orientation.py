@@ -35,13 +35,14 @@ from ..exposures.phantom import Phantom
 from ..photogrammetry.adjustment import Adjustment
 from ..photogrammetry.collinearity import to_sensor
 from ..photogrammetry.elimination import CovarianceBlocks, factorize
-from ..photogrammetry.known_orientation import HELD_SD_MM, HELD_SD_RAD
 from ..photogrammetry.network import Network
 from ..photogrammetry.normal_equations import normal_equations
 from ..photogrammetry.precision import covariance_blocks
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation, with_datum_of_points
 from ..photogrammetry.rotations import matrix_from_quaternion
 from ..photogrammetry.unknowns import (
+    RIGID_SD_MM,
+    RIGID_SD_RAD,
     RelativeConstraint,
     RelativePose,
     discrepancies_with_jacobian,
@@ -87,7 +88,7 @@ def orientation_of_known(
     size = ORIENTATION_SIZE * len(names)
     covariance = np.zeros((size, size))
     for f, name in enumerate(names):
-        sd_mm, sd_rad = known[name].exterior_sd or (HELD_SD_MM, HELD_SD_RAD)
+        sd_mm, sd_rad = known[name].exterior_sd or (RIGID_SD_MM, RIGID_SD_RAD)
         at = slice(ORIENTATION_SIZE * f, ORIENTATION_SIZE * (f + 1))
         own = np.diag(np.repeat([sd_mm**2, sd_rad**2, 0.0], 3))
         own[6:, 6:] = calibrations[name].interior_covariance

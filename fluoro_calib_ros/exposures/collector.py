@@ -252,7 +252,7 @@ def _is_stream(frames: Sequence[Frame], still: StillOptions) -> bool:
 
 
 RECOMMENDED_EXPOSURES = 15  # docs/usage.md; accuracy by number: docs/how_good/accuracy.md
-RECOMMENDED_COVERAGE = 0.9
+RECOMMENDED_COVERAGE = 0.9  # share of the image
 MAX_AREAS = 2  # named at once
 
 

@@ -25,9 +25,8 @@ from ..io.calibration import save_orientation
 from ..jobs.calibration import CalibrationOutcome, Rig, run_in_worker_process
 from ..jobs.orientation import OrientationOutcome, orient
 from ..jobs.result_folder import belongs_to, check_result_folder
-from .calibration_output import CalibrationOutput
-from .calibration_settings import NOT_ACTIVE, CalibrationFiles, RigSetup
-from .exposure_input import ExposureInput
+from .calibration_settings import NOT_ACTIVE
+from .exposure_input import NodeParts, RigServices
 from .messages.self_calibration import (
     Request,
     Result,
@@ -36,9 +35,8 @@ from .messages.self_calibration import (
     fill_verdict,
     options_of_request,
 )
-from .runtime.lifecycle import StreamNode
 from .runtime.parameters import check_timeout
-from .runtime.services import Requests, ServiceEntry, in_thread, wake, within
+from .runtime.services import ServiceEntry, in_thread, wake, within
 
 
 class _Capture:
@@ -65,16 +63,11 @@ class _Capture:
                 self.done.set_result(is_complete)
 
 
-class OrientationService:
+class OrientationService(RigServices):
     """The service orient, which orients the rig from the next frames of the phantom."""
 
-    def __init__(
-        self, node: StreamNode, rig: RigSetup, output: CalibrationOutput, requests: Requests
-    ) -> None:
-        self._node = node
-        self._rig = rig
-        self._output = output
-        self._requests = requests
+    def __init__(self, parts: NodeParts) -> None:
+        super().__init__(parts)
         self._capture: _Capture | None = None
         self.services = (ServiceEntry('orient', Orient, self._on_orient),)
 
@@ -92,7 +85,6 @@ class OrientationService:
         self, request: Orient.Request, response: Orient.Response
     ) -> Orient.Response:
         """Orient the rig, save the orientation and publish it."""
-        logger = self._node.get_logger()
         try:
             with self._requests.one():
                 outcome = await self._orient(request)
@@ -100,7 +92,7 @@ class OrientationService:
             save_orientation(self._rig.directory, orientation)
         except (DataError, ValueError, OSError) as error:
             response.message = f'the orientation of the rig is unchanged: {error}'
-            logger.error(response.message)
+            self._logger.error(response.message)
             return response
         self._output.publish_orientation(orientation)
         response.success = True
@@ -112,9 +104,9 @@ class OrientationService:
         )
         response.message = '; '.join([response.message, *sentences(outcome.findings)])
         if outcome.findings:
-            logger.warning(response.message)
+            self._logger.warning(response.message)
         else:
-            logger.info(response.message)
+            self._logger.info(response.message)
         return response
 
     async def _orient(self, request: Orient.Request) -> OrientationOutcome:
@@ -161,27 +153,15 @@ class Cancelled(Exception):
     """The running job has to stop."""
 
 
-class Job:
+class Job(RigServices):
     """Runs one job of an action at a time, in a process of its own."""
 
     kind: Any  #: type of the action
     action: str  #: its name
     title: str  #: what is run
 
-    def __init__(
-        self,
-        node: StreamNode,
-        rig: RigSetup,
-        output: CalibrationOutput,
-        files: CalibrationFiles,
-        requests: Requests,
-    ) -> None:
-        self._node = node
-        self._rig = rig
-        self._output = output
-        self._files = files
-        self._requests = requests
-        self._logger = node.get_logger()
+    def __init__(self, parts: NodeParts) -> None:
+        super().__init__(parts)
         self._stopping = threading.Event()
         self._is_running = False
         self._thread: threading.Thread | None = None  # waits for the process of the job
@@ -268,19 +248,10 @@ class SelfCalibration(Job):
     action = 'self_calibrate'
     title = 'self-calibration'
 
-    def __init__(
-        self,
-        node: StreamNode,
-        rig: RigSetup,
-        exposures: ExposureInput,
-        output: CalibrationOutput,
-        files: CalibrationFiles,
-        requests: Requests,
-    ) -> None:
-        super().__init__(node, rig, output, files, requests)
+    def __init__(self, parts: NodeParts) -> None:
+        super().__init__(parts)
         self.running: tuple[str, ...] = ()  #: fluoroscopes of the running job
         self.last_round: dict[str, Round] = {}  #: of the running or last job, by fluoroscope
-        self._exposures = exposures
         self.services = (ServiceEntry('calibrate', Calibrate, self._on_calibrate),)
 
     async def _on_calibrate(

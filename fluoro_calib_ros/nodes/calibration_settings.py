@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -42,10 +42,11 @@ from .runtime.diagnostics import Logger, StartError
 from .runtime.parameters import (
     READ_LIMITS,
     ManagedParameters,
-    ParameterGroup,
     ParameterNode,
     default_calibration_directory,
     expand_path,
+    group,
+    groups_of,
 )
 from .runtime.services import ServiceEntry
 
@@ -108,62 +109,34 @@ class CalibrationParameters(ManagedParameters):
 
 
 _OF_REQUESTS = ('model', 'interior', 'loss', 'max_iterations', 'relative_orientation', 'datum')
-_NODE = ParameterGroup(
-    CalibrationParameters,
-    settable=('collect', 'joint', 'rig_frame', 'capture_timeout', 'heal_time', 'heal_accept'),
-)
-_STILL = ParameterGroup(
-    StillOptions,
-    {'still_time_s': 'still_time', 'still_px': 'still_px', 'new_px': 'new_px'},
-    settable=('still_time', 'still_px', 'new_px'),
-)
-_PAIRING = ParameterGroup(
-    PairingOptions,
-    {'pair_by': 'pair_by', 'tolerance_s': 'pair_tolerance'},
-    settable=('pair_tolerance',),
-)
-_CALIBRATION = ParameterGroup(
-    CalibrationOptions, {name: name for name in _OF_REQUESTS}, settable=_OF_REQUESTS
-)
-_ANGLES = ParameterGroup(AngleOptions)
-_LIMITS = ParameterGroup(CollectLimits)
-PARAMETERS = (_NODE, _STILL, _PAIRING, _CALIBRATION, _ANGLES, _LIMITS, READ_LIMITS)
 
 
 @dataclass(frozen=True)
 class CalibrationSettings:
     """Values of the parameters, by group."""
 
-    node: CalibrationParameters
-    still: StillOptions
-    pairing: PairingOptions
-    calibration: CalibrationOptions
-    angles: AngleOptions
-    limits: CollectLimits
-
-
-def declare_settings(node: ParameterNode) -> CalibrationSettings:
-    """Declare the parameters of a node. Raises StartError."""
-    return CalibrationSettings(
-        node=_NODE.declare(node),
-        still=_STILL.declare(node),
-        pairing=_PAIRING.declare(node),
-        calibration=_CALIBRATION.declare(node),
-        angles=_ANGLES.declare(node),
-        limits=_LIMITS.declare(node),
+    node: CalibrationParameters = group(
+        CalibrationParameters,
+        settable=('collect', 'joint', 'rig_frame', 'capture_timeout', 'heal_time', 'heal_accept'),
     )
+    still: StillOptions = group(
+        StillOptions,
+        {'still_time_s': 'still_time', 'still_px': 'still_px', 'new_px': 'new_px'},
+        settable=('still_time', 'still_px', 'new_px'),
+    )
+    pairing: PairingOptions = group(
+        PairingOptions,
+        {'pair_by': 'pair_by', 'tolerance_s': 'pair_tolerance'},
+        settable=('pair_tolerance',),
+    )
+    calibration: CalibrationOptions = group(
+        CalibrationOptions, {name: name for name in _OF_REQUESTS}, settable=_OF_REQUESTS
+    )
+    angles: AngleOptions = group(AngleOptions)
+    limits: CollectLimits = group(CollectLimits)
 
 
-def follow_settings(
-    node: ParameterNode,
-    present: Callable[[], CalibrationSettings],
-    use: Callable[[CalibrationSettings], None],
-) -> None:
-    """Call use() with new settings whenever parameters have been set."""
-    _NODE.follow(node, lambda new: use(replace(present(), node=new)))
-    _STILL.follow(node, lambda new: use(replace(present(), still=new)))
-    _PAIRING.follow(node, lambda new: use(replace(present(), pairing=new)))
-    _CALIBRATION.follow(node, lambda new: use(replace(present(), calibration=new)))
+PARAMETERS = (*groups_of(CalibrationSettings).values(), READ_LIMITS)
 
 
 @dataclass(frozen=True)

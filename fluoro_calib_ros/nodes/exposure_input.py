@@ -8,6 +8,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from fluoro_calib_msgs.srv import Capture, Reset
@@ -21,7 +22,12 @@ from ..exposures.frame import Frame, validate_frame
 from ..exposures.pairing import CompletePairer
 from ..exposures.phantom import Phantom
 from .calibration_output import CalibrationOutput
-from .calibration_settings import NOT_ACTIVE, CalibrationSettings, RigSetup
+from .calibration_settings import (
+    NOT_ACTIVE,
+    CalibrationFiles,
+    CalibrationSettings,
+    RigSetup,
+)
 from .messages.observations import ObservedFrame, frame_from_observed
 from .messages.status import Collected
 from .runtime.diagnostics import Logger, RateLimitedLogger, RefusalLog
@@ -262,22 +268,38 @@ class ExposureInput:
         self._logger.info(f'next pose: {"; ".join(advice)}')
 
 
-class CollectServices:
+@dataclass(frozen=True)
+class NodeParts:
+    """What the services of a calibration node work on."""
+
+    node: StreamNode
+    rig: RigSetup
+    exposures: ExposureInput
+    output: CalibrationOutput
+    files: CalibrationFiles
+    requests: Requests
+
+
+class RigServices:
+    """Services of a calibration node, in the table `services`."""
+
+    services: tuple[ServiceEntry, ...]
+
+    def __init__(self, parts: NodeParts) -> None:
+        self._node = parts.node
+        self._rig = parts.rig
+        self._exposures = parts.exposures
+        self._output = parts.output
+        self._files = parts.files
+        self._requests = parts.requests
+        self._logger = parts.node.get_logger()
+
+
+class CollectServices(RigServices):
     """The services capture, reset and collect_anew."""
 
-    def __init__(
-        self,
-        node: StreamNode,
-        rig: RigSetup,
-        exposures: ExposureInput,
-        output: CalibrationOutput,
-        requests: Requests,
-    ) -> None:
-        self._node = node
-        self._rig = rig
-        self._exposures = exposures
-        self._output = output
-        self._requests = requests
+    def __init__(self, parts: NodeParts) -> None:
+        super().__init__(parts)
         self.services = (
             ServiceEntry('capture', Capture, self._on_capture),
             ServiceEntry('reset', Reset, self._on_reset),
@@ -338,5 +360,5 @@ class CollectServices:
         response.message += (
             '; new exposures are collected whenever the phantom stands still in a new pose'
         )
-        self._node.get_logger().info(response.message)
+        self._logger.info(response.message)
         return response

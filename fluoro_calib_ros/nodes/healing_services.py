@@ -35,14 +35,13 @@ from ..jobs.healing_versions import (
 )
 from ..jobs.result_folder import save_calibrations
 from ..photogrammetry.rig_orientation import RigOrientation
-from .calibration_output import CalibrationOutput
 from .calibration_services import Job
-from .calibration_settings import NOT_ACTIVE, CalibrationFiles, RigSetup, check_folders
+from .calibration_settings import NOT_ACTIVE, check_folders
+from .exposure_input import NodeParts
 from .messages.healing import fill_healing
 from .messages.observations import ObservedFrame, frame_from_observed
-from .runtime.lifecycle import StreamNode
 from .runtime.parameters import expand_path
-from .runtime.services import Requests, ServiceEntry, in_thread, wake, within
+from .runtime.services import ServiceEntry, in_thread, wake, within
 
 MAX_FRAMES = 20_000  # of a fluoroscope that are collected, whatever its rate
 MAX_SECONDS = 60.0
@@ -110,15 +109,8 @@ class Healing(Job):
     action = 'heal'
     title = 'healing'
 
-    def __init__(
-        self,
-        node: StreamNode,
-        rig: RigSetup,
-        output: CalibrationOutput,
-        files: CalibrationFiles,
-        requests: Requests,
-    ) -> None:
-        super().__init__(node, rig, output, files, requests)
+    def __init__(self, parts: NodeParts) -> None:
+        super().__init__(parts)
         self._collection: _Collection | None = None
         self._healed: tuple[HealingOutcome, _Rig] | None = None  # to be accepted
         self.services = (

@@ -27,7 +27,7 @@ from .unknowns import EXTERIOR_SIZE, Parameters
 
 # Correlation above which two unknowns are reported, and how many pairs at most.
 HIGH_CORRELATION = 0.95
-MAX_CORRELATIONS = 20
+MAX_CORRELATIONS = 20  # pairs that are listed
 # Eigenvalue of the scaled normal matrix below which it is a rounding error.
 MAX_OPEN_EIGENVALUE = 1e-11
 # A network is judged at this image noise at most, so that distorted images do not make it look

@@ -105,7 +105,7 @@ def detect_beads(
     return target_id[found], seen
 
 
-CLUSTER_MARKERS = 6
+CLUSTER_MARKERS = 6  # of a rigid body
 # Centres of the clusters [mm]; the first two are on the one bone.
 CLUSTER_CENTRES = np.array(
     [

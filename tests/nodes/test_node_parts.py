@@ -208,13 +208,17 @@ def test_orientation_of_outdated_calibrations_is_rejected(monkeypatch):
         destroy_timer=lambda _: None,
         readers=['active'],
         executor=None,
+        get_logger=lambda: None,
     )
     rig = SimpleNamespace(
         names=('a', 'b'),
         required_phantom=lambda: rigs.rig().phantom,
         settings=lambda: SimpleNamespace(node=SimpleNamespace(rig_frame='rig')),
     )
-    service = OrientationService(node, rig, output, Requests())
+    parts = SimpleNamespace(
+        node=node, rig=rig, exposures=None, output=output, files=None, requests=Requests()
+    )
+    service = OrientationService(parts)
 
     async def recalibrated():
         output.calibrations.update(new)

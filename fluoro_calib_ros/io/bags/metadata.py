@@ -385,7 +385,7 @@ _Dumper.add_representer(
 )
 
 
-BAG_VERSION = 9
+BAG_VERSION = 9  # of metadata.yaml, as rosbag2 of Jazzy writes it
 NO_MESSAGE_NS = 2**63 - 1  # starting time of a bag without messages [ns]
 
 

@@ -42,7 +42,7 @@ def one_line(error: BaseException) -> str:
 
 
 MAX_LINE = 4000  # characters
-MAX_TRACE = 20_000
+MAX_TRACE = 20_000  # characters
 
 # rclpy keeps state for each place that logs: that is the caller of this module.
 rcutils_logger._internal_callers.append(os.path.realpath(__file__))

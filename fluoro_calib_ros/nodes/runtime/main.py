@@ -41,7 +41,6 @@ INTERRUPTED = 130  # exit status after a second interrupt
 # Time in which further signals belong to the first one: launch and service managers signal a group
 # of processes and each of them, with SIGINT and SIGTERM.
 ONE_INTERRUPT_S = 1.0
-MAX_SIGNALS = 1000
 # Time in which a node ends after a signal; launch sends the next one, SIGTERM, after 5 s. A node
 # that has something to write has an attribute end_s.
 END_S = 4.0
@@ -189,7 +188,7 @@ def _call_on_interrupt(end: Callable[[], None], patience_s: Callable[[], float])
         time.sleep(ONE_INTERRUPT_S)
         os.set_blocking(reading, False)
         with suppress(BlockingIOError):  # no further signal has come
-            os.read(reading, MAX_SIGNALS)
+            os.read(reading, 1000)
         patience = patience_s()
         if select.select([reading], [], [], patience - ONE_INTERRUPT_S)[0]:
             os._exit(INTERRUPTED)
@@ -202,8 +201,6 @@ def _call_on_interrupt(end: Callable[[], None], patience_s: Callable[[], float])
 
 
 # What a node prints with --help: its task, how to start it, and its parameters.
-
-MAX_WIDTH = 100
 
 
 def asks_for_help(arguments: Sequence[str]) -> bool:
@@ -219,7 +216,7 @@ def help_text(module: ModuleType) -> str:
     name = module.__name__.rpartition('.')[2]
     if name == '__main__' and module.__spec__ is not None:
         name = module.__spec__.name.rpartition('.')[2]
-    width = min(MAX_WIDTH, shutil.get_terminal_size().columns)
+    width = min(100, shutil.get_terminal_size().columns)
     task = ' '.join((module.__doc__ or '').strip().partition('\n\n')[0].split())
     settable = settable_parameters(module.PARAMETERS)
     lines = [

@@ -9,7 +9,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -44,6 +44,7 @@ SIM_TIME = 'use_sim_time'
 _OF_ROS = ('qos_overrides.', SIM_TIME, 'start_type_description_service')
 
 T = TypeVar('T')
+_GROUP = 'group'  # key of the metadata of a field of settings
 
 
 @dataclass(frozen=True)
@@ -208,6 +209,34 @@ class ParameterGroup(Generic[T]):
         for parameter, declaration in self.declarations.items():
             declaration.validate(values[parameter])
         return self.options(**{name: values[parameter] for name, parameter in self._names.items()})
+
+
+def group(
+    options: type[T], names: Mapping[str, str] | None = None, settable: Sequence[str] = ()
+) -> Any:
+    """Declare a field of a settings dataclass: the options of a `ParameterGroup`."""
+    return field(metadata={_GROUP: ParameterGroup(options, names or {}, settable)})
+
+
+def groups_of(settings: type[Any]) -> dict[str, ParameterGroup[Any]]:
+    """Return the groups of a settings dataclass by field."""
+    return {each.name: each.metadata[_GROUP] for each in fields(settings)}
+
+
+def declare_groups(node: Node, settings: type[T]) -> T:
+    """Declare the parameters of a settings dataclass; returns their values. Raises StartError."""
+    return settings(**{name: each.declare(node) for name, each in groups_of(settings).items()})
+
+
+def follow_groups(node: Node, present: Callable[[], T], use: Callable[[T], None]) -> None:
+    """Call use() with new settings whenever parameters have been set."""
+
+    def follow(name: str, each: ParameterGroup[Any]) -> None:
+        each.follow(node, lambda new: use(replace(present(), **{name: new})))  # type: ignore[type-var]
+
+    for name, each in groups_of(type(present())).items():
+        if each.settable:
+            follow(name, each)
 
 
 READ_LIMITS = ParameterGroup(ReadLimits)  # of every node that reads files or images

@@ -71,12 +71,23 @@ class _Route(NamedTuple):
     """A subscription, what makes a message from its bytes, and what is called with it."""
 
     topic: str
-    name: str  # with namespace and remaps
-    kind: type
-    handle: Any
+    subscription: Subscription
     decode: Callable[..., Any]
     callback: Callable[..., Any]
+    handle: Any
     is_latched: bool
+
+    @classmethod
+    def of(
+        cls,
+        topic: str,
+        subscription: Subscription,
+        decode: Callable[..., Any],
+        callback: Callable[..., Any],
+    ) -> _Route:
+        """Return the route of a subscription."""
+        latched = subscription.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+        return cls(topic, subscription, decode, callback, subscription.handle, is_latched=latched)
 
 
 @dataclass(frozen=True)
@@ -97,23 +108,6 @@ class FaultHandlers:
     overrun: Callable[[str, int], None] | None = None
 
 
-def _route(
-    topic: str,
-    subscription: Subscription,
-    decode: Callable[..., Any],
-    callback: Callable[..., Any],
-) -> _Route:
-    return _Route(
-        topic,
-        subscription.topic_name,
-        subscription.msg_type,
-        subscription.handle,
-        decode=decode,
-        callback=callback,
-        is_latched=subscription.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL,
-    )
-
-
 class StreamReader:
     """Subscriptions of a node that a thread of their own serves between start() and stop()."""
 
@@ -121,8 +115,7 @@ class StreamReader:
         self._node = node
         self._faults = faults
         self._group = _ReaderGroup()
-        # (topic, Subscription, decode, callback)
-        self._routes: list[tuple[str, Subscription, Callable[..., Any], Callable[..., Any]]] = []
+        self._routes: list[_Route] = []
         self._max_bytes: dict[str, int] = {}  # by topic
         self._first: set[str] = set()  # topics
         self._sequence: dict[str, int] = {}  # number of the last message by topic
@@ -167,7 +160,7 @@ class StreamReader:
         )
         self._max_bytes[topic] = max_bytes or read_limits().max_image_bytes
         decode = decode or (lambda data: deserialize_message(data, kind))
-        self._routes.append((topic, subscription, decode, callback))
+        self._routes.append(_Route.of(topic, subscription, decode, callback))
 
     def take_first(self, topic: str) -> None:
         """Handle what is pending of a subscribed topic before each message of the others."""
@@ -176,8 +169,8 @@ class StreamReader:
     def topics(self) -> dict[str, bool]:
         """Return the subscribed topics by relative name, and whether each has a publisher."""
         return {
-            topic: bool(self._node.count_publishers(subscription.topic_name))
-            for topic, subscription, *_ in self._routes
+            route.topic: bool(self._node.count_publishers(route.subscription.topic_name))
+            for route in self._routes
         }
 
     def accept_best_effort(self) -> list[str]:
@@ -187,13 +180,15 @@ class StreamReader:
         them. To be called from the thread that made the subscriptions.
         """
         lowered = [
-            number for number, route in enumerate(self._routes) if self._is_unreliable(route)
+            number
+            for number, route in enumerate(self._routes)
+            if needs_best_effort(self._node, route.subscription)
         ]
         if not lowered:
             return []
         self._halt()
         for number in lowered:
-            topic, old, decode, callback = self._routes[number]
+            topic, old, decode, callback, *_ = self._routes[number]
             qos = copy(old.qos_profile)
             qos.reliability = ReliabilityPolicy.BEST_EFFORT
             self._node.destroy_subscription(old)
@@ -205,15 +200,9 @@ class StreamReader:
                 callback_group=self._group,
                 event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
             )
-            self._routes[number] = (topic, new, decode, callback)
+            self._routes[number] = _Route.of(topic, new, decode, callback)
         self.start()
-        return [self._routes[number][0] for number in lowered]
-
-    def _is_unreliable(
-        self, route: tuple[str, Subscription, Callable[..., Any], Callable[..., Any]]
-    ) -> bool:
-        """Return whether a reliable subscription has best-effort publishers only."""
-        return needs_best_effort(self._node, route[1])
+        return [self._routes[number].topic for number in lowered]
 
     def incompatible_publishers(self) -> dict[str, str]:
         """Return a message for every topic with a publisher that offers less than is requested.
@@ -246,9 +235,9 @@ class StreamReader:
         if take_pending:
             self._stopping.clear()
             for route in self._routes:
-                self._drain(_route(*route), [], route[1].qos_profile.depth)
-        for _, subscription, *_ in self._routes:
-            self._node.destroy_subscription(subscription)
+                self._drain(route, [], route.subscription.qos_profile.depth)
+        for route in self._routes:
+            self._node.destroy_subscription(route.subscription)
         self._routes = []
 
     def _halt(self) -> None:
@@ -273,10 +262,7 @@ class StreamReader:
         wait_set: Any = None
         while not self._stopping.is_set() and self._node.context.ok():
             if len(self._routes) != served:  # a topic was added meanwhile
-                routes = {
-                    s.handle.pointer: _route(topic, s, decode, callback)
-                    for topic, s, decode, callback in list(self._routes)
-                }
+                routes = {route.handle.pointer: route for route in list(self._routes)}
                 served = len(routes)
                 wait_set = rclpy_implementation.WaitSet(
                     served, 0, 0, 0, 0, 0, self._node.context.handle
@@ -308,7 +294,7 @@ class StreamReader:
             if self._stopping.is_set():
                 return
             # As bytes: taking the message itself would not tell a damaged one from none.
-            received = route.handle.take_message(route.kind, True)
+            received = route.handle.take_message(route.subscription.msg_type, True)
             if received is None:
                 return
             for other in first:
@@ -324,7 +310,7 @@ class StreamReader:
         lost = number - self._sequence.get(route.topic, number - 1) - 1
         self._sequence[route.topic] = number
         # Each of several publishers has numbers of its own; so has one that was started again.
-        if lost > 0 and self._node.count_publishers(route.name) == 1:
+        if lost > 0 and self._node.count_publishers(route.subscription.topic_name) == 1:
             self._faults.overrun(route.topic, lost)
 
     def _handle(self, route: _Route, data: bytes, info: dict[str, Any]) -> None:

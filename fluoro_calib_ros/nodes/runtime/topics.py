@@ -196,7 +196,7 @@ OBSERVATION_DEPTH = 100
 # Images take a megabyte or more, so few are queued, a twelfth of a second at 120 Hz. A slower
 # reader gets the newest ones.
 IMAGE_DEPTH = 10
-RECORDED_LATCHED_DEPTH = 100
+RECORDED_LATCHED_DEPTH = 100  # messages of as many publishers
 # Requests that come at once and are all answered; ROS's default is 10.
 REQUEST_DEPTH = 200
 

@@ -182,7 +182,6 @@ def orientation_of_capture(
     phantom: Phantom,
     calibrations: Calibrations,
     frame_id: str = 'rig',
-    loss: str = 'student_t',
 ) -> RigOrientation:
     """Orientation from a capture of the phantom at rest, whose frame is that of the rig.
 
@@ -198,8 +197,6 @@ def orientation_of_capture(
         Fixed.
     frame_id : str
         Name of the rig frame.
-    loss : str
-        Noise model of the image points.
 
     Raises
     ------
@@ -217,7 +214,7 @@ def orientation_of_capture(
             )
     with threadpool_limits(1):
         measured = network_of_calibrations(still, phantom, calibrations)
-        fixed = _adjusted(measured, calibrations, loss, True)
+        fixed = _adjusted(measured, calibrations, True)
         known = fixed.covariance_of_all()
     parameters = fixed.after.parameters
     count = len(frames)
@@ -236,7 +233,6 @@ def orientation_and_scatter(
     frames: Frames,
     phantom: Phantom,
     calibrations: Calibrations,
-    loss: str = 'student_t',
     starts: StartValues | None = None,
 ) -> tuple[RigOrientation, tuple[PairScatter, ...]]:
     """Orientation in the optical frame of the first fluoroscope, from exposures of the phantom.
@@ -255,7 +251,7 @@ def orientation_and_scatter(
     paired = _paired(frames)
     with threadpool_limits(1):
         measured = network_of_calibrations(paired, phantom, calibrations, starts=starts)
-        fixed = _adjusted(measured, calibrations, loss, False)
+        fixed = _adjusted(measured, calibrations, False)
         turning = {name for name, each in calibrations.items() if each.angle_field is not None}
         exteriors, scatter = _relative_to_first(fixed, turning)
     first = fixed.measured.fluoroscopes[0]
@@ -435,7 +431,7 @@ def _unpaired(names: Sequence[str], b: int) -> str:
 
 
 def _adjusted(
-    measured: Measured, calibrations: Calibrations, loss: str, noise_fixed: bool
+    measured: Measured, calibrations: Calibrations, noise_fixed: bool
 ) -> _FixedAdjustment:
     """Adjust a network with the calibrations fixed.
 
@@ -448,7 +444,7 @@ def _adjusted(
         network,
         measured.start,
         correction,
-        noise_of_calibrations(loss, used),
+        noise_of_calibrations('student_t', used),
         noise_fixed=noise_fixed or too_few_rays_for_noise(network),
     )
     if not np.isfinite(after.parameters.position_mm).all():

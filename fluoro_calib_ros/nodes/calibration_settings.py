@@ -43,7 +43,6 @@ from .runtime.parameters import (
     READ_LIMITS,
     ManagedParameters,
     ParameterNode,
-    default_calibration_directory,
     expand_path,
     group,
     groups_of,
@@ -182,6 +181,16 @@ def read_rig(node: ParameterNode, settings: Callable[[], CalibrationSettings]) -
             f'only serves saved calibrations, and there are none in {directory}'
         )
     return RigSetup(parameters.fluoroscopes, phantom, names, directory, settings)
+
+
+def default_calibration_directory(namespace: str) -> Path:
+    """Return the folder in which a calibration node of a namespace saves its calibrations.
+
+    It is fluoro_calib/<namespace> in $ROS_HOME, or in ~/.ros where that is not set. Raises
+    DataError where there is no home folder.
+    """
+    home = os.environ.get('ROS_HOME') or '~/.ros'
+    return expand_path(home) / 'fluoro_calib' / namespace.strip('/')
 
 
 class CalibrationFiles:

@@ -192,15 +192,13 @@ def _flatness_remark(network: Network) -> str:
     return '; the beads lie nearly in one plane' if flat else ''
 
 
-def reduced_normal_matrix(
-    network: Network, parameters: Parameters, noise_px: float = NOMINAL_NOISE_PX
-) -> np.ndarray:
+def reduced_normal_matrix(network: Network, parameters: Parameters) -> np.ndarray:
     """Normal matrix of the exposures and free global unknowns, object points eliminated.
 
     Shape (6m + G, 6m + G), with the sources in the sensor frame and all weights equal. It may be
     singular.
     """
-    noise = Noise('gaussian', noise_px / float(np.median(network.sigma)))
+    noise = Noise('gaussian', NOMINAL_NOISE_PX / float(np.median(network.sigma)))
     equations = normal_equations(network, parameters, 0.0, noise)
     elimination = EliminatePoints(network)
     system = elimination.bordered_system(replace(equations, gauge=None))

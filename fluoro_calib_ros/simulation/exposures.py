@@ -221,30 +221,12 @@ def simulate_grid(
     count: int,
     seed: int = 0,
     noise_px: float = 0.25,
-    start: StreamStart | None = None,
-    rate_hz: float = 30.0,
 ) -> dict[str, list[Frame]]:
-    """Simulate frames of a grid of 2,028 points in front of the detector.
+    """Simulate count frames of a grid of 2,028 points in front of the detector, at 30 Hz.
 
-    Parameters
-    ----------
-    rig : VirtualRig
-    count : int
-        Number of frames of each fluoroscope.
-    seed : int
-        The same seed gives the same frames.
-    noise_px : float
-        Standard deviation of an image coordinate.
-    start : StreamStart, optional
-    rate_hz : float
-        Frame rate.
-
-    Returns
-    -------
-    dict of str to list of Frame
-        By fluoroscope.
+    seed: the same one gives the same frames. noise_px: standard deviation of an image coordinate.
     """
-    start = start or StreamStart()
+    start = StreamStart()
     rng = np.random.default_rng([seed, 5])
     frames = {}
     for fluoroscope in rig.fluoroscopes:
@@ -257,7 +239,7 @@ def simulate_grid(
         of_fluoroscope = []
         for index in range(count):
             observed = np.round(distorted + rng.normal(0, noise_px, distorted.shape), DECIMALS)
-            time_s = index / rate_hz
+            time_s = index / 30.0
             of_fluoroscope.append(start.frame(fluoroscope, index, time_s, ids, observed))
         frames[fluoroscope.name] = of_fluoroscope
     return frames

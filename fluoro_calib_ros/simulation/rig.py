@@ -189,19 +189,17 @@ class DistortionField:
         return observed
 
 
-def random_field(
-    rng: np.random.Generator, strength: float = 1.0, image_size: tuple[int, int] = (1024, 1024)
-) -> DistortionField:
+def random_field(rng: np.random.Generator, strength: float = 1.0) -> DistortionField:
     """Draw a field at random.
 
     At strength 1 it is some 15 px along the border of the image and 26 to 35 px in its corners.
     """
     sign = rng.choice([-1.0, 1.0], size=4)
-    centre = np.asarray(image_size) / 2 - 0.5 + rng.uniform(-20, 20, 2)
+    centre = np.asarray(IMAGE_SIZE) / 2 - 0.5 + rng.uniform(-20, 20, 2)
     ripples = np.column_stack(
         [
-            rng.uniform(0, image_size[0], RIPPLES),
-            rng.uniform(0, image_size[1], RIPPLES),
+            rng.uniform(0, IMAGE_SIZE[0], RIPPLES),
+            rng.uniform(0, IMAGE_SIZE[1], RIPPLES),
             rng.uniform(70, 130, RIPPLES),
             rng.uniform(-1.2, 1.2, (RIPPLES, 2)),
         ]

@@ -317,17 +317,15 @@ _POLICY_NAMES = {
 }
 
 
-def profile(
-    reliability: str = 'reliable', durability: str = 'volatile', depth: int = 10
-) -> dict[str, Any]:
-    """Return a QoS profile {policy: value} as rosbag2 writes it.
+def profile(durability: str = 'volatile', depth: int = 10) -> dict[str, Any]:
+    """Return a reliable QoS profile {policy: value} as rosbag2 writes it.
 
     Keep last, without deadline and lifespan.
     """
     return {
         'history': 'keep_last',
         'depth': depth,
-        'reliability': reliability,
+        'reliability': 'reliable',
         'durability': durability,
         'deadline': dict(_INFINITE),
         'lifespan': dict(_INFINITE),

@@ -397,13 +397,3 @@ def expand_path(text: str) -> Path:
         return Path(text).expanduser()
     except RuntimeError:
         raise DataError(f'{text}: there is no such home folder') from None
-
-
-def default_calibration_directory(namespace: str) -> Path:
-    """Return the folder in which a calibration node of a namespace saves its calibrations.
-
-    It is fluoro_calib/<namespace> in $ROS_HOME, or in ~/.ros where that is not set. Raises
-    DataError where there is no home folder.
-    """
-    home = os.environ.get('ROS_HOME') or '~/.ros'
-    return expand_path(home) / 'fluoro_calib' / namespace.strip('/')

@@ -123,14 +123,15 @@ def publisher_conflict(node: Node, topic: str) -> str:
     )
 
 
-def wait_until_acknowledged(
-    publishers: Iterable[Publisher], stop: threading.Event, timeout_s: float = 10.0
-) -> bool:
+ACKNOWLEDGED_S = 10.0  # in which readers have to confirm what was published last
+
+
+def wait_until_acknowledged(publishers: Iterable[Publisher], stop: threading.Event) -> bool:
     """Wait until all messages have arrived, and return whether they have.
 
     What is not acknowledged is lost when the process ends. Setting `stop` ends the wait.
     """
-    end = time.monotonic() + timeout_s
+    end = time.monotonic() + ACKNOWLEDGED_S
     for publisher in publishers:
         while not publisher.wait_for_all_acked(Duration(seconds=0.1)):
             if stop.is_set() or time.monotonic() > end:

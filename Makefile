@@ -21,7 +21,7 @@ help:
 	@echo 'make oldest       run the tests that need no ROS with the oldest supported versions of all packages'
 	@echo 'make lint         run ruff, mypy and the import contracts (also part of the tests)'
 	@echo 'make docs         build the documentation and the API reference in docs/_build/html'
-	@echo 'make fuzz         fuzz every reader with atheris, SECONDS=600 each: docs/security.md'
+	@echo 'make fuzz         fuzz every reader with atheris, SECONDS=600 each: docs/reliability.md'
 	@echo 'make lock         resolve requirements.in into requirements.lock, with hashes'
 	@echo 'make audit        compare requirements.lock with known vulnerabilities (needs pypi.org or osv.dev)'
 	@echo 'make setup        create or update .venv: packages, ROS 2 and messages; demo, test, ... run it first'

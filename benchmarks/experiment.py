@@ -29,7 +29,7 @@ from fluoro_calib_ros.estimation.fixed_calibration import fixed_corrections, too
 from fluoro_calib_ros.estimation.initial_network import (
     KnownSensor,
     Measured,
-    network_of_known_sensors,
+    measured_network,
     start_noise,
 )
 from fluoro_calib_ros.estimation.options import AUTO, CalibrationOptions
@@ -261,8 +261,8 @@ class Scene:
                 f.name: KnownSensor(f.interior, _correction(None if known else f.distortion))
                 for f in self.rig.fluoroscopes
             }
-            self._tested[key] = network_of_known_sensors(
-                {n: frames[n] for n in fluoroscopes}, self.rig.phantom, sensors
+            self._tested[key] = measured_network(
+                {n: frames[n] for n in fluoroscopes}, self.rig.phantom, sensors=sensors
             )
         return self._tested[key]
 

@@ -45,7 +45,7 @@ from fluoro_calib_ros.jobs.extraction import ExtractionRequest, run_extraction
 from fluoro_calib_ros.jobs.simulation import SETTINGS, RenderedScene, Renderers
 from fluoro_calib_ros.nodes.messages.image import message_from_image
 from fluoro_calib_ros.nodes.messages.observations import stamp_from_nanoseconds
-from fluoro_calib_ros.nodes.runtime.streams import images_qos, latched_qos, observations_qos
+from fluoro_calib_ros.nodes.runtime.topics import images_qos, latched_qos, observations_qos
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.simulation.exposures import phantom_poses
 from fluoro_calib_ros.simulation.marker_images import (

@@ -29,8 +29,8 @@ from benchmarks.bead_images import bead_image
 from fluoro_calib_ros.nodes.runtime.lifecycle import ManagedNode
 from fluoro_calib_ros.nodes.runtime.main import run
 from fluoro_calib_ros.nodes.runtime.parameters import ParameterGroup
-from fluoro_calib_ros.nodes.runtime.streams import (
-    StreamReader,
+from fluoro_calib_ros.nodes.runtime.streams import StreamReader
+from fluoro_calib_ros.nodes.runtime.topics import (
     images_qos,
     wait_for_readers,
     wait_until_acknowledged,

@@ -11,7 +11,7 @@ Camera, node and the reader (this process, or one of its own for another transpo
 machine. An image without an output is lost; latency is from the stamp of the camera, set
 just before it publishes, to the time stamp that DDS gives the output. A segment of shared memory
 of Fast DDS is smaller than an image by default: the cases `wide` use one of 32 MB, as described in
-docs/images.md.
+docs/extraction.md.
 """
 
 from __future__ import annotations
@@ -136,7 +136,7 @@ class Reader:
         from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import (
             message_from_calibration,
         )
-        from fluoro_calib_ros.nodes.runtime.streams import latched_qos
+        from fluoro_calib_ros.nodes.runtime.topics import latched_qos
 
         self.node = rclpy.create_node('reader')
         self._latched = self.node.create_publisher(
@@ -150,7 +150,8 @@ class Reader:
         """Collect (stamp, latency) [ns] of a topic, without decoding the images."""
         from sensor_msgs.msg import Image
 
-        from fluoro_calib_ros.nodes.runtime.streams import StreamReader, images_qos
+        from fluoro_calib_ros.nodes.runtime.streams import StreamReader
+        from fluoro_calib_ros.nodes.runtime.topics import images_qos
 
         from .online import logged
 

@@ -58,12 +58,8 @@ from fluoro_calib_ros.estimation.rig_orientation import orientation_and_scatter
 from fluoro_calib_ros.io.bodies import write_bodies
 from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import message_from_calibration
 from fluoro_calib_ros.nodes.messages.rig_orientation import message_from_orientation
-from fluoro_calib_ros.nodes.runtime.streams import (
-    FaultHandlers,
-    StreamReader,
-    latched_qos,
-    observations_qos,
-)
+from fluoro_calib_ros.nodes.runtime.streams import FaultHandlers, StreamReader
+from fluoro_calib_ros.nodes.runtime.topics import latched_qos, observations_qos
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation as Orientation
 from fluoro_calib_ros.simulation.exposures import simulate_exposures, simulate_tracking
 from fluoro_calib_ros.simulation.rig import virtual_rig

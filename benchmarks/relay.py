@@ -24,7 +24,8 @@ from fluoro_calib_ros.nodes.runtime.diagnostics import (
 )
 from fluoro_calib_ros.nodes.runtime.lifecycle import ManagedNode
 from fluoro_calib_ros.nodes.runtime.main import run
-from fluoro_calib_ros.nodes.runtime.streams import FaultHandlers, StreamReader, observations_qos
+from fluoro_calib_ros.nodes.runtime.streams import FaultHandlers, StreamReader
+from fluoro_calib_ros.nodes.runtime.topics import observations_qos
 
 
 class Relay(ManagedNode):

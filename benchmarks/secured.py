@@ -5,7 +5,7 @@
 
 python -m benchmarks.secured KEYSTORE [--foreign KEYSTORE]
 
-KEYSTORE is made as docs/security.md says; the ROS of this environment must have a Fast DDS with
+KEYSTORE is made as docs/reliability.md says; the ROS of this environment must have a Fast DDS with
 its security plugins. Calibrates from bags/calibration and reconstructs bags/tracking with each
 node in its enclave; then tries to publish a calibration from the enclave of the player, without
 keys, and with keys of another authority.

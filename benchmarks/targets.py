@@ -25,7 +25,7 @@ from fluoro_calib_ros.estimation.calibrate import calibrate_request
 from fluoro_calib_ros.estimation.initial_network import (
     KnownSensor,
     adjusted_with_precision,
-    network_of_known_sensors,
+    measured_network,
     start_noise,
 )
 from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
@@ -256,7 +256,7 @@ def points_rmse(
     """
     weak = replace(rig.phantom, sd_mm=WEAK_SURVEY * rig.phantom.sd_mm)
     sensor = KnownSensor(interior, lambda frame: predict(frame.uv))
-    measured = network_of_known_sensors({'a': frames}, weak, {'a': sensor})
+    measured = measured_network({'a': frames}, weak, sensors={'a': sensor})
     network = measured.network
     after, _ = adjusted_with_precision(
         network, measured.start, predict(network.uv), start_noise('student_t')

@@ -10,7 +10,7 @@ Camera, image node and the reader (this process) share the machine. Cases at 30 
 fluoroscopes; in cases `fast` the camera sends an image as soon as one of three in flight is
 corrected. The arm turns by 30 degrees a second, there and back: each image needs another map. A
 state of its joint comes with each image. Segments of shared memory of Fast DDS are large, as
-described in docs/images.md. `correct` corrects a video and a stack, in this process.
+described in docs/extraction.md. `correct` corrects a video and a stack, in this process.
 """
 
 from __future__ import annotations
@@ -220,8 +220,8 @@ def camera(show: _Show) -> None:
     from sensor_msgs.msg import CameraInfo, Image, JointState
 
     from fluoro_calib_ros.nodes.messages.observations import stamp_from_nanoseconds
-    from fluoro_calib_ros.nodes.runtime.streams import (
-        StreamReader,
+    from fluoro_calib_ros.nodes.runtime.streams import StreamReader
+    from fluoro_calib_ros.nodes.runtime.topics import (
         images_qos,
         observations_qos,
         wait_for_readers,
@@ -321,7 +321,7 @@ class _Reader:
         from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import (
             message_from_calibration,
         )
-        from fluoro_calib_ros.nodes.runtime.streams import latched_qos
+        from fluoro_calib_ros.nodes.runtime.topics import latched_qos
 
         self.node = rclpy.create_node('reader')
         self._latched = []
@@ -338,7 +338,8 @@ class _Reader:
         from rclpy.qos import QoSProfile
         from sensor_msgs.msg import Image
 
-        from fluoro_calib_ros.nodes.runtime.streams import StreamReader, images_qos
+        from fluoro_calib_ros.nodes.runtime.streams import StreamReader
+        from fluoro_calib_ros.nodes.runtime.topics import images_qos
 
         from .online import logged
 

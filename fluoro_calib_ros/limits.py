@@ -27,7 +27,7 @@ BYTES_OF_POINT = 41  # at most: an id, four numbers and a status, and their padd
 MAX_IMAGE_SIDE = 32_000  # px: OpenCV holds whole pixels in 16 bits
 MAX_ANGLES = 10_000  # of the exposures of a calibration
 MAX_CORNERS = 1000  # of the calibrated area
-MAX_NEIGHBOURS = 1000
+MAX_NEIGHBOURS = 1000  # of a model that is read
 MAX_COINCIDENT = 1000  # training points on one place
 MAX_PX = 1e6  # of a coordinate or correction
 MAX_PRINCIPAL_DISTANCE_PX = 1e9
@@ -47,7 +47,7 @@ DOCUMENT_BYTES = {
 MAX_DEPTH = 100  # of what is nested in a document
 # Tables of text: a row takes up to 0.3 kB and 2.5 us, one of our own CSV files 0.05 kB and 1 us.
 MAX_ROWS = 2_000_000  # of other programs: a frame each, of two hours at 250 Hz
-MAX_ROWS_CSV = 20_000_000
+MAX_ROWS_CSV = 20_000_000  # of our own tables
 MAX_FRAMES = 2_000_000  # of a file of image points: 1 kB and 40 us each
 MAX_MEMBER = 64 * MEGABYTE  # of a text in an archive, unpacked
 

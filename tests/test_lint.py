@@ -107,3 +107,37 @@ def test_parallel_assignments_are_rare():
         if isinstance(node.targets[0], ast.Tuple) and isinstance(node.value, ast.Tuple)
     ]
     assert len(parallel) < 0.01 * len(assigned)
+
+
+def calls_of_package(tree):
+    """Yield the calls of a file that are not those of a library with positional arguments only."""
+    foreign = {'cv2', 'rclpy_implementation', 'zip'}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            target = node.func
+            while isinstance(target, ast.Attribute):
+                target = target.value
+            if not (isinstance(target, ast.Name) and target.id in foreign):
+                yield node
+
+
+def test_sources_keep_their_sizes():
+    """A node fits 400 lines, a class 310, a function 77; no call has six positional arguments."""
+    too_large = []
+    for path in SOURCES:
+        text = path.read_text()
+        tree = ast.parse(text)
+        if path.parent.name in ('nodes', 'runtime') and len(text.splitlines()) > 400:
+            too_large.append(f'{path.name}: {len(text.splitlines())} lines')
+        for node in ast.walk(tree):
+            limit = {ast.ClassDef: 310, ast.FunctionDef: 77, ast.AsyncFunctionDef: 77}.get(
+                type(node)
+            )
+            if limit and node.end_lineno - node.lineno + 1 > limit:
+                too_large.append(f'{path.name}: {node.name}')
+        for call in calls_of_package(tree):
+            if len(call.args) > 5 and not any(isinstance(a, ast.Starred) for a in call.args):
+                too_large.append(
+                    f'{path.name}:{call.lineno}: {len(call.args)} positional arguments'
+                )
+    assert not too_large

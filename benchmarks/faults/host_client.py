@@ -40,7 +40,8 @@ from rclpy.qos import QoSProfile
 from std_srvs.srv import SetBool, Trigger
 
 from fluoro_calib_ros.nodes.messages.observations import decode_target_observations
-from fluoro_calib_ros.nodes.runtime.streams import FaultHandlers, StreamReader, latched_qos
+from fluoro_calib_ros.nodes.runtime.streams import FaultHandlers, StreamReader
+from fluoro_calib_ros.nodes.runtime.topics import latched_qos
 
 NAMES = ('a', 'b')
 DEPTH = 5000  # what is lost is not lost here

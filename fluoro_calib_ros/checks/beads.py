@@ -330,16 +330,7 @@ def compare_with_survey(
     """
     count = len(beads.target_id)
     if count < MIN_BEADS:
-        reason = f'only {count} beads are seen often enough to be found from the images alone'
-        return [
-            Check(
-                kind,
-                f'check {kind.value} could not be made, {reason}',
-                advice='take more exposures',
-                numbers={'beads': count},
-            )
-            for kind in (Kind.BEADS, Kind.DISTANCES)
-        ]
+        return [_not_made(kind, count) for kind in (Kind.BEADS, Kind.DISTANCES)]
     limit = SD_FACTOR**2 * chdtri(3, FALSE_ALARM / count)
     square = beads.chi2
     suspects = np.flatnonzero(square > limit)
@@ -384,6 +375,17 @@ def compare_with_survey(
         # A bead that is in place without one of its rays has a false match and tells nothing.
         _check_distances(beads.without(beads.target_id[suspects]), has_trend),
     ]
+
+
+def _not_made(kind: Kind, count: int) -> Check:
+    """Return a check that was not made, because too few beads are seen."""
+    return Check(
+        kind,
+        f'check {kind.value} could not be made, only {count} beads are seen often enough to be '
+        'found from the images alone',
+        advice='take more exposures',
+        numbers={'beads': count},
+    )
 
 
 def _wrong_beads(target_id: np.ndarray, size: np.ndarray) -> str:

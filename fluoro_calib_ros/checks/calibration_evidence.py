@@ -38,9 +38,8 @@ from .residual_tests import (
 # The calibration of a part has at most so many rounds: with few exposures it converges slowly, and
 # after these rounds without visible change.
 MAX_ROUNDS = 25
-MAX_LOST = (
-    0.03  # share of the image points of a part that may be rejected beside that of the whole
-)
+# Share of the image points of a part that may be rejected beside that of the whole.
+MAX_LOST = 0.03
 MIN_VARYING_EXPOSURES = 4  # with enough image points, to tell whether the distortion varies
 
 

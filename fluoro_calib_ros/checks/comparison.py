@@ -139,7 +139,7 @@ def describe_place(uv: ArrayLike, image_size: tuple[int, int]) -> str:
 
 
 CELLS = 64  # along the longer side of the image
-LEVEL = 0.99
+LEVEL = 0.99  # of confidence
 MIN_COMMON = 20  # cells that both calibrations cover
 # Of the area: this much differs at the level by chance, doubled for the cells' correlation.
 CHANCE = 2 * (1 - LEVEL)

@@ -200,20 +200,11 @@ class EpipolarObservations:
 
     def __post_init__(self) -> None:
         n = len(self.target_id)
-        for name, expected in (
-            ('uv_a', (n, 2)),
-            ('uv_b', (n, 2)),
-            ('residual', (n,)),
-            ('sd_noise', (n,)),
-            ('sd_systematic', (n,)),
-            ('normal_a', (n, 2)),
-            ('normal_b', (n, 2)),
-            ('factor_a', (n,)),
-            ('factor_b', (n,)),
-        ):
-            shape = getattr(self, name).shape
+        for field in fields(self)[1:]:
+            expected = (n, 2) if field.name.startswith(('uv', 'normal')) else (n,)
+            shape = getattr(self, field.name).shape
             if shape != expected:
-                raise ValueError(f'{name} must have the shape {expected}, not {shape}')
+                raise ValueError(f'{field.name} must have the shape {expected}, not {shape}')
 
     def __len__(self) -> int:
         return len(self.target_id)

@@ -191,10 +191,10 @@ def _hold_out(
                 ExposureSums(
                     int(number),
                     points.sum(),
-                    squared_outside[points].sum(),
-                    squared_inside[points].sum(),
-                    predicted[points].sum(),
-                    _white(outside.uv[points], outside.r[points], sd[points]),
+                    outside=squared_outside[points].sum(),
+                    inside=squared_inside[points].sum(),
+                    predicted=predicted[points].sum(),
+                    white=_white(outside.uv[points], outside.r[points], sd[points]),
                 )
             )
     return out

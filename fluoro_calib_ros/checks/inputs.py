@@ -32,16 +32,14 @@ from ..photogrammetry.collinearity import project
 from ..photogrammetry.known_orientation import KnownOrientation
 from ..photogrammetry.plane_resection import flatness, plane_of, robust_homography
 from ..photogrammetry.resection import MIN_FLATNESS, decompose, robust_dlt, squared_residuals
-from .mixed_units import DISTANCES_MM, mixed_units
+from .mixed_units import DISTANCES_MM, FIT, UNITS, mixed_units
 
 MAX_TESTED = 3  # exposures of a fluoroscope, those with the most targets
 MIN_TESTED = 20  # targets of a single exposure that is tested
-FIT = 0.004  # median residual over the longer side of the image of ids that are certainly right
 MISFIT = 0.03  # median residual over the longer side of the image from which nothing fits
 BETTER = 0.35  # median residual of other ids over that of the given ones from which they are right
 GOOD_MISFIT = 0.01  # median residual over the longer side of the image of ids that are right
-UNITS_MM = {'cm': 10.0, 'inches': 25.4, 'm': 1000.0}
-MAX_COORDINATE_MM = 1e6
+MAX_COORDINATE_MM = 1e6  # a kilometre
 EXTENT_SHARE = 0.9  # of the targets, within the extent of the phantom
 MAX_EXTENT = 6.0  # distance of a target from the middle over that extent
 SD_MM = (1e-6, 1e3)  # of surveyed coordinates
@@ -414,17 +412,14 @@ def wrong_unit(distance_mm: float, phantom: Phantom) -> Finding | None:
             'camera',
             numbers=numbers,
         )
-    units = [unit for unit, mm in UNITS_MM.items() if low <= distance_mm * mm <= high]
+    units = [unit for mm, unit in UNITS.items() if low <= distance_mm * mm <= high]
+    perhaps = f', but perhaps in {" or ".join(units)}' if units else ''
     return Finding(
         Kind.WRONG_UNIT,
-        f'the coordinates of the phantom are not in mm{_in(units)}: it would be {extent:.3g} mm '
+        f'the coordinates of the phantom are not in mm{perhaps}: it would be {extent:.3g} mm '
         f'large and {distance_mm:.3g} mm from the source',
         numbers=numbers,
     )
-
-
-def _in(units: Sequence[str]) -> str:
-    return f', but perhaps in {" or ".join(units)}' if units else ''
 
 
 def _cause(frame: Frame, phantom: Phantom) -> Finding | None:

@@ -126,7 +126,9 @@ class PairWatch:
             reference = np.sum(mean[nodes] * weights, axis=1)
             relative = np.clip(observations.residual - reference, -limit, limit)
         else:
-            self.field.add(marker, nodes, weights, absolute, variance, systematic)
+            self.field.add(
+                marker, nodes, weights, residual=absolute, variance=variance, systematic=systematic
+            )
             relative = absolute
         out = PairBlock.empty(len(self._areas))
         residuals = np.stack([absolute, relative])

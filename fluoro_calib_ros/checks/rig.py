@@ -319,8 +319,8 @@ def rig_findings(
         None if refused else orientation,
         doubts,
         scatter,
-        noise,
-        tuple(one for one in trusted if one is not None),
+        noise_px=noise,
+        trusted=tuple(one for one in trusted if one is not None),
     )
 
 

@@ -156,9 +156,8 @@ class RecordingDriftWatch(RigDriftWatch):
         image_sizes: Mapping[str, tuple[int, int]],
         options: DriftOptions | None = None,
         bodies: Sequence[Body] = (),
-        rate_hz: float = 120.0,
     ) -> None:
-        super().__init__(orientation, image_sizes, options, bodies, rate_hz)
+        super().__init__(orientation, image_sizes, options, bodies)
         self._first_ns: int | None = None
         self._worst = self.state
         self._worst_ns = 0

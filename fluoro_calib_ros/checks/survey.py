@@ -28,7 +28,7 @@ MIN_BEADS = 10  # of both halves
 # 7 of benchmarks.survey).
 HALVES_LIMIT = 1.5
 OFF_SD = 1.5  # times what the sd of rough coordinates says, as an RMS of many beads
-DATUM = 7
+DATUM = 7  # shift, rotation and scale
 UNKNOWN = 1e6  # variance of a datum that is not known, over that of the beads
 
 

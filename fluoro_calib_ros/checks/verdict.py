@@ -165,7 +165,9 @@ def validate(
         known=request.known_orientations,
     )
     request = replace(request, frames=_used_frames(request.frames, result))
-    steps = _StepCounter(progress, 1 + _count_steps(len(request.groups)))
+    groups = len(request.groups)
+    count = sum(subject.steps * (1 if subject.of_rig else groups) for subject in SUBJECTS)
+    steps = _StepCounter(progress, 1 + count)
     evidence = Evidence(request, calibrations, result, steps.report)
     steps.report('residuals and beads')
     checks = []
@@ -177,16 +179,18 @@ def validate(
             if not subject.of_rig:
                 checks += subject.run(evidence, names)
     checks = with_given_interior(evidence, checks)
-    checks = _by_fluoroscope(checks, [name for names in request.groups for name in names])
+    # One fluoroscope after the other, then the rig.
+    order = [*(name for names in request.groups for name in names), '']
+    checks = [check for name in order for check in checks if check.place.fluoroscope == name]
     rig = rig or rig_findings(request, result, request.frames, calibrations)
     checks += check_rig(rig)
     return Validation(
         verdict_of(checks),
         tuple(checks),
         _identities(calibrations),
-        time.perf_counter() - began,
-        {name: _achieved_sd(evidence, name, checks) for name in request.frames},
-        (*rig.notes, *trusted_shape(checks)),
+        seconds=time.perf_counter() - began,
+        achieved_sd_px={name: _achieved_sd(evidence, name, checks) for name in request.frames},
+        notes=(*rig.notes, *trusted_shape(checks)),
     )
 
 
@@ -236,10 +240,6 @@ class _StepCounter:
         self._done += 1
 
 
-def _count_steps(groups: int) -> int:
-    return sum(subject.steps * (1 if subject.of_rig else groups) for subject in SUBJECTS)
-
-
 def _used_frames(frames: Frames, result: CalibrationResult) -> dict[str, list[Frame]]:
     """Return the frames that an adjustment used, in the order of their numbers."""
     out = {}
@@ -247,11 +247,6 @@ def _used_frames(frames: Frames, result: CalibrationResult) -> dict[str, list[Fr
         used = {e.exposure for e in result.fluoroscopes[name].exposures}
         out[name] = sorted((f for f in of_fluoroscope if f.number in used), key=lambda f: f.number)
     return out
-
-
-def _by_fluoroscope(checks: Sequence[Check], names: Sequence[str]) -> list[Check]:
-    """Return the checks of one fluoroscope after the other, then those of the rig."""
-    return [check for name in (*names, '') for check in checks if check.place.fluoroscope == name]
 
 
 def _identities(calibrations: Calibrations) -> dict[str, str]:

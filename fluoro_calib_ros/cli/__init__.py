@@ -110,10 +110,6 @@ class _Parser(argparse.ArgumentParser):
         formatter.add_text(self.epilog)
         return formatter.format_help()
 
-    def format_whole_help(self) -> str:
-        """Return the help with all groups."""
-        return super().format_help()
-
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         try:
             super()._check_value(action, value)
@@ -131,8 +127,7 @@ class _WholeHelp(argparse.Action):
     """Prints the help with all options, and ends."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: Any, **__: Any) -> None:
-        assert isinstance(parser, _Parser)
-        print(parser.format_whole_help(), end='')
+        print(argparse.ArgumentParser.format_help(parser), end='')
         parser.exit()
 
 

@@ -29,7 +29,7 @@ from .output import print_notes, print_result
 NAME = 'convert'
 HELP = 'Convert between this program and others: XMALab, Autoscoper, Anipose, OpenCV, C3D, TRC ...'
 EXAMPLE = 'fluoro-calib convert result --to mayacam2 --out mayacam'
-MAX_RATE = 1e6
+MAX_RATE = 1e6  # [Hz] no camera is faster
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -63,6 +63,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='KIND',
         help='format of SOURCE (default: as it is recognised)',
     )
+    _add_selection(parser)
+    parser.add_argument(
+        '--rate',
+        type=number_in(1e-6, MAX_RATE),
+        metavar='HZ',
+        help='frames per second, where SOURCE does not contain it',
+    )
+    add_file_options(parser)
+    parser.add_argument(
+        '--out-units', choices=UNITS, help='unit of what is written (default: --units, else mm)'
+    )
+
+
+def _add_selection(parser: argparse.ArgumentParser) -> None:
+    """Add what is converted, and with which calibration."""
     add_image_size(parser, 'where SOURCE does not contain it [px]')
     add_fluoroscopes(parser, 'convert')
     parser.add_argument(
@@ -87,16 +102,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         parser, 'of the corrections that are written, and of corrected points without angle_deg'
     )
     add_angle_options(parser)
-    parser.add_argument(
-        '--rate',
-        type=number_in(1e-6, MAX_RATE),
-        metavar='HZ',
-        help='frames per second, where SOURCE does not contain it',
-    )
-    add_file_options(parser)
-    parser.add_argument(
-        '--out-units', choices=UNITS, help='unit of what is written (default: --units, else mm)'
-    )
 
 
 def check(arguments: argparse.Namespace, error: Callable[[str], NoReturn]) -> None:

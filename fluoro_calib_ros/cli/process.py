@@ -15,7 +15,7 @@ import hashlib
 import os
 import shlex
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -39,7 +39,7 @@ EXAMPLE = 'fluoro-calib process knee_study'
 STATE = 'study.json'  # which steps are done, with the digest of what they were done with
 TABLE = 'trials.csv'
 LOG = 'log.txt'
-POLL_S = 0.05
+POLL_S = 0.05  # between looks at the commands that run
 NOT_PASSED = 3  # exit status of a step whose verdict is not pass
 SOURCE = 'source'
 OF_PROCESS = ('out', 'calibration', 'json', 'help', 'help_all', SOURCE)
@@ -170,7 +170,8 @@ def _process(
         for name, steps in trials.items()
     ]
     path = study.folder / _write_table(study.out, rows)
-    counts = ', '.join(f'{sum(r["verdict"] == v for r in rows)} {v}' for v in _verdicts(rows))
+    verdicts = Counter(row['verdict'] for row in rows)
+    counts = ', '.join(f'{count} {name}' for name, count in sorted(verdicts.items()))
     lines = [
         f'{row["trial"]}: {row["verdict"]}' + (f', {row["cause"]}' if row['cause'] else '')
         for row in rows
@@ -452,10 +453,6 @@ def _bodies_cells(row: Mapping[str, Any], document: Mapping[str, Any]) -> dict[s
     if doubtful and row['verdict'] == 'pass':
         cells |= {'verdict': 'cannot tell', 'cause': '; '.join(doubtful)}
     return cells
-
-
-def _verdicts(rows: Iterable[Mapping[str, Any]]) -> list[str]:
-    return sorted({row['verdict'] for row in rows})
 
 
 def _write_table(out: Path, rows: Sequence[Mapping[str, Any]]) -> Path:

@@ -53,7 +53,7 @@ class Field:
 
 VERSION = 4  # of the file
 MAX_DEGREE = 15  # of a series that is read
-MAX_MODES = 100
+MAX_MODES = 100  # of a series that is read
 SD_GRID = 33  # nodes of the standard deviation along each side of the image
 ORDERS = 2  # harmonics of the angle
 HARMONICS = 2 * ORDERS
@@ -62,6 +62,22 @@ VARIANCES = HARMONICS + HARMONICS * (HARMONICS + 1) // 2  # with the series and 
 
 _correction = partial(Field, identity='correction')
 _detail = partial(Field, identity='detail')
+
+
+def _pixels(name: str, meaning: str, shape: tuple[int | str, ...] = (), **more: Any) -> Field:
+    """Declare lengths in an image that determine a correction."""
+    return _correction(name, 'float', shape, 'px', meaning, maximum=MAX_PX, **more)
+
+
+def _count(name: str, meaning: str, shape: tuple[int | str, ...] = (), **more: Any) -> Field:
+    """Declare numbers of something, which do not change a correction."""
+    return _detail(name, 'int', shape, '1', meaning, minimum=0, **more)
+
+
+def _fit(name: str, meaning: str, allowed: str, **more: Any) -> Field:
+    """Declare a number that tells how well an adjustment fits, without a dimension."""
+    return _detail(name, 'float', (), '1', meaning, allowed=allowed, **more)
+
 
 FIELDS = (
     # What determines a correction.
@@ -89,22 +105,16 @@ FIELDS = (
         maximum=MAX_IMAGE_SIDE,
         message=('image_width', 'image_height'),
     ),
-    _correction(
+    _pixels(
         'train_uv',
-        'float',
-        ('N', 2),
-        'px',
         'observed u, v of each training point',
-        maximum=MAX_PX,
+        ('N', 2),
         message=('train_u', 'train_v'),
     ),
-    _correction(
+    _pixels(
         'train_duv',
-        'float',
-        ('N', 2),
-        'px',
         'correction du, dv at each training point',
-        maximum=MAX_PX,
+        ('N', 2),
         message=('train_du', 'train_dv'),
     ),
     _correction(
@@ -117,35 +127,20 @@ FIELDS = (
         maximum=MAX_NEIGHBOURS,
         message=('k',),
     ),
-    _correction(
+    _pixels(
         'noise_px',
-        'float',
-        (),
-        'px',
         'standard deviation of a single training correction',
         minimum=0,
-        maximum=MAX_PX,
         message=('model_noise',),
     ),
-    _correction(
-        'bias_px',
-        'float',
-        (),
-        'px',
-        'systematic error of a predicted correction',
-        minimum=0,
-        maximum=MAX_PX,
-        message=('model_bias',),
+    _pixels(
+        'bias_px', 'systematic error of a predicted correction', minimum=0, message=('model_bias',)
     ),
-    _correction(
+    _pixels(
         'image_sd',
-        'float',
-        (),
-        'px',
         "standard deviation of an inlier's image coordinate, with what the distortion of single "
         'exposures differs; for points without sigma',
         minimum=0,
-        maximum=MAX_PX,
     ),
     _correction(
         'sigma0',
@@ -178,26 +173,20 @@ FIELDS = (
         since=2,
         before=np.array(0),
     ),
-    _correction(
+    _pixels(
         'series_coefficients',
-        'float',
-        (2, 'M'),
-        'px',
         'coefficients in u and in v; M = 0 without a series',
-        maximum=MAX_PX,
+        (2, 'M'),
         since=2,
         before=np.zeros((2, 0)),
         message=('series_u', 'series_v'),
     ),
-    _correction(
+    _pixels(
         'series_sd',
-        'float',
-        ('S', 'S'),
-        'px',
         f'standard deviation of the series on a grid from edge to edge of the image, row by row, '
         f'S = {SD_GRID}; (0, 0) without a series',
+        ('S', 'S'),
         minimum=0,
-        maximum=MAX_PX,
         lengths={'S': SD_GRID},
         since=2,
         before=np.zeros((0, 0)),
@@ -213,14 +202,11 @@ FIELDS = (
         since=3,
         before=np.zeros(0),
     ),
-    _correction(
+    _pixels(
         'angle_coefficients',
-        'float',
-        ('H', 2, 'T'),
-        'px',
         'coefficients in u and v of what each harmonic of the angle adds, '
         f'H = {HARMONICS}, T = {TERMS}; (0, 2, 0) without angles',
-        maximum=MAX_PX,
+        ('H', 2, 'T'),
         lengths={'H': HARMONICS, 'T': TERMS},
         since=3,
         before=np.zeros((0, 2, 0)),
@@ -271,14 +257,7 @@ FIELDS = (
         'covariance of xp, yp, c; zeros if the interior orientation was fixed',
         maximum=MAX_PRINCIPAL_DISTANCE_PX**2,
     ),
-    _detail(
-        'train_exposure',
-        'int',
-        ('N',),
-        '1',
-        'number of the exposure of each training point',
-        minimum=0,
-    ),
+    _count('train_exposure', 'number of the exposure of each training point', ('N',)),
     _detail(
         'rmse_before',
         'float',
@@ -299,49 +278,26 @@ FIELDS = (
         allowed='nan',
         message=('rmse_after_u', 'rmse_after_v'),
     ),
-    _detail(
-        'nu',
-        'float',
-        (),
-        '1',
-        'degrees of freedom of that noise; `inf`: Gaussian',
-        minimum=0,
-        allowed='inf',
-    ),
-    _detail(
+    _fit('nu', 'degrees of freedom of that noise; `inf`: Gaussian', 'inf', minimum=0),
+    _fit(
         'cost_adjustment',
-        'float',
-        (),
-        '1',
         'F, final negative log-likelihood of the image points; may be NaN',
-        allowed='nan',
+        'nan',
     ),
-    _detail(
+    _fit(
         'cost_regression',
-        'float',
-        (),
-        '1',
         'G, final weighted sum of squares of the cross-validation; may be NaN',
-        allowed='nan',
+        'nan',
     ),
     _detail(
         'interior_estimated',
         'bool',
         meaning='true: estimated in the adjustment; false: fixed, the correction model learned it',
     ),
-    _detail('exposures', 'int', (), '1', 'number of exposures used', minimum=0),
-    _detail('observations', 'int', (), '1', 'number of image points used', minimum=0),
-    _detail(
-        'inliers',
-        'int',
-        (),
-        '1',
-        'number of image points that the adjustment classified as inliers',
-        minimum=0,
-    ),
-    _detail(
-        'iterations', 'int', (), '1', 'number of rounds of adjustment and regression', minimum=0
-    ),
+    _count('exposures', 'number of exposures used'),
+    _count('observations', 'number of image points used'),
+    _count('inliers', 'number of image points that the adjustment classified as inliers'),
+    _count('iterations', 'number of rounds of adjustment and regression'),
     _detail('converged', 'bool', meaning='false: stopped at the maximum number of rounds'),
     # What the id does not depend on: files of observations have neither stamps nor frames, and a
     # calibration from files has the id of the same one by the node.

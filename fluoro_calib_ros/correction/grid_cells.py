@@ -27,7 +27,7 @@ TARGET_PX = 0.6 * LIMIT_PX
 # Cells of the smallest size in which the difference is measured: those with the largest second
 # differences.
 MIN_MEASURED = 500
-MAX_MEASURED = 25_000
+MAX_MEASURED = 25_000  # centres of cells, which bounds the time
 PLACES = ((0.5, 0.5), (0.5, 0.0), (0.0, 0.5), (0.5, 1.0), (1.0, 0.5))  # in a cell, where it is
 
 
@@ -94,7 +94,7 @@ def _second_differences(values: np.ndarray) -> np.ndarray:
 
 CELL_PX = (8, 4, 2)  # sizes of cells that are tried
 MAX_SHARE_DIVIDED = 0.01  # of cells, so that not all of them have to be smaller
-MAX_DIVIDED = 2500
+MAX_DIVIDED = 2500  # cells, the worst ones
 MAX_PARTS = 16  # of a divided cell along a side
 MAX_TABLE_BYTES = 128_000_000
 MAX_CELL_PX = 64  # larger ones would not resemble the model

@@ -213,7 +213,9 @@ def create_model(
 
     Raises ValueError for an unknown kind, and for a content that the model does not accept.
     """
-    return model_type(kind)(k, train_uv, train_duv, noise_px, bias_px, series)
+    return model_type(kind)(
+        k, train_uv, train_duv, noise_px=noise_px, bias_px=bias_px, series=series
+    )
 
 
 def model_from_values(values: Mapping[str, Any], image_size: tuple[int, int]) -> CorrectionModel:

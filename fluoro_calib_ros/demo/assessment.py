@@ -25,7 +25,7 @@ from ..simulation.rig import DistortionField
 # UDP port of the first participant of a ROS domain (DDSI-RTPS 2.5, section 9.6.1.1).
 DISCOVERY_PORT = 7400
 PORTS_PER_DOMAIN = 250
-FIRST_PARTICIPANT = 10
+FIRST_PARTICIPANT = 10  # offset of the unicast ports of a domain
 
 
 class NodeProcesses(Programs):

@@ -60,7 +60,10 @@ def run_graph(bags: Path, out: Path, client: DemoClient, knee: LiveKnee) -> int:
             'player_node', {'bag': bags / 'calibration', 'rate': 5.0, 'wait_for_readers': 3}
         )
         client.wait(
-            lambda: _has_exposures(client, min(recorded.values())) or nodes.failed(),
+            lambda: (
+                min(client.exposures.values(), default=0) >= min(recorded.values())
+                or nodes.failed()
+            ),
             60,
             'the exposures',
         )
@@ -231,10 +234,6 @@ def _start_nodes(
     )
     nodes.start('correction_node', {'fluoroscopes': fluoroscopes})
     nodes.start('reconstruction_node', {'fluoroscopes': fluoroscopes, **knee.parameters})
-
-
-def _has_exposures(client: DemoClient, count: int) -> bool:
-    return bool(client.exposures) and min(client.exposures.values()) >= count
 
 
 def _raise_if_failed(nodes: NodeProcesses, out: Path) -> None:

@@ -130,10 +130,10 @@ def _write_images(
                     header(stamp, f'{name}_optical'),
                     height,
                     width,
-                    'mono8',
-                    0,
-                    width,
-                    image.reshape(-1),
+                    encoding='mono8',
+                    is_bigendian=0,
+                    step=width,
+                    data=image.reshape(-1),
                 )
                 bag.write(f'/{name}/image_raw', IMAGE, message, stamp_ns)
 

@@ -233,23 +233,11 @@ def calibrate_by_regression(
 ) -> SelfCalibration:
     """Self-calibrate by adjustment and regression in turn.
 
-    Parameters
-    ----------
-    measured : Measured
-    before : Adjustment
-        Adjustment without correction.
-    options : CalibrationOptions
-    terms : AdjustedTerms or None
-        Terms of the correction that are estimated in the adjustments.
-    regressions : Regressions
-        What fits the rest of the correction.
-    progress : callable, optional
-        Called with the Round after every round.
+    before: adjustment without correction. terms: those of the correction that are estimated in the
+    adjustments. regressions: what fits the rest of it. progress: called with the Round after every
+    round.
 
-    Raises
-    ------
-    DataError
-        If there are too few inliers, or the exposures do not determine the unknowns.
+    Raises DataError if there are too few inliers, or the exposures do not determine the unknowns.
     """
     network = measured.network
     after = before

@@ -26,6 +26,7 @@ from ..exposures.phantom import Phantom
 from ..findings import Finding
 from ..photogrammetry.adjustment import Adjustment
 from ..photogrammetry.known_orientation import KnownOrientation
+from ..photogrammetry.noise import MIN_REDUNDANCY
 from ..photogrammetry.precision import (
     Precision,
     geometric_redundancy,
@@ -64,7 +65,6 @@ from .rounds import (
 from .self_calibration import self_calibrate
 
 MAX_REPEATS = 3  # of a calibration, to exclude exposures that do not fit
-MIN_REDUNDANCY = 0.05  # of a coordinate, for the square of its residual to be divided by
 EQUAL_WEIGHTS_NU = 100.0  # degrees of freedom from which weights of inliers hardly differ
 TOLERANCE_WITHOUT_CORRECTION = 1e-4  # its residuals are only reported
 
@@ -309,25 +309,12 @@ def adjust_with_calibrations(
     Covariances hold the uncertainty of both: that of the interior orientation is common to all
     exposures, that of the correction is part of the noise of every image point.
 
-    Parameters
-    ----------
-    frames : mapping of str to sequence of Frame
-        By fluoroscope; all fluoroscopes share the object points.
-    phantom : Phantom
-    calibrations : mapping of str to FluoroscopeCalibration
-    loss : str
-        Noise model of the image points.
-    known : mapping of str to KnownOrientation, optional
-        Orientations that are known beforehand, by fluoroscope.
-    starts : StartValues, optional
-        Of an earlier adjustment of the frames, for its residuals: the residuals without correction
-        are then not computed again, their RMSE is NaN, and covariances are without the
-        uncertainty of the interior orientations.
+    frames: by fluoroscope; all share the object points. loss: noise model of the image points.
+    known: orientations that are known beforehand, by fluoroscope. starts: of an earlier adjustment
+    of the frames, for its residuals; the residuals without correction are then not computed again,
+    their RMSE is NaN, and covariances are without the uncertainty of the interior orientations.
 
-    Raises
-    ------
-    DataError
-        If a frame is invalid or has another image size than its calibration.
+    Raises DataError if a frame is invalid or has another image size than its calibration.
     """
     began = time.perf_counter()
     for name, of_fluoroscope in frames.items():
@@ -335,11 +322,7 @@ def adjust_with_calibrations(
             validate_frame(frame, phantom, calibrations[name].image_size)
     with threadpool_limits(1):
         measured = network_of_calibrations(
-            frames,
-            phantom,
-            calibrations=calibrations,
-            known=known,
-            starts=starts,
+            frames, phantom, calibrations=calibrations, known=known, starts=starts
         )
         correction, network = fixed_corrections(measured, calibrations)
         after, precise = adjusted_with_precision(
@@ -357,8 +340,8 @@ def adjust_with_calibrations(
             before, _ = adjusted_with_precision(
                 network,
                 after.parameters,
-                correction=np.zeros_like(correction),
-                noise=after.noise,
+                np.zeros_like(correction),
+                after.noise,
                 tolerance=TOLERANCE_WITHOUT_CORRECTION,
             )
     figures = {

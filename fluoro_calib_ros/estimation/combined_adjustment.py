@@ -46,23 +46,10 @@ def calibrate_by_adjustment(
 ) -> SelfCalibration:
     """Self-calibrate with the model among the unknowns.
 
-    Parameters
-    ----------
-    measured : Measured
-    before : Adjustment
-        Adjustment without correction.
-    model_type : type of CorrectionModel
-        A model that is a series.
-    terms : AdjustedTerms
-        Terms of that model for the network of measured.
-    max_rounds : int
-    progress : callable, optional
-        Called with the Round after every adjustment.
+    before: adjustment without correction. model_type: a model that is a series. terms: of that
+    model, for the network of measured. progress: called with the Round after every adjustment.
 
-    Raises
-    ------
-    DataError
-        If there are too few inliers, or the exposures do not determine the unknowns.
+    Raises DataError if there are too few inliers, or the exposures do not determine the unknowns.
     """
     history = History(measured, progress)
 
@@ -162,28 +149,11 @@ def adjust_with_terms(
 ) -> tuple[Network, Adjustment, bool]:
     """Adjust a network together with terms of its distortion.
 
-    Parameters
-    ----------
-    plain : Network
-        Network without additional parameters.
-    before : Adjustment
-        Adjustment without correction.
-    terms : AdjustedTerms
-    max_rounds : int
-    report : callable
-        Called with every Adjustment and the RMS change of the correction [px].
+    plain: network without additional parameters. before: its adjustment without correction.
+    report: called with every Adjustment and the RMS change of the correction [px].
 
-    Returns
-    -------
-    network : Network
-        With the terms as additional parameters.
-    adjustment : Adjustment
-    converged : bool
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        If the network does not determine the unknowns.
+    Returns the network with the terms as additional parameters, its adjustment, and whether it
+    converged. Raises LinAlgError if the network does not determine the unknowns.
     """
     correction = np.zeros_like(plain.uv)
     zero = correction

@@ -64,14 +64,14 @@ class RelativeOrientation:
         return np.sqrt(np.diagonal(self.covariance)[3:])
 
 
-def paired_exposures(measured: Measured, b: int, a: int = 0) -> np.ndarray:
-    """Rows (k, 2) of the exposures of fluoroscopes a and b that have the same number."""
+def paired_exposures(measured: Measured, b: int) -> np.ndarray:
+    """Rows (k, 2) of the exposures of fluoroscopes 0 and b that have the same number."""
     row = {
         (int(f), frame.number): j
         for j, (f, frame) in enumerate(zip(measured.network.fluoroscope, measured.frames))
     }
     pairs = [
-        (row[a, number], j) for (f, number), j in row.items() if f == b and (a, number) in row
+        (row[0, number], j) for (f, number), j in row.items() if f == b and (0, number) in row
     ]
     return np.array(pairs, dtype=int).reshape(-1, 2)
 

@@ -31,7 +31,7 @@ from .initial_network import (
     KnownSensor,
     Measured,
     StartValues,
-    network_of_known_sensors,
+    measured_network,
     start_noise,
 )
 
@@ -78,7 +78,7 @@ class SolvedNetwork:
         others = [p.ravel() for p in parameters.additional if p is not None]
         relative = [np.append(p.translation_mm, angles[0]) for p in parameters.relative]
         return JointPrecision(
-            (*self._exterior_names(), *self._target_names(), *self._global_names()),
+            (*self._names(), *global_names(network, self.measured.fluoroscopes)),
             np.concatenate(
                 [
                     np.hstack([parameters.position_mm, angles]).ravel(),
@@ -141,18 +141,14 @@ class SolvedNetwork:
         scale[: len(claimed)][free] = np.sqrt(claimed[free] / variance[free])
         return scale[:, None] * covariance * scale
 
-    def _exterior_names(self) -> list[str]:
+    def _names(self) -> list[str]:
+        """Names of the unknowns of exposures and targets."""
+        exposures = [f'exposure {f.number} of {f.fluoroscope}' for f in self.measured.frames]
+        targets = [f'target {number}' for number in self.measured.target_id]
         return [
-            f'exposure {frame.number} of {frame.fluoroscope}: {part}'
-            for frame in self.measured.frames
-            for part in EXTERIOR
+            *(f'{name}: {part}' for name in exposures for part in EXTERIOR),
+            *(f'{name}: {part}' for name in targets for part in 'xyz'),
         ]
-
-    def _target_names(self) -> list[str]:
-        return [f'target {number}: {part}' for number in self.measured.target_id for part in 'xyz']
-
-    def _global_names(self) -> list[str]:
-        return global_names(self.measured.network, self.measured.fluoroscopes)
 
 
 # Mean number of image points of a target from which the noise can be estimated: with fewer the
@@ -174,13 +170,7 @@ def network_of_calibrations(
     Raises DataError as `measured_network`.
     """
     sensors = {name: _sensor(calibrations[name]) for name in frames}
-    return network_of_known_sensors(
-        frames,
-        phantom,
-        sensors=sensors,
-        known=known,
-        starts=starts,
-    )
+    return measured_network(frames, phantom, known=known, starts=starts, sensors=sensors)
 
 
 def _sensor(calibration: FluoroscopeCalibration) -> KnownSensor:

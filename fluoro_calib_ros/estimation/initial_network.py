@@ -18,8 +18,6 @@ from ..exposures.phantom import Phantom
 from ..findings import Finding, Kind, Place, Severity
 from ..photogrammetry.adjustment import Adjustment, SolverOptions, adjust
 from ..photogrammetry.known_orientation import (
-    HELD_SD_MM,
-    HELD_SD_RAD,
     ExteriorPrior,
     KnownOrientation,
 )
@@ -30,7 +28,7 @@ from ..photogrammetry.plane_resection import flatness, plane_of, tilt_of
 from ..photogrammetry.precision import Precision, precision
 from ..photogrammetry.resection import MIN_FLATNESS, Resection, refine_resection, resection_at
 from ..photogrammetry.rotations import rotation_angle
-from ..photogrammetry.unknowns import EXTERIOR_SIZE, Parameters
+from ..photogrammetry.unknowns import EXTERIOR_SIZE, RIGID_SD_MM, RIGID_SD_RAD, Parameters
 from .priors import Prior
 from .start_orientation import (
     UNTILTED,
@@ -262,45 +260,17 @@ def measured_network(
     principal_distance: float | None = None,
     known: Known | None = None,
     starts: StartValues | None = None,
+    sensors: Mapping[str, KnownSensor] | None = None,
 ) -> Measured:
     """Return network and start values of the frames of fluoroscopes that are to be calibrated.
 
     principal_distance: start value [px]; by default it is taken from the observations. known:
     orientations that are known beforehand, by fluoroscope. starts: used for a fluoroscope with
-    start values of all its exposures. Raises DataError if a frame is invalid, if exposures or
-    targets are too few, or if all exposures show one pose.
+    start values of all its exposures. sensors {fluoroscope: KnownSensor}: interior orientations
+    and corrections that are fixed; one exposure of a fluoroscope is then enough. Raises DataError
+    if a frame is invalid, if exposures or targets are too few, or if all exposures show one pose.
     """
-    task = _Task(
-        phantom,
-        None,
-        principal_distance=principal_distance,
-        known=known or {},
-        starts=starts,
-    )
-    return _measured(
-        task, {name: _resected(task, name, of_one) for name, of_one in frames.items()}
-    )
-
-
-def network_of_known_sensors(
-    frames: Frames,
-    phantom: Phantom,
-    sensors: Mapping[str, KnownSensor],
-    known: Known | None = None,
-    starts: StartValues | None = None,
-) -> Measured:
-    """Return network and start values with interior orientations and corrections fixed.
-
-    One exposure of a fluoroscope is enough. The arguments and errors are those of
-    `measured_network`; sensors {fluoroscope: KnownSensor}.
-    """
-    task = _Task(
-        phantom,
-        sensors,
-        principal_distance=None,
-        known=known or {},
-        starts=starts,
-    )
+    task = _Task(phantom, sensors, principal_distance, known or {}, starts)
     return _measured(
         task, {name: _resected(task, name, of_one) for name, of_one in frames.items()}
     )
@@ -348,7 +318,7 @@ def _exterior_prior(task: _Task, frames: Sequence[Frame]) -> ExteriorPrior:
         if known is not None:
             rotation[row] = known.rotation
             position[row] = known.position_mm
-            sd[row] = np.repeat(known.exterior_sd or (HELD_SD_MM, HELD_SD_RAD), 3)
+            sd[row] = np.repeat(known.exterior_sd or (RIGID_SD_MM, RIGID_SD_RAD), 3)
     return ExteriorPrior(rotation, position, sd)
 
 

@@ -278,7 +278,7 @@ class NeighbourRegression(RegressionStep[NeighbourModel]):
             self.k,
             uv,
             duv if series is None else duv + series.predict(uv),
-            float(np.sqrt(noise2)),
-            float(np.sqrt(max(bias2, 0.0))),
-            series,
+            noise_px=float(np.sqrt(noise2)),
+            bias_px=float(np.sqrt(max(bias2, 0.0))),
+            series=series,
         )

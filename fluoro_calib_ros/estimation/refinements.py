@@ -230,12 +230,6 @@ def exposure_terms(solution: Solution) -> Change | None:
     return Change([min(number, START_MODES) for number in solution.modes], exposure_terms=found)
 
 
-def _with_short_field(part: FluoroscopeTerms) -> Prior:
-    """Prior of a fluoroscope with a short field to start with."""
-    signal = part.prior.signal.with_short_field(max(part.image_size))
-    return replace(part.prior, signal=signal)
-
-
 class AgreeingOutliers:
     """Rejected image points that agree: they are not false matches.
 
@@ -308,7 +302,8 @@ def _followed(
     information = block_diag(*[weighted.T @ weighted] * 2)
     right = (weighted.T @ observed).T.ravel()
     if prior.local is None:
-        prior = _with_short_field(part)
+        signal = part.prior.signal.with_short_field(max(part.image_size))
+        prior = replace(part.prior, signal=signal)
         prior = most_likely_prior(functions, information, right, gauge, prior=prior)
     precision = information + gauge + prior_precision(functions, prior)
     return prior, np.linalg.solve(precision, right)

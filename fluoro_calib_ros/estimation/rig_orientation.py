@@ -35,13 +35,14 @@ from ..exposures.phantom import Phantom
 from ..photogrammetry.adjustment import Adjustment
 from ..photogrammetry.collinearity import to_sensor
 from ..photogrammetry.elimination import CovarianceBlocks, factorize
-from ..photogrammetry.known_orientation import HELD_SD_MM, HELD_SD_RAD
 from ..photogrammetry.network import Network
 from ..photogrammetry.normal_equations import normal_equations
 from ..photogrammetry.precision import covariance_blocks
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation, with_datum_of_points
 from ..photogrammetry.rotations import matrix_from_quaternion
 from ..photogrammetry.unknowns import (
+    RIGID_SD_MM,
+    RIGID_SD_RAD,
     RelativeConstraint,
     RelativePose,
     discrepancies_with_jacobian,
@@ -87,7 +88,7 @@ def orientation_of_known(
     size = ORIENTATION_SIZE * len(names)
     covariance = np.zeros((size, size))
     for f, name in enumerate(names):
-        sd_mm, sd_rad = known[name].exterior_sd or (HELD_SD_MM, HELD_SD_RAD)
+        sd_mm, sd_rad = known[name].exterior_sd or (RIGID_SD_MM, RIGID_SD_RAD)
         at = slice(ORIENTATION_SIZE * f, ORIENTATION_SIZE * (f + 1))
         own = np.diag(np.repeat([sd_mm**2, sd_rad**2, 0.0], 3))
         own[6:, 6:] = calibrations[name].interior_covariance
@@ -181,7 +182,6 @@ def orientation_of_capture(
     phantom: Phantom,
     calibrations: Calibrations,
     frame_id: str = 'rig',
-    loss: str = 'student_t',
 ) -> RigOrientation:
     """Orientation from a capture of the phantom at rest, whose frame is that of the rig.
 
@@ -197,8 +197,6 @@ def orientation_of_capture(
         Fixed.
     frame_id : str
         Name of the rig frame.
-    loss : str
-        Noise model of the image points.
 
     Raises
     ------
@@ -216,7 +214,7 @@ def orientation_of_capture(
             )
     with threadpool_limits(1):
         measured = network_of_calibrations(still, phantom, calibrations)
-        fixed = _adjusted(measured, calibrations, loss, True)
+        fixed = _adjusted(measured, calibrations, True)
         known = fixed.covariance_of_all()
     parameters = fixed.after.parameters
     count = len(frames)
@@ -235,7 +233,6 @@ def orientation_and_scatter(
     frames: Frames,
     phantom: Phantom,
     calibrations: Calibrations,
-    loss: str = 'student_t',
     starts: StartValues | None = None,
 ) -> tuple[RigOrientation, tuple[PairScatter, ...]]:
     """Orientation in the optical frame of the first fluoroscope, from exposures of the phantom.
@@ -254,7 +251,7 @@ def orientation_and_scatter(
     paired = _paired(frames)
     with threadpool_limits(1):
         measured = network_of_calibrations(paired, phantom, calibrations, starts=starts)
-        fixed = _adjusted(measured, calibrations, loss, False)
+        fixed = _adjusted(measured, calibrations, False)
         turning = {name for name, each in calibrations.items() if each.angle_field is not None}
         exteriors, scatter = _relative_to_first(fixed, turning)
     first = fixed.measured.fluoroscopes[0]
@@ -434,7 +431,7 @@ def _unpaired(names: Sequence[str], b: int) -> str:
 
 
 def _adjusted(
-    measured: Measured, calibrations: Calibrations, loss: str, noise_fixed: bool
+    measured: Measured, calibrations: Calibrations, noise_fixed: bool
 ) -> _FixedAdjustment:
     """Adjust a network with the calibrations fixed.
 
@@ -447,7 +444,7 @@ def _adjusted(
         network,
         measured.start,
         correction,
-        noise_of_calibrations(loss, used),
+        noise_of_calibrations('student_t', used),
         noise_fixed=noise_fixed or too_few_rays_for_noise(network),
     )
     if not np.isfinite(after.parameters.position_mm).all():

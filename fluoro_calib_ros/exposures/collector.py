@@ -205,7 +205,6 @@ def collect_recorded(
     frames: Frames,
     mode: str = 'auto',
     pair_by: str = 'frame_number',
-    still: StillOptions | None = None,
     tolerance_s: float = PairingOptions.tolerance_s,
 ) -> tuple[dict[str, list[Frame]], dict[str, int]]:
     """Collect the exposures of a recording, as the calibration node would.
@@ -218,7 +217,6 @@ def collect_recorded(
         'all' collects every pair, 'still' those in which the phantom stands still in a new pose;
         'auto' is 'still' for a stream and 'all' for single shots.
     pair_by : {'frame_number', 'stamp'}
-    still : StillOptions, optional
     tolerance_s : float
         Largest difference between the stamps of an exposure [s].
 
@@ -229,7 +227,7 @@ def collect_recorded(
     unpaired : dict of str to int
         Number of frames without partner by fluoroscope.
     """
-    still = still or StillOptions()
+    still = StillOptions()
     pairer = CompletePairer(frames, recording_options(pair_by, tolerance_s))
     collector = ExposureCollector(frames, still)
     if mode == 'auto':
@@ -252,7 +250,7 @@ def _is_stream(frames: Sequence[Frame], still: StillOptions) -> bool:
 
 
 RECOMMENDED_EXPOSURES = 15  # docs/usage.md; accuracy by number: docs/how_good/accuracy.md
-RECOMMENDED_COVERAGE = 0.9
+RECOMMENDED_COVERAGE = 0.9  # share of the image
 MAX_AREAS = 2  # named at once
 
 

@@ -23,7 +23,7 @@ Joints: joints.toml, which defines them, and joints.csv, their motion.
     axes = {x = [1, 0, 0], z = [0, 0, 1]}   # or quaternion_wxyz = [1, 0, 0, 0]
     origin = [0, 0, 0]                      # or matrix = [[...], [...], [...], [0, 0, 0, 1]]
 
-Without a frame, the axes are those of the body. docs/joints.md describes both files.
+Without a frame, the axes are those of the body. docs/bodies.md describes both files.
 """
 
 from __future__ import annotations

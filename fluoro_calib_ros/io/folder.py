@@ -34,8 +34,8 @@ _INPUT_NAMES = (
     *('.mcap', '.db3', '.zstd', '.npz', '.yaml', '.json'),
     *('observations.csv', 'phantom.csv', 'names.csv'),
 )
-_AT_FDCWD = -100
-_RENAME_EXCHANGE = 2
+_AT_FDCWD = -100  # linux/fcntl.h: paths are relative to the working directory
+_RENAME_EXCHANGE = 2  # linux/fs.h
 # What a file system or an old kernel without exchange answers.
 _NO_EXCHANGE = (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EXDEV)
 

@@ -90,7 +90,6 @@ _BEGINNINGS = (
     (0, b'P5', '.pgm'),
     (128, b'DICM', '.dcm'),
 )
-_BEGINNING_BYTES = 132
 _DIRECTORY = 'DICOMDIR'  # a DICOM file that lists others
 
 
@@ -108,7 +107,7 @@ def image_suffix_of(path: PathLike) -> str:
         return ''
     try:
         with open(path, 'rb') as file:
-            begin = file.read(_BEGINNING_BYTES)
+            begin = file.read(132)
     except OSError:
         return ''
     return next((s for at, mark, s in _BEGINNINGS if begin[at:].startswith(mark)), '')

@@ -170,9 +170,9 @@ FRAME_RATE = 768  # offset in SETUP, 32 bits; SETUP begins with a frame rate of 
 ANNOTATION = 8  # bytes at least
 CINE_GREY = 0  # compression of the file header; 1: JPEG, 2: mosaic of a colour sensor
 UNPACKED = 0  # biCompression
-PACKED_10 = 0x100
-PACKED_12 = 0x400
-MAX_IMAGES = 100_000_000
+PACKED_10 = 0x100  # biCompression of 10 bits
+PACKED_12 = 0x400  # biCompression of 12 bits
+MAX_IMAGES = 100_000_000  # of a recording: more than a day at 1000 Hz
 SIDES = 2**30  # px, more cannot be meant
 
 

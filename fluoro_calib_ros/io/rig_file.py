@@ -28,7 +28,7 @@ from .documents import read_toml
 
 NAME = 'rig.toml'
 MAX_ABOUT = 100  # entries
-MAX_ABOUT_TEXT = 1000
+MAX_ABOUT_TEXT = 1000  # characters of an entry
 
 
 @dataclass(frozen=True)

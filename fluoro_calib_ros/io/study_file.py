@@ -39,7 +39,7 @@ OF_TRIALS = ('extract', 'reconstruct', 'bodies')  # commands, in their order
 CONVERT = 'convert'  # a table of tables: one for each format
 CALIBRATE = 'calibrate'
 SOURCE = 'source'
-MAX_TRIALS = 10_000
+MAX_TRIALS = 10_000  # of a study
 Options = Mapping[str, Any]
 
 

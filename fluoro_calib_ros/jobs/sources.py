@@ -243,7 +243,6 @@ def read_source(
     """
     settings = settings or FileSettings()
     selection = selection or BagSelection()
-    content = Content()
     bag = is_bag(path)
     if bag:
         contents = read_frames(path, validate)
@@ -253,11 +252,7 @@ def read_source(
     else:
         selection.check_file(path)
         settings = replace(settings, image_size=image_size, fluoroscopes=tuple(fluoroscopes or ()))
-        content = read_content(path, settings, 'observations', 'observations')
-        require_observed(path, content.corrected_by)
-        found = {name: list(frames) for name, frames in (content.observations or {}).items()}
-        if not found:
-            raise DataError(f'{path}: the file has no image points')
+        found, content = _observed(path, settings)
     names = settings.names.merged(content.names)
     wanted = list(found) if fluoroscopes is None else list(fluoroscopes)
     for name in wanted:
@@ -274,6 +269,16 @@ def read_source(
         frames, collect or 'all', selection.pair_by, tolerance_s=selection.tolerance_s
     )
     return Recording(*collected, names, notes)
+
+
+def _observed(path: PathLike, settings: FileSettings) -> tuple[dict[str, list[Frame]], Content]:
+    """Read the frames of a file, and all else that it says. Raises DataError."""
+    content = read_content(path, settings, 'observations', 'observations')
+    require_observed(path, content.corrected_by)
+    found = {name: list(frames) for name, frames in (content.observations or {}).items()}
+    if not found:
+        raise DataError(f'{path}: the file has no image points')
+    return found, content
 
 
 def select_calibrations(

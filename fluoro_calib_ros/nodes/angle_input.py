@@ -16,7 +16,8 @@ from ..exposures.angles import AngleOptions
 from .messages.observations import JointStates, decode_joint_state
 from .runtime.diagnostics import WARN, Health, RateLimitedLogger, StartError
 from .runtime.lifecycle import StreamNode
-from .runtime.streams import FaultHandlers, StreamReader, observations_qos
+from .runtime.streams import FaultHandlers, StreamReader
+from .runtime.topics import observations_qos
 
 TOPIC = 'joint_states'
 MAX_BYTES = 1_000_000  # of a message

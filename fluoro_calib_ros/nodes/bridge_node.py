@@ -33,12 +33,11 @@ from .recorder_node import adapted_qos, type_hash_text
 from .runtime.diagnostics import RateLimitedLogger, StartError
 from .runtime.main import run
 from .runtime.parameters import ParameterGroup, ParameterNode
-from .runtime.streams import TopicDiscovery, definition_of, installed_type
+from .runtime.topics import TopicDiscovery, definition_of, installed_type
 
 MAX_HEAD = 16_384  # bytes of a request
 HEAD_S = 5.0  # in which it has to come
-MAX_CLIENTS = 32
-BLOCK = 65_536
+MAX_CLIENTS = 32  # connections at a time
 CLIENT_ERRORS = (
     OSError,
     asyncio.TimeoutError,
@@ -150,7 +149,7 @@ class Gate:
 async def _pass_on(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
     """Pass on what comes until one side ends; a slow reader is waited for."""
     with suppress(OSError):
-        while data := await reader.read(BLOCK):
+        while data := await reader.read(65_536):
             writer.write(data)
             await writer.drain()
 

@@ -21,7 +21,8 @@ from .messages.fluoroscope_calibration import (
     message_from_calibration,
 )
 from .runtime.diagnostics import one_line
-from .runtime.streams import DECODING_ERRORS, latched_qos, publisher_conflict
+from .runtime.streams import DECODING_ERRORS
+from .runtime.topics import latched_qos, publisher_conflict
 
 # Calls of release() after which an undisputed calibration is used, in case a second node that is
 # seen has died.

@@ -9,8 +9,8 @@ process of its own. rclpy's MultiThreadedExecutor is no alternative: it schedule
 and again until it has started, which on a busy machine costs so much time that frames are lost.
 
 The parts: parameters and rig (calibration_settings), exposures (exposure_input), what is published
-(calibration_output), and the services that collect and orient the rig
-(calibration_services), calibrate, heal (healing_services), save and load (calibration_settings).
+(calibration_output), and the services that collect (exposure_input), orient the rig and calibrate
+(calibration_services), heal (healing_services), save and load (calibration_settings).
 """
 
 from __future__ import annotations
@@ -26,26 +26,25 @@ from rclpy.lifecycle.node import LifecycleState
 from ..exposures.frame import Frame
 from .angle_input import AngleInput
 from .calibration_output import CONDITIONS, CalibrationOutput, FluoroscopeState
-from .calibration_services import CollectServices, OrientationService, SelfCalibration
+from .calibration_services import OrientationService, SelfCalibration
 from .calibration_settings import (
     PARAMETERS,
     CalibrationFiles,
     CalibrationSettings,
-    declare_settings,
-    follow_settings,
     read_rig,
 )
-from .exposure_input import ExposureInput
+from .exposure_input import CollectServices, ExposureInput, NodeParts
 from .frame_validation import with_limit
 from .healing_services import Healing
 from .messages.observations import NS_PER_S, ObservedFrame, decode_target_observations
 from .messages.status import FluoroscopeProgress
 from .runtime.diagnostics import Status, health_of
-from .runtime.lifecycle import Requests, StreamNode, create_services, wake
+from .runtime.lifecycle import StreamNode
 from .runtime.main import run
-from .runtime.parameters import declare_read_limits
+from .runtime.parameters import declare_groups, declare_read_limits, follow_groups
+from .runtime.services import Requests, create_services, wake
 from .runtime.stream import stream_faults
-from .runtime.streams import observations_qos
+from .runtime.topics import observations_qos
 
 __all__ = ['PARAMETERS', 'CalibrationNode', 'main']
 
@@ -58,12 +57,12 @@ class CalibrationNode(StreamNode):
     def __init__(self) -> None:
         super().__init__('calibration_node')
         declare_read_limits(self)
-        self._settings = declare_settings(self)
+        self._settings = declare_groups(self, CalibrationSettings)
         self.autostart = self._settings.node.autostart
         self._rig = read_rig(self, lambda: self._settings)
         self._requests = Requests()
         self.reset()
-        follow_settings(self, lambda: self._settings, self._use)
+        follow_groups(self, lambda: self._settings, self._use)
 
     def reset(self) -> None:
         """Forget exposures and angles, and start counting from zero."""
@@ -90,21 +89,22 @@ class CalibrationNode(StreamNode):
         rig = self._rig
         self._output = output = CalibrationOutput(self, rig.names)
         files = CalibrationFiles(rig, output, self.get_logger())
-        collecting = CollectServices(self, rig, self._exposures, output, self._requests)
-        self._orienting = OrientationService(self, rig, output, self._requests)
-        self._calibrating = SelfCalibration(
+        parts = NodeParts(
             self, rig, self._exposures, output=output, files=files, requests=self._requests
         )
-        self._healing = Healing(self, rig, output, files, self._requests)
+        self._orienting = OrientationService(parts)
+        self._calibrating = SelfCalibration(parts)
+        self._healing = Healing(parts)
         # Services that await must not keep others from being answered.
         group = ReentrantCallbackGroup()
-        table = [
-            *self._calibrating.services,
-            *collecting.services,
-            *files.services,
-            *self._orienting.services,
-            *self._healing.services,
-        ]
+        groups = (
+            self._calibrating,
+            CollectServices(parts),
+            files,
+            self._orienting,
+            self._healing,
+        )
+        table = [entry for services in groups for entry in services.services]
         for service in create_services(self, table, group):
             self.own(service, self.destroy_service, service)
         for job in (self._calibrating, self._healing):

@@ -33,7 +33,7 @@ from .runtime.stream import (
     refused_messages,
     unpaired_frames,
 )
-from .runtime.streams import latched_qos, publisher_conflict
+from .runtime.topics import latched_qos, publisher_conflict
 
 
 class CalibrationOutput:

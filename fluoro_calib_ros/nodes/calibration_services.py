@@ -1,23 +1,21 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Services of a calibration node: capture and reset exposures, orient the rig, self-calibrate."""
+"""Jobs of a calibration node: orient the rig, self-calibrate."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 from fluoro_calib_msgs.action import SelfCalibrate
-from fluoro_calib_msgs.srv import Calibrate, Capture, Orient, Reset
+from fluoro_calib_msgs.srv import Calibrate, Orient
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import CallbackGroup
-from rclpy.parameter import Parameter
 from rclpy.task import Future
 
-from ..checks.check import Validation
 from ..errors import DataError
 from ..estimation.options import CalibrationRequest
 from ..estimation.rounds import Round
@@ -27,9 +25,8 @@ from ..io.calibration import save_orientation
 from ..jobs.calibration import CalibrationOutcome, Rig, run_in_worker_process
 from ..jobs.orientation import OrientationOutcome, orient
 from ..jobs.result_folder import belongs_to, check_result_folder
-from .calibration_output import CalibrationOutput
-from .calibration_settings import CalibrationFiles, RigSetup
-from .exposure_input import ExposureInput
+from .calibration_settings import NOT_ACTIVE
+from .exposure_input import NodeParts, RigServices
 from .messages.self_calibration import (
     Request,
     Result,
@@ -38,8 +35,8 @@ from .messages.self_calibration import (
     fill_verdict,
     options_of_request,
 )
-from .runtime.lifecycle import Requests, ServiceEntry, StreamNode, in_thread, wake, within
 from .runtime.parameters import check_timeout
+from .runtime.services import ServiceEntry, in_thread, wake, within
 
 
 class _Capture:
@@ -66,16 +63,11 @@ class _Capture:
                 self.done.set_result(is_complete)
 
 
-class OrientationService:
+class OrientationService(RigServices):
     """The service orient, which orients the rig from the next frames of the phantom."""
 
-    def __init__(
-        self, node: StreamNode, rig: RigSetup, output: CalibrationOutput, requests: Requests
-    ) -> None:
-        self._node = node
-        self._rig = rig
-        self._output = output
-        self._requests = requests
+    def __init__(self, parts: NodeParts) -> None:
+        super().__init__(parts)
         self._capture: _Capture | None = None
         self.services = (ServiceEntry('orient', Orient, self._on_orient),)
 
@@ -93,7 +85,6 @@ class OrientationService:
         self, request: Orient.Request, response: Orient.Response
     ) -> Orient.Response:
         """Orient the rig, save the orientation and publish it."""
-        logger = self._node.get_logger()
         try:
             with self._requests.one():
                 outcome = await self._orient(request)
@@ -101,7 +92,7 @@ class OrientationService:
             save_orientation(self._rig.directory, orientation)
         except (DataError, ValueError, OSError) as error:
             response.message = f'the orientation of the rig is unchanged: {error}'
-            logger.error(response.message)
+            self._logger.error(response.message)
             return response
         self._output.publish_orientation(orientation)
         response.success = True
@@ -113,9 +104,9 @@ class OrientationService:
         )
         response.message = '; '.join([response.message, *sentences(outcome.findings)])
         if outcome.findings:
-            logger.warning(response.message)
+            self._logger.warning(response.message)
         else:
-            logger.info(response.message)
+            self._logger.info(response.message)
         return response
 
     async def _orient(self, request: Orient.Request) -> OrientationOutcome:
@@ -158,127 +149,32 @@ class OrientationService:
         )
 
 
-NOT_ACTIVE = 'the node is not active, so no frames come in'
-
-
-class CollectServices:
-    """The services capture, reset and collect_anew."""
-
-    def __init__(
-        self,
-        node: StreamNode,
-        rig: RigSetup,
-        exposures: ExposureInput,
-        output: CalibrationOutput,
-        requests: Requests,
-    ) -> None:
-        self._node = node
-        self._rig = rig
-        self._exposures = exposures
-        self._output = output
-        self._requests = requests
-        self.services = (
-            ServiceEntry('capture', Capture, self._on_capture),
-            ServiceEntry('reset', Reset, self._on_reset),
-            ServiceEntry('collect_anew', Reset, self._on_collect_anew),
-        )
-
-    async def _on_capture(
-        self, request: Capture.Request, response: Capture.Response
-    ) -> Capture.Response:
-        timeout = request.timeout_sec or self._rig.settings().node.capture_timeout
-        try:
-            self._check(timeout)
-        except ValueError as error:  # DataError among them
-            response.message = str(error)
-            return response
-        captured = self._exposures.capture()
-        with self._requests.one():
-            found = await within(
-                self._node, timeout, captured, lambda: self._exposures.give_up(captured)
-            )
-        response.success = found is not None
-        if found is not None:
-            number, response.exposures = found
-            response.message = f'frame {number} captured, {response.exposures} exposures now'
-        else:
-            names = self._rig.names
-            streams = self._exposures.streams.values()
-            received = ', '.join(f'{stream.name} {stream.received}' for stream in streams)
-            response.exposures = self._exposures.collected(names[0]).exposures
-            response.message = self._exposures.capture_refusal or (
-                f'no frame of all fluoroscopes ({", ".join(names)}) came within {timeout:g} s; '
-                f'frames received: {received}'
-            )
-        return response
-
-    def _check(self, timeout_s: float) -> None:
-        """Raise ValueError, DataError among them, where nothing can be captured."""
-        self._rig.required_phantom()
-        check_timeout(timeout_s)
-        if not self._node.readers:
-            raise DataError(NOT_ACTIVE)
-        waiting = self._requests.waiting
-        if waiting >= self._rig.settings().limits.max_waiting:
-            raise DataError(
-                f'{waiting} requests wait for their answers, as many as max_waiting allows'
-            )
-
-    def _on_reset(self, _: Reset.Request, response: Reset.Response) -> Reset.Response:
-        count = self._exposures.reset()
-        self._output.refused.clear()
-        response.success = True
-        response.message = f'{count} exposures discarded, the calibration stays in use'
-        return response
-
-    def _on_collect_anew(self, request: Reset.Request, response: Reset.Response) -> Reset.Response:
-        self._node.set_parameters([Parameter('collect', value='still')])
-        self._on_reset(request, response)
-        response.message += (
-            '; new exposures are collected whenever the phantom stands still in a new pose'
-        )
-        self._node.get_logger().info(response.message)
-        return response
-
-
 class Cancelled(Exception):
     """The running job has to stop."""
 
 
-class SelfCalibration:
-    """Runs one self-calibration at a time, in a process of its own."""
+class Job(RigServices):
+    """Runs one job of an action at a time, in a process of its own."""
 
-    def __init__(
-        self,
-        node: StreamNode,
-        rig: RigSetup,
-        exposures: ExposureInput,
-        output: CalibrationOutput,
-        files: CalibrationFiles,
-        requests: Requests,
-    ) -> None:
-        self.running: tuple[str, ...] = ()  #: fluoroscopes of the running job
-        self.last_round: dict[str, Round] = {}  #: of the running or last job, by fluoroscope
-        self._node = node
-        self._rig = rig
-        self._exposures = exposures
-        self._output = output
-        self._files = files
-        self._requests = requests
-        self._logger = node.get_logger()
+    kind: Any  #: type of the action
+    action: str  #: its name
+    title: str  #: what is run
+
+    def __init__(self, parts: NodeParts) -> None:
+        super().__init__(parts)
         self._stopping = threading.Event()
+        self._is_running = False
         self._thread: threading.Thread | None = None  # waits for the process of the job
-        self.services = (ServiceEntry('calibrate', Calibrate, self._on_calibrate),)
 
     def create_action(self, group: CallbackGroup) -> ActionServer:
         """Return the action server."""
         return ActionServer(
             self._node,
-            SelfCalibrate,
-            'self_calibrate',
+            self.kind,
+            self.action,
             self._on_action,
             goal_callback=lambda _: GoalResponse.ACCEPT,
-            cancel_callback=lambda _: CancelResponse.ACCEPT,
+            cancel_callback=self._on_cancel,
             callback_group=group,
         )
 
@@ -292,66 +188,103 @@ class SelfCalibration:
         if self._thread is not None:
             self._thread.join()
 
+    async def _work(self, goal: Any, result: Any) -> None:
+        """Run the job of a goal and fill in the result. Raises DataError, Cancelled."""
+        raise NotImplementedError
+
+    def _on_cancel(self, _: Any) -> CancelResponse:
+        return CancelResponse.ACCEPT
+
+    async def _on_action(self, goal: Any) -> Any:
+        result = self.kind.Result()
+        if await self._answer(result, self._work(goal, result)):
+            goal.succeed()
+        elif goal.is_cancel_requested:
+            goal.canceled()
+        else:  # also where the node ends
+            goal.abort()
+        return result
+
+    async def _answer(self, result: Any, work: Coroutine[Any, Any, None]) -> bool:
+        """Let the work be done, or say in the result why it was not; returns whether it was.
+
+        Without success nothing is changed.
+        """
+        if self._is_running:
+            work.close()
+            result.message = f'refused: a {self.title} is already running'
+            self._logger.warning(result.message)
+            return False
+        self._is_running = True
+        try:
+            with self._requests.one():
+                await work
+        except Cancelled:
+            result.message = 'cancelled, nothing was changed'
+            self._logger.info(result.message)
+        except (DataError, ValueError, OSError) as error:
+            result.message = str(error)
+            self._logger.error(result.message)
+        except Exception as error:  # a bug must reach the caller, and must not end the node
+            result.message = f'the {self.title} failed unexpectedly: {error}'
+            self._logger.error(result.message)
+        else:
+            return True
+        finally:
+            self._is_running = False
+            self._thread = None
+        return False
+
+    def _raise_if_cancelled(self, is_cancel_requested: bool) -> None:
+        """Raise Cancelled where the job has to stop."""
+        if is_cancel_requested or self._stopping.is_set():
+            raise Cancelled
+
+
+class SelfCalibration(Job):
+    """The action self_calibrate, and the service calibrate."""
+
+    kind = SelfCalibrate
+    action = 'self_calibrate'
+    title = 'self-calibration'
+
+    def __init__(self, parts: NodeParts) -> None:
+        super().__init__(parts)
+        self.running: tuple[str, ...] = ()  #: fluoroscopes of the running job
+        self.last_round: dict[str, Round] = {}  #: of the running or last job, by fluoroscope
+        self.services = (ServiceEntry('calibrate', Calibrate, self._on_calibrate),)
+
     async def _on_calibrate(
         self, request: Calibrate.Request, response: Calibrate.Response
     ) -> Calibrate.Response:
-        with self._requests.one():
-            await self._answer(request, response, lambda *_: None, lambda: False)
+        work = self._calibrate(request, response, lambda *_: None, lambda: False)
+        await self._answer(response, work)
         return response
 
-    async def _on_action(self, goal: Any) -> SelfCalibrate.Result:
-        result = SelfCalibrate.Result()
+    async def _work(self, goal: Any, result: Any) -> None:
         feedback = SelfCalibrate.Feedback()
 
         def progress(label: str, last: Round) -> None:
             fill_feedback(feedback, label, last)
             goal.publish_feedback(feedback)
 
-        with self._requests.one():
-            cancelled = await self._answer(
-                goal.request, result, progress, lambda: goal.is_cancel_requested
-            )
-        if result.success:
-            goal.succeed()
-        elif cancelled:
-            goal.canceled()
-        else:
-            goal.abort()
-        return result
+        await self._calibrate(goal.request, result, progress, lambda: goal.is_cancel_requested)
 
-    async def _answer(
+    async def _calibrate(
         self,
         request: Request,
         result: Result,
         progress: Callable[[str, Round], None],
         is_cancel_requested: Callable[[], bool],
-    ) -> bool:
-        """Run a calibration and fill in the result; returns whether it was cancelled.
-
-        Without success nothing is changed.
-        """
-        if self._thread is not None:
-            result.message = 'refused: a self-calibration is already running'
-            self._logger.warning(result.message)
-            return False
+    ) -> None:
         try:
             outcome = await self._start(request, progress, is_cancel_requested)
             self._use(outcome, result)
-        except Cancelled:
-            result.message = 'cancelled, nothing was changed'
-            self._logger.info(result.message)
-            return True
         except (DataError, ValueError, OSError) as error:
-            result.message = str(error)
-            self._logger.error(result.message)
-            self._output.refused.update(dict.fromkeys(self.running, result.message))
-        except Exception as error:  # a bug must reach the caller, and must not end the node
-            result.message = f'the self-calibration failed unexpectedly: {error}'
-            self._logger.error(result.message)
+            self._output.refused.update(dict.fromkeys(self.running, str(error)))
+            raise
         finally:
             self.running = ()
-            self._thread = None
-        return False
 
     def _start(
         self,
@@ -370,17 +303,13 @@ class SelfCalibration:
             self.last_round.update(dict.fromkeys(label.split('+'), last))
             progress(label, last)
 
-        def raise_if_cancelled() -> None:
-            if is_cancel_requested() or self._stopping.is_set():
-                raise Cancelled
-
         def run() -> CalibrationOutcome:
             return run_in_worker_process(
                 job,
                 validate=request.validate,
                 rig=rig,
                 progress=on_round,
-                raise_if_cancelled=raise_if_cancelled,
+                raise_if_cancelled=lambda: self._raise_if_cancelled(is_cancel_requested()),
             )
 
         self.running = tuple(job.frames)
@@ -429,9 +358,7 @@ class SelfCalibration:
         self._logger.info(result.message)
         if outcome.validation is not None:
             fill_verdict(result, outcome.validation)
-            self._log_verdict(outcome.validation)
-
-    def _log_verdict(self, validation: Validation) -> None:
-        self._logger.info(f'verdict: {validation.verdict} ({validation.seconds:.1f} s)')
-        for found in validation.findings:
-            self._logger.warning(found.sentence)
+            verdict = outcome.validation
+            self._logger.info(f'verdict: {verdict.verdict} ({verdict.seconds:.1f} s)')
+            for found in verdict.findings:
+                self._logger.warning(found.sentence)

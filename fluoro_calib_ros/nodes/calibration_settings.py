@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -39,16 +39,17 @@ from ..options import option
 from ..photogrammetry.rig_orientation import RigOrientation
 from .calibration_output import CalibrationOutput
 from .runtime.diagnostics import Logger, StartError
-from .runtime.lifecycle import ServiceEntry
 from .runtime.parameters import (
     READ_LIMITS,
     ManagedParameters,
-    ParameterGroup,
     ParameterNode,
-    default_calibration_directory,
     expand_path,
+    group,
+    groups_of,
 )
+from .runtime.services import ServiceEntry
 
+NOT_ACTIVE = 'the node is not active, so no frames come in'
 COLLECT_MODES = ('still', 'request')
 
 
@@ -107,62 +108,34 @@ class CalibrationParameters(ManagedParameters):
 
 
 _OF_REQUESTS = ('model', 'interior', 'loss', 'max_iterations', 'relative_orientation', 'datum')
-_NODE = ParameterGroup(
-    CalibrationParameters,
-    settable=('collect', 'joint', 'rig_frame', 'capture_timeout', 'heal_time', 'heal_accept'),
-)
-_STILL = ParameterGroup(
-    StillOptions,
-    {'still_time_s': 'still_time', 'still_px': 'still_px', 'new_px': 'new_px'},
-    settable=('still_time', 'still_px', 'new_px'),
-)
-_PAIRING = ParameterGroup(
-    PairingOptions,
-    {'pair_by': 'pair_by', 'tolerance_s': 'pair_tolerance'},
-    settable=('pair_tolerance',),
-)
-_CALIBRATION = ParameterGroup(
-    CalibrationOptions, {name: name for name in _OF_REQUESTS}, settable=_OF_REQUESTS
-)
-_ANGLES = ParameterGroup(AngleOptions)
-_LIMITS = ParameterGroup(CollectLimits)
-PARAMETERS = (_NODE, _STILL, _PAIRING, _CALIBRATION, _ANGLES, _LIMITS, READ_LIMITS)
 
 
 @dataclass(frozen=True)
 class CalibrationSettings:
     """Values of the parameters, by group."""
 
-    node: CalibrationParameters
-    still: StillOptions
-    pairing: PairingOptions
-    calibration: CalibrationOptions
-    angles: AngleOptions
-    limits: CollectLimits
-
-
-def declare_settings(node: ParameterNode) -> CalibrationSettings:
-    """Declare the parameters of a node. Raises StartError."""
-    return CalibrationSettings(
-        node=_NODE.declare(node),
-        still=_STILL.declare(node),
-        pairing=_PAIRING.declare(node),
-        calibration=_CALIBRATION.declare(node),
-        angles=_ANGLES.declare(node),
-        limits=_LIMITS.declare(node),
+    node: CalibrationParameters = group(
+        CalibrationParameters,
+        settable=('collect', 'joint', 'rig_frame', 'capture_timeout', 'heal_time', 'heal_accept'),
     )
+    still: StillOptions = group(
+        StillOptions,
+        {'still_time_s': 'still_time', 'still_px': 'still_px', 'new_px': 'new_px'},
+        settable=('still_time', 'still_px', 'new_px'),
+    )
+    pairing: PairingOptions = group(
+        PairingOptions,
+        {'pair_by': 'pair_by', 'tolerance_s': 'pair_tolerance'},
+        settable=('pair_tolerance',),
+    )
+    calibration: CalibrationOptions = group(
+        CalibrationOptions, {name: name for name in _OF_REQUESTS}, settable=_OF_REQUESTS
+    )
+    angles: AngleOptions = group(AngleOptions)
+    limits: CollectLimits = group(CollectLimits)
 
 
-def follow_settings(
-    node: ParameterNode,
-    present: Callable[[], CalibrationSettings],
-    use: Callable[[CalibrationSettings], None],
-) -> None:
-    """Call use() with new settings whenever parameters have been set."""
-    _NODE.follow(node, lambda new: use(replace(present(), node=new)))
-    _STILL.follow(node, lambda new: use(replace(present(), still=new)))
-    _PAIRING.follow(node, lambda new: use(replace(present(), pairing=new)))
-    _CALIBRATION.follow(node, lambda new: use(replace(present(), calibration=new)))
+PARAMETERS = (*groups_of(CalibrationSettings).values(), READ_LIMITS)
 
 
 @dataclass(frozen=True)
@@ -208,6 +181,16 @@ def read_rig(node: ParameterNode, settings: Callable[[], CalibrationSettings]) -
             f'only serves saved calibrations, and there are none in {directory}'
         )
     return RigSetup(parameters.fluoroscopes, phantom, names, directory, settings)
+
+
+def default_calibration_directory(namespace: str) -> Path:
+    """Return the folder in which a calibration node of a namespace saves its calibrations.
+
+    It is fluoro_calib/<namespace> in $ROS_HOME, or in ~/.ros where that is not set. Raises
+    DataError where there is no home folder.
+    """
+    home = os.environ.get('ROS_HOME') or '~/.ros'
+    return expand_path(home) / 'fluoro_calib' / namespace.strip('/')
 
 
 class CalibrationFiles:

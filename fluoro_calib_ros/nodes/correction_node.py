@@ -35,7 +35,7 @@ from .runtime.parameters import (
     ParameterGroup,
     declare_read_limits,
 )
-from .runtime.streams import latched_qos, observations_qos
+from .runtime.topics import latched_qos, observations_qos
 
 # An integer: comparing an array with an enum member takes longer than the rest of the node.
 INVALID = int(CorrectionStatus.INVALID)

@@ -39,7 +39,8 @@ from .messages.observations import (
 )
 from .messages.points import GoodPoints, good_points_of
 from .messages.self_calibration import feedback_text
-from .runtime.streams import FaultHandlers, StreamReader, latched_qos, observations_qos
+from .runtime.streams import FaultHandlers, StreamReader
+from .runtime.topics import latched_qos, observations_qos
 
 
 class DemoError(RuntimeError):

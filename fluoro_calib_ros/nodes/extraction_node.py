@@ -43,13 +43,14 @@ from .runtime.main import run
 from .runtime.parameters import (
     READ_LIMITS,
     ManagedParameters,
-    ParameterGroup,
-    ParameterNode,
+    declare_groups,
     declare_read_limits,
     expand_path,
+    group,
+    groups_of,
 )
 from .runtime.stream import stream_faults
-from .runtime.streams import images_qos, observations_qos
+from .runtime.topics import images_qos, observations_qos
 
 MODES = ('phantom', 'markers')
 LARGEST_PX = 2**14  # of an image, for points whose image is not known yet
@@ -119,34 +120,19 @@ class ExtractionParameters(ManagedParameters):
         return declared_bodies([text for text in self.clusters if text])
 
 
-_NODE = ParameterGroup(ExtractionParameters)
-_PAIRING = ParameterGroup(PairingOptions, {'tolerance_s': 'pair_tolerance'})
-_FOLLOWING = ParameterGroup(
-    MarkerOptions,
-    {name: name for name in ('gate', 'shutter', 'lost_after', 'search_every')},
-)
-_ANGLES = ParameterGroup(AngleOptions)
-PARAMETERS = (_NODE, _PAIRING, _FOLLOWING, _ANGLES, READ_LIMITS)
-
-
 @dataclass(frozen=True)
 class ExtractionSettings:
     """Values of the parameters, by group."""
 
-    node: ExtractionParameters
-    pairing: PairingOptions
-    following: MarkerOptions
-    angles: AngleOptions
-
-
-def declare_settings(node: ParameterNode) -> ExtractionSettings:
-    """Declare the parameters of a node. Raises StartError."""
-    return ExtractionSettings(
-        node=_NODE.declare(node),
-        pairing=_PAIRING.declare(node),
-        following=_FOLLOWING.declare(node),
-        angles=_ANGLES.declare(node),
+    node: ExtractionParameters = group(ExtractionParameters)
+    pairing: PairingOptions = group(PairingOptions, {'tolerance_s': 'pair_tolerance'})
+    following: MarkerOptions = group(
+        MarkerOptions, {name: name for name in ('gate', 'shutter', 'lost_after', 'search_every')}
     )
+    angles: AngleOptions = group(AngleOptions)
+
+
+PARAMETERS = (*groups_of(ExtractionSettings).values(), READ_LIMITS)
 
 
 def read_followers(settings: ExtractionSettings, logger: Logger) -> Sequence[MakeFollower]:
@@ -223,7 +209,7 @@ class ExtractionNode(StreamNode):
     def __init__(self) -> None:
         super().__init__('extraction_node')
         declare_read_limits(self)
-        self._settings = settings = declare_settings(self)
+        self._settings = settings = declare_groups(self, ExtractionSettings)
         self.autostart = settings.node.autostart
         self.names = settings.node.fluoroscopes
         self._inputs = INPUTS[settings.node.inputs]

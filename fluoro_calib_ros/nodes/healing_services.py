@@ -18,8 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from fluoro_calib_msgs.action import Heal
 from fluoro_calib_msgs.srv import Reset
-from rclpy.action import ActionServer, CancelResponse, GoalResponse
-from rclpy.callback_groups import CallbackGroup
+from rclpy.action import CancelResponse
 from rclpy.task import Future
 
 from ..bodies.body import Body
@@ -36,18 +35,17 @@ from ..jobs.healing_versions import (
 )
 from ..jobs.result_folder import save_calibrations
 from ..photogrammetry.rig_orientation import RigOrientation
-from .calibration_output import CalibrationOutput
-from .calibration_services import NOT_ACTIVE, Cancelled
-from .calibration_settings import CalibrationFiles, RigSetup, check_folders
+from .calibration_services import Job
+from .calibration_settings import NOT_ACTIVE, check_folders
+from .exposure_input import NodeParts
 from .messages.healing import fill_healing
 from .messages.observations import ObservedFrame, frame_from_observed
-from .runtime.lifecycle import Requests, ServiceEntry, StreamNode, in_thread, wake, within
 from .runtime.parameters import expand_path
+from .runtime.services import ServiceEntry, in_thread, wake, within
 
 MAX_FRAMES = 20_000  # of a fluoroscope that are collected, whatever its rate
 MAX_SECONDS = 60.0
 FEEDBACK_S = 0.5
-RUNNING = 'refused: a healing is already running'
 CHANGED = 'the rig in use has changed meanwhile, heal it again'
 
 
@@ -104,43 +102,20 @@ class _Collection:
                 self.done.set_result(None)
 
 
-class Healing:
-    """Runs one healing at a time, in a process of its own, and keeps its outcome."""
+class Healing(Job):
+    """The action heal, which keeps its outcome until it is accepted."""
 
-    def __init__(
-        self,
-        node: StreamNode,
-        rig: RigSetup,
-        output: CalibrationOutput,
-        files: CalibrationFiles,
-        requests: Requests,
-    ) -> None:
-        self._node = node
-        self._rig = rig
-        self._output = output
-        self._files = files
-        self._requests = requests
-        self._logger = node.get_logger()
-        self._stopping = threading.Event()
-        self._running = False
-        self._thread: threading.Thread | None = None  # waits for the process of the job
+    kind = Heal
+    action = 'heal'
+    title = 'healing'
+
+    def __init__(self, parts: NodeParts) -> None:
+        super().__init__(parts)
         self._collection: _Collection | None = None
         self._healed: tuple[HealingOutcome, _Rig] | None = None  # to be accepted
         self.services = (
             ServiceEntry('accept_healing', Reset, self._on_accept),
             ServiceEntry('roll_back_healing', Reset, self._on_roll_back),
-        )
-
-    def create_action(self, group: CallbackGroup) -> ActionServer:
-        """Return the action server."""
-        return ActionServer(
-            self._node,
-            Heal,
-            'heal',
-            self._on_action,
-            goal_callback=lambda _: GoalResponse.ACCEPT,
-            cancel_callback=self._on_cancel,
-            callback_group=group,
         )
 
     def add(self, name: str, observed: ObservedFrame, angle: Callable[[], float | None]) -> None:
@@ -150,16 +125,10 @@ class Healing:
             collection.add(name, observed, angle())
 
     def stop(self) -> None:
-        """Cancel the running job."""
-        self._stopping.set()
+        """Cancel the running job, and those that are still to come."""
+        super().stop()
         if self._collection is not None:
             self._collection.finish()
-
-    def end(self) -> None:
-        """Cancel the running job, and wait for its end."""
-        self.stop()
-        if self._thread is not None:
-            self._thread.join()
 
     # -- the action
 
@@ -169,39 +138,8 @@ class Healing:
             self._collection.finish()
         return CancelResponse.ACCEPT
 
-    async def _on_action(self, goal: Any) -> Heal.Result:
-        result = Heal.Result()
-        if self._running:
-            result.message = RUNNING
-            self._logger.warning(result.message)
-            goal.abort()
-            return result
-        self._running = True
-        try:
-            with self._requests.one():
-                await self._heal(goal, result)
-            goal.succeed()
-        except Cancelled:
-            result.message = 'cancelled, nothing was changed'
-            if goal.is_cancel_requested:
-                goal.canceled()
-            else:  # the node ends
-                goal.abort()
-        except (DataError, ValueError, OSError) as error:
-            result.message = str(error)
-            self._logger.error(result.message)
-            goal.abort()
-        except Exception as error:  # a bug must reach the caller, and must not end the node
-            result.message = f'the healing failed unexpectedly: {error}'
-            self._logger.error(result.message)
-            goal.abort()
-        finally:
-            self._running = False
-            self._thread = None
-        return result
-
-    async def _heal(self, goal: Any, result: Heal.Result) -> None:
-        """Collect frames, find out what has changed, and keep it. Raises DataError, Cancelled."""
+    async def _work(self, goal: Any, result: Any) -> None:
+        """Collect frames, find out what has changed, and keep it."""
         seconds = goal.request.seconds or self._rig.settings().node.heal_time
         if not 0 < seconds <= MAX_SECONDS:
             raise DataError(f'seconds is above 0 and at most {MAX_SECONDS:g}, not {seconds:g}')
@@ -209,8 +147,7 @@ class Healing:
         self._healed = None
 
         def raise_if_cancelled() -> None:
-            if goal.is_cancel_requested or self._stopping.is_set():
-                raise Cancelled
+            self._raise_if_cancelled(goal.is_cancel_requested)
 
         frames = await self._collected(goal, rig, seconds)
         raise_if_cancelled()
@@ -299,12 +236,12 @@ class Healing:
     # -- versions
 
     def _on_accept(self, _: Reset.Request, response: Reset.Response) -> Reset.Response:
-        return self._answer(response, 'not accepted', self._accept)
+        return self._told(response, 'not accepted', self._accept)
 
     def _on_roll_back(self, _: Reset.Request, response: Reset.Response) -> Reset.Response:
-        return self._answer(response, 'not rolled back', self._roll_back)
+        return self._told(response, 'not rolled back', self._roll_back)
 
-    def _answer(
+    def _told(
         self, response: Reset.Response, refused: str, act: Callable[[], str]
     ) -> Reset.Response:
         try:

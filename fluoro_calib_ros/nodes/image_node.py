@@ -43,7 +43,7 @@ from .runtime.parameters import (
     ParameterGroup,
     declare_read_limits,
 )
-from .runtime.streams import images_qos, latched_qos
+from .runtime.topics import images_qos, latched_qos
 
 RAW = (Image, 'image_raw')
 COMPRESSED = (CompressedImage, 'image_raw/compressed')

@@ -22,10 +22,10 @@ from ..errors import DataError
 from ..io.bags.reader import TopicInfo, iterate_messages, topics_of
 from ..options import option
 from .runtime.diagnostics import StartError, Trace, one_line
-from .runtime.lifecycle import ServiceEntry, create_services
 from .runtime.main import run
 from .runtime.parameters import READ_LIMITS, ParameterGroup, ParameterNode, declare_read_limits
-from .runtime.streams import (
+from .runtime.services import ServiceEntry, create_services
+from .runtime.topics import (
     clock_qos,
     installed_type,
     observations_qos,

@@ -51,7 +51,7 @@ from .runtime.parameters import (
     declare_read_limits,
 )
 from .runtime.stream import Stream, stream_faults
-from .runtime.streams import latched_qos, observations_qos
+from .runtime.topics import latched_qos, observations_qos
 
 VIEWS = 'corrected_observations'
 

@@ -56,7 +56,7 @@ from .runtime.stream import (
     refused_messages,
     unpaired_frames,
 )
-from .runtime.streams import observations_qos
+from .runtime.topics import observations_qos
 
 COUNTED_STATUSES = {
     'outside': OUTSIDE,

@@ -31,13 +31,8 @@ from .runtime.diagnostics import (
 )
 from .runtime.main import run
 from .runtime.parameters import ParameterGroup, ParameterNode, expand_path
-from .runtime.streams import (
-    FaultHandlers,
-    StreamReader,
-    TopicDiscovery,
-    definition_of,
-    installed_type,
-)
+from .runtime.streams import FaultHandlers, StreamReader
+from .runtime.topics import TopicDiscovery, definition_of, installed_type
 
 DISCOVERY_S = 0.1  # period in which new topics are looked for
 JOINT_STATES = 'joint_states'

@@ -36,7 +36,7 @@ from .messages.observations import message_from_frame, set_number_and_stamp, sta
 from .runtime.diagnostics import StartError, Trace
 from .runtime.main import run
 from .runtime.parameters import ParameterGroup, ParameterNode, RigParameters
-from .runtime.streams import (
+from .runtime.topics import (
     images_qos,
     observations_qos,
     qos_overrides,

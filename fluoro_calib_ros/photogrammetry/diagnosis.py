@@ -27,7 +27,7 @@ from .unknowns import EXTERIOR_SIZE, Parameters
 
 # Correlation above which two unknowns are reported, and how many pairs at most.
 HIGH_CORRELATION = 0.95
-MAX_CORRELATIONS = 20
+MAX_CORRELATIONS = 20  # pairs that are listed
 # Eigenvalue of the scaled normal matrix below which it is a rounding error.
 MAX_OPEN_EIGENVALUE = 1e-11
 # A network is judged at this image noise at most, so that distorted images do not make it look
@@ -192,15 +192,13 @@ def _flatness_remark(network: Network) -> str:
     return '; the beads lie nearly in one plane' if flat else ''
 
 
-def reduced_normal_matrix(
-    network: Network, parameters: Parameters, noise_px: float = NOMINAL_NOISE_PX
-) -> np.ndarray:
+def reduced_normal_matrix(network: Network, parameters: Parameters) -> np.ndarray:
     """Normal matrix of the exposures and free global unknowns, object points eliminated.
 
     Shape (6m + G, 6m + G), with the sources in the sensor frame and all weights equal. It may be
     singular.
     """
-    noise = Noise('gaussian', noise_px / float(np.median(network.sigma)))
+    noise = Noise('gaussian', NOMINAL_NOISE_PX / float(np.median(network.sigma)))
     equations = normal_equations(network, parameters, 0.0, noise)
     elimination = EliminatePoints(network)
     system = elimination.bordered_system(replace(equations, gauge=None))

@@ -21,11 +21,6 @@ from .rotations import vector_from_matrix
 
 # Exterior orientations that are known beforehand: weighted observations of the adjustment.
 
-# Standard deviations that stand for an orientation that is fixed: a thousandth of what images of
-# 0.25 px noise determine.
-HELD_SD_MM = 3e-4
-HELD_SD_RAD = 1e-7
-
 
 @dataclass(frozen=True)
 class ExteriorPrior:

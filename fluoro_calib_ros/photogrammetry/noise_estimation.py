@@ -42,30 +42,13 @@ def adjust_and_estimate_noise(
     noise: Noise = DEFAULT_NOISE,
     options: SolverOptions = DEFAULT_OPTIONS,
 ) -> Adjustment:
-    """Adjust a network and estimate its noise model.
+    """Adjust a network and estimate its noise model; see `adjust` for the arguments.
 
-    Parameters
-    ----------
-    network : Network
-    start : Parameters
-        Start values.
-    correction : (N, 2) ndarray, optional
-        Correction of the image points [px], without that of the additional parameters.
-    noise : Noise
-        Loss and start values of the noise model.
-    options : SolverOptions
-        Options of the last adjustment; those before it have a looser tolerance.
+    noise: loss and start values of the noise model. options: of the last adjustment; those before
+    it have a looser tolerance.
 
-    Returns
-    -------
-    Adjustment
-        `converged` is False where adjustment or scale did not settle. `steps` are those of the
-        last adjustment.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        Where the network does not determine the unknowns.
+    `converged` of the result is False where adjustment or scale did not settle, `steps` are those
+    of the last adjustment. Raises LinAlgError where the network does not determine the unknowns.
     """
     correction = np.zeros_like(network.uv) if correction is None else correction
     _, q = residuals_and_q(network, start, correction, noise)

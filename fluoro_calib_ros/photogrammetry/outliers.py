@@ -67,19 +67,11 @@ class TargetTest:
     ray_square: NDArray[np.float64]
 
 
-def find_outliers(
-    network: Network,
-    adjustment: Adjustment,
-    precision: Precision,
-    significance: float = SIGNIFICANCE,
-) -> Outliers:
-    """Image points and targets that fail the test.
-
-    significance: probability of any false alarm of each of the two tests.
-    """
-    targets = target_statistics(network, adjustment, precision, significance)
+def find_outliers(network: Network, adjustment: Adjustment, precision: Precision) -> Outliers:
+    """Image points and targets that fail the test."""
+    targets = target_statistics(network, adjustment, precision)
     wrong = np.flatnonzero(targets.value > targets.critical)
-    image, critical_image = image_statistics(network, adjustment, precision, significance)
+    image, critical_image = image_statistics(network, adjustment, precision)
     # An image point that fits its target where the images see it is not at fault.
     explained = np.isin(network.point, wrong) & (targets.ray_square <= critical_image)
     found = np.flatnonzero((image > critical_image) & ~explained)
@@ -96,10 +88,7 @@ def find_outliers(
 
 
 def image_statistics(
-    network: Network,
-    adjustment: Adjustment,
-    precision: Precision,
-    significance: float = SIGNIFICANCE,
+    network: Network, adjustment: Adjustment, precision: Precision
 ) -> tuple[np.ndarray, float]:
     """Statistics (N,) of the image points and their critical value.
 
@@ -124,7 +113,7 @@ def image_statistics(
     if noise.loss == 'gaussian':
         # Refer to the variance estimated without the image point, which contributes to it.
         value = value * (redundancy - 2) / np.maximum(redundancy - value, 1e-3 * redundancy)
-    critical = 2 * _f_limit(significance / count, min(noise.nu, redundancy - 2))
+    critical = 2 * _f_limit(SIGNIFICANCE / count, min(noise.nu, redundancy - 2))
     return np.where(tested, value, np.nan), float(critical)
 
 
@@ -139,10 +128,7 @@ def _f_limit(probability: float, freedom: float) -> float:
 
 
 def target_statistics(
-    network: Network,
-    adjustment: Adjustment,
-    precision: Precision,
-    significance: float = SIGNIFICANCE,
+    network: Network, adjustment: Adjustment, precision: Precision
 ) -> TargetTest:
     """Test the surveyed coordinates of the targets.
 
@@ -163,7 +149,7 @@ def target_statistics(
     standardised = np.linalg.solve(covariance[testable], tested[..., None])[..., 0]
     value = np.full(n, np.nan)
     value[testable] = np.einsum('ni,ni->n', tested, standardised)
-    critical = special.chdtri(3, significance / max(int(testable.sum()), 1))
+    critical = special.chdtri(3, SIGNIFICANCE / max(int(testable.sum()), 1))
     return TargetTest(value, float(critical), np.where(testable[:, None], offset, 0.0), square)
 
 

@@ -97,7 +97,7 @@ def _normalised(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return (points - mean) / size, back
 
 
-def robust_homography(xy: np.ndarray, uv: np.ndarray, seed: int = 0) -> NDArray[np.float64]:
+def robust_homography(xy: np.ndarray, uv: np.ndarray) -> NDArray[np.float64]:
     """Homography (3, 3) of targets of which up to half may be falsely matched.
 
     The sample with the least median of squared residuals (Rousseeuw 1984) is refined on all points
@@ -109,7 +109,7 @@ def robust_homography(xy: np.ndarray, uv: np.ndarray, seed: int = 0) -> NDArray[
     spread = np.linalg.svd(uv - uv.mean(axis=0), compute_uv=False)
     if spread[1] <= MIN_FLATNESS * spread[0]:
         raise DataError('all image points lie on one line or in one place')
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     samples = np.argsort(rng.random((SAMPLES, len(xy))), axis=1)[:, :SAMPLE_SIZE]
     candidates = homography(xy[samples], uv[samples])
     squared = squared_residuals(candidates, xy, uv)

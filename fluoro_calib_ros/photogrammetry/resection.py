@@ -157,7 +157,7 @@ def robust_variance(squared: np.ndarray) -> float:
     return max(np.median(squared) / (2 * np.log(2)), MIN_VARIANCE)
 
 
-def robust_dlt(xyz: np.ndarray, uv: np.ndarray, seed: int = 0) -> NDArray[np.float64]:
+def robust_dlt(xyz: np.ndarray, uv: np.ndarray) -> NDArray[np.float64]:
     """Projection matrix (3, 4) of targets of which up to half may be falsely matched.
 
     xyz (n, 3) [mm] and uv (n, 2) [px] of n >= 8 targets. Raises DataError where the targets are
@@ -177,7 +177,7 @@ def robust_dlt(xyz: np.ndarray, uv: np.ndarray, seed: int = 0) -> NDArray[np.flo
     spread = np.linalg.svd(uv - uv.mean(axis=0), compute_uv=False)
     if spread[1] <= MIN_FLATNESS * spread[0]:
         raise DataError('all image points lie on one line or in one place')
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     samples = np.argsort(rng.random((SAMPLES, len(xyz))), axis=1)[:, :SAMPLE_SIZE]
     candidates = direct_linear_transformation(
         xyz[samples], uv[samples], least=least_vectors_with_last_one
@@ -196,7 +196,7 @@ def robust_dlt(xyz: np.ndarray, uv: np.ndarray, seed: int = 0) -> NDArray[np.flo
 
 
 def robust_p3p(
-    xyz: np.ndarray, uv: np.ndarray, interior: np.ndarray, seed: int = 0
+    xyz: np.ndarray, uv: np.ndarray, interior: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rotation (3, 3) and position (3,) [mm] of few targets of which up to half may be false.
 
@@ -205,7 +205,7 @@ def robust_p3p(
     that of the half of the targets that fits it (SQPnP of Terzakis and Lourakis, ECCV 2020), if it
     is better. xyz (n, 3), uv (n, 2), interior (3,) [px]. Raises DataError where there is none.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     rays = (uv - interior[:2]) / interior[2]
     best: tuple[float, np.ndarray, np.ndarray] | None = None
 

@@ -28,9 +28,10 @@ from numpy.typing import NDArray
 from .rotations import cross_matrix, matrix_from_vector, vector_from_matrix
 
 POSE_SIZE = 6  # translation [mm], rotation vector [rad]
-# Standard deviations that stand for a rigid mounting: a thousandth of what one pair of exposures
-# determines from images of 0.25 px noise. The solution is that of the limit within some 1e-5
-# standard deviations, and rounding errors are still far away.
+# Standard deviations that stand for a rigid mounting, or for an orientation that is fixed: a
+# thousandth of what one pair of exposures determines from images of 0.25 px noise. The solution
+# is that of the limit within some 1e-5 standard deviations, and rounding errors are still far
+# away.
 RIGID_SD_MM = 3e-4
 RIGID_SD_RAD = 1e-7
 
@@ -74,7 +75,7 @@ class RelativePose:
 
 
 EXTERIOR_SIZE = 6  # source T [mm], rotation vector w [rad]
-POINT_SIZE = 3
+POINT_SIZE = 3  # coordinates [mm]
 INTERIOR_SIZE = 3  # xp, yp, c [px]
 
 

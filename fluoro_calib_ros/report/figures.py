@@ -26,7 +26,6 @@ from ..correction.base import Correction, CorrectionModel
 from ..exposures.phantom import Drawing
 from .tables import model_text
 
-DPI = 120
 STYLE = {
     'font.size': 11,
     'axes.titlesize': 12,
@@ -46,7 +45,7 @@ AFTER = BLUE
 
 def new_figure(width: float, height: float, title: str, layout: Any = 'constrained') -> Figure:
     """An empty figure; width and height in inches."""
-    figure = Figure(figsize=(width, height), dpi=DPI, layout=layout)
+    figure = Figure(figsize=(width, height), dpi=120, layout=layout)
     figure.suptitle(title)
     return figure
 
@@ -59,8 +58,7 @@ def png_bytes(figure: Figure) -> bytes:
 
 
 INCH = 0.33  # of a place, so that an id of four digits can be read
-MAX_INCH = 60.0
-ID_POINTS = 6
+MAX_INCH = 60.0  # of the longer side, however many places a sheet has
 EDGE = 0.8  # of a pitch around the places
 
 
@@ -113,7 +111,7 @@ def _draw_layer(axes: matplotlib.axes.Axes, drawing: Drawing, layer: int, radius
             textcoords='offset points',
             ha='center',
             va='center',
-            fontsize=ID_POINTS,
+            fontsize=6,
             color=RED if is_blocked else BLACK,
         )
 
@@ -130,11 +128,11 @@ def picture_bytes(figure: Figure, suffix: str) -> bytes:
 
 # Along the longer side of the image.
 FIELD_CELLS = 160
-FIELD_ARROWS = 17
-SCALE_CELLS = 48
+FIELD_ARROWS = 17  # across the longer side of the image
+SCALE_CELLS = 48  # across it, for the largest correction
 # Of the longer side, around the image for the arrows at its border, and twice that below it.
 MARGIN = 0.09
-MIN_ARROW_PX = 1e-6
+MIN_ARROW_PX = 1e-6  # where there is no correction
 ROUND_NUMBERS = (1, 1.5, 2, 3, 5, 7)
 
 

@@ -149,7 +149,6 @@ def _names_text(names: Sequence[str]) -> str:
 
 
 ARROW_SHARE = 0.03  # of the image, of the largest of most residuals
-BINS = 41
 
 
 def residual_map(residuals: Residuals, name: str, image_size: tuple[int, int]) -> Figure:
@@ -230,7 +229,7 @@ def distribution(residuals: Residuals, name: str) -> Figure:
     left, right = figure.subplots(1, 2)
     sd = 1.4826 * float(np.median(np.abs(values)))
     limit = 5 * max(sd, 1e-9)
-    left.hist(np.clip(values, -limit, limit), BINS, color=AFTER, alpha=0.6, density=True)
+    left.hist(np.clip(values, -limit, limit), 41, color=AFTER, alpha=0.6, density=True)
     x = np.linspace(-limit, limit, 200)
     normal = np.exp(-((x / max(sd, 1e-9)) ** 2) / 2) / (np.sqrt(2 * np.pi) * max(sd, 1e-9))
     left.plot(x, normal, color=BLACK, linewidth=1)

@@ -116,7 +116,7 @@ def residuals_of(
 
 MIN_HISTOGRAM_SD = 5.0  # standard deviations to either side
 MAX_HISTOGRAM_SD = 15.0
-BIN_SD = 0.25
+BIN_SD = 0.25  # width of a bar, in standard deviations
 STRIPES = 16  # of the image, for the running median
 COORDINATES = ('u', 'v')
 

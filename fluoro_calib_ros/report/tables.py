@@ -22,7 +22,7 @@ from ..photogrammetry.rig_orientation import RigOrientation
 
 # Widths of the columns of quantities and of fluoroscopes.
 LABEL_WIDTH = 36
-COLUMN_WIDTH = 20
+COLUMN_WIDTH = 20  # of the values of a fluoroscope, in characters
 
 
 def summary_table(result: CalibrationResult, latency_ms: Mapping[str, float] | None = None) -> str:

@@ -105,7 +105,7 @@ def detect_beads(
     return target_id[found], seen
 
 
-CLUSTER_MARKERS = 6
+CLUSTER_MARKERS = 6  # of a rigid body
 # Centres of the clusters [mm]; the first two are on the one bone.
 CLUSTER_CENTRES = np.array(
     [
@@ -165,7 +165,9 @@ def simulate_tracking(
     times_s = [index / rate_hz for index in range(round(seconds * rate_hz))]
     points = np.array([_markers_at(time_s, shapes) for time_s in times_s])
     points = points.reshape(len(times_s), len(ids), 3)
-    frames, ideal = image_frames(rig, points, ids, times_s, noise_px, rng, start)
+    frames, ideal = image_frames(
+        rig, points, ids, times_s, noise_px=noise_px, rng=rng, start=start
+    )
     return SimulatedTracking(frames, ids, points, ideal)
 
 
@@ -219,30 +221,12 @@ def simulate_grid(
     count: int,
     seed: int = 0,
     noise_px: float = 0.25,
-    start: StreamStart | None = None,
-    rate_hz: float = 30.0,
 ) -> dict[str, list[Frame]]:
-    """Simulate frames of a grid of 2,028 points in front of the detector.
+    """Simulate count frames of a grid of 2,028 points in front of the detector, at 30 Hz.
 
-    Parameters
-    ----------
-    rig : VirtualRig
-    count : int
-        Number of frames of each fluoroscope.
-    seed : int
-        The same seed gives the same frames.
-    noise_px : float
-        Standard deviation of an image coordinate.
-    start : StreamStart, optional
-    rate_hz : float
-        Frame rate.
-
-    Returns
-    -------
-    dict of str to list of Frame
-        By fluoroscope.
+    seed: the same one gives the same frames. noise_px: standard deviation of an image coordinate.
     """
-    start = start or StreamStart()
+    start = StreamStart()
     rng = np.random.default_rng([seed, 5])
     frames = {}
     for fluoroscope in rig.fluoroscopes:
@@ -255,7 +239,7 @@ def simulate_grid(
         of_fluoroscope = []
         for index in range(count):
             observed = np.round(distorted + rng.normal(0, noise_px, distorted.shape), DECIMALS)
-            time_s = index / rate_hz
+            time_s = index / 30.0
             of_fluoroscope.append(start.frame(fluoroscope, index, time_s, ids, observed))
         frames[fluoroscope.name] = of_fluoroscope
     return frames

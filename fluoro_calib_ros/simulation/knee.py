@@ -23,7 +23,7 @@ from ..photogrammetry.rotations import matrix_from_vector
 from .exposures import image_frames
 from .rig import StreamStart, VirtualRig
 
-CT_SD_MM = 0.1
+CT_SD_MM = 0.1  # of a coordinate of a marker
 SIDE = 'right'
 JOINT = 'knee'
 CONVENTION = 'grood_suntay_knee'
@@ -54,9 +54,9 @@ LANDMARKS_MM = {
 # et al., J. Biomech. 41 (2008) 1639; the largest residual is 0.44 degrees.
 GAIT_COS_DEG = (23.338, -1.981, -14.122, -0.619, -0.895, -0.598)
 GAIT_SIN_DEG = (-18.904, 6.962, 4.516, 0.641, 0.742)
-CYCLE_S = 1.1
-THIGH_MM = 425.0
-SHANK_MM = 375.0
+CYCLE_S = 1.1  # of a step of walking
+THIGH_MM = 425.0  # length
+SHANK_MM = 375.0  # length
 GRAVITY = 9810.0  # mm/s^2
 
 # Landing from 0.2 m on one leg. The pulse of the tibia, t exp(-t/RISE_S), takes up its speed and
@@ -65,8 +65,8 @@ DROP_MM = 200.0
 RISE_S = 0.003
 FLEX_S = 0.05  # time to the largest angular velocity of the knee, 370 degrees a second
 FALL_S = 0.06  # recorded before the contact
-LANDING_S = 0.4
-LANDING_HZ = 500.0
+LANDING_S = 0.4  # recorded
+LANDING_HZ = 500.0  # frame rate
 
 
 @dataclass(frozen=True)
@@ -273,7 +273,13 @@ def simulate_knee(
     )
     rng = np.random.default_rng([seed, 12])
     frames, _ = image_frames(
-        rig, points, ids, motion.times_s.tolist(), noise_px, rng, start or StreamStart()
+        rig,
+        points,
+        ids,
+        motion.times_s.tolist(),
+        noise_px=noise_px,
+        rng=rng,
+        start=start or StreamStart(),
     )
     return SimulatedKnee(frames, motion)
 

@@ -41,7 +41,7 @@ BONE_ATTENUATION = 0.028  # of compact bone less that of soft tissue [1/mm]
 HIDING = 0.02  # light that passes a disc of metal
 HIDING_PX = (7.0, 11.0)  # radius of such a disc
 HIDDEN_FRAMES = (3, 25)  # how long a bead is hidden
-FIRST_ID = 1001
+FIRST_ID = 1001  # of the markers
 
 
 @dataclass(frozen=True)

@@ -22,9 +22,9 @@ from ..photogrammetry.collinearity import project
 from ..photogrammetry.rotations import matrix_from_vector
 
 IMAGE_SIZE = (1024, 1024)
-CUBE_MM = 260.0
-BEADS = 503
-SURVEY_SD_MM = 0.1
+CUBE_MM = 260.0  # edge of the phantom
+BEADS = 503  # of the phantom
+SURVEY_SD_MM = 0.1  # of a coordinate of a bead
 BETWEEN_DEG = 84.0  # angle between the axes of neighbouring fluoroscopes
 
 # Rotation (3, 3) and shift (3,) [mm] that take points of the phantom into the rig frame.
@@ -144,9 +144,9 @@ def virtual_rig(
 
 
 EDGE_PX = 512.0  # half the width of an image; the parts of a field are given by their size there
-MAX_ITERATIONS = 100
-TOLERANCE_PX = 1e-11
-RIPPLES = 14
+MAX_ITERATIONS = 100  # of the inversion of a field
+TOLERANCE_PX = 1e-11  # rounding
+RIPPLES = 14  # parts of a random field
 
 
 @dataclass(frozen=True)
@@ -189,19 +189,17 @@ class DistortionField:
         return observed
 
 
-def random_field(
-    rng: np.random.Generator, strength: float = 1.0, image_size: tuple[int, int] = (1024, 1024)
-) -> DistortionField:
+def random_field(rng: np.random.Generator, strength: float = 1.0) -> DistortionField:
     """Draw a field at random.
 
     At strength 1 it is some 15 px along the border of the image and 26 to 35 px in its corners.
     """
     sign = rng.choice([-1.0, 1.0], size=4)
-    centre = np.asarray(image_size) / 2 - 0.5 + rng.uniform(-20, 20, 2)
+    centre = np.asarray(IMAGE_SIZE) / 2 - 0.5 + rng.uniform(-20, 20, 2)
     ripples = np.column_stack(
         [
-            rng.uniform(0, image_size[0], RIPPLES),
-            rng.uniform(0, image_size[1], RIPPLES),
+            rng.uniform(0, IMAGE_SIZE[0], RIPPLES),
+            rng.uniform(0, IMAGE_SIZE[1], RIPPLES),
             rng.uniform(70, 130, RIPPLES),
             rng.uniform(-1.2, 1.2, (RIPPLES, 2)),
         ]

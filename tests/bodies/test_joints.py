@@ -657,7 +657,7 @@ def test_two_joints_of_one_bone_are_no_cycle():
 
 def test_the_documentation_has_all_names():
     """Conventions, names of angles and translations, landmarks and states."""
-    text = (Path(__file__).parents[2] / 'docs' / 'joints.md').read_text()
+    text = (Path(__file__).parents[2] / 'docs' / 'bodies.md').read_text()
     names = [name for frame in LANDMARK_FRAMES.values() for name in frame.landmarks]
     for name in CLINICAL:
         names += [name, *CONVENTIONS[name].angles]

@@ -11,12 +11,8 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
-from fluoro_calib_ros.nodes.runtime.parameters import (
-    asks_for_help,
-    help_text,
-    parameters_of,
-    unknown_parameters,
-)
+from fluoro_calib_ros.nodes.runtime.main import asks_for_help, help_text
+from fluoro_calib_ros.nodes.runtime.parameters import parameters_of, unknown_parameters
 
 NODES = (
     'bridge_node',

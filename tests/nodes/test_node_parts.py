@@ -30,8 +30,8 @@ from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import (
 )
 from fluoro_calib_ros.nodes.messages.image import ImageConverter
 from fluoro_calib_ros.nodes.runtime.diagnostics import Refused, one_line
-from fluoro_calib_ros.nodes.runtime.lifecycle import Requests
 from fluoro_calib_ros.nodes.runtime.parameters import check_timeout, expand_path
+from fluoro_calib_ros.nodes.runtime.services import Requests
 
 SIZE = (64, 48)
 ROOT = Path(__file__).parents[2]
@@ -227,13 +227,17 @@ def test_orientation_of_outdated_calibrations_is_rejected(monkeypatch):
         destroy_timer=lambda _: None,
         readers=['active'],
         executor=None,
+        get_logger=lambda: None,
     )
     rig = SimpleNamespace(
         names=('a', 'b'),
         required_phantom=lambda: rigs.rig().phantom,
         settings=lambda: SimpleNamespace(node=SimpleNamespace(rig_frame='rig')),
     )
-    service = OrientationService(node, rig, output, Requests())
+    parts = SimpleNamespace(
+        node=node, rig=rig, exposures=None, output=output, files=None, requests=Requests()
+    )
+    service = OrientationService(parts)
 
     async def recalibrated():
         output.calibrations.update(new)

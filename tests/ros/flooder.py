@@ -15,7 +15,7 @@ from fluoro_calib_msgs.msg import TargetObservations
 from rclpy.serialization import serialize_message
 
 from fluoro_calib_ros.nodes.messages.observations import float64_field, uint32_field
-from fluoro_calib_ros.nodes.runtime.streams import observations_qos
+from fluoro_calib_ros.nodes.runtime.topics import observations_qos
 
 POINTS = 100_000
 PERIOD_S = 1e-4

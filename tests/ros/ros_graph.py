@@ -55,7 +55,7 @@ from visualization_msgs.msg import MarkerArray
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.nodes.messages.bodies import FORMS
 from fluoro_calib_ros.nodes.messages.observations import message_from_frame
-from fluoro_calib_ros.nodes.runtime.streams import OBSERVATION_DEPTH, latched_qos, observations_qos
+from fluoro_calib_ros.nodes.runtime.topics import OBSERVATION_DEPTH, latched_qos, observations_qos
 
 ROOT = Path(__file__).parents[2]
 BAGS = ROOT / 'bags'

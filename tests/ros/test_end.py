@@ -17,7 +17,7 @@ from ros_graph import ROOT
 
 from fluoro_calib_ros.correction.registry import create_model
 from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import message_from_calibration
-from fluoro_calib_ros.nodes.runtime.streams import latched_qos
+from fluoro_calib_ros.nodes.runtime.topics import latched_qos
 
 SIDE = 8192  # px; the preparation of this calibration takes a minute
 POINTS = 200_000

@@ -25,7 +25,7 @@ from fluoro_calib_ros.io.phantom import read_phantom, write_phantom
 from fluoro_calib_ros.jobs.calibration import run_calibration
 from fluoro_calib_ros.jobs.extraction import ExtractionRequest, run_extraction
 from fluoro_calib_ros.nodes.messages.observations import stamp_from_nanoseconds
-from fluoro_calib_ros.nodes.runtime.streams import images_qos
+from fluoro_calib_ros.nodes.runtime.topics import images_qos
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.simulation.exposures import simulate_tracking
 from fluoro_calib_ros.simulation.rig import virtual_rig

@@ -18,7 +18,7 @@ from sensor_msgs.msg import CameraInfo
 from fluoro_calib_ros.nodes.correction_node import CorrectionNode
 from fluoro_calib_ros.nodes.messages.observations import message_from_frame
 from fluoro_calib_ros.nodes.runtime import diagnostics
-from fluoro_calib_ros.nodes.runtime.streams import latched_qos, observations_qos
+from fluoro_calib_ros.nodes.runtime.topics import latched_qos, observations_qos
 
 
 def drift_observations(status):

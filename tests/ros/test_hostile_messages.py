@@ -19,7 +19,7 @@ from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.io.calibration import load_calibration
 from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import message_from_calibration
 from fluoro_calib_ros.nodes.messages.observations import message_from_frame
-from fluoro_calib_ros.nodes.runtime.streams import latched_qos
+from fluoro_calib_ros.nodes.runtime.topics import latched_qos
 
 FRAMES = 100
 LARGE = 10  # messages of the flood that are seen to be shed

@@ -14,7 +14,7 @@ from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from ros_graph import BAGS
 
-from fluoro_calib_ros.nodes.runtime.streams import services_qos
+from fluoro_calib_ros.nodes.runtime.topics import services_qos
 
 MANAGED = {
     'correction_node': {},

@@ -26,7 +26,7 @@ from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import (
     message_of_corrected_stream,
 )
 from fluoro_calib_ros.nodes.messages.observations import stamp_from_nanoseconds
-from fluoro_calib_ros.nodes.runtime.streams import images_qos, latched_qos
+from fluoro_calib_ros.nodes.runtime.topics import images_qos, latched_qos
 
 SIZE = (1024, 1024)
 DEPTHS = {'mono8': np.uint8, 'mono16': np.uint16}

@@ -38,7 +38,8 @@ from fluoro_calib_ros.jobs.followers import MarkerSettings
 from fluoro_calib_ros.jobs.sources import BagSelection, read_calibrated_source
 from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import message_from_calibration
 from fluoro_calib_ros.nodes.messages.observations import stamp_from_nanoseconds
-from fluoro_calib_ros.nodes.runtime.streams import FaultHandlers, StreamReader, images_qos
+from fluoro_calib_ros.nodes.runtime.streams import FaultHandlers, StreamReader
+from fluoro_calib_ros.nodes.runtime.topics import images_qos
 
 START_NS = 10**18
 STEP_NS = 50_000_000  # between frames, and between states

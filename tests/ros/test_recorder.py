@@ -13,7 +13,7 @@ from std_msgs.msg import String
 from fluoro_calib_ros.io.bags.metadata import type_hash
 from fluoro_calib_ros.io.bags.reader import read_frames, topics_of
 from fluoro_calib_ros.io.bags.salvage import inspect_bag, recover_bag
-from fluoro_calib_ros.nodes.runtime.streams import latched_qos
+from fluoro_calib_ros.nodes.runtime.topics import latched_qos
 
 
 def recorded(status, key='messages'):

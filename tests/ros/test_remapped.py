@@ -7,7 +7,7 @@ import pytest
 from fluoro_calib_msgs.msg import CorrectedObservations, TargetObservations
 from ros_graph import value_of
 
-from fluoro_calib_ros.nodes.runtime.streams import observations_qos
+from fluoro_calib_ros.nodes.runtime.topics import observations_qos
 
 
 @pytest.mark.parametrize(

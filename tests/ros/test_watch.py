@@ -8,7 +8,7 @@ from ros_graph import NAMES, standing
 from sensor_msgs.msg import Image
 
 from fluoro_calib_ros.nodes.dashboard.watch import SessionClient
-from fluoro_calib_ros.nodes.runtime.streams import latched_qos
+from fluoro_calib_ros.nodes.runtime.topics import latched_qos
 
 
 def test_session_is_run_from_the_dashboard(graph, exposures, tmp_path, monkeypatch):

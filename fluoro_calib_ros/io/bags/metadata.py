@@ -317,17 +317,15 @@ _POLICY_NAMES = {
 }
 
 
-def profile(
-    reliability: str = 'reliable', durability: str = 'volatile', depth: int = 10
-) -> dict[str, Any]:
-    """Return a QoS profile {policy: value} as rosbag2 writes it.
+def profile(durability: str = 'volatile', depth: int = 10) -> dict[str, Any]:
+    """Return a reliable QoS profile {policy: value} as rosbag2 writes it.
 
     Keep last, without deadline and lifespan.
     """
     return {
         'history': 'keep_last',
         'depth': depth,
-        'reliability': reliability,
+        'reliability': 'reliable',
         'durability': durability,
         'deadline': dict(_INFINITE),
         'lifespan': dict(_INFINITE),
@@ -385,7 +383,7 @@ _Dumper.add_representer(
 )
 
 
-BAG_VERSION = 9
+BAG_VERSION = 9  # of metadata.yaml, as rosbag2 of Jazzy writes it
 NO_MESSAGE_NS = 2**63 - 1  # starting time of a bag without messages [ns]
 
 

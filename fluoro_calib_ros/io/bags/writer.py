@@ -112,7 +112,9 @@ class BagWriter:
         try:
             with _writing(self.path):
                 self._close_file()
-                write_text(os.path.join(self._folder, 'metadata.yaml'), self._metadata_yaml())
+                document = bag_metadata(self._topics.values(), self._files, self._total)
+                text = to_yaml({'rosbag2_bagfile_information': document}) + '\n'
+                write_text(os.path.join(self._folder, 'metadata.yaml'), text)
                 if not self._live:
                     _put_in_place(self._folder, self.path, self._overwrite)
         except BaseException:
@@ -284,10 +286,6 @@ class BagWriter:
     def _write_metadata(self, topics: Iterable[BagTopic]) -> None:
         document = bag_metadata(topics, self._files, self._total)
         self._mcap.add_metadata('rosbag2', {'serialized_metadata': to_yaml(document)})
-
-    def _metadata_yaml(self) -> str:
-        document = bag_metadata(self._topics.values(), self._files, self._total)
-        return to_yaml({'rosbag2_bagfile_information': document}) + '\n'
 
     def _abandon(self) -> None:
         """Close the file; delete the folder unless the bag is a recording."""

@@ -61,7 +61,7 @@ COLUMNS = (
 )
 _FIRST = re.compile(r'(?P<body>.+)_R11(?P<filter>_[\d.]+Hz)?')
 ROTATION_TOLERANCE = 1e-6  # rounding of 12 digits is far below
-LAST_TOLERANCE = 1e-9
+LAST_TOLERANCE = 1e-9  # of the last row, 0, 0, 0, 1
 
 
 def _read_xmalab(path: Path, settings: FileSettings) -> Content:

@@ -28,6 +28,7 @@ from ...exposures.frame import Frame, Frames, points_on_image
 from ...exposures.phantom import Phantom, first_repeated
 from ..access import make_folder, write_text
 from .content import (
+    Y_UP_TO_DOWN,
     Camera,
     Content,
     FileSettings,
@@ -44,8 +45,6 @@ from .xmalab_points import camera_order
 
 NAME = 'bundle'  # of the files written
 WIDTHS = {'.pho': 8, '.iop': 25, '.eop': 8, '.xyz': 7}
-# x right, y up, z backwards -> x right, y down, z forwards.
-_AXES = np.diag([1.0, -1.0, -1.0])
 _SIGMA_PX = 1.0  # of observations whose precision is unknown
 
 
@@ -203,7 +202,7 @@ def _station(row: Row, cameras: _Cameras, mm: float) -> Station:
     return Station(
         cameras.fluoroscope(number),
         cameras.exposures[number],
-        _AXES @ turn,
+        Y_UP_TO_DOWN @ turn,
         from_units(np.array(values[:3]), mm),
     )
 
@@ -288,7 +287,7 @@ def _iop(path: Path, camera: Camera, number: int) -> str:
 
 
 def _eop(station: Station, numbering: _Numbering, mm: float) -> str:
-    turn = (_AXES @ station.rotation).T
+    turn = (Y_UP_TO_DOWN @ station.rotation).T
     angles = Rotation.from_matrix(turn).as_euler('XYZ', degrees=True)
     number = numbering.station(station.fluoroscope, station.exposure)
     camera = numbering.camera[station.fluoroscope]

@@ -22,6 +22,8 @@ from ...exposures.names import Names
 from ...exposures.phantom import Phantom
 from ..access import PathLike, check_safe_name, make_folder, write_text
 
+# Camera axes x right, y up, z backwards -> x right, y down, z forwards.
+Y_UP_TO_DOWN = np.diag([1.0, -1.0, -1.0])
 UNITS_MM = {'mm': 1.0, 'cm': 10.0, 'm': 1000.0}
 # Attributes of a Content, as messages call them.
 PARTS = {

@@ -64,14 +64,14 @@ from .tables import (
     write_frames,
 )
 
-MISSING = -1.0
+MISSING = -1.0  # residual of a point that is not there (C3D)
 STEPS = 255  # of the byte of a residual, in units of POINT:SCALE
 # Of the process that reads: to start, for each byte of the file, and at most.
 BASE_SECONDS = 10
 SECONDS_OF_BYTE = 1e-6
 MAX_SECONDS = 60
 MAX_FRAME = 65535  # the header counts in uint16
-_MAGIC = 0x50
+_MAGIC = 0x50  # second byte of a C3D file
 _INTEL = 84  # processor type
 BLOCK = 512  # bytes
 ROTATION_TOLERANCE = 1e-4  # float32, and programs that compute in it
@@ -343,7 +343,7 @@ XMALAB3D = Format(
 # a marker is not seen, OpenSim writes and reads NaN; other programs leave the cell empty, which is
 # read, too. TRC has no residuals.
 
-_HEADER_ROWS = 5
+_HEADER_ROWS = 5  # of a TRC file
 TAB = '\t'
 _NAMES = (
     *('DataRate', 'CameraRate', 'NumFrames', 'NumMarkers'),

@@ -26,7 +26,7 @@ from .points import C3D, TRC, XMALAB3D
 from .xmalab_cameras import DLT, LOOKUP, MAYACAM1, MAYACAM2
 
 HEAD = 65536  # bytes by which a format is recognised
-LINES = 20
+LINES = 20  # lines by which a format is recognised
 MAX_SHOWN = 60  # characters of a line in a message
 
 # The order is that in which a file is compared with them, and that of help texts.

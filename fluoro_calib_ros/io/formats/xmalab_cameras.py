@@ -31,6 +31,7 @@ from ...errors import DataError
 from ...limits import MAX_IMAGE_SIDE
 from ..access import atomic_file, check_rows, check_safe_name, make_folder, read_text, write_text
 from .content import (
+    Y_UP_TO_DOWN,
     Camera,
     Content,
     FileSettings,
@@ -51,7 +52,7 @@ from .tables import Row, joined, number_text, read_table, require_width, separat
 _MAYACAM2 = '_MayaCam2.txt'
 _TITLES = {1: 'image size', 4: 'camera matrix', 9: 'rotation', 14: 'translation'}
 _UNDISTORTION = 19  # line of its title
-_COEFFICIENTS = 8
+_COEFFICIENTS = 8  # k1, k2, p1, p2, k3 to k6 of OpenCV
 
 
 def _read_mayacam2(path: Path, settings: FileSettings) -> Content:
@@ -154,9 +155,7 @@ MAYACAM2 = Format(
 
 _MAYACAM1 = '_MayaCam.csv'
 _DEFAULT_SIZE = 1024
-_ROWS_MAYACAM1 = 5
-# x right, y up, z backwards -> x right, y down, z forwards.
-_AXES = np.diag([1.0, -1.0, -1.0])
+_ROWS_MAYACAM1 = 5  # numbers of three columns each
 
 
 def _is_mayacam1(sample: Sample) -> bool:
@@ -186,7 +185,7 @@ def _read_mayacam1(path: Path, settings: FileSettings) -> Content:
         name_of_file(path, _MAYACAM1),
         matrix,
         size,
-        (axes @ _AXES).T,
+        (axes @ Y_UP_TO_DOWN).T,
         from_units(np.array(position), settings.unit_read(path)),
     )
     return Content(cameras=(camera,))
@@ -217,7 +216,7 @@ MAYACAM1 = Format(
 # (Abdel-Aziz and Karara, 1971). x and y count from 1, y upwards; the image height turns them into
 # ours. The unit is that of the calibration object, and the file does not say it.
 
-_ROWS_DLT = 11
+_ROWS_DLT = 11  # coefficients of the direct linear transformation
 
 
 def _is_dlt(sample: Sample) -> bool:
@@ -318,7 +317,7 @@ DLT = Format(
 
 
 ENDING = '_LUT.csv'
-NOWHERE = -1.0
+NOWHERE = -1.0  # no pixel: what XMALab writes
 _MIN_COLUMNS = 32  # narrower tables are something else
 
 

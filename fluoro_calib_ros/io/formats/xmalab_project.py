@@ -35,8 +35,8 @@ from .phantoms import content_of
 from .tables import Row, default_name, named_targets, table_of
 
 _SEEN = 0  # a marker is seen where its status is above
-_INLIER = 1
-NO_POINT = -1.0
+_INLIER = 1  # flag of a grid point that is used
+NO_POINT = -1.0  # coordinates of a grid point that was not found
 
 
 def read(path: Path, settings: FileSettings) -> Content:

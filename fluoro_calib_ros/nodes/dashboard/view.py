@@ -30,7 +30,7 @@ ORIENT = 'orient'
 RESET = 'reset'
 REQUESTS = (CAPTURE, CALIBRATE, CALIBRATE_FAST, CANCEL, ORIENT, RESET)
 
-RATE_WINDOW_S = 5.0
+RATE_WINDOW_S = 5.0  # over which rates are counted
 
 
 @dataclass(frozen=True)
@@ -130,10 +130,9 @@ COLOURS = {
     'calibrated': 'green',
     'calibrating': 'cyan',
 }
-REFRESH_S = 0.5
 CONFIRM_S = 5.0  # in which a second key confirms
 BAR = 20  # characters of the coverage bar
-LOG_LINES = 6
+LOG_LINES = 6  # that are shown
 
 
 def session_text(state: SessionState) -> Group:
@@ -297,7 +296,7 @@ class Dashboard(App[None]):
     def on_mount(self) -> None:
         """Show the state from now on."""
         self.show()
-        self.set_interval(REFRESH_S, self.show)
+        self.set_interval(0.5, self.show)
 
     def show(self) -> None:
         """Show the present state."""

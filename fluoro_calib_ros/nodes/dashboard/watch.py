@@ -47,8 +47,8 @@ from .view import (
 
 NODES = ('calibration_node', 'correction_node', 'reconstruction_node', 'image_node')
 SILENT_S = 5.0  # a node reports once a second
-ORIENT_FRAMES = 10
-LOG_LINES = 50
+ORIENT_FRAMES = 10  # captured by the key o
+LOG_LINES = 50  # that are kept
 STATES = {
     CalibrationStatus.COLLECTING: 'collecting',
     CalibrationStatus.CALIBRATING: 'calibrating',

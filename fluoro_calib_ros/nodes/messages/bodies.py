@@ -45,7 +45,7 @@ _TO_METRES = np.repeat([1e-3, 1.0], 3)  # position, then rotation
 _SCALE = _TO_METRES[:, None] * _TO_METRES
 _OF_JOINT = _SCALE[::-1, ::-1]  # angles, then translations
 AXES = [ColorRGBA(r=r, g=g, b=b, a=1.0) for r, g, b in np.eye(3).tolist()]  # as RViz draws them
-MARKER_MM = 2.0
+MARKER_MM = 2.0  # diameter of a bead as it is drawn
 
 
 class BodiesContent(NamedTuple):

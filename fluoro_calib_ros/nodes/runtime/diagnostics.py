@@ -42,7 +42,7 @@ def one_line(error: BaseException) -> str:
 
 
 MAX_LINE = 4000  # characters
-MAX_TRACE = 20_000
+MAX_TRACE = 20_000  # characters
 
 # rclpy keeps state for each place that logs: that is the caller of this module.
 rcutils_logger._internal_callers.append(os.path.realpath(__file__))
@@ -95,13 +95,15 @@ def log_line(text: str) -> str:
 Logger: TypeAlias = 'RcutilsLogger | PrintableLogger'
 
 
+BURST = 20.0  # messages that are logged at once
+
+
 class RateLimitedLogger:
     """Logs a burst of messages, then one a second; the next one says how many were suppressed."""
 
-    def __init__(self, logger: Logger, burst: int = 20) -> None:
+    def __init__(self, logger: Logger) -> None:
         self._logger = logger
-        self._burst = burst
-        self._allowance = float(burst)
+        self._allowance = BURST
         self._last = time.monotonic()
         self._suppressed = 0
 
@@ -117,7 +119,7 @@ class RateLimitedLogger:
 
     def _is_allowed(self) -> bool:
         now = time.monotonic()
-        self._allowance = min(self._burst, self._allowance + now - self._last)
+        self._allowance = min(BURST, self._allowance + now - self._last)
         self._last = now
         if self._allowance < 1:
             self._suppressed += 1
@@ -378,8 +380,8 @@ class DiagnosticsPublisher:
 class LatencyWindow:
     """The last latencies; one thread writes them and another one reads them."""
 
-    def __init__(self, size: int = 2000) -> None:
-        self._ring = np.zeros(size, dtype=np.int64)
+    def __init__(self) -> None:
+        self._ring = np.zeros(2000, dtype=np.int64)
         self._count = 0
 
     def add(self, nanoseconds: int) -> None:

@@ -8,8 +8,10 @@ from __future__ import annotations
 import gc
 import os
 import select
+import shutil
 import signal
 import sys
+import textwrap
 import threading
 import time
 import traceback
@@ -17,6 +19,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from itertools import pairwise
+from types import ModuleType
 from typing import NoReturn
 
 import rclpy
@@ -28,16 +31,16 @@ from rclpy.signals import SignalHandlerOptions
 
 from ...errors import DataError
 from ...io.access import check_regular_file
+from ...options import Option
 from .diagnostics import USER_ERRORS, StartError, log_line, one_line
-from .lifecycle import guard_services
-from .parameters import asks_for_help, help_text, unknown_parameters
+from .parameters import parameters_of, settable_parameters, unknown_parameters
+from .services import guard_services
 
 MAX_FAILURES = 100  # of callbacks within a second: nothing else works
 INTERRUPTED = 130  # exit status after a second interrupt
 # Time in which further signals belong to the first one: launch and service managers signal a group
 # of processes and each of them, with SIGINT and SIGTERM.
 ONE_INTERRUPT_S = 1.0
-MAX_SIGNALS = 1000
 # Time in which a node ends after a signal; launch sends the next one, SIGTERM, after 5 s. A node
 # that has something to write has an attribute end_s.
 END_S = 4.0
@@ -185,7 +188,7 @@ def _call_on_interrupt(end: Callable[[], None], patience_s: Callable[[], float])
         time.sleep(ONE_INTERRUPT_S)
         os.set_blocking(reading, False)
         with suppress(BlockingIOError):  # no further signal has come
-            os.read(reading, MAX_SIGNALS)
+            os.read(reading, 1000)
         patience = patience_s()
         if select.select([reading], [], [], patience - ONE_INTERRUPT_S)[0]:
             os._exit(INTERRUPTED)
@@ -195,3 +198,54 @@ def _call_on_interrupt(end: Callable[[], None], patience_s: Callable[[], float])
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
+
+
+# What a node prints with --help: its task, how to start it, and its parameters.
+
+
+def asks_for_help(arguments: Sequence[str]) -> bool:
+    """Return whether -h or --help is among the arguments in front of those of ROS."""
+    words = list(arguments)
+    if '--ros-args' in words:
+        words = words[: words.index('--ros-args')]
+    return any(word in ('-h', '--help') for word in words)
+
+
+def help_text(module: ModuleType) -> str:
+    """Return the help of the node of a module: its docstring, usage and PARAMETERS."""
+    name = module.__name__.rpartition('.')[2]
+    if name == '__main__' and module.__spec__ is not None:
+        name = module.__spec__.name.rpartition('.')[2]
+    width = min(100, shutil.get_terminal_size().columns)
+    task = ' '.join((module.__doc__ or '').strip().partition('\n\n')[0].split())
+    settable = settable_parameters(module.PARAMETERS)
+    lines = [
+        f'usage: {name} [--ros-args -p PARAMETER:=VALUE ... -r __ns:=/NAMESPACE]',
+        '',
+        *textwrap.wrap(task, width),
+        '',
+        'parameters (* may change while the node runs):',
+    ]
+    for parameter, declaration in parameters_of(module.PARAMETERS).items():
+        mark = ' *' if parameter in settable else ''
+        lines.append(f'  {parameter}{mark}')
+        lines += textwrap.wrap(
+            _description(declaration), width, initial_indent=' ' * 6, subsequent_indent=' ' * 6
+        )
+    lines += ['', 'topics, services and the meaning of the diagnostics: docs/nodes.md']
+    return '\n'.join(lines)
+
+
+def _description(declaration: Option) -> str:
+    """Return description, values and default of a parameter."""
+    default = declaration.default
+    text = declaration.help
+    if declaration.minimum is not None and declaration.maximum is not None:
+        text += f'; {declaration.minimum:g} to {declaration.maximum:g}'
+    if isinstance(default, bool):
+        shown = str(default).lower()
+    elif isinstance(default, tuple):
+        shown = f'[{", ".join(map(str, default))}]'
+    else:
+        shown = str(default) if default != '' else "''"
+    return f'{text} (default: {shown})'

@@ -7,14 +7,11 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
 import sys
-import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from difflib import get_close_matches
 from pathlib import Path
-from types import ModuleType
 from typing import Any, Generic, TypeVar
 
 from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
@@ -47,6 +44,7 @@ SIM_TIME = 'use_sim_time'
 _OF_ROS = ('qos_overrides.', SIM_TIME, 'start_type_description_service')
 
 T = TypeVar('T')
+_GROUP = 'group'  # key of the metadata of a field of settings
 
 
 @dataclass(frozen=True)
@@ -213,6 +211,34 @@ class ParameterGroup(Generic[T]):
         return self.options(**{name: values[parameter] for name, parameter in self._names.items()})
 
 
+def group(
+    options: type[T], names: Mapping[str, str] | None = None, settable: Sequence[str] = ()
+) -> Any:
+    """Declare a field of a settings dataclass: the options of a `ParameterGroup`."""
+    return field(metadata={_GROUP: ParameterGroup(options, names or {}, settable)})
+
+
+def groups_of(settings: type[Any]) -> dict[str, ParameterGroup[Any]]:
+    """Return the groups of a settings dataclass by field."""
+    return {each.name: each.metadata[_GROUP] for each in fields(settings)}
+
+
+def declare_groups(node: Node, settings: type[T]) -> T:
+    """Declare the parameters of a settings dataclass; returns their values. Raises StartError."""
+    return settings(**{name: each.declare(node) for name, each in groups_of(settings).items()})
+
+
+def follow_groups(node: Node, present: Callable[[], T], use: Callable[[T], None]) -> None:
+    """Call use() with new settings whenever parameters have been set."""
+
+    def follow(name: str, each: ParameterGroup[Any]) -> None:
+        each.follow(node, lambda new: use(replace(present(), **{name: new})))  # type: ignore[type-var]
+
+    for name, each in groups_of(type(present())).items():
+        if each.settable:
+            follow(name, each)
+
+
 READ_LIMITS = ParameterGroup(ReadLimits)  # of every node that reads files or images
 
 
@@ -371,66 +397,3 @@ def expand_path(text: str) -> Path:
         return Path(text).expanduser()
     except RuntimeError:
         raise DataError(f'{text}: there is no such home folder') from None
-
-
-def default_calibration_directory(namespace: str) -> Path:
-    """Return the folder in which a calibration node of a namespace saves its calibrations.
-
-    It is fluoro_calib/<namespace> in $ROS_HOME, or in ~/.ros where that is not set. Raises
-    DataError where there is no home folder.
-    """
-    home = os.environ.get('ROS_HOME') or '~/.ros'
-    return expand_path(home) / 'fluoro_calib' / namespace.strip('/')
-
-
-# What a node prints with --help: its task, how to start it, and its parameters.
-
-MAX_WIDTH = 100
-
-
-def asks_for_help(arguments: Sequence[str]) -> bool:
-    """Return whether -h or --help is among the arguments in front of those of ROS."""
-    words = list(arguments)
-    if '--ros-args' in words:
-        words = words[: words.index('--ros-args')]
-    return any(word in ('-h', '--help') for word in words)
-
-
-def help_text(module: ModuleType) -> str:
-    """Return the help of the node of a module: its docstring, usage and PARAMETERS."""
-    name = module.__name__.rpartition('.')[2]
-    if name == '__main__' and module.__spec__ is not None:
-        name = module.__spec__.name.rpartition('.')[2]
-    width = min(MAX_WIDTH, shutil.get_terminal_size().columns)
-    task = ' '.join((module.__doc__ or '').strip().partition('\n\n')[0].split())
-    settable = settable_parameters(module.PARAMETERS)
-    lines = [
-        f'usage: {name} [--ros-args -p PARAMETER:=VALUE ... -r __ns:=/NAMESPACE]',
-        '',
-        *textwrap.wrap(task, width),
-        '',
-        'parameters (* may change while the node runs):',
-    ]
-    for parameter, declaration in parameters_of(module.PARAMETERS).items():
-        mark = ' *' if parameter in settable else ''
-        lines.append(f'  {parameter}{mark}')
-        lines += textwrap.wrap(
-            _description(declaration), width, initial_indent=' ' * 6, subsequent_indent=' ' * 6
-        )
-    lines += ['', 'topics, services and the meaning of the diagnostics: docs/nodes.md']
-    return '\n'.join(lines)
-
-
-def _description(declaration: Option) -> str:
-    """Return description, values and default of a parameter."""
-    default = declaration.default
-    text = declaration.help
-    if declaration.minimum is not None and declaration.maximum is not None:
-        text += f'; {declaration.minimum:g} to {declaration.maximum:g}'
-    if isinstance(default, bool):
-        shown = str(default).lower()
-    elif isinstance(default, tuple):
-        shown = f'[{", ".join(map(str, default))}]'
-    else:
-        shown = str(default) if default != '' else "''"
-    return f'{text} (default: {shown})'

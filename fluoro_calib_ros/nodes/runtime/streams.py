@@ -16,266 +16,30 @@ a second.
 
 from __future__ import annotations
 
-import os
 import threading
-import time
 import traceback
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
-from importlib import import_module
 from typing import Any, NamedTuple
 
-from ament_index_python.packages import (
-    PackageNotFoundError,
-    get_package_prefix,
-    get_package_share_directory,
-)
 from rclpy._rclpy_pybind11 import InvalidHandle, RCLError
 from rclpy.callback_groups import CallbackGroup
-from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
-from rclpy.publisher import Publisher
 from rclpy.qos import (
     DurabilityPolicy,
-    HistoryPolicy,
     QoSCompatibility,
     QoSProfile,
     ReliabilityPolicy,
     qos_check_compatible,
 )
-from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
-from rclpy.topic_endpoint_info import TopicEndpointInfo
-from rclpy.type_support import check_for_type_support
 
-from ...errors import DataError
-from ...io.access import read_text
-from ...io.bags.metadata import SEPARATOR, Definition, fields_of, known_definition, nested_types
 from ...limits import read_limits
-
-# Finding topics, and waiting for their other end.
-
-# Time in which readers discover a publisher that has discovered them, several times the measured
-# one.
-SETTLING_S = 0.3
-
-
-def wait_for_readers(
-    node: Node, publishers: Iterable[Publisher], count: int, stop: threading.Event
-) -> None:
-    """Wait until each publisher of a node has `count` readers, and these know it.
-
-    A publisher discovers a reader and the reader the publisher independently of each other. What
-    is published between these moments is lost, reliable or not, and nothing signals the second
-    one. Setting `stop` ends the wait.
-    """
-    while missing := [p.topic_name for p in publishers if p.get_subscription_count() < count]:
-        node.get_logger().info(
-            f'waiting for {count} readers of {", ".join(missing)}', throttle_duration_sec=5.0
-        )
-        if stop.wait(0.05):
-            return
-    if count:
-        stop.wait(SETTLING_S)
-
-
-def needs_best_effort(node: Node, subscription: Subscription) -> bool:
-    """Return whether a reliable subscription has publishers, all of them best effort."""
-    if subscription.qos_profile.reliability != ReliabilityPolicy.RELIABLE:
-        return False
-    publishers = node.get_publishers_info_by_topic(subscription.topic_name)
-    return bool(publishers) and all(
-        p.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT for p in publishers
-    )
-
-
-def best_effort_message(topic: str) -> str:
-    """Return the message about a topic that is subscribed best effort from now on."""
-    return (
-        f'topic {topic}: its publishers offer best effort only; it is subscribed best effort now, '
-        'so lost messages are not sent again'
-    )
-
-
-class TopicDiscovery:
-    """Finds the topics of the graph that have a publisher, each once.
-
-    wanted: names as the node calls them; none: all but those that are hidden, whose names have a
-    part that begins with an underscore.
-    """
-
-    def __init__(self, node: Node, wanted: Iterable[str]) -> None:
-        self._node = node
-        self._found: set[str] = set()
-        self.wanted = {node.resolve_topic_name(topic) for topic in wanted}
-
-    def new(self) -> Iterator[tuple[str, list[str], list[TopicEndpointInfo]]]:
-        """Yield topics that were not found before, with their types and publishers."""
-        for topic, types in self._node.get_topic_names_and_types():
-            hidden = any(part.startswith('_') for part in topic.split('/'))
-            is_wanted = topic in self.wanted if self.wanted else not hidden
-            if not is_wanted or topic in self._found:
-                continue
-            publishers = self._node.get_publishers_info_by_topic(topic)
-            if publishers:
-                self._found.add(topic)
-                yield topic, types, publishers
-
-
-def publisher_conflict(node: Node, topic: str) -> str:
-    """Return a message where several nodes publish a topic that belongs to one, else ''.
-
-    A node that was killed counts until DDS notices, within half a minute.
-    """
-    publishers = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
-    if len(publishers) < 2:
-        return ''
-    names = sorted(
-        f'{p.node_namespace.rstrip("/")}/{p.node_name}'
-        for p in publishers
-        if 'UNKNOWN' not in p.node_name  # DDS announces the names of nodes later
-    )
-    return (
-        f'{len(publishers)} nodes publish {topic} ({", ".join(names)}): no new calibration is '
-        'used until only one is left'
-    )
-
-
-def wait_until_acknowledged(
-    publishers: Iterable[Publisher], stop: threading.Event, timeout_s: float = 10.0
-) -> bool:
-    """Wait until all messages have arrived, and return whether they have.
-
-    What is not acknowledged is lost when the process ends. Setting `stop` ends the wait.
-    """
-    end = time.monotonic() + timeout_s
-    for publisher in publishers:
-        while not publisher.wait_for_all_acked(Duration(seconds=0.1)):
-            if stop.is_set() or time.monotonic() > end:
-                return False
-    return True
-
-
-# Message types that are installed: their classes and their definitions.
-
-
-def installed_type(name: str) -> type[Any] | None:
-    """Return the class of a message type, None where it is not installed.
-
-    Only packages in the ament index are imported: a bag or a peer must not name any module.
-    """
-    package, _, kind = name.partition('/msg/')
-    try:
-        get_package_prefix(package)
-        message_type: type[Any] = getattr(import_module(f'{package}.msg'), kind)
-        check_for_type_support(message_type)
-    except (PackageNotFoundError, ValueError, ImportError, AttributeError):
-        return None
-    return message_type
-
-
-def definition_of(name: str, type_hash: str) -> Definition:
-    """Return the definition of a message type as a bag contains it.
-
-    It is that of this package if it has the hash that publishers offer, '' for an unknown one;
-    else the installed .msg files. The text is empty where there are none.
-    """
-    try:
-        known = known_definition(name)
-        if type_hash in ('', known.type_hash):
-            return known
-    except DataError:
-        pass
-    try:
-        return Definition(_installed_text(name, set()), 'ros2msg', type_hash)
-    except (DataError, PackageNotFoundError, ValueError):
-        return Definition('', 'ros2msg', type_hash)
-
-
-def _installed_text(name: str, seen: set[str]) -> str:
-    """Return the .msg file of a type and those of the types it depends on. Raises DataError."""
-    package, _, kind = name.partition('/msg/')
-    text = read_text(os.path.join(get_package_share_directory(package), 'msg', f'{kind}.msg'))
-    for nested in sorted(nested_types(fields_of(name, text, 'ros2msg')[name])):
-        if nested not in seen:
-            seen.add(nested)
-            heading = f'\n{SEPARATOR}\nMSG: {nested.replace("/msg/", "/")}\n'
-            text += heading + _installed_text(nested, seen)
-    return text
-
-
-# Quality of service of the topics.
-#
-# Every function returns a new profile: rclpy writes the overrides of one topic into the profile
-# object that it was given, so a shared one would carry them over to other topics.
-
-# A fluoroscope at 1000 frames a second and a reader that is busy for a tenth of a second.
-OBSERVATION_DEPTH = 100
-# Images take a megabyte or more, so few are queued, a twelfth of a second at 120 Hz. A slower
-# reader gets the newest ones.
-IMAGE_DEPTH = 10
-RECORDED_LATCHED_DEPTH = 100
-# Requests that come at once and are all answered; ROS's default is 10.
-REQUEST_DEPTH = 200
-
-
-def observations_qos() -> QoSProfile:
-    """Profile of image points and reconstructed points."""
-    return _reliable(OBSERVATION_DEPTH)
-
-
-def images_qos() -> QoSProfile:
-    """Profile of images."""
-    return _reliable(IMAGE_DEPTH)
-
-
-def latched_qos() -> QoSProfile:
-    """Profile of topics whose last message late subscribers receive, too."""
-    return _reliable(1, DurabilityPolicy.TRANSIENT_LOCAL)
-
-
-def recorded_latched_qos() -> QoSProfile:
-    """Profile for playing latched topics: one player replays what many publishers have latched."""
-    return _reliable(RECORDED_LATCHED_DEPTH, DurabilityPolicy.TRANSIENT_LOCAL)
-
-
-def clock_qos() -> QoSProfile:
-    """Profile of /clock, as rosbag2 has it."""
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.BEST_EFFORT
-    )
-
-
-def services_qos() -> QoSProfile:
-    """Profile of services: a burst of requests is queued, and every one of them is answered."""
-    return _reliable(REQUEST_DEPTH)
-
-
-def qos_overrides() -> QoSOverridingOptions:
-    """Let a user override history, depth and reliability of a topic by parameters."""
-    return QoSOverridingOptions.with_default_policies()
-
-
-def incompatible_qos_message(topic: str, policy: str) -> str:
-    """Return the message about a publisher that offers less than a subscription requests."""
-    return (
-        f'topic {topic}: a publisher offers an incompatible quality of service ({policy}), '
-        'its messages are not received'
-    )
-
-
-def _reliable(depth: int, durability: DurabilityPolicy = DurabilityPolicy.VOLATILE) -> QoSProfile:
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=depth,
-        reliability=ReliabilityPolicy.RELIABLE,
-        durability=durability,
-    )
-
+from .topics import incompatible_qos_message, needs_best_effort, qos_overrides
 
 WAIT_NS = 50_000_000  # after which the thread checks whether it has to end
 # Messages of a topic that are handled before the next topic has its turn: views wait for each
@@ -307,12 +71,23 @@ class _Route(NamedTuple):
     """A subscription, what makes a message from its bytes, and what is called with it."""
 
     topic: str
-    name: str  # with namespace and remaps
-    kind: type
-    handle: Any
+    subscription: Subscription
     decode: Callable[..., Any]
     callback: Callable[..., Any]
+    handle: Any
     is_latched: bool
+
+    @classmethod
+    def of(
+        cls,
+        topic: str,
+        subscription: Subscription,
+        decode: Callable[..., Any],
+        callback: Callable[..., Any],
+    ) -> _Route:
+        """Return the route of a subscription."""
+        latched = subscription.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+        return cls(topic, subscription, decode, callback, subscription.handle, is_latched=latched)
 
 
 @dataclass(frozen=True)
@@ -333,23 +108,6 @@ class FaultHandlers:
     overrun: Callable[[str, int], None] | None = None
 
 
-def _route(
-    topic: str,
-    subscription: Subscription,
-    decode: Callable[..., Any],
-    callback: Callable[..., Any],
-) -> _Route:
-    return _Route(
-        topic,
-        subscription.topic_name,
-        subscription.msg_type,
-        subscription.handle,
-        decode=decode,
-        callback=callback,
-        is_latched=subscription.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL,
-    )
-
-
 class StreamReader:
     """Subscriptions of a node that a thread of their own serves between start() and stop()."""
 
@@ -357,8 +115,7 @@ class StreamReader:
         self._node = node
         self._faults = faults
         self._group = _ReaderGroup()
-        # (topic, Subscription, decode, callback)
-        self._routes: list[tuple[str, Subscription, Callable[..., Any], Callable[..., Any]]] = []
+        self._routes: list[_Route] = []
         self._max_bytes: dict[str, int] = {}  # by topic
         self._first: set[str] = set()  # topics
         self._sequence: dict[str, int] = {}  # number of the last message by topic
@@ -403,7 +160,7 @@ class StreamReader:
         )
         self._max_bytes[topic] = max_bytes or read_limits().max_image_bytes
         decode = decode or (lambda data: deserialize_message(data, kind))
-        self._routes.append((topic, subscription, decode, callback))
+        self._routes.append(_Route.of(topic, subscription, decode, callback))
 
     def take_first(self, topic: str) -> None:
         """Handle what is pending of a subscribed topic before each message of the others."""
@@ -412,8 +169,8 @@ class StreamReader:
     def topics(self) -> dict[str, bool]:
         """Return the subscribed topics by relative name, and whether each has a publisher."""
         return {
-            topic: bool(self._node.count_publishers(subscription.topic_name))
-            for topic, subscription, *_ in self._routes
+            route.topic: bool(self._node.count_publishers(route.subscription.topic_name))
+            for route in self._routes
         }
 
     def accept_best_effort(self) -> list[str]:
@@ -423,13 +180,15 @@ class StreamReader:
         them. To be called from the thread that made the subscriptions.
         """
         lowered = [
-            number for number, route in enumerate(self._routes) if self._is_unreliable(route)
+            number
+            for number, route in enumerate(self._routes)
+            if needs_best_effort(self._node, route.subscription)
         ]
         if not lowered:
             return []
         self._halt()
         for number in lowered:
-            topic, old, decode, callback = self._routes[number]
+            topic, old, decode, callback, *_ = self._routes[number]
             qos = copy(old.qos_profile)
             qos.reliability = ReliabilityPolicy.BEST_EFFORT
             self._node.destroy_subscription(old)
@@ -441,15 +200,9 @@ class StreamReader:
                 callback_group=self._group,
                 event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
             )
-            self._routes[number] = (topic, new, decode, callback)
+            self._routes[number] = _Route.of(topic, new, decode, callback)
         self.start()
-        return [self._routes[number][0] for number in lowered]
-
-    def _is_unreliable(
-        self, route: tuple[str, Subscription, Callable[..., Any], Callable[..., Any]]
-    ) -> bool:
-        """Return whether a reliable subscription has best-effort publishers only."""
-        return needs_best_effort(self._node, route[1])
+        return [self._routes[number].topic for number in lowered]
 
     def incompatible_publishers(self) -> dict[str, str]:
         """Return a message for every topic with a publisher that offers less than is requested.
@@ -482,9 +235,9 @@ class StreamReader:
         if take_pending:
             self._stopping.clear()
             for route in self._routes:
-                self._drain(_route(*route), [], route[1].qos_profile.depth)
-        for _, subscription, *_ in self._routes:
-            self._node.destroy_subscription(subscription)
+                self._drain(route, [], route.subscription.qos_profile.depth)
+        for route in self._routes:
+            self._node.destroy_subscription(route.subscription)
         self._routes = []
 
     def _halt(self) -> None:
@@ -509,10 +262,7 @@ class StreamReader:
         wait_set: Any = None
         while not self._stopping.is_set() and self._node.context.ok():
             if len(self._routes) != served:  # a topic was added meanwhile
-                routes = {
-                    s.handle.pointer: _route(topic, s, decode, callback)
-                    for topic, s, decode, callback in list(self._routes)
-                }
+                routes = {route.handle.pointer: route for route in list(self._routes)}
                 served = len(routes)
                 wait_set = rclpy_implementation.WaitSet(
                     served, 0, 0, 0, 0, 0, self._node.context.handle
@@ -544,7 +294,7 @@ class StreamReader:
             if self._stopping.is_set():
                 return
             # As bytes: taking the message itself would not tell a damaged one from none.
-            received = route.handle.take_message(route.kind, True)
+            received = route.handle.take_message(route.subscription.msg_type, True)
             if received is None:
                 return
             for other in first:
@@ -560,7 +310,7 @@ class StreamReader:
         lost = number - self._sequence.get(route.topic, number - 1) - 1
         self._sequence[route.topic] = number
         # Each of several publishers has numbers of its own; so has one that was started again.
-        if lost > 0 and self._node.count_publishers(route.name) == 1:
+        if lost > 0 and self._node.count_publishers(route.subscription.topic_name) == 1:
             self._faults.overrun(route.topic, lost)
 
     def _handle(self, route: _Route, data: bytes, info: dict[str, Any]) -> None:

@@ -1,0 +1,165 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Services of the nodes, and requests whose answers wait for something."""
+
+from __future__ import annotations
+
+import inspect
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from rclpy.callback_groups import CallbackGroup
+from rclpy.node import Node
+from rclpy.service import Service
+from rclpy.task import Future
+
+from ...limits import MAX_TEXT
+from .diagnostics import (
+    one_line,
+)
+from .parameters import ParameterNode
+from .topics import services_qos
+
+# Services that answer a request that cannot be handled, instead of ending the node.
+#
+# rclpy raises from its own services where a transition does not fit the state of a managed node,
+# and where a parameter has an unknown type. Without a guard one such request of any peer ends the
+# node. rcl logs the texts of a request as they are, such as the label of a transition.
+
+Callback = Callable[[Any, Any], Any]
+
+
+def guard_services(node: Node, services: Iterable[Service]) -> None:
+    """Let services of a node refuse the requests at which their callbacks raise."""
+    for service in services:
+        service.callback = _guarded(node, service.srv_name, service.callback)
+
+
+def _guarded(node: Node, name: str, callback: Callback) -> Callback:
+    def refused(request: Any, response: Any, error: Exception) -> Any:
+        reason = one_line(error)
+        node.get_logger().error(f'service {name}: request refused: {reason}')
+        return _refusal_of(request, type(response)(), reason)
+
+    def guarded(request: Any, response: Any) -> Any:
+        try:
+            _check_texts(request)
+            return callback(request, response)
+        except Exception as error:  # a request may contain anything
+            return refused(request, response, error)
+
+    async def guarded_coroutine(request: Any, response: Any) -> Any:
+        try:
+            _check_texts(request)
+            return await callback(request, response)
+        except Exception as error:
+            return refused(request, response, error)
+
+    return guarded_coroutine if inspect.iscoroutinefunction(callback) else guarded
+
+
+def _check_texts(value: Any, where: str = 'request') -> None:
+    """Raise ValueError unless all texts in a request, or a field of it, are lines of a log."""
+    if isinstance(value, str):
+        if len(value) > MAX_TEXT or not value.isprintable():
+            raise ValueError(f'{where} is printable text of at most {MAX_TEXT} characters')
+    elif isinstance(value, list):
+        for item in value:
+            _check_texts(item, where)
+    elif hasattr(value, 'get_fields_and_field_types'):
+        for name in value.get_fields_and_field_types():
+            _check_texts(getattr(value, name), name)
+
+
+def _refusal_of(request: Any, response: Any, reason: str) -> Any:
+    """Return the response that says that nothing was done; its flags are false by default."""
+    refusal = SetParametersResult(successful=False, reason=reason)
+    if isinstance(request, SetParameters.Request):
+        response.results = [refusal] * len(request.parameters)
+    elif isinstance(request, SetParametersAtomically.Request):
+        response.result = refusal
+    elif hasattr(response, 'message'):
+        response.message = reason
+    return response
+
+
+class ServiceEntry(NamedTuple):
+    """A service: name, type, and a handler (request, response) -> response, also a coroutine."""
+
+    name: str
+    kind: type
+    handler: Callable[[Any, Any], Any]
+
+
+def create_services(
+    node: Node, table: Iterable[ServiceEntry], group: CallbackGroup | None = None
+) -> list[Service]:
+    """Make the services of a table; one whose handler raises says so in its answer.
+
+    Handlers that are coroutines need a reentrant group, or they keep others from being answered.
+    """
+    services = [
+        node.create_service(
+            entry.kind,
+            entry.name,
+            entry.handler,
+            qos_profile=services_qos(),
+            callback_group=group,
+        )
+        for entry in table
+    ]
+    guard_services(node, services)
+    return services
+
+
+class Requests:
+    """Counts the requests whose answers wait for something."""
+
+    def __init__(self) -> None:
+        self.waiting = 0
+
+    @contextmanager
+    def one(self) -> Iterator[None]:
+        """Count a request while it is being answered."""
+        self.waiting += 1
+        try:
+            yield
+        finally:
+            self.waiting -= 1
+
+
+async def within(
+    node: ParameterNode, timeout_s: float, future: Future, give_up: Callable[[], object]
+) -> Any:
+    """Return the result of a Future; give_up() is called when the time is up and has to set it."""
+    timer = node.create_timer(timeout_s, give_up)
+    result = await future
+    node.destroy_timer(timer)
+    return result
+
+
+def in_thread(node: Node, function: Callable[[], Any]) -> tuple[Future, threading.Thread]:
+    """Run a function in a thread of its own; returns the Future of its result, and the thread."""
+    done = Future()
+
+    def work() -> None:
+        try:
+            done.set_result(function())
+        except Exception as error:  # for the one who awaits it
+            done.set_exception(error)
+        wake(node)
+
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    return done, thread
+
+
+def wake(node: Node) -> None:
+    """Make the executor of a node continue what awaits a result of another thread."""
+    if node.executor is not None:
+        node.executor.wake()

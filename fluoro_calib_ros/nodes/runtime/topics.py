@@ -1,0 +1,256 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Topics of the graph: finding them, their types, and their quality of service."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Iterable, Iterator
+from importlib import import_module
+from typing import Any
+
+from ament_index_python.packages import (
+    PackageNotFoundError,
+    get_package_prefix,
+    get_package_share_directory,
+)
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import (
+    DurabilityPolicy,
+    HistoryPolicy,
+    QoSProfile,
+    ReliabilityPolicy,
+)
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.subscription import Subscription
+from rclpy.topic_endpoint_info import TopicEndpointInfo
+from rclpy.type_support import check_for_type_support
+
+from ...errors import DataError
+from ...io.access import read_text
+from ...io.bags.metadata import SEPARATOR, Definition, fields_of, known_definition, nested_types
+
+# Finding topics, and waiting for their other end.
+
+# Time in which readers discover a publisher that has discovered them, several times the measured
+# one.
+SETTLING_S = 0.3
+
+
+def wait_for_readers(
+    node: Node, publishers: Iterable[Publisher], count: int, stop: threading.Event
+) -> None:
+    """Wait until each publisher of a node has `count` readers, and these know it.
+
+    A publisher discovers a reader and the reader the publisher independently of each other. What
+    is published between these moments is lost, reliable or not, and nothing signals the second
+    one. Setting `stop` ends the wait.
+    """
+    while missing := [p.topic_name for p in publishers if p.get_subscription_count() < count]:
+        node.get_logger().info(
+            f'waiting for {count} readers of {", ".join(missing)}', throttle_duration_sec=5.0
+        )
+        if stop.wait(0.05):
+            return
+    if count:
+        stop.wait(SETTLING_S)
+
+
+def needs_best_effort(node: Node, subscription: Subscription) -> bool:
+    """Return whether a reliable subscription has publishers, all of them best effort."""
+    if subscription.qos_profile.reliability != ReliabilityPolicy.RELIABLE:
+        return False
+    publishers = node.get_publishers_info_by_topic(subscription.topic_name)
+    return bool(publishers) and all(
+        p.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT for p in publishers
+    )
+
+
+def best_effort_message(topic: str) -> str:
+    """Return the message about a topic that is subscribed best effort from now on."""
+    return (
+        f'topic {topic}: its publishers offer best effort only; it is subscribed best effort now, '
+        'so lost messages are not sent again'
+    )
+
+
+class TopicDiscovery:
+    """Finds the topics of the graph that have a publisher, each once.
+
+    wanted: names as the node calls them; none: all but those that are hidden, whose names have a
+    part that begins with an underscore.
+    """
+
+    def __init__(self, node: Node, wanted: Iterable[str]) -> None:
+        self._node = node
+        self._found: set[str] = set()
+        self.wanted = {node.resolve_topic_name(topic) for topic in wanted}
+
+    def new(self) -> Iterator[tuple[str, list[str], list[TopicEndpointInfo]]]:
+        """Yield topics that were not found before, with their types and publishers."""
+        for topic, types in self._node.get_topic_names_and_types():
+            hidden = any(part.startswith('_') for part in topic.split('/'))
+            is_wanted = topic in self.wanted if self.wanted else not hidden
+            if not is_wanted or topic in self._found:
+                continue
+            publishers = self._node.get_publishers_info_by_topic(topic)
+            if publishers:
+                self._found.add(topic)
+                yield topic, types, publishers
+
+
+def publisher_conflict(node: Node, topic: str) -> str:
+    """Return a message where several nodes publish a topic that belongs to one, else ''.
+
+    A node that was killed counts until DDS notices, within half a minute.
+    """
+    publishers = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
+    if len(publishers) < 2:
+        return ''
+    names = sorted(
+        f'{p.node_namespace.rstrip("/")}/{p.node_name}'
+        for p in publishers
+        if 'UNKNOWN' not in p.node_name  # DDS announces the names of nodes later
+    )
+    return (
+        f'{len(publishers)} nodes publish {topic} ({", ".join(names)}): no new calibration is '
+        'used until only one is left'
+    )
+
+
+ACKNOWLEDGED_S = 10.0  # in which readers have to confirm what was published last
+
+
+def wait_until_acknowledged(publishers: Iterable[Publisher], stop: threading.Event) -> bool:
+    """Wait until all messages have arrived, and return whether they have.
+
+    What is not acknowledged is lost when the process ends. Setting `stop` ends the wait.
+    """
+    end = time.monotonic() + ACKNOWLEDGED_S
+    for publisher in publishers:
+        while not publisher.wait_for_all_acked(Duration(seconds=0.1)):
+            if stop.is_set() or time.monotonic() > end:
+                return False
+    return True
+
+
+# Message types that are installed: their classes and their definitions.
+
+
+def installed_type(name: str) -> type[Any] | None:
+    """Return the class of a message type, None where it is not installed.
+
+    Only packages in the ament index are imported: a bag or a peer must not name any module.
+    """
+    package, _, kind = name.partition('/msg/')
+    try:
+        get_package_prefix(package)
+        message_type: type[Any] = getattr(import_module(f'{package}.msg'), kind)
+        check_for_type_support(message_type)
+    except (PackageNotFoundError, ValueError, ImportError, AttributeError):
+        return None
+    return message_type
+
+
+def definition_of(name: str, type_hash: str) -> Definition:
+    """Return the definition of a message type as a bag contains it.
+
+    It is that of this package if it has the hash that publishers offer, '' for an unknown one;
+    else the installed .msg files. The text is empty where there are none.
+    """
+    try:
+        known = known_definition(name)
+        if type_hash in ('', known.type_hash):
+            return known
+    except DataError:
+        pass
+    try:
+        return Definition(_installed_text(name, set()), 'ros2msg', type_hash)
+    except (DataError, PackageNotFoundError, ValueError):
+        return Definition('', 'ros2msg', type_hash)
+
+
+def _installed_text(name: str, seen: set[str]) -> str:
+    """Return the .msg file of a type and those of the types it depends on. Raises DataError."""
+    package, _, kind = name.partition('/msg/')
+    text = read_text(os.path.join(get_package_share_directory(package), 'msg', f'{kind}.msg'))
+    for nested in sorted(nested_types(fields_of(name, text, 'ros2msg')[name])):
+        if nested not in seen:
+            seen.add(nested)
+            heading = f'\n{SEPARATOR}\nMSG: {nested.replace("/msg/", "/")}\n'
+            text += heading + _installed_text(nested, seen)
+    return text
+
+
+# Quality of service of the topics.
+#
+# Every function returns a new profile: rclpy writes the overrides of one topic into the profile
+# object that it was given, so a shared one would carry them over to other topics.
+
+# A fluoroscope at 1000 frames a second and a reader that is busy for a tenth of a second.
+OBSERVATION_DEPTH = 100
+# Images take a megabyte or more, so few are queued, a twelfth of a second at 120 Hz. A slower
+# reader gets the newest ones.
+IMAGE_DEPTH = 10
+RECORDED_LATCHED_DEPTH = 100  # messages of as many publishers
+# Requests that come at once and are all answered; ROS's default is 10.
+REQUEST_DEPTH = 200
+
+
+def observations_qos() -> QoSProfile:
+    """Profile of image points and reconstructed points."""
+    return _reliable(OBSERVATION_DEPTH)
+
+
+def images_qos() -> QoSProfile:
+    """Profile of images."""
+    return _reliable(IMAGE_DEPTH)
+
+
+def latched_qos() -> QoSProfile:
+    """Profile of topics whose last message late subscribers receive, too."""
+    return _reliable(1, DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def recorded_latched_qos() -> QoSProfile:
+    """Profile for playing latched topics: one player replays what many publishers have latched."""
+    return _reliable(RECORDED_LATCHED_DEPTH, DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def clock_qos() -> QoSProfile:
+    """Profile of /clock, as rosbag2 has it."""
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.BEST_EFFORT
+    )
+
+
+def services_qos() -> QoSProfile:
+    """Profile of services: a burst of requests is queued, and every one of them is answered."""
+    return _reliable(REQUEST_DEPTH)
+
+
+def qos_overrides() -> QoSOverridingOptions:
+    """Let a user override history, depth and reliability of a topic by parameters."""
+    return QoSOverridingOptions.with_default_policies()
+
+
+def incompatible_qos_message(topic: str, policy: str) -> str:
+    """Return the message about a publisher that offers less than a subscription requests."""
+    return (
+        f'topic {topic}: a publisher offers an incompatible quality of service ({policy}), '
+        'its messages are not received'
+    )
+
+
+def _reliable(depth: int, durability: DurabilityPolicy = DurabilityPolicy.VOLATILE) -> QoSProfile:
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=depth,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=durability,
+    )

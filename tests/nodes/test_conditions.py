@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import pytest
 from fluoro_calib_msgs.srv import Reset
 
+from fluoro_calib_ros.findings import Finding, Kind
 from fluoro_calib_ros.nodes import calibration_output, correcting_node, image_stream
 from fluoro_calib_ros.nodes import reconstruction_output as reconstruction
 from fluoro_calib_ros.nodes.runtime.diagnostics import (
@@ -84,7 +85,7 @@ def reconstruction_state(stalled, **changes):
             stamps=SimpleNamespace(disagreement=lambda: ''),
             silent=frozenset(),
         ),
-        'misses': SimpleNamespace(message=lambda: ''),
+        'misses': SimpleNamespace(finding=lambda: None),
         'recent': Counter(),
     }
     return reconstruction.ReconstructionState(**{**values, **changes})
@@ -95,7 +96,8 @@ def test_stopped_streams_stand_before_what_else_is_wrong():
     assert health_of(well, reconstruction.CONDITIONS) == (OK, 'reconstructing')
     stopped = reconstruction_state([('a', 'no frame for 2 s'), ('b', '')])
     assert health_of(stopped, reconstruction.CONDITIONS) == (WARN, 'a: no frame for 2 s')
-    wrong = SimpleNamespace(message=lambda: 'the rays miss each other')
+    missing = Finding(Kind.RAYS_DO_NOT_MEET, 'the rays miss each other')
+    wrong = SimpleNamespace(finding=lambda: missing)
     both = reconstruction_state([('a', 'no frame for 2 s'), ('b', '')], misses=wrong)
     found = health_of(both, reconstruction.CONDITIONS)
     assert found == (ERROR, 'a: no frame for 2 s; the rays miss each other')

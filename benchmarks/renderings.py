@@ -5,6 +5,8 @@
 
     python -m benchmarks.renderings --images 20                 all rows, printed as a table
     python -m benchmarks.renderings --rows cube-24 --pictures DIR
+    python -m benchmarks.renderings --records FILE              what became of each image
+    python -m benchmarks.renderings --records FILE --page docs/how_good/real_radiographs.md
 
 The renderer shares no code with the package. A ray from the source to each of 3 x 3 points of a
 pixel is attenuated along its chords through spheres and plates (Beer and Lambert). Light is
@@ -16,9 +18,11 @@ a shadow against its centre (an ellipse) is part of the error.
 from __future__ import annotations
 
 import argparse
+import json
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
 
@@ -33,6 +37,7 @@ from fluoro_calib_ros.images.extraction import Extraction, extract_beads
 from fluoro_calib_ros.images.matching import PhantomModel
 from fluoro_calib_ros.images.overlay import draw_overlay
 from fluoro_calib_ros.images.view import Lens
+from tools.sections import show_section
 
 SIZE = 1024  # [px]
 PRINCIPAL_PX = 4500.0
@@ -41,9 +46,20 @@ STEEL_PER_MM = 0.55  # attenuation at some 70 keV
 ACRYLIC_PER_MM = 0.022
 BONE_PER_MM = 0.05
 SHEET_MM = 1.5
+ENLARGED = 1.4  # diameter of an enlarged hole over that of the others
 SUB = 3  # points of a pixel in each direction
 WRONG_PX = 3.0  # an observation farther from its bead is that of another
 FOUND = 0.5  # share of the visible beads from which an image counts as found
+IN_TIME_S = 5.0  # CPU time in which an image without the phantom is to be refused
+TARGETS = (
+    '| target | found | seen | wrong ids | largest error | > 0.5 px | > 5 sd | NSE | s '
+    '| slowest | refused |',
+    '| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |',
+)
+NEGATIVES = (
+    '| image | found | s | slowest | within 5 s | refused |',
+    '| --- | --- | --- | --- | --- | --- |',
+)
 
 
 @dataclass(frozen=True)
@@ -146,8 +162,10 @@ def three_sizes(beads: int) -> Callable[..., Target]:
     return drawn
 
 
-def sheet(count: int, pitch: float, hexagonal: bool, marks: int) -> Callable[..., Target]:
-    """A perforated sheet; the place of a hole is that of a bright disc in the image."""
+def sheet(
+    count: int, pitch: float, hexagonal: bool, marks: int, enlarged: bool = False
+) -> Callable[..., Target]:
+    """A perforated sheet, some of its holes blocked or larger than the others."""
 
     def drawn(rng: np.random.Generator) -> Target:
         i, j = np.mgrid[:count, :count].reshape(2, -1) - (count - 1) / 2
@@ -155,9 +173,12 @@ def sheet(count: int, pitch: float, hexagonal: bool, marks: int) -> Callable[...
         y = pitch * j * (np.sqrt(3) / 2 if hexagonal else 1.0)
         kept = np.ones(count**2, dtype=bool)
         near = np.flatnonzero(np.hypot(x, y) < 0.3 * count * pitch)
-        kept[rng.permutation(near)[:marks]] = False
-        xyz = np.column_stack([x, y, np.zeros_like(x)])[kept]
-        return Target(xyz, np.full(len(xyz), 0.45 * pitch))
+        marked = rng.permutation(near)[:marks]
+        diameter = np.full(count**2, 0.45 * pitch)
+        diameter[marked] *= ENLARGED
+        kept[marked] = enlarged
+        xyz = np.column_stack([x, y, np.zeros_like(x)])
+        return Target(xyz[kept], diameter[kept])
 
     return drawn
 
@@ -209,6 +230,13 @@ ROWS: dict[str, Row] = {
             (45, 6.0, 0),
             (45, 4.5, 2),
         )
+    },
+    **{
+        f'{"hexagonal" if hexagonal else "square"} sheet 20 with {marks} enlarged holes': Row(
+            sheet(20, 6.0, hexagonal, marks, enlarged=True), holes=True, told=True, tilt_deg=15.0
+        )
+        for hexagonal in (False, True)
+        for marks in (1, 3)
     },
     'nothing': Row(nothing, wanted=cube(36)),
     'nothing at 3 % dose': Row(nothing, photons=45.0, wanted=cube(36)),
@@ -344,7 +372,9 @@ def _perforated(
     holes = cKDTree(target.xyz[:, :2])
     step = (np.arange(2) + 0.5) / 2 - 0.5
     light = np.zeros((SIZE, SIZE))
-    reach = np.abs(target.xyz[:, :2]).max(axis=0) + target.diameter[0]
+    reach = np.abs(target.xyz[:, :2]).max(axis=0) + target.diameter.min()
+    largest = target.diameter.max() / 2
+    radius = np.append(target.diameter / 2, 0.0)
     for b, a in product(step, step):
         v, u = np.mgrid[:SIZE, :SIZE]
         xy = (bend.undistorted(np.stack([u + a, v + b], -1)) - (SIZE - 1) / 2) / PRINCIPAL_PX
@@ -353,9 +383,9 @@ def _perforated(
         for face in (-0.5, 0.5):
             way = (face * SHEET_MM - source[2]) / ray[..., 2]
             place = source[:2] + way[..., None] * ray[..., :2]
-            away, _ = holes.query(place, distance_upper_bound=target.diameter[0] / 2)
+            away, nearest = holes.query(place, distance_upper_bound=largest)
             on_sheet = (np.abs(place) < reach).all(axis=-1)
-            metal += 0.5 * (on_sheet & ~np.isfinite(away))
+            metal += 0.5 * (on_sheet & (away > radius[nearest]))
         slant = np.linalg.norm(ray, axis=-1) / np.abs(ray[..., 2])
         light += np.exp(-STEEL_PER_MM * SHEET_MM * slant * metal) / 4
     return light
@@ -488,62 +518,129 @@ def _overlap(uv: np.ndarray, target: Target, centres: np.ndarray) -> np.ndarray:
     return apart.min(axis=1)
 
 
-@dataclass
-class Tally:
-    """What became of the images of a row."""
+@dataclass(frozen=True)
+class Outcome:
+    """What became of an image.
 
-    images: int = 0
-    found: int = 0
-    beads: int = 0
-    visible: int = 0
+    wrong, over_half_px and over_5_sd are numbers of observations; normalised is the root mean
+    square of errors over their standard deviations.
+    """
+
+    row: str
+    seed: int
+    visible: int
+    seen: int = 0
+    found: bool = False
     wrong: int = 0
     largest_px: float = 0.0
-    over_5_sd: int = 0
     over_half_px: int = 0
+    over_5_sd: int = 0
     normalised: float = 0.0
     seconds: float = 0.0
-    slowest: float = 0.0
-    refusals: tuple[str, ...] = ()
+    refusal: str = ''
 
-    def add(
-        self, scene: Scene, result: Extraction | DataError, seconds: float, any_place: bool
-    ) -> None:
-        """Count an image; with any_place, an observation belongs to the nearest target."""
-        self.images += 1
-        self.seconds += seconds
-        self.slowest = max(self.slowest, seconds)
-        self.visible += int(scene.visible.sum())
-        if isinstance(result, DataError):
-            self.refusals += (result.finding.kind.value,)
-            return
-        bead = cKDTree(scene.uv).query(result.uv)[1] if any_place else result.bead
-        error = result.uv - scene.uv[bead]
-        off = np.linalg.norm(error, axis=1)
-        right = off < WRONG_PX
-        self.found += bool(right.sum() >= FOUND * scene.visible.sum())
-        self.beads += int(np.isin(bead[right], np.flatnonzero(scene.visible)).sum())
-        self.wrong += int((~right).sum())
-        self.largest_px = max(self.largest_px, float(off[right].max(initial=0)))
-        self.over_5_sd += int((off[right] > 5 * result.sigma[right]).sum())
-        self.over_half_px += int((off[right] > 0.5).sum())
-        squared = (error[right] / result.sigma[right, None]) ** 2
-        self.normalised += float(np.sqrt(squared.mean())) if len(squared) else 0.0
 
-    def text(self, name: str) -> str:
-        done = self.images - len(self.refusals)
-        causes = {cause: self.refusals.count(cause) for cause in sorted(set(self.refusals))}
-        return (
-            f'| {name} | {self.found}/{self.images} | {self.beads}/{self.visible} | {self.wrong} '
-            f'| {self.largest_px:.2f} | {self.over_half_px} | {self.over_5_sd} '
-            f'| {self.normalised / max(done, 1):.2f} '
-            f'| {self.seconds / self.images:.1f} | {self.slowest:.1f} | {causes or ""} |'
-        )
+def outcome(name: str, seed: int, scene: Scene, result: Extraction | DataError) -> Outcome:
+    """Compare an extraction with the truth."""
+    visible = int(scene.visible.sum())
+    if isinstance(result, DataError):
+        return Outcome(name, seed, visible, refusal=result.finding.kind.value)
+    if not len(scene.uv) or ROWS[name].wanted is not None:
+        return Outcome(name, seed, visible, found=True, wrong=len(result.bead))
+    # Any place of a regular lattice will do: an observation belongs to the nearest target.
+    nearest = ROWS[name].regular
+    bead = cKDTree(scene.uv).query(result.uv)[1] if nearest else result.bead
+    error = result.uv - scene.uv[bead]
+    off = np.linalg.norm(error, axis=1)
+    right = off < WRONG_PX
+    squared = (error[right] / result.sigma[right, None]) ** 2
+    return Outcome(
+        name,
+        seed,
+        visible,
+        seen=int(np.isin(bead[right], np.flatnonzero(scene.visible)).sum()),
+        found=bool(right.sum() >= FOUND * visible),
+        wrong=int((~right).sum()),
+        largest_px=float(off[right].max(initial=0)),
+        over_half_px=int((off[right] > 0.5).sum()),
+        over_5_sd=int((off[right] > 5 * result.sigma[right]).sum()),
+        normalised=float(np.sqrt(squared.mean())) if len(squared) else 0.0,
+    )
+
+
+def table(outcomes: Sequence[Outcome]) -> str:
+    """Return the table of targets and that of images without what is looked for."""
+    targets = [*TARGETS]
+    negatives = ['', *NEGATIVES]
+    for name, row in ROWS.items():
+        images = [one for one in outcomes if one.row == name]
+        if images and row.wanted is None:
+            targets.append(f'| {name} | {_of_targets(images)} |')
+        elif images:
+            negatives.append(f'| {name} | {_of_negatives(images)} |')
+    return '\n'.join(targets + negatives)
+
+
+def _of_targets(images: list[Outcome]) -> str:
+    measured = [one for one in images if not one.refusal]
+    normalised = float(np.mean([one.normalised for one in measured])) if measured else np.nan
+    cells = (
+        f'{sum(one.found for one in images)}/{len(images)}',
+        f'{sum(one.seen for one in images)}/{sum(one.visible for one in images)}',
+        f'{sum(one.wrong for one in images)}',
+        f'{max(one.largest_px for one in images):.2f}',
+        f'{sum(one.over_half_px for one in images)}',
+        f'{sum(one.over_5_sd for one in images)}',
+        f'{normalised:.2f}',
+        f'{np.mean([one.seconds for one in images]):.1f}',
+        f'{max(one.seconds for one in images):.1f}',
+        _causes(images),
+    )
+    return ' | '.join(cells)
+
+
+def _of_negatives(images: list[Outcome]) -> str:
+    cells = (
+        f'{sum(not one.refusal for one in images)}/{len(images)}',
+        f'{np.mean([one.seconds for one in images]):.1f}',
+        f'{max(one.seconds for one in images):.1f}',
+        f'{sum(one.seconds <= IN_TIME_S for one in images)}',
+        _causes(images),
+    )
+    return ' | '.join(cells)
+
+
+def _causes(images: list[Outcome]) -> str:
+    count = Counter(one.refusal for one in images if one.refusal)
+    return ', '.join(f'{cause} {count[cause]}' for cause in sorted(count))
 
 
 def scenes(name: str, images: int, first: int) -> Iterator[Scene]:
     """Yield the scenes of a row, by seeds from the first on."""
     for number in range(first, first + images):
         yield render(ROWS[name], np.random.default_rng([number, *name.encode()]))
+
+
+def measured(name: str, images: int, first: int, pictures: Path | None) -> Iterator[Outcome]:
+    """Yield what becomes of the images of a row; pictures is a folder for overlays."""
+    lens = Lens((SIZE, SIZE), PRINCIPAL_PX * 1.05)
+    for seed, scene in enumerate(scenes(name, images, first), first):
+        other = ROWS[name].wanted
+        wanted = scene.target if other is None else other(np.random.default_rng(seed))
+        told = wanted.diameter if ROWS[name].told else None
+        model = PhantomModel.of(wanted.xyz, told, ROWS[name].regular)
+        began = time.process_time()
+        try:
+            result: Extraction | DataError = extract_beads(scene.image, model, lens)
+        except DataError as error:
+            result = error
+        seconds = time.process_time() - began
+        if pictures:
+            pictures.mkdir(parents=True, exist_ok=True)
+            found = None if isinstance(result, DataError) else result
+            picture = draw_overlay(scene.image, found, '' if found else str(result))
+            cv2.imwrite(str(pictures / f'{name}-{seed}.png'), picture)
+        yield replace(outcome(name, seed, scene, result), seconds=seconds)
 
 
 def main() -> None:
@@ -553,37 +650,22 @@ def main() -> None:
     parser.add_argument('--first', type=int, default=1, help='first seed')
     parser.add_argument('--rows', default='', help='names, comma separated')
     parser.add_argument('--pictures', type=Path, help='folder for overlays')
+    parser.add_argument('--records', type=Path, help='a line of JSON for each image, appended')
+    parser.add_argument('--page', type=Path, help='write the table of all records into this page')
     options = parser.parse_args()
     names = [name.strip() for name in options.rows.split(',') if name.strip()] or list(ROWS)
-    print(
-        '| target | found | beads seen | wrong ids | error up to [px] | > 0.5 px | > 5 sd '
-        '| normalised | s | slowest | refused |'
-    )
-    print('| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |')
-    lens = Lens((SIZE, SIZE), PRINCIPAL_PX * 1.05)
-    for name in names:
-        tally = Tally()
-        for number, scene in enumerate(scenes(name, options.images, options.first)):
-            wanted = scene.target
-            other = ROWS[name].wanted
-            if other is not None:
-                wanted = other(np.random.default_rng(number))
-            told = wanted.diameter if ROWS[name].told else None
-            model = PhantomModel.of(wanted.xyz, told, ROWS[name].regular)
-            began = time.process_time()
-            try:
-                result: Extraction | DataError = extract_beads(scene.image, model, lens)
-            except DataError as error:
-                result = error
-            tally.add(
-                scene, result, seconds=time.process_time() - began, any_place=ROWS[name].regular
-            )
-            if options.pictures:
-                options.pictures.mkdir(parents=True, exist_ok=True)
-                found = None if isinstance(result, DataError) else result
-                picture = draw_overlay(scene.image, found, '' if found else str(result))
-                cv2.imwrite(str(options.pictures / f'{name}-{number}.png'), picture)
-        print(tally.text(name), flush=True)
+    outcomes: list[Outcome] = []
+    for name in () if options.page else names:
+        for one in measured(name, options.images, options.first, options.pictures):
+            outcomes.append(one)
+            if options.records:
+                with options.records.open('a') as file:
+                    file.write(json.dumps(asdict(one)) + '\n')
+        print(table([one for one in outcomes if one.row == name]), flush=True)
+    if options.records:
+        lines = options.records.read_text().splitlines()
+        outcomes = [Outcome(**json.loads(line)) for line in lines]
+    show_section(table(outcomes), options.page, 'renderings')
 
 
 if __name__ == '__main__':

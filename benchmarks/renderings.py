@@ -185,7 +185,10 @@ def three_sizes(beads: int) -> Callable[..., Target]:
 def sheet(
     count: int, pitch: float, hexagonal: bool, marks: int, enlarged: bool = False
 ) -> Callable[..., Target]:
-    """A perforated sheet, some of its holes blocked or larger than the others."""
+    """A perforated sheet, some of its holes blocked or larger than the others.
+
+    The marks break every symmetry of the sheet.
+    """
 
     def drawn(rng: np.random.Generator) -> Target:
         i, j = np.mgrid[:count, :count].reshape(2, -1) - (count - 1) / 2
@@ -193,7 +196,10 @@ def sheet(
         y = pitch * j * (np.sqrt(3) / 2 if hexagonal else 1.0)
         kept = np.ones(count**2, dtype=bool)
         near = np.flatnonzero(np.hypot(x, y) < 0.3 * count * pitch)
-        marked = rng.permutation(near)[:marks]
+        while True:
+            marked = rng.permutation(near)[:marks]
+            if not marks or not _symmetric(np.column_stack([x, y]), marked, 0.1 * pitch):
+                break
         diameter = np.full(count**2, 0.45 * pitch)
         diameter[marked] *= ENLARGED
         kept[marked] = enlarged
@@ -201,6 +207,19 @@ def sheet(
         return Target(xyz[kept], diameter[kept])
 
     return drawn
+
+
+def _symmetric(places: np.ndarray, marked: np.ndarray, reach: float) -> bool:
+    """Return whether a turn or reflection takes all places (n, 2) and the marked ones to such."""
+    tree = cKDTree(places)
+    own = np.sort(marked)
+    for degrees, sign in product(range(0, 360, 30), (1, -1)):
+        turn = Rotation.from_euler('z', degrees, degrees=True).as_matrix()[:2, :2] * (1, sign)
+        away, row = tree.query((places - places.mean(axis=0)) @ turn.T + places.mean(axis=0))
+        same = np.array_equal(np.sort(row[marked]), own)
+        if (degrees, sign) != (0, 1) and away.max() < reach and same:
+            return True
+    return False
 
 
 def frame(beads: int, side: float = 140.0, diameter: float = 2.0) -> Callable[..., Target]:

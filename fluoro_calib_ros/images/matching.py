@@ -58,7 +58,11 @@ RIVAL_STEPS = 3
 MIN_SIZES = 0.1  # relative difference of diameters from which sizes tell beads apart
 SIZE_MARGIN = 10.0  # log-likelihood by which sizes must prefer a pose
 GRID_MARGIN = 10.0  # log-likelihood by which a pose of a grid must exceed another one
-SIZE_TAIL = 6.0
+SIZE_TAIL = 6.0  # residual of a response beyond which it counts no more [standard deviations]
+SIZE_NEIGHBOURS = 12  # that tell what response is usual
+# Of the logarithm of a response to that of a radius r. A disc has r^2 exp(-r^2 / 2 s^2) at a scale
+# s, where r < 1.2 s; a small sphere has its thickness as a further factor.
+SIZE_SLOPES = (0.5, 3.0)
 CLOSER = 2.0  # factor on the residuals of one pose from which another is the better one
 SYMMETRY_SHARE = 0.4  # of the beads that a symmetry takes near to a bead
 SYMMETRY_REACH = 0.3  # of the distance between neighbours
@@ -274,27 +278,41 @@ def unambiguous(best: Match, seen: Seen, model: PhantomModel, turn_rad: float = 
 def _best_by_size(matches: list[Match], seen: Seen, model: PhantomModel) -> Match | None:
     """Return the match in which beads are seen as large as they are; None where none stands out.
 
-    The logarithm of the response to a bead is linear in that of the size of its shadow. Matches
-    are compared by the likelihood of the residuals from that line.
+    Matches are compared by the likelihood of the responses to their beads.
     """
     diameter = model.diameter_mm
     if seen.strength is None or diameter is None or np.ptp(diameter) < MIN_SIZES * diameter.min():
         return None
-    likelihoods = []
-    for one in matches:
-        size = np.log(diameter[one.bead] / np.abs(one.view.depth(model.xyz[one.bead])))
-        response = np.log(np.maximum(seen.strength[one.detection], 1e-3))
-        x = size - size.mean()
-        slope = max(float(x @ response / max(x @ x, 1e-12)), 0.0)
-        residual = response - np.median(response - slope * x) - slope * x
-        spread = 1.4826 * float(np.median(np.abs(residual)))
-        # Beads that overlap or are cut off have any response.
-        squared = np.minimum(residual**2, (SIZE_TAIL * spread) ** 2)
-        likelihoods.append(-0.5 * len(x) * np.log(max(float(squared.mean()), 1e-12)))
+    likelihoods = [_likelihood_of_sizes(one, diameter, seen, model) for one in matches]
     order = np.argsort(likelihoods)
     if likelihoods[order[-1]] - likelihoods[order[-2]] < SIZE_MARGIN:
         return None
     return matches[order[-1]]
+
+
+def _likelihood_of_sizes(
+    one: Match, diameter: np.ndarray, seen: Seen, model: PhantomModel
+) -> float:
+    """Log-likelihood of the responses to beads of known diameters (n,) [mm].
+
+    The logarithm of a response is linear in that of the size of the shadow, and changes slowly
+    across the image. Its scatter is that of the beads around: it is larger at the edge of a
+    sheet, so that a mark elsewhere stands out.
+    """
+    assert seen.strength is not None
+    uv = seen.uv[one.detection]
+    response = np.log(np.maximum(seen.strength[one.detection], 1e-3))
+    size = np.log(diameter[one.bead] / np.abs(one.view.depth(model.xyz[one.bead])))
+    _, near = cKDTree(uv).query(uv, k=min(SIZE_NEIGHBOURS + 1, len(uv)))
+    x = size - size[near].mean(axis=1)
+    y = response - response[near].mean(axis=1)
+    slope = np.clip(float(x @ y) / max(float(x @ x), 1e-12), *SIZE_SLOPES)
+    level = response - slope * size
+    around = np.median(level[near], axis=1)
+    scatter = 1.4826 * np.median(np.abs(level[near] - around[:, None]), axis=1)
+    scatter = np.maximum(scatter, np.median(scatter))
+    residual = np.minimum(np.abs(level - around) / np.maximum(scatter, 1e-6), SIZE_TAIL)
+    return float(-np.sum(np.log(np.maximum(scatter, 1e-6))) - 0.5 * np.sum(residual**2))
 
 
 def _climbed(

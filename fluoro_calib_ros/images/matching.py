@@ -278,31 +278,35 @@ def unambiguous(best: Match, seen: Seen, model: PhantomModel, turn_rad: float = 
 def _best_by_size(matches: list[Match], seen: Seen, model: PhantomModel) -> Match | None:
     """Return the match in which beads are seen as large as they are; None where none stands out.
 
-    Matches are compared by the likelihood of the responses to their beads.
+    Matches are compared by the likelihood of the responses to the beads that all of them have.
     """
     diameter = model.diameter_mm
     if seen.strength is None or diameter is None or np.ptp(diameter) < MIN_SIZES * diameter.min():
         return None
-    likelihoods = [_likelihood_of_sizes(one, diameter, seen, model) for one in matches]
+    common = set.intersection(*(set(one.detection.tolist()) for one in matches))
+    if len(common) < MIN_BEADS:
+        return None
+    rows = [np.flatnonzero(np.isin(one.detection, list(common))) for one in matches]
+    likelihoods = [
+        _likelihood_of_sizes(
+            np.log(diameter[one.bead] / np.abs(one.view.depth(model.xyz[one.bead])))[row],
+            np.log(np.maximum(seen.strength[one.detection], 1e-3))[row],
+            seen.uv[one.detection][row],
+        )
+        for one, row in zip(matches, rows)
+    ]
     order = np.argsort(likelihoods)
     if likelihoods[order[-1]] - likelihoods[order[-2]] < SIZE_MARGIN:
         return None
     return matches[order[-1]]
 
 
-def _likelihood_of_sizes(
-    one: Match, diameter: np.ndarray, seen: Seen, model: PhantomModel
-) -> float:
-    """Log-likelihood of the responses to beads of known diameters (n,) [mm].
+def _likelihood_of_sizes(size: np.ndarray, response: np.ndarray, uv: np.ndarray) -> float:
+    """Log-likelihood of responses (n,) to shadows of sizes (n,), as logarithms, at uv (n, 2).
 
-    The logarithm of a response is linear in that of the size of the shadow, and changes slowly
-    across the image. Its scatter is that of the beads around: it is larger at the edge of a
-    sheet, so that a mark elsewhere stands out.
+    A response is linear in the size, and changes slowly across the image. Its scatter is that of
+    the beads around: it is larger at the edge of a sheet, so that a mark elsewhere stands out.
     """
-    assert seen.strength is not None
-    uv = seen.uv[one.detection]
-    response = np.log(np.maximum(seen.strength[one.detection], 1e-3))
-    size = np.log(diameter[one.bead] / np.abs(one.view.depth(model.xyz[one.bead])))
     _, near = cKDTree(uv).query(uv, k=min(SIZE_NEIGHBOURS + 1, len(uv)))
     x = size - size[near].mean(axis=1)
     y = response - response[near].mean(axis=1)

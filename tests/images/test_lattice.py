@@ -97,16 +97,16 @@ def with_responses(seen: Seen, true: np.ndarray, enlarged: list[int]) -> Seen:
     """What is found of a sheet, with the responses to its holes: they scatter most at its rim."""
     response = np.random.default_rng(5).normal(0, 0.04, len(true))
     place = np.arange(len(true))
-    rim = np.isin(place // 15, (0, 14)) | np.isin(place % 15, (0, 14))
+    rim = np.isin(place // 13, (0, 12)) | np.isin(place % 13, (0, 12))
     response[rim] -= np.random.default_rng(6).uniform(0, 0.6, rim.sum())
     response[enlarged] += 0.35
     return replace(seen, strength=np.exp(response))
 
 
 @pytest.mark.parametrize('steps', [SQUARE, HEXAGONAL])
-@pytest.mark.parametrize('count', [1, 3])
+@pytest.mark.parametrize('count', [1, 2])
 def test_enlarged_holes_tell_where_a_sheet_is(steps, count):
-    xyz = grid(steps)
+    xyz = grid(steps, 13)
     order = np.argsort(np.linalg.norm(xyz - (21.0, 9.0, 0.0), axis=1))
     diameter = np.full(len(xyz), 2.0)
     diameter[order[:count]] *= 1.4
@@ -119,7 +119,7 @@ def test_enlarged_holes_tell_where_a_sheet_is(steps, count):
 
 
 def test_an_enlarged_hole_on_an_axis_of_symmetry_does_not_tell_the_side_of_a_sheet():
-    xyz = grid(SQUARE)
+    xyz = grid(SQUARE, 13)
     diameter = np.full(len(xyz), 2.0)
     mark = int(np.argmin(np.linalg.norm(xyz - (20.0, 20.0, 0.0), axis=1)))
     diameter[mark] *= 1.4

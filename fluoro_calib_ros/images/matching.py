@@ -24,6 +24,7 @@ from ..photogrammetry.rotations import rotation_angle
 from .growth import Match, Seen, grow, settle, start_view
 from .lattice import FlatGrid, GridPose, grid_poses
 from .pose_search import Triples, local_poses, nearby_map, triples_of
+from .search_length import enough_seeds
 from .view import Lens, View, fit_view
 
 MIN_BEADS = 10
@@ -42,7 +43,8 @@ MARGIN_BEADS = 8
 # Levels of the search: neighbours of a bead in the phantom, in the image, beads tried (from, to),
 # and limits of the scale by the extent of what is seen. The first finds most poses, the second and
 # third find those that see all faces of a phantom from the edge. The others find a phantom with
-# other things around it, and a small part of a phantom.
+# other things around it, and a small part of a phantom. Beads are tried until a right pose would
+# have been found (search_length.py); the third is for phantoms with which so many are not enough.
 LEVELS = (
     (8, 6, (0, 8), (0.85, 1.4)),
     (8, 6, (8, 80), (0.85, 1.4)),
@@ -370,9 +372,15 @@ def _candidates(seen: Seen, model: PhantomModel, lens: Lens) -> Iterator[Match]:
     beads = nearby_map(seen.uv, lens.image_size, seen.tolerance_px)
     beads[~seen.field] = 2
     order = seeds_of(seen)
-    for triples, (_, neighbours, (first, last), limits) in zip(model.triples, LEVELS):
+    enough = len(order)
+    for triples, (wide, neighbours, (first, last), limits) in zip(model.triples, LEVELS):
         scales = _scales(seen, model, limits)
-        for seed in order[first:last]:
+        if first == CENTRAL:
+            enough = _enough(seen, model)
+        elif wide > LEVELS[0][0] and enough < LEVELS[1][2][1]:
+            # Fewer neighbours were enough.
+            continue
+        for seed in order[first : min(last, enough)]:
             _, around = seen.tree.query(seen.uv[seed], k=min(neighbours + 1, len(seen.uv)))
             around = around[around != seed]
             for pose in local_poses(
@@ -382,6 +390,12 @@ def _candidates(seen: Seen, model: PhantomModel, lens: Lens) -> Iterator[Match]:
                 found = grow(view, pose.bead, model.xyz, seen)
                 if found is not None:
                     yield found
+
+
+def _enough(seen: Seen, model: PhantomModel) -> int:
+    """From how many beads the search for the phantom, in view as a whole, is long enough."""
+    radius_mm = seen.radius_px / _scale_by_extent(seen, model)
+    return enough_seeds(model.xyz, len(seen.uv), radius_mm, LEVELS[0][:2])
 
 
 def seeds_of(seen: Seen) -> np.ndarray:
@@ -406,14 +420,18 @@ def seeds_of(seen: Seen) -> np.ndarray:
 
 def _scales(seen: Seen, model: PhantomModel, limits: tuple[float, float]) -> tuple[float, float]:
     """Smallest and largest scale [px/mm]; limits are those by the extent of what is seen."""
-    spread = np.sqrt(np.mean(np.sum((seen.uv - np.median(seen.uv, axis=0)) ** 2, axis=1)))
-    extent = np.sqrt(np.mean(np.sum((model.xyz - model.xyz.mean(axis=0)) ** 2, axis=1)))
-    by_extent = spread / (np.sqrt(2 / 3) * extent)
-    low, high = (by_extent * factor for factor in limits)
+    low, high = (_scale_by_extent(seen, model) * factor for factor in limits)
     if model.diameter_mm is None:
         return low, high
     by_size = 2 * seen.radius_px / float(np.median(model.diameter_mm))
     return max(low, by_size * SCALE_BY_SIZE[0]), min(high, by_size * SCALE_BY_SIZE[1])
+
+
+def _scale_by_extent(seen: Seen, model: PhantomModel) -> float:
+    """Scale [px/mm] at which the phantom is as large as what is seen."""
+    spread = np.sqrt(np.mean(np.sum((seen.uv - np.median(seen.uv, axis=0)) ** 2, axis=1)))
+    extent = np.sqrt(np.mean(np.sum((model.xyz - model.xyz.mean(axis=0)) ** 2, axis=1)))
+    return float(spread / (np.sqrt(2 / 3) * extent))
 
 
 def _symmetries(xyz: np.ndarray) -> Iterator[Symmetry]:

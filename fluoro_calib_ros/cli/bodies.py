@@ -105,7 +105,7 @@ def run(arguments: argparse.Namespace) -> None:
         rate=arguments.rate,
         neutral=neutral,
     )
-    with ErrorsAt(arguments.source), ProgressBar('exposures') as bar:
+    with ErrorsAt(arguments.source), ProgressBar('bodies', 'exposure') as bar:
         outcome = track_bodies(
             recording.frames,
             calibrations,
@@ -115,10 +115,12 @@ def run(arguments: argparse.Namespace) -> None:
             options=options,
             progress=bar,
         )
-    film = None
-    if arguments.film is not None:
-        film = Film(arguments.film, calibrations, orientation.subset(list(recording.frames)))
-    save_bodies(arguments.out, outcome, arguments.report, film)
+    with ProgressBar('film') as bar:
+        film = None
+        if arguments.film is not None:
+            views = orientation.subset(list(recording.frames))
+            film = Film(arguments.film, calibrations, views, bar)
+        save_bodies(arguments.out, outcome, arguments.report, film)
     print_unpaired(arguments.source, outcome.unpaired)
     print_findings(outcome.findings, 'doubtful: ')
     _print(arguments, outcome)

@@ -68,7 +68,7 @@ def run(arguments: argparse.Namespace) -> bool:
     recording, calibrations, orientation = read_oriented_source(arguments, path)
     print_notes(recording.notes)
     options = options_of(HealingOptions, arguments)
-    with ErrorsAt(arguments.source), ProgressBar('steps') as bar:
+    with ErrorsAt(arguments.source), ProgressBar('heal', 'step') as bar:
         outcome = heal_rig(
             recording.frames, calibrations, orientation, bodies, options, progress=bar
         )

@@ -114,10 +114,14 @@ def print_step(step: str, done: int, total: int) -> None:
 
 
 class ProgressBar:
-    """A progress bar on a terminal, nothing elsewhere; a context manager."""
+    """A progress bar on a terminal, 'name: image 3 of 16'; a context manager.
 
-    def __init__(self, name: str) -> None:
+    Elsewhere it shows nothing. unit is what is counted.
+    """
+
+    def __init__(self, name: str, unit: str = 'image') -> None:
         self._name = name
+        self._unit = unit
         self._bar: Any = None
 
     def __call__(self, done: int, total: int) -> None:
@@ -129,11 +133,13 @@ class ProgressBar:
             self._bar = tqdm(
                 desc=self._name,
                 total=total or None,
-                unit=' images',
+                unit=self._unit,
+                bar_format='{desc}: {unit} {n_fmt} of {total_fmt} {bar} {remaining}',
                 disable=None,
                 leave=False,
                 ncols=shutil.get_terminal_size().columns,
             )
+        self._bar.total = total or None
         self._bar.update(done - self._bar.n)
 
     def __enter__(self) -> ProgressBar:

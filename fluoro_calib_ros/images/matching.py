@@ -24,6 +24,7 @@ from ..photogrammetry.rotations import rotation_angle
 from .growth import Match, Seen, grow, settle, start_view
 from .lattice import FlatGrid, GridPose, grid_poses
 from .pose_search import Triples, local_poses, nearby_map, triples_of
+from .search_length import enough_seeds
 from .view import Lens, View, fit_view
 
 MIN_BEADS = 10
@@ -42,7 +43,8 @@ MARGIN_BEADS = 8
 # Levels of the search: neighbours of a bead in the phantom, in the image, beads tried (from, to),
 # and limits of the scale by the extent of what is seen. The first finds most poses, the second and
 # third find those that see all faces of a phantom from the edge. The others find a phantom with
-# other things around it, and a small part of a phantom.
+# other things around it, and a small part of a phantom. Beads are tried until a right pose would
+# have been found (search_length.py); the third is for phantoms with which so many are not enough.
 LEVELS = (
     (8, 6, (0, 8), (0.85, 1.4)),
     (8, 6, (8, 80), (0.85, 1.4)),
@@ -58,7 +60,11 @@ RIVAL_STEPS = 3
 MIN_SIZES = 0.1  # relative difference of diameters from which sizes tell beads apart
 SIZE_MARGIN = 10.0  # log-likelihood by which sizes must prefer a pose
 GRID_MARGIN = 10.0  # log-likelihood by which a pose of a grid must exceed another one
-SIZE_TAIL = 6.0
+SIZE_TAIL = 6.0  # residual of a response beyond which it counts no more [standard deviations]
+SIZE_NEIGHBOURS = 12  # that tell what response is usual
+# Of the logarithm of a response to that of a radius r. A disc has r^2 exp(-r^2 / 2 s^2) at a scale
+# s, where r < 1.2 s; a small sphere has its thickness as a further factor.
+SIZE_SLOPES = (0.5, 3.0)
 CLOSER = 2.0  # factor on the residuals of one pose from which another is the better one
 SYMMETRY_SHARE = 0.4  # of the beads that a symmetry takes near to a bead
 SYMMETRY_REACH = 0.3  # of the distance between neighbours
@@ -274,27 +280,45 @@ def unambiguous(best: Match, seen: Seen, model: PhantomModel, turn_rad: float = 
 def _best_by_size(matches: list[Match], seen: Seen, model: PhantomModel) -> Match | None:
     """Return the match in which beads are seen as large as they are; None where none stands out.
 
-    The logarithm of the response to a bead is linear in that of the size of its shadow. Matches
-    are compared by the likelihood of the residuals from that line.
+    Matches are compared by the likelihood of the responses to the beads that all of them have.
     """
     diameter = model.diameter_mm
     if seen.strength is None or diameter is None or np.ptp(diameter) < MIN_SIZES * diameter.min():
         return None
-    likelihoods = []
-    for one in matches:
-        size = np.log(diameter[one.bead] / np.abs(one.view.depth(model.xyz[one.bead])))
-        response = np.log(np.maximum(seen.strength[one.detection], 1e-3))
-        x = size - size.mean()
-        slope = max(float(x @ response / max(x @ x, 1e-12)), 0.0)
-        residual = response - np.median(response - slope * x) - slope * x
-        spread = 1.4826 * float(np.median(np.abs(residual)))
-        # Beads that overlap or are cut off have any response.
-        squared = np.minimum(residual**2, (SIZE_TAIL * spread) ** 2)
-        likelihoods.append(-0.5 * len(x) * np.log(max(float(squared.mean()), 1e-12)))
+    common = set.intersection(*(set(one.detection.tolist()) for one in matches))
+    if len(common) < MIN_BEADS:
+        return None
+    rows = [np.flatnonzero(np.isin(one.detection, list(common))) for one in matches]
+    likelihoods = [
+        _likelihood_of_sizes(
+            np.log(diameter[one.bead] / np.abs(one.view.depth(model.xyz[one.bead])))[row],
+            np.log(np.maximum(seen.strength[one.detection], 1e-3))[row],
+            seen.uv[one.detection][row],
+        )
+        for one, row in zip(matches, rows)
+    ]
     order = np.argsort(likelihoods)
     if likelihoods[order[-1]] - likelihoods[order[-2]] < SIZE_MARGIN:
         return None
     return matches[order[-1]]
+
+
+def _likelihood_of_sizes(size: np.ndarray, response: np.ndarray, uv: np.ndarray) -> float:
+    """Log-likelihood of responses (n,) to shadows of sizes (n,), as logarithms, at uv (n, 2).
+
+    A response is linear in the size, and changes slowly across the image. Its scatter is that of
+    the beads around: it is larger at the edge of a sheet, so that a mark elsewhere stands out.
+    """
+    _, near = cKDTree(uv).query(uv, k=min(SIZE_NEIGHBOURS + 1, len(uv)))
+    x = size - size[near].mean(axis=1)
+    y = response - response[near].mean(axis=1)
+    slope = np.clip(float(x @ y) / max(float(x @ x), 1e-12), *SIZE_SLOPES)
+    level = response - slope * size
+    around = np.median(level[near], axis=1)
+    scatter = 1.4826 * np.median(np.abs(level[near] - around[:, None]), axis=1)
+    scatter = np.maximum(scatter, np.median(scatter))
+    residual = np.minimum(np.abs(level - around) / np.maximum(scatter, 1e-6), SIZE_TAIL)
+    return float(-np.sum(np.log(np.maximum(scatter, 1e-6))) - 0.5 * np.sum(residual**2))
 
 
 def _climbed(
@@ -348,9 +372,15 @@ def _candidates(seen: Seen, model: PhantomModel, lens: Lens) -> Iterator[Match]:
     beads = nearby_map(seen.uv, lens.image_size, seen.tolerance_px)
     beads[~seen.field] = 2
     order = seeds_of(seen)
-    for triples, (_, neighbours, (first, last), limits) in zip(model.triples, LEVELS):
+    enough = len(order)
+    for triples, (wide, neighbours, (first, last), limits) in zip(model.triples, LEVELS):
         scales = _scales(seen, model, limits)
-        for seed in order[first:last]:
+        if first == CENTRAL:
+            enough = _enough(seen, model)
+        elif wide > LEVELS[0][0] and enough < LEVELS[1][2][1]:
+            # Fewer neighbours were enough.
+            continue
+        for seed in order[first : min(last, enough)]:
             _, around = seen.tree.query(seen.uv[seed], k=min(neighbours + 1, len(seen.uv)))
             around = around[around != seed]
             for pose in local_poses(
@@ -360,6 +390,12 @@ def _candidates(seen: Seen, model: PhantomModel, lens: Lens) -> Iterator[Match]:
                 found = grow(view, pose.bead, model.xyz, seen)
                 if found is not None:
                     yield found
+
+
+def _enough(seen: Seen, model: PhantomModel) -> int:
+    """From how many beads the search for the phantom, in view as a whole, is long enough."""
+    radius_mm = seen.radius_px / _scale_by_extent(seen, model)
+    return enough_seeds(model.xyz, len(seen.uv), radius_mm, LEVELS[0][:2])
 
 
 def seeds_of(seen: Seen) -> np.ndarray:
@@ -384,14 +420,18 @@ def seeds_of(seen: Seen) -> np.ndarray:
 
 def _scales(seen: Seen, model: PhantomModel, limits: tuple[float, float]) -> tuple[float, float]:
     """Smallest and largest scale [px/mm]; limits are those by the extent of what is seen."""
-    spread = np.sqrt(np.mean(np.sum((seen.uv - np.median(seen.uv, axis=0)) ** 2, axis=1)))
-    extent = np.sqrt(np.mean(np.sum((model.xyz - model.xyz.mean(axis=0)) ** 2, axis=1)))
-    by_extent = spread / (np.sqrt(2 / 3) * extent)
-    low, high = (by_extent * factor for factor in limits)
+    low, high = (_scale_by_extent(seen, model) * factor for factor in limits)
     if model.diameter_mm is None:
         return low, high
     by_size = 2 * seen.radius_px / float(np.median(model.diameter_mm))
     return max(low, by_size * SCALE_BY_SIZE[0]), min(high, by_size * SCALE_BY_SIZE[1])
+
+
+def _scale_by_extent(seen: Seen, model: PhantomModel) -> float:
+    """Scale [px/mm] at which the phantom is as large as what is seen."""
+    spread = np.sqrt(np.mean(np.sum((seen.uv - np.median(seen.uv, axis=0)) ** 2, axis=1)))
+    extent = np.sqrt(np.mean(np.sum((model.xyz - model.xyz.mean(axis=0)) ** 2, axis=1)))
+    return float(spread / (np.sqrt(2 / 3) * extent))
 
 
 def _symmetries(xyz: np.ndarray) -> Iterator[Symmetry]:

@@ -56,6 +56,8 @@ class Film:
     source: Path  #: bag of images, or folder with a folder for each fluoroscope
     calibrations: Calibrations
     orientation: RigOrientation  #: of the fluoroscopes of the recording
+    #: called after each image with the number of those read of a fluoroscope, and their total
+    progress: Callable[[int, int], None] | None = None
 
 
 def write_films(
@@ -95,7 +97,7 @@ def _frames(
 ) -> Iterator[tuple[str, np.ndarray]]:
     """Yield the pictures of a fluoroscope. Raises DataError for an image that cannot be read."""
     rows = {number: row for row, number in enumerate(poses[0].number.tolist())}
-    for image in open_sources([source], name).images():
+    for image in open_sources([source], name).counted(film.progress):
         if isinstance(image.image, DataError):
             raise image.image.at(image.place)
         row = rows.get(image.exposure)

@@ -83,6 +83,13 @@ class ImageSources:
     count: int
     images: Callable[[], Iterator[SourceImage]]
 
+    def counted(self, progress: Callable[[int, int], None] | None) -> Iterator[SourceImage]:
+        """Yield the images; progress is called after each with their number and the total."""
+        for number, image in enumerate(self.images(), 1):
+            yield image
+            if progress is not None:
+                progress(number, max(self.count, number))
+
 
 def open_sources(
     sources: Sequence[Path], fluoroscope: str = '', angles: ImageAngles | None = None

@@ -217,9 +217,9 @@ def run_marker_extraction(
     """Follow markers through the images of one or two fluoroscopes.
 
     A damaged image, or one of another size, is passed over, and its result says why. progress is
-    called after every exposure with the number of those that are done, and their total. Raises
-    DataError for sources that cannot be read, markers that are not in the images, and fluoroscopes
-    without calibration.
+    called after every exposure with the number of those that are done, and their total, and again
+    while pictures of them are written. Raises DataError for sources that cannot be read, markers
+    that are not in the images, and fluoroscopes without calibration.
     """
     names = list(request.sources)
     sources = {name: open_sources(request.sources[name], name, request.angles) for name in names}
@@ -235,7 +235,7 @@ def run_marker_extraction(
                 progress(number, max(total, number))
     outcome = recording.outcome()
     if request.overlay is not None:
-        _write_pictures(request, sources, outcome)
+        _write_pictures(request, sources, outcome, progress)
     return outcome
 
 
@@ -433,13 +433,16 @@ def _ahead(images: Iterator[SourceImage]) -> Iterator[SourceImage]:
 
 
 def _write_pictures(
-    request: MarkerRequest, sources: Mapping[str, ImageSources], outcome: MarkerOutcome
+    request: MarkerRequest,
+    sources: Mapping[str, ImageSources],
+    outcome: MarkerOutcome,
+    progress: Progress | None,
 ) -> None:
     """Write a picture of every image that can be read, with the final ids."""
     assert request.overlay is not None
     for name, source in sources.items():
         found = {result.exposure: result.markers for result in outcome.results[name]}
-        for image in source.images():
+        for image in source.counted(progress):
             if image.exposure in found and not isinstance(image.image, DataError):
                 picture = draw_markers(image.image, found[image.exposure], request.target_names)
                 path = request.overlay / f'{name}_{image.exposure:04d}.png'

@@ -148,11 +148,18 @@ def test_film_has_the_markers_where_they_were_observed(knee, tmp_path, monkeypat
         return draw_bodies(image, title, bodies)
 
     monkeypatch.setattr('fluoro_calib_ros.jobs.bodies.draw_bodies', draw)
+    counted = []
+    monkeypatch.setattr(
+        'fluoro_calib_ros.cli.output.ProgressBar.__call__',
+        lambda bar, done, total: counted.append((bar._name, bar._unit, done, total)),
+    )
     film = ('--smooth', 'none', '--film', tmp_path / 'images')
     assert bodies(knee, tmp_path / 'motion', *film) == 0
     frames = read_frames(knee / 'walking').frames
     seen = [{f.number: f for f in frames[name]}[number] for name in 'ab' for number in shown]
     assert len(views) == len(seen)
+    of_film = [each[1:] for each in counted if each[0] == 'film']
+    assert of_film == 2 * [('image', number + 1, 4) for number in range(4)]
     for frame, of_image in zip(seen, views):
         markers = np.concatenate([view.markers for view in of_image])
         ids = np.array([3001, 3002, 3003, 3004, 3011, 3012, 3013, 3014])

@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from rigs import refused
@@ -89,6 +91,42 @@ def test_blocked_holes_tell_where_a_sheet_is(steps, blocked):
     away = np.linalg.norm(seen.uv[found.detection] - true[found.bead], axis=1)
     assert len(found.bead) > 0.97 * len(seen.uv)
     assert away.max() < 1
+
+
+def with_responses(seen: Seen, true: np.ndarray, enlarged: list[int]) -> Seen:
+    """What is found of a sheet, with the responses to its holes: they scatter most at its rim."""
+    response = np.random.default_rng(5).normal(0, 0.04, len(true))
+    place = np.arange(len(true))
+    rim = np.isin(place // 13, (0, 12)) | np.isin(place % 13, (0, 12))
+    response[rim] -= np.random.default_rng(6).uniform(0, 0.6, rim.sum())
+    response[enlarged] += 0.35
+    return replace(seen, strength=np.exp(response))
+
+
+@pytest.mark.parametrize('steps', [SQUARE, HEXAGONAL])
+@pytest.mark.parametrize('count', [1, 2])
+def test_enlarged_holes_tell_where_a_sheet_is(steps, count):
+    xyz = grid(steps, 13)
+    order = np.argsort(np.linalg.norm(xyz - (21.0, 9.0, 0.0), axis=1))
+    diameter = np.full(len(xyz), 2.0)
+    diameter[order[:count]] *= 1.4
+    for tilt in ((0.1, -0.05, 2.0), (0.1, 0.1, 4.0), (np.pi, 0.1, 1.0)):
+        true = pixels(xyz, tilt)
+        assert np.isfinite(true).all()
+        seen = with_responses(seen_of(true), true, list(order[:count]))
+        found = match(seen, PhantomModel.of(xyz, diameter), LENS)
+        assert np.array_equal(found.bead, found.detection)
+
+
+def test_an_enlarged_hole_on_an_axis_of_symmetry_does_not_tell_the_side_of_a_sheet():
+    xyz = grid(SQUARE, 13)
+    diameter = np.full(len(xyz), 2.0)
+    mark = int(np.argmin(np.linalg.norm(xyz - (20.0, 20.0, 0.0), axis=1)))
+    diameter[mark] *= 1.4
+    true = pixels(xyz, (0.1, -0.05, 2.0))
+    seen = with_responses(seen_of(true), true, [mark])
+    with refused(Kind.POSE_AMBIGUOUS):
+        match(seen, PhantomModel.of(xyz, diameter), LENS)
 
 
 def test_a_mark_outside_of_the_image_does_not_tell_where_a_sheet_is():

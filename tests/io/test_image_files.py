@@ -359,7 +359,7 @@ def test_progress_bar_only_on_a_terminal(one, tmp_path, capfd, monkeypatch):
     monkeypatch.setattr('sys.stderr', Terminal())
     assert correct(tmp_path / 'in.avi', one, tmp_path / 'out.avi', '--json') == 0
     shown = sys.stderr.getvalue()
-    assert 'in.avi' in shown and '5 images' not in shown.rpartition('\r')[2]
+    assert 'in.avi: image 0 of 5' in shown and 'image' not in shown.rpartition('\r')[2]
     json.loads(capfd.readouterr().out)
 
 

@@ -1,0 +1,64 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""How long a pose is searched for in an image of another phantom."""
+
+from __future__ import annotations
+
+import numpy as np
+from rigs import refused
+
+from fluoro_calib_ros.findings import Kind
+from fluoro_calib_ros.images import matching
+from fluoro_calib_ros.images.growth import Seen
+from fluoro_calib_ros.images.search_length import enough_seeds
+from fluoro_calib_ros.images.view import Lens
+from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
+
+LENS = Lens((1024, 1024), 4000.0)
+NEIGHBOURS = (8, 6)
+
+
+def beads(seed: int, count: int) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(-90, 90, (count, 3))
+
+
+def seen_of(xyz: np.ndarray) -> Seen:
+    uv = xyz @ matrix_from_vector([0.3, -0.5, 0.2]).T
+    uv = 4000 * uv[:, :2] / (uv[:, 2:] + 1500) + 511.5
+    return Seen.of(uv, np.ones((1024, 1024), bool), 3.0)
+
+
+def test_more_beads_are_tried_where_more_else_is_seen():
+    xyz = beads(1, 80)
+    tried = [enough_seeds(xyz, found, 1.0, NEIGHBOURS) for found in (50, 80, 120)]
+    assert tried == sorted(tried) and tried[0] < tried[1] < tried[2]
+
+
+def test_more_beads_are_tried_where_their_shadows_touch():
+    xyz = beads(1, 80)
+    assert enough_seeds(xyz, 80, 6.0, NEIGHBOURS) > enough_seeds(xyz, 80, 1.0, NEIGHBOURS)
+
+
+def test_a_phantom_whose_shadows_would_all_be_one_is_not_looked_for():
+    sheet = np.array([(x, y, 0.0) for x in range(0, 60, 6) for y in range(0, 60, 6)])
+    assert enough_seeds(sheet, 80, 6.5, NEIGHBOURS) == 0
+
+
+def test_another_phantom_is_refused_after_as_many_beads_as_would_tell(monkeypatch):
+    tried = []
+
+    def counted(seed, *arguments, **named):
+        tried.append(seed)
+        return search(seed, *arguments, **named)
+
+    search = matching.local_poses
+    monkeypatch.setattr(matching, 'local_poses', counted)
+    model = matching.PhantomModel.of(beads(1, 80))
+    seen = seen_of(beads(2, 80))
+    with refused(Kind.NO_POSE):
+        matching.match(seen, model, LENS)
+    assert len(tried) < 70  # of 122
+    tried.clear()
+    found = matching.match(seen_of(model.xyz), model, LENS)
+    assert np.array_equal(found.bead, found.detection) and len(tried) <= matching.CENTRAL

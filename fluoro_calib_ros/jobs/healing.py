@@ -140,12 +140,7 @@ def heal_rig(
     used, unused = _chosen(len(paired))
     rig = _Rig(calibrations, orientation, usable)
     observed, poses = rig.observe([paired[row] for row in used])
-    seen = int(poses.known.any(axis=1).sum())
-    if seen < MIN_EXPOSURES:
-        raise DataError(
-            f'{seen} of {len(used)} exposures show three markers of a body in two views, '
-            f'{MIN_EXPOSURES} are needed'
-        )
+    _check_seen(poses)
     step(1, 4)
     places = poses.centre_mm[poses.known]
     before = rig_errors(orientation, places)
@@ -153,19 +148,19 @@ def heal_rig(
     diagnosis = diagnostician.diagnose(observed, poses)
     step(2, 4)
     changed = [change for change in diagnosis.changes if change.cause in OF_RIG]
+    fixed = rig.with_fixed_correction(changed)
     healed = None
     after = before
     now = rig
-    fixed = rig.with_fixed_correction(changed)
     if changed and not fixed:
         stamp_ns = max(frame.stamp_ns for frame in paired[used[-1]].values())
         healed = healed_rig(diagnostician, diagnosis, stamp_ns, len(used))
         now = rig.healed(healed)
         after = rig_errors(now.orientation, places)
     step(3, 4)
-    kept_back = [paired[row] for row in unused]
     checks = [_correctable(fixed) if fixed else _identified(healed), _sure(diagnosis, rig)]
     if not fixed:  # else they tell of the same change
+        kept_back = [paired[row] for row in unused]
         checks += _unused_exposures(now, kept_back, diagnosis, before.scale)
     step(4, 4)
     return HealingOutcome(
@@ -180,6 +175,16 @@ def heal_rig(
         findings=tuple(_finding(change, rig, diagnosis) for change in diagnosis.changes),
         exposures=len(used),
     )
+
+
+def _check_seen(poses: Poses) -> None:
+    """Raise DataError for too few exposures with a pose of a body."""
+    seen = int(poses.known.any(axis=1).sum())
+    if seen < MIN_EXPOSURES:
+        raise DataError(
+            f'{seen} of {len(poses.known)} exposures show three markers of a body in two views, '
+            f'{MIN_EXPOSURES} are needed'
+        )
 
 
 def _chosen(count: int) -> tuple[list[int], list[int]]:

@@ -413,6 +413,17 @@ class NeighbourModel(CorrectionModel):
 # order (Gronenschild, Medical Physics 24, 1997), so that polynomial is fitted first.
 
 
+def _distances(
+    candidates: np.ndarray, uv: np.ndarray, k: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Differences (n, c) in u and v of candidates, squared distances, and those of the k-th."""
+    dx = candidates[:, 0] - uv[:, :1]
+    dy = candidates[:, 1] - uv[:, 1:]
+    distance2 = dx * dx
+    distance2 += dy * dy
+    return dx, dy, distance2, np.partition(distance2, k - 1, axis=1)[:, k - 1]
+
+
 class LocalLinearModel(NeighbourModel):
     """Cubic trend plus a plane fitted to the k nearest remainders with tricube weights."""
 
@@ -430,11 +441,7 @@ class LocalLinearModel(NeighbourModel):
     @classmethod
     def weights_of_candidates(cls, candidates: np.ndarray, uv: np.ndarray, k: int) -> np.ndarray:
         """Weights (n, c); a candidate as far as the k-th nearest or farther has the weight 0."""
-        dx = candidates[:, 0] - uv[:, :1]
-        dy = candidates[:, 1] - uv[:, 1:]
-        distance2 = dx * dx
-        distance2 += dy * dy
-        kth = np.partition(distance2, k - 1, axis=1)[:, k - 1]
+        dx, dy, distance2, kth = _distances(candidates, uv, k)
         ratio = distance2 / np.maximum(kth, 1e-12)[:, None]
         np.minimum(ratio, 1, out=ratio)
         kernel = np.sqrt(ratio)
@@ -460,10 +467,6 @@ class HybridModel(LocalLinearModel):
     gauge_passes = 3
 
 
-MIN_CANDIDATE = 3
-MAX_CANDIDATE = 100
-
-
 class KnnModel(NeighbourModel):
     """Mean of the k nearest training corrections, as scikit-learn's KNeighborsRegressor."""
 
@@ -481,16 +484,12 @@ class KnnModel(NeighbourModel):
     @classmethod
     def weights_of_candidates(cls, candidates: np.ndarray, uv: np.ndarray, k: int) -> np.ndarray:
         """Weights (n, c); candidates at the distance of the k-th nearest share its weight."""
-        dx = candidates[:, 0] - uv[:, :1]
-        dy = candidates[:, 1] - uv[:, 1:]
-        distance2 = dx * dx
-        distance2 += dy * dy
-        kth = np.partition(distance2, k - 1, axis=1)[:, k - 1]
+        *_, distance2, kth = _distances(candidates, uv, k)
         nearest = (distance2 <= kth[:, None]).astype(float)
         return nearest / nearest.sum(axis=1, keepdims=True)
 
     @classmethod
     def candidate_k(cls, count: int) -> np.ndarray:
         """Return all k from 3 to 100, or to 40 % of count training points."""
-        largest = max(cls.min_k, min(int(count * 0.4), MAX_CANDIDATE))
-        return np.arange(min(MIN_CANDIDATE, largest), largest + 1)
+        largest = max(cls.min_k, min(int(count * 0.4), 100))
+        return np.arange(min(3, largest), largest + 1)

@@ -154,10 +154,6 @@ class CalibrationOutcome:
         """
         return dataframe_of(result_tables(self.result), name)
 
-    def without_runs(self) -> CalibrationOutcome:
-        """Return the outcome without the networks behind it, which only the figures need."""
-        return replace(self, result=replace(self.result, runs={}, solved={}))
-
 
 def run_calibration(
     request: CalibrationRequest,
@@ -413,4 +409,5 @@ def _outcome(
 ) -> CalibrationOutcome:
     """Run the job in the worker process."""
     outcome = run_calibration(request, validate=validate, rig=rig, progress=progress)
-    return outcome.without_runs()
+    # Only the figures need the networks behind it.
+    return replace(outcome, result=replace(outcome.result, runs={}, solved={}))

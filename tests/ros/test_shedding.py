@@ -42,7 +42,7 @@ with subprocess.Popen(command, stdout=subprocess.PIPE) as publishers:
     publishers.stdout.read(1)
     time.sleep(0.5)
     found = set()
-    end = time.monotonic() + 5
+    end = time.monotonic() + 2
     while time.monotonic() < end and len(found - {-1}) < int(sys.argv[2]):
         taken = reader.handle.take_message(Int32, False)
         if taken is None:

@@ -7,11 +7,12 @@ import csv
 import json
 import os
 import shutil
+from types import SimpleNamespace
 
 import pytest
 from rigs import run
 
-from fluoro_calib_ros.cli.process import STATE, trial_row
+from fluoro_calib_ros.cli.process import STATE, Done, _Work, trial_row
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.io.csv_table import write_table
 from fluoro_calib_ros.io.study_file import read_study
@@ -224,3 +225,21 @@ def test_doubt_about_a_body_makes_a_trial_doubtful():
     assert row['verdict'] == 'cannot tell' and row['cause'] == 'marker 3 has moved'
     assert row['tibia_poses'] == 5 and row['knee_flexion_range_deg'] == 30.0
     assert trial_row('walk', 'fail', [(Bodies, Given)])['verdict'] == 'fail'
+
+
+def test_step_is_kept_only_with_its_digest_and_all_that_it_wrote(tmp_path):
+    step = SimpleNamespace(key='k', out=tmp_path / 'out', document=tmp_path / 'document.json')
+    work = SimpleNamespace(_state={'k': {'digest': 'd', 'status': 3}, 'other': 5})
+
+    def kept(digest='d', key='k'):
+        step.key = key
+        return _Work._kept(work, step, digest)
+
+    assert kept() is None
+    step.out.mkdir()
+    assert kept() is None
+    step.document.write_text('{"a": 1}')
+    assert kept() == Done(3, {'a': 1})
+    assert kept('e') is None and kept(key='other') is None and kept(key='unknown') is None
+    step.out.rmdir()
+    assert kept() is None

@@ -207,6 +207,15 @@ def test_mayacam1_of_xmalab_is_read(tmp_path):
     assert_same(registry.read(tmp_path, MM).cameras, cameras())
 
 
+@pytest.mark.parametrize('count', [0, 4, 6])
+def test_mayacam1_has_five_rows(tmp_path, count):
+    rows = [*xmalab_mayacam1(cameras()[0]), [1, 2, 3]][:count]
+    path = tmp_path / 'a_MayaCam.csv'
+    path.write_text('\n'.join(','.join(f'{value:.15g}' for value in row) for row in rows) + '\n')
+    with pytest.raises(DataError, match=f'{count} rows' if count else 'no rows'):
+        registry.read(path, MM, 'mayacam1')
+
+
 def test_dlt_gives_pixels_from_one_upwards(tmp_path):
     """By the eleven coefficients of XMALab and DLTdv: L1 X + L2 Y + L3 Z + L4 over the third."""
     path = tmp_path / 'dlt.csv'

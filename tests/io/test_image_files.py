@@ -23,7 +23,12 @@ from fluoro_calib_ros.images.corrector import ImageCorrector
 from fluoro_calib_ros.io import image_reading as tiff
 from fluoro_calib_ros.io.calibration import save_calibration
 from fluoro_calib_ros.io.image_reading import IMAGE_SUFFIXES, SUPPORTS_16_BIT_VIDEOS, ImageSource
-from fluoro_calib_ros.io.image_writing import correct_images, list_images, write_video
+from fluoro_calib_ros.io.image_writing import (
+    correct_images,
+    folder_like,
+    list_images,
+    write_video,
+)
 
 SIZE = (128, 96)
 BEADS = [[30.2, 20.9], [60.5, 50.1], [100.0, 80.4], [20.3, 75.7]]
@@ -622,3 +627,18 @@ def test_angles_of_images_need_one_file_and_a_calibration_that_depends_on_them(
     assert 'angles are those of the images of one file' in capsys.readouterr().err
     assert correct(folder / 'one.png', one, tmp_path / 'out.png', '--angles', angles) == 0
     assert 'does not depend on an angle' in capsys.readouterr().err
+
+
+def test_folder_of_images_does_not_replace_a_file(tmp_path):
+    source = tmp_path / 'images'
+    source.mkdir()
+    (source / 'one.png').write_bytes(encode(np.full((4, 6), 9, np.uint8), '.png'))
+    out = tmp_path / 'out'
+    out.write_text('mine')
+    with pytest.raises(DataError, match='this is a file'), folder_like(out, list_images(source)):
+        raise AssertionError
+    assert out.read_text() == 'mine' and sorted(tmp_path.iterdir()) == [source, out]
+    out.unlink()
+    with folder_like(out, list_images(source)) as folder:
+        (folder / 'one.png').write_bytes(b'new')
+    assert (out / 'one.png').read_bytes() == b'new'

@@ -21,8 +21,12 @@ from rosbags.rosbag2 import Reader
 
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.io.bags import writer as writer_module
-from fluoro_calib_ros.io.bags.mcap_file import RECORD
-from fluoro_calib_ros.io.bags.metadata import TARGET_OBSERVATIONS, message_from_frame
+from fluoro_calib_ros.io.bags.mcap_file import RECORD, channels_of_bag, is_foreign
+from fluoro_calib_ros.io.bags.metadata import (
+    TARGET_OBSERVATIONS,
+    known_definition,
+    message_from_frame,
+)
 from fluoro_calib_ros.io.bags.reader import iterate_messages, read_frames
 from fluoro_calib_ros.io.bags.salvage import FileSalvage, _decompressed, recover_bag
 from fluoro_calib_ros.io.bags.writer import BagWriter
@@ -263,3 +267,16 @@ def test_information_about_a_bag(tmp_path, frames, capsys):
     write_bag(tmp_path / 'good', frames)
     assert run('bag', 'info', tmp_path / 'good') == 0
     assert 'no faults found' in capsys.readouterr().out
+
+
+def test_channels_of_a_bag_have_type_hash_format_and_count(bag, frames):
+    found = {one.channel.topic: one for one in channels_of_bag(bag)}
+    assert set(found) == {f'/{name}/target_observations' for name in frames}
+    known = known_definition(TARGET_OBSERVATIONS)
+    for name, of_one in frames.items():
+        one = found[f'/{name}/target_observations']
+        assert one.count == len(of_one)
+        assert one.channel.metadata['topic_type_hash'] == known.type_hash
+        assert one.channel.message_encoding == 'cdr' and one.schema.name == TARGET_OBSERVATIONS
+    assert not is_foreign(bag) and not is_foreign(bag / 'bag_0.mcap')
+    assert not is_foreign(bag / 'none')

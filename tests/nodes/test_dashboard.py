@@ -70,7 +70,7 @@ def test_text_holds_every_part_of_the_state():
 def test_findings_follow_the_verdict():
     state = replace(STATE, verdict='fail', findings=('the residuals have a trend',))
     text = text_of(session_text(state))
-    assert text.index('fail') < text.index('the residuals have a trend')
+    assert text.index('verdict') < text.index('fail') < text.index('the residuals have a trend')
 
 
 def test_brackets_are_shown_and_control_characters_are_not():

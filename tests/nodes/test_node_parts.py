@@ -206,7 +206,24 @@ def test_calibration_message_that_is_too_large_is_refused_undecoded(calibration,
         assert inbox.ended.acquire(timeout=60)
         assert len(inbox.refused) == sentences and len(inbox.taken) == 1 - sentences
     inbox.calibrations._on_data('a', b'\0\1\0\0damaged')
-    assert len(inbox.refused) == 1 and len(inbox.taken) == 1
+    (sentence,) = inbox.refused
+    assert 'topic a/calibration ' in sentence and len(inbox.taken) == 1
+
+
+def test_calibrations_wait_while_two_nodes_publish_them(calibration):
+    """The newest one is used when one node is left."""
+    inbox = Inbox()
+    inbox.go.set()
+    one, other = (SimpleNamespace(node_namespace='/', node_name=name) for name in 'xy')
+    inbox.publishers = [one, other]
+    for number in (1, 2):
+        inbox.put(message_from_calibration(replace(calibration, stamp_ns=number)))
+    inbox.calibrations.release()
+    assert not inbox.ended.acquire(timeout=0.2) and not inbox.taken
+    assert 'x' in inbox.calibrations.conflict('a') and not inbox.refused
+    inbox.publishers = [other]
+    inbox.calibrations.release()
+    assert inbox.ended.acquire(timeout=60) and inbox.taken == [2]
 
 
 # ---- orientation, and what requests may ask

@@ -19,6 +19,7 @@ from fluoro_calib_ros.simulation.knee import (
     CYCLE_S,
     FALL_S,
     MOTIONS,
+    _coupled,
     landing,
     simulate_knee,
     virtual_knee,
@@ -166,3 +167,11 @@ def test_the_markers_are_seen(name):
             np.testing.assert_array_equal(frame.uv, other.uv)
     ids = np.concatenate([body.target_id for body in knee.bodies])
     assert len(set(ids.tolist())) == 8 and ids.min() > 2000
+
+
+def test_what_goes_with_flexion_is_a_few_degrees_and_millimetres():
+    """Of an extended knee and one bent by 90 degrees: the drawer goes back by 6 mm."""
+    angles, translations = _coupled(np.deg2rad([0.0, 90.0]), np.zeros(2))
+    assert np.rad2deg(angles[:, 0]) == pytest.approx([0.0, 90.0])
+    assert angles[1, 1:] - angles[0, 1:] == pytest.approx([-0.04, 0.1])
+    assert translations == pytest.approx(np.array([[1.0, 4.0, 3.0], [2.5, -2.0, 5.0]]))

@@ -9,6 +9,8 @@ beads is attenuated by both.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -35,7 +37,7 @@ SETTINGS = FitSettings(
     crowds=((1, 2), (3, 6)),
     max_step_px=0.6,
     pooled=60.0,
-    crossed=1.35,
+    crossed=1.0,
     dtype=np.float32,
     whole_scale=False,
     robust_relative=True,
@@ -50,6 +52,7 @@ START_BLUR_PX = 0.9
 START_ATTENUATION = 1.5
 START_SCATTER = 0.1
 MAX_SHIFT_PX = 4.0  # of a centre, beyond which the fit has lost its bead
+RADIUS_SD = 0.01  # of the radius of a shadow: what profile and distortion leave open
 HELD = 1e12  # weight of a term that stays zero
 
 
@@ -284,7 +287,19 @@ class _BeadFit(ShadowFit):
         """Return what was measured."""
         measured = self.measured & np.isfinite(self.uv).all(axis=1)
         typical = float(np.median(self.misfit[measured])) if measured.any() else 1.0
-        return self._beads(measured, typical, self.inflation or 1.0)
+        beads = self._beads(measured, typical, self.inflation or 1.0)
+        return replace(beads, sigma=np.hypot(beads.sigma, self._moved_by_radius()))
+
+    def _moved_by_radius(self) -> NDArray[np.float64]:
+        """Standard deviations (n,) of centres from that of the radius, 0 for beads alone.
+
+        Where another bead hides an arc of the edge, half as long as the angle of its middle from
+        the ends, the rest moves the centre with the radius: by least squares over what is seen.
+        """
+        radius = self.profile.radius_px * self.radius
+        angle = np.arccos(np.clip(self.distance / (2 * radius), 0, 1))
+        moved = 2 * np.sin(angle) / (np.pi - angle - 0.5 * np.sin(2 * angle))
+        return np.asarray(RADIUS_SD * radius * moved / np.sqrt(2))
 
 
 def _inflation(influence: np.ndarray, offset: np.ndarray, noise: Noise) -> float:

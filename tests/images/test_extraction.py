@@ -97,6 +97,30 @@ def test_each_refused_bead_has_a_reason():
     assert not set(found.bead.tolist()) & {refusal.bead for refusal in found.refused}
 
 
+def test_beads_that_overlap_are_as_sure_as_their_radius_is_known():
+    """One of a radius of 12 px that is taken as 12.12 px; alone, it moves no centre."""
+    true = np.array([[40.2, 40.4], [55.9, 40.9], [100.3, 40.1]])
+    axis = np.arange(0, 560) / 4
+    u, v = np.meshgrid(axis, axis[:320])
+    light = 800.0 * np.ones(u.shape)
+    for centre in true:
+        squared = (u - centre[0]) ** 2 + (v - centre[1]) ** 2
+        light *= np.exp(-1.9 * 2 * np.sqrt(np.maximum(12.0**2 - squared, 0)) / 12.0)
+    light = cv2.GaussianBlur(light, (0, 0), 4 * np.sqrt(1.0**2 + 1 / 12))[::4, ::4]
+    image = np.random.default_rng(3).poisson(light).astype(np.float32)
+    field = np.ones(image.shape, bool)
+    noise = replace(
+        estimate_noise(image, field), constant=0.1, gain=1.0, correlation=np.ones((1, 1))
+    )
+    profile = Profile(12.12, 1.0, 1.9, 0.0)
+    beads = measure_beads(Light(image, field), true + 0.2, np.ones(3), profile, noise)
+    off = np.linalg.norm(beads.uv - true, axis=1)
+    assert list(beads.overlapped) == [True, True, False]
+    assert off[:2].min() > 0.03 and off[2] < 0.03
+    assert (off < 3 * beads.sigma).all()
+    assert beads.sigma[2] < 0.25 * beads.sigma[:2].min()
+
+
 def test_two_overlapping_beads_have_honest_sigmas():
     profile = Profile(2.8, 0.9, 1.2, 0.0)
     rng = np.random.default_rng(3)

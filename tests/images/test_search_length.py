@@ -54,8 +54,8 @@ def test_another_phantom_is_refused_after_as_many_beads_as_would_tell(monkeypatc
 
     search = matching.local_poses
     monkeypatch.setattr(matching, 'local_poses', counted)
-    model = matching.PhantomModel.of(beads(1, 80))
-    seen = seen_of(beads(2, 80))
+    model = matching.PhantomModel.of(beads(1, 170))
+    seen = seen_of(beads(2, 170))
     with refused(Kind.NO_POSE):
         matching.match(seen, model, LENS)
     assert len(tried) < 70  # of 122

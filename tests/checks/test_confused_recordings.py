@@ -364,9 +364,9 @@ def test_share_of_rejected_points_is_of_points_of_two_views():
     assert share_rejected([]) == (0.0, 0)
     misses = RecentMisses()
     misses.add(SimpleNamespace(status=status))
-    assert misses.message() == ''  # 10 points are few
+    assert misses.finding() is None  # 10 points are few
     misses.add(SimpleNamespace(status=status))
-    assert '60 %' in misses.message()
+    assert misses.finding().numbers['share'] == 0.6
     alone = RecentMisses()
     alone.add(SimpleNamespace(status=np.full(20, SINGLE_VIEW)))
     assert alone.message()

@@ -134,7 +134,8 @@ def test_sources_keep_their_sizes():
         limit = limits.get(type(node))
         if limit and node.end_lineno - node.lineno + 1 > limit:
             too_large.append(f'{path}: {node.name}')
-        if isinstance(node, ast.Call) and len(node.args) > 5 and not is_of_library(node):
-            if not any(isinstance(a, ast.Starred) for a in node.args):
-                too_large.append(f'{path}:{node.lineno}: {len(node.args)} positional arguments')
+        if not isinstance(node, ast.Call) or is_of_library(node):
+            continue
+        if len(node.args) > 5 and not any(isinstance(a, ast.Starred) for a in node.args):
+            too_large.append(f'{path}:{node.lineno}: {len(node.args)} positional arguments')
     assert not too_large

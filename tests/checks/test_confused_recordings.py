@@ -369,7 +369,7 @@ def test_share_of_rejected_points_is_of_points_of_two_views():
     assert misses.finding().numbers['share'] == 0.6
     alone = RecentMisses()
     alone.add(SimpleNamespace(status=np.full(20, SINGLE_VIEW)))
-    assert alone.message()
+    assert alone.finding().kind is Kind.NO_COMMON_TARGETS
 
 
 def test_some_false_matches_do_not_refuse_a_reconstruction():

@@ -88,7 +88,10 @@ def find_outliers(network: Network, adjustment: Adjustment, precision: Precision
 
 
 def image_statistics(
-    network: Network, adjustment: Adjustment, precision: Precision
+    network: Network,
+    adjustment: Adjustment,
+    precision: Precision,
+    significance: float = SIGNIFICANCE,
 ) -> tuple[np.ndarray, float]:
     """Statistics (N,) of the image points and their critical value.
 
@@ -113,7 +116,7 @@ def image_statistics(
     if noise.loss == 'gaussian':
         # Refer to the variance estimated without the image point, which contributes to it.
         value = value * (redundancy - 2) / np.maximum(redundancy - value, 1e-3 * redundancy)
-    critical = 2 * _f_limit(SIGNIFICANCE / count, min(noise.nu, redundancy - 2))
+    critical = 2 * _f_limit(significance / count, min(noise.nu, redundancy - 2))
     return np.where(tested, value, np.nan), float(critical)
 
 
@@ -128,7 +131,10 @@ def _f_limit(probability: float, freedom: float) -> float:
 
 
 def target_statistics(
-    network: Network, adjustment: Adjustment, precision: Precision
+    network: Network,
+    adjustment: Adjustment,
+    precision: Precision,
+    significance: float = SIGNIFICANCE,
 ) -> TargetTest:
     """Test the surveyed coordinates of the targets.
 
@@ -149,7 +155,7 @@ def target_statistics(
     standardised = np.linalg.solve(covariance[testable], tested[..., None])[..., 0]
     value = np.full(n, np.nan)
     value[testable] = np.einsum('ni,ni->n', tested, standardised)
-    critical = special.chdtri(3, SIGNIFICANCE / max(int(testable.sum()), 1))
+    critical = special.chdtri(3, significance / max(int(testable.sum()), 1))
     return TargetTest(value, float(critical), np.where(testable[:, None], offset, 0.0), square)
 
 

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import threading
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -153,7 +154,7 @@ class Cancelled(Exception):
     """The running job has to stop."""
 
 
-class Job(RigServices):
+class Job(RigServices, ABC):
     """Runs one job of an action at a time, in a process of its own."""
 
     kind: Any  #: type of the action
@@ -188,9 +189,9 @@ class Job(RigServices):
         if self._thread is not None:
             self._thread.join()
 
+    @abstractmethod
     async def _work(self, goal: Any, result: Any) -> None:
         """Run the job of a goal and fill in the result. Raises DataError, Cancelled."""
-        raise NotImplementedError
 
     def _on_cancel(self, _: Any) -> CancelResponse:
         return CancelResponse.ACCEPT

@@ -10,25 +10,24 @@ import sys
 from ros_graph import ROOT
 
 HONEST = 80
+# Lines on its output tell what is done; on its input, that the next step may begin.
 PUBLISH = """
-import sys, time
+import sys
 import rclpy
 from std_msgs.msg import Int32
 rclpy.init()
 nodes = [rclpy.create_node(name) for name in ('honest', 'hostile')]
 honest, hostile = (node.create_publisher(Int32, '/a/target_observations', 100) for node in nodes)
 while not honest.get_subscription_count() or not hostile.get_subscription_count():
-    time.sleep(0.05)
-sys.stdin.read(1)
+    rclpy.spin_once(nodes[0], timeout_sec=0.1)
+print('matched', flush=True)
+sys.stdin.readline()
 for number in range(int(sys.argv[1])):
     honest.publish(Int32(data=number))
-    for _ in range(20):
+    for _ in range(25):
         hostile.publish(Int32(data=-1))
-for number in range(400):
-    hostile.publish(Int32(data=-1))
-    time.sleep(0.001)
-print(flush=True)
-time.sleep(60)
+print('published', flush=True)
+sys.stdin.readline()
 """
 READ = """
 import os, subprocess, sys, time
@@ -38,26 +37,21 @@ from std_msgs.msg import Int32
 rclpy.init()
 node = rclpy.create_node('reading')
 qos = QoSProfile(history=HistoryPolicy.KEEP_ALL, depth=100)
-reader = node.create_subscription(Int32, '/a/target_observations', lambda _: None, qos)
+found = []
+topic = '/a/target_observations'
+reader = node.create_subscription(Int32, topic, lambda message: found.append(message.data), qos)
 command = [sys.executable, '-c', sys.argv[2], sys.argv[1]]
 pipe = subprocess.PIPE
-with subprocess.Popen(command, stdin=pipe, stdout=pipe) as publishers:
-    while node.count_publishers('/a/target_observations') < 2:
-        time.sleep(0.05)
-    time.sleep(1)  # the endpoints are matched a little later
-    publishers.stdin.write(b'1')
-    publishers.stdin.close()
-    publishers.stdout.read(1)
-    time.sleep(0.5)
-    found = []
-    end = time.monotonic() + 10
+with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) as publishers:
+    publishers.stdout.readline()
+    while node.count_publishers(topic) < 2 or reader.get_publisher_count() < 2:
+        rclpy.spin_once(node, timeout_sec=0.1)
+    print(file=publishers.stdin, flush=True)
+    publishers.stdout.readline()
+    end = time.monotonic() + 30
     while time.monotonic() < end and len(set(found) - {-1}) < int(sys.argv[1]):
-        taken = reader.handle.take_message(Int32, False)
-        if taken is None:
-            time.sleep(0.01)
-        else:
-            found.append(taken[0].data)
-    publishers.kill()
+        rclpy.spin_once(node, timeout_sec=0.1)
+    publishers.stdin.close()
 print(len(set(found) - {-1}), found.count(-1), flush=True)
 os._exit(0)
 """

@@ -23,6 +23,7 @@ setup(
     packages=find_packages(include=[package_name, package_name + '.*']),
     package_data={
         package_name + '.io.bags': ['msg/*.msg'],
+        package_name + '.nodes.dashboard': ['page/*'],
         package_name + '.report': ['templates/*'],
     },
     data_files=[
@@ -58,7 +59,7 @@ setup(
         'completion': ['shtab'],
         'foxglove': ['foxglove-sdk'],
         'pandas': ['pandas'],
-        'watch': ['textual'],
+        'watch': ['textual', 'tornado'],
         'test': ['hypothesis', 'pytest', 'pytest-timeout', 'pytest-xdist'],
     },
     zip_safe=False,

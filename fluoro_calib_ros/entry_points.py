@@ -24,6 +24,7 @@ _REMEDIES = {
         '`make setup` and use .venv'
     ),
     'textual': 'the dashboard needs it: pip install textual',
+    'tornado': 'the page of the dashboard needs it: pip install tornado',
 }
 
 # Modules that a user knows as a command.

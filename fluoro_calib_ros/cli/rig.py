@@ -25,6 +25,7 @@ USED = {
     'orient': (*_SOURCE, 'phantom', 'calibration'),
     'reconstruct': (*_SOURCE, 'calibration'),
     'convert': _SOURCE,
+    'watch': (),  # what it says about the rig
 }
 
 

@@ -8,9 +8,12 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from collections.abc import Mapping
+
+from .arguments import number_in
 
 NAME = 'watch'
-HELP = 'Watch and run a live session in the terminal: nodes, exposures, calibration (needs ROS 2).'
+HELP = 'Watch and run a live session in a terminal or a browser (needs ROS 2).'
 EXAMPLE = 'fluoro-calib watch'
 
 
@@ -22,12 +25,42 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--once', action='store_true', help='print the state once and end, for logs and scripts'
     )
+    parser.add_argument(
+        '--web',
+        action='store_true',
+        help='offer a page for a browser beside the machine: state, radiographs, points in space',
+    )
+    parser.add_argument(
+        '--host',
+        default='127.0.0.1',
+        help='address of the page, 0.0.0.0 for all of this machine (default: 127.0.0.1)',
+    )
+    parser.add_argument(
+        '--port',
+        type=number_in(0, 65535, int),
+        default=8080,
+        help='port of the page, 0 for any free one (default: 8080)',
+    )
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Replace this process by the dashboard, which has the terminal to itself."""
     words = ['--once'] if arguments.once else []
+    if arguments.web:
+        about = (arguments.rig_file and arguments.rig_file.about) or {}
+        words += ['--web', '--host', arguments.host, '--port', str(arguments.port)]
+        words += ['--mas', str(tube_load(about))]
     if arguments.namespace:
         words += ['--ros-args', '-r', f'__ns:=/{arguments.namespace.strip("/")}']
     code = 'from fluoro_calib_ros.entry_points import watch; watch()'
     os.execv(sys.executable, [sys.executable, '-c', code, *words])
+
+
+def tube_load(about: Mapping[str, str]) -> float:
+    """Return the tube load of a frame by a rig.toml: mAs, or mA and ms; 0 where it is unknown."""
+    try:
+        if 'mAs' in about:
+            return float(about['mAs'])
+        return float(about['mA']) * float(about['ms']) / 1000
+    except (KeyError, ValueError):
+        return 0.0

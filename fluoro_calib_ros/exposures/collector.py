@@ -260,6 +260,7 @@ class Readiness:
 
     ready: bool  #: whether there are enough exposures and enough of the image is covered
     advice: str  #: what the next pose should show, or that it is time to calibrate
+    areas: tuple[int, ...] = ()  #: areas of the image, indices of AREAS, that it should show
 
 
 def readiness(exposures: int, coverage: Coverage | None) -> Readiness:
@@ -269,15 +270,17 @@ def readiness(exposures: int, coverage: Coverage | None) -> Readiness:
     """
     if coverage is None or not exposures:
         return Readiness(False, 'show the phantom and keep it still')
-    missing = coverage.missing_areas[:MAX_AREAS]
-    covered = coverage.fraction >= RECOMMENDED_COVERAGE
+    areas = coverage.missing_areas[:MAX_AREAS]
+    covered = coverage.fraction_of_field >= RECOMMENDED_COVERAGE
     if exposures >= RECOMMENDED_EXPOSURES and covered:
-        return Readiness(True, 'ready to calibrate')
+        corners = '; if the field of view is not round, show beads in the corners, too'
+        return Readiness(True, f'ready to calibrate{corners if coverage.is_round else ""}')
     further = RECOMMENDED_EXPOSURES - exposures
     count = f'{further} more, ' if further > 0 else ''
-    if not missing:
+    if not areas:
         return Readiness(False, f'{count}with the phantom turned and tilted')
-    return Readiness(False, f'{count}with beads {" and ".join(missing)} of the image')
+    where = ' and '.join(AREAS[area] for area in areas)
+    return Readiness(False, f'{count}with beads {where} of the image', areas)
 
 
 # Coverage of the image by the collected image points.
@@ -296,6 +299,9 @@ AREAS = (
     'at the lower edge',
     'in the lower right corner',
 )
+# Covered part of the inscribed ellipse from which empty corners are taken for those of a round
+# field. It decides the advice only, which tells so.
+ROUND_FROM = 0.6
 SUFFICIENT_OF_AREA = 0.85  # covered fraction above which an area is not named as missing
 
 
@@ -325,16 +331,43 @@ class Coverage:
         return float(np.mean(self.covered))
 
     @property
-    def missing_areas(self) -> tuple[str, ...]:
-        """Areas of the image that are not sufficiently covered, the emptiest first, in words."""
-        thirds = np.linspace(0, CELLS, 4).astype(int)
-        covered = np.add.reduceat(
-            np.add.reduceat(self.covered.astype(float), thirds[:-1], 0), thirds[:-1], 1
-        )
-        size = np.diff(thirds)
-        fractions = (covered / np.outer(size, size)).ravel()
+    def is_round(self) -> bool:
+        """Whether the points may fill a round field of view, as image intensifiers have it.
+
+        So it is where most of the inscribed ellipse is covered, and no point lies outside.
+        """
+        inside = _ellipse()
+        within = float(np.mean(self.covered[inside]))
+        return within >= ROUND_FROM and not self._occupied[~inside].any()
+
+    @property
+    def fraction_of_field(self) -> float:
+        """Covered fraction of the field of view, 0 to 1."""
+        return float(np.mean(self.covered[self._field()]))
+
+    def _field(self) -> np.ndarray:
+        """Return whether cells (rows, columns) belong to the field of view."""
+        return _ellipse() if self.is_round else np.ones((CELLS, CELLS), dtype=bool)
+
+    @property
+    def missing_areas(self) -> tuple[int, ...]:
+        """Areas that are not sufficiently covered, indices of AREAS, the emptiest first."""
+        field = self._field()
+        fractions = (_sums_of_areas(self.covered & field) / _sums_of_areas(field)).ravel()
         order = np.argsort(fractions, kind='stable')
-        return tuple(AREAS[i] for i in order if fractions[i] < SUFFICIENT_OF_AREA)
+        return tuple(int(i) for i in order if fractions[i] < SUFFICIENT_OF_AREA)
+
+
+def _sums_of_areas(cells: np.ndarray) -> np.ndarray:
+    """Return the number of cells (rows, columns) of bool in each of the 3 x 3 areas."""
+    thirds = np.linspace(0, CELLS, 4).astype(int)[:-1]
+    return np.add.reduceat(np.add.reduceat(cells.astype(float), thirds, 0), thirds, 1)
+
+
+def _ellipse() -> np.ndarray:
+    """Return whether cells (rows, columns) touch the ellipse that is inscribed into the image."""
+    nearest = np.abs(np.arange(CELLS) + 0.5 - CELLS / 2) - 0.5  # edge towards the centre
+    return np.hypot(nearest[:, None], nearest[None]) <= CELLS / 2
 
 
 STILL_PX = StillOptions().still_px  # median displacement of the targets

@@ -65,10 +65,15 @@ def draw_overlay(image: np.ndarray, extraction: Extraction | None, reason: str =
     return _labelled(picture, lines)
 
 
+def full_contrast(image: np.ndarray) -> np.ndarray:
+    """Return an image (h, w) as uint8 of full contrast."""
+    low, high = np.percentile(image[::4, ::4], [0.5, 99.8])
+    return np.clip((image - low) * (255 / max(high - low, 1)), 0, 255).astype(np.uint8)
+
+
 def _picture(image: np.ndarray) -> tuple[np.ndarray, int]:
     """Return an image as a picture of full contrast, small ones enlarged by a factor."""
-    low, high = np.percentile(image[::4, ::4], [0.5, 99.8])
-    grey = np.clip((image - low) * (255 / max(high - low, 1)), 0, 255).astype(np.uint8)
+    grey = full_contrast(image)
     factor = 2 if max(image.shape) <= 512 else 1
     if factor > 1:
         grey = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_NEAREST)
@@ -189,18 +194,23 @@ def draw_bodies(image: np.ndarray, title: str, bodies: Sequence[BodyView]) -> np
 COVERED = (60, 150, 70)  # RGB
 MISSING = (90, 90, 90)
 LINES = (235, 235, 235)
+NEXT = (255, 200, 0)
 TEXT_ROWS = 22  # px a line of text
 WIDTH = 480  # px
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 def coverage_picture(
-    covered: np.ndarray, image_size: tuple[int, int], lines: tuple[str, ...]
+    covered: np.ndarray,
+    image_size: tuple[int, int],
+    lines: tuple[str, ...],
+    areas: Sequence[int] = (),
 ) -> np.ndarray:
     """Draw covered cells green and missing ones grey, with lines of text below.
 
     covered: (rows, columns) of bool; image_size: (width, height) [px] of the image, whose shape
-    the picture has. Returns (h, w, 3) of uint8, RGB.
+    the picture has; areas: those that the next pose should show, framed, in rows of three from the
+    top left. Returns (h, w, 3) of uint8, RGB.
     """
     width, height = image_size
     rows = max(1, round(WIDTH * height / width))
@@ -211,6 +221,11 @@ def coverage_picture(
     for i in (1, 2):  # the areas that the advice names
         cv2.line(picture, (WIDTH * i // 3, 0), (WIDTH * i // 3, rows), LINES, 1)
         cv2.line(picture, (0, rows * i // 3), (WIDTH, rows * i // 3), LINES, 1)
+    for area in areas:
+        row, column = divmod(area, 3)
+        first = (WIDTH * column // 3 + 3, rows * row // 3 + 3)
+        last = (WIDTH * (column + 1) // 3 - 4, rows * (row + 1) // 3 - 4)
+        cv2.rectangle(picture, first, last, NEXT, 4)
     text = np.zeros((TEXT_ROWS * len(lines) + 8, WIDTH, 3), np.uint8)
     for i, line in enumerate(lines):
         place = (6, TEXT_ROWS * (i + 1) - 6)

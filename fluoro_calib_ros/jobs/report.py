@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jinja2 import UndefinedError
@@ -33,7 +34,7 @@ from ..io.calibration_request import read_request
 from ..io.csv_table import read_names
 from ..io.documents import read_json
 from ..photogrammetry.rig_orientation import RigOrientation
-from ..report.html import ReportInput, report_html
+from ..report.html import ReportInput, report_html, residual_rows
 from ..report.rig_geometry import SpaceAccuracy, accuracy_in_space
 from .conversion import stations_of
 from .reconstruction import ReconstructionOptions, reconstruct
@@ -94,6 +95,26 @@ def _distances(directory: Path) -> dict[str, float]:
     return {name: float(np.median(values)) for name, values in found.items()}
 
 
+# What reading a damaged result raises.
+NOT_A_RESULT = (
+    ArithmeticError,
+    AttributeError,
+    IndexError,
+    KeyError,
+    TypeError,
+    UndefinedError,
+    ValueError,
+)
+
+
+def _not_a_result(directory: PathLike, error: Exception) -> DataError:
+    if isinstance(error, DataError):
+        return error
+    return DataError(
+        f'{Path(directory) / RESULT}: this is not the result of a calibration ({error})'
+    )
+
+
 def write_report(directory: PathLike) -> str:
     """Write DIR/report.html from the result folder of a calibration, and return its path.
 
@@ -105,22 +126,22 @@ def write_report(directory: PathLike) -> str:
     try:
         with np.errstate(all='ignore'):  # giant numbers of a damaged result
             text = report_html(given)
-    except DataError:
-        raise
-    except (
-        ArithmeticError,
-        AttributeError,
-        IndexError,
-        KeyError,
-        TypeError,
-        UndefinedError,
-        ValueError,
-    ) as error:
-        raise DataError(
-            f'{Path(directory) / RESULT}: this is not the result of a calibration ({error})'
-        ) from None
+    except NOT_A_RESULT as error:
+        raise _not_a_result(directory, error) from None
     write_text(path, text)
     return str(path)
+
+
+def residual_vectors(directory: PathLike) -> dict[str, Any]:
+    """Return the residuals of a result folder, by fluoroscope and number of the exposure.
+
+    Of a fluoroscope: size, width and height [px], and exposures, with rows u, v, du, dv [px] and
+    whether the point was used. Empty for too many. Raises DataError.
+    """
+    try:
+        return residual_rows(read_report_input(directory))
+    except NOT_A_RESULT as error:
+        raise _not_a_result(directory, error) from None
 
 
 def read_report_input(directory: PathLike) -> ReportInput:

@@ -29,11 +29,11 @@ from rclpy.qos import DurabilityPolicy
 from rclpy.subscription import Subscription
 
 from ..options import option
-from .recorder_node import adapted_qos, type_hash_text
+from .recorder_node import type_hash_text
 from .runtime.diagnostics import RateLimitedLogger, StartError
 from .runtime.main import run
 from .runtime.parameters import ParameterGroup, ParameterNode
-from .runtime.topics import TopicDiscovery, definition_of, installed_type
+from .runtime.topics import TopicDiscovery, adapted_qos, definition_of, installed_type
 
 MAX_HEAD = 16_384  # bytes of a request
 HEAD_S = 5.0  # in which it has to come
@@ -287,9 +287,8 @@ class BridgeNode(ParameterNode):
             self._shown[topic] = _Shown(topic, kind, channel)
 
     def _subscribe(self, shown: _Shown) -> None:
-        qos = adapted_qos(self.get_publishers_info_by_topic(shown.topic))
+        qos = adapted_qos(self.get_publishers_info_by_topic(shown.topic), DEPTH)
         is_latched = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
-        qos.depth = DEPTH
 
         def on_message(data: bytes) -> None:
             shown.channel.log(data)

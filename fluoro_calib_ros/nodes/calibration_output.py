@@ -107,7 +107,8 @@ class CalibrationOutput:
             f'{name}: {collected.exposures} exposures, {100 * collected.coverage:.0f} % covered',
             collected.readiness.advice,
         )
-        picture = coverage_picture(collected.covered, collected.image_size or (1, 1), lines)
+        size = collected.image_size or (1, 1)
+        picture = coverage_picture(collected.covered, size, lines, collected.readiness.areas)
         self._coverage[name].publish(colour_message(picture, stamp, f'{name}_optical'))
 
 

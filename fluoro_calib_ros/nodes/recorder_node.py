@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from rclpy.duration import Duration
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from ..errors import DataError
@@ -32,7 +32,7 @@ from .runtime.diagnostics import (
 from .runtime.main import run
 from .runtime.parameters import ParameterGroup, ParameterNode, expand_path
 from .runtime.streams import FaultHandlers, StreamReader
-from .runtime.topics import TopicDiscovery, definition_of, installed_type
+from .runtime.topics import TopicDiscovery, adapted_qos, definition_of, installed_type
 
 DISCOVERY_S = 0.1  # period in which new topics are looked for
 JOINT_STATES = 'joint_states'
@@ -147,7 +147,7 @@ class RecorderNode(ParameterNode):
             )
             self.get_logger().warning(f'{topic} is not recorded: {reason}')
             return
-        qos = adapted_qos(publishers)
+        qos = adapted_qos(publishers, DEPTH)
         is_latched = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
         self._topics[topic] = types[0]
         self._recording.add_topic(
@@ -221,19 +221,6 @@ class RecorderNode(ParameterNode):
             f'{self._recording.path}, {self._recording.dropped.total()} dropped; at most '
             f'{self._recording.most_waiting_bytes / MEGABYTE:.1f} MB waited'
         )
-
-
-def adapted_qos(publishers: Sequence[TopicEndpointInfo]) -> QoSProfile:
-    """Return the profile with which the messages of all publishers are received."""
-    profiles = [publisher.qos_profile for publisher in publishers]
-    reliable = all(p.reliability == ReliabilityPolicy.RELIABLE for p in profiles)
-    latched = all(p.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in profiles)
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=DEPTH,
-        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-    )
 
 
 def qos_document(profile: QoSProfile) -> dict[str, Any]:

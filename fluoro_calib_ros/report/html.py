@@ -198,6 +198,11 @@ def _outliers(given: ReportInput, residuals: Mapping[str, Residuals]) -> dict[st
     return {'count': len(points), 'of': sum(len(r.uv) for r in residuals.values()), 'rows': rows}
 
 
+def residual_rows(given: ReportInput) -> dict[str, Any]:
+    """Return the residuals of every exposure as the report has them, see `_arrows`."""
+    return _arrows(given, {name: _residuals(given, name) for name in given.calibrations})
+
+
 def _arrows(given: ReportInput, residuals: Mapping[str, Residuals]) -> dict[str, Any]:
     """Return the residuals of every exposure, to be looked at one by one; {} for too many.
 

@@ -12,9 +12,11 @@ from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.collector import (
     Coverage,
     ExposureCollector,
+    Readiness,
     StillOptions,
     collect_recorded,
     displacement,
+    readiness,
 )
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.exposures.pairing import CompletePairer, PairingOptions
@@ -319,3 +321,44 @@ def test_coverage_by_fluoroscope():
     collector = ExposureCollector('ab')
     collector.add({'a': frame('a', 1), 'b': frame('b', 1, ids=range(3))})
     assert collector.coverage['a'].fraction > collector.coverage['b'].fraction > 0
+
+
+# ---- what is missing to a calibration
+
+
+def points_within(radius, count=4000, seed=3):
+    """Image points in a circle around the middle of the image, as a part of its half height."""
+    rng = np.random.default_rng(seed)
+    angle, distance = rng.uniform(0, 2 * np.pi, count), np.sqrt(rng.uniform(0, 1, count))
+    reach = radius * distance[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+    return (0.5 + 0.5 * reach) * SIZE - 0.5
+
+
+def test_without_exposures_the_phantom_is_asked_for():
+    assert readiness(0, None) == Readiness(False, 'show the phantom and keep it still')
+
+
+def test_empty_areas_are_named_the_emptiest_first():
+    coverage = Coverage(SIZE)
+    left = np.stack(np.meshgrid(np.arange(0, 600.0, 5), np.arange(0, 800.0, 5)), axis=2)
+    coverage.add(left.reshape(-1, 2))
+    found = readiness(15, coverage)
+    assert not found.ready and found.areas == (2, 5)  # the right column from the top
+    assert 'in the upper right corner and at the right edge' in found.advice
+    assert readiness(10, coverage).advice.startswith('5 more, ')
+
+
+def test_a_round_field_of_view_has_no_corners():
+    """Those of an image intensifier hold no bead, whatever is shown."""
+    whole = Coverage(SIZE)
+    whole.add(points_within(1.0))
+    assert whole.fraction < 0.9 <= whole.fraction_of_field and whole.is_round
+    found = readiness(15, whole)
+    assert found.ready and found.areas == () and 'not round' in found.advice
+    assert not readiness(14, whole).ready
+    small = Coverage(SIZE)
+    small.add(points_within(0.5))  # too little of the field to tell
+    assert not small.is_round and not readiness(15, small).ready
+    corner = Coverage(SIZE)
+    corner.add(np.vstack([points_within(1.0), [[2.0, 2.0]]]))
+    assert not corner.is_round

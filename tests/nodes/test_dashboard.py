@@ -10,12 +10,15 @@ import pytest
 from rich.console import Console
 from textual.widgets import Static
 
-from fluoro_calib_ros.nodes.dashboard.view import (
-    Dashboard,
+from fluoro_calib_ros.nodes.dashboard.state import (
     FluoroscopeState,
     NodeState,
     RateMeter,
     SessionState,
+    light,
+)
+from fluoro_calib_ros.nodes.dashboard.terminal import (
+    Dashboard,
     _calibration,
     _coverage,
     _duration,
@@ -155,3 +158,38 @@ def test_bar_of_the_coverage_is_as_long_as_it(share):
     bar, percent, _ = text.split()
     assert len(bar) == 20 and bar.count('#') == round(20 * share)
     assert int(percent) == round(100 * share)
+
+
+CALIBRATED = tuple(FluoroscopeState(n, 'calibrated', calibration_id=f'{n}-1') for n in 'ab')
+GOOD = NodeState('correction_node', 'ok', 'correcting')
+READY = FluoroscopeState('a', 'collecting', ready=True)
+
+
+@pytest.mark.parametrize(
+    'changes, level, word',
+    [
+        ({'nodes': ()}, 'error', 'No signal'),
+        ({'nodes': (GOOD, NodeState('x', 'error', 'broken'))}, 'error', 'Problem'),
+        ({'nodes': (GOOD, NodeState('x', 'silent', 'gone'))}, 'error', 'Problem'),
+        ({'job': 'round 3'}, 'busy', 'Calibrating'),
+        ({'verdict': 'fail'}, 'error', 'Do not use'),
+        ({'fluoroscopes': (*CALIBRATED, FluoroscopeState('c'))}, 'warn', 'Collecting'),
+        ({'fluoroscopes': (READY,)}, 'warn', 'Ready'),
+        ({'nodes': (GOOD, NodeState('x', 'warn', 'slow'))}, 'warn', 'Attention'),
+        ({'verdict': 'cannot tell'}, 'warn', 'Attention'),
+        ({'verdict': 'pass', 'drift': 'no drift is seen'}, 'ok', 'OK'),
+    ],
+)
+def test_light_is_the_worst_or_what_is_to_be_done_next(changes, level, word):
+    state = replace(SessionState(fluoroscopes=CALIBRATED, nodes=(GOOD,)), **changes)
+    shown = light(state)
+    assert (shown.level, shown.word) == (level, word)
+    assert shown.sentence
+
+
+def test_a_broken_node_comes_before_everything_else():
+    broken = NodeState('calibration_node', 'error', 'disk full')
+    state = SessionState(
+        fluoroscopes=(READY,), nodes=(GOOD, broken), job='round 3', verdict='fail'
+    )
+    assert light(state).sentence == 'calibration_node: disk full'

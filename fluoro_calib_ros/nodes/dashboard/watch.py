@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import argparse
 import sys
 import threading
 import time
@@ -25,11 +26,13 @@ from rclpy.action import ActionClient
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.parameter_client import AsyncParameterClient
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
 from ..messages.self_calibration import feedback_text
-from .view import (
+from ..runtime.parameters import expand_path
+from .state import (
     CALIBRATE,
     CALIBRATE_FAST,
     CANCEL,
@@ -37,15 +40,19 @@ from .view import (
     LEVELS,
     ORIENT,
     RESET,
-    Dashboard,
     FluoroscopeState,
     NodeState,
     RateMeter,
     SessionState,
-    session_text,
 )
 
-NODES = ('calibration_node', 'correction_node', 'reconstruction_node', 'image_node')
+NODES = (
+    'calibration_node',
+    'extraction_node',
+    'correction_node',
+    'reconstruction_node',
+    'image_node',
+)
 SILENT_S = 5.0  # a node reports once a second
 ORIENT_FRAMES = 10  # captured by the key o
 LOG_LINES = 50  # that are kept
@@ -74,6 +81,8 @@ class SessionClient(Node):
         self._log: deque[str] = deque(maxlen=LOG_LINES)
         self._goal: Any = None
         self._session = SessionState(self.get_namespace())
+        self._points_at: tuple[int, float] | None = None  # exposures reconstructed, and since when
+        self._settings = AsyncParameterClient(self, 'calibration_node')
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 50)
         self._callers = {
             CAPTURE: self.create_client(Capture, 'capture'),
@@ -87,12 +96,24 @@ class SessionClient(Node):
     def state(self) -> SessionState:
         """Return the present state."""
         with self._lock:
+            level, drift = self._drift_now()
             return replace(
                 self._session,
+                drift_level=level,
+                drift=drift,
                 fluoroscopes=tuple(v for _, v in sorted(self._fluoroscopes.items())),
                 nodes=tuple(self._node_states()),
                 log=tuple(self._log),
             )
+
+    def _drift_now(self) -> tuple[str, str]:
+        """Return level and text of the drift: of a stream that has ended, nothing is known now."""
+        level = self._session.drift_level
+        drift = self._session.drift
+        idle_s = 0.0 if self._points_at is None else time.monotonic() - self._points_at[1]
+        if not drift or idle_s <= SILENT_S:
+            return level, drift
+        return '', f'not watched: no exposure for {idle_s:.0f} s (before: {drift})'
 
     def request(self, action: str) -> None:
         """Start one of REQUESTS; the answer comes into the log."""
@@ -171,6 +192,7 @@ class SessionClient(Node):
             self._update(
                 message.fluoroscope,
                 state=STATES.get(message.state, ''),
+                frames=message.frames_received,
                 exposures=message.exposures,
                 coverage=message.coverage,
                 rejected=message.frames_rejected,
@@ -222,6 +244,7 @@ class SessionClient(Node):
             )
         elif function == 'reconstruction':
             count = values.get('exposures reconstructed')
+            self._note_points(count)
             self._set(
                 points_hz=self._rate(node, function, count, stamp_s),
                 points_latency_ms=(
@@ -234,13 +257,25 @@ class SessionClient(Node):
             level = LEVELS[min(int.from_bytes(status.level, 'little'), 2)]
             self._set(drift_level=level, drift=status.message)
 
+    def _note_points(self, count: str | None) -> None:
+        """Remember when the number of reconstructed exposures changed last."""
+        if count is not None and (self._points_at is None or self._points_at[0] != int(count)):
+            self._points_at = int(count), time.monotonic()
+
     def _follow(self, name: str) -> None:
         """Subscribe to the status of a fluoroscope, once."""
+        if not self._session.results and self._settings.services_are_ready():
+            found = self._settings.get_parameters(['calibration_directory'])
+            found.add_done_callback(self._on_settings)
         if name not in self._followed:
             self._followed.add(name)
             self.create_subscription(
                 CalibrationStatus, f'{name}/calibration_status', self._on_status, 10
             )
+
+    def _on_settings(self, future: Future) -> None:
+        (value,) = future.result().values
+        self._set(results=str(expand_path(value.string_value)) if value.string_value else '')
 
     def _rate(self, node: str, function: str, count: str | None, stamp_s: float) -> float:
         meter = self._meters.setdefault((node, function), RateMeter())
@@ -306,26 +341,41 @@ def _until_shutdown(spin: Callable[[], None]) -> Callable[[], None]:
     return run
 
 
-ONCE = '--once'
 FIRST_REPORT_S = 5.0  # nodes report once a second, and have to be discovered first
 
 
 def main(args: Sequence[str] | None = None) -> None:
-    """Show the session in the terminal until a key ends it; with --once, print it and end."""
-    words = list(sys.argv[1:] if args is None else args)
-    once = ONCE in words
-    if not once and not (sys.stdin.isatty() and sys.stdout.isatty()):
+    """Show the session in the terminal or a browser until it is ended; with --once, print it."""
+    parser = argparse.ArgumentParser('fluoro-calib watch')
+    parser.add_argument('--once', action='store_true')
+    parser.add_argument('--web', action='store_true')
+    parser.add_argument('--host', default='127.0.0.1')
+    parser.add_argument('--port', type=int, default=8080)
+    parser.add_argument('--mas', type=float, default=0.0)
+    options, words = parser.parse_known_args(args)
+    is_terminal = sys.stdin.isatty() and sys.stdout.isatty()
+    if not options.once and not options.web and not is_terminal:
         sys.exit('fluoro-calib watch: this is no terminal; with --once the state is only printed')
-    with session_client([word for word in words if word != ONCE]) as client:
-        if once:
+    with session_client(words) as client:
+        if options.once:
             _print(client)
+        elif options.web:
+            from .scene import Scene
+            from .web import WebOptions, serve
+
+            scene = Scene(client.get_namespace())
+            serve(client, scene, WebOptions(options.host, options.port, mas=options.mas))
         else:
+            from .terminal import Dashboard
+
             Dashboard(client).run()
 
 
 def _print(client: SessionClient) -> None:
     """Print the state once, after the first reports."""
     from rich.console import Console
+
+    from .terminal import session_text
 
     end = time.monotonic() + FIRST_REPORT_S
     while time.monotonic() < end:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from importlib import import_module
 from typing import Any
 
@@ -232,6 +232,19 @@ def clock_qos() -> QoSProfile:
 def services_qos() -> QoSProfile:
     """Profile of services: a burst of requests is queued, and every one of them is answered."""
     return _reliable(REQUEST_DEPTH)
+
+
+def adapted_qos(publishers: Sequence[TopicEndpointInfo], depth: int) -> QoSProfile:
+    """Return the profile with which the messages of all publishers are received."""
+    profiles = [publisher.qos_profile for publisher in publishers]
+    reliable = all(p.reliability == ReliabilityPolicy.RELIABLE for p in profiles)
+    latched = all(p.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in profiles)
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=depth,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
 
 
 def qos_overrides() -> QoSOverridingOptions:

@@ -1,16 +1,13 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the dashboard shows, and its view in a terminal; it knows the state, not ROS."""
+"""The dashboard in a terminal; it knows the state, not ROS."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Protocol
 
 from rich.console import Group, RenderableType
 from rich.table import Table
@@ -20,104 +17,7 @@ from textual.binding import Binding
 from textual.containers import VerticalScroll
 from textual.widgets import Footer, Static
 
-LEVELS = ('ok', 'warn', 'error', 'silent')  # of a node or a function; silent: nothing is heard
-# Keys by which a user asks for something, and what the dashboard then calls.
-CAPTURE = 'capture'
-CALIBRATE = 'calibrate'
-CALIBRATE_FAST = 'calibrate_fast'
-CANCEL = 'cancel'
-ORIENT = 'orient'
-RESET = 'reset'
-REQUESTS = (CAPTURE, CALIBRATE, CALIBRATE_FAST, CANCEL, ORIENT, RESET)
-
-RATE_WINDOW_S = 5.0  # over which rates are counted
-
-
-@dataclass(frozen=True)
-class FluoroscopeState:
-    """One fluoroscope. NaN and '' stand for what is not known yet."""
-
-    name: str
-    state: str = ''  #: 'collecting', 'calibrating', 'calibrated'
-    #: frames that arrive, and frames that are corrected, a second
-    frames_hz: float = math.nan
-    corrected_hz: float = math.nan
-    #: from the arrival of a frame to its correction
-    latency_p50_ms: float = math.nan
-    latency_p99_ms: float = math.nan
-    rejected: int = 0  #: frames refused because their content was wrong
-    exposures: int = 0
-    coverage: float = 0.0  #: covered part of the image, 0 to 1
-    next_pose: str = ''  #: what the next exposure should show
-    ready: bool = False  #: whether the exposures suffice
-    iteration: int = 0  #: round of the running or last calibration
-    rmse_px: tuple[float, float] = (math.nan, math.nan)  #: of that round, in u and v
-    calibration_id: str = ''
-    age_s: float = math.nan  #: of the calibration
-
-
-@dataclass(frozen=True)
-class NodeState:
-    """One node: its worst level and the message that belongs to it."""
-
-    name: str
-    level: str
-    message: str
-
-
-@dataclass(frozen=True)
-class SessionState:
-    """The whole session."""
-
-    namespace: str = '/'
-    fluoroscopes: tuple[FluoroscopeState, ...] = ()
-    nodes: tuple[NodeState, ...] = ()
-    points_hz: float = math.nan  #: exposures reconstructed a second
-    points_latency_ms: tuple[float, float] = (math.nan, math.nan)  #: median and 99th percentile
-    orientation: str = ''  #: source of the orientation of the rig, '' without one
-    #: of the drift watch
-    drift_level: str = ''
-    drift: str = ''
-    verdict: str = ''  #: of the last calibration of this session that was validated
-    findings: tuple[str, ...] = ()
-    job: str = ''  #: what runs at the moment, '' if nothing does
-    log: tuple[str, ...] = ()  #: what was asked for, and the answers; the newest last
-
-
-class Session(Protocol):
-    """What the view needs: the present state, and somebody who carries out requests."""
-
-    def state(self) -> SessionState:
-        """Return the present state."""
-        ...
-
-    def request(self, action: str) -> None:
-        """Start one of REQUESTS; the answer comes into the log."""
-        ...
-
-
-@dataclass
-class RateMeter:
-    """Events a second, from a counter that is read now and then."""
-
-    _readings: deque[tuple[float, int]] = field(default_factory=lambda: deque(maxlen=100))
-
-    def add(self, seconds: float, count: int) -> None:
-        """Add a reading; a counter that was reset begins anew."""
-        if self._readings and count < self._readings[-1][1]:
-            self._readings.clear()
-        self._readings.append((seconds, count))
-        while seconds - self._readings[0][0] > RATE_WINDOW_S:
-            self._readings.popleft()
-
-    @property
-    def hz(self) -> float:
-        """The mean rate of the last seconds, NaN before two readings."""
-        if len(self._readings) < 2:
-            return math.nan
-        (first_s, first), (last_s, last) = self._readings[0], self._readings[-1]
-        return (last - first) / (last_s - first_s) if last_s > first_s else math.nan
-
+from .state import FluoroscopeState, Session, SessionState
 
 COLOURS = {
     'ok': 'green',

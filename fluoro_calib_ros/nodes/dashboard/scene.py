@@ -1,0 +1,240 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""What a rig sees at the moment: radiographs with image points, coverage, points in space."""
+
+from __future__ import annotations
+
+import base64
+import math
+import time
+from collections import OrderedDict
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import numpy as np
+from fluoro_calib_msgs.msg import ReconstructedPoints, RigOrientation, TargetObservations
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.subscription import Subscription
+from sensor_msgs.msg import CompressedImage, Image
+
+from ...images.codec import encode
+from ...images.overlay import full_contrast
+from ...photogrammetry import rig_orientation
+from ..messages.image import ImageConverter
+from ..messages.rig_orientation import orientation_from_message
+from ..runtime.diagnostics import Refused
+from ..runtime.topics import adapted_qos
+
+IDLE_S = 10.0  # after which a topic that nobody looks at is no longer subscribed
+LARGEST_PX = 768  # of a radiograph that is shown
+QUALITY = 80  # of its JPEG
+KEPT = 16  # radiographs that wait for their image points, which come later
+WAITING = 100  # image points that wait to be taken: three seconds at 30 Hz
+METRE_MM = 1000.0
+
+
+@dataclass
+class _Film:
+    """The last radiographs of a fluoroscope, and image points by stamp [ns]."""
+
+    converter: ImageConverter
+    #: JPEG, and width and height [px]
+    images: OrderedDict[int, tuple[bytes, int, int]] = field(default_factory=OrderedDict)
+    points: OrderedDict[int, TargetObservations] = field(default_factory=OrderedDict)
+    found_at: float = -math.inf  #: when the last image points were taken
+
+
+@dataclass
+class _Reader:
+    subscription: Subscription
+    kind: type
+    depth: int
+    used_at: float
+
+
+class Scene:
+    """Takes the newest messages of a rig when somebody looks; for one thread.
+
+    Its node is not spun: DDS keeps the last messages of a topic, and none of the others costs
+    Python any time. What nobody has looked at for a while is not subscribed.
+    """
+
+    def __init__(self, namespace: str, context: Context | None = None) -> None:
+        self._node = Node(
+            'watch_scene',
+            namespace=namespace,
+            context=context,
+            enable_rosout=False,
+            start_parameter_services=False,
+        )
+        self._readers: dict[str, _Reader] = {}
+        self._films: dict[str, _Film] = {}
+        self._latched: dict[str, Any] = {}
+
+    def close(self) -> None:
+        """End the node."""
+        self._node.destroy_node()
+
+    def radiograph(self, name: str) -> dict[str, Any]:
+        """Return the newest image that was searched, and the image points of the same exposure.
+
+        Keys: stamp [ns]; age [s], by how much it is older than the newest image; width, height
+        [px] of the image; jpeg, its picture as a data URL, '' for a stream without images; points,
+        rows (id, u, v) [px]. Empty before there is anything.
+        """
+        film = self._films.setdefault(name, _Film(ImageConverter(name)))
+        has_images = self._take_image(name, film)
+        depth = WAITING if has_images else 1
+        for message in self._taken(f'{name}/target_observations', TargetObservations, depth):
+            _keep(film.points, _stamp_ns(message), message, WAITING)
+            film.found_at = time.monotonic()
+        if has_images and film.images:
+            stamp = _shown(film)
+            jpeg, width, height = film.images[stamp]
+        elif film.points:
+            stamp = next(reversed(film.points))
+            jpeg = b''
+            width = film.points[stamp].image_width
+            height = film.points[stamp].image_height
+        else:
+            return {}
+        return {
+            'stamp': str(stamp),  # JavaScript has 53 bits
+            'age': (max(film.images, default=stamp) - stamp) * 1e-9,
+            'width': width,
+            'height': height,
+            'jpeg': f'data:image/jpeg;base64,{base64.b64encode(jpeg).decode()}' if jpeg else '',
+            'points': _rows(film.points.get(stamp)),
+        }
+
+    def _take_image(self, name: str, film: _Film) -> bool:
+        """Take the newest image of a fluoroscope; returns whether somebody publishes images."""
+        for topic, kind in (('image_raw', Image), ('image_raw/compressed', CompressedImage)):
+            if not self._node.count_publishers(f'{name}/{topic}'):
+                continue
+            for message in self._taken(f'{name}/{topic}', kind):
+                try:
+                    image, _ = film.converter.decoded(message)
+                except Refused:  # the extraction node says what is wrong with it
+                    continue
+                height, width = image.shape
+                _keep(film.images, _stamp_ns(message), (_jpeg(image), width, height), KEPT)
+            return True
+        return False
+
+    def coverage(self, name: str) -> bytes:
+        """Return the picture of the coverage of a fluoroscope as PNG, b'' before there is one."""
+        message = self._last(f'{name}/coverage', Image)
+        if message is None or message.encoding != 'rgb8':
+            return b''
+        shape = message.height, message.width, 3
+        picture = np.frombuffer(message.data, np.uint8)
+        if picture.size != math.prod(shape):
+            return b''
+        return encode(cv2.cvtColor(picture.reshape(shape), cv2.COLOR_RGB2BGR), '.png', 0)
+
+    def space(self) -> dict[str, Any]:
+        """Return the newest points in space and the sources of the fluoroscopes [mm].
+
+        Keys: frame; points, rows (id, x, y, z, status); sources, each with name, position and
+        axis, the direction of its beam.
+        """
+        out: dict[str, Any] = {'points': [], 'sources': []}
+        orientation = self._last('rig_orientation', RigOrientation)
+        if orientation is not None:
+            with suppress(ValueError):  # the reconstruction node says what is wrong with it
+                out['sources'] = _sources(orientation_from_message(orientation))
+        points = self._last('reconstruction/points_with_covariance', ReconstructedPoints)
+        if points is not None:
+            xyz = METRE_MM * np.column_stack([points.x, points.y, points.z])
+            seen = np.atleast_1d(np.isfinite(xyz).all(axis=1))
+            rows = zip(points.target_id, xyz.round(3).tolist(), points.status, seen.tolist())
+            out['frame'] = points.frame_number
+            out['points'] = [[int(i), *x, int(status)] for i, x, status, good in rows if good]
+        return out
+
+    def _last(self, topic: str, kind: type) -> Any:
+        """Return the newest message of a topic, also one that was taken before; None for none."""
+        for message in self._taken(topic, kind):
+            self._latched[topic] = message
+        if not self._node.count_publishers(topic):
+            self._latched.pop(topic, None)
+        return self._latched.get(topic)
+
+    def _taken(self, topic: str, kind: type, depth: int = 1) -> list[Any]:
+        """Return the messages of a topic that have come since, at most the last ones."""
+        now = time.monotonic()
+        for name, known in list(self._readers.items()):
+            if now - known.used_at > IDLE_S or (name == topic and known.depth != depth):
+                self._node.destroy_subscription(self._readers.pop(name).subscription)
+        reader = self._readers.get(topic) or self._open(topic, kind, depth)
+        if reader is None:
+            return []
+        reader.used_at = now
+        out: list[Any] = []
+        handle = reader.subscription.handle
+        with handle:
+            while len(out) < depth:
+                taken = handle.take_message(kind, False)
+                if taken is None:
+                    break
+                out.append(taken[0])
+        return out
+
+    def _open(self, topic: str, kind: type, depth: int) -> _Reader | None:
+        """Subscribe to a topic, None where nobody publishes it."""
+        publishers = self._node.get_publishers_info_by_topic(self._node.resolve_topic_name(topic))
+        if not publishers:
+            return None
+        qos = adapted_qos(publishers, depth)
+        subscription = self._node.create_subscription(kind, topic, lambda _: None, qos)
+        self._readers[topic] = _Reader(subscription, kind, depth, time.monotonic())
+        return self._readers[topic]
+
+
+def _sources(rig: rig_orientation.RigOrientation) -> list[dict[str, Any]]:
+    rows = zip(rig.fluoroscopes, rig.position_mm.tolist(), rig.rotation.tolist())
+    return [{'name': name, 'position': x, 'axis': rotation[2]} for name, x, rotation in rows]
+
+
+def _shown(film: _Film) -> int:
+    """Return the stamp of the image to show: the newest one that was searched.
+
+    That is the newest one of all where nothing was found for a while.
+    """
+    newest = next(reversed(film.images))
+    if time.monotonic() - film.found_at > IDLE_S:
+        return newest
+    last = next(reversed(film.points))
+    return max((stamp for stamp in film.images if stamp <= last), default=newest)
+
+
+def _keep(table: OrderedDict[int, Any], stamp: int, value: Any, most: int) -> None:
+    table[stamp] = value
+    while len(table) > most:
+        table.popitem(last=False)
+
+
+def _stamp_ns(message: Any) -> int:
+    stamp = message.header.stamp
+    return int(stamp.sec * 10**9 + stamp.nanosec)
+
+
+def _rows(message: TargetObservations | None) -> list[list[float]]:
+    """Return id, u and v of the image points of a message that are numbers."""
+    if message is None:
+        return []
+    rows = np.column_stack([message.target_id, message.u, message.v])
+    return rows[np.isfinite(rows).all(axis=1)].round(1).tolist()
+
+
+def _jpeg(image: np.ndarray) -> bytes:
+    """Return a grey image as JPEG of full contrast, large ones reduced."""
+    factor = LARGEST_PX / max(image.shape)
+    if factor < 1:
+        image = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+    return encode(full_contrast(image), '.jpg', QUALITY)

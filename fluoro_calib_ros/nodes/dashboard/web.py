@@ -1,0 +1,314 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The dashboard in a browser: a page beside the X-ray machine.
+
+The page asks for everything by HTTP; nothing is loaded from elsewhere. Who opens the address with
+the token gets a cookie, without which nothing is answered. What acts on the rig is accepted from
+this page only (same origin).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+import logging
+import os
+import secrets
+import signal
+import sys
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from tornado.httpserver import HTTPServer
+from tornado.netutil import bind_sockets
+from tornado.web import Application, HTTPError, RequestHandler
+
+from ...errors import DataError
+from ...io.calibration import RESULT_NAME
+from ...io.documents import to_json_values
+from ...jobs.result_folder import REPORT
+from .scene import Scene
+from .state import REQUESTS, Session, light
+
+PAGE = Path(__file__).parent / 'page'
+FILES = {
+    '/': ('index.html', 'text/html'),
+    '/style.css': ('style.css', 'text/css'),
+    '/page.js': ('page.js', 'text/javascript'),
+}
+POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src data: blob:; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+# The report has its styles and scripts inside, and must not act in the name of this page.
+REPORT_POLICY = (
+    "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline'; "
+    "style-src 'unsafe-inline'; img-src data:"
+)
+MAX_BODY = 1000  # bytes of a request
+REFUSAL = 'open the address that fluoro-calib watch has printed, with its token'
+
+
+@dataclass(frozen=True)
+class WebOptions:
+    """Where the page is offered, and what a rig.toml says.
+
+    port 0: any free one. token: empty for a new one. mas: tube load of a frame [mAs], 0 where it
+    is unknown.
+    """
+
+    host: str = '127.0.0.1'
+    port: int = 8080
+    token: str = ''
+    mas: float = 0.0
+
+
+@dataclass(frozen=True)
+class Desk:
+    """What the handlers of the page share."""
+
+    session: Session
+    scene: Scene
+    options: WebOptions
+    residuals: dict[str, Any]  #: residual vectors, by the id of their calibrations
+
+
+class Handler(RequestHandler):
+    """Answers who has the token."""
+
+    def initialize(self, desk: Desk) -> None:
+        """Take over what the handlers share."""
+        self._desk = desk
+
+    def set_default_headers(self) -> None:
+        """Forbid everything that the page does not need."""
+        self.set_header('Content-Security-Policy', POLICY)
+        self.set_header('X-Content-Type-Options', 'nosniff')
+        self.set_header('Referrer-Policy', 'no-referrer')
+        self.set_header('Cache-Control', 'no-store')
+
+    def prepare(self) -> None:
+        """Refuse a request without token, and one of another page that acts."""
+        given = self.get_query_argument('token', '')
+        cookie = f'fluoro_calib_{self._desk.options.port}'
+        if self._is_token(given):
+            self.set_cookie(cookie, given, httponly=True, samesite='Strict')
+            self.redirect(self.request.path)  # without the token, which a picture would show
+        elif not self._is_token(self.get_cookie(cookie) or ''):
+            raise HTTPError(403, reason='Forbidden', log_message=REFUSAL)
+        elif self.request.method != 'GET':
+            origin = f'{self.request.protocol}://{self.request.host}'
+            if self.request.headers.get('Origin') != origin:
+                raise HTTPError(403, reason='Forbidden', log_message='another page has asked')
+
+    def write_error(self, status_code: int, **kwargs: Any) -> None:
+        """Answer with one sentence."""
+        error = kwargs.get('exc_info', (None, None, None))[1]
+        self.set_header('Content-Type', 'text/plain; charset=utf-8')
+        self.finish(str(getattr(error, 'log_message', None) or 'this cannot be answered'))
+
+    def _is_token(self, given: str) -> bool:
+        return hmac.compare_digest(given.encode(), self._desk.options.token.encode())
+
+    def _finish_json(self, value: dict[str, Any]) -> None:
+        self.finish(to_json_values(value))
+
+
+class FileHandler(Handler):
+    """A file of the page."""
+
+    def get(self) -> None:
+        """Answer with the file."""
+        name, kind = FILES[self.request.path]
+        self.set_header('Content-Type', f'{kind}; charset=utf-8')
+        self.finish((PAGE / name).read_bytes())
+
+
+class StateHandler(Handler):
+    """The state of the session."""
+
+    def get(self) -> None:
+        """Answer with the state, its light, and the tube load of a frame."""
+        state = self._desk.session.state()
+        self._finish_json(
+            {**asdict(state), 'light': asdict(light(state)), 'mas': self._desk.options.mas}
+        )
+
+
+class RadiographHandler(Handler):
+    """What a fluoroscope sees."""
+
+    def get(self, name: str) -> None:
+        """Answer with the newest image and its image points."""
+        self._finish_json(self._desk.scene.radiograph(_known(self._desk, name)))
+
+
+class CoverageHandler(Handler):
+    """What the exposures cover, and the next pose."""
+
+    def get(self, name: str) -> None:
+        """Answer with the picture, 204 before there is one."""
+        picture = self._desk.scene.coverage(_known(self._desk, name))
+        if not picture:
+            self.set_status(204)
+            return
+        self.set_header('Content-Type', 'image/png')
+        self.finish(picture)
+
+
+class SpaceHandler(Handler):
+    """Points in space."""
+
+    def get(self) -> None:
+        """Answer with the newest points, and the sources."""
+        self._finish_json(self._desk.scene.space())
+
+
+class ResidualHandler(Handler):
+    """Residual vectors of the calibration in use."""
+
+    async def get(self) -> None:
+        """Answer with the vectors, or with the reason why there are none."""
+        key = ' '.join(f.calibration_id for f in self._desk.session.state().fluoroscopes)
+        known = self._desk.residuals
+        if key not in known:
+            known.clear()
+            folder = _results(self._desk)
+            known[key] = await asyncio.to_thread(_vectors_of, folder)
+        self._finish_json(known[key])
+
+
+class ReportHandler(Handler):
+    """The report of the calibration in use."""
+
+    async def get(self) -> None:
+        """Answer with the report, which is written where it is missing or older."""
+        folder = _results(self._desk)
+        report = folder / REPORT
+        result = folder / RESULT_NAME
+        if not report.exists() or report.stat().st_mtime < result.stat().st_mtime:
+            await _write_report(folder)
+        self.set_header('Content-Security-Policy', REPORT_POLICY)
+        self.finish(report.read_bytes())
+
+
+class RequestHandlerOfSession(Handler):
+    """Requests to the rig."""
+
+    def post(self, action: str) -> None:
+        """Ask the session; the answer comes into its log."""
+        if action not in REQUESTS:
+            raise HTTPError(404, log_message='there is no such request')
+        self._desk.session.request(action)
+        self.set_status(204)
+
+
+def _known(desk: Desk, name: str) -> str:
+    """Return the name of a fluoroscope of the session. Raises HTTPError."""
+    if name not in {f.name for f in desk.session.state().fluoroscopes}:
+        raise HTTPError(404, log_message='there is no such fluoroscope')
+    return name
+
+
+def _results(desk: Desk) -> Path:
+    """Return the result folder of the calibration node. Raises HTTPError."""
+    folder = Path(desk.session.state().results or os.devnull)
+    if not (folder / RESULT_NAME).is_file():
+        raise HTTPError(
+            404, log_message='there is no result of a calibration in a folder of this machine yet'
+        )
+    return folder
+
+
+def _vectors_of(folder: Path) -> dict[str, Any]:
+    from ...jobs.report import residual_vectors  # with matplotlib
+
+    try:
+        return {'fluoroscopes': residual_vectors(folder)}
+    except DataError as error:
+        return {'fluoroscopes': {}, 'reason': str(error)}
+
+
+async def _write_report(folder: Path) -> None:
+    """Write the report in a process of its own: it takes seconds. Raises HTTPError."""
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, '-m', 'fluoro_calib_ros.cli', 'report', str(folder)),
+        stdout=asyncio.subprocess.DEVNULL,
+        stderr=asyncio.subprocess.PIPE,
+    )
+    _, message = await process.communicate()
+    if process.returncode:
+        raise HTTPError(500, log_message=message.decode(errors='replace').strip()[-1000:])
+
+
+def application(desk: Desk) -> Application:
+    """Return the application that answers the page."""
+    name = '([A-Za-z0-9_-]+)'
+    routes: list[tuple[str, type[Handler]]] = [
+        *((path, FileHandler) for path in FILES),
+        ('/state', StateHandler),
+        (f'/fluoroscopes/{name}/radiograph', RadiographHandler),
+        (f'/fluoroscopes/{name}/coverage', CoverageHandler),
+        ('/space', SpaceHandler),
+        ('/residuals', ResidualHandler),
+        ('/report', ReportHandler),
+        (f'/request/{name}', RequestHandlerOfSession),
+    ]
+    return Application([(path, handler, {'desk': desk}) for path, handler in routes])
+
+
+async def run_server(
+    session: Session, scene: Scene, options: WebOptions, started: Callable[[str], None]
+) -> None:
+    """Answer the page until the task is cancelled; started is called with its address.
+
+    Raises DataError where nothing can listen there.
+    """
+    logging.getLogger('tornado.access').setLevel(logging.CRITICAL)  # refusals are told to who asks
+    try:
+        sockets = bind_sockets(options.port, options.host)
+    except OSError as error:
+        raise DataError(
+            f'no page on {options.host}:{options.port} ({error.strerror or error}); --port '
+            'chooses another'
+        ) from None
+    options = replace(
+        options,
+        port=sockets[0].getsockname()[1],
+        token=options.token or secrets.token_urlsafe(16),
+    )
+    server = HTTPServer(
+        application(Desk(session, scene, options, residuals={})), max_body_size=MAX_BODY
+    )
+    server.add_sockets(sockets)
+    started(f'http://{options.host}:{options.port}/?token={options.token}')
+    try:
+        await asyncio.Event().wait()
+    finally:
+        server.stop()
+        await server.close_all_connections()
+
+
+def serve(session: Session, scene: Scene, options: WebOptions) -> None:
+    """Answer the page until an interrupt. Exits with a sentence where nothing can listen."""
+
+    def started(address: str) -> None:
+        print(f'fluoro-calib watch: open {address} in a browser; Ctrl-C ends it', flush=True)
+
+    async def main() -> None:
+        task = asyncio.ensure_future(run_server(session, scene, options, started))
+        for number in (signal.SIGINT, signal.SIGTERM):
+            asyncio.get_running_loop().add_signal_handler(number, task.cancel)
+        await asyncio.wait([task])
+        if not task.cancelled():
+            task.result()
+
+    try:
+        asyncio.run(main())
+    except DataError as error:
+        sys.exit(f'fluoro-calib watch: {error}')
+    finally:
+        scene.close()

@@ -16,6 +16,17 @@ from typing import IO, Any
 from ..errors import DataError
 from ..limits import read_limits
 
+UTF_16 = (b'\xff\xfe', b'\xfe\xff')  # byte order marks
+# How files begin that hold tables, but are no text.
+_NO_TEXT = (
+    (b'PK\x03\x04', 'an xlsx spreadsheet or another zip archive; save the table as CSV'),
+    (b'\xd0\xcf\x11\xe0', 'an xls spreadsheet; save the table as CSV'),
+    (
+        b'\x89HDF',
+        'an HDF5 file, as DeepLabCut and SLEAP write; save it as CSV (DeepLabCut: '
+        'analyze_videos_converth5_to_csv)',
+    ),
+)
 _SAFE_NAME = re.compile('[A-Za-z0-9_-]+')
 
 PathLike = str | os.PathLike[str]
@@ -70,18 +81,33 @@ def read_bytes(path: PathLike) -> bytes:
 
 
 def read_text(path: PathLike) -> str:
-    """Return the text of a UTF-8 file, without its byte order mark.
+    """Return the text of a file in UTF-8, or in UTF-16 with its byte order mark, without the mark.
 
-    Raises DataError as `read_bytes` does, and for a file that is not UTF-8.
+    Raises DataError as `read_bytes` does, and for a file in neither.
     """
     content = read_bytes(path)
+    kind = kind_without_text(content)
+    if kind:
+        raise DataError(f'this is {kind}', at=path)
+    encoding = encoding_of(content)
     try:
-        return content.decode('utf-8-sig')
+        return content.decode(encoding)
     except UnicodeDecodeError as error:
         row = content.count(b'\n', 0, error.start) + 1
+        name = encoding.upper().removesuffix('-SIG')
         raise DataError(
-            f'{path}, row {row}: this is not UTF-8 text (byte 0x{content[error.start]:02x})'
+            f'{path}, row {row}: this is not {name} text (byte 0x{content[error.start]:02x})'
         ) from None
+
+
+def encoding_of(content: bytes) -> str:
+    """Return the encoding of a text by how it begins."""
+    return 'utf-16' if content.startswith(UTF_16) else 'utf-8-sig'
+
+
+def kind_without_text(content: bytes) -> str:
+    """Return what a file is that holds tables but no text, and what to do; '' for any other."""
+    return next((kind for start, kind in _NO_TEXT if content.startswith(start)), '')
 
 
 def check_rows(text: str, most: int, where: object) -> None:

@@ -32,6 +32,8 @@ from fluoro_calib_ros.io.calibration import (
     save_orientation,
 )
 from fluoro_calib_ros.io.documents import read_json, write_json
+from fluoro_calib_ros.io.formats import registry
+from fluoro_calib_ros.io.formats.content import FileSettings
 from fluoro_calib_ros.io.observations import (
     correct_points,
     read_observations_csv,
@@ -254,6 +256,31 @@ def test_phantom_header_encoding_and_number_of_targets(tmp_path):
     assert 'row 3: this is not UTF-8 text (byte 0xe4)' in said(
         b'target_id,x,y,z,sd\n1,2,3,4,5\n\xe4'
     )
+
+
+PHANTOM = 'target_id,x,y,z,sd\n' + ''.join(f'{i},{i},2,{i * i},.1\n' for i in range(1, 6))
+
+
+@pytest.mark.parametrize('encoding', ['utf-8-sig', 'utf-16'])  # as spreadsheets save text
+def test_encodings_of_spreadsheets_are_read(tmp_path, encoding):
+    path = text_file(tmp_path, 'phantom.csv', PHANTOM.encode(encoding))
+    assert read_phantom(path).target_id.tolist() == [1, 2, 3, 4, 5]
+    assert registry.recognised(path).kind == 'phantom'
+
+
+@pytest.mark.parametrize(
+    'start, remedy',
+    [
+        (b'PK\x03\x04\x14\0', 'xlsx spreadsheet or another zip archive; save the table as CSV'),
+        (b'\xd0\xcf\x11\xe0\xa1', 'xls spreadsheet; save the table as CSV'),
+        (b'\x89HDF\r\n\x1a\n', 'HDF5 file, as DeepLabCut and SLEAP write; save it as CSV'),
+    ],
+)
+def test_tables_that_are_no_text_are_named(tmp_path, start, remedy):
+    path = text_file(tmp_path, 'points.table', start + bytes(range(256)))
+    assert remedy in message_of(read_phantom, path)
+    settings = FileSettings(image_size=(100, 100))
+    assert remedy in message_of(lambda p: registry.read(p, settings), path)
 
 
 def test_row_numbers_count_line_ends_inside_cells(tmp_path):

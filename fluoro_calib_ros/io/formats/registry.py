@@ -16,7 +16,13 @@ from pathlib import Path
 from ...errors import DataError
 from ...exposures.frame import Frame
 from ...exposures.names import Names
-from ..access import PathLike, check_regular_file, os_error_reason
+from ..access import (
+    PathLike,
+    check_regular_file,
+    encoding_of,
+    kind_without_text,
+    os_error_reason,
+)
 from . import bundle, deeplabcut, native, xmalab_points, xmalab_project
 from .bodies import AUTOSCOPER, OPENSIM, POSES, RIGIDBODY
 from .content import PARTS, Content, FileSettings, Format, Sample, Written, has_content
@@ -79,9 +85,10 @@ def sample_of(path: PathLike) -> Sample:
         raise DataError(f'{path}: cannot be read ({error})') from None
     if not head:
         raise DataError(f'{path}: the file is empty')
-    if b'\0' in head:
+    encoding = encoding_of(head)
+    if b'\0' in head and encoding != 'utf-16':
         return Sample(path, head, [])
-    text = head.decode('utf-8-sig', 'replace')
+    text = head.decode(encoding, 'replace')
     lines = [line.strip() for line in text.splitlines()]
     return Sample(path, head, [line for line in lines if line][:LINES])
 
@@ -118,7 +125,7 @@ def read(path: PathLike, settings: FileSettings, kind: str | None = None) -> Con
 def _beginning(path: Path) -> str:
     sample = sample_of(path)
     if not sample.lines:
-        return 'it is not text'
+        return f'it is {kind_without_text(sample.head) or "not text"}'
     return f'it begins with {sample.lines[0][:MAX_SHOWN]!r}'
 
 

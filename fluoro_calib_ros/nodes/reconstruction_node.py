@@ -288,7 +288,8 @@ class ReconstructionNode(StreamNode):
         ]
         first = next(exposure[name] for name in self._names if name in exposure)
         self._drift.newest = rig.watch, rig.orientation, first.stamp_ns
-        found = intersect_exposure(views, rig.intersector, rig.scatter)
+        wide, image_sd = rig.widened()
+        found = intersect_exposure(views, wide, rig.scatter, image_sd)
         content = PointsContent(
             stamp_ns=first.stamp_ns,
             frame_number=first.frame.frame_number,
@@ -306,7 +307,8 @@ class ReconstructionNode(StreamNode):
         )
         if self._follower is not None:
             number = first.frame.frame_number
-            for bodies in self._follower.add(found, rig, number, first.stamp_ns):
+            following = rig._replace(intersector=wide)
+            for bodies in self._follower.add(found, following, number, first.stamp_ns):
                 self._bodies_output.publish(bodies)
         if rig.watch is not None:
             watch_exposure(rig.watch, first.stamp_ns, found)

@@ -50,6 +50,11 @@ class Rig(NamedTuple):
     scatter: ObservedScatter
     watch: RigDriftWatch | None
 
+    def widened(self) -> tuple[Intersector, float]:
+        """Return the intersector with what an alarm adds, and the addition to sigma [px]."""
+        watch = self.watch
+        return (self.intersector, 0.0) if watch is None else watch.widened(self.intersector)
+
 
 class RigInput:
     """The last orientations, by the calibrations that they belong to.
@@ -265,6 +270,7 @@ class BodyFollower:
             )
             if begins_anew:
                 self.joints = self._new_joints()
+        self._tracker.use(rig.intersector.orientation)
         self._rig = rig
         self.untimed += stamp_ns == self._last_ns
         self._last_ns = stamp_ns

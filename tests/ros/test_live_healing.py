@@ -366,6 +366,11 @@ def test_alarm_of_the_drift_watch_heals_the_rig(rig, graph, calibrated):
     learned('reconstruction_node', lambda s: int(value_of(s, 'observations') or 0) > 4500, 'drift')
     assert {one.orientation_id for one in orientations} == {before}
     is_bumped = True
+    client.wait_for_diagnostics(
+        'reconstruction_node',
+        lambda s: 'until the rig is healed' in value_of(s, 'standard deviations'),
+        'drift',
+    )
     client.wait_until(lambda: orientations[-1].orientation_id != before, JOB_DEADLINE, 'healing')
     healed = orientations[-1].orientation_id
     client.wait_until(

@@ -125,7 +125,7 @@ def test_points_of_a_knocked_rig_are_found_with_honest_deviations():
     assert np.mean(np.concatenate([frame.points.status for frame in plain]) == 0) < 0.5
 
 
-def test_small_drift_widens_points_and_poses_and_ends_with_the_alarm():
+def test_small_drift_widens_points_and_poses_while_rays_show_it():
     mean = []
     for seed in SEEDS:
         calibrations, orientation, frames, truth = scene(0.3, seed)
@@ -155,11 +155,19 @@ def test_small_drift_widens_points_and_poses_and_ends_with_the_alarm():
     assert watch.state.level == ERROR and watch.widening is not None
     watch = RigDriftWatch(orientation, sizes)
     found, _ = reconstruct_recording(back, calibrations, Intersector(orientation), watch=watch)
-    assert watch.widening is None
-    given = Intersector(orientation)
-    assert watch.widened(given) == (given, 0.0)
+    # The alarm goes on for a while; what it adds is what the newest rays show.
     last = np.nanmedian(found[-1].points.sd_mm)
-    assert last < 1.2 * np.nanmedian(found[0].points.sd_mm)
+    assert last < 1.5 * np.nanmedian(found[0].points.sd_mm)
+
+
+def test_without_an_alarm_nothing_is_added():
+    calibrations, orientation, frames, _ = scene(0.0)
+    watch = RigDriftWatch(orientation, {n: calibrations[n].image_size for n in 'ab'})
+    given = Intersector(orientation)
+    found, _ = reconstruct_recording(frames, calibrations, given, watch=watch)
+    plain, _ = reconstruct_recording(frames, calibrations, given)
+    assert watch.widening is None and watch.widened(given) == (given, 0.0)
+    np.testing.assert_array_equal(found[-1].points.covariance, plain[-1].points.covariance)
 
 
 def _later(frames):

@@ -248,7 +248,9 @@ class ReconstructionNode(StreamNode):
         """Use an orientation, and publish its transforms."""
         if self._rigs.add(message):
             self._misses = RecentMisses()
-            self._transforms.publish(transforms_of_orientation(message, self._settings.rig_frame))
+            self._transforms.publish(
+                transforms_of_orientation(message, self._settings.rig_frame, self._rigs.calibrated)
+            )
 
     def _on_camera_info(self, name: str, message: CameraInfo) -> None:
         """Take the image size of a fluoroscope, which the drift watch needs."""
@@ -359,6 +361,7 @@ class ReconstructionNode(StreamNode):
             'last fault': self._refusals.last_fault,
             'orientation': rig.orientation_id if rig else '',
             'source of the orientation': rig.orientation.source if rig else '',
+            'healed by': self._rigs.correction,
             **self._latencies.values(),
         }
 

@@ -135,17 +135,17 @@ class Recording:
             rng.uniform(0, 2 * np.pi, (scenario.bodies, 3)),
             rng.uniform(-1, 1, (3, scenario.bodies, 3)),
         )
-        self.bodies = self._learned(self._moving(times, 1.0))
-        points = self._moving(times, scenario.moving)
+        self.bodies = self._learned(self.moving(times, 1.0))
+        points = self.moving(times, scenario.moving)
         phase = 0.8 * np.pi * times
         shift = np.stack([np.sin(phase), np.cos(phase), np.sin(2 * phase)], axis=1)
         self.points = self._changed(points + scenario.shift_mm * shift[:, None, None])
         self.change = np.zeros((EXPOSURES, 18))
         if scenario.change is not None:
             self.change = scenario.change(rng, times)
-        self.frames = self._frames()
+        self.frames, self.false = self.seen(self.points, times, self.errors + self.change)
 
-    def _moving(self, times: np.ndarray, share: float) -> np.ndarray:
+    def moving(self, times: np.ndarray, share: float) -> np.ndarray:
         """Points (T, B, M, 3) of the markers: turns of up to 23 degrees, shifts of up to 25 mm."""
         phase, (turn, centre, swing) = self._motion
         angle = 1.6 * np.pi * times[:, None, None] + phase
@@ -195,10 +195,15 @@ class Recording:
             out.append(uv.reshape(*points.shape[:-1], 2))
         return np.stack(out, axis=-2)
 
-    def _frames(self) -> dict[str, list[Frame]]:
-        """Frames with noise, false matches and errors of the correction."""
-        uv = self.project(self.points, self.errors + self.change)
-        uv = uv.reshape(EXPOSURES, -1, 2, 2)
+    def seen(
+        self, points: np.ndarray, times: np.ndarray, errors: np.ndarray
+    ) -> tuple[dict[str, list[Frame]], np.ndarray]:
+        """Frames of points (T, B, M, 3) with noise, false matches and errors of the correction.
+
+        times (T,) [s]; errors (T, 18) of the rig. Also returns which (T, B M) have a false match.
+        """
+        uv = self.project(points, errors)
+        uv = uv.reshape(len(points), -1, 2, 2)
         if self.scenario.drift_px:
             x, y = np.moveaxis((uv[..., 1, :] - 511.5) / 512, -1, 0)
             a = self.rng.uniform(-1, 1, 6) * self.scenario.drift_px
@@ -216,9 +221,10 @@ class Recording:
             for t, of_time in enumerate(uv[:, :, f]):
                 on = ((of_time >= 0) & (of_time <= 1023)).all(axis=1)
                 sigma = np.full(np.count_nonzero(on), NOISE_PX)
-                frame = Frame(name, t, ids[on], of_time[on], SIZE, sigma, stamp_ns=1 + 50 * t)
+                stamp = 1 + round(1e9 * times[t])
+                frame = Frame(name, t, ids[on], of_time[on], SIZE, sigma, stamp_ns=stamp)
                 frames[name].append(frame)
-        return frames
+        return frames, false.any(axis=2)
 
     def orientation(self) -> RigOrientation:
         """Return the rig as it was calibrated."""

@@ -162,6 +162,7 @@ class Kind(str, Enum):
     NO_DRIFT = 'no_drift'
     NOT_WATCHED = 'not_watched'
     SHORT_RECORDING = 'short_recording'
+    WIDENED_BY_ALARM = 'widened_by_alarm'
 
 
 @dataclass(frozen=True)

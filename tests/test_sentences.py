@@ -28,7 +28,7 @@ from fluoro_calib_ros.checks.drift_charts import ERROR, WARN
 from fluoro_calib_ros.checks.drift_evidence import DriftEstimate
 from fluoro_calib_ros.checks.drift_watch import DriftWatch
 from fluoro_calib_ros.checks.rig import doubtful
-from fluoro_calib_ros.checks.rig_watch import RecordingDriftWatch
+from fluoro_calib_ros.checks.rig_watch import RecordingDriftWatch, widened
 from fluoro_calib_ros.checks.survey import unsurveyed
 from fluoro_calib_ros.checks.verdict import validate, validate_or_report
 from fluoro_calib_ros.errors import DataError
@@ -201,7 +201,7 @@ def trial(kind):
     """What a trial of the reconstruction says is confused."""
     both = {name: list(of_one[:2]) for name, of_one in exposures().items()}
     found = [why for why, _ in epipolar._trials(both, 'ab', {1, 2})]
-    return epipolar._missing(0.9, next(one for one in found if one.kind is kind))
+    return epipolar.missing_rays(0.9, next(one for one in found if one.kind is kind))
 
 
 def bead(**changes):
@@ -461,7 +461,7 @@ MAKERS = {
     Kind.NO_COMMON_TARGETS: lambda: epipolar.UNMATCHED,
     Kind.PAIRS_CONTRADICT: lambda: about_pairs(unexplained=20.0),
     Kind.PAIRS_EXCLUDED: lambda: about_pairs(used=np.arange(8) != 4),
-    Kind.RAYS_DO_NOT_MEET: lambda: epipolar._missing(0.9, epipolar.UNKNOWN),
+    Kind.RAYS_DO_NOT_MEET: lambda: epipolar.missing_rays(0.9, epipolar.UNKNOWN),
     Kind.RIG_DEPENDS_ON_ANGLE: lambda: about_pairs(angle_px=1.5),
     Kind.RIG_MOVED: moved_rig,
     Kind.RIG_NOTE: saved_note,
@@ -524,6 +524,7 @@ MAKERS = {
         )[1].finding
     ),
     Kind.SHORT_RECORDING: lambda: RecordingDriftWatch(orientation(), SIZES).verdict().finding,
+    Kind.WIDENED_BY_ALARM: lambda: widened(0.05, 0.6, miss_px=2.1, image_sd_px=0.0),
 }
 SENTENCES = {
     Kind.DATA: 'phantom.csv: the file is empty',
@@ -874,6 +875,10 @@ SENTENCES = {
     Kind.SHORT_RECORDING: (
         'the recording is too short to detect a drift: it has # s, of which the first # s are '
         'learned'
+    ),
+    Kind.WIDENED_BY_ALARM: (
+        'rays miss each other by # px (RMS): until the rig is healed, the standard deviation of '
+        'a coordinate is # mm (median) instead of # mm'
     ),
 }
 

@@ -135,6 +135,11 @@ class BodyTracker:
         moved = self.filter.rotation @ (self.solver.centre - before)[:, :, None]
         self.filter.mean[:, :3] += moved[:, :, 0]
 
+    def use(self, orientation: RigOrientation) -> None:
+        """Use the same orientation with another covariance from now on."""
+        if orientation is not self.solver.orientation:
+            self.solver = PoseSolver(orientation, self.bodies, self._reject)
+
     def flush(self) -> list[TrackedExposure]:
         """Return the exposures that are not reported yet, at the end of a stream."""
         if not self._taken or self.lag is None:

@@ -18,7 +18,9 @@ import numpy as np
 from ..bodies.body import Body
 from ..findings import Finding, Kind
 from ..photogrammetry.rig_orientation import RigOrientation
-from ..reconstruction.epipolar import EpipolarGeometry
+from ..reconstruction.epipolar import UNKNOWN, EpipolarGeometry, missing_rays
+from ..reconstruction.intersection import OK as INTERSECTED
+from ..reconstruction.intersection import Intersector
 from ..reconstruction.reconstruct import IntersectedViews
 from .drift_charts import (
     ERROR,
@@ -30,11 +32,12 @@ from .drift_charts import (
     DriftState,
     EpipolarObservations,
 )
+from .drift_evidence import EPIPOLAR
 from .drift_watch import DriftWatch
+from .rig_change import FALSE_MATCH_SD, Addition, RigChange
 
-# A residual above FALSE_MATCH_SD standard deviations and FALSE_MATCH_PX more is that of a false
+# A residual above FALSE_MATCH_SD standard deviations and so many pixels more is that of a false
 # match. Up to there it may be that of a drift, even if the intersection rejects it.
-FALSE_MATCH_SD = 4.0
 FALSE_MATCH_PX = 3.0
 
 
@@ -66,6 +69,14 @@ class RigDriftWatch:
         self._min_interval_ns = round(0.9e9 / rate_hz)
         self._last_ns: int | None = None
         self._has_bodies = bool(bodies)
+        self._orientation = orientation
+        self._change = RigChange(orientation, self._pairs)
+        self._of_charts = self._watch.state  # of the last block
+        self._state = self._of_charts
+        self._addition: Addition | None = None
+        self._wide: tuple[Intersector, Intersector] | None = None  # as given, and widened
+        #: what an alarm adds to standard deviations, None without one
+        self.widening: Finding | None = None
 
     @property
     def options(self) -> DriftOptions:
@@ -75,7 +86,7 @@ class RigDriftWatch:
     @property
     def state(self) -> DriftState:
         """Present state."""
-        return self._watch.state
+        return self._state
 
     @property
     def watched_s(self) -> float:
@@ -87,16 +98,35 @@ class RigDriftWatch:
         last = self._last_ns
         return last is None or not 0 <= stamp_ns - last < self._min_interval_ns
 
+    def widened(self, intersector: Intersector) -> tuple[Intersector, float]:
+        """Return the intersector of the next exposure, and what is added to sigma [px].
+
+        While there is an alarm, its covariance of the rig contains what the alarm shows.
+        """
+        added = self._addition
+        if added is None:
+            return intersector, 0.0
+        if self._wide is None or self._wide[0] is not intersector:
+            covariance = self._orientation.covariance + added.covariance
+            wide = replace(self._orientation, covariance=covariance)
+            self._wide = intersector, Intersector(wide, intersector.reject)
+        return self._wide[1], added.image_sd
+
     def add_exposure(self, stamp_ns: int, exposure: IntersectedViews) -> DriftState:
-        """Add an exposure of the fluoroscopes of the orientation, and return the state."""
+        """Add an exposure of the fluoroscopes of the orientation, and return the state.
+
+        The exposure was intersected with what `widened` has returned.
+        """
         self._last_ns = stamp_ns
+        exposure = self._as_calibrated(exposure)
         target_id = exposure.target_id
         uv, sigma = exposure.views.uv, exposure.views.sigma
         noise2 = np.maximum(sigma * sigma - exposure.views.correction_sd**2, 0)
-        for i, j, geometry in self._pairs:
+        for number, (i, j, geometry) in enumerate(self._pairs):
             found = geometry.residuals(uv[i], uv[j], sigma[i], sigma[j])
             noise = found.factor_a**2 * noise2[i] + found.factor_b**2 * noise2[j]
             limit = FALSE_MATCH_SD * found.sd_total + FALSE_MATCH_PX
+            self._change.add(number, target_id, (uv[i], uv[j]), found, noise=noise)
             good = np.flatnonzero(np.abs(found.residual) <= limit)
             observations = EpipolarObservations(
                 target_id[good],
@@ -113,7 +143,95 @@ class RigDriftWatch:
             self._watch.add_residuals(stamp_ns, self._names[i], self._names[j], observations)
         if self._has_bodies:
             self._watch.add_points(stamp_ns, exposure)
+        if self._watch.state is not self._of_charts:  # a block has ended
+            self._of_charts = self._watch.state
+            self._change.close()
+            self._state = self._present_state()
+            self._widen(exposure)
         return self.state
+
+    def _as_calibrated(self, exposure: IntersectedViews) -> IntersectedViews:
+        """Return an exposure without what an alarm has added to its image points."""
+        if self._addition is None or not self._addition.image_sd:
+            return exposure
+        views = exposure.views
+        added = self._addition.image_sd**2
+        sigma, correction_sd = (
+            np.sqrt(np.maximum(sd * sd - added, 0)) for sd in (views.sigma, views.correction_sd)
+        )
+        return replace(exposure, views=replace(views, sigma=sigma, correction_sd=correction_sd))
+
+    def _present_state(self) -> DriftState:
+        """State by the charts, or of a knock, whose rays are too far apart for them."""
+        share = self._change.share_apart
+        if not share:
+            return self._of_charts
+        since_s = self._change.blocks_apart * self.options.block_s
+        return replace(
+            self._of_charts,
+            finding=replace(missing_rays(share, UNKNOWN), severity=ERROR),
+            source=EPIPOLAR,
+            since_s=since_s,
+        )
+
+    def _widen(self, exposure: IntersectedViews) -> None:
+        """Find out what an alarm adds, from its newest rays. exposure: the last one."""
+        state = self._state
+        self._wide = None
+        self._addition = self.widening = None
+        if state.level == OK or state.finding.kind is Kind.CLUSTER_CHANGE:
+            return
+        added = self._change.addition(round(state.since_s / self.options.block_s))
+        if added is None:
+            return
+        if state.source != EPIPOLAR and np.isfinite(state.size):
+            added = self._with_shift(added, state)
+        self._addition = added
+        self.widening = self._widening(exposure, added)
+
+    def _with_shift(self, added: Addition, state: DriftState) -> Addition:
+        """Add a drift along epipolar lines, which only bodies show: a shift of the image."""
+        covariance = added.covariance.copy()
+        for f, name in enumerate(self._names):
+            if name in state.fluoroscope.split(' or '):
+                rows = self._orientation.covariance_rows([f])[6:8]
+                covariance[rows, rows] += state.size**2 + state.sd**2
+        return replace(added, covariance=covariance)
+
+    def _widening(self, exposure: IntersectedViews, added: Addition) -> Finding | None:
+        """Say by how much standard deviations of the points of an exposure grow."""
+        views = exposure.views
+        given = Intersector(self._orientation, None)
+        wide, image_sd = self.widened(given)
+        self._wide = None
+        before, now = (
+            one.intersect(views.uv, np.hypot(views.sigma, sd))
+            for one, sd in ((given, 0.0), (wide, image_sd))
+        )
+        good = (before.status == INTERSECTED) & (now.status == INTERSECTED)
+        if not good.any():
+            return None
+        sd_before_mm, sd_mm = (
+            float(np.sqrt(np.median(np.trace(one.covariance[good], axis1=1, axis2=2)) / 3))
+            for one in (before, now)
+        )
+        return widened(sd_before_mm, sd_mm, miss_px=added.miss, image_sd_px=added.image_sd)
+
+
+def widened(sd_before_mm: float, sd_mm: float, miss_px: float, image_sd_px: float) -> Finding:
+    """Return the finding that an alarm adds to standard deviations."""
+    return Finding(
+        Kind.WIDENED_BY_ALARM,
+        f'rays miss each other by {miss_px:.2f} px (RMS): until the rig is healed, the standard '
+        f'deviation of a coordinate is {sd_mm:.3f} mm (median) instead of {sd_before_mm:.3f} mm',
+        severity=WARN,
+        numbers={
+            'sd_before_mm': sd_before_mm,
+            'sd_mm': sd_mm,
+            'miss_px': miss_px,
+            'image_sd_px': image_sd_px,
+        },
+    )
 
 
 @dataclass(frozen=True)
@@ -128,6 +246,7 @@ class DriftVerdict:
     began_ns: int | None = None  #: begin of the drift by the last estimate [ns]
     level_at_end: str | None = None  #: 'ok', 'warn' or 'error'
     watched_s: float = 0.0  #: time in which a drift could have been detected [s]
+    widening: Finding | None = None  #: the most that an alarm has added to standard deviations
 
     @property
     def level(self) -> str:
@@ -162,6 +281,7 @@ class RecordingDriftWatch(RigDriftWatch):
         self._worst = self.state
         self._worst_ns = 0
         self._found_ns = 0
+        self._widest: Finding | None = None
 
     def add_exposure(self, stamp_ns: int, exposure: IntersectedViews) -> DriftState:
         """Add an exposure as a RigDriftWatch does, and return the state."""
@@ -175,6 +295,12 @@ class RecordingDriftWatch(RigDriftWatch):
                 self._found_ns = stamp_ns
             self._worst = state
             self._worst_ns = stamp_ns
+        widest = self._widest
+        wide = self.widening
+        if wide is not None and (
+            widest is None or wide.numbers['sd_mm'] > widest.numbers['sd_mm']
+        ):
+            self._widest = wide
         return state
 
     def verdict(self) -> DriftVerdict:
@@ -190,6 +316,7 @@ class RecordingDriftWatch(RigDriftWatch):
                 began_ns=self._worst_ns - round(1e9 * worst.since_s),
                 level_at_end=level_at_end,
                 watched_s=watched,
+                widening=self._widest,
             )
         min_s = MIN_BLOCKS_TO_ALARM * self.options.block_s
         if watched >= min_s:

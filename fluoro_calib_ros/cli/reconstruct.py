@@ -100,6 +100,8 @@ def run(arguments: argparse.Namespace) -> None:
     print_unpaired(arguments.source, outcome.unpaired)
     if outcome.disagreement:
         print_note(f'{arguments.source}: {outcome.disagreement}')
+    if outcome.drift is not None and outcome.drift.widening is not None:
+        print_note(f'{arguments.source}: {outcome.drift.widening.sentence}')
     if outcome.widening > 1:
         check = (
             'check the sigma of the image points, whether they are corrected already or count '

@@ -18,6 +18,7 @@ from ..bodies.butterworth import filtered_poses
 from ..bodies.joints import JointMotion, joint_motion, with_neutral
 from ..bodies.shapes import EstimatedShape, estimate_shape, places_of
 from ..bodies.tracking import BodyTracker, TrackedExposure, poses_alone, poses_of
+from ..checks.rig_watch import RigDriftWatch
 from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
 from ..errors import DataError
 from ..exposures.frame import Frames
@@ -302,6 +303,7 @@ def track_bodies(
     tracker = BodyTracker(orientation, usable, options.reject, lag)
     tracked = []
     for count, one in enumerate(exposures, 1):
+        tracker.use(one.orientation)
         found = tracker.add(one.views, one.number, one.stamp_ns)
         if found is not None:
             tracked.append(found)
@@ -332,6 +334,7 @@ class _Exposure:
     number: int
     stamp_ns: int
     views: IntersectedViews
+    orientation: RigOrientation  #: with what an alarm of the drift watch adds to its covariance
 
 
 def _intersected(
@@ -344,13 +347,15 @@ def _intersected(
         raise DataError(f'no frames of {" and ".join(names)} belong together by {options.pair_by}')
     intersector = Intersector(orientation, options.reject)
     scatter = ObservedScatter()
+    watch = RigDriftWatch(orientation, {name: calibrations[name].image_size for name in names})
     out = []
     for exposure in paired:
-        views, present = intersect_frames(exposure, calibrations, intersector, scatter)
+        wide, _ = watch.widened(intersector)
+        views, present = intersect_frames(exposure, calibrations, intersector, scatter, watch)
         stamp = present[0].stamp_ns
         if options.rate is not None:
             stamp = 1 + round(present[0].number * NS_PER_S / options.rate)
-        out.append(_Exposure(present[0].number, stamp, views))
+        out.append(_Exposure(present[0].number, stamp, views, wide.orientation))
     stamps = np.array([one.stamp_ns for one in out])
     if len(out) > 1 and not (np.diff(stamps) > 0).all():
         raise DataError(

@@ -148,7 +148,8 @@ class DriftMonitor:
         if is_alarm and not self._alarmed:
             self._raise_alarm(state)
         self._alarmed = is_alarm
-        return [Status('drift', LEVELS[state.level], state.message, _values(state))]
+        values = _values(state, watch.widening)
+        return [Status('drift', LEVELS[state.level], state.message, values)]
 
     def _missing_sizes(self) -> list[str]:
         return [name for name in self._names if name not in self._sizes]
@@ -169,8 +170,9 @@ class DriftMonitor:
                 self._logger.error('the action heal is not available: the rig is not healed')
 
 
-def _values(state: DriftState) -> dict[str, object]:
+def _values(state: DriftState, widening: Finding | None) -> dict[str, object]:
     return {
+        'standard deviations': 'as calibrated' if widening is None else widening.sentence,
         'fluoroscope': state.fluoroscope,
         'place': state.place,
         'source': state.source,

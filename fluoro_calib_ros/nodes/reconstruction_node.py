@@ -248,7 +248,9 @@ class ReconstructionNode(StreamNode):
         """Use an orientation, and publish its transforms."""
         if self._rigs.add(message):
             self._misses = RecentMisses()
-            self._transforms.publish(transforms_of_orientation(message, self._settings.rig_frame))
+            self._transforms.publish(
+                transforms_of_orientation(message, self._settings.rig_frame, self._rigs.calibrated)
+            )
 
     def _on_camera_info(self, name: str, message: CameraInfo) -> None:
         """Take the image size of a fluoroscope, which the drift watch needs."""
@@ -288,7 +290,8 @@ class ReconstructionNode(StreamNode):
         ]
         first = next(exposure[name] for name in self._names if name in exposure)
         self._drift.newest = rig.watch, rig.orientation, first.stamp_ns
-        found = intersect_exposure(views, rig.intersector, rig.scatter)
+        wide, image_sd = rig.widened()
+        found = intersect_exposure(views, wide, rig.scatter, image_sd)
         content = PointsContent(
             stamp_ns=first.stamp_ns,
             frame_number=first.frame.frame_number,
@@ -306,7 +309,8 @@ class ReconstructionNode(StreamNode):
         )
         if self._follower is not None:
             number = first.frame.frame_number
-            for bodies in self._follower.add(found, rig, number, first.stamp_ns):
+            following = rig._replace(intersector=wide)
+            for bodies in self._follower.add(found, following, number, first.stamp_ns):
                 self._bodies_output.publish(bodies)
         if rig.watch is not None:
             watch_exposure(rig.watch, first.stamp_ns, found)
@@ -357,6 +361,7 @@ class ReconstructionNode(StreamNode):
             'last fault': self._refusals.last_fault,
             'orientation': rig.orientation_id if rig else '',
             'source of the orientation': rig.orientation.source if rig else '',
+            'healed by': self._rigs.correction,
             **self._latencies.values(),
         }
 

@@ -50,6 +50,11 @@ class Rig(NamedTuple):
     scatter: ObservedScatter
     watch: RigDriftWatch | None
 
+    def widened(self) -> tuple[Intersector, float]:
+        """Return the intersector with what an alarm adds, and the addition to sigma [px]."""
+        watch = self.watch
+        return (self.intersector, 0.0) if watch is None else watch.widened(self.intersector)
+
 
 class RigInput:
     """The last orientations, by the calibrations that they belong to.
@@ -76,6 +81,21 @@ class RigInput:
         self._logger = logger
         # By calibration ids, the oldest first; replaced as a whole.
         self._rigs: dict[tuple[str | None, ...], Rig] = {}
+        self._calibrated: rig_orientation.RigOrientation | None = None  # the last, not healed
+
+    @property
+    def calibrated(self) -> rig_orientation.RigOrientation | None:
+        """The orientation before the newest one was healed, None where that was not."""
+        rig, known = self.newest, self._calibrated
+        if rig is None or known is None or rig.orientation.source != 'healing':
+            return None
+        return known if known.frame_id == rig.orientation.frame_id else None
+
+    @property
+    def correction(self) -> str:
+        """By how much the newest one differs from the one before it was healed."""
+        rig, known = self.newest, self.calibrated
+        return '' if rig is None or known is None else jump_text(known, rig.orientation)
 
     @property
     def newest(self) -> Rig | None:
@@ -117,6 +137,8 @@ class RigInput:
             self._logger.error(f'orientation refused, the current one stays in use: {error}')
             return False
         self._tell_jump(orientation)
+        if orientation.source != 'healing':
+            self._calibrated = orientation
         ids = orientation.calibration_ids
         newest = list(self._rigs.items())[-(MAX_ORIENTATIONS - 1) :]
         self._rigs = {**{i: old for i, old in newest if i != ids}, ids: rig}
@@ -265,6 +287,7 @@ class BodyFollower:
             )
             if begins_anew:
                 self.joints = self._new_joints()
+        self._tracker.use(rig.intersector.orientation)
         self._rig = rig
         self.untimed += stamp_ns == self._last_ns
         self._last_ns = stamp_ns

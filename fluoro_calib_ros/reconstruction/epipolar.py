@@ -93,6 +93,7 @@ class EpipolarGeometry:
         columns = orientation.covariance_rows(rows)
         covariance = orientation.covariance[np.ix_(columns, columns)]
         derivative = _essential_jacobian(relative_rotation, shift, r_b, self._interior[:, 2])
+        self._derivative = derivative
         self._covariance = derivative @ covariance @ derivative.T
 
     def residuals(
@@ -129,6 +130,17 @@ class EpipolarGeometry:
             factor_a=length_a / norm,
             factor_b=length_b / norm,
         )
+
+    def by_orientation(self, uv_a: ArrayLike, uv_b: ArrayLike) -> NDArray[np.float64]:
+        """Derivatives (n, 18) of the residuals by T, w, xp, yp, c of a and of b."""
+        x_a = _directions(uv_a, self._interior[0])
+        x_b = _directions(uv_b, self._interior[1])
+        c_a, c_b = self._interior[:, 2]
+        slope_a = (x_b @ self.essential)[:, :2] / c_a
+        slope_b = (x_a @ self.essential.T)[:, :2] / c_b
+        norm = np.sqrt(np.sum(slope_a * slope_a + slope_b * slope_b, axis=1))
+        terms = (x_b[:, :, None] * x_a[:, None, :]).reshape(-1, 9)
+        return np.asarray(terms @ self._derivative / norm[:, None])
 
 
 def _directions(uv: ArrayLike, interior: np.ndarray) -> np.ndarray:
@@ -208,10 +220,10 @@ class RecentMisses:
             return UNMATCHED
         if total < MIN_POINTS or bad <= MAX_REJECTED * total:
             return None
-        return _missing(bad / total, UNKNOWN)
+        return missing_rays(bad / total, UNKNOWN)
 
 
-def _missing(share: float, why: Finding) -> Finding:
+def missing_rays(share: float, why: Finding) -> Finding:
     """Return the finding that a share of the rays miss each other for a reason."""
     cause = f'{100 * share:.0f} % of the rays miss each other: {why.cause}'
     return replace(why, cause=cause, numbers={**why.numbers, 'share': share})
@@ -250,8 +262,8 @@ def mismatch(
         tried, _ = reconstruct_recording(changed, calibrations, intersector, pair_by)
         rejected, count = share_rejected(tried)
         if count >= MIN_POINTS and rejected < BETTER * share:
-            return _missing(share, why)
-    return _missing(share, UNKNOWN)
+            return missing_rays(share, why)
+    return missing_rays(share, UNKNOWN)
 
 
 def cause_of_misses(

@@ -118,6 +118,9 @@ class ExposureWatch(Protocol):
     def add_exposure(self, stamp_ns: int, exposure: IntersectedViews) -> Any:
         """Examine an exposure."""
 
+    def widened(self, intersector: Intersector) -> tuple[Intersector, float]:
+        """Return the intersector of the next exposure, and what is added to sigma [px]."""
+
 
 @dataclass(frozen=True)
 class ReconstructedFrame:
@@ -135,13 +138,21 @@ def intersect_exposure(
     views: Sequence[CorrectedView | None],
     intersector: Intersector,
     scatter: ObservedScatter | None = None,
+    image_sd: float = 0.0,
 ) -> IntersectedViews:
     """Match and intersect the views of an exposure.
 
     They are in the order of the orientation's fluoroscopes, None for one that is missing. scatter:
-    that of the recording, by which the limit of false matches is widened.
+    that of the recording, by which the limit of false matches is widened. image_sd: standard
+    deviation that is added to that of the corrections [px].
     """
     matched = match_views(views)
+    if image_sd:
+        matched = replace(
+            matched,
+            sigma=np.hypot(matched.sigma, image_sd),
+            correction_sd=np.hypot(matched.correction_sd, image_sd),
+        )
     points = intersector.intersect(matched.uv, matched.sigma, matched.outside, scatter)
     return IntersectedViews(matched, points)
 
@@ -171,9 +182,7 @@ def reconstruct_exposure(
     examines the exposure. scatter: scatter of the recording so far. Raises DataError for an image
     whose size is not that of the calibration, and for a repeated target.
     """
-    found, present = intersect_frames(exposure, calibrations, intersector, scatter)
-    if watch is not None:
-        watch_exposure(watch, present[0].stamp_ns, found)
+    found, present = intersect_frames(exposure, calibrations, intersector, scatter, watch)
     return ReconstructedFrame(
         present[0].number,
         present[0].stamp_ns,
@@ -188,6 +197,7 @@ def intersect_frames(
     calibrations: Calibrations,
     intersector: Intersector,
     scatter: ObservedScatter | None = None,
+    watch: ExposureWatch | None = None,
 ) -> tuple[IntersectedViews, list[Frame]]:
     """Correct, match and intersect the frames of an exposure, see `reconstruct_exposure`.
 
@@ -198,8 +208,13 @@ def intersect_frames(
         None if frame is None else _corrected_view(frame, calibrations[frame.fluoroscope])
         for frame in frames
     ]
-    found = intersect_exposure(views, intersector, scatter)
-    return found, [frame for frame in frames if frame is not None]
+    present = [frame for frame in frames if frame is not None]
+    if watch is None:
+        return intersect_exposure(views, intersector, scatter), present
+    wide, image_sd = watch.widened(intersector)
+    found = intersect_exposure(views, wide, scatter, image_sd)
+    watch_exposure(watch, present[0].stamp_ns, found)
+    return found, present
 
 
 def _corrected_view(frame: Frame, calibration: FluoroscopeCalibration) -> CorrectedView:

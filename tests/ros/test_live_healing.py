@@ -69,6 +69,7 @@ class Rig:
         self.reconstruction = nodes['reconstruction_node']
         self.points = self.client.listen('reconstruction/points_with_covariance')
         self.orientations = self.client.listen('rig_orientation')
+        self.transforms = self.client.listen('/tf_static')
         self.client.wait_until(
             lambda: (
                 self.orientations
@@ -187,6 +188,14 @@ def test_bumped_rig_is_healed_accepted_and_rolled_back(rig, tmp_path, capsys):
     )
     shift = np.linalg.norm(result.change[:3])
     assert f'transforms of the rig jump: b by {shift:.2f} mm and ' in rig.reconstruction.log
+    transforms = {one.child_frame_id: one for one in rig.transforms[-1].transforms}
+    child = transforms['b_optical']
+    kept = transforms[child.header.frame_id]
+    assert (child.header.frame_id, kept.header.frame_id) == ('b_optical_as_calibrated', 'rig')
+    (first,) = (o for o in rig.transforms[0].transforms if o.child_frame_id == 'b_optical')
+    assert kept.transform == first.transform, 'the frame as calibrated does not jump'
+    moved = child.transform.translation
+    assert 1000 * np.linalg.norm([moved.x, moved.y, moved.z]) == pytest.approx(shift, rel=1e-6)
     saved = load_orientation(orientation_path(rig.folder))
     assert (saved.orientation_id, saved.source) == (result.orientation_id, 'healing')
     versions = {path.name for path in (rig.folder / 'versions').iterdir()}
@@ -366,6 +375,11 @@ def test_alarm_of_the_drift_watch_heals_the_rig(rig, graph, calibrated):
     learned('reconstruction_node', lambda s: int(value_of(s, 'observations') or 0) > 4500, 'drift')
     assert {one.orientation_id for one in orientations} == {before}
     is_bumped = True
+    client.wait_for_diagnostics(
+        'reconstruction_node',
+        lambda s: 'until the rig is healed' in value_of(s, 'standard deviations'),
+        'drift',
+    )
     client.wait_until(lambda: orientations[-1].orientation_id != before, JOB_DEADLINE, 'healing')
     healed = orientations[-1].orientation_id
     client.wait_until(

@@ -27,13 +27,24 @@ ROUNDING_RAD = 1e-7
 # Static transforms of the optical frames of a rig.
 
 
-def transforms_of_orientation(message: RigOrientation, rig_frame: str) -> TFMessage:
+AS_CALIBRATED = '_as_calibrated'  # ending of an optical frame that healing leaves where it is
+
+
+def transforms_of_orientation(
+    message: RigOrientation, rig_frame: str, calibrated: rig.RigOrientation | None = None
+) -> TFMessage:
     """Return the optical frames as children of the rig frame.
 
     An orientation from the calibration is given in the optical frame of its first fluoroscope;
     the rig frame then coincides with it. So every optical frame has the same parent whatever the
     source of the orientation is, and no transform of an earlier one stays valid.
+
+    calibrated: the orientation before it was healed. Between the rig frame and an optical frame
+    that has moved since there is another one, which stays where it was (REP 105: as odom does
+    between map and robot).
     """
+    if calibrated is not None:
+        return _with_corrections(message, rig_frame, calibrated)
     out = TFMessage()
     given = message.header.frame_id
     if given != rig_frame and given not in message.optical_frame_id:
@@ -48,6 +59,51 @@ def transforms_of_orientation(message: RigOrientation, rig_frame: str) -> TFMess
             setattr(stamped.transform.rotation, name, getattr(message, f'q{name}')[i])
         out.transforms.append(stamped)
     return out
+
+
+def _with_corrections(
+    message: RigOrientation, rig_frame: str, calibrated: rig.RigOrientation
+) -> TFMessage:
+    """Return the transforms of a healed orientation, with frames that stay as calibrated."""
+    out = transforms_of_orientation(message, rig_frame)
+    before = message_from_orientation(calibrated)
+    earlier = {
+        one.child_frame_id: one for one in transforms_of_orientation(before, rig_frame).transforms
+    }
+    moved = rig_change(calibrated, content_of_orientation(message))
+    for healed in list(out.transforms):
+        child = healed.child_frame_id
+        if child not in moved or child not in earlier:
+            continue
+        old = earlier[child]
+        old.child_frame_id = healed.header.frame_id = f'{child}{AS_CALIBRATED}'
+        out.transforms.append(old)
+        (p0, r0), (p1, r1) = (_pose_of(one) for one in (old, healed))
+        _set_pose(healed, r0.T @ (p1 - p0), r0.T @ r1)
+    return out
+
+
+def rig_change(before: rig.RigOrientation, after: rig.RigOrientation) -> dict[str, str]:
+    """Return by how much optical frames have moved between orientations, by their names."""
+    return {
+        after.optical_frame_ids[f]: text
+        for f, name in enumerate(after.fluoroscopes)
+        if (text := _moved_by(before, after, name))
+    }
+
+
+def _pose_of(stamped: TransformStamped) -> tuple[np.ndarray, np.ndarray]:
+    place, turn = stamped.transform.translation, stamped.transform.rotation
+    rotation = matrix_from_quaternion(np.array([[turn.w, turn.x, turn.y, turn.z]]))[0]
+    return np.array([place.x, place.y, place.z]), rotation
+
+
+def _set_pose(stamped: TransformStamped, place: np.ndarray, rotation: np.ndarray) -> None:
+    turn = quaternion_from_matrix(rotation)
+    for name, value in zip('xyz', place):
+        setattr(stamped.transform.translation, name, float(value))
+    for name, value in zip('wxyz', turn):
+        setattr(stamped.transform.rotation, name, float(value))
 
 
 def _transform(message: RigOrientation, parent: str, child: str) -> TransformStamped:
@@ -160,16 +216,20 @@ def jump_text(before: rig.RigOrientation, after: rig.RigOrientation) -> str:
     """Return how far fluoroscopes are displaced between orientations, '' where none is."""
     if before.frame_id != after.frame_id:
         return f'the rig frame is {after.frame_id} instead of {before.frame_id}'
-    parts = []
-    for f, name in enumerate(after.fluoroscopes):
-        if name not in before.fluoroscopes:
-            continue
-        old = before.fluoroscopes.index(name)
-        shift = np.linalg.norm(after.position_mm[f] - before.position_mm[old])
-        turn = np.linalg.norm(vector_from_matrix(after.rotation[f] @ before.rotation[old].T))
-        if shift > ROUNDING_MM or turn > ROUNDING_RAD:
-            parts.append(f'{name} by {shift:.2f} mm and {np.degrees(turn):.3f} degrees')
-    return ', '.join(parts)
+    texts = ((name, _moved_by(before, after, name)) for name in after.fluoroscopes)
+    return ', '.join(f'{name} by {text}' for name, text in texts if text)
+
+
+def _moved_by(before: rig.RigOrientation, after: rig.RigOrientation, name: str) -> str:
+    """Return how far a fluoroscope is displaced between orientations, '' where it is not."""
+    if name not in before.fluoroscopes:
+        return ''
+    old, f = before.index(name), after.index(name)
+    shift = np.linalg.norm(after.position_mm[f] - before.position_mm[old])
+    turn = np.linalg.norm(vector_from_matrix(after.rotation[f] @ before.rotation[old].T))
+    if not (shift > ROUNDING_MM or turn > ROUNDING_RAD):
+        return ''
+    return f'{shift:.2f} mm and {np.degrees(turn):.3f} degrees'
 
 
 def _metre_scale(count: int) -> np.ndarray:

@@ -1,0 +1,248 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""What the rays of an alarm tell of a change of the rig, as an addition to its covariance.
+
+The unknowns of the rig have changed by d. Epipolar residuals are r = -J d + noise. A cause, such
+as a knock, and its size s are a normal prior of d with the covariance s^2 D (see bodies.healing).
+With the normal equations N = J'WJ and g = -J'Wr, a cause of a size has the posterior mean m and
+covariance P and the evidence Z,
+
+    P = (N + (s^2 D)^-1)^-1,  m = P g,  log Z = 1/2 g'Pg - 1/2 log det(I + s^2 N D).
+
+Points are still intersected with the rig as it was calibrated, so d is their error, and its
+second moment is added to the covariance of the rig: the mean of m m' + P over causes and sizes,
+weighted by Z. Where rays tell nothing, along epipolar lines, it is that of a change as large as
+what they tell. What no change of the rig explains is added to the image points.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..bodies.healing import FOCUS, KNOCK_MM, KNOCK_RAD, SHIFT_PX
+from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
+from ..reconstruction.epipolar import EpipolarGeometry, EpipolarResiduals
+
+FALSE_MATCH_SD = 4.0  # standard deviations above which rays do not meet
+WINDOW = 8  # newest blocks that tell of a change
+SIZES = np.geomspace(2.0**-7, 4.0, 10)  # of a change, relative to a knock
+# Variance of the median of normal errors over that of their mean.
+MEDIAN_VARIANCE = np.pi / 2
+ITERATIONS = 10
+NU = 4.0  # degrees of freedom of the distribution by which residuals are weighted
+NORMAL_MEDIAN = 0.455  # of chi-squared with one degree of freedom
+# Blocks in a row, with so many markers and most of their rays apart, that show a knock.
+KNOCKED_BLOCKS = 2
+MIN_MARKERS = 3
+MOST = 0.5
+
+
+@dataclass(frozen=True)
+class Addition:
+    """What is added to the errors of a rig and of its image points."""
+
+    covariance: NDArray[np.float64]  #: (9F, 9F)
+    image_sd: float  #: of each coordinate of an image point [px]
+    miss: float  #: RMS of what the rays miss each other by [px]
+
+
+@dataclass(frozen=True)
+class _Rays:
+    """Residuals (n,) of pairs of rays, and their derivatives (n, 9F) by the rig."""
+
+    residual: np.ndarray
+    noise: np.ndarray  # variance
+    systematic: np.ndarray  # variance of the part that stays
+    by_rig: np.ndarray
+    is_apart: np.ndarray  # so that they do not meet
+
+
+class RigChange:
+    """Collects the rays of the newest blocks, and says what they tell of a change.
+
+    pairs: fluoroscopes of each pair by their numbers, and their geometry.
+    """
+
+    def __init__(
+        self, orientation: RigOrientation, pairs: Sequence[tuple[int, int, EpipolarGeometry]]
+    ) -> None:
+        self._orientation = orientation
+        self._pairs = tuple(pairs)
+        self._hypotheses = _hypotheses(orientation)
+        self._open: list[list[tuple[np.ndarray, ...]]] = [[] for _ in self._pairs]
+        self._blocks: deque[_Rays] = deque(maxlen=WINDOW)
+        self._has_met = False
+        self._apart = 0  # blocks in a row whose rays are apart
+
+    def add(
+        self,
+        number: int,
+        target_id: np.ndarray,
+        uv: tuple[np.ndarray, np.ndarray],
+        found: EpipolarResiduals,
+        noise: np.ndarray,
+    ) -> None:
+        """Add the image points uv (n, 2) of a pair in an exposure.
+
+        noise (n,): variances of the residuals by noise alone.
+        """
+        good = np.isfinite(found.residual)
+        columns = (
+            target_id,
+            *uv,
+            found.residual,
+            noise,
+            found.sd_total**2 - noise,
+            np.abs(found.residual) > FALSE_MATCH_SD * found.sd_total,
+        )
+        self._open[number].append(tuple(column[good] for column in columns))
+
+    def close(self) -> None:
+        """End a block."""
+        parts = [
+            self._median(number, [np.concatenate(column) for column in zip(*rows)])
+            for number, rows in enumerate(self._open)
+            if rows
+        ]
+        self._open = [[] for _ in self._pairs]
+        if not parts:
+            return
+        rays = _joined(parts)
+        if len(rays.residual) < MIN_MARKERS:
+            return
+        self._blocks.append(rays)
+        is_apart = bool(rays.is_apart.mean() > MOST)
+        self._apart = self._apart + 1 if is_apart else 0
+        self._has_met |= not is_apart
+
+    @property
+    def share_apart(self) -> float:
+        """Share of the rays of a rig that has been knocked that miss each other; else 0.
+
+        Rays that have never met are confused, or the rig is another one.
+        """
+        if not self._has_met or self._apart < KNOCKED_BLOCKS:
+            return 0.0
+        return float(self._blocks[-1].is_apart.mean())
+
+    @property
+    def blocks_apart(self) -> int:
+        """Blocks in a row whose rays are apart."""
+        return self._apart
+
+    def _median(self, number: int, columns: list[np.ndarray]) -> _Rays:
+        """Return the median residual of each marker in a block: false matches do not count."""
+        target_id, uv_a, uv_b, residual, noise, systematic, is_apart = columns
+        order = np.lexsort((residual, target_id))
+        _, first, count = np.unique(target_id[order], return_index=True, return_counts=True)
+        rows = order[first + count // 2]
+        i, j, geometry = self._pairs[number]
+        by_rig = np.zeros((len(rows), ORIENTATION_SIZE * len(self._orientation.fluoroscopes)))
+        columns_of_pair = self._orientation.covariance_rows([i, j])
+        by_rig[:, columns_of_pair] = geometry.by_orientation(uv_a[rows], uv_b[rows])
+        return _Rays(
+            residual[rows],
+            MEDIAN_VARIANCE * noise[rows] / count,
+            np.maximum(systematic[rows], 0.0),
+            by_rig,
+            is_apart[rows],
+        )
+
+    def addition(self, blocks: int) -> Addition | None:
+        """Return what so many of the newest blocks tell, at most WINDOW; None without any."""
+        newest = list(self._blocks)[-max(blocks, 1) :]
+        if not newest:
+            return None
+        rays = _joined(newest)
+        # The systematic error of a marker that stands still does not average out.
+        variance = rays.noise + len(newest) * rays.systematic
+        broad = np.sqrt(np.sum([sd**2 for sd in self._hypotheses], axis=0)) * SIZES[-1]
+        design = rays.by_rig * broad
+        factor, weight = _weights(design, rays.residual, variance)
+        normal = rays.by_rig.T @ (rays.by_rig * weight[:, None])
+        right = -rays.by_rig.T @ (weight * rays.residual)
+        moments = []
+        evidence = []
+        for sd in self._hypotheses:
+            for size in SIZES:
+                moment, log_z = _moment(normal, right, size * sd)
+                moments.append(moment)
+                evidence.append(log_z)
+        share = np.exp(np.array(evidence) - max(evidence))
+        covariance = np.tensordot(share / share.sum(), np.array(moments), axes=1)
+        return Addition(
+            (covariance + covariance.T) / 2,
+            float(np.sqrt(max(factor - 1, 0.0) * np.median(variance))),
+            float(np.sqrt(np.mean(np.minimum(rays.residual**2, _cap(rays.residual))))),
+        )
+
+
+def _cap(residual: np.ndarray) -> float:
+    """Square of a residual beyond which it counts as false in a mean."""
+    return float(9 * np.median(residual**2) / NORMAL_MEDIAN)
+
+
+def _joined(parts: Sequence[_Rays]) -> _Rays:
+    return _Rays(
+        *(
+            np.concatenate([getattr(part, name) for part in parts])
+            for name in ('residual', 'noise', 'systematic', 'by_rig', 'is_apart')
+        )
+    )
+
+
+def _hypotheses(orientation: RigOrientation) -> list[NDArray[np.float64]]:
+    """Standard deviations (9F,) of a knock, and of source against detector, by fluoroscope.
+
+    Of two views, only the orientation of one against the other can be seen.
+    """
+    views = len(orientation.fluoroscopes)
+    out = []
+    for f in range(views):
+        sd = np.zeros((2, views, ORIENTATION_SIZE))
+        sd[0, f, :6] = [KNOCK_MM] * 3 + [KNOCK_RAD] * 3
+        sd[1, f, 6:] = [SHIFT_PX, SHIFT_PX, FOCUS * orientation.interior[f, 2]]
+        out += [row.ravel() for row in sd[int(views == 2 and f == 0) :]]
+    return out
+
+
+def _weights(
+    design: np.ndarray, residual: np.ndarray, variance: np.ndarray
+) -> tuple[float, np.ndarray]:
+    """Return the factor of the variance, at least 1, and the weights (n,) of residuals (n,).
+
+    design (n, K): derivatives by unknowns of variance one. Weights are those of a t distribution
+    (Lange, Little and Taylor, JASA 84, 1989).
+    """
+    weight = 1 / variance
+    factor = 1.0
+    unit = np.eye(design.shape[1])
+    for _ in range(ITERATIONS):
+        normal = design.T @ (design * weight[:, None]) + unit
+        inverse = np.linalg.inv(normal)
+        rest = residual - design @ (inverse @ (design.T @ (weight * residual)))
+        squares = rest**2 / variance
+        free = max(len(rest) - len(unit) + float(np.trace(inverse)), 1.0)
+        factor = max(1.0, float(np.median(squares)) / NORMAL_MEDIAN * len(rest) / free)
+        weight = (NU + 1) / (NU + squares / factor) / (variance * factor)
+    return factor, weight
+
+
+def _moment(normal: np.ndarray, right: np.ndarray, sd: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return second moment (K, K) and log evidence of a change of standard deviations (K,)."""
+    rows = np.flatnonzero(sd)
+    scale = sd[rows]
+    whitened = np.eye(len(rows)) + normal[np.ix_(rows, rows)] * np.outer(scale, scale)
+    covariance = np.linalg.inv(whitened)
+    gradient = scale * right[rows]
+    mean = covariance @ gradient
+    moment = np.zeros((len(sd), len(sd)))
+    moment[np.ix_(rows, rows)] = np.outer(scale, scale) * (np.outer(mean, mean) + covariance)
+    log_z = 0.5 * (gradient @ mean - np.linalg.slogdet(whitened)[1])
+    return moment, float(log_z)

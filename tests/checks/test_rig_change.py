@@ -1,0 +1,176 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Between an alarm of the drift watch and healing, standard deviations contain what it shows."""
+
+import functools
+from dataclasses import replace
+
+import numpy as np
+from rigs import true_calibrations, true_orientation
+
+from fluoro_calib_ros.bodies.body import Body
+from fluoro_calib_ros.checks.drift_charts import ERROR
+from fluoro_calib_ros.checks.rig_watch import RigDriftWatch
+from fluoro_calib_ros.findings import Kind
+from fluoro_calib_ros.jobs.bodies import BodiesOptions, track_bodies
+from fluoro_calib_ros.jobs.reconstruction import ReconstructionOptions, reconstruct
+from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
+from fluoro_calib_ros.reconstruction.epipolar import EpipolarGeometry
+from fluoro_calib_ros.reconstruction.intersection import Intersector
+from fluoro_calib_ros.reconstruction.reconstruct import reconstruct_recording
+from fluoro_calib_ros.simulation.exposures import simulate_tracking
+from fluoro_calib_ros.simulation.rig import virtual_rig
+
+NOISE_PX = 0.25
+RATE_HZ = 30.0
+BUMPED = 360  # exposure
+SEEDS = range(4)  # of knocks: how far off points are varies with their direction
+BODY = np.arange(1001, 1007)
+
+
+def moved(rig, change):
+    a, b = rig.fluoroscopes
+    other = replace(
+        b,
+        rotation=matrix_from_vector(change[3:]) @ b.rotation,
+        position_mm=b.position_mm + change[:3],
+    )
+    return replace(rig, fluoroscopes=(a, other))
+
+
+@functools.cache
+def scene(size, seed=0):
+    """Calibrations, orientation, frames of a rig whose b is knocked, and true points."""
+    rng = np.random.default_rng(seed)
+    shift, turn = rng.normal(size=(2, 3))
+    change = np.concatenate(
+        [2.4 * shift / np.linalg.norm(shift), 0.0042 * turn / np.linalg.norm(turn)]
+    )
+    rig = virtual_rig(2, strength=0.0, names=('a', 'b'), between_deg=60.0)
+    calibrations = true_calibrations(rig.fluoroscopes, NOISE_PX)
+    orientation = true_orientation(rig.fluoroscopes, calibrations)
+    healthy, late = (
+        simulate_tracking(one, 16.0, RATE_HZ, seed=4, noise_px=NOISE_PX)
+        for one in (rig, moved(rig, size * change))
+    )
+    frames = {n: [*healthy.frames[n][:BUMPED], *late.frames[n][BUMPED:]] for n in 'ab'}
+    return calibrations, orientation, frames, healthy
+
+
+def squares(found, truth):
+    """NSE of points by exposure; NaN where none is found."""
+    out = []
+    for frame in found:
+        rows = np.searchsorted(truth.marker_id, frame.target_id)
+        number = frame.number - found[0].number
+        error = frame.points.xyz_mm - truth.points_mm[number, rows]
+        good = np.isfinite(error).all(axis=1)
+        error, covariance = error[good], frame.points.covariance[good]
+        square = np.sum(error * np.linalg.solve(covariance, error[..., None])[..., 0], axis=1)
+        out.append(np.mean(square) / 3 if len(square) else np.nan)
+    return np.array(out)
+
+
+def test_derivatives_are_those_of_differences():
+    _, orientation, _, truth = scene(0.0)
+    uv = [truth.frames[name][0].uv for name in 'ab']
+    count = min(map(len, uv))
+    uv = [one[:count] for one in uv]
+    told = EpipolarGeometry(orientation, 'a', 'b').by_orientation(*uv)
+    for column in range(18):
+        f, k = divmod(column, 9)
+        step = 1e-3 if k < 3 or k > 5 else 1e-6
+        found = []
+        for sign in (1, -1):
+            position, rotation, interior = (
+                getattr(orientation, n).copy() for n in ('position_mm', 'rotation', 'interior')
+            )
+            if k < 3:
+                position[f, k] += sign * step
+            elif k < 6:
+                turn = matrix_from_vector(sign * step * np.eye(3)[k - 3])
+                rotation[f] = turn @ rotation[f]
+            else:
+                interior[f, k - 6] += sign * step
+            other = replace(
+                orientation, position_mm=position, rotation=rotation, interior=interior
+            )
+            residuals = EpipolarGeometry(other, 'a', 'b').residuals(*uv, 1.0, 1.0)
+            found.append(residuals.residual)
+        difference = (found[0] - found[1]) / (2 * step)
+        np.testing.assert_allclose(told[:, column], difference, rtol=0.02, atol=0.02)
+
+
+def test_points_of_a_knocked_rig_are_found_with_honest_deviations():
+    """Most rays no longer meet; without the alarm there would hardly be a point."""
+    alarm = BUMPED + round(1.5 * RATE_HZ)
+    mean = []
+    for seed in SEEDS:
+        calibrations, orientation, frames, truth = scene(1.0, seed)
+        outcome = reconstruct(frames, calibrations, orientation)
+        assert outcome.drift.level == 'error'
+        nse = squares(outcome.frames, truth)
+        assert np.mean(nse[:BUMPED]) < 1.3
+        mean.append(np.nanmean(nse[alarm:]))
+        late = np.concatenate([frame.points.status for frame in outcome.frames[alarm:]])
+        assert np.mean(late == 0) > 0.9
+        widening = outcome.drift.widening
+        assert widening.kind is Kind.WIDENED_BY_ALARM
+        assert widening.numbers['sd_mm'] > 5 * widening.numbers['sd_before_mm']
+    assert 0.2 < np.mean(mean) < 1.5
+    plain = reconstruct_recording(
+        {n: of[alarm:] for n, of in frames.items()}, calibrations, Intersector(orientation)
+    )[0]
+    assert np.mean(np.concatenate([frame.points.status for frame in plain]) == 0) < 0.5
+
+
+def test_small_drift_widens_points_and_poses_while_rays_show_it():
+    mean = []
+    for seed in SEEDS:
+        calibrations, orientation, frames, truth = scene(0.3, seed)
+        late = slice(BUMPED + round(3 * RATE_HZ), None)
+        for options in (ReconstructionOptions(), ReconstructionOptions(drift_watch=False)):
+            found = reconstruct(frames, calibrations, orientation, options).frames
+            mean.append(squares(found, truth)[late])
+    assert 0.2 < np.nanmean(mean[::2]) < 1.5
+    assert np.nanmean(mean[1::2]) > 10
+    rows = np.searchsorted(truth.marker_id, BODY)
+    shape = truth.points_mm[0, rows]
+    body = Body('bone', BODY, shape, np.full(len(BODY), 0.01))
+    tracked = track_bodies(
+        frames,
+        calibrations,
+        orientation,
+        [body],
+        options=BodiesOptions(smooth='lag', estimate_shapes=False),
+    )
+    sd = tracked.poses[0].sd[:, :3].max(axis=1)
+    assert np.nanmedian(sd[-60:]) > 3 * np.nanmedian(sd[: BUMPED - 30])
+
+    back = {n: [*of, *_later(frames[n][:BUMPED])] for n, of in frames.items()}
+    sizes = {n: calibrations[n].image_size for n in 'ab'}
+    watch = RigDriftWatch(orientation, sizes)
+    reconstruct_recording(frames, calibrations, Intersector(orientation), watch=watch)
+    assert watch.state.level == ERROR and watch.widening is not None
+    watch = RigDriftWatch(orientation, sizes)
+    found, _ = reconstruct_recording(back, calibrations, Intersector(orientation), watch=watch)
+    # The alarm goes on for a while; what it adds is what the newest rays show.
+    last = np.nanmedian(found[-1].points.sd_mm)
+    assert last < 1.5 * np.nanmedian(found[0].points.sd_mm)
+
+
+def test_without_an_alarm_nothing_is_added():
+    calibrations, orientation, frames, _ = scene(0.0)
+    watch = RigDriftWatch(orientation, {n: calibrations[n].image_size for n in 'ab'})
+    given = Intersector(orientation)
+    found, _ = reconstruct_recording(frames, calibrations, given, watch=watch)
+    plain, _ = reconstruct_recording(frames, calibrations, given)
+    assert watch.widening is None and watch.widened(given) == (given, 0.0)
+    np.testing.assert_array_equal(found[-1].points.covariance, plain[-1].points.covariance)
+
+
+def _later(frames):
+    """Repeat frames after the end of the recording."""
+    count = round(16 * RATE_HZ)
+    return [replace(f, number=f.number + count, stamp_ns=f.stamp_ns + round(16e9)) for f in frames]

@@ -48,9 +48,8 @@ class DriftState:
     threshold_error: float
     observations: int  #: residuals and distances since the last reset
     learning: bool  #: whether the reference is still being learned from the start of the stream
-    #: name of the fluoroscope whose image has drifted, 'a or b' where the two cannot be
-    #: distinguished, '' without a drift
-    fluoroscope: str = ''
+    #: fluoroscope whose image has drifted, several where they cannot be distinguished
+    fluoroscopes: tuple[str, ...] = ()
     #: corners u0, v0, u1, v1 of the area that has drifted [px]
     area: tuple[float, ...] = (NAN,) * 4
     place: str = ''  #: the same area in words
@@ -69,6 +68,11 @@ class DriftState:
     def level(self) -> Severity:
         """Level of the alarm."""
         return self.finding.severity
+
+    @property
+    def fluoroscope(self) -> str:
+        """Name of the fluoroscope that has drifted, 'a or b' for one of two, '' for none."""
+        return ' or '.join(self.fluoroscopes)
 
     @property
     def message(self) -> str:

@@ -303,7 +303,7 @@ class DriftWatch:
             error,
             self._observations,
             learning=self._is_learning(),
-            fluoroscope=' or '.join(estimate.fluoroscopes),
+            fluoroscopes=tuple(estimate.fluoroscopes),
             area=corners,
             place=place,
             size=abs(estimate.size),

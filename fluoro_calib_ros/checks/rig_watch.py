@@ -193,7 +193,7 @@ class RigDriftWatch:
         """Add a drift along epipolar lines, which only bodies show: a shift of the image."""
         covariance = added.covariance.copy()
         for f, name in enumerate(self._names):
-            if name in state.fluoroscope.split(' or '):
+            if name in state.fluoroscopes:
                 rows = self._orientation.covariance_rows([f])[6:8]
                 covariance[rows, rows] += state.size**2 + state.sd**2
         return replace(added, covariance=covariance)

@@ -116,10 +116,7 @@ class DecidedView:
         for decision in decisions:
             if decision.fluoroscope == self.name and decision.since <= frame:
                 found = revise(found, decision)
-        doubtful = np.array(
-            [self.tracker.doubted_since(int(i)) is not None for i in found.target_id], dtype=bool
-        )
-        return replace(found, doubtful=doubtful)
+        return replace(found, doubtful=np.isin(found.target_id, self.tracker.doubtful()))
 
 
 def revise(found: MarkerFrame, decision: Decision) -> MarkerFrame:

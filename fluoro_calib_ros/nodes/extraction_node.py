@@ -34,7 +34,14 @@ from ..jobs.sources import read_calibrations, read_source, read_survey
 from ..options import option
 from .angle_input import AngleInput
 from .image_node import INPUTS
-from .image_stream import CONDITIONS, ExtractionWorkers, ImageState, ImageStream, Task
+from .image_stream import (
+    CONDITIONS,
+    LATE,
+    ExtractionWorkers,
+    ImageState,
+    ImageStream,
+    Task,
+)
 from .messages.image import message_from_image, use_single_thread
 from .messages.observations import NS_PER_S, message_from_frame
 from .runtime.diagnostics import Logger, RefusalLog, StartError, Status, health_of
@@ -242,8 +249,8 @@ class ExtractionNode(StreamNode):
 
     def _make_workers(self) -> ExtractionWorkers:
         size = self._settings.node.queue_size
-        # One view of a pair waits for the other until the next exposure comes.
-        size = max(size, 2) if self._calibrations else size
+        # One view of a pair waits for the other.
+        size = max(size, LATE + 1) if self._calibrations else size
         return ExtractionWorkers(self.streams, size, self._is_overlay_wanted, self._finish)
 
     # -- lifecycle

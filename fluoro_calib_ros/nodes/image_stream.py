@@ -14,6 +14,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 from sensor_msgs.msg import CompressedImage, Image
+from std_msgs.msg import Header
 
 from ..jobs.followers import MakeFollower, Observations, follower_process
 from ..processes import LentArrays, WorkerProcess
@@ -45,6 +46,8 @@ class ImageStream(Stream):
         self.followed = 0
         self.without = 0
         self.shed = 0
+        self.headers: OrderedDict[int, Header] = OrderedDict()  #: of the last images, by number
+        self.retracted = 0  #: ids that were published and taken back
         self.last: Observations | None = None  #: of the last image
         self.converter = ImageConverter(name)
         self.seconds = 0.0  #: that images took
@@ -122,6 +125,7 @@ class ImageStream(Stream):
             'explained [%]': f'{100 * last.explained:.1f}',
             'overlapped': int(last.overlapped.sum()),
             'doubtful': last.doubtful,
+            'ids retracted': self.retracted,
             'refusal of the last image': last.reason,
             'rate [Hz]': f'{self.rate_hz:.1f}',
             'time of an image [ms]': f'{1e3 * self.seconds / max(processed, 1):.0f}',

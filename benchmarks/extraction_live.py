@@ -725,12 +725,17 @@ def compare_chain(folder: Path) -> None:
         )
     if (folder / 'live.npz').exists() and (folder / 'offline.npz').exists():
         with np.load(folder / 'live.npz') as live, np.load(folder / 'offline.npz') as own:
-            common = [key for key in live.files if key in own.files]
-            same = [
-                live[key].shape == own[key].shape and np.array_equal(live[key], own[key])
-                for key in common
-            ]
-        print(f'{sum(same)} of {len(common)} images have the same observations live and offline')
+            pairs = [(live[key], own[key]) for key in live.files if key in own.files]
+        same = [
+            (one, other)
+            for one, other in pairs
+            if len(one) == len(other) and (one[:, 0] == other[:, 0]).all()
+        ]
+        away = np.concatenate([one[:, 1:3] - other[:, 1:3] for one, other in same])
+        print(
+            f'{len(same)} of {len(pairs)} images have the same ids live and offline, which began '
+            f'with other images; their places differ by {np.sqrt(np.mean(away**2)):.1g} px (RMS)'
+        )
 
 
 def chain(folder: Path, seconds: float, parts: bool) -> None:

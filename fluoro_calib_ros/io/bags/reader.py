@@ -142,7 +142,7 @@ def _without_retracted(source: PathLike, frames: Frames) -> tuple[dict[str, list
         ids = wrong.setdefault((topics[message.topic], stamp_ns), set())
         ids.update(one.target_id.tolist())
     count = 0
-    out = {}
+    out: dict[str, list[Frame]] = {}
     for name, of_view in frames.items():
         out[name] = []
         for frame in of_view:
@@ -150,8 +150,10 @@ def _without_retracted(source: PathLike, frames: Frames) -> tuple[dict[str, list
             kept = ~np.isin(frame.target_id, list(ids))
             count += int(np.count_nonzero(~kept))
             sigma = None if frame.sigma is None else np.asarray(frame.sigma)[kept]
-            points = {'target_id': frame.target_id[kept], 'uv': frame.uv[kept], 'sigma': sigma}
-            out[name].append(frame if kept.all() else replace(frame, **points))
+            points = replace(
+                frame, target_id=frame.target_id[kept], uv=frame.uv[kept], sigma=sigma
+            )
+            out[name].append(frame if kept.all() else points)
     return out, count
 
 

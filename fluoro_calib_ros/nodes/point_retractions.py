@@ -19,6 +19,7 @@ from .runtime.topics import observations_qos
 
 TOPIC = 'retractions'
 REMEMBERED = 1000  # views and retractions
+MAX_BYTES = 100_000  # of a message
 
 
 class PointRetractions:

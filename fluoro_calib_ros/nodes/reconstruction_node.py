@@ -37,7 +37,7 @@ from .messages.fluoroscope_calibration import image_size_of
 from .messages.observations import NS_PER_S, CorrectedFrame, decode_corrected_observations
 from .messages.points import PointsContent
 from .messages.rig_orientation import transforms_of_orientation
-from .point_retractions import TOPIC, PointRetractions
+from .point_retractions import MAX_BYTES, TOPIC, PointRetractions
 from .reconstruction_output import (
     CONDITIONS,
     BodiesOutput,
@@ -249,7 +249,13 @@ class ReconstructionNode(StreamNode):
                 max_bytes=self._limits.max_bytes,
             )
             retracted = partial(self._retractions.on_retraction, name)
-            reader.subscribe(Retraction, f'{name}/{TOPIC}', retracted, observations_qos())
+            reader.subscribe(
+                Retraction,
+                f'{name}/{TOPIC}',
+                retracted,
+                observations_qos(),
+                max_bytes=MAX_BYTES,
+            )
 
     # -- the rig
 

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections import OrderedDict
 from collections.abc import Mapping
 from typing import Any
@@ -19,7 +20,7 @@ from .runtime.topics import observations_qos
 
 TOPIC = 'retractions'
 REMEMBERED = 1000  # views and retractions
-MAX_BYTES = 100_000  # of a message
+MAX_IDS = 10_000  # of a retraction
 
 
 class PointRetractions:
@@ -32,22 +33,25 @@ class PointRetractions:
         # By fluoroscope and stamp of a view.
         self._exposures: OrderedDict[tuple[str, int], PointsContent] = OrderedDict()
         self._early: OrderedDict[tuple[str, int], Retraction] = OrderedDict()
+        self._lock = threading.Lock()  # views and retractions come in two threads
         self.count = 0  #: points that were taken back
 
     def note(self, stamps_ns: Mapping[str, int], content: PointsContent) -> None:
         """Remember an exposure that was reconstructed, by the stamps of its views."""
-        for key in stamps_ns.items():
-            _remember(self._exposures, key, content)
-            if key in self._early:
-                self._publish(content, self._early.pop(key))
+        with self._lock:
+            for key in stamps_ns.items():
+                _remember(self._exposures, key, content)
+                if key in self._early:
+                    self._publish(content, self._early.pop(key))
 
-    def on_retraction(self, name: str, message: Retraction, _: Mapping[str, Any]) -> None:
+    def on_retraction(self, name: str, message: Retraction) -> None:
         """Take back points of an exposure, or of one that is still to come."""
         key = name, nanoseconds_from_stamp(message.header.stamp)
-        if key in self._exposures:
-            self._publish(self._exposures[key], message)
-        else:
-            _remember(self._early, key, message)
+        with self._lock:
+            if key in self._exposures:
+                self._publish(self._exposures[key], message)
+            elif len(message.target_id) <= MAX_IDS:
+                _remember(self._early, key, message)
 
     def _publish(self, content: PointsContent, message: Retraction) -> None:
         wrong = np.intersect1d(content.target_id, message.target_id)

@@ -37,7 +37,7 @@ from .messages.fluoroscope_calibration import image_size_of
 from .messages.observations import NS_PER_S, CorrectedFrame, decode_corrected_observations
 from .messages.points import PointsContent
 from .messages.rig_orientation import transforms_of_orientation
-from .point_retractions import MAX_BYTES, TOPIC, PointRetractions
+from .point_retractions import TOPIC, PointRetractions
 from .reconstruction_output import (
     CONDITIONS,
     BodiesOutput,
@@ -235,6 +235,13 @@ class ReconstructionNode(StreamNode):
                 latched_qos(),
                 self._refusals,
             )
+            self.create_input(
+                Retraction,
+                f'{name}/{TOPIC}',
+                partial(self._retractions.on_retraction, name),
+                observations_qos(),
+                self._refusals,
+            )
 
     def create_readers(self) -> None:
         """Receive the corrected observations of all fluoroscopes in one thread."""
@@ -247,14 +254,6 @@ class ReconstructionNode(StreamNode):
                 observations_qos(),
                 decode=with_limit(decode_corrected_observations, self._limits.max_points),
                 max_bytes=self._limits.max_bytes,
-            )
-            retracted = partial(self._retractions.on_retraction, name)
-            reader.subscribe(
-                Retraction,
-                f'{name}/{TOPIC}',
-                retracted,
-                observations_qos(),
-                max_bytes=MAX_BYTES,
             )
 
     # -- the rig

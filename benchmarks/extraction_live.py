@@ -8,15 +8,25 @@ reconstruction. First the observations and the calibration are compared with tho
 behind the commands extract and calibrate. Then the latency from two images to their points, and
 the rate, are measured: for a phantom in ever other poses, for one that moves slowly and is
 followed, for one that is filmed at 30 Hz, and for 30 markers that are filmed so.
+
+`--chain SECONDS` measures the chain from images to poses instead: 30 markers in five bodies, two
+views of 1024 x 1024 px and 8 bits at 30 Hz, whose images another process plays from a bag.
+Nothing but bodies.csv and the calibrations is given. It prints lost exposures, latency, and CPU
+time of each process; with `--parts`, what the milliseconds of an exposure are spent on. `--folder`
+keeps what is rendered. The profile for large messages is used with
+`FASTRTPS_DEFAULT_PROFILES_FILE=config/large_images.xml`.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
+import struct
 import tempfile
+import threading
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,30 +34,58 @@ import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from fluoro_calib_msgs.msg import (
+    BodyPoses,
     CalibrationStatus,
+    CorrectedObservations,
     ReconstructedPoints,
     RigOrientation,
     TargetObservations,
 )
 from fluoro_calib_msgs.srv import Calibrate
 from rclpy.node import Node
+from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
+from fluoro_calib_ros.api import calibrate
+from fluoro_calib_ros.bodies.body import Body
 from fluoro_calib_ros.demo.assessment import NodeProcesses, isolate_ros_graph
 from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.images.codec import encode
+from fluoro_calib_ros.images.marker_fit import MarkerMeasurement
+from fluoro_calib_ros.images.marker_intensity import MarkerSearch
+from fluoro_calib_ros.images.marker_motion import MarkerStates
+from fluoro_calib_ros.images.marker_pair import MarkerPair
+from fluoro_calib_ros.images.marker_rays import MarkerBodies, PairRays
+from fluoro_calib_ros.images.marker_watch import MarkerWatch
+from fluoro_calib_ros.io.bags.reader import iterate_messages
+from fluoro_calib_ros.io.bags.writer import BagWriter
+from fluoro_calib_ros.io.bodies import read_bodies, write_bodies
+from fluoro_calib_ros.io.calibration import load_orientation, orientation_path
 from fluoro_calib_ros.io.observations import write_observations_csv
 from fluoro_calib_ros.io.phantom import write_phantom
 from fluoro_calib_ros.jobs.calibration import run_calibration
 from fluoro_calib_ros.jobs.extraction import ExtractionRequest, run_extraction
+from fluoro_calib_ros.jobs.followers import MarkerSettings
+from fluoro_calib_ros.jobs.result_folder import save_outcome
 from fluoro_calib_ros.jobs.simulation import SETTINGS, RenderedScene, Renderers
-from fluoro_calib_ros.nodes.messages.image import message_from_image
-from fluoro_calib_ros.nodes.messages.observations import stamp_from_nanoseconds
-from fluoro_calib_ros.nodes.runtime.topics import images_qos, latched_qos, observations_qos
+from fluoro_calib_ros.jobs.sources import read_calibrations
+from fluoro_calib_ros.nodes.messages.image import ImageConverter, message_from_image
+from fluoro_calib_ros.nodes.messages.observations import (
+    nanoseconds_from_stamp,
+    stamp_from_nanoseconds,
+)
+from fluoro_calib_ros.nodes.runtime.topics import (
+    images_qos,
+    latched_qos,
+    observations_qos,
+    wait_for_readers,
+    wait_until_acknowledged,
+)
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
-from fluoro_calib_ros.simulation.exposures import phantom_poses
+from fluoro_calib_ros.processes import one_core
+from fluoro_calib_ros.simulation.exposures import phantom_poses, simulate_exposures
 from fluoro_calib_ros.simulation.marker_images import (
     FIRST_ID,
     MARKER_SETTINGS,
@@ -65,6 +103,8 @@ SHIFT_MM = 1.0
 FILM_HZ = 30.0
 FIRST_NS = 1_700_000_000_000_000_000
 EXPOSURE_NS = 500_000_000
+SHAPE_SD_MM = 0.05
+WRONG_PX = 1.5
 SETTLING_S = 2.0  # in which a node discovers the camera, too
 
 Images = Sequence[Mapping[str, np.ndarray]]
@@ -342,7 +382,6 @@ def run(exposures: int, steps: int, seconds: float, folder: Path) -> None:
     film = rendered(rig, moving(poses[3], steps))
     frames = by_command(still, rig, folder)
     write_phantom(folder / 'phantom.csv', rig.phantom)
-    isolate_ros_graph()
     rclpy.init(args=[])
     camera = Camera()
     phantom = {'phantom': folder / 'phantom.csv'}
@@ -376,15 +415,372 @@ def run(exposures: int, steps: int, seconds: float, folder: Path) -> None:
     rclpy.shutdown()
 
 
+# The whole chain, from images to poses.
+
+CHAIN_SEED = 310
+CHAIN_SETTINGS = replace(MARKER_SETTINGS, bits=8)
+IMAGE_TYPE = 'sensor_msgs/msg/Image'
+STAMP_AT = 4  # byte of the stamp in a serialized Image
+WARM_UP_S = 3.0  # at the beginning of the bag, in which the bodies are identified; not counted
+PLAYED = 'played.npy'  # stamps of the exposures that were played
+TICKS = os.sysconf('SC_CLK_TCK')
+# What an exposure of two images is spent on in the process that follows markers.
+PARTS: dict[str, tuple[tuple[type, str], ...]] = {
+    'predict': ((MarkerStates, 'advance'), (MarkerPair, '_suggest')),
+    'search': ((MarkerSearch, 'shadows'), (MarkerPair, '_search')),
+    'fit': ((MarkerMeasurement, 'measure'),),
+    'ids': (
+        (MarkerPair, '_decide'),
+        *((MarkerWatch, n) for n in ('shadows_met', 'found_again', 'other_shadows')),
+        (MarkerWatch, 'moving_alone'),
+    ),
+    'rays and bodies': (
+        (PairRays, 'intersect'),
+        (MarkerBodies, 'update'),
+        (MarkerBodies, 'learn'),
+    ),
+}
+
+
+def write_chain(folder: Path, exposures: int) -> None:
+    """Write calibration, bodies.csv and a bag of images of moving bodies, and the truth."""
+    rig = virtual_rig(CHAIN_SEED)
+    outcome = calibrate(simulate_exposures(rig, 15, CHAIN_SEED).frames, rig.phantom, joint=True)
+    save_outcome(folder / 'calibration', outcome)
+    markers = MovingMarkers(MarkerScene(), CHAIN_SEED)
+    bodies = []
+    for number in range(markers.scene.clusters):
+        own = markers.cluster == number
+        sd = np.full(np.count_nonzero(own), SHAPE_SD_MM)
+        bodies.append(Body(f'bone_{number}', markers.target_id[own], markers.local_mm[own], sd))
+    write_bodies(folder / 'bodies.csv', bodies)
+    sequence = MarkerSequence(rig, markers, CHAIN_SETTINGS, exposures, CHAIN_SEED)
+    truth: dict[str, list[np.ndarray]] = {name: [] for name in NAMES}
+    with BagWriter(folder / 'images', overwrite=True) as bag:
+        for number, views in enumerate(sequence):
+            stamp_ns = FIRST_NS + round(number * 1e9 / FILM_HZ)
+            for name, view in views.items():
+                header = Header(stamp=stamp_from_nanoseconds(stamp_ns), frame_id=f'{name}_optical')
+                data = serialize_message(message_from_image(header, view.image))
+                bag.write(f'/{name}/image_raw', IMAGE_TYPE, data, stamp_ns)
+                truth[name].append(np.where(view.seen[:, None], view.uv, np.nan))
+    save_arrays(folder / 'truth.npz', {name: np.array(uv) for name, uv in truth.items()})
+
+
+class BagCamera(Node):
+    """Publishes the images of a bag at their times, with the time of publication as stamp."""
+
+    def __init__(self, bag: Path) -> None:
+        super().__init__('bag_camera')
+        outputs = {
+            f'/{name}/image_raw': self.create_publisher(Image, f'{name}/image_raw', images_qos())
+            for name in NAMES
+        }
+        wait_for_readers(self, outputs.values(), 1, threading.Event())
+        start = time.monotonic()
+        first: int | None = None
+        due = 0
+        stamp_ns = 0
+        stamps = []
+        for message in iterate_messages(bag):
+            if first is None:
+                first = message.log_time_ns
+            if message.log_time_ns != due:
+                due = message.log_time_ns
+                time.sleep(max(0.0, start + (due - first) * 1e-9 - time.monotonic()))
+                stamp_ns = time.time_ns()
+                stamps.append(stamp_ns)
+            data = bytearray(message.data)
+            struct.pack_into('<iI', data, STAMP_AT, stamp_ns // 10**9, stamp_ns % 10**9)
+            outputs[message.topic].publish(bytes(data))
+        wait_until_acknowledged(outputs.values(), threading.Event())
+        np.save(bag.parent / PLAYED, stamps)
+
+
+class ChainReader(Node):
+    """Notes when what follows from the images was published, by the stamp of the images [ns]."""
+
+    def __init__(self) -> None:
+        super().__init__('chain_reader')
+        self.came: dict[str, dict[int, int]] = {}
+        self.observed: dict[str, list[TargetObservations]] = {name: [] for name in NAMES}
+        self.tracked: dict[int, int] = {}  # bodies with a pose, by stamp
+        for name in NAMES:
+            self._listen(TargetObservations, f'{name}/target_observations')
+            self._listen(CorrectedObservations, f'{name}/corrected_observations')
+        self._listen(ReconstructedPoints, 'reconstruction/points_with_covariance')
+        self._listen(BodyPoses, 'reconstruction/body_poses')
+        self.extraction: dict[str, dict[str, str]] = {}
+        self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
+
+    def _listen(self, kind: Any, topic: str) -> None:
+        came = self.came[topic] = {}
+
+        def note(message: Any, info: Mapping[str, int]) -> None:
+            stamp = nanoseconds_from_stamp(message.header.stamp)
+            came[stamp] = info['source_timestamp']
+            if kind is TargetObservations:
+                self.observed[topic.partition('/')[0]].append(message)
+            if kind is BodyPoses:
+                self.tracked[stamp] = sum(s != BodyPoses.FAILED for s in message.status)
+
+        self.create_subscription(kind, topic, note, observations_qos())
+
+    def _on_diagnostics(self, array: DiagnosticArray) -> None:
+        for status in array.status:
+            if status.name.startswith('/extraction_node'):
+                self.extraction[status.hardware_id] = {v.key: v.value for v in status.values}
+
+
+def cpu_seconds(pid: int) -> float:
+    """CPU time [s] that a process has used, all its threads together."""
+    fields = Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()
+    return (int(fields[11]) + int(fields[12])) / TICKS
+
+
+def processes_of(nodes: Mapping[str, int]) -> dict[str, list[int]]:
+    """Ids of nodes, and of their workers."""
+    out = {name: [pid] for name, pid in nodes.items()}
+    for name, pid in nodes.items():
+        children = [
+            int(child)
+            for task in Path(f'/proc/{pid}/task').iterdir()
+            for child in (task / 'children').read_text().split()
+        ]
+        if children:
+            out[f'{name}, its workers'] = children
+    return out
+
+
+def measure_chain(folder: Path) -> None:
+    """Play the bag to the nodes, and print what was lost, latencies and CPU times."""
+    rclpy.init(args=[])
+    reader = ChainReader()
+    calibrated = {'calibration_directory': folder / 'calibration'}
+    bodies = {**calibrated, 'bodies': folder / 'bodies.csv'}
+    with NodeProcesses(folder) as programs:
+        nodes = {
+            'extraction_node': programs.start('extraction_node', {**bodies, 'mode': 'markers'}),
+            'correction_node': programs.start('correction_node', calibrated),
+            'reconstruction_node': programs.start('reconstruction_node', bodies),
+        }
+        wait_for_nodes(reader, len(nodes))
+        camera = programs.run(
+            'benchmarks.extraction_live', '--play', str(folder / 'images'), log=folder / 'camera'
+        )
+        counted: dict[str, float] = {}
+        used: dict[str, float] = {}
+        began = ended = 0
+        last = 0.0
+        while camera.poll() is None or time.monotonic() < last + 2:
+            rclpy.spin_once(reader, timeout_sec=0.02)
+            last = time.monotonic() if camera.poll() is None else last
+            done = reader.came['reconstruction/body_poses']
+            if not counted and len(done) > WARM_UP_S * FILM_HZ:
+                began = max(done)
+                ids = processes_of({name: p.pid for name, p in nodes.items()})
+                counted = {n: sum(map(cpu_seconds, pids)) for n, pids in ids.items()}
+            if counted and camera.poll() is None:
+                used = {n: sum(map(cpu_seconds, pids)) for n, pids in ids.items()}
+                ended = max(done)
+    played = np.load(folder / PLAYED).tolist()
+    stamps = [stamp for stamp in played if stamp > began]
+    during = sum(stamp <= ended for stamp in stamps)
+    print_chain(reader, stamps)
+    total = 0.0
+    for name, seconds in used.items():
+        each = 1e3 * (seconds - counted[name]) / during
+        total += each
+        print(f'| {name} | {each:.1f} |')
+    print(f'| together | {total:.1f} |', flush=True)
+    number_of = {stamp: number for number, stamp in enumerate(played, 1)}
+    save_arrays(
+        folder / 'live.npz',
+        {
+            f'{name}_{number_of[nanoseconds_from_stamp(m.header.stamp)]:05d}': np.column_stack(
+                [m.target_id, m.u, m.v, m.sigma]
+            )
+            for name, messages in reader.observed.items()
+            for m in messages
+        },
+    )
+    reader.destroy_node()
+    rclpy.shutdown()
+
+
+def wait_for_nodes(reader: ChainReader, count: int) -> None:
+    """Wait until the outputs of all nodes are there."""
+    topics = list(reader.came)
+    end = time.monotonic() + 60
+    while not all(map(reader.count_publishers, topics)) or len(reader.extraction) < 2:
+        rclpy.spin_once(reader, timeout_sec=0.1)
+        if time.monotonic() > end:
+            raise RuntimeError(f'the {count} nodes do not publish: see their logs')
+
+
+def print_chain(reader: ChainReader, stamps: Sequence[int]) -> None:
+    """Print which exposures were lost, and the latencies [ms] of what came."""
+    for topic, came in reader.came.items():
+        late = 1e-6 * np.array([came[s] - s for s in stamps if s in came])
+        p50, p95, p99 = np.percentile(late, [50, 95, 99])
+        print(
+            f'| {topic} | {len(stamps) - len(late)} of {len(stamps)} | {p50:.1f} | {p95:.1f} | '
+            f'{p99:.1f} | {late.max():.1f} |'
+        )
+    came = reader.came['reconstruction/body_poses']
+    tracked = np.array([reader.tracked[s] for s in stamps if s in came])
+    print(f'bodies with a pose {tracked.mean():.3f} in the mean, at least {tracked.min()}')
+    for name, values in reader.extraction.items():
+        kept = ('images received', 'images extracted', 'images shed', 'lost at the input')
+        print(name, {key: values[key] for key in kept if key in values}, flush=True)
+
+
+def stopwatch(seconds: dict[str, float], part: str, owner: type, method: str) -> None:
+    """Add the time that calls of a method take to the seconds of a part."""
+    plain = getattr(owner, method)
+
+    def timed(*arguments: Any, **keywords: Any) -> Any:
+        began = time.thread_time()
+        try:
+            return plain(*arguments, **keywords)
+        finally:
+            seconds[part] += time.thread_time() - began
+
+    setattr(owner, method, timed)
+
+
+def measure_parts(folder: Path, exposures: int, pause_s: float) -> None:
+    """Follow the images of the bag in this process, and print where the time goes."""
+    bodies = read_bodies(folder / 'bodies.csv')
+    calibrations = read_calibrations(folder / 'calibration', NAMES)
+    orientation = load_orientation(orientation_path(folder / 'calibration')).subset(NAMES)
+    follower = MarkerSettings(
+        {}, calibrations=calibrations, orientation=orientation, bodies=bodies
+    )()
+    seconds = dict.fromkeys((*PARTS, 'decode', 'all'), 0.0)
+    for part, methods in PARTS.items():
+        for owner, method in methods:
+            stopwatch(seconds, part, owner, method)
+    converter = ImageConverter('')
+    warm = round(WARM_UP_S * FILM_HZ)
+    out = {}
+    images: dict[str, np.ndarray] = {}
+    number = 0
+    with one_core():
+        for message in iterate_messages(folder / 'images'):
+            name = message.topic.split('/')[1]
+            time.sleep(pause_s)
+            began = time.thread_time()
+            images[name], _ = converter.decoded(deserialize_message(message.data, Image))
+            seconds['decode'] += time.thread_time() - began
+            if len(images) < len(NAMES):
+                continue
+            number += 1
+            began = time.thread_time()
+            found = follower.extract(images, number)
+            seconds['all'] += time.thread_time() - began
+            images = {}
+            if number == warm:
+                seconds.update(dict.fromkeys(seconds, 0.0))
+            for view, of_view in found.items():
+                out[f'{view}_{number:05d}'] = np.column_stack(
+                    [of_view.target_id, of_view.uv, of_view.sigma]
+                )
+            if number == exposures:
+                break
+    for part, total in seconds.items():
+        print(f'| {part} | {1e3 * total / (number - warm):.2f} |')
+    save_arrays(folder / 'offline.npz', out)
+
+
+def save_arrays(path: Path, found: Mapping[str, np.ndarray]) -> None:
+    """Write arrays by name; those of images have rows of id, u, v, sigma."""
+    arrays: dict[str, Any] = dict(found)
+    np.savez(path, **arrays)
+
+
+def compare_chain(folder: Path) -> None:
+    """Print how the truth, the live observations and those of this process differ."""
+    truth = np.load(folder / 'truth.npz')
+    for source in ('offline', 'live'):
+        if not (folder / f'{source}.npz').exists():
+            continue
+        wrong = measured = seen = 0
+        errors = []
+        with np.load(folder / f'{source}.npz') as found:
+            for key in found.files:
+                name, number = key.split('_')
+                true = truth[name][int(number) - 1]
+                rows = found[key]
+                away = rows[:, 1:3] - true[rows[:, 0].astype(int) - FIRST_ID]
+                distance = np.linalg.norm(away, axis=1)
+                wrong += int(np.count_nonzero(distance > WRONG_PX))
+                measured += int(np.isfinite(distance).sum())
+                seen += int(np.isfinite(true[:, 0]).sum())
+                errors.append(away[distance <= WRONG_PX])
+        rmse = np.sqrt(np.mean(np.concatenate(errors) ** 2))
+        print(
+            f'{source}: {measured / seen:.2%} of {seen} visible markers measured, {wrong} further '
+            f'than {WRONG_PX} px from their place, RMSE {rmse:.4f} px'
+        )
+    if (folder / 'live.npz').exists() and (folder / 'offline.npz').exists():
+        with np.load(folder / 'live.npz') as live, np.load(folder / 'offline.npz') as own:
+            pairs = [(live[key], own[key]) for key in live.files if key in own.files]
+        same = [
+            (one, other)
+            for one, other in pairs
+            if len(one) == len(other) and (one[:, 0] == other[:, 0]).all()
+        ]
+        away = np.concatenate([one[:, 1:3] - other[:, 1:3] for one, other in same])
+        print(
+            f'{len(same)} of {len(pairs)} images have the same ids live and offline, which began '
+            f'with other images; their places differ by {np.sqrt(np.mean(away**2)):.1g} px (RMS)'
+        )
+
+
+def chain(folder: Path, seconds: float, parts: bool) -> None:
+    """Render what is not there, and measure the chain, or the parts of an exposure."""
+    exposures = round(seconds * FILM_HZ)
+    if not (folder / 'truth.npz').exists():
+        write_chain(folder, exposures)
+    if parts:
+        measure_parts(folder, exposures, 0.0)
+    else:
+        measure_chain(folder)
+    compare_chain(folder)
+
+
+def play(bag: Path) -> None:
+    """Play a bag, as a camera would."""
+    rclpy.init(args=[])
+    BagCamera(bag)
+    rclpy.shutdown()
+
+
 def main() -> None:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument('--exposures', type=int, default=15)
     parser.add_argument('--steps', type=int, default=15, help='images of the moving phantom')
     parser.add_argument('--seconds', type=float, default=20.0, help='length of the film')
+    parser.add_argument('--chain', type=float, metavar='SECONDS', help='from images to poses')
+    parser.add_argument('--parts', action='store_true', help='with --chain: parts of an exposure')
+    parser.add_argument('--play', type=Path, metavar='BAG', help=argparse.SUPPRESS)
+    parser.add_argument('--folder', type=Path, help='of images and logs, which are kept')
     arguments = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        run(arguments.exposures, arguments.steps, arguments.seconds, Path(folder))
+    if arguments.play:
+        play(arguments.play)
+        return
+    isolate_ros_graph()
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = arguments.folder or Path(temporary)
+        folder.mkdir(exist_ok=True)
+        if arguments.chain:
+            chain(folder, arguments.chain, arguments.parts)
+        else:
+            run(arguments.exposures, arguments.steps, arguments.seconds, folder)
 
 
 if __name__ == '__main__':

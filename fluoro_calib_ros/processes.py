@@ -3,9 +3,10 @@
 
 """Work in processes of their own: started, watched, limited and ended in one way.
 
-A `WorkerProcess` calls a function in another process, call after call; `run_module` runs a module
-as a program. Either ends with the process that has started it, however that ends. `Programs` run
-beside it, and are interrupted at its end.
+A `WorkerProcess` calls a function in another process, call after call; `LentArrays` gives it large
+arrays without pickling them; `run_module` runs a module as a program. Either process ends with the
+one that has started it, however that ends. `Programs` run beside it, and are interrupted at its
+end.
 """
 
 from __future__ import annotations
@@ -24,8 +25,11 @@ from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
+from multiprocessing.shared_memory import SharedMemory
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
+
+import numpy as np
 
 from .errors import DataError
 from .limits import ReadLimits, read_limits, use_read_limits
@@ -179,6 +183,61 @@ class WorkerProcess:
         process.terminate()
         process.join()
         return process.exitcode
+
+
+class LentArrays:
+    """Shared memory for arrays that are arguments of a WorkerProcess.
+
+    Each slot holds one array, which is read-only in the process, until the slot is filled again:
+    after the call that has used it.
+    """
+
+    def __init__(self) -> None:
+        self._blocks: dict[str, SharedMemory] = {}
+
+    def lend(self, slot: str, array: np.ndarray) -> Any:
+        """Copy an array into a slot; returns what arrives in a process as that array."""
+        block = self._blocks.get(slot)
+        if block is None or block.size < array.nbytes:
+            self._release(slot)
+            block = self._blocks[slot] = SharedMemory(create=True, size=max(array.nbytes, 1))
+        np.ndarray(array.shape, array.dtype, block.buf)[...] = array
+        return _Lent(block.name, array.shape, array.dtype.str)
+
+    def close(self) -> None:
+        """Give the memory back; the process keeps its own until it ends."""
+        for slot in tuple(self._blocks):
+            self._release(slot)
+
+    def _release(self, slot: str) -> None:
+        block = self._blocks.pop(slot, None)
+        if block is not None:
+            block.close()
+            block.unlink()
+
+
+@dataclass(frozen=True)
+class _Lent:
+    """An array in shared memory, as it is sent."""
+
+    name: str
+    shape: tuple[int, ...]
+    dtype: str
+
+    def __reduce__(self) -> tuple[Callable[..., np.ndarray], tuple[Any, ...]]:
+        return _borrowed, (self.name, self.shape, self.dtype)
+
+
+_borrowed_blocks: dict[str, SharedMemory] = {}  # of this process, by name
+
+
+def _borrowed(name: str, shape: tuple[int, ...], dtype: str) -> np.ndarray:
+    """Return an array that the caller of this process has lent."""
+    if name not in _borrowed_blocks:
+        _borrowed_blocks[name] = SharedMemory(name)
+    array: np.ndarray = np.ndarray(shape, dtype, _borrowed_blocks[name].buf)
+    array.flags.writeable = False
+    return array
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -116,10 +117,7 @@ class DecidedView:
         for decision in decisions:
             if decision.fluoroscope == self.name and decision.since <= frame:
                 found = revise(found, decision)
-        doubtful = np.array(
-            [self.tracker.doubted_since(int(i)) is not None for i in found.target_id], dtype=bool
-        )
-        return replace(found, doubtful=doubtful)
+        return replace(found, doubtful=np.isin(found.target_id, self.tracker.doubtful()))
 
 
 def revise(found: MarkerFrame, decision: Decision) -> MarkerFrame:
@@ -157,6 +155,44 @@ def revise(found: MarkerFrame, decision: Decision) -> MarkerFrame:
         predicted=predicted,
         lost=lost,
     )
+
+
+@dataclass(frozen=True)
+class Retraction:
+    """Ids of an image that were given and turned out to be wrong."""
+
+    frame: int
+    target_id: tuple[int, ...]
+
+
+class EarlierImages:
+    """Markers of the images of a view, which later decisions change.
+
+    most: images that are kept; None for all of them.
+    """
+
+    def __init__(self, most: int | None = None) -> None:
+        self._found: deque[MarkerFrame] = deque(maxlen=most)
+
+    def __iter__(self) -> Iterator[MarkerFrame]:
+        return iter(self._found)
+
+    def add(self, found: MarkerFrame) -> None:
+        """Keep the markers of an image."""
+        self._found.append(found)
+
+    def revise(self, decision: Decision) -> list[Retraction]:
+        """Write a decision into the images that it holds for; return the ids that it changes."""
+        out = []
+        for row in range(len(self._found) - 1, -1, -1):
+            found = self._found[row]
+            if found.frame < decision.since:
+                break
+            wrong = np.intersect1d(found.target_id, decision.target_id)
+            if decision.kind != 'confirmed' and len(wrong):
+                out.append(Retraction(found.frame, tuple(wrong.tolist())))
+            self._found[row] = revise(found, decision)
+        return out[::-1]
 
 
 DECIDED = 3  # exposures that agree before an id is confirmed

@@ -11,6 +11,7 @@ that of the middle of the exposure.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -36,18 +37,19 @@ from .shadow_fit import (
 )
 
 SETTINGS = FitSettings(
-    steps=4,  # of markers whose shadows touch
-    crossing_steps=(2,),
-    crowds=((1, 1), (2, 3)),
+    steps=3,  # of markers whose shadows touch
+    crossing_steps=(1,),
+    crowds=((1, 3),),
     max_step_px=0.8,
     pooled=120.0,
     crossed=1.2,
-    dtype=np.float64,
+    dtype=np.float32,
     whole_scale=True,
     robust_relative=False,
     moves_unusable=True,
 )
-STEPS_ALONE = 3
+STEPS_ALONE = 2
+CONVERGED_PX = 0.1  # a longer last step is followed by another one
 # Largest motion [px] for a number of points along the way.
 QUADRATURE = ((0.7, 1), (3.0, 2), (6.0, 3), (10.0, 5), (np.inf, 7))
 
@@ -72,6 +74,13 @@ def fit_markers(
     return fit.result()
 
 
+@lru_cache(maxsize=8)
+def _gauss_points(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes and weights (count,) of the quadrature from -1 to 1."""
+    node, weight = np.polynomial.legendre.leggauss(count)
+    return node, weight
+
+
 class _MarkerFit(ShadowFit):
     """Fit of markers of one size, which may move."""
 
@@ -81,7 +90,7 @@ class _MarkerFit(ShadowFit):
         length = np.sqrt((guess.motion**2).sum(axis=1))
         longest = float(length.max(initial=0.0))
         points = next(count for limit, count in QUADRATURE if longest <= limit)
-        node, weight = np.polynomial.legendre.leggauss(points)
+        node, weight = _gauss_points(points)
         self.way = 0.5 * node[:, None, None] * guess.motion  # (q, n, 2)
         self.way_weight = 0.5 * weight
         reach = profile.reach_px + 0.5 * np.ceil(longest)
@@ -94,7 +103,7 @@ class _MarkerFit(ShadowFit):
             window_px=reach + MARGIN_PX,
         )
         self.guess = guess
-        self.offset_u, self.offset_v = np.ascontiguousarray(self.offset.T, dtype=float)
+        self.offset_u, self.offset_v = np.ascontiguousarray(self.offset.T, dtype=SETTINGS.dtype)
         self.inflation = 1.0
         grey, valid = windows.read(self.middle, self.offset)
         self._set_windows(grey, valid, bright=grey)
@@ -113,6 +122,7 @@ class _MarkerFit(ShadowFit):
 
     def run(self) -> None:
         """Take Gauss-Newton steps; the last one gives standard deviations as well."""
+        moved = np.zeros(len(self.uv))
         for step in range(self.settings.steps):
             if step in self.settings.crossing_steps and len(self.crowded):
                 self._cross()
@@ -121,10 +131,20 @@ class _MarkerFit(ShadowFit):
                 if alone and step >= STEPS_ALONE:
                     continue
                 final = step == (STEPS_ALONE if alone else self.settings.steps) - 1
-                uv, depth, background = self._step(rows, near, final)
-                self.uv[rows] = uv
-                self.depth[rows] = depth
-                self.background[rows] = background
+                moved[rows] = self._take_step(rows, near, final)
+        for rows, near in self.groups:
+            again = moved[rows] > CONVERGED_PX
+            if again.any():
+                self._take_step(rows[again], near[again], True)
+
+    def _take_step(self, rows: np.ndarray, near: np.ndarray, final: bool) -> np.ndarray:
+        """Take a step of some markers; return how far (g,) their centres move [px]."""
+        uv, depth, background = self._step(rows, near, final)
+        moved = np.abs(uv - self.uv[rows]).max(axis=1)
+        self.uv[rows] = uv
+        self.depth[rows] = depth
+        self.background[rows] = background
+        return np.asarray(moved)
 
     def _shadow(
         self, rows: np.ndarray, middle: np.ndarray
@@ -135,20 +155,25 @@ class _MarkerFit(ShadowFit):
         """
         # Points along the way are the first axis; few large arrays are faster than many small.
         centre = self.way[:, rows] + (self.uv[rows] - middle[:, None])
+        centre = centre.astype(SETTINGS.dtype)
         x = self.offset_u - centre[..., 0, None]
         y = self.offset_v - centre[..., 1, None]
-        distance = np.sqrt(x * x + y * y)
+        distance = x * x
+        distance += y * y
+        np.sqrt(distance, out=distance)
         value, derivative = self.profile.shadow(distance)
-        derivative /= np.maximum(distance, 1e-9)
+        derivative /= np.maximum(distance, 1e-9, out=distance)
         x *= derivative
         y *= derivative
         if len(self.way) == 1:
             return value[0], -x[0], -y[0]
-        weight = self.way_weight[:, None, None, None]
+        weight = self.way_weight.astype(SETTINGS.dtype)
+        points = len(weight)
+        shape = value.shape[1:]
         return (
-            (weight * value).sum(axis=0),
-            -(weight * x).sum(axis=0),
-            -(weight * y).sum(axis=0),
+            (weight @ value.reshape(points, -1)).reshape(shape),
+            (-weight @ x.reshape(points, -1)).reshape(shape),
+            (-weight @ y.reshape(points, -1)).reshape(shape),
         )
 
     def _model(self, rows: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

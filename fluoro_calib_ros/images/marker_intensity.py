@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -102,12 +103,12 @@ class LightWindows:
         )
         if inside:
             index = row * width + column
-            valid = np.ones(index.shape, dtype=bool) if self._all else self._field[index]
+            valid = np.ones(index.shape, dtype=bool) if self._all else self._field.take(index)
         else:
             valid = (column >= 0) & (column < width) & (row >= 0) & (row < height)
             index = np.clip(row, 0, height - 1) * width + np.clip(column, 0, width - 1)
             valid &= self._field[index]
-        grey = self._flat[index].astype(np.float32)
+        grey = self._flat.take(index).astype(np.float32)
         return (grey if self._top is None else self._top - grey), valid
 
 
@@ -162,7 +163,7 @@ def learn_look(
     _, strength, scale, inverted = best
     light = top - grey if inverted else grey
     field = field_of_view(light, scale)
-    relative = _responses(light, scale)[0] / np.maximum(
+    relative = _dark_response(light, scale) / np.maximum(
         cv2.blur(light, (2 * BACKGROUND_PX + 1,) * 2), 1e-3 * top
     )
     quiet = relative[field]
@@ -184,7 +185,7 @@ def search_image(image: np.ndarray, look: MarkerLook, share: float) -> Shadows:
     grey = image.astype(np.float32)
     light = float(np.iinfo(image.dtype).max) - grey if look.inverted else grey
     around = cv2.blur(light, (2 * BACKGROUND_PX + 1,) * 2)
-    response = _relative(_responses(light, look.scale)[0], around, look)
+    response = _relative(_dark_response(light, look.scale), around, look)
     response[~look.field] = 0
     response[[0, -1]] = 0
     response[:, [0, -1]] = 0
@@ -197,11 +198,9 @@ def search_windows(
     """Search windows of 2 half + 1 px around pixels middle (n, 2), each shadow found once."""
     border = int(np.ceil(BORDER * look.scale))
     size = 2 * (half + border) + 1
-    axis = np.arange(-half - border, half + border + 1)
-    offset = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
-    grey, valid = windows.read(middle, offset)
+    grey, valid = windows.read(middle, _square(half + border))
     around = cv2.blur(grey.reshape(-1, size), (2 * WINDOW_BACKGROUND_PX + 1, 1))
-    response = _relative(_responses(grey.reshape(-1, size), look.scale)[0], around, look)
+    response = _relative(_dark_response(grey.reshape(-1, size), look.scale), around, look)
     response = response.reshape(len(middle), size, size)
     response *= valid.reshape(response.shape)
     # The seams between windows lie in their borders.
@@ -218,6 +217,13 @@ def search_windows(
     return Shadows(place, found.strength).distinct() if len(place) else found
 
 
+@lru_cache(maxsize=64)
+def _square(half: int) -> np.ndarray:
+    """Pixels (m, 2) of a square window, from its middle, row by row."""
+    axis = np.arange(-half, half + 1)
+    return np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+
+
 def _relative(response: np.ndarray, around: np.ndarray, look: MarkerLook) -> np.ndarray:
     """Responses over the light around, 0 where noise explains them: it grows in the dark."""
     light = np.maximum(around, 1e-3 * look.light)
@@ -228,6 +234,19 @@ def _relative(response: np.ndarray, around: np.ndarray, look: MarkerLook) -> np.
 
 def _responses(grey: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
     """Responses (h, w) to dark and to bright blobs: the smaller eigenvalue, or 0."""
+    mean, spread = _curvatures(grey, scale)
+    return np.maximum(mean - spread, 0), np.maximum(-mean - spread, 0)
+
+
+def _dark_response(grey: np.ndarray, scale: float) -> np.ndarray:
+    """Response (h, w) to dark blobs alone."""
+    mean, spread = _curvatures(grey, scale)
+    mean -= spread
+    return np.maximum(mean, 0, out=mean)
+
+
+def _curvatures(grey: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """Mean (h, w) of both eigenvalues of the scaled Hessian, and half their difference."""
     smooth = cv2.GaussianBlur(grey, (0, 0), scale)
     twice = np.array([1.0, -2.0, 1.0], dtype=np.float32)
     one = np.array([0.0, 1.0, 0.0], dtype=np.float32)
@@ -237,8 +256,12 @@ def _responses(grey: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
     xy = cv2.sepFilter2D(smooth, cv2.CV_32F, once, once)
     mean = (0.5 * scale**2) * (xx + yy)
     difference = 0.5 * (xx - yy)
-    spread = scale**2 * cv2.sqrt(difference * difference + xy * xy)
-    return np.maximum(mean - spread, 0), np.maximum(-mean - spread, 0)
+    difference *= difference
+    xy *= xy
+    difference += xy
+    spread = cv2.sqrt(difference)
+    spread *= scale**2
+    return mean, spread
 
 
 def _typical(response: np.ndarray, scale: float, near: np.ndarray | None, count: int) -> float:

@@ -161,6 +161,7 @@ class MarkerTracker:
         self.target_id = first.target_id  # of all markers
         if later is not None:
             self.target_id = np.concatenate([first.target_id, later])
+        self._rows = {number: row for row, number in enumerate(self.target_id.tolist())}
         self._followed: _Followed | None = None
         self._frame = 0
         self._gap = 1  # frames between the last two images
@@ -207,6 +208,10 @@ class MarkerTracker:
     def doubted_since(self, target_id: int) -> int | None:
         """Return the image since which an id may be wrong, None for one that is sure."""
         return self._known().doubts.since(self._row(target_id))
+
+    def doubtful(self) -> np.ndarray:
+        """Ids (k,) of markers whose id may be wrong."""
+        return self.target_id[self._known().doubts.doubtful]
 
     def confirm(self, target_id: int) -> None:
         """Take back the doubt in a marker."""
@@ -270,10 +275,10 @@ class MarkerTracker:
         return self._followed
 
     def _row(self, target_id: int) -> int:
-        rows = np.flatnonzero(self.target_id == target_id)
-        if not len(rows):
+        row = self._rows.get(target_id)
+        if row is None:
             raise DataError(f'there is no marker {target_id}')
-        return int(rows[0])
+        return row
 
     def _start(self, image: np.ndarray) -> _Followed:
         """Learn from the first image. Raises DataError where the markers are not there."""

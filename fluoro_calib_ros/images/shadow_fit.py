@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import cv2
 import numpy as np
@@ -92,12 +92,15 @@ class NormalEquations:
     weighted: np.ndarray  #: (g, u, m), derivatives of the pixels times their weights
 
 
+@lru_cache(maxsize=32)
 def window_offsets(radius_px: float) -> np.ndarray:
     """Pixels (m, 2) of a round window, from its middle."""
     half = int(np.ceil(radius_px))
     axis = np.arange(-half, half + 1)
     grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
-    return grid[(grid * grid).sum(axis=1) <= radius_px**2]
+    offsets = grid[(grid * grid).sum(axis=1) <= radius_px**2]
+    offsets.flags.writeable = False
+    return offsets
 
 
 class FineGrid:
@@ -241,7 +244,7 @@ class ShadowFit(ABC):
         dtype = self.settings.dtype
         grey = self.grey[rows]
         residual = grey - light
-        valid = self.valid[rows] & ~self._says_nothing(grey, light)
+        valid = self._valid(rows, grey, light)
         weight = valid / self.noise.variance(light)
         squared = residual * residual * weight
         total = squared.sum(axis=1)
@@ -280,7 +283,7 @@ class ShadowFit(ABC):
                 continue
             light, jacobian = self._model(rows, near)
             grey = self.grey[rows]
-            valid = self.valid[rows] & ~self._says_nothing(grey, light)
+            valid = self._valid(rows, grey, light)
             self.strength[rows] = self.cosines.strengths(
                 jacobian[:, 0],
                 jacobian=jacobian,
@@ -293,9 +296,17 @@ class ShadowFit(ABC):
         """Background of a window beyond the polynomial."""
         return Cosines(self.offset, self.settings.dtype)
 
-    def _says_nothing(self, grey: np.ndarray, light: np.ndarray) -> NDArray[np.bool_]:
-        """Return (g, m) where a clipped grey value agrees with the light that is expected."""
-        return ((grey >= self.high) & (light > grey)) | ((grey <= self.low) & (light < grey))
+    def _valid(self, rows: np.ndarray, grey: np.ndarray, light: np.ndarray) -> NDArray[np.bool_]:
+        """Return (g, m) the pixels that count: a clipped one that agrees with the light does not.
+
+        grey, light: (g, m) values, and what is expected.
+        """
+        valid = self.valid[rows]
+        if np.isfinite(self.high):
+            valid &= (grey < self.high) | (light <= grey)
+        if np.isfinite(self.low):
+            valid &= (grey > self.low) | (light >= grey)
+        return valid
 
     def _prior(self, rows: np.ndarray, near: np.ndarray) -> np.ndarray:
         """Weights (g, OWN + 3 k) of what is expected of the unknowns."""
@@ -309,7 +320,11 @@ class ShadowFit(ABC):
     def typical(self) -> float:
         """Median lack of fit of the beads whose fit goes on."""
         values = self.misfit[self.usable & np.isfinite(self.misfit)]
-        return float(np.median(values)) if len(values) else 1.0
+        if not len(values):
+            return 1.0
+        values.sort()
+        half = len(values) // 2
+        return float(values[half] if len(values) % 2 else values[half - 1 : half + 1].mean())
 
     def _beads(self, measured: np.ndarray, typical: float, inflation: float) -> Beads:
         """Return what was measured, given the usual lack of fit and the inflation of variances."""
@@ -355,6 +370,9 @@ class Profile:
     attenuation: float  #: along the radius: coefficient times radius
     scatter: float = 0.0  #: share of the light that is not attenuated
     _table: np.ndarray = field(init=False, repr=False, compare=False)
+    _by_dtype: dict[np.dtype, tuple[np.ndarray, ...]] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
 
     def __post_init__(self) -> None:
         object.__setattr__(self, '_table', _tabulated(self))
@@ -371,16 +389,25 @@ class Profile:
 
     def shadow(self, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Absorbed share of the light at distances [px], and its derivative [1/px]."""
-        value, slope = self._table.astype(distance.dtype)
-        position = np.minimum(
-            distance * distance.dtype.type(1 / TABLE_STEP), distance.dtype.type(len(value) - 2)
-        )
+        value, slope, to_value, to_slope = self._tables(distance.dtype)
+        position = distance * distance.dtype.type(1 / TABLE_STEP)
+        np.minimum(position, distance.dtype.type(len(value) - 2), out=position)
         index = position.astype(np.intp)
-        part = position - index.astype(distance.dtype)
-        return (
-            value.take(index) + part * np.diff(value).take(index),
-            slope.take(index) + part * np.diff(slope).take(index),
-        )
+        position -= index.astype(distance.dtype)
+        absorbed = to_value.take(index)
+        absorbed *= position
+        absorbed += value.take(index)
+        derivative = to_slope.take(index)
+        derivative *= position
+        derivative += slope.take(index)
+        return absorbed, derivative
+
+    def _tables(self, dtype: np.dtype) -> tuple[np.ndarray, ...]:
+        """Absorbed shares (n,), derivatives (n,), and the steps (n - 1,) to the next of each."""
+        if dtype not in self._by_dtype:
+            value, slope = self._table.astype(dtype)
+            self._by_dtype[dtype] = (value, slope, np.diff(value), np.diff(slope))
+        return self._by_dtype[dtype]
 
 
 def _tabulated(profile: Profile) -> np.ndarray:

@@ -26,7 +26,7 @@ from ..exposures.phantom import Phantom
 from ..findings import Finding, Kind, Place
 from ..images.extraction import Extraction, Nearby, extract_beads
 from ..images.following import Far, moved_on
-from ..images.marker_decisions import Decision
+from ..images.marker_decisions import Decision, EarlierImages, Retraction
 from ..images.marker_ids import identifiable, identify_markers
 from ..images.marker_pair import MarkerPair, PairFrame
 from ..images.markers import FirstMarkers, MarkerFrame, MarkerOptions, MarkerTracker
@@ -60,6 +60,8 @@ class Observations:
     view: View | None = None  #: of the phantom
     followed: bool = False  #: whether the image before gave the start
     doubtful: int = 0  #: targets whose id may be wrong
+    #: ids of earlier images of the fluoroscope that turned out to be wrong with this one
+    retracted: tuple[Retraction, ...] = ()
     #: (h, w, 3), overlay of uint8, blue, green, red, if it was asked for
     picture: np.ndarray | None = None
     seconds: float = 0.0
@@ -243,6 +245,7 @@ def _model_of(beads: bytes, diameters: bytes | None, regular: bool) -> PhantomMo
 
 
 MIN_STARTED = 0.5  # of the given markers, in the first image
+REVISED = 300  # images, in which late decisions take ids back
 DECIDED = {
     'exchanged': 'were exchanged, which is undone from now on',
     'dropped': 'is not what was followed, and is searched for',
@@ -284,6 +287,7 @@ class MarkerFollower:
     def __init__(self, settings: MarkerSettings) -> None:
         self._settings = settings
         self._begun = False
+        self._earlier = {name: EarlierImages(REVISED) for name in settings.names}
         self._renew()
         if not settings.first and not identifiable(settings.bodies):
             raise DataError(
@@ -375,10 +379,13 @@ class MarkerFollower:
             found = exposure.views[name]
             result = _observed(found, len(self._trackers[name].target_id))
             decided = [d for d in exposure.decisions if d.fluoroscope == name]
+            earlier = self._earlier[name]
+            retracted = [one for d in decided for one in earlier.revise(d)]
+            earlier.add(found)
             notes = [result.note, *(_decision_text(d) for d in decided if d.kind in DECIDED)]
             picture = draw_markers(image, found) if name in overlays else None
             note = '; '.join(note for note in notes if note)
-            out[name] = replace(result, note=note, picture=picture)
+            out[name] = replace(result, note=note, picture=picture, retracted=tuple(retracted))
         return out
 
     def _identify(

@@ -27,7 +27,7 @@ from ..errors import DataError
 from ..exposures.frame import Frame, Frames
 from ..exposures.phantom import Phantom
 from ..findings import Finding
-from ..images.marker_decisions import Decision, revise
+from ..images.marker_decisions import Decision, EarlierImages
 from ..images.marker_ids import identifiable, identify_markers
 from ..images.markers import FirstMarkers, MarkerFrame, MarkerOptions
 from ..images.overlay import draw_markers
@@ -257,6 +257,7 @@ class _Recording:
                 raise DataError(f'there are no given markers of fluoroscope {name}')
         self._follower: MarkerFollower | None = None
         self._results: dict[str, list[MarkerImageResult]] = {name: [] for name in self._names}
+        self._earlier = {name: EarlierImages() for name in self._names}
         self._decisions: list[Decision] = []
         self._size: dict[str, tuple[int, int]] = {}
         self._before = dict.fromkeys(self._names, 0)
@@ -288,13 +289,14 @@ class _Recording:
         found = self._follower.update(arrays, exposure, _angles_of(images))
         self._decisions += found.decisions
         for decision in found.decisions:
-            self._correct(decision)
+            self._earlier[decision.fluoroscope].revise(decision)
         for name, image in images.items():
             view = found.views[name]
             if isinstance(image.image, DataError):
                 view = replace(view, finding=image.image.finding)
             result = MarkerImageResult(exposure, image.place, view, image.angle)
             self._results[name].append(result)
+            self._earlier[name].add(view)
 
     def _first_markers(
         self, images: Mapping[str, SourceImage], exposure: int
@@ -358,15 +360,6 @@ class _Recording:
             )
         )
 
-    def _correct(self, decision: Decision) -> None:
-        """Apply a decision to the earlier images since the doubt began."""
-        results = self._results[decision.fluoroscope]
-        for number in range(len(results) - 1, -1, -1):
-            if results[number].exposure < decision.since:
-                break
-            markers = revise(results[number].markers, decision)
-            results[number] = replace(results[number], markers=markers)
-
     def outcome(self) -> MarkerOutcome:
         """Return all results. Raises DataError where following did not begin."""
         if self._follower is None and self._start is None:
@@ -377,7 +370,13 @@ class _Recording:
                 f'of {" and ".join(self._names)}'
             )
         return MarkerOutcome(
-            {name: tuple(results) for name, results in self._results.items()},
+            {
+                name: tuple(
+                    replace(result, markers=markers)
+                    for result, markers in zip(results, self._earlier[name], strict=True)
+                )
+                for name, results in self._results.items()
+            },
             tuple(self._decisions),
             self._size,
             self._before,

@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from fluoro_calib_msgs.msg import TargetObservations
+from fluoro_calib_msgs.msg import Retraction, TargetObservations
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import CompressedImage, Image
 
@@ -28,15 +28,28 @@ from ..exposures.stamps import ExposureNumbers
 from ..images.markers import FirstMarkers, MarkerOptions
 from ..io.bodies import read_bodies
 from ..io.calibration import load_orientation, orientation_path
-from ..jobs.followers import MakeFollower, MarkerSettings, Observations, PhantomSettings
+from ..jobs.followers import (
+    REVISED,
+    MakeFollower,
+    MarkerSettings,
+    Observations,
+    PhantomSettings,
+)
 from ..jobs.reconstruction import check_orientation
 from ..jobs.sources import read_calibrations, read_source, read_survey
 from ..options import option
 from .angle_input import AngleInput
 from .image_node import INPUTS
-from .image_stream import CONDITIONS, ExtractionWorkers, ImageState, ImageStream, Task
+from .image_stream import (
+    CONDITIONS,
+    LATE,
+    ExtractionWorkers,
+    ImageState,
+    ImageStream,
+    Task,
+)
 from .messages.image import message_from_image, use_single_thread
-from .messages.observations import NS_PER_S, message_from_frame
+from .messages.observations import NS_PER_S, message_from_frame, uint32_field
 from .runtime.diagnostics import Logger, RefusalLog, StartError, Status, health_of
 from .runtime.lifecycle import StreamNode
 from .runtime.main import run
@@ -201,6 +214,7 @@ def _of_pair(settings: ExtractionSettings, first: Mapping[str, FirstMarkers]) ->
 __all__ = ['PARAMETERS', 'ExtractionNode', 'main']
 
 OVERLAY = 'image_overlay'
+RETRACTIONS = 'retractions'
 
 
 class ExtractionNode(StreamNode):
@@ -242,8 +256,8 @@ class ExtractionNode(StreamNode):
 
     def _make_workers(self) -> ExtractionWorkers:
         size = self._settings.node.queue_size
-        # One view of a pair waits for the other until the next exposure comes.
-        size = max(size, 2) if self._calibrations else size
+        # One view of a pair waits for the other.
+        size = max(size, LATE + 1) if self._calibrations else size
         return ExtractionWorkers(self.streams, size, self._is_overlay_wanted, self._finish)
 
     # -- lifecycle
@@ -252,11 +266,15 @@ class ExtractionNode(StreamNode):
         """Make the outputs."""
         self._observations: dict[str, Publisher] = {}
         self._overlays: dict[str, Publisher] = {}
+        self._retractions: dict[str, Publisher] = {}
         for name in self.names:
             self._observations[name] = self.create_output(
                 TargetObservations, f'{name}/target_observations', observations_qos()
             )
             self._overlays[name] = self.create_output(Image, f'{name}/{OVERLAY}', images_qos())
+            self._retractions[name] = self.create_output(
+                Retraction, f'{name}/{RETRACTIONS}', observations_qos()
+            )
 
     def create_readers(self) -> None:
         """Receive the images of all fluoroscopes in one thread, and number them."""
@@ -319,11 +337,26 @@ class ExtractionNode(StreamNode):
             )
             self._observations[stream.name].publish(message_from_frame(frame))
             stream.add_latency(task.received_ns)
+        self._retract(stream, task, found)
         stream.count(task.message, found)
         if found.picture is not None:
             self._overlays[stream.name].publish(
                 message_from_image(header, np.ascontiguousarray(found.picture))
             )
+
+    def _retract(self, stream: ImageStream, task: Task, found: Observations) -> None:
+        """Publish which ids of earlier images are taken back."""
+        headers = stream.headers
+        headers[task.number] = task.message.header
+        if len(headers) > REVISED:
+            headers.popitem(last=False)
+        for one in found.retracted:
+            if one.frame not in headers:
+                continue
+            message = Retraction(header=headers[one.frame], frame_number=one.frame)
+            message.target_id = uint32_field(one.target_id)
+            self._retractions[stream.name].publish(message)
+            stream.retracted += len(one.target_id)
 
     # -- diagnostics
 

@@ -14,9 +14,10 @@ from typing import Generic, TypeVar
 
 import numpy as np
 from sensor_msgs.msg import CompressedImage, Image
+from std_msgs.msg import Header
 
 from ..jobs.followers import MakeFollower, Observations, follower_process
-from ..processes import WorkerProcess
+from ..processes import LentArrays, WorkerProcess
 from .angle_input import AngleInput
 from .messages.image import IMAGE_REFUSALS, ImageConverter
 from .runtime.diagnostics import OK, Health, RefusalLog, Refused, warning
@@ -45,6 +46,8 @@ class ImageStream(Stream):
         self.followed = 0
         self.without = 0
         self.shed = 0
+        self.headers: OrderedDict[int, Header] = OrderedDict()  #: of the last images, by number
+        self.retracted = 0  #: ids that were published and taken back
         self.last: Observations | None = None  #: of the last image
         self.converter = ImageConverter(name)
         self.seconds = 0.0  #: that images took
@@ -122,6 +125,7 @@ class ImageStream(Stream):
             'explained [%]': f'{100 * last.explained:.1f}',
             'overlapped': int(last.overlapped.sum()),
             'doubtful': last.doubtful,
+            'ids retracted': self.retracted,
             'refusal of the last image': last.reason,
             'rate [Hz]': f'{self.rate_hz:.1f}',
             'time of an image [ms]': f'{1e3 * self.seconds / max(processed, 1):.0f}',
@@ -179,6 +183,7 @@ CONDITIONS = (
 T = TypeVar('T')
 
 REMEMBERED = 1000  # numbers of exposures that were begun or shed
+LATE = 3  # exposures that one view may come after the other
 
 
 class ExposureQueue(Generic[T]):
@@ -193,6 +198,8 @@ class ExposureQueue(Generic[T]):
         self._waiting: dict[str, OrderedDict[int, T]] = {n: OrderedDict() for n in fluoroscopes}
         self._begun: deque[int] = deque(maxlen=REMEMBERED)
         self._shed: deque[int] = deque(maxlen=REMEMBERED)
+        # Last exposure that was given out to several fluoroscopes together, by each of them.
+        self._given: dict[str, int] = {}
         self._changed = threading.Condition()
         self._closed = False
 
@@ -200,7 +207,7 @@ class ExposureQueue(Generic[T]):
         """Add an item; returns the fluoroscopes that have lost one."""
         with self._changed:
             waiting = self._waiting[fluoroscope]
-            if number in self._shed:
+            if number in self._shed or number <= self._given.get(fluoroscope, -1):
                 return [fluoroscope]
             lost = [fluoroscope] if number in waiting else []  # a number that is used again
             waiting[number] = item
@@ -224,6 +231,8 @@ class ExposureQueue(Generic[T]):
                 return None
             number = _lowest(views)
             self._begun.append(number)
+            if len(views) > 1:
+                self._given.update(dict.fromkeys(views, number))
             return number, {n: items.pop(number) for n, items in views.items() if number in items}
 
     @property
@@ -262,13 +271,13 @@ def _lowest(views: Mapping[str, Mapping[int, object]]) -> int:
 def _is_complete(views: Mapping[str, Mapping[int, object]]) -> bool:
     """Return whether the lowest exposure that waits has all items that it will have."""
     number = _lowest(views)
-    # A fluoroscope with a later exposure has lost this one, and one that is an exposure late is
-    # not waited for.
-    overdue = any(number in items and len(items) > 1 for items in views.values())
+    # A fluoroscope with a later exposure has lost this one, and one that is several exposures late
+    # is not waited for.
+    overdue = any(number in items and len(items) > LATE for items in views.values())
     return overdue or all(number in items or items for items in views.values())
 
 
-PATIENCE_S = 5.0  # with the other view of an exposure, unless the next one comes before
+PATIENCE_S = 5.0  # with the other view of an exposure, unless LATE exposures come before
 
 
 @dataclass(frozen=True)
@@ -337,10 +346,19 @@ class ExtractionWorkers:
 
     def _serve(self, names: Collection[str], process: WorkerProcess) -> None:
         """Extract the images of some fluoroscopes, exposure by exposure."""
+        lent = LentArrays()
+        try:
+            self._serve_exposures(names, process, lent)
+        finally:
+            lent.close()
+
+    def _serve_exposures(
+        self, names: Collection[str], process: WorkerProcess, lent: LentArrays
+    ) -> None:
         while (exposure := self._queue.get(names, PATIENCE_S)) is not None:
             number, tasks = exposure
             try:
-                self._extract(number, tasks, process)
+                self._extract(number, tasks, process, lent)
             except Exception as error:  # this exposure is lost, the next ones are not
                 if self._queue.closed:
                     return  # the process has been ended
@@ -348,7 +366,9 @@ class ExtractionWorkers:
                     stream = self._streams[name]
                     stream.refusals.fail(stream.topic, error)
 
-    def _extract(self, number: int, tasks: Mapping[str, Task], process: WorkerProcess) -> None:
+    def _extract(
+        self, number: int, tasks: Mapping[str, Task], process: WorkerProcess, lent: LentArrays
+    ) -> None:
         """Extract the images of an exposure in a process."""
         images = {}
         for name, task in tasks.items():
@@ -360,5 +380,6 @@ class ExtractionWorkers:
             return
         wanted = [name for name in images if self._wanted(name)]
         angles = {name: tasks[name].angle for name in images}
-        for name, found in process(images, number, wanted, angles).items():
+        arguments = {name: lent.lend(name, image) for name, image in images.items()}
+        for name, found in process(arguments, number, wanted, angles).items():
             self._finish(self._streams[name], tasks[name], images[name], found)

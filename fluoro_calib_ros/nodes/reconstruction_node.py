@@ -12,7 +12,12 @@ from functools import partial
 
 import numpy as np
 from fluoro_calib_msgs.action import Heal
-from fluoro_calib_msgs.msg import CorrectedObservations, DriftStatus, RigOrientation
+from fluoro_calib_msgs.msg import (
+    CorrectedObservations,
+    DriftStatus,
+    Retraction,
+    RigOrientation,
+)
 from fluoro_calib_msgs.srv import Reset
 from rclpy.action import ActionClient
 from sensor_msgs.msg import CameraInfo
@@ -32,6 +37,7 @@ from .messages.fluoroscope_calibration import image_size_of
 from .messages.observations import NS_PER_S, CorrectedFrame, decode_corrected_observations
 from .messages.points import PointsContent
 from .messages.rig_orientation import transforms_of_orientation
+from .point_retractions import TOPIC, PointRetractions
 from .reconstruction_output import (
     CONDITIONS,
     BodiesOutput,
@@ -188,6 +194,7 @@ class ReconstructionNode(StreamNode):
     def create_outputs(self) -> None:
         """Make the outputs and subscribe to orientations."""
         self._output = PointsOutput(self)
+        self._retractions = PointRetractions(self)
         self._create_bodies()
         drift = self.create_lifecycle_publisher(DriftStatus, 'reconstruction/drift', 10)
         self.own(drift, self.destroy_publisher, drift)
@@ -226,6 +233,13 @@ class ReconstructionNode(StreamNode):
                 f'{name}/camera_info',
                 partial(self._on_camera_info, name),
                 latched_qos(),
+                self._refusals,
+            )
+            self.create_input(
+                Retraction,
+                f'{name}/{TOPIC}',
+                partial(self._retractions.on_retraction, name),
+                observations_qos(),
                 self._refusals,
             )
 
@@ -301,6 +315,7 @@ class ReconstructionNode(StreamNode):
             points=found.points,
         )
         self._output.publish(content)
+        self._retractions.note({n: view.stamp_ns for n, view in exposure.items()}, content)
         self._reconstructed += 1
         self._points.add(found.points)
         self._misses.add(found.points)
@@ -357,6 +372,7 @@ class ReconstructionNode(StreamNode):
             'frames late': sum(self._pairer.late.values()),
             **self._refusals.values(CORRECTED_REFUSALS),
             **self._points.values(),
+            'points retracted': self._retractions.count,
             'limit of false matches widened by': round(rig.scatter.factor, 2) if rig else 1.0,
             'last fault': self._refusals.last_fault,
             'orientation': rig.orientation_id if rig else '',

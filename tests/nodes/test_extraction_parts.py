@@ -14,7 +14,7 @@ import pytest
 
 from fluoro_calib_ros.exposures.stamps import ExposureNumbers
 from fluoro_calib_ros.jobs.followers import Observations, follower_process
-from fluoro_calib_ros.nodes.image_stream import ExposureQueue, _is_complete
+from fluoro_calib_ros.nodes.image_stream import LATE, ExposureQueue, _is_complete
 
 MS = 1_000_000
 
@@ -70,16 +70,17 @@ def test_a_queue_whose_exposures_are_all_begun_sheds_the_oldest_item():
 
 
 def test_an_exposure_is_given_out_whole_or_when_its_partner_is_lost():
-    queue = ExposureQueue('ab', 4)
+    queue = ExposureQueue('ab', LATE + 1)
     for name, number in (('a', 1), ('b', 1), ('a', 2), ('b', 3)):
         queue.put(name, number, (name, number))
     forever = 600.0  # what is lost is not waited for
     assert queue.get('ab', forever) == (1, {'a': ('a', 1), 'b': ('b', 1)})
     assert queue.get('ab', forever) == (2, {'a': ('a', 2)})  # b is at 3
     assert queue.get('ab', 0.0) == (3, {'b': ('b', 3)})  # of which a may still come
-    for number in (4, 5):
+    for number in range(4, 5 + LATE):
         queue.put('a', number, ('a', number))
-    assert queue.get('ab', forever) == (4, {'a': ('a', 4)})  # b is an exposure late
+    assert queue.get('ab', forever) == (4, {'a': ('a', 4)})  # b is several exposures late
+    assert queue.put('b', 4, ('b', 4)) == ['b']  # too late: it must not be given out again
     queue.close()
     assert queue.get('ab', forever) is None
 
@@ -89,10 +90,11 @@ def test_an_exposure_is_given_out_whole_or_when_its_partner_is_lost():
     [
         ([1], [1], True),
         ([1], [], False),  # b may still come
-        ([1, 2], [], True),  # b is an exposure late
+        ([1, 2], [], False),  # b is an exposure late, as in a burst
+        ([1, 2, 3, 4], [], True),  # b is not waited for any longer
         ([1], [2], True),  # b has lost it
         ([], [3], False),
-        ([], [3, 4], True),
+        ([], [3, 4, 5, 6], True),
         ([2], [1], True),
     ],
 )

@@ -29,6 +29,7 @@ from fluoro_calib_msgs.msg import (
     FluoroscopeCalibration,
     JointAngles,
     ReconstructedPoints,
+    Retraction,
     RigOrientation,
     TargetObservations,
 )
@@ -71,6 +72,7 @@ TOPICS = {
     'calibration': (FluoroscopeCalibration, latched_qos()),
     'camera_info': (CameraInfo, latched_qos()),
     'calibration_status': (CalibrationStatus, 10),
+    'retractions': (Retraction, observations_qos()),
     'rig_orientation': (RigOrientation, latched_qos()),
     'points_with_covariance': (ReconstructedPoints, observations_qos()),
     'points': (PointCloud2, observations_qos()),

@@ -235,6 +235,7 @@ def nested_types(fields: Iterable[Any]) -> set[str]:
 # Frames and TargetObservations messages, as dataclasses of the rosbags typestore.
 
 TOPIC_NAME = 'target_observations'
+RETRACTION = f'{PACKAGE}/msg/Retraction'
 
 
 def frame_from_message(message: Any, fluoroscope: str) -> Frame:

@@ -29,6 +29,7 @@ from .mcap_file import (
     storage_files,
 )
 from .metadata import (
+    RETRACTION,
     TARGET_OBSERVATIONS,
     fields_of,
     fluoroscope_of_topic,
@@ -110,6 +111,9 @@ def read_frames(source: PathLike, validate: bool = True) -> BagContents:
             f'{source}: the frame numbers begin again ({counts} times), '
             f'{step} is added to those that follow each time'
         )
+    frames, count = _without_retracted(source, frames)
+    if count:
+        notes.append(f'not used: {count} image points whose ids were retracted')
     topics = {name: topic for topic, name in fluoroscopes.items() if frames[name]}
     if not topics:
         raise DataError(f'{source}: the bag has no message on {" or ".join(fluoroscopes)}')
@@ -118,6 +122,39 @@ def read_frames(source: PathLike, validate: bool = True) -> BagContents:
         dict(sorted(topics.items())),
         tuple(notes),
     )
+
+
+def _without_retracted(source: PathLike, frames: Frames) -> tuple[dict[str, list[Frame]], int]:
+    """Return frames without image points whose ids were taken back later, and their number.
+
+    Raises DataError.
+    """
+    topics = {
+        topic: fluoroscope_of_topic(topic)
+        for topic, info in topics_of(source).items()
+        if info.type == RETRACTION
+    }
+    wrong: dict[tuple[str, int], set[int]] = {}
+    for message in iterate_messages(source, topics) if topics else ():
+        with ErrorsAt(f'{source}, topic {message.topic}'):
+            one = from_cdr(message.data, RETRACTION)
+        stamp_ns = one.header.stamp.sec * 10**9 + one.header.stamp.nanosec
+        ids = wrong.setdefault((topics[message.topic], stamp_ns), set())
+        ids.update(one.target_id.tolist())
+    count = 0
+    out: dict[str, list[Frame]] = {}
+    for name, of_view in frames.items():
+        out[name] = []
+        for frame in of_view:
+            ids = wrong.get((name, frame.stamp_ns), set())
+            kept = ~np.isin(frame.target_id, list(ids))
+            count += int(np.count_nonzero(~kept))
+            sigma = None if frame.sigma is None else np.asarray(frame.sigma)[kept]
+            points = replace(
+                frame, target_id=frame.target_id[kept], uv=frame.uv[kept], sigma=sigma
+            )
+            out[name].append(frame if kept.all() else points)
+    return out, count
 
 
 def _is_restart(last: Frame, frame: Frame) -> bool:

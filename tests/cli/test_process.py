@@ -69,9 +69,13 @@ class Forked:
         def work():
             for stream, number in ((stdout, 1), (stderr, 2)):
                 os.dup2(stream.fileno(), number)
-            with open(1, 'w', closefd=False) as out, open(2, 'w', closefd=False) as err:
-                with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-                    status = run(*command[3:])
+            with (
+                open(1, 'w', closefd=False) as out,
+                open(2, 'w', closefd=False) as err,
+                contextlib.redirect_stdout(out),
+                contextlib.redirect_stderr(err),
+            ):
+                status = run(*command[3:])
             os._exit(status)
 
         self._process = multiprocessing.get_context('fork').Process(target=work)

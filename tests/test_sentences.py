@@ -79,7 +79,7 @@ def shape(change=lambda given: given, moves=0.0):
 
 SIZES = {'a': (1024, 1024), 'b': (1024, 1024)}
 FAST = CalibrationOptions(model='parametric', max_iterations=2)
-NUMBER = r'(?:-?[\d.]+(?:e[+-]?\d+)?|nan)'
+NUMBER = r'(?:[-+]?[\d.]+(?:e[+-]?\d+)?|nan)'
 
 
 def frames(count=4):

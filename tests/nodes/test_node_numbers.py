@@ -307,15 +307,15 @@ def angles():
     log = Log()
     made = AngleInput(AngleOptions('a:carm'), ['a', 'b'], RateLimitedLogger(log))
     made._on_state((10**9, ['carm'], [0.1]), {})
-    made._on_state((12 * 10**8, ['carm'], [0.3]), {})
+    made._on_state((101 * 10**7, ['carm'], [0.3]), {})
     return made, log
 
 
 def test_angles_are_given_counted_and_doubted_once():
     made, log = angles()
-    assert made.of_frame('a', 11 * 10**8, needed=True) == pytest.approx(0.2)
+    assert made.of_frame('a', 1005 * 10**6, needed=True) == pytest.approx(0.1)
     values = made.values('a')
-    assert float(values['angle [deg]']) == pytest.approx(np.degrees(0.2), abs=5e-4)
+    assert float(values['angle [deg]']) == pytest.approx(np.degrees(0.1), abs=5e-4)
     assert (values['joint states received'], values['frames without angle']) == (2, 0)
     assert made.values('b') == {} and made.health('a', {}) is None
     for _ in range(3):
@@ -328,7 +328,7 @@ def test_angles_are_given_counted_and_doubted_once():
     made.of_frame('b', 1, needed=True)
     assert made.values('b')['frames without angle'] == 1
     assert made.health('b', {'joint_states': 'no match'}).message == 'no match'
-    made.of_frame('a', 11 * 10**8, needed=True)
+    made.of_frame('a', 1005 * 10**6, needed=True)
     made.of_frame('a', 99 * 10**9, needed=True)
     assert log.lines['warning'] == 3  # told again after it was known
 

@@ -31,8 +31,9 @@ from fluoro_calib_ros.nodes.bridge_node import Admission
 from fluoro_calib_ros.nodes.calibration_input import HOLD_TICKS, CalibrationInput
 from fluoro_calib_ros.nodes.calibration_services import OrientationService, _Capture
 from fluoro_calib_ros.nodes.calibration_settings import CalibrationFiles, check_folders
-from fluoro_calib_ros.nodes.dashboard import view
-from fluoro_calib_ros.nodes.dashboard.view import (
+from fluoro_calib_ros.nodes.dashboard import state as session_state
+from fluoro_calib_ros.nodes.dashboard import terminal
+from fluoro_calib_ros.nodes.dashboard.state import (
     FluoroscopeState,
     NodeState,
     RateMeter,
@@ -48,7 +49,7 @@ from fluoro_calib_ros.nodes.frame_validation import (
 )
 from fluoro_calib_ros.nodes.image_stream import ExposureQueue, ImageStream
 from fluoro_calib_ros.nodes.reconstruction_output import PointsCounter
-from fluoro_calib_ros.nodes.recorder_node import adapted_qos, qos_document, type_hash_text
+from fluoro_calib_ros.nodes.recorder_node import qos_document, type_hash_text
 from fluoro_calib_ros.nodes.rig_input import RigInput
 from fluoro_calib_ros.nodes.runtime.diagnostics import (
     ERROR,
@@ -59,6 +60,7 @@ from fluoro_calib_ros.nodes.runtime.diagnostics import (
     Refused,
 )
 from fluoro_calib_ros.nodes.runtime.services import Requests
+from fluoro_calib_ros.nodes.runtime.topics import adapted_qos
 from fluoro_calib_ros.nodes.simulator_node import SimulatorNode
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.reconstruction.intersection import (
@@ -96,9 +98,9 @@ def test_rate_is_of_the_readings_of_a_window():
     assert np.isnan(meter.hz)
     meter.add(0.0, 0)
     assert np.isnan(meter.hz)
-    meter.add(view.RATE_WINDOW_S, 50)  # just within the window
-    assert meter.hz == 50 / view.RATE_WINDOW_S
-    meter.add(view.RATE_WINDOW_S + 1, 90)
+    meter.add(session_state.RATE_WINDOW_S, 50)  # just within the window
+    assert meter.hz == 50 / session_state.RATE_WINDOW_S
+    meter.add(session_state.RATE_WINDOW_S + 1, 90)
     assert meter.hz == 40.0
     still = RateMeter()
     for _ in range(2):
@@ -111,9 +113,11 @@ def cells(table):
 
 
 def test_tables_of_the_dashboard_have_their_columns():
-    names, levels, texts = cells(view._nodes(SessionState(nodes=(NodeState('n', 'warn', 'm'),))))
+    names, levels, texts = cells(
+        terminal._nodes(SessionState(nodes=(NodeState('n', 'warn', 'm'),)))
+    )
     assert (names, levels, texts) == (['n'], ['warn'], ['m'])
-    assert cells(view._nodes(SessionState())) == [['none'], [''], ['']]
+    assert cells(terminal._nodes(SessionState())) == [['none'], [''], ['']]
     state = SessionState(
         points_hz=30.0,
         points_latency_ms=(1.5, 2.5),
@@ -122,7 +126,7 @@ def test_tables_of_the_dashboard_have_their_columns():
         verdict='fail',
         findings=('one', 'two'),
     )
-    labels, values = cells(view._results(state))
+    labels, values = cells(terminal._results(state))
     assert labels == ['points in space', 'orientation', 'drift', 'verdict', '', '']
     assert values == [
         '30.0 a second  1.50 ms (99 %: 2.50)',
@@ -134,18 +138,19 @@ def test_tables_of_the_dashboard_have_their_columns():
     ]
     one = FluoroscopeState('a', 'collecting', corrected_hz=60.0, latency_p50_ms=0.5)
     one = replace(one, latency_p99_ms=0.75, exposures=3, rejected=2, frames_hz=59.0)
-    labels, values = cells(view._fluoroscopes(SessionState(fluoroscopes=(one,))))
+    labels, values = cells(terminal._fluoroscopes(SessionState(fluoroscopes=(one,))))
     found = dict(zip(labels, values))
     assert found['corrected'] == '60.0 a second  0.50 ms (99 %: 0.75)'
     assert (found['state'], found['exposures']) == ('collecting', '3')
     assert found['frames'] == '59.0 a second, 2 refused'
     silent = replace(one, state='', corrected_hz=np.nan, rejected=0)
-    found = dict(zip(*cells(view._fluoroscopes(SessionState(fluoroscopes=(silent,))))))
+    found = dict(zip(*cells(terminal._fluoroscopes(SessionState(fluoroscopes=(silent,))))))
     assert (found['exposures'], found['corrected'], found['state']) == ('-', '-', '-')
 
 
 def client(**values):
-    made = Fake(_heard_at={}, _functions={}, _meters={}, **values)
+    made = Fake(_heard_at={}, _functions={}, _meters={}, _points_at=None, **values)
+    made._note_points = lambda count: SessionClient._note_points(made, count)
     made._rate = lambda *words: SessionClient._rate(made, *words)
     return made
 
@@ -882,7 +887,8 @@ def publisher(reliable=True, latched=True, depth=5):
     ],
 )
 def test_recorder_asks_for_what_all_publishers_offer(publishers, reliable, latched):
-    found = adapted_qos(publishers)
+    found = adapted_qos(publishers, 7)
+    assert found.depth == 7
     assert (found.reliability == ReliabilityPolicy.RELIABLE) is reliable
     assert (found.durability == DurabilityPolicy.TRANSIENT_LOCAL) is latched
 

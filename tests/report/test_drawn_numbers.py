@@ -463,7 +463,8 @@ def test_pictures_are_those_that_there_is_something_to_show_for(monkeypatch):
     monkeypatch.setattr(html, 'png_text', lambda figure: '')
     for name in ('distortion_figure', 'residual_map', 'exposure_bars', 'distribution'):
         monkeypatch.setattr(html, name, lambda *_: None)
-    none = replace(rigs.true_calibrations(rigs.rig().fluoroscopes)['a'], image_size=SIZE)
+    empty = {'model': rigs.no_correction(), 'train_exposure': np.zeros(0, dtype=int)}
+    none = replace(rigs.pincushion('a', SIZE), **empty)
     scale = Scale(1.0, 1.0)
     titles = [title for title, _ in html._pictures(given(), 'a', some_residuals(), scale)]
     assert len(titles) == 5 and titles[0].startswith('Distortion')

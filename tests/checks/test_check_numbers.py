@@ -11,7 +11,7 @@ import pytest
 import rigs
 from rigs import kinds
 
-from fluoro_calib_ros.checks import field_checks, inputs, shape, verdict
+from fluoro_calib_ros.checks import field_checks, held_out, inputs, shape, verdict
 from fluoro_calib_ros.checks.bead_intersection import Beads, _scale, distances
 from fluoro_calib_ros.checks.beads import _layers, _sums, rejected_beads
 from fluoro_calib_ros.checks.check import Check, more_exposures, verdict_of
@@ -329,6 +329,26 @@ def test_white_part_is_half_the_squared_difference_of_neighbours():
     assert _white(uv[:1], r[:1], np.ones(1)) == 0
 
 
+def sums(number, outside, inside, predicted, points=50):
+    return held_out.ExposureSums(number, points, outside, inside, predicted, white=inside)
+
+
+def test_exposures_held_out_are_expected_to_have_noise_and_error_of_the_correction():
+    common = Fake(trend=Fake(size=0.1), is_significant=False, of_exposure=None)
+    given = Fake(trends={'a': common}, frames={'a': range(15)})
+    parts = [sums(n, 14.0, 11.0, 3.0) for n in range(1, 15)] + [sums(20, 60.0, 11.0, 3.0)]
+    whole, of_one = held_out._checks(given, 'a', parts)
+    noise = 11 - 2 * 50 * 0.01
+    assert whole.value == pytest.approx(np.sqrt((14 * 14 + 60) / (2 * 50 * 15)))
+    assert whole.numbers['expected_px'] == pytest.approx(np.sqrt((noise + 3) / 100))
+    assert whole.limit == pytest.approx(1.13 * whole.numbers['expected_px'])
+    assert of_one.place.exposures == (20,)
+    assert of_one.value == pytest.approx(np.sqrt(60 / (noise + 3))) and of_one.limit == 1.6
+    common.trend.size = 9.0
+    whole, _ = held_out._checks(given, 'a', parts)
+    assert whole.numbers['expected_px'] == pytest.approx(np.sqrt((0.05 * 11 + 3) / 100))
+
+
 def test_misfits_are_of_residuals_over_the_noise():
     result = Fake(
         fluoroscopes={n: Fake(rmse_after=np.array(r)) for n, r in (('a', [3, 4]), ('b', [1, 1]))}
@@ -415,7 +435,7 @@ def test_scale_of_beads_is_that_of_the_images():
 
 
 def test_distances_of_three_beads_have_their_rms_and_expectation():
-    survey = np.array([[0.0, 0, 0], [30, 0, 0], [0, 40, 0]])
+    survey = np.array([[0.0, 0, 0], [30, 0, 0], [0, 40, 0]]) + [7, -3, 20]
     xyz = survey + [[0, 0, 0], [0.3, 0, 0], [0, -0.4, 0]]
     given = Beads(
         np.arange(3),

@@ -238,6 +238,8 @@ def test_findings_are_printed_warnings_first_and_errors_last(capsys):
     assert capsys.readouterr().err == 'x\ny\n'
     output.print_unpaired(Path('s'), {'a': 0, 'b': 3})
     assert capsys.readouterr().err.endswith('not used: b 3\n')
+    output.print_status('extracting')
+    assert capsys.readouterr().err == 'extracting\n'
     output.print_unpaired(Path('s'), {'a': 0})
     assert capsys.readouterr().err == ''
 

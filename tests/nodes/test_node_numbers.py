@@ -524,6 +524,8 @@ def test_one_capture_waits_at_a_time_and_says_how_many_frames_came(monkeypatch):
 
 def test_requests_for_captures_are_limited():
     service = exposing.CollectServices(parts())
+    entries = [(entry.name, entry.kind) for entry in service.services]
+    assert entries == [('capture', Capture), ('reset', Reset), ('collect_anew', Reset)]
     service._check(5.0)
     with service._requests.one(), service._requests.one(), pytest.raises(DataError, match='2 req'):
         service._check(5.0)

@@ -30,6 +30,7 @@ from fluoro_calib_ros.report.figures import (
 from fluoro_calib_ros.report.motion import _draw_gaps, points_figure
 from fluoro_calib_ros.report.report_figures import (
     bead_shifts,
+    covered_cells,
     distribution,
     exposure_bars,
     missing_sides,
@@ -163,6 +164,9 @@ def test_map_of_residuals_has_arrows_of_inliers_and_crosses():
     (drawn,) = residual_map(one, 'a', SIZE).axes
     assert drawn.get_xlim() == (-0.5, 319.5) and drawn.get_ylim() == (159.5, -0.5)
     assert drawn.images[0].get_extent() == [-0.5, 319.5, 159.5, -0.5]
+    grey = drawn.images[0].get_array()
+    shown = np.ma.getmaskarray(grey) | np.isnan(np.ma.getdata(grey))
+    assert np.array_equal(shown, covered_cells(one.uv, SIZE)) and 0 < shown.mean() < 1
     arrows = drawn.collections[0]
     factor = arrows.U[0] / one.after[0, 0]
     assert factor > 1 and np.isclose(factor, float(f'{factor:.1g}'))

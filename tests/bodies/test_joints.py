@@ -356,7 +356,7 @@ def test_standard_deviations_near_gimbal_lock(name, sd_deg):
 def test_standard_deviations_in_gimbal_lock(name):
     """Within three sd of it, of rotations that are equally likely; a linear covariance fails."""
     error, covariance, status = near_lock(
-        name, 1.0, lambda rng: 3 * np.sqrt(rng.uniform(0, 1, 1000))
+        name, 1.0, lambda rng: 3 * np.sqrt(rng.uniform(0, 1, 600))
     )
     assert (status == JointStatus.GIMBAL).mean() > 0.97  # noise takes some out of five sd
     assert 0.85 < nse(error, covariance).mean() < 1.3

@@ -79,8 +79,8 @@ def test_one_image_point_a_view_is_never_believed_to_give_the_pose():
             uv[0, 5:] = uv[1, [4, 6, 7]] = np.nan
 
     squares = []
-    for seed in range(3):
-        trial = Trial(seed, hidden=hidden, count=200)
+    for seed in range(2):
+        trial = Trial(seed, hidden=hidden, count=120)
         _, live = trial.follow(lag=0)
         for row, poses in enumerate(poses_of(trial.bodies, live)):
             away, sd = trial.errors(poses, row)
@@ -208,7 +208,7 @@ def test_errors_that_stay_are_not_smoothed_away():
     rig = orientation()
     given = body(rng, 4)
     squares = []
-    for _ in range(8):
+    for _ in range(6):
         tracker = BodyTracker(rig, [given], lag=None)
         shift = rng.normal(0, 0.2, (2, 4, 2))
         for k in range(15):

@@ -388,7 +388,7 @@ def distorted():
     held = {}
     seen_so = {}
     for name in 'ab':
-        calibration = calibrated(name).calibrations[name]
+        calibration = calibrated(name, 6).calibrations[name]
         held[name] = replace(
             calibrations()[name],
             model=calibration.model,

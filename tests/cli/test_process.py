@@ -3,15 +3,19 @@
 
 """fluoro-calib process: a study of trials, done once, resumed, and judged trial by trial."""
 
+import contextlib
 import csv
 import json
+import multiprocessing
 import os
 import shutil
+import subprocess
 from types import SimpleNamespace
 
 import pytest
 from rigs import run
 
+from fluoro_calib_ros import processes
 from fluoro_calib_ros.cli.process import STATE, Done, _Work, trial_row
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.io.csv_table import write_table
@@ -56,6 +60,43 @@ def study(rig, tmp_path):
     return folder
 
 
+class Forked:
+    """A command in a fork of this process, in the place of a program that loads all modules."""
+
+    def __init__(self, command, stdout, stderr, start_new_session):
+        assert command[1:3] == ['-m', 'fluoro_calib_ros.cli'] and start_new_session
+
+        def work():
+            for stream, number in ((stdout, 1), (stderr, 2)):
+                os.dup2(stream.fileno(), number)
+            with (
+                open(1, 'w', closefd=False) as out,
+                open(2, 'w', closefd=False) as err,
+                contextlib.redirect_stdout(out),
+                contextlib.redirect_stderr(err),
+            ):
+                status = run(*command[3:])
+            os._exit(status)
+
+        self._process = multiprocessing.get_context('fork').Process(target=work)
+        self._process.start()
+
+    def poll(self):
+        return self._process.exitcode
+
+    returncode = property(poll)
+
+
+def use_forks(monkeypatch):
+    of_programs = SimpleNamespace(Popen=Forked, TimeoutExpired=subprocess.TimeoutExpired)
+    monkeypatch.setattr(processes, 'subprocess', of_programs)
+
+
+@pytest.fixture
+def forked(monkeypatch):
+    use_forks(monkeypatch)
+
+
 def rows_of(study):
     with open(study / 'results' / 'trials.csv', newline='') as file:
         return {row['trial']: row for row in csv.DictReader(file)}
@@ -72,7 +113,7 @@ def changed_by(study, *more):
     return {str(p.relative_to(results)) for p in changed} - {'trials.csv'}, status
 
 
-def test_trials_are_processed_once_and_again_where_something_changed(study):
+def test_trials_are_processed_once_and_again_where_something_changed(study, forked):
     everything = {
         f'trials/{name}/points.{kind}' for name in ('walk', 'run') for kind in ('csv', 'trc')
     }
@@ -91,7 +132,7 @@ def test_trials_are_processed_once_and_again_where_something_changed(study):
     assert changed_by(study, '--again') == (everything, 3)
 
 
-def test_a_trial_that_fails_does_not_stop_the_others(study, capsys):
+def test_a_trial_that_fails_does_not_stop_the_others(study, capsys, monkeypatch):
     (study / 'trials' / 'walk.csv').write_text('fluoroscope,exposure,target_id,u,v\na,1,x\n')
     assert run('process', study) == 1
     err = capsys.readouterr().err
@@ -103,10 +144,11 @@ def test_a_trial_that_fails_does_not_stop_the_others(study, capsys):
     assert not (study / 'results/trials/walk/points.trc').exists()
     shutil.copy(study / 'trials' / 'run.csv', study / 'trials' / 'walk.csv')
     walk = {'trials/walk/points.csv', 'trials/walk/points.trc'}
+    use_forks(monkeypatch)
     assert changed_by(study) == (walk, 3)  # what has failed is tried again
 
 
-def test_a_trial_of_a_rig_that_has_moved_fails(study):
+def test_a_trial_of_a_rig_that_has_moved_fails(study, forked):
     """As one that was recorded after a knock: the rays of its points miss each other."""
     path = study / 'trials' / 'walk.csv'
     with open(path, newline='') as file:

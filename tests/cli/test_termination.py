@@ -16,7 +16,8 @@ LOSES_THE_EXCEPTION = """
 import os
 import signal
 import sys
-from fluoro_calib_ros.cli.output import terminated_by_signals
+from fluoro_calib_ros.cli import output
+output.AGAIN_S = 0.05
 
 class Sender:
     def __del__(self):
@@ -24,7 +25,7 @@ class Sender:
         for _ in range(1000):  # the handler runs here, and Python drops what it raises
             pass
 
-with terminated_by_signals():
+with output.terminated_by_signals():
     sender = Sender()
     del sender
     print('goes on', flush=True)

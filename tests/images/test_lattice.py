@@ -110,7 +110,7 @@ def test_enlarged_holes_tell_where_a_sheet_is(steps, count):
     order = np.argsort(np.linalg.norm(xyz - (21.0, 9.0, 0.0), axis=1))
     diameter = np.full(len(xyz), 2.0)
     diameter[order[:count]] *= 1.4
-    for tilt in ((0.1, -0.05, 2.0), (0.1, 0.1, 4.0), (np.pi, 0.1, 1.0)):
+    for tilt in ((0.1, -0.05, 2.0), (np.pi, 0.1, 1.0)):
         true = pixels(xyz, tilt)
         assert np.isfinite(true).all()
         seen = with_responses(seen_of(true), true, list(order[:count]))

@@ -1,0 +1,276 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Numbers of parts of extraction and following on a few points."""
+
+from types import SimpleNamespace as Fake
+
+import numpy as np
+import pytest
+
+from fluoro_calib_ros.findings import Kind
+from fluoro_calib_ros.images import extraction
+from fluoro_calib_ros.images.growth import (
+    Match,
+    Seen,
+    _good_cells,
+    _turn_to,
+    pairs,
+    smoothed,
+    supported,
+)
+from fluoro_calib_ros.images.lattice import _basis
+from fluoro_calib_ros.images.marker_motion import MAX_SD_PX, MIN_ACCELERATION_PX, Motion
+from fluoro_calib_ros.images.marker_watch import (
+    SHARED_PX,
+    MarkerCompany,
+    MarkerDoubts,
+    follow_beside,
+)
+
+
+def seen(uv, shape=(60, 80), radius=2.0):
+    return Seen.of(np.asarray(uv, float), np.ones(shape, bool), radius)
+
+
+def test_field_of_view_is_within_the_image_and_lit():
+    one = seen([[1, 1], [5, 5], [9, 9], [20, 20]])
+    one.field[10, 30] = False
+    places = [[30, 10], [10, 30], [79.4, 59.4], [79.6, 0], [0, 59.6], [-0.6, 5], [np.nan, 5]]
+    assert one.in_field(np.array(places)).tolist() == [False, True, True] + [False] * 4
+    grid = np.stack(np.meshgrid(np.arange(5) * 20.0, np.arange(5) * 20.0), -1).reshape(-1, 2)
+    assert seen(grid).tolerance_px == 4.0
+    assert (seen(0.1 * grid).tolerance_px, seen(3 * grid).tolerance_px) == (2.5, 6.0)
+
+
+def test_predictions_are_paired_with_what_is_nearest():
+    one = seen([[10, 10], [20, 10], [50, 50]])
+    predicted = np.array([[13.0, 10], [11, 10], [19, 10], [56, 50], [50, 47]])
+    rows, found = pairs(predicted, one, 5.0)
+    assert dict(zip(rows.tolist(), found.tolist())) == {1: 0, 2: 1, 4: 2}
+    assert pairs(predicted, one, 0.5)[0].tolist() == []
+
+
+def test_score_of_a_match_counts_what_is_missing():
+    empty = np.zeros(0)
+    one = Match(None, np.arange(30), empty, empty, found=0.9, explained=1, scale_px=1, expected=40)
+    assert one.score == pytest.approx(26)
+
+
+@pytest.mark.parametrize('ray', [(0.3, -0.2, 1.0), (0.0, 0.0, 2.0), (-0.1, 0.4, 1.0)])
+def test_smallest_rotation_takes_the_axis_to_a_ray(ray):
+    turn = _turn_to(np.array(ray))
+    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(turn @ [0, 0, 1], ray / np.linalg.norm(ray), atol=1e-12)
+    across = np.cross([0, 0, 1], ray)
+    np.testing.assert_allclose(turn @ across, across, atol=1e-12)
+
+
+def test_residuals_are_those_of_neighbours_without_the_own():
+    xyz = np.column_stack([np.arange(30.0), np.zeros((30, 2))])
+    view = Fake(project=lambda x: x[:, :2])
+    bead = np.arange(0, 30, 2)
+    shift = np.array([0.4, -0.2])
+    uv = xyz[bead, :2] + shift
+    found = smoothed(view, xyz, bead, uv)
+    assert (found[:, 0] > 0.2).all() and (found[:, 0] < 0.4).all() and (found[:, 1] < 0).all()
+    np.testing.assert_allclose(found[:, 1], -0.5 * found[:, 0])
+    uv[5] += 50
+    spoilt = smoothed(view, xyz, bead, uv)
+    np.testing.assert_allclose(spoilt[10], found[10])
+    assert 0 < np.abs(spoilt - found).max() < 0.3
+
+
+def test_beads_are_supported_by_most_of_their_neighbours():
+    xyz = np.column_stack([np.arange(40.0), np.zeros((40, 2))])
+    good = np.arange(40) < 20
+    found = supported(xyz, good)
+    assert found[:18].all() and not found[22:].any()
+    alone = np.zeros(40, bool)
+    alone[20] = True
+    assert not supported(xyz, alone)[20]
+
+
+def test_regions_with_few_beads_found_are_bad():
+    uv = np.array([[5.0, 5]] * 5 + [[95.0, 5]] * 5 + [[5.0, 55]] * 4 + [[95, 55]] * 5)
+    found = np.array([1, 1, 1, 0, 0] + [1, 1, 0, 0, 0] + [0] * 4 + [1] * 5, bool)
+    assert _good_cells(uv, found, (60, 100)).tolist() == [True] * 5 + [False] * 5 + [True] * 9
+
+
+def test_steps_of_a_lattice_are_the_shortest_two_across():
+    grid = np.stack(np.meshgrid(np.arange(5) * 3.0, np.arange(5) * 4.0), -1).reshape(-1, 2)
+    tree = seen(grid).tree
+    found = _basis(grid, tree, 12)
+    assert np.abs(found).tolist() == [[3, 0], [0, 4]]
+    line = np.column_stack([np.arange(9.0), np.zeros(9)])
+    assert _basis(line, seen(line).tree, 4) is None
+
+
+def beads(**changes):
+    n = 6
+    values = {
+        'uv': np.tile([10.0, 20], (n, 1)),
+        'sigma': np.full(n, 0.05),
+        'overlapped': np.zeros(n, bool),
+        'light': np.full(n, 100.0),
+        'depth': np.full(n, 0.3),
+        'measured': np.ones(n, bool),
+        'misfit': np.zeros(n),
+    }
+    return Fake(**{**values, **changes})
+
+
+@pytest.mark.parametrize(
+    ('name', 'good', 'bad', 'kind'),
+    [
+        ('misfit', extraction.MAX_MISFIT, 1.01 * extraction.MAX_MISFIT, extraction.DISTURBED.kind),
+        ('sigma', extraction.MAX_SIGMA_PX, 1.01 * extraction.MAX_SIGMA_PX, extraction.HIDDEN.kind),
+        ('depth', 1.01 * extraction.DEPTH[0], extraction.DEPTH[0], Kind.BEAD_CONTRAST),
+        ('depth', 0.99 * extraction.DEPTH[1], extraction.DEPTH[1], Kind.BEAD_CONTRAST),
+        ('measured', True, False, extraction.LOST.kind),
+    ],
+)
+def test_bead_is_refused_at_its_limits(monkeypatch, name, good, bad, kind):
+    monkeypatch.setattr(extraction, '_usual_depth', lambda beads: np.ones(6))
+    for value, expected in ((good, None), (bad, kind)):
+        one = beads(depth=np.ones(6))
+        getattr(one, name)[2] = value
+        reasons = extraction._reasons(one, one.uv)
+        assert [r and r.kind for r in reasons] == [None, None, expected, None, None, None]
+    away = beads(depth=np.ones(6))
+    limit = extraction.FIRST_RESIDUAL_PX
+    predicted = away.uv + np.outer([0, limit, limit + 0.01, 0, 0, 0], [0.6, 0.8])
+    found = extraction._reasons(away, predicted)
+    assert [r is None for r in found] == [True, True, False, True, True, True]
+    assert found[2].numbers['off_px'] == pytest.approx(limit + 0.01)
+
+
+def test_beads_that_stray_or_are_vague_are_refused_by_the_scatter_of_the_others():
+    n = 12
+    off = np.full(n, 0.1)
+    off[3] = 5.0
+    sigma = np.full(n, 0.05)
+    sigma[7] = 1.01 * extraction.MAX_SIGMAS * 0.05
+    sigma[8] = 0.99 * extraction.MAX_SIGMAS * 0.05
+    predicted = np.arange(2.0 * n).reshape(n, 2)
+    one = Fake(uv=predicted + np.outer(off, [0.6, 0.8]), sigma=sigma, overlapped=np.zeros(n, bool))
+    measured = (np.arange(n), one, [None] * n, predicted)
+    imaging = extraction._Imaging(None, 'profile')
+    found = extraction._checked(None, None, None, measured, imaging)
+    assert found.bead.tolist() == [k for k in range(n) if k not in (3, 7)]
+    assert [refusal.bead for refusal in found.refused] == [3, 7]
+    kinds = [refusal.finding.kind for refusal in found.refused]
+    assert kinds == [Kind.BEAD_AWAY, Kind.BEAD_UNSURE]
+    assert found.refused[0].finding.numbers['off_px'] == pytest.approx(5)
+    scatter = max(0.1 / np.sqrt(2 * np.log(2)), extraction.MIN_SCATTER_PX)
+    limit = extraction.RESIDUAL_SIGMAS * np.hypot(scatter, 0.05)
+    for part, is_kept in ((0.98, True), (1.02, False)):
+        off[3] = part * limit
+        one.uv = predicted + np.outer(off, [0.6, 0.8])
+        measured = (np.arange(n), one, [None] * n, predicted)
+        found = extraction._checked(None, None, None, measured, imaging)
+        assert (3 in found.bead) is is_kept
+
+
+def test_beads_of_a_line_start_where_they_were_found_alone():
+    predicted = np.array([[0.0, 0], [30, 0], [33, 0], [80, 0], [200, 0]])
+    rows = np.arange(4)
+    bead = np.array([0, 1, 3])
+    uv = np.array([[1.0, 1], [31, 1], [81, 1]])
+    start = extraction._starts(predicted, rows, bead, uv, Fake(radius_px=2.0))
+    assert start.tolist() == [[1, 1], [30, 0], [33, 0], [81, 1]]
+
+
+@pytest.mark.parametrize('diameter', [None, np.array([2.0, 2, 4, 2, 2])])
+def test_radius_of_a_shadow_is_by_depth_and_diameter(diameter):
+    view = Fake(depth=lambda xyz: np.array([500.0, 1000, 1000, 2000, -3]))
+    found = extraction._relative_radius(view, Fake(xyz=None, diameter_mm=diameter))
+    expected = [2, 1, 1 if diameter is None else 2, 0.5, 1]
+    assert found == pytest.approx(expected)
+
+
+# ---- markers in motion
+
+
+def motion(n=6, spread=20.0):
+    made = Motion.start(np.arange(2.0 * n).reshape(n, 2) * spread, 1.0)
+    made.velocity[:] = [3.0, -1.0]
+    made.covariance[:, 1, 1] = 0.01
+    return made
+
+
+def test_prediction_adds_velocity_and_acceleration():
+    one = motion()
+    one.squared[:] = 4.0
+    one.squared[0] = 9.0
+    before = one.uv.copy()
+    one.covariance[:, 0, 1] = one.covariance[:, 1, 0] = 0.05
+    one.predict(2)
+    np.testing.assert_allclose(one.uv, before + [6, -2])
+    for row, q in ((0, 9.0), (1, 4.0)):
+        expected = 1 + 2 * 2 * 0.05 + 4 * 0.01 + q * 4
+        assert one.variance[row] == pytest.approx(expected)
+        assert one.covariance[row, 0, 1] == pytest.approx(0.05 + 2 * 0.01 + q * 4)
+        assert one.covariance[row, 1, 1] == pytest.approx(0.01 + 4 * q)
+    still = motion()
+    still.squared[:] = 0
+    still.predict(1)
+    assert still.variance[0] == pytest.approx(1 + 0.01 + MIN_ACCELERATION_PX**2 / 4)
+    for _ in range(99):
+        one.predict(5)
+    assert one.variance.max() == pytest.approx(MAX_SD_PX**2)
+
+
+def test_doubts_are_of_pairs_and_begin_with_the_first():
+    doubts = MarkerDoubts(4)
+    doubts.add_pair(0, 1, 5)
+    doubts.add(0, 9)
+    doubts.add(3, 7)
+    assert doubts.doubtful.tolist() == [True, True, False, True]
+    assert [doubts.since(row) for row in range(4)] == [5, 5, None, 7]
+    assert doubts.partners(0) == {0, 1} and doubts.partners(1) == {0}
+    doubts.confirm_alone(0)
+    doubts.confirm_alone(3)
+    assert doubts.doubtful.tolist() == [True, True, False, False]
+    doubts.part(1, 0)
+    assert doubts.partners(0) == {0} and not doubts.partners(1)
+    doubts.add_pair(0, 2, 11)
+    doubts.confirm(0)
+    assert not doubts.doubtful.any() and doubts.since(2) is None
+    doubts.add(2, 12)
+    assert doubts.since(2) == 12
+
+
+def test_marker_that_shares_the_way_of_the_others_is_no_other_shadow():
+    """After some way, counted in frames; one that moves alone is told after two images."""
+    rows = np.arange(3)
+    doubtful = np.array([True, False, True])
+    ratio = np.array([0.0, 99.0, 0.0])
+    others = np.tile([5.0, 0.0], (3, 1))
+    velocity = np.array([[5.0, 1], [0, 0], [1, 0]])
+    given = Fake(strangeness=lambda measured: (rows, ratio, others), velocity=velocity)
+    company = MarkerCompany(3)
+    measured = np.ones(3, bool)
+    steps = int(SHARED_PX // 10) + 1
+    for step in range(1, steps + 1):
+        alone, together = company.compare(given, measured, doubtful, 2)
+        assert alone == ([1] if step == 2 else [])
+        assert together == ([0] if step == steps else [])
+    assert company.compare(given, measured, doubtful, 2)[1] == []
+
+
+def test_marker_of_unknown_velocity_follows_those_beside_it():
+    one = motion(7)
+    one.covariance[2, 1, 1] = 1e4
+    assert one.settled.tolist() == [k != 2 for k in range(7)]
+    one.velocity[2] = [50.0, 50.0]
+    before = one.uv.copy()
+    follow_beside(Fake(motion=one, unseen=np.ones(7)), 2)
+    np.testing.assert_allclose(one.uv[2], before[2] + 2 * (np.array([3, -1]) - 50))
+    np.testing.assert_allclose(one.velocity[2], [3, -1])
+    np.testing.assert_allclose(one.uv[[0, 1, 3, 4]], before[[0, 1, 3, 4]])
+    few = motion(4)
+    few.covariance[2, 1, 1] = 1e4
+    before = few.uv.copy()
+    follow_beside(Fake(motion=few, unseen=np.ones(4)), 2)
+    assert np.array_equal(few.uv, before)

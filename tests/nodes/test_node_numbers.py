@@ -1,0 +1,933 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""What parts of the nodes count, decide and pass on, on plain objects without a graph."""
+
+import asyncio
+import time
+from collections import Counter
+from dataclasses import replace
+from types import SimpleNamespace as Fake
+
+import numpy as np
+import pytest
+import rigs
+from fluoro_calib_msgs.srv import Capture, Reset
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.exposures.angles import AngleOptions
+from fluoro_calib_ros.findings import Finding, Kind, Severity
+from fluoro_calib_ros.nodes import (
+    calibration_services,
+    calibration_settings,
+    drift_monitor,
+    healing_services,
+    player_node,
+)
+from fluoro_calib_ros.nodes import exposure_input as exposing
+from fluoro_calib_ros.nodes.angle_input import AngleInput, beyond_text
+from fluoro_calib_ros.nodes.bridge_node import Admission
+from fluoro_calib_ros.nodes.calibration_input import HOLD_TICKS, CalibrationInput
+from fluoro_calib_ros.nodes.calibration_services import OrientationService, _Capture
+from fluoro_calib_ros.nodes.calibration_settings import CalibrationFiles, check_folders
+from fluoro_calib_ros.nodes.dashboard import state as session_state
+from fluoro_calib_ros.nodes.dashboard import terminal
+from fluoro_calib_ros.nodes.dashboard.state import (
+    FluoroscopeState,
+    NodeState,
+    RateMeter,
+    SessionState,
+)
+from fluoro_calib_ros.nodes.dashboard.watch import SessionClient, _number
+from fluoro_calib_ros.nodes.drift_monitor import DriftMonitor, DriftParameters
+from fluoro_calib_ros.nodes.frame_validation import (
+    FrameValidator,
+    TooLarge,
+    validate_corrected,
+    with_limit,
+)
+from fluoro_calib_ros.nodes.image_stream import ExposureQueue, ImageStream
+from fluoro_calib_ros.nodes.reconstruction_output import PointsCounter
+from fluoro_calib_ros.nodes.recorder_node import qos_document, type_hash_text
+from fluoro_calib_ros.nodes.rig_input import RigInput
+from fluoro_calib_ros.nodes.runtime.diagnostics import (
+    ERROR,
+    OK,
+    WARN,
+    RateLimitedLogger,
+    RefusalLog,
+    Refused,
+)
+from fluoro_calib_ros.nodes.runtime.services import Requests
+from fluoro_calib_ros.nodes.runtime.topics import adapted_qos
+from fluoro_calib_ros.nodes.simulator_node import SimulatorNode
+from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
+from fluoro_calib_ros.reconstruction.intersection import (
+    FAILED,
+    OUTSIDE,
+    REJECTED,
+    SINGLE_VIEW,
+)
+
+
+class Log:
+    """A logger that keeps what it is told by level."""
+
+    def __init__(self):
+        self.lines = Counter()
+        self.texts = []
+
+    def __getattr__(self, level):
+        def write(text):
+            self.lines[level] += 1
+            self.texts.append(str(text))
+
+        return write
+
+
+def refusals():
+    return RefusalLog('frame', RateLimitedLogger(Log()))
+
+
+# ---- dashboard
+
+
+def test_rate_is_of_the_readings_of_a_window():
+    meter = RateMeter()
+    assert np.isnan(meter.hz)
+    meter.add(0.0, 0)
+    assert np.isnan(meter.hz)
+    meter.add(session_state.RATE_WINDOW_S, 50)  # just within the window
+    assert meter.hz == 50 / session_state.RATE_WINDOW_S
+    meter.add(session_state.RATE_WINDOW_S + 1, 90)
+    assert meter.hz == 40.0
+    still = RateMeter()
+    for _ in range(2):
+        still.add(3.0, 7)
+    assert np.isnan(still.hz)
+
+
+def cells(table):
+    return [[str(cell) for cell in column.cells] for column in table.columns]
+
+
+def test_tables_of_the_dashboard_have_their_columns():
+    names, levels, texts = cells(
+        terminal._nodes(SessionState(nodes=(NodeState('n', 'warn', 'm'),)))
+    )
+    assert (names, levels, texts) == (['n'], ['warn'], ['m'])
+    assert cells(terminal._nodes(SessionState())) == [['none'], [''], ['']]
+    state = SessionState(
+        points_hz=30.0,
+        points_latency_ms=(1.5, 2.5),
+        drift_level='warn',
+        drift='a drifts',
+        verdict='fail',
+        findings=('one', 'two'),
+    )
+    labels, values = cells(terminal._results(state))
+    assert labels == ['points in space', 'orientation', 'drift', 'verdict', '', '']
+    assert values == [
+        '30.0 a second  1.50 ms (99 %: 2.50)',
+        'none yet',
+        'a drifts',
+        'fail',
+        'one',
+        'two',
+    ]
+    one = FluoroscopeState('a', 'collecting', corrected_hz=60.0, latency_p50_ms=0.5)
+    one = replace(one, latency_p99_ms=0.75, exposures=3, rejected=2, frames_hz=59.0)
+    labels, values = cells(terminal._fluoroscopes(SessionState(fluoroscopes=(one,))))
+    found = dict(zip(labels, values))
+    assert found['corrected'] == '60.0 a second  0.50 ms (99 %: 0.75)'
+    assert (found['state'], found['exposures']) == ('collecting', '3')
+    assert found['frames'] == '59.0 a second, 2 refused'
+    silent = replace(one, state='', corrected_hz=np.nan, rejected=0)
+    found = dict(zip(*cells(terminal._fluoroscopes(SessionState(fluoroscopes=(silent,))))))
+    assert (found['exposures'], found['corrected'], found['state']) == ('-', '-', '-')
+
+
+def client(**values):
+    made = Fake(_heard_at={}, _functions={}, _meters={}, _points_at=None, **values)
+    made._note_points = lambda count: SessionClient._note_points(made, count)
+    made._rate = lambda *words: SessionClient._rate(made, *words)
+    return made
+
+
+def test_worst_function_of_a_node_is_told_and_a_node_that_is_silent():
+    now = time.monotonic()
+    made = client()
+    made._heard_at = {'calibration_node': now, 'image_node': now - 60}
+    made._functions = {
+        'image_node': {'a': NodeState('a', 'ok', 'correcting')},
+        'calibration_node': {
+            name: NodeState(name, level, f'{name} is {level}')
+            for name, level in (('a', 'ok'), ('b', 'error'), ('c', 'warn'))
+        },
+    }
+    found = list(SessionClient._node_states(made))
+    assert [(one.name, one.level) for one in found] == [
+        ('calibration_node', 'error'),
+        ('image_node', 'silent'),
+    ]
+    assert found[0].message == 'b: b is error' and '60 s' in found[1].message
+    made._functions = {'image_node': {'a': NodeState('a', 'warn', 'slow')}}
+    made._heard_at['image_node'] = now
+    assert next(iter(SessionClient._node_states(made))).message == 'slow'
+
+
+def test_values_of_the_diagnostics_are_taken_over():
+    taken = {}
+    made = client(_set=taken.update, _follow=lambda name: taken.update(followed=name))
+    made._update = lambda name, **values: taken.update(values, name=name)
+
+    def read(node, function, stamp_s, level=OK, **values):
+        values = {key.replace('_', ' '): value for key, value in values.items()}
+        status = Fake(level=level, message='m')
+        SessionClient._read(made, node, function, values, stamp_s, status)
+
+    for second in (0.0, 2.0):
+        read('calibration_node', 'a', second, frames_received=str(int(60 * second)), ready='True')
+    assert (taken['name'], taken['followed'], taken['frames_hz']) == ('a', 'a', 60)
+    assert taken['ready'] is True
+    read('calibration_node', 'a', 3.0, next_pose='tilt')
+    assert (taken['ready'], taken['next_pose'], taken['frames_hz']) == (False, 'tilt', 60)
+    for second in (0.0, 4.0):
+        read(
+            'reconstruction_node',
+            'reconstruction',
+            second,
+            exposures_reconstructed=str(int(second)),
+        )
+    assert taken['points_hz'] == 1 and np.isnan(taken['points_latency_ms']).all()
+    read('reconstruction_node', 'drift', 1.0, level=ERROR)
+    assert (taken['drift_level'], taken['drift']) == ('error', 'm')
+    assert _number('2.5') == 2.5 and np.isnan(_number(None)) and np.isnan(_number('x'))
+
+
+# ---- validation of frames
+
+
+CALIBRATION = Fake(image_size=(64, 48), frame_id='a_optical')
+
+
+def observed(ids=(3, 5), **changes):
+    values = {
+        'target_id': np.array(ids, np.uint32).tobytes(),
+        'u': np.array([1.0, 2]),
+        'v': np.array([3.0, 4]),
+        'sigma': np.array([0.2, 0.3]),
+        'image_size': (64, 48),
+        'frame_id': 'a_optical',
+        'frame_number': 9,
+    }
+    return Fake(**{**values, **changes})
+
+
+@pytest.mark.parametrize(
+    ('changes', 'kind'),
+    [
+        ({'u': np.zeros(3)}, 'lengths'),
+        ({'v': np.zeros(1)}, 'lengths'),
+        ({'sigma': np.ones(1)}, 'lengths'),
+        ({'image_size': (48, 64)}, 'image size'),
+        ({'frame_id': 'b_optical'}, 'frame id'),
+        ({'ids': (3, 3)}, 'repeated target'),
+        ({'sigma': np.array([0.2, 0.0])}, 'sigma'),
+        ({'sigma': np.array([0.2, np.inf])}, 'sigma'),
+        ({'sigma': np.array([np.nan, 0.2])}, 'sigma'),
+    ],
+)
+def test_frame_that_cannot_be_corrected_is_refused_by_kind(changes, kind):
+    with pytest.raises(Refused) as error:
+        FrameValidator('a').validated_arrays(observed(**changes), CALIBRATION)
+    assert error.value.kind == kind and 'frame 9' in str(error.value)
+
+
+def test_frame_that_can_be_corrected_is_passed_on():
+    validator = FrameValidator('a')
+    given = observed()
+    found = validator.validated_arrays(given, CALIBRATION)
+    assert found == (given.u, given.v, given.sigma)
+    assert validator.validated_arrays(observed(sigma=np.zeros(0)), CALIBRATION)[2] is None
+    for unnamed in (observed(frame_id=''), observed()):
+        assert validator.validated_arrays(unnamed, CALIBRATION)
+    assert validator.validated_arrays(observed(), replace_id('')) is not None
+    # Ids that have changed are examined again.
+    with pytest.raises(Refused):
+        validator.validated_arrays(observed((5, 5)), CALIBRATION)
+
+
+def replace_id(frame_id):
+    return Fake(image_size=(64, 48), frame_id=frame_id)
+
+
+def corrected(**changes):
+    values = {
+        'u': np.zeros(2),
+        'v': np.zeros(2),
+        'sigma': np.array([0.2, np.nan]),
+        'correction_sd': np.array([0.0, np.nan]),
+        'status': np.array([0, 2]),
+        'target_id': np.array([4, 6]),
+        'frame_number': 7,
+    }
+    return Fake(**{**values, **changes})
+
+
+@pytest.mark.parametrize(
+    ('changes', 'kind'),
+    [
+        ({}, None),
+        ({'v': np.zeros(3)}, 'lengths'),
+        ({'status': np.zeros(1)}, 'lengths'),
+        ({'target_id': np.array([4, 4])}, 'repeated target'),
+        ({'sigma': np.array([0.2, 0.0])}, 'sigma'),
+        ({'correction_sd': np.array([0.2, -0.1])}, 'sigma'),
+    ],
+)
+def test_corrected_frame_is_validated(changes, kind):
+    if kind is None:
+        validate_corrected('a', corrected())
+        return
+    with pytest.raises(Refused) as error:
+        validate_corrected('a', corrected(**changes))
+    assert error.value.kind == kind
+    if kind == 'sigma':
+        assert 'target 6 ' in str(error.value)
+
+
+def test_points_of_a_frame_are_limited_by_number():
+    decode = with_limit(lambda data: Fake(u=data), 3)
+    assert decode([1, 2, 3]).u == [1, 2, 3]
+    with pytest.raises(TooLarge):
+        decode([1, 2, 3, 4])
+
+
+# ---- angles of the C-arm
+
+
+def angles():
+    log = Log()
+    made = AngleInput(AngleOptions('a:carm'), ['a', 'b'], RateLimitedLogger(log))
+    made._on_state((10**9, ['carm'], [0.1]), {})
+    made._on_state((101 * 10**7, ['carm'], [0.3]), {})
+    return made, log
+
+
+def test_angles_are_given_counted_and_doubted_once():
+    made, log = angles()
+    assert made.of_frame('a', 1005 * 10**6, needed=True) == pytest.approx(0.1)
+    values = made.values('a')
+    assert float(values['angle [deg]']) == pytest.approx(np.degrees(0.1), abs=5e-4)
+    assert (values['joint states received'], values['frames without angle']) == (2, 0)
+    assert made.values('b') == {} and made.health('a', {}) is None
+    for _ in range(3):
+        assert made.of_frame('a', 99 * 10**9, needed=True) is None
+    assert made.of_frame('a', 99 * 10**9, needed=False) is None
+    assert made.values('a')['frames without angle'] == 3 and made.values('a')['angle [deg]'] == ''
+    assert log.lines['warning'] == 1
+    found = made.health('a', {})
+    assert found.level == WARN and made.health('a', {}) is None
+    made.of_frame('b', 1, needed=True)
+    assert made.values('b')['frames without angle'] == 1
+    assert made.health('b', {'joint_states': 'no match'}).message == 'no match'
+    made.of_frame('a', 1005 * 10**6, needed=True)
+    made.of_frame('a', 99 * 10**9, needed=True)
+    assert log.lines['warning'] == 3  # told again after it was known
+
+
+def test_faults_of_joint_states_are_not_those_of_the_stream():
+    made, _ = angles()
+    told = []
+    names = ('undecodable', 'callback_error', 'reader_error', 'too_large', 'overrun')
+    given = Fake(**{n: lambda *words, n=n: told.append((n, *words)) for n in names})
+    guarded = made._guarded(given)
+    guarded.undecodable('joint_states')
+    guarded.too_large('joint_states', 5)
+    guarded.callback_error('joint_states', KeyError())
+    guarded.overrun('joint_states', 4)
+    assert made.values('a')['joint states refused'] == 3 and not told
+    guarded.undecodable('a/x')
+    guarded.too_large('a/x', 5)
+    guarded.overrun('a/x', 4)
+    assert told == [('undecodable', 'a/x'), ('too_large', 'a/x', 5), ('overrun', 'a/x', 4)]
+
+
+def test_nearest_calibrated_angle_is_round_the_circle():
+    text = beyond_text(np.deg2rad(175.0), np.deg2rad([0.0, 90, -170]))
+    assert '175.0 degrees' in text and 'the nearest is -170.0' in text
+
+
+# ---- calibrations that arrive
+
+
+class Waiting(CalibrationInput):
+    """An input whose calibrations are used at once, and whose peers are given."""
+
+    def __init__(self, names='a'):
+        self.asked = []
+        self.begun = []
+        self.peers = ''
+        node = Fake(
+            create_subscription=lambda *words, **how: self.asked.append((*words, how)),
+            get_logger=Log,
+        )
+        self.refused = []
+        super().__init__(node, names, None, None, lambda *words: self.refused.append(words))
+
+    def conflict(self, name):
+        return self.peers
+
+    def _start(self, name, message):
+        self.begun.append((name, message.calibration_id))
+
+
+def test_calibrations_are_subscribed_and_refused_by_fluoroscope(monkeypatch):
+    made = Waiting('ab')
+    assert [words[1] for words in made.asked] == ['a/calibration', 'b/calibration']
+    assert {words[0].__name__ for words in made.asked} == {'FluoroscopeCalibration'}
+    assert all(words[-1] == {'raw': True} for words in made.asked)
+    monkeypatch.setattr(
+        'fluoro_calib_ros.nodes.calibration_input.read_limits',
+        lambda: Fake(max_calibration_bytes=3_000_000),
+    )
+    made._on_data('b', bytes(5_000_000))
+    ((name, reason),) = made.refused
+    assert name == 'b' and '5 MB' in reason and '3 MB' in reason
+    made._on_data('a', b'\0\1\0\0x')
+    assert made.refused[1][0] == 'a' and 'a/calibration' in made.refused[1][1]
+
+
+def test_newest_calibration_that_was_held_back_is_used():
+    """One that is sent again is the newest; none before a peer is gone, unless it is the only."""
+    made = Waiting()
+    made.peers = 'two nodes'
+    for sent in ('x', 'y', 'x'):
+        made._on_calibration('a', Fake(calibration_id=sent))
+    for _ in range(2 * HOLD_TICKS):
+        made.release()
+    assert made.begun == []
+    made.peers = ''
+    made.release()
+    made.release()
+    assert made.begun == [('a', 'x')]
+    made.peers = 'two nodes'
+    made._on_calibration('a', Fake(calibration_id='z'))
+    for tick in range(HOLD_TICKS):
+        assert made.begun == [('a', 'x')], tick
+        made.release()
+    assert made.begun == [('a', 'x'), ('a', 'z')]
+    made._on_calibration('a', Fake(calibration_id='w'))
+    made._current['a'] = 'in use'
+    for _ in range(2 * HOLD_TICKS):
+        made.release()
+    assert len(made.begun) == 2
+    made.peers = ''
+    made._on_calibration('a', Fake(calibration_id='v'))
+    made.release()
+    assert made.begun[2:] == [('a', 'v')]
+
+
+# ---- captures and jobs
+
+
+def frame(name, number=1):
+    return replace(rigs.exposures()['a'][0], fluoroscope=name, number=number)
+
+
+def test_capture_ends_with_its_last_frame():
+    capture = _Capture('ab', 2)
+    assert not capture.add({name: frame(name, 1) for name in 'ab'}) and not capture.done.done()
+    assert capture.add({name: frame(name, 2) for name in 'ab'})
+    assert capture.done.result() is True
+    assert [f.number for f in capture.frames['b']] == [1, 2]
+    capture.finish(False)
+    assert capture.done.result() is True
+    late = _Capture('ab', 2)
+    late.finish(False)
+    assert late.done.result() is False and late.add({'a': frame('a')})
+
+
+def parts(**changes):
+    node = Fake(readers=['active'], get_logger=Log, set_parameters=lambda _: None, executor=None)
+    settings = Fake(
+        node=Fake(rig_frame='rig', capture_timeout=5.0, any_directory=False),
+        limits=Fake(max_waiting=2, max_folders=3),
+    )
+    rig = Fake(
+        names=('a', 'b'),
+        required_phantom=lambda: rigs.rig().phantom,
+        phantom=rigs.rig().phantom,
+        settings=lambda: settings,
+    )
+    output = Fake(calibrations={'a': 1, 'b': 2}, orientation=None, refused={'a': 'x'})
+    values = {
+        'node': node,
+        'rig': rig,
+        'exposures': None,
+        'output': output,
+        'files': None,
+        'requests': Requests(),
+    }
+    return Fake(**{**values, **changes})
+
+
+@pytest.mark.parametrize(
+    ('frames', 'seconds', 'count', 'timeout'), [(0, 0.0, 1, 5.0), (7, 2.5, 7, 2.5)]
+)
+def test_orient_captures_as_many_frames_as_asked(monkeypatch, frames, seconds, count, timeout):
+    service = OrientationService(parts())
+    asked = []
+
+    async def captured(*words):
+        asked.append(words)
+        raise DataError('enough')
+
+    monkeypatch.setattr(service, '_captured', captured)
+    with pytest.raises(DataError, match='enough'):
+        asyncio.run(service._orient(Fake(frames=frames, timeout_sec=seconds)))
+    assert asked == [(('a', 'b'), count, timeout)]
+
+
+@pytest.mark.parametrize(
+    ('change', 'sentence'),
+    [
+        (lambda given: given.node.readers.clear(), 'not active'),
+        (lambda given: given.output.calibrations.pop('b'), 'b is not calibrated'),
+    ],
+)
+def test_orient_needs_calibrations_and_frames(change, sentence):
+    given = parts()
+    change(given)
+    with pytest.raises(DataError, match=sentence):
+        asyncio.run(OrientationService(given)._orient(Fake(frames=1, timeout_sec=1.0)))
+
+
+def test_one_capture_waits_at_a_time_and_says_how_many_frames_came(monkeypatch):
+    service = OrientationService(parts())
+
+    async def too_late(node, timeout_s, future, give_up):
+        service.add({name: frame(name) for name in 'ab'})
+        give_up()
+        return future.result()
+
+    monkeypatch.setattr(calibration_services, 'within', too_late)
+    with pytest.raises(DataError, match=r'1 of 3 frames .*within 2 s'):
+        asyncio.run(service._captured(('a', 'b'), 3, 2.0))
+    assert service._capture is None
+    service._capture = 'one that waits'
+    with pytest.raises(DataError, match='another capture'):
+        asyncio.run(service._captured(('a', 'b'), 3, 2.0))
+
+
+def test_requests_for_captures_are_limited():
+    service = exposing.CollectServices(parts())
+    entries = [(entry.name, entry.kind) for entry in service.services]
+    assert entries == [('capture', Capture), ('reset', Reset), ('collect_anew', Reset)]
+    service._check(5.0)
+    with service._requests.one(), service._requests.one(), pytest.raises(DataError, match='2 req'):
+        service._check(5.0)
+    service._node.readers.clear()
+    with pytest.raises(DataError, match='not active'):
+        service._check(5.0)
+
+
+@pytest.mark.parametrize('seconds', [0.0, 3.0])
+def test_capture_answers_with_its_frame_or_what_was_received(monkeypatch, seconds):
+    exposures = Fake(
+        capture=lambda: 'future',
+        collected=lambda name: Fake(exposures={'a': 4}[name]),
+        streams={name: Fake(name=name, received=n) for name, n in (('a', 7), ('b', 0))},
+        capture_refusal='',
+        reset=lambda: 6,
+    )
+    service = exposing.CollectServices(parts(exposures=exposures))
+    asked = []
+
+    async def within(node, timeout_s, future, give_up):
+        asked.append((timeout_s, future))
+        return (12, 5) if len(asked) == 1 else None
+
+    monkeypatch.setattr(exposing, 'within', within)
+    request = Fake(timeout_sec=seconds)
+    answer = asyncio.run(service._on_capture(request, Capture.Response()))
+    assert answer.success and answer.exposures == 5 and '12' in answer.message
+    answer = asyncio.run(service._on_capture(request, Capture.Response()))
+    assert not answer.success and answer.exposures == 4
+    assert 'a 7, b 0' in answer.message and asked == [(seconds or 5.0, 'future')] * 2
+    exposures.capture_refusal = 'the phantom moved'
+    answer = asyncio.run(service._on_capture(request, Capture.Response()))
+    assert answer.message == 'the phantom moved'
+    answer = service._on_reset(None, Reset.Response())
+    assert answer.success and answer.message.startswith('6 ') and not service._output.refused
+
+
+def test_folders_below_the_calibrations_are_counted(tmp_path):
+    for name in ('x', 'y'):
+        (tmp_path / name).mkdir()
+    check_folders(tmp_path / 'z', tmp_path, 3)
+    with pytest.raises(DataError):
+        check_folders(tmp_path / 'z', tmp_path, 2)
+    with pytest.raises(DataError):
+        check_folders(tmp_path / 'z' / 'deep', tmp_path, 3)
+    check_folders(tmp_path / 'x', tmp_path, 0)
+    check_folders(tmp_path.parent / 'elsewhere', tmp_path, 0)
+
+
+def test_requests_name_folders_below_that_of_the_calibrations(tmp_path):
+    given = parts()
+    given.rig.directory = tmp_path
+    files = CalibrationFiles(given.rig, given.output, Log())
+    assert files._directory_of(Fake(directory='')) == tmp_path
+    assert files._directory_of(Fake(directory='x')) == tmp_path / 'x'
+    for outside in ('..', '/tmp', 'x/../../y'):
+        with pytest.raises(DataError, match='any_directory'):
+            files._directory_of(Fake(directory=outside))
+    given.rig.settings().node.any_directory = True
+    assert files._directory_of(Fake(directory=str(tmp_path.parent))) == tmp_path.parent
+
+
+def test_default_folder_follows_the_namespace(monkeypatch):
+    monkeypatch.setenv('ROS_HOME', '/ros')
+    found = calibration_settings.default_calibration_directory('/lab/left/')
+    assert str(found) == '/ros/fluoro_calib/lab/left'
+
+
+# ---- healing
+
+
+def collection(monkeypatch, most=3):
+    monkeypatch.setattr(healing_services, 'MAX_FRAMES', most)
+    monkeypatch.setattr(healing_services, 'frame_from_observed', lambda seen, name, angle: seen)
+    rig = Fake(
+        bodies=[Fake(target_id=np.array([5, 2])), Fake(target_id=np.array([40]))],
+        calibrations={'a': Fake(image_size=(1024, 1024))},
+    )
+    return healing_services._Collection(rig)
+
+
+def test_collection_keeps_the_markers_of_bodies(monkeypatch):
+    found = collection(monkeypatch)
+    uv = np.arange(8.0).reshape(4, 2)
+    shown = replace(
+        frame('a'), target_id=np.array([2, 3, 40, 77]), uv=uv, sigma=np.array([1.0, 2, 3, 4])
+    )
+    found.add('a', shown, None)
+    found.add('b', shown, None)
+    (kept,) = found.frames['a']
+    assert kept.target_id.tolist() == [2, 40] and kept.sigma.tolist() == [1, 3]
+    assert kept.uv.tolist() == [[0, 1], [4, 5]] and found.count == 1
+    found.add('a', replace(shown, image_size=(9, 9)), None)
+    assert found.count == 1 and len(found.refused) == 1
+    for _ in range(5):
+        found.add('a', replace(shown, sigma=None), None)
+    assert found.count == 3 and found.frames['a'][-1].sigma is None
+    found.finish()
+    found.finish()
+    del found.frames['a'][:]
+    found.add('a', shown, None)
+    assert found.count == 0
+
+
+def test_rig_that_has_changed_is_not_healed():
+    service = healing_services.Healing.__new__(healing_services.Healing)
+    one = {'a': Fake(calibration_id='a-1')}
+    service._output = Fake(orientation='o', calibrations=one)
+    service._check_unchanged(Fake(orientation='o', calibrations={'a': Fake(calibration_id='a-1')}))
+    for rig in (
+        Fake(orientation='p', calibrations=one),
+        Fake(orientation='o', calibrations={'a': Fake(calibration_id='a-2')}),
+    ):
+        with pytest.raises(DataError):
+            service._check_unchanged(rig)
+    service._healed = None
+    with pytest.raises(DataError, match='no healed rig'):
+        service._accept()
+    service._healed = Fake(verdict='fail', checks=[Fake(sentence='s', passed=False)]), None
+    with pytest.raises(DataError, match='is fail: s'):
+        service._accept()
+
+
+# ---- drift
+
+
+def state(level=Severity.NOTE, observations=5):
+    return Fake(
+        finding=Finding(Kind.NO_DRIFT, 'no drift', severity=level),
+        level=level,
+        message='m',
+        fluoroscope='a',
+        place='',
+        source='',
+        size=0.5,
+        sd=0.125,
+        evidence=3.0,
+        threshold_warn=10.0,
+        threshold_error=20.0,
+        since_s=2.0,
+        observations=observations,
+    )
+
+
+def test_alarm_asks_the_calibration_node_once(monkeypatch):
+    asked = []
+    monkeypatch.setattr(
+        drift_monitor, 'message_from_drift_state', lambda state, stamp, _: (state.level, stamp)
+    )
+    log = Log()
+    parameters = DriftParameters(collect_on_drift=True, heal_on_drift=True)
+    monitor = DriftMonitor('ab', parameters, None, log)
+    ready = {'collect': True, 'heal': True}
+    monitor.connect(
+        Fake(publish=asked.append),
+        Fake(
+            service_is_ready=lambda: ready['collect'],
+            call_async=lambda _: asked.append('collect'),
+        ),
+        Fake(
+            server_is_ready=lambda: ready['heal'], send_goal_async=lambda _: asked.append('heal')
+        ),
+    )
+    assert monitor.publish_state(None) == []
+    monitor.newest = None, 'orientation', 7
+    (status,) = monitor.publish_state(None)
+    assert status.level == WARN and status.message.endswith('of a, b')
+    assert monitor.set_image_size('a', (9, 8)) and not monitor.set_image_size('a', (9, 8))
+    assert monitor.publish_state(None)[0].message.endswith('of b')
+    for level, diagnosed in (
+        (Severity.NOTE, OK),
+        (Severity.WARNING, WARN),
+        (Severity.ERROR, ERROR),
+        (Severity.ERROR, ERROR),
+    ):
+        monitor.newest = Fake(state=state(level)), 'orientation', 7
+        (status,) = monitor.publish_state(None)
+        assert status.level == diagnosed and status.values['size [px]'] == '0.50'
+    alarm = (Severity.ERROR, 7)
+    assert asked == [(Severity.NOTE, 7), (Severity.WARNING, 7), alarm, 'collect', 'heal', alarm]
+    assert log.lines['error'] == 1
+    monitor.newest = Fake(state=state()), 'orientation', 7
+    monitor.publish_state(None)
+    ready.update(collect=False, heal=False)
+    monitor.newest = Fake(state=state(Severity.ERROR)), 'orientation', 7
+    monitor.publish_state(None)
+    assert asked[-1] == alarm and log.lines['error'] == 4
+
+
+def test_parameters_that_only_ask_make_no_new_watches():
+    monitor = DriftMonitor('ab', DriftParameters(), None, Log())
+    assert not monitor.use(DriftParameters(collect_on_drift=True, heal_on_drift=True))
+    assert monitor.use(DriftParameters(collect_on_drift=True, heal_on_drift=True, drift_rate=5.0))
+    assert monitor.make_watch(None) is None  # sizes are not known
+    assert monitor.use(DriftParameters(drift_watch=False))
+    monitor.newest = Fake(state=state()), 'o', 7
+    assert monitor.publish_state(None) == []
+
+
+# ---- points and images
+
+
+def test_points_are_counted_by_status():
+    counter = PointsCounter()
+    for status in ([0, 0, OUTSIDE], [REJECTED, REJECTED, FAILED, SINGLE_VIEW, SINGLE_VIEW, 0]):
+        counter.add(Fake(status=np.array(status)))
+    counter.add(Fake(status=np.zeros(4, int)))
+    assert counter.values() == {
+        'points': 13,
+        'points outside': 1,
+        'points rejected': 2,
+        'points failed': 1,
+        'points in a single view': 2,
+    }
+
+
+def test_stream_of_images_measures_its_rate_and_what_was_shed():
+    stream = ImageStream('a', refusals(), 'a/image_raw')
+    found = Fake(reason='', followed=True, note='', seconds=0.25)
+    for each in (found, found, Fake(reason='dark', followed=False, note='', seconds=0.5)):
+        stream.count(Fake(header=Fake(stamp=Fake(sec=1, nanosec=2))), each)
+    assert (stream.extracted, stream.followed, stream.without, stream.seconds) == (2, 2, 1, 1.0)
+    stream.shed = 4
+    then, *_ = stream._before
+    stream._before = (then - 10, 1, 1)
+    stream.measure()
+    assert stream.rate_hz == pytest.approx(0.2, rel=0.01) and stream.shed_now == 3
+    stream.measure()
+    assert stream.rate_hz == 0 and stream.shed_now == 0
+
+
+def test_image_of_another_size_or_frame_is_refused():
+    stream = ImageStream('a', refusals(), 'a/image_raw')
+    shape = {'now': (4, 6)}
+    stream.converter = Fake(
+        decoded=lambda message: (np.zeros(shape['now']), 'mono8'),
+        refusal=lambda kind, message, text: Refused(kind, text),
+    )
+    message = Fake(header=Fake(frame_id='x'))
+    for _ in range(2):
+        assert stream.decoded(message).shape == (4, 6)
+    shape['now'] = (6, 4)
+    with pytest.raises(Refused) as error:
+        stream.decoded(message)
+    assert error.value.kind == 'image size' and '4 x 6 px' in str(error.value)
+    with pytest.raises(Refused) as error:
+        stream.decoded(Fake(header=Fake(frame_id='y')))
+    assert error.value.kind == 'frame id'
+
+
+def test_number_that_is_used_again_loses_the_one_before():
+    queue = ExposureQueue('ab', 5)
+    assert queue.put('a', 3, 'old') == [] and queue.put('a', 3, 'new') == ['a']
+    assert queue.waiting('a') == 1 and queue.get('a') == (3, {'a': 'new'})
+
+
+# ---- orientations of the rig
+
+
+def rig_input(*ids):
+    made = RigInput(('a', 'b', 'c'), 4.0, None, refusals=None, logger=None)
+    made._rigs = {one: f'rig {number}' for number, one in enumerate(ids)}
+    return made
+
+
+def test_rig_is_the_newest_with_the_calibrations_of_all_views():
+    made = rig_input(('a1', 'b1', 'c1'), ('a2', 'b1', 'c1'), ('a2', 'b2', 'c1'))
+    assert made.newest == 'rig 2'
+    assert made.rig_of({'a': 'a1', 'b': 'b1', 'c': 'c1'}) == 'rig 0'
+    assert made.rig_of({'b': 'b1', 'c': 'c1'}) == 'rig 1'
+    assert made.rig_of({'a': 'a2'}) == 'rig 2'
+    assert made.rig_of({'a': 'a1', 'b': 'b2'}) is None
+    assert made.rig_of({'a': 'a9', 'b': 'b1', 'c': 'c1'}) is None
+    assert rig_input().newest is None and rig_input().camera_of('a') == ('', None)
+
+
+# ---- simulator, player, recorder, bridge
+
+
+def simulator(stand_s, move_s, rate=10.0):
+    poses = [
+        (np.eye(3), np.zeros(3)),
+        (matrix_from_vector([0, 0, 0.4]), np.array([10.0, 0, 0])),
+    ]
+    settings = Fake(stand_time=stand_s, move_time=move_s, rate=rate)
+    return lambda number: SimulatorNode._pose(Fake(_settings=settings, _poses=poses), number)
+
+
+def test_phantom_stands_and_moves_between_its_poses():
+    pose = simulator(1.0, 2.0)
+    for number in (1, 10):
+        assert pose(number)[1].tolist() == [0, 0, 0]
+    turn, shift = pose(15)  # a quarter of the way
+    np.testing.assert_allclose(turn, matrix_from_vector([0, 0, 0.1]), atol=1e-12)
+    assert shift == pytest.approx([2.5, 0, 0])
+    assert pose(35)[1].tolist() == [10, 0, 0]
+    assert pose(55)[1] == pytest.approx([2.5, 0, 0])  # on the way back
+    assert pose(65)[1].tolist() == [0, 0, 0]
+    assert simulator(0.0, 0.0)(7)[1].tolist() == [0, 0, 0]
+
+
+def test_pace_of_a_player_stops_goes_on_and_changes(monkeypatch):
+    now = {'s': 100.0}
+    monkeypatch.setattr(player_node, 'time', Fake(monotonic=lambda: now['s']))
+    pace = player_node.Pace(2.0)
+    now['s'] += 3
+    assert pace.position_s == 6.0 and not pace.paused
+    pace.pause()
+    now['s'] += 5
+    assert pace.position_s == 6.0 and pace.paused
+    pace.change(0.5)
+    now['s'] += 1
+    assert pace.position_s == 6.0
+    pace.resume()
+    now['s'] += 4
+    assert pace.position_s == 8.0
+    pace.change(4.0)
+    now['s'] += 1
+    assert pace.position_s == 12.0
+    waited = []
+
+    def wait(seconds):
+        waited.append(seconds)
+        now['s'] += seconds
+        return False
+
+    stop = Fake(wait=wait, is_set=lambda: False)
+    assert pace.wait(13.0, stop) is False and sum(waited) == pytest.approx(0.25)
+    assert max(waited) <= player_node.LONGEST_WAIT_S
+    assert pace.wait(2.0, Fake(is_set=lambda: True)) is True
+    assert pace.wait(99.0, Fake(wait=lambda _: True)) is True
+    paused = player_node.Pace(1.0, paused=True)
+    now['s'] += 9
+    assert paused.position_s == 0 and paused.wait(5.0, Fake(wait=lambda _: True)) is True
+    paused.step()
+    assert paused.wait(5.0, stop) is False and paused.position_s == 5
+
+
+def publisher(reliable=True, latched=True, depth=5):
+    profile = Fake(
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+        depth=depth,
+        history=Fake(name='KEEP_LAST'),
+        liveliness=Fake(name='AUTOMATIC'),
+        deadline=Fake(nanoseconds=2_500_000_000),
+        lifespan=Fake(nanoseconds=0),
+        liveliness_lease_duration=Fake(nanoseconds=7),
+        avoid_ros_namespace_conventions=False,
+    )
+    return Fake(qos_profile=profile)
+
+
+@pytest.mark.parametrize(
+    ('publishers', 'reliable', 'latched'),
+    [
+        ([publisher(), publisher()], True, True),
+        ([publisher(), publisher(reliable=False)], False, True),
+        ([publisher(), publisher(latched=False)], True, False),
+    ],
+)
+def test_recorder_asks_for_what_all_publishers_offer(publishers, reliable, latched):
+    found = adapted_qos(publishers, 7)
+    assert found.depth == 7
+    assert (found.reliability == ReliabilityPolicy.RELIABLE) is reliable
+    assert (found.durability == DurabilityPolicy.TRANSIENT_LOCAL) is latched
+
+
+def test_offered_profile_is_written_as_it_is():
+    found = qos_document(publisher(latched=False).qos_profile)
+    assert found['deadline'] == {'sec': 2, 'nsec': 500_000_000}
+    assert found['liveliness_lease_duration'] == {'sec': 0, 'nsec': 7}
+    assert (found['reliability'], found['durability']) == ('reliable', 'volatile')
+    assert (found['history'], found['liveliness'], found['depth']) == ('keep_last', 'automatic', 5)
+
+
+@pytest.mark.parametrize(
+    ('version', 'value', 'text'),
+    [(1, [0, 171], 'RIHS01_00ab'), (2, [1], ''), (1, [0, 0], '')],
+)
+def test_hash_of_a_type_is_told_where_it_is_known(version, value, text):
+    assert type_hash_text(Fake(topic_type_hash=Fake(version=version, value=value))) == text
+    assert type_hash_text(Fake(topic_type_hash=None)) == ''
+
+
+@pytest.mark.parametrize(
+    ('request_line', 'origin', 'admitted'),
+    [
+        ('GET /?token=secret HTTP/1.1', '', True),
+        ('GET /?token=secret HTTP/1.1', 'https://here', True),
+        ('GET /?token=secret HTTP/1.1', 'https://there', False),
+        ('GET /?token=secret HTTP/1.1', 'HTTP://here', False),
+        ('GET /?token=secret HTTP/1.1', 'null', False),
+        ('GET /?token=secret HTTP/1.1', 'file://x', True),
+        ('GET /?token=other HTTP/1.1', '', False),
+        ('GET / HTTP/1.1', '', False),
+        ('POST /?token=secret HTTP/1.1', '', False),
+        ('GET /?token=secret', '', False),
+    ],
+)
+def test_bridge_admits_by_token_and_origin(request_line, origin, admitted):
+    lines = [request_line, 'Host: x', *([f'Origin: {origin}'] if origin else []), '', '']
+    refusal = Admission('secret', ['https://here']).refusal('\r\n'.join(lines).encode())
+    assert (refusal == '') is admitted

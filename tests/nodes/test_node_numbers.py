@@ -3,8 +3,6 @@
 
 """What parts of the nodes count, decide and pass on, on plain objects without a graph."""
 
-import asyncio
-import time
 from collections import Counter
 from dataclasses import replace
 from types import SimpleNamespace as Fake
@@ -12,25 +10,30 @@ from types import SimpleNamespace as Fake
 import numpy as np
 import pytest
 import rigs
-from fluoro_calib_msgs.srv import Capture, Reset
-from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from rclpy.duration import Duration
+from rclpy.qos import (
+    DurabilityPolicy,
+    HistoryPolicy,
+    LivelinessPolicy,
+    QoSProfile,
+    ReliabilityPolicy,
+)
+from rclpy.topic_endpoint_info import TopicEndpointInfo
+from rclpy.type_hash import TypeHash
+from sensor_msgs.msg import Image
+from std_msgs.msg import Header
 
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.angles import AngleOptions
-from fluoro_calib_ros.findings import Finding, Kind, Severity
 from fluoro_calib_ros.nodes import (
-    calibration_services,
     calibration_settings,
-    drift_monitor,
     healing_services,
     player_node,
 )
-from fluoro_calib_ros.nodes import exposure_input as exposing
 from fluoro_calib_ros.nodes.angle_input import AngleInput, beyond_text
 from fluoro_calib_ros.nodes.bridge_node import Admission
-from fluoro_calib_ros.nodes.calibration_input import HOLD_TICKS, CalibrationInput
-from fluoro_calib_ros.nodes.calibration_services import OrientationService, _Capture
-from fluoro_calib_ros.nodes.calibration_settings import CalibrationFiles, check_folders
+from fluoro_calib_ros.nodes.calibration_services import _Capture
+from fluoro_calib_ros.nodes.calibration_settings import check_folders
 from fluoro_calib_ros.nodes.dashboard import state as session_state
 from fluoro_calib_ros.nodes.dashboard import terminal
 from fluoro_calib_ros.nodes.dashboard.state import (
@@ -39,7 +42,6 @@ from fluoro_calib_ros.nodes.dashboard.state import (
     RateMeter,
     SessionState,
 )
-from fluoro_calib_ros.nodes.dashboard.watch import SessionClient, _number
 from fluoro_calib_ros.nodes.drift_monitor import DriftMonitor, DriftParameters
 from fluoro_calib_ros.nodes.frame_validation import (
     FrameValidator,
@@ -52,17 +54,12 @@ from fluoro_calib_ros.nodes.reconstruction_output import PointsCounter
 from fluoro_calib_ros.nodes.recorder_node import qos_document, type_hash_text
 from fluoro_calib_ros.nodes.rig_input import RigInput
 from fluoro_calib_ros.nodes.runtime.diagnostics import (
-    ERROR,
-    OK,
     WARN,
     RateLimitedLogger,
     RefusalLog,
     Refused,
 )
-from fluoro_calib_ros.nodes.runtime.services import Requests
 from fluoro_calib_ros.nodes.runtime.topics import adapted_qos
-from fluoro_calib_ros.nodes.simulator_node import SimulatorNode
-from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.reconstruction.intersection import (
     FAILED,
     OUTSIDE,
@@ -146,64 +143,6 @@ def test_tables_of_the_dashboard_have_their_columns():
     silent = replace(one, state='', corrected_hz=np.nan, rejected=0)
     found = dict(zip(*cells(terminal._fluoroscopes(SessionState(fluoroscopes=(silent,))))))
     assert (found['exposures'], found['corrected'], found['state']) == ('-', '-', '-')
-
-
-def client(**values):
-    made = Fake(_heard_at={}, _functions={}, _meters={}, _points_at=None, **values)
-    made._note_points = lambda count: SessionClient._note_points(made, count)
-    made._rate = lambda *words: SessionClient._rate(made, *words)
-    return made
-
-
-def test_worst_function_of_a_node_is_told_and_a_node_that_is_silent():
-    now = time.monotonic()
-    made = client()
-    made._heard_at = {'calibration_node': now, 'image_node': now - 60}
-    made._functions = {
-        'image_node': {'a': NodeState('a', 'ok', 'correcting')},
-        'calibration_node': {
-            name: NodeState(name, level, f'{name} is {level}')
-            for name, level in (('a', 'ok'), ('b', 'error'), ('c', 'warn'))
-        },
-    }
-    found = list(SessionClient._node_states(made))
-    assert [(one.name, one.level) for one in found] == [
-        ('calibration_node', 'error'),
-        ('image_node', 'silent'),
-    ]
-    assert found[0].message == 'b: b is error' and '60 s' in found[1].message
-    made._functions = {'image_node': {'a': NodeState('a', 'warn', 'slow')}}
-    made._heard_at['image_node'] = now
-    assert next(iter(SessionClient._node_states(made))).message == 'slow'
-
-
-def test_values_of_the_diagnostics_are_taken_over():
-    taken = {}
-    made = client(_set=taken.update, _follow=lambda name: taken.update(followed=name))
-    made._update = lambda name, **values: taken.update(values, name=name)
-
-    def read(node, function, stamp_s, level=OK, **values):
-        values = {key.replace('_', ' '): value for key, value in values.items()}
-        status = Fake(level=level, message='m')
-        SessionClient._read(made, node, function, values, stamp_s, status)
-
-    for second in (0.0, 2.0):
-        read('calibration_node', 'a', second, frames_received=str(int(60 * second)), ready='True')
-    assert (taken['name'], taken['followed'], taken['frames_hz']) == ('a', 'a', 60)
-    assert taken['ready'] is True
-    read('calibration_node', 'a', 3.0, next_pose='tilt')
-    assert (taken['ready'], taken['next_pose'], taken['frames_hz']) == (False, 'tilt', 60)
-    for second in (0.0, 4.0):
-        read(
-            'reconstruction_node',
-            'reconstruction',
-            second,
-            exposures_reconstructed=str(int(second)),
-        )
-    assert taken['points_hz'] == 1 and np.isnan(taken['points_latency_ms']).all()
-    read('reconstruction_node', 'drift', 1.0, level=ERROR)
-    assert (taken['drift_level'], taken['drift']) == ('error', 'm')
-    assert _number('2.5') == 2.5 and np.isnan(_number(None)) and np.isnan(_number('x'))
 
 
 # ---- validation of frames
@@ -363,73 +302,6 @@ def test_nearest_calibrated_angle_is_round_the_circle():
 # ---- calibrations that arrive
 
 
-class Waiting(CalibrationInput):
-    """An input whose calibrations are used at once, and whose peers are given."""
-
-    def __init__(self, names='a'):
-        self.asked = []
-        self.begun = []
-        self.peers = ''
-        node = Fake(
-            create_subscription=lambda *words, **how: self.asked.append((*words, how)),
-            get_logger=Log,
-        )
-        self.refused = []
-        super().__init__(node, names, None, None, lambda *words: self.refused.append(words))
-
-    def conflict(self, name):
-        return self.peers
-
-    def _start(self, name, message):
-        self.begun.append((name, message.calibration_id))
-
-
-def test_calibrations_are_subscribed_and_refused_by_fluoroscope(monkeypatch):
-    made = Waiting('ab')
-    assert [words[1] for words in made.asked] == ['a/calibration', 'b/calibration']
-    assert {words[0].__name__ for words in made.asked} == {'FluoroscopeCalibration'}
-    assert all(words[-1] == {'raw': True} for words in made.asked)
-    monkeypatch.setattr(
-        'fluoro_calib_ros.nodes.calibration_input.read_limits',
-        lambda: Fake(max_calibration_bytes=3_000_000),
-    )
-    made._on_data('b', bytes(5_000_000))
-    ((name, reason),) = made.refused
-    assert name == 'b' and '5 MB' in reason and '3 MB' in reason
-    made._on_data('a', b'\0\1\0\0x')
-    assert made.refused[1][0] == 'a' and 'a/calibration' in made.refused[1][1]
-
-
-def test_newest_calibration_that_was_held_back_is_used():
-    """One that is sent again is the newest; none before a peer is gone, unless it is the only."""
-    made = Waiting()
-    made.peers = 'two nodes'
-    for sent in ('x', 'y', 'x'):
-        made._on_calibration('a', Fake(calibration_id=sent))
-    for _ in range(2 * HOLD_TICKS):
-        made.release()
-    assert made.begun == []
-    made.peers = ''
-    made.release()
-    made.release()
-    assert made.begun == [('a', 'x')]
-    made.peers = 'two nodes'
-    made._on_calibration('a', Fake(calibration_id='z'))
-    for tick in range(HOLD_TICKS):
-        assert made.begun == [('a', 'x')], tick
-        made.release()
-    assert made.begun == [('a', 'x'), ('a', 'z')]
-    made._on_calibration('a', Fake(calibration_id='w'))
-    made._current['a'] = 'in use'
-    for _ in range(2 * HOLD_TICKS):
-        made.release()
-    assert len(made.begun) == 2
-    made.peers = ''
-    made._on_calibration('a', Fake(calibration_id='v'))
-    made.release()
-    assert made.begun[2:] == [('a', 'v')]
-
-
 # ---- captures and jobs
 
 
@@ -450,120 +322,6 @@ def test_capture_ends_with_its_last_frame():
     assert late.done.result() is False and late.add({'a': frame('a')})
 
 
-def parts(**changes):
-    node = Fake(readers=['active'], get_logger=Log, set_parameters=lambda _: None, executor=None)
-    settings = Fake(
-        node=Fake(rig_frame='rig', capture_timeout=5.0, any_directory=False),
-        limits=Fake(max_waiting=2, max_folders=3),
-    )
-    rig = Fake(
-        names=('a', 'b'),
-        required_phantom=lambda: rigs.rig().phantom,
-        phantom=rigs.rig().phantom,
-        settings=lambda: settings,
-    )
-    output = Fake(calibrations={'a': 1, 'b': 2}, orientation=None, refused={'a': 'x'})
-    values = {
-        'node': node,
-        'rig': rig,
-        'exposures': None,
-        'output': output,
-        'files': None,
-        'requests': Requests(),
-    }
-    return Fake(**{**values, **changes})
-
-
-@pytest.mark.parametrize(
-    ('frames', 'seconds', 'count', 'timeout'), [(0, 0.0, 1, 5.0), (7, 2.5, 7, 2.5)]
-)
-def test_orient_captures_as_many_frames_as_asked(monkeypatch, frames, seconds, count, timeout):
-    service = OrientationService(parts())
-    asked = []
-
-    async def captured(*words):
-        asked.append(words)
-        raise DataError('enough')
-
-    monkeypatch.setattr(service, '_captured', captured)
-    with pytest.raises(DataError, match='enough'):
-        asyncio.run(service._orient(Fake(frames=frames, timeout_sec=seconds)))
-    assert asked == [(('a', 'b'), count, timeout)]
-
-
-@pytest.mark.parametrize(
-    ('change', 'sentence'),
-    [
-        (lambda given: given.node.readers.clear(), 'not active'),
-        (lambda given: given.output.calibrations.pop('b'), 'b is not calibrated'),
-    ],
-)
-def test_orient_needs_calibrations_and_frames(change, sentence):
-    given = parts()
-    change(given)
-    with pytest.raises(DataError, match=sentence):
-        asyncio.run(OrientationService(given)._orient(Fake(frames=1, timeout_sec=1.0)))
-
-
-def test_one_capture_waits_at_a_time_and_says_how_many_frames_came(monkeypatch):
-    service = OrientationService(parts())
-
-    async def too_late(node, timeout_s, future, give_up):
-        service.add({name: frame(name) for name in 'ab'})
-        give_up()
-        return future.result()
-
-    monkeypatch.setattr(calibration_services, 'within', too_late)
-    with pytest.raises(DataError, match=r'1 of 3 frames .*within 2 s'):
-        asyncio.run(service._captured(('a', 'b'), 3, 2.0))
-    assert service._capture is None
-    service._capture = 'one that waits'
-    with pytest.raises(DataError, match='another capture'):
-        asyncio.run(service._captured(('a', 'b'), 3, 2.0))
-
-
-def test_requests_for_captures_are_limited():
-    service = exposing.CollectServices(parts())
-    entries = [(entry.name, entry.kind) for entry in service.services]
-    assert entries == [('capture', Capture), ('reset', Reset), ('collect_anew', Reset)]
-    service._check(5.0)
-    with service._requests.one(), service._requests.one(), pytest.raises(DataError, match='2 req'):
-        service._check(5.0)
-    service._node.readers.clear()
-    with pytest.raises(DataError, match='not active'):
-        service._check(5.0)
-
-
-@pytest.mark.parametrize('seconds', [0.0, 3.0])
-def test_capture_answers_with_its_frame_or_what_was_received(monkeypatch, seconds):
-    exposures = Fake(
-        capture=lambda: 'future',
-        collected=lambda name: Fake(exposures={'a': 4}[name]),
-        streams={name: Fake(name=name, received=n) for name, n in (('a', 7), ('b', 0))},
-        capture_refusal='',
-        reset=lambda: 6,
-    )
-    service = exposing.CollectServices(parts(exposures=exposures))
-    asked = []
-
-    async def within(node, timeout_s, future, give_up):
-        asked.append((timeout_s, future))
-        return (12, 5) if len(asked) == 1 else None
-
-    monkeypatch.setattr(exposing, 'within', within)
-    request = Fake(timeout_sec=seconds)
-    answer = asyncio.run(service._on_capture(request, Capture.Response()))
-    assert answer.success and answer.exposures == 5 and '12' in answer.message
-    answer = asyncio.run(service._on_capture(request, Capture.Response()))
-    assert not answer.success and answer.exposures == 4
-    assert 'a 7, b 0' in answer.message and asked == [(seconds or 5.0, 'future')] * 2
-    exposures.capture_refusal = 'the phantom moved'
-    answer = asyncio.run(service._on_capture(request, Capture.Response()))
-    assert answer.message == 'the phantom moved'
-    answer = service._on_reset(None, Reset.Response())
-    assert answer.success and answer.message.startswith('6 ') and not service._output.refused
-
-
 def test_folders_below_the_calibrations_are_counted(tmp_path):
     for name in ('x', 'y'):
         (tmp_path / name).mkdir()
@@ -574,19 +332,6 @@ def test_folders_below_the_calibrations_are_counted(tmp_path):
         check_folders(tmp_path / 'z' / 'deep', tmp_path, 3)
     check_folders(tmp_path / 'x', tmp_path, 0)
     check_folders(tmp_path.parent / 'elsewhere', tmp_path, 0)
-
-
-def test_requests_name_folders_below_that_of_the_calibrations(tmp_path):
-    given = parts()
-    given.rig.directory = tmp_path
-    files = CalibrationFiles(given.rig, given.output, Log())
-    assert files._directory_of(Fake(directory='')) == tmp_path
-    assert files._directory_of(Fake(directory='x')) == tmp_path / 'x'
-    for outside in ('..', '/tmp', 'x/../../y'):
-        with pytest.raises(DataError, match='any_directory'):
-            files._directory_of(Fake(directory=outside))
-    given.rig.settings().node.any_directory = True
-    assert files._directory_of(Fake(directory=str(tmp_path.parent))) == tmp_path.parent
 
 
 def test_default_folder_follows_the_namespace(monkeypatch):
@@ -631,89 +376,7 @@ def test_collection_keeps_the_markers_of_bodies(monkeypatch):
     assert found.count == 0
 
 
-def test_rig_that_has_changed_is_not_healed():
-    service = healing_services.Healing.__new__(healing_services.Healing)
-    one = {'a': Fake(calibration_id='a-1')}
-    service._output = Fake(orientation='o', calibrations=one)
-    service._check_unchanged(Fake(orientation='o', calibrations={'a': Fake(calibration_id='a-1')}))
-    for rig in (
-        Fake(orientation='p', calibrations=one),
-        Fake(orientation='o', calibrations={'a': Fake(calibration_id='a-2')}),
-    ):
-        with pytest.raises(DataError):
-            service._check_unchanged(rig)
-    service._healed = None
-    with pytest.raises(DataError, match='no healed rig'):
-        service._accept()
-    service._healed = Fake(verdict='fail', checks=[Fake(sentence='s', passed=False)]), None
-    with pytest.raises(DataError, match='is fail: s'):
-        service._accept()
-
-
 # ---- drift
-
-
-def state(level=Severity.NOTE, observations=5):
-    return Fake(
-        finding=Finding(Kind.NO_DRIFT, 'no drift', severity=level),
-        level=level,
-        message='m',
-        fluoroscope='a',
-        place='',
-        source='',
-        size=0.5,
-        sd=0.125,
-        evidence=3.0,
-        threshold_warn=10.0,
-        threshold_error=20.0,
-        since_s=2.0,
-        observations=observations,
-    )
-
-
-def test_alarm_asks_the_calibration_node_once(monkeypatch):
-    asked = []
-    monkeypatch.setattr(
-        drift_monitor, 'message_from_drift_state', lambda state, stamp, _: (state.level, stamp)
-    )
-    log = Log()
-    parameters = DriftParameters(collect_on_drift=True, heal_on_drift=True)
-    monitor = DriftMonitor('ab', parameters, None, log)
-    ready = {'collect': True, 'heal': True}
-    monitor.connect(
-        Fake(publish=asked.append),
-        Fake(
-            service_is_ready=lambda: ready['collect'],
-            call_async=lambda _: asked.append('collect'),
-        ),
-        Fake(
-            server_is_ready=lambda: ready['heal'], send_goal_async=lambda _: asked.append('heal')
-        ),
-    )
-    assert monitor.publish_state(None) == []
-    monitor.newest = None, 'orientation', 7
-    (status,) = monitor.publish_state(None)
-    assert status.level == WARN and status.message.endswith('of a, b')
-    assert monitor.set_image_size('a', (9, 8)) and not monitor.set_image_size('a', (9, 8))
-    assert monitor.publish_state(None)[0].message.endswith('of b')
-    for level, diagnosed in (
-        (Severity.NOTE, OK),
-        (Severity.WARNING, WARN),
-        (Severity.ERROR, ERROR),
-        (Severity.ERROR, ERROR),
-    ):
-        monitor.newest = Fake(state=state(level)), 'orientation', 7
-        (status,) = monitor.publish_state(None)
-        assert status.level == diagnosed and status.values['size [px]'] == '0.50'
-    alarm = (Severity.ERROR, 7)
-    assert asked == [(Severity.NOTE, 7), (Severity.WARNING, 7), alarm, 'collect', 'heal', alarm]
-    assert log.lines['error'] == 1
-    monitor.newest = Fake(state=state()), 'orientation', 7
-    monitor.publish_state(None)
-    ready.update(collect=False, heal=False)
-    monitor.newest = Fake(state=state(Severity.ERROR)), 'orientation', 7
-    monitor.publish_state(None)
-    assert asked[-1] == alarm and log.lines['error'] == 4
 
 
 def test_parameters_that_only_ask_make_no_new_watches():
@@ -722,7 +385,7 @@ def test_parameters_that_only_ask_make_no_new_watches():
     assert monitor.use(DriftParameters(collect_on_drift=True, heal_on_drift=True, drift_rate=5.0))
     assert monitor.make_watch(None) is None  # sizes are not known
     assert monitor.use(DriftParameters(drift_watch=False))
-    monitor.newest = Fake(state=state()), 'o', 7
+    monitor.newest = None, 'o', 7
     assert monitor.publish_state(None) == []
 
 
@@ -747,7 +410,7 @@ def test_stream_of_images_measures_its_rate_and_what_was_shed():
     stream = ImageStream('a', refusals(), 'a/image_raw')
     found = Fake(reason='', followed=True, note='', seconds=0.25)
     for each in (found, found, Fake(reason='dark', followed=False, note='', seconds=0.5)):
-        stream.count(Fake(header=Fake(stamp=Fake(sec=1, nanosec=2))), each)
+        stream.count(Image(), each)
     assert (stream.extracted, stream.followed, stream.without, stream.seconds) == (2, 2, 1, 1.0)
     stream.shed = 4
     then, *_ = stream._before
@@ -765,7 +428,7 @@ def test_image_of_another_size_or_frame_is_refused():
         decoded=lambda message: (np.zeros(shape['now']), 'mono8'),
         refusal=lambda kind, message, text: Refused(kind, text),
     )
-    message = Fake(header=Fake(frame_id='x'))
+    message = Image(header=Header(frame_id='x'))
     for _ in range(2):
         assert stream.decoded(message).shape == (4, 6)
     shape['now'] = (6, 4)
@@ -773,7 +436,7 @@ def test_image_of_another_size_or_frame_is_refused():
         stream.decoded(message)
     assert error.value.kind == 'image size' and '4 x 6 px' in str(error.value)
     with pytest.raises(Refused) as error:
-        stream.decoded(Fake(header=Fake(frame_id='y')))
+        stream.decoded(Image(header=Header(frame_id='y')))
     assert error.value.kind == 'frame id'
 
 
@@ -804,28 +467,6 @@ def test_rig_is_the_newest_with_the_calibrations_of_all_views():
 
 
 # ---- simulator, player, recorder, bridge
-
-
-def simulator(stand_s, move_s, rate=10.0):
-    poses = [
-        (np.eye(3), np.zeros(3)),
-        (matrix_from_vector([0, 0, 0.4]), np.array([10.0, 0, 0])),
-    ]
-    settings = Fake(stand_time=stand_s, move_time=move_s, rate=rate)
-    return lambda number: SimulatorNode._pose(Fake(_settings=settings, _poses=poses), number)
-
-
-def test_phantom_stands_and_moves_between_its_poses():
-    pose = simulator(1.0, 2.0)
-    for number in (1, 10):
-        assert pose(number)[1].tolist() == [0, 0, 0]
-    turn, shift = pose(15)  # a quarter of the way
-    np.testing.assert_allclose(turn, matrix_from_vector([0, 0, 0.1]), atol=1e-12)
-    assert shift == pytest.approx([2.5, 0, 0])
-    assert pose(35)[1].tolist() == [10, 0, 0]
-    assert pose(55)[1] == pytest.approx([2.5, 0, 0])  # on the way back
-    assert pose(65)[1].tolist() == [0, 0, 0]
-    assert simulator(0.0, 0.0)(7)[1].tolist() == [0, 0, 0]
 
 
 def test_pace_of_a_player_stops_goes_on_and_changes(monkeypatch):
@@ -866,18 +507,17 @@ def test_pace_of_a_player_stops_goes_on_and_changes(monkeypatch):
 
 
 def publisher(reliable=True, latched=True, depth=5):
-    profile = Fake(
+    profile = QoSProfile(
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
         depth=depth,
-        history=Fake(name='KEEP_LAST'),
-        liveliness=Fake(name='AUTOMATIC'),
-        deadline=Fake(nanoseconds=2_500_000_000),
-        lifespan=Fake(nanoseconds=0),
-        liveliness_lease_duration=Fake(nanoseconds=7),
+        history=HistoryPolicy.KEEP_LAST,
+        liveliness=LivelinessPolicy.AUTOMATIC,
+        deadline=Duration(nanoseconds=2_500_000_000),
+        liveliness_lease_duration=Duration(nanoseconds=7),
         avoid_ros_namespace_conventions=False,
     )
-    return Fake(qos_profile=profile)
+    return TopicEndpointInfo(qos_profile=profile)
 
 
 @pytest.mark.parametrize(
@@ -908,8 +548,8 @@ def test_offered_profile_is_written_as_it_is():
     [(1, [0, 171], 'RIHS01_00ab'), (2, [1], ''), (1, [0, 0], '')],
 )
 def test_hash_of_a_type_is_told_where_it_is_known(version, value, text):
-    assert type_hash_text(Fake(topic_type_hash=Fake(version=version, value=value))) == text
-    assert type_hash_text(Fake(topic_type_hash=None)) == ''
+    endpoint = TopicEndpointInfo(topic_type_hash=TypeHash(version, bytes(value)))
+    assert type_hash_text(endpoint) == text
 
 
 @pytest.mark.parametrize(

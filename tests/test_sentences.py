@@ -513,7 +513,7 @@ MAKERS = {
     Kind.MARKER_MIGRATED: lambda: shape(lambda given: given + np.eye(5, 3)),
     Kind.MARKERS_EXCHANGED: lambda: shape(lambda given: given[[1, 0, 2, 3, 4]]),
     Kind.CAUSE_SURE: unsure_cause,
-    Kind.CHANGE_IDENTIFIED: lambda: healing._identified(Fake(weakest=0.7)),
+    Kind.CHANGE_IDENTIFIED: lambda: healing._identified(Fake(weakest=0.7), None, None),
     Kind.DISTORTION_CHANGED: lambda: changed(Cause.DISTORTION),
     Kind.FLUOROSCOPE_MOVED: lambda: changed(Cause.ORIENTATION),
     Kind.INTERIOR_CHANGED: lambda: changed(Cause.INTERIOR),

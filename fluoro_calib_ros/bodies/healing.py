@@ -168,11 +168,14 @@ class Diagnostician:
         changes += self._exchanges(best)
         return [self._with(best, change, first) for change in changes]
 
+    def knocks(self) -> list[Change]:
+        """Return the changes of the orientation that can be seen."""
+        return [Change(Cause.ORIENTATION, f) for f in self._moved]
+
     def _of_rig(self) -> list[Change]:
         """Return all changes of the rig."""
         views = range(len(self.adjustment.functions))
-        moved = [Change(Cause.ORIENTATION, f) for f in self._moved]
-        return moved + [Change(cause, f) for cause in OF_RIG[1:] for f in views]
+        return self.knocks() + [Change(cause, f) for cause in OF_RIG[1:] for f in views]
 
     def _changes_of_unknowns(self, best: _Tried) -> list[Change]:
         """Return the changes of rig and shapes that may have evidence.
@@ -395,16 +398,34 @@ def healed_rig(
                 adjustment.drift_at(solution.values)[f],
                 solution.covariance[np.ix_(number, number)],
             )
-    rows = np.flatnonzero(changed[adjustment.rig])
-    weakest = 0.0
-    if len(rows):
-        before = adjustment.orientation.covariance + np.diag(largest[adjustment.rig] ** 2)
-        of_rows = np.ix_(rows, rows)
-        weakest = float(np.sqrt(eigh(covariance[of_rows], before[of_rows], eigvals_only=True)[-1]))
     return HealedRig(
         orientation,
         drift,
         changes=solution.values[adjustment.rig].reshape(views, -1),
         sd=np.sqrt(np.diagonal(covariance)).reshape(views, -1),
-        weakest=weakest,
+        weakest=_weakest(adjustment, covariance, largest),
     )
+
+
+def weakest_of_knock(diagnostician: Diagnostician, diagnosis: Diagnosis) -> float:
+    """Return how well a knock would have been seen, see `HealedRig.weakest`."""
+    adjustment = diagnostician.adjustment
+    sd = np.zeros(adjustment.size)
+    for change in diagnostician.knocks():
+        sd = np.hypot(sd, diagnostician.sd_of(change))
+    prior = diagnosis.prior.widened(sd)
+    solution = adjustment.with_fixed(diagnosis.observed, prior, diagnosis.solution, sd > 0)
+    return _weakest(adjustment, solution.covariance[adjustment.rig, adjustment.rig], sd)
+
+
+def _weakest(adjustment: RigAdjustment, covariance: np.ndarray, sd: np.ndarray) -> float:
+    """Return the largest standard deviation of a direction over that before the data.
+
+    covariance (9F, 9F) of the rig; sd (K,) by which the changed unknowns may have changed.
+    """
+    rows = np.flatnonzero(sd[adjustment.rig])
+    if not len(rows):
+        return 0.0
+    before = adjustment.orientation.covariance + np.diag(sd[adjustment.rig] ** 2)
+    of_rows = np.ix_(rows, rows)
+    return float(np.sqrt(eigh(covariance[of_rows], before[of_rows], eigvals_only=True)[-1]))

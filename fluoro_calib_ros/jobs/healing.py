@@ -25,6 +25,7 @@ from ..bodies.healing import (
     Diagnostician,
     HealedRig,
     healed_rig,
+    weakest_of_knock,
 )
 from ..bodies.rig_adjustment import ObservedBodies, Poses, RigAdjustment, RigErrors, rig_errors
 from ..bodies.rigid import robust_pose
@@ -158,8 +159,11 @@ def heal_rig(
         now = rig.healed(healed)
         after = rig_errors(now.orientation, places)
     step(3, 4)
-    checks = [_correctable(fixed) if fixed else _identified(healed), _sure(diagnosis, rig)]
-    if not fixed:  # else they tell of the same change
+    checks = [_sure(diagnosis, rig)]
+    if fixed:  # exposures that were not used tell of the same change
+        checks.insert(0, _correctable(fixed))
+    else:
+        checks.insert(0, _identified(healed, diagnostician, diagnosis))
         kept_back = [paired[row] for row in unused]
         checks += _unused_exposures(now, kept_back, diagnosis, before.scale)
     step(4, 4)
@@ -383,14 +387,18 @@ def _cause_text(change: Change, rig: _Rig) -> str:
     }[change.cause]
 
 
-def _identified(healed: HealedRig | None) -> Check:
-    """Check that the bodies tell all of the change."""
+def _identified(
+    healed: HealedRig | None, diagnostician: Diagnostician, diagnosis: Diagnosis
+) -> Check:
+    """Check that the bodies tell all of the change, or would tell that of a knock."""
+    change = 'a knock' if healed is None else 'the change'
+    weakest = healed.weakest if healed else weakest_of_knock(diagnostician, diagnosis)
     return Check(
         Kind.CHANGE_IDENTIFIED,
-        'the direction of the change that is known worst has a standard deviation of '
-        f'{100 * (healed.weakest if healed else 0.0):.0f} % of what such a change may be',
+        f'the direction of {change} that is known worst has a standard deviation of '
+        f'{100 * weakest:.1f} % of what such a change may be',
         advice='record bodies that move through more of the field of view',
-        value=healed.weakest if healed else 0.0,
+        value=weakest,
         limit=IDENTIFIED,
     )
 

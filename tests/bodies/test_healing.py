@@ -11,7 +11,13 @@ from body_views import orientation, project
 from scipy.spatial.transform import Rotation
 
 from fluoro_calib_ros.bodies.body import Body
-from fluoro_calib_ros.bodies.healing import SIZES, Cause, Diagnostician, healed_rig
+from fluoro_calib_ros.bodies.healing import (
+    SIZES,
+    Cause,
+    Diagnostician,
+    healed_rig,
+    weakest_of_knock,
+)
 from fluoro_calib_ros.bodies.rig_adjustment import (
     ObservedBodies,
     Poses,
@@ -58,7 +64,7 @@ class Scene:
         for body, markers, sd in scatter_mm:
             points[:, body, markers] += self.rng.normal(0, sd, points[:, body, markers].shape)
         uv = project(self.rig, points.reshape(-1, 3), self.errors + changed)
-        uv = uv.transpose(1, 0, 2).reshape(EXPOSURES, BODIES, MARKERS, 2, 2)
+        uv = uv.transpose(1, 0, 2).reshape(EXPOSURES, len(self.bodies), MARKERS, 2, 2)
         uv = uv + self.rng.normal(0, NOISE_PX, uv.shape)
         false = self.rng.random(uv.shape[:4]) < 0.01
         uv[false] = self.rng.uniform(0, 1023, (np.count_nonzero(false), 2))
@@ -116,6 +122,22 @@ def test_healthy_rig_has_not_changed():
     found = scene.diagnostician().diagnose(scene.observe(), scene.poses())
     assert found.changes == () and found.rest > 0.95 and found.sure
     assert found.noise < 1.1
+
+
+def test_knock_would_be_told_by_bodies_that_move_and_not_by_a_single_one_that_stands():
+    scene = Scene(3)
+    diagnostician = scene.diagnostician()
+    found = diagnostician.diagnose(scene.observe(), scene.poses())
+    by_all = weakest_of_knock(diagnostician, found)
+    still = Scene(3)
+    still.bodies = [replace(still.bodies[0], sd_mm=np.full(MARKERS, 1.0))]
+    still.shapes = still.shapes[:1]
+    still.rotation = np.repeat(still.rotation[:1, :1], EXPOSURES, axis=0)
+    still.centre = np.repeat(still.centre[:1, :1], EXPOSURES, axis=0)
+    diagnostician = still.diagnostician()
+    poses = Poses(still.rotation, still.centre, np.ones((EXPOSURES, 1), dtype=bool))
+    found = diagnostician.diagnose(still.observe(), poses)
+    assert by_all < 0.2 and weakest_of_knock(diagnostician, found) > 0.5
 
 
 @pytest.mark.long

@@ -159,11 +159,9 @@ def heal_rig(
         now = rig.healed(healed)
         after = rig_errors(now.orientation, places)
     step(3, 4)
-    checks = [_sure(diagnosis, rig)]
-    if fixed:  # exposures that were not used tell of the same change
-        checks.insert(0, _correctable(fixed))
-    else:
-        checks.insert(0, _identified(healed, diagnostician, diagnosis))
+    known = _correctable(fixed) if fixed else _identified(healed, diagnostician, diagnosis)
+    checks = [known, _sure(diagnosis, rig)]
+    if not fixed:  # else they tell of the same change
         kept_back = [paired[row] for row in unused]
         checks += _unused_exposures(now, kept_back, diagnosis, before.scale)
     step(4, 4)

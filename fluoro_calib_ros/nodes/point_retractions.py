@@ -8,6 +8,7 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from fluoro_calib_msgs.msg import Retraction
 
 from .messages.observations import nanoseconds_from_stamp, stamp_from_nanoseconds, uint32_field
 from .messages.points import PointsContent
+from .runtime.diagnostics import RefusalLog
 from .runtime.lifecycle import StreamNode
 from .runtime.topics import observations_qos
 
@@ -27,6 +29,7 @@ class PointRetractions:
     """Publishes which points of an exposure are by image points that were taken back."""
 
     def __init__(self, node: StreamNode) -> None:
+        self._node = node
         self._output = node.create_output(
             Retraction, f'reconstruction/{TOPIC}', observations_qos()
         )
@@ -35,6 +38,12 @@ class PointRetractions:
         self._early: OrderedDict[tuple[str, int], Retraction] = OrderedDict()
         self._lock = threading.Lock()  # views and retractions come in two threads
         self.count = 0  #: points that were taken back
+
+    def listen(self, name: str, refusals: RefusalLog) -> None:
+        """Receive what is taken back of a fluoroscope."""
+        on_retraction = partial(self.on_retraction, name)
+        topic = f'{name}/{TOPIC}'
+        self._node.create_input(Retraction, topic, on_retraction, observations_qos(), refusals)
 
     def note(self, stamps_ns: Mapping[str, int], content: PointsContent) -> None:
         """Remember an exposure that was reconstructed, by the stamps of its views."""

@@ -12,12 +12,7 @@ from functools import partial
 
 import numpy as np
 from fluoro_calib_msgs.action import Heal
-from fluoro_calib_msgs.msg import (
-    CorrectedObservations,
-    DriftStatus,
-    Retraction,
-    RigOrientation,
-)
+from fluoro_calib_msgs.msg import CorrectedObservations, DriftStatus, RigOrientation
 from fluoro_calib_msgs.srv import Reset
 from rclpy.action import ActionClient
 from sensor_msgs.msg import CameraInfo
@@ -37,7 +32,7 @@ from .messages.fluoroscope_calibration import image_size_of
 from .messages.observations import NS_PER_S, CorrectedFrame, decode_corrected_observations
 from .messages.points import PointsContent
 from .messages.rig_orientation import transforms_of_orientation
-from .point_retractions import TOPIC, PointRetractions
+from .point_retractions import PointRetractions
 from .reconstruction_output import (
     CONDITIONS,
     BodiesOutput,
@@ -235,13 +230,7 @@ class ReconstructionNode(StreamNode):
                 latched_qos(),
                 self._refusals,
             )
-            self.create_input(
-                Retraction,
-                f'{name}/{TOPIC}',
-                partial(self._retractions.on_retraction, name),
-                observations_qos(),
-                self._refusals,
-            )
+            self._retractions.listen(name, self._refusals)
 
     def create_readers(self) -> None:
         """Receive the corrected observations of all fluoroscopes in one thread."""

@@ -346,6 +346,7 @@ def test_reconstruct_says_by_how_much_its_limit_was_widened(
         unpaired={},
         disagreement='',
         widening=widening,
+        drift=Fake(widening=None),
         cause=None,
         plot=None,
     )

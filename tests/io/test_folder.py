@@ -135,7 +135,12 @@ def test_killed_simulation_leaves_a_whole_data_set(tmp_path):
 
 
 def contents(path):
-    return {str(p.relative_to(path)): p.read_bytes() for p in path.rglob('*') if p.is_file()}
+    """Files by name, without hidden ones: what a killed run leaves, and the next one deletes."""
+    return {
+        str(p.relative_to(path)): p.read_bytes()
+        for p in path.rglob('*')
+        if p.is_file() and not p.name.startswith('.')
+    }
 
 
 def test_terminated_command_leaves_nothing_unfinished(tmp_path):

@@ -116,6 +116,21 @@ def add_options(
         add_option(parser, options[name], **changes.get(name, {}))
 
 
+def add_address(parser: argparse.ArgumentParser, what: str, port: int) -> None:
+    """Add --host and --port of what a command offers, with a default port."""
+    parser.add_argument(
+        '--host',
+        default='127.0.0.1',
+        help=f'address of {what}, 0.0.0.0 for all of this machine (default: 127.0.0.1)',
+    )
+    parser.add_argument(
+        '--port',
+        type=number_in(0, 65535, int),
+        default=port,
+        help=f'port of {what}, 0 for any free one (default: {port})',
+    )
+
+
 def add_orientation(parser: Parser) -> None:
     """Add --orientation, the file of the orientation of the rig."""
     parser.add_argument(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 
-from .arguments import names, number_in
+from .arguments import add_address, names
 from .bag import become_node
 
 NAME = 'bridge'
@@ -19,17 +19,7 @@ EXAMPLE = 'fluoro-calib bridge --host 0.0.0.0'
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    parser.add_argument(
-        '--host',
-        default='127.0.0.1',
-        help='address on which it listens, 0.0.0.0 for all of this machine (default: 127.0.0.1)',
-    )
-    parser.add_argument(
-        '--port',
-        type=number_in(0, 65535, int),
-        default=8765,
-        help='port of the WebSocket (default: 8765)',
-    )
+    add_address(parser, 'the WebSocket', 8765)
     parser.add_argument(
         '--token',
         default='',

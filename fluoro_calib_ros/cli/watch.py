@@ -10,7 +10,7 @@ import os
 import sys
 from collections.abc import Mapping
 
-from .arguments import number_in
+from .arguments import add_address
 
 NAME = 'watch'
 HELP = 'Watch and run a live session in a terminal or a browser (needs ROS 2).'
@@ -30,17 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action='store_true',
         help='offer a page for a browser beside the machine: state, radiographs, points in space',
     )
-    parser.add_argument(
-        '--host',
-        default='127.0.0.1',
-        help='address of the page, 0.0.0.0 for all of this machine (default: 127.0.0.1)',
-    )
-    parser.add_argument(
-        '--port',
-        type=number_in(0, 65535, int),
-        default=8080,
-        help='port of the page, 0 for any free one (default: 8080)',
-    )
+    add_address(parser, 'the page', 8080)
 
 
 def run(arguments: argparse.Namespace) -> None:

@@ -17,7 +17,7 @@ from rclpy.publisher import Publisher
 from ..bodies.body import Body, declared_bodies
 from ..checks.drift_charts import DriftOptions, DriftState
 from ..checks.rig_watch import RigDriftWatch
-from ..findings import Finding, Severity
+from ..findings import Finding
 from ..options import option
 from ..photogrammetry.rig_orientation import RigOrientation
 from .messages.status import ALARM, message_from_drift_state
@@ -126,12 +126,8 @@ class DriftMonitor:
             self._parameters.drift_rate,
         )
 
-    def publish_state(self, misses: Finding | None) -> list[Status]:
-        """Publish the state of the watch; returns its diagnostics, nothing without exposures.
-
-        misses: what is wrong with rays that miss each other. The watch excludes such rays as false
-        matches; where rays of this orientation have met before, a fluoroscope was knocked.
-        """
+    def publish_state(self) -> list[Status]:
+        """Publish the state of the watch; returns its diagnostics, nothing without exposures."""
         newest = self.newest
         if not self._parameters.drift_watch or newest is None:
             return []
@@ -140,8 +136,6 @@ class DriftMonitor:
             missing = ', '.join(self._missing_sizes())
             return [Status('drift', WARN, f'drift is not watched: no camera_info of {missing}')]
         state = watch.state
-        if misses is not None and state.observations:
-            state = replace(state, finding=replace(misses, severity=Severity.ERROR))
         message = message_from_drift_state(state, stamp_ns, orientation)
         self._publisher.publish(message)
         is_alarm = state.level == ALARM

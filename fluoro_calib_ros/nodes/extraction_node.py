@@ -62,7 +62,7 @@ from .runtime.parameters import (
     group,
     groups_of,
 )
-from .runtime.stream import stream_faults
+from .runtime.stream import remember, stream_faults
 from .runtime.topics import images_qos, observations_qos
 
 MODES = ('phantom', 'markers')
@@ -347,9 +347,7 @@ class ExtractionNode(StreamNode):
     def _retract(self, stream: ImageStream, task: Task, found: Observations) -> None:
         """Publish which ids of earlier images are taken back."""
         headers = stream.headers
-        headers[task.number] = task.message.header
-        if len(headers) > REVISED:
-            headers.popitem(last=False)
+        remember(headers, task.number, task.message.header, REVISED)
         for one in found.retracted:
             if one.frame not in headers:
                 continue

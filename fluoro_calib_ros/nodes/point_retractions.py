@@ -9,7 +9,6 @@ import threading
 from collections import OrderedDict
 from collections.abc import Mapping
 from functools import partial
-from typing import Any
 
 import numpy as np
 from fluoro_calib_msgs.msg import Retraction
@@ -18,6 +17,7 @@ from .messages.observations import nanoseconds_from_stamp, stamp_from_nanosecond
 from .messages.points import PointsContent
 from .runtime.diagnostics import RefusalLog
 from .runtime.lifecycle import StreamNode
+from .runtime.stream import remember
 from .runtime.topics import observations_qos
 
 TOPIC = 'retractions'
@@ -49,7 +49,7 @@ class PointRetractions:
         """Remember an exposure that was reconstructed, by the stamps of its views."""
         with self._lock:
             for key in stamps_ns.items():
-                _remember(self._exposures, key, content)
+                remember(self._exposures, key, content, REMEMBERED)
                 if key in self._early:
                     self._publish(content, self._early.pop(key))
 
@@ -60,7 +60,7 @@ class PointRetractions:
             if key in self._exposures:
                 self._publish(self._exposures[key], message)
             elif len(message.target_id) <= MAX_IDS:
-                _remember(self._early, key, message)
+                remember(self._early, key, message, REMEMBERED)
 
     def _publish(self, content: PointsContent, message: Retraction) -> None:
         wrong = np.intersect1d(content.target_id, message.target_id)
@@ -71,9 +71,3 @@ class PointRetractions:
         out.header.frame_id = content.orientation.frame_id
         self._output.publish(out)
         self.count += len(wrong)
-
-
-def _remember(values: OrderedDict[Any, Any], key: object, value: object) -> None:
-    values[key] = value
-    if len(values) > REMEMBERED:
-        values.popitem(last=False)

@@ -336,7 +336,7 @@ class ReconstructionNode(StreamNode):
         )
         status = Status('reconstruction', *health_of(state, CONDITIONS), self._values())
         bodies = [] if self._follower is None else statuses_of(self._follower, self.recent)
-        return [status, *bodies, *self._drift.publish_state(self._misses.finding())]
+        return [status, *bodies, *self._drift.publish_state()]
 
     def _recent(self) -> dict[str, int]:
         return self.recent.growth(

@@ -201,10 +201,11 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_colours_are_for_terminals(monkeypatch):
+def test_colours_are_for_terminals_without_no_color(monkeypatch):
     monkeypatch.delenv('NO_COLOR', raising=False)
     monkeypatch.setenv('TERM', 'xterm')
     assert output.styled('x', 'red', Terminal()) == '\033[31;1mx\033[0m'
+    assert output.styled('pass', 'green', Terminal()) == '\033[32;1mpass\033[0m'
     assert output.styled('x', 'red', io.StringIO()) == output.styled('x', '', Terminal()) == 'x'
     monkeypatch.setenv('TERM', 'dumb')
     assert output.styled('x', 'red', Terminal()) == 'x'

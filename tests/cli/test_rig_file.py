@@ -3,7 +3,6 @@
 
 """rig.toml, names of arguments, completion and colours of the command line."""
 
-import io
 import subprocess
 from pathlib import Path
 
@@ -12,7 +11,6 @@ from rigs import run
 
 from fluoro_calib_ros.cli import COMMANDS, main, make_parser
 from fluoro_calib_ros.cli.arguments import angle_options
-from fluoro_calib_ros.cli.output import styled
 from fluoro_calib_ros.cli.rig import find_rig
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.io.rig_file import RigFile, read_rig_file
@@ -207,17 +205,3 @@ def test_completion_script_is_valid_bash(capsys):
     assert ended.value.code == 0 and 'mayacam2' in script
     checked = subprocess.run(['bash', '-n'], input=script, text=True, capture_output=True)
     assert checked.returncode == 0, checked.stderr
-
-
-class Terminal(io.StringIO):
-    def isatty(self):
-        return True
-
-
-def test_colours_are_for_terminals_without_no_color(monkeypatch):
-    monkeypatch.delenv('NO_COLOR', raising=False)
-    monkeypatch.setenv('TERM', 'xterm')
-    assert styled('pass', 'green', Terminal()) == '\033[32;1mpass\033[0m'
-    assert styled('pass', 'green', io.StringIO()) == 'pass'
-    monkeypatch.setenv('NO_COLOR', '1')
-    assert styled('pass', 'green', Terminal()) == 'pass'

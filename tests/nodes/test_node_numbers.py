@@ -386,7 +386,7 @@ def test_parameters_that_only_ask_make_no_new_watches():
     assert monitor.make_watch(None) is None  # sizes are not known
     assert monitor.use(DriftParameters(drift_watch=False))
     monitor.newest = None, 'o', 7
-    assert monitor.publish_state(None) == []
+    assert monitor.publish_state() == []
 
 
 # ---- points and images

@@ -27,6 +27,7 @@ from ...photogrammetry import rig_orientation
 from ..messages.image import ImageConverter
 from ..messages.rig_orientation import orientation_from_message
 from ..runtime.diagnostics import Refused
+from ..runtime.stream import remember
 from ..runtime.topics import adapted_qos
 
 IDLE_S = 10.0  # after which a topic that nobody looks at is no longer subscribed
@@ -90,7 +91,7 @@ class Scene:
         has_images = self._take_image(name, film)
         depth = WAITING if has_images else 1
         for message in self._taken(f'{name}/target_observations', TargetObservations, depth):
-            _keep(film.points, _stamp_ns(message), message, WAITING)
+            remember(film.points, _stamp_ns(message), message, WAITING)
             film.found_at = time.monotonic()
         if has_images and film.images:
             stamp = _shown(film)
@@ -122,7 +123,7 @@ class Scene:
                 except Refused:  # the extraction node says what is wrong with it
                     continue
                 height, width = image.shape
-                _keep(film.images, _stamp_ns(message), (_jpeg(image), width, height), KEPT)
+                remember(film.images, _stamp_ns(message), (_jpeg(image), width, height), KEPT)
             return True
         return False
 
@@ -211,12 +212,6 @@ def _shown(film: _Film) -> int:
         return newest
     last = next(reversed(film.points))
     return max((stamp for stamp in film.images if stamp <= last), default=newest)
-
-
-def _keep(table: OrderedDict[int, Any], stamp: int, value: Any, most: int) -> None:
-    table[stamp] = value
-    while len(table) > most:
-        table.popitem(last=False)
 
 
 def _stamp_ns(message: Any) -> int:

@@ -6,12 +6,21 @@
 from __future__ import annotations
 
 import time
+from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from .diagnostics import Health, LatencyWindow, RefusalLog, StallDetector, fault, warning
 from .lifecycle import StreamNode
 from .streams import FaultHandlers
+
+
+def remember(table: OrderedDict[Any, Any], key: object, value: object, most: int) -> None:
+    """Keep a value by its key; of more than that many, the oldest is forgotten."""
+    table[key] = value
+    if len(table) > most:
+        table.popitem(last=False)
 
 
 class Stream:

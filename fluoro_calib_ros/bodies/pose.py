@@ -39,7 +39,7 @@ from ..reconstruction.reconstruct import IntersectedViews
 from .body import POSE_SIZE, Body
 from .image_points import Cameras, ImagePoints, Linear
 from .motion import PoseInformation, turn_of_twists, twist_between
-from .rigid import fitted_pose
+from .rigid import robust_pose
 
 MAX_STEPS = 8
 # Square of the next step in standard deviations below which the iteration ends. A step of
@@ -48,6 +48,9 @@ LAST_STEP = 1e-8  # a ten-thousandth of a standard deviation
 # Rotation [rad] up to which derivatives hold: what they neglect of a marker's place is half of its
 # square, 0.1 % of the distance from the centre.
 LINEAR_RAD = 0.05
+# Distance of markers from where they are predicted, over the size of their body, up to which an
+# iteration starts from the prediction. An error of rotation w leaves w^2 / 2: .3, .05, .001.
+START_RAD = 0.3
 # An exposure alone gives a pose if it determines the rotation so that derivatives hold at two
 # standard deviations.
 ALONE_SD_RAD = LINEAR_RAD / 2
@@ -153,6 +156,7 @@ class PoseSolver:
             self.target_id[row, :count] = body.target_id
             self.xyz[row, :count] = body.xyz_mm - self.centre[row]
             self.variance[row, :count] = body.sd_mm**2
+        self._size = np.linalg.norm(self.xyz, axis=2).max(axis=1)
         self._variance_3 = self.variance[..., None, None]
         self.cameras = Cameras(orientation, self.target_id)
         # Of each element of a step, how much of it the next one is about.
@@ -227,17 +231,18 @@ class PoseSolver:
         rotation = np.where(prediction.known[:, None, None], prediction.rotation, np.eye(3))
         centre = np.where(prediction.known[:, None], prediction.centre_mm, 0.0)
         started = prediction.known.copy()
-        if started.all():
-            return rotation, centre, started
-        xyz = self.cameras.places(exposure)
-        seen = np.isfinite(xyz).all(axis=2) & (points.seen.sum(axis=2) > 1)
-        missing = np.flatnonzero(~started & (np.count_nonzero(seen, axis=1) >= 3))
-        if len(missing):
-            place = np.where(seen[..., None], xyz, 0.0)[missing]
-            rotation[missing], centre[missing] = fitted_pose(
-                self.xyz[missing], place, seen[missing].astype(float)
-            )
-            started[missing] = True
+        place = self.cameras.places(exposure)
+        seen = np.isfinite(place).all(axis=2) & (points.seen.sum(axis=2) > 1)
+        predicted = self.xyz @ np.swapaxes(rotation, 1, 2) + centre[:, None]
+        away = np.linalg.norm(place - predicted, axis=2)
+        near = np.count_nonzero(seen & (away < START_RAD * self._size[:, None]), axis=1)
+        count = np.count_nonzero(seen, axis=1)
+        # Where a prediction is far off, as after two stamps that are nearly the same, the iteration
+        # would end elsewhere: the points in space tell where to start.
+        for row in np.flatnonzero((count >= 3) & (~started | (2 * near <= count))).tolist():
+            markers = seen[row]
+            rotation[row], centre[row] = robust_pose(self.xyz[row, markers], place[row, markers])
+            started[row] = True
         return rotation, centre, started
 
     def _converge(

@@ -32,6 +32,9 @@ MIN_LAYER = 8  # of a layer, and of the rest
 BORDERS = 40  # between layers that are tried along each axis
 FALSE_ALARM_LAYER = 1e-3
 MOTION = 6  # unknowns
+# Gap beside a border [sd of the survey's difference of two beads]. In a smaller one the survey's
+# own errors decide which bead lies on which side, and a layer seems displaced by its selection.
+BORDER_SDS = 3.0
 EXPLAINED = 0.5  # part of the excess of the square sum that a displaced layer explains
 IMPROVED = 2.0  # factor by which the median square of its beads falls
 
@@ -146,7 +149,7 @@ class _Fit:
         """Layers along an axis, with what their own motion gains."""
         coordinate = self._beads.survey_mm[:, axis]
         order = np.argsort(coordinate, kind='stable')
-        start, stop = _layers(coordinate[order]).T
+        start, stop = _layers(coordinate[order], self._beads.survey_sd_mm[order]).T
         own = _Equations(
             _sums(self._normals[order], start, stop), _sums(self._rights[order], start, stop)
         )
@@ -216,15 +219,18 @@ def _motions(x: np.ndarray) -> np.ndarray:
     return out
 
 
-def _layers(coordinate: np.ndarray) -> np.ndarray:
-    """Starts and stops (k, 2) of the layers to try, from coordinates (n,) in order.
+def _layers(coordinate: np.ndarray, sd: np.ndarray) -> np.ndarray:
+    """Starts and stops (k, 2) of the layers to try, from coordinates (n,) in order with their sd.
 
     Borders are where the gaps are largest. Of a face and the rest, the smaller one is tried.
     """
     count = len(coordinate)
-    gaps = np.argsort(-np.diff(coordinate), kind='stable')[:BORDERS] + 1
-    regular = np.linspace(0, count, BORDERS // 2).astype(int)
-    borders = np.unique(np.concatenate([[0, count], gaps, regular]))
+    gap = np.diff(coordinate)
+    gaps = np.argsort(-gap, kind='stable')[:BORDERS] + 1
+    regular = np.linspace(0, count, BORDERS // 2).astype(int)[1:-1]
+    inner = np.concatenate([gaps, regular])
+    clear = gap > BORDER_SDS * np.hypot(sd[1:], sd[:-1])
+    borders = np.unique(np.concatenate([[0, count], inner[clear[inner - 1]]]))
     pairs = borders[np.stack(np.triu_indices(len(borders), 1), axis=1)]
     size = pairs[:, 1] - pairs[:, 0]
     return pairs[(size >= MIN_LAYER) & (size <= count // 2)]

@@ -202,6 +202,21 @@ def test_an_exposure_that_is_not_later_is_not_taken():
     assert tracker.add(trial.exposures[2], 2, 4_000_000) is not None
 
 
+def test_stamps_of_arrival_lose_no_body():
+    """Exposures that are stamped when they arrive, some within a tenth of a millisecond."""
+    trial = Trial(seed=4, count=600)
+    rng = np.random.default_rng(11)
+    tracker = BodyTracker(trial.rig, trial.bodies)
+    arrived = 0
+    poses = []
+    for k, one in enumerate(trial.exposures):
+        late = rng.choice([0.0, 2e6, 9e6, 25e6], p=[0.6, 0.2, 0.15, 0.05])
+        arrived = max(round(1e9 * k / RATE + late), arrived + round(rng.uniform(2e4, 2e5)))
+        poses.append(tracker.add(one, k, arrived))
+    assert all(one.frame.alone.all() for one in poses)
+    assert all((one.status == PoseStatus.OK).all() for one in poses[1:])
+
+
 def test_errors_that_stay_are_not_smoothed_away():
     """The correction is the same error in all exposures, however many there are."""
     rng = np.random.default_rng(6)

@@ -470,9 +470,12 @@ def test_beads_of_which_most_points_are_rejected_are_named():
 
 def test_layers_are_between_the_largest_gaps():
     coordinate = np.concatenate([np.zeros(12), np.full(8, 10.0), np.full(20, 30.0)])
-    found = {tuple(pair) for pair in _layers(coordinate).tolist()}
+    found = {tuple(pair) for pair in _layers(coordinate, np.full(40, 0.1)).tolist()}
     assert {(0, 12), (12, 20), (20, 40), (0, 20)} <= found
     assert all(stop - start <= 20 for start, stop in found)
+    # The survey does not tell beads of less than 13 mm apart: only the last gap is a border.
+    vague = _layers(coordinate, np.full(40, 13 / 18**0.5)).tolist()
+    assert vague == [[0, 20], [20, 40]]
     sums = _sums(np.arange(1.0, 6.0), np.array([0, 2]), np.array([2, 5]))
     assert sums.tolist() == [3, 12]
 

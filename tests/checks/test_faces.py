@@ -90,6 +90,22 @@ def test_single_beads_and_noise_are_no_layer(shape):
         assert 4 <= len(check.place.target_id) <= 5 and 'shift_mm' not in check.numbers
 
 
+@pytest.mark.parametrize('shape', [plates, cloud])
+def test_errors_of_the_survey_select_no_layer(shape):
+    """The beads of a plate that are surveyed too high are no layer of their own."""
+    rng = np.random.default_rng(6)
+    for _ in range(20):
+        true = shape(rng)
+        survey = true + rng.normal(0, 0.1, true.shape)
+        found = true + rng.normal(0, SD_MM, true.shape)
+        covariance = np.tile(SD_MM**2 * np.eye(3), (len(true), 1, 1))
+        count = len(true)
+        beads = Beads(
+            np.arange(count), found, covariance, np.full(count, 4), survey, np.full(count, 0.1)
+        )
+        assert displaced_layer(beads) is None
+
+
 def test_noise_that_differs_between_exposures_accuses_none():
     """An exposure stands out only against the scatter of all."""
     rng = np.random.default_rng(4)

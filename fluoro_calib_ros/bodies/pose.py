@@ -237,8 +237,8 @@ class PoseSolver:
         away = np.linalg.norm(place - predicted, axis=2)
         near = np.count_nonzero(seen & (away < START_RAD * self._size[:, None]), axis=1)
         count = np.count_nonzero(seen, axis=1)
-        # Where a prediction is far off, as after two stamps that are nearly the same, the iteration
-        # would end elsewhere: the points in space tell where to start.
+        # Where a prediction is far off, as after two stamps that are nearly the same, the
+        # iteration would end elsewhere: the points in space tell where to start.
         for row in np.flatnonzero((count >= 3) & (~started | (2 * near <= count))).tolist():
             markers = seen[row]
             rotation[row], centre[row] = robust_pose(self.xyz[row, markers], place[row, markers])

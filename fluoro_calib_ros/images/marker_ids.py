@@ -15,32 +15,40 @@ anywhere.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from math import comb
 
 import numpy as np
 from scipy.spatial.distance import pdist
+from scipy.special import chdtri, erfc
 
-from ..bodies.body import Body
+from ..bodies.body import POSE_SIZE, Body
 from ..bodies.rigid import fitted_pose
 from ..correction.fluoroscope_calibration import Calibrations
 from ..errors import DataError
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.epipolar import EpipolarGeometry
 from ..reconstruction.intersection import OK, OUTSIDE, Intersector
-from .marker_intensity import MARKER_SCALES, check_image, learn_look, search_image
+from .marker_intensity import (
+    MARKER_SCALES,
+    FilteredImage,
+    check_image,
+    filter_image,
+    first_shadows,
+)
 from .marker_rays import AGREE, project_observed
 from .markers import FirstMarkers
 
 SHARE = 0.4  # of the response to a typical marker
 SHADOW_SD_PX = 0.25  # of the place of a shadow that is not measured
-TOLERANCE_MM = 0.6  # of a distance between two points that are not measured yet
-RMS_MM = 0.35  # of the members of a body about its shape
+REJECT = 4.0  # standardised deviation above which a distance is not that of two members
+CHANCE = float(erfc(REJECT / 2**0.5))  # of the same deviation
 MIN_MEMBERS = 4
 MIN_SHARE = 0.6  # of the members that are found
-BETTER = 2.0  # factor on the RMS of another way to fit as many members
-MAX_CHANCE = 1e-3  # number of fits as good that chance gives in an exposure
+BETTER = 4.0  # factor on the square sum of another way to fit as many members
+# Number of fits as good that chance gives in an exposure: one in a day at 100 exposures a second.
+MAX_CHANCE = 1e-7
 MAX_SHADOWS = 120
 MAX_STEPS = 200_000  # of the search
 
@@ -55,15 +63,29 @@ class CalibratedRig:
 
 
 @dataclass(frozen=True)
+class _Points:
+    """Points (n, 3) in space [mm], variances (n,) of them, and rows (n, 2) of their shadows."""
+
+    xyz: np.ndarray
+    variance: np.ndarray  # in the direction in which it is largest
+    pairs: np.ndarray
+
+
+@dataclass(frozen=True)
 class _Fit:
     """Points (k,) of the members of a body, -1 for none, and how well they fit."""
 
     point: np.ndarray
     rms_mm: float
+    chi2: float
 
     @property
     def count(self) -> int:
         return int(np.count_nonzero(self.point >= 0))
+
+    def only(self, members: np.ndarray) -> _Fit:
+        """Return the fit without the points of other members than these (k,)."""
+        return replace(self, point=np.where(members, self.point, -1))
 
 
 def identify_markers(
@@ -108,11 +130,17 @@ def identify_markers(
     count = sum(len(body.target_id) for body in bodies)
     reason: DataError | None = None
     best: dict[str, FirstMarkers] = {}
+    filtered: dict[float, list[FilteredImage]] = {}
     # What else is round in the images may be larger, and more distinct. Of many bodies, perhaps
     # one is there.
-    for strongest, scale in product((2 * count, MIN_MEMBERS), MARKER_SCALES[:3]):
+    for strongest, scale in product((count, MIN_MEMBERS), MARKER_SCALES[:3]):
         try:
-            shadows = [_shadows(images[name], strongest, scale) for name in names]
+            if scale not in filtered:
+                filtered[scale] = [filter_image(images[name], scale) for name in names]
+            shadows = [
+                first_shadows(image, strongest, SHARE).strongest(MAX_SHADOWS).uv
+                for image in filtered[scale]
+            ]
             found, missing = find_bodies(shadows, rig, bodies)
         except DataError as error:
             reason = reason or error
@@ -138,23 +166,18 @@ def _count(found: Mapping[str, FirstMarkers]) -> int:
     return sum(len(first.target_id) for first in found.values())
 
 
-def _shadows(image: np.ndarray, count: int, scale: float) -> np.ndarray:
-    """Places (n, 2) of the most distinct shadows of a size. Raises DataError for none."""
-    found = search_image(image, learn_look(image, None, count, (scale,)), SHARE)
-    return found.strongest(MAX_SHADOWS).uv
-
-
 def find_bodies(
     shadows: Sequence[np.ndarray], rig: CalibratedRig, bodies: Sequence[Body]
 ) -> tuple[dict[str, FirstMarkers], list[DataError]]:
     """Find bodies among shadows (k, 2) of both views; return their markers, and why not all."""
-    xyz, pairs = _points(shadows, rig)
+    points = _points(shadows, rig)
     fits: list[tuple[Body, _Fit]] = []
     missing = []
-    free = np.ones(len(xyz), dtype=bool)
+    pairs = points.pairs
+    free = np.ones(len(pairs), dtype=bool)
     for body in sorted(bodies, key=lambda body: -len(body.target_id)):
         try:
-            fit = _fit(body, xyz, free)
+            fit = _fit(body, points, free)
         except DataError as error:
             missing.append(error)
             continue
@@ -165,14 +188,14 @@ def find_bodies(
     if not fits:
         return {}, missing
     found = {
-        name: _first(view, rig, fits, (xyz, pairs, shadows[view]))
+        name: _first(view, rig, fits, points, shadows[view])
         for view, name in enumerate(rig.orientation.fluoroscopes)
     }
     return found, missing
 
 
-def _points(shadows: Sequence[np.ndarray], rig: CalibratedRig) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 3) [mm] where rays of shadows meet, and the rows (n, 2) of these shadows."""
+def _points(shadows: Sequence[np.ndarray], rig: CalibratedRig) -> _Points:
+    """Points where rays of shadows meet."""
     orientation = rig.orientation
     names = orientation.fluoroscopes
     corrected = [
@@ -190,12 +213,13 @@ def _points(shadows: Sequence[np.ndarray], rig: CalibratedRig) -> tuple[np.ndarr
     b = b[near]
     points = Intersector(orientation, None).intersect(uv, sigma)
     good = np.isin(points.status, (OK, OUTSIDE)) & (points.standardised < AGREE)
-    return points.xyz_mm[good], np.column_stack([a, b])[good]
+    variance = np.linalg.eigvalsh(points.covariance[good])[:, -1]
+    return _Points(points.xyz_mm[good], variance, np.column_stack([a, b])[good])
 
 
-def _fit(body: Body, xyz: np.ndarray, free: np.ndarray) -> _Fit:
-    """Find the members of a body among points (n, 3). Raises DataError."""
-    search = _Search(body, xyz, free)
+def _fit(body: Body, points: _Points, free: np.ndarray) -> _Fit:
+    """Find the members of a body among points. Raises DataError."""
+    search = _Search(body, points, free)
     search.run()
     least = max(MIN_MEMBERS, int(np.ceil(MIN_SHARE * len(body.target_id))))
     best = search.best
@@ -205,15 +229,18 @@ def _fit(body: Body, xyz: np.ndarray, free: np.ndarray) -> _Fit:
             f'body {body.name}: only {found} of {len(body.target_id)} markers fit its shape '
             'in this exposure'
         )
-    if search.second is not None and search.second.rms_mm < BETTER * best.rms_mm:
-        raise DataError(
-            f'body {body.name}: its shape fits in more than one way in this exposure, its '
-            'distances do not tell the markers apart'
-        )
-    if _by_chance(body, best, xyz[free]) > MAX_CHANCE:
+    if _by_chance(body, best, points.xyz[free]) > MAX_CHANCE:
         raise DataError(
             f'body {body.name}: {best.count} of {len(body.target_id)} markers fit its shape in '
             f'this exposure, but so may others of {np.count_nonzero(free)} points by chance'
+        )
+    # Where a body fits in more than one way, the members are known in which all ways agree.
+    rivals = [fit.point for fit in search.fits if fit.chi2 < BETTER * best.chi2]
+    best = best.only((np.array(rivals) == best.point).all(axis=0))
+    if best.count < least:
+        raise DataError(
+            f'body {body.name}: its shape fits in more than one way in this exposure, its '
+            'distances do not tell the markers apart'
         )
     return best
 
@@ -241,14 +268,17 @@ def _by_chance(body: Body, fit: _Fit, xyz: np.ndarray) -> float:
 class _Search:
     """Search of a body with backtracking: members are points with the right distances."""
 
-    def __init__(self, body: Body, xyz: np.ndarray, free: np.ndarray) -> None:
+    def __init__(self, body: Body, points: _Points, free: np.ndarray) -> None:
         self.body = body
-        self.xyz = xyz
+        self.points = points
+        xyz = points.xyz
         self.wanted = np.linalg.norm(body.xyz_mm[:, None] - body.xyz_mm[None], axis=2)
         self.given = np.linalg.norm(xyz[:, None] - xyz[None], axis=2)
+        # Variances of the distances, of the points and of the shape.
+        self.given_variance = points.variance[:, None] + points.variance
+        self.wanted_variance = body.sd_mm[:, None] ** 2 + body.sd_mm**2
         self.free = free
-        self.best: _Fit | None = None
-        self.second: _Fit | None = None
+        self.fits: list[_Fit] = []  # with as many members as the best one
         self.steps = 0
         self.point = np.full(len(body.target_id), -1)
 
@@ -263,7 +293,7 @@ class _Search:
             raise DataError(f'body {self.body.name}: too many round shadows to search')
         size = len(self.point)
         chosen = np.flatnonzero(self.point >= 0)
-        least = self.best.count if self.best is not None else MIN_MEMBERS
+        least = self.fits[0].count if self.fits else MIN_MEMBERS
         if len(chosen) + size - member < least:
             return
         if member == size:
@@ -272,7 +302,9 @@ class _Search:
         fits = free.copy()
         for other in chosen:
             away = self.given[self.point[other]] - self.wanted[other, member]
-            fits &= np.abs(away) < TOLERANCE_MM
+            variance = self.given_variance[self.point[other]]
+            variance = variance + self.wanted_variance[other, member]
+            fits &= away**2 < REJECT**2 * variance
         for point in np.flatnonzero(fits).tolist():
             self.point[member] = point
             free[point] = False
@@ -286,46 +318,42 @@ class _Search:
         chosen = self.point >= 0
         if np.count_nonzero(chosen) < MIN_MEMBERS:
             return
-        xyz = self.xyz[self.point[chosen]]
-        rotation, shift = fitted_pose(self.body.xyz_mm[chosen], xyz)
-        error = self.body.xyz_mm[chosen] @ rotation.T + shift - xyz
-        rms = float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
-        if rms > RMS_MM:
+        xyz = self.points.xyz[self.point[chosen]]
+        variance = self.points.variance[self.point[chosen]] + self.body.sd_mm[chosen] ** 2
+        rotation, shift = fitted_pose(self.body.xyz_mm[chosen], xyz, 1 / variance)
+        squares = np.sum((self.body.xyz_mm[chosen] @ rotation.T + shift - xyz) ** 2, axis=1)
+        chi2 = float(np.sum(squares / variance))
+        if chi2 > chdtri(3 * len(xyz) - POSE_SIZE, CHANCE):
             return
-        fit = _Fit(self.point.copy(), rms)
-        if self.best is None or (fit.count, -fit.rms_mm) > (self.best.count, -self.best.rms_mm):
-            if self.best is not None and self.best.count == fit.count:
-                self._rival(self.best)
-            else:
-                self.second = None
-            self.best = fit
-        elif fit.count == self.best.count:
-            self._rival(fit)
+        fit = _Fit(self.point.copy(), float(np.sqrt(np.mean(squares))), chi2)
+        if self.fits and fit.count > self.fits[0].count:
+            self.fits.clear()
+        self.fits.append(fit)
 
-    def _rival(self, fit: _Fit) -> None:
-        """Note another choice with as many members."""
-        if self.second is None or fit.rms_mm < self.second.rms_mm:
-            self.second = fit
+    @property
+    def best(self) -> _Fit | None:
+        """The fit of most members, of several the closest one."""
+        return min(self.fits, key=lambda fit: fit.chi2, default=None)
 
 
 def _first(
     view: int,
     rig: CalibratedRig,
     fits: Sequence[tuple[Body, _Fit]],
-    found: tuple[np.ndarray, np.ndarray, np.ndarray],
+    points: _Points,
+    shadows: np.ndarray,
 ) -> FirstMarkers:
-    """Return the markers of a view; found are points, their pairs, and the shadows of the view."""
-    xyz, pairs, shadows = found
+    """Return the markers of a view with these shadows."""
     name = rig.orientation.fluoroscopes[view]
     calibration = rig.calibrations[name]
     ids = []
     places = []
     for body, fit in fits:
         chosen = fit.point >= 0
-        rotation, shift = fitted_pose(body.xyz_mm[chosen], xyz[fit.point[chosen]])
+        rotation, shift = fitted_pose(body.xyz_mm[chosen], points.xyz[fit.point[chosen]])
         members = body.xyz_mm @ rotation.T + shift
         place = project_observed(rig.orientation, view, calibration, members, rig.angles.get(name))
-        place[chosen] = shadows[pairs[fit.point[chosen], view]]
+        place[chosen] = shadows[points.pairs[fit.point[chosen], view]]
         width, height = calibration.image_size
         inside = ((place > 0) & (place < np.array([width - 1, height - 1]))).all(axis=1)
         ids.append(np.asarray(body.target_id)[inside])

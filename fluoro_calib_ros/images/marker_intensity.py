@@ -10,7 +10,7 @@ shadow is the smaller eigenvalue of the Hessian, as in `detection`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -80,6 +80,21 @@ class MarkerLook:
         return self.scale * BLOB_RADIUS
 
 
+@dataclass(frozen=True)
+class FilteredImage:
+    """An image (h, w), filtered for shadows of one size: of dark and of bright ones."""
+
+    scale: float
+    lights: tuple[np.ndarray, np.ndarray]  # in which the shadows are dark
+    responses: tuple[np.ndarray, np.ndarray]
+    around: tuple[np.ndarray, np.ndarray]  # mean of the light around
+
+    def relative(self, polarity: int) -> np.ndarray:
+        """Responses over the light around."""
+        top = float(self.lights[0].flat[0] + self.lights[1].flat[0])
+        return np.asarray(self.responses[polarity] / np.maximum(self.around[polarity], 1e-3 * top))
+
+
 class LightWindows:
     """Reads windows of one image, markers dark."""
 
@@ -146,27 +161,56 @@ def learn_look(
     Without points, the count strongest shadows of each scale decide. scales are those that are
     tried. Raises DataError where there is nothing round.
     """
+    return _learned((filter_image(image, scale) for scale in scales), near, count)[0]
+
+
+def first_shadows(filtered: FilteredImage, count: int, share: float) -> Shadows:
+    """Find the shadows in an image that says itself what markers look like.
+
+    count: of the strongest shadows, which do; share: of their response that is found. Raises
+    DataError where there is nothing round.
+    """
+    look, filtered = _learned((filtered,), None, count)
+    polarity = int(look.inverted)
+    return _found(look, filtered.responses[polarity], filtered.around[polarity], share)
+
+
+def search_image(image: np.ndarray, look: MarkerLook, share: float) -> Shadows:
+    """Search a whole image for shadows with a share of the strength of a typical marker."""
     grey = image.astype(np.float32)
-    around = cv2.blur(grey, (2 * BACKGROUND_PX + 1,) * 2)
+    light = float(np.iinfo(image.dtype).max) - grey if look.inverted else grey
+    around = cv2.blur(light, (2 * BACKGROUND_PX + 1,) * 2)
+    return _found(look, _dark_response(light, look.scale), around, share)
+
+
+def filter_image(image: np.ndarray, scale: float) -> FilteredImage:
+    """Filter a whole image for round shadows of a size, dark and bright ones."""
+    grey = image.astype(np.float32)
     top = float(np.iinfo(image.dtype).max)
-    best: tuple[float, float, float, bool] | None = None
-    for scale in scales:
-        for inverted, response in zip((False, True), _responses(grey, scale)):
-            relative = response / np.maximum(top - around if inverted else around, 1e-3 * top)
-            typical = _typical(relative, scale, near, count)
+    around = cv2.blur(grey, (2 * BACKGROUND_PX + 1,) * 2)
+    lights = (grey, top - grey)
+    return FilteredImage(scale, lights, _responses(grey, scale), (around, top - around))
+
+
+def _learned(
+    images: Iterable[FilteredImage], near: np.ndarray | None, count: int
+) -> tuple[MarkerLook, FilteredImage]:
+    """Return what `learn_look` does, from an image filtered at some scales, and the best."""
+    best: tuple[float, float, FilteredImage, int] | None = None
+    for filtered in images:
+        for polarity in (0, 1):
+            relative = filtered.relative(polarity)
+            typical = _typical(relative, filtered.scale, near, count)
             # Small scales have the strongest response to noise, too.
             noise = float(np.median(relative[relative > 0])) if (relative > 0).any() else 1.0
             merit = typical / (noise + NOISE_WEIGHT * typical)
             if best is None or merit * typical > best[0]:
-                best = (merit * typical, typical, scale, inverted)
+                best = (merit * typical, typical, filtered, polarity)
     assert best is not None
-    _, strength, scale, inverted = best
-    light = top - grey if inverted else grey
-    field = field_of_view(light, scale)
-    relative = _dark_response(light, scale) / np.maximum(
-        cv2.blur(light, (2 * BACKGROUND_PX + 1,) * 2), 1e-3 * top
-    )
-    quiet = relative[field]
+    _, strength, filtered, polarity = best
+    light = filtered.lights[polarity]
+    field = field_of_view(light, filtered.scale)
+    quiet = filtered.relative(polarity)[field]
     noise = float(np.median(quiet[quiet > 0])) if (quiet > 0).any() else 0.0
     floor = max(MIN_SNR * noise, MIN_CONTRAST)
     if strength < floor:
@@ -175,17 +219,20 @@ def learn_look(
             cause = 'there are no markers in the image, nothing round rises above the noise'
         raise DataError(cause, kind=Kind.NO_MARKERS)
     usual = float(np.median(light[field])) if field.any() else float(light.mean())
-    return MarkerLook(
-        scale, inverted, field=field, strength=strength, floor=floor, light=max(usual, 1.0)
+    look = MarkerLook(
+        filtered.scale,
+        bool(polarity),
+        field=field,
+        strength=strength,
+        floor=floor,
+        light=max(usual, 1.0),
     )
+    return look, filtered
 
 
-def search_image(image: np.ndarray, look: MarkerLook, share: float) -> Shadows:
-    """Search a whole image for shadows with a share of the strength of a typical marker."""
-    grey = image.astype(np.float32)
-    light = float(np.iinfo(image.dtype).max) - grey if look.inverted else grey
-    around = cv2.blur(light, (2 * BACKGROUND_PX + 1,) * 2)
-    response = _relative(_dark_response(light, look.scale), around, look)
+def _found(look: MarkerLook, response: np.ndarray, around: np.ndarray, share: float) -> Shadows:
+    """Find the shadows of a whole image by its response and the light around its pixels."""
+    response = _relative(response, around, look)
     response[~look.field] = 0
     response[[0, -1]] = 0
     response[:, [0, -1]] = 0

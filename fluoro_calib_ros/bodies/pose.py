@@ -48,9 +48,6 @@ LAST_STEP = 1e-8  # a ten-thousandth of a standard deviation
 # Rotation [rad] up to which derivatives hold: what they neglect of a marker's place is half of its
 # square, 0.1 % of the distance from the centre.
 LINEAR_RAD = 0.05
-# Distance of markers from where they are predicted, over the size of their body, up to which an
-# iteration starts from the prediction. An error of rotation w leaves w^2 / 2: .3, .05, .001.
-START_RAD = 0.3
 # An exposure alone gives a pose if it determines the rotation so that derivatives hold at two
 # standard deviations.
 ALONE_SD_RAD = LINEAR_RAD / 2
@@ -156,7 +153,6 @@ class PoseSolver:
             self.target_id[row, :count] = body.target_id
             self.xyz[row, :count] = body.xyz_mm - self.centre[row]
             self.variance[row, :count] = body.sd_mm**2
-        self._size = np.linalg.norm(self.xyz, axis=2).max(axis=1)
         self._variance_3 = self.variance[..., None, None]
         self.cameras = Cameras(orientation, self.target_id)
         # Of each element of a step, how much of it the next one is about.
@@ -170,16 +166,33 @@ class PoseSolver:
     def solve(self, exposure: IntersectedViews, prediction: Prediction) -> FramePoses:
         """Solve for the poses of one exposure; the views are those of the orientation."""
         points = self.cameras.sorted(exposure)
-        rotation, centre, started = self._start(exposure, points, prediction)
-        used = points.seen.any(axis=2) & started[:, None]
+        rotation = np.where(prediction.known[:, None, None], prediction.rotation, np.eye(3))
+        centre = np.where(prediction.known[:, None], prediction.centre_mm, 0.0)
+        started = prediction.known.copy()
+        if not started.all():
+            self._start(exposure, points, np.flatnonzero(~started), (rotation, centre, started))
+        seen = points.seen.any(axis=2)
+        used = seen & started[:, None]
         test = np.full(used.shape, np.nan)
-        for _ in range(self.xyz.shape[1]):
+        from_prediction = prediction.known
+        for _ in range(self.xyz.shape[1] + 1):
             solution = self._converge((rotation, centre), points, used, prediction)
             wrong, worst = self._false_markers(solution, (points, used), prediction, test)
+            rotation, centre = solution.rotation, solution.centre
+            # From a prediction that is far off, as after two stamps that are nearly the same, an
+            # iteration may end elsewhere: the points in space tell where to start.
+            doubted = ~solution.alone & from_prediction
+            doubted[wrong] = from_prediction[wrong]
+            again = self._start(
+                exposure, points, np.flatnonzero(doubted), (rotation, centre, started)
+            )
+            from_prediction = from_prediction & ~doubted
+            if again:
+                test[doubted] = np.nan
+                continue
             if not len(wrong):
                 break
             used[wrong, worst] = False
-            rotation, centre = solution.rotation, solution.centre
         ambiguous = self._ambiguous(solution, points, used, prediction)
         return self._result(solution, (points, used), prediction, test, ambiguous)
 
@@ -225,25 +238,27 @@ class PoseSolver:
         return bool(squares > self._limit[3])
 
     def _start(
-        self, exposure: IntersectedViews, points: ImagePoints, prediction: Prediction
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """First rotations and centres, and whether (B,) there are any."""
-        rotation = np.where(prediction.known[:, None, None], prediction.rotation, np.eye(3))
-        centre = np.where(prediction.known[:, None], prediction.centre_mm, 0.0)
-        started = prediction.known.copy()
-        place = self.cameras.places(exposure)
-        seen = np.isfinite(place).all(axis=2) & (points.seen.sum(axis=2) > 1)
-        predicted = self.xyz @ np.swapaxes(rotation, 1, 2) + centre[:, None]
-        away = np.linalg.norm(place - predicted, axis=2)
-        near = np.count_nonzero(seen & (away < START_RAD * self._size[:, None]), axis=1)
-        count = np.count_nonzero(seen, axis=1)
-        # Where a prediction is far off, as after two stamps that are nearly the same, the
-        # iteration would end elsewhere: the points in space tell where to start.
-        for row in np.flatnonzero((count >= 3) & (~started | (2 * near <= count))).tolist():
+        self,
+        exposure: IntersectedViews,
+        points: ImagePoints,
+        rows: np.ndarray,
+        pose: tuple[np.ndarray, np.ndarray, np.ndarray],
+    ) -> bool:
+        """Start bodies at points in space; returns whether there are enough of any.
+
+        pose: rotations, centres, and whether (B,) there are any; they are changed.
+        """
+        if not len(rows):
+            return False
+        rotation, centre, started = pose
+        xyz = self.cameras.places(exposure)
+        seen = np.isfinite(xyz).all(axis=2) & (points.seen.sum(axis=2) > 1)
+        enough = rows[np.count_nonzero(seen[rows], axis=1) >= 3]
+        for row in enough.tolist():
             markers = seen[row]
-            rotation[row], centre[row] = robust_pose(self.xyz[row, markers], place[row, markers])
+            rotation[row], centre[row] = robust_pose(self.xyz[row, markers], xyz[row, markers])
             started[row] = True
-        return rotation, centre, started
+        return len(enough) > 0
 
     def _converge(
         self,

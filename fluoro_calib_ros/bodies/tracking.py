@@ -220,20 +220,14 @@ def _filled_backwards(taken: Sequence[_Taken]) -> list[_Taken]:
 
 def poses_of(bodies: Sequence[Body], exposures: Sequence[TrackedExposure]) -> list[BodyPoses]:
     """Poses of the frames of the bodies, from those of the centres of their markers."""
-    return [
-        _poses(
-            body,
-            exposures,
-            rotation=np.array([one.rotation[row] for one in exposures]),
-            centre=np.array([one.centre_mm[row] for one in exposures]),
-            covariances=(
-                np.array([one.covariance[row][POSE, POSE] for one in exposures]),
-                np.array([one.fixed[row] for one in exposures]),
-            ),
-            row=row,
-        )
-        for row, body in enumerate(bodies)
-    ]
+    return _poses(
+        bodies,
+        exposures,
+        pose=(_by_body(exposures, 'rotation'), _by_body(exposures, 'centre_mm')),
+        noise=_by_body(exposures, 'covariance')[..., POSE, POSE],
+        fixed=_by_body(exposures, 'fixed'),
+        status=_by_body(exposures, 'status'),
+    )
 
 
 def twists_of(
@@ -263,55 +257,66 @@ def twists_of(
 
 def poses_alone(bodies: Sequence[Body], exposures: Sequence[TrackedExposure]) -> list[BodyPoses]:
     """Poses that each exposure gives alone, without a filter."""
-    out = []
-    for row, body in enumerate(bodies):
-        frames = [one.frame for one in exposures]
-        poses = _poses(
-            body,
-            exposures,
-            rotation=np.array([frame.rotation[row] for frame in frames]),
-            centre=np.array([frame.centre_mm[row] for frame in frames]),
-            covariances=(
-                np.array([frame.covariance_noise[row] for frame in frames]),
-                np.array([frame.covariance_fixed[row] for frame in frames]),
-            ),
-            row=row,
-        )
-        alone = np.array([frame.alone[row] for frame in frames])
-        status = np.where(alone, PoseStatus.OK, PoseStatus.FAILED).astype(np.uint8)
-        out.append(replace(poses, status=status))
-    return out
+    frames = [one.frame for one in exposures]
+    alone = _by_body(frames, 'alone')
+    return _poses(
+        bodies,
+        exposures,
+        pose=(_by_body(frames, 'rotation'), _by_body(frames, 'centre_mm')),
+        noise=_by_body(frames, 'covariance_noise'),
+        fixed=_by_body(frames, 'covariance_fixed'),
+        status=np.where(alone, PoseStatus.OK, PoseStatus.FAILED).astype(np.uint8),
+    )
+
+
+def _by_body(exposures: Sequence[object], name: str) -> NDArray[np.float64]:
+    """Stack values (B, T, ...) of T exposures."""
+    return np.stack([getattr(one, name) for one in exposures], axis=1)
 
 
 def _poses(
-    body: Body,
+    bodies: Sequence[Body],
     exposures: Sequence[TrackedExposure],
-    rotation: np.ndarray,
-    centre: np.ndarray,
-    covariances: tuple[np.ndarray, np.ndarray],
-    row: int,
-) -> BodyPoses:
-    """Move poses from the centre of the markers to the origin of a body: t = c - R x_c."""
-    arm = rotation @ body.centre
-    move = np.broadcast_to(np.eye(POSE_SIZE), (len(exposures), POSE_SIZE, POSE_SIZE)).copy()
-    move[:, :3, 3:] = cross_matrix(arm)
-    back = np.swapaxes(move, 1, 2)
-    noise = move @ covariances[0] @ back
-    fixed = covariances[1]
-    if body.frame_covariance.any():
+    pose: tuple[np.ndarray, np.ndarray],
+    *,
+    noise: np.ndarray,
+    fixed: np.ndarray,
+    status: np.ndarray,
+) -> list[BodyPoses]:
+    """Move poses from the centres of the markers to the origins of B bodies: t = c - R x_c.
+
+    pose: rotations (B, T, 3, 3) and centres (B, T, 3); noise, fixed (B, T, 6, 6).
+    """
+    rotation, centre = pose
+    arm = (rotation @ np.array([body.centre for body in bodies])[:, None, :, None])[..., 0]
+    move = np.zeros(noise.shape)
+    move[..., range(POSE_SIZE), range(POSE_SIZE)] = 1.0
+    move[..., :3, 3:] = cross_matrix(arm)
+    back = np.swapaxes(move, 2, 3)
+    frames = np.array([body.frame_covariance for body in bodies])
+    if frames.any():
         axes = np.zeros_like(move)
-        axes[:, :3, :3] = axes[:, 3:, 3:] = rotation
-        fixed = fixed + axes @ body.frame_covariance @ np.swapaxes(axes, 1, 2)
+        axes[..., :3, :3] = axes[..., 3:, 3:] = rotation
+        fixed = fixed + axes @ frames[:, None] @ np.swapaxes(axes, 2, 3)
+    position = centre - arm
+    noise = move @ noise @ back
     fixed = move @ fixed @ back
-    return BodyPoses(
-        body.name,
-        np.array([one.number for one in exposures]),
-        np.array([one.stamp_ns for one in exposures]),
-        rotation=rotation,
-        position_mm=centre - arm,
-        covariance_noise=noise,
-        covariance_fixed=fixed,
-        rig_root=move @ np.array([one.rig_root[row] for one in exposures]),
-        markers=np.array([one.frame.markers[row] for one in exposures]),
-        status=np.array([one.status[row] for one in exposures]),
-    )
+    rig_root = move @ _by_body(exposures, 'rig_root')
+    markers = _by_body([one.frame for one in exposures], 'markers')
+    number = np.array([one.number for one in exposures])
+    stamp_ns = np.array([one.stamp_ns for one in exposures])
+    return [
+        BodyPoses(
+            body.name,
+            number,
+            stamp_ns,
+            rotation=rotation[row],
+            position_mm=position[row],
+            covariance_noise=noise[row],
+            covariance_fixed=fixed[row],
+            rig_root=rig_root[row],
+            markers=markers[row],
+            status=status[row],
+        )
+        for row, body in enumerate(bodies)
+    ]

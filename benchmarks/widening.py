@@ -91,9 +91,9 @@ class Stream:
         self.frames: dict[str, list[Frame]] = {name: [] for name in NAMES}
         false = []
         for rows, drift in ((~late, 0.0), (late, scenario.drift_px)):
-            given.scenario = replace(scenario, drift_px=drift)
+            of_part = replace(scenario, drift_px=drift)
             frames, wrong = given.seen(
-                self.points[rows], self.times[rows], given.errors + change[rows]
+                self.points[rows], self.times[rows], given.errors + change[rows], of_part
             )
             false.append(wrong)
             first = len(self.frames['a'])

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from .bodies.body import Body, BodyPoses
 from .bodies.joints import Joint, JointMotion
+from .bodies.shapes import LearnedShapes
 from .checks.check import Validation
 from .checks.verdict import validate
 from .correction.fluoroscope_calibration import CorrectedPoints, FluoroscopeCalibration
@@ -32,6 +33,7 @@ from .io.bodies import JointEntry, read_bodies, read_joints, write_bodies
 from .io.calibration import load_orientation, save_orientation
 from .io.calibration_request import read_request
 from .io.formats.content import FileSettings
+from .io.learned_shapes import read_learned_shapes, write_learned_shapes
 from .io.phantom import read_moving_points, read_phantom, write_phantom
 from .io.poses import write_reconstruction
 from .jobs.bodies import BodiesOptions, BodiesOutcome, save_bodies, track_bodies
@@ -40,6 +42,7 @@ from .jobs.conversion import ConversionRequest, convert
 from .jobs.extraction import ExtractionOutcome, ExtractionRequest
 from .jobs.extraction import run_extraction as extract
 from .jobs.healing import HealingOptions, HealingOutcome, heal_rig, save_healing
+from .jobs.learning import learn_shapes
 from .jobs.orientation import OrientationOutcome, orient
 from .jobs.reconstruction import ReconstructionOptions, ReconstructionOutcome, reconstruct
 from .jobs.result_folder import save_outcome, save_result
@@ -81,6 +84,7 @@ __all__ = [
     'JointMotion',
     'Kind',
     'KnownOrientation',
+    'LearnedShapes',
     'MeasuredDistance',
     'MovingPoints',
     'Names',
@@ -103,11 +107,13 @@ __all__ = [
     'correct',
     'extract',
     'heal_rig',
+    'learn_shapes',
     'load_orientation',
     'orient',
     'read_bodies',
     'read_calibrations',
     'read_joints',
+    'read_learned_shapes',
     'read_moving_points',
     'read_orientations',
     'read_phantom',
@@ -126,6 +132,7 @@ __all__ = [
     'track_bodies',
     'validate',
     'write_bodies',
+    'write_learned_shapes',
     'write_phantom',
     'write_reconstruction',
 ]

@@ -144,6 +144,7 @@ class Kind(str, Enum):
     # What has changed in a rig, and whether that is known.
     CAUSE_SURE = 'cause_sure'
     CHANGE_IDENTIFIED = 'change_identified'
+    COMMON_MOTION = 'common_motion'
     DISTORTION_CHANGED = 'distortion_changed'
     FLUOROSCOPE_MOVED = 'fluoroscope_moved'
     INTERIOR_CHANGED = 'interior_changed'

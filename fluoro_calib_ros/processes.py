@@ -22,6 +22,7 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
@@ -183,6 +184,27 @@ class WorkerProcess:
         process.terminate()
         process.join()
         return process.exitcode
+
+
+def in_worker_process(
+    function: Callable[..., Any],
+    *arguments: Any,
+    progress: Callable[..., None] | None = None,
+    raise_if_cancelled: Callable[[], None] | None = None,
+) -> Any:
+    """Return the result of one call of a function in a process with the resources of a job.
+
+    The function is one of a module. Errors are those of a call of a WorkerProcess.
+    """
+    process = WorkerProcess(partial(_given, function), 'the worker process', OF_JOB)
+    try:
+        return process(*arguments, progress=progress, raise_if_cancelled=raise_if_cancelled)
+    finally:
+        process.close()
+
+
+def _given(function: Callable[..., Any]) -> Callable[..., Any]:
+    return function
 
 
 class LentArrays:

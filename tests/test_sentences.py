@@ -513,7 +513,8 @@ MAKERS = {
     Kind.MARKER_MIGRATED: lambda: shape(lambda given: given + np.eye(5, 3)),
     Kind.MARKERS_EXCHANGED: lambda: shape(lambda given: given[[1, 0, 2, 3, 4]]),
     Kind.CAUSE_SURE: unsure_cause,
-    Kind.CHANGE_IDENTIFIED: lambda: healing._identified(Fake(weakest=0.7), None, None),
+    Kind.CHANGE_IDENTIFIED: lambda: healing._identified(0.7, True),
+    Kind.COMMON_MOTION: lambda: healing.common_motion(0.3),
     Kind.DISTORTION_CHANGED: lambda: changed(Cause.DISTORTION),
     Kind.FLUOROSCOPE_MOVED: lambda: changed(Cause.ORIENTATION),
     Kind.INTERIOR_CHANGED: lambda: changed(Cause.INTERIOR),
@@ -858,6 +859,9 @@ SENTENCES = {
     Kind.CHANGE_IDENTIFIED: (
         'the direction of the change that is known worst has a standard deviation of # % of what '
         'such a change may be: record bodies that move through more of the field of view'
+    ),
+    Kind.COMMON_MOTION: (
+        'all points together may have moved by # mm (RMS) in the rig frame, which no body shows'
     ),
     Kind.DISTORTION_CHANGED: 'fluoroscope a: the distortion has changed',
     Kind.FLUOROSCOPE_MOVED: (

@@ -37,6 +37,8 @@ class Body:
     frame_covariance : (6, 6) ndarray
         Of the frame itself against the markers: a shift [mm] and a rotation [rad] about their
         centre, along the axes of the body. 0 where sd_mm contains it.
+    covariance_mm2 : (3 m, 3 m) ndarray
+        Of the coordinates relative to each other; by default sd_mm, independent of each other.
     """
 
     name: str
@@ -46,6 +48,7 @@ class Body:
     frame_covariance: NDArray[np.float64] = field(
         default_factory=lambda: np.zeros((POSE_SIZE, POSE_SIZE))
     )
+    covariance_mm2: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         target_id = np.array(self.target_id, dtype=np.int64).reshape(-1)
@@ -72,6 +75,9 @@ class Body:
                 f'body {self.name}: the coordinates or the standard deviation of marker '
                 f'{target_id[bad][0]} are not finite, or negative'
             )
+        if self.covariance_mm2 is not None:
+            rows = (3 * order[:, None] + np.arange(3)).ravel()
+            object.__setattr__(self, 'covariance_mm2', self.covariance_mm2[np.ix_(rows, rows)])
         for name, array in (
             ('target_id', target_id),
             ('xyz_mm', xyz[order]),
@@ -87,11 +93,15 @@ class Body:
 
     def rows(self, chosen: NDArray[np.bool_]) -> Body:
         """The body with some of its markers (m,) only."""
+        covariance = self.covariance_mm2
+        if covariance is not None:
+            covariance = covariance[np.ix_(np.repeat(chosen, 3), np.repeat(chosen, 3))]
         return replace(
             self,
             target_id=self.target_id[chosen],
             xyz_mm=self.xyz_mm[chosen],
             sd_mm=self.sd_mm[chosen],
+            covariance_mm2=covariance,
         )
 
     @cached_property

@@ -407,15 +407,23 @@ def healed_rig(
     )
 
 
-def weakest_of_knock(diagnostician: Diagnostician, diagnosis: Diagnosis) -> float:
-    """Return how well a knock would have been seen, see `HealedRig.weakest`."""
+def unseen_knock(
+    diagnostician: Diagnostician, diagnosis: Diagnosis
+) -> tuple[NDArray[np.float64], float]:
+    """Return second moments (9F, 9F) of the knock that a rig may have had which seems unchanged.
+
+    Also returns how well it would have been seen, see `HealedRig.weakest`.
+    """
     adjustment = diagnostician.adjustment
     sd = np.zeros(adjustment.size)
     for change in diagnostician.knocks():
         sd = np.hypot(sd, diagnostician.sd_of(change))
     prior = diagnosis.prior.widened(sd)
     solution = adjustment.with_fixed(diagnosis.observed, prior, diagnosis.solution, sd > 0)
-    return _weakest(adjustment, solution.covariance[adjustment.rig, adjustment.rig], sd)
+    covariance = solution.covariance[adjustment.rig, adjustment.rig]
+    knock = solution.values[adjustment.rig]
+    moments = (covariance + covariance.T) / 2 + np.outer(knock, knock)
+    return moments, _weakest(adjustment, covariance, sd)
 
 
 def _weakest(adjustment: RigAdjustment, covariance: np.ndarray, sd: np.ndarray) -> float:

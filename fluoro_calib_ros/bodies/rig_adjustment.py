@@ -113,7 +113,8 @@ class Prior:
 
     #: (9F, 9F) covariance of the orientation, as it was calibrated
     orientation: NDArray[np.float64]
-    #: (K,) standard deviations of changes in addition, and of the other unknowns
+    #: (K,) standard deviations of changes in addition to what was known of rig and shapes, and of
+    #: the other unknowns
     sd: NDArray[np.float64]
     #: (B, M) factor of the standard deviations of the image points of a marker
     inflation: NDArray[np.float64]
@@ -174,6 +175,7 @@ class RigAdjustment:
             own = len(body.target_id)
             self.target_id[row, :own] = body.target_id
             self.xyz[row, :own] = body.xyz_mm - body.centre
+        self._of_shapes = [_shape_covariance(body, count) for body in bodies]
         self._views = len(orientation.fluoroscopes)
         sizes = [
             ORIENTATION_SIZE * self._views,
@@ -196,9 +198,6 @@ class RigAdjustment:
         shape_scale: standard deviation of the scale that all shapes have in common.
         """
         sd = np.zeros(self.size)
-        shape = sd[self.shape].reshape(self.xyz.shape)
-        for row, body in enumerate(self.bodies):
-            shape[row, : len(body.sd_mm)] = body.sd_mm[:, None]
         sd[self.scale] = shape_scale
         seen = observed.seen.sum(axis=0)
         drift = sd[self.drift].reshape(self._views, -1)
@@ -220,6 +219,11 @@ class RigAdjustment:
         root[self.rig, self.rig] = replace(
             self.orientation, covariance=covariance
         ).covariance_root()
+        of_shapes = sd[self.shape].reshape(len(self.bodies), -1)
+        for row, (covariance, widened) in enumerate(zip(self._of_shapes, of_shapes)):
+            first = self.shape.start + row * len(widened)
+            rows = slice(first, first + len(widened))
+            root[rows, rows] = _root_of(covariance + np.diag(widened**2))
         return root[:, (root != 0).any(axis=0)]
 
     def rig_at(self, values: np.ndarray) -> RigOrientation:
@@ -560,6 +564,22 @@ def _quantile(values: np.ndarray, share: float) -> np.ndarray:
     return lower + (at - below) * (ordered[row, np.ceil(at).astype(int)] - lower)
 
 
+def _shape_covariance(body: Body, count: int) -> np.ndarray:
+    """Covariance (3 count, 3 count) of the shape of a body, 0 where it has no markers."""
+    out = np.zeros((3 * count, 3 * count))
+    own = slice(3 * len(body.sd_mm))
+    known = body.covariance_mm2
+    out[own, own] = np.diag(np.repeat(body.sd_mm**2, 3)) if known is None else known
+    return out
+
+
+def _root_of(covariance: np.ndarray) -> np.ndarray:
+    """Root L of a covariance L L' that may be singular: of a motion of a whole body nothing."""
+    variance, axes = np.linalg.eigh(covariance)
+    rounding = len(variance) * np.finfo(float).eps * variance[-1]
+    return np.asarray(axes * np.sqrt(np.where(variance > rounding, variance, 0.0)))
+
+
 def _share_of_functions(functions: Functions) -> np.ndarray:
     """Standard deviations (n,) of coefficients that give a field of variance one.
 
@@ -597,10 +617,12 @@ def _moved(poses: Poses, normal: _Normal, step: np.ndarray) -> Poses:
 
 @dataclass(frozen=True)
 class RigErrors:
-    """Errors of points by those of a rig, relative to each other."""
+    """Errors of points by those of a rig: relative to each other, and of all together."""
 
     scale: float  #: standard deviation of the scale
     place_mm: float  #: of a coordinate, where all points move together freely
+    #: RMS distance by which points move together, as a rigid body
+    common_mm: float
 
 
 def rig_errors(orientation: RigOrientation, points_mm: NDArray[np.float64]) -> RigErrors:
@@ -632,7 +654,9 @@ def rig_errors(orientation: RigOrientation, points_mm: NDArray[np.float64]) -> R
     rigid = rigid.reshape(-1, POSE_SIZE)
     similar = np.column_stack([rigid, arm.ravel()])
     scale = np.linalg.pinv(similar)[-1] @ moved
-    rest = moved - rigid @ (np.linalg.pinv(rigid) @ moved)
+    common = rigid @ (np.linalg.pinv(rigid) @ moved)
+    by_coordinate = (np.sqrt(np.mean(np.sum(x**2, axis=1))) for x in (moved - common, common))
+    place_mm, common_mm = map(float, by_coordinate)
     return RigErrors(
-        float(np.sqrt(scale @ scale)), float(np.sqrt(np.mean(np.sum(rest**2, axis=1))))
+        float(np.sqrt(scale @ scale)), place_mm, common_mm=float(np.sqrt(3)) * common_mm
     )

@@ -27,12 +27,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from ..errors import DataError
 from ..findings import Finding, Kind, Place, Severity
 from ..photogrammetry.rotations import cross_matrix
 from .body import POSE_SIZE, Body
 from .rigid import by_pose, fitted_pose
 
 ROUNDS = 4  # the problem is nearly linear once poses are known
+# Share of the places of a marker that may be false matches, and are left out: of 1 % false image
+# points some 0.3 % are near enough to the epipolar line to become a place. A marker with more of
+# them moves against the others.
+FALSE_SHARE = 0.05
 # ISO 16087:2013 and Valstar et al., "Guidelines for standardization of radiostereometry", Acta
 # Orthop. 76, 2005: condition number [1/m] above which markers lie too near a line, and mean error
 # of rigid-body fitting [mm] above which a body is not stable.
@@ -61,18 +66,49 @@ class BodyPlaces:
         """Return (T, m) whether a marker is known in space."""
         return np.asarray(np.isfinite(self.xyz_mm).all(axis=2))
 
+    def without(self, places: NDArray[np.bool_]) -> BodyPlaces:
+        """Return the same without some places (T, m)."""
+        return replace(self, xyz_mm=np.where(places[..., None], np.nan, self.xyz_mm))
+
 
 @dataclass(frozen=True)
 class EstimatedShape:
     """The shape of a body."""
 
-    #: coordinates in its frame, their standard deviations relative to each other, and the
-    #: covariance of the frame by CT
+    #: coordinates in its frame, their covariance relative to each other, and that of the frame by
+    #: CT
     body: Body
     condition: float  #: condition number [1/m]
     mean_error_mm: float  #: mean error of rigid-body fitting, over all exposures
     exposures: int  #: exposures that contributed
     findings: tuple[Finding, ...]
+
+
+@dataclass(frozen=True)
+class LearnedShapes:
+    """Shapes of bodies as a healthy rig has seen them."""
+
+    #: with the covariance of their coordinates; without markers that were not seen
+    bodies: tuple[Body, ...]
+    #: of the orientation that they were learned with, then of those that they have healed
+    orientation_ids: tuple[str, ...]
+    calibration_ids: Mapping[str, str]  #: by fluoroscope, that they were learned with
+    begin_ns: int  #: stamps of the first and of the last exposure
+    end_ns: int
+    exposures: int  #: that the drift watch has seen, and shapes were estimated from
+    findings: tuple[Finding, ...] = ()  #: about bodies, also those that were left out
+
+    def with_healed(self, orientation_id: str) -> LearnedShapes:
+        """Return the same for an orientation that they have healed, too."""
+        return replace(self, orientation_ids=(*self.orientation_ids, orientation_id))
+
+    def check(self, orientation_id: str) -> None:
+        """Raise DataError unless they belong to an orientation."""
+        if orientation_id not in self.orientation_ids:
+            raise DataError(
+                f'the shapes were learned with {self.orientation_ids[0]}, not with the '
+                f'orientation {orientation_id}; learn them anew while the rig is healthy'
+            )
 
 
 def condition_number(xyz_mm: NDArray[np.float64]) -> float:
@@ -110,6 +146,13 @@ def estimate_shape(body: Body, places: BodyPlaces) -> EstimatedShape:
     if wrong:
         return _unchanged(body, wrong)
     adjustment = _adjust(body, places, start)
+    # A false place takes those of the other markers in its exposure with it, which go, too.
+    while (false := _false_places(adjustment)).any():
+        places = places.without(false)
+        start = _start(body, places)
+        if start is None:
+            return _unchanged(body, [_unseen(body)])
+        adjustment = _adjust(body, places, start)
     known = np.isfinite(adjustment.xyz).all(axis=1)
     findings = _contradictions(body, places, adjustment)
     moved = [marker for one in findings if one.kind in _MOVED for marker in one.place.target_id]
@@ -121,10 +164,12 @@ def estimate_shape(body: Body, places: BodyPlaces) -> EstimatedShape:
     frame, relative = _datum(shape[known], adjustment.covariance)
     sd = np.full(len(shape), np.inf)
     sd[known] = np.sqrt(np.diagonal(relative).reshape(-1, 3).mean(axis=1))
+    covariance = np.diag(np.full(3 * len(shape), np.inf))
+    covariance[np.ix_(np.repeat(known, 3), np.repeat(known, 3))] = relative
     condition = condition_number(shape[known])
     findings += _stability(body, condition, adjustment.mean_error_mm)
     return EstimatedShape(
-        replace(body, xyz_mm=shape, sd_mm=sd, frame_covariance=frame),
+        replace(body, xyz_mm=shape, sd_mm=sd, frame_covariance=frame, covariance_mm2=covariance),
         condition,
         mean_error_mm=adjustment.mean_error_mm,
         exposures=adjustment.exposures,
@@ -142,6 +187,7 @@ def learned_shape(
     """
     blank = replace(body, xyz_mm=np.full_like(body.xyz_mm, np.nan))
     found = estimate_shape(blank, BodyPlaces(xyz_mm, covariance, np.zeros_like(covariance))).body
+    found = replace(found, covariance_mm2=None)
     both = found.known & body.known
     if np.count_nonzero(both) < 2:
         return found
@@ -153,12 +199,14 @@ def learned_shape(
 class _Adjustment:
     """Coordinates (m, 3), covariance (3k, 3k) of the k known ones, and how markers fit.
 
-    test (m,): sum of squares of a marker over its expectation.
+    test (m,): sum of squares of a marker over its expectation. squares (T, m): weighted ones of
+    the residuals of places, 0 for those that are not used.
     """
 
     xyz: np.ndarray
     covariance: np.ndarray
     test: np.ndarray
+    squares: np.ndarray
     mean_error_mm: float
     exposures: int
 
@@ -235,14 +283,19 @@ def _adjust(body: Body, places: BodyPlaces, start: tuple[np.ndarray, np.ndarray]
     residual = _residual(problem, shape, rotation, shift)
     out = xyz.copy()
     out[known] = shape
+    squares = np.zeros(places.seen.shape)
+    squares[np.ix_(rows, known)] = np.sum(
+        residual * (problem.information @ residual[..., None])[..., 0], axis=2
+    )
     test = np.full(len(xyz), np.nan)
-    test[known] = _squares_over_expectation(problem, reduced, residual)
+    test[known] = _squares_over_expectation(problem, reduced, squares[np.ix_(rows, known)])
     stays = _stays(places, (rows, known), problem, reduced, rotation)
     count = max(np.count_nonzero(problem.seen), 1)
     return _Adjustment(
         out,
         covariance + covariance @ stays @ covariance,
         test=test,
+        squares=squares,
         mean_error_mm=float(np.sqrt(np.sum(residual**2) / count)),
         exposures=len(rows),
     )
@@ -316,15 +369,28 @@ def _reduced(
 
 
 def _squares_over_expectation(
-    problem: _Problem, reduced: _Reduced, residual: np.ndarray
+    problem: _Problem, reduced: _Reduced, squares: np.ndarray
 ) -> np.ndarray:
-    """Weighted squares (k,) of the residuals of markers over their redundancy, NaN without any."""
-    squares = np.sum(residual * (problem.information @ residual[..., None])[..., 0], axis=2)
+    """Sums (k,) of weighted squares (T, k) over their redundancy, NaN without any."""
     of_place = reduced.by_pose @ np.linalg.inv(reduced.normal)[:, None]
     of_place = of_place @ np.swapaxes(reduced.by_pose, 2, 3)
     share = np.trace(of_place @ problem.information, axis1=2, axis2=3)
     freedom = np.where(problem.seen, 3 - share, 0.0).sum(axis=0)
     return np.where(freedom > 1, squares.sum(axis=0) / np.maximum(freedom, 1), np.nan)
+
+
+def _false_places(adjustment: _Adjustment) -> np.ndarray:
+    """Return the places (T, m) that are false matches: far larger squares than of the marker.
+
+    A marker that moves has large ones in many exposures; it keeps its places.
+    """
+    used = np.where(adjustment.squares > 0, adjustment.squares, np.nan)
+    ordinary = np.ones(used.shape[1])
+    some = np.isfinite(used).any(axis=0)
+    # The median of three squares is chdtri(3, 0.5).
+    ordinary[some] = np.maximum(1.0, np.nanmedian(used[:, some], axis=0) / chdtri(3, 0.5))
+    false = adjustment.squares > ordinary * chdtri(3, REJECT_TAIL)
+    return np.asarray(false & (false.sum(axis=0) <= FALSE_SHARE * np.isfinite(used).sum(axis=0)))
 
 
 def _stays(

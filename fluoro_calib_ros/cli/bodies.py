@@ -54,6 +54,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='take the coordinates of the markers as they are, do not estimate them anew',
     )
     parser.add_argument(
+        '--learn',
+        action='store_true',
+        help='save the shapes with the calibration: the rig is healthy, and fluoro-calib heal '
+        'finds out by them what has changed later',
+    )
+    parser.add_argument(
         '--report',
         action='store_true',
         help='write DIR/report.html: joints and bodies over time, with bands, and paths in space',
@@ -77,7 +83,9 @@ def run(arguments: argparse.Namespace) -> None:
     """Write poses and joints of a recording. Raises DataError."""
     from ..io.bodies import read_bodies, read_joints
     from ..io.calibration import orientation_path
+    from ..io.learned_shapes import write_learned_shapes
     from ..jobs.bodies import BodiesOptions, Film, check_bodies_folder, save_bodies, track_bodies
+    from ..jobs.learning import learn_shapes
     from ..jobs.sources import is_bag
 
     path = arguments.orientation or orientation_path(arguments.calibration)
@@ -115,6 +123,12 @@ def run(arguments: argparse.Namespace) -> None:
             options=options,
             progress=bar,
         )
+    if arguments.learn:
+        with ErrorsAt(arguments.source):
+            learned = learn_shapes(recording.frames, calibrations, orientation, bodies, options)
+        write_learned_shapes(arguments.calibration, learned)
+        names = ', '.join(body.name for body in learned.bodies)
+        print_notes([f'{arguments.calibration}: shapes of {names} are learned'])
     with ProgressBar('film') as bar:
         film = None
         if arguments.film is not None:

@@ -25,9 +25,7 @@ if TYPE_CHECKING:
 
 NAME = 'heal'
 HELP = 'Find out from ordinary markers what has changed in a rig, and calibrate that anew.'
-EXAMPLE = (
-    'fluoro-calib heal rig/walking --calibration result --bodies learned/shapes.csv --out healed'
-)
+EXAMPLE = 'fluoro-calib heal rig/walking --calibration result --out healed'
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -37,11 +35,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_oriented_source(parser, HealingOptions)
     parser.add_argument(
         '--bodies',
-        required=True,
         type=Path,
         metavar='FILE',
-        help='shapes of the bodies as they were learned while the rig was healthy: shapes.csv of '
-        'fluoro-calib bodies',
+        help='shapes of the bodies as they were while the rig was healthy: shapes.csv of '
+        'fluoro-calib bodies (default: those that were learned with the calibration, by '
+        'fluoro-calib bodies --learn or by calibration_node)',
     )
     add_out(parser, 'folder to write: calibrations and orientation as they are now, healing.json')
     add_exit_zero(parser)
@@ -59,21 +57,28 @@ def run(arguments: argparse.Namespace) -> bool:
         healing_document,
         save_healing,
     )
+    from ..jobs.learning import learned_for
 
     path = arguments.orientation or orientation_path(arguments.calibration)
     check_healing_folder(
-        arguments.out, [arguments.source, arguments.calibration, path, arguments.bodies]
+        arguments.out, [arguments.source, arguments.calibration, path, arguments.bodies or path]
     )
-    bodies = read_bodies(arguments.bodies)
+    bodies = read_bodies(arguments.bodies) if arguments.bodies else ()
     recording, calibrations, orientation = read_oriented_source(arguments, path)
+    learned = None if bodies else learned_for(arguments.calibration, orientation)
     print_notes(recording.notes)
     options = options_of(HealingOptions, arguments)
     with ErrorsAt(arguments.source), ProgressBar('heal', 'step') as bar:
         outcome = heal_rig(
-            recording.frames, calibrations, orientation, bodies, options, progress=bar
+            recording.frames,
+            calibrations,
+            orientation,
+            bodies=bodies if learned is None else learned.bodies,
+            options=options,
+            progress=bar,
         )
     if outcome.healed is not None:
-        save_healing(arguments.out, outcome, orientation)
+        save_healing(arguments.out, outcome, orientation, learned)
     print_findings(outcome.findings, 'changed: ')
     document = healing_document(outcome, orientation)
     print_result(arguments, document, '\n'.join(_lines(arguments, outcome)))
@@ -106,6 +111,7 @@ def _lines(arguments: argparse.Namespace, outcome: HealingOutcome) -> list[str]:
         )
         lines.append(f'points relative to each other: sd {after} (as calibrated {before})')
         lines.append(f'written to {arguments.out}')
+    lines.append(outcome.common_motion.sentence)
     lines += [check.sentence for check in outcome.checks if not check.passed]
     lines.append(styled_verdict(f'Verdict: {outcome.verdict}', outcome.verdict))
     return lines

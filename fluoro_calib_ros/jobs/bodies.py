@@ -18,7 +18,7 @@ from ..bodies.butterworth import filtered_poses
 from ..bodies.joints import JointMotion, joint_motion, with_neutral
 from ..bodies.shapes import EstimatedShape, estimate_shape, places_of
 from ..bodies.tracking import BodyTracker, TrackedExposure, poses_alone, poses_of
-from ..checks.rig_watch import RigDriftWatch
+from ..checks.rig_watch import DriftVerdict, RecordingDriftWatch
 from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
 from ..errors import DataError
 from ..exposures.frame import Frames
@@ -296,8 +296,10 @@ def track_bodies(
     options = options or BodiesOptions()
     check_bodies(bodies)
     orientation = orientation_of_recorded(frames, orientation)
-    exposures, unpaired = _intersected(frames, calibrations, orientation, options)
-    shapes = _shapes(bodies, [one.views for one in exposures], options)
+    exposures, unpaired, _ = intersected(frames, calibrations, orientation, options)
+    shapes = [EstimatedShape(body, np.nan, np.nan, 0, ()) for body in bodies]
+    if options.estimate_shapes:
+        shapes = estimated_shapes(bodies, exposures)
     usable = solvable_bodies([shape.body for shape in shapes])
     lag = options.lag if options.smooth == 'lag' else None
     tracker = BodyTracker(orientation, usable, options.reject, lag)
@@ -330,24 +332,31 @@ def track_bodies(
 
 
 @dataclass(frozen=True)
-class _Exposure:
+class IntersectedExposure:
+    """An exposure of a recording, and its points in space."""
+
     number: int
     stamp_ns: int
     views: IntersectedViews
     orientation: RigOrientation  #: with what an alarm of the drift watch adds to its covariance
 
 
-def _intersected(
+def intersected(
     frames: Frames, calibrations: Calibrations, orientation: RigOrientation, options: BodiesOptions
-) -> tuple[list[_Exposure], dict[str, int]]:
-    """Pair and intersect the frames of a recording. Raises DataError."""
+) -> tuple[list[IntersectedExposure], dict[str, int], DriftVerdict]:
+    """Pair and intersect the frames of a recording.
+
+    Also returns the frames without partner, by fluoroscope, and what the drift watch says. Raises
+    DataError.
+    """
     names = orientation.fluoroscopes
     paired, unpaired = pair_recording(frames, names, options.pair_by, options.pair_tolerance)
     if not paired:
         raise DataError(f'no frames of {" and ".join(names)} belong together by {options.pair_by}')
     intersector = Intersector(orientation, options.reject)
     scatter = ObservedScatter()
-    watch = RigDriftWatch(orientation, {name: calibrations[name].image_size for name in names})
+    sizes = {name: calibrations[name].image_size for name in names}
+    watch = RecordingDriftWatch(orientation, sizes)
     out = []
     for exposure in paired:
         wide, _ = watch.widened(intersector)
@@ -355,27 +364,23 @@ def _intersected(
         stamp = present[0].stamp_ns
         if options.rate is not None:
             stamp = 1 + round(present[0].number * NS_PER_S / options.rate)
-        out.append(_Exposure(present[0].number, stamp, views, wide.orientation))
+        out.append(IntersectedExposure(present[0].number, stamp, views, wide.orientation))
     stamps = np.array([one.stamp_ns for one in out])
     if len(out) > 1 and not (np.diff(stamps) > 0).all():
         raise DataError(
             'the exposures have no times, or not in their order; give the rate of the recording'
         )
-    return out, unpaired
+    return out, unpaired, watch.verdict()
 
 
-def _shapes(
-    bodies: Sequence[Body], exposures: Sequence[IntersectedViews], options: BodiesOptions
+def estimated_shapes(
+    bodies: Sequence[Body], exposures: Sequence[IntersectedExposure]
 ) -> list[EstimatedShape]:
     """Estimate the shapes of bodies from exposures that are spread over the recording."""
-    if not options.estimate_shapes:
-        exposures = []
     rows = np.unique(np.linspace(0, len(exposures) - 1, SHAPE_EXPOSURES).astype(int))
-    chosen = [exposures[row] for row in rows] if len(exposures) else []
+    chosen = [exposures[row].views for row in rows]
     ids = [one.target_id for one in chosen]
     points = [_split(one) for one in chosen]
-    if not options.estimate_shapes:
-        return [EstimatedShape(body, np.nan, np.nan, 0, ()) for body in bodies]
     return [estimate_shape(body, places_of(body, ids, points)) for body in bodies]
 
 
@@ -415,7 +420,7 @@ def _poses_alone(
     options: BodiesOptions,
 ) -> list[BodyPoses]:
     """Poses that the exposures of another recording give alone. Raises DataError."""
-    exposures, _ = _intersected(frames, calibrations, orientation, options)
+    exposures, _, _ = intersected(frames, calibrations, orientation, options)
     tracker = BodyTracker(orientation, bodies, options.reject)
     tracked = [tracker.add(one.views, one.number, one.stamp_ns) for one in exposures]
     return poses_alone(bodies, [one for one in tracked if one is not None])

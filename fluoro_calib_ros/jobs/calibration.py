@@ -48,7 +48,7 @@ from ..findings import Finding, Kind, Place, Severity
 from ..io.csv_table import dataframe_of
 from ..io.result_document import result_tables
 from ..photogrammetry.rig_orientation import RigOrientation
-from ..processes import OF_JOB, WorkerProcess
+from ..processes import in_worker_process
 from .sources import select_calibrations
 
 if TYPE_CHECKING:
@@ -388,17 +388,14 @@ def run_in_worker_process(
     raise_if_cancelled is called repeatedly and may raise to terminate the process. Raises
     RuntimeError for any other failure of the process.
     """
-    process = WorkerProcess(_calibration, 'the worker process', OF_JOB)
-    try:
-        return process(
-            request, validate, rig, progress=progress, raise_if_cancelled=raise_if_cancelled
-        )
-    finally:
-        process.close()
-
-
-def _calibration() -> Callable[..., CalibrationOutcome]:
-    return _outcome
+    return in_worker_process(
+        _outcome,
+        request,
+        validate,
+        rig,
+        progress=progress,
+        raise_if_cancelled=raise_if_cancelled,
+    )
 
 
 def _outcome(

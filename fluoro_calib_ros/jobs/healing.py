@@ -25,10 +25,11 @@ from ..bodies.healing import (
     Diagnostician,
     HealedRig,
     healed_rig,
-    weakest_of_knock,
+    unseen_knock,
 )
 from ..bodies.rig_adjustment import ObservedBodies, Poses, RigAdjustment, RigErrors, rig_errors
 from ..bodies.rigid import robust_pose
+from ..bodies.shapes import LearnedShapes
 from ..checks.check import Check, verdict_of
 from ..correction.base import CorrectionStatus
 from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration, with_drift
@@ -42,6 +43,8 @@ from ..io.calibration import ORIENTATION_NAME as ORIENTATION
 from ..io.calibration import SUFFIX, save_calibration, save_orientation
 from ..io.documents import write_json
 from ..io.folder import FolderKind, check_output_folder, replaced_folder
+from ..io.learned_shapes import LEARNED_SHAPES, write_learned_shapes
+from ..io.versions import HEALING
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.intersection import OK, OUTSIDE, Intersector
 from ..reconstruction.reconstruct import orientation_of_recorded, pair_recording
@@ -75,6 +78,8 @@ class HealingOutcome:
         Of the healed rig.
     before, after : RigErrors
         Errors of points where the bodies were.
+    common_motion : Finding
+        How far all points together may have moved, which no body shows.
     verdict : {'pass', 'fail', 'cannot tell'}
     checks : tuple of Check
     findings : tuple of Finding
@@ -89,6 +94,7 @@ class HealingOutcome:
     orientation: RigOrientation
     before: RigErrors
     after: RigErrors
+    common_motion: Finding
     verdict: str
     checks: tuple[Check, ...]
     findings: tuple[Finding, ...]
@@ -134,12 +140,11 @@ def heal_rig(
     options = options or HealingOptions()
     step = progress or (lambda done, total: None)
     check_bodies(bodies)
-    usable = solvable_bodies(bodies)
     orientation = orientation_of_recorded(frames, orientation)
     names = orientation.fluoroscopes
     paired, _ = pair_recording(frames, names, options.pair_by, options.pair_tolerance)
     used, unused = _chosen(len(paired))
-    rig = _Rig(calibrations, orientation, usable)
+    rig = _Rig(calibrations, orientation, solvable_bodies(bodies))
     observed, poses = rig.observe([paired[row] for row in used])
     _check_seen(poses)
     step(1, 4)
@@ -159,11 +164,11 @@ def heal_rig(
         now = rig.healed(healed)
         after = rig_errors(now.orientation, places)
     step(3, 4)
-    known = _correctable(fixed) if fixed else _identified(healed, diagnostician, diagnosis)
+    weakest, common_mm = _seen_of_change(healed, diagnostician, diagnosis, places)
+    known = _correctable(fixed) if fixed else _identified(weakest, healed is not None)
     checks = [known, _sure(diagnosis, rig)]
     if not fixed:  # else they tell of the same change
-        kept_back = [paired[row] for row in unused]
-        checks += _unused_exposures(now, kept_back, diagnosis, before.scale)
+        checks += _unused_exposures(now, [paired[row] for row in unused], diagnosis, before.scale)
     step(4, 4)
     return HealingOutcome(
         diagnosis,
@@ -172,11 +177,26 @@ def heal_rig(
         orientation=now.orientation,
         before=before,
         after=after,
+        common_motion=common_motion(common_mm),
         verdict=verdict_of(checks),
         checks=tuple(checks),
         findings=tuple(_finding(change, rig, diagnosis) for change in diagnosis.changes),
         exposures=len(used),
     )
+
+
+def _seen_of_change(
+    healed: HealedRig | None,
+    diagnostician: Diagnostician,
+    diagnosis: Diagnosis,
+    places: np.ndarray,
+) -> tuple[float, float]:
+    """Return how well bodies show the change, or else a knock, and the common motion [mm]."""
+    if healed is not None:
+        return healed.weakest, rig_errors(healed.orientation, places).common_mm
+    moments, weakest = unseen_knock(diagnostician, diagnosis)
+    orientation = replace(diagnostician.adjustment.orientation, covariance=moments)
+    return weakest, rig_errors(orientation, places).common_mm
 
 
 def _check_seen(poses: Poses) -> None:
@@ -190,7 +210,12 @@ def _check_seen(poses: Poses) -> None:
 
 
 def _chosen(count: int) -> tuple[list[int], list[int]]:
-    """Exposures for the diagnosis and for its verdict, from alternating blocks."""
+    """Exposures for the diagnosis and for its verdict, from alternating blocks.
+
+    Raises DataError for too few.
+    """
+    if count < MIN_EXPOSURES:
+        raise DataError(f'{count} exposures have two views, {MIN_EXPOSURES} are needed')
     block = np.arange(count) * BLOCKS // max(count, 1)
     out: list[list[int]] = []
     for part in (0, 1):
@@ -385,12 +410,20 @@ def _cause_text(change: Change, rig: _Rig) -> str:
     }[change.cause]
 
 
-def _identified(
-    healed: HealedRig | None, diagnostician: Diagnostician, diagnosis: Diagnosis
-) -> Check:
+def common_motion(distance_mm: float) -> Finding:
+    """Return how far all points together may have moved [mm]."""
+    return Finding(
+        Kind.COMMON_MOTION,
+        f'all points together may have moved by {distance_mm:.2f} mm (RMS) in the rig frame, '
+        'which no body shows',
+        severity=Severity.NOTE,
+        numbers={'distance_mm': distance_mm},
+    )
+
+
+def _identified(weakest: float, is_healed: bool) -> Check:
     """Check that the bodies tell all of the change, or would tell that of a knock."""
-    change = 'a knock' if healed is None else 'the change'
-    weakest = healed.weakest if healed else weakest_of_knock(diagnostician, diagnosis)
+    change = 'the change' if is_healed else 'a knock'
     return Check(
         Kind.CHANGE_IDENTIFIED,
         f'the direction of {change} that is known worst has a standard deviation of '
@@ -477,12 +510,13 @@ def _unused(rest: Diagnosis | None, half: int, rig: _Rig) -> Check:
 
 # The folder with a healed rig: calibrations, orientation, and what was changed and why.
 
-HEALING = 'healing.json'
 VERSION = 1
 
 
 HEALING_FOLDER = FolderKind(
-    'a folder of a healed rig', parts=(HEALING, ORIENTATION, f'*{SUFFIX}'), marks=(HEALING,)
+    'a folder of a healed rig',
+    parts=(HEALING, ORIENTATION, LEARNED_SHAPES, f'*{SUFFIX}'),
+    marks=(HEALING,),
 )
 
 
@@ -491,12 +525,22 @@ def check_healing_folder(directory: PathLike, inputs: Iterable[PathLike]) -> Non
     check_output_folder(directory, HEALING_FOLDER, inputs)
 
 
-def save_healing(directory: PathLike, outcome: HealingOutcome, parent: RigOrientation) -> None:
-    """Write a healed rig, all or nothing. parent: its orientation before. Raises DataError."""
+def save_healing(
+    directory: PathLike,
+    outcome: HealingOutcome,
+    parent: RigOrientation,
+    learned: LearnedShapes | None = None,
+) -> None:
+    """Write a healed rig, all or nothing, and the shapes that have healed it.
+
+    parent: its orientation before. Raises DataError.
+    """
     with replaced_folder(directory, HEALING_FOLDER) as folder:
         for calibration in outcome.calibrations.values():
             save_calibration(folder, calibration)
         save_orientation(folder, outcome.orientation)
+        if learned is not None:
+            write_learned_shapes(folder, learned.with_healed(outcome.orientation.orientation_id))
         write_json(folder / HEALING, healing_document(outcome, parent))
 
 
@@ -525,6 +569,7 @@ def healing_document(outcome: HealingOutcome, parent: RigOrientation) -> dict[st
             for check in outcome.checks
         ],
         'changes': _changes(outcome),
+        'common_motion': _finding_document(outcome.common_motion),
         'errors_before': _errors(outcome.before),
         'errors_after': _errors(outcome.after),
     }

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
+from ..bodies.shapes import LearnedShapes
 from ..correction.fluoroscope_calibration import Calibrations
 from ..errors import DataError
 from ..estimation.result import CalibrationResult
@@ -35,11 +36,14 @@ from ..io.calibration import RESULT_NAME as RESULT
 from ..io.calibration_request import write_request
 from ..io.documents import write_json
 from ..io.folder import FolderKind, check_output_folder, replaced_folder
+from ..io.learned_shapes import write_learned_shapes
 from ..io.result_document import NAMES as TABLES
 from ..io.result_document import SUFFIX as COVARIANCE
 from ..io.result_document import result_document, result_tables, write_covariance, write_validation
+from ..io.versions import version_folder
 from ..photogrammetry.rig_orientation import RigOrientation
 from .calibration import CalibrationOutcome
+from .healing import HealingOutcome, save_healing
 
 REPORT = 'report.html'
 # Calibrations of other fluoroscopes stay in the folder.
@@ -142,6 +146,26 @@ def save_calibrations(
             save_calibration(folder, calibration)
         if orientation is not None:
             save_orientation(folder, orientation)
+
+
+def save_healed_version(
+    directory: Path,
+    outcome: HealingOutcome,
+    calibrations: Calibrations,
+    parent: RigOrientation,
+    learned: LearnedShapes,
+) -> None:
+    """Save a healed rig as a version beside its parent, and as the rig to be used.
+
+    The parent comes first and the rig to be used last, so that a failure in between leaves the
+    parent in use. calibrations, parent: the rig as it was before. learned: the shapes that have
+    healed it. Raises DataError.
+    """
+    healed_id = outcome.orientation.orientation_id
+    save_calibrations(version_folder(directory, parent.orientation_id), calibrations, parent)
+    save_healing(version_folder(directory, healed_id), outcome, parent, learned)
+    write_learned_shapes(directory, learned.with_healed(healed_id))
+    save_calibrations(directory, {**calibrations, **outcome.calibrations}, outcome.orientation)
 
 
 def check_result_folder(directory: PathLike, inputs: Iterable[PathLike] = ()) -> None:

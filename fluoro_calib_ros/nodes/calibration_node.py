@@ -10,7 +10,8 @@ and again until it has started, which on a busy machine costs so much time that 
 
 The parts: parameters and rig (calibration_settings), exposures (exposure_input), what is published
 (calibration_output), and the services that collect (exposure_input), orient the rig and calibrate
-(calibration_services), heal (healing_services), save and load (calibration_settings).
+(calibration_services), heal (healing_services), save and load (calibration_settings); and shapes
+that are learned (shape_learning).
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import partial
 
-from fluoro_calib_msgs.msg import TargetObservations
+from fluoro_calib_msgs.msg import DriftStatus, TargetObservations
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.lifecycle.node import LifecycleState
@@ -38,13 +39,14 @@ from .frame_validation import with_limit
 from .healing_services import Healing
 from .messages.observations import NS_PER_S, ObservedFrame, decode_target_observations
 from .messages.status import FluoroscopeProgress
-from .runtime.diagnostics import Status, health_of
+from .runtime.diagnostics import RefusalLog, Status, health_of
 from .runtime.lifecycle import StreamNode
 from .runtime.main import run
 from .runtime.parameters import declare_groups, declare_read_limits, follow_groups
 from .runtime.services import Requests, create_services, wake
 from .runtime.stream import stream_faults
 from .runtime.topics import observations_qos
+from .shape_learning import ShapeLearning
 
 __all__ = ['PARAMETERS', 'CalibrationNode', 'main']
 
@@ -87,7 +89,7 @@ class CalibrationNode(StreamNode):
     def create_outputs(self) -> None:
         """Make topics, services and action, and publish the saved calibrations."""
         rig = self._rig
-        self._output = output = CalibrationOutput(self, rig.names)
+        self._output = output = CalibrationOutput(self, rig.names, rig.directory)
         files = CalibrationFiles(rig, output, self.get_logger())
         parts = NodeParts(
             self, rig, self._exposures, output=output, files=files, requests=self._requests
@@ -95,6 +97,7 @@ class CalibrationNode(StreamNode):
         self._orienting = OrientationService(parts)
         self._calibrating = SelfCalibration(parts)
         self._healing = Healing(parts)
+        self._learning = ShapeLearning(parts)
         # Services that await must not keep others from being answered.
         group = ReentrantCallbackGroup()
         groups = (
@@ -111,6 +114,11 @@ class CalibrationNode(StreamNode):
             action = job.create_action(group)
             self.own(action, action.destroy)
             self.own(job, job.end)
+        self.own(self._learning, self._learning.end)
+        if self._settings.node.learn_bodies:
+            topic, callback = 'reconstruction/drift', self._learning.on_drift
+            refusals = RefusalLog(topic, self.limited_logger)
+            self.create_input(DriftStatus, topic, callback, observations_qos(), refusals)
         files.load_at_start()
 
     def create_readers(self) -> None:
@@ -156,6 +164,7 @@ class CalibrationNode(StreamNode):
 
         self._exposures.add(name, frame, angle)
         self._healing.add(name, frame, angle)
+        self._learning.add(name, frame, angle)
 
     def _on_pair(self, pair: Mapping[str, Frame]) -> None:
         self._orienting.add(pair)
@@ -165,7 +174,8 @@ class CalibrationNode(StreamNode):
     def diagnose(self) -> list[Status]:
         """Return the status of every fluoroscope, and publish it."""
         incompatible = self.incompatible_publishers()
-        return [self._diagnose(name, incompatible) for name in self._rig.names]
+        statuses = [self._diagnose(name, incompatible) for name in self._rig.names]
+        return [*statuses, *self._learning.diagnose()]
 
     def _diagnose(self, name: str, incompatible: Mapping[str, str]) -> Status:
         progress = self._progress_of(name)

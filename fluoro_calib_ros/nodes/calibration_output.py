@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from fluoro_calib_msgs.msg import CalibrationStatus, FluoroscopeCalibration, RigOrientation
 from rclpy.publisher import Publisher
@@ -16,6 +17,7 @@ from sensor_msgs.msg import Image
 
 from ..correction import fluoroscope_calibration as calibration_result
 from ..images.overlay import coverage_picture
+from ..io.versions import calibrated_orientation
 from ..photogrammetry import rig_orientation
 from .messages.fluoroscope_calibration import message_from_calibration
 from .messages.image import colour_message
@@ -39,7 +41,7 @@ from .runtime.topics import latched_qos, publisher_conflict
 class CalibrationOutput:
     """Publishers of a calibration node, what is in use, and what went wrong with the rest."""
 
-    def __init__(self, node: StreamNode, names: Sequence[str]) -> None:
+    def __init__(self, node: StreamNode, names: Sequence[str], directory: Path) -> None:
         self.orientation: rig_orientation.RigOrientation | None = None  #: the one in use
         self.refused: dict[str, str] = {}  #: why the last calibration of a fluoroscope was refused
         #: why calibrations were not loaded at the start, or are not saved; '' where they are
@@ -47,6 +49,7 @@ class CalibrationOutput:
         self.save_fault = ''
         self._node = node
         self._names = names
+        self._directory = directory
         self._in_use: dict[str, calibration_result.FluoroscopeCalibration] = {}
         self._since: dict[str, float] = {}
         # The status first: by its publishers, receivers of calibrations recognise that two nodes
@@ -54,7 +57,10 @@ class CalibrationOutput:
         self._status = self._publishers(CalibrationStatus, 'calibration_status', 10)
         self._calibration = self._publishers(FluoroscopeCalibration, 'calibration', latched_qos())
         self._coverage = self._publishers(Image, 'coverage', latched_qos())
-        self._orientation = self._publisher(RigOrientation, 'rig_orientation', latched_qos())
+        self._orientation, self._as_calibrated = (
+            self._publisher(RigOrientation, topic, latched_qos())
+            for topic in ('rig_orientation', 'rig_orientation_as_calibrated')
+        )
 
     def _publishers(self, kind: type, topic: str, qos: QoSProfile | int) -> dict[str, Publisher]:
         return {name: self._publisher(kind, f'{name}/{topic}', qos) for name in self._names}
@@ -87,8 +93,11 @@ class CalibrationOutput:
             self._calibration[name].publish(message_from_calibration(calibration))
 
     def publish_orientation(self, orientation: rig_orientation.RigOrientation) -> None:
-        """Use and publish an orientation."""
+        """Use and publish an orientation, and before it the one that it was healed from."""
         self.orientation = orientation
+        calibrated = calibrated_orientation(self._directory, orientation)
+        if calibrated is not None:
+            self._as_calibrated.publish(message_from_orientation(calibrated))
         self._orientation.publish(message_from_orientation(orientation))
 
     def age_s(self, name: str) -> float:

@@ -90,10 +90,17 @@ class CalibrationParameters(ManagedParameters):
         maximum=600.0,
         unit='s',
     )
-    learned_shapes: str = option(
+    learn_bodies: str = option(
         '',
-        'shapes.csv of fluoro-calib bodies: shapes of bodies that were learned while the rig was '
-        'healthy, for the action heal; empty: heal is refused',
+        'bodies.csv: bodies whose shapes are learned from the stream while the rig is healthy, '
+        'for the action heal; places of markers may be left empty; empty: none are learned',
+    )
+    learn_time: float = option(
+        30.0,
+        'how long markers are seen before shapes are learned from them',
+        minimum=0.1,
+        maximum=600.0,
+        unit='s of stream',
     )
     heal_time: float = option(
         5.0,
@@ -116,7 +123,10 @@ class CalibrationSettings:
 
     node: CalibrationParameters = group(
         CalibrationParameters,
-        settable=('collect', 'joint', 'rig_frame', 'capture_timeout', 'heal_time', 'heal_accept'),
+        settable=(
+            *('collect', 'joint', 'rig_frame', 'capture_timeout'),
+            *('heal_time', 'heal_accept', 'learn_time'),
+        ),
     )
     still: StillOptions = group(
         StillOptions,

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -22,25 +22,21 @@ from rclpy.action import CancelResponse
 from rclpy.task import Future
 
 from ..bodies.body import Body
+from ..bodies.shapes import LearnedShapes
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError
 from ..exposures.frame import Frame, validate_frame
-from ..io.bodies import read_bodies
-from ..jobs.healing import HealingOptions, HealingOutcome
-from ..jobs.healing_versions import (
-    heal_in_worker_process,
-    parent_folder,
-    save_healed_version,
-    version_folder,
-)
-from ..jobs.result_folder import save_calibrations
+from ..io.versions import parent_folder, version_folder
+from ..jobs.healing import HealingOptions, HealingOutcome, heal_rig
+from ..jobs.learning import learned_for
+from ..jobs.result_folder import save_calibrations, save_healed_version
 from ..photogrammetry.rig_orientation import RigOrientation
+from ..processes import in_worker_process
 from .calibration_services import Job
 from .calibration_settings import NOT_ACTIVE, check_folders
 from .exposure_input import NodeParts
 from .messages.healing import fill_healing
 from .messages.observations import ObservedFrame, frame_from_observed
-from .runtime.parameters import expand_path
 from .runtime.services import ServiceEntry, in_thread, wake, within
 
 MAX_FRAMES = 20_000  # of a fluoroscope that are collected, whatever its rate
@@ -52,20 +48,22 @@ CHANGED = 'the rig in use has changed meanwhile, heal it again'
 class _Rig(NamedTuple):
     """What is healed."""
 
-    bodies: tuple[Body, ...]
+    learned: LearnedShapes
     calibrations: dict[str, FluoroscopeCalibration]
     orientation: RigOrientation
 
 
-class _Collection:
+class MarkerCollection:
     """Frames of markers, collected in the thread of the streams until finish()."""
 
-    def __init__(self, rig: _Rig) -> None:
+    def __init__(
+        self, bodies: Sequence[Body], calibrations: Mapping[str, FluoroscopeCalibration]
+    ) -> None:
         self.frames: dict[str, list[Frame]] = {}
         self.refused: deque[str] = deque(maxlen=1)  # why the last invalid frame was left out
         self.done = Future()
-        self._rig = rig
-        self._markers = np.concatenate([body.target_id for body in rig.bodies])
+        self._calibrations = calibrations
+        self._markers = np.concatenate([body.target_id for body in bodies])
         self._lock = threading.Lock()
 
     @property
@@ -75,8 +73,8 @@ class _Collection:
 
     def add(self, name: str, observed: ObservedFrame, angle: float | None) -> None:
         """Keep a valid frame, without what is no marker of the bodies."""
-        calibration = self._rig.calibrations.get(name)
-        if calibration is None or len(self.frames.get(name, ())) >= MAX_FRAMES:
+        calibration = self._calibrations.get(name)
+        if calibration is None or self.is_full(name):
             return
         try:
             frame = frame_from_observed(observed, name, angle).sorted()
@@ -93,7 +91,15 @@ class _Collection:
         )
         with self._lock:
             if not self.done.done():
-                self.frames.setdefault(name, []).append(frame)
+                self.keep(frame)
+
+    def is_full(self, name: str) -> bool:
+        """Return whether no more frames of a fluoroscope are needed."""
+        return len(self.frames.get(name, ())) >= MAX_FRAMES
+
+    def keep(self, frame: Frame) -> None:
+        """Keep a frame."""
+        self.frames.setdefault(frame.fluoroscope, []).append(frame)
 
     def finish(self) -> None:
         """End the collection: time, a cancellation and the end of the node may all do so."""
@@ -111,7 +117,7 @@ class Healing(Job):
 
     def __init__(self, parts: NodeParts) -> None:
         super().__init__(parts)
-        self._collection: _Collection | None = None
+        self._collection: MarkerCollection | None = None
         self._healed: tuple[HealingOutcome, _Rig] | None = None  # to be accepted
         self.services = (
             ServiceEntry('accept_healing', Reset, self._on_accept),
@@ -164,12 +170,9 @@ class Healing(Job):
 
         done, self._thread = in_thread(
             self._node,
-            lambda: heal_in_worker_process(
-                frames,
-                rig.calibrations,
-                rig.orientation,
-                rig.bodies,
-                options,
+            lambda: in_worker_process(
+                heal_rig,
+                *(frames, rig.calibrations, rig.orientation, rig.learned.bodies, options),
                 progress=progress,
                 raise_if_cancelled=raise_if_cancelled,
             ),
@@ -185,7 +188,7 @@ class Healing(Job):
 
     async def _collected(self, goal: Any, rig: _Rig, seconds: float) -> dict[str, list[Frame]]:
         """Return the frames of the next seconds, or fewer where the goal is cancelled."""
-        collection = _Collection(rig)
+        collection = MarkerCollection(rig.learned.bodies, rig.calibrations)
 
         def tell() -> None:
             goal.publish_feedback(Heal.Feedback(stage='collecting', frames=collection.count))
@@ -206,12 +209,6 @@ class Healing(Job):
 
     def _present_rig(self) -> _Rig:
         """Return what is to be healed. Raises DataError where something is missing."""
-        path = self._rig.settings().node.learned_shapes
-        if not path:
-            raise DataError(
-                'parameter learned_shapes is not set: it names the shapes of bodies that were '
-                'learned while the rig was healthy'
-            )
         if not self._node.readers:
             raise DataError(NOT_ACTIVE)
         calibrations = self._output.calibrations
@@ -220,11 +217,8 @@ class Healing(Job):
             raise DataError(f'fluoroscope {missing[0]} is not calibrated yet')
         if self._output.orientation is None:
             raise DataError('the rig is not oriented yet')
-        try:
-            bodies = tuple(read_bodies(expand_path(path)))
-        except DataError as error:
-            raise error.at(path) from None
-        return _Rig(bodies, calibrations, self._output.orientation)
+        learned = learned_for(self._rig.directory, self._output.orientation)
+        return _Rig(learned, calibrations, self._output.orientation)
 
     def _check_unchanged(self, rig: _Rig) -> None:
         """Raise DataError where another rig is in use than the one that was healed."""
@@ -269,7 +263,9 @@ class Healing(Job):
         limit = self._rig.settings().limits.max_folders
         for orientation in (rig.orientation, outcome.orientation):
             check_folders(version_folder(directory, orientation.orientation_id), directory, limit)
-        save_healed_version(directory, outcome, rig.calibrations, rig.orientation)
+        save_healed_version(
+            directory, outcome, rig.calibrations, rig.orientation, learned=rig.learned
+        )
         self._use(outcome.calibrations, outcome.orientation)
         return (
             f'{outcome.orientation.orientation_id} accepted and in use, its parent is '

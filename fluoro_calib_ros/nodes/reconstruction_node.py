@@ -31,7 +31,7 @@ from .frame_validation import CORRECTED_REFUSALS, validate_corrected, with_limit
 from .messages.fluoroscope_calibration import image_size_of
 from .messages.observations import NS_PER_S, CorrectedFrame, decode_corrected_observations
 from .messages.points import PointsContent
-from .messages.rig_orientation import transforms_of_orientation
+from .messages.rig_orientation import message_from_orientation, transforms_of_orientation
 from .point_retractions import PointRetractions
 from .reconstruction_output import (
     CONDITIONS,
@@ -215,13 +215,11 @@ class ReconstructionNode(StreamNode):
             self._bodies_output = BodiesOutput(self, names, bool(joints), self._settings.rig_frame)
 
     def _create_inputs(self) -> None:
-        self.create_input(
-            RigOrientation,
-            'rig_orientation',
-            self._on_orientation,
-            latched_qos(),
-            self._refusals,
-        )
+        for topic, callback in (
+            ('rig_orientation', self._on_orientation),
+            ('rig_orientation_as_calibrated', self._on_calibrated),
+        ):
+            self.create_input(RigOrientation, topic, callback, latched_qos(), self._refusals)
         for name in self._names:
             self.create_input(
                 CameraInfo,
@@ -251,9 +249,18 @@ class ReconstructionNode(StreamNode):
         """Use an orientation, and publish its transforms."""
         if self._rigs.add(message):
             self._misses = RecentMisses()
-            self._transforms.publish(
-                transforms_of_orientation(message, self._settings.rig_frame, self._rigs.calibrated)
-            )
+            self._publish_transforms(message)
+
+    def _on_calibrated(self, message: RigOrientation) -> None:
+        """Take the orientation from before the rig was healed, which may come after it."""
+        self._rigs.use_calibrated(message)
+        if self._rigs.newest is not None and self._rigs.calibrated is not None:
+            self._publish_transforms(message_from_orientation(self._rigs.newest.orientation))
+
+    def _publish_transforms(self, message: RigOrientation) -> None:
+        self._transforms.publish(
+            transforms_of_orientation(message, self._settings.rig_frame, self._rigs.calibrated)
+        )
 
     def _on_camera_info(self, name: str, message: CameraInfo) -> None:
         """Take the image size of a fluoroscope, which the drift watch needs."""

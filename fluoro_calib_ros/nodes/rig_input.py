@@ -22,6 +22,7 @@ from ..checks.rig_watch import RigDriftWatch
 from ..errors import DataError
 from ..io.bodies import JointEntry, read_bodies, read_joints
 from ..io.calibration import load_orientation, orientation_path
+from ..io.versions import calibrated_orientation
 from ..options import option
 from ..photogrammetry import rig_orientation
 from ..photogrammetry.noise import ObservedScatter
@@ -81,7 +82,7 @@ class RigInput:
         self._logger = logger
         # By calibration ids, the oldest first; replaced as a whole.
         self._rigs: dict[tuple[str | None, ...], Rig] = {}
-        self._calibrated: rig_orientation.RigOrientation | None = None  # the last, not healed
+        self._calibrated: rig_orientation.RigOrientation | None = None  # before it was healed
 
     @property
     def calibrated(self) -> rig_orientation.RigOrientation | None:
@@ -137,13 +138,18 @@ class RigInput:
             self._logger.error(f'orientation refused, the current one stays in use: {error}')
             return False
         self._tell_jump(orientation)
-        if orientation.source != 'healing':
-            self._calibrated = orientation
         ids = orientation.calibration_ids
         newest = list(self._rigs.items())[-(MAX_ORIENTATIONS - 1) :]
         self._rigs = {**{i: old for i, old in newest if i != ids}, ids: rig}
         self._logger.info(f'{description_of(message)}, in use')
         return True
+
+    def use_calibrated(self, message: RigOrientation) -> None:
+        """Take the orientation that the newest one was healed from, unless it is refused."""
+        try:
+            self._calibrated = orientation_from_message(message).subset(self._names)
+        except ValueError as error:  # DataError among them
+            self._logger.error(f'orientation as calibrated refused: {error}')
 
     def _tell_jump(self, orientation: rig_orientation.RigOrientation) -> None:
         """Log how far the transforms of the rig jump by another orientation."""
@@ -160,7 +166,12 @@ class RigInput:
             if not path and folder:
                 known = orientation_path(expand_path(folder))
                 path = known if Path(known).exists() else ''
-            return message_from_orientation(load_orientation(path)) if path else None
+            if not path:
+                return None
+            orientation = load_orientation(path)
+            if folder:
+                self._calibrated = calibrated_orientation(expand_path(folder), orientation)
+            return message_from_orientation(orientation)
         except DataError as error:
             self._logger.error(str(error))
             self._refusals.last_fault = str(error)

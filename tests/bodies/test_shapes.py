@@ -3,6 +3,8 @@
 
 """Shapes from a recording and CT: scatter as claimed, and what is wrong with a body."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from rigs import kinds
@@ -39,6 +41,10 @@ def by_ct(rng, true, sd=CT_SD_MM):
     return Body('femur', np.arange(len(true)) + 1, given, np.full(len(true), sd))
 
 
+def unknown(count=len(CORNERS)):
+    return Body('femur', np.arange(count) + 1, np.full((count, 3), np.nan), np.full(count, np.inf))
+
+
 def relative_errors(shape, true):
     rotation, shift = fitted_pose(shape.body.xyz_mm, true)
     return shape.body.xyz_mm @ rotation.T + shift - true
@@ -72,10 +78,43 @@ def test_errors_of_ct_are_recovered():
     assert 0.03 < shape.mean_error_mm < 0.1
 
 
+def test_covariance_is_that_of_the_errors_in_the_datum_of_the_markers():
+    """Of 12 coordinates 6 are the motion of the body, which has no error."""
+    rng = np.random.default_rng(7)
+    true = CORNERS[:4]
+    squares = []
+    for _ in range(40):
+        found = estimate_shape(unknown(len(true)), recording(rng, true, 60)).body
+        rotation, shift = fitted_pose(true, found.xyz_mm)
+        error = (found.xyz_mm - true @ rotation.T - shift).ravel()
+        variance, axes = np.linalg.eigh(found.covariance_mm2)
+        assert variance[5] < 1e-9 * variance[6]
+        squares.append(np.sum((axes[:, 6:].T @ error) ** 2 / variance[6:]) / 6)
+    assert np.mean(squares) == pytest.approx(1, abs=4 * np.sqrt(2 / 240))
+
+
+def test_false_places_are_left_out():
+    """Three of 1000 are false matches by 100 mm; a marker with many of them is loose."""
+    rng = np.random.default_rng(8)
+    places = recording(rng, CORNERS, 400, lost=0.0)
+    clean = estimate_shape(unknown(), places)
+    false = rng.random(places.seen.shape) < 0.003
+    assert np.count_nonzero(false) > 3
+    wrong = places.xyz_mm + np.where(false[..., None], rng.uniform(-100, 100, 3), 0.0)
+    found = estimate_shape(unknown(), replace(places, xyz_mm=wrong))
+    assert not found.findings
+    assert np.abs(relative_errors(found, CORNERS)).max() < 0.01
+    np.testing.assert_allclose(found.body.sd_mm, clean.body.sd_mm, rtol=0.05)
+    moves = rng.random(400) < 0.2
+    jumping = places.xyz_mm.copy()
+    jumping[moves, 2] += rng.normal(0, 1.0, (np.count_nonzero(moves), 3))
+    found = estimate_shape(unknown(), replace(places, xyz_mm=jumping))
+    assert Kind.MARKER_LOOSE in kinds(found.findings)
+
+
 def test_a_shape_without_ct():
     rng = np.random.default_rng(3)
-    unknown = Body('femur', np.arange(5), np.full((5, 3), np.nan), np.full(5, np.inf))
-    shape = estimate_shape(unknown, recording(rng, CORNERS))
+    shape = estimate_shape(unknown(), recording(rng, CORNERS))
     assert not shape.findings and shape.body.known.all()
     away = relative_errors(shape, CORNERS) / shape.body.sd_mm[:, None]
     assert 0.3 < np.mean(away**2) < 1.6

@@ -4,6 +4,7 @@
 """fluoro-calib heal: a virtual rig is bumped, and calibrated anew from a walking knee."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from rigs import run
 
 from fluoro_calib_ros.io.calibration import load_orientation
+from fluoro_calib_ros.io.learned_shapes import LEARNED_SHAPES, read_learned_shapes
 from fluoro_calib_ros.jobs.simulation import write_knee_recording
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.simulation.knee import simulate_knee, virtual_knee, walking
@@ -33,7 +35,7 @@ def rig(tmp_path_factory):
     assert run(*calibrate, '--fast', '--out', folder / 'result') == 0
     bodies = ('bodies', folder / 'walking', '--bodies', folder / 'bodies.csv')
     calibration = ('--calibration', folder / 'result')
-    assert run(*bodies, *calibration, '--out', folder / 'learned') == 0
+    assert run(*bodies, *calibration, '--learn', '--out', folder / 'learned') == 0
     virtual = virtual_rig(SEED)
     a, b = virtual.fluoroscopes
     moved = replace(
@@ -55,8 +57,7 @@ def rig(tmp_path_factory):
 
 def heal(rig, recording, out, *more):
     return run(
-        *('heal', rig / recording, '--bodies', rig / 'learned' / 'shapes.csv'),
-        *('--calibration', rig / 'result', '--out', out, *more),
+        *('heal', rig / recording, '--calibration', rig / 'result', '--out', out, *more),
     )
 
 
@@ -74,6 +75,12 @@ def test_bumped_rig_is_healed_and_its_points_are_right_again(rig, tmp_path, caps
     assert document['orientation_id'] == after.orientation_id and after.source == 'healing'
     # Nothing but the orientation of b has changed: the calibrations are the same.
     assert after.calibration_ids == before.calibration_ids
+    assert document['common_motion']['numbers']['distance_mm'] > 0.05
+    learned = read_learned_shapes(healed)
+    assert learned.orientation_ids == (before.orientation_id, after.orientation_id)
+    again = ('heal', rig / 'bumped', '--calibration', healed, '--out', tmp_path / 'again')
+    assert run(*again) == 0
+    assert 'as it was calibrated' in capsys.readouterr().out
     change = document['changes']['b']
     np.testing.assert_array_less(
         np.abs(np.radians(change['rotation_deg']) - TURNED_RAD),
@@ -108,6 +115,12 @@ def test_what_cannot_be_healed_is_refused(rig, tmp_path, capsys):
     assert run(*base, '--bodies', unknown) == 1
     assert 'body femur: the places of 0 of its 4 markers are known' in capsys.readouterr().err
     assert run(*base, '--bodies', shapes, '--orientation', tmp_path / 'none.npz') == 1
+    plain = shutil.copytree(rig / 'result', tmp_path / 'plain')
+    (plain / LEARNED_SHAPES).unlink()
+    capsys.readouterr()
+    unlearned = ('heal', rig / 'bumped', '--calibration', plain, '--out', tmp_path / 'out')
+    assert run(*unlearned) == 1
+    assert 'no shapes of bodies were learned' in capsys.readouterr().err
     inside = ('heal', rig / 'bumped', '--calibration', rig / 'result', '--bodies', shapes)
     assert run(*inside, '--out', rig / 'result') == 1
     assert 'would be overwritten' in capsys.readouterr().err

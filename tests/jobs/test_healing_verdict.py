@@ -28,7 +28,7 @@ def outcome(*changes):
         healing._unused(SimpleNamespace(changes=changes, complete=True), 2, RIG),
     ]
     diagnosis = SimpleNamespace(changes=(), probability=())
-    errors = RigErrors(1e-4, 0.01)
+    errors = RigErrors(1e-4, 0.01, common_mm=0.2)
     return healing.HealingOutcome(
         diagnosis,
         healed=None,
@@ -36,6 +36,7 @@ def outcome(*changes):
         orientation=RIG.orientation,
         before=errors,
         after=errors,
+        common_motion=healing.common_motion(0.3),
         verdict=verdict_of(checks),
         checks=tuple(checks),
         findings=(),
@@ -69,7 +70,9 @@ def test_rig_that_changed_during_the_recording_is_told():
     assert not any('no change' in line for line in lines)
     steady = outcome()
     assert not steady.changed_meanwhile and steady.verdict == 'pass'
-    assert 'no change of the rig is evident' in _lines(Namespace(out='healed'), steady)[0]
+    lines = _lines(Namespace(out='healed'), steady)
+    assert 'no change of the rig is evident' in lines[0]
+    assert lines[1] == healing.common_motion(0.3).sentence
 
 
 def test_distortion_that_a_model_cannot_take_is_diagnosed_and_does_not_pass():

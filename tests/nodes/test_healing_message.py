@@ -8,14 +8,15 @@ from types import SimpleNamespace
 import pytest
 from fluoro_calib_msgs.action import Heal
 
+from fluoro_calib_ros.jobs.healing import common_motion
 from fluoro_calib_ros.nodes.messages.healing import fill_healing
 
 
 @pytest.mark.parametrize(
     'meanwhile, message',
     [
-        (True, 'the rig changed during the recording; verdict: fail'),
-        (False, 'no change is evident; verdict: fail'),
+        (True, 'the rig changed during the recording'),
+        (False, 'no change is evident'),
     ],
 )
 def test_message_tells_that_the_rig_changed_during_the_recording(meanwhile, message):
@@ -28,7 +29,8 @@ def test_message_tells_that_the_rig_changed_during_the_recording(meanwhile, mess
         after=SimpleNamespace(place_mm=0.01, scale=1e-4),
         healed=None,
         changed_meanwhile=meanwhile,
+        common_motion=common_motion(0.3),
     )
     result = Heal.Result()
     fill_healing(result, outcome, SimpleNamespace(orientation_id='rig-0'))
-    assert result.message == message
+    assert result.message == f'{message}; {common_motion(0.3).sentence}; verdict: fail'

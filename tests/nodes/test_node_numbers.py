@@ -346,11 +346,9 @@ def test_default_folder_follows_the_namespace(monkeypatch):
 def collection(monkeypatch, most=3):
     monkeypatch.setattr(healing_services, 'MAX_FRAMES', most)
     monkeypatch.setattr(healing_services, 'frame_from_observed', lambda seen, name, angle: seen)
-    rig = Fake(
-        bodies=[Fake(target_id=np.array([5, 2])), Fake(target_id=np.array([40]))],
-        calibrations={'a': Fake(image_size=(1024, 1024))},
-    )
-    return healing_services._Collection(rig)
+    bodies = [Fake(target_id=np.array([5, 2])), Fake(target_id=np.array([40]))]
+    calibrations = {'a': Fake(image_size=(1024, 1024))}
+    return healing_services.MarkerCollection(bodies, calibrations)
 
 
 def test_collection_keeps_the_markers_of_bodies(monkeypatch):

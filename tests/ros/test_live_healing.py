@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A rig is bumped and healed live, with the numbers of the command; versions come and go."""
+"""Shapes are learned live, the rig is bumped and healed, with the numbers of the command."""
 
 import itertools
 import json
@@ -15,12 +15,18 @@ from rigs import run
 from ros_graph import ABORTED, CANCELED, JOB_DEADLINE, NAMES, SUCCEEDED, value_of
 from test_reconstruction import coordinates
 
+from fluoro_calib_ros.checks.rig_watch import RigDriftWatch
 from fluoro_calib_ros.io.bodies import write_bodies
-from fluoro_calib_ros.io.calibration import load_orientation, orientation_path
+from fluoro_calib_ros.io.calibration import load_calibrations, load_orientation, orientation_path
+from fluoro_calib_ros.io.learned_shapes import LEARNED_SHAPES, read_learned_shapes
 from fluoro_calib_ros.jobs.healing import BLOCKS
+from fluoro_calib_ros.jobs.reconstruction import ReconstructionOptions
 from fluoro_calib_ros.jobs.simulation import write_bag
 from fluoro_calib_ros.nodes.messages.observations import message_from_frame
+from fluoro_calib_ros.nodes.messages.points import PointsContent, message_from_points
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
+from fluoro_calib_ros.reconstruction.intersection import Intersector
+from fluoro_calib_ros.reconstruction.reconstruct import reconstruct_recording
 from fluoro_calib_ros.simulation.knee import simulate_knee, virtual_knee, walking
 from fluoro_calib_ros.simulation.rig import virtual_rig
 
@@ -29,6 +35,7 @@ EXPOSURES = 60
 RATE_HZ = 120.0
 MOVED_MM = np.array([3.0, -2.0, 3.5])  # 5 mm
 TURNED_RAD = np.radians([0.35, -0.28, 0.22])  # 0.5 degrees
+COVARIANCE = [f'cov_{name}' for name in ('xx', 'xy', 'xz', 'yy', 'yz', 'zz')]
 FAULTS = ('accept_healing', 'roll_back_healing')
 
 
@@ -44,28 +51,36 @@ def bumped_rig():
     return replace(rig, fluoroscopes=(a, moved))
 
 
+def later(frame):
+    """A frame of the bumped rig, which comes after those of the healthy one."""
+    stamp_ns = frame.stamp_ns + round(1e9 * EXPOSURES / 60)
+    return replace(frame, number=frame.number + EXPOSURES, stamp_ns=stamp_ns)
+
+
 class Rig:
-    """All nodes with a calibration, learned shapes, and a knee that walks in a bumped rig."""
+    """All nodes with a calibration; a knee walks, and walks on in a bumped rig."""
 
     def __init__(self, graph, folder, by_command):
         self.graph = graph
         self.client = graph.client
-        self.calibrated = by_command
+        self.calibrated = shutil.copytree(by_command, folder / 'by_command')
         self.folder = shutil.copytree(by_command, folder / 'calibrations')
         self.knee = virtual_knee(SEED)
         self.motion = walking(self.knee, np.arange(EXPOSURES) / 60)
-        write_bodies(folder / 'bodies.csv', self.knee.surveyed)
-        healthy = simulate_knee(virtual_rig(SEED), self.knee, self.motion)
-        write_bag(folder / 'walking', healthy.frames)
-        given = ('--bodies', folder / 'bodies.csv', '--calibration', by_command)
-        assert run('bodies', folder / 'walking', *given, '--out', folder / 'learned') == 0
-        self.shapes = folder / 'learned' / 'shapes.csv'
-        bumped = simulate_knee(bumped_rig(), self.knee, self.motion)
+        self.bodies = folder / 'bodies.csv'
+        write_bodies(self.bodies, self.knee.surveyed)
+        self.healthy = simulate_knee(virtual_rig(SEED), self.knee, self.motion).frames
+        write_bag(folder / 'walking', self.healthy)
+        given = ('--bodies', self.bodies, '--calibration', self.calibrated, '--learn')
+        assert run('bodies', folder / 'walking', *given, '--out', folder / 'motion') == 0
+        bumped = simulate_knee(bumped_rig(), self.knee, self.motion).frames
+        self.frames = {name: [later(frame) for frame in bumped[name]] for name in NAMES}
         self.bag = folder / 'bumped'
-        write_bag(self.bag, bumped.frames)
-        self.frames = bumped.frames
-        self.first = 0
-        nodes = graph.whole_chain(self.folder, learned_shapes=self.shapes)
+        write_bag(self.bag, self.frames)
+        # One exposure less does not do.
+        nodes = graph.whole_chain(
+            self.folder, learn_bodies=self.bodies, learn_time=(EXPOSURES - 1.5) / 60
+        )
         self.reconstruction = nodes['reconstruction_node']
         self.points = self.client.listen('reconstruction/points_with_covariance')
         self.orientations = self.client.listen('rig_orientation')
@@ -78,16 +93,18 @@ class Rig:
             what='the first orientation',
         )
         graph.wait_for_readers(1)
+        assert not (self.folder / LEARNED_SHAPES).exists()
+        self.publish(self.healthy)
+        self.client.wait_for_diagnostics(
+            'calibration_node', lambda s: s.message.startswith('shapes of'), 'shapes', 'shapes'
+        )
 
-    def pairs(self):
-        """Yield (fluoroscope, message) of the exposures, in their order."""
-        for pair in zip(*(self.frames[name] for name in NAMES)):
-            yield from ((frame.fluoroscope, message_from_frame(frame)) for frame in pair)
-
-    def publish(self):
-        """Publish all exposures; returns the points (T, n, 3) [mm] found in them."""
+    def publish(self, frames=None):
+        """Publish exposures, by default all of the bump; returns the points (T, n, 3) [mm]."""
         before = len(self.points)
-        self.client.publish_in_step(list(self.pairs()), lambda: 2 * (len(self.points) - before))
+        pairs = zip(*((frames or self.frames)[name] for name in NAMES))
+        messages = [(one.fluoroscope, message_from_frame(one)) for pair in pairs for one in pair]
+        self.client.publish_in_step(messages, lambda: 2 * (len(self.points) - before))
         self.client.wait_until(
             lambda: len(self.points) == before + EXPOSURES, what='points of all exposures'
         )
@@ -106,20 +123,30 @@ class Rig:
         self.publish()
         return self.client.result_of(answer, JOB_DEADLINE)
 
-    def stream(self):
-        """Yield pairs of frames of a knee that walks on and on."""
-        pairs = list(zip(*(self.frames[name] for name in NAMES)))
+    def stream(self, of_rig=None):
+        """Yield pairs of frames of a knee that walks on and on, of the last rig of a list."""
+        of_rig = of_rig or [self.frames]
         step_ns = round(1e9 / RATE_HZ)
         for number in itertools.count(10**6):
-            pair = pairs[number % EXPOSURES]
+            pair = [of_rig[-1][name][number % EXPOSURES] for name in NAMES]
             yield [replace(f, number=number, stamp_ns=10**18 + number * step_ns) for f in pair]
 
     def by_command(self, tmp_path, capsys):
         """Return healing.json of the same exposures by the command."""
         capsys.readouterr()
-        given = ('--bodies', self.shapes, '--calibration', self.calibrated)
-        assert run('heal', self.bag, *given, '--out', tmp_path / 'healed', '--json') == 0
+        given = ('--calibration', self.calibrated, '--out', tmp_path / 'healed')
+        assert run('heal', self.bag, *given, '--json') == 0
         return json.loads(capsys.readouterr().out)
+
+    def restart_reconstruction(self):
+        """End the reconstruction node, and start another one."""
+        assert self.reconstruction.end() == 0
+        self.transforms.clear()
+        self.reconstruction = self.graph.start('reconstruction_node')
+        self.client.wait_until(
+            lambda: self.transforms and len(self.transforms[-1].transforms) > 2, what='transforms'
+        )
+        self.graph.wait_for_readers(1)
 
     def wait_for_orientation(self, orientation_id):
         self.client.wait_for_diagnostics(
@@ -157,6 +184,53 @@ def rig(module_graph, by_command, tmp_path_factory):
     return Rig(module_graph, tmp_path_factory.mktemp('healing'), by_command)
 
 
+@pytest.fixture
+def learned(rig, calibrated):
+    """Folder with a calibration and learned shapes that a test may change."""
+    shutil.copy(rig.calibrated / LEARNED_SHAPES, calibrated)
+    return calibrated
+
+
+def test_shapes_are_learned_live_to_the_same_bytes(rig):
+    live, offline = (folder / LEARNED_SHAPES for folder in (rig.folder, rig.calibrated))
+    assert live.read_bytes() == offline.read_bytes()
+    learned = read_learned_shapes(rig.folder)
+    assert learned.exposures == EXPOSURES
+    assert learned.begin_ns == rig.healthy['a'][0].stamp_ns
+    assert learned.end_ns == rig.healthy['a'][-1].stamp_ns
+    for body in learned.bodies:
+        assert body.covariance_mm2.shape == (12, 12) and (body.sd_mm < 0.1).all()
+
+
+def test_deviations_between_alarm_and_healing_are_those_of_the_recording(rig):
+    """The same bytes live and offline, before the alarm and with what it adds."""
+    first = len(rig.points) - EXPOSURES
+    points = rig.publish()
+    frames = {name: [*rig.healthy[name], *rig.frames[name]] for name in NAMES}
+    calibrations = load_calibrations(rig.folder)
+    orientation = load_orientation(orientation_path(rig.folder))
+    sizes = {name: calibrations[name].image_size for name in NAMES}
+    watch = RigDriftWatch(orientation, sizes)
+    intersector = Intersector(orientation, ReconstructionOptions().reject)
+    offline, _ = reconstruct_recording(frames, calibrations, intersector, watch=watch)
+    assert watch.widening is not None
+    for message, frame in zip(rig.points[first:], offline, strict=True):
+        content = PointsContent(
+            frame.stamp_ns,
+            frame.number,
+            message.orientation_id,
+            orientation=orientation,
+            target_id=frame.target_id,
+            points=frame.points,
+        )
+        expected = message_from_points(content)
+        for name in COVARIANCE:
+            assert getattr(message, name).tobytes() == getattr(expected, name).tobytes()
+    assert found_share(points[:10]) < 0.1, 'views that do not fit give no points'
+    before, after = (np.nanmedian(rig.points[row].cov_zz) for row in (first, -1))
+    assert after > 10 * before, 'along the view of a'
+
+
 def test_bumped_rig_is_healed_accepted_and_rolled_back(rig, tmp_path, capsys):
     """Live numbers are those of the command, points are right again, and the parent is kept."""
     before = load_orientation(orientation_path(rig.folder))
@@ -164,7 +238,6 @@ def test_bumped_rig_is_healed_accepted_and_rolled_back(rig, tmp_path, capsys):
         refused = rig.client.call(Reset, service)
         assert not refused.success
     assert 'was not healed, there is nothing to roll back' in refused.message
-    bumped = rig.publish()
     answer = rig.healed(seconds=3.0)
     assert answer.status == SUCCEEDED, answer.result.message
     result = answer.result
@@ -196,13 +269,15 @@ def test_bumped_rig_is_healed_accepted_and_rolled_back(rig, tmp_path, capsys):
     assert kept.transform == first.transform, 'the frame as calibrated does not jump'
     moved = child.transform.translation
     assert 1000 * np.linalg.norm([moved.x, moved.y, moved.z]) == pytest.approx(shift, rel=1e-6)
+    rig.restart_reconstruction()
+    again = {one.child_frame_id: one for one in rig.transforms[-1].transforms}
+    assert again == transforms, 'the frame as calibrated outlives the node'
     saved = load_orientation(orientation_path(rig.folder))
     assert (saved.orientation_id, saved.source) == (result.orientation_id, 'healing')
     versions = {path.name for path in (rig.folder / 'versions').iterdir()}
     assert versions == {before.orientation_id, result.orientation_id}
     points = rig.publish()
     assert rig.points[-1].orientation_id == result.orientation_id
-    assert found_share(bumped) < 0.1, 'views that do not fit give no points'
     assert found_share(points) > 0.9
     assert rig.shape_error_mm(points) < 0.2
     assert not rig.client.call(Reset, 'accept_healing').success
@@ -257,12 +332,12 @@ def test_refused_healing_gives_the_reason(rig, fields, message):
     assert answer.status == ABORTED and answer.result.message == message
 
 
-def test_what_is_missing_is_told(graph, tmp_path, calibrated, rig):
-    for directory, parameters, message in (
-        (calibrated, {}, 'parameter learned_shapes is not set'),
-        (tmp_path / 'empty', {'learned_shapes': rig.shapes}, 'fluoroscope a is not calibrated'),
+def test_what_is_missing_is_told(graph, tmp_path, calibrated):
+    for directory, message in (
+        (calibrated, 'no shapes of bodies were learned while the rig was healthy'),
+        (tmp_path / 'empty', 'fluoroscope a is not calibrated'),
     ):
-        node = graph.calibration_node(directory, **parameters)
+        node = graph.calibration_node(directory)
         answer = graph.client.result_of(graph.client.heal().get_result_async())
         assert answer.status == ABORTED and message in answer.result.message
         assert node.end() == 0
@@ -271,11 +346,11 @@ def test_what_is_missing_is_told(graph, tmp_path, calibrated, rig):
         )
 
 
-def test_healed_rig_accepted_by_the_parameter_outlives_the_node(rig, graph, calibrated):
-    before = load_orientation(orientation_path(calibrated)).orientation_id
+def test_healed_rig_accepted_by_the_parameter_outlives_the_node(rig, graph, learned):
+    before = load_orientation(orientation_path(learned)).orientation_id
     client = graph.client
     published = client.listen('rig_orientation')
-    node = graph.calibration_node(calibrated, learned_shapes=rig.shapes, heal_accept=True)
+    node = graph.calibration_node(learned, heal_accept=True)
     answer = client.heal(seconds=1.0).get_result_async()
     client.stream(rig.stream(), RATE_HZ)
     result = client.result_of(answer, JOB_DEADLINE).result
@@ -287,13 +362,14 @@ def test_healed_rig_accepted_by_the_parameter_outlives_the_node(rig, graph, cali
     assert node.end() == 0
     client.wait_until(lambda: not client.count_publishers('rig_orientation'), what='its end')
     published.clear()
-    graph.calibration_node(calibrated)
+    graph.calibration_node(learned)
     client.wait_until(lambda: published, what='the saved rig')
     assert published[-1].orientation_id == result.orientation_id
     back = client.call(Reset, 'roll_back_healing')
     assert back.success, back.message
     client.wait_until(lambda: published[-1].orientation_id == before, what='the parent')
-    assert load_orientation(orientation_path(calibrated)).orientation_id == before
+    assert load_orientation(orientation_path(learned)).orientation_id == before
+    assert len(read_learned_shapes(learned).orientation_ids) == 2
 
 
 def stream_of(rig, virtual, motion):
@@ -303,9 +379,9 @@ def stream_of(rig, virtual, motion):
         yield [replace(f, stamp_ns=10**18 + f.number * 10**7) for f in pair]
 
 
-def test_healthy_rig_is_left_as_it_is(rig, graph, calibrated):
+def test_healthy_rig_is_left_as_it_is(rig, graph, learned):
     client = graph.client
-    graph.calibration_node(calibrated, learned_shapes=rig.shapes, heal_accept=True)
+    graph.calibration_node(learned, heal_accept=True)
     answer = client.heal(seconds=1.0).get_result_async()
     client.stream(stream_of(rig, virtual_rig(SEED), rig.motion), RATE_HZ)
     result = client.result_of(answer, JOB_DEADLINE).result
@@ -314,10 +390,10 @@ def test_healthy_rig_is_left_as_it_is(rig, graph, calibrated):
     assert 'no healed rig to accept' in client.call(Reset, 'accept_healing').message
 
 
-def test_rig_that_moves_while_it_is_recorded_is_not_accepted(rig, graph, calibrated):
+def test_rig_that_moves_while_it_is_recorded_is_not_accepted(rig, graph, learned):
     client = graph.client
-    before = load_orientation(orientation_path(calibrated)).orientation_id
-    graph.calibration_node(calibrated, learned_shapes=rig.shapes, heal_accept=True)
+    before = load_orientation(orientation_path(learned)).orientation_id
+    graph.calibration_node(learned, heal_accept=True)
     answer = client.heal(seconds=1.5).get_result_async()
     # The blocks that the diagnosis does not use show the rig as it was.
     rigs = zip(
@@ -331,12 +407,12 @@ def test_rig_that_moves_while_it_is_recorded_is_not_accepted(rig, graph, calibra
     assert not refused.success
     assert result.orientation_id
     assert refused.message.startswith('not accepted: the verdict on the healed rig is fail: ')
-    assert load_orientation(orientation_path(calibrated)).orientation_id == before
+    assert load_orientation(orientation_path(learned)).orientation_id == before
 
 
-def test_too_few_exposures_are_refused(rig, graph, calibrated):
+def test_too_few_exposures_are_refused(rig, graph, learned):
     client = graph.client
-    graph.calibration_node(calibrated, learned_shapes=rig.shapes)
+    graph.calibration_node(learned)
     answer = client.heal(seconds=1.0).get_result_async()
     few = itertools.islice(stream_of(rig, bumped_rig(), rig.motion), 8)
     client.stream(few, RATE_HZ)
@@ -346,15 +422,14 @@ def test_too_few_exposures_are_refused(rig, graph, calibrated):
     assert refused.result.message.endswith('two views, 10 are needed')
 
 
-def test_alarm_of_the_drift_watch_heals_the_rig(rig, graph, calibrated):
+def test_alarm_of_the_drift_watch_heals_the_rig(rig, graph, learned):
     """From the bump on, nobody asks: the watch, the healing and its acceptance follow."""
     client = graph.client
-    before = load_orientation(orientation_path(calibrated)).orientation_id
+    before = load_orientation(orientation_path(learned)).orientation_id
     orientations = client.listen('rig_orientation')
     graph.whole_chain(
-        calibrated,
+        learned,
         {'heal_on_drift': True},
-        learned_shapes=rig.shapes,
         heal_accept=True,
         heal_time=1.0,
     )
@@ -371,8 +446,9 @@ def test_alarm_of_the_drift_watch_heals_the_rig(rig, graph, calibrated):
             yield [replace(f, number=number, stamp_ns=stamp_ns) for f in pair]
 
     client.stream(stream(), 2 * RATE_HZ)
-    learned = client.wait_for_diagnostics
-    learned('reconstruction_node', lambda s: int(value_of(s, 'observations') or 0) > 4500, 'drift')
+    client.wait_for_diagnostics(
+        'reconstruction_node', lambda s: int(value_of(s, 'observations') or 0) > 4500, 'drift'
+    )
     assert {one.orientation_id for one in orientations} == {before}
     is_bumped = True
     client.wait_for_diagnostics(
@@ -388,11 +464,51 @@ def test_alarm_of_the_drift_watch_heals_the_rig(rig, graph, calibrated):
     )
     client.end_stream()
     assert orientations[-1].source == 'healing'
-    assert load_orientation(orientation_path(calibrated)).orientation_id == healed
+    assert load_orientation(orientation_path(learned)).orientation_id == healed
 
 
-def test_node_ends_while_it_heals(rig, graph, calibrated):
-    node = graph.calibration_node(calibrated, learned_shapes=rig.shapes)
+def test_nothing_is_learned_after_an_alarm_of_the_drift_watch(rig, graph, calibrated):
+    client = graph.client
+    graph.whole_chain(calibrated, learn_bodies=rig.bodies, learn_time=600.0)
+    points = client.listen('reconstruction/points_with_covariance')
+
+    def told(message):
+        client.wait_for_diagnostics('calibration_node', lambda s: message in s.message, 'shapes')
+
+    told('markers seen for')
+    of_rig = [rig.healthy]
+    client.stream(rig.stream(of_rig), RATE_HZ, lambda: len(points))
+    client.wait_for_diagnostics(
+        'reconstruction_node', lambda s: int(value_of(s, 'observations') or 0) > 1000, 'drift'
+    )
+    of_rig.append(rig.frames)
+    told('the drift watch has given an alarm')
+    client.end_stream()
+    assert not (calibrated / LEARNED_SHAPES).exists()
+
+
+def test_no_exposure_is_lost_while_shapes_are_learned(rig, graph, calibrated):
+    client = graph.client
+    graph.whole_chain(calibrated, learn_bodies=rig.bodies, learn_time=2.0)
+    points = client.listen('reconstruction/points_with_covariance')
+    client.wait_until(
+        lambda: client.count_publishers('reconstruction/points_with_covariance'), what='points'
+    )
+    graph.wait_for_readers(1)
+    client.stream(rig.stream([rig.healthy]), RATE_HZ, lambda: len(points))
+    client.wait_for_diagnostics(
+        'calibration_node', lambda s: s.message.startswith('shapes of'), 'shapes', 'shapes'
+    )
+    published = client.published
+    client.end_stream()
+    client.wait_until(lambda: len(points) == published, what='points of all exposures')
+    numbers = [m.frame_number for m in points]
+    assert numbers == list(range(10**6, 10**6 + published)) and published > 2 * RATE_HZ
+    assert read_learned_shapes(calibrated).exposures == pytest.approx(2 * RATE_HZ, abs=2)
+
+
+def test_node_ends_while_it_heals(rig, graph, learned):
+    node = graph.calibration_node(learned)
     graph.client.heal(seconds=60.0)
     assert node.end() == 0
     assert 'Traceback' not in node.log

@@ -28,7 +28,11 @@ def fill_healing(result: Heal.Result, outcome: HealingOutcome, parent: RigOrient
     if outcome.changed_meanwhile:
         what.insert(0, CHANGED_MEANWHILE)
     result.message = '; '.join(
-        [*(what or ['no change is evident']), f'verdict: {outcome.verdict}']
+        [
+            *(what or ['no change is evident']),
+            outcome.common_motion.sentence,
+            f'verdict: {outcome.verdict}',
+        ]
     )
 
 

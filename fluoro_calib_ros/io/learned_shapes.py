@@ -1,0 +1,99 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Shapes of bodies that a healthy rig has learned: learned_shapes.json beside its calibrations."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..bodies.body import Body, check_bodies
+from ..bodies.shapes import LearnedShapes
+from ..errors import DataError, ErrorsAt
+from .access import PathLike
+from .calibration import edited, with_digest
+from .documents import read_json, write_json
+
+LEARNED_SHAPES = 'learned_shapes.json'
+VERSION = 1
+
+
+def write_learned_shapes(directory: PathLike, learned: LearnedShapes) -> None:
+    """Write learned shapes into a folder, to be read with the same values. Raises DataError."""
+    bodies = [
+        {
+            'body': body.name,
+            'marker': body.target_id,
+            'xyz_mm': body.xyz_mm,
+            'sd_mm': body.sd_mm,
+            'covariance_mm2': body.covariance_mm2,
+        }
+        for body in learned.bodies
+    ]
+    document = {
+        'version': VERSION,
+        'orientation_ids': learned.orientation_ids,
+        'calibration_ids': learned.calibration_ids,
+        'begin_ns': learned.begin_ns,
+        'end_ns': learned.end_ns,
+        'exposures': learned.exposures,
+        'bodies': bodies,
+    }
+    write_json(Path(directory) / LEARNED_SHAPES, with_digest(document))
+
+
+def has_learned_shapes(directory: PathLike) -> bool:
+    """Return whether a folder contains learned shapes."""
+    return os.path.exists(Path(directory) / LEARNED_SHAPES)
+
+
+def read_learned_shapes(directory: PathLike) -> LearnedShapes:
+    """Read the learned shapes of a folder. Raises DataError, also for a file that was edited."""
+    path = Path(directory) / LEARNED_SHAPES
+    document = read_json(path)
+    if document.get('version') != VERSION:
+        raise DataError(
+            f'{path}: version {document.get("version")} of learned shapes is not known, only '
+            f'{VERSION}'
+        )
+    found = edited(directory, document, LEARNED_SHAPES)
+    if found is not None:
+        raise DataError(found)
+    with ErrorsAt(path):
+        try:
+            learned = LearnedShapes(
+                bodies=tuple(_body(one) for one in document['bodies']),
+                orientation_ids=tuple(document['orientation_ids']),
+                calibration_ids=dict(document['calibration_ids']),
+                begin_ns=int(document['begin_ns']),
+                end_ns=int(document['end_ns']),
+                exposures=int(document['exposures']),
+            )
+        except (KeyError, TypeError, ValueError) as error:  # DataError among them
+            raise (
+                error
+                if isinstance(error, DataError)
+                else DataError(f'this is not a file of learned shapes ({error})')
+            ) from None
+        check_bodies(learned.bodies)
+    return learned
+
+
+def _body(document: Any) -> Body:
+    """Return a body. Raises DataError, KeyError, TypeError and ValueError."""
+    markers = np.array(document['marker'], dtype=np.int64)
+    size = 3 * len(markers)
+    covariance = np.array(document['covariance_mm2'], dtype=float)
+    if covariance.shape != (size, size) or not np.isfinite(covariance).all():
+        raise DataError(f'the covariance of {document["body"]} is not {size} x {size} numbers')
+    return Body(
+        str(document['body']),
+        markers,
+        np.array(document['xyz_mm'], dtype=float),
+        np.array(document['sd_mm'], dtype=float),
+        covariance_mm2=covariance,
+    )

@@ -1,0 +1,122 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The job of learning: shapes of bodies by a healthy rig, with which it is healed later."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ..bodies.body import Body, check_bodies
+from ..bodies.shapes import EstimatedShape, LearnedShapes
+from ..correction.fluoroscope_calibration import Calibrations
+from ..errors import DataError, ErrorsAt
+from ..exposures.frame import Frames
+from ..findings import Kind
+from ..io.access import PathLike
+from ..io.learned_shapes import has_learned_shapes, read_learned_shapes
+from ..photogrammetry.rig_orientation import RigOrientation
+from ..reconstruction.reconstruct import orientation_of_recorded
+from .bodies import BodiesOptions, estimated_shapes, intersected
+from .healing import MIN_EXPOSURES
+
+# What is wrong with a body whose shape is not used; what CT says of it does not matter.
+REFUSED = (
+    Kind.BODY_MIRRORED,
+    Kind.BODY_NOT_RIGID,
+    Kind.BODY_UNSEEN,
+    Kind.MARKER_LOOSE,
+    Kind.WRONG_UNIT,
+)
+# What the drift watch says in an alarm.
+DRIFTED = (Kind.CLUSTER_CHANGE, Kind.IMAGE_DRIFT, Kind.RAYS_DO_NOT_MEET)
+
+
+def learn_shapes(
+    frames: Frames,
+    calibrations: Calibrations,
+    orientation: RigOrientation,
+    bodies: Sequence[Body],
+    options: BodiesOptions | None = None,
+) -> LearnedShapes:
+    """Learn the shapes of bodies from a recording of a healthy rig.
+
+    Parameters
+    ----------
+    frames : mapping of str to sequence of Frame
+        Observed image points of the markers of bodies, by fluoroscope.
+    calibrations : mapping of str to FluoroscopeCalibration
+    orientation : RigOrientation
+    bodies : sequence of Body
+        Places of their markers may be unknown.
+    options : BodiesOptions, optional
+        How frames are paired.
+
+    Returns
+    -------
+    LearnedShapes
+        Without bodies that are loose, soft or not seen, which its findings name.
+
+    Raises
+    ------
+    DataError
+        For a healed rig, for a recording with an alarm of the drift watch, for frames that cannot
+        be paired or corrected, and where no shape can be learned.
+    """
+    if orientation.source == 'healing':
+        raise DataError(
+            f'{orientation.orientation_id} is a healed rig, from which no shapes are learned'
+        )
+    options = options or BodiesOptions()
+    check_bodies(bodies)
+    recorded = orientation_of_recorded(frames, orientation)
+    exposures, _, drift = intersected(frames, calibrations, recorded, options)
+    if drift.state is not None:
+        raise DataError(replace(drift.finding, advice='no shapes are learned in a drift'))
+    shapes = estimated_shapes(bodies, exposures)
+    learned = [_known(shape.body) for shape in shapes if _is_good(shape)]
+    findings = [finding for shape in shapes for finding in shape.findings]
+    if not learned:
+        raise DataError(
+            *[one for one in findings if one.kind in REFUSED],
+            f'no body has a shape from {MIN_EXPOSURES} exposures or more, none is learned',
+        )
+    return LearnedShapes(
+        tuple(learned),
+        (orientation.orientation_id,),
+        dict(zip(orientation.fluoroscopes, orientation.calibration_ids)),
+        begin_ns=exposures[0].stamp_ns,
+        end_ns=exposures[-1].stamp_ns,
+        exposures=len(exposures),
+        findings=tuple(findings),
+    )
+
+
+def learned_for(directory: PathLike, orientation: RigOrientation) -> LearnedShapes:
+    """Return the learned shapes in a folder of calibrations, for an orientation of theirs.
+
+    Raises DataError where there are none, or those of another calibration.
+    """
+    if not has_learned_shapes(directory):
+        raise DataError(
+            f'{directory}: no shapes of bodies were learned while the rig was healthy; they are '
+            'by fluoro-calib bodies --learn, or the parameter learn_bodies of calibration_node'
+        )
+    learned = read_learned_shapes(directory)
+    with ErrorsAt(directory):
+        learned.check(orientation.orientation_id)
+    return learned
+
+
+def _is_good(shape: EstimatedShape) -> bool:
+    """Whether a shape may be compared with what a rig sees later."""
+    enough = shape.exposures >= MIN_EXPOSURES and int(shape.body.known.sum()) >= 3
+    return enough and not any(one.kind in REFUSED for one in shape.findings)
+
+
+def _known(body: Body) -> Body:
+    """Return a body with the markers that were seen."""
+    return body.rows(body.known & np.isfinite(body.sd_mm))

@@ -1,0 +1,206 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""A calibration node learns the shapes of bodies while the rig is healthy, for the action heal.
+
+Once a second it looks how far it is: frames of markers are collected in the thread of the streams,
+and shapes are estimated from them in a process of their own.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping, Sequence
+
+from fluoro_calib_msgs.msg import DriftStatus
+from rclpy.task import Future
+
+from ..bodies.body import Body
+from ..bodies.shapes import LearnedShapes
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..errors import DataError, ErrorsAt
+from ..exposures.frame import Frame
+from ..io.bodies import read_bodies
+from ..io.learned_shapes import write_learned_shapes
+from ..jobs.bodies import BodiesOptions
+from ..jobs.learning import DRIFTED, learn_shapes, learned_for
+from ..photogrammetry.rig_orientation import RigOrientation
+from ..processes import in_worker_process
+from .calibration_services import Cancelled
+from .exposure_input import NodeParts, RigServices
+from .healing_services import MarkerCollection
+from .messages.observations import ObservedFrame
+from .runtime.diagnostics import OK, WARN, Health, Status
+from .runtime.parameters import expand_path
+from .runtime.services import in_thread
+
+PAUSE_S = 1.0  # between frames that show markers; a longer one is no time in which they are seen
+DRIFT = 'the drift watch has given an alarm: no shapes are learned before the next calibration'
+
+
+class _Window(MarkerCollection):
+    """Frames that show markers, for a time of the stream."""
+
+    def __init__(
+        self,
+        bodies: Sequence[Body],
+        calibrations: Mapping[str, FluoroscopeCalibration],
+        seconds: float,
+    ) -> None:
+        super().__init__(bodies, calibrations)
+        self._seconds = seconds
+        self._seen = dict.fromkeys(calibrations, 0.0)
+
+    @property
+    def seen_s(self) -> float:
+        """How long all fluoroscopes have seen markers [s]."""
+        return min(self._seen.values())
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether it has all frames."""
+        return all(map(self.is_full, self._seen))
+
+    def is_full(self, name: str) -> bool:
+        """Return whether no more frames of a fluoroscope are needed."""
+        return self._seen[name] >= self._seconds or super().is_full(name)
+
+    def keep(self, frame: Frame) -> None:
+        """Keep a frame that shows markers."""
+        if not len(frame.target_id):
+            return
+        before = self.frames.get(frame.fluoroscope)
+        if before:
+            after_s = (frame.stamp_ns - before[-1].stamp_ns) / 1e9
+            self._seen[frame.fluoroscope] += after_s if 0 < after_s <= PAUSE_S else 0.0
+        super().keep(frame)
+
+
+class ShapeLearning(RigServices):
+    """Learns shapes once for each orientation that is not healed, before any alarm."""
+
+    services = ()
+
+    def __init__(self, parts: NodeParts) -> None:
+        super().__init__(parts)
+        self._bodies = _declared(self._rig.settings().node.learn_bodies)
+        self._orientation: RigOrientation | None = None  # that is learned with
+        self._window: _Window | None = None
+        self._job: tuple[Future, threading.Thread] | None = None
+        self._stopping = threading.Event()
+        self._alarmed = False  # whether the drift watch has given an alarm of this orientation
+        self._learned: LearnedShapes | None = None
+        self._refusal = ''  # why the last shapes were not learned
+
+    def add(self, name: str, observed: ObservedFrame, angle: Callable[[], float | None]) -> None:
+        """Give a frame to the window, if any. Called in the thread of the streams."""
+        window = self._window
+        if window is not None:
+            window.add(name, observed, angle())
+
+    def on_drift(self, message: DriftStatus) -> None:
+        """Learn nothing any more where the drift watch has given an alarm."""
+        # A message that comes right after a new orientation may be about the one before.
+        if message.level != DriftStatus.OK and self._orientation is self._output.orientation:
+            self._alarmed = True
+            self._window = None
+
+    def end(self) -> None:
+        """Cancel a running job, and wait for its end."""
+        self._stopping.set()
+        if self._job is not None:
+            self._job[1].join()
+
+    def diagnose(self) -> list[Status]:
+        """Take the next step; return how far the shapes are, nothing where none are learned."""
+        if not self._bodies:
+            return []
+        if self._orientation is not self._output.orientation:
+            self._begin_anew()
+        if self._job is not None and self._job[0].done():
+            self._finish(self._job[0])
+        return [Status('shapes', *self._step())]
+
+    def _begin_anew(self) -> None:
+        """Begin with the orientation in use; what is learned with it already, is kept."""
+        self._orientation = orientation = self._output.orientation
+        self._window = self._learned = None
+        self._alarmed = False
+        self._refusal = ''
+        if orientation is not None:
+            try:
+                self._learned = learned_for(self._rig.directory, orientation)
+            except DataError as error:
+                self._logger.info(f'shapes of bodies are learned: {error}')
+
+    def _step(self) -> Health:
+        """Collect or estimate, whichever is next; returns level and message."""
+        orientation = self._orientation
+        learned = self._learned
+        if learned is not None:
+            names = ', '.join(body.name for body in learned.bodies)
+            return Health(OK, f'shapes of {names} learned from {learned.exposures} exposures')
+        if orientation is None:
+            return Health(OK, 'shapes are learned once the rig is oriented')
+        if orientation.source == 'healing':
+            return Health(WARN, 'no shapes are learned with a healed rig')
+        if self._alarmed:
+            return Health(WARN, DRIFT)
+        if self._job is not None:
+            return Health(OK, 'shapes are being estimated')
+        window = self._window
+        if window is None:
+            seconds = self._rig.settings().node.learn_time
+            window = self._window = _Window(self._bodies, self._output.calibrations, seconds)
+        if window.is_complete:
+            self._window = None
+            self._start(window, orientation)
+        again = f'not learned: {self._refusal}; ' if self._refusal else ''
+        return Health(WARN if again else OK, f'{again}markers seen for {window.seen_s:.1f} s')
+
+    def _start(self, window: _Window, orientation: RigOrientation) -> None:
+        """Estimate shapes in another process."""
+        pairing = self._rig.settings().pairing
+        options = BodiesOptions(pairing.pair_by, pairing.tolerance_s)
+        calibrations = self._output.calibrations
+
+        def raise_if_cancelled() -> None:
+            if self._stopping.is_set() or self._orientation is not orientation or self._alarmed:
+                raise Cancelled
+
+        self._job = in_thread(
+            self._node,
+            lambda: in_worker_process(
+                learn_shapes,
+                *(window.frames, calibrations, orientation, self._bodies, options),
+                raise_if_cancelled=raise_if_cancelled,
+            ),
+        )
+
+    def _finish(self, done: Future) -> None:
+        """Save what was learned, unless there was an alarm meanwhile."""
+        self._job = None
+        orientation = self._orientation
+        try:
+            learned = done.result()
+            if orientation is None or self._alarmed:
+                return
+            learned.check(orientation.orientation_id)
+            write_learned_shapes(self._rig.directory, learned)
+        except Cancelled:
+            return
+        except (DataError, OSError) as error:
+            self._refusal = str(error)
+            self._logger.error(f'no shapes learned: {error}')
+            self._alarmed = isinstance(error, DataError) and error.finding.kind in DRIFTED
+            return
+        self._learned = learned
+        for found in learned.findings:
+            self._logger.warning(found.sentence)
+        self._logger.info(f'shapes of {len(learned.bodies)} bodies learned')
+
+
+def _declared(path: str) -> tuple[Body, ...]:
+    """Return the bodies of a file, none without one. Raises DataError."""
+    with ErrorsAt('learn_bodies'):
+        return read_bodies(expand_path(path)) if path else ()

@@ -547,8 +547,8 @@ SENTENCES = {
     ),
     Kind.EXPOSURES: (
         'fluoroscope a: exposure # fits the calibration of the others worst, with # times the '
-        'expected residuals: inspect it (phantom or fluoroscope moved, wrong ids), exclude '
-        'it and calibrate again'
+        'expected residuals: inspect it (phantom or fluoroscope moved, wrong ids), leave it '
+        'out by a decision in doubtful.csv and calibrate again'
     ),
     Kind.HALVES: (
         'fluoroscope a: two halves of the exposures give corrections that differ by # px, '

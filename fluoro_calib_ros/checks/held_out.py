@@ -243,7 +243,8 @@ def _checks(evidence: Evidence, name: str, sums: Sequence[ExposureSums]) -> list
         f'exposure {number[worst]} fits the calibration of the others worst, '
         f'with {ratio[worst]:.2f} times the expected residuals',
         Place((name,), (int(number[worst]),), name=f'fluoroscope {name}'),
-        'inspect it (phantom or fluoroscope moved, wrong ids), exclude it and calibrate again',
+        'inspect it (phantom or fluoroscope moved, wrong ids), leave it out by a decision in '
+        'doubtful.csv and calibrate again',
         value=ratio[worst],
         limit=limits[worst],
         unit='1',
@@ -262,7 +263,7 @@ def _rejected_exposure(name: str, found: RejectedExposure) -> Check:
         'false matches, but agree with their neighbours',
         Place((name,), (found.number,), name=f'fluoroscope {name}'),
         'the calibration does not hold in this exposure: inspect it (phantom, lens or fluoroscope '
-        'moved, wrong ids), exclude it and calibrate again',
+        'moved, wrong ids), leave it out by a decision in doubtful.csv and calibrate again',
         numbers={'rejected_points': found.points, 'points': found.of},
         value=found.agreement,
         limit=found.limit,

@@ -271,6 +271,13 @@ def add_source(
     group = parser.add_argument_group('input')
     add_image_size(group, image_size_help)
     add_fluoroscopes(group)
+    group.add_argument(
+        '--decisions',
+        type=Path,
+        metavar='CSV',
+        help='table of doubtful image points and exposures (doubtful.csv) with your decisions: '
+        '"leave out", or the right target_id',
+    )
     add_file_options(parser)
     return group
 
@@ -367,6 +374,7 @@ def file_settings(arguments: argparse.Namespace, **changes: Any) -> FileSettings
         'one_based': arguments.one_based,
         'y_up': arguments.y_up,
         'trial': arguments.trial,
+        'decisions': getattr(arguments, 'decisions', None),
     }
     settings.update(changes)
     return FileSettings(**settings)

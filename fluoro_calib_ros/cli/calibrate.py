@@ -43,6 +43,7 @@ from .output import (
 
 if TYPE_CHECKING:
     from ..estimation.options import CalibrationRequest
+    from ..io.radiographs import Radiographs
     from ..jobs.calibration import CalibrationOutcome
     from ..jobs.sources import Recording, Survey
 
@@ -181,13 +182,16 @@ def run(arguments: argparse.Namespace) -> bool:
 
     Raises DataError.
     """
+    from ..io.radiographs import write_radiographs
     from ..jobs.calibration import run_calibration
     from ..jobs.result_folder import check_result_folder, save_outcome, write_covariances
 
-    inputs = (arguments.source, arguments.phantom, *arguments.known_orientation)
+    inputs = [arguments.source, arguments.phantom, *arguments.known_orientation]
+    inputs += [arguments.decisions] if arguments.decisions else []
     check_result_folder(arguments.out, inputs)
+    request, radiographs = _request(arguments)
     outcome = run_calibration(
-        _request(arguments),
+        request,
         validate=not arguments.fast,
         force=arguments.force,
         progress=print_round,
@@ -195,6 +199,7 @@ def run(arguments: argparse.Namespace) -> bool:
     )
 
     def write_more(folder: Path) -> None:
+        write_radiographs(folder, radiographs)
         if arguments.figures:
             from ..report.report_figures import write_figures
 
@@ -207,8 +212,8 @@ def run(arguments: argparse.Namespace) -> bool:
     return outcome.validation is None or outcome.validation.verdict == 'pass'
 
 
-def _request(arguments: argparse.Namespace) -> CalibrationRequest:
-    """Read what the arguments name. Raises DataError."""
+def _request(arguments: argparse.Namespace) -> tuple[CalibrationRequest, Radiographs]:
+    """Read what the arguments name, with radiographs of images. Raises DataError."""
     from ..estimation.options import CalibrationOptions, CalibrationRequest
     from ..exposures.names import Names
     from ..io.phantom import has_exposures, read_moving_points
@@ -228,7 +233,7 @@ def _request(arguments: argparse.Namespace) -> CalibrationRequest:
         frames = recording.frames
         phantom = survey.phantom
         names = recording.names
-    return CalibrationRequest(
+    request = CalibrationRequest(
         frames,
         phantom,
         options_of(CalibrationOptions, arguments),
@@ -239,19 +244,21 @@ def _request(arguments: argparse.Namespace) -> CalibrationRequest:
         about={
             'observations': str(arguments.source),
             'phantom': str(arguments.phantom),
+            **({'decisions': str(arguments.decisions)} if arguments.decisions else {}),
             **((arguments.rig_file and arguments.rig_file.about) or {}),
         },
     )
+    return request, recording.radiographs
 
 
 def _recording(arguments: argparse.Namespace, survey: Survey | None) -> Recording:
     """Read or extract the observations. Raises DataError."""
     from ..exposures.names import Names
     from ..jobs.image_sources import contains_images
-    from ..jobs.sources import read_source
+    from ..jobs.sources import read_source, with_decisions
 
     if contains_images(arguments.source):
-        return _extracted(arguments, survey)
+        return with_decisions(_extracted(arguments, survey), arguments.decisions)
     names = Names() if survey is None else survey.names
     return read_source(
         arguments.source,

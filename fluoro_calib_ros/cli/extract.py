@@ -252,10 +252,12 @@ def _text(out: Path, outcome: ExtractionOutcome) -> str:
 
 def _run_markers(arguments: argparse.Namespace) -> None:
     """Follow markers through images. Raises DataError."""
+    from ..exposures.names import Names
     from ..io.access import check_safe_name
+    from ..io.decisions import DOUBTFUL, doubtful_table
     from ..io.folder import check_output_file
     from ..io.observations import write_markers
-    from ..jobs.marker_extraction import run_marker_extraction
+    from ..jobs.marker_extraction import doubtful_ids, run_marker_extraction
 
     for name in arguments.fluoroscope:
         check_safe_name(name, '--fluoroscope')
@@ -266,7 +268,9 @@ def _run_markers(arguments: argparse.Namespace) -> None:
         arguments.bodies,
     )
     inputs = [*arguments.sources, *(path for path in given if path is not None)]
+    decide = arguments.out.with_name(f'{arguments.out.stem}.{DOUBTFUL}')
     check_output_file(arguments.out, inputs)
+    check_output_file(decide, inputs)
     request = _marker_request(arguments)
     with ProgressBar('extract') as bar:
         outcome = run_marker_extraction(request, bar)
@@ -283,6 +287,11 @@ def _run_markers(arguments: argparse.Namespace) -> None:
     print_notes(outcome.notes)
     for text in _doubt_texts(outcome.spans(), request):
         print_note(text)
+    doubtful = doubtful_ids(outcome)
+    if doubtful:
+        known = Names({name: number for number, name in request.target_names.items()})
+        doubtful_table(doubtful, known).write(decide)
+        print_note(f'{decide}: decide on the doubtful ids there, and give it with --decisions')
     print_result(
         arguments, _marker_document(arguments.out, outcome), _marker_text(arguments.out, outcome)
     )

@@ -20,6 +20,11 @@ EXAMPLE = 'fluoro-calib report result'
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     add_result_folder(parser)
+    parser.add_argument(
+        '--pdf',
+        action='store_true',
+        help='print it as DIR/report.pdf, too, by the Chromium, Chrome or Edge of this machine',
+    )
 
 
 def check(arguments: argparse.Namespace, error: Callable[[str], NoReturn]) -> None:
@@ -28,8 +33,14 @@ def check(arguments: argparse.Namespace, error: Callable[[str], NoReturn]) -> No
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Write DIR/report.html. Raises DataError."""
+    """Write DIR/report.html, and print it. Raises DataError."""
+    from ..jobs.printing import print_page
     from ..jobs.report import write_report
+    from ..jobs.result_folder import REPORT_PDF
 
     path = write_report(arguments.directory)
-    print_result(arguments, {'out': path}, f'written to {path}')
+    document = {'out': path}
+    if arguments.pdf:
+        document['pdf'] = str(arguments.directory / REPORT_PDF)
+        print_page(path, document['pdf'])
+    print_result(arguments, document, f'written to {" and ".join(document.values())}')

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from ..errors import DataError
+from .codec import encode
 from .detection import detect_beads
 from .extraction import Extraction
 from .markers import MarkerFrame
@@ -23,6 +24,7 @@ REFUSED = (60, 60, 255)
 UNEXPLAINED = (0, 190, 255)
 TEXT = (235, 235, 235)
 TEXT_HEIGHT = 18
+QUALITY = 80  # of a small JPEG
 
 
 def draw_overlay(image: np.ndarray, extraction: Extraction | None, reason: str = '') -> np.ndarray:
@@ -69,6 +71,14 @@ def full_contrast(image: np.ndarray) -> np.ndarray:
     """Return an image (h, w) as uint8 of full contrast."""
     low, high = np.percentile(image[::4, ::4], [0.5, 99.8])
     return np.clip((image - low) * (255 / max(high - low, 1)), 0, 255).astype(np.uint8)
+
+
+def small_jpeg(image: np.ndarray, largest_px: int) -> bytes:
+    """Return an image (h, w) as JPEG of full contrast, a large one reduced to largest_px."""
+    factor = largest_px / max(image.shape)
+    if factor < 1:
+        image = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+    return encode(full_contrast(image), '.jpg', QUALITY)
 
 
 def _picture(image: np.ndarray) -> tuple[np.ndarray, int]:

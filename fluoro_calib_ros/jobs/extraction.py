@@ -18,6 +18,7 @@ from ..exposures.frame import Frame
 from ..exposures.phantom import Phantom
 from ..findings import Finding, Kind, Place
 from ..images.lattice import NOT_MARKED, FlatGrid
+from ..images.overlay import small_jpeg
 from ..images.view import Lens, assumed_lens, may_be_found, shared_lens
 from ..io.access import check_safe_name, make_folder, write_bytes
 from ..io.bags.reader import image_topics
@@ -34,6 +35,7 @@ from .scheduling import Cluster, Workers, open_workers
 from .sources import Recording, Survey
 
 FOLLOWED = 12  # images of a video after which the pose is searched for anew
+RADIOGRAPH_PX = 512  # largest side of the radiographs of a report
 MAX_MIRRORED = 2  # images that are tried mirrored, where none gives observations
 
 Progress = Callable[[int, int], None]
@@ -47,6 +49,8 @@ class ImageResult(Observations):
     place: str = ''  #: file, page or message
     frame: Frame | None = None  #: None where the image gives no observations; the finding says why
     png: bytes | None = None  #: overlay, if it was asked for
+    #: the image of full contrast, reduced, if it was asked for and gives observations
+    jpeg: bytes = b''
 
 
 @dataclass(frozen=True)
@@ -72,6 +76,8 @@ class ExtractionRequest:
         The phantom is a regular flat grid. Its place and turn are arbitrary by whole steps.
     angles : ImageAngles
         Angles of the C-arm.
+    radiographs : bool
+        Whether results keep their images, reduced to RADIOGRAPH_PX.
     """
 
     sources: Sequence[Path]
@@ -83,6 +89,7 @@ class ExtractionRequest:
     scheduler: Cluster | str | None = None
     regular_grid: bool = False
     angles: ImageAngles = field(default_factory=ImageAngles)
+    radiographs: bool = False
 
 
 @dataclass(frozen=True)
@@ -111,6 +118,7 @@ class _Task:
     images: tuple[SourceImage, ...]
     settings: PhantomSettings
     overlay: bool = False
+    radiographs: bool = False
 
 
 def _extract(task: _Task) -> list[ImageResult]:
@@ -127,7 +135,10 @@ def _extract(task: _Task) -> list[ImageResult]:
             found = follower.extract({name: image}, source.exposure, overlays)[name]
             if found.finding is not None:
                 found = replace(found, finding=found.finding.at(source.place))
-        results.append(_result(found, source, task.settings))
+        result = _result(found, source, task.settings)
+        if task.radiographs and result.frame is not None and isinstance(image, np.ndarray):
+            result = replace(result, jpeg=small_jpeg(image, RADIOGRAPH_PX))
+        results.append(result)
     return results
 
 
@@ -249,7 +260,7 @@ def _task(request: ExtractionRequest, images: tuple[SourceImage, ...], lens: Len
         lens=lens or Lens((1, 1), 1.0),
         regular_grid=request.regular_grid,
     )
-    return _Task(images, settings, overlay=request.overlay is not None)
+    return _Task(images, settings, request.overlay is not None, request.radiographs)
 
 
 def _with_picture_written(request: ExtractionRequest, result: ImageResult) -> ImageResult:
@@ -302,6 +313,7 @@ def recording_of_images(
     angles = angles or ImageAngles()
     angles.check([source], [*names, *known])
     frames: dict[str, list[Frame]] = {}
+    radiographs: dict[str, dict[int, bytes]] = {}
     notes: list[str] = []
     for name in names:
         if known and name not in known:
@@ -314,12 +326,14 @@ def recording_of_images(
             principal_distance_px,
             scheduler=scheduler,
             angles=angles,
+            radiographs=True,
         )
         outcome = run_extraction(request, progress)
         frames[name] = outcome.frames
+        radiographs[name] = {r.exposure: r.jpeg for r in outcome.results if r.jpeg}
         notes += [f'not used: {result.finding}' for result in outcome.refused]
         notes += map(str, outcome.notes)
-    return Recording(frames, {}, survey.names, tuple(notes))
+    return Recording(frames, {}, survey.names, tuple(notes), radiographs)
 
 
 def _first_lens(request: ExtractionRequest, image: np.ndarray | DataError) -> Lens | None:

@@ -24,6 +24,7 @@ from ..bodies.body import Body
 from ..correction.angle_field import note_on_angles
 from ..correction.fluoroscope_calibration import Calibrations
 from ..errors import DataError
+from ..exposures.decisions import Doubtful
 from ..exposures.frame import Frame, Frames
 from ..exposures.phantom import Phantom
 from ..findings import Finding
@@ -161,6 +162,14 @@ class MarkerOutcome:
                     )
             out += open_spans.values()
         return out
+
+
+def doubtful_ids(outcome: MarkerOutcome) -> list[Doubtful]:
+    """Return what is still doubtful, for the table in which a person decides."""
+    return [
+        Doubtful(s.fluoroscope, s.first, s.last, s.target_id, s.reason, others=s.others)
+        for s in outcome.spans()
+    ]
 
 
 def sequences(

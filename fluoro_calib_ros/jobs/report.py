@@ -33,6 +33,7 @@ from ..io.calibration import RESULT_NAME as RESULT
 from ..io.calibration_request import read_request
 from ..io.csv_table import read_names
 from ..io.documents import read_json
+from ..io.radiographs import read_radiographs
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..report.html import ReportInput, report_html, residual_rows
 from ..report.rig_geometry import SpaceAccuracy, accuracy_in_space
@@ -180,6 +181,9 @@ def read_report_input(directory: PathLike) -> ReportInput:
         rig_note=saved_rig_note(directory),
         edited=edited(directory, result) or changed,
         space=_accuracy_in_space(request, present, orientation),
+        radiographs=read_radiographs(
+            directory, ((name, f.number) for name, own in request.frames.items() for f in own)
+        ),
     )
 
 

@@ -5,14 +5,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 from ..bodies.shapes import LearnedShapes
+from ..checks.check import Check
+from ..checks.doubtful import doubtful_observations
 from ..correction.fluoroscope_calibration import Calibrations
 from ..errors import DataError
 from ..estimation.result import CalibrationResult
+from ..exposures.names import Names
 from ..findings import Finding, Kind, Severity
 from ..io import csv_table as names
 from ..io.access import PathLike
@@ -34,9 +37,11 @@ from ..io.calibration import (
 from ..io.calibration import ORIENTATION_NAME as ORIENTATION
 from ..io.calibration import RESULT_NAME as RESULT
 from ..io.calibration_request import write_request
+from ..io.decisions import DOUBTFUL, doubtful_table
 from ..io.documents import write_json
 from ..io.folder import FolderKind, check_output_folder, replaced_folder
 from ..io.learned_shapes import write_learned_shapes
+from ..io.radiographs import RADIOGRAPHS
 from ..io.result_document import NAMES as TABLES
 from ..io.result_document import SUFFIX as COVARIANCE
 from ..io.result_document import result_document, result_tables, write_covariance, write_validation
@@ -46,12 +51,14 @@ from .calibration import CalibrationOutcome
 from .healing import HealingOutcome, save_healing
 
 REPORT = 'report.html'
+REPORT_PDF = 'report.pdf'
 # Calibrations of other fluoroscopes stay in the folder.
 RESULT_FOLDER = FolderKind(
     'a result folder',
     parts=(
         *(RESULT, OBSERVATIONS, PHANTOM, OPTIONS, KNOWN_ORIENTATION, ORIENTATION),
-        *(names.NAMES_FILE, VALIDATION_NAME, *TABLES, f'*{COVARIANCE}', 'figures', REPORT),
+        *(names.NAMES_FILE, VALIDATION_NAME, *TABLES, DOUBTFUL, f'*{COVARIANCE}'),
+        *('figures', RADIOGRAPHS, REPORT, REPORT_PDF),
     ),
     marks=(RESULT, ORIENTATION, f'*{SUFFIX}'),
 )
@@ -92,7 +99,8 @@ def save_outcome(
         present or saved_orientation(directory), outcome.orientation, outcome.calibrations
     )
     with replaced_folder(directory, RESULT_FOLDER) as folder:
-        _write_result(folder, outcome.result)
+        checks = outcome.validation.checks if outcome.validation else ()
+        _write_result(folder, outcome.result, outcome.request.names, checks)
         write_request(folder, outcome.request)
         if orientation is not None:
             save_orientation(folder, orientation)
@@ -173,12 +181,20 @@ def check_result_folder(directory: PathLike, inputs: Iterable[PathLike] = ()) ->
     check_output_folder(directory, RESULT_FOLDER, inputs)
 
 
-def _write_result(folder: Path, result: CalibrationResult) -> None:
+def _write_result(
+    folder: Path,
+    result: CalibrationResult,
+    known: Names | None = None,
+    checks: Sequence[Check] = (),
+) -> None:
     for calibration in result.calibrations.values():
         save_calibration(folder, calibration)
     write_json(folder / RESULT, written_document(result))
     for name, table in result_tables(result).items():
         table.write(folder / name)
+    doubtful = doubtful_observations(result, checks)
+    if doubtful:
+        doubtful_table(doubtful, known).write(folder / DOUBTFUL)
 
 
 def written_document(result: CalibrationResult) -> dict[str, Any]:

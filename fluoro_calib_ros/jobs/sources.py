@@ -17,6 +17,7 @@ from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibr
 from ..errors import DataError, ErrorsAt
 from ..exposures.angles import AngleOptions
 from ..exposures.collector import collect_recorded
+from ..exposures.decisions import decided
 from ..exposures.frame import Frame, Frames
 from ..exposures.names import Names
 from ..exposures.pairing import PairingOptions, disagreement_of_recording
@@ -26,6 +27,7 @@ from ..io.access import PathLike, check_regular_file
 from ..io.bags.reader import joint_topics, read_frames, with_angles
 from ..io.calibration import disagreements, load_calibrations
 from ..io.csv_table import read_names
+from ..io.decisions import read_decisions
 from ..io.formats import registry
 from ..io.formats.content import PARTS, Content, FileSettings
 from ..io.formats.native import holds_known_orientations, read_known_orientations
@@ -58,12 +60,15 @@ class Recording:
         The known names and those of the source.
     notes : tuple of str
         What a user has to know about the source.
+    radiographs : mapping of str to mapping of int to bytes
+        By fluoroscope and exposure a small JPEG; of a source of images.
     """
 
     frames: dict[str, list[Frame]]
     unpaired: Mapping[str, int] = field(default_factory=dict)
     names: Names = field(default_factory=Names)
     notes: tuple[str, ...] = ()
+    radiographs: Mapping[str, Mapping[int, bytes]] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         counts = ', '.join(f'{name}: {len(own)} frames' for name, own in self.frames.items())
@@ -260,7 +265,7 @@ def read_source(
             raise DataError(f'{path}: there is no fluoroscope {name!r}, only {", ".join(found)}')
     frames = {name: found[name] for name in wanted}
     if not bag or (collect is None and selection.pair_by == 'frame_number'):
-        return Recording(frames, {}, names, content.notes)
+        return with_decisions(Recording(frames, {}, names, content.notes), settings.decisions)
     notes = content.notes
     if selection.pair_by == 'frame_number':
         disagreement = disagreement_of_recording(frames)
@@ -268,7 +273,20 @@ def read_source(
     collected = collect_recorded(
         frames, collect or 'all', selection.pair_by, tolerance_s=selection.tolerance_s
     )
-    return Recording(*collected, names, notes)
+    return with_decisions(Recording(*collected, names, notes), settings.decisions)
+
+
+def with_decisions(recording: Recording, path: PathLike | None) -> Recording:
+    """Return a recording after the decisions in a table, if any. Raises DataError."""
+    if path is None:
+        return recording
+    decisions = read_decisions(path, recording.names)
+    frames, (exposures, points, renamed) = decided(recording.frames, decisions)
+    note = (
+        f'{path}: by decision, {exposures} exposures and {points} further image points are left '
+        f'out, and {renamed} have another id'
+    )
+    return replace(recording, frames=frames, notes=(*recording.notes, note))
 
 
 def _observed(path: PathLike, settings: FileSettings) -> tuple[dict[str, list[Frame]], Content]:

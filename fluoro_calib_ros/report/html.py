@@ -47,6 +47,7 @@ VERDICTS = {
 }
 MAX_ROWS = 40  # of the lists of outliers and correlations
 MAX_ARROWS = 30_000  # residuals of all exposures: a megabyte
+MAX_RADIOGRAPHS_BYTES = 3_000_000  # of all exposures together, 4 MB in the report
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,8 @@ class ReportInput:
     edited: Finding | None = None  #: what is wrong with result.json itself
     #: how well the beads of the exposures are known in space, None for a single fluoroscope
     space: SpaceAccuracy | None = None
+    #: JPEG by fluoroscope and exposure, where the exposures come from images
+    radiographs: Mapping[str, Mapping[int, bytes]] = field(default_factory=dict)
 
 
 def report_html(given: ReportInput) -> str:
@@ -90,6 +93,7 @@ def report_html(given: ReportInput) -> str:
         beams=beams(given.orientation) if given.orientation else [],
         outliers=_outliers(given, residuals),
         arrows=_arrows(given, residuals),
+        radiographs=_radiographs(given, residuals),
         space=given.space,
         about=given.settings.get('about') or {},
         adjustments=given.result.get('adjustments', []),
@@ -191,6 +195,7 @@ def _outliers(given: ReportInput, residuals: Mapping[str, Residuals]) -> dict[st
             **o,
             'target': targets.get(int(o['target_id']), o['target_id']),
             'exposure_name': exposures.get(int(o['exposure']), o['exposure']),
+            **{key: np.sqrt(float(o[key])) for key in ('value', 'critical')},
             'px': length.get((o['fluoroscope'], int(o['exposure']), int(o['target_id']))),
         }
         for o in points[:MAX_ROWS]
@@ -218,6 +223,29 @@ def _arrows(given: ReportInput, residuals: Mapping[str, Residuals]) -> dict[str,
             for number in np.unique(one.exposure)
         }
         out[name] = {'size': list(given.calibrations[name].image_size), 'exposures': exposures}
+    return out
+
+
+def _radiographs(
+    given: ReportInput, residuals: Mapping[str, Residuals]
+) -> dict[str, dict[int, str]]:
+    """Return the radiographs in base64, by fluoroscope and exposure.
+
+    Of too many, those with the largest residuals.
+    """
+    by_rms = sorted(
+        (-np.nan_to_num(after, nan=np.inf), name, number)
+        for name, one in residuals.items()
+        for number, _, _, after in one.of_exposures()
+        if number in given.radiographs.get(name, {})
+    )
+    out: dict[str, dict[int, str]] = {}
+    left = MAX_RADIOGRAPHS_BYTES
+    for _, name, number in by_rms:
+        content = given.radiographs[name][number]
+        if len(content) <= left:
+            left -= len(content)
+            out.setdefault(name, {})[number] = base64.b64encode(content).decode()
     return out
 
 

@@ -371,6 +371,10 @@ def test_calibrate_takes_the_angles_of_images_in_a_bag(folder, monkeypatch):
     main([*words, 'carm'])
     (folder / 'out.csv').write_bytes((folder / 'result' / 'observations.csv').read_bytes())
     assert angles_in_table(folder) == [5.7296, 11.4592, 11.4592]
+    kept = sorted((folder / 'result' / 'radiographs').iterdir())
+    assert [path.name for path in kept] == ['a_1.jpg', 'a_2.jpg', 'a_3.jpg']
+    shown = cv2.imread(str(kept[0]), cv2.IMREAD_GRAYSCALE)
+    assert shown.shape == (SIZE, SIZE) and shown.std() > 10
     with pytest.raises(SystemExit):
         main([*words, 'table'])
 

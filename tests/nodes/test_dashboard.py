@@ -11,6 +11,7 @@ from rich.console import Console
 from textual.widgets import Static
 
 from fluoro_calib_ros.nodes.dashboard.state import (
+    Diagnosis,
     FluoroscopeState,
     NodeState,
     RateMeter,
@@ -76,6 +77,14 @@ def test_findings_follow_the_verdict():
     assert text.index('verdict') < text.index('fail') < text.index('the residuals have a trend')
 
 
+def test_a_diagnosis_is_shown_with_the_key_that_accepts_it():
+    state = replace(STATE, diagnosis=HEALED)
+    text = text_of(session_text(state))
+    assert text.index('pass, a accepts it') < text.index('fluoroscope b has moved')
+    in_use = text_of(session_text(replace(state, orientation_id='healed-1')))
+    assert 'accepts it' not in in_use and 'fluoroscope b has moved' in in_use
+
+
 def test_brackets_are_shown_and_control_characters_are_not():
     message = 'fluoroscopes [a, b]: [/x] \x1b[2Jgone'
     state = replace(STATE, nodes=(NodeState('calibration_node', 'warn', message),))
@@ -91,10 +100,19 @@ def test_keys_ask_the_session():
     session = Recorded()
 
     async def scenario(_, pilot):
-        await pilot.press('p', 'c', 'f', 'o', 'x')
+        await pilot.press('p', 'c', 'f', 'o', 'h', 'a', 'x')
 
     run(session, scenario)
-    assert session.asked == ['capture', 'calibrate', 'calibrate_fast', 'orient', 'cancel']
+    asked = [
+        'capture',
+        'calibrate',
+        'calibrate_fast',
+        'orient',
+        'heal',
+        'accept_healing',
+        'cancel',
+    ]
+    assert session.asked == asked
 
 
 def test_reset_needs_a_second_key():
@@ -108,6 +126,19 @@ def test_reset_needs_a_second_key():
 
     run(session, scenario)
     assert session.asked == ['reset']
+
+
+def test_a_key_confirms_only_what_it_asked_for():
+    session = Recorded()
+
+    async def scenario(app, pilot):
+        await pilot.press('r', 'b')
+        assert not session.asked
+        assert 'press b again' in str(app.query_one('#log', Static).render())
+        await pilot.press('b')
+
+    run(session, scenario)
+    assert session.asked == ['roll_back_healing']
 
 
 def test_the_view_follows_the_state():
@@ -163,6 +194,7 @@ def test_bar_of_the_coverage_is_as_long_as_it(share):
 CALIBRATED = tuple(FluoroscopeState(n, 'calibrated', calibration_id=f'{n}-1') for n in 'ab')
 GOOD = NodeState('correction_node', 'ok', 'correcting')
 READY = FluoroscopeState('a', 'collecting', ready=True)
+HEALED = Diagnosis('pass', ('fluoroscope b has moved',), 'healed-1')
 
 
 @pytest.mark.parametrize(
@@ -172,6 +204,11 @@ READY = FluoroscopeState('a', 'collecting', ready=True)
         ({'nodes': (GOOD, NodeState('x', 'error', 'broken'))}, 'error', 'Problem'),
         ({'nodes': (GOOD, NodeState('x', 'silent', 'gone'))}, 'error', 'Problem'),
         ({'job': 'round 3'}, 'busy', 'Calibrating'),
+        ({'job': 'healing: 12 frames of markers'}, 'busy', 'Healing'),
+        ({'diagnosis': HEALED, 'nodes': (NodeState('x', 'error', 'drift'),)}, 'warn', 'Healed'),
+        ({'diagnosis': HEALED, 'orientation_id': 'healed-1'}, 'ok', 'OK'),
+        ({'diagnosis': Diagnosis('fail', ('creeps',), 'healed-1')}, 'ok', 'OK'),
+        ({'diagnosis': Diagnosis('pass', ('nothing has changed',))}, 'ok', 'OK'),
         ({'verdict': 'fail'}, 'error', 'Do not use'),
         ({'fluoroscopes': (*CALIBRATED, FluoroscopeState('c'))}, 'warn', 'Collecting'),
         ({'fluoroscopes': (READY,)}, 'warn', 'Ready'),

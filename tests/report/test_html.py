@@ -3,6 +3,7 @@
 
 """The report of a calibration as one HTML file."""
 
+import base64
 import html.parser
 import json
 import re
@@ -13,9 +14,12 @@ import numpy as np
 import pytest
 from rigs import calibrated, exposures, rig, run, turning
 
+from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
 from fluoro_calib_ros.exposures.names import Names
+from fluoro_calib_ros.images.codec import encode
 from fluoro_calib_ros.io.calibration_request import write_request
+from fluoro_calib_ros.io.radiographs import write_radiographs
 from fluoro_calib_ros.jobs.calibration import run_calibration
 from fluoro_calib_ros.jobs.report import read_report_input
 from fluoro_calib_ros.jobs.result_folder import save_outcome, save_result
@@ -219,6 +223,43 @@ def test_exposures_are_there_to_be_looked_at_one_by_one(folder):
     np.testing.assert_allclose((u, v), residuals['a'].uv[0], atol=0.051)
     np.testing.assert_allclose((du, dv), residuals['a'].after[0], atol=0.0051)
     assert bool(used) == residuals['a'].inlier[0]
+
+
+def jpeg(grey):
+    return encode(np.full((60, 80), grey, np.uint8), '.jpg', 80)
+
+
+def test_radiographs_are_embedded(folder, tmp_path, without_pictures):
+    copy = shutil.copytree(folder, tmp_path / 'result')
+    numbers = sorted(f.number for f in read_report_input(copy).frames['a'])
+    write_radiographs(copy, {'a': {n: jpeg(n % 250) for n in (*numbers[:2], 999)}})
+    given = read_report_input(copy)
+    assert sorted(given.radiographs['a']) == numbers[:2], 'those of exposures of the calibration'
+    text = html_report.report_html(given)
+    for number in numbers[:2]:
+        assert base64.b64encode(jpeg(number % 250)).decode() in text
+    assert 'Circles are the beads' in text and 'with the largest residuals' in text
+    assert 'Circles are the beads' not in html_report.report_html(read_report_input(folder))
+
+
+def test_radiographs_of_the_largest_residuals_fit_the_bound(folder, monkeypatch):
+    given = read_report_input(folder)
+    residuals = {'a': html_report._residuals(given, 'a')}
+    by_rms = sorted(residuals['a'].of_exposures(), key=lambda row: -row[3])
+    size = len(jpeg(1))
+    given = replace(given, radiographs={'a': {row[0]: jpeg(1) for row in by_rms}})
+    monkeypatch.setattr(html_report, 'MAX_RADIOGRAPHS_BYTES', 2 * size + 1)
+    chosen = html_report._radiographs(given, residuals)['a']
+    assert list(chosen) == [row[0] for row in by_rms[:2]]
+
+
+@pytest.mark.parametrize('content', [b'<svg onload="alert()">', jpeg(1) + bytes(2**20)])
+def test_what_is_no_small_jpeg_is_refused(folder, tmp_path, content):
+    copy = shutil.copytree(folder, tmp_path / 'result')
+    number = read_report_input(copy).frames['a'][0].number
+    write_radiographs(copy, {'a': {number: content}})
+    with pytest.raises(DataError, match=f'a_{number}.jpg: this is no '):
+        read_report_input(copy)
 
 
 def test_beads_are_compared_with_their_survey(folder, without_pictures):

@@ -14,6 +14,7 @@ from fluoro_calib_msgs.srv import Reset
 from rigs import run
 from ros_graph import ABORTED, CANCELED, JOB_DEADLINE, NAMES, SUCCEEDED, value_of
 from test_reconstruction import coordinates
+from test_web import page
 
 from fluoro_calib_ros.checks.rig_watch import RigDriftWatch
 from fluoro_calib_ros.io.bodies import write_bodies
@@ -287,6 +288,33 @@ def test_bumped_rig_is_healed_accepted_and_rolled_back(rig, tmp_path, capsys):
     rig.wait_for_orientation(before.orientation_id)
     assert load_orientation(orientation_path(rig.folder)).orientation_id == before.orientation_id
     assert not rig.client.call(Reset, 'roll_back_healing').success
+
+
+def test_page_heals_accepts_and_rolls_back(rig):
+    before = load_orientation(orientation_path(rig.folder)).orientation_id
+    wait = rig.client.wait_until
+    with page(rig.graph) as (_, browser):
+        browser.enter()
+
+        def state():
+            return browser.json('/state')
+
+        wait(lambda: state()['orientation_id'] == before, what='the rig as calibrated')
+        assert browser.ask('accept_healing')[0] == 204
+        wait(lambda: 'no healed rig to accept' in state()['log'][-1], what='a refusal')
+        assert browser.ask('heal')[0] == 204
+        wait(lambda: 'frames of markers' in state()['job'], what='the start')
+        rig.publish()
+        found = wait(lambda: (s := state())['acceptable'] and s, JOB_DEADLINE, 'a healed rig')
+        assert found['light']['word'] == 'Healed' and not found['job']
+        assert found['diagnosis']['verdict'] == 'pass' and found['diagnosis']['findings']
+        assert browser.ask('accept_healing')[0] == 204
+        healed = found['diagnosis']['orientation_id']
+        wait(lambda: state()['orientation_id'] == healed, what='the healed rig in use')
+        wait(lambda: not state()['diagnosis']['verdict'], what='the answer')
+        assert state()['orientation'] == 'healing' and not state()['acceptable']
+        assert browser.ask('roll_back_healing')[0] == 204
+        wait(lambda: state()['orientation_id'] == before, what='the rig before')
 
 
 def test_stream_goes_on_while_a_rig_is_healed(rig):

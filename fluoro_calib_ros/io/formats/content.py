@@ -221,6 +221,8 @@ class FileSettings:
         Names for cameras that a file only numbers.
     wanted : tuple of str
         Parts to read from a format of several, names of PARTS.
+    decisions : path-like or None
+        Table of what a person decided on doubtful image points and exposures of the file.
     """
 
     image_size: tuple[int, int] | None = None
@@ -232,6 +234,7 @@ class FileSettings:
     names: Names = field(default_factory=Names)
     fluoroscopes: tuple[str, ...] = ()
     wanted: tuple[str, ...] = tuple(PARTS)
+    decisions: PathLike | None = None
 
     def image_size_of(self, where: object) -> tuple[int, int]:
         """Return the image size of a file that does not say it. Raises DataError without."""

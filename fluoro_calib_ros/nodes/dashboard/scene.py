@@ -22,7 +22,7 @@ from rclpy.subscription import Subscription
 from sensor_msgs.msg import CompressedImage, Image
 
 from ...images.codec import encode
-from ...images.overlay import full_contrast
+from ...images.overlay import small_jpeg
 from ...photogrammetry import rig_orientation
 from ..messages.image import ImageConverter
 from ..messages.rig_orientation import orientation_from_message
@@ -32,7 +32,6 @@ from ..runtime.topics import adapted_qos
 
 IDLE_S = 10.0  # after which a topic that nobody looks at is no longer subscribed
 LARGEST_PX = 768  # of a radiograph that is shown
-QUALITY = 80  # of its JPEG
 KEPT = 16  # radiographs that wait for their image points, which come later
 WAITING = 100  # image points that wait to be taken: three seconds at 30 Hz
 METRE_MM = 1000.0
@@ -123,7 +122,12 @@ class Scene:
                 except Refused:  # the extraction node says what is wrong with it
                     continue
                 height, width = image.shape
-                remember(film.images, _stamp_ns(message), (_jpeg(image), width, height), KEPT)
+                remember(
+                    film.images,
+                    _stamp_ns(message),
+                    (small_jpeg(image, LARGEST_PX), width, height),
+                    KEPT,
+                )
             return True
         return False
 
@@ -225,11 +229,3 @@ def _rows(message: TargetObservations | None) -> list[list[float]]:
         return []
     rows = np.column_stack([message.target_id, message.u, message.v])
     return rows[np.isfinite(rows).all(axis=1)].round(1).tolist()
-
-
-def _jpeg(image: np.ndarray) -> bytes:
-    """Return a grey image as JPEG of full contrast, large ones reduced."""
-    factor = LARGEST_PX / max(image.shape)
-    if factor < 1:
-        image = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
-    return encode(full_contrast(image), '.jpg', QUALITY)

@@ -18,7 +18,13 @@ CALIBRATE_FAST = 'calibrate_fast'
 CANCEL = 'cancel'
 ORIENT = 'orient'
 RESET = 'reset'
-REQUESTS = (CAPTURE, CALIBRATE, CALIBRATE_FAST, CANCEL, ORIENT, RESET)
+HEAL = 'heal'
+ACCEPT = 'accept_healing'
+ROLL_BACK = 'roll_back_healing'
+REQUESTS = (
+    *(CAPTURE, CALIBRATE, CALIBRATE_FAST, CANCEL, ORIENT, RESET),
+    *(HEAL, ACCEPT, ROLL_BACK),
+)
 
 RATE_WINDOW_S = 5.0  # over which rates are counted
 
@@ -57,6 +63,15 @@ class NodeState:
 
 
 @dataclass(frozen=True)
+class Diagnosis:
+    """What the action heal has found, until it is accepted or rolled back."""
+
+    verdict: str = ''  #: on the healed rig, '' without a diagnosis
+    findings: tuple[str, ...] = ()  #: what has changed, and what speaks against the healed rig
+    orientation_id: str = ''  #: of the healed rig, '' where nothing of the rig has changed
+
+
+@dataclass(frozen=True)
 class SessionState:
     """The whole session."""
 
@@ -66,6 +81,8 @@ class SessionState:
     points_hz: float = math.nan  #: exposures reconstructed a second
     points_latency_ms: tuple[float, float] = (math.nan, math.nan)  #: median and 99th percentile
     orientation: str = ''  #: source of the orientation of the rig, '' without one
+    orientation_id: str = ''  #: of the one in use
+    diagnosis: Diagnosis = field(default_factory=Diagnosis)
     #: of the drift watch
     drift_level: str = ''
     drift: str = ''
@@ -74,6 +91,12 @@ class SessionState:
     results: str = ''  #: folder into which the calibration node writes its results
     job: str = ''  #: what runs at the moment, '' if nothing does
     log: tuple[str, ...] = ()  #: what was asked for, and the answers; the newest last
+
+    @property
+    def acceptable(self) -> bool:
+        """Whether a healed rig waits to be accepted."""
+        healed = self.diagnosis
+        return healed.verdict == 'pass' and healed.orientation_id not in ('', self.orientation_id)
 
 
 class Session(Protocol):
@@ -125,10 +148,12 @@ def light(state: SessionState) -> Light:
     bad = [node for node in state.nodes if node.level in ('error', 'silent')]
     if not state.nodes:
         return Light('error', 'No signal', 'no node of the rig has reported yet')
+    if state.acceptable and not state.job:
+        return Light('warn', 'Healed', 'accept the healed rig, which is then in use')
     if bad:
         return Light('error', 'Problem', f'{bad[0].name}: {bad[0].message}')
     if state.job:
-        return Light('busy', 'Calibrating', state.job)
+        return Light('busy', 'Healing' if state.job.startswith(HEAL) else 'Calibrating', state.job)
     if state.verdict == 'fail':
         return Light('error', 'Do not use', 'the last calibration has failed its verdict')
     open_ = [f for f in state.fluoroscopes if not f.calibration_id]

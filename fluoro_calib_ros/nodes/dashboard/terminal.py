@@ -31,6 +31,10 @@ COLOURS = {
     'calibrating': 'cyan',
 }
 CONFIRM_S = 5.0  # in which a second key confirms
+CONFIRMATIONS = {
+    'reset': 'press r again to discard the exposures; the calibration stays',
+    'roll_back_healing': 'press b again to return to the rig before it was healed',
+}
 BAR = 20  # characters of the coverage bar
 LOG_LINES = 6  # that are shown
 
@@ -132,6 +136,13 @@ def _results(state: SessionState) -> Table:
     table.add_row('points in space', points)
     table.add_row('orientation', _cell(state.orientation or 'none yet'))
     table.add_row('drift', _coloured(state.drift_level, state.drift or '-'))
+    if state.diagnosis.verdict:
+        healed = ', a accepts it' if state.acceptable else ''
+        table.add_row(
+            'healing', _coloured(state.diagnosis.verdict, state.diagnosis.verdict + healed)
+        )
+        for finding in state.diagnosis.findings:
+            table.add_row('', _cell(finding))
     verdict = _coloured(state.verdict, state.verdict or 'no calibration of this session yet')
     table.add_row('verdict', verdict)
     for finding in state.findings:
@@ -175,6 +186,9 @@ class Dashboard(App[None]):
         Binding('c', "ask('calibrate')", 'Calibrate'),
         Binding('f', "ask('calibrate_fast')", 'Fast, no verdict'),
         Binding('o', "ask('orient')", 'Orient'),
+        Binding('h', "ask('heal')", 'Heal'),
+        Binding('a', "ask('accept_healing')", 'Accept'),
+        Binding('b', "confirm('roll_back_healing')", 'Roll back'),
         Binding('r', "confirm('reset')", 'Reset'),
         Binding('x', "ask('cancel')", 'Cancel'),
         Binding('q', 'quit', 'Quit'),
@@ -184,6 +198,7 @@ class Dashboard(App[None]):
         super().__init__()
         self._session = session
         self._confirm_until = 0.0
+        self._confirmed = ''  # what a second key asks for
         self._note = ''
 
     def compose(self) -> ComposeResult:
@@ -221,9 +236,10 @@ class Dashboard(App[None]):
 
     def action_confirm(self, request: str) -> None:
         """Ask for something that loses data, once the key is pressed again."""
-        if time.monotonic() < self._confirm_until:
+        if request == self._confirmed and time.monotonic() < self._confirm_until:
             self.action_ask(request)
             return
+        self._confirmed = request
         self._confirm_until = time.monotonic() + CONFIRM_S
-        self._note = 'press r again to discard the exposures; the calibration stays'
+        self._note = CONFIRMATIONS[request]
         self.show()

@@ -17,12 +17,9 @@ from functools import partial
 from typing import Any
 
 import rclpy
-from action_msgs.msg import GoalStatus
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from fluoro_calib_msgs.action import SelfCalibrate
 from fluoro_calib_msgs.msg import CalibrationStatus
 from fluoro_calib_msgs.srv import Capture, Orient, Reset
-from rclpy.action import ActionClient
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
@@ -30,16 +27,20 @@ from rclpy.parameter_client import AsyncParameterClient
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
-from ..messages.self_calibration import feedback_text
 from ..runtime.parameters import expand_path
+from .actions import Actions
 from .state import (
+    ACCEPT,
     CALIBRATE,
     CALIBRATE_FAST,
     CANCEL,
     CAPTURE,
+    HEAL,
     LEVELS,
     ORIENT,
     RESET,
+    ROLL_BACK,
+    Diagnosis,
     FluoroscopeState,
     NodeState,
     RateMeter,
@@ -79,7 +80,6 @@ class SessionClient(Node):
         self._heard_at: dict[str, float] = {}
         self._meters: dict[tuple[str, str], RateMeter] = {}
         self._log: deque[str] = deque(maxlen=LOG_LINES)
-        self._goal: Any = None
         self._session = SessionState(self.get_namespace())
         self._points_at: tuple[int, float] | None = None  # exposures reconstructed, and since when
         self._settings = AsyncParameterClient(self, 'calibration_node')
@@ -87,9 +87,9 @@ class SessionClient(Node):
         self._callers = {
             CAPTURE: self.create_client(Capture, 'capture'),
             ORIENT: self.create_client(Orient, 'orient'),
-            RESET: self.create_client(Reset, 'reset'),
+            **{name: self.create_client(Reset, name) for name in (RESET, ACCEPT, ROLL_BACK)},
         }
-        self._action = ActionClient(self, SelfCalibrate, 'self_calibrate')
+        self._actions = Actions(self, self._say, self._set)
 
     # -- the view's thread
 
@@ -118,10 +118,10 @@ class SessionClient(Node):
     def request(self, action: str) -> None:
         """Start one of REQUESTS; the answer comes into the log."""
         with self._lock:
-            if action in (CALIBRATE, CALIBRATE_FAST):
-                self._calibrate(validate=action == CALIBRATE)
+            if action in (CALIBRATE, CALIBRATE_FAST, HEAL):
+                self._actions.request(action)
             elif action == CANCEL:
-                self._cancel()
+                self._actions.cancel()
             else:
                 self._call(action)
 
@@ -133,58 +133,19 @@ class SessionClient(Node):
         requests = {
             CAPTURE: Capture.Request,
             ORIENT: lambda: Orient.Request(frames=ORIENT_FRAMES),
-            RESET: Reset.Request,
         }
-        self._say(f'{action} ...')
-        future = client.call_async(requests[action]())
+        self._say(f'{action.replace("_", " ")} ...')
+        future = client.call_async(requests.get(action, Reset.Request)())
         future.add_done_callback(partial(self._on_answer, action))
-
-    def _calibrate(self, validate: bool) -> None:
-        if not self._action.server_is_ready():
-            self._say(f'calibrate: no calibration node answers in {self.get_namespace()}')
-            return
-        if self._session.job:
-            self._say(f'calibrate: {self._session.job} already')
-            return
-        self._set(job='calibrating')
-        self._say('calibrate, with verdict ...' if validate else 'calibrate, without verdict ...')
-        sent = self._action.send_goal_async(
-            SelfCalibrate.Goal(validate=validate),
-            feedback_callback=lambda m: self._set(job=feedback_text(m.feedback)),
-        )
-        sent.add_done_callback(self._on_goal)
-
-    def _cancel(self) -> None:
-        if self._goal is None:
-            self._say('cancel: nothing runs that was started here')
-            return
-        self._goal.cancel_goal_async()
-        self._say('cancel ...')
 
     # -- the executor's thread
 
     def _on_answer(self, action: str, future: Future) -> None:
         answer = future.result()
         failed = '' if answer.success else ' failed'
-        self._say(f'{action}{failed}: {answer.message}')
-
-    def _on_goal(self, future: Future) -> None:
-        handle = future.result()
-        with self._lock:
-            self._goal = handle
-        handle.get_result_async().add_done_callback(self._on_result)
-
-    def _on_result(self, future: Future) -> None:
-        answer = future.result()
-        result = answer.result
-        with self._lock:
-            self._goal = None
-            self._set(job='')
-            if answer.status == GoalStatus.STATUS_SUCCEEDED:
-                self._set(verdict=result.verdict, findings=tuple(result.findings))
-                self._say(f'calibrate: {result.message}')
-            else:
-                self._say(f'calibrate failed: {result.message}')
+        if answer.success and action in (ACCEPT, ROLL_BACK):
+            self._set(diagnosis=Diagnosis())
+        self._say(f'{action.replace("_", " ")}{failed}: {answer.message}')
 
     def _on_status(self, message: CalibrationStatus) -> None:
         rmse = (message.rmse_u, message.rmse_v)
@@ -252,6 +213,7 @@ class SessionClient(Node):
                     _number(values.get('latency p99 [ms]')),
                 ),
                 orientation=values.get('source of the orientation', ''),
+                orientation_id=values.get('orientation', ''),
             )
         elif function == 'drift':
             level = LEVELS[min(int.from_bytes(status.level, 'little'), 2)]

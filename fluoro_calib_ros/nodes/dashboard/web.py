@@ -134,7 +134,12 @@ class StateHandler(Handler):
         """Answer with the state, its light, and the tube load of a frame."""
         state = self._desk.session.state()
         self._finish_json(
-            {**asdict(state), 'light': asdict(light(state)), 'mas': self._desk.options.mas}
+            {
+                **asdict(state),
+                'acceptable': state.acceptable,
+                'light': asdict(light(state)),
+                'mas': self._desk.options.mas,
+            }
         )
 
 

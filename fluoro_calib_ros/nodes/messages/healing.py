@@ -36,6 +36,13 @@ def fill_healing(result: Heal.Result, outcome: HealingOutcome, parent: RigOrient
     )
 
 
+def healing_text(feedback: Heal.Feedback) -> str:
+    """Return the feedback of a healing in one line, for people."""
+    if feedback.stage == 'collecting':
+        return f'healing: {feedback.frames} frames of markers'
+    return f'healing: diagnosis, step {feedback.step} of {feedback.steps}'
+
+
 def _fill_changes(result: Heal.Result, outcome: HealingOutcome) -> None:
     """Fill in the changes of the fluoroscopes that have changed."""
     healed = outcome.healed

@@ -11,6 +11,10 @@ const BEAD = '#5ee37b';
 const SOURCE = '#ffc14d';
 const BEAM = '#7a5a1c';
 const AXES = ['#ff7b72', '#6fdd8b', '#79b8ff'];
+const CONFIRMATIONS = {
+  reset: 'Discard all exposures that were collected? The calibration stays.',
+  roll_back_healing: 'Return to the rig as it was before it was healed?',
+};
 const ARROW_PX = 18; // of a large residual, 95 % are smaller
 
 const by = (id) => document.getElementById(id);
@@ -112,9 +116,12 @@ function showState(state) {
     ['Verdict', state.verdict || 'no calibration of this session yet', state.verdict],
     ['Orientation', state.orientation || 'none yet'],
     ['Drift', state.drift || '-', state.drift_level],
+    ...(state.diagnosis.verdict ? [['Healing', state.diagnosis.verdict, state.diagnosis.verdict]] : []),
     ['Points', rate(state.points_hz)],
   ]);
-  fillList(by('findings'), state.findings);
+  fillList(by('findings'), [...state.findings, ...state.diagnosis.findings]);
+  by('accept').hidden = !state.acceptable;
+  by('roll-back').hidden = state.orientation !== 'healing';
   fillNodes(state.nodes);
   fillList(by('log'), state.log.slice(-8).reverse());
   ring(state.fluoroscopes);
@@ -324,9 +331,16 @@ function startActions() {
   document.querySelectorAll('[data-request]').forEach((button) => {
     button.addEventListener('click', () => request(button.dataset.request));
   });
-  by('reset').addEventListener('click', () => by('confirm').showModal());
+  let asked = '';
+  document.querySelectorAll('[data-confirm]').forEach((button) => {
+    button.addEventListener('click', () => {
+      asked = button.dataset.confirm;
+      put(by('confirm-text'), CONFIRMATIONS[asked]);
+      by('confirm').showModal();
+    });
+  });
   by('confirm').addEventListener('close', () => {
-    if (by('confirm').returnValue === 'yes') request('reset');
+    if (by('confirm').returnValue === 'yes') request(asked);
     by('confirm').returnValue = '';
   });
   by('sound').addEventListener('click', () => {

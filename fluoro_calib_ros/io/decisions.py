@@ -1,0 +1,117 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Tables of doubtful image points and exposures, in which a person decides (docs/files.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
+
+from ..exposures.decisions import Doubtful, PointDecision
+from ..exposures.names import MAX_ID, Names
+from .access import PathLike
+from .csv_table import Block, Table, read_blocks
+
+DOUBTFUL = 'doubtful.csv'  # of a result folder
+LEAVE_OUT = 'leave out'
+COLUMNS = (
+    *('fluoroscope', 'exposure', 'last_exposure', 'target_id', 'u_px', 'v_px', 'residual_px'),
+    *('may_be', 'reason', 'decision'),
+)
+REQUIRED = ('fluoroscope', 'exposure', 'target_id', 'decision')
+
+
+def doubtful_table(doubtful: Iterable[Doubtful], names: Names | None = None) -> Table:
+    """Return the table of what is doubtful, with the names of targets and exposures."""
+    names = names or Names()
+    targets = names.target_names()
+    exposures = names.exposure_names()
+    fluoroscopes = names.fluoroscope_names()
+
+    def rows() -> Iterator[list[Any]]:
+        for one in doubtful:
+            target: Any = (
+                '' if one.target_id is None else targets.get(one.target_id, one.target_id)
+            )
+            yield [
+                fluoroscopes.get(one.fluoroscope, one.fluoroscope),
+                exposures.get(one.first, one.first),
+                exposures.get(one.last, one.last),
+                target,
+                *(one.uv or (float('nan'),) * 2),
+                one.residual_px,
+                ' '.join(str(targets.get(i, i)) for i in one.others),
+                one.reason,
+                '',
+            ]
+
+    return Table(COLUMNS, rows())
+
+
+def read_decisions(path: PathLike, names: Names) -> list[PointDecision]:
+    """Read the decisions in a table; rows without one are passed over.
+
+    names: of fluoroscopes, exposures and targets, by which the table may call them. Raises
+    DataError, which names the row, for a decision that is neither 'leave out' nor a target.
+    """
+    out = []
+    for block in read_blocks(path, REQUIRED):
+        columns = {name: block.strings(name) for name in (*REQUIRED, *_optional(block))}
+        for index, given in enumerate(columns['decision']):
+            words = ' '.join(given.replace('_', ' ').lower().split())
+            if not words:
+                continue
+            row = {name: cells[index].strip() for name, cells in columns.items()}
+            new_id = None if words == LEAVE_OUT else _new_id(block, index, row, names)
+            first = _number(block, index, row, 'exposure', names.exposures)
+            last = first
+            if row.get('last_exposure'):
+                last = _number(block, index, row, 'last_exposure', names.exposures)
+            if last < first:
+                block.fail(index, f'last_exposure is {last}, before exposure {first}')
+            target = None
+            if row['target_id']:
+                target = _number(block, index, row, 'target_id', names.targets)
+            name = row['fluoroscope']
+            out.append(
+                PointDecision(
+                    f'{path}, row {block.lines[index]}',
+                    names.fluoroscopes.get(name, name),
+                    first,
+                    last,
+                    target_id=target,
+                    new_id=new_id,
+                )
+            )
+    return out
+
+
+def _optional(block: Block) -> tuple[str, ...]:
+    return tuple(name for name in ('last_exposure',) if name in block.header)
+
+
+def _new_id(block: Block, index: int, row: Mapping[str, str], names: Names) -> int:
+    """Return the id that an image point gets. Raises DataError."""
+    text = row['decision']
+    if not row['target_id']:
+        block.fail(
+            index,
+            f'decision is {text!r}, but a whole exposure can only be left out: {LEAVE_OUT!r}; for '
+            'another id, name the target_id',
+        )
+    if text not in names.targets and not text.isdecimal():
+        block.fail(index, f'decision is {text!r}, neither {LEAVE_OUT!r} nor a target_id')
+    return _number(block, index, row, 'decision', names.targets)
+
+
+def _number(
+    block: Block, index: int, row: Mapping[str, str], column: str, known: Mapping[str, int]
+) -> int:
+    """Return the number of a cell, which may be a known name. Raises DataError."""
+    text = row[column]
+    if text in known:
+        return known[text]
+    if not text.isdecimal() or int(text[:11]) > MAX_ID:
+        block.fail(index, f'{column} is {text!r}, not a whole number from 0 to {MAX_ID}')
+    return int(text)

@@ -1,0 +1,111 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The long requests of a dashboard: actions self_calibrate and heal of the calibration node."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+from action_msgs.msg import GoalStatus
+from fluoro_calib_msgs.action import Heal, SelfCalibrate
+from rclpy.action import ActionClient
+from rclpy.node import Node
+from rclpy.task import Future
+
+from ..messages.healing import healing_text
+from ..messages.self_calibration import feedback_text
+from .state import CALIBRATE, CALIBRATE_FAST, HEAL, Diagnosis
+
+
+class _Kind(NamedTuple):
+    """One of the actions, and what the dashboard says of it."""
+
+    name: str  #: of the request
+    client: ActionClient
+    job: str  #: what runs
+    feedback: Callable[[Any], str]
+
+
+class Actions:
+    """Starts the actions, one at a time, and tells what becomes of them.
+
+    say takes a line of the log, set what has changed in the session. They are called in the
+    executor's thread; request() and cancel() in that of the view.
+    """
+
+    def __init__(self, node: Node, say: Callable[[str], None], set_: Callable[..., None]) -> None:
+        self._say = say
+        self._set = set_
+        self._lock = threading.RLock()
+        self._goal: Any = None
+        self._job = ''
+        calibrate = ActionClient(node, SelfCalibrate, 'self_calibrate')
+        heal = ActionClient(node, Heal, 'heal')
+        self._calibrate = _Kind(CALIBRATE, calibrate, 'calibrating', feedback_text)
+        self._heal = _Kind(HEAL, heal, 'healing', healing_text)
+        self._namespace = node.get_namespace()
+
+    def request(self, action: str) -> None:
+        """Start one of CALIBRATE, CALIBRATE_FAST and HEAL."""
+        if action == HEAL:
+            self._start(self._heal, Heal.Goal(), 'heal, from the markers that are seen now ...')
+            return
+        validate = action != CALIBRATE_FAST
+        text = 'calibrate, with verdict ...' if validate else 'calibrate, without verdict ...'
+        self._start(self._calibrate, SelfCalibrate.Goal(validate=validate), text)
+
+    def cancel(self) -> None:
+        """Cancel what was started here."""
+        if self._goal is None:
+            self._say('cancel: nothing runs that was started here')
+            return
+        self._goal.cancel_goal_async()
+        self._say('cancel ...')
+
+    def _start(self, kind: _Kind, goal: Any, text: str) -> None:
+        with self._lock:
+            if not kind.client.server_is_ready():
+                self._say(f'{kind.name}: no calibration node answers in {self._namespace}')
+                return
+            if self._job:
+                self._say(f'{kind.name}: {self._job} already')
+                return
+            self._job = kind.job
+        self._set(job=kind.job)
+        self._say(text)
+        sent = kind.client.send_goal_async(
+            goal, feedback_callback=lambda m: self._set(job=kind.feedback(m.feedback))
+        )
+        sent.add_done_callback(partial(self._on_goal, kind))
+
+    # -- the executor's thread
+
+    def _on_goal(self, kind: _Kind, future: Future) -> None:
+        handle = future.result()
+        if not handle.accepted:
+            self._job = ''
+            self._set(job='')
+            self._say(f'{kind.name}: refused, the calibration node does something else')
+            return
+        self._goal = handle
+        handle.get_result_async().add_done_callback(partial(self._on_result, kind))
+
+    def _on_result(self, kind: _Kind, future: Future) -> None:
+        answer = future.result()
+        result = answer.result
+        with self._lock:
+            self._goal = None
+            self._job = ''
+        changes: dict[str, Any] = {'job': ''}
+        succeeded = answer.status == GoalStatus.STATUS_SUCCEEDED
+        if succeeded and kind.name == HEAL:
+            findings = (*result.findings, *result.checks)
+            changes['diagnosis'] = Diagnosis(result.verdict, findings, result.orientation_id)
+        elif succeeded:
+            changes |= {'verdict': result.verdict, 'findings': tuple(result.findings)}
+        self._set(**changes)
+        self._say(f'{kind.name}{"" if succeeded else " failed"}: {result.message}')

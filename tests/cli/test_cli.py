@@ -376,6 +376,15 @@ def test_correct_removes_the_distortion(rig, result, tmp_path, capsys):
         ).tolist()
 
 
+def test_correct_tells_a_missing_file_from_one_of_another_kind(result, tmp_path, capsys):
+    path = tmp_path / 'points.xlsx'
+    arguments = ('correct', path, '--calibration', result, '--out', tmp_path / 'x.csv')
+    assert 'no such file' in said(capsys, arguments)
+    path.write_text('u,v\n')
+    err = said(capsys, arguments)
+    assert 'xlsx' in err and 'only csv, ' in err
+
+
 # ---- what users get wrong
 
 

@@ -22,6 +22,7 @@ from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.names import Names
 from fluoro_calib_ros.findings import Finding, Kind, Severity
 from fluoro_calib_ros.io.bags.salvage import BagReport, Damage, TopicReport
+from fluoro_calib_ros.jobs.reconstruction import ReconstructionOptions
 from fluoro_calib_ros.jobs.scheduling import Cluster
 
 
@@ -359,9 +360,12 @@ def test_reconstruct_says_by_how_much_its_limit_was_widened(
         reconstruct_command, 'read_oriented_source', lambda *_: (recording, {}, None)
     )
     asked = {}
-    monkeypatch.setattr(
-        reconstruct_command, 'options_of', lambda kind, arguments, **values: asked.update(values)
-    )
+
+    def options_of(kind, given, **values):
+        assert kind is ReconstructionOptions and given is arguments
+        asked.update(values)
+
+    monkeypatch.setattr(reconstruct_command, 'options_of', options_of)
     monkeypatch.setattr(reconstruct_command, '_print', lambda *_: None)
     source = tmp_path / 'x.csv'
     source.touch()
@@ -443,6 +447,10 @@ def test_information_about_a_bag_has_its_times_and_rates():
         'no faults found',
     ]
     assert bag._info_text(report, ['x']).splitlines()[-1] == 'fault: x'
+    stopped = TopicReport('T', [10**9, 10**9])
+    lines = bag._info_text(BagReport(['f'], {'/a': stopped}, {}, (), {}), []).splitlines()
+    assert lines[2] == '  /a [T]: 2 messages' and lines[1].endswith('(0.000 s)')
+    assert bag._topic_document(stopped)['rate_hz'] is None
     document = bag._topic_document(one)
     assert (document['rate_hz'], document['start_ns'], document['end_ns']) == (2, 10**9, 2 * 10**9)
     assert document['longest_gap_s'] == 0.5 and bag._topic_document(lone)['rate_hz'] is None
@@ -559,7 +567,7 @@ def test_steps_are_digested_with_words_inputs_and_their_state(tmp_path):
     (given / 'g').write_text('')
     assert digest() != second
     log = tmp_path / 'log'
-    log.write_text('one\ntwo\n\n')
-    assert process._last_line(log) == 'two'
+    log.write_text('one\ntwo\nthree\n\n')
+    assert process._last_line(log) == 'three'
     log.write_text('')
     assert 'without a message' in process._last_line(log)

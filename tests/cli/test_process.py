@@ -18,6 +18,7 @@ from rigs import run
 from fluoro_calib_ros import processes
 from fluoro_calib_ros.cli.process import STATE, Done, _Work, trial_row
 from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.io.calibration import load_calibration
 from fluoro_calib_ros.io.csv_table import write_table
 from fluoro_calib_ros.io.study_file import read_study
 
@@ -97,6 +98,13 @@ def forked(monkeypatch):
     use_forks(monkeypatch)
 
 
+def load_result_ids(folder):
+    return {
+        name: load_calibration(str(folder / f'{name}.calibration.npz')).calibration_id
+        for name in 'ab'
+    }
+
+
 def rows_of(study):
     with open(study / 'results' / 'trials.csv', newline='') as file:
         return {row['trial']: row for row in csv.DictReader(file)}
@@ -161,6 +169,26 @@ def test_a_trial_of_a_rig_that_has_moved_fails(study, forked):
     rows = rows_of(study)
     assert rows['trials/walk']['verdict'] == 'fail' and 'rays' in rows['trials/walk']['cause']
     assert rows['trials/run']['verdict'] == 'cannot tell'
+
+
+def test_calibration_that_fails_ends_the_study_with_its_cause(study, capsys, forked):
+    text = STUDY.replace('calibration = "result"\n', '')
+    calibrate = '[calibrate]\nsource = "trials/walk.csv"\nphantom = "phantom.csv"\n'
+    write_study(study, text + calibrate)
+    (study / 'phantom.csv').write_text('target_id,x,y,z,sd\n1,0,0\n')
+    assert run('process', study) == 1
+    err = capsys.readouterr().err.splitlines()[-1]
+    assert 'no calibration: ' in err and 'phantom.csv' in err and 'log' in err
+    assert not (study / 'results' / 'trials').exists()
+
+
+def test_trials_of_a_calibration_that_failed_are_not_processed(study, capsys):
+    given = load_result_ids(study / 'result')
+    document = {'verdict': 'fail', 'checks': [], 'findings': [], 'calibration_id': given}
+    (study / 'result' / 'validation.json').write_text(json.dumps(document))
+    assert run('process', study) == 1
+    assert 'verdict of the calibration is fail' in capsys.readouterr().err
+    assert not (study / 'results' / 'trials').exists()
 
 
 @pytest.mark.long

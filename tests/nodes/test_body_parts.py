@@ -247,6 +247,20 @@ def test_follower_gives_the_poses_of_the_tracker():
                 assert np.array_equal(a.covariance, b.covariance)
 
 
+@pytest.mark.parametrize(('reject', 'markers'), [(4.0, 3), (None, 4)])
+def test_follower_leaves_out_what_is_false_by_the_limit_of_the_rig(reject, markers):
+    """A marker of the body that stands where no marker is; without a limit all are used."""
+    follower = BodyFollower(BODIES, (), lag=0)
+    rng = np.random.default_rng(5)
+    for row in range(10):
+        shown = exposure(row, rng=rng)
+        if row == 9:
+            shown.views.uv[:, np.searchsorted(shown.target_id, 12)] += 6.0
+        (found,) = follower.add(shown, rig(reject=reject), row + 1, stamp(row))
+    femur, tibia = found.poses
+    assert (femur.markers[0], tibia.markers[0]) == (4, markers)
+
+
 @pytest.mark.parametrize('change', ['orientation', 'recording that begins anew'])
 def test_new_tracker_first_gives_what_waits(change):
     """No exposure is lost, and the new tracker begins without a motion."""

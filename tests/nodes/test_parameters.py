@@ -16,6 +16,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from fluoro_calib_ros.estimation.options import CalibrationOptions
+from fluoro_calib_ros.limits import MAX_TEXT
 from fluoro_calib_ros.nodes.runtime.diagnostics import StartError
 from fluoro_calib_ros.nodes.runtime.parameters import (
     MAX_INTEGER,
@@ -206,6 +207,7 @@ class Settings(ParameterNode):
         SETTABLE.declare(self)
         SETTABLE.follow(self, self.used.append)
         ParameterGroup(Options, {'kind': 'kind'}).declare(self)
+        self.declare_parameter('note', '')
 
 
 @pytest.fixture
@@ -249,6 +251,13 @@ def test_what_cannot_be_set_says_why_and_changes_nothing(settings, name, value, 
     done = settings.set_parameters_atomically([Parameter(name, value=value)])
     assert not done.successful and sentence in done.reason and '\n' not in done.reason
     assert settings.get_parameter(name).value == before and not settings.used
+
+
+def test_text_of_a_parameter_is_as_long_as_its_limit(settings):
+    for length, is_taken in ((MAX_TEXT, True), (MAX_TEXT + 1, False)):
+        done = settings.set_parameters_atomically([Parameter('note', value='x' * length)])
+        assert done.successful is is_taken, done.reason
+    assert len(settings.get_parameter('note').value) == MAX_TEXT
 
 
 @pytest.mark.parametrize('node', write_tables.NODES)

@@ -190,6 +190,7 @@ def test_distribution_is_compared_with_the_normal_of_its_robust_deviation():
     values = np.random.default_rng(1).normal(0, 0.3, (500, 2))
     one = replace(some_residuals(), after=values, inlier=np.ones(500, bool))
     left, right = distribution(one, 'a').axes
+    assert left.get_position().x1 < right.get_position().x0
     sd = 1.4826 * np.median(np.abs(values))
     x, y = left.lines[0].get_data()
     np.testing.assert_allclose(y, np.exp(-((x / sd) ** 2) / 2) / (np.sqrt(2 * np.pi) * sd))
@@ -202,7 +203,10 @@ def test_distribution_is_compared_with_the_normal_of_its_robust_deviation():
 
 def test_shifts_of_beads_are_relative_to_their_sd():
     shift = np.array([[0.3, 0, 0], [0, 0.6, 0], [0, 0, 0.9]])
-    _, right = bead_shifts(shift, np.array([0.1, 0.1, 0.3])).axes
+    left, right = bead_shifts(shift, np.array([0.1, 0.1, 0.3])).axes
+    assert left.get_position().x1 < right.get_position().x0  # beside each other
+    assert {text.get_text() for text in left.get_legend().get_texts()} == {'x', 'y', 'z'}
+    assert max(step.get_xy()[:, 0].max() for step in left.patches) == pytest.approx(0.9)
     counts = np.array([bar.get_height() for bar in right.patches])
     left_edges = np.array([bar.get_x() for bar in right.patches])
     assert counts.sum() == 3 and counts[0] == 2  # 0.3 and 0.9 / 3 over the root of 3

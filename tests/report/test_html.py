@@ -149,8 +149,9 @@ def test_verdict_and_what_to_do_come_first(folder, tmp_path, without_pictures, v
     copy = shutil.copytree(folder, tmp_path / 'copy')
     write_verdict(copy, verdict, 'Record <5> more exposures.')
     assert run('report', copy) == 0
-    page, _ = page_of(copy / 'report.html')
+    page, source = page_of(copy / 'report.html')
     text = ' '.join(page.text)
+    assert f'class="verdict {verdict.replace(" ", "-")}"' in source
     place = text.index(f'Verdict: {verdict}')
     assert place < text.index(sentence) < text.index('Record <5> more') < text.index('In short')
 
@@ -316,7 +317,7 @@ def test_exterior_orientations_have_the_names_of_their_exposures(folder):
     given = read_report_input(folder)
     entry = given.result['fluoroscopes']['a']
     listed = [e['exposure'] for e in entry['exposures']]
-    names = Names({}, {f'pose <{n}>': int(n) for n in listed[1:]})
+    names = Names({}, {f'pose <{n}>': int(n) for n in listed[1:]}, {'<left>': 'a'})
     as_text = [{**e, 'exposure': str(e['exposure'])} for e in entry['exposures']]
     for listed_so in (entry['exposures'], as_text):
         result = {**given.result, 'fluoroscopes': {'a': {**entry, 'exposures': listed_so}}}
@@ -325,6 +326,9 @@ def test_exterior_orientations_have_the_names_of_their_exposures(folder):
         shown = [name for name, _ in numbers['exterior']]
         assert shown == [listed_so[0]['exposure'], *(f'pose <{n}>' for n in listed[1:])]
         assert [e for _, e in numbers['exterior']] == listed_so
+        assert numbers['label'] == '<left>'
+        assert [row[0] for row in numbers['exposures']] == [int(n) for n in listed]
+        assert [row[1] for row in numbers['exposures']] == [int(listed[0]), *shown[1:]]
 
 
 def test_panels_of_residuals_are_two_coordinates_by_three_scales():

@@ -32,7 +32,7 @@ from ..reconstruction.epipolar import EpipolarGeometry
 from ..reconstruction.intersection import OK, OUTSIDE, Intersector
 from .marker_intensity import (
     MARKER_SCALES,
-    FilteredImage,
+    FilteredLight,
     check_image,
     filter_image,
     first_shadows,
@@ -130,7 +130,7 @@ def identify_markers(
     count = sum(len(body.target_id) for body in bodies)
     reason: DataError | None = None
     best: dict[str, FirstMarkers] = {}
-    filtered: dict[float, list[FilteredImage]] = {}
+    filtered: dict[float, list[tuple[FilteredLight, FilteredLight]]] = {}
     # What else is round in the images may be larger, and more distinct. Of many bodies, perhaps
     # one is there.
     for strongest, scale in product((count, MIN_MEMBERS), MARKER_SCALES[:3]):
@@ -138,8 +138,8 @@ def identify_markers(
             if scale not in filtered:
                 filtered[scale] = [filter_image(images[name], scale) for name in names]
             shadows = [
-                first_shadows(image, strongest, SHARE).strongest(MAX_SHADOWS).uv
-                for image in filtered[scale]
+                first_shadows(lights, strongest, SHARE).strongest(MAX_SHADOWS).uv
+                for lights in filtered[scale]
             ]
             found, missing = find_bodies(shadows, rig, bodies)
         except DataError as error:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import cv2
 import numpy as np
@@ -34,6 +34,7 @@ MIN_CONTRAST = 0.02  # of a response, as a fraction of the light around it
 MIN_SNR = 4.5  # of a response, over the noise of the response
 WINDOW_BACKGROUND_PX = 6  # the same along the rows of a window
 BACKGROUND_PX = 15  # half the width of the box whose mean is the light around a pixel
+SAMPLED = 4  # rows and columns from one pixel to the next, where all are of one kind
 SAME_PX = 1.0  # between maxima that are one shadow
 BORDER = 3  # scales of the blur at the edge of a window that are not searched
 
@@ -81,18 +82,49 @@ class MarkerLook:
 
 
 @dataclass(frozen=True)
-class FilteredImage:
-    """An image (h, w), filtered for shadows of one size: of dark and of bright ones."""
+class FilteredLight:
+    """Light (h, w) of an image in which markers are dark, filtered for shadows of one size."""
 
     scale: float
-    lights: tuple[np.ndarray, np.ndarray]  # in which the shadows are dark
-    responses: tuple[np.ndarray, np.ndarray]
-    around: tuple[np.ndarray, np.ndarray]  # mean of the light around
+    inverted: bool  # whether they are bright in the image
+    light: np.ndarray
+    response: np.ndarray
+    around: np.ndarray  # mean of the light around
 
-    def relative(self, polarity: int) -> np.ndarray:
-        """Responses over the light around."""
-        top = float(self.lights[0].flat[0] + self.lights[1].flat[0])
-        return np.asarray(self.responses[polarity] / np.maximum(self.around[polarity], 1e-3 * top))
+    @cached_property
+    def relative(self) -> NDArray[np.float32]:
+        """Response (h, w) over the light around."""
+        least = 1e-3 * float(self.light.max())
+        return np.asarray(self.response / np.maximum(self.around, least))
+
+    @cached_property
+    def field(self) -> NDArray[np.bool_]:
+        """Field of view (h, w)."""
+        return field_of_view(self.light, self.scale)
+
+    @cached_property
+    def noise(self) -> float:
+        """Median response where there is any; a part of the pixels tells it."""
+        return _positive_median(self.relative[::SAMPLED, ::SAMPLED])
+
+    @cached_property
+    def noise_in_field(self) -> float:
+        """The same in the field of view."""
+        part = self.relative[::SAMPLED, ::SAMPLED]
+        return _positive_median(part[self.field[::SAMPLED, ::SAMPLED]])
+
+    @cached_property
+    def usual(self) -> float:
+        """Light of the middle of the range."""
+        part = self.light[::SAMPLED, ::SAMPLED]
+        field = self.field[::SAMPLED, ::SAMPLED]
+        return float(np.median(part[field])) if field.any() else float(self.light.mean())
+
+
+def _positive_median(values: np.ndarray) -> float:
+    """Median of the positive values, 0 without any."""
+    positive = values[values > 0]
+    return float(np.median(positive)) if len(positive) else 0.0
 
 
 class LightWindows:
@@ -161,18 +193,18 @@ def learn_look(
     Without points, the count strongest shadows of each scale decide. scales are those that are
     tried. Raises DataError where there is nothing round.
     """
-    return _learned((filter_image(image, scale) for scale in scales), near, count)[0]
+    lights = (light for scale in scales for light in filter_image(image, scale))
+    return _learned(lights, near, count)[0]
 
 
-def first_shadows(filtered: FilteredImage, count: int, share: float) -> Shadows:
+def first_shadows(lights: Iterable[FilteredLight], count: int, share: float) -> Shadows:
     """Find the shadows in an image that says itself what markers look like.
 
-    count: of the strongest shadows, which do; share: of their response that is found. Raises
-    DataError where there is nothing round.
+    lights: as `filter_image` returns them. count: of the strongest shadows, which tell the look;
+    share: of their response that is found. Raises DataError where there is nothing round.
     """
-    look, filtered = _learned((filtered,), None, count)
-    polarity = int(look.inverted)
-    return _found(look, filtered.responses[polarity], filtered.around[polarity], share)
+    look, light = _learned(lights, None, count)
+    return _found(look, light.response, light.around, share)
 
 
 def search_image(image: np.ndarray, look: MarkerLook, share: float) -> Shadows:
@@ -183,51 +215,48 @@ def search_image(image: np.ndarray, look: MarkerLook, share: float) -> Shadows:
     return _found(look, _dark_response(light, look.scale), around, share)
 
 
-def filter_image(image: np.ndarray, scale: float) -> FilteredImage:
-    """Filter a whole image for round shadows of a size, dark and bright ones."""
+def filter_image(image: np.ndarray, scale: float) -> tuple[FilteredLight, FilteredLight]:
+    """Filter a whole image for shadows of a size, dark ones and bright ones."""
     grey = image.astype(np.float32)
     top = float(np.iinfo(image.dtype).max)
     around = cv2.blur(grey, (2 * BACKGROUND_PX + 1,) * 2)
-    lights = (grey, top - grey)
-    return FilteredImage(scale, lights, _responses(grey, scale), (around, top - around))
+    dark, bright = _responses(grey, scale)
+    return (
+        FilteredLight(scale, inverted=False, light=grey, response=dark, around=around),
+        FilteredLight(
+            scale, inverted=True, light=top - grey, response=bright, around=top - around
+        ),
+    )
 
 
 def _learned(
-    images: Iterable[FilteredImage], near: np.ndarray | None, count: int
-) -> tuple[MarkerLook, FilteredImage]:
-    """Return what `learn_look` does, from an image filtered at some scales, and the best."""
-    best: tuple[float, float, FilteredImage, int] | None = None
-    for filtered in images:
-        for polarity in (0, 1):
-            relative = filtered.relative(polarity)
-            typical = _typical(relative, filtered.scale, near, count)
-            # Small scales have the strongest response to noise, too.
-            noise = float(np.median(relative[relative > 0])) if (relative > 0).any() else 1.0
-            merit = typical / (noise + NOISE_WEIGHT * typical)
-            if best is None or merit * typical > best[0]:
-                best = (merit * typical, typical, filtered, polarity)
+    lights: Iterable[FilteredLight], near: np.ndarray | None, count: int
+) -> tuple[MarkerLook, FilteredLight]:
+    """Return what `learn_look` does, from lights of some scales, and the best of them."""
+    best: tuple[float, float, FilteredLight] | None = None
+    for light in lights:
+        typical = _typical(light.relative, light.scale, near, count)
+        # Small scales have the strongest response to noise, too.
+        merit = typical / ((light.noise or 1.0) + NOISE_WEIGHT * typical)
+        if best is None or merit * typical > best[0]:
+            best = (merit * typical, typical, light)
     assert best is not None
-    _, strength, filtered, polarity = best
-    light = filtered.lights[polarity]
-    field = field_of_view(light, filtered.scale)
-    quiet = filtered.relative(polarity)[field]
-    noise = float(np.median(quiet[quiet > 0])) if (quiet > 0).any() else 0.0
-    floor = max(MIN_SNR * noise, MIN_CONTRAST)
+    _, strength, light = best
+    floor = max(MIN_SNR * light.noise_in_field, MIN_CONTRAST)
     if strength < floor:
         cause = 'there is nothing round where the markers should be'
         if near is None:
             cause = 'there are no markers in the image, nothing round rises above the noise'
         raise DataError(cause, kind=Kind.NO_MARKERS)
-    usual = float(np.median(light[field])) if field.any() else float(light.mean())
     look = MarkerLook(
-        filtered.scale,
-        bool(polarity),
-        field=field,
+        light.scale,
+        light.inverted,
+        field=light.field,
         strength=strength,
         floor=floor,
-        light=max(usual, 1.0),
+        light=max(light.usual, 1.0),
     )
-    return look, filtered
+    return look, light
 
 
 def _found(look: MarkerLook, response: np.ndarray, around: np.ndarray, share: float) -> Shadows:

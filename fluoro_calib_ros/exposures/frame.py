@@ -74,6 +74,11 @@ class Frame:
         if self.angle is not None:
             object.__setattr__(self, 'angle', float(np.radians(angle_in_degrees(self.angle))))
 
+    def rows(self, chosen: NDArray[np.bool_]) -> Frame:
+        """Return the frame with some of its targets (n,)."""
+        sigma = None if self.sigma is None else np.asarray(self.sigma)[chosen]
+        return replace(self, target_id=self.target_id[chosen], uv=self.uv[chosen], sigma=sigma)
+
     def sorted(self) -> Frame:
         """Return the frame with its targets in ascending order.
 
@@ -92,6 +97,18 @@ class Frame:
             frame_id=self.frame_id,
             angle=self.angle,
         )
+
+
+def frames_of_targets(frames: Frames, target_id: NDArray[np.int64]) -> dict[str, list[Frame]]:
+    """Return the frames that show some of these targets, without others."""
+    return {
+        name: [
+            frame.rows(seen)
+            for frame in of_one
+            if (seen := np.isin(frame.target_id, target_id)).any()
+        ]
+        for name, of_one in frames.items()
+    }
 
 
 def validate_frame(

@@ -270,14 +270,7 @@ def _corrected(
             angle = request.angle if frame.angle is None else frame.angle
             points = calibrations[name].correct(frame.uv, frame.sigma, angle=angle)
             kept = points.status != CorrectionStatus.INVALID
-            out[name].append(
-                replace(
-                    frame,
-                    target_id=frame.target_id[kept],
-                    uv=points.uv[kept],
-                    sigma=points.sigma[kept],
-                )
-            )
+            out[name].append(replace(frame, uv=points.uv, sigma=points.sigma).rows(kept))
     return out, tuple(notes)
 
 

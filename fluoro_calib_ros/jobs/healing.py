@@ -35,7 +35,7 @@ from ..correction.base import CorrectionStatus
 from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration, with_drift
 from ..correction.series import sd_over_image
 from ..errors import DataError
-from ..exposures.frame import Frame, Frames
+from ..exposures.frame import Frame, Frames, frames_of_targets
 from ..exposures.pairing import RecordedPairing
 from ..findings import Finding, Kind, Place, Severity
 from ..io.access import PathLike
@@ -141,8 +141,9 @@ def heal_rig(
     step = progress or (lambda done, total: None)
     check_bodies(bodies)
     orientation = orientation_of_recorded(frames, orientation)
+    seen = frames_of_targets(frames, np.concatenate([body.target_id for body in bodies]))
     names = orientation.fluoroscopes
-    paired, _ = pair_recording(frames, names, options.pair_by, options.pair_tolerance)
+    paired, _ = pair_recording(seen, names, options.pair_by, options.pair_tolerance)
     used, unused = _chosen(len(paired))
     rig = _Rig(calibrations, orientation, solvable_bodies(bodies))
     observed, poses = rig.observe([paired[row] for row in used])
@@ -156,8 +157,7 @@ def heal_rig(
     changed = [change for change in diagnosis.changes if change.cause in OF_RIG]
     fixed = rig.with_fixed_correction(changed)
     healed = None
-    after = before
-    now = rig
+    after, now = before, rig
     if changed and not fixed:
         stamp_ns = max(frame.stamp_ns for frame in paired[used[-1]].values())
         healed = healed_rig(diagnostician, diagnosis, stamp_ns, len(used))

@@ -14,7 +14,7 @@ from ..bodies.body import Body, check_bodies
 from ..bodies.shapes import EstimatedShape, LearnedShapes
 from ..correction.fluoroscope_calibration import Calibrations
 from ..errors import DataError, ErrorsAt
-from ..exposures.frame import Frames
+from ..exposures.frame import Frames, frames_of_targets
 from ..findings import Kind
 from ..io.access import PathLike
 from ..io.learned_shapes import has_learned_shapes, read_learned_shapes
@@ -73,7 +73,9 @@ def learn_shapes(
     options = options or BodiesOptions()
     check_bodies(bodies)
     recorded = orientation_of_recorded(frames, orientation)
-    exposures, _, drift = intersected(frames, calibrations, recorded, options)
+    markers = np.concatenate([body.target_id for body in bodies])
+    seen = frames_of_targets(frames, markers)
+    exposures, _, drift = intersected(seen, calibrations, recorded, options)
     if drift.state is not None:
         raise DataError(replace(drift.finding, advice='no shapes are learned in a drift'))
     shapes = estimated_shapes(bodies, exposures)

@@ -12,7 +12,6 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -41,6 +40,7 @@ from .runtime.services import ServiceEntry, in_thread, wake, within
 
 MAX_FRAMES = 20_000  # of a fluoroscope that are collected, whatever its rate
 MAX_SECONDS = 60.0
+PAUSE_S = 1.0  # between frames that show markers; a longer one is no time in which they are seen
 FEEDBACK_S = 0.5
 CHANGED = 'the rig in use has changed meanwhile, heal it again'
 
@@ -54,16 +54,24 @@ class _Rig(NamedTuple):
 
 
 class MarkerCollection:
-    """Frames of markers, collected in the thread of the streams until finish()."""
+    """Frames that show markers of bodies, collected in the thread of the streams until finish().
+
+    seconds: of the stream in which a fluoroscope has seen markers, after which it has enough.
+    """
 
     def __init__(
-        self, bodies: Sequence[Body], calibrations: Mapping[str, FluoroscopeCalibration]
+        self,
+        bodies: Sequence[Body],
+        calibrations: Mapping[str, FluoroscopeCalibration],
+        seconds: float = np.inf,
     ) -> None:
         self.frames: dict[str, list[Frame]] = {}
         self.refused: deque[str] = deque(maxlen=1)  # why the last invalid frame was left out
         self.done = Future()
         self._calibrations = calibrations
         self._markers = np.concatenate([body.target_id for body in bodies])
+        self._seconds = seconds
+        self._seen_s = dict.fromkeys(calibrations, 0.0)
         self._lock = threading.Lock()
 
     @property
@@ -71,10 +79,23 @@ class MarkerCollection:
         """Number of the frames of all fluoroscopes."""
         return sum(map(len, list(self.frames.values())))
 
+    @property
+    def seen_s(self) -> float:
+        """How long all fluoroscopes have seen markers [s]."""
+        return min(self._seen_s.values())
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether all fluoroscopes have enough."""
+        return all(map(self._is_full, self._calibrations))
+
+    def _is_full(self, name: str) -> bool:
+        return self._seen_s[name] >= self._seconds or len(self.frames.get(name, ())) >= MAX_FRAMES
+
     def add(self, name: str, observed: ObservedFrame, angle: float | None) -> None:
-        """Keep a valid frame, without what is no marker of the bodies."""
+        """Keep a valid frame that shows markers, without what is no marker of the bodies."""
         calibration = self._calibrations.get(name)
-        if calibration is None or self.is_full(name):
+        if calibration is None or self._is_full(name):
             return
         try:
             frame = frame_from_observed(observed, name, angle).sorted()
@@ -82,24 +103,16 @@ class MarkerCollection:
         except DataError as error:
             self.refused.append(str(error))
             return
-        keep = np.isin(frame.target_id, self._markers)
-        frame = replace(
-            frame,
-            target_id=frame.target_id[keep],
-            uv=frame.uv[keep],
-            sigma=None if frame.sigma is None else frame.sigma[keep],
-        )
+        seen = np.isin(frame.target_id, self._markers)
+        if not seen.any():
+            return
         with self._lock:
-            if not self.done.done():
-                self.keep(frame)
-
-    def is_full(self, name: str) -> bool:
-        """Return whether no more frames of a fluoroscope are needed."""
-        return len(self.frames.get(name, ())) >= MAX_FRAMES
-
-    def keep(self, frame: Frame) -> None:
-        """Keep a frame."""
-        self.frames.setdefault(frame.fluoroscope, []).append(frame)
+            if self.done.done():
+                return
+            of_one = self.frames.setdefault(name, [])
+            after_s = (frame.stamp_ns - of_one[-1].stamp_ns) / 1e9 if of_one else 0.0
+            self._seen_s[name] += after_s if 0 < after_s <= PAUSE_S else 0.0
+            of_one.append(frame.rows(seen))
 
     def finish(self) -> None:
         """End the collection: time, a cancellation and the end of the node may all do so."""
@@ -158,7 +171,7 @@ class Healing(Job):
         frames = await self._collected(goal, rig, seconds)
         raise_if_cancelled()
         if not frames:
-            raise DataError(f'no frame of any fluoroscope came within {seconds:g} s')
+            raise DataError(f'no frame with a marker of a body came within {seconds:g} s')
         pairing = self._rig.settings().pairing
         options = HealingOptions(pairing.pair_by, pairing.tolerance_s)
         count = sum(map(len, frames.values()))

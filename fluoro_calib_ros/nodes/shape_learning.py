@@ -10,20 +10,19 @@ and shapes are estimated from them in a process of their own.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 
 from fluoro_calib_msgs.msg import DriftStatus
 from rclpy.task import Future
 
 from ..bodies.body import Body
 from ..bodies.shapes import LearnedShapes
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError, ErrorsAt
-from ..exposures.frame import Frame
 from ..io.bodies import read_bodies
 from ..io.learned_shapes import write_learned_shapes
 from ..jobs.bodies import BodiesOptions
 from ..jobs.learning import DRIFTED, learn_shapes, learned_for
+from ..jobs.result_folder import belongs_to
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..processes import in_worker_process
 from .calibration_services import Cancelled
@@ -34,46 +33,7 @@ from .runtime.diagnostics import OK, WARN, Health, Status
 from .runtime.parameters import expand_path
 from .runtime.services import in_thread
 
-PAUSE_S = 1.0  # between frames that show markers; a longer one is no time in which they are seen
 DRIFT = 'the drift watch has given an alarm: no shapes are learned before the next calibration'
-
-
-class _Window(MarkerCollection):
-    """Frames that show markers, for a time of the stream."""
-
-    def __init__(
-        self,
-        bodies: Sequence[Body],
-        calibrations: Mapping[str, FluoroscopeCalibration],
-        seconds: float,
-    ) -> None:
-        super().__init__(bodies, calibrations)
-        self._seconds = seconds
-        self._seen = dict.fromkeys(calibrations, 0.0)
-
-    @property
-    def seen_s(self) -> float:
-        """How long all fluoroscopes have seen markers [s]."""
-        return min(self._seen.values())
-
-    @property
-    def is_complete(self) -> bool:
-        """Whether it has all frames."""
-        return all(map(self.is_full, self._seen))
-
-    def is_full(self, name: str) -> bool:
-        """Return whether no more frames of a fluoroscope are needed."""
-        return self._seen[name] >= self._seconds or super().is_full(name)
-
-    def keep(self, frame: Frame) -> None:
-        """Keep a frame that shows markers."""
-        if not len(frame.target_id):
-            return
-        before = self.frames.get(frame.fluoroscope)
-        if before:
-            after_s = (frame.stamp_ns - before[-1].stamp_ns) / 1e9
-            self._seen[frame.fluoroscope] += after_s if 0 < after_s <= PAUSE_S else 0.0
-        super().keep(frame)
 
 
 class ShapeLearning(RigServices):
@@ -85,7 +45,7 @@ class ShapeLearning(RigServices):
         super().__init__(parts)
         self._bodies = _declared(self._rig.settings().node.learn_bodies)
         self._orientation: RigOrientation | None = None  # that is learned with
-        self._window: _Window | None = None
+        self._window: MarkerCollection | None = None
         self._job: tuple[Future, threading.Thread] | None = None
         self._stopping = threading.Event()
         self._alarmed = False  # whether the drift watch has given an alarm of this orientation
@@ -140,7 +100,8 @@ class ShapeLearning(RigServices):
         if learned is not None:
             names = ', '.join(body.name for body in learned.bodies)
             return Health(OK, f'shapes of {names} learned from {learned.exposures} exposures')
-        if orientation is None:
+        calibrations = self._output.calibrations
+        if orientation is None or not belongs_to(orientation, calibrations):
             return Health(OK, 'shapes are learned once the rig is oriented')
         if orientation.source == 'healing':
             return Health(WARN, 'no shapes are learned with a healed rig')
@@ -151,14 +112,14 @@ class ShapeLearning(RigServices):
         window = self._window
         if window is None:
             seconds = self._rig.settings().node.learn_time
-            window = self._window = _Window(self._bodies, self._output.calibrations, seconds)
+            window = self._window = MarkerCollection(self._bodies, calibrations, seconds)
         if window.is_complete:
             self._window = None
             self._start(window, orientation)
         again = f'not learned: {self._refusal}; ' if self._refusal else ''
         return Health(WARN if again else OK, f'{again}markers seen for {window.seen_s:.1f} s')
 
-    def _start(self, window: _Window, orientation: RigOrientation) -> None:
+    def _start(self, window: MarkerCollection, orientation: RigOrientation) -> None:
         """Estimate shapes in another process."""
         pairing = self._rig.settings().pairing
         options = BodiesOptions(pairing.pair_by, pairing.tolerance_s)
@@ -189,10 +150,10 @@ class ShapeLearning(RigServices):
             write_learned_shapes(self._rig.directory, learned)
         except Cancelled:
             return
-        except (DataError, OSError) as error:
+        except Exception as error:  # a bug must not end the diagnostics
             self._refusal = str(error)
             self._logger.error(f'no shapes learned: {error}')
-            self._alarmed = isinstance(error, DataError) and error.finding.kind in DRIFTED
+            self._alarmed |= isinstance(error, DataError) and error.finding.kind in DRIFTED
             return
         self._learned = learned
         for found in learned.findings:

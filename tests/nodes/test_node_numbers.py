@@ -343,12 +343,12 @@ def test_default_folder_follows_the_namespace(monkeypatch):
 # ---- healing
 
 
-def collection(monkeypatch, most=3):
+def collection(monkeypatch, most=3, **options):
     monkeypatch.setattr(healing_services, 'MAX_FRAMES', most)
     monkeypatch.setattr(healing_services, 'frame_from_observed', lambda seen, name, angle: seen)
     bodies = [Fake(target_id=np.array([5, 2])), Fake(target_id=np.array([40]))]
     calibrations = {'a': Fake(image_size=(1024, 1024))}
-    return healing_services.MarkerCollection(bodies, calibrations)
+    return healing_services.MarkerCollection(bodies, calibrations, **options)
 
 
 def test_collection_keeps_the_markers_of_bodies(monkeypatch):
@@ -372,6 +372,21 @@ def test_collection_keeps_the_markers_of_bodies(monkeypatch):
     del found.frames['a'][:]
     found.add('a', shown, None)
     assert found.count == 0
+
+
+def test_window_has_the_frames_of_a_time_in_which_markers_are_seen(monkeypatch):
+    found = collection(monkeypatch, most=100, seconds=1.0)
+    other, shown = (
+        replace(frame('a'), target_id=np.array([target]), uv=np.zeros((1, 2)), sigma=None)
+        for target in (3, 40)
+    )
+    for stamp_s, one in ((0, other), (1, shown), (1.5, shown), (1.7, other), (9, shown)):
+        found.add('a', replace(one, stamp_ns=int(1e9 * stamp_s)), None)
+    assert found.count == 3 and found.seen_s == 0.5 and not found.is_complete
+    for stamp_s in (9.4, 9.8, 10.0):  # enough with the second one
+        found.add('a', replace(shown, stamp_ns=int(1e9 * stamp_s)), None)
+    assert found.count == 5 and found.is_complete
+    assert found.frames['a'][-1].stamp_ns == int(1e9 * 9.8)
 
 
 # ---- drift

@@ -352,7 +352,7 @@ def test_cancelled_healing_changes_nothing_and_a_second_one_is_refused(rig):
     [
         ({'seconds': -1.0}, 'seconds is above 0 and at most 60, not -1'),
         ({'seconds': float('nan')}, 'seconds is above 0 and at most 60, not nan'),
-        ({'seconds': 0.2}, 'no frame of any fluoroscope came within 0.2 s'),
+        ({'seconds': 0.2}, 'no frame with a marker of a body came within 0.2 s'),
     ],
 )
 def test_refused_healing_gives_the_reason(rig, fields, message):

@@ -149,11 +149,7 @@ def _without_retracted(source: PathLike, frames: Frames) -> tuple[dict[str, list
             ids = wrong.get((name, frame.stamp_ns), set())
             kept = ~np.isin(frame.target_id, list(ids))
             count += int(np.count_nonzero(~kept))
-            sigma = None if frame.sigma is None else np.asarray(frame.sigma)[kept]
-            points = replace(
-                frame, target_id=frame.target_id[kept], uv=frame.uv[kept], sigma=sigma
-            )
-            out[name].append(frame if kept.all() else points)
+            out[name].append(frame if kept.all() else frame.rows(kept))
     return out, count
 
 

@@ -30,7 +30,9 @@ SECONDS = 10  # of a child
 assert ezc3d  # loaded before the forks
 
 
-def _run(name: str, kind: str, path: str, timeout_s: float) -> subprocess.CompletedProcess[bytes]:
+def run_forked(
+    name: str, kind: str, path: str, timeout_s: float
+) -> subprocess.CompletedProcess[bytes]:
     """Do what `run_module` does with the program of the reader."""
     pipes = [os.pipe(), os.pipe()]
     child = os.fork()
@@ -70,7 +72,7 @@ def _work(kind: str, path: str) -> NoReturn:
 
 
 def _read(path: Path) -> None:
-    with mock.patch.object(reader_process, 'run_module', _run):
+    with mock.patch.object(reader_process, 'run_module', run_forked):
         of_points.read_c3d(path, SETTINGS)
 
 

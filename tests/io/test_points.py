@@ -275,7 +275,7 @@ def test_points_of_sleap(tmp_path, order, named):
     assert first.uv.tolist() == [[10.5, 20.25], [30, 40], [11, 21]]
     np.testing.assert_allclose(first.sigma, [1, 2, 1.25])
     assert second.sigma.tolist() == [1, 1, 1], 'labelled by hand'
-    assert '1 points with a score of 0' in content.notes[0]
+    assert '1 points are not used, their score is 0' in content.notes[0]
 
 
 def test_a_folder_of_sleap_returns(tmp_path):

@@ -26,6 +26,7 @@ from .reader_process import arrays_apart
 from .tables import default_name, named_targets, with_sigma_of_likelihood
 
 MAGIC = b'\x89HDF\r\n\x1a\n'
+LEAST_SCORE = 1e-6  # below it a point weighs nothing beside the others
 _OF_VIDEO = re.compile(r'.*\.\d{3}_(?P<video>.+)')  # <project>.<number of the video>_<video>
 
 
@@ -57,7 +58,7 @@ def read(path: Path, settings: FileSettings) -> Content:
     target_id = np.array([ids[name] for name in targets], dtype=np.int64)
     fluoroscope = _fluoroscope(path, settings)
     placed = np.isfinite(uv).all(axis=2)
-    seen = placed & (score > 0)
+    seen = placed & (score > LEAST_SCORE) & (score < 1 / LEAST_SCORE)
     frames = []
     for number in np.flatnonzero(seen.any(axis=1)):
         points = uv[number, seen[number]]
@@ -81,7 +82,9 @@ def read(path: Path, settings: FileSettings) -> Content:
     return Content(
         observations={fluoroscope: frames} if frames else {},
         names=Names(named_targets({name: ids[name] for name in targets})),
-        notes=(f'{path}: {unsure} points with a score of 0 are not used',) if unsure else (),
+        notes=(f'{path}: {unsure} points are not used, their score is 0 or no score',)
+        if unsure
+        else (),
     )
 
 

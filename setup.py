@@ -59,6 +59,7 @@ setup(
         'completion': ['shtab'],
         'foxglove': ['foxglove-sdk'],
         'pandas': ['pandas'],
+        'sleap': ['h5py'],
         'watch': ['textual', 'tornado'],
         'test': ['hypothesis', 'pytest', 'pytest-timeout', 'pytest-xdist'],
     },

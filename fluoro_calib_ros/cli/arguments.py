@@ -264,9 +264,9 @@ def add_source(
         'source',
         type=Path,
         metavar='SOURCE',
-        help='bag (file or folder), CSV file '
-        'fluoroscope,exposure,target_id,u,v[,sigma][,angle_deg], or image points of another '
-        'program: XMALab 2-D points or project, .pho (docs/formats.md)' + more,
+        help='bag (file or folder), CSV file with the columns fluoroscope, exposure, target_id, '
+        'u, v and, where known, sigma and angle_deg, or image points of another program: XMALab '
+        '2-D points or project, DeepLabCut, SLEAP, .pho (docs/formats.md)' + more,
     )
     group = parser.add_argument_group('input')
     add_image_size(group, image_size_help)

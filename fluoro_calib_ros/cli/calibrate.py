@@ -245,10 +245,19 @@ def _request(arguments: argparse.Namespace) -> tuple[CalibrationRequest, Radiogr
             'observations': str(arguments.source),
             'phantom': str(arguments.phantom),
             **({'decisions': str(arguments.decisions)} if arguments.decisions else {}),
+            **_doses(arguments.source),
             **((arguments.rig_file and arguments.rig_file.about) or {}),
         },
     )
     return request, recording.radiographs
+
+
+def _doses(source: Path) -> dict[str, str]:
+    """Return what DICOM files say of the dose, for the report."""
+    from ..jobs.image_sources import contains_images, dose_texts
+
+    texts = dose_texts(source) if contains_images(source) else {}
+    return {f'dose {name}'.strip(): text for name, text in texts.items()}
 
 
 def _recording(arguments: argparse.Namespace, survey: Survey | None) -> Recording:

@@ -32,6 +32,16 @@ EXAMPLE = 'fluoro-calib convert result --to mayacam2 --out mayacam'
 MAX_RATE = 1e6  # [Hz] no camera is faster
 
 
+def _with_meaning(kind: str) -> str:
+    """Return a kind of format and what it is, for the help."""
+    from ..io.formats.registry import FORMATS
+
+    if kind not in FORMATS:
+        return f'{kind} (MCAP bag as rosbag2 writes it)'
+    title = FORMATS[kind].title.removesuffix(' of fluoro_calib_ros')
+    return kind if title.lower() == kind else f'{kind} ({title})'
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     from ..jobs.conversion import kinds_read, kinds_written
@@ -48,12 +58,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         required=True,
         choices=kinds_written(),
         metavar='KIND',
-        help=f'format to write: {", ".join(kinds_written())}',
+        help=f'format to write: {"; ".join(map(_with_meaning, kinds_written()))}',
     )
     add_out(
         parser,
-        'file to write; for mayacam2, opencv, camera_info and lut a folder with one file a '
-        'fluoroscope, for bundle a folder',
+        'file to write; for mayacam2, opencv, camera_info, lut, deeplabcut and sleap a folder '
+        'with one file a fluoroscope, for bundle a folder',
         'PATH',
     )
     parser.add_argument(

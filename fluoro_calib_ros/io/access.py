@@ -23,8 +23,8 @@ _NO_TEXT = (
     (b'\xd0\xcf\x11\xe0', 'an xls spreadsheet; save the table as CSV'),
     (
         b'\x89HDF',
-        'an HDF5 file, as DeepLabCut and SLEAP write; save it as CSV (DeepLabCut: '
-        'analyze_videos_converth5_to_csv)',
+        'an HDF5 file; of these, analysis files of SLEAP are read, as image points; save others '
+        'as CSV (DeepLabCut: analyze_videos_converth5_to_csv)',
     ),
 )
 _SAFE_NAME = re.compile('[A-Za-z0-9_-]+')

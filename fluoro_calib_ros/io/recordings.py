@@ -19,6 +19,7 @@ values are returned as they are stored: packed ones are on the camera's curve, n
 
 from __future__ import annotations
 
+import math
 import os
 import struct
 import warnings
@@ -52,6 +53,9 @@ class DicomHeader:
     inverted: bool
     shape: tuple[int, int]  #: rows and columns
     frame_rate: float | None  #: [Hz]
+    #: of the file: tube load [mAs], and dose area product [dGy cm^2]; None where it is not told
+    tube_load: float | None = None
+    area_dose: float | None = None
 
 
 def read_dicom_header(path: Path) -> DicomHeader:
@@ -76,6 +80,29 @@ def read_dicom_header(path: Path) -> DicomHeader:
     except Exception:  # pydicom raises what its parsing stumbles over
         raise DataError('this is no DICOM file, or it is damaged', at=path) from None
     return header
+
+
+# Tags of the tube load and their units in mAs, the finest first (PS3.3, X-Ray Acquisition).
+_TUBE_LOADS = (('ExposureInmAs', 1.0), ('ExposureInuAs', 1e-3), ('Exposure', 1.0))
+
+
+def _tube_load(dataset: Any) -> float | None:
+    """Return the tube load [mAs] of a data set, None where it is not told."""
+    for tag, unit in _TUBE_LOADS:
+        value = _amount(dataset, tag)
+        if value is not None:
+            return unit * value
+    current, time_ms = _amount(dataset, 'XRayTubeCurrent'), _amount(dataset, 'ExposureTime')
+    return None if current is None or time_ms is None else current * time_ms / 1000
+
+
+def _amount(dataset: Any, tag: str) -> float | None:
+    """Return a number above 0 of a data set, None for anything else."""
+    try:
+        value = float(dataset.get(tag))
+    except (TypeError, ValueError):
+        return None
+    return value if 0 < value < math.inf else None
 
 
 def read_dicom_images(path: Path, header: DicomHeader) -> Iterator[tuple[str, np.ndarray]]:
@@ -137,6 +164,8 @@ def _dicom_header(dataset: Any, file_size: int) -> DicomHeader:
         inverted=kind == 'MONOCHROME1',
         shape=(rows, columns),
         frame_rate=_dicom_rate(dataset),
+        tube_load=_tube_load(dataset),
+        area_dose=_amount(dataset, 'ImageAndFluoroscopyAreaDoseProduct'),
     )
 
 

@@ -9,6 +9,7 @@ The command line, the calibration node, its worker process and Python users all 
 
 from __future__ import annotations
 
+import html
 from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
@@ -53,6 +54,7 @@ from .sources import select_calibrations
 
 if TYPE_CHECKING:
     import pandas
+    from matplotlib.figure import Figure
 
 # The adjustment job: adjust exposures with calibrations fixed, an out-of-sample test.
 
@@ -140,6 +142,28 @@ class CalibrationOutcome:
         own = ', '.join(self.result.calibrations)
         verdict = self.validation.verdict if self.validation else 'not validated'
         return f'<CalibrationOutcome of {own}: {verdict}>'
+
+    def _repr_html_(self) -> str:
+        return f'<pre>{html.escape(self.summary())}</pre>'
+
+    def summary(self) -> str:
+        """Return the table that the command prints, and the verdict."""
+        from ..report.tables import summary_table, verdict_line
+
+        verdict = [verdict_line(self.validation)] if self.validation else []
+        return '\n'.join([summary_table(self.result).rstrip(), *verdict])
+
+    def plot(self, name: str) -> Figure:
+        """Return a matplotlib figure of the distortion of a fluoroscope, and of its sd.
+
+        Raises DataError for a fluoroscope that is not calibrated, or without correction.
+        """
+        from ..report.figures import distortion_figure
+
+        (one,) = select_calibrations(self.result.calibrations, [name]).values()
+        if not one.model.corrects:
+            raise DataError(f'fluoroscope {name}: the model {one.model.kind} corrects nothing')
+        return distortion_figure(one.model, name, one.image_size, one.interior_estimated)
 
     @property
     def calibrations(self) -> dict[str, FluoroscopeCalibration]:

@@ -17,6 +17,7 @@ from ..errors import DataError
 from ..exposures.angles import AngleOptions, JointAngles
 from ..io.bags.reader import angles_in, image_topics, images_of_topic, topics_of
 from ..io.image_reading import (
+    DICOM_SUFFIXES,
     EXPOSURE_SUFFIXES,
     VIDEO_SUFFIXES,
     image_suffix_of,
@@ -24,6 +25,7 @@ from ..io.image_reading import (
     open_images,
     suffix_of,
 )
+from ..io.recordings import read_dicom_header
 
 BAG_SUFFIXES = ('.mcap', '.db3')
 
@@ -147,6 +149,36 @@ def fluoroscope_folders(source: Path) -> dict[str, Path]:
         if path.is_dir()
         and any(image_suffix_of(file) in EXPOSURE_SUFFIXES for file in path.iterdir())
     }
+
+
+def dose_texts(source: Path) -> dict[str, str]:
+    """Return what DICOM files say of the dose, by fluoroscope; '' for the images of a single one.
+
+    Empty where none says anything. Files that cannot be read are passed over.
+    """
+    texts = {}
+    for name, folder in (fluoroscope_folders(source) or {'': source}).items():
+        files = sorted(folder.iterdir()) if folder.is_dir() else [folder]
+        told = [_dose(path) for path in files if image_suffix_of(path) in DICOM_SUFFIXES]
+        sums = []
+        for values, unit in zip(zip(*told), ('mAs', 'dGy cm2')):
+            known = [value for value in values if value is not None]
+            if known:
+                part = '' if len(known) == len(told) else f' in {len(known)} of them'
+                sums.append(f'{sum(known):.4g} {unit}{part}')
+        if sums:
+            count = f'{len(told)} DICOM files' if len(told) > 1 else '1 DICOM file'
+            texts[name] = f'{count}: {", ".join(sums)}'
+    return texts
+
+
+def _dose(path: Path) -> tuple[float | None, float | None]:
+    """Return tube load and dose area product of a DICOM file, None where unknown."""
+    try:
+        header = read_dicom_header(path)
+    except DataError:  # its reader says what is wrong
+        return None, None
+    return header.tube_load, header.area_dose
 
 
 def contains_images(source: Path) -> bool:

@@ -16,10 +16,13 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.collections import Collection
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 
 from ..correction.base import Correction, CorrectionModel
@@ -55,6 +58,35 @@ def png_bytes(figure: Figure) -> bytes:
     buffer = io.BytesIO()
     FigureCanvasAgg(figure).print_png(buffer, metadata={'Software': None})
     return buffer.getvalue()
+
+
+# Marks of an artist that are vectors in an SVG: each takes some 100 bytes, pixels in their place
+# some 30 kB.
+MAX_VECTORS = 300
+
+
+def svg_bytes(figure: Figure, text: str = 'path') -> bytes:
+    """Bytes of a figure as SVG, the same for the same figure; many marks are pixels in it.
+
+    text: 'path', or 'none' for characters, which a reader can search.
+    """
+    for axes in figure.axes:
+        for artist in axes.get_children():
+            if _marks(artist) > MAX_VECTORS:
+                artist.set_rasterized(True)
+    buffer = io.BytesIO()
+    with matplotlib.rc_context({'svg.hashsalt': 'fluoro_calib_ros', 'svg.fonttype': text}):
+        FigureCanvasSVG(figure).print_svg(buffer, metadata={'Date': None})
+    return buffer.getvalue()
+
+
+def _marks(artist: Artist) -> int:
+    """Return how many marks an artist draws."""
+    if isinstance(artist, Line2D):
+        return len(np.atleast_1d(artist.get_xdata()))
+    if isinstance(artist, Collection):
+        return max(len(artist.get_offsets()), len(artist.get_paths()))
+    return 1
 
 
 INCH = 0.33  # of a place, so that an id of four digits can be read
@@ -118,12 +150,7 @@ def _draw_layer(axes: matplotlib.axes.Axes, drawing: Drawing, layer: int, radius
 
 def picture_bytes(figure: Figure, suffix: str) -> bytes:
     """Bytes of a figure as .png, or as .svg; the same for the same figure."""
-    if suffix == '.png':
-        return png_bytes(figure)
-    buffer = io.BytesIO()
-    with matplotlib.rc_context({'svg.hashsalt': 'phantom', 'svg.fonttype': 'none'}):
-        FigureCanvasSVG(figure).print_svg(buffer, metadata={'Date': None})
-    return buffer.getvalue()
+    return png_bytes(figure) if suffix == '.png' else svg_bytes(figure, 'none')
 
 
 # Along the longer side of the image.

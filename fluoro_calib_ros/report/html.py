@@ -25,7 +25,7 @@ from ..exposures.phantom import Phantom
 from ..findings import Finding, sentences
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import matrix_from_quaternion
-from .figures import STYLE, Scale, common_scale, distortion_figure, png_bytes
+from .figures import STYLE, Scale, common_scale, distortion_figure, svg_bytes
 from .report_figures import (
     bead_shifts,
     covered_cells,
@@ -195,7 +195,6 @@ def _outliers(given: ReportInput, residuals: Mapping[str, Residuals]) -> dict[st
             **o,
             'target': targets.get(int(o['target_id']), o['target_id']),
             'exposure_name': exposures.get(int(o['exposure']), o['exposure']),
-            **{key: np.sqrt(float(o[key])) for key in ('value', 'critical')},
             'px': length.get((o['fluoroscope'], int(o['exposure']), int(o['target_id']))),
         }
         for o in points[:MAX_ROWS]
@@ -297,7 +296,7 @@ def _correlation(covariance: np.ndarray) -> list[list[float]]:
 def _pictures(
     given: ReportInput, name: str, residuals: Residuals, scale: Scale
 ) -> list[tuple[str, str]]:
-    """Return title and PNG (base64) of the pictures of a fluoroscope."""
+    """Return title and SVG (base64) of the pictures of a fluoroscope."""
     calibration = given.calibrations[name]
     size = calibration.image_size
     figures: list[tuple[str, Figure]] = []
@@ -313,12 +312,12 @@ def _pictures(
             ('RMS and number of beads by exposure', exposure_bars(residuals, name)),
             ('Distribution of the residuals', distribution(residuals, name)),
         ]
-    return [(title, png_text(figure)) for title, figure in figures]
+    return [(title, svg_text(figure)) for title, figure in figures]
 
 
-def png_text(figure: Figure) -> str:
-    """Return a figure as PNG in base64."""
-    return base64.b64encode(png_bytes(figure)).decode()
+def svg_text(figure: Figure) -> str:
+    """Return a figure as SVG in base64."""
+    return base64.b64encode(svg_bytes(figure)).decode()
 
 
 def _bead_picture(given: ReportInput) -> dict[str, Any] | None:
@@ -335,7 +334,7 @@ def _bead_picture(given: ReportInput) -> dict[str, Any] | None:
     order = np.argsort(-np.hypot(np.hypot(*shift.T[:2]), shift.T[2]) / sd)[:10]
     names = given.names.target_names()
     return {
-        'png': png_text(bead_shifts(shift, sd)),
+        'svg': svg_text(bead_shifts(shift, sd)),
         'rms': np.sqrt(np.mean(shift**2, axis=0)).tolist(),
         'largest': [
             (names.get(int(i), int(i)), shift[k].tolist(), float(sd[k]))

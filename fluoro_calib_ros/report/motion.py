@@ -19,7 +19,7 @@ from ..photogrammetry.rotations import vector_from_matrix
 from ..reconstruction.intersection import OK
 from ..reconstruction.reconstruct import ReconstructedFrame
 from .figures import BLUE, GREY, RED, STYLE, new_figure
-from .html import page, png_text
+from .html import page, svg_text
 
 BAND = 2.0  # standard deviations, 95 %
 FILLED = 0.15  # opacity of the times without a marker
@@ -206,5 +206,5 @@ def bodies_html(
         exposures=len(poses[0].number),
         findings=findings,
         summary=summary,
-        pictures=[(name, png_text(figure)) for name, figure in figures],
+        pictures=[(name, svg_text(figure)) for name, figure in figures],
     )

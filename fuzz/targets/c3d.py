@@ -18,8 +18,8 @@ from unittest import mock
 import ezc3d
 import numpy as np
 
-from fluoro_calib_ros.io.formats import c3d_process
 from fluoro_calib_ros.io.formats import points as of_points
+from fluoro_calib_ros.io.formats import reader_process
 from fluoro_calib_ros.io.formats.content import Content, FileSettings, points_without_precision
 
 from ..harness import Target
@@ -30,14 +30,16 @@ SECONDS = 10  # of a child
 assert ezc3d  # loaded before the forks
 
 
-def _run(name: str, path: str, timeout_s: float) -> subprocess.CompletedProcess[bytes]:
+def run_forked(
+    name: str, kind: str, path: str, timeout_s: float
+) -> subprocess.CompletedProcess[bytes]:
     """Do what `run_module` does with the program of the reader."""
     pipes = [os.pipe(), os.pipe()]
     child = os.fork()
     if not child:
         for (_, end), target in zip(pipes, (1, 2)):
             os.dup2(end, target)
-        _work(path)
+        _work(kind, path)
     contents = []
     for ours, theirs in pipes:
         os.close(theirs)
@@ -49,19 +51,19 @@ def _run(name: str, path: str, timeout_s: float) -> subprocess.CompletedProcess[
     return subprocess.CompletedProcess([name, path], status, *contents)
 
 
-def _work(path: str) -> NoReturn:
+def _work(kind: str, path: str) -> NoReturn:
     """Be the process of the reader."""
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     for number in (signal.SIGSEGV, signal.SIGABRT, signal.SIGFPE, signal.SIGBUS):
         signal.signal(number, signal.SIG_DFL)  # those of the fuzzer would report a finding
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     signal.alarm(SECONDS)
-    sys.argv = ['c3d_process', path]
+    sys.argv = ['reader_process', kind, path]
     sys.stdout = io.TextIOWrapper(io.FileIO(1, 'w', closefd=False))
     sys.stderr = io.TextIOWrapper(io.FileIO(2, 'w', closefd=False))
     status = 1
     try:
-        c3d_process.main()
+        reader_process.main()
         sys.stdout.flush()
         status = 0
     finally:
@@ -70,7 +72,7 @@ def _work(path: str) -> NoReturn:
 
 
 def _read(path: Path) -> None:
-    with mock.patch.object(of_points, 'run_module', _run):
+    with mock.patch.object(reader_process, 'run_module', run_forked):
         of_points.read_c3d(path, SETTINGS)
 
 

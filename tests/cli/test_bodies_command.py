@@ -109,7 +109,7 @@ def test_report_of_joints_and_bodies_needs_nothing_else(knee, tmp_path):
     text = (tmp_path / 'motion' / 'report.html').read_text()
     shown = re.findall('<figcaption>(.*?)</figcaption>', text)
     assert shown == ['joint knee', 'paths in space', 'body femur', 'body tibia']
-    assert text.count('data:image/png;base64,') == 4
+    assert text.count('data:image/svg+xml;base64,') == 4
     assert not re.search('https?:', re.sub('base64,[^"]+', '', text))
     assert '<td>flexion</td>' in text and '60 OK' in text
 

@@ -53,6 +53,14 @@ def test_paths_are_taken_and_shown_in_a_line():
     options = fc.CalibrationOptions(model='none')
     outcome = fc.calibrate(ROOT / 'bags' / 'calibration', ROOT / 'bags' / 'phantom.csv', options)
     assert repr(outcome) == '<CalibrationOutcome of a, b: not validated>'
+    assert 'RMSE u after [px]' in outcome.summary()
+    assert outcome._repr_html_() == f'<pre>{outcome.summary()}</pre>'
+    for name, cause in (
+        ('a', 'the model none corrects nothing'),
+        ('c', 'there is no calibration'),
+    ):
+        with pytest.raises(fc.DataError, match=cause):
+            outcome.plot(name)
     assert dir(fc) == sorted(fc.__all__)
 
 

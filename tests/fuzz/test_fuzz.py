@@ -42,6 +42,7 @@ EXAMPLES = {  # the slow ones
         'calibration_npz': 25,
         'calibration_message': 10,
         'c3d': 10,
+        'sleap': 10,
         'points_csv': 20,
     },
 }

@@ -273,7 +273,6 @@ def test_encodings_of_spreadsheets_are_read(tmp_path, encoding):
     [
         (b'PK\x03\x04\x14\0', 'xlsx spreadsheet or another zip archive; save the table as CSV'),
         (b'\xd0\xcf\x11\xe0\xa1', 'xls spreadsheet; save the table as CSV'),
-        (b'\x89HDF\r\n\x1a\n', 'HDF5 file, as DeepLabCut and SLEAP write; save it as CSV'),
     ],
 )
 def test_tables_that_are_no_text_are_named(tmp_path, start, remedy):
@@ -281,6 +280,13 @@ def test_tables_that_are_no_text_are_named(tmp_path, start, remedy):
     assert remedy in message_of(read_phantom, path)
     settings = FileSettings(image_size=(100, 100))
     assert remedy in message_of(lambda p: registry.read(p, settings), path)
+
+
+def test_hdf5_that_is_no_table_is_named(tmp_path):
+    path = text_file(tmp_path, 'points.h5', b'\x89HDF\r\n\x1a\n' + bytes(range(256)))
+    assert 'HDF5 file; of these, analysis files of SLEAP' in message_of(read_phantom, path)
+    settings = FileSettings(image_size=(100, 100))
+    assert 'this HDF5 file cannot be' in message_of(lambda p: registry.read(p, settings), path)
 
 
 def test_row_numbers_count_line_ends_inside_cells(tmp_path):

@@ -13,6 +13,7 @@ import subprocess
 import sys
 
 import ezc3d
+import h5py
 import numpy as np
 import pandas
 import pytest
@@ -160,6 +161,7 @@ def test_points_predicted_by_deeplabcut(tmp_path):
     assert content.names.targets == {'tib lat': 1, 'fem': 2}
     assert first.uv.tolist() == [[10.5, 20.25], [300, 400]]
     assert second.target_id.tolist() == [2]
+    np.testing.assert_allclose(first.sigma, [1 / 0.99, 1 / 0.98])
     assert '2 points with a likelihood below 0.6' in content.notes[0]
     # As DeepLabCut itself reads it.
     table = pandas.read_csv(path, header=[0, 1, 2], index_col=0)
@@ -220,6 +222,93 @@ def test_a_damaged_deeplabcut_table_is_refused(tmp_path, text, settings, cause):
     path.write_text(text)
     with pytest.raises(DataError, match=re.escape(cause)):
         registry.read(path, settings)
+
+
+SLEAP_UV = np.array(  # frames, tracks, nodes, x and y
+    [
+        [[[10.5, 20.25], [30, 40]], [[11, 21], [31, 41]]],
+        [[[np.nan] * 2] * 2] * 2,
+        [[[12, 22], [np.nan, np.nan]], [[13, 23], [33, 43]]],
+    ]
+)
+SLEAP_SCORES = np.array([[[1.0, 0.5], [0.8, 0.0]], np.full((2, 2), np.nan), [[1, np.nan]] * 2])
+
+
+def sleap_file(path, order, named=True, **others):
+    """An analysis file as SLEAP writes it, or as sleap-io with other orders of the axes."""
+    axes = ('frame', 'track', 'node', 'xy')
+    with h5py.File(path, 'w') as file:
+        tracks = file.create_dataset(
+            'tracks', data=SLEAP_UV.transpose([axes.index(a) for a in order])
+        )
+        if named:
+            tracks.attrs['dims'] = json.dumps(order)
+        plain = [axes.index(a) for a in order if a != 'xy']
+        values = {
+            'point_scores': SLEAP_SCORES.transpose(plain),
+            'node_names': np.array([b'hip', b'knee']),
+            'track_names': np.array([b'left', b'right']),
+            **others,
+        }
+        for name, value in values.items():
+            if value is not None:
+                file[name] = value
+    return path
+
+
+@pytest.mark.parametrize(
+    ('order', 'named'),
+    [
+        (('track', 'xy', 'node', 'frame'), False),
+        (('track', 'xy', 'node', 'frame'), True),
+        (('frame', 'track', 'node', 'xy'), True),
+    ],
+)
+def test_points_of_sleap(tmp_path, order, named):
+    path = sleap_file(tmp_path / 'labels.v001.000_camA.analysis.h5', order, named)
+    content = registry.read(path, SETTINGS)
+    ids = {'left hip': 1, 'left knee': 2, 'right hip': 3, 'right knee': 4}
+    assert content.names.targets == ids
+    first, second = content.observations['camA']
+    assert (first.number, second.number) == (0, 2)
+    assert first.target_id.tolist() == [1, 2, 3] and second.target_id.tolist() == [1, 3, 4]
+    assert first.uv.tolist() == [[10.5, 20.25], [30, 40], [11, 21]]
+    np.testing.assert_allclose(first.sigma, [1, 2, 1.25])
+    assert second.sigma.tolist() == [1, 1, 1], 'labelled by hand'
+    assert '1 points are not used, their score is 0' in content.notes[0]
+
+
+def test_a_folder_of_sleap_returns(tmp_path):
+    names = Names({'tib lat': 7, 'tib med': 8, 'fem': 9, 'pat': 12})
+    given = Content(observations=frames(numbers=(0, 3)), names=names)
+    registry.write(tmp_path / 'points', 'sleap', given, SETTINGS)
+    content = registry.read(tmp_path / 'points', FileSettings(image_size=SIZE, names=names))
+    assert_same_frames(content.observations, given.observations)
+    with h5py.File(tmp_path / 'points' / 'cam2.analysis.h5') as file:
+        assert file['tracks'].shape == (1, 2, 3, 4)
+        assert file['track_occupancy'][:].ravel().tolist() == [1, 0, 0, 1]
+
+
+@pytest.mark.parametrize(
+    ('others', 'cause'),
+    [
+        ({'df_with_missing': 1}, 'it is of DeepLabCut, whose column names are pickled'),
+        ({'node_names': None}, 'it is no analysis file of SLEAP'),
+        ({'node_names': np.array([b'hip'] * 2)}, 'two points have the same name'),
+        ({'node_names': np.array([b'hip'])}, 'tracks, point_scores and node_names are of'),
+        ({'point_scores': np.ones((2, 2, 5))}, 'tracks, point_scores and node_names are of'),
+    ],
+)
+def test_hdf5_of_something_else_is_refused(tmp_path, others, cause):
+    path = sleap_file(tmp_path / 'a.h5', ('track', 'xy', 'node', 'frame'), **others)
+    with pytest.raises(DataError, match=re.escape(cause)):
+        registry.read(path, SETTINGS)
+
+
+def test_points_of_sleap_off_the_image_are_named(tmp_path):
+    path = sleap_file(tmp_path / 'a.h5', ('track', 'xy', 'node', 'frame'))
+    with pytest.raises(DataError, match='frame 2: a point is off the image of 35 x 42 px'):
+        registry.read(path, FileSettings(image_size=(35, 42)))
 
 
 def test_names_of_markers_return(tmp_path):

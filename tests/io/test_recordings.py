@@ -13,8 +13,8 @@ import pytest
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.io.image_reading import image_suffix_of, is_image_source, open_images
 from fluoro_calib_ros.io.image_writing import list_images
-from fluoro_calib_ros.io.recordings import read_cine_header
-from fluoro_calib_ros.jobs.image_sources import contains_images, open_sources
+from fluoro_calib_ros.io.recordings import read_cine_header, read_dicom_header
+from fluoro_calib_ros.jobs.image_sources import contains_images, dose_texts, open_sources
 
 LITTLE = '1.2.840.10008.1.2.1'
 JPEG = '1.2.840.10008.1.2.4.50'
@@ -222,6 +222,25 @@ def test_recordings_are_sources_of_exposures(tmp_path, saved):
     for number in (17, 4):
         dicom(folder / f'image_{number}.dcm', grey(1))
     assert [image.exposure for image in open_sources([folder]).images()] == [4, 17]
+
+
+def test_dose_is_summed_over_dicom_files(tmp_path):
+    for name in ('a', 'b'):
+        (tmp_path / name).mkdir()
+    dicom(tmp_path / 'a' / '1.dcm', grey(1), ExposureInuAs=1500, Exposure=2)  # rounded to mAs
+    dicom(tmp_path / 'a' / '2.dcm', grey(1), Exposure=3, ImageAndFluoroscopyAreaDoseProduct=0.25)
+    dicom(tmp_path / 'a' / '3.dcm', grey(), XRayTubeCurrent=50, ExposureTime=10)
+    dicom(tmp_path / 'b' / '1.dcm', grey(1))
+    (tmp_path / 'a' / '4.dcm').write_bytes(bytes(200))
+    expected = '4 DICOM files: 5 mAs in 3 of them, 0.25 dGy cm2 in 1 of them'
+    assert dose_texts(tmp_path) == {'a': expected}
+    assert dose_texts(tmp_path / 'a' / '1.dcm') == {'': '1 DICOM file: 1.5 mAs'}
+
+
+@pytest.mark.parametrize('value', [0, -1, ''])
+def test_a_dose_that_is_no_amount_is_not_told(tmp_path, value):
+    path = dicom(tmp_path / '1.dcm', grey(1), ImageAndFluoroscopyAreaDoseProduct=value)
+    assert read_dicom_header(path).area_dose is None
 
 
 def test_missing_pydicom_is_told(tmp_path, monkeypatch):

@@ -121,5 +121,5 @@ def test_a_process_has_the_limits_of_its_caller_and_one_core(process):
 def test_a_module_that_takes_too_long_is_ended():
     with pytest.raises(TimeoutError, match=r'longer than 0\.2 s'):
         run_module('http.server', '0', timeout_s=0.2)
-    done = run_module('fluoro_calib_ros.io.formats.c3d_process', '/nothing.c3d', timeout_s=60)
+    done = run_module('fluoro_calib_ros.io.formats.reader_process', 'c3d', '/no.c3d', timeout_s=60)
     assert done.returncode == 1 and done.stderr

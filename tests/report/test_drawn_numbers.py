@@ -453,7 +453,7 @@ def test_largest_correction_and_correlations():
 
 
 def test_shifts_of_beads_are_named_by_their_significance(monkeypatch):
-    monkeypatch.setattr(html, 'png_text', lambda figure: '')
+    monkeypatch.setattr(html, 'svg_text', lambda figure: '')
     phantom = Phantom(np.array([1, 2, 3, 4]), np.zeros((4, 3)), np.array([0.1, 0.5, 0.1, 1]))
     targets = [
         {'target_id': target, 'xyz_mm': xyz}
@@ -468,7 +468,7 @@ def test_shifts_of_beads_are_named_by_their_significance(monkeypatch):
 
 
 def test_pictures_are_those_that_there_is_something_to_show_for(monkeypatch):
-    monkeypatch.setattr(html, 'png_text', lambda figure: '')
+    monkeypatch.setattr(html, 'svg_text', lambda figure: '')
     for name in ('distortion_figure', 'residual_map', 'exposure_bars', 'distribution'):
         monkeypatch.setattr(html, name, lambda *_: None)
     empty = {'model': rigs.no_correction(), 'train_exposure': np.zeros(0, dtype=int)}

@@ -20,10 +20,11 @@ from fluoro_calib_ros.exposures.names import Names
 from fluoro_calib_ros.images.codec import encode
 from fluoro_calib_ros.io.calibration_request import write_request
 from fluoro_calib_ros.io.radiographs import write_radiographs
-from fluoro_calib_ros.jobs.calibration import run_calibration
+from fluoro_calib_ros.jobs.calibration import CalibrationOutcome, run_calibration
 from fluoro_calib_ros.jobs.report import read_report_input
 from fluoro_calib_ros.jobs.result_folder import save_outcome, save_result
 from fluoro_calib_ros.report import html as html_report
+from fluoro_calib_ros.report.figures import MAX_VECTORS, new_figure, svg_bytes
 from fluoro_calib_ros.report.residuals import position_figure
 from fluoro_calib_ros.report.rig_geometry import beams, phantom_distance
 
@@ -47,7 +48,7 @@ def folder(tmp_path_factory):
 @pytest.fixture
 def without_pictures(monkeypatch):
     """Pictures are drawn, but not rendered."""
-    monkeypatch.setattr(html_report, 'png_text', lambda figure: '')
+    monkeypatch.setattr(html_report, 'svg_text', lambda figure: '')
 
 
 class Page(html.parser.HTMLParser):
@@ -101,11 +102,28 @@ def test_report_needs_nothing_else(folder, capsys):
     path = folder / 'report.html'
     page, text = page_of(path)
     assert path.stat().st_size < MAX_BYTES
-    assert page.loads and all(load.startswith('data:image/png;base64,') for load in page.loads)
+    assert page.loads and all(load.startswith('data:image/svg+xml;base64,') for load in page.loads)
     without_pictures = re.sub(r'base64,[^"]+', '', text)
     assert not re.search(r'https?:|//[a-z]|@import|url\(', without_pictures)
     assert '<bead>' not in without_pictures and '&lt;bead&gt;' in without_pictures
     assert str(path) in capsys.readouterr().out
+
+
+def test_distortion_of_an_outcome_is_a_figure(folder):
+    request = CalibrationRequest({'a': exposures()['a'][:6]}, rig().phantom)
+    outcome = CalibrationOutcome(request, calibrated('a', 6, **OPTIONS))
+    assert 'Fluoroscope a: estimated distortion' in outcome.plot('a').get_suptitle()
+    assert outcome.summary().startswith('Fluoroscope') and 'Verdict' not in outcome.summary()
+
+
+def test_many_marks_are_pixels_and_few_are_vectors():
+    figure = new_figure(4, 3, 'marks')
+    axes = figure.subplots()
+    axes.plot(np.arange(MAX_VECTORS), '.')
+    assert b'<image' not in svg_bytes(figure) and svg_bytes(figure) == svg_bytes(figure)
+    axes.plot(np.arange(MAX_VECTORS + 1), '.')
+    text = svg_bytes(figure)
+    assert text.count(b'<image') == 1 and b'data:image/png;base64' in text
 
 
 def test_report_shows_the_residuals_of_the_adjustment(folder):

@@ -22,7 +22,15 @@ from ...exposures.names import Names, number_names
 from ..access import atomic_file, check_safe_name, make_folder
 from ..csv_table import as_text
 from .content import Content, FileSettings, Format, Written
-from .tables import Row, default_name, named_targets, number_text, read_table, require_width
+from .tables import (
+    Row,
+    default_name,
+    named_targets,
+    number_text,
+    read_table,
+    require_width,
+    with_sigma_of_likelihood,
+)
 
 HEADER = ('scorer', 'individuals', 'bodyparts', 'coords')
 SCORER = 'fluoro_calib_ros'
@@ -47,6 +55,7 @@ def read(path: Path, settings: FileSettings) -> Content:
     size = settings.image_size_of(path)
     fluoroscope = _fluoroscope(path, settings)
     frames: dict[int, Frame] = {}
+    likelihood: list[np.ndarray] = []
     unsure = 0
     for row in body:
         values = np.array(row.numbers_or_nan(first)).reshape(len(targets), -1)
@@ -66,11 +75,13 @@ def read(path: Path, settings: FileSettings) -> Content:
             frames[number] = Frame(
                 fluoroscope, number, target_id[seen], uv, size, frame_id=frame_id
             )
+            likelihood.append(values[seen, 2] if values.shape[1] == 3 else np.ones(len(uv)))
+    observed = with_sigma_of_likelihood(list(frames.values()), likelihood)
     notes = (
         f'{path}: {unsure} points with a likelihood below {LIKELIHOOD} (pcutoff) are not used',
     )
     return Content(
-        observations={fluoroscope: list(frames.values())} if frames else {},
+        observations={fluoroscope: observed} if observed else {},
         names=Names(named_targets({name: ids[name] for name in targets})),
         notes=notes if unsure else (),
     )

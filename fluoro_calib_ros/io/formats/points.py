@@ -17,7 +17,6 @@ cut-off frequency to the names, which then belongs to them.
 
 from __future__ import annotations
 
-import io
 import math
 import os
 import re
@@ -31,10 +30,8 @@ import numpy as np
 
 from ...errors import DataError
 from ...exposures.names import Names, number_names
-from ...processes import run_module
 from ..access import atomic_file, read_bytes, read_text, write_bytes
 from ..csv_table import as_text
-from . import c3d_process
 from .content import (
     UNITS_MM,
     Bodies,
@@ -49,6 +46,7 @@ from .content import (
     in_units,
     points_without_precision,
 )
+from .reader_process import arrays_apart
 from .tables import (
     Row,
     bodies_of,
@@ -66,10 +64,6 @@ from .tables import (
 
 MISSING = -1.0  # residual of a point that is not there (C3D)
 STEPS = 255  # of the byte of a residual, in units of POINT:SCALE
-# Of the process that reads: to start, for each byte of the file, and at most.
-BASE_SECONDS = 10
-SECONDS_OF_BYTE = 1e-6
-MAX_SECONDS = 60
 MAX_FRAME = 65535  # the header counts in uint16
 _MAGIC = 0x50  # second byte of a C3D file
 _INTEL = 84  # processor type
@@ -91,7 +85,7 @@ def read_c3d(path: Path, settings: FileSettings) -> Content:
     """Read points in space. Raises DataError."""
     _check_size(path, read_bytes(path))
     _ezc3d()
-    arrays = _arrays(path)
+    arrays = arrays_apart('c3d', path, 'C3D')
     if not arrays['xyz'].size and not arrays['rotations'].size:
         raise DataError(f'{path}: the file has no points')
     content = _points(path, arrays, settings) if arrays['xyz'].size else Content()
@@ -182,22 +176,6 @@ def _check_size(path: Path, content: bytes) -> None:
     values = (last - first + 1) * (4 * points + analog)
     if last < MAX_FRAME and (data - 1) * BLOCK + values * (4 if scale < 0 else 2) > len(content):
         raise DataError(f'{path}: this C3D file is truncated, or its header is damaged')
-
-
-def _arrays(path: Path) -> dict[str, np.ndarray]:
-    """Return the arrays of `c3d_process`. Raises DataError for a file that ezc3d cannot read."""
-    seconds = min(BASE_SECONDS + SECONDS_OF_BYTE * path.stat().st_size, MAX_SECONDS)
-    try:
-        done = run_module(c3d_process.__name__, os.fspath(path.resolve()), timeout_s=seconds)
-    except TimeoutError:
-        raise DataError(f'{path}: this C3D file cannot be read, it is damaged') from None
-    if done.returncode:
-        cause = done.stderr.decode('utf-8', 'replace').strip() if done.returncode == 1 else ''
-        raise DataError(
-            f'{path}: this C3D file cannot be read ({cause or "it is damaged"})'
-        ) from None
-    with np.load(io.BytesIO(done.stdout), allow_pickle=False) as arrays:
-        return dict(arrays)
 
 
 def write_c3d(path: Path, content: Content, settings: FileSettings) -> Written:

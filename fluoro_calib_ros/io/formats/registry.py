@@ -23,7 +23,7 @@ from ..access import (
     kind_without_text,
     os_error_reason,
 )
-from . import bundle, deeplabcut, native, xmalab_points, xmalab_project
+from . import bundle, deeplabcut, native, sleap, xmalab_points, xmalab_project
 from .bodies import AUTOSCOPER, OPENSIM, POSES, RIGIDBODY
 from .content import PARTS, Content, FileSettings, Format, Sample, Written, has_content
 from .opencv_cameras import ANIPOSE, CAMERA_INFO, OPENCV
@@ -43,6 +43,7 @@ FORMATS: dict[str, Format] = {
         native.KNOWN_ORIENTATION,
         xmalab_points.FORMAT,
         deeplabcut.FORMAT,
+        sleap.FORMAT,
         xmalab_project.FORMAT,
         FRAMESPEC,
         RIGIDBODY,

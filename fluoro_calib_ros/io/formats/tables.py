@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from ...bodies.body import BodyPoses
 from ...errors import DataError
+from ...exposures.frame import Frame
 from ...exposures.names import without_trivial
 from ...limits import MAX_ROWS
 from ..access import PathLike, atomic_file, check_rows, read_text
@@ -26,6 +27,22 @@ from .content import Bodies, Content, FileSettings, Points
 
 MISSING = ('', 'nan', 'none', 'null', 'na', 'n/a')
 MAX_SHOWN = 40  # characters of a cell in a message
+
+
+def with_sigma_of_likelihood(
+    frames: Sequence[Frame], likelihood: Sequence[NDArray[np.float64]]
+) -> list[Frame]:
+    """Return frames of points of a network with standard deviations, 1 px where it is sure.
+
+    likelihood: (n,) of each frame. Where all are 1, as in files that are written here, nothing is
+    known, and the frames are as they were. Residuals are weighted by the likelihood, as by
+    Karashchuk et al., "Anipose: A toolkit for robust markerless 3D pose estimation", Cell Reports
+    36, 2021. The pixel is a convention: these programs do not tell the size of their errors, and
+    an adjustment estimates it.
+    """
+    if all((values == 1).all() for values in likelihood):
+        return list(frames)
+    return [replace(frame, sigma=1.0 / values) for frame, values in zip(frames, likelihood)]
 
 
 @dataclass(frozen=True)

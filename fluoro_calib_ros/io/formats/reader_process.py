@@ -1,0 +1,157 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Read a C3D or HDF5 file in a process of its own: `python -m ...reader_process KIND PATH`.
+
+ezc3d and HDF5 trust what a file says about itself: a damaged one can make them crash, or fill the
+memory. Standard output is an .npz of arrays. Of C3D: labels, unit, rate, first, xyz (m, n, 3),
+residual (m, n), and rotation_labels, rotation_unit, rotation_rate, rotations (m, b, 4, 4). Of an
+analysis file of SLEAP: uv (m, t, n, 2) and score (m, t, n) of frames, tracks and nodes, and the
+names nodes and tracks.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...errors import DataError
+from ...processes import run_module, watch_parent
+
+# Bytes of address space: for the program, for each byte of the file, and at most.
+BASE_MEMORY = 3 * 2**30
+MEMORY_OF_BYTE = 100
+MAX_MEMORY = 8 * 2**30
+
+
+def labels_of(parameters: Any) -> list[str]:
+    """Return the names of all points: a parameter holds 255, the others follow in LABELS2, ..."""
+    found = list(parameters['LABELS']['value'])
+    number = 2
+    while f'LABELS{number}' in parameters:
+        found += parameters[f'LABELS{number}']['value']
+        number += 1
+    return [str(label).strip() for label in found]
+
+
+def c3d_arrays(path: str) -> dict[str, Any]:
+    """Return the arrays of a C3D file."""
+    import ezc3d
+
+    file = ezc3d.c3d(path)
+    parameters = file['parameters']['POINT']
+    header = file['header']['points']
+    # A file without rotations has neither the group nor matrices.
+    group = file['parameters'].get('ROTATION', {})
+    rotations = np.asarray(file['data']['rotations'], dtype=float)
+
+    def of_group(name: str, default: Any) -> Any:
+        values = group[name]['value'] if name in group else []
+        return values[0] if len(values) else default
+
+    return {
+        'rotation_labels': np.array(labels_of(group) if 'LABELS' in group else [], dtype=str),
+        'rotation_unit': str(of_group('UNITS', '')).strip(),
+        'rotation_rate': float(of_group('RATE', header['frame_rate'])),
+        'rotations': rotations.reshape(4, 4, *rotations.shape[2:]).transpose(3, 2, 0, 1),
+        'labels': np.array(labels_of(parameters), dtype=str),
+        'unit': str(parameters['UNITS']['value'][0]).strip(),
+        'rate': float(header['frame_rate']),
+        'first': int(header['first_frame']) + 1,
+        'xyz': np.asarray(file['data']['points'], dtype=float)[:3].transpose(2, 1, 0),
+        'residual': np.asarray(file['data']['meta_points']['residuals'], dtype=float)[0].T,
+    }
+
+
+# Axes of `tracks` in a file that does not name them, as SLEAP itself writes.
+SLEAP_AXES = ('track', 'xy', 'node', 'frame')
+
+
+def sleap_arrays(path: str) -> dict[str, Any]:
+    """Return the arrays of an analysis file of SLEAP. Raises ValueError for any other file."""
+    import h5py
+
+    with h5py.File(path, 'r') as file:
+        if 'df_with_missing' in file:
+            raise ValueError(
+                'it is of DeepLabCut, whose column names are pickled, which could run any code: '
+                'save it as CSV with analyze_videos_converth5_to_csv'
+            )
+        if 'tracks' not in file or 'node_names' not in file:
+            raise ValueError(
+                'it is no analysis file of SLEAP, which has tracks and node_names; of a project, '
+                'export the analysis HDF5'
+            )
+        tracks = file['tracks']
+        axes = list(json.loads(tracks.attrs['dims']) if 'dims' in tracks.attrs else SLEAP_AXES)
+        uv = np.transpose(tracks[:], [axes.index(n) for n in ('frame', 'track', 'node', 'xy')])
+        axes.remove('xy')
+        score = np.full(uv.shape[:3], np.nan)
+        if 'point_scores' in file:
+            order = [axes.index(name) for name in ('frame', 'track', 'node')]
+            score = np.transpose(file['point_scores'][:], order)
+        return {
+            'uv': np.asarray(uv, dtype=float),
+            'score': np.asarray(score, dtype=float),
+            'nodes': np.array(_texts(file['node_names']), dtype=str),
+            'tracks': np.array(_texts(file.get('track_names', [])), dtype=str),
+        }
+
+
+def _texts(values: Any) -> list[str]:
+    return [v.decode() if isinstance(v, bytes) else str(v) for v in values]
+
+
+READERS = {'c3d': c3d_arrays, 'sleap': sleap_arrays}
+
+
+def main() -> None:
+    """Write the arrays to standard output, or the cause to standard error and exit with 1."""
+    watch_parent(os.getppid())
+    with suppress(ImportError, ValueError, OSError):  # Windows has no such limit
+        import resource
+
+        size = os.path.getsize(sys.argv[2])
+        memory = min(BASE_MEMORY + MEMORY_OF_BYTE * size, MAX_MEMORY)
+        resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
+    try:
+        arrays = READERS[sys.argv[1]](sys.argv[2])
+    except Exception as error:  # the errors of ezc3d have no type
+        print(' '.join(str(error).split()), file=sys.stderr)
+        sys.exit(1)
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    sys.stdout.buffer.write(buffer.getvalue())
+
+
+# Of the process that reads: to start, for each byte of the file, and at most.
+BASE_SECONDS = 10
+SECONDS_OF_BYTE = 1e-6
+MAX_SECONDS = 60
+
+
+def arrays_apart(kind: str, path: Path, title: str) -> dict[str, np.ndarray]:
+    """Return the arrays of a file, read by the process. Raises DataError where it cannot be."""
+    seconds = min(BASE_SECONDS + SECONDS_OF_BYTE * path.stat().st_size, MAX_SECONDS)
+    try:
+        done = run_module(__name__, kind, os.fspath(path.resolve()), timeout_s=seconds)
+    except TimeoutError:
+        raise DataError(f'{path}: this {title} file cannot be read, it is damaged') from None
+    if done.returncode:
+        cause = done.stderr.decode('utf-8', 'replace').strip() if done.returncode == 1 else ''
+        raise DataError(
+            f'{path}: this {title} file cannot be read ({cause or "it is damaged"})'
+        ) from None
+    with np.load(io.BytesIO(done.stdout), allow_pickle=False) as arrays:
+        return dict(arrays)
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,48 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Analysis files of SLEAP; the process in which HDF5 runs is forked, as that of C3D."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from unittest import mock
+
+import h5py
+import numpy as np
+
+from fluoro_calib_ros.exposures.frame import Frame, validate_frame
+from fluoro_calib_ros.io.formats import reader_process, sleap
+from fluoro_calib_ros.io.formats.content import Content, FileSettings
+
+from ..harness import Target
+from ..seeds import written
+from .c3d import run_forked
+
+SIZE = (64, 64)
+SETTINGS = FileSettings(image_size=SIZE)
+assert h5py  # loaded before the forks
+
+
+def _read(path: Path) -> None:
+    with mock.patch.object(reader_process, 'run_module', run_forked):
+        content = sleap.read(path, SETTINGS)
+    for frames in (content.observations or {}).values():
+        for frame in frames:
+            validate_frame(frame)
+
+
+def _write(path: Path, count: int) -> None:
+    uv = np.arange(4.0).reshape(2, 2)
+    frames = [Frame('a', k, np.array([1, 2]), uv + k, SIZE) for k in range(count)]
+    folder = path.with_name('cameras')
+    sleap.write(folder, Content(observations={'a': frames}), SETTINGS)
+    (folder / 'a.analysis.h5').rename(path)
+
+
+TARGET = Target(
+    'sleap',
+    'trial.analysis.h5',
+    _read,
+    lambda: written(lambda path: _write(path, 1), lambda path: _write(path, 3)),
+)

@@ -263,7 +263,7 @@ def findings_of(monkeypatch, scatters, figures=None, delay_ns=0, known=()):
         name: Fake(image_sd=0.2 + 0.1 * i, image_size=(1000, 800)) for i, name in enumerate(names)
     }
     result = Fake(
-        fluoroscopes=figures or {name: calm for name in names[:1]}, calibrations='c', starts='s'
+        fluoroscopes=figures or dict.fromkeys(names[:1], calm), calibrations='c', starts='s'
     )
     request = Fake(known_orientations=dict.fromkeys(known), phantom='p')
     return rig_findings(request, result, frames, calibrations), asked

@@ -3,6 +3,7 @@
 
 """Conversion of small sources whose content is known: what is kept, corrected, and left out."""
 
+import functools
 import json
 from dataclasses import replace
 
@@ -28,9 +29,15 @@ from fluoro_calib_ros.jobs.conversion import (
 from fluoro_calib_ros.jobs.simulation import write_bag
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_quaternion
 
-SIZE = (640, 480)
+SIZE = (320, 240)
 TURN = [0.5, 0.5, -0.5, 0.5]  # quaternion w, x, y, z of a third of a full turn
 PLACES = {3: [10.0, 20, -900], 7: [-5.0, 0, -800]}  # of the source of a, by exposure
+
+
+@functools.cache
+def calibration(name):
+    """A fluoroscope with a distortion of some pixels."""
+    return rigs.pincushion(name, SIZE)
 
 
 def frames(angle=None):
@@ -39,7 +46,7 @@ def frames(angle=None):
     ids = np.arange(12) + 1
     return {
         name: [
-            Frame(name, n, ids, rng.uniform(50, 400, (12, 2)), SIZE, np.full(12, 0.3), angle=angle)
+            Frame(name, n, ids, rng.uniform(20, 220, (12, 2)), SIZE, np.full(12, 0.3), angle=angle)
             for n in (2, 3, 7)
         ]
         for name in 'ab'
@@ -58,7 +65,7 @@ def result(tmp_path):
     """A result folder of a and b with exterior orientations, and the observations of a."""
     folder = tmp_path / 'result'
     for name in 'ab':
-        save_calibration(folder, rigs.pincushion(name, SIZE))
+        save_calibration(folder, calibration(name))
     entries = {
         n: {'exposure': n, 'quaternion_wxyz': TURN, 'position_mm': place}
         for n, place in PLACES.items()
@@ -116,7 +123,7 @@ def test_corrected_points_are_those_of_the_calibration(table, result, tmp_path):
     seen = frames()
     for (name, number), (_, uv) in points_of(out).items():
         one = next(frame for frame in seen[name] if frame.number == number)
-        wanted = rigs.pincushion(name, SIZE).correct(one.uv, one.sigma)
+        wanted = calibration(name).correct(one.uv, one.sigma)
         np.testing.assert_allclose(uv, wanted.uv, atol=1e-6)
         assert np.abs(uv - one.uv).max() > 0.1
     with pytest.raises(DataError, match='corrected'):
@@ -187,7 +194,7 @@ def test_stations_of_a_result_are_its_exterior_orientations(result):
 
 def test_cameras_of_a_result_stand_as_in_an_exposure_or_in_the_rig(result):
     plain = content(result, 'cameras').cameras
-    xp, yp, c = rigs.pincushion('a', SIZE).interior
+    xp, yp, c = calibration('a').interior
     for camera, name in zip(plain, 'ab'):
         assert (camera.name, camera.image_size) == (name, SIZE)
         assert camera.matrix.tolist() == [[c, 0, xp], [0, c, yp], [0, 0, 1]]
@@ -198,7 +205,7 @@ def test_cameras_of_a_result_stand_as_in_an_exposure_or_in_the_rig(result):
     assert of_exposure[1].rotation is None
     with pytest.raises(DataError, match='no exposure 5'):
         content(result, 'cameras', exposure=5)
-    calibrations = {name: rigs.pincushion(name, SIZE) for name in 'ab'}
+    calibrations = {name: calibration(name) for name in 'ab'}
     rig = rigs.true_orientation(rigs.rig().fluoroscopes, calibrations)
     save_orientation(result, rig)
     for camera, rotation in zip(content(result, 'cameras').cameras, rig.rotation):
@@ -218,7 +225,7 @@ def test_poses_of_the_phantom_are_in_the_order_of_the_exposures(result):
         np.testing.assert_allclose(
             bodies.translation_mm[row, 0], -turn @ PLACES[number], atol=1e-9
         )
-    calibrations = {name: rigs.pincushion(name, SIZE) for name in 'ab'}
+    calibrations = {name: calibration(name) for name in 'ab'}
     rig = rigs.true_orientation(rigs.rig().fluoroscopes, calibrations)
     save_orientation(result, rig)
     bodies = content(result, 'bodies').bodies
@@ -244,13 +251,13 @@ def test_lookup_of_a_correction_gives_the_observed_pixel(result):
     assert list(only.lookups) == ['b'] and only.notes == ()
     lookup = found['a']
     assert lookup.shape == (2, SIZE[1], SIZE[0])
-    v, u = 100, 400
-    corrected = rigs.pincushion('a', SIZE).correct(lookup[:, v, u][None].astype(float)).uv
+    v, u = 60, 250
+    corrected = calibration('a').correct(lookup[:, v, u][None].astype(float)).uv
     np.testing.assert_allclose(corrected, [[u, v]], atol=0.02)
 
 
 def test_lookup_at_an_unknown_angle_is_told(result):
-    save_calibration(result, rigs.turning(rigs.pincushion('b', SIZE)))
+    save_calibration(result, rigs.turning(calibration('b')))
     (note,) = content(result, 'lookups').notes
     assert ' b depend' in note
     assert content(result, 'lookups', angle=0.5).notes == ()

@@ -349,6 +349,50 @@ def test_exposures_held_out_are_expected_to_have_noise_and_error_of_the_correcti
     assert whole.numbers['expected_px'] == pytest.approx(np.sqrt((0.05 * 11 + 3) / 100))
 
 
+@pytest.mark.parametrize(
+    ('agreement', 'outside', 'is_told'),
+    [(5.0, 14.0, True), (3.0, 14.0, False), (5.0, 60.0, False)],
+)
+def test_rejected_points_that_agree_are_told_where_no_exposure_stands_out(
+    agreement, outside, is_told
+):
+    of_exposure = Fake(number=4, points=12, of=60, agreement=agreement, limit=4.0)
+    common = Fake(trend=Fake(size=0.1), is_significant=False, of_exposure=of_exposure)
+    given = Fake(trends={'a': common}, frames={'a': range(15)})
+    parts = [sums(n, 14.0, 11.0, 3.0) for n in range(1, 15)] + [sums(20, outside, 11.0, 3.0)]
+    _, of_one = held_out._checks(given, 'a', parts)
+    if is_told:
+        assert of_one.place.exposures == (4,) and (of_one.value, of_one.limit) == (5.0, 4.0)
+        assert of_one.numbers == {'rejected_points': 12, 'points': 60} and not of_one.passed
+    else:
+        assert of_one.unit == '1' and of_one.passed is (outside < 50)
+
+
+def adjusted(**rmse):
+    return Fake(
+        fluoroscopes={
+            name: Fake(rmse_before=np.full(2, before), rmse_after=np.full(2, after))
+            for name, (before, after) in rmse.items()
+        }
+    )
+
+
+def test_fit_is_poor_from_a_multiple_of_the_noise_and_corrected_if_it_was_better_before():
+    noise = {name: Fake(image_sd=0.5) for name in 'abc'}
+    limit = held_out.MAX_NOISE * 0.5
+    result = adjusted(
+        a=(9.0, 0.99 * limit),
+        b=(held_out.CORRECTED * 1.01 * 1.01 * limit, 1.01 * limit),
+        c=(held_out.CORRECTED * 0.99 * 1.01 * limit, 1.01 * limit),
+    )
+    found = held_out.poor_fits(result, noise)
+    assert kinds(found) == [Kind.POOR_CALIBRATION_FIT, Kind.CORRECTED_ALREADY]
+    assert [one.place.fluoroscopes for one in found] == [('b',), ('c',)]
+    for one in found:
+        assert one.numbers['rmse_px'] == pytest.approx(1.01 * limit)
+        assert one.numbers['ratio'] == pytest.approx(1.01 * held_out.MAX_NOISE)
+
+
 def test_misfits_are_of_residuals_over_the_noise():
     result = Fake(
         fluoroscopes={n: Fake(rmse_after=np.array(r)) for n, r in (('a', [3, 4]), ('b', [1, 1]))}

@@ -383,6 +383,7 @@ def test_some_false_matches_do_not_refuse_a_reconstruction():
     assert outcome.status_counts['OK'] > outcome.status_counts['REJECTED'] > 0
 
 
+@functools.cache
 def distorted():
     """Calibrations with a distortion, and frames that have it."""
     held = {}

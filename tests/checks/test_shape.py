@@ -8,9 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fluoro_calib_ros.checks import shape
 from fluoro_calib_ros.checks.calibration_evidence import Evidence
 from fluoro_calib_ros.checks.check import Check
 from fluoro_calib_ros.checks.shape import (
+    Strain,
     _strains,
     _strains_that_show,
     _without_similarity,
@@ -91,6 +93,42 @@ def test_a_strain_that_nobody_would_see_is_taken_on_trust():
         found = trusted_shape([check])
         assert [one.kind for one in found] == [Kind.TAKEN_ON_TRUST] * expected
         assert all(one.severity is Severity.NOTE for one in found)
+
+
+@pytest.mark.parametrize(
+    ('test', 'nse', 'limit'),
+    [
+        (40.0, 1.0, 0.2 * np.sqrt(20 / 40)),  # what chance exceeds
+        (40.0, 0.3, 0.2 * np.sqrt(0.25 / 0.3)),  # what does not matter
+        (5.0, 1.0, 0.4),
+    ],
+)
+def test_strain_is_compared_with_what_chance_exceeds_and_what_matters(
+    monkeypatch, test, nse, limit
+):
+    axis = np.array([1.0, 2.0, -2.0]) / 3
+    found = Strain(
+        np.diag([-3e-3, 1e-3, 2e-3]),
+        rms_mm=0.2,
+        test=test,
+        critical=20.0,
+        nse=nse,
+        hidden_nse=3.0,
+        hidden=5e-3 * np.outer(axis, axis),
+    )
+    monkeypatch.setattr(shape, 'strain_of_survey', lambda evidence: found)
+    (check,) = check_shape(None, ('a',))
+    assert (check.value, check.limit) == (0.2, pytest.approx(limit))
+    assert check.numbers['strain'] == pytest.approx(-3e-3) and '-0.300 %' in check.cause
+    assert '(1.00, 0.00, 0.00)' in check.cause and '0.200 mm' in check.cause
+    hidden = [check.numbers[f'hidden_{coordinate}'] for coordinate in 'xyz']
+    np.testing.assert_allclose(np.abs(hidden), np.abs(axis), atol=1e-12)
+    assert check.numbers['hidden_strain'] == pytest.approx(5e-3)
+    (trusted,) = trusted_shape([check])
+    assert trusted.numbers == {'strain': pytest.approx(5e-3), 'nse': 3.0}
+    assert '0.50 %' in trusted.cause and '2.0 times' in trusted.cause
+    monkeypatch.setattr(shape, 'strain_of_survey', lambda evidence: None)
+    assert check_shape(None, ('a',)) == []
 
 
 def test_strain_of_a_small_set_has_axis_and_size():

@@ -5,12 +5,23 @@
 
 import numpy as np
 import pytest
+from scipy import special
 
 from fluoro_calib_ros.checks.body_watch import _inverse
-from fluoro_calib_ros.checks.residual_tests import Residuals, _joins, _scatter
+from fluoro_calib_ros.checks.residual_tests import (
+    FALSE_ALARM,
+    Residuals,
+    _cell_sums,
+    _joins,
+    _scatter,
+    change_of_trend,
+    common_trend,
+    rejected_exposure,
+)
 from fluoro_calib_ros.checks.rig import doubtful
 from fluoro_calib_ros.estimation.pair_scatter import PairScatter
 from fluoro_calib_ros.findings import Kind
+from fluoro_calib_ros.photogrammetry.noise import INLIER_Q
 
 
 def test_joins_are_the_products_of_neighbours_of_two_exposures():
@@ -47,6 +58,117 @@ def test_scatter_has_a_degree_of_freedom_less_for_the_mean_of_each_group():
     expected = [sum(2 * max(row[group].sum() - 1, 0) for group in groups) for row in seen]
     assert freedom.tolist() == expected
     assert scatter.sum() / freedom.sum() == pytest.approx(1, abs=5 / np.sqrt(freedom.sum()))
+
+
+SIZE = (800, 400)
+CELL = np.array([349.5, 224.5])  # centre of the one in column 3, row 4 of 8
+
+
+def residuals(trend=(0.0, 0.0), bump=(0.0, 0.0), half=(0.0, 0.0), exposures=10, seed=4):
+    """Residuals of noise 0.3 px; trend: in all, bump: about CELL, half: as the halves differ."""
+    rng = np.random.default_rng(seed)
+    per = 400
+    uv = rng.uniform(-0.5, np.array(SIZE) - 0.5, (exposures * per, 2))
+    exposure = np.repeat(np.arange(exposures), per)
+    r = rng.normal(0, 0.3, uv.shape) + trend
+    r[(np.abs(uv - CELL) < [50, 25]).all(axis=1)] += bump
+    r += np.where(exposure[:, None] >= exposures // 2, 0.5, -0.5) * half
+    angles = np.full(exposures, np.nan)
+    return Residuals(uv, r, exposure, np.arange(len(uv)), np.arange(exposures) + 1, angles)
+
+
+def test_trend_of_all_exposures_is_found_with_its_size_and_place():
+    """The size is of a coordinate, that of a cell is the length."""
+    calm = common_trend(residuals(), SIZE)
+    assert calm.size < calm.limit < 0.05 and calm.cell_size < calm.cell_limit
+    found = common_trend(residuals(trend=(0.3, -0.4)), SIZE)
+    assert found.size == pytest.approx(0.5 / np.sqrt(2), rel=0.05) and found.size > found.limit
+    assert found.cell_size == pytest.approx(0.5, rel=0.4) and found.cell_size > found.cell_limit
+    local = common_trend(residuals(bump=(-0.3, 0.4)), SIZE)
+    np.testing.assert_allclose(local.place, CELL)
+    assert local.cell_size == pytest.approx(0.5, rel=0.2) and local.cell_size > local.cell_limit
+    assert local.size < 0.2
+    # About 62 points of noise 0.3 px in a cell, and 18 degrees of freedom in each of 64.
+    variance = 0.3**2 / (4000 / 64)
+    expected = np.sqrt(2 * variance * special.fdtri(2, 64 * 18, 1 - FALSE_ALARM / 64))
+    assert local.cell_limit == pytest.approx(expected, rel=0.25)
+
+
+def test_trend_of_one_exposure_is_not_common():
+    given = residuals()
+    given.r[given.exposure == 3] += [3.0, 2.0]
+    found = common_trend(given, SIZE)
+    assert found.size < found.limit and found.cell_size < found.cell_limit
+
+
+def test_change_between_the_halves_is_found_with_its_size():
+    calm = change_of_trend(residuals(trend=(0.3, -0.4)), SIZE)
+    assert calm.size < calm.limit and calm.cell_size < calm.cell_limit
+    found = change_of_trend(residuals(half=(0.6, 0.8)), SIZE)
+    assert found.size == pytest.approx(1 / np.sqrt(2), rel=0.05) and found.size > found.limit
+    assert found.cell_size == pytest.approx(1.0, rel=0.3) and found.cell_size > found.cell_limit
+    odd = change_of_trend(residuals(half=(0.6, 0.8), exposures=7), SIZE)
+    assert odd.size == pytest.approx(1 / np.sqrt(2), rel=0.1)
+
+
+def test_few_image_points_show_no_trend():
+    given = residuals(trend=(5.0, 0.0), exposures=2)
+    found = common_trend(given, SIZE)  # a single pair has no scatter
+    assert (found.size, found.limit) == (0.0, np.inf)
+    few = given._part(np.arange(len(given.uv)) % 40 == 0)
+    found = common_trend(few, SIZE)
+    assert (found.cell_size, found.cell_limit) == (0.0, np.inf)
+    np.testing.assert_allclose(found.place, [400, 200])
+
+
+def test_cells_that_overlap_are_sums_of_their_parts():
+    given = residuals(exposures=3)
+    for overlap in (1, 2):
+        sums, counts, centres = _cell_sums(given, SIZE, overlap)
+        side = 8 * overlap - overlap + 1
+        assert sums.shape == (side**2, 3, 2) and counts.shape == (side**2, 3)
+        for cell in (0, side - 1, side + 3, side**2 - 1):
+            inside = (np.abs(given.uv - centres[cell]) < [50, 25]).all(axis=1)
+            for row in range(3):
+                own = inside & (given.exposure == row)
+                assert counts[cell, row] == own.sum()
+                np.testing.assert_allclose(sums[cell, row], given.r[own].sum(axis=0))
+
+
+def test_residuals_are_divided_at_the_core_of_the_noise():
+    r = np.array([[0.0, 0.1], [0.0, 99.0], [3e3, 0.0], [np.nan, 0.0]])
+    exposure = np.arange(4)
+    given = Residuals(r, r, exposure, exposure + 10, exposure + 1, np.full(4, 0.5))
+    sd = np.array([0.5, 9.0, 9.0, 2.0])
+    assert given.inliers(sd).target_id.tolist() == [10]
+    assert given.rejected(sd).target_id.tolist() == [11]  # 11 standard deviations, not 333
+    assert given.capped(sd) == pytest.approx([0.01, *(INLIER_Q * sd[1:] ** 2)])
+    assert given.angle.tolist() == [0.5] * 4
+    assert given.inliers(sd).numbers.tolist() == [1, 2, 3, 4]
+
+
+def test_rejected_points_of_an_exposure_agree_where_neighbours_are_alike():
+    rng = np.random.default_rng(6)
+    uv = rng.uniform(0, 400, (60, 2))
+    exposure = np.repeat([0, 1, 2], [25, 34, 1])
+    r = rng.normal(0, 5, (60, 2))
+    r[exposure == 1] = [4.0, 3.0] + rng.normal(0, 0.1, (34, 2))
+    given = Residuals(uv, r, exposure, np.arange(60), np.array([4, 7, 9]), np.full(3, np.nan))
+    fitted = given._part(np.arange(60) % 2 == 0)
+    found = rejected_exposure(given, fitted)
+    inside = int(np.sum(exposure[::2] == 1))
+    assert (found.number, found.points, found.of) == (7, 34, 34 + inside)
+    pairs = set()
+    for i in range(25, 59):
+        distance = np.linalg.norm(uv[25:59] - uv[i], axis=1)
+        distance[i - 25] = np.inf
+        pairs.add(frozenset((i, 25 + int(np.argmin(distance)))))
+    # Products of 5 px and 5 px, over the root of half the sum of their squares.
+    assert found.agreement == pytest.approx(np.sqrt(2 * len(pairs)), rel=0.05)
+    assert found.limit == pytest.approx(special.ndtri(1 - FALSE_ALARM / 3))
+    false = rejected_exposure(given._part(exposure == 0), fitted)
+    assert false.number == 4 and false.agreement < false.limit
+    assert rejected_exposure(given._part(exposure == 2), fitted) is None
 
 
 def test_inverse_of_an_open_rotation_is_large_and_not_negative():

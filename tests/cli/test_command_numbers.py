@@ -11,9 +11,13 @@ from types import SimpleNamespace as Fake
 
 import numpy as np
 import pytest
+from rigs import run
 
+from fluoro_calib_ros.bodies.healing import Cause
+from fluoro_calib_ros.checks.check import Check
 from fluoro_calib_ros.cli import bag, calibrate, convert, extract, heal, output, phantom, process
 from fluoro_calib_ros.cli import reconstruct as reconstruct_command
+from fluoro_calib_ros.cli import survey as survey_command
 from fluoro_calib_ros.cli.arguments import angle_of, cluster_of, result_folder
 from fluoro_calib_ros.cli.orient import exposure_numbers
 from fluoro_calib_ros.cli.process import Done, Step, _option_words, trial_row
@@ -22,6 +26,7 @@ from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.names import Names
 from fluoro_calib_ros.findings import Finding, Kind, Severity
 from fluoro_calib_ros.io.bags.salvage import BagReport, Damage, TopicReport
+from fluoro_calib_ros.io.phantom import read_phantom
 from fluoro_calib_ros.jobs.reconstruction import ReconstructionOptions
 from fluoro_calib_ros.jobs.scheduling import Cluster
 
@@ -192,6 +197,31 @@ def test_arguments_of_extract_that_exclude_each_other(changes, is_wrong):
         return
     with pytest.raises(Wrong):
         extract.check(extract_arguments(**changes), wrong)
+
+
+@pytest.mark.parametrize(
+    ('clusters', 'no_drift_watch', 'source', 'is_wrong'),
+    [
+        (['tibia: 1 2 3'], False, 'bag', False),
+        (['tibia: 1 2 3'], True, 'bag', True),
+        (['tibia: 1 2 3'], False, 'points.csv', True),
+        (['tibia'], False, 'bag', True),
+        ([], True, 'points.csv', False),
+    ],
+)
+def test_clusters_of_reconstruct_need_the_drift_watch_of_a_bag(
+    tmp_path, clusters, no_drift_watch, source, is_wrong
+):
+    (tmp_path / 'bag').mkdir()
+    (tmp_path / 'bag' / 'metadata.yaml').touch()
+    (tmp_path / 'points.csv').touch()
+    given = Fake(cluster=clusters, no_drift_watch=no_drift_watch, source=tmp_path / source)
+    if is_wrong:
+        with pytest.raises(Wrong):
+            reconstruct_command.check(given, wrong)
+        return
+    reconstruct_command.check(given, wrong)
+    assert [body.name for body in given.bodies] == ['tibia'] * len(clusters)
 
 
 # ---- what is printed
@@ -412,6 +442,111 @@ def test_changes_of_a_healed_rig_are_told_with_their_units():
         'principal point moved by 5.00 (sd 0.20), -6.00 (sd 0.30) px; '
         'principal distance changed by 7.0 (sd 4.0) px'
     )
+
+
+def healing(changed=(), drift=(), verdict='pass', meanwhile=False, causes=(), **more):
+    """Outcome of healing two fluoroscopes; changed: numbers of those that stand otherwise."""
+    changes, sd = np.zeros((2, 9)), np.full((2, 9), 0.5)
+    changes[list(changed), 0] = 2.0
+    healed = Fake(changes=changes, sd=sd, drift=dict.fromkeys(drift))
+    values = {
+        'healed': healed if changed or drift else None,
+        'changed_meanwhile': meanwhile,
+        'diagnosis': Fake(changes=[Fake(cause=cause) for cause in causes]),
+        'orientation': Fake(fluoroscopes=('a', 'b')),
+        'before': Fake(place_mm=0.5, scale=2e-4),
+        'after': Fake(place_mm=0.04, scale=3e-5),
+        'checks': [Fake(passed=True, sentence='good'), Fake(passed=None, sentence='unknown')],
+        'verdict': verdict,
+    }
+    return Fake(**{**values, **more})
+
+
+def test_healed_rig_is_told_by_fluoroscope_with_what_it_is_worth():
+    lines = heal._lines(Fake(out='healed'), healing([1], [0]))
+    assert lines[0] == 'a: its correction has changed'
+    assert lines[1].startswith('b: source moved by 2.00 (sd 0.50), 0.00')
+    assert lines[2] == (
+        'points relative to each other: sd 0.040 mm, scale 30 ppm (as calibrated 0.500 mm, '
+        'scale 200 ppm)'
+    )
+    assert lines[3:] == ['written to healed', 'unknown', 'Verdict: pass']
+
+
+@pytest.mark.parametrize(
+    ('causes', 'meanwhile', 'first'),
+    [
+        ((), False, 'no change of the rig is evident'),
+        ((Cause.LOOSE,), False, 'no change of the rig is evident'),
+        ((Cause.LOOSE, Cause.DISTORTION), False, 'it stays'),
+        ((), True, 'the rig changed during the recording'),
+    ],
+)
+def test_rig_that_is_not_healed_stays_as_it_was_calibrated(causes, meanwhile, first):
+    lines = heal._lines(Fake(out='healed'), healing(causes=causes, meanwhile=meanwhile))
+    assert lines[0].startswith(first)
+    assert lines[meanwhile].endswith('it stays as it was calibrated, nothing is written')
+    assert lines[meanwhile].startswith('no change') is (first.startswith('no change'))
+    assert not any('healed' in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    ('passed', 'force', 'is_written'),
+    [(True, False, True), (None, False, True), (False, False, False), (False, True, True)],
+)
+def test_survey_that_fails_is_written_only_by_force(
+    monkeypatch, tmp_path, capsys, passed, force, is_written
+):
+    check = Check(Kind.BEADS, 'x', value=1.0, limit={True: 2.0, False: 0.5, None: np.nan}[passed])
+    outcome = Fake(
+        findings=(), validation=Fake(checks=[check], verdict='x'), phantom='surveyed', beads=None
+    )
+    recording = Fake(notes=(), unpaired={}, frames={})
+    given = Fake(notes=(), phantom='given', names=Names())
+    written = []
+    monkeypatch.setattr('fluoro_calib_ros.jobs.sources.read_survey', lambda *_, **__: given)
+    monkeypatch.setattr('fluoro_calib_ros.jobs.sources.read_source', lambda *_, **__: recording)
+    monkeypatch.setattr('fluoro_calib_ros.jobs.survey.survey', lambda *_: outcome)
+    monkeypatch.setattr('fluoro_calib_ros.io.phantom.write_phantom', lambda *w: written.append(w))
+    monkeypatch.setattr(survey_command, '_document', lambda outcome, path: {'out': path})
+    monkeypatch.setattr(survey_command, '_text', lambda outcome, path: f'written to {path}')
+    parser = argparse.ArgumentParser()
+    parser.add_argument('--json', action='store_true')
+    survey_command.add_arguments(parser)
+    words = ['s.csv', '--phantom', 'p.csv', '--out', str(tmp_path / 'new.csv')]
+    arguments = parser.parse_args(words + ['--force'] * force)
+    arguments.rig_file = None
+    if passed is False:
+        with pytest.raises(DataError) as caught:
+            survey_command.run(arguments)
+        assert ('nothing is written' in str(caught.value)) is not force
+    else:
+        survey_command.run(arguments)
+    out = capsys.readouterr().out
+    assert ('Next: ' in out) is is_written
+    assert written == [(tmp_path / 'new.csv', 'surveyed', Names())] * is_written
+
+
+@pytest.mark.parametrize(
+    ('words', 'full', 'blocked'),
+    [
+        (['--square', '5x4', '--blocked', '1,5'], 20, [5]),
+        (['--hex', '5x4'], 20, []),
+        (['--cube', '3x2x2', '--blocked', '2,1,2'], 12, [10]),
+    ],
+)
+def test_phantom_is_written_with_its_picture(tmp_path, capsys, words, full, blocked):
+    out = tmp_path / 'p.csv'
+    command = ('phantom', *words, '--pitch', '10', '--diameter', '3')
+    assert run(*command, '--out', out, '--json') == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told['targets'], told['blocked']) == (full - len(blocked), blocked)
+    assert told['picture'] == str(tmp_path / 'p.svg') and (tmp_path / 'p.svg').exists()
+    assert read_phantom(out).target_id.tolist() == sorted({*range(1, full + 1)} - {*blocked})
+    for wrong_picture in ('p.gif', 'p.svg'):
+        path = tmp_path / wrong_picture
+        assert run(*command, '--out', tmp_path / 'p.svg', '--picture', path) == 1
+        assert str(path) in capsys.readouterr().err
 
 
 # ---- bags

@@ -5,6 +5,7 @@
 
 from dataclasses import dataclass
 
+import numpy as np
 import pytest
 
 from fluoro_calib_ros.exposures.pairing import (
@@ -13,6 +14,7 @@ from fluoro_calib_ros.exposures.pairing import (
     disagreement_of_recording,
     exposure_pairer,
 )
+from fluoro_calib_ros.exposures.stamps import _frame_interval
 
 MS = 1_000_000
 INTERVAL = 40 * MS  # 25 Hz
@@ -84,3 +86,19 @@ def test_pairing_by_stamp_has_no_disagreement():
     for frame in (*stream('a'), *stream('b', delay_ns=INTERVAL, first=7)):
         pairer.add(frame)
     assert not pairer.stamps.disagreement()
+
+
+def test_numbers_that_never_grow_give_no_frame_interval():
+    """A camera that sends one number again and again: the frames cannot be told apart."""
+    repeated = {
+        name: [Frame(name, 1, frame.stamp_ns) for frame in stream(name, delay_ns=delay)]
+        for name, delay in (('a', 0), ('b', INTERVAL))
+    }
+    pairer = CompletePairer('ab')
+    for pair in zip(*repeated.values()):
+        for frame in pair:
+            pairer.add(frame)
+    assert not pairer.stamps.disagreement()
+    number, stamp_ns = np.array([5, 5, 4]), np.array([10, 20, 30])
+    assert _frame_interval(number, stamp_ns) == 0
+    assert _frame_interval(np.array([5, 7, 6, 8]), np.array([10, 30, 40, 90])) == 17.5

@@ -160,11 +160,16 @@ def test_a_cube_has_layers():
         dict(diameter_mm=10.0),
         dict(columns=0),
         dict(pitch_mm=(0.0, 1.0, 1.0)),
+        dict(pitch_mm=(1.0, np.inf, 1.0)),
+        dict(pitch_mm=(1.0, 1.0, -1.0)),
+        dict(pitch_mm=(1.0, np.nan, 1.0)),
     ],
 )
 def test_what_cannot_be_drawn_is_refused(fault):
-    with pytest.raises(DataError):
+    with pytest.raises(DataError) as caught:
         Drawing(**{'columns': 5, 'rows': 5, **fault})
+    if 'pitch_mm' in fault:
+        assert caught.value.finding.kind is Kind.IMPLAUSIBLE_NUMBER
 
 
 def test_the_command_writes_file_and_picture(tmp_path, capsys):

@@ -102,12 +102,12 @@ def test_figures_of_joint_run_with_interior_held(scene, tmp_path):
     assert os.listdir(tmp_path / 'other') == []
 
 
-def test_figures_without_model_or_runs(scene, job, plain, tmp_path):
+def test_figures_without_model_or_runs(scene, plain, tmp_path):
     """Without a model there is no cost or distortion; without runs there are no figures."""
     phantom, frames = scene
     names = {os.path.basename(path) for path in write_figures(plain, tmp_path)}
     assert names == {'residuals_histogram_a.png', 'residuals_position_a.png'}
-    adjusted = adjust_with_calibrations({'a': frames['a']}, phantom, job.calibrations)
+    adjusted = adjust_with_calibrations({'a': frames['a']}, phantom, plain.calibrations)
     assert write_figures(adjusted, tmp_path) == []
     rows = [line.split() for line in summary_table(adjusted).splitlines()]
     assert ['iterations', '-'] in rows and ['converged', 'yes'] in rows

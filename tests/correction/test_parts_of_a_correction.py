@@ -1,0 +1,81 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Parts of a correction: what an angle adds, neighbours that are tried, errors of its cells."""
+
+import numpy as np
+import pytest
+from rigs import pincushion, turning
+
+from fluoro_calib_ros.correction.grid_cells import PLACES, errors_where_curved
+from fluoro_calib_ros.correction.neighbours import KnnModel
+from fluoro_calib_ros.correction.series import MARGIN, Functions
+
+SIZE = (320, 240)
+UV = np.random.default_rng(2).uniform(40, 200, (30, 2))
+
+
+def test_angle_adds_its_change_and_variance_to_the_correction():
+    turned = turning(pincushion('a', SIZE))
+    plain = turned.model.evaluate(UV)
+    for angle in (0.3, np.linspace(-0.9, 0.9, 30)):
+        change, variance = turned.angle_field.change(UV, angle)
+        found = turned.correction(UV, angle)
+        np.testing.assert_allclose(found.duv, plain.duv + change, atol=1e-12)
+        assert np.abs(change).max() > 0.1
+        np.testing.assert_allclose(found.sd**2, plain.sd**2 + variance, atol=1e-12)
+        assert np.array_equal(found.outside, plain.outside)
+    beyond = turned.correction(UV, np.deg2rad(80))
+    assert beyond.outside.all()
+    unknown = turned.correction(UV)
+    mean, variance = turned.angle_field.change(UV, np.nan)
+    np.testing.assert_allclose(unknown.duv, plain.duv + mean, atol=1e-12)
+    np.testing.assert_allclose(unknown.sd**2, plain.sd**2 + variance, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ('count', 'first', 'last'),
+    [(4, 1, 1), (6, 2, 2), (10, 3, 4), (50, 3, 20), (250, 3, 100), (10_000, 3, 100)],
+)
+def test_neighbours_that_are_tried_reach_from_three_to_forty_percent(count, first, last):
+    assert KnnModel.candidate_k(count).tolist() == list(range(first, last + 1))
+
+
+@pytest.mark.parametrize('affordable', [10**9, 60])
+def test_errors_of_cells_are_those_of_the_interpolation_at_their_places(affordable):
+    """By loops; where few values are affordable, of the most curved cells."""
+    model = pincushion('a', SIZE).model
+    columns, rows = np.linspace(0, 300, 9), np.linspace(10, 230, 7)
+    corners = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+    values = model.evaluate_in_bulk(corners).reshape(3, 7, 9)
+    errors = errors_where_curved(model, (columns, rows), values, affordable)
+    measured = np.argwhere(np.isfinite(errors[0]))
+    assert len(measured) == min(48, affordable // len(PLACES))
+    for j, i in measured:
+        largest = np.zeros(3)
+        for x, y in PLACES:
+            at = [[columns[i] + x * np.diff(columns)[i], rows[j] + y * np.diff(rows)[j]]]
+            between = sum(
+                wx * wy * values[:, j + n, i + m]
+                for m, wx in enumerate((1 - x, x))
+                for n, wy in enumerate((1 - y, y))
+            )
+            error = np.abs(between - model.evaluate_in_bulk(np.array(at))[:, 0])
+            largest = np.maximum(largest, error)
+        np.testing.assert_allclose(errors[:, j, i], [largest[:2].max(), largest[2]], atol=1e-9)
+
+
+def test_sines_of_a_series_are_counted_along_the_longer_side():
+    functions = Functions(SIZE, 2, 6, absent=(4,))
+    longest = np.pi / (MARGIN * 320)
+    assert functions.frequency_of_mode == pytest.approx(longest)
+    u, v = functions._sines.T
+    wanted = np.hypot(u * np.pi / (MARGIN * 320), v * np.pi / (MARGIN * 240))
+    np.testing.assert_allclose(functions.frequency, wanted)
+    band = np.rint(wanted / longest)
+    assert functions.band.tolist() == band.tolist() and set(band) == {2, 3, 5, 6}
+    assert (functions.complete, functions.highest) == (3, pytest.approx(3.5 * longest))
+    assert wanted.max() <= 6.5 * longest
+    assert len(functions) == 6 + len(u) and functions.trend == 6
+    whole = Functions(SIZE, -1, 6)
+    assert (whole.complete, whole.trend) == (6, 0) and len(whole) > len(u)

@@ -225,17 +225,8 @@ class PoseSolver:
             turn = second.rotation[row] @ solution.rotation[row].T
             away = float(np.linalg.norm(vector_from_matrix(turn)))
             fits = squares[1] - squares[0] < self._limit[1] and away > LINEAR_RAD
-            out[row] = fits and not self._tells(prediction, row, second)
+            out[row] = fits and not _excludes(prediction, row, second, self._limit[3])
         return out
-
-    def _tells(self, prediction: Prediction, row: int, second: _Solution) -> bool:
-        """Whether the prediction of a body excludes a second pose."""
-        if not prediction.known[row]:
-            return False
-        turn = second.rotation[row] @ prediction.rotation[row].T
-        w = vector_from_matrix(turn)
-        squares = w @ np.linalg.solve(prediction.covariance[row, 3:, 3:], w)
-        return bool(squares > self._limit[3])
 
     def _start(
         self,
@@ -431,6 +422,16 @@ class PoseSolver:
             chi2=np.sum(_own_squares(solution.marker, self.variance), axis=1),
             freedom=2.0 * np.sum(points.seen & used[..., None], axis=(1, 2)) - POSE_SIZE,
         )
+
+
+def _excludes(prediction: Prediction, row: int, second: _Solution, limit: float) -> bool:
+    """Whether the prediction of a body excludes a second pose."""
+    if not prediction.known[row]:
+        return False
+    turn = second.rotation[row] @ prediction.rotation[row].T
+    w = vector_from_matrix(turn)
+    squares = w @ np.linalg.solve(prediction.covariance[row, 3:, 3:], w)
+    return bool(squares > limit)
 
 
 def _growth_by_rig(

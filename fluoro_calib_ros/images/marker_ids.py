@@ -211,9 +211,12 @@ def _points(shadows: Sequence[np.ndarray], rig: CalibratedRig) -> _Points:
     sigma = sigma[:, near]
     a = a[near]
     b = b[near]
-    points = Intersector(orientation, None).intersect(uv, sigma)
+    intersector = Intersector(orientation, None)
+    points = intersector.intersect(uv, sigma)
     good = np.isin(points.status, (OK, OUTSIDE)) & (points.standardised < AGREE)
-    variance = np.linalg.eigvalsh(points.covariance[good])[:, -1]
+    # Errors of orientation and correction are the same for all members of a body, nearly.
+    alone = intersector.intersect(uv[:, good], np.full((2, good.sum()), SHADOW_SD_PX))
+    variance = np.linalg.eigvalsh(alone.covariance_noise)[:, -1]
     return _Points(points.xyz_mm[good], variance, np.column_stack([a, b])[good])
 
 

@@ -351,12 +351,13 @@ def test_calibrate_returns_whether_nothing_speaks_against_it(
         'fluoro_calib_ros.report.report_figures.write_figures',
         lambda *words: asked.update(figures=words),
     )
-    monkeypatch.setattr(calibrate, '_request', lambda _: None)
+    monkeypatch.setattr(calibrate, '_request', lambda _: (None, ()))
     monkeypatch.setattr(calibrate, '_print', lambda *_: None)
     arguments = Fake(
         source='s',
         phantom='p',
         known_orientation=[],
+        decisions=None,
         out='o',
         fast=fast,
         force=True,
@@ -457,6 +458,7 @@ def healing(changed=(), drift=(), verdict='pass', meanwhile=False, causes=(), **
         'before': Fake(place_mm=0.5, scale=2e-4),
         'after': Fake(place_mm=0.04, scale=3e-5),
         'checks': [Fake(passed=True, sentence='good'), Fake(passed=None, sentence='unknown')],
+        'common_motion': Fake(sentence='seen by no body'),
         'verdict': verdict,
     }
     return Fake(**{**values, **more})
@@ -470,7 +472,7 @@ def test_healed_rig_is_told_by_fluoroscope_with_what_it_is_worth():
         'points relative to each other: sd 0.040 mm, scale 30 ppm (as calibrated 0.500 mm, '
         'scale 200 ppm)'
     )
-    assert lines[3:] == ['written to healed', 'unknown', 'Verdict: pass']
+    assert lines[3:] == ['written to healed', 'seen by no body', 'unknown', 'Verdict: pass']
 
 
 @pytest.mark.parametrize(

@@ -3,11 +3,24 @@
 
 """Parts of a correction: what an angle adds, neighbours that are tried, errors of its cells."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from rigs import pincushion, turning
 
-from fluoro_calib_ros.correction.grid_cells import PLACES, errors_where_curved
+from fluoro_calib_ros.correction.fluoroscope_calibration import (
+    packed_profile,
+    unpacked_profile,
+)
+from fluoro_calib_ros.correction.grid_cells import (
+    MAX_PARTS,
+    PLACES,
+    TARGET_PX,
+    build_cells,
+    divide_cells,
+    errors_where_curved,
+)
 from fluoro_calib_ros.correction.neighbours import KnnModel
 from fluoro_calib_ros.correction.series import MARGIN, Functions
 
@@ -79,3 +92,42 @@ def test_sines_of_a_series_are_counted_along_the_longer_side():
     assert len(functions) == 6 + len(u) and functions.trend == 6
     whole = Functions(SIZE, -1, 6)
     assert (whole.complete, whole.trend) == (6, 0) and len(whole) > len(u)
+
+
+def test_cells_are_divided_by_how_far_they_miss_the_target():
+    """Once more than halving would need; their coefficients are those of the model's values."""
+    model = pincushion('a', SIZE).model
+    cells = build_cells(model, SIZE)
+    errors = np.zeros_like(cells.errors)
+    for (row, column), error in {(2, 5): 0.9, (3, 4): 1.9, (7, 1): 3.9, (8, 8): 1e6}.items():
+        errors[0, row, column] = error * TARGET_PX
+    errors[1] = 99.0  # of the standard deviation, which is no reason
+    divided = divide_cells(model, replace(cells, errors=errors))
+    assert list(zip(divided.row, divided.column)) == [(3, 4), (7, 1), (8, 8)]
+    assert divided.parts.tolist() == [4, 8, MAX_PARTS]
+    assert divided.first.tolist() == [0, 16, 80] and len(divided.table) == 80 + MAX_PARTS**2
+    columns, rows = cells.nodes
+    part = 1  # the second one of the first row, of cell (3, 4)
+    step = (columns[5] - columns[4]) / 4, (rows[4] - rows[3]) / 4
+    u, v = columns[4] + part * step[0], rows[3]
+    places = np.array([[u, v], [u + step[0], v], [u, v + step[1]], [u + step[0], v + step[1]]])
+    for place, value in zip(places, model.evaluate_in_bulk(places).T):
+        terms = np.repeat([1.0, place[0], place[1], place[0] * place[1]], 3)
+        found = (terms * divided.table[part]).reshape(4, 3).sum(axis=0)
+        np.testing.assert_allclose(found, value, atol=1e-9)
+    assert divide_cells(model, replace(cells, errors=0 * errors)) is None
+
+
+@pytest.mark.parametrize(
+    'values',
+    [(0.0, 1, 1), (1, 0.0, 1), (1, 1, 0.0), (1, -1, 1), (1, 1, np.inf), (1, 1e4, 1), (1, 1)],
+)
+def test_noise_that_no_image_has_is_refused(values):
+    with pytest.raises(ValueError, match='noise profile'):
+        unpacked_profile(np.array(values))
+
+
+def test_noise_profile_survives_its_packing():
+    for profile in (None, unpacked_profile(np.array([1.0, 1.5, 0.7]))):
+        assert unpacked_profile(packed_profile(profile)) == profile
+    assert packed_profile(profile).tolist() == [1.0, 1.5, 0.7]

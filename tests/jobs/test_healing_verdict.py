@@ -8,6 +8,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
 from fluoro_calib_ros.bodies.body import Body
 from fluoro_calib_ros.bodies.healing import Cause, Change
@@ -73,6 +74,36 @@ def test_rig_that_changed_during_the_recording_is_told():
     lines = _lines(Namespace(out='healed'), steady)
     assert 'no change of the rig is evident' in lines[0]
     assert lines[1] == healing.common_motion(0.3).sentence
+
+
+def test_bodies_have_a_pose_with_three_markers_whose_ids_begin_at_0():
+    ids = np.array([[0, 1, 2, -1], [5, 6, -1, -1], [7, 8, 9, 10]])
+    nothing = np.zeros(ids.shape, bool)
+    assert healing._solvable(ids, nothing).tolist() == [True, False, True]
+    nothing[[0, 2], 0] = True
+    assert healing._solvable(ids, nothing).tolist() == [False, False, True]
+
+
+@pytest.mark.parametrize(
+    ('changes', 'complete', 'value', 'passed'),
+    [
+        ((), True, 0, True),
+        ((Change(Cause.LOOSE, body=0),), True, 0, True),
+        ((Change(Cause.LOOSE, body=0),), False, 1, False),
+        ((Change(Cause.ORIENTATION, fluoroscope=1), Change(Cause.LOOSE, body=0)), True, 1, False),
+        ((Change(Cause.ORIENTATION, fluoroscope=1),), False, 2, False),
+    ],
+)
+def test_exposures_that_were_not_used_count_changes_of_the_rig_and_what_is_unexplained(
+    changes, complete, value, passed
+):
+    rest = SimpleNamespace(changes=changes, complete=complete)
+    check = healing._unused(rest, 1, RIG)
+    assert (check.value, check.passed) == (value, passed)
+    unexplained = not complete and value == 1
+    assert ('do not explain' in check.cause) is unexplained
+    assert ('no further change' in check.cause) is passed
+    assert healing._unused(None, 2, RIG).passed is None
 
 
 def test_distortion_that_a_model_cannot_take_is_diagnosed_and_does_not_pass():

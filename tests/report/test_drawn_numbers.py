@@ -26,6 +26,7 @@ from fluoro_calib_ros.report.figures import (
     Scale,
     distortion_figure,
     phantom_figure,
+    picture_bytes,
 )
 from fluoro_calib_ros.report.motion import _draw_gaps, points_figure
 from fluoro_calib_ros.report.report_figures import (
@@ -255,6 +256,16 @@ def test_drawing_of_a_phantom_has_its_places(layers):
         low, high = places[:, :2].min(axis=0) - 4, places[:, :2].max(axis=0) + 4
         assert drawn.get_xlim() == pytest.approx((low[0], high[0]))
         assert drawn.get_ylim() == pytest.approx((high[1], low[1]))
+    plt.close('all')
+
+
+def test_drawing_without_diameter_shows_places_and_is_written_as_its_suffix_says():
+    figure = phantom_figure(Drawing(4, 3, pitch_mm=(20.0, 10.0, 1.0)))
+    (drawn,) = figure.axes
+    assert {patch.radius for patch in drawn.patches} == {3.0}
+    assert picture_bytes(figure, '.png')[:4] == b'\x89PNG'
+    text = picture_bytes(figure, '.svg')
+    assert b'<svg' in text and b'>12<' in text and picture_bytes(figure, '.svg') == text
     plt.close('all')
 
 

@@ -12,11 +12,21 @@ import numpy as np
 import pytest
 
 from fluoro_calib_ros.bodies.body import BodyPoses, PoseStatus
+from fluoro_calib_ros.correction.fluoroscope_calibration import digest_of_sources
 from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
+from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.exposures.names import Names
+from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.images.codec import decode
 from fluoro_calib_ros.io import image_reading, image_writing, recordings
-from fluoro_calib_ros.io.calibration_request import VERSION, read_options
+from fluoro_calib_ros.io.calibration_request import (
+    VERSION,
+    read_options,
+    read_request,
+    write_request,
+)
+from fluoro_calib_ros.io.observations import correct_points, points_of_frames
 from fluoro_calib_ros.io.poses import COLUMNS, POINT_COLUMNS, point_table, pose_table
 from fluoro_calib_ros.io.recordings import DicomHeader, _cine_rate, _dicom_rate, _grey
 from fluoro_calib_ros.io.result_document import drift_document
@@ -214,3 +224,37 @@ def test_tables_of_points_and_poses_have_their_columns():
     assert (first['x_mm'], first['sd_x_mm'], first['sd_rz_rad']) == (1, 1, 6)
     assert second['time_s'] == 1.0 and np.isnan(second['qx']) and second['markers'] == 0
     assert (first['status'], second['status']) == ('OK', 'FAILED')
+
+
+def test_missing_source_of_a_calibration_is_named_with_what_can_be_given_instead(tmp_path):
+    rng = np.random.default_rng(2)
+    frame = Frame('a', 1, np.arange(5), rng.uniform(0, 90, (5, 2)), (100, 100))
+    phantom = Phantom(np.arange(5), rng.uniform(-5, 5, (5, 3)), np.full(5, 0.1))
+    request = CalibrationRequest({'a': [frame]}, phantom, CalibrationOptions())
+    calibrations = {
+        'a': Fake(image_size=(100, 100), source_digest=digest_of_sources([frame], phantom))
+    }
+    write_request(tmp_path, request)
+    assert read_request(tmp_path, calibrations).frames['a'][0].target_id.tolist() == [*range(5)]
+    for name, option in (('observations.csv', '--source'), ('phantom.csv', '--phantom')):
+        (tmp_path / name).rename(tmp_path / 'away')
+        with pytest.raises(DataError) as caught:
+            read_request(tmp_path, calibrations)
+        assert f'{name}: ' in str(caught.value) and f'give {option}' in str(caught.value)
+        (tmp_path / 'away').rename(tmp_path / name)
+    assert read_request(tmp_path, calibrations, {'a': [frame]}, phantom).phantom is phantom
+
+
+def test_points_of_frames_are_rows_below_the_header():
+    frames = {
+        name: [Frame(name, 7, np.array([3, 9]), np.array([[1.5, 2], [3, 4]]), (9, 9), angle=angle)]
+        for name, angle in (('a', None), ('b', 0.25))
+    }
+    points = points_of_frames('x.trc', frames, Names({'bead': 9}, {'pose': 7}))
+    assert points.rows[1] == ['a', 'pose', 'bead', '3.0', '4.0'] and points.rows[2][0] == 'b'
+    assert points.lines.tolist() == [2, 3, 4, 5] and points.uv[0].tolist() == [1.5, 2]
+    assert np.isnan(points.angle[:2]).all() and points.angle[2:] == pytest.approx(0.25)
+    with pytest.raises(DataError, match=r'x\.trc, row 4: '):
+        correct_points(points, {'a': None})
+    with pytest.raises(DataError, match='no image points'):
+        points_of_frames('x.trc', {'a': []}, Names())

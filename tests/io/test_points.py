@@ -371,6 +371,10 @@ def test_semicolons_with_decimal_commas_are_recognised(tmp_path):
         ('m_cam1_X,m_cam1_Y\n1,2,3\n', 'row 2: 3 columns, but the header has 2'),
         ('m_cam1_X,m_cam2_Y\n1,2\n', 'row 1: the column m_cam1_X is not followed by m_cam1_Y'),
         ('m_cam1_X,m_cam1_Y\n1,900\n', 'row 2: the point (1, 900) of m in cam1 is off the image'),
+        (
+            'm_cam1_X,m_cam1_Y,n_cam2_X,n_cam2_Y\n1,2,3,4\n5,6,7,900\n',
+            'row 3: the point (7, 900) of n in cam2 is off the image',
+        ),
         ('m_cam1_X,m_cam1_Y,m_cam1_X,m_cam1_Y\n1,2,1,2\n', 'row 1: m_cam1 is given twice'),
         ('m_cam1_X,m_cam1_Y\n', 'the file has a header, but no rows'),
     ],
@@ -602,6 +606,14 @@ def test_frames_left_out_are_gaps_at_a_constant_rate(tmp_path):
     found = registry.read(path, FileSettings()).points
     assert found.frame.tolist() == [1, 2, 3, 4]
     assert np.isnan(found.xyz_mm[1:3]).all() and found.xyz_mm[3, 0].tolist() == [4, 5, 6]
+
+
+def test_trc_without_frames_is_refused(tmp_path):
+    path = tmp_path / 'points.trc'
+    registry.write(path, 'trc', Content(points=points()), FileSettings(units='mm'))
+    header = path.read_text().splitlines()[:5]
+    path.write_text('\n'.join(header) + '\n\n')
+    assert 'no frames' in refused(path, FileSettings())
 
 
 def test_xmalab_3d_points_of_a_lab_are_read(tmp_path):

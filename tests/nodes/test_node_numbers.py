@@ -269,9 +269,12 @@ def test_angles_are_given_counted_and_doubted_once():
     assert log.lines['warning'] == 1
     found = made.health('a', {})
     assert found.level == WARN and made.health('a', {}) is None
+    assert 'joint carm' in found.message and '97.990 s older' in found.message
     made.of_frame('b', 1, needed=True)
     assert made.values('b')['frames without angle'] == 1
     assert made.health('b', {'joint_states': 'no match'}).message == 'no match'
+    made.of_frame('b', 2, needed=True)
+    assert 'names no joint' in made.health('b', {}).message
     made.of_frame('a', 1005 * 10**6, needed=True)
     made.of_frame('a', 99 * 10**9, needed=True)
     assert log.lines['warning'] == 3  # told again after it was known

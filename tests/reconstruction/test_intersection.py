@@ -360,6 +360,28 @@ def test_false_match_of_more_views_loses_its_ray(names):
     np.testing.assert_allclose(found.covariance[0], alone.covariance[0], rtol=1e-3, atol=1e-7)
 
 
+def test_false_match_loses_its_ray_where_other_points_are_seen_by_two():
+    """Points of two, three and one view in one frame are as those of frames of their own."""
+    orientation = orientation_of(('a', 'b', 'c'))
+    _, uv, sigma = seen(orientation, 12)
+    uv[2, 4] += 40.0  # a false match of the third view
+    uv[0, 7:9] = np.nan
+    uv[1:, 9] = np.nan
+    sigma[1] = 2 * SIGMA
+    intersector = Intersector(orientation)
+    found = intersector.intersect(uv, sigma)
+    assert (found.dropped_view[4], found.rays[4], found.status[4]) == (2, 2, OK)
+    assert found.rays[7:10].tolist() == [2, 2, 1] and found.status[9] == SINGLE_VIEW
+    for row in (0, 4, 7):
+        alone = intersector.intersect(uv[:, [row]], sigma[:, [row]])
+        np.testing.assert_allclose(found.xyz_mm[row], alone.xyz_mm[0], atol=1e-6)
+        np.testing.assert_allclose(
+            found.covariance[row], alone.covariance[0], rtol=1e-3, atol=1e-6
+        )
+    two = Intersector(orientation.subset(['a', 'b'])).intersect(uv[:2, [4]], sigma[:2, [4]])
+    np.testing.assert_allclose(found.xyz_mm[4], two.xyz_mm[0], atol=1e-6)
+
+
 def test_points_seen_by_few_fluoroscopes():
     """Every point is intersected from its own rays."""
     orientation = orientation_of(('a', 'b', 'c'))

@@ -222,6 +222,7 @@ def test_calibrate_writes_result_and_calibrations(result):
     assert sorted(p.name for p in result.iterdir()) == [
         'a.calibration.npz',
         'b.calibration.npz',
+        'doubtful.csv',
         'exposures.csv',
         'interior.csv',
         'observations.csv',

@@ -320,12 +320,13 @@ def test_calibrate_returns_whether_nothing_speaks_against_it(
         'fluoro_calib_ros.report.report_figures.write_figures',
         lambda *words: asked.update(figures=words),
     )
-    monkeypatch.setattr(calibrate, '_request', lambda _: None)
+    monkeypatch.setattr(calibrate, '_request', lambda _: (None, {}))
     monkeypatch.setattr(calibrate, '_print', lambda *_: None)
     arguments = Fake(
         source='s',
         phantom='p',
         known_orientation=[],
+        decisions=None,
         out='o',
         fast=fast,
         force=True,

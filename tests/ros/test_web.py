@@ -123,7 +123,8 @@ def test_page_shows_what_the_rig_sees_and_has_measured(graph, calibrated, exposu
         # Points in space, the sources, the residuals of the calibration and its report.
         client.stream(zip(tracking['a'], tracking['b']), rate=30.0)
         space = client.wait_until(
-            lambda: (s := browser.json('/space')) and s['points'] and s, what='points in space'
+            lambda: (s := browser.json('/space')) and s['points'] and s['sources'] and s,
+            what='points in space, and the sources',
         )
         assert [source['name'] for source in space['sources']] == ['a', 'b']
         assert all(np.linalg.norm(s['axis']) == pytest.approx(1) for s in space['sources'])

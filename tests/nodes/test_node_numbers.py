@@ -300,6 +300,7 @@ def test_faults_of_joint_states_are_not_those_of_the_stream():
 def test_nearest_calibrated_angle_is_round_the_circle():
     text = beyond_text(np.deg2rad(175.0), np.deg2rad([0.0, 90, -170]))
     assert '175.0 degrees' in text and 'the nearest is -170.0' in text
+    assert 'the nearest is 80.0' in beyond_text(np.deg2rad(100.0), np.deg2rad([0.0, 80, -170]))
 
 
 # ---- calibrations that arrive

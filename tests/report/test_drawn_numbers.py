@@ -10,6 +10,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import rigs
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from fluoro_calib_ros.exposures.names import Names
@@ -38,6 +39,8 @@ from fluoro_calib_ros.report.report_figures import (
     residual_map,
 )
 from fluoro_calib_ros.report.residuals import (
+    AFTER,
+    BEFORE,
     STRIPES,
     Residuals,
     _plot_histogram,
@@ -132,6 +135,9 @@ def test_histogram_is_a_density_of_all_values():
     x, y = drawn.patches[0].get_xy().T
     assert (x.min(), x.max()) == (-5, 5)
     assert y.max() == pytest.approx(2 / 8 / 0.25)  # two of eight in a bar of 0.25
+    assert drawn.patches[0].get_facecolor()[:3] == to_rgb(AFTER)
+    _plot_histogram(drawn, values, 5.0, 'before')
+    assert drawn.patches[1].get_facecolor()[:3] == to_rgb(BEFORE)
     label = drawn.patches[0].get_label()
     assert label.startswith(f'after: standard deviation {values.std():.1f}, 50.0 % within')
     assert label.endswith('37.5 % beyond the panel')
@@ -251,6 +257,8 @@ def test_drawing_of_a_phantom_has_its_places(layers):
         assert labels == [str(6 * layer + k) for k in range(1, 7)]
         assert np.allclose([text.xy for text in drawn.texts], places[:, :2])
         blocked = len(drawn.lines)
+        crosses = [line.get_xydata().tolist() for line in drawn.lines]
+        assert crosses == [[places[1, :2].tolist()]] * (layer == 0)
         assert len(drawn.patches) + blocked == 6
         assert {patch.radius for patch in drawn.patches} == {1.0}
         low, high = places[:, :2].min(axis=0) - 4, places[:, :2].max(axis=0) + 4

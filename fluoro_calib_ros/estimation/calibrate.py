@@ -39,6 +39,7 @@ from .fixed_calibration import (
     fixed_corrections,
     network_of_calibrations,
     noise_of_calibrations,
+    start_within_survey,
     too_few_rays_for_noise,
 )
 from .initial_network import (
@@ -325,11 +326,12 @@ def adjust_with_calibrations(
             frames, phantom, calibrations=calibrations, known=known, starts=starts
         )
         correction, network = fixed_corrections(measured, calibrations)
+        noise = noise_of_calibrations(loss, calibrations.values())
         after, precise = adjusted_with_precision(
             network,
-            measured.start,
+            start_within_survey(network, measured.start, correction, noise),
             correction,
-            noise_of_calibrations(loss, calibrations.values()),
+            noise,
             noise_fixed=too_few_rays_for_noise(network),
         )
         before = None

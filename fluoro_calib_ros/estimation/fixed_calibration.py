@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
 from ..exposures.frame import Frame, Frames, angles_of
 from ..exposures.phantom import Phantom
-from ..photogrammetry.adjustment import Adjustment
+from ..photogrammetry.adjustment import Adjustment, SolverOptions, adjust
 from ..photogrammetry.diagnosis import global_names
 from ..photogrammetry.elimination import CovarianceBlocks, factorize
 from ..photogrammetry.network import Network
@@ -26,6 +26,7 @@ from ..photogrammetry.precision import (
     equations_with_fixed_interiors,
     joint_covariance,
 )
+from ..photogrammetry.unknowns import Parameters
 from .initial_network import (
     Known,
     KnownSensor,
@@ -154,6 +155,9 @@ class SolvedNetwork:
 # Mean number of image points of a target from which the noise can be estimated: with fewer the
 # noise cannot be told from errors of the survey.
 MIN_RAYS_FOR_NOISE = 3
+# Decrease of the cost at which an adjustment with too large a noise ends: a point that is off by a
+# standard deviation costs 1/2.
+GRADUATED_TOLERANCE = 0.1
 
 
 def network_of_calibrations(
@@ -221,6 +225,31 @@ def noise_of_calibrations(loss: str, calibrations: Iterable[FluoroscopeCalibrati
         scale=float(np.median([c.sigma0 for c in used])),
         nu=float(np.median([c.nu for c in used])),
     )
+
+
+def start_within_survey(
+    network: Network, start: Parameters, correction: NDArray[np.float64], noise: Noise
+) -> Parameters:
+    """Return start values near which no image point seems false by the survey of its target.
+
+    Where the errors of the survey are larger in the image than its noise, a robust adjustment that
+    begins at the survey would keep them, and reject the image points. So the noise contains them
+    first, and is halved from adjustment to adjustment (graduated non-convexity: Blake and
+    Zisserman, "Visual Reconstruction", MIT Press 1987).
+    """
+    if network.datum != 'survey' or not len(network.uv):
+        return start
+    distance_mm = np.linalg.norm(start.position_mm, axis=1)
+    magnification = start.interior[network.fluoroscope, 2] / distance_mm  # px/mm
+    survey_px = network.survey_sd_mm[network.point] * magnification[network.exposure]
+    scale = float(np.hypot(noise.scale, np.median(survey_px / network.sigma)))
+    while scale > 2 * noise.scale:
+        wide = replace(noise, scale=scale)
+        options = SolverOptions(tolerance=GRADUATED_TOLERANCE)
+        wider = adjust(network, start, correction=correction, noise=wide, options=options)
+        start = wider.parameters
+        scale /= 2
+    return start
 
 
 def too_few_rays_for_noise(network: Network) -> bool:

@@ -380,6 +380,7 @@ class ExtractionNode(StreamNode):
         values = {
             **stream.values(self._workers.waiting(name)),
             'lost at the input': stream.overrun,
+            'readers': self._observations[stream.name].get_subscription_count(),
             **self._angles.values(name),
             **stream.latencies.values(),
         }

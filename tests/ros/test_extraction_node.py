@@ -102,6 +102,8 @@ def rig(module_graph, tmp_path_factory):
     client.wait_until(
         lambda: all(p.get_subscription_count() for p in publishers.values()), what='the readers'
     )
+    for name in NAMES:  # the client, and the calibration node
+        wait_for(client, lambda values, _: int(values.get('readers', 0)) == 2, name, 'readers')
     client.node = nodes[0]
     client.folder = folder
     client.images = publishers

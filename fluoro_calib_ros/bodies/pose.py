@@ -175,7 +175,8 @@ class PoseSolver:
         used = seen & started[:, None]
         test = np.full(used.shape, np.nan)
         from_prediction = prediction.known
-        for _ in range(self.xyz.shape[1] + 1):
+        # Each body may lose all its markers, one at a time, and is started again once.
+        for _ in range(self.xyz.shape[1] + len(self.bodies)):
             solution = self._converge((rotation, centre), points, used, prediction)
             wrong, worst = self._false_markers(solution, (points, used), prediction, test)
             rotation, centre = solution.rotation, solution.centre

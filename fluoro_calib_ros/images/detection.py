@@ -46,6 +46,10 @@ BACKGROUND = 8.0  # blur of the light around a bead, over its scale
 COARSE_BLUR = 4.0  # at which a coarser image has the same blur within 1 %
 FIELD_BLUR_PX = 4.0
 FIELD_LEVEL = 0.18  # of the light in the field below which there is no field
+MAX_PARTS = 8  # of the field, that plates cut apart
+# Of what a part of the field adds to its convex hull. Lines of letters beside a round field add
+# less than a quarter; what lies beyond a plate adds nearly a half where the plate is widest.
+MIN_LIT = 1 / 3
 MIN_CONTRAST = 0.05  # of a bead, as a fraction of the light around it
 
 
@@ -231,15 +235,30 @@ def field_of_view(light: np.ndarray, scale: float) -> np.ndarray:
     mask = (smooth > low + FIELD_LEVEL * (high - low)).astype(np.uint8)
     if mask.mean() > 0.98 or low > 0.35 * high:
         return np.ones(light.shape, dtype=bool)
-    contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    largest = max(contours, key=cv2.contourArea)
-    filled = np.zeros_like(mask)
-    # Beads at the edge leave bays in it, so the convex hull is the field.
-    cv2.drawContours(filled, [cv2.convexHull(largest)], -1, 1, -1)
+    filled = _lit(mask)
     margin = 2 * int(np.ceil(1.5 * scale)) + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (margin, margin))
     eroded = cv2.erode(filled, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=1)
     return eroded.astype(bool)
+
+
+def _lit(mask: np.ndarray) -> np.ndarray:
+    """Return the field (h, w) of a mask of what is bright: convex, for beads leave bays in it.
+
+    A plate seen from its edge may cut off a part of the field. Letters beside the field are lit as
+    well; between them and the field it is dark.
+    """
+    contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    contours = sorted(contours, key=cv2.contourArea, reverse=True)
+    hull = cv2.convexHull(contours[0])
+    field = cv2.drawContours(np.zeros_like(mask), [hull], -1, 1, -1)
+    for contour in contours[1:MAX_PARTS]:
+        wider = cv2.convexHull(np.concatenate([hull, contour]))
+        wider_field = cv2.drawContours(np.zeros_like(mask), [wider], -1, 1, -1)
+        if mask[wider_field > field].sum() > MIN_LIT * (wider_field > field).sum():
+            hull = wider
+            field = wider_field
+    return field
 
 
 @dataclass(frozen=True)

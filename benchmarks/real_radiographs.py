@@ -221,7 +221,7 @@ def centroid(image: np.ndarray, place: np.ndarray, radius: float) -> np.ndarray:
 def distances(found: Extraction) -> Iterator[float]:
     """Yield distances of centres from centroids [px]; infinite where there is no shadow."""
     light = found.detections.light
-    radius = found.profile.radius_px
+    radius = found.imaging.profile.radius_px
     for uv in found.uv:
         off = np.linalg.norm(centroid(light.grey, uv, radius) - uv)
         yield float(off) if np.isfinite(off) else np.inf

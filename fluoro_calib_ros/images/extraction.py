@@ -17,13 +17,15 @@ from ..errors import DataError
 from ..findings import Finding, Kind
 from .detection import Detections, detect_beads, likely_detections
 from .following import Far, follow
-from .growth import Match, Seen, smoothed, supported
-from .light import Noise
+from .growth import Match, Seen, nearby_residuals, supported
+from .imaging import Expected, Imaging, first_imaging
 from .matching import PhantomModel, match
-from .measurement import FIRST_STEPS, STEPS, estimate_profile, measure_beads
-from .shadow_fit import MAX_SIGMA_PX, Beads, Profile
+from .measurement import FIRST_STEPS, STEPS, measure_beads
+from .shadow_fit import MAX_SIGMA_PX, Beads
 from .view import Lens, View, fit_view
 
+# Of a bead of which one in a thousand is half a pixel off (Rayleigh's distribution).
+SURE_SIGMA_PX = 0.5 / np.sqrt(2 * np.log(1000))
 MAX_SIGMAS = 2.9  # times that of a usual bead of the image: an eighth of its weight
 MAX_MISFIT = 5.0
 DEPTH = (0.55, 1.7)  # of the shadow of a bead, 1 for what is usual in such light
@@ -32,6 +34,7 @@ CONTRAST_STEPS = 8
 MIN_USUAL_DEPTH = 0.1
 RESIDUAL_SIGMAS = 4.5  # from the prediction by neighbours
 FIRST_RESIDUAL_PX = 2.5
+ALONE_RADII = 2.5  # distance of the next shadow from that of a bead alone
 MIN_ACCEPTED = 0.5  # of the matched beads that are measured well
 MIN_SCATTER_PX = 0.05
 # Why predicted beads are not observed, where no number belongs to it.
@@ -64,8 +67,7 @@ class Extraction:
     view: View
     detections: Detections
     match: Match
-    profile: Profile
-    noise: Noise
+    imaging: Imaging
     followed: bool = False  #: the pose comes from the exposure before, not from a search
 
     @property
@@ -75,8 +77,7 @@ class Extraction:
         return Nearby(
             self.view,
             self.match.scale_px,
-            profile=self.profile,
-            noise=self.noise,
+            imaging=self.imaging,
             radius_px=found.radius_px,
             inverted=found.inverted,
         )
@@ -88,8 +89,7 @@ class Nearby:
 
     view: View
     scale_px: float  #: robust standard deviation of its residuals [px]
-    profile: Profile
-    noise: Noise
+    imaging: Imaging
     radius_px: float  #: of a bead
     inverted: bool  #: beads are bright
     far: Far | None = None  #: for images that were left out since
@@ -122,7 +122,7 @@ def _searched(image: np.ndarray, model: PhantomModel, lens: Lens) -> Extraction:
         seen = _seen(detections)
         try:
             found = match(seen, model, lens)
-            return _measured(detections, seen, found, model, _Imaging(detections.noise))
+            return _measured(detections, seen, found, model)
         except DataError as error:
             first = first or error
             if error.finding.kind is Kind.POSE_AMBIGUOUS:
@@ -141,9 +141,8 @@ def _followed(image: np.ndarray, model: PhantomModel, near: Nearby) -> Extractio
         found = follow(seen, model, near.view, near.scale_px, near.far)
         if found is None:
             return None
-        imaging = _Imaging(near.noise, near.profile)
         followed = _measured(
-            detections, seen, found=found, model=model, imaging=imaging, passes=(STEPS,)
+            detections, seen, found=found, model=model, imaging=near.imaging, passes=(STEPS,)
         )
     except DataError:
         return None
@@ -156,20 +155,12 @@ def _seen(detections: Detections) -> Seen:
     )
 
 
-@dataclass(frozen=True)
-class _Imaging:
-    """What is known of noise and shadows before beads are measured."""
-
-    noise: Noise
-    profile: Profile | None = None
-
-
 def _measured(
     detections: Detections,
     seen: Seen,
     found: Match,
     model: PhantomModel,
-    imaging: _Imaging,
+    imaging: Imaging | None = None,
     passes: tuple[int, ...] = (FIRST_STEPS, STEPS),
 ) -> Extraction:
     """Measure all predicted beads, by default twice: the second time from a better prediction."""
@@ -178,24 +169,26 @@ def _measured(
     bead = found.bead
     uv = seen.uv[found.detection]
     light = detections.light
-    noise = imaging.noise
-    profile = imaging.profile
     for steps in passes:
         rows = np.flatnonzero(seen.in_field(predicted))
-        start = _starts(predicted, rows, bead, uv, seen)
-        radius = _relative_radius(view, model)
-        if profile is None:
-            known = np.isin(rows, bead)
-            profile = estimate_profile(light, start[known], radius[rows[known]], seen.radius_px)
+        shadows = _expected(predicted, rows, bead, uv, seen, view.depth(model.xyz))
+        if imaging is None:
+            told = _relative_sizes(model)
+            imaging = first_imaging(light, detections.noise, shadows, seen.radius_px, size=told)
+        imaging = imaging.completed(light, shadows)
+        sized = np.isfinite(imaging.size[rows])
+        size = np.where(sized, imaging.size[rows], 1.0)
         beads = measure_beads(
             light,
-            uv=start,
-            relative_radius=radius[rows],
-            profile=profile,
-            noise=noise,
+            uv=shadows.uv,
+            relative_radius=shadows.radius,
+            size=size,
+            profile=imaging.profile,
+            noise=imaging.noise,
             steps=steps,
         )
         reasons = _reasons(beads, predicted[rows])
+        reasons = [reason if known else HIDDEN for reason, known in zip(reasons, sized)]
         good = np.array([reason is None for reason in reasons], dtype=bool)
         if np.count_nonzero(good) < max(4, MIN_ACCEPTED * len(found.bead)):
             measured_well = int(np.count_nonzero(good))
@@ -208,26 +201,40 @@ def _measured(
         bead = rows[good]
         uv = beads.uv[good]
         view, _ = fit_view(view, model.xyz[bead], uv, 3)
-        predicted = view.project(model.xyz) + smoothed(view, model.xyz, bead, uv)
-    measured = (rows, beads, reasons, predicted)
-    extraction = _checked(detections, found, view, measured, _Imaging(noise, profile))
+        nearby = nearby_residuals(view, model.xyz, bead, uv)
+        predicted = view.project(model.xyz) + nearby.value
+    measured = _Measured(rows, beads, reasons, predicted, nearby.sd_px[rows])
+    assert imaging is not None
+    extraction = _checked(detections, found, view, measured, imaging)
     return _with_support(extraction, model, rows)
+
+
+@dataclass(frozen=True)
+class _Measured:
+    """Predicted beads (n,) that were measured."""
+
+    rows: NDArray[np.int64]  #: (n,), of the phantom
+    beads: Beads
+    reasons: list[Finding | None]  #: (n,), against observations
+    predicted: NDArray[np.float64]  #: (m, 2), pixels of all beads of the phantom, by neighbours
+    #: (n,), of the difference of a coordinate from that; it contains what the survey leaves open
+    sd_px: NDArray[np.float64]
 
 
 def _checked(
     detections: Detections,
     found: Match,
     view: View,
-    measured: tuple[np.ndarray, Beads, list[Finding | None], np.ndarray],
-    imaging: _Imaging,
+    measured: _Measured,
+    imaging: Imaging,
 ) -> Extraction:
     """Exclude beads that are not where their neighbours say, or measured badly."""
-    rows, beads, reasons, predicted = measured
-    residual = np.linalg.norm(beads.uv - predicted[rows], axis=1)
+    beads = measured.beads
+    reasons = list(measured.reasons)
+    predicted = measured.predicted[measured.rows]
+    residual = np.linalg.norm(beads.uv - predicted, axis=1)
     good = np.array([reason is None for reason in reasons], dtype=bool)
-    scatter = max(float(np.median(residual[good])) / np.sqrt(2 * np.log(2)), MIN_SCATTER_PX)
-    # The scatter contains what the survey and the smoothing leave open.
-    limit = RESIDUAL_SIGMAS * np.hypot(scatter, beads.sigma)
+    limit = RESIDUAL_SIGMAS * np.hypot(np.maximum(measured.sd_px, MIN_SCATTER_PX), beads.sigma)
     far = good & ~(residual < limit)
     for number in np.flatnonzero(far):
         cause = f'{residual[number]:.2f} px from where its neighbours say'
@@ -236,7 +243,7 @@ def _checked(
         )
     good &= ~far
     usual = float(np.median(beads.sigma[good]))
-    vague = good & (beads.sigma > MAX_SIGMAS * usual)
+    vague = good & (beads.sigma > max(SURE_SIGMA_PX, MAX_SIGMAS * usual))
     for number in np.flatnonzero(vague):
         cause = f'sigma {beads.sigma[number]:.2f} px, that of most is {usual:.2f} px'
         reasons[number] = Finding(
@@ -244,13 +251,12 @@ def _checked(
         )
     good &= ~vague
     refused = tuple(
-        Refusal(int(row), predicted[row], reason)
-        for row, reason in zip(rows, reasons)
+        Refusal(int(row), uv, reason)
+        for row, uv, reason in zip(measured.rows, predicted, reasons)
         if reason is not None
     )
-    assert imaging.profile is not None
     return Extraction(
-        rows[good],
+        measured.rows[good],
         beads.uv[good],
         sigma=beads.sigma[good],
         overlapped=beads.overlapped[good],
@@ -258,8 +264,7 @@ def _checked(
         view=view,
         detections=detections,
         match=found,
-        profile=imaging.profile,
-        noise=imaging.noise,
+        imaging=imaging,
     )
 
 
@@ -289,25 +294,31 @@ def _with_support(extraction: Extraction, model: PhantomModel, rows: np.ndarray)
     )
 
 
-def _starts(
-    predicted: np.ndarray, rows: np.ndarray, bead: np.ndarray, uv: np.ndarray, seen: Seen
-) -> np.ndarray:
-    """Start values (n, 2) of predicted beads: what was found of one alone, else the prediction."""
+def _expected(
+    predicted: np.ndarray,
+    rows: np.ndarray,
+    bead: np.ndarray,
+    uv: np.ndarray,
+    seen: Seen,
+    depth: np.ndarray,
+) -> Expected:
+    """Shadows of predicted beads: where one alone was found, else where it is predicted."""
     start = predicted.copy()
+    apart = np.full(len(predicted), np.inf)
     if len(rows) > 1:
-        distance = cKDTree(predicted[rows]).query(predicted[bead], k=[2])[0][:, 0]
-        alone = distance > 2.5 * seen.radius_px
-        start[bead[alone]] = uv[alone]
-    return start[rows]
+        apart[rows] = cKDTree(predicted[rows]).query(predicted[rows], k=[2])[0][:, 0]
+    alone = apart > ALONE_RADII * seen.radius_px
+    start[bead[alone[bead]]] = uv[alone[bead]]
+    typical = np.median(depth)
+    radius = np.clip(typical / np.where(depth > 0, depth, typical), 0.2, 5.0)
+    return Expected(rows, start[rows], radius[rows], np.isin(rows, bead), alone[rows])
 
 
-def _relative_radius(view: View, model: PhantomModel) -> np.ndarray:
-    """Radii (n,) of the shadows of all beads, 1 for a typical one."""
-    depth = view.depth(model.xyz)
-    radius = np.median(depth) / np.where(depth > 0, depth, np.median(depth))
-    if model.diameter_mm is not None:
-        radius = radius * model.diameter_mm / np.median(model.diameter_mm)
-    return np.clip(radius, 0.2, 5.0)
+def _relative_sizes(model: PhantomModel) -> NDArray[np.float64]:
+    """Sizes (n,) of the beads of a phantom, 1 for a typical one, NaN where they are not told."""
+    if model.diameter_mm is None:
+        return np.full(len(model.xyz), np.nan)
+    return np.asarray(model.diameter_mm / np.median(model.diameter_mm))
 
 
 def _usual_depth(beads: Beads) -> np.ndarray:

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from .interpolation import Interpolation, interpolated
 from .pose_search import LocalPose
-from .view import SMOOTHING, SMOOTHING_PRIOR, Lens, View, fit_view
+from .view import Lens, View, fit_view
 
 START_BEADS = 14  # within the first radius
 GROWTH = 1.25  # of the radius in a step
@@ -26,6 +27,9 @@ MIN_CELL = 5  # predicted beads of a region that is judged
 AMBIGUOUS_PX = 1.5  # by which another prediction must be farther
 SUPPORT = 12  # neighbours in space, and the share of them that must be found as well
 MIN_SUPPORT = 0.5
+# Of the residuals of a view, as a share of half the image: a polynomial of degree 6 has five
+# extrema across it.
+LENGTH = 0.5
 
 
 @dataclass(frozen=True)
@@ -170,7 +174,7 @@ def settle(view: View, xyz: np.ndarray, seen: Seen) -> Match | None:
         if len(bead) < MIN_SHARE * len(row) and step:
             return None
         view, scale = fit_view(view, xyz[bead], seen.uv[detection], 2)
-        residual = smoothed(view, xyz, bead, seen.uv[detection])
+        residual = nearby_residuals(view, xyz, bead, seen.uv[detection]).value
         tolerance = max(0.6 * tolerance, min(LAST_TOLERANCE_PX, seen.tolerance_px))
     predicted = view.project(xyz) + residual
     return _judged(view, xyz, seen, predicted, scale)
@@ -186,25 +190,15 @@ def pairs(predicted: np.ndarray, seen: Seen, tolerance: float) -> tuple[np.ndarr
     return kept, detection[kept]
 
 
-def smoothed(view: View, xyz: np.ndarray, bead: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """Residuals (n, 2) of all beads, as their matched neighbours in the image have them.
+def nearby_residuals(
+    view: View, xyz: np.ndarray, bead: np.ndarray, uv: np.ndarray
+) -> Interpolation:
+    """Residuals of all beads of a view, as their matched neighbours in the image have them.
 
-    A matched bead does not take part in its own value. xyz (n, 3) are all beads, bead (m,) the
-    matched rows with pixels uv (m, 2).
+    xyz (n, 3) are all beads, bead (m,) the matched rows with pixels uv (m, 2).
     """
-    predicted = view.project(xyz)
-    residual = uv - predicted[bead]
-    count = min(SMOOTHING + 1, len(bead))
-    usable = np.where(np.isfinite(predicted), predicted, 1e9)
-    _, near = cKDTree(predicted[bead]).query(usable, k=count)
-    near = near.reshape(len(xyz), -1)
-    other = bead[near] != np.arange(len(xyz))[:, None]
-    values = residual[near]
-    # The median is not moved by a false match among the neighbours.
-    limit = 3 * np.median(np.abs(residual), axis=0) + 0.2
-    values = np.clip(values, -limit, limit)
-    total = np.sum(values * other[..., None], axis=1)
-    return total / (other.sum(axis=1, keepdims=True) + SMOOTHING_PRIOR)
+    place = view.project(xyz)
+    return interpolated(place, bead, uv - place[bead], LENGTH * view.lens.half_px)
 
 
 def _judged(

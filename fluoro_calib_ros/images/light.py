@@ -30,7 +30,7 @@ SECOND = np.array([1.0, -2.0, 1.0])  # differences
 MIN_SEEN = 0.1  # of the variance: what second differences see of noise blurred by a pixel
 MIN_CLIPPED = 10  # pixels
 MIN_PIXELS = 1000  # whose correlation is computed
-MAX_SLOW = 0.9  # share of slow changes, beyond which there is no noise to see
+MAX_SLOW = 0.9  # share of slow changes, beyond which the noise is not seen
 
 
 @dataclass(frozen=True)
@@ -139,20 +139,27 @@ def _correlation(light: np.ndarray, field: NDArray[np.bool_]) -> np.ndarray:
     total = float(np.sum(rest * rest)) / float(valid.sum())
     if total < MIN_VARIANCE:
         return white
-    out = white.copy()
-    height, width = rest.shape
+    return correlation_of(rest[None], valid[None])
+
+
+def correlation_of(residual: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Correlation (2 LAGS + 1, 2 LAGS + 1) of residuals (k, h, w), 0 where they are not valid.
+
+    At the largest lags the noise is not correlated: what is seen there are slow changes of the
+    light, or what a fit has taken from all lags.
+    """
+    total = float(np.sum(residual * residual)) / max(float(valid.sum()), 1.0)
+    height, width = residual.shape[1:]
+    out = np.zeros((2 * LAGS + 1, 2 * LAGS + 1))
     for row in range(LAGS + 1):
         for column in range(-LAGS, LAGS + 1):
-            a = np.s_[: height - row, max(0, -column) : width - max(0, column)]
-            b = np.s_[row:, max(0, column) : width + min(0, column)]
+            a = np.s_[:, : height - row, max(0, -column) : width - max(0, column)]
+            b = np.s_[:, row:, max(0, column) : width + min(0, column)]
             pairs = max(float(np.sum(valid[a] * valid[b])), 1.0)
-            value = float(np.sum(rest[a] * rest[b])) / pairs / total
+            value = float(np.sum(residual[a] * residual[b])) / pairs / max(total, 1e-300)
             out[LAGS + row, LAGS + column] = out[LAGS - row, LAGS - column] = value
-    # What is left of slow changes of the light is no noise.
     edge = float(np.median(np.concatenate([out[0], out[-1], out[:, 0], out[:, -1]])))
-    if edge > MAX_SLOW:
-        return white
-    out = np.clip((out - edge) / (1 - edge), 0, 1)
+    out = np.clip((out - edge) / max(1 - edge, 1 - MAX_SLOW), 0, 1)
     out[out < MIN_CORRELATION] = 0
     out[LAGS, LAGS] = 1
     return out

@@ -13,7 +13,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
@@ -104,7 +103,6 @@ class _MarkerFit(ShadowFit):
         )
         self.guess = guess
         self.offset_u, self.offset_v = np.ascontiguousarray(self.offset.T, dtype=SETTINGS.dtype)
-        self.inflation = 1.0
         grey, valid = windows.read(self.middle, self.offset)
         self._set_windows(grey, valid, bright=grey)
         self._set_groups(self._near(2 * reach + MARGIN_PX))
@@ -219,26 +217,8 @@ class _MarkerFit(ShadowFit):
     ) -> np.ndarray:
         if not final:
             return np.linalg.solve(equations.matrix, equations.right[..., None])[..., 0]
-        inverse = np.linalg.inv(equations.matrix)
-        variance = 0.5 * (inverse[:, TERMS, TERMS] + inverse[:, TERMS + 1, TERMS + 1])
-        self.sigma[rows] = np.sqrt(np.maximum(variance, 0))
-        if not near.shape[1]:
-            self._inflate(inverse[:, TERMS, None] @ equations.weighted)
+        inverse = self._note_precision(rows, equations)
         return (inverse @ equations.right[..., None])[..., 0]
-
-    def _inflate(self, influence: np.ndarray) -> None:
-        """Note the factor on variances by the correlation of noise.
-
-        influence (g, 1, m) of the pixels on a centre.
-        """
-        correlation = self.noise.correlation
-        if np.count_nonzero(correlation) < 2:
-            return
-        half = int(np.abs(self.offset).max())
-        image = np.zeros((2 * half + 1, 2 * half + 1))
-        image[self.offset[:, 1] + half, self.offset[:, 0] + half] = influence[len(influence) // 2]
-        spread = cv2.filter2D(image, cv2.CV_64F, correlation, borderType=cv2.BORDER_CONSTANT)
-        self.inflation = max(float((image * spread).sum() / (image * image).sum()), 1.0)
 
     def _cross(self) -> None:
         """Note what shadows that touch have together, beyond the product of both."""
@@ -269,7 +249,7 @@ class _MarkerFit(ShadowFit):
         away = np.abs(self.uv - self.start).max(axis=1, initial=0.0)
         measured = self.usable & np.isfinite(self.uv).all(axis=1) & np.isfinite(self.sigma)
         measured &= away < self.settings.steps * self.settings.max_step_px
-        return self._beads(measured, self.typical(), self.inflation)
+        return self._beads(measured, self.typical())
 
 
 # Measurement of markers: shadows are assigned to all of them together, fitted and checked.

@@ -22,12 +22,14 @@ from .shadow_fit import (
     MARGIN_PX,
     MIN_PASSED,
     TERMS,
+    UNDISTURBED,
     Beads,
     FineGrid,
     FitSettings,
     NormalEquations,
     Profile,
     ShadowFit,
+    Shadows,
     fit_profile,
 )
 
@@ -46,13 +48,15 @@ SETTINGS = FitSettings(
 STEPS = SETTINGS.steps
 FIRST_STEPS = 4  # that only have to tell beads from other things
 PROFILE_STEPS = 3
-PROFILE_BEADS = 150
-PROFILE_ROUNDS = 3
+PROFILE_BEADS = 100
+PATIENCE = 2  # rounds without a better fit: a hard edge with a wide blur looks like a sphere
+PROFILE_ROUNDS = 20  # at most, for a first radius that is a third too small
 START_BLUR_PX = 0.9
 START_ATTENUATION = 1.5
 START_SCATTER = 0.1
 MAX_SHIFT_PX = 4.0  # of a centre, beyond which the fit has lost its bead
 RADIUS_SD = 0.01  # of the radius of a shadow: what profile and distortion leave open
+SETTLED = 0.1 * RADIUS_SD  # change of a radius at which a profile is kept
 HELD = 1e12  # weight of a term that stays zero
 
 
@@ -71,7 +75,10 @@ def estimate_profile(
     noise = Noise(0.0, 1.0, np.ones((1, 1)))
     distance = cKDTree(uv).query(uv, k=[2])[0][:, 0] if len(uv) > 1 else np.full(1, np.inf)
     alone = np.argsort(-distance, kind='stable')[:PROFILE_BEADS]
-    for _ in range(PROFILE_ROUNDS):
+    best = profile
+    least = np.inf
+    worse = 0
+    for number in range(PROFILE_ROUNDS):
         fit = _BeadFit(
             light,
             uv=uv[alone],
@@ -80,9 +87,18 @@ def estimate_profile(
             noise=noise,
         )
         fit.plane_only = True
-        fit.run(PROFILE_STEPS)
-        place, absorbed, weight = fit.shadows()
-        profile = fit_profile(place, absorbed, weight, profile)
+        fit.run(1 if number else PROFILE_STEPS)
+        lack = fit.typical()
+        worse = 0 if lack < least else worse + 1
+        if lack < least:
+            best = profile
+            least = lack
+        if worse == PATIENCE:
+            return best
+        before = profile
+        profile = fit_profile(*fit.absorbed(), before)
+        if abs(profile.radius_px - before.radius_px) < SETTLED * profile.radius_px:
+            break
     return profile
 
 
@@ -93,14 +109,31 @@ def measure_beads(
     profile: Profile,
     noise: Noise,
     steps: int = STEPS,
+    size: np.ndarray | None = None,
 ) -> Beads:
     """Measure all beads near pixels uv (n, 2) at once, in so many Gauss-Newton steps.
 
-    The other arguments are those of `estimate_profile` and what was estimated.
+    size: (n,) of the beads, 1 for a typical one, apart from what makes the radii of equal ones
+    differ; None for equal ones. The other arguments are those of `estimate_profile` and what was
+    estimated.
     """
-    fit = _BeadFit(light, uv=uv, relative_radius=relative_radius, profile=profile, noise=noise)
+    fit = _BeadFit(light, uv, relative_radius, profile=profile, noise=noise, size=size)
     fit.run(steps)
     return fit.result()
+
+
+def lack_of_fit(
+    light: Light,
+    uv: np.ndarray,
+    relative_radius: np.ndarray,
+    profile: Profile,
+    noise: Noise,
+    size: np.ndarray,
+) -> NDArray[np.float64]:
+    """Mean squared residuals (n,) over the noise of beads of some sizes (n,)."""
+    fit = _BeadFit(light, uv, relative_radius, profile=profile, noise=noise, size=size)
+    fit.run(FIRST_STEPS)
+    return fit.misfit
 
 
 class _BeadFit(ShadowFit):
@@ -113,8 +146,15 @@ class _BeadFit(ShadowFit):
         relative_radius: np.ndarray,
         profile: Profile,
         noise: Noise,
+        size: np.ndarray | None = None,
     ) -> None:
-        self.radius = np.asarray(relative_radius, dtype=float)
+        self.stretch = np.asarray(relative_radius, dtype=float)
+        self.size = np.ones(len(uv)) if size is None else size
+        self.radius = self.stretch * self.size
+        # Sizes that differ by less than a radius is known share a table.
+        step = np.log1p(RADIUS_SD)
+        kinds, self.kind = np.unique(np.rint(np.log(self.size) / step), return_inverse=True)
+        self.shadows = Shadows([profile.sized(float(np.exp(step * one))) for one in kinds])
         reach = profile.reach_px * float(self.radius.max(initial=1.0))
         window = reach + MARGIN_PX
         super().__init__(
@@ -122,7 +162,6 @@ class _BeadFit(ShadowFit):
         )
         self.measured = np.zeros(len(uv), dtype=bool)
         self.disturbed = np.zeros(len(uv), dtype=bool)
-        self.inflation: float | None = None
         self.plane_only = False
         self._set_groups(self._near(window + reach))
         self._read(light)
@@ -163,7 +202,7 @@ class _BeadFit(ShadowFit):
             if step == steps // 2:
                 self.disturbed = self.misfit > DISTURBED * self.typical()
                 if steps >= STEPS:
-                    self._add_texture(self.misfit > self.typical())
+                    self._add_texture(self.misfit > min(self.typical(), DISTURBED))
             for (rows, _), (uv, depth, background) in zip(self.groups, moved):
                 lost = np.linalg.norm(uv - self.start[rows], axis=1) > MAX_SHIFT_PX
                 self.usable[rows[lost]] = False
@@ -206,10 +245,12 @@ class _BeadFit(ShadowFit):
             squared = (axis[None, :, None] - centre[:, 1, None, None]) ** 2 + (
                 axis[None, None, :] - centre[:, 0, None, None]
             ) ** 2
-            absorbed = self.profile.absorbed(squared * scale[:, None, None] ** 2)
+            size = self.size[bead, None, None]
+            absorbed = self.profile.absorbed(squared * scale[:, None, None] ** 2, size)
             raw *= (1 - depth[:, None, None] * absorbed).astype(np.float32)
-            away = np.linalg.norm(self.offset - centre[:, None], axis=2) * scale[:, None]
-            blurred *= 1 - depth[:, None] * self.profile.shadow(away)[0]
+            away = np.linalg.norm(self.offset - centre[:, None], axis=2)
+            away /= self.stretch[bead, None]
+            blurred *= 1 - depth[:, None] * self.shadows.shadow(away, self.kind[bead])[0]
         out = np.empty_like(blurred)
         for number, image in enumerate(raw):
             out[number] = grid.blurred(image)
@@ -219,12 +260,12 @@ class _BeadFit(ShadowFit):
         """Light (g, m) and its derivatives (g, OWN + 3 k, m), of single precision."""
         everyone = np.concatenate([rows[:, None], near], axis=1)
         there = everyone >= 0
-        scale = (1 / self.radius[everyone]).astype(np.float32)[..., None]
+        scale = (1 / self.stretch[everyone]).astype(np.float32)[..., None]
         centre = (self.middle[rows, None] - self.uv[everyone]).astype(np.float32)
         x = centre[..., :1] + self.offset[:, 0].astype(np.float32)
         y = centre[..., 1:] + self.offset[:, 1].astype(np.float32)
         distance = np.sqrt(x * x + y * y)
-        shadow, slope = self.profile.shadow(distance * scale)
+        shadow, slope = self.shadows.shadow(distance * scale, self.kind[everyone])
         shadow *= there[..., None]
         slope *= there[..., None] * scale / np.maximum(distance, 1e-6)
         depth = self.depth[everyone].astype(np.float32)[..., None]
@@ -259,27 +300,19 @@ class _BeadFit(ShadowFit):
         self, rows: np.ndarray, near: np.ndarray, equations: NormalEquations, final: bool
     ) -> np.ndarray:
         if final:
-            self._precision(rows, equations.matrix, equations.weighted)
+            self._note_precision(rows, equations)
+            self.measured[rows] = self.usable[rows] & np.isfinite(self.sigma[rows])
         return np.linalg.solve(equations.matrix, equations.right[..., None])[..., 0]
 
-    def _precision(self, rows: np.ndarray, normal: np.ndarray, weighted: np.ndarray) -> None:
-        """Note standard deviations of centres."""
-        covariance = np.linalg.inv(normal)[:, TERMS : TERMS + 2, TERMS : TERMS + 2]
-        variance = 0.5 * np.trace(covariance, axis1=1, axis2=2)
-        self.sigma[rows] = np.sqrt(np.maximum(variance, 0))
-        self.measured[rows] = self.usable[rows] & np.isfinite(variance)
-        if len(weighted) and self.inflation is None:
-            # The influence of each pixel on a centre: noise of neighbouring pixels adds up.
-            influence = np.linalg.solve(normal[:20], weighted[:20])[:, TERMS]
-            self.inflation = _inflation(influence, self.offset, self.noise)
-
-    def shadows(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def absorbed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Distances [px] of pixels from beads, absorbed shares there, and weights (n,)."""
         plane = self._plane(np.arange(len(self.uv)))
         away = self.middle[:, None] + self.offset - self.uv[:, None]
         distance = np.hypot(away[..., 0], away[..., 1]) / self.radius[:, None]
         known = self.valid & (self.grey > self.low) & (self.grey < self.high)
-        good = known & (self.measured & (self.misfit < 4 * np.median(self.misfit)))[:, None]
+        good = (
+            known & (self.measured & (self.misfit < UNDISTURBED * np.median(self.misfit)))[:, None]
+        )
         weight = plane / np.maximum(np.median(plane), 1e-9)
         return distance[good], (1 - self.grey / plane)[good], weight[good]
 
@@ -287,8 +320,11 @@ class _BeadFit(ShadowFit):
         """Return what was measured."""
         measured = self.measured & np.isfinite(self.uv).all(axis=1)
         typical = float(np.median(self.misfit[measured])) if measured.any() else 1.0
-        beads = self._beads(measured, typical, self.inflation or 1.0)
-        return replace(beads, sigma=np.hypot(beads.sigma, self._moved_by_radius()))
+        beads = self._beads(measured, typical)
+        return replace(
+            beads,
+            sigma=np.hypot(beads.sigma, self._moved_by_radius()),
+        )
 
     def _moved_by_radius(self) -> NDArray[np.float64]:
         """Standard deviations (n,) of centres from that of the radius, 0 for beads alone.
@@ -300,22 +336,3 @@ class _BeadFit(ShadowFit):
         angle = np.arccos(np.clip(self.distance / (2 * radius), 0, 1))
         moved = 2 * np.sin(angle) / (np.pi - angle - 0.5 * np.sin(2 * angle))
         return np.asarray(RADIUS_SD * radius * moved / np.sqrt(2))
-
-
-def _inflation(influence: np.ndarray, offset: np.ndarray, noise: Noise) -> float:
-    """Factor on the variance of a centre for correlated noise.
-
-    influence (g, m) of the pixels of windows with offsets (m, 2).
-    """
-    half = int(np.abs(offset).max())
-    image = np.zeros((len(influence), 2 * half + 1, 2 * half + 1))
-    image[:, offset[:, 1] + half, offset[:, 0] + half] = influence
-    lags = len(noise.correlation) // 2
-    total = 0.0
-    for row in range(-lags, lags + 1):
-        for column in range(-lags, lags + 1):
-            value = noise.correlation[row + lags, column + lags]
-            if value:
-                shifted = np.roll(image, (row, column), axis=(1, 2))
-                total += value * float(np.sum(image * shifted))
-    return max(total / max(float(np.sum(image * image)), 1e-300), 1.0)

@@ -43,7 +43,7 @@ def draw_overlay(image: np.ndarray, extraction: Extraction | None, reason: str =
         except DataError:
             pass  # the reason says it
         return _labelled(picture, [(reason or 'refused', REFUSED)])
-    radius = extraction.profile.reach_px
+    radius = extraction.imaging.profile.reach_px
     explained = np.linalg.norm(
         extraction.detections.uv[:, None] - extraction.match.predicted[None], axis=2
     )

@@ -11,7 +11,8 @@ All windows of an image take their Gauss-Newton steps at once.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import cv2
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 
-from .light import Cosines, Noise
+from .light import MIN_PIXELS, Cosines, Noise, correlation_of
 
 MAX_SIGMA_PX = 0.3  # of a centre: a larger one is that of no shadow, or of one hardly seen
 MARGIN_PX = 2.0  # of background around the shadow
@@ -31,10 +32,13 @@ NEIGHBOUR_SD = 0.2  # of a step of a neighbour's depth
 DEPTH_SD = 1.0  # of the depth of a shadow, 1 for the profile
 DEPTHS = (0.05, 3.0)  # bounds; a shadow takes light away
 MIN_PASSED = 0.02  # of the light, behind a bead: derivatives are divided by it
-MIN_PIXELS = 0.6  # of a window that lie in the field
+MIN_INSIDE = 0.6  # of a window that lies in the field
 FINE = 3  # points across a pixel of the grid on which shadows that touch are blurred
 OVERLAP = 0.85  # times both reaches; shadows that are nearer overlap
 DISTURBED = 1.6  # lack of fit from which pixels with large residuals count less
+CORRELATED = 60  # windows that tell the correlation of the noise
+INFLUENCES = 20  # beads of whose pixels the influence is computed
+UNDISTURBED = 4.0  # times the median lack of fit, of a window without anything else
 ROBUST = 2.5  # residual of half weight [standard deviations of the noise]
 
 # Rows of beads (g,) and of their neighbours (g, k), -1 for none.
@@ -88,8 +92,11 @@ class NormalEquations:
     """Normal equations of some windows, for steps of u = 6 + 3 + 3 k unknowns."""
 
     matrix: NDArray[np.float64]  #: (g, u, u)
+    plain: NDArray[np.float64]  #: (g, u, u), with a background that is no more than the polynomial
     right: NDArray[np.float64]  #: (g, u)
     weighted: np.ndarray  #: (g, u, m), derivatives of the pixels times their weights
+    residual: np.ndarray  #: (g, m), of the pixels, over their standard deviations; 0 for invalid
+    valid: np.ndarray  #: (g, m)
 
 
 @lru_cache(maxsize=32)
@@ -152,7 +159,9 @@ class ShadowFit(ABC):
         self.basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
         n = len(self.uv)
         self.background = np.zeros((n, TERMS))
-        self.sigma = np.full(n, np.inf)
+        self.sigma = np.full(n, np.inf)  # of centres, where the noise of pixels is independent
+        self.noise_sigma = np.full(n, np.inf)  # the part of it that comes from the noise
+        self.inflation: float | None = None  # factor on the variances of that part
         self.misfit = np.full(n, np.inf)
         self.distance = np.full(n, np.inf)  # of the nearest bead
         self.low = -np.inf  # at which grey values are clipped
@@ -168,7 +177,7 @@ class ShadowFit(ABC):
         """
         self.grey = grey.astype(self.settings.dtype)
         self.valid = valid
-        self.usable = valid.mean(axis=1) >= MIN_PIXELS
+        self.usable = valid.mean(axis=1) >= MIN_INSIDE
         place = int(0.75 * len(self.offset))
         self.background[:, 0] = np.partition(bright, place, axis=1)[:, place]
 
@@ -260,8 +269,10 @@ class ShadowFit(ABC):
         right = (weighted @ residual.astype(dtype)[..., None])[..., 0].astype(float)
         expected = self.expected_depth[rows]
         right[:, TERMS + 2] -= prior[:, TERMS + 2] * (self.depth[rows] - expected)
+        plain = normal
         textured = np.flatnonzero(self.strength[rows])
         if len(textured):
+            plain = normal.copy()
             taken = self.cosines.eliminated(
                 self.strength[rows[textured]],
                 relative=jacobian[textured, 0],
@@ -273,7 +284,8 @@ class ShadowFit(ABC):
             right[textured] -= taken[1]
             total[textured] -= taken[2]
         self.misfit[rows] = total / np.maximum(valid.sum(axis=1) - OWN, 1)
-        return NormalEquations(normal, right, weighted)
+        standardised = np.sqrt(squared) * np.sign(residual)
+        return NormalEquations(normal, plain, right, weighted, standardised, valid)
 
     def _add_texture(self, chosen: NDArray[np.bool_]) -> None:
         """Give some beads (n,) a background beyond the polynomial, as strong as pixels say."""
@@ -284,11 +296,16 @@ class ShadowFit(ABC):
             light, jacobian = self._model(rows, near)
             grey = self.grey[rows]
             valid = self._valid(rows, grey, light)
-            self.strength[rows] = self.cosines.strengths(
-                jacobian[:, 0],
-                jacobian=jacobian,
-                weight=valid / (self.noise.variance(light) * self.typical()),
-                residual=grey - light,
+            typical = self.typical()
+            # In units in which the weights of the fit are right.
+            self.strength[rows] = (
+                self.cosines.strengths(
+                    jacobian[:, 0],
+                    jacobian=jacobian,
+                    weight=valid / (self.noise.variance(light) * typical),
+                    residual=grey - light,
+                )
+                / typical
             )
 
     @cached_property
@@ -326,25 +343,79 @@ class ShadowFit(ABC):
         half = len(values) // 2
         return float(values[half] if len(values) % 2 else values[half - 1 : half + 1].mean())
 
-    def _beads(self, measured: np.ndarray, typical: float, inflation: float) -> Beads:
-        """Return what was measured, given the usual lack of fit and the inflation of variances."""
+    def _note_precision(self, rows: np.ndarray, equations: NormalEquations) -> np.ndarray:
+        """Note standard deviations of centres; return the covariances (g, u, u)."""
+        inverse = np.linalg.inv(equations.matrix)
+        self.sigma[rows] = self.noise_sigma[rows] = _sd_of_centre(inverse)
+        textured = np.flatnonzero(self.strength[rows])
+        if len(textured):
+            self.noise_sigma[rows[textured]] = _sd_of_centre(
+                np.linalg.inv(equations.plain[textured])
+            )
+        if self.inflation is None:
+            # The influence of pixels on a centre: noise of neighbouring pixels adds up.
+            plain = equations.plain[:INFLUENCES]
+            influence = np.linalg.solve(plain, equations.weighted[:INFLUENCES])[:, TERMS]
+            self.inflation = self._inflation(influence, self._correlation(rows, equations))
+        return inverse
+
+    def _images(self, windows: np.ndarray) -> np.ndarray:
+        """Square images (g, w, w) of round windows (g, m)."""
+        half = int(np.abs(self.offset).max())
+        images = np.zeros((len(windows), 2 * half + 1, 2 * half + 1))
+        images[:, self.offset[:, 1] + half, self.offset[:, 0] + half] = windows
+        return images
+
+    def _correlation(self, rows: np.ndarray, equations: NormalEquations) -> np.ndarray:
+        """Correlation of the noise where nothing but beads is, that of the image where it is not.
+
+        The background between beads that are dense contains their shadows.
+        """
+        plain = self.strength[rows] == 0
+        plain &= self.misfit[rows] < UNDISTURBED * self.typical()
+        chosen = np.flatnonzero(plain)[:CORRELATED]
+        if not len(chosen) or equations.valid[chosen].sum() < MIN_PIXELS:
+            return self.noise.correlation
+        residual, valid = (
+            self._images(one[chosen]) for one in (equations.residual, equations.valid)
+        )
+        return correlation_of(residual, valid)
+
+    def _inflation(self, influence: np.ndarray, correlation: np.ndarray) -> float:
+        """Return the factor on variances for correlated noise; influence (g, m) of pixels."""
+        correlated = independent = 0.0
+        for image in self._images(influence):
+            spread = cv2.filter2D(image, cv2.CV_64F, correlation, borderType=cv2.BORDER_CONSTANT)
+            correlated += float(np.sum(image * spread))
+            independent += float(np.sum(image * image))
+        return max(correlated / max(independent, 1e-300), 1.0)
+
+    def _beads(self, measured: np.ndarray, typical: float) -> Beads:
+        """Return what was measured, given the usual lack of fit."""
         pixels = self.valid.sum(axis=1)
         pooled_freedom = self.settings.pooled
         # The noise of one window is known to some 10 %; that of all windows helps.
         pooled = (self.misfit * pixels + typical * pooled_freedom) / (pixels + pooled_freedom)
-        factor = np.sqrt(np.maximum(pooled, typical) * np.where(self.strength > 0, 1.0, inflation))
+        by_correlation = ((self.inflation or 1.0) - 1) * self.noise_sigma**2
+        factor = np.sqrt(np.maximum(pooled, typical))
         # Where shadows cross, their model is less right than its noise says.
         touching = self.distance < 2 * self.profile.radius_px
         factor = np.where(touching, self.settings.crossed * factor, factor)
         return Beads(
             self.uv.copy(),
-            self.sigma * factor,
+            np.sqrt(self.sigma**2 + by_correlation) * factor,
             depth=self.depth.copy(),
             light=self.background[:, 0].copy(),
             misfit=self.misfit / max(typical, 1e-12),
             overlapped=self.distance < 2 * self.profile.reach_px * OVERLAP,
             measured=measured,
         )
+
+
+def _sd_of_centre(covariance: np.ndarray) -> np.ndarray:
+    """Standard deviations (g,) of a coordinate of centres, from covariances (g, u, u)."""
+    variance = 0.5 * (covariance[:, TERMS, TERMS] + covariance[:, TERMS + 1, TERMS + 1])
+    return np.sqrt(np.maximum(variance, 0))
 
 
 # Shadow of a sphere in an image: attenuated light, blurred, as a function of the distance.
@@ -369,31 +440,60 @@ class Profile:
     blur_px: float  #: standard deviation
     attenuation: float  #: along the radius: coefficient times radius
     scatter: float = 0.0  #: share of the light that is not attenuated
-    _table: np.ndarray = field(init=False, repr=False, compare=False)
-    _by_dtype: dict[np.dtype, tuple[np.ndarray, ...]] = field(
-        default_factory=dict, init=False, repr=False, compare=False
-    )
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, '_table', _tabulated(self))
 
     @property
     def reach_px(self) -> float:
         """Distance from the centre at which the shadow has ended [px]."""
         return self.radius_px + REACH_SIGMAS * self.blur_px
 
-    def absorbed(self, squared: np.ndarray) -> np.ndarray:
-        """Absorbed share of the light without blur at squared distances [px^2]."""
+    def sized(self, size: float) -> Profile:
+        """Return the profile of a bead of another relative size, which absorbs more, or less."""
+        attenuation = self.attenuation * size
+        return Profile(self.radius_px * size, self.blur_px, attenuation, self.scatter)
+
+    def absorbed(self, squared: np.ndarray, size: np.ndarray | float = 1.0) -> np.ndarray:
+        """Absorbed share of the light without blur at squared distances [px^2].
+
+        size: relative ones, of which squared distances are multiples of their squares.
+        """
         chord = 2 * np.sqrt(np.maximum(self.radius_px**2 - squared, 0)) / self.radius_px
-        return 1 - np.exp(-self.attenuation * chord)
+        return 1 - np.exp(-self.attenuation * size * chord)
 
     def shadow(self, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Absorbed share of the light at distances [px], and its derivative [1/px]."""
+        return self._tables.shadow(distance)
+
+    @cached_property
+    def _tables(self) -> Shadows:
+        return Shadows([self])
+
+
+class Shadows:
+    """Tables of the shadows of beads of one or of several profiles."""
+
+    def __init__(self, profiles: Sequence[Profile]) -> None:
+        tables = [_tabulated(one) for one in profiles]
+        ends = np.cumsum([table.shape[1] for table in tables])
+        self._first = np.concatenate([[0], ends[:-1]])
+        self._last = ends - 2
+        self._table = np.concatenate(tables, axis=1)
+        self._by_dtype: dict[np.dtype, tuple[np.ndarray, ...]] = {}
+
+    def shadow(
+        self, distance: np.ndarray, profile: np.ndarray | int = 0
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Absorbed share of the light at distances [px] (..., m), and its derivative [1/px].
+
+        profile: (...,), which of the profiles.
+        """
         value, slope, to_value, to_slope = self._tables(distance.dtype)
+        first = np.asarray(self._first[profile])[..., None]
+        last = np.asarray(self._last[profile])[..., None] - first
         position = distance * distance.dtype.type(1 / TABLE_STEP)
-        np.minimum(position, distance.dtype.type(len(value) - 2), out=position)
+        np.minimum(position, last.astype(distance.dtype), out=position)
         index = position.astype(np.intp)
         position -= index.astype(distance.dtype)
+        index += first
         absorbed = to_value.take(index)
         absorbed *= position
         absorbed += value.take(index)

@@ -27,8 +27,6 @@ PRIOR_SD = (0.01, 0.012, 0.03, 0.008, 0.008, 0.003, 0.003)
 TAIL = 2.5  # residual, in robust standard deviations, at which the weight is halved
 POSE = 7  # unknowns before the coefficients: rotation, shift, log of the principal distance
 DAMPING = 1e-6
-SMOOTHING = 8  # matched neighbours whose residuals correct a prediction
-SMOOTHING_PRIOR = 2.0  # neighbours of residual 0 among them
 
 
 @dataclass(frozen=True)

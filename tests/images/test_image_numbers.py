@@ -16,7 +16,6 @@ from fluoro_calib_ros.images.growth import (
     _good_cells,
     _turn_to,
     pairs,
-    smoothed,
     supported,
 )
 from fluoro_calib_ros.images.lattice import _basis
@@ -64,21 +63,6 @@ def test_smallest_rotation_takes_the_axis_to_a_ray(ray):
     np.testing.assert_allclose(turn @ [0, 0, 1], ray / np.linalg.norm(ray), atol=1e-12)
     across = np.cross([0, 0, 1], ray)
     np.testing.assert_allclose(turn @ across, across, atol=1e-12)
-
-
-def test_residuals_are_those_of_neighbours_without_the_own():
-    xyz = np.column_stack([np.arange(30.0), np.zeros((30, 2))])
-    view = Fake(project=lambda x: x[:, :2])
-    bead = np.arange(0, 30, 2)
-    shift = np.array([0.4, -0.2])
-    uv = xyz[bead, :2] + shift
-    found = smoothed(view, xyz, bead, uv)
-    assert (found[:, 0] > 0.2).all() and (found[:, 0] < 0.4).all() and (found[:, 1] < 0).all()
-    np.testing.assert_allclose(found[:, 1], -0.5 * found[:, 0])
-    uv[5] += 50
-    spoilt = smoothed(view, xyz, bead, uv)
-    np.testing.assert_allclose(spoilt[10], found[10])
-    assert 0 < np.abs(spoilt - found).max() < 0.3
 
 
 def test_beads_are_supported_by_most_of_their_neighbours():
@@ -149,27 +133,28 @@ def test_beads_that_stray_or_are_vague_are_refused_by_the_scatter_of_the_others(
     n = 12
     off = np.full(n, 0.1)
     off[3] = 5.0
-    sigma = np.full(n, 0.05)
-    sigma[7] = 1.01 * extraction.MAX_SIGMAS * 0.05
-    sigma[8] = 0.99 * extraction.MAX_SIGMAS * 0.05
+    sigma = np.full(n, 0.06)
+    sigma[7] = 1.01 * extraction.MAX_SIGMAS * 0.06
+    sigma[8] = 0.99 * extraction.MAX_SIGMAS * 0.06
     predicted = np.arange(2.0 * n).reshape(n, 2)
     one = Fake(uv=predicted + np.outer(off, [0.6, 0.8]), sigma=sigma, overlapped=np.zeros(n, bool))
-    measured = (np.arange(n), one, [None] * n, predicted)
-    imaging = extraction._Imaging(None, 'profile')
-    found = extraction._checked(None, None, None, measured, imaging)
+    sd_px = np.linspace(0.06, 0.1, n)
+
+    def checked():
+        measured = extraction._Measured(np.arange(n), one, [None] * n, predicted, sd_px)
+        return extraction._checked(None, None, None, measured, 'imaging')
+
+    found = checked()
     assert found.bead.tolist() == [k for k in range(n) if k not in (3, 7)]
     assert [refusal.bead for refusal in found.refused] == [3, 7]
     kinds = [refusal.finding.kind for refusal in found.refused]
     assert kinds == [Kind.BEAD_AWAY, Kind.BEAD_UNSURE]
     assert found.refused[0].finding.numbers['off_px'] == pytest.approx(5)
-    scatter = max(0.1 / np.sqrt(2 * np.log(2)), extraction.MIN_SCATTER_PX)
-    limit = extraction.RESIDUAL_SIGMAS * np.hypot(scatter, 0.05)
+    limit = extraction.RESIDUAL_SIGMAS * np.hypot(sd_px[3], 0.06)
     for part, is_kept in ((0.98, True), (1.02, False)):
         off[3] = part * limit
         one.uv = predicted + np.outer(off, [0.6, 0.8])
-        measured = (np.arange(n), one, [None] * n, predicted)
-        found = extraction._checked(None, None, None, measured, imaging)
-        assert (3 in found.bead) is is_kept
+        assert (3 in checked().bead) is is_kept
 
 
 def test_beads_of_a_line_start_where_they_were_found_alone():
@@ -177,16 +162,12 @@ def test_beads_of_a_line_start_where_they_were_found_alone():
     rows = np.arange(4)
     bead = np.array([0, 1, 3])
     uv = np.array([[1.0, 1], [31, 1], [81, 1]])
-    start = extraction._starts(predicted, rows, bead, uv, Fake(radius_px=2.0))
-    assert start.tolist() == [[1, 1], [30, 0], [33, 0], [81, 1]]
-
-
-@pytest.mark.parametrize('diameter', [None, np.array([2.0, 2, 4, 2, 2])])
-def test_radius_of_a_shadow_is_by_depth_and_diameter(diameter):
-    view = Fake(depth=lambda xyz: np.array([500.0, 1000, 1000, 2000, -3]))
-    found = extraction._relative_radius(view, Fake(xyz=None, diameter_mm=diameter))
-    expected = [2, 1, 1 if diameter is None else 2, 0.5, 1]
-    assert found == pytest.approx(expected)
+    depth = np.array([500.0, 1000, 1000, 2000, -3])
+    found = extraction._expected(predicted, rows, bead, uv, Fake(radius_px=2.0), depth)
+    assert found.uv.tolist() == [[1, 1], [30, 0], [33, 0], [81, 1]]
+    assert found.seen.tolist() == [True, True, False, True]
+    assert found.alone.tolist() == [True, False, False, True]
+    assert found.radius.tolist() == [2, 1, 1, 0.5]
 
 
 # ---- markers in motion

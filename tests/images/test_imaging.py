@@ -1,0 +1,120 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The shadow of a typical bead, and the sizes of all, are told by an image."""
+
+import cv2
+import numpy as np
+import pytest
+
+from fluoro_calib_ros.images.detection import field_of_view
+from fluoro_calib_ros.images.imaging import Expected, Imaging, first_imaging
+from fluoro_calib_ros.images.light import Light, estimate_noise
+from fluoro_calib_ros.images.measurement import measure_beads
+
+FINE = 4  # points across a pixel
+PITCH = 60
+ABSORBED = 0.1  # along a pixel of steel
+
+
+def image_of(radii: np.ndarray, blur_px: float, seed: int = 5) -> tuple[np.ndarray, np.ndarray]:
+    """Radiograph (h, w) of spheres of some radii [px], and their centres (n, 2) [px]."""
+    rng = np.random.default_rng(seed)
+    across = int(np.ceil(np.sqrt(len(radii))))
+    size = PITCH * across
+    row, column = np.divmod(np.arange(len(radii)), across)
+    uv = PITCH * (np.column_stack([column, row]) + 0.5) + rng.uniform(-3, 3, (len(radii), 2))
+    v, u = (np.mgrid[: FINE * size, : FINE * size] + 0.5) / FINE - 0.5
+    depth = np.zeros(u.shape)
+    for (x, y), radius in zip(uv, radii):
+        depth += 2 * np.sqrt(np.maximum(radius**2 - (u - x) ** 2 - (v - y) ** 2, 0))
+    light = cv2.GaussianBlur(900 * np.exp(-ABSORBED * depth), (0, 0), FINE * blur_px)
+    light = light.reshape(size, FINE, size, FINE).mean(axis=(1, 3))
+    return rng.poisson(light).astype(np.float32), uv
+
+
+def completed(
+    radii: np.ndarray, size: np.ndarray | None, radius_px: float, blur_px: float = 1.2
+) -> tuple[Imaging, Light, np.ndarray]:
+    """What an image of spheres tells, the image, and the centres of the spheres."""
+    image, uv = image_of(radii, blur_px)
+    light = Light(image, np.ones(image.shape, bool))
+    n = len(uv)
+    size = np.full(n, np.nan) if size is None else size
+    shadows = Expected(np.arange(n), uv, np.ones(n), np.ones(n, bool), np.ones(n, bool))
+    noise = estimate_noise(image, light.field)
+    return first_imaging(light, noise, shadows, radius_px, size=size), light, uv
+
+
+@pytest.mark.parametrize('radius_px', [6.0, 11.0])
+def test_profile_does_not_depend_on_the_first_radius(radius_px):
+    imaging, *_ = completed(np.full(30, 10.0), None, radius_px)
+    assert imaging.profile.radius_px == pytest.approx(10, abs=0.15)
+    assert imaging.profile.blur_px == pytest.approx(1.2, abs=0.15)
+    assert (imaging.size == 1).all()
+
+
+@pytest.mark.parametrize('radius_px', [5.5, 8.0])
+def test_sizes_that_are_not_told_are_seen(radius_px):
+    radii = np.tile([5.5, 8.0, 8.0, 10.5], 9)
+    imaging, *_ = completed(radii, None, radius_px)
+    size = imaging.size / np.median(imaging.size[radii == 8])
+    np.testing.assert_allclose(size, radii / 8, rtol=0.05)
+
+
+@pytest.mark.parametrize('told', [True, False])
+def test_centres_of_beads_of_several_sizes_are_as_good_as_their_sigma(told):
+    radii = np.tile([5.5, 8.0, 10.5], 12)
+    imaging, light, uv = completed(radii, radii / 8 if told else None, 8.0)
+    beads = measure_beads(
+        light,
+        uv + 0.2,
+        np.ones(len(uv)),
+        profile=imaging.profile,
+        noise=imaging.noise,
+        size=imaging.size,
+    )
+    off = (beads.uv - uv) / beads.sigma[:, None]
+    assert 0.75 < np.sqrt(np.mean(off**2)) < 1.3
+    assert (np.abs(beads.depth - 1) < 0.2).all()
+    assert beads.misfit.max() < 1.5
+
+
+def test_centres_in_a_compressed_image_are_as_good_as_their_sigma():
+    off = []
+    error = []
+    for seed in range(2):
+        image, uv = image_of(np.full(36, 7.5), 1.2, seed)
+        _, data = cv2.imencode('.jpg', np.clip(image / 5, 0, 255), [cv2.IMWRITE_JPEG_QUALITY, 15])
+        image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE).astype(np.float32)
+        light = Light(image, np.ones(image.shape, bool))
+        noise = estimate_noise(image, light.field)
+        shadows = Expected(np.arange(36), uv, np.ones(36), np.ones(36, bool), np.ones(36, bool))
+        imaging = first_imaging(light, noise, shadows, 7.0, size=np.ones(36))
+        beads = measure_beads(light, uv + 0.2, np.ones(36), profile=imaging.profile, noise=noise)
+        error.append(beads.uv - uv)
+        off.append(error[-1] / beads.sigma[:, None])
+    assert np.sqrt(np.mean(np.square(error))) < 0.2
+    assert 0.7 < np.sqrt(np.mean(np.square(off))) < 1.3
+
+
+def test_something_beside_a_few_beads_is_no_other_size():
+    image, uv = image_of(np.full(36, 8.0), 1.2)
+    image[40:, :60] *= 0.8  # the edge of a plate, across the first beads of the rows
+    light = Light(image, np.ones(image.shape, bool))
+    shadows = Expected(np.arange(36), uv, np.ones(36), np.ones(36, bool), np.ones(36, bool))
+    noise = estimate_noise(image, light.field)
+    imaging = first_imaging(light, noise, shadows, 8.0, size=np.full(36, np.nan))
+    assert (imaging.size == 1).all()
+
+
+def test_field_of_view_goes_on_beyond_a_plate_and_ends_before_letters():
+    v, u = np.mgrid[:400, :400]
+    light = 180.0 * (np.hypot(u - 200, v - 200) < 170).astype(np.float32)
+    cut = light.copy()
+    cut[np.abs(u - v + 150) < 20] *= 0.08
+    both = np.hypot(u - 200, v - 200) < 155
+    assert field_of_view(cut, 3.0)[both].all()
+    light[370:392, 20:110] = 180
+    assert field_of_view(light, 3.0)[both].all()
+    assert not field_of_view(light, 3.0)[360:, :120].any()

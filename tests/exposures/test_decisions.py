@@ -26,7 +26,7 @@ from fluoro_calib_ros.io.phantom import write_phantom
 from fluoro_calib_ros.jobs.result_folder import save_result
 from fluoro_calib_ros.jobs.sources import read_source
 
-OPTIONS = {'model': 'parametric', 'max_iterations': 3}
+OPTIONS = {'max_iterations': 2}
 
 
 def frame(number, ids, sigma=True):

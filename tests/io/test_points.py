@@ -989,7 +989,7 @@ def test_damaged_files_are_refused_in_one_sentence(tmp_path, kind):
     rng = np.random.default_rng(7)
     for path in map(pathlib.Path, written.paths):
         whole = path.read_bytes()
-        for _ in range(8):
+        for _ in range(1 if kind == 'sleap' else 8):  # which is read by a program
             for damaged in _damaged(whole, rng):
                 path.write_bytes(damaged)
                 for as_kind in (None, kind):

@@ -28,7 +28,7 @@ from fluoro_calib_ros.report.figures import MAX_VECTORS, new_figure, svg_bytes
 from fluoro_calib_ros.report.residuals import position_figure
 from fluoro_calib_ros.report.rig_geometry import beams, phantom_distance
 
-OPTIONS = {'model': 'parametric', 'max_iterations': 3}
+OPTIONS = {'max_iterations': 2}
 MAX_BYTES = 5_000_000
 
 

@@ -271,6 +271,17 @@ def test_opencv_reads_the_file_itself(tmp_path):
     assert int(storage.getNode('image_width').real()) == SIZE[0]
 
 
+@pytest.mark.parametrize(
+    'matrix',
+    ['K2: 5', 'K: !!opencv-matrix\n   rows: 2\n   cols: 3\n   dt: d\n   data: [1,0,5,0,1,5]'],
+)
+def test_file_of_opencv_without_a_camera_matrix_is_refused(tmp_path, matrix):
+    path = tmp_path / 'a_opencv.yaml'
+    path.write_text(f'%YAML:1.0\n---\n{matrix}\n')
+    with pytest.raises(DataError, match='there is no camera_matrix of 3 x 3 numbers'):
+        registry.read(path, MM, 'opencv')
+
+
 def changed(lines, row, text):
     return [*lines[: row - 1], text, *lines[row:]]
 

@@ -108,7 +108,7 @@ def other_view_missing():
 
 
 def wrong_given_interior():
-    calibration = calibrated('a', 5, model='parametric').calibrations['a']
+    calibration = calibrated('a', 6, max_iterations=2).calibrations['a']
     held = replace(calibration, rmse_after=np.array([3.0, 3.0]))
     evidence = Fake(
         calibrations={'a': held}, request=Fake(options=Fake(interior_sd=(1.0, 1.0, 1.0)))
@@ -118,7 +118,7 @@ def wrong_given_interior():
 
 def no_validation():
     few = [replace(f, target_id=f.target_id[:5], uv=f.uv[:5]) for f in frames()]
-    calibrations = calibrated('a', 5, model='parametric').calibrations
+    calibrations = calibrated('a', 6, max_iterations=2).calibrations
     return validate_or_report(CalibrationRequest({'a': few}, PHANTOM), calibrations).checks[0]
 
 
@@ -267,7 +267,7 @@ def no_pose():
 
 
 def principal_distance():
-    calibration = calibrated('a', 5, model='parametric').calibrations['a']
+    calibration = calibrated('a', 6, max_iterations=2).calibrations['a']
     with mock.patch.object(plausibility, '_interior_about_middle', lambda _: (0, 0, 9000.0)):
         return plausibility._wrong_given_distance(calibration)
 

@@ -9,7 +9,6 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..correction.fluoroscope_calibration import Calibrations
 from ..errors import DataError
 from ..findings import first_few
 from .arguments import (
@@ -26,7 +25,7 @@ from .arguments import (
 from .output import ProgressBar, print_note, print_notes, print_result
 
 if TYPE_CHECKING:
-    from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+    from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
     from ..io.image_writing import CorrectedImages
 
 NAME = 'correct'

@@ -11,7 +11,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from ..correction.fluoroscope_calibration import Calibrations
 from ..errors import DataError
 from ..exposures.frame import Frames
 from .arguments import (
@@ -30,6 +29,7 @@ from .arguments import (
 from .output import print_notes, print_result, print_step, print_unpaired
 
 if TYPE_CHECKING:
+    from ..correction.fluoroscope_calibration import Calibrations
     from ..estimation.options import CalibrationRequest
 
 NAME = 'validate'

@@ -28,7 +28,6 @@ from .terms import CUBIC, ring_coefficients
 MARGIN = 1.3  # size of the rectangle of the sines, which vanish at its border, over the image
 RING_DEGREE = CUBIC + 2  # of the first radial polynomial beyond a cubic trend
 PREDICTION_CHUNK = 20_000  # pixels for which a series is evaluated at once
-PREDICTION_VALUES = 20_000_000  # of functions at these pixels, to bound the memory
 
 
 @dataclass(frozen=True)
@@ -237,16 +236,38 @@ class Series:
         return Series(both, total.reshape(2, -1), np.hypot(self.sd, other.sd))
 
     def predict(self, uv: ArrayLike) -> NDArray[np.float64]:
-        """Corrections (n, 2) [px] at pixels uv (n, 2)."""
-        return self.functions(uv) @ self.coefficients.T
+        """Corrections (n, 2) [px] at pixels uv (n, 2).
+
+        All functions are products of one along u and one along v: few of them are evaluated.
+        """
+        x, y = self.functions._coordinates(uv)
+        out = np.zeros((len(x), 2))
+        powers, sines = self._by_axes
+        of_axes = (np.vander(a, powers.shape[1], increasing=True) for a in (x, y))
+        for coefficients, (of_x, of_y) in (
+            (powers, of_axes),
+            (sines, self.functions._waves_of_both(x, y)),
+        ):
+            for column, matrix in zip(out.T, coefficients):
+                column += np.einsum('ni,ni->n', of_x @ matrix, of_y)
+        return out
+
+    @cached_property
+    def _by_axes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Coefficients (2, i, j) of powers, and of sines, along u times those along v."""
+        functions, coefficients = self.functions.as_polynomials(self.coefficients)
+        powers = np.zeros((2, functions.degree + 1, functions.degree + 1))
+        for (i, j), column in zip(functions.powers, coefficients.T):
+            powers[:, i, j] = column
+        sines = np.zeros((2, functions.modes, functions.modes))
+        i, j = functions._sines.T - 1
+        sines[:, i, j] = coefficients[:, functions.trend :]
+        return powers, sines
 
     def predict_in_chunks(self, uv: np.ndarray) -> NDArray[np.float64]:
         """Corrections (n, 2) [px] at many pixels uv (n, 2), with bounded memory."""
-        size = min(PREDICTION_CHUNK, max(1, PREDICTION_VALUES // max(1, len(self.functions))))
-        starts = range(0, len(uv), size)
-        return np.concatenate(
-            [self.predict(uv[i : i + size]) for i in starts] or [np.zeros((0, 2))]
-        )
+        starts = range(0, max(1, len(uv)), PREDICTION_CHUNK)
+        return np.concatenate([self.predict(uv[i : i + PREDICTION_CHUNK]) for i in starts])
 
     def sd_at(self, uv: ArrayLike) -> NDArray[np.float64]:
         """Standard deviations (n,) [px] of the corrections at pixels uv (n, 2), interpolated."""

@@ -101,24 +101,37 @@ def direct_linear_transformation(
     normalised (Hartley and Zisserman, algorithm 7.1). least: vectors (..., 12) that make the
     quadratic forms of matrices (..., 12, 12) small.
     """
+    return _dlt_of_weights(xyz, uv, least)(weights)
+
+
+def _dlt_of_weights(
+    xyz: np.ndarray, uv: np.ndarray, least: Callable[[np.ndarray], np.ndarray] = least_vectors
+) -> Callable[[np.ndarray | None], NDArray[np.float64]]:
+    """Return `direct_linear_transformation` of these points as a function of their weights."""
     mean_x = xyz.mean(axis=-2, keepdims=True)
     mean_u = uv.mean(axis=-2, keepdims=True)
     scale_x = np.sqrt(3 / np.mean(np.sum((xyz - mean_x) ** 2, axis=-1), axis=-1))[..., None, None]
     scale_u = np.sqrt(2 / np.mean(np.sum((uv - mean_u) ** 2, axis=-1), axis=-1))[..., None, None]
     x = (xyz - mean_x) * scale_x
     u = (uv - mean_u) * scale_u
-    rows = dlt_rows(x, u, weights)
-    vectors = least(np.swapaxes(rows, -1, -2) @ rows)
-    normalised = vectors.reshape(vectors.shape[:-1] + (3, 4))
-    to_x = np.zeros(normalised.shape[:-2] + (4, 4))
+    rows = dlt_rows(x, u, None)
+    to_x = np.zeros(xyz.shape[:-2] + (4, 4))
     to_x[..., range(3), range(3)] = scale_x[..., 0]
     to_x[..., :3, 3] = -(scale_x * mean_x)[..., 0, :]
     to_x[..., 3, 3] = 1
-    from_u = np.zeros(normalised.shape[:-2] + (3, 3))
+    from_u = np.zeros(xyz.shape[:-2] + (3, 3))
     from_u[..., [0, 1], [0, 1]] = 1 / scale_u[..., 0]
     from_u[..., :2, 2] = mean_u[..., 0, :]
     from_u[..., 2, 2] = 1
-    return from_u @ normalised @ to_x
+
+    def projections(weights: np.ndarray | None) -> NDArray[np.float64]:
+        weighted = rows
+        if weights is not None:
+            weighted = rows * np.concatenate([weights, weights], axis=-1)[..., None]
+        vectors = least(np.swapaxes(rows, -1, -2) @ weighted)
+        return from_u @ vectors.reshape(vectors.shape[:-1] + (3, 4)) @ to_x
+
+    return projections
 
 
 def decompose(projection: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -178,19 +191,20 @@ def robust_dlt(xyz: np.ndarray, uv: np.ndarray) -> NDArray[np.float64]:
     if spread[1] <= MIN_FLATNESS * spread[0]:
         raise DataError('all image points lie on one line or in one place')
     rng = np.random.default_rng(0)
-    samples = np.argsort(rng.random((SAMPLES, len(xyz))), axis=1)[:, :SAMPLE_SIZE]
+    samples = np.argpartition(rng.random((SAMPLES, len(xyz))), SAMPLE_SIZE)[:, :SAMPLE_SIZE]
     candidates = direct_linear_transformation(
         xyz[samples], uv[samples], least=least_vectors_with_last_one
     )
     squared = squared_residuals(candidates, xyz, uv)
     best = squared[np.argmin(np.median(squared, axis=1))]
     weights = np.zeros(len(xyz))
+    weighted = _dlt_of_weights(xyz, uv)
     for _ in range(DLT_ITERATIONS):
         last = weights
         weights = Noise(nu=NU).weight(best / robust_variance(best))
         if np.max(np.abs(weights - last)) < SETTLED_WEIGHTS:
             break
-        projection = direct_linear_transformation(xyz, uv, weights)
+        projection = weighted(weights)
         best = squared_residuals(projection, xyz, uv)
     return projection
 

@@ -5,7 +5,6 @@
 
 import numpy as np
 import pytest
-from scipy.signal import butter, filtfilt
 from scipy.spatial.transform import Rotation
 
 from fluoro_calib_ros.bodies.motion import (
@@ -93,6 +92,8 @@ def errors(motion, centre, turn):
 
 def best_butterworth(values, true):
     """Smallest RMS error of zero-lag Butterworth filters, whose cutoff is chosen by the truth."""
+    from scipy.signal import butter, filtfilt  # half a second, in each worker
+
     return min(
         np.sqrt(np.mean((filtfilt(*butter(2, cutoff, fs=RATE), values, axis=0) - true) ** 2))
         for cutoff in np.geomspace(2, 0.45 * RATE, 30)

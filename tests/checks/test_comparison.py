@@ -23,7 +23,7 @@ PLACE = np.array([300.0, 700.0])
 
 @functools.cache
 def base():
-    return calibrated('a', 6, model='parametric', max_iterations=2)
+    return calibrated('a', 6, max_iterations=2)
 
 
 @functools.cache

@@ -88,14 +88,10 @@ class Forked:
     returncode = property(poll)
 
 
-def use_forks(monkeypatch):
-    of_programs = SimpleNamespace(Popen=Forked, TimeoutExpired=subprocess.TimeoutExpired)
-    monkeypatch.setattr(processes, 'subprocess', of_programs)
-
-
 @pytest.fixture
 def forked(monkeypatch):
-    use_forks(monkeypatch)
+    of_programs = SimpleNamespace(Popen=Forked, TimeoutExpired=subprocess.TimeoutExpired)
+    monkeypatch.setattr(processes, 'subprocess', of_programs)
 
 
 def load_result_ids(folder):
@@ -140,7 +136,7 @@ def test_trials_are_processed_once_and_again_where_something_changed(study, fork
     assert changed_by(study, '--again') == (everything, 3)
 
 
-def test_a_trial_that_fails_does_not_stop_the_others(study, capsys, monkeypatch):
+def test_a_trial_that_fails_does_not_stop_the_others(study, capsys, forked):
     (study / 'trials' / 'walk.csv').write_text('fluoroscope,exposure,target_id,u,v\na,1,x\n')
     assert run('process', study) == 1
     err = capsys.readouterr().err
@@ -152,7 +148,6 @@ def test_a_trial_that_fails_does_not_stop_the_others(study, capsys, monkeypatch)
     assert not (study / 'results/trials/walk/points.trc').exists()
     shutil.copy(study / 'trials' / 'run.csv', study / 'trials' / 'walk.csv')
     walk = {'trials/walk/points.csv', 'trials/walk/points.trc'}
-    use_forks(monkeypatch)
     assert changed_by(study) == (walk, 3)  # what has failed is tried again
 
 

@@ -33,7 +33,7 @@ def test_sum_of_series_is_the_sum_of_their_corrections():
 
 
 def test_calibration_with_a_drift_corrects_by_it_too():
-    calibration = calibrated('a', 5).calibrations['a']
+    calibration = calibrated('a', 6, max_iterations=2).calibrations['a']
     drift = random_series(4, Functions(SIZE, 3, 4), 0.2)
     changed = with_drift(calibration, drift.functions, drift.coefficients, drift.sd)
     uv = np.random.default_rng(5).uniform(300, 700, (40, 2))
@@ -50,7 +50,7 @@ def test_calibration_with_a_drift_corrects_by_it_too():
 
 
 def test_work_grows_with_points_and_functions():
-    calibration = calibrated('a', 5).calibrations['a']
+    calibration = calibrated('a', 6, max_iterations=2).calibrations['a']
     drift = random_series(4, Functions(SIZE, 3, 4), 0.2)
     changed = with_drift(calibration, drift.functions, drift.coefficients, drift.sd).model
     plain = create_model('local_linear', 6, changed.train_uv, changed.train_duv, 0.2, 0.0)

@@ -104,7 +104,7 @@ def drawn_calibrations(of_rig, seed):
     root = np.array([[1.2, 0, 0], [0.3, 2.0, 0], [0.2, -0.2, 1.0]])
     for f in of_rig.fluoroscopes:
         out[f.name] = replace(
-            calibrated('a', 5, model='parametric').calibrations['a'],
+            calibrated('a', 6, max_iterations=2).calibrations['a'],
             fluoroscope=f.name,
             interior=f.interior + root @ rng.normal(size=3),
             interior_covariance=root @ root.T,

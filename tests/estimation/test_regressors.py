@@ -17,7 +17,6 @@ from sklearn.neighbors import KNeighborsRegressor
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import PolynomialFeatures
 from sklearn.tree import DecisionTreeRegressor
-from sklearn.utils.estimator_checks import check_estimator
 
 from fluoro_calib_ros.correction.neighbours import KnnModel, LocalLinearModel
 from fluoro_calib_ros.correction.registry import (
@@ -61,6 +60,8 @@ def training(n=600, seed=0, noise=0.2):
 
 def failed_checks_of_old_version(regressor):
     """Names of the checks of scikit-learn that an estimator fails."""
+    from sklearn.utils.estimator_checks import check_estimator
+
     failed = set()
     for estimator, check in check_estimator(regressor(), generate_only=True):
         try:
@@ -74,6 +75,8 @@ def failed_checks_of_old_version(regressor):
 
 @pytest.mark.parametrize('regressor', [KnnRegressor, LocalLinearRegressor])
 def test_regressors_pass_check_estimator(regressor):
+    from sklearn.utils.estimator_checks import check_estimator  # slow to load
+
     if 'expected_failed_checks' not in inspect.signature(check_estimator).parameters:
         failed = failed_checks_of_old_version(regressor)  # before scikit-learn 1.6
         assert failed <= {'check_sample_weights_invariance'}

@@ -26,7 +26,7 @@ from fluoro_calib_ros.io.phantom import write_phantom
 from fluoro_calib_ros.jobs.result_folder import save_result
 from fluoro_calib_ros.jobs.sources import read_source
 
-OPTIONS = {'model': 'parametric', 'max_iterations': 3}
+OPTIONS = {'max_iterations': 2}
 
 
 def frame(number, ids, sigma=True):
@@ -173,7 +173,7 @@ def test_commands_read_decisions(tmp_path, capsys):
     write_phantom(tmp_path / 'phantom.csv', rig().phantom)
     table = write(tmp_path / 'd.csv', f'a,{exposures()["a"][3].number},,,leave out')
     given = ('--phantom', tmp_path / 'phantom.csv', '--image-size', '1024x1024', '--fast')
-    given += ('--decisions', table, '--model', 'parametric', '--max-iterations', '3')
+    given += ('--decisions', table, '--max-iterations', '2')
     assert run('calibrate', tmp_path / 'seen.csv', *given, '--out', tmp_path / 'result') == 0
     assert '1 exposures and 0 further image points are left out' in capsys.readouterr().err
     with (tmp_path / 'result' / 'exposures.csv').open() as file:

@@ -21,9 +21,18 @@ from fluoro_calib_ros.io.bags.metadata import (
     TARGET_OBSERVATIONS,
     FileSpan,
     _added,
+    message_class,
     parse_profiles,
 )
-from fluoro_calib_ros.io.bags.reader import _is_restart, _pixels, _renumbered
+from fluoro_calib_ros.io.bags.reader import (
+    COMPRESSED_IMAGE,
+    IMAGE,
+    _is_restart,
+    _pixels,
+    _renumbered,
+    image_topics,
+    images_of_topic,
+)
 from fluoro_calib_ros.io.bags.recording import Recording, RecordingOptions, lost_text
 from fluoro_calib_ros.io.bags.salvage import (
     Damage,
@@ -37,6 +46,7 @@ from fluoro_calib_ros.io.bags.salvage import (
     _read_header,
     _without_partner,
 )
+from fluoro_calib_ros.io.bags.writer import BagWriter
 
 MS = 1_000_000
 
@@ -330,6 +340,35 @@ def test_rows_of_an_image_begin_after_its_step(big, first):
 def test_image_with_too_few_bytes_is_refused(wrong):
     with pytest.raises(DataError):
         _pixels(image(**wrong))
+
+
+def test_images_of_a_bag_are_those_of_a_topic_of_each_fluoroscope(tmp_path):
+    """It is the part of a name before the last, or its only one; plain images come first."""
+    stamp = message_class('builtin_interfaces/msg/Time')(3, 7)
+    header = message_class('std_msgs/msg/Header')(stamp, '')
+    grey = np.arange(6, dtype=np.uint8).reshape(2, 3)
+    plain = message_class(IMAGE)(header, 2, 3, 'mono8', 0, 3, grey.ravel())
+    damaged = message_class(IMAGE)(header, 2, 3, 'mono8', 0, 3, grey.ravel()[:5])
+    packed = message_class(COMPRESSED_IMAGE)(header, 'png', np.zeros(9, np.uint8))
+    bag = tmp_path / 'bag'
+    with BagWriter(bag) as out:
+        for topic in ('/a', '/lab/b/image_raw'):
+            for message in (plain, damaged, plain):
+                out.write(topic, IMAGE, message, 5 * 10**9)
+        for name in 'bc':
+            out.write(f'/lab/{name}/image_raw/compressed', COMPRESSED_IMAGE, packed, 5 * 10**9)
+    assert image_topics(bag) == {
+        'a': '/a',
+        'b': '/lab/b/image_raw',
+        'c': '/lab/c/image_raw/compressed',
+    }
+    first, second, third = images_of_topic(bag, '/a')
+    assert first.stamp_ns == second.stamp_ns == 3 * 10**9 + 7
+    assert first.image.tolist() == third.image.tolist() == grey.tolist()
+    assert isinstance(second.image, DataError)
+    assert second.place == f'{bag}, topic /a, message 2' and second.place in str(second.image)
+    (refused,) = images_of_topic(bag, '/lab/c/image_raw/compressed')
+    assert isinstance(refused.image, DataError) and refused.stamp_ns == 3 * 10**9 + 7
 
 
 # ---- recording

@@ -216,6 +216,13 @@ def test_mayacam1_has_five_rows(tmp_path, count):
         registry.read(path, MM, 'mayacam1')
 
 
+def test_coefficients_of_dlt_without_an_image_size_are_refused(tmp_path):
+    path = tmp_path / 'dlt.csv'
+    registry.write(path, 'dlt', Content(cameras=cameras()), MM)
+    with pytest.raises(DataError, match='do not contain the image size, --image-size WxH'):
+        registry.read(path, FileSettings(units='mm'))
+
+
 def test_dlt_gives_pixels_from_one_upwards(tmp_path):
     """By the eleven coefficients of XMALab and DLTdv: L1 X + L2 Y + L3 Z + L4 over the third."""
     path = tmp_path / 'dlt.csv'
@@ -269,6 +276,17 @@ def test_opencv_reads_the_file_itself(tmp_path):
     np.testing.assert_array_equal(storage.getNode('camera_matrix').mat(), cameras()[1].matrix)
     np.testing.assert_array_equal(storage.getNode('R').mat(), cameras()[1].rotation)
     assert int(storage.getNode('image_width').real()) == SIZE[0]
+
+
+@pytest.mark.parametrize(
+    'matrix',
+    ['K2: 5', 'K: !!opencv-matrix\n   rows: 2\n   cols: 3\n   dt: d\n   data: [1,0,5,0,1,5]'],
+)
+def test_file_of_opencv_without_a_camera_matrix_is_refused(tmp_path, matrix):
+    path = tmp_path / 'a_opencv.yaml'
+    path.write_text(f'%YAML:1.0\n---\n{matrix}\n')
+    with pytest.raises(DataError, match='there is no camera_matrix of 3 x 3 numbers'):
+        registry.read(path, MM, 'opencv')
 
 
 def changed(lines, row, text):

@@ -303,7 +303,8 @@ def test_output_file_that_is_an_input_is_refused(tmp_path):
     for name in ('bag/bag_0.mcap', 'same.csv', 'pipe', 'bag'):
         with pytest.raises(DataError, match='choose another output'):
             check_output_file(tmp_path / name, inputs)
-    for name in ('bag/points3d.csv', 'new.csv'):
+    (tmp_path / 'earlier.json').write_text('of an earlier run')
+    for name in ('bag/points3d.csv', 'new.csv', 'earlier.json'):
         check_output_file(tmp_path / name, inputs)
     assert np.all([p.exists() for p in inputs])
 

@@ -23,7 +23,7 @@ from fluoro_calib_ros.io.phantom import read_phantom
 from fluoro_calib_ros.jobs.sources import read_source, read_survey
 
 IMAGE = ('--image-size', '1024x1024')
-FAST = ('--model', 'parametric', '--max-iterations', '3', '--fast')
+FAST = ('--max-iterations', '2', '--fast')
 
 
 @pytest.fixture(scope='module')

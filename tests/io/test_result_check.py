@@ -18,7 +18,7 @@ from fluoro_calib_ros.io.result_document import write_validation
 from fluoro_calib_ros.jobs.result_folder import save_result
 from fluoro_calib_ros.report import html as html_report
 
-OPTIONS = {'model': 'parametric', 'max_iterations': 3}
+OPTIONS = {'max_iterations': 2}
 
 
 @pytest.fixture

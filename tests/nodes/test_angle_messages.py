@@ -39,7 +39,7 @@ EARLIER_HASHES = (
 
 @pytest.fixture(scope='module')
 def plain():
-    return rigs.calibrated('a', 5, model='collocation').calibrations['a']
+    return rigs.calibrated('a', 6, max_iterations=2).calibrations['a']
 
 
 @pytest.fixture(scope='module')
@@ -121,7 +121,7 @@ def test_earlier_definition_is_the_one_that_was_recorded(changes, expected):
     'model, padding', [('collocation', 0), ('knn', 0), ('knn', 4), ('none', 0), ('none', 4)]
 )
 def test_message_of_an_earlier_definition_is_read(model, padding, changes):
-    calibration = rigs.calibrated('a', 5, model=model).calibrations['a']
+    calibration = rigs.calibrated('a', 6, model=model, max_iterations=2).calibrations['a']
     calibration = replace(calibration, noise_profile=None)
     # Each empty sequence of float64 may leave four bytes at the end, of any content.
     data = earlier_bytes(calibration, changes) + b'\xff' * padding

@@ -166,6 +166,16 @@ def test_calibrations_are_prepared_one_at_a_time_and_the_last_one_stays(calibrat
     assert inbox.ended.acquire(timeout=60) and inbox.taken[-1] == 99
 
 
+def test_calibration_that_comes_while_the_thread_before_it_ends_is_prepared(calibration):
+    """That thread has found nothing more to do, but is still there."""
+    inbox = Inbox()
+    inbox.go.set()
+    inbox.calibrations._threads['a'] = threading.current_thread()
+    inbox.calibrations._work('a')
+    inbox.put(message_from_calibration(calibration))
+    assert inbox.ended.acquire(timeout=60) and len(inbox.taken) == 1
+
+
 def test_closing_does_not_wait_for_a_calibration_and_it_is_not_used(calibration):
     inbox = Inbox()
     inbox.put(message_from_calibration(calibration))

@@ -565,7 +565,7 @@ def recording(count=3, **change):
     """Frames of fluoroscopes a and b with three targets, calibrations, Intersector and truth."""
     rig = virtual_rig(1)
     calibrations = {
-        name: calibrated(name, 5, model='parametric').calibrations[name] for name in ('a', 'b')
+        name: calibrated(name, 6, max_iterations=2).calibrations[name] for name in ('a', 'b')
     }
     orientation = replace(
         orientation_of(), calibration_ids=tuple(c.calibration_id for c in calibrations.values())

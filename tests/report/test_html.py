@@ -9,6 +9,7 @@ import json
 import re
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -28,7 +29,7 @@ from fluoro_calib_ros.report.figures import MAX_VECTORS, new_figure, svg_bytes
 from fluoro_calib_ros.report.residuals import position_figure
 from fluoro_calib_ros.report.rig_geometry import beams, phantom_distance
 
-OPTIONS = {'model': 'parametric', 'max_iterations': 3}
+OPTIONS = {'max_iterations': 2}
 MAX_BYTES = 5_000_000
 
 
@@ -172,6 +173,22 @@ def test_verdict_and_what_to_do_come_first(folder, tmp_path, without_pictures, v
     assert f'class="verdict {verdict.replace(" ", "-")}"' in source
     place = text.index(f'Verdict: {verdict}')
     assert place < text.index(sentence) < text.index('Record <5> more') < text.index('In short')
+
+
+@pytest.mark.parametrize(
+    ('verdict', 'findings', 'recommended'),
+    [('pass', [], True), ('pass', ['one bead is wrong'], False), ('fail', [], False)],
+)
+def test_only_a_calibration_without_findings_is_recommended(verdict, findings, recommended):
+    given = SimpleNamespace(
+        validation={'verdict': verdict, 'findings': findings},
+        edited=None,
+        result={},
+        rig_note=None,
+    )
+    shown = html_report._verdict(given)['findings']
+    assert shown[: len(findings)] == findings
+    assert any('Correct and reconstruct with it' in text for text in shown) is recommended
 
 
 def test_verdict_on_another_calibration_is_not_shown(folder, tmp_path, without_pictures):

@@ -37,7 +37,7 @@ DISTANCE_PX = 1600.0
 POSES = 4
 START_NS = 10**18
 INTERVAL_NS = 500_000_000
-MODEL = 'parametric'
+MODEL = 'collocation'
 
 
 def picture(name, number, beads=BEADS, dtype=np.uint8):

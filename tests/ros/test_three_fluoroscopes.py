@@ -73,7 +73,7 @@ def calibrated(graph, of_rig):
         for frame in frames:
             client.publish(frame)
     client.wait_for_status(lambda s: s.exposures == POSES, 'c', 'all exposures')
-    answer = client.call(Calibrate, 'calibrate', model='parametric')
+    answer = client.call(Calibrate, 'calibrate', model='collocation')
     assert answer.success and list(answer.fluoroscope) == list(THREE), answer.message
     future = client.call_async(Orient, 'orient', timeout_sec=30.0)
     numbers = iter(range(100, 1000))

@@ -9,7 +9,7 @@ Nothing here needs ROS. Frames are passed as {fluoroscope: [Frame, ...]}, calibr
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,6 +23,7 @@ from .correction.fluoroscope_calibration import CorrectedPoints, FluoroscopeCali
 from .errors import DataError
 from .estimation.options import CalibrationOptions, CalibrationRequest
 from .estimation.result import CalibrationResult
+from .estimation.rounds import Round
 from .estimation.survey import MeasuredDistance
 from .exposures.frame import Frame, MovingPoints
 from .exposures.names import Names
@@ -146,7 +147,7 @@ def calibrate(
     joint: bool = False,
     principal_distance: float | None = None,
     validated: bool = False,
-    force: bool = False,
+    progress: Callable[[str, int, int], None] | None = None,
 ) -> CalibrationOutcome:
     """Self-calibrate fluoroscopes, and orient the rig.
 
@@ -164,8 +165,9 @@ def calibrate(
     validated : bool
         Whether the calibration is validated with its own exposures, which takes some six times as
         long.
-    force : bool
-        Whether to calibrate also input that cannot be right, such as another phantom.
+    progress : callable, optional
+        Called after every round and before every step of the validation with a text, the number
+        of rounds or steps done and the total, which is 0 for rounds; may raise to stop.
 
     Returns
     -------
@@ -176,6 +178,7 @@ def calibrate(
     ------
     DataError
         For observations that do not suffice or cannot be right: place and cause in a sentence.
+        `run_calibration` calibrates these, too.
     ValueError
         For options that contradict each other.
     """
@@ -190,7 +193,7 @@ def calibrate(
         joint,
         principal_distance,
     )
-    return run_calibration(request, validate=validated, force=force)
+    return _calibrated(request, validated, progress)
 
 
 def calibrate_with_known_orientations(
@@ -200,7 +203,7 @@ def calibrate_with_known_orientations(
     options: CalibrationOptions | None = None,
     *,
     validated: bool = False,
-    force: bool = False,
+    progress: Callable[[str, int, int], None] | None = None,
 ) -> CalibrationOutcome:
     """Estimate the distortion of fluoroscopes whose K, R and t are known.
 
@@ -215,8 +218,8 @@ def calibrate_with_known_orientations(
     options : CalibrationOptions, optional
     validated : bool
         Whether the calibration is validated with its own exposures.
-    force : bool
-        Whether to calibrate also input that cannot be right.
+    progress : callable, optional
+        Called as by `calibrate`.
 
     Returns
     -------
@@ -230,7 +233,21 @@ def calibrate_with_known_orientations(
     request = CalibrationRequest(
         frames, phantom, options or CalibrationOptions(), known_orientations=known
     )
-    return run_calibration(request, validate=validated, force=force)
+    return _calibrated(request, validated, progress)
+
+
+def _calibrated(
+    request: CalibrationRequest,
+    validated: bool,
+    progress: Callable[[str, int, int], None] | None,
+) -> CalibrationOutcome:
+    """Run a calibration that tells its rounds as it does the steps of its validation."""
+
+    def tell(names: str, this: Round) -> None:
+        if progress is not None:
+            progress(f'{names}: {this}', this.iteration, 0)
+
+    return run_calibration(request, validate=validated, progress=tell, report_step=progress)
 
 
 def correct(

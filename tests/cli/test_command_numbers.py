@@ -287,7 +287,7 @@ def test_steps_and_rounds_are_shown_on_a_terminal(monkeypatch):
     output.print_round('a', this)
     step, of_round = screen.getvalue().splitlines()
     assert step.split() == ['25', '%', 'halves']
-    assert of_round.split() == 'a: round 4 k 30 RMSE a: 0.250 0.500 px'.split()
+    assert ' '.join(of_round.split()) == 'a: round 4 k 30 RMSE a: 0.250 0.500 px'
     this = replace(this, k={'a': 0})
     output.print_round('a', this)
     assert ' k ' not in screen.getvalue().splitlines()[-1]

@@ -116,6 +116,27 @@ def test_fluoroscopes_get_names_that_files_and_topics_may_have():
 # ---- XMALab 2-D points
 
 
+@pytest.mark.parametrize(
+    'header, given, expected, notes',
+    [
+        ('pt1_cam1_X,pt1_cam1_Y', {}, (10, 20), 1),
+        ('pt1_cam1_X,pt1_cam1_Y', {'one_based': True}, (9, 19), 0),  # DLTdv8
+        ('pt1_cam1_X,pt1_cam1_Y', {'one_based': True, 'y_up': True}, (9, SIZE[1] - 20), 0),
+        ('Track 1_cam_1_x,Track 1_cam_1_y', {'y_up': True}, (10, SIZE[1] - 21), 0),  # Argus
+        ('Track 1_cam_1_x,Track 1_cam_1_y', {}, (10, 20), 1),
+        ('tib_cam1_X,tib_cam1_Y', {}, (10, 20), 0),
+    ],
+)
+def test_points_of_dltdv_and_argus_have_their_origin(tmp_path, header, given, expected, notes):
+    """Their names tell the program, and a note the flags where none is given."""
+    path = tmp_path / 'xypts.csv'
+    path.write_text(f'{header}\nNaN,NaN\n10,20\n')
+    content = registry.read(path, FileSettings(image_size=SIZE, **given))
+    (frame,) = content.observations['cam1']
+    assert (frame.number, frame.uv.tolist()) == (2, [list(expected)])
+    assert len(content.notes) == notes
+
+
 @pytest.mark.parametrize('one_based', [False, True])
 @pytest.mark.parametrize('y_up', [False, True])
 def test_xmalab_points_return(tmp_path, one_based, y_up):

@@ -83,8 +83,9 @@ def _read_coordinates(path: Path, settings: FileSettings) -> Content:
             row.fail(f'{len(row.cells)} columns, but the first row has {len(rows[0].cells)}')
     mm = _unit(path, layout, settings)
     xyz = from_units(np.array([_numbers(row, layout, ('x', 'y', 'z')) for row in beads]), mm)
+    notes: tuple[str, ...] = ()
     if 'sd' in layout.columns:
-        sd, notes = _positive(beads, layout, 'sd') * mm, ()
+        sd = _positive(beads, layout, 'sd') * mm
     else:
         sd, notes = _sd_unsaid(path, len(beads), settings)
     diameter = _positive(beads, layout, 'diameter') * mm if 'diameter' in layout.columns else None

@@ -10,6 +10,8 @@ Nothing here needs ROS. Frames are passed as {fluoroscope: [Frame, ...]}, calibr
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -40,9 +42,10 @@ from .io.poses import write_reconstruction
 from .jobs.bodies import BodiesOptions, BodiesOutcome, save_bodies, track_bodies
 from .jobs.calibration import CalibrationOutcome, adjust, run_calibration
 from .jobs.conversion import ConversionRequest, convert
-from .jobs.extraction import ExtractionOutcome, ExtractionRequest
+from .jobs.extraction import ExtractionOutcome, ExtractionRequest, recording_of_images
 from .jobs.extraction import run_extraction as extract
 from .jobs.healing import HealingOptions, HealingOutcome, heal_rig, save_healing
+from .jobs.image_sources import contains_images
 from .jobs.learning import learn_shapes
 from .jobs.orientation import OrientationOutcome, orient
 from .jobs.reconstruction import ReconstructionOptions, ReconstructionOutcome, reconstruct
@@ -154,7 +157,8 @@ def calibrate(
     Parameters
     ----------
     frames : mapping of str to sequence of Frame, or path-like
-        Exposures of the phantom by fluoroscope; or a bag or file of them.
+        Exposures of the phantom by fluoroscope; or a bag or file of them, or a folder with a
+        folder of images for each fluoroscope.
     phantom : Phantom or path-like
         Its survey, or the file of it.
     options : CalibrationOptions, optional
@@ -166,8 +170,8 @@ def calibrate(
         Whether the calibration is validated with its own exposures, which takes some six times as
         long.
     progress : callable, optional
-        Called after every round and before every step of the validation with a text, the number
-        of rounds or steps done and the total, which is 0 for rounds; may raise to stop.
+        Called after every image and round, and before every step of the validation, with a text,
+        how many of these are done and the total, which is 0 for rounds; may raise to stop.
 
     Returns
     -------
@@ -182,13 +186,12 @@ def calibrate(
     ValueError
         For options that contradict each other.
     """
-    if not isinstance(phantom, Phantom):
-        phantom = read_survey(phantom).phantom
+    survey = Survey(phantom, Names()) if isinstance(phantom, Phantom) else read_survey(phantom)
     if not isinstance(frames, Mapping):
-        frames = read_source(frames, collect='auto').frames
+        frames = _frames_in(Path(frames), survey, principal_distance, progress)
     request = CalibrationRequest(
         frames,
-        phantom,
+        survey.phantom,
         options or CalibrationOptions(),
         joint,
         principal_distance,
@@ -234,6 +237,21 @@ def calibrate_with_known_orientations(
         frames, phantom, options or CalibrationOptions(), known_orientations=known
     )
     return _calibrated(request, validated, progress)
+
+
+def _frames_in(
+    source: Path,
+    survey: Survey,
+    principal_distance: float | None,
+    progress: Callable[[str, int, int], None] | None,
+) -> Mapping[str, Sequence[Frame]]:
+    """Read the exposures of a bag or file, or find the beads of images. Raises DataError."""
+    if not contains_images(source):
+        return read_source(source, collect='auto').frames
+    told = None if progress is None else partial(progress, 'image')
+    return recording_of_images(
+        source, survey, principal_distance_px=principal_distance, progress=told
+    ).frames
 
 
 def _calibrated(

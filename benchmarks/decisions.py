@@ -33,7 +33,7 @@ from tools.sections import show_section
 from .survey import Case, out_of_sample
 
 EXPOSURES = 15
-SAME_PX = 4.0  # between an image point and its bead, in standard deviations of the noise
+SAME_PX = 5.0  # between an image point and its bead, in standard deviations of the noise
 CASES = (0.0, 0.01, 0.05, 0.2)  # part of the beads that get a wrong id
 Frames = Mapping[str, Sequence[Frame]]
 

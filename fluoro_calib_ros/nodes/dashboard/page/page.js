@@ -276,9 +276,11 @@ async function showResiduals() {
   by('residuals').replaceChildren();
   by('report').hidden = true;
   if (!calibrated) return;
+  const wanted = calibrated;
   let found;
   try {
     found = await ask('/residuals');
+    if (wanted !== calibrated) return; // asked for again: the fluoroscopes tell one after the other
   } catch (error) {
     put(by('residuals-text'), error.message);
     return;

@@ -9,7 +9,9 @@ Nothing here needs ROS. Frames are passed as {fluoroscope: [Frame, ...]}, calibr
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,6 +25,7 @@ from .correction.fluoroscope_calibration import CorrectedPoints, FluoroscopeCali
 from .errors import DataError
 from .estimation.options import CalibrationOptions, CalibrationRequest
 from .estimation.result import CalibrationResult
+from .estimation.rounds import Round
 from .estimation.survey import MeasuredDistance
 from .exposures.frame import Frame, MovingPoints
 from .exposures.names import Names
@@ -39,9 +42,10 @@ from .io.poses import write_reconstruction
 from .jobs.bodies import BodiesOptions, BodiesOutcome, save_bodies, track_bodies
 from .jobs.calibration import CalibrationOutcome, adjust, run_calibration
 from .jobs.conversion import ConversionRequest, convert
-from .jobs.extraction import ExtractionOutcome, ExtractionRequest
+from .jobs.extraction import ExtractionOutcome, ExtractionRequest, recording_of_images
 from .jobs.extraction import run_extraction as extract
 from .jobs.healing import HealingOptions, HealingOutcome, heal_rig, save_healing
+from .jobs.image_sources import contains_images
 from .jobs.learning import learn_shapes
 from .jobs.orientation import OrientationOutcome, orient
 from .jobs.reconstruction import ReconstructionOptions, ReconstructionOutcome, reconstruct
@@ -146,14 +150,15 @@ def calibrate(
     joint: bool = False,
     principal_distance: float | None = None,
     validated: bool = False,
-    force: bool = False,
+    progress: Callable[[str, int, int], None] | None = None,
 ) -> CalibrationOutcome:
     """Self-calibrate fluoroscopes, and orient the rig.
 
     Parameters
     ----------
     frames : mapping of str to sequence of Frame, or path-like
-        Exposures of the phantom by fluoroscope; or a bag or file of them.
+        Exposures of the phantom by fluoroscope; or a bag or file of them, or a folder with a
+        folder of images for each fluoroscope.
     phantom : Phantom or path-like
         Its survey, or the file of it.
     options : CalibrationOptions, optional
@@ -164,8 +169,9 @@ def calibrate(
     validated : bool
         Whether the calibration is validated with its own exposures, which takes some six times as
         long.
-    force : bool
-        Whether to calibrate also input that cannot be right, such as another phantom.
+    progress : callable, optional
+        Called after every image and round, and before every step of the validation, with a text,
+        how many of these are done and the total, which is 0 for rounds; may raise to stop.
 
     Returns
     -------
@@ -176,21 +182,21 @@ def calibrate(
     ------
     DataError
         For observations that do not suffice or cannot be right: place and cause in a sentence.
+        `run_calibration` calibrates these, too.
     ValueError
         For options that contradict each other.
     """
-    if not isinstance(phantom, Phantom):
-        phantom = read_survey(phantom).phantom
+    survey = Survey(phantom, Names()) if isinstance(phantom, Phantom) else read_survey(phantom)
     if not isinstance(frames, Mapping):
-        frames = read_source(frames, collect='auto').frames
+        frames = _frames_in(Path(frames), survey, principal_distance, progress)
     request = CalibrationRequest(
         frames,
-        phantom,
+        survey.phantom,
         options or CalibrationOptions(),
         joint,
         principal_distance,
     )
-    return run_calibration(request, validate=validated, force=force)
+    return _calibrated(request, validated, progress)
 
 
 def calibrate_with_known_orientations(
@@ -200,7 +206,7 @@ def calibrate_with_known_orientations(
     options: CalibrationOptions | None = None,
     *,
     validated: bool = False,
-    force: bool = False,
+    progress: Callable[[str, int, int], None] | None = None,
 ) -> CalibrationOutcome:
     """Estimate the distortion of fluoroscopes whose K, R and t are known.
 
@@ -215,8 +221,8 @@ def calibrate_with_known_orientations(
     options : CalibrationOptions, optional
     validated : bool
         Whether the calibration is validated with its own exposures.
-    force : bool
-        Whether to calibrate also input that cannot be right.
+    progress : callable, optional
+        Called as by `calibrate`.
 
     Returns
     -------
@@ -230,7 +236,36 @@ def calibrate_with_known_orientations(
     request = CalibrationRequest(
         frames, phantom, options or CalibrationOptions(), known_orientations=known
     )
-    return run_calibration(request, validate=validated, force=force)
+    return _calibrated(request, validated, progress)
+
+
+def _frames_in(
+    source: Path,
+    survey: Survey,
+    principal_distance: float | None,
+    progress: Callable[[str, int, int], None] | None,
+) -> Mapping[str, Sequence[Frame]]:
+    """Read the exposures of a bag or file, or find the beads of images. Raises DataError."""
+    if not contains_images(source):
+        return read_source(source, collect='auto').frames
+    told = None if progress is None else partial(progress, 'image')
+    return recording_of_images(
+        source, survey, principal_distance_px=principal_distance, progress=told
+    ).frames
+
+
+def _calibrated(
+    request: CalibrationRequest,
+    validated: bool,
+    progress: Callable[[str, int, int], None] | None,
+) -> CalibrationOutcome:
+    """Run a calibration that tells its rounds as it does the steps of its validation."""
+
+    def tell(names: str, this: Round) -> None:
+        if progress is not None:
+            progress(f'{names}: {this}', this.iteration, 0)
+
+    return run_calibration(request, validate=validated, progress=tell, report_step=progress)
 
 
 def correct(

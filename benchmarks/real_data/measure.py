@@ -118,19 +118,18 @@ def splits(frames: Sequence[Frame], seed: int = 1) -> list[tuple[list[Frame], li
 def _calibrated(data: DataSet, training: Sequence[Frame], fold: Fold) -> fc.CalibrationOutcome:
     """Calibrate, by force where the input is refused; fills the fold."""
     before = time.process_time()
+    request = fc.CalibrationRequest(
+        {CAMERA: training},
+        data.phantom,
+        fc.CalibrationOptions(),
+        principal_distance=data.principal_distance,
+    )
     try:
-        outcome = fc.calibrate(
-            {CAMERA: training}, data.phantom, principal_distance=data.principal_distance
-        )
+        outcome = fc.run_calibration(request)
     except fc.DataError as error:
         fold.doubts = [str(error)]
         before = time.process_time()
-        outcome = fc.calibrate(
-            {CAMERA: training},
-            data.phantom,
-            principal_distance=data.principal_distance,
-            force=True,
-        )
+        outcome = fc.run_calibration(request, force=True)
     fold.seconds = time.process_time() - before
     return outcome
 

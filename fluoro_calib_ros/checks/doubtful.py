@@ -5,7 +5,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -56,23 +57,32 @@ def _of_finding(found: Finding) -> Iterator[Doubtful]:
 
 def _outlying_points(result: CalibrationResult, table: ResidualTable) -> Iterator[Doubtful]:
     """Yield the image points that fail their test, with the targets that they may be."""
-    for point in result.outliers[0]:
-        name, exposure, target = point['fluoroscope'], point['exposure'], point['target_id']
+
+    def of_exposure(point: Mapping[str, Any]) -> tuple[str, int]:
+        return point['fluoroscope'], point['exposure']
+
+    for (name, exposure), points in groupby(
+        sorted(result.outliers[0], key=of_exposure), of_exposure
+    ):
+        tests = {point['target_id']: point for point in points}
         here = (table.fluoroscope == name) & (table.exposure == exposure)
-        for row in np.flatnonzero(here & (table.target_id == target)):
-            length = float(np.hypot(*table.residual[row]))
-            sd = float(np.sqrt(point['value']))
-            limit = float(np.sqrt(point['critical']))
+        rows = np.flatnonzero(here & np.isin(table.target_id, list(tests)))
+        lengths = np.linalg.norm(table.residual[rows], axis=1)
+        found = [tests[target] for target in table.target_id[rows].tolist()]
+        sd = np.sqrt([point['value'] for point in found])
+        limit = np.sqrt([point['critical'] for point in found])
+        may_be = _may_be(result, table, here, rows, lengths * limit / sd)
+        for k, row in enumerate(rows):
             yield Doubtful(
                 name,
                 exposure,
                 exposure,
-                target,
-                f'residual {length:.2f} px, {sd:.1f} times its standard deviation '
-                f'(limit {limit:.1f})',
-                others=_may_be(result, table, here, row, length * limit / sd),
+                int(table.target_id[row]),
+                f'residual {lengths[k]:.2f} px, {sd[k]:.1f} times its standard deviation '
+                f'(limit {limit[k]:.1f})',
+                others=may_be[k],
                 uv=(round(float(table.uv[row, 0]), 4), round(float(table.uv[row, 1]), 4)),
-                residual_px=round(length, 3),
+                residual_px=round(float(lengths[k]), 3),
             )
 
 
@@ -80,27 +90,24 @@ def _may_be(
     result: CalibrationResult,
     table: ResidualTable,
     here: NDArray[np.bool_],
-    row: np.intp,
-    limit_px: float,
-) -> tuple[int, ...]:
-    """Return other targets in whose place an image point would pass its test, the nearest first.
+    rows: NDArray[np.intp],
+    limit_px: NDArray[np.float64],
+) -> list[tuple[int, ...]]:
+    """Return other targets in whose place image points would pass their test, the nearest first.
 
-    here (N,): the image points of its exposure. Those that fit where they are, are none of them.
-    limit_px: of its residual; at other targets it has about the same standard deviation.
+    here (N,): the image points of their exposure; rows (k,): those that fail. A target that fits
+    where it is, is none of them, and each is only for the image point that is nearest to it.
+    limit_px (k,): of residuals; at other targets they have about the same standard deviation.
     """
-    name = str(table.fluoroscope[row])
+    name = str(table.fluoroscope[rows[0]])
     figures = result.fluoroscopes[name]
-    pose = next(e for e in figures.exposures if e.exposure == table.exposure[row])
-    outlying = {
-        p['target_id']
-        for p in result.outliers[0]
-        if p['fluoroscope'] == name and p['exposure'] == pose.exposure
-    }
-    seen = set(table.target_id[here].tolist()) - outlying
+    pose = next(e for e in figures.exposures if e.exposure == table.exposure[rows[0]])
     ids = result.targets.target_id
-    others = np.array([i not in seen and i != table.target_id[row] for i in ids.tolist()])
+    fits = here.copy()
+    fits[rows] = False
+    others = ~np.isin(ids, table.target_id[fits])
     if not others.any():
-        return ()
+        return [()] * len(rows)
     points = result.targets.xyz_mm[others]
     count = len(points)
     uv: Any = project(
@@ -109,6 +116,12 @@ def _may_be(
         points,
         figures.interior,
     )
-    distance = np.linalg.norm(table.uv[row] - table.correction[row] - uv, axis=1)
-    order = np.argsort(distance)
-    return tuple(int(i) for i in ids[others][order[distance[order] < limit_px]])
+    seen = table.uv[rows] - table.correction[rows]
+    distance = np.linalg.norm(seen[:, None] - uv, axis=2)
+    nearest = distance.argmin(axis=0) == np.arange(len(rows))[:, None]
+    fitting = nearest & (distance < limit_px[:, None])
+    own = table.target_id[rows][:, None] == ids[others]
+    return [
+        tuple(ids[others][order][good[order]].tolist())
+        for order, good in zip(np.argsort(distance, axis=1), fitting & ~own)
+    ]

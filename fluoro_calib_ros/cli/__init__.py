@@ -36,7 +36,7 @@ from . import (
     watch,
 )
 from .arguments import add_read_limits, set_read_limits
-from .output import print_note, styled, terminated_by_signals
+from .output import print_status, styled, terminated_by_signals
 from .rig import add_rig, find_rig
 
 if TYPE_CHECKING:
@@ -246,7 +246,7 @@ def _run(words: list[str]) -> None:
         options = parse_words(words)
         set_read_limits(options)
         if options.rig_file is not None:
-            print_note(f'defaults of {options.rig_file.path}')
+            print_status(f'defaults of {options.rig_file.path}')
         passed = options.module.run(options)
     except (DataError, OSError) as error:
         known = command if command in [module.NAME for module in COMMANDS] else ''

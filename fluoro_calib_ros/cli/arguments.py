@@ -354,6 +354,12 @@ def add_file_options(parser: argparse.ArgumentParser) -> None:
         '--units', choices=UNITS, help='unit of lengths, where the format does not say it'
     )
     group.add_argument(
+        '--phantom-sd',
+        type=number_in(1e-6, 100.0),
+        metavar='MM',
+        help='standard deviation of the coordinates of beads, where the file has none',
+    )
+    group.add_argument(
         '--one-based', action='store_true', help='pixels of XMALab points count from 1'
     )
     group.add_argument(
@@ -371,6 +377,7 @@ def file_settings(arguments: argparse.Namespace, **changes: Any) -> FileSettings
     settings: dict[str, Any] = {
         'image_size': getattr(arguments, 'image_size', None),
         'units': arguments.units,
+        'phantom_sd_mm': arguments.phantom_sd,
         'one_based': arguments.one_based,
         'y_up': arguments.y_up,
         'trial': arguments.trial,

@@ -98,19 +98,13 @@ def print_unpaired(source: Path, unpaired: Mapping[str, int]) -> None:
 def print_round(label: str, this: Round) -> None:
     """Print a round of a self-calibration, on a terminal only."""
     if sys.stderr.isatty():
-        k = max(this.k.values())
-        neighbours = f'k {k:3d}  ' if k else ''
-        rmse = '  '.join(f'{n}: {r[0]:.3f} {r[1]:.3f} px' for n, r in this.rmse.items())
-        print_note(
-            f'{label}: round {this.iteration:2d}  F {this.F:12.2f}  G {this.G:12.2f}  '
-            f'{neighbours}RMSE {rmse}'
-        )
+        print_status(f'{label}: {this}')
 
 
 def print_step(step: str, done: int, total: int) -> None:
     """Print a step of a validation, on a terminal only."""
     if sys.stderr.isatty():
-        print_note(f'{100 * done // total:3d} %  {step}')
+        print_status(f'{100 * done // total:3d} %  {step}')
 
 
 class ProgressBar:

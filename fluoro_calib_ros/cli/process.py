@@ -293,14 +293,13 @@ class _Work:
 
     def run(self, chains: Iterable[Sequence[Step]], workers: int) -> None:
         """Do chains of steps, some at a time; a chain ends at a step that fails."""
-        waiting = deque(deque(chain) for chain in chains)
+        waiting = deque((place, deque(chain)) for place, chain in enumerate(chains, 1))
         total = len(waiting)
-        running: list[tuple[deque[Step], _Started]] = []
+        running: list[tuple[tuple[int, deque[Step]], _Started]] = []
         while waiting or running:
             while waiting and len(running) < workers:
-                chain = waiting.popleft()
-                place = f'{total - len(waiting)} of {total}'
-                started = self._next(chain, place)
+                place, steps = chain = waiting.popleft()
+                started = self._next(steps, f'{place} of {total}')
                 if started is not None:
                     running.append((chain, started))
             for one in list(running):

@@ -13,9 +13,10 @@ from ..io.rig_file import NAME, RigFile, read_rig_file
 
 # Arguments whose default a rig.toml gives, by command; `out` is the key calibration.
 _ANGLE = ('angle_joint', 'angle_max_age')
-_SOURCE = ('fluoroscopes', 'image_size', *_ANGLE)
+_IMAGES = ('fluoroscopes', 'image_size', *_ANGLE)
+_SOURCE = (*_IMAGES, 'units', 'phantom_sd')
 USED = {
-    'extract': ('phantom', *_ANGLE),
+    'extract': ('phantom', 'units', 'phantom_sd', *_ANGLE),
     'calibrate': (*_SOURCE, 'phantom', 'out'),
     'adjust': (*_SOURCE, 'phantom', 'calibration'),
     'correct': ('calibration',),
@@ -24,7 +25,7 @@ USED = {
     'report': ('calibration',),
     'orient': (*_SOURCE, 'phantom', 'calibration'),
     'reconstruct': (*_SOURCE, 'calibration'),
-    'convert': _SOURCE,
+    'convert': _IMAGES,  # --units is that of its output, too
     'watch': (),  # what it says about the rig
 }
 

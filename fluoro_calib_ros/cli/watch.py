@@ -9,6 +9,7 @@ import argparse
 import os
 import sys
 from collections.abc import Mapping
+from pathlib import Path
 
 from .arguments import add_address
 
@@ -30,6 +31,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action='store_true',
         help='offer a page for a browser beside the machine: state, radiographs, points in space',
     )
+    parser.add_argument(
+        '--dicom',
+        type=Path,
+        metavar='FOLDER',
+        help='where the machine writes DICOM files, in a folder for each fluoroscope: the page '
+        'tells their dose, else that of a rig.toml',
+    )
     add_address(parser, 'the page', 8080)
 
 
@@ -40,6 +48,7 @@ def run(arguments: argparse.Namespace) -> None:
         about = (arguments.rig_file and arguments.rig_file.about) or {}
         words += ['--web', '--host', arguments.host, '--port', str(arguments.port)]
         words += ['--mas', str(tube_load(about))]
+        words += ['--dicom', str(arguments.dicom)] if arguments.dicom else []
     if arguments.namespace:
         words += ['--ros-args', '-r', f'__ns:=/{arguments.namespace.strip("/")}']
     code = 'from fluoro_calib_ros.entry_points import watch; watch()'

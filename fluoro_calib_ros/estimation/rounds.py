@@ -46,6 +46,12 @@ class Round:
     quadratic: float  #: robustly weighted square sum of the residuals [px^2]
     change: float  #: RMS change of the correction that the next round would make [px]
 
+    def __str__(self) -> str:
+        k = max(self.k.values())
+        neighbours = f'k {k:3d}  ' if k else ''
+        rmse = '  '.join(f'{n}: {u:.3f} {v:.3f} px' for n, (u, v) in self.rmse.items())
+        return f'round {self.iteration:2d}  {neighbours}RMSE {rmse}'
+
 
 @dataclass(frozen=True)
 class SelfCalibration:

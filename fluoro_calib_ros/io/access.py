@@ -18,7 +18,10 @@ from ..limits import read_limits
 
 UTF_16 = (b'\xff\xfe', b'\xfe\xff')  # byte order marks
 # How files begin that hold tables, but are no text.
-_NO_TEXT = (
+_QTM = 'a TSV export of Qualisys Track Manager; export the trial as C3D, which is read'
+_NEXUS = 'an ASCII export of Vicon Nexus; take the C3D file of the trial, which is read'
+# How files begin that are not read, and what to do about them.
+_NOT_READ = (
     (b'PK\x03\x04', 'an xlsx spreadsheet or another zip archive; save the table as CSV'),
     (b'\xd0\xcf\x11\xe0', 'an xls spreadsheet; save the table as CSV'),
     (
@@ -26,6 +29,11 @@ _NO_TEXT = (
         'an HDF5 file; of these, analysis files of SLEAP are read, as image points; save others '
         'as CSV (DeepLabCut: analyze_videos_converth5_to_csv)',
     ),
+    (b'NO_OF_FRAMES\t', _QTM),
+    (b'FILE_VERSION\t', _QTM),
+    (b'Trajectories', _NEXUS),
+    (b'Model Outputs', _NEXUS),
+    (b'Sparse format ', 'a sparse file of DLTdv8; save the data in flat format, as CSV'),
 )
 _SAFE_NAME = re.compile('[A-Za-z0-9_-]+')
 
@@ -86,7 +94,7 @@ def read_text(path: PathLike) -> str:
     Raises DataError as `read_bytes` does, and for a file in neither.
     """
     content = read_bytes(path)
-    kind = kind_without_text(content)
+    kind = kind_not_read(content)
     if kind:
         raise DataError(f'this is {kind}', at=path)
     encoding = encoding_of(content)
@@ -105,9 +113,10 @@ def encoding_of(content: bytes) -> str:
     return 'utf-16' if content.startswith(UTF_16) else 'utf-8-sig'
 
 
-def kind_without_text(content: bytes) -> str:
-    """Return what a file is that holds tables but no text, and what to do; '' for any other."""
-    return next((kind for start, kind in _NO_TEXT if content.startswith(start)), '')
+def kind_not_read(content: bytes) -> str:
+    """Return what a table is whose kind is not read, and what to do; '' for any other file."""
+    begin = content.lstrip()
+    return next((kind for start, kind in _NOT_READ if begin.startswith(start)), '')
 
 
 def check_rows(text: str, most: int, where: object) -> None:

@@ -6,6 +6,8 @@
     fluoroscopes = ["a", "b"]
     image_size = [1024, 1024]     # width, height [px]
     phantom = "phantom.csv"
+    units = "cm"                  # of files that do not say theirs, such as the phantom
+    phantom_sd = 0.05             # of the coordinates of beads, where the file has none [mm]
     calibration = "result"        # result folder of calibrate
     angle_joint = "carm"          # joint of the C-arm; or {a = "frontal", b = "lateral"}
     angle_max_age = 0.5           # longest time from its last state to an exposure [s]
@@ -41,6 +43,8 @@ class RigFile:
     #: file with the phantom, and result folder
     phantom: Path | None = None
     calibration: Path | None = None
+    units: str | None = None  #: of files that do not say theirs
+    phantom_sd: float | None = None  #: of the coordinates of beads, where the file has none [mm]
     #: joint of the C-arm, or one for each fluoroscope, as the option of this name
     angle_joint: str | None = None
     #: longest time from the last state of the joint to an exposure [s]
@@ -65,6 +69,8 @@ def read_rig_file(path: Path) -> RigFile:
         image_size=_size(path, document.get('image_size')),
         phantom=_path(path, 'phantom', document.get('phantom')),
         calibration=_path(path, 'calibration', document.get('calibration')),
+        units=_units(path, document.get('units')),
+        phantom_sd=_phantom_sd(path, document.get('phantom_sd')),
         angle_joint=_joint(path, document.get('angle_joint'), names),
         angle_max_age=_max_age(path, document.get('angle_max_age')),
         about=_about(path, document.get('about')),
@@ -87,6 +93,20 @@ def _size(path: Path, value: Any) -> tuple[int, int] | None:
     if not whole or len(value) != 2:
         raise DataError(f'{path}, key image_size: width and height [px], such as [1024, 1024]')
     return value[0], value[1]
+
+
+def _units(path: Path, value: Any) -> str | None:
+    if value is not None and value not in ('mm', 'cm', 'm'):
+        raise DataError(f'{path}, key units: "mm", "cm" or "m"')
+    return value
+
+
+def _phantom_sd(path: Path, value: Any) -> float | None:
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value <= 100:
+        raise DataError(f'{path}, key phantom_sd: a standard deviation [mm], such as 0.05')
+    return float(value)
 
 
 def _joint(path: Path, value: Any, names: list[str] | None) -> str | None:

@@ -13,7 +13,7 @@ import html
 from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -404,6 +404,7 @@ def run_in_worker_process(
     validate: bool = False,
     rig: Rig | None = None,
     progress: Progress | None = None,
+    report_step: Callable[[str, int, int], None] | None = None,
     raise_if_cancelled: Callable[[], None] | None = None,
 ) -> CalibrationOutcome:
     """Run `run_calibration` in another process.
@@ -412,12 +413,18 @@ def run_in_worker_process(
     raise_if_cancelled is called repeatedly and may raise to terminate the process. Raises
     RuntimeError for any other failure of the process.
     """
+
+    def told(*arguments: Any) -> None:
+        call = progress if isinstance(arguments[-1], Round) else report_step
+        if call is not None:
+            call(*arguments)
+
     return in_worker_process(
         _outcome,
         request,
         validate,
         rig,
-        progress=progress,
+        progress=told,
         raise_if_cancelled=raise_if_cancelled,
     )
 
@@ -426,9 +433,11 @@ def _outcome(
     request: CalibrationRequest,
     validate: bool,
     rig: Rig | None,
-    progress: Progress | None = None,
+    progress: Callable[..., None] | None = None,
 ) -> CalibrationOutcome:
-    """Run the job in the worker process."""
-    outcome = run_calibration(request, validate=validate, rig=rig, progress=progress)
+    """Run the job in the worker process; progress is that of rounds and that of steps."""
+    outcome = run_calibration(
+        request, validate=validate, rig=rig, progress=progress, report_step=progress
+    )
     # Only the figures need the networks behind it.
     return replace(outcome, result=replace(outcome.result, runs={}, solved={}))

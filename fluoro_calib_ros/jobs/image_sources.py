@@ -9,6 +9,7 @@ import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -159,7 +160,11 @@ def dose_texts(source: Path) -> dict[str, str]:
     texts = {}
     for name, folder in (fluoroscope_folders(source) or {'': source}).items():
         files = sorted(folder.iterdir()) if folder.is_dir() else [folder]
-        told = [_dose(path) for path in files if image_suffix_of(path) in DICOM_SUFFIXES]
+        told = [
+            _dose(path, path.stat().st_mtime_ns)
+            for path in files
+            if image_suffix_of(path) in DICOM_SUFFIXES
+        ]
         sums = []
         for values, unit in zip(zip(*told), ('mAs', 'dGy cm2')):
             known = [value for value in values if value is not None]
@@ -172,7 +177,8 @@ def dose_texts(source: Path) -> dict[str, str]:
     return texts
 
 
-def _dose(path: Path) -> tuple[float | None, float | None]:
+@lru_cache(maxsize=10_000)  # a live page asks again and again
+def _dose(path: Path, changed_ns: int) -> tuple[float | None, float | None]:
     """Return tube load and dose area product of a DICOM file, None where unknown."""
     try:
         header = read_dicom_header(path)

@@ -31,7 +31,8 @@ from .exposure_input import NodeParts, RigServices
 from .messages.self_calibration import (
     Request,
     Result,
-    fill_feedback,
+    feedback_of_round,
+    feedback_of_step,
     fill_result,
     fill_verdict,
     options_of_request,
@@ -258,28 +259,24 @@ class SelfCalibration(Job):
     async def _on_calibrate(
         self, request: Calibrate.Request, response: Calibrate.Response
     ) -> Calibrate.Response:
-        work = self._calibrate(request, response, lambda *_: None, lambda: False)
+        work = self._calibrate(request, response, lambda _: None, lambda: False)
         await self._answer(response, work)
         return response
 
     async def _work(self, goal: Any, result: Any) -> None:
-        feedback = SelfCalibrate.Feedback()
-
-        def progress(label: str, last: Round) -> None:
-            fill_feedback(feedback, label, last)
-            goal.publish_feedback(feedback)
-
-        await self._calibrate(goal.request, result, progress, lambda: goal.is_cancel_requested)
+        await self._calibrate(
+            goal.request, result, goal.publish_feedback, lambda: goal.is_cancel_requested
+        )
 
     async def _calibrate(
         self,
         request: Request,
         result: Result,
-        progress: Callable[[str, Round], None],
+        tell: Callable[[SelfCalibrate.Feedback], None],
         is_cancel_requested: Callable[[], bool],
     ) -> None:
         try:
-            outcome = await self._start(request, progress, is_cancel_requested)
+            outcome = await self._start(request, tell, is_cancel_requested)
             self._use(outcome, result)
         except (DataError, ValueError, OSError) as error:
             self._output.refused.update(dict.fromkeys(self.running, str(error)))
@@ -290,7 +287,7 @@ class SelfCalibration(Job):
     def _start(
         self,
         request: Request,
-        progress: Callable[[str, Round], None],
+        tell: Callable[[SelfCalibrate.Feedback], None],
         is_cancel_requested: Callable[[], bool],
     ) -> Future:
         """Start a calibration in a worker process; returns the Future of its CalibrationOutcome.
@@ -302,7 +299,7 @@ class SelfCalibration(Job):
 
         def on_round(label: str, last: Round) -> None:
             self.last_round.update(dict.fromkeys(label.split('+'), last))
-            progress(label, last)
+            tell(feedback_of_round(label, last))
 
         def run() -> CalibrationOutcome:
             return run_in_worker_process(
@@ -310,6 +307,7 @@ class SelfCalibration(Job):
                 validate=request.validate,
                 rig=rig,
                 progress=on_round,
+                report_step=lambda *step: tell(feedback_of_step(*step)),
                 raise_if_cancelled=lambda: self._raise_if_cancelled(is_cancel_requested()),
             )
 

@@ -66,6 +66,8 @@ def _column(result: CalibrationResult, name: str) -> dict[str, str]:
     converged = result.converged if run is None else run.converged
     inlier_percent = 100 * figures.inliers / max(figures.observations, 1)
     model = calibration.model
+    # An adjustment with calibrations has no rounds.
+    estimated = calibration.interior_estimated and bool(result.history)
     return {
         'Fluoroscope': name if len(name) < COLUMN_WIDTH else name[: COLUMN_WIDTH - 4] + '...',
         **_rmse_rows(figures),
@@ -76,7 +78,7 @@ def _column(result: CalibrationResult, name: str) -> dict[str, str]:
         'observations': str(figures.observations),
         'inliers': f'{figures.inliers} ({inlier_percent:.1f} %)',
         'exposures': str(len(figures.exposures)),
-        'interior orientation': 'estimated' if calibration.interior_estimated else 'fixed',
+        'interior orientation': 'estimated' if estimated else 'fixed',
         **_interior_rows(figures),
         'noise of an image coordinate [px]': _noise_text(calibration),
         'median sd of the correction [px]': number_text(_median_sd(calibration)),

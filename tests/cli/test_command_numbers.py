@@ -6,6 +6,7 @@
 import argparse
 import io
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace as Fake
 
@@ -23,6 +24,7 @@ from fluoro_calib_ros.cli.orient import exposure_numbers
 from fluoro_calib_ros.cli.process import Done, Step, _option_words, trial_row
 from fluoro_calib_ros.cli.survey import _distances, distance
 from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.estimation.rounds import Round
 from fluoro_calib_ros.exposures.names import Names
 from fluoro_calib_ros.findings import Finding, Kind, Severity
 from fluoro_calib_ros.io.bags.salvage import BagReport, Damage, TopicReport
@@ -281,15 +283,18 @@ def test_steps_and_rounds_are_shown_on_a_terminal(monkeypatch):
     monkeypatch.setenv('NO_COLOR', '1')
     monkeypatch.setattr(output.sys, 'stderr', screen)
     output.print_step('halves', 3, 12)
-    this = Fake(k={'a': 30, 'b': 20}, rmse={'a': (0.25, 0.5)}, iteration=4, F=10.0, G=2.0)
+    this = Round(4, 10.0, 2.0, {'a': 30, 'b': 20}, {'a': (0.25, 0.5)}, 1.0, 0.1)
     output.print_round('a', this)
     step, of_round = screen.getvalue().splitlines()
     assert step.split() == ['25', '%', 'halves']
-    words = 'a: round 4 F 10.00 G 2.00 k 30 RMSE a: 0.250 0.500 px'
-    assert of_round.split() == words.split()
-    this.k = {'a': 0}
+    assert ' '.join(of_round.split()) == 'a: round 4 k 30 RMSE a: 0.250 0.500 px'
+    this = replace(this, k={'a': 0})
     output.print_round('a', this)
     assert ' k ' not in screen.getvalue().splitlines()[-1]
+    monkeypatch.delenv('NO_COLOR')
+    monkeypatch.setenv('TERM', 'xterm')
+    output.print_round('a', this)
+    assert screen.getvalue().splitlines()[-1].startswith(f'\033[{output.STYLES["dim"]}m')
     monkeypatch.setattr(output.sys, 'stderr', quiet := io.StringIO())
     output.print_step('halves', 3, 12)
     output.print_round('a', this)

@@ -64,6 +64,31 @@ def test_paths_are_taken_and_shown_in_a_line():
     assert dir(fc) == sorted(fc.__all__)
 
 
+def test_progress_of_a_calibration_is_told_and_may_stop_it():
+    recording = fc.read_source(ROOT / 'bags' / 'calibration')
+    phantom = ROOT / 'bags' / 'phantom.csv'
+    told = []
+    fc.calibrate(
+        {'a': recording.frames['a']},
+        phantom,
+        fc.CalibrationOptions(model='none'),
+        validated=True,
+        progress=lambda *step: told.append(step),
+    )
+    rounds = [step for step in told if step[2] == 0]
+    assert rounds[0][0].startswith('a: round  1  RMSE a: ')
+    assert [done for _, done, _ in rounds] == list(range(1, len(rounds) + 1))
+    steps = told[len(rounds) :]
+    assert [done for _, done, _ in steps] == list(range(len(steps)))
+    assert {total for _, _, total in steps} == {len(steps)}
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fc.calibrate(recording.frames, phantom, progress=stop)
+
+
 def test_public_names_are_those_of_the_api():
     assert sorted(fc.__all__) == sorted(api.__all__)
     for name in fc.__all__:

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
+import fluoro_calib_ros as fc
 from benchmarks.bead_images import bead_image
 from fluoro_calib_ros.cli import main
 from fluoro_calib_ros.errors import DataError
@@ -238,6 +239,24 @@ def test_images_of_one_fluoroscope_need_its_name(folder, capsys):
             ]
         )
     assert 'name it with --fluoroscopes NAME' in capsys.readouterr().err
+
+
+def test_python_calibrates_from_images(folder, tmp_path_factory):
+    """A folder with a folder for each fluoroscope, beside nothing else; image n of m is told."""
+    images = tmp_path_factory.mktemp('images')
+    (folder / 'a').rename(images / 'a')
+    for number in (4, 5, 6):
+        cv2.imwrite(str(images / 'a' / f'image_{number:04d}.png'), picture(number)[0])
+    told = []
+    outcome = fc.calibrate(
+        images,
+        folder / 'phantom.csv',
+        fc.CalibrationOptions(model='none'),
+        progress=lambda *step: told.append(step),
+    )
+    assert outcome.result.fluoroscopes['a'].observations > 5 * COUNT
+    assert told[:6] == [('image', done, 6) for done in range(1, 7)]
+    assert told[6][0].startswith('a: round  1')
 
 
 def test_diameters_of_a_phantom_are_kept(tmp_path):

@@ -42,6 +42,8 @@ WHOLE = """
 fluoroscopes = ["a", "b"]
 image_size = [1024, 1000]
 phantom = "cube/phantom.csv"
+units = "cm"
+phantom_sd = 0.05
 calibration = "result"
 """
 
@@ -53,6 +55,9 @@ def test_rig_file_makes_flags_unnecessary(rig, tmp_path):
     assert arguments.phantom == tmp_path / 'cube' / 'phantom.csv'
     assert arguments.out == tmp_path / 'result'
     assert parsed(['orient', 'capture'], content).calibration == tmp_path / 'result'
+    assert (arguments.units, arguments.phantom_sd) == ('cm', 0.05)
+    out = ['convert', 'result', '--to', 'mayacam2', '--out', 'cameras']
+    assert parsed(out, content).units is None  # which would be that of its output
     flags = ['calibrate', 'points.csv', '--out', 'x', '--fluoroscopes', 'c']
     arguments = parsed(flags, content)
     assert arguments.out == Path('x') and arguments.fluoroscopes == ['c']
@@ -132,6 +137,11 @@ def test_what_the_file_says_about_the_rig_is_in_the_report(rig, tmp_path, monkey
         ('fluoroscopes = ["a", "a"]', 'key fluoroscopes: a list of different names'),
         ('fluoroscopes = "a"', 'key fluoroscopes: a list of different names'),
         ('phantom = 3', 'key phantom: a path is a text'),
+        ('units = "inch"', 'key units: "mm", "cm" or "m"'),
+        ('units = []', 'key units: "mm", "cm" or "m"'),
+        ('phantom_sd = 0', 'key phantom_sd: a standard deviation [mm]'),
+        ('phantom_sd = true', 'key phantom_sd: a standard deviation [mm]'),
+        ('phantom_sd = nan', 'key phantom_sd: a standard deviation [mm]'),
         ('phantom = ', 'TOML'),
         ('angle_joint = 3', 'key angle_joint: a joint, such as "carm", or one for each'),
         ('angle_joint = ""', 'key angle_joint: a joint, such as'),

@@ -27,10 +27,14 @@ def test_commands_of_the_tutorial(tmp_path, monkeypatch, capsys):
     for command in COMMANDS:
         if command[0] == 'calibrate':
             Path('rig.toml').write_text(RIG)
+            capsys.readouterr()
         if command[0] not in ('validate', 'report'):
             main(command)
+        if command[0] in ('calibrate', 'adjust', 'orient'):
+            assert 'change it with' not in capsys.readouterr().err  # rig.toml says unit and sd
     assert 'marker' in Path('walk_undistorted.csv').read_text()
-    assert Path('points.c3d').stat().st_size and len(list(Path('mayacam').iterdir())) == 2
+    assert Path('points.png').stat().st_size and Path('points.c3d').stat().st_size
+    assert len(list(Path('mayacam').iterdir())) == 2
 
     with open('points.csv') as file:
         found = {(int(r['frame']), int(r['target_id'])): r for r in csv.DictReader(file)}

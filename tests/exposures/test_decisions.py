@@ -168,6 +168,25 @@ def test_exchanged_ids_are_found_with_the_right_ones_and_repaired(tmp_path):
     assert 'by decision' in recording.notes[-1]
 
 
+def test_two_points_at_one_bead_do_not_both_get_its_id():
+    """One of them is left out: an exposure has a target once."""
+    true = exposures()['a'][:6]
+    ids = true[2].target_id
+    far = np.argsort(-np.linalg.norm(true[2].uv - true[2].uv[0], axis=1))
+    first, second = far[:2]
+    uv = true[2].uv.copy()
+    uv[[first, second]] = true[2].uv[0] + [[0.1, 0], [0, 0.2]]
+    wrong = replace(true[2], target_id=ids[1:], uv=uv[1:])
+    result = calibrate(
+        {'a': [*true[:2], wrong, *true[3:]]}, rig().phantom, CalibrationOptions(**OPTIONS)
+    )
+    found = [d for d in doubtful_observations(result) if d.first == wrong.number]
+    both = [d for d in found if d.target_id in (ids[first], ids[second])]
+    assert len(both) == 2
+    assert [d.others[:1] for d in both].count((int(ids[0]),)) == 1
+    assert sum(int(ids[0]) in d.others for d in found) == 1
+
+
 def test_commands_read_decisions(tmp_path, capsys):
     write_observations_csv(tmp_path / 'seen.csv', {'a': exposures()['a'][:7]})
     write_phantom(tmp_path / 'phantom.csv', rig().phantom)

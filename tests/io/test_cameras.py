@@ -237,6 +237,26 @@ def test_dlt_gives_pixels_from_one_upwards(tmp_path):
         np.testing.assert_allclose(y / w, SIZE[1] - expected[:, 1], atol=1e-8)
 
 
+def test_dlt_of_dltdv8_counts_rows_downwards(tmp_path):
+    """As DLTdv8 and easyWand6 do, from the first pixel, 1: found by the origin."""
+    path = tmp_path / 'dlt.csv'
+    from_one = np.array([[1.0, 0, 1], [0, 1, 1], [0, 0, 1]])
+    columns = []
+    for camera in cameras():
+        pose = np.column_stack([camera.rotation, camera.translation_mm])
+        projection = from_one @ camera.matrix @ pose
+        columns.append((projection / projection[2, 3]).ravel()[:11])
+    np.savetxt(path, np.array(columns).T, delimiter=',')
+    content = registry.read(path, MM)
+    assert len(content.notes) == 1
+    for found, expected in zip(content.cameras, cameras()):
+        np.testing.assert_allclose(
+            pixels(found, points_mm()), pixels(expected, points_mm()), atol=1e-6
+        )
+    registry.write(path, 'dlt', Content(cameras=cameras()), MM)
+    assert not registry.read(path, MM).notes
+
+
 def test_anipose_file_projects_with_opencv(tmp_path):
     """Rodrigues vector, translation and matrix as aniposelib gives them to cv2.projectPoints."""
     path = tmp_path / 'calibration.toml'

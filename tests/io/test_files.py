@@ -42,6 +42,7 @@ from fluoro_calib_ros.io.observations import (
     write_points,
 )
 from fluoro_calib_ros.io.phantom import read_phantom, write_phantom
+from fluoro_calib_ros.jobs.sources import read_content
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 
 SIZE = (1024, 960)
@@ -280,6 +281,25 @@ def test_tables_that_are_no_text_are_named(tmp_path, start, remedy):
     assert remedy in message_of(read_phantom, path)
     settings = FileSettings(image_size=(100, 100))
     assert remedy in message_of(lambda p: registry.read(p, settings), path)
+
+
+@pytest.mark.parametrize(
+    'text, remedy',
+    [
+        ('NO_OF_FRAMES\t3\nNO_OF_CAMERAS\t13\nNO_OF_MARKERS\t2\n', 'as C3D, which is read'),
+        ('FILE_VERSION\t2.0.0\nNO_OF_FRAMES\t3\n', 'as C3D, which is read'),
+        ('\n\nTrajectories\n100\n,,Mouse:foot,,\n', 'the C3D file of the trial, which is read'),
+        ('Sparse format camera coordinates file\n9\t4\t8\n1\t1\t5.5\n', 'in flat format, as CSV'),
+    ],
+)
+@pytest.mark.parametrize('name', ['points.tsv', 'points.csv'])
+def test_texts_of_other_programs_that_are_not_read_are_named(tmp_path, text, remedy, name):
+    """With what to do: by Qualisys Track Manager, Vicon Nexus and DLTdv8."""
+    path = text_file(tmp_path, name, text)
+    settings = FileSettings(image_size=(100, 100))
+    for part, default in (('survey', 'phantom'), ('observations', 'observations')):
+        message = message_of(lambda p, *a: read_content(p, settings, *a), path, part, default)
+        assert message.endswith(remedy)
 
 
 def test_hdf5_that_is_no_table_is_named(tmp_path):

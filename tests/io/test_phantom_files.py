@@ -45,6 +45,8 @@ def test_plain_lists_are_read(tmp_path, separator, suffix):
         np.testing.assert_array_equal(found.phantom.xyz_mm, XYZ)
         assert found.phantom.target_id.tolist() == ids
         assert 'no standard deviation' in found.notes[0]
+        said = read_survey(path, FileSettings(units='mm', phantom_sd_mm=0.02))
+        assert (said.phantom.sd_mm == 0.02).all() and not said.notes
 
 
 @pytest.mark.parametrize(

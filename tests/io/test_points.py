@@ -9,6 +9,7 @@ import json
 import os
 import pathlib
 import re
+import struct
 import subprocess
 import sys
 
@@ -113,6 +114,27 @@ def test_fluoroscopes_get_names_that_files_and_topics_may_have():
 
 
 # ---- XMALab 2-D points
+
+
+@pytest.mark.parametrize(
+    'header, given, expected, notes',
+    [
+        ('pt1_cam1_X,pt1_cam1_Y', {}, (10, 20), 1),
+        ('pt1_cam1_X,pt1_cam1_Y', {'one_based': True}, (9, 19), 0),  # DLTdv8
+        ('pt1_cam1_X,pt1_cam1_Y', {'one_based': True, 'y_up': True}, (9, SIZE[1] - 20), 0),
+        ('Track 1_cam_1_x,Track 1_cam_1_y', {'y_up': True}, (10, SIZE[1] - 21), 0),  # Argus
+        ('Track 1_cam_1_x,Track 1_cam_1_y', {}, (10, 20), 1),
+        ('tib_cam1_X,tib_cam1_Y', {}, (10, 20), 0),
+    ],
+)
+def test_points_of_dltdv_and_argus_have_their_origin(tmp_path, header, given, expected, notes):
+    """Their names tell the program, and a note the flags where none is given."""
+    path = tmp_path / 'xypts.csv'
+    path.write_text(f'{header}\nNaN,NaN\n10,20\n')
+    content = registry.read(path, FileSettings(image_size=SIZE, **given))
+    (frame,) = content.observations['cam1']
+    assert (frame.number, frame.uv.tolist()) == (2, [list(expected)])
+    assert len(content.notes) == notes
 
 
 @pytest.mark.parametrize('one_based', [False, True])
@@ -528,8 +550,57 @@ def test_c3d_is_read_by_ezc3d(tmp_path):
     seen = ~np.isnan(points().xyz_mm)
     np.testing.assert_array_equal(xyz[seen], points().xyz_mm[seen].astype(np.float32))
     residual = file['data']['meta_points']['residuals'][0].T
-    assert (residual[~seen[..., 0]] == -1).all()
-    np.testing.assert_allclose(residual[seen[..., 0]], points().sd_mm[seen[..., 0]], atol=2e-4)
+    np.testing.assert_array_equal(residual < 0, ~seen[..., 0])
+
+
+def test_scale_and_residuals_of_c3d_are_where_the_user_guide_has_them(tmp_path):
+    """As py-c3d reads them: the low byte of the fourth word; the high one tells the cameras."""
+    path = tmp_path / 'points.c3d'
+    registry.write(path, 'c3d', Content(points=points(), names=NAMED), FileSettings())
+    content = path.read_bytes()
+    points_of_frame, analog, first, last, _, scale, data = struct.unpack_from('<5HfH', content, 2)
+    assert (points_of_frame, analog, first, last) == (3, 0, 11, 15)
+    assert scale == np.float32(ezc3d.c3d(str(path))['parameters']['POINT']['SCALE']['value'][0])
+    words = np.frombuffer(content, '<f4', 60, (data - 1) * 512).reshape(5, 3, 4)[..., 3]
+    missing = np.isnan(points().sd_mm)
+    np.testing.assert_array_equal(words == -1, missing)
+    assert words.max() == 255
+    np.testing.assert_allclose(
+        words[~missing] * -scale, points().sd_mm[~missing], atol=-scale / 2 + 1e-6
+    )
+
+
+def dec(values):
+    """Numbers as DEC processors have them: halves interchanged, the exponent larger by two."""
+    return (values.astype('<f4') * 4).view('<u2').reshape(-1, 2)[:, ::-1].tobytes()
+
+
+@pytest.mark.parametrize('kind', ['float', 'integer', 'DEC float'])
+def test_residuals_of_cameras_are_read_from_c3d(tmp_path, kind):
+    """As Vicon and Qualisys write them, with a mask of cameras in the high byte."""
+    path = tmp_path / 'points.c3d'
+    registry.write(path, 'c3d', Content(points=points(), names=NAMED), FileSettings())
+    content = bytearray(path.read_bytes())
+    (data,) = struct.unpack_from('<H', content, 16)
+    values = np.frombuffer(content, '<f4', 60, (data - 1) * 512).copy()
+    values[3::4] = np.where(values[3::4] < 0, -1, 0b101 * 256 + 200)
+    step = 0.01
+    scale = step if kind == 'integer' else -step
+    if kind == 'integer':
+        values[np.arange(60) % 4 != 3] /= step
+        values = np.round(values).astype('<i2')
+    as_bytes = np.ndarray.tobytes
+    if kind == 'DEC float':
+        as_bytes = dec
+        content[(content[0] - 1) * 512 + 3] = 85
+    content[(data - 1) * 512 :] = as_bytes(values).ljust(512, b'\0')
+    place = content.index(b'SCALE') + 9  # behind the offset of 2 bytes, type and dimensions
+    content[12:16] = content[place : place + 4] = as_bytes(np.array([scale], dtype='<f4'))
+    path.write_bytes(content)
+    found = registry.read(path, FileSettings()).points
+    seen = ~np.isnan(points().xyz_mm)
+    np.testing.assert_allclose(found.xyz_mm[seen], points().xyz_mm[seen], atol=step)
+    np.testing.assert_allclose(found.sd_mm[seen[..., 0]], 200 * step, rtol=1e-6)
 
 
 def test_damaged_c3d_is_refused(tmp_path):

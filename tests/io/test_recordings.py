@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pydicom
 import pytest
+from dicom_files import dicom
 
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.io.image_reading import image_suffix_of, is_image_source, open_images
@@ -16,7 +17,6 @@ from fluoro_calib_ros.io.image_writing import list_images
 from fluoro_calib_ros.io.recordings import read_cine_header, read_dicom_header
 from fluoro_calib_ros.jobs.image_sources import contains_images, dose_texts, open_sources
 
-LITTLE = '1.2.840.10008.1.2.1'
 JPEG = '1.2.840.10008.1.2.4.50'
 
 
@@ -69,32 +69,6 @@ def cine(images, bits=8, rate=500, annotation=b'', **changes):
             *blocks,
         ]
     )
-
-
-def dicom(path, frames, rle=False, **changes):
-    """A DICOM file by pydicom; changes replace elements."""
-    bits = 8 if frames.max() < 256 else 12
-    meta = pydicom.dataset.FileMetaDataset()
-    meta.TransferSyntaxUID = changes.pop('syntax', LITTLE)
-    meta.MediaStorageSOPClassUID = '1.2.840.10008.5.1.4.1.1.12.2'
-    meta.MediaStorageSOPInstanceUID = '1.2.3.4'
-    dataset = pydicom.dataset.FileDataset(path, {}, file_meta=meta, preamble=bytes(128))
-    dataset.SOPClassUID = meta.MediaStorageSOPClassUID
-    dataset.SOPInstanceUID = '1.2.3.4'
-    dataset.NumberOfFrames, dataset.Rows, dataset.Columns = frames.shape
-    dataset.SamplesPerPixel = 1
-    dataset.PhotometricInterpretation = 'MONOCHROME2'
-    dataset.BitsAllocated = 8 if bits == 8 else 16
-    dataset.BitsStored = bits
-    dataset.HighBit = bits - 1
-    dataset.PixelRepresentation = int(frames.min() < 0)
-    dataset.PixelData = frames.astype('u1' if bits == 8 else '<i2').tobytes()
-    if rle:
-        dataset.compress(pydicom.uid.RLELossless)
-    for name, value in changes.items():
-        setattr(dataset, name, value)
-    dataset.save_as(path, enforce_file_format=True)
-    return path
 
 
 def images_of(path):

@@ -9,6 +9,8 @@ from fluoro_calib_msgs.srv import Calibrate
 from ros_graph import SUCCEEDED
 from test_jobs import rig  # noqa: F401  a fixture
 
+from fluoro_calib_ros.nodes.messages.self_calibration import feedback_text
+
 
 def test_job_reports_the_verdict_on_request(rig):  # noqa: F811
     """A model that corrects nothing is published, its verdict is fail, with the reason."""
@@ -19,6 +21,10 @@ def test_job_reports_the_verdict_on_request(rig):  # noqa: F811
     assert done.status == SUCCEEDED and done.result.verdict == 'fail'
     assert 'the residuals have a trend of' in done.result.findings[0]
     assert done.result.message.endswith('; verdict: fail')
+    steps = [feedback for feedback in client.feedback if feedback.stage]
+    assert [feedback.step for feedback in steps] == list(range(steps[0].steps))
+    assert feedback_text(steps[-1]).startswith('verdict: 83 %, b: ')
+    assert feedback_text(client.feedback[0]).startswith('fluoroscope b  round  1  RMSE ')
     document = json.loads((rig.folder / 'validation.json').read_text())
     assert document['findings'] == list(done.result.findings)
     assert document['calibration_id'] == {'b': done.result.calibration_id[0]}

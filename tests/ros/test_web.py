@@ -14,6 +14,7 @@ from http.cookiejar import CookieJar
 import cv2
 import numpy as np
 import pytest
+from dicom_files import dicom
 from ros_graph import NAMES, Process, entry_point, standing
 from sensor_msgs.msg import Image
 
@@ -55,7 +56,7 @@ class Browser:
 def page(graph):
     """Run the command beside the nodes of a graph, and yield it and a browser."""
     command = [*entry_point('cli'), 'watch', '--web', '--port', '0']
-    command += ['--namespace', graph.namespace]
+    command += ['--namespace', graph.namespace, '--dicom', str(graph.directory)]
     process = Process(command, graph.directory / 'watch.log', graph.environment)
     try:
         found = graph.client.wait_until(lambda: re.search(r'http://\S+', process.log))
@@ -65,6 +66,8 @@ def page(graph):
 
 
 def test_only_who_has_the_token_is_answered_and_only_this_page_acts(graph):
+    (graph.directory / 'a').mkdir()
+    dicom(graph.directory / 'a' / '1.dcm', np.zeros((1, 8, 8), dtype=np.uint8), Exposure=3)
     with page(graph) as (process, browser):
         for path in ('/', '/state', '/space', '/report', '/fluoroscopes/a/radiograph'):
             assert browser.open(path)[0] == 403
@@ -74,7 +77,9 @@ def test_only_who_has_the_token_is_answered_and_only_this_page_acts(graph):
         assert path == '/' and '<h1 id="word">' in text
         for path, kind in (('/page.js', 'text/javascript'), ('/style.css', 'text/css')):
             assert browser.open(path)[:2] == (200, kind)
-        assert browser.json('/state')['light']['word'] == 'No signal'
+        state = browser.json('/state')
+        assert state['light']['word'] == 'No signal'
+        assert state['doses'] == {'a': '1 DICOM file: 3 mAs'}
         assert browser.ask('reset', origin='http://elsewhere.example')[0] == 403
         assert browser.ask('explode')[0] == 404
         assert browser.ask('capture')[0] == 204

@@ -211,6 +211,8 @@ class FileSettings:
         Whether the file counts pixels from 1.
     y_up : bool
         Whether rows of the image are counted upwards in the file.
+    phantom_sd_mm : float or None
+        Standard deviation of the coordinates of beads, where the file has none.
     trial : str or None
         Trial of an XMALab project.
     rate_hz : float or None
@@ -229,6 +231,7 @@ class FileSettings:
     units: str | None = None
     one_based: bool = False
     y_up: bool = False
+    phantom_sd_mm: float | None = None
     trial: str | None = None
     rate_hz: float | None = None
     names: Names = field(default_factory=Names)

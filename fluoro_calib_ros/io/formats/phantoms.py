@@ -83,12 +83,11 @@ def _read_coordinates(path: Path, settings: FileSettings) -> Content:
             row.fail(f'{len(row.cells)} columns, but the first row has {len(rows[0].cells)}')
     mm = _unit(path, layout, settings)
     xyz = from_units(np.array([_numbers(row, layout, ('x', 'y', 'z')) for row in beads]), mm)
-    sd = np.full(len(beads), DEFAULT_SD_MM)
     notes: tuple[str, ...] = ()
     if 'sd' in layout.columns:
         sd = _positive(beads, layout, 'sd') * mm
     else:
-        notes = (f'{path}: the file has no standard deviation, {DEFAULT_SD_MM:g} mm is used',)
+        sd, notes = _sd_unsaid(path, len(beads), settings)
     diameter = _positive(beads, layout, 'diameter') * mm if 'diameter' in layout.columns else None
     ids = _ids(beads, layout)
     with ErrorsAt(path):
@@ -228,7 +227,7 @@ COORDINATES = Format(
 # one row a bead. The number of the row, from 1, is the bead's id unless the bead has a name.
 # XMALab does not say a unit; its users give centimetres.
 
-DEFAULT_SD_MM = 0.1  # the format has no standard deviation
+DEFAULT_SD_MM = 0.1  # of coordinates, where nobody says one
 _FIRST_ROW = re.compile(r'(white|x[\s,;]+y[\s,;]+z|s[\d.,]+([,;]\s*s[\d.,]+){2}).*', re.IGNORECASE)
 
 
@@ -240,7 +239,7 @@ def _is_framespec(sample: Sample) -> bool:
 
 
 def _read_framespec(path: Path, settings: FileSettings) -> Content:
-    """Read the survey of a phantom; its standard deviation is 0.1 mm. Raises DataError."""
+    """Read the survey of a phantom. Raises DataError."""
     return content_of(path, read_text(path), settings)
 
 
@@ -262,13 +261,20 @@ def content_of(path: Path, text: str, settings: FileSettings) -> Content:
     if len(ids) < len(beads):
         index = next(i for i, name in enumerate(given) if name in given[:i])
         beads[index].fail(f'the bead {given[index]!r} is given twice')
-    notes = (
-        *notes,
-        f'{path}: the format has no standard deviation, {DEFAULT_SD_MM:g} mm is used',
-    )
+    sd, of_sd = _sd_unsaid(path, len(xyz), settings)
     with ErrorsAt(path):
-        survey = Phantom(np.array(list(ids.values())), xyz, np.full(len(xyz), DEFAULT_SD_MM))
-    return Content(survey=survey, names=Names(without_trivial(ids)), notes=notes)
+        survey = Phantom(np.array(list(ids.values())), xyz, sd)
+    return Content(survey=survey, names=Names(without_trivial(ids)), notes=(*notes, *of_sd))
+
+
+def _sd_unsaid(
+    path: Path, count: int, settings: FileSettings
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return standard deviations (n,) [mm] that a file does not say, and a note if nobody does."""
+    if settings.phantom_sd_mm is not None:
+        return np.full(count, settings.phantom_sd_mm), ()
+    note = f'{path}: the file has no standard deviation, {DEFAULT_SD_MM:g} mm is used; change it '
+    return np.full(count, DEFAULT_SD_MM), (note + 'with --phantom-sd',)
 
 
 def _factors(row: Row) -> np.ndarray:

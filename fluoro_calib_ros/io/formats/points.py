@@ -4,8 +4,9 @@
 """Points in space: files of XMALab, C3D (c3d.org) and TRC.
 
 C3D is read and written with ezc3d: points in mm, rotations, rate and names. The residual of a C3D
-point is in the unit of the points, and negative where there is no point. It is written as the
-standard deviation of the position, the root of the sum of its variances in x, y and z [mm]; 0
+point is in the unit of the points, the low byte of its fourth word times POINT:SCALE, and the word
+is negative where there is no point (c3d.org, "The C3D File Format, User Guide"). It is written as
+the standard deviation of the position, the root of the sum of its variances in x, y and z [mm]; 0
 where that is unknown. C3D holds coordinates as float32, and residuals in 255 steps. Poses of
 bodies are the 4 x 4 matrices, body -> world, of the group ROTATION.
 
@@ -67,6 +68,9 @@ STEPS = 255  # of the byte of a residual, in units of POINT:SCALE
 MAX_FRAME = 65535  # the header counts in uint16
 _MAGIC = 0x50  # second byte of a C3D file
 _INTEL = 84  # processor type
+# Places of the scale factor and of the first block of the data in the header [bytes].
+_SCALE = 12
+_DATA = 16
 BLOCK = 512  # bytes
 ROTATION_TOLERANCE = 1e-4  # float32, and programs that compute in it
 
@@ -171,8 +175,8 @@ def _check_size(path: Path, content: bytes) -> None:
     if content[start + 3 : start + 4] != bytes([_INTEL]):
         return
     points, analog, first, last = struct.unpack_from('<4H', content, 2)
-    (scale,) = struct.unpack_from('<f', content, 12)
-    (data,) = struct.unpack_from('<H', content, 16)
+    (scale,) = struct.unpack_from('<f', content, _SCALE)
+    (data,) = struct.unpack_from('<H', content, _DATA)
     values = (last - first + 1) * (4 * points + analog)
     if last < MAX_FRAME and (data - 1) * BLOCK + values * (4 if scale < 0 else 2) > len(content):
         raise DataError(f'{path}: this C3D file is truncated, or its header is damaged')
@@ -213,11 +217,9 @@ def _add_points(file: Any, points: Points, mm: float) -> None:
     with_one = np.concatenate([xyz, np.ones((*xyz.shape[:2], 1))], axis=2)
     sd = np.nan_to_num(points.sd_mm / mm)
     step = max(float(sd.max(initial=0.0)) / STEPS, 1e-6)
-    # The byte of a residual is cut off, not rounded.
-    residual = np.where(missing, MISSING, (np.round(sd / step) + 0.01) * step)
     file['parameters']['POINT']['SCALE']['value'] = [-step]
     file['data']['points'] = with_one.transpose(2, 1, 0)
-    file['data']['meta_points']['residuals'] = residual.T[None]
+    file['data']['meta_points']['residuals'] = np.where(missing, MISSING, sd).T[None]
 
 
 def _bytes_of(file: Any, path: Path) -> bytes:
@@ -226,9 +228,19 @@ def _bytes_of(file: Any, path: Path) -> bytes:
         temporary = Path(folder) / 'points.c3d'
         try:
             file.write(os.fspath(temporary))
-            return temporary.read_bytes()
+            content = bytearray(temporary.read_bytes())
         except Exception as error:
             raise DataError(f'{path}: cannot be written ({error})') from None
+    # ezc3d leaves -1 in the header, and readers such as py-c3d refuse a file where it is not that
+    # of the parameter. It writes residuals into the byte of the cameras, where large ones have the
+    # sign of a missing point.
+    (scale,) = file['parameters']['POINT']['SCALE']['value']
+    struct.pack_into('<f', content, _SCALE, scale)
+    residual = file['data']['meta_points']['residuals'][0].T
+    (data,) = struct.unpack_from('<H', content, _DATA)
+    words = np.frombuffer(content, '<f4', 4 * residual.size, (data - 1) * BLOCK)
+    words[3::4] = np.where(residual < 0, MISSING, np.round(residual / -scale)).ravel()
+    return bytes(content)
 
 
 C3D = Format(

@@ -51,6 +51,7 @@ def c3d_arrays(path: str) -> dict[str, Any]:
     # A file without rotations has neither the group nor matrices.
     group = file['parameters'].get('ROTATION', {})
     rotations = np.asarray(file['data']['rotations'], dtype=float)
+    xyz = np.asarray(file['data']['points'], dtype=float)[:3].transpose(2, 1, 0)
 
     def of_group(name: str, default: Any) -> Any:
         values = group[name]['value'] if name in group else []
@@ -65,9 +66,31 @@ def c3d_arrays(path: str) -> dict[str, Any]:
         'unit': str(parameters['UNITS']['value'][0]).strip(),
         'rate': float(header['frame_rate']),
         'first': int(header['first_frame']) + 1,
-        'xyz': np.asarray(file['data']['points'], dtype=float)[:3].transpose(2, 1, 0),
-        'residual': np.asarray(file['data']['meta_points']['residuals'], dtype=float)[0].T,
+        'xyz': xyz,
+        'residual': _residuals(path, xyz, float(parameters['SCALE']['value'][0])),
     }
+
+
+DEC = 85  # processor type of a C3D file
+
+
+def _residuals(path: str, xyz: np.ndarray, scale: float) -> np.ndarray:
+    """Return the residuals (m, n) of the points of a C3D file, -1 where there is none.
+
+    They are the low byte of the fourth word of a point. ezc3d 1.7.2 gives the high byte, which
+    tells the cameras.
+    """
+    content = Path(path).read_bytes()
+    analog, data = (int.from_bytes(content[place : place + 2], 'little') for place in (4, 16))
+    frames, points, _ = xyz.shape
+    width = 4 * points + analog
+    kind = '<f4' if scale < 0 else '<i2'
+    values = np.frombuffer(content, kind, frames * width, (data - 1) * 512)
+    if scale < 0 and content[(content[0] - 1) * 512 + 3] == DEC:
+        values = values.view('<u2').reshape(-1, 2)[:, ::-1].copy().view('<f4') / 4
+    words = values.reshape(frames, width)[:, 3 : 4 * points : 4]
+    steps = np.where(words >= 0, words, -1).astype(np.int64)
+    return np.where(steps < 0, -1.0, (steps & 0xFF) * abs(scale))
 
 
 # Axes of `tracks` in a file that does not name them, as SLEAP itself writes.

@@ -20,7 +20,7 @@ from ..access import (
     PathLike,
     check_regular_file,
     encoding_of,
-    kind_without_text,
+    kind_not_read,
     os_error_reason,
 )
 from . import bundle, deeplabcut, native, sleap, xmalab_points, xmalab_project
@@ -125,8 +125,9 @@ def read(path: PathLike, settings: FileSettings, kind: str | None = None) -> Con
 
 def _beginning(path: Path) -> str:
     sample = sample_of(path)
-    if not sample.lines:
-        return f'it is {kind_without_text(sample.head) or "not text"}'
+    kind = kind_not_read(sample.head)
+    if kind or not sample.lines:
+        return f'it is {kind or "not text"}'
     return f'it begins with {sample.lines[0][:MAX_SHOWN]!r}'
 
 

@@ -214,7 +214,9 @@ MAYACAM1 = Format(
 # The layout is that of `Project::exportDLT` of XMALab 2.2.7, as DLTdv and Argus read it: eleven
 # rows L1 to L11, x = (L1 X + L2 Y + L3 Z + L4) / (L9 X + L10 Y + L11 Z + 1), y with L5 to L8
 # (Abdel-Aziz and Karara, 1971). x and y count from 1, y upwards; the image height turns them into
-# ours. The unit is that of the calibration object, and the file does not say it.
+# ours. DLTdv8 and easyWand6 count y downwards: then the origin, where L12 is 1, lies behind every
+# camera, if y is taken as upwards. The unit is that of the calibration object, and the file does
+# not say it.
 
 _ROWS_DLT = 11  # coefficients of the direct linear transformation
 
@@ -250,28 +252,33 @@ def _read_dlt(path: Path, settings: FileSettings) -> Content:
     names = settings.fluoroscopes
     if len(names) != len(columns):
         names = tuple(f'cam{number}' for number in range(1, len(columns) + 1))
+    ones = np.ones((len(columns), 1))
+    projections = np.concatenate([columns, ones], axis=1).reshape(-1, 3, 4)
+    downwards = bool((np.linalg.det(projections[:, :, :3]) > 0).all())
+    to_ours = np.linalg.inv(_file_pixels(settings.image_size, downwards))
     cameras = []
-    for name, column in zip(names, columns):
+    for name, projection in zip(names, projections):
         try:
-            cameras.append(_dlt_camera(name, column, settings.image_size, mm))
+            cameras.append(_dlt_camera(name, to_ours @ projection, settings.image_size, mm))
         except ValueError as error:
             raise DataError(f'{path}, {name}: {error}') from None
-    return Content(cameras=tuple(cameras))
+    note = f'{path}: rows count downwards, as in DLTdv8, or the origin would be behind the cameras'
+    return Content(cameras=tuple(cameras), notes=(note,) if downwards else ())
 
 
-def _file_pixels(size: tuple[int, int]) -> np.ndarray:
+def _file_pixels(size: tuple[int, int], downwards: bool = False) -> np.ndarray:
     """Return the matrix (3, 3) from our homogeneous pixels to those of the file."""
+    if downwards:
+        return np.array([[1.0, 0, 1], [0, 1, 1], [0, 0, 1]])
     return np.array([[1.0, 0, 1], [0, -1, size[1]], [0, 0, 1]])
 
 
-def _dlt_camera(name: str, coefficients: np.ndarray, size: tuple[int, int], mm: float) -> Camera:
-    """Return the camera of the coefficients (11,).
+def _dlt_camera(name: str, projection: np.ndarray, size: tuple[int, int], mm: float) -> Camera:
+    """Return the camera of a matrix (3, 4) from homogeneous coordinates to our pixels.
 
     Source: Hartley and Zisserman, Multiple View Geometry, 2nd edition, section 6.2.4. Raises
-    ValueError for coefficients that are not of a camera.
+    ValueError for a matrix that is not of a camera.
     """
-    projection = np.append(coefficients, 1.0).reshape(3, 4)
-    projection = np.linalg.inv(_file_pixels(size)) @ projection
     if not np.linalg.det(projection[:, :3]):
         raise ValueError('the coefficients are not those of a camera with a finite position')
     position = -np.linalg.solve(projection[:, :3], projection[:, 3])

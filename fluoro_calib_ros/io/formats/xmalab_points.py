@@ -3,10 +3,11 @@
 
 """XMALab 2-D points: `name_cam1_X,name_cam1_Y,name_cam2_X,...`, one row a frame.
 
-The layout is that of `Trial::save2dPoints` and `load2dPoints` of XMALab 2.2.7, which DLTdv
-users know, too: pixel centres at integers from (0, 0), v downwards, NaN where a marker
-is not seen. Variants, chosen in its dialogue and not visible in the file: pixels from 1
-(one_based), rows counted upwards (y_up). A further variant begins with the columns
+The layout is that of `Trial::save2dPoints` and `load2dPoints` of XMALab 2.2.7: pixel centres at
+integers from (0, 0), v downwards, NaN where a marker is not seen. Variants, chosen in its dialogue
+and not visible in the file: pixels from 1 (one_based), rows counted upwards (y_up). DLTdv calls
+the points pt1, pt2, ... and counts from 1, before version 8 upwards; Argus, which writes
+`name_cam_1_x`, counts upwards. A further variant begins with the columns
 cam<n>_offset; XMALab writes their header without the separating commas. The row is the exposure,
 counted from 1, unless there is a column Frame.
 """
@@ -36,7 +37,7 @@ from .tables import (
     require_width,
 )
 
-COLUMN = re.compile(r'(?P<target>.+)_cam(?P<camera>\d+)_(?P<axis>[XY])', re.IGNORECASE)
+COLUMN = re.compile(r'(?P<target>.+)_cam_?(?P<camera>\d+)_(?P<axis>[XY])', re.IGNORECASE)
 _OFFSET = re.compile(r'cam\d+_offset', re.IGNORECASE)
 
 
@@ -73,7 +74,18 @@ def read(path: Path, settings: FileSettings) -> Content:
     return Content(
         observations={name: of_camera for name, of_camera in frames.items() if of_camera},
         names=Names(named_targets({name: ids[name] for name in targets})),
+        notes=_origin_notes(path, top, settings),
     )
+
+
+def _origin_notes(path: Path, header: Row, settings: FileSettings) -> tuple[str, ...]:
+    """Return what to do about the origin of pixels of another program that names points so."""
+    if settings.one_based or settings.y_up:
+        return ()
+    last = header.cells[-1]
+    if re.fullmatch(r'pt\d+_cam\d+_Y', last):
+        return (f'{path}: of DLTdv8, add --one-based; of DLTdv5 to 7, --one-based --y-up',)
+    return (f'{path}: of Argus, add --y-up',) if re.search(r'_cam_\d+_y$', last) else ()
 
 
 def _header(row: Row, first: int) -> tuple[list[tuple[str, int]], int]:
@@ -204,7 +216,7 @@ FORMAT = Format(
     'xmalab2d',
     'XMALab 2-D points',
     parts=('observations',),
-    recognise=lambda sample: re.search(r'_cam\d+_[XY]\b', sample.first, re.I) is not None,
+    recognise=lambda sample: re.search(r'_cam_?\d+_[XY]\b', sample.first, re.I) is not None,
     read=read,
     write=write,
     looks_like='bead01_cam1_X,bead01_cam1_Y,bead01_cam2_X,bead01_cam2_Y',

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import rclpy
@@ -314,6 +315,7 @@ def main(args: Sequence[str] | None = None) -> None:
     parser.add_argument('--host', default='127.0.0.1')
     parser.add_argument('--port', type=int, default=8080)
     parser.add_argument('--mas', type=float, default=0.0)
+    parser.add_argument('--dicom', type=Path)
     options, words = parser.parse_known_args(args)
     is_terminal = sys.stdin.isatty() and sys.stdout.isatty()
     if not options.once and not options.web and not is_terminal:
@@ -326,7 +328,8 @@ def main(args: Sequence[str] | None = None) -> None:
             from .web import WebOptions, serve
 
             scene = Scene(client.get_namespace())
-            serve(client, scene, WebOptions(options.host, options.port, mas=options.mas))
+            page = WebOptions(options.host, options.port, mas=options.mas, dicom=options.dicom)
+            serve(client, scene, page)
         else:
             from .terminal import Dashboard
 

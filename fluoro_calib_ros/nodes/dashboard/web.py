@@ -29,6 +29,7 @@ from tornado.web import Application, HTTPError, RequestHandler
 from ...errors import DataError
 from ...io.calibration import RESULT_NAME
 from ...io.documents import to_json_values
+from ...jobs.image_sources import dose_texts
 from ...jobs.result_folder import REPORT
 from .scene import Scene
 from .state import REQUESTS, Session, light
@@ -57,13 +58,14 @@ class WebOptions:
     """Where the page is offered, and what a rig.toml says.
 
     port 0: any free one. token: empty for a new one. mas: tube load of a frame [mAs], 0 where it
-    is unknown.
+    is unknown. dicom: folder of DICOM files that tell the dose, None without.
     """
 
     host: str = '127.0.0.1'
     port: int = 8080
     token: str = ''
     mas: float = 0.0
+    dicom: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -130,15 +132,18 @@ class FileHandler(Handler):
 class StateHandler(Handler):
     """The state of the session."""
 
-    def get(self) -> None:
-        """Answer with the state, its light, and the tube load of a frame."""
+    async def get(self) -> None:
+        """Answer with the state, its light, and what is known of the dose."""
         state = self._desk.session.state()
+        folder = self._desk.options.dicom
+        doses = await asyncio.to_thread(dose_texts, folder) if folder else {}
         self._finish_json(
             {
                 **asdict(state),
                 'acceptable': state.acceptable,
                 'light': asdict(light(state)),
                 'mas': self._desk.options.mas,
+                'doses': doses,
             }
         )
 

@@ -41,23 +41,33 @@ def options_of_request(
     return replace(defaults, **requested)
 
 
-def fill_feedback(feedback: SelfCalibrate.Feedback, label: str, last: Round) -> None:
-    """Fill in the feedback of a round of the fluoroscopes named by the label."""
-    feedback.fluoroscope = label
-    feedback.iteration = last.iteration
-    feedback.cost_adjustment = last.F
-    feedback.cost_regression = last.G
-    feedback.k = max(last.k.values())
+def feedback_of_round(label: str, last: Round) -> SelfCalibrate.Feedback:
+    """Return the feedback of a round of the fluoroscopes named by the label."""
     mean_square = np.mean([np.square(rmse) for rmse in last.rmse.values()], axis=0)
-    feedback.rmse_u, feedback.rmse_v = (float(x) for x in np.sqrt(mean_square))
+    rmse_u, rmse_v = (float(x) for x in np.sqrt(mean_square))
+    return SelfCalibrate.Feedback(
+        fluoroscope=label,
+        iteration=last.iteration,
+        cost_adjustment=last.F,
+        cost_regression=last.G,
+        k=max(last.k.values()),
+        rmse_u=rmse_u,
+        rmse_v=rmse_v,
+    )
+
+
+def feedback_of_step(stage: str, step: int, steps: int) -> SelfCalibrate.Feedback:
+    """Return the feedback of a step of the verdict that begins."""
+    return SelfCalibrate.Feedback(stage=stage, step=step, steps=steps)
 
 
 def feedback_text(feedback: SelfCalibrate.Feedback) -> str:
-    """Return the feedback of a round in one line, for people."""
+    """Return the feedback of a round or step in one line, for people."""
+    if feedback.stage:
+        return f'verdict: {100 * feedback.step // feedback.steps} %, {feedback.stage}'
     neighbours = f'k {feedback.k:3d}  ' if feedback.k else ''
     return (
         f'fluoroscope {feedback.fluoroscope}  round {feedback.iteration:2d}  '
-        f'F {feedback.cost_adjustment:10.1f}  G {feedback.cost_regression:10.1f}  '
         f'{neighbours}RMSE {feedback.rmse_u:.3f} {feedback.rmse_v:.3f} px'
     )
 

@@ -90,10 +90,10 @@ function calibrationText(f) {
   return [f.age_s === null ? '' : `${duration(f.age_s)} ago`, residuals].filter(Boolean).join(', ');
 }
 
-function showFluoroscope(f, mas) {
+function showFluoroscope(f, mas, doses) {
   const view = viewOf(f.name);
   put(view.querySelector('.pose'), f.next_pose ? `Next pose: ${f.next_pose}` : '');
-  const load = mas ? `, ${number(mas * f.frames, 2)} mAs` : '';
+  const load = mas && !doses[f.name] ? `, ${number(mas * f.frames, 2)} mAs` : '';
   const rows = [
     ['State', f.state || '-'],
     ['Exposures', `${f.exposures}, ${Math.round(100 * f.coverage)} % of the image covered`],
@@ -101,6 +101,7 @@ function showFluoroscope(f, mas) {
     ['Calibration', calibrationText(f)],
     ['Corrected', rate(f.corrected_hz)],
   ];
+  if (doses[f.name]) rows.push(['Dose', doses[f.name]]);
   if (f.rejected) rows.push(['Refused', `${f.rejected} frames`, 'warn']);
   fillRows(view.querySelector('tbody'), rows);
 }
@@ -111,7 +112,7 @@ function showState(state) {
   put(by('word'), state.light.word);
   put(by('sentence'), state.light.sentence);
   document.title = `${state.light.word} - fluoroscopes ${state.namespace}`;
-  state.fluoroscopes.forEach((f) => showFluoroscope(f, state.mas));
+  state.fluoroscopes.forEach((f) => showFluoroscope(f, state.mas, state.doses));
   fillRows(by('results'), [
     ['Verdict', state.verdict || 'no calibration of this session yet', state.verdict],
     ['Orientation', state.orientation || 'none yet'],
@@ -275,9 +276,11 @@ async function showResiduals() {
   by('residuals').replaceChildren();
   by('report').hidden = true;
   if (!calibrated) return;
+  const wanted = calibrated;
   let found;
   try {
     found = await ask('/residuals');
+    if (wanted !== calibrated) return; // asked for again: the fluoroscopes tell one after the other
   } catch (error) {
     put(by('residuals-text'), error.message);
     return;

@@ -50,6 +50,9 @@ FIRST_STEPS = 4  # that only have to tell beads from other things
 PROFILE_STEPS = 3
 PROFILE_BEADS = 100
 PATIENCE = 2  # rounds without a better fit: a hard edge with a wide blur looks like a sphere
+# Growth of a radius in a round, beyond which the fits cannot be compared: the window ended within
+# the shadow. One of a bead of 20 px then grows by half of the margin of the window.
+GROWING = 0.05
 PROFILE_ROUNDS = 20  # at most, for a first radius that is a third too small
 START_BLUR_PX = 0.9
 START_ATTENUATION = 1.5
@@ -77,6 +80,7 @@ def estimate_profile(
     alone = np.argsort(-distance, kind='stable')[:PROFILE_BEADS]
     best = profile
     least = np.inf
+    growth = np.inf
     worse = 0
     for number in range(PROFILE_ROUNDS):
         fit = _BeadFit(
@@ -89,15 +93,17 @@ def estimate_profile(
         fit.plane_only = True
         fit.run(1 if number else PROFILE_STEPS)
         lack = fit.typical()
-        worse = 0 if lack < least else worse + 1
-        if lack < least:
+        worse += 1
+        if growth > GROWING or lack < least:
             best = profile
             least = lack
+            worse = 0
         if worse == PATIENCE:
             return best
         before = profile
         profile = fit_profile(*fit.absorbed(), before)
-        if abs(profile.radius_px - before.radius_px) < SETTLED * profile.radius_px:
+        growth = profile.radius_px / before.radius_px - 1
+        if abs(growth) < SETTLED:
             break
     return profile
 

@@ -78,20 +78,22 @@ def estimate_profile(
     noise = Noise(0.0, 1.0, np.ones((1, 1)))
     distance = cKDTree(uv).query(uv, k=[2])[0][:, 0] if len(uv) > 1 else np.full(1, np.inf)
     alone = np.argsort(-distance, kind='stable')[:PROFILE_BEADS]
+    place = uv[alone]
     best = profile
     least = np.inf
     growth = np.inf
     worse = 0
-    for number in range(PROFILE_ROUNDS):
+    for _ in range(PROFILE_ROUNDS):
         fit = _BeadFit(
             light,
-            uv=uv[alone],
+            uv=place,
             relative_radius=relative_radius[alone],
             profile=profile,
             noise=noise,
         )
         fit.plane_only = True
-        fit.run(1 if number else PROFILE_STEPS)
+        fit.run(PROFILE_STEPS)
+        place = fit.uv
         lack = fit.typical()
         worse += 1
         if growth > GROWING or lack < least:

@@ -24,7 +24,7 @@ from .shadow_fit import DISTURBED, Profile
 TYPICAL = 1 / 3  # of the beads of a phantom with several sizes
 STEP = 1.25  # factor between sizes that are compared
 SIZES = STEP ** np.arange(-4, 5)
-STEPS = (STEP, 1.1, 1.03)  # between those that are compared then
+STEPS = (STEP**0.5, STEP**0.25, STEP**0.125)  # between those that are compared then
 SAMPLE = 40  # beads that tell whether sizes differ
 OTHERS = 0.2  # share of them with something else beside them
 ROUNDS = 2  # the second one with a profile of beads of one size
@@ -121,14 +121,18 @@ class _Sizes:
         return bool(np.mean(np.abs(off) > 0.5 * np.log(STEP)) <= OTHERS)
 
     def best(self, rows: np.ndarray) -> NDArray[np.float64]:
-        """Sizes (m,) of best fit of some beads, between those that are compared by parabolas."""
+        """Sizes (m,) of best fit of some beads."""
         same = np.ones(len(rows))
         lack = self.lacks(rows, [one * same for one in SIZES])
         size = SIZES[np.clip(np.argmin(lack, axis=0), 1, len(SIZES) - 2)]
+        row = np.arange(len(rows))
         for step in STEPS:
-            before, at, after = -self.lacks(rows, [size / step, size, size * step])
-            size = size * step ** vertex(before, at, after)
-        return np.asarray(size)
+            tried = np.stack([size / step, size, size * step])
+            lack = self.lacks(rows, list(tried))
+            least = np.argmin(lack, axis=0)
+            size = tried[least, row]
+        # Only where both neighbours fit worse, a parabola says more.
+        return np.asarray(size * np.where(least == 1, STEPS[-1] ** vertex(*-lack), 1.0))
 
     def lacks(self, rows: np.ndarray, sizes: Sequence[np.ndarray]) -> np.ndarray:
         """Lack of fit (k, m) of some beads (m,) with some sizes (m,) each.

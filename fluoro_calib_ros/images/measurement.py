@@ -49,11 +49,11 @@ STEPS = SETTINGS.steps
 FIRST_STEPS = 4  # that only have to tell beads from other things
 PROFILE_STEPS = 3
 PROFILE_BEADS = 100
-PATIENCE = 2  # rounds without a better fit: a hard edge with a wide blur looks like a sphere
-# Growth of a radius in a round, beyond which the fits cannot be compared: the window ended within
-# the shadow. One of a bead of 20 px then grows by half of the margin of the window.
-GROWING = 0.05
-PROFILE_ROUNDS = 20  # at most, for a first radius that is a third too small
+# Rounds without a better fit, after which the best profile is chosen in windows of one size: a
+# hard edge with a wide blur looks like a sphere. Where the radius grows by a half, fits are worse
+# at first.
+PATIENCE = 4
+MOST = 2.0  # factor between the radius of a bead and that of its detection
 START_BLUR_PX = 0.9
 START_ATTENUATION = 1.5
 START_SCATTER = 0.1
@@ -74,40 +74,41 @@ def estimate_profile(
     uv: (n, 2) beads [px]. relative_radius: (n,) 1 for a typical bead. radius_px: first value of
     its radius.
     """
-    profile = Profile(radius_px * 0.95, START_BLUR_PX, START_ATTENUATION, START_SCATTER)
-    noise = Noise(0.0, 1.0, np.ones((1, 1)))
     distance = cKDTree(uv).query(uv, k=[2])[0][:, 0] if len(uv) > 1 else np.full(1, np.inf)
     alone = np.argsort(-distance, kind='stable')[:PROFILE_BEADS]
     place = uv[alone]
-    best = profile
-    least = np.inf
-    growth = np.inf
-    worse = 0
-    for _ in range(PROFILE_ROUNDS):
-        fit = _BeadFit(
-            light,
-            uv=place,
-            relative_radius=relative_radius[alone],
-            profile=profile,
-            noise=noise,
-        )
-        fit.plane_only = True
-        fit.run(PROFILE_STEPS)
+    radius = relative_radius[alone]
+    profiles = [Profile(radius_px * 0.95, START_BLUR_PX, START_ATTENUATION, START_SCATTER)]
+    lacks: list[float] = []
+    while len(lacks) - int(np.argmin(lacks or [0])) <= PATIENCE:
+        before = profiles[-1]
+        fit = _profile_fit(light, place, radius, before)
         place = fit.uv
-        lack = fit.typical()
-        worse += 1
-        if growth > GROWING or lack < least:
-            best = profile
-            least = lack
-            worse = 0
-        if worse == PATIENCE:
-            return best
-        before = profile
+        lacks.append(fit.typical())
         profile = fit_profile(*fit.absorbed(), before)
-        growth = profile.radius_px / before.radius_px - 1
-        if abs(growth) < SETTLED:
+        if not radius_px / MOST < profile.radius_px < radius_px * MOST:
             break
-    return profile
+        profiles.append(profile)
+        if abs(profile.radius_px / before.radius_px - 1) < SETTLED:
+            return profile
+    reach_px = max(profile.reach_px for profile in profiles)
+    fits = [_profile_fit(light, uv[alone], radius, profile, reach_px) for profile in profiles]
+    return min(fits, key=ShadowFit.typical).profile
+
+
+def _profile_fit(
+    light: Light,
+    uv: np.ndarray,
+    radius: np.ndarray,
+    profile: Profile,
+    reach_px: float = 0.0,
+) -> _BeadFit:
+    """Return the fit of shadows with a profile, in windows for a reach that is no smaller."""
+    noise = Noise(0.0, 1.0, np.ones((1, 1)))
+    fit = _BeadFit(light, uv, radius, profile=profile, noise=noise, reach_px=reach_px)
+    fit.plane_only = True
+    fit.run(PROFILE_STEPS)
+    return fit
 
 
 def measure_beads(
@@ -155,6 +156,7 @@ class _BeadFit(ShadowFit):
         profile: Profile,
         noise: Noise,
         size: np.ndarray | None = None,
+        reach_px: float = 0.0,
     ) -> None:
         self.stretch = np.asarray(relative_radius, dtype=float)
         self.size = np.ones(len(uv)) if size is None else size
@@ -163,7 +165,7 @@ class _BeadFit(ShadowFit):
         step = np.log1p(RADIUS_SD)
         kinds, self.kind = np.unique(np.rint(np.log(self.size) / step), return_inverse=True)
         self.shadows = Shadows([profile.sized(float(np.exp(step * one))) for one in kinds])
-        reach = profile.reach_px * float(self.radius.max(initial=1.0))
+        reach = max(profile.reach_px, reach_px) * float(self.radius.max(initial=1.0))
         window = reach + MARGIN_PX
         super().__init__(
             SETTINGS, profile, noise=noise, uv=uv, depth=np.ones(len(uv)), window_px=window

@@ -430,6 +430,7 @@ REACH_SIGMAS = 3.2
 # Bounds of radius, blur [px], attenuation along the radius, and scattered light.
 LOW = (0.5, 0.35, 0.05, 0.0)
 HIGH = (40.0, 6.0, 6.0, 0.6)
+CHANGE = 1.5  # factor on the first three in one fit
 
 
 @dataclass(frozen=True)
@@ -549,5 +550,8 @@ def fit_profile(
 
     first = np.array([start.radius_px, start.blur_px, start.attenuation, start.scatter])
     first = np.clip(first, np.asarray(LOW) * 1.01 + 1e-3, np.asarray(HIGH) * 0.99)
-    found = least_squares(residual, first, bounds=(LOW, HIGH), x_scale=first, max_nfev=12)
+    # The backgrounds belong to the shadows before.
+    change = np.append(np.full(3, CHANGE), np.inf)
+    bounds = (np.maximum(LOW, first / change), np.minimum(HIGH, first * change))
+    found = least_squares(residual, first, bounds=bounds, x_scale=first, max_nfev=12)
     return Profile(*map(float, found.x))

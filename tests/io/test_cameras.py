@@ -216,6 +216,13 @@ def test_mayacam1_has_five_rows(tmp_path, count):
         registry.read(path, MM, 'mayacam1')
 
 
+def test_coefficients_of_dlt_without_an_image_size_are_refused(tmp_path):
+    path = tmp_path / 'dlt.csv'
+    registry.write(path, 'dlt', Content(cameras=cameras()), MM)
+    with pytest.raises(DataError, match='do not contain the image size, --image-size WxH'):
+        registry.read(path, FileSettings(units='mm'))
+
+
 def test_dlt_gives_pixels_from_one_upwards(tmp_path):
     """By the eleven coefficients of XMALab and DLTdv: L1 X + L2 Y + L3 Z + L4 over the third."""
     path = tmp_path / 'dlt.csv'

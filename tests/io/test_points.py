@@ -608,6 +608,27 @@ def test_frames_left_out_are_gaps_at_a_constant_rate(tmp_path):
     assert np.isnan(found.xyz_mm[1:3]).all() and found.xyz_mm[3, 0].tolist() == [4, 5, 6]
 
 
+def test_trc_of_an_unknown_unit_needs_the_unit(tmp_path):
+    path = tmp_path / 'points.trc'
+    registry.write(path, 'trc', Content(points=points()), FileSettings(units='mm'))
+    lines = path.read_text().split('\n')
+    lines[2] = lines[2].replace('mm', 'furlong')
+    path.write_text('\n'.join(lines))
+    sentence = f"{path}, row 3: the unit is 'furlong', give it with --units"
+    assert refused(path, FileSettings()) == sentence
+    found = registry.read(path, FileSettings(units='cm')).points.xyz_mm
+    np.testing.assert_allclose(found, 10 * points().xyz_mm)
+
+
+@pytest.mark.parametrize(
+    'header', ['Frame,a_X,b_Y,a_Z', 'Frame,a_X,a_Y', 'Frame,a_X,a_Z,a_Y', 'Frame,a_X,a_Y,a_Z,a_X']
+)
+def test_columns_that_are_not_triples_of_a_target_are_refused(tmp_path, header):
+    path = tmp_path / 'points.csv'
+    path.write_text(f'{header}\n1{",5" * header.count(",")}\n')
+    assert f'{path}, row 1: the column' in refused(path, SETTINGS, 'xmalab3d')
+
+
 def test_trc_without_frames_is_refused(tmp_path):
     path = tmp_path / 'points.trc'
     registry.write(path, 'trc', Content(points=points()), FileSettings(units='mm'))

@@ -137,7 +137,7 @@ def _farther(seen: Seen, model: PhantomModel, near: View) -> Iterator[Match | No
         around = around[around != seed]
         with np.errstate(invalid='ignore'):
             close = np.linalg.norm(predicted - seen.uv[seed], axis=1) < reach
-        triples = model.triples[0].of_beads(close)
+        triples = model.triples(LEVELS[0][0]).of_beads(close)
         poses = local_poses(
             int(seed), seen.uv, near=around, triples=triples, found=beads, scales=scales
         )

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import permutations, product
 
 import numpy as np
@@ -103,7 +104,6 @@ class PhantomModel:
 
     xyz: NDArray[np.float64]  #: (n, 3) [mm]
     diameter_mm: NDArray[np.float64] | None  #: (n,)
-    triples: tuple[Triples, ...]  #: by level of the search
     symmetries: tuple[Symmetry, ...]
     grid: FlatGrid | None  #: for a flat grid
     #: any of several poses that fit equally well is taken: a regular grid looks alike in all
@@ -120,16 +120,23 @@ class PhantomModel:
         grid = FlatGrid.of(xyz)
         if regular and grid is None:
             raise DataError('the phantom is no flat grid with rows and columns')
-        by_count = {level[0]: triples_of(xyz, level[0]) for level in LEVELS}
-        triples = tuple(by_count[level[0]] for level in LEVELS)
         return cls(
             xyz,
             diameter_mm,
-            triples=triples,
             symmetries=tuple(_symmetries(xyz)),
             grid=grid,
             regular=regular,
         )
+
+    @cached_property
+    def _triples(self) -> dict[int, Triples]:
+        return {}
+
+    def triples(self, neighbours: int) -> Triples:
+        """Return the triples of beads with so many neighbours, made when they are first needed."""
+        if neighbours not in self._triples:
+            self._triples[neighbours] = triples_of(self.xyz, neighbours)
+        return self._triples[neighbours]
 
 
 def match(seen: Seen, model: PhantomModel, lens: Lens) -> Match:
@@ -376,13 +383,14 @@ def _candidates(seen: Seen, model: PhantomModel, lens: Lens) -> Iterator[Match]:
     beads[~seen.field] = 2
     order = seeds_of(seen)
     enough = len(order)
-    for triples, (wide, neighbours, (first, last), limits) in zip(model.triples, LEVELS):
+    for wide, neighbours, (first, last), limits in LEVELS:
         scales = _scales(seen, model, limits)
         if first == CENTRAL:
             enough = _enough(seen, model)
         elif wide > LEVELS[0][0] and enough < LEVELS[1][2][1]:
             # Fewer neighbours were enough.
             continue
+        triples = model.triples(wide)
         for seed in order[first : min(last, enough)]:
             _, around = seen.tree.query(seen.uv[seed], k=min(neighbours + 1, len(seen.uv)))
             around = around[around != seed]

@@ -31,9 +31,9 @@ def calibration(kind='auto'):
 
 
 @functools.cache
-def corrector(interpolation='linear', kind='auto'):
+def corrector(interpolation='linear', kind='auto', border=0):
     """An ImageCorrector of it."""
-    return ImageCorrector(calibration(kind), interpolation)
+    return ImageCorrector(calibration(kind), interpolation, border)
 
 
 def with_model(model, size):
@@ -185,7 +185,7 @@ def test_constant_image_stays_constant(dtype, interpolation):
     """Up to the edge of the observed area, without mixing with the border; beyond it is the
     border.
     """
-    this = ImageCorrector(calibration(), interpolation, border=7)
+    this = corrector(interpolation, border=7)
     value = np.iinfo(dtype).max
     got = this.correct(np.full(SIZE[::-1], value, dtype=dtype))
     assert (got[this.mask] == value).all() and (got[~this.mask] == 7).all()

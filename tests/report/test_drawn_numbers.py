@@ -13,6 +13,7 @@ import rigs
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
+from fluoro_calib_ros.correction.fluoroscope_calibration import NoiseProfile
 from fluoro_calib_ros.exposures.names import Names
 from fluoro_calib_ros.exposures.phantom import Drawing, Phantom
 from fluoro_calib_ros.reconstruction.intersection import OK, REJECTED
@@ -57,6 +58,7 @@ from fluoro_calib_ros.report.rig_geometry import (
     phantom_in_sensor,
     uncalibrated_share,
 )
+from fluoro_calib_ros.report.tables import _noise_text
 
 SIZE = (320, 160)
 
@@ -210,7 +212,9 @@ def test_distribution_is_compared_with_the_normal_of_its_robust_deviation():
 
 def test_shifts_of_beads_are_relative_to_their_sd():
     shift = np.array([[0.3, 0, 0], [0, 0.6, 0], [0, 0, 0.9]])
-    left, right = bead_shifts(shift, np.array([0.1, 0.1, 0.3])).axes
+    figure = bead_shifts(shift, np.array([0.1, 0.1, 0.3]))
+    left, right = figure.axes
+    assert figure.get_figwidth() > figure.get_figheight()
     assert left.get_position().x1 < right.get_position().x0  # beside each other
     assert {text.get_text() for text in left.get_legend().get_texts()} == {'x', 'y', 'z'}
     assert max(step.get_xy()[:, 0].max() for step in left.patches) == pytest.approx(0.9)
@@ -218,6 +222,12 @@ def test_shifts_of_beads_are_relative_to_their_sd():
     left_edges = np.array([bar.get_x() for bar in right.patches])
     assert counts.sum() == 3 and counts[0] == 2  # 0.3 and 0.9 / 3 over the root of 3
     assert left_edges[0] == pytest.approx(np.sqrt(3)) and counts[-1] == 1
+
+
+def test_noise_is_told_of_the_middle_and_of_the_border():
+    profile = NoiseProfile(middle=0.9, rim=1.5, reach=1.0)
+    assert _noise_text(Fake(image_sd=0.2, noise_profile=profile)) == '0.180; border 0.300'
+    assert _noise_text(Fake(image_sd=0.2, noise_profile=None)) == '0.200'
 
 
 def test_parts_of_the_image_without_beads_are_named():

@@ -51,7 +51,10 @@ BETTER = 4.0  # factor on the square sum of another way to fit as many members
 MAX_CHANCE = 1e-7
 MAX_SHADOWS = 120
 MAX_STEPS = 200_000  # of the search
-AT_ONCE = 64  # choices of points that are judged together, in about the time of one
+# Choices of points that are judged together, in about the time of one: an eighth of those before,
+# for what fits ends the search for fewer members, and at most 64.
+PART_AT_ONCE = 8
+MAX_AT_ONCE = 64
 
 
 @dataclass(frozen=True)
@@ -285,6 +288,7 @@ class _Search:
         self.fits: list[_Fit] = []  # with as many members as the best one
         self.steps = 0
         self.choices: list[np.ndarray] = []  # complete ones that are not judged yet
+        self.judged = 0
         self.point = np.full(len(body.target_id), -1)
 
     def run(self) -> None:
@@ -304,7 +308,7 @@ class _Search:
             return
         if member == size:
             self.choices.append(self.point.copy())
-            if len(self.choices) == AT_ONCE:
+            if len(self.choices) >= min(1 + self.judged // PART_AT_ONCE, MAX_AT_ONCE):
                 self._judge()
             return
         fits = free.copy()
@@ -325,7 +329,8 @@ class _Search:
         """Compare complete choices with the best ones, those of most members first."""
         by_count: dict[int, list[np.ndarray]] = {}
         for choice in self.choices:
-            by_count.setdefault(np.count_nonzero(choice >= 0), []).append(choice)
+            by_count.setdefault(int(np.count_nonzero(choice >= 0)), []).append(choice)
+        self.judged += len(self.choices)
         self.choices.clear()
         for count in sorted(by_count, reverse=True):
             if self.fits and count < self.fits[0].count:

@@ -12,6 +12,7 @@ that none of them used.
 """
 
 import argparse
+import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -69,11 +70,8 @@ def measured(part: float, seed: int) -> tuple[Counter[str], float, float]:
     rig = virtual_rig(seed)
     simulated = simulate_exposures(rig, EXPOSURES, seed, Detection(false_matches=part))
     truth = true_ids(rig, simulated.frames, simulated.poses)
-    outcome = run_calibration(
-        CalibrationRequest(simulated.frames, rig.phantom, joint=True), validate=True
-    )
-    assert outcome.validation is not None
-    doubtful = doubtful_observations(outcome.result, outcome.validation.checks)
+    outcome = run_calibration(CalibrationRequest(simulated.frames, rig.phantom, joint=True))
+    doubtful = doubtful_observations(outcome.result)
     false = {key for key, ids in truth.items() if key[2] not in ids}
     count = Counter(points=len(truth), false=len(false))
     for found in doubtful:
@@ -95,10 +93,12 @@ def measured(part: float, seed: int) -> tuple[Counter[str], float, float]:
 def errors(one: Case, doubtful: Sequence[Doubtful], seed: int) -> tuple[float, float]:
     """Return errors [mm] in unused exposures, with the frames as they are and after decisions."""
     before = out_of_sample(one, one.rig.phantom, one.frames, seed)
+    if not doubtful:
+        return before, before
     try:
         repaired, _ = decided(one.frames, suggested(doubtful))
     except DataError as error:  # two points with one suggestion
-        print(f'seed {seed}: {error}')
+        print(f'seed {seed}{error}', file=sys.stderr)
         return before, float('nan')
     return before, out_of_sample(one, one.rig.phantom, repaired, seed)
 
@@ -111,7 +111,7 @@ def row(seeds: Iterable[int], part: float) -> str:
         found, *of_seed = measured(part, seed)
         count += found
         both.append(of_seed)
-    before, after = np.nanmean(both, axis=0)
+    before, after = np.mean(both, axis=0)  # NaN where a table was refused
     refused = int(np.isnan(both).any(axis=1).sum())
     return (
         f'| {100 * part:g} % | {count["false"]} of {count["points"]} | {count["listed"]} | '

@@ -106,7 +106,7 @@ FIDUCIAL = np.array(
     ]
 )
 LARGE = (8, 12)
-DIAMETERS = (4.5, 8.0)  # [mm] at that scale, from their shadows
+DIAMETERS = (4.5, 7.5)  # [mm] at that scale, from their shadows at half of the contrast
 REACH = (1.5, 2.0)  # of the ring of light around a shadow, over its radius
 WRONG_PX = 3.0
 

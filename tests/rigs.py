@@ -69,7 +69,7 @@ def _calibrated(name, count, options):
 
 def true_calibrations(fluoroscopes, image_sd=0.25):
     """True calibrations by name of the fluoroscopes of a rig without distortion."""
-    one = calibrated('a', 5, model='none').calibrations['a']
+    one = calibrated('a', 5, model='parametric').calibrations['a']
     return {
         f.name: replace(
             one,

@@ -223,27 +223,21 @@ def bead(**changes):
 
 
 def not_measured(n=20):
-    found = Fake(view=None, predicted=np.zeros((n, 2)), bead=np.arange(n), detection=np.arange(n))
-    seen = Fake(uv=np.zeros((n, 2)), in_field=lambda uv: np.ones(n, bool))
-    imaging = extraction._Imaging(None, profile=object())
+    view = Fake(depth=lambda _: np.ones(n))
+    found = Fake(view=view, predicted=np.zeros((n, 2)), bead=np.arange(n), detection=np.arange(n))
+    seen = Fake(uv=np.zeros((n, 2)), in_field=lambda uv: np.ones(n, bool), radius_px=1.0)
+    imaging = Fake(completed=lambda *_: imaging, size=np.ones(n), profile=None, noise=None)
     with mock.patch.multiple(
-        extraction,
-        _starts=mock.DEFAULT,
-        _relative_radius=lambda *_: np.ones(n),
-        measure_beads=mock.DEFAULT,
-        _reasons=lambda *_: [extraction.LOST] * n,
+        extraction, measure_beads=mock.DEFAULT, _reasons=lambda *_: [extraction.LOST] * n
     ):
-        return raised(
-            extraction._measured, Fake(light=None, field=None), seen, found, None, imaging
-        )
+        return raised(extraction._measured, Fake(light=None), seen, found, Fake(xyz=None), imaging)
 
 
 def unsure_bead(n=10):
     sigma = np.where(np.arange(n) == 3, 1.0, 0.1)
     beads = Fake(uv=np.zeros((n, 2)), sigma=sigma, overlapped=np.zeros(n, bool))
-    measured = (np.arange(n), beads, [None] * n, np.zeros((n, 2)))
-    imaging = extraction._Imaging(None, profile=object())
-    return extraction._checked(None, None, None, measured, imaging).refused[0].finding
+    measured = extraction._Measured(np.arange(n), beads, [None] * n, np.zeros((n, 2)), np.zeros(n))
+    return extraction._checked(None, None, None, measured, None).refused[0].finding
 
 
 def drift(source, confirmed, level=ERROR):

@@ -171,7 +171,8 @@ def _measured(
     light = detections.light
     for steps in passes:
         rows = np.flatnonzero(seen.in_field(predicted))
-        shadows = _expected(predicted, rows, bead, uv, seen, view.depth(model.xyz))
+        depth = view.depth(model.xyz)
+        shadows = _expected(predicted, rows, bead, uv, seen=seen, depth=depth)
         if imaging is None:
             told = _relative_sizes(model)
             imaging = first_imaging(light, detections.noise, shadows, seen.radius_px, size=told)

@@ -108,17 +108,22 @@ class _Sizes:
         self.imaging = imaging
 
     def are_equal(self, rows: np.ndarray) -> bool:
-        """Return whether nearly all of some beads that nothing is beside have the same size."""
+        """Return whether nearly all of some beads that nothing is beside have the same size.
+
+        Another size counts where the common one fits as badly as if something were beside a bead.
+        """
         if not len(rows):
             return True
         same = np.ones(len(rows))
-        least = np.argmin(self.lacks(rows, [same / STEP, same, same * STEP]), axis=0)
-        if np.mean(least != 1) <= OTHERS:
+        smaller, common, larger = self.lacks(rows, [same / STEP, same, same * STEP])
+        if np.mean(common > DISTURBED * np.minimum(smaller, larger)) <= OTHERS:
             return True
         size = self.best(rows)
-        lack = self.lacks(rows, [size])[0]
-        off = np.log(size / np.median(size))[lack < DISTURBED * np.median(lack)]
-        return bool(np.mean(np.abs(off) > 0.5 * np.log(STEP)) <= OTHERS)
+        middle = np.median(size)
+        own, common = self.lacks(rows, [size, middle * same])
+        differs = np.abs(np.log(size / middle)) > 0.5 * np.log(STEP)
+        differs &= common > DISTURBED * own
+        return bool(np.mean(differs[own < DISTURBED * np.median(own)]) <= OTHERS)
 
     def best(self, rows: np.ndarray) -> NDArray[np.float64]:
         """Sizes (m,) of best fit of some beads."""

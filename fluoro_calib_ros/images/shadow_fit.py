@@ -285,7 +285,9 @@ class ShadowFit(ABC):
             total[textured] -= taken[2]
         self.misfit[rows] = total / np.maximum(valid.sum(axis=1) - OWN, 1)
         standardised = np.sqrt(squared) * np.sign(residual)
-        return NormalEquations(normal, plain, right, weighted, standardised, valid)
+        return NormalEquations(
+            normal, plain, right, weighted=weighted, residual=standardised, valid=valid
+        )
 
     def _add_texture(self, chosen: NDArray[np.bool_]) -> None:
         """Give some beads (n,) a background beyond the polynomial, as strong as pixels say."""

@@ -277,7 +277,7 @@ def write_figures(result: CalibrationResult, directory: str | os.PathLike[str]) 
             (run.models[name], image_size)
             for run in result.runs.values()
             for name, image_size in zip(run.measured.fluoroscopes, run.measured.image_size)
-            if run.models[name].corrects
+            if name in run.models and run.models[name].corrects
         )
         for label, run in result.runs.items():
             for name, figure in _figures_of_run(label, run, scale):

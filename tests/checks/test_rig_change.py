@@ -24,9 +24,8 @@ from fluoro_calib_ros.simulation.exposures import simulate_tracking
 from fluoro_calib_ros.simulation.rig import virtual_rig
 
 NOISE_PX = 0.25
-RATE_HZ = 15.0
-SECONDS = 16.0
-BUMPED = 180  # exposure, after the start has been learned
+RATE_HZ = 30.0
+BUMPED = 360  # exposure
 SEEDS = range(4)  # of knocks: how far off points are varies with their direction
 BODY = np.arange(1001, 1007)
 
@@ -43,7 +42,7 @@ def moved(rig, change):
 
 def recorded(rig):
     """A recording of markers in front of a rig, always with the same noise."""
-    return simulate_tracking(rig, SECONDS, RATE_HZ, seed=4, noise_px=NOISE_PX)
+    return simulate_tracking(rig, 16.0, RATE_HZ, seed=4, noise_px=NOISE_PX)
 
 
 @functools.cache
@@ -191,6 +190,5 @@ def test_without_an_alarm_nothing_is_added():
 
 def _later(frames):
     """Repeat frames after the end of the recording."""
-    count = round(SECONDS * RATE_HZ)
-    later_ns = round(SECONDS * 1e9)
-    return [replace(f, number=f.number + count, stamp_ns=f.stamp_ns + later_ns) for f in frames]
+    count = round(16 * RATE_HZ)
+    return [replace(f, number=f.number + count, stamp_ns=f.stamp_ns + round(16e9)) for f in frames]

@@ -53,6 +53,7 @@ PROFILE_BEADS = 100
 # hard edge with a wide blur looks like a sphere. Where the radius grows by a half, fits are worse
 # at first.
 PATIENCE = 4
+PROFILE_ROUNDS = 30  # at most; 4 to 10 were needed
 MOST = 2.0  # factor between the radius of a bead and that of its detection
 START_BLUR_PX = 0.9
 START_ATTENUATION = 1.5
@@ -80,7 +81,7 @@ def estimate_profile(
     radius = relative_radius[alone]
     profiles = [Profile(radius_px * 0.95, START_BLUR_PX, START_ATTENUATION, START_SCATTER)]
     lacks: list[float] = []
-    while len(lacks) - int(np.argmin(lacks or [0])) <= PATIENCE:
+    while len(lacks) < PROFILE_ROUNDS and len(lacks) - int(np.argmin(lacks or [0])) <= PATIENCE:
         before = profiles[-1]
         fit = _profile_fit(light, place, radius, before)
         place = fit.uv

@@ -8,19 +8,22 @@ whose power decreases with the cube of their frequency, as that of radiographs o
 of any edge averaged over its directions (Burgess, Jacobson and Judy, "Human observer detection
 experiments with mammograms and power-law noise", Med. Phys. 28, 2001). There is one unknown, the
 strength, estimated by restricted maximum likelihood (Patterson and Thompson, Biometrika 58, 1971).
-The cosines are eliminated from the normal equations, so a standard deviation contains what the
-background leaves open.
+Whether a window has such a background is decided with all windows of the image: the more have one,
+the less evidence is asked for. The cosines are eliminated from the normal equations, so a standard
+deviation contains what the background leaves open.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from itertools import product
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
+from scipy.special import expit, logit, logsumexp
 
 MIN_VARIANCE = 1 / 12  # of rounding
 NOISE_BLOCK = 16  # [px]
@@ -166,11 +169,14 @@ def correlation_of(residual: np.ndarray, valid: np.ndarray) -> np.ndarray:
 
 
 HIGHEST = 9  # half waves across a window
+TELLING = 6  # of those that tell the strength: 0.97 of the variance is in them
 EXPONENT = 3.0
 # Ratios of the variance of the background to that of the noise that are compared. Steps of a
 # factor of 2 change a standard deviation by less than a quarter of what the ratio itself leaves
 # open.
 RATIOS = 2.0 ** np.arange(-4, 13)
+ROUNDS = 3  # of the strengths and the factor on the noise
+EM_STEPS = 30  # which settle the share of windows to one in a hundred
 
 
 class Cosines:
@@ -195,19 +201,22 @@ class Cosines:
         power = np.sum(number**2, axis=1) ** (-EXPONENT / 2)
         # Of one unit of strength a pixel has one unit of variance.
         self.variance = power / (power @ np.mean(self.waves**2, axis=1))
+        telling = np.sum(number**2, axis=1) <= TELLING**2
+        self.telling = self.waves[telling] * np.sqrt(self.variance[telling, None]).astype(dtype)
 
-    def strengths(
+    def spectra(
         self, relative: np.ndarray, jacobian: np.ndarray, weight: np.ndarray, residual: np.ndarray
-    ) -> NDArray[np.float64]:
-        """Estimate the variances (g,) of the backgrounds of windows, 0 for none.
+    ) -> Spectra:
+        """Project the residuals of windows on the cosines that tell the strength.
 
         relative: (g, m) light behind the beads, as a fraction of that without them. jacobian: (g,
         u, m) derivatives of the light by the unknowns that are estimated with it. weight,
         residual: (g, m).
         """
-        waves = (relative[:, None] * self.waves) * np.sqrt(self.variance)[:, None]
-        both = np.concatenate([jacobian, waves, residual[:, None]], axis=1).astype(float)
-        products = (both * weight[:, None]) @ np.swapaxes(both, 1, 2)
+        waves = relative[:, None] * self.telling
+        both = np.concatenate([jacobian, waves, residual[:, None]], axis=1)
+        both *= np.sqrt(weight).astype(both.dtype)[:, None]
+        products = (both @ np.swapaxes(both, 1, 2)).astype(float)
         unknowns = jacobian.shape[1]
         known = products[:, :unknowns, :unknowns]
         diagonal = np.arange(unknowns)
@@ -219,13 +228,13 @@ class Cosines:
         )
         values, vectors = np.linalg.eigh(left[:, :-1, :-1])
         seen = (np.swapaxes(vectors, 1, 2) @ left[:, :-1, -1:])[..., 0] ** 2
-        noise = 1 / np.maximum(np.mean(weight, axis=1), 1e-12)
-        strength = RATIOS * noise[:, None]
-        factor = 1 + strength[..., None] * np.maximum(values, 0)[:, None]
-        gain = np.sum(strength[..., None] * seen[:, None] / factor - np.log(factor), axis=2)
-        best = np.argmax(gain, axis=1)
-        rows = np.arange(len(best))
-        return np.where(gain[rows, best] > 0, strength[rows, best], 0.0)
+        return Spectra(
+            np.maximum(values, 0),
+            seen,
+            squared=left[:, -1, -1],
+            freedom=np.maximum(np.count_nonzero(weight, axis=1) - unknowns, 1),
+            noise=1 / np.maximum(np.mean(weight, axis=1), 1e-12),
+        )
 
     def eliminated(
         self,
@@ -237,7 +246,7 @@ class Cosines:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return what the backgrounds take from normal equations, right sides and squared sums.
 
-        strength (g,) is positive; the other arguments are those of `strengths`.
+        strength (g,) is positive; the other arguments are those of `spectra`.
         """
         waves = relative[:, None] * self.waves
         weighted = waves * weight.astype(waves.dtype)[:, None]
@@ -248,3 +257,60 @@ class Cosines:
         cross = (weighted @ np.swapaxes(both, 1, 2)).astype(float)
         taken = np.swapaxes(cross, 1, 2) @ np.linalg.solve(inner, cross)
         return taken[:, :-1, :-1], taken[:, :-1, -1], taken[:, -1, -1]
+
+
+@dataclass(frozen=True)
+class Spectra:
+    """Backgrounds of windows (g,) beyond the polynomial, wave by wave (k,)."""
+
+    values: NDArray[np.float64]  #: (g, k), information of a unit of strength
+    seen: NDArray[np.float64]  #: (g, k), squared projections of the residuals
+    squared: NDArray[np.float64]  #: (g,), residuals over the noise
+    freedom: NDArray[np.int64]  #: (g,), of the residuals
+    noise: NDArray[np.float64]  #: (g,), variance of a usual pixel
+
+    @classmethod
+    def joined(cls, parts: Sequence[Spectra]) -> Spectra:
+        """Return those of all windows of some groups."""
+        names = [field.name for field in fields(cls)]
+        return cls(
+            **{name: np.concatenate([getattr(one, name) for one in parts]) for name in names}
+        )
+
+    def strengths(self, excess: float) -> NDArray[np.float64]:
+        """Variances (g,) of the backgrounds, 0 where there is more likely none.
+
+        The share of windows that have one is estimated with the strengths, and so is a common
+        factor on the noise. excess: variance of slow waves of the noise over that of white noise.
+        """
+        strength = np.zeros(len(self.noise))
+        for _ in range(ROUNDS):
+            scale = float(np.median(self._lack(strength)))
+            white = scale * excess
+            candidates = scale * RATIOS * self.noise[:, None]
+            share = candidates[..., None] * self.values[:, None] / white
+            gain = candidates[..., None] / white**2 * self.seen[:, None] / (1 + share)
+            gain = 0.5 * np.sum(gain - np.log1p(share), axis=2)
+            best = np.argmax(gain, axis=1)
+            likely = _likely(logsumexp(gain, axis=1) - np.log(len(RATIOS)))
+            strength = np.where(likely, RATIOS[best] * self.noise, 0.0)
+        return strength
+
+    def _lack(self, strength: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Mean squares (g,) of what backgrounds of some strengths (g,) leave."""
+        taken = strength[:, None] * self.seen / (1 + strength[:, None] * self.values)
+        return (self.squared - np.sum(taken, axis=1)) / self.freedom
+
+
+def _likely(evidence: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return (g,) whether windows are of a kind, given logarithms of the evidence for it.
+
+    How many are is unknown: by expectation and maximisation (Dempster, Laird and Rubin, J. R.
+    Stat. Soc. B 39, 1977).
+    """
+    least = 0.5 / len(evidence)
+    odds = 0.0
+    for _ in range(EM_STEPS):
+        share = np.mean(expit(evidence + odds))
+        odds = float(logit(np.clip(share, least, 1 - least)))
+    return np.asarray(evidence + odds > 0)

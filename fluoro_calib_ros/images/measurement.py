@@ -213,7 +213,7 @@ class _BeadFit(ShadowFit):
             if step == steps // 2:
                 self.disturbed = self.misfit > DISTURBED * self.typical()
                 if steps >= STEPS:
-                    self._add_texture(self.misfit > min(self.typical(), DISTURBED))
+                    self._add_texture()
             for (rows, _), (uv, depth, background) in zip(self.groups, moved):
                 lost = np.linalg.norm(uv - self.start[rows], axis=1) > MAX_SHIFT_PX
                 self.usable[rows[lost]] = False

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 
-from .light import MIN_PIXELS, Cosines, Noise, correlation_of
+from .light import MIN_PIXELS, Cosines, Noise, Spectra, correlation_of
 
 MAX_SIGMA_PX = 0.3  # of a centre: a larger one is that of no shadow, or of one hardly seen
 MARGIN_PX = 2.0  # of background around the shadow
@@ -161,6 +161,8 @@ class ShadowFit(ABC):
         self.background = np.zeros((n, TERMS))
         self.sigma = np.full(n, np.inf)  # of centres, where the noise of pixels is independent
         self.noise_sigma = np.full(n, np.inf)  # the part of it that comes from the noise
+        # Of the noise, as windows tell it.
+        self.correlation: NDArray[np.float64] | None = None
         self.inflation: float | None = None  # factor on the variances of that part
         self.misfit = np.full(n, np.inf)
         self.distance = np.full(n, np.inf)  # of the nearest bead
@@ -289,26 +291,39 @@ class ShadowFit(ABC):
             normal, plain, right, weighted=weighted, residual=standardised, valid=valid
         )
 
-    def _add_texture(self, chosen: NDArray[np.bool_]) -> None:
-        """Give some beads (n,) a background beyond the polynomial, as strong as pixels say."""
+    def _add_texture(self) -> None:
+        """Give beads a background beyond the polynomial where pixels say so."""
+        usual = self.typical()
+        spectra = []
+        usual_residuals = []
         for rows, near in self.groups:
-            rows, near = rows[chosen[rows]], near[chosen[rows]]
-            if not len(rows):
-                continue
             light, jacobian = self._model(rows, near)
             grey = self.grey[rows]
             valid = self._valid(rows, grey, light)
-            typical = self.typical()
-            # In units in which the weights of the fit are right.
-            self.strength[rows] = (
-                self.cosines.strengths(
-                    jacobian[:, 0],
-                    jacobian=jacobian,
-                    weight=valid / (self.noise.variance(light) * typical),
-                    residual=grey - light,
+            weight = valid / self.noise.variance(light)
+            residual = grey - light
+            spectra.append(
+                self.cosines.spectra(
+                    jacobian[:, 0], jacobian=jacobian, weight=weight, residual=residual
                 )
-                / typical
             )
+            plain = np.flatnonzero(self.misfit[rows] <= usual)[:CORRELATED]
+            usual_residuals.append((residual[plain] * np.sqrt(weight[plain]), valid[plain]))
+        self.correlation = self._correlation(*map(np.concatenate, zip(*usual_residuals)))
+        rows = np.concatenate([rows for rows, _ in self.groups])
+        # The waves are longer than the noise is correlated.
+        excess = float(self.correlation.sum())
+        self.strength[rows] = Spectra.joined(spectra).strengths(excess)
+
+    def _correlation(self, residual: np.ndarray, valid: np.ndarray) -> NDArray[np.float64]:
+        """Correlation of the noise from standardised residuals (g, m) of windows.
+
+        The background between beads that are dense contains their shadows. It tells the
+        correlation only where windows have too few pixels.
+        """
+        if valid.sum() < MIN_PIXELS:
+            return self.noise.correlation
+        return correlation_of(self._images(residual), self._images(valid))
 
     @cached_property
     def cosines(self) -> Cosines:
@@ -354,11 +369,15 @@ class ShadowFit(ABC):
             self.noise_sigma[rows[textured]] = _sd_of_centre(
                 np.linalg.inv(equations.plain[textured])
             )
+        if self.correlation is None:
+            alone = np.flatnonzero(self.misfit[rows] < UNDISTURBED * self.typical())[:CORRELATED]
+            residuals = equations.residual[alone]
+            self.correlation = self._correlation(residuals, equations.valid[alone])
         if self.inflation is None:
             # The influence of pixels on a centre: noise of neighbouring pixels adds up.
             plain = equations.plain[:INFLUENCES]
             influence = np.linalg.solve(plain, equations.weighted[:INFLUENCES])[:, TERMS]
-            self.inflation = self._inflation(influence, self._correlation(rows, equations))
+            self.inflation = self._inflation(influence, self.correlation)
         return inverse
 
     def _images(self, windows: np.ndarray) -> np.ndarray:
@@ -367,21 +386,6 @@ class ShadowFit(ABC):
         images = np.zeros((len(windows), 2 * half + 1, 2 * half + 1))
         images[:, self.offset[:, 1] + half, self.offset[:, 0] + half] = windows
         return images
-
-    def _correlation(self, rows: np.ndarray, equations: NormalEquations) -> np.ndarray:
-        """Correlation of the noise where nothing but beads is, that of the image where it is not.
-
-        The background between beads that are dense contains their shadows.
-        """
-        plain = self.strength[rows] == 0
-        plain &= self.misfit[rows] < UNDISTURBED * self.typical()
-        chosen = np.flatnonzero(plain)[:CORRELATED]
-        if not len(chosen) or equations.valid[chosen].sum() < MIN_PIXELS:
-            return self.noise.correlation
-        residual, valid = (
-            self._images(one[chosen]) for one in (equations.residual, equations.valid)
-        )
-        return correlation_of(residual, valid)
 
     def _inflation(self, influence: np.ndarray, correlation: np.ndarray) -> float:
         """Return the factor on variances for correlated noise; influence (g, m) of pixels."""

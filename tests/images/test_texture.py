@@ -54,12 +54,41 @@ def test_strengths_are_those_of_the_backgrounds(true):
     residual = relative * (amplitude @ COSINES.waves) + rng.normal(size=relative.shape) / np.sqrt(
         weight
     )
-    found = COSINES.strengths(relative, jacobian=jacobian, weight=weight, residual=residual)
-    assert np.median(found) == pytest.approx(true, rel=0.5)
+    spectra = COSINES.spectra(relative, jacobian=jacobian, weight=weight, residual=residual)
+    assert np.median(spectra.strengths(1.0)) == pytest.approx(true, rel=0.5)
 
 
-def test_noise_alone_has_hardly_any_background():
+def test_noise_alone_has_no_background():
     relative, jacobian, weight = windows(200, 5)
     residual = np.random.default_rng(6).normal(size=relative.shape) / np.sqrt(weight)
-    found = COSINES.strengths(relative, jacobian=jacobian, weight=weight, residual=residual)
-    assert np.median(found) < 0.1
+    spectra = COSINES.spectra(relative, jacobian=jacobian, weight=weight, residual=residual)
+    assert np.count_nonzero(spectra.strengths(1.0)) <= 2
+
+
+@pytest.mark.parametrize('scale', [0.5, 4.0])
+def test_backgrounds_of_some_windows_are_found_whatever_the_noise(scale):
+    relative, jacobian, weight = windows(200, 7)
+    rng = np.random.default_rng(8)
+    residual = rng.normal(size=relative.shape) / np.sqrt(weight) * np.sqrt(scale)
+    amplitude = rng.normal(size=(60, len(COSINES.variance)))
+    amplitude *= np.sqrt(30.0 * scale * COSINES.variance)
+    residual[:60] += relative[:60] * (amplitude @ COSINES.waves)
+    spectra = COSINES.spectra(relative, jacobian=jacobian, weight=weight, residual=residual)
+    found = spectra.strengths(1.0)
+    # In units of noise that is as strong as the weights say.
+    assert np.log2(np.median(found[:60]) / 30.0) == pytest.approx(0, abs=1)
+    assert np.count_nonzero(found[:60]) >= 54
+    assert np.count_nonzero(found[60:]) <= 3
+
+
+def test_slow_waves_of_correlated_noise_are_no_background():
+    relative, jacobian, weight = windows(200, 9)
+    rng = np.random.default_rng(10)
+    side = 2 * int(OFFSET.max()) + 1
+    white = rng.normal(size=(200, side + 2, side + 2))
+    rows, columns = (OFFSET - OFFSET.min()).T[::-1]
+    summed = sum(white[:, i : i + side, j : j + side] for i in range(3) for j in range(3)) / 3
+    residual = summed[:, rows, columns] / np.sqrt(weight)
+    spectra = COSINES.spectra(relative, jacobian=jacobian, weight=weight, residual=residual)
+    assert np.count_nonzero(spectra.strengths(1.0)) > 150
+    assert np.count_nonzero(spectra.strengths(9.0)) <= 2

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from ..errors import DataError
 from ..photogrammetry.rotations import matrix_from_vector, rotation_angle, vector_from_matrix
 from .growth import Match, Seen, grow, settle, start_view
-from .matching import LEVELS, MIN_BEADS, PhantomModel, is_sure, seeds_of, unambiguous
+from .matching import LEVELS, MIN_BEADS, PhantomModel, is_evident, seeds_of, unambiguous
 from .pose_search import LocalPose, local_poses, nearby_map
 from .view import View
 
@@ -66,13 +66,13 @@ def follow(
 
 
 def _fits(found: Match | None, limit_px: float) -> bool:
-    """Return whether a match is sure, with residuals as small as before.
+    """Return whether a match is evident, with residuals as small as before.
 
     A phantom that was turned by nearly a symmetry of its own would have larger ones.
     """
     return (
         found is not None
-        and is_sure(found)
+        and is_evident(found)
         and found.scale_px < limit_px
         and len(found.bead) >= MIN_BEADS
     )

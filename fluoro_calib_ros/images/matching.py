@@ -161,9 +161,9 @@ def match(seen: Seen, model: PhantomModel, lens: Lens) -> Match:
         if best is None or candidate.score > best.score:
             agreed = agreed if best is not None and _same(candidate, best) else 1
             best = candidate
-            if _is_evident(best) and not is_sure(best):
+            if is_evident(best) and not is_sure(best):
                 best, _ = _climbed(best, seen, model)
-        if is_sure(best) or (agreed >= AGREED and _is_evident(best)):
+        if is_sure(best) or (agreed >= AGREED and is_evident(best)):
             break
     if best is None:
         raise DataError('no pose of the phantom fits the beads in the image', kind=Kind.NO_POSE)
@@ -182,7 +182,7 @@ def _grid_match(grid: FlatGrid, seen: Seen, model: PhantomModel, lens: Lens) -> 
     rivals: list[Match] = []
     for pose in grid_poses(grid, model.xyz, seen, lens):
         if best is None:
-            if _is_evident(pose.match):
+            if is_evident(pose.match):
                 best = pose
             continue
         if model.regular or not _could_be(pose, best):
@@ -239,14 +239,14 @@ def _improved(one: Match, seen: Seen, model: PhantomModel) -> Match:
     return one
 
 
-def _is_evident(best: Match) -> bool:
+def is_evident(best: Match) -> bool:
     """Return whether enough of what is predicted is found, and the reverse."""
     return any(best.found >= found and best.explained >= explained for found, explained in EVIDENT)
 
 
 def _check_evidence(best: Match) -> None:
     """Raise DataError where too few predicted beads are found, or the reverse."""
-    enough = best.explained < MIN_EXPLAINED or _is_evident(best)
+    enough = best.explained < MIN_EXPLAINED or is_evident(best)
     if not enough or len(best.bead) < MIN_BEADS:
         cause = (
             f'predicts {best.expected} beads in the image, of which only {best.found:.0%} are '

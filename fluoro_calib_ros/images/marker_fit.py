@@ -23,6 +23,7 @@ from .marker_motion import SHADOW_SD_PX, MarkerStates, MeasuredMarkers, Motion, 
 from .shadow_fit import (
     DEPTH_SD,
     DISTURBED,
+    DTYPE,
     MARGIN_PX,
     MAX_SIGMA_PX,
     MIN_PASSED,
@@ -42,10 +43,6 @@ SETTINGS = FitSettings(
     max_step_px=0.8,
     pooled=120.0,
     crossed=1.2,
-    dtype=np.float32,
-    whole_scale=True,
-    robust_relative=False,
-    moves_unusable=True,
 )
 STEPS_ALONE = 2
 CONVERGED_PX = 0.1  # a longer last step is followed by another one
@@ -102,7 +99,7 @@ class _MarkerFit(ShadowFit):
             window_px=reach + MARGIN_PX,
         )
         self.guess = guess
-        self.offset_u, self.offset_v = np.ascontiguousarray(self.offset.T, dtype=SETTINGS.dtype)
+        self.offset_u, self.offset_v = np.ascontiguousarray(self.offset.T, dtype=DTYPE)
         grey, valid = windows.read(self.middle, self.offset)
         self._set_windows(grey, valid, bright=grey)
         self._set_groups(self._near(2 * reach + MARGIN_PX))
@@ -153,7 +150,7 @@ class _MarkerFit(ShadowFit):
         """
         # Points along the way are the first axis; few large arrays are faster than many small.
         centre = self.way[:, rows] + (self.uv[rows] - middle[:, None])
-        centre = centre.astype(SETTINGS.dtype)
+        centre = centre.astype(DTYPE)
         x = self.offset_u - centre[..., 0, None]
         y = self.offset_v - centre[..., 1, None]
         distance = x * x
@@ -165,7 +162,7 @@ class _MarkerFit(ShadowFit):
         y *= derivative
         if len(self.way) == 1:
             return value[0], -x[0], -y[0]
-        weight = self.way_weight.astype(SETTINGS.dtype)
+        weight = self.way_weight.astype(DTYPE)
         points = len(weight)
         shape = value.shape[1:]
         return (

@@ -40,10 +40,6 @@ SETTINGS = FitSettings(
     max_step_px=0.6,
     pooled=60.0,
     crossed=1.0,
-    dtype=np.float32,
-    whole_scale=False,
-    robust_relative=True,
-    moves_unusable=False,
 )
 STEPS = SETTINGS.steps
 FIRST_STEPS = 4  # that only have to tell beads from other things

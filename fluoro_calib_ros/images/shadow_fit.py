@@ -25,6 +25,7 @@ from .light import MIN_PIXELS, Cosines, Noise, Spectra, correlation_of
 
 MAX_SIGMA_PX = 0.3  # of a centre: a larger one is that of no shadow, or of one hardly seen
 MARGIN_PX = 2.0  # of background around the shadow
+DTYPE = np.float32  # of model and derivatives
 TERMS = 6  # of the background: a polynomial of degree 2
 OWN = TERMS + 3  # unknowns of a bead alone: its background, centre and depth
 NEIGHBOUR_SD_PX = 0.3  # of a step of a neighbour, which its own fit finds
@@ -62,10 +63,7 @@ class Beads:
 
 @dataclass(frozen=True)
 class FitSettings:
-    """What differs between fits of shadows.
-
-    The last three fields keep the numbers of two fits that were once apart.
-    """
+    """What differs between fits of shadows."""
 
     steps: int  #: Gauss-Newton steps
     crossing_steps: tuple[int, ...]  #: before which shadows that touch are blurred together
@@ -74,12 +72,6 @@ class FitSettings:
     max_step_px: float  #: largest step of a centre
     pooled: float  #: degrees of freedom of the noise of all beads, in that of one
     crossed: float  #: factor on the standard deviation where shadows cross
-    dtype: type[np.floating]  #: precision of model and derivatives
-    #: whether the polynomial of the background is scaled by a whole number of pixels
-    whole_scale: bool
-    #: whether a residual of half weight is relative to the typical lack of fit
-    robust_relative: bool
-    moves_unusable: bool  #: whether beads move whose windows are cut off
 
     @property
     def neighbours(self) -> int:
@@ -154,8 +146,7 @@ class ShadowFit(ABC):
         self.depth = self.expected_depth.copy()
         self.middle = np.rint(self.uv).astype(int)
         self.offset = window_offsets(window_px)
-        scale = np.ceil(window_px) if settings.whole_scale else window_px
-        x, y = (self.offset.T / scale).astype(settings.dtype)
+        x, y = (self.offset.T / window_px).astype(DTYPE)
         self.basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
         n = len(self.uv)
         self.background = np.zeros((n, TERMS))
@@ -177,7 +168,7 @@ class ShadowFit(ABC):
 
         bright has the grey values whose upper quartile is the first background.
         """
-        self.grey = grey.astype(self.settings.dtype)
+        self.grey = grey.astype(DTYPE)
         self.valid = valid
         self.usable = valid.mean(axis=1) >= MIN_INSIDE
         place = int(0.75 * len(self.offset))
@@ -218,18 +209,18 @@ class ShadowFit(ABC):
 
     def _plane(self, rows: np.ndarray) -> np.ndarray:
         """Light (g, m) in windows without beads."""
-        background = self.background[rows].astype(self.settings.dtype)
+        background = self.background[rows].astype(DTYPE)
         plane = background @ self.basis.T
         return np.maximum(plane, 1e-3 * np.abs(background[:, :1]) + 1e-6)
 
     def _crossing_in(self, rows: np.ndarray) -> np.ndarray:
         """What shadows that touch have together in windows, beyond the product of both."""
-        return self.settings.dtype(0) if self.crossing is None else self.crossing[rows]
+        return DTYPE(0) if self.crossing is None else self.crossing[rows]
 
     def _jacobian(self, relative: np.ndarray, beads: int) -> np.ndarray:
         """Derivatives (g, TERMS + 3 beads, m); only those by the background are set."""
         shape = (len(relative), TERMS + 3 * beads, len(self.offset))
-        jacobian = np.empty(shape, dtype=self.settings.dtype)
+        jacobian = np.empty(shape, dtype=DTYPE)
         np.multiply(relative[:, None], self.basis.T, out=jacobian[:, :TERMS])
         return jacobian
 
@@ -240,8 +231,7 @@ class ShadowFit(ABC):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return centres, depths and backgrounds of some beads after a step."""
         step = self._solve(rows, near, self._equations(rows, near, final), final)
-        moving = self.usable[rows] | self.settings.moves_unusable
-        step = np.where(moving[:, None], step, 0)
+        step = np.where(self.usable[rows][:, None], step, 0)
         longest = self.settings.max_step_px
         return (
             self.uv[rows] + np.clip(step[:, TERMS : TERMS + 2], -longest, longest),
@@ -252,7 +242,6 @@ class ShadowFit(ABC):
     def _equations(self, rows: np.ndarray, near: np.ndarray, final: bool) -> NormalEquations:
         """Return the normal equations of some beads, and note their lack of fit."""
         light, jacobian = self._model(rows, near)
-        dtype = self.settings.dtype
         grey = self.grey[rows]
         residual = grey - light
         valid = self._valid(rows, grey, light)
@@ -261,14 +250,14 @@ class ShadowFit(ABC):
         total = squared.sum(axis=1)
         disturbed = self._disturbed(rows, near, final) & (self.strength[rows] == 0)
         if disturbed.any():
-            usual = self.typical() if self.settings.robust_relative else 1.0
-            weight = weight / (1 + disturbed[:, None] * squared / (ROBUST**2 * usual))
-        weighted = jacobian * weight.astype(dtype)[:, None]
+            half = ROBUST**2 * self.typical()
+            weight = weight / (1 + disturbed[:, None] * squared / half)
+        weighted = jacobian * weight.astype(DTYPE)[:, None]
         prior = self._prior(rows, near)
         normal = (weighted @ np.swapaxes(jacobian, 1, 2)).astype(float)
         diagonal = np.arange(normal.shape[1])
         normal[:, diagonal, diagonal] += prior + 1e-9 * normal[:, diagonal, diagonal] + 1e-12
-        right = (weighted @ residual.astype(dtype)[..., None])[..., 0].astype(float)
+        right = (weighted @ residual.astype(DTYPE)[..., None])[..., 0].astype(float)
         expected = self.expected_depth[rows]
         right[:, TERMS + 2] -= prior[:, TERMS + 2] * (self.depth[rows] - expected)
         plain = normal
@@ -328,7 +317,7 @@ class ShadowFit(ABC):
     @cached_property
     def cosines(self) -> Cosines:
         """Background of a window beyond the polynomial."""
-        return Cosines(self.offset, self.settings.dtype)
+        return Cosines(self.offset, DTYPE)
 
     def _valid(self, rows: np.ndarray, grey: np.ndarray, light: np.ndarray) -> NDArray[np.bool_]:
         """Return (g, m) the pixels that count: a clipped one that agrees with the light does not.

@@ -89,7 +89,9 @@ def estimate_profile(
         if abs(profile.radius_px / before.radius_px - 1) < SETTLED:
             return profile
     reach_px = max(profile.reach_px for profile in profiles)
-    fits = [_profile_fit(light, uv[alone], radius, profile, reach_px) for profile in profiles]
+    # The first one is no estimate. Of shadows as small as their blur it fits about as well.
+    estimates = profiles[1:] or profiles
+    fits = [_profile_fit(light, uv[alone], radius, profile, reach_px) for profile in estimates]
     return min(fits, key=ShadowFit.typical).profile
 
 

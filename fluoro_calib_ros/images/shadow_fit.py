@@ -152,8 +152,7 @@ class ShadowFit(ABC):
         self.background = np.zeros((n, TERMS))
         self.sigma = np.full(n, np.inf)  # of centres, where the noise of pixels is independent
         self.noise_sigma = np.full(n, np.inf)  # the part of it that comes from the noise
-        # Of the noise, as windows tell it.
-        self.correlation: NDArray[np.float64] | None = None
+        self.correlation = noise.correlation
         self.inflation: float | None = None  # factor on the variances of that part
         self.misfit = np.full(n, np.inf)
         self.distance = np.full(n, np.inf)  # of the nearest bead
@@ -358,10 +357,6 @@ class ShadowFit(ABC):
             self.noise_sigma[rows[textured]] = _sd_of_centre(
                 np.linalg.inv(equations.plain[textured])
             )
-        if self.correlation is None:
-            alone = np.flatnonzero(self.misfit[rows] < UNDISTURBED * self.typical())[:CORRELATED]
-            residuals = equations.residual[alone]
-            self.correlation = self._correlation(residuals, equations.valid[alone])
         if self.inflation is None:
             # The influence of pixels on a centre: noise of neighbouring pixels adds up.
             plain = equations.plain[:INFLUENCES]

@@ -10,7 +10,7 @@ import pytest
 from fluoro_calib_ros.images.detection import field_of_view
 from fluoro_calib_ros.images.imaging import Expected, Imaging, first_imaging
 from fluoro_calib_ros.images.light import Light, estimate_noise
-from fluoro_calib_ros.images.measurement import measure_beads
+from fluoro_calib_ros.images.measurement import estimate_profile, measure_beads
 
 FINE = 4  # points across a pixel
 PITCH = 60
@@ -52,6 +52,34 @@ def test_profile_does_not_depend_on_the_first_radius(radius_px):
     assert imaging.profile.radius_px == pytest.approx(10, abs=0.15)
     assert imaging.profile.blur_px == pytest.approx(1.2, abs=0.15)
     assert (imaging.size == 1).all()
+
+
+def test_profile_of_small_shadows_that_move_is_an_estimate():
+    rng = np.random.default_rng(5)
+    pitch, across, count = 60, 6, 29
+    row, column = np.divmod(np.arange(count), across)
+    uv = pitch * (np.column_stack([column, row]) + 0.5) + rng.uniform(-3, 3, (count, 2))
+    ways = rng.normal(0, 3.0, (count, 2))
+    rows, columns = (np.mgrid[: FINE * pitch * across, : FINE * pitch * across] + 0.5) / FINE - 0.5
+    light = np.full(rows.shape, 150.0)
+    for (x, y), (a, b) in zip(uv, ways):
+        near = np.s_[
+            int(FINE * (y - 15)) : int(FINE * (y + 15)),
+            int(FINE * (x - 15)) : int(FINE * (x + 15)),
+        ]
+        passed = 0.0
+        for t in np.linspace(-0.5, 0.5, 7):
+            squared = (columns[near] - x - t * a) ** 2 + (rows[near] - y - t * b) ** 2
+            passed += np.exp(-2 * np.sqrt(np.maximum(1.3**2 - squared, 0))) / 7
+        light[near] *= passed
+    light = cv2.GaussianBlur(light, (0, 0), FINE * 1.0)
+    size = pitch * across
+    light = light.reshape(size, FINE, size, FINE).mean(axis=(1, 3))
+    image = Light(rng.poisson(light).astype(np.float32), np.ones(light.shape, bool))
+    profile = estimate_profile(image, uv + 0.3, np.ones(count), 1.875)
+    # Motion adds to the blur.
+    assert 1.0 < profile.blur_px < 1.4
+    assert 1.0 < profile.radius_px < 1.7
 
 
 @pytest.mark.parametrize('radius_px', [5.5, 8.0])

@@ -26,7 +26,8 @@ from scipy.optimize import nnls
 from scipy.special import expit, logit, logsumexp
 
 MIN_VARIANCE = 1 / 12  # of rounding
-NOISE_BLOCK = 16  # [px]
+SAMPLED = 100_000  # pixels that tell the noise: a median of each level to 2 %
+LEVELS = 30  # of light, at which it is estimated
 MIN_CORRELATION = 0.08  # that is told from slow changes of the light
 LAGS = 4  # pixels over which noise is correlated
 SECOND = np.array([1.0, -2.0, 1.0])  # differences
@@ -82,27 +83,23 @@ class Noise:
 def estimate_noise(light: np.ndarray, usable: NDArray[np.bool_]) -> Noise:
     """Estimate the noise of an image (h, w) from what a plane does not explain.
 
-    The second differences of Immerkaer, "Fast noise variance estimation", CVIU 64, 1996, by
-    blocks of usable pixels, robustly, against the mean grey value. They see less of a noise that
-    is correlated, by a factor that follows from the correlation. Where no block is usable, there
-    is the noise of rounding.
+    The second differences of Immerkaer, "Fast noise variance estimation", CVIU 64, 1996, of
+    usable pixels of about the same light, robustly. They see less of a noise that is correlated,
+    by a factor that follows from the correlation. Where hardly a pixel is usable, there is the
+    noise of rounding.
     """
     correlation = _correlation(light, usable)
     kernel = np.outer(SECOND, SECOND) / float(np.sum(SECOND**2))
-    high = cv2.filter2D(light, cv2.CV_32F, kernel)
-    height, width = (size // NOISE_BLOCK * NOISE_BLOCK for size in light.shape)
-
-    def blocks(values: np.ndarray) -> np.ndarray:
-        cut = values[:height, :width].reshape(
-            height // NOISE_BLOCK, NOISE_BLOCK, width // NOISE_BLOCK, NOISE_BLOCK
-        )
-        return cut.swapaxes(1, 2).reshape(-1, NOISE_BLOCK**2)
-
-    used = np.asarray(blocks(usable).all(axis=1))
-    if not used.any():
+    inside = cv2.erode(usable.astype(np.uint8), np.ones((3, 3), np.uint8))
+    chosen = np.flatnonzero(inside)
+    if len(chosen) < MIN_PIXELS:
         return Noise(MIN_VARIANCE, 0.0, correlation)
-    mean = np.median(blocks(light)[used], axis=1)
-    variance = (1.4826 * np.median(np.abs(blocks(high)[used]), axis=1)) ** 2
+    chosen = chosen[:: len(chosen) // SAMPLED + 1]
+    around = cv2.blur(light, (3, 3)).ravel()[chosen]
+    off = np.abs(cv2.filter2D(light, cv2.CV_32F, kernel).ravel()[chosen])
+    parts = np.array_split(np.argsort(around), LEVELS)
+    mean = np.array([np.median(around[part]) for part in parts])
+    variance = np.array([(1.4826 * np.median(off[part])) ** 2 for part in parts])
     variance = np.maximum(variance / _seen_by(SECOND, correlation), MIN_VARIANCE)
     weight = 1 / variance
     gain = constant = 0.0

@@ -23,6 +23,7 @@ from scipy.spatial import cKDTree
 
 from ..errors import DataError
 from ..findings import Kind
+from .discs import set_apart
 from .light import Light, Noise, clipped_at, estimate_noise
 
 MIN_SIZE = 32  # of an image [px]
@@ -216,12 +217,14 @@ class _Sight:
             blobs = self.blobs(wider * scale, inverted)
             uv = self.merged(_beads(blobs, field, self.typical), wider * scale, inverted)
             if len(uv):
+                around = np.maximum(_background(light, scale), 1e-3 * light.max())
+                uv, radius = set_apart(light / around, uv)
                 return Detections(
                     Light(light, field, low, high),
                     estimate_noise(light, field) if inverted else self.noise,
                     uv=uv,
-                    strength=_strengths(light, uv, scale),
-                    radius_px=scale * BLOB_RADIUS,
+                    strength=_strengths(light, around, uv, scale),
+                    radius_px=radius or scale * BLOB_RADIUS,
                     inverted=inverted,
                 )
         return None
@@ -424,15 +427,16 @@ def _beads(blobs: _Blobs, field: NDArray[np.bool_], count: int) -> _Blobs:
     return blobs.chosen(inside & (values > MIN_SHARE * typical) & (typical >= MIN_CONTRAST))
 
 
-def _strengths(light: np.ndarray, uv: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
+def _strengths(
+    light: np.ndarray, around: np.ndarray, uv: NDArray[np.float64], scale: float
+) -> NDArray[np.float64]:
     """Responses (n,) to beads at a scale beyond that of most, 1 for a typical one.
 
     There they increase with the size of a bead; at its own scale they hardly do.
     """
     column, row = np.rint(uv).astype(int).T
-    background = _background(light, scale)
     response, _ = _responses(light, WIDER[-1] * scale)
-    relative = response[row, column] / np.maximum(background[row, column], 1e-3 * light.max())
+    relative = response[row, column] / around[row, column]
     return np.asarray(relative / max(float(np.median(relative)), 1e-9), dtype=float)
 
 

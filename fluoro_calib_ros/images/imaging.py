@@ -25,6 +25,7 @@ TYPICAL = 1 / 3  # of the beads of a phantom with several sizes
 STEP = 1.25  # factor between sizes that are compared
 SIZES = STEP ** np.arange(-4, 5)
 STEPS = (STEP**0.5, STEP**0.25, STEP**0.125)  # between those that are compared then
+FEW = 5  # beads alone, below which those that overlap tell their shadow as well
 SAMPLE = 40  # beads that tell whether sizes differ
 OTHERS = 0.2  # share of them with something else beside them
 ROUNDS = 2  # the second one with a profile of beads of one size
@@ -91,7 +92,9 @@ def first_imaging(
 
 def _typical(light: Light, shadows: Expected, size: np.ndarray, radius_px: float) -> Profile:
     """Return the profile of beads of about the typical size: a third, and all equals."""
-    seen = np.flatnonzero(shadows.seen)
+    seen = np.flatnonzero(shadows.seen & shadows.alone)
+    if len(seen) < FEW:
+        seen = np.flatnonzero(shadows.seen)
     relative = np.nan_to_num(size[shadows.row[seen]], nan=1.0)
     off = np.abs(np.log(relative))
     near = off <= np.quantile(off, TYPICAL) + RADIUS_SD

@@ -297,10 +297,13 @@ class ShadowFit(ABC):
             )
             plain = np.flatnonzero(self.misfit[rows] <= usual)[:CORRELATED]
             usual_residuals.append((residual[plain] * np.sqrt(weight[plain]), valid[plain]))
-        self.correlation = self._correlation(*map(np.concatenate, zip(*usual_residuals)))
-        rows = np.concatenate([rows for rows, _ in self.groups])
+        residual, valid = map(np.concatenate, zip(*usual_residuals))
+        self.correlation = self._correlation(residual, valid)
+        # Where the shadow is not quite that of a sphere, all windows show it: that is no noise.
+        common = residual.sum(axis=0) / np.maximum(valid.sum(axis=0), 1)
         # The waves are longer than the noise is correlated.
-        excess = float(self.correlation.sum())
+        excess = float(self._correlation((residual - common) * valid, valid).sum())
+        rows = np.concatenate([rows for rows, _ in self.groups])
         self.strength[rows] = Spectra.joined(spectra).strengths(excess)
 
     def _correlation(self, residual: np.ndarray, valid: np.ndarray) -> NDArray[np.float64]:

@@ -28,7 +28,8 @@ MARGIN_PX = 2.0  # of background around the shadow
 DTYPE = np.float32  # of model and derivatives
 TERMS = 6  # of the background: a polynomial of degree 2
 OWN = TERMS + 3  # unknowns of a bead alone: its background, centre and depth
-NEIGHBOUR_SD_PX = 0.3  # of a step of a neighbour, which its own fit finds
+# Of a step of a neighbour. With less, two beads that nearly coincide stay where they begin.
+NEIGHBOUR_SD_PX = 1.0
 NEIGHBOUR_SD = 0.2  # of a step of a neighbour's depth
 DEPTH_SD = 1.0  # of the depth of a shadow, 1 for the profile
 DEPTHS = (0.05, 3.0)  # bounds; a shadow takes light away

@@ -188,12 +188,13 @@ def _squares(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
 
 def _pose_square(stream: Stream, row: int, body: int, pose: BodyPoses) -> float:
-    shape = stream.recording.shapes[body]
+    xyz = stream.recording.bodies[body].xyz_mm  # in the frame that was learned
+    centre = xyz.mean(axis=0)
     truth = stream.points[row, body]
-    own = shape - shape.mean(axis=0)
-    turn = Rotation.align_vectors(truth - truth.mean(axis=0), own)[0]
+    turn = Rotation.align_vectors(truth - truth.mean(axis=0), xyz - centre)[0]
+    origin = truth.mean(axis=0) - turn.apply(centre)
     rotation = (Rotation.from_matrix(pose.rotation[0]) * turn.inv()).as_rotvec()
-    error = np.concatenate([pose.position_mm[0] - truth.mean(axis=0), rotation])
+    error = np.concatenate([pose.position_mm[0] - origin, rotation])
     return float(_squares(error, pose.covariance[0])) / 6
 
 

@@ -354,7 +354,8 @@ class Result:
     unsure: int = 0
     wrong: int = 0
     nse: list[float] = field(default_factory=list)  # of the six parameters of b, a mean
-    # RMS drift of the distortion that is left in a coordinate, where the markers were
+    # RMS drift of the distortion that is left in a coordinate, where the markers were, apart from
+    # an affine map
     left_px: list[float] = field(default_factory=list)
     scale_ppm: list[float] = field(default_factory=list)
     scale_sd_ppm: list[float] = field(default_factory=list)
@@ -416,7 +417,7 @@ def _is_within(result: Result, scenario: Scenario) -> bool:
 def _compare(recording: Recording, outcome: HealingOutcome, result: Result) -> None:
     """Add the errors of a rig that passes to a result."""
     if recording.scenario.cause is Cause.DISTORTION:
-        result.left_px.append(_left_px(recording, outcome))
+        _compare_distortion(recording, outcome, result)
     if recording.scenario.cause not in (Cause.ORIENTATION, None):
         return
     true = recording.errors + recording.change[0]
@@ -438,12 +439,22 @@ def _compare(recording: Recording, outcome: HealingOutcome, result: Result) -> N
     result.scale_sd_ppm.append(1e6 * _claimed(outcome, there).scale)
 
 
-def _left_px(recording: Recording, outcome: HealingOutcome) -> float:
-    """Drift of the distortion of b that is left where the markers were, RMS of a coordinate."""
-    uv = recording.project(recording.points[::10], recording.errors)[..., 1, :].reshape(-1, 2)
-    seen = uv + recording.drift(uv)
-    u, v, *_ = outcome.calibrations['b'].correct_arrays(seen[:, 0], seen[:, 1])
-    return rms((np.stack([u, v], axis=1) - uv).ravel())
+def _compare_distortion(recording: Recording, outcome: HealingOutcome, result: Result) -> None:
+    """Add what is left of a drift of b in a rig that passes."""
+    there = recording.points[::10].reshape(-1, 3)
+    uv = recording.project(there[None], recording.errors)[0]
+    image = uv.copy()
+    image[:, 1] += recording.drift(uv[:, 1])
+    for f, name in enumerate(NAMES):
+        u, v, *_ = outcome.calibrations[name].correct_arrays(*image[:, f].T)
+        image[:, f] = np.stack([u, v], axis=1)
+    design = np.column_stack([np.ones(len(uv)), uv[:, 1] - 511.5])
+    left = (image - uv)[:, 1]
+    left = left - design @ np.linalg.lstsq(design, left, rcond=None)[0]
+    result.left_px.append(rms(left.ravel()))
+    estimated = np.zeros(18) if outcome.healed is None else outcome.healed.changes.ravel()
+    result.there_mm.append(_misfit(intersected(recording.rig, image, estimated), there))
+    result.there_sd_mm.append(outcome.unseen_distortion.value)
 
 
 def _common_motion(recording: Recording, outcome: HealingOutcome) -> float:
@@ -474,7 +485,12 @@ def _error(
     recording: Recording, points: np.ndarray, estimated: np.ndarray, true: np.ndarray
 ) -> float:
     """RMS distance of points (n, 3) by the estimated rig after the best rigid motion [mm]."""
-    found = intersected(recording.rig, recording.project(points[None], true)[0], estimated)
+    image = recording.project(points[None], true)[0]
+    return _misfit(intersected(recording.rig, image, estimated), points)
+
+
+def _misfit(found: np.ndarray, points: np.ndarray) -> float:
+    """RMS distance of points (n, 3) from others after the best rigid motion [mm]."""
     one = found - found.mean(axis=0)
     other = points - points.mean(axis=0)
     rest = Rotation.align_vectors(other, one)[0].apply(one) - other
@@ -504,12 +520,13 @@ Right: the cause is named and the verdict is pass; never where the rig goes on c
 none is named, the verdict is pass, and what the rig has not found lies within what it claims: six
 parameters of b by their covariance (chi-squared, {tail:g}), a distortion below {left} px where the
 markers were (RMS). Not passed: the verdict says that it is not sure, or that the rig changed
-meanwhile. Wrong: another cause, or none, passes. Left: the distortion that passes, where the
-markers were. Of rigs that pass, moved or as they were: NSE, the squared error of the six
-parameters over their claimed covariance; the scale; errors as distances after the best rigid
-motion, RMS, where the markers were and on a grid of {step:.0f} mm in all that both fluoroscopes
-see; claimed: from the covariance of the healed rig. Common motion: the distance by which all
-points are moved together in the rig frame; said: what `heal` says of it.
+meanwhile. Wrong: another cause, or none, passes. Left: what remains of the drift of the distortion
+where the markers were, apart from an affine map of the image, which moves all points together; the
+claimed error is then `unseen_distortion`. Of rigs that pass, moved or as they were: NSE, the
+squared error of the six parameters over their claimed covariance; the scale; errors as distances
+after the best rigid motion, RMS, where the markers were and on a grid of {step:.0f} mm in all that
+both fluoroscopes see; claimed: from the covariance of the healed rig. Common motion: the distance
+by which all points are moved together in the rig frame; said: what `heal` says of it.
 
 {rows}
 """

@@ -148,6 +148,7 @@ class Kind(str, Enum):
     DISTORTION_CHANGED = 'distortion_changed'
     FLUOROSCOPE_MOVED = 'fluoroscope_moved'
     INTERIOR_CHANGED = 'interior_changed'
+    UNSEEN_DISTORTION = 'unseen_distortion'
     UNUSED_EXPOSURES = 'unused_exposures'
 
     # Files that do not belong together.

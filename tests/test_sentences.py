@@ -512,6 +512,7 @@ MAKERS = {
     Kind.DISTORTION_CHANGED: lambda: changed(Cause.DISTORTION),
     Kind.FLUOROSCOPE_MOVED: lambda: changed(Cause.ORIENTATION),
     Kind.INTERIOR_CHANGED: lambda: changed(Cause.INTERIOR),
+    Kind.UNSEEN_DISTORTION: lambda: healing._unseen_distortion(0.3, 0.1),
     Kind.UNUSED_EXPOSURES: lambda: healing._unused(changed_rig(Cause.INTERIOR), 1, HEALED),
     Kind.NO_MARKERS: lambda: state(0, 0),
     Kind.OTHER_VIEW_MISSING: other_view_missing,
@@ -862,6 +863,11 @@ SENTENCES = {
         'fluoroscope a: it has moved against the other fluoroscope, or that one against it'
     ),
     Kind.INTERIOR_CHANGED: 'fluoroscope a: source and detector have moved against each other',
+    Kind.UNSEEN_DISTORTION: (
+        'a change of the distortion that no body shows may have moved points by # mm (RMS) '
+        'relative to each other where the markers were, and by more elsewhere: record more '
+        'bodies, or bodies that move through more of the field of view'
+    ),
     Kind.UNUSED_EXPOSURES: (
         'the first half of the exposures that were not used: fluoroscope a: source and detector '
         'have moved against each other: the rig changes while it is recorded: take another '

@@ -23,7 +23,14 @@ from scipy.linalg import eigh
 
 from ..correction.series import Functions
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
-from .rig_adjustment import ObservedBodies, Poses, Prior, RigAdjustment, RigSolution
+from .rig_adjustment import (
+    ObservedBodies,
+    Poses,
+    Prior,
+    RigAdjustment,
+    RigSolution,
+    drift_errors,
+)
 
 MAX_CAUSES = 3
 # Probability that nothing more has changed, from 1 - SURE on no further cause is looked for.
@@ -368,62 +375,69 @@ def healed_rig(
 
     A change of orientation or interior may be as large as any. The size with the largest evidence
     is that of the directions that are known well; it would pull the others towards no change.
+
+    Where nothing of the rig has changed, it stays as it was, with the second moments of the knock
+    that it may have had: bodies do not show all of a knock.
     """
     adjustment = diagnostician.adjustment
     changed = np.zeros(adjustment.size)
     largest = np.zeros(adjustment.size)
-    for change in diagnosis.changes:
-        if change.cause in OF_RIG:
-            changed = np.hypot(changed, diagnostician.sd_of(change))
-            largest = np.hypot(largest, diagnostician.sd_of(replace(change, size=SIZES[0])))
+    changes = [change for change in diagnosis.changes if change.cause in OF_RIG]
+    for change in changes or diagnostician.knocks():
+        changed = np.hypot(changed, diagnostician.sd_of(change))
+        largest = np.hypot(largest, diagnostician.sd_of(replace(change, size=SIZES[0])))
     largest[adjustment.drift] = 0.0
     prior = diagnosis.prior.widened(largest)
     solution = adjustment.with_fixed(diagnosis.observed, prior, diagnosis.solution, changed > 0)
+    values = solution.values
     covariance = solution.covariance[adjustment.rig, adjustment.rig]
+    weakest = _weakest(adjustment, covariance, largest)
+    if not changes:
+        knock = values[adjustment.rig]
+        covariance = covariance + np.outer(knock, knock)
+        values = np.zeros(adjustment.size)
     views = len(adjustment.functions)
     orientation = replace(
-        adjustment.rig_at(solution.values),
+        adjustment.rig_at(values),
         covariance=(covariance + covariance.T) / 2,
         source='healing',
         stamp_ns=stamp_ns,
         exposures=exposures,
     ).rounded()
     drift = {}
-    for change in diagnosis.changes:
+    for change in changes:
         if change.cause is Cause.DISTORTION:
             f = change.fluoroscope
             number = np.arange(adjustment.size)[adjustment.drift].reshape(views, -1)[f]
             drift[f] = (
                 adjustment.functions[f],
-                adjustment.drift_at(solution.values)[f],
+                adjustment.drift_at(values)[f],
                 solution.covariance[np.ix_(number, number)],
             )
     return HealedRig(
         orientation,
         drift,
-        changes=solution.values[adjustment.rig].reshape(views, -1),
+        changes=values[adjustment.rig].reshape(views, -1),
         sd=np.sqrt(np.diagonal(covariance)).reshape(views, -1),
-        weakest=_weakest(adjustment, covariance, largest),
+        weakest=weakest,
     )
 
 
-def unseen_knock(
-    diagnostician: Diagnostician, diagnosis: Diagnosis
-) -> tuple[NDArray[np.float64], float]:
-    """Return second moments (9F, 9F) of the knock that a rig may have had which seems unchanged.
+def unseen_distortion(diagnostician: Diagnostician, diagnosis: Diagnosis) -> tuple[float, float]:
+    """Return how far changes of the distortion may move points that the data do not show [mm].
 
-    Also returns how well it would have been seen, see `HealedRig.weakest`.
+    RMS distances relative to each other where the markers were: by changes that may be as large as
+    any, and by the noise of a single point.
     """
     adjustment = diagnostician.adjustment
-    sd = np.zeros(adjustment.size)
-    for change in diagnostician.knocks():
-        sd = np.hypot(sd, diagnostician.sd_of(change))
-    prior = diagnosis.prior.widened(sd)
-    solution = adjustment.with_fixed(diagnosis.observed, prior, diagnosis.solution, sd > 0)
-    covariance = solution.covariance[adjustment.rig, adjustment.rig]
-    knock = solution.values[adjustment.rig]
-    moments = (covariance + covariance.T) / 2 + np.outer(knock, knock)
-    return moments, _weakest(adjustment, covariance, sd)
+    prior = diagnosis.prior
+    for f in range(len(adjustment.functions)):
+        prior = prior.widened(diagnostician.sd_of(Change(Cause.DISTORTION, f)))
+    covariance = adjustment.covariance_at(diagnosis.observed, prior, diagnosis.solution)
+    places = adjustment.places_at(diagnosis.solution)
+    errors, by_noise = drift_errors(adjustment, covariance, places)
+    variance = diagnosis.observed.variance[diagnosis.observed.seen].mean()
+    return float(np.sqrt(3) * errors.place_mm), by_noise * float(np.sqrt(variance))
 
 
 def _weakest(adjustment: RigAdjustment, covariance: np.ndarray, sd: np.ndarray) -> float:

@@ -18,9 +18,8 @@ Inference, and Learning Algorithms", Cambridge 2003, ch. 28):
     log Z = -1/2 (loss + z'z) - 1/2 log det(I + L'HL).
 
 The correction of an image point has an error that stays while a marker stands still. How far it
-reaches is not known. Twice it is taken for the most that it can be: as a smooth field over the
-image, which all markers have in common, and as the same for a marker and a view over the whole
-recording.
+reaches is not known. A part of its variance is taken for a smooth field over the image, which all
+markers have in common, the rest for an error of each marker and view that stays all the time.
 """
 
 from __future__ import annotations
@@ -46,6 +45,9 @@ LAST_STEP = 1e-2
 # Of a drift of the distortion: degree of the polynomials, half waves along the longer side.
 DRIFT_DEGREE = 3
 DRIFT_MODES = 4
+# Share of the variance of a correction that is smooth over the image. It may be anything from 0 to
+# 1: this is the mean.
+SMOOTH_SHARE = 0.5
 FITTING = 0.8  # share of the image points of a body that are no false matches, at least
 MAX_NOISE_PX = 10.0  # of image points that are no false matches
 LOOSEST = 1e-6  # weight of a pose [1/mm^2, 1/rad^2] that keeps an unseen one where it is
@@ -199,11 +201,17 @@ class RigAdjustment:
         """
         sd = np.zeros(self.size)
         sd[self.scale] = shape_scale
-        seen = observed.seen.sum(axis=0)
         drift = sd[self.drift].reshape(self._views, -1)
+        correction = np.broadcast_to(observed.correction, observed.seen.shape)
         for f in range(self._views):
-            of_view = observed.correction[..., f] * seen[..., f]
-            drift[f] = self.sd_of_drift(f) * np.sqrt(of_view.sum() / max(seen[..., f].sum(), 1))
+            seen = observed.seen[..., f]
+            one_px = self.sd_of_drift(f)
+            values = self.functions[f](observed.pixel[..., f, :][seen])
+            # A drift of 1 px at the edges has another variance than 1 px^2 at the markers.
+            variance = np.sum((values * one_px[: values.shape[1]]) ** 2)
+            if variance > 0:
+                smooth = SMOOTH_SHARE * correction[..., f][seen].sum()
+                drift[f] = one_px * np.sqrt(smooth / variance)
         return Prior(self.orientation.covariance, sd, np.ones(self.target_id.shape))
 
     def sd_of_drift(self, fluoroscope: int) -> NDArray[np.float64]:
@@ -213,7 +221,7 @@ class RigAdjustment:
     def root(self, prior: Prior, correction: np.ndarray) -> NDArray[np.float64]:
         """Return L (K, k) of a prior; unknowns that are certain have no columns."""
         sd = prior.sd.copy()
-        sd[self.bias] = np.repeat(np.sqrt(correction).ravel(), 2)
+        sd[self.bias] = np.repeat(np.sqrt((1 - SMOOTH_SHARE) * correction).ravel(), 2)
         root = np.diag(sd)
         covariance = prior.orientation + np.diag(sd[self.rig] ** 2)
         root[self.rig, self.rig] = replace(
@@ -265,6 +273,22 @@ class RigAdjustment:
         weight = _Mixture.of(self, linear, observed, prior).weight(1.0)
         normal = self._normal(linear, weight, np.ones(self.size, dtype=bool))
         return normal.matrix, normal.right
+
+    def covariance_at(
+        self, observed: ObservedBodies, prior: Prior, solution: RigSolution
+    ) -> NDArray[np.float64]:
+        """Return the covariance (K, K) of the unknowns with another prior, at a solution."""
+        root = self.root(prior, observed.correction)
+        normal, _ = self.normal_at(observed, prior, solution)
+        whitened = np.eye(root.shape[1]) + root.T @ normal @ root
+        return np.asarray(root @ np.linalg.solve(whitened, root.T))
+
+    def places_at(self, solution: RigSolution) -> NDArray[np.float64]:
+        """Return the places (n, 3) of all markers in the exposures that show their bodies [mm]."""
+        poses = solution.poses
+        xyz = self.shapes_at(solution.values) @ np.swapaxes(poses.rotation, 2, 3)
+        known = poses.known[..., None] & (self.target_id >= 0)
+        return np.asarray((xyz + poses.centre_mm[:, :, None])[known])
 
     # -- the solution
 
@@ -631,24 +655,70 @@ def rig_errors(orientation: RigOrientation, points_mm: NDArray[np.float64]) -> R
     The points move by -(A'A)^-1 A'B do (see `intersection`). Their scale is what they have in
     common with a similarity about their centre, the rest what a rigid motion leaves.
     """
-    cameras = Cameras(orientation, np.zeros((1, len(points_mm)), dtype=int))
-    views = len(orientation.fluoroscopes)
-    shape = (1, len(points_mm), views)
-    empty = ImagePoints(
-        np.zeros((*shape, 2)), np.ones(shape), np.zeros(shape), np.ones(shape, dtype=bool)
-    )
-    linear = cameras.linear(points_mm[None], (np.eye(3)[None], np.zeros((1, 3))), empty)
-    by_place = linear.by_place[0].reshape(len(points_mm), -1, 3)
-    by_rig = np.zeros((len(points_mm), views, 2, views, ORIENTATION_SIZE))
-    by_orientation = cameras.by_orientation(linear)[0]
+    image = _Intersected.of(orientation, points_mm)
+    return _errors(points_mm, image.moved(image.by_rig) @ orientation.covariance_root())
+
+
+def drift_errors(
+    adjustment: RigAdjustment, covariance: NDArray[np.float64], points_mm: NDArray[np.float64]
+) -> tuple[RigErrors, float]:
+    """Return the errors of points (n, 3) by those of rig and drifts, with a covariance (K, K).
+
+    Also returns the RMS distance [mm] by which noise of 1 px moves a point.
+    """
+    image = _Intersected.of(adjustment.orientation, points_mm)
+    functions = adjustment.functions_at(image.uv)
+    _, views, count = functions.shape
+    by_drift = np.zeros((len(points_mm), views, 2, views, 2, count))
     for f in range(views):
-        by_rig[:, f, :, f] = by_orientation[:, f]
-    flat = by_rig.reshape(len(points_mm), -1, ORIENTATION_SIZE * views)
-    transposed = np.swapaxes(by_place, 1, 2)
-    moved = -np.linalg.solve(transposed @ by_place, transposed @ flat).reshape(
-        3 * len(points_mm), -1
-    )
-    moved = moved @ orientation.covariance_root()
+        for axis in range(2):
+            by_drift[:, f, axis, f, axis] = functions[:, f]
+    derivatives = [image.by_rig, by_drift.reshape(*image.by_rig.shape[:3], -1)]
+    rows = np.r_[adjustment.rig, adjustment.drift]
+    root = _root_of(covariance[np.ix_(rows, rows)])
+    noise = np.sqrt(np.mean(np.sum(image.by_uv**2, axis=(1, 2))))
+    moved = image.moved(np.concatenate(derivatives, axis=-1)) @ root
+    return _errors(points_mm, moved), float(noise)
+
+
+@dataclass(frozen=True)
+class _Intersected:
+    """Image points uv (n, F, 2) of points (n, 3), and how the points follow from them.
+
+    by_rig (n, F, 2, 9F): derivatives of the image points by the orientation. by_uv (n, 3, 2F):
+    of the points by the image points.
+    """
+
+    uv: np.ndarray
+    by_rig: np.ndarray
+    by_uv: np.ndarray
+
+    @classmethod
+    def of(cls, orientation: RigOrientation, points_mm: np.ndarray) -> _Intersected:
+        cameras = Cameras(orientation, np.zeros((1, len(points_mm)), dtype=int))
+        views = len(orientation.fluoroscopes)
+        shape = (1, len(points_mm), views)
+        empty = ImagePoints(
+            np.zeros((*shape, 2)), np.ones(shape), np.zeros(shape), np.ones(shape, dtype=bool)
+        )
+        linear = cameras.linear(points_mm[None], (np.eye(3)[None], np.zeros((1, 3))), empty)
+        by_place = linear.by_place[0].reshape(len(points_mm), -1, 3)
+        by_rig = np.zeros((len(points_mm), views, 2, views, ORIENTATION_SIZE))
+        by_orientation = cameras.by_orientation(linear)[0]
+        for f in range(views):
+            by_rig[:, f, :, f] = by_orientation[:, f]
+        transposed = np.swapaxes(by_place, 1, 2)
+        by_uv = np.linalg.solve(transposed @ by_place, transposed)
+        return cls(linear.uv[0], by_rig.reshape(*by_rig.shape[:3], -1), by_uv)
+
+    def moved(self, derivatives: np.ndarray) -> np.ndarray:
+        """Return by how much points move (3n, k), from derivatives (n, F, 2, k) of their views."""
+        flat = derivatives.reshape(len(self.uv), -1, derivatives.shape[-1])
+        return np.asarray(-(self.by_uv @ flat).reshape(-1, flat.shape[2]))
+
+
+def _errors(points_mm: np.ndarray, moved: np.ndarray) -> RigErrors:
+    """Errors of points (n, 3) that move by moved (3n, k), times unknowns of variance one."""
     arm = points_mm - points_mm.mean(axis=0)
     rigid = np.concatenate([np.broadcast_to(np.eye(3), (len(arm), 3, 3)), -cross_matrix(arm)], 2)
     rigid = rigid.reshape(-1, POSE_SIZE)

@@ -508,14 +508,31 @@ def _wrong_frame(body: Body, places: BodyPlaces) -> list[Finding]:
 
 
 def _contradictions(body: Body, places: BodyPlaces, adjustment: _Adjustment) -> list[Finding]:
-    """Name markers that are loose, have migrated since CT, or are exchanged."""
+    """Name markers that are loose, have migrated since CT, or are exchanged, and soft bodies."""
     findings = []
     known = body.known & np.isfinite(adjustment.xyz).all(axis=1) & np.isfinite(body.sd_mm)
     if np.count_nonzero(known) >= 4:
         findings += _migrated(body, adjustment, known)
     test = adjustment.test
     typical = float(np.nanmedian(test)) if np.isfinite(test).any() else 1.0
-    loose = np.flatnonzero(test > _limit_of_ratio(places) * max(1.0, typical))
+    limit = _limit_of_ratio(places)
+    loose = np.flatnonzero(test > limit * max(1.0, typical))
+    is_stable = adjustment.mean_error_mm <= MAX_MEAN_ERROR_MM  # else that is said
+    if typical > limit and not len(loose) and is_stable:
+        ratio = float(np.sqrt(typical))
+        cause = (
+            'it is not rigid: the places of its markers scatter '
+            f'{ratio:.1f} times as much as their standard deviations'
+        )
+        findings.append(
+            Finding(
+                Kind.BODY_NOT_RIGID,
+                cause,
+                place=_place(body),
+                severity=Severity.WARNING,
+                numbers={'ratio': ratio, 'mean_error_mm': adjustment.mean_error_mm},
+            )
+        )
     for row in loose:
         marker = int(body.target_id[row])
         cause = (

@@ -92,14 +92,15 @@ def _lines(arguments: argparse.Namespace, outcome: HealingOutcome) -> list[str]:
 
     lines = []
     healed = outcome.healed
+    is_changed = any(one.cause in OF_RIG for one in outcome.diagnosis.changes)
     if outcome.changed_meanwhile:
         lines.append(CHANGED_MEANWHILE)
-    if healed is None:
-        is_changed = any(one.cause in OF_RIG for one in outcome.diagnosis.changes)
-        is_changed = is_changed or outcome.changed_meanwhile
-        evident = '' if is_changed else 'no change of the rig is evident: '
-        lines.append(f'{evident}it stays as it was calibrated, nothing is written')
-    else:
+    if healed is None or not is_changed:
+        is_evident = is_changed or outcome.changed_meanwhile
+        evident = '' if is_evident else 'no change of the rig is evident: '
+        rest = 'nothing is written' if healed is None else 'its sd contain an unseen knock'
+        lines.append(f'{evident}it stays as it was calibrated, {rest}')
+    if healed is not None:
         for f, name in enumerate(outcome.orientation.fluoroscopes):
             if healed.changes[f].any():
                 lines.append(f'{name}: {_change(healed.changes[f], healed.sd[f])}')
@@ -112,6 +113,8 @@ def _lines(arguments: argparse.Namespace, outcome: HealingOutcome) -> list[str]:
         lines.append(f'points relative to each other: sd {after} (as calibrated {before})')
         lines.append(f'written to {arguments.out}')
     lines.append(outcome.common_motion.sentence)
+    if outcome.unseen_distortion.passed:  # else it is one of the checks that follow
+        lines.append(outcome.unseen_distortion.sentence)
     lines += [check.sentence for check in outcome.checks if not check.passed]
     lines.append(styled_verdict(f'Verdict: {outcome.verdict}', outcome.verdict))
     return lines

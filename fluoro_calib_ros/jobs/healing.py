@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from ..bodies.healing import (
     Diagnostician,
     HealedRig,
     healed_rig,
-    unseen_knock,
+    unseen_distortion,
 )
 from ..bodies.rig_adjustment import ObservedBodies, Poses, RigAdjustment, RigErrors, rig_errors
 from ..bodies.rigid import robust_pose
@@ -57,6 +57,8 @@ MIN_EXPOSURES = 10
 IDENTIFIED = 0.5
 CHANGED_MEANWHILE = 'the rig changed during the recording'
 
+_Exposure: TypeAlias = Mapping[str, Frame]
+
 
 @dataclass(frozen=True)
 class HealingOptions(RecordedPairing):
@@ -71,7 +73,8 @@ class HealingOutcome:
     ----------
     diagnosis : Diagnosis
     healed : HealedRig or None
-        None where nothing of the rig has changed.
+        None where nothing of the rig has changed and its claims hold. Where they are less than a
+        knock that bodies do not show, it is the rig as it was calibrated, with larger ones.
     calibrations : mapping of str to FluoroscopeCalibration
         Of the healed rig.
     orientation : RigOrientation
@@ -99,6 +102,11 @@ class HealingOutcome:
     checks: tuple[Check, ...]
     findings: tuple[Finding, ...]
     exposures: int
+
+    @property
+    def unseen_distortion(self) -> Check:
+        """How far changes of the distortion that bodies do not show may have moved points."""
+        return next(check for check in self.checks if check.kind is Kind.UNSEEN_DISTORTION)
 
     @property
     def changed_meanwhile(self) -> bool:
@@ -144,9 +152,9 @@ def heal_rig(
     seen = frames_of_targets(frames, np.concatenate([body.target_id for body in bodies]))
     names = orientation.fluoroscopes
     paired, _ = pair_recording(seen, names, options.pair_by, options.pair_tolerance)
-    used, unused = _chosen(len(paired))
+    used, unused = _chosen(paired)
     rig = _Rig(calibrations, orientation, solvable_bodies(bodies))
-    observed, poses = rig.observe([paired[row] for row in used])
+    observed, poses = rig.observe(used)
     _check_seen(poses)
     step(1, 4)
     places = poses.centre_mm[poses.known]
@@ -156,47 +164,32 @@ def heal_rig(
     step(2, 4)
     changed = [change for change in diagnosis.changes if change.cause in OF_RIG]
     fixed = rig.with_fixed_correction(changed)
-    healed = None
-    after, now = before, rig
-    if changed and not fixed:
-        stamp_ns = max(frame.stamp_ns for frame in paired[used[-1]].values())
-        healed = healed_rig(diagnostician, diagnosis, stamp_ns, len(used))
-        now = rig.healed(healed)
-        after = rig_errors(now.orientation, places)
+    stamp_ns = max(frame.stamp_ns for frame in used[-1].values())
+    healed = healed_rig(diagnostician, diagnosis, stamp_ns, len(used))
+    after = rig_errors(healed.orientation, places)
+    # Where nothing has changed, the rig is another one only if it may err by more than it claims.
+    is_other = not fixed and (bool(changed) or after.common_mm > before.common_mm)
+    now = rig.healed(healed) if is_other else rig
     step(3, 4)
-    weakest, common_mm = _seen_of_change(healed, diagnostician, diagnosis, places)
-    known = _correctable(fixed) if fixed else _identified(weakest, healed is not None)
-    checks = [known, _sure(diagnosis, rig)]
+    known = _correctable(fixed) if fixed else _identified(healed.weakest, bool(changed))
+    unseen = _unseen_distortion(*unseen_distortion(diagnostician, diagnosis))
+    checks = [known, _sure(diagnosis, rig), unseen]
     if not fixed:  # else they tell of the same change
-        checks += _unused_exposures(now, [paired[row] for row in unused], diagnosis, before.scale)
+        checks += _unused_exposures(now if changed else rig, unused, diagnosis, before.scale)
     step(4, 4)
     return HealingOutcome(
         diagnosis,
-        healed,
+        healed=healed if is_other else None,
         calibrations=now.calibrations,
         orientation=now.orientation,
         before=before,
-        after=after,
-        common_motion=common_motion(common_mm),
+        after=after if is_other else before,
+        common_motion=common_motion(after.common_mm),
         verdict=verdict_of(checks),
         checks=tuple(checks),
         findings=tuple(_finding(change, rig, diagnosis) for change in diagnosis.changes),
         exposures=len(used),
     )
-
-
-def _seen_of_change(
-    healed: HealedRig | None,
-    diagnostician: Diagnostician,
-    diagnosis: Diagnosis,
-    places: np.ndarray,
-) -> tuple[float, float]:
-    """Return how well bodies show the change, or else a knock, and the common motion [mm]."""
-    if healed is not None:
-        return healed.weakest, rig_errors(healed.orientation, places).common_mm
-    moments, weakest = unseen_knock(diagnostician, diagnosis)
-    orientation = replace(diagnostician.adjustment.orientation, covariance=moments)
-    return weakest, rig_errors(orientation, places).common_mm
 
 
 def _check_seen(poses: Poses) -> None:
@@ -209,19 +202,20 @@ def _check_seen(poses: Poses) -> None:
         )
 
 
-def _chosen(count: int) -> tuple[list[int], list[int]]:
+def _chosen(paired: Sequence[_Exposure]) -> tuple[list[_Exposure], list[_Exposure]]:
     """Exposures for the diagnosis and for its verdict, from alternating blocks.
 
     Raises DataError for too few.
     """
+    count = len(paired)
     if count < MIN_EXPOSURES:
         raise DataError(f'{count} exposures have two views, {MIN_EXPOSURES} are needed')
-    block = np.arange(count) * BLOCKS // max(count, 1)
-    out: list[list[int]] = []
+    block = np.arange(count) * BLOCKS // count
+    out = []
     for part in (0, 1):
         rows = np.flatnonzero(block % 2 == part)
         few = np.unique(np.linspace(0, len(rows) - 1, MAX_EXPOSURES).astype(int))
-        out.append(rows[few[few >= 0]].tolist())
+        out.append([paired[row] for row in rows[few]])
     return out[0], out[1]
 
 
@@ -238,7 +232,7 @@ class _Rig:
         sizes = [self.calibrations[name].image_size for name in self.orientation.fluoroscopes]
         return RigAdjustment(self.orientation, self.bodies, sizes)
 
-    def observe(self, exposures: Sequence[Mapping[str, Frame]]) -> tuple[ObservedBodies, Poses]:
+    def observe(self, exposures: Sequence[_Exposure]) -> tuple[ObservedBodies, Poses]:
         """Correct the image points of exposures, and return first poses of the bodies."""
         target_id = self.adjustment().target_id
         names = self.orientation.fluoroscopes
@@ -309,7 +303,7 @@ class _Rig:
         return replace(self, calibrations=calibrations, orientation=orientation)
 
     def diagnose(
-        self, exposures: Sequence[Mapping[str, Frame]], known: Diagnosis, shape_scale: float
+        self, exposures: Sequence[_Exposure], known: Diagnosis, shape_scale: float
     ) -> Diagnosis | None:
         """Say what has changed beside what is known of the bodies; None for too few exposures."""
         if len(exposures) < MIN_EXPOSURES:
@@ -421,6 +415,20 @@ def common_motion(distance_mm: float) -> Finding:
     )
 
 
+def _unseen_distortion(distance_mm: float, noise_mm: float) -> Check:
+    """Check that changes of the distortion which bodies do not show are below the noise."""
+    return Check(
+        Kind.UNSEEN_DISTORTION,
+        'a change of the distortion that no body shows may have moved points by '
+        f'{distance_mm:.3f} mm (RMS) relative to each other where the markers were, and by more '
+        'elsewhere',
+        advice='record more bodies, or bodies that move through more of the field of view',
+        value=distance_mm,
+        limit=noise_mm,
+        unit='mm',
+    )
+
+
 def _identified(weakest: float, is_healed: bool) -> Check:
     """Check that the bodies tell all of the change, or would tell that of a knock."""
     change = 'the change' if is_healed else 'a knock'
@@ -472,7 +480,7 @@ def _sure(diagnosis: Diagnosis, rig: _Rig) -> Check:
 
 
 def _unused_exposures(
-    now: _Rig, exposures: Sequence[Mapping[str, Frame]], known: Diagnosis, shape_scale: float
+    now: _Rig, exposures: Sequence[_Exposure], known: Diagnosis, shape_scale: float
 ) -> list[Check]:
     """Check both halves of the exposures that were not used: a rig that creeps changes between."""
     middle = len(exposures) // 2
@@ -570,6 +578,7 @@ def healing_document(outcome: HealingOutcome, parent: RigOrientation) -> dict[st
         ],
         'changes': _changes(outcome),
         'common_motion': _finding_document(outcome.common_motion),
+        'unseen_distortion': _finding_document(outcome.unseen_distortion),
         'errors_before': _errors(outcome.before),
         'errors_after': _errors(outcome.after),
     }

@@ -19,6 +19,7 @@ from ..bodies.body import Body
 from ..bodies.shapes import LearnedShapes
 from ..errors import DataError, ErrorsAt
 from ..io.bodies import read_bodies
+from ..io.drift_alarm import has_drift_alarm, write_drift_alarm
 from ..io.learned_shapes import write_learned_shapes
 from ..jobs.bodies import BodiesOptions
 from ..jobs.learning import DRIFTED, learn_shapes, learned_for
@@ -61,9 +62,16 @@ class ShapeLearning(RigServices):
     def on_drift(self, message: DriftStatus) -> None:
         """Learn nothing any more where the drift watch has given an alarm."""
         # A message that comes right after a new orientation may be about the one before.
-        if message.level != DriftStatus.OK and self._orientation is self._output.orientation:
+        orientation = self._orientation
+        if message.level == DriftStatus.OK or orientation is not self._output.orientation:
+            return
+        self._window = None
+        if orientation is not None and not self._alarmed:
             self._alarmed = True
-            self._window = None
+            try:  # to be known after a restart, too
+                write_drift_alarm(self._rig.directory, orientation.orientation_id, message.message)
+            except (DataError, OSError) as error:
+                self._logger.error(f'the alarm of the drift watch is not saved: {error}')
 
     def end(self) -> None:
         """Cancel a running job, and wait for its end."""
@@ -88,6 +96,11 @@ class ShapeLearning(RigServices):
         self._alarmed = False
         self._refusal = ''
         if orientation is not None:
+            try:
+                self._alarmed = has_drift_alarm(self._rig.directory, orientation.orientation_id)
+            except DataError as error:
+                self._alarmed = True
+                self._logger.error(str(error))
             try:
                 self._learned = learned_for(self._rig.directory, orientation)
             except DataError as error:

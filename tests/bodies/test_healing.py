@@ -16,7 +16,6 @@ from fluoro_calib_ros.bodies.healing import (
     Cause,
     Diagnostician,
     healed_rig,
-    unseen_knock,
 )
 from fluoro_calib_ros.bodies.rig_adjustment import (
     ObservedBodies,
@@ -117,6 +116,21 @@ def test_derivatives_are_those_of_differences():
             np.testing.assert_allclose(linear.by_pose(row)[..., axis], found, atol=1e-5)
 
 
+def test_error_of_a_correction_counts_once():
+    """Its smooth part and that of single markers have together the variance that is claimed."""
+    scene = Scene(3)
+    adjustment = scene.diagnostician().adjustment
+    observed = scene.observe()
+    prior = adjustment.healthy_prior(observed, 1e-4)
+    root = adjustment.root(prior, observed.correction)
+    covariance = root @ root.T
+    of_drift = np.diagonal(covariance)[adjustment.drift].reshape(2, 2, -1)
+    functions = adjustment.functions_at(observed.pixel)
+    smooth = np.mean(np.sum(functions**2 * of_drift[:, 0], axis=-1), axis=(0, 1, 2))
+    of_markers = np.diagonal(covariance)[adjustment.bias].reshape(BODIES, MARKERS, 2, 2)
+    np.testing.assert_allclose(smooth + of_markers[0, 0, :, 0], observed.correction[0, 0])
+
+
 def test_healthy_rig_has_not_changed():
     scene = Scene(3)
     found = scene.diagnostician().diagnose(scene.observe(), scene.poses())
@@ -128,7 +142,14 @@ def test_knock_would_be_told_by_bodies_that_move_and_not_by_a_single_one_that_st
     scene = Scene(3)
     diagnostician = scene.diagnostician()
     found = diagnostician.diagnose(scene.observe(), scene.poses())
-    by_all = unseen_knock(diagnostician, found)[1]
+    healed = healed_rig(diagnostician, found, 7, EXPOSURES)
+    assert not healed.changes.any() and healed.orientation.source == 'healing'
+    known = scene.rig.rounded()
+    np.testing.assert_array_equal(healed.orientation.position_mm, known.position_mm)
+    claimed, known = (np.diagonal(one.covariance) for one in (healed.orientation, known))
+    assert (claimed[9:15] > known[9:15]).all()
+    np.testing.assert_allclose(claimed[15:], known[15:], rtol=1e-6)
+    by_all = healed.weakest
     still = Scene(3)
     still.bodies = [replace(still.bodies[0], sd_mm=np.full(MARKERS, 1.0))]
     still.shapes = still.shapes[:1]
@@ -137,7 +158,8 @@ def test_knock_would_be_told_by_bodies_that_move_and_not_by_a_single_one_that_st
     diagnostician = still.diagnostician()
     poses = Poses(still.rotation, still.centre, np.ones((EXPOSURES, 1), dtype=bool))
     found = diagnostician.diagnose(still.observe(), poses)
-    assert by_all < 0.2 and unseen_knock(diagnostician, found)[1] > 0.5
+    by_one = healed_rig(diagnostician, found, 7, EXPOSURES).weakest
+    assert by_all < 0.2 and by_one > 0.5
 
 
 @pytest.mark.long

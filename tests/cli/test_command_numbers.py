@@ -464,20 +464,23 @@ def healing(changed=(), drift=(), verdict='pass', meanwhile=False, causes=(), **
         'after': Fake(place_mm=0.04, scale=3e-5),
         'checks': [Fake(passed=True, sentence='good'), Fake(passed=None, sentence='unknown')],
         'common_motion': Fake(sentence='seen by no body'),
+        'unseen_distortion': Fake(sentence='seen nowhere', passed=True),
         'verdict': verdict,
     }
     return Fake(**{**values, **more})
 
 
 def test_healed_rig_is_told_by_fluoroscope_with_what_it_is_worth():
-    lines = heal._lines(Fake(out='healed'), healing([1], [0]))
+    causes = (Cause.ORIENTATION, Cause.DISTORTION)
+    lines = heal._lines(Fake(out='healed'), healing([1], [0], causes=causes))
     assert lines[0] == 'a: its correction has changed'
     assert lines[1].startswith('b: source moved by 2.00 (sd 0.50), 0.00')
     assert lines[2] == (
         'points relative to each other: sd 0.040 mm, scale 30 ppm (as calibrated 0.500 mm, '
         'scale 200 ppm)'
     )
-    assert lines[3:] == ['written to healed', 'seen by no body', 'unknown', 'Verdict: pass']
+    unseen = ['seen by no body', 'seen nowhere']
+    assert lines[3:] == ['written to healed', *unseen, 'unknown', 'Verdict: pass']
 
 
 @pytest.mark.parametrize(

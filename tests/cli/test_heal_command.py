@@ -91,10 +91,22 @@ def test_bumped_rig_is_healed_and_its_points_are_right_again(rig, tmp_path, caps
     assert json.loads(capsys.readouterr().out)['bodies']['femur']['poses'] == 60
 
 
-def test_rig_that_has_not_changed_is_left_as_it_is(rig, tmp_path, capsys):
-    assert heal(rig, 'walking', tmp_path / 'healed') == 0
-    assert 'as it was calibrated' in capsys.readouterr().out
-    assert not (tmp_path / 'healed').exists()
+def test_rig_that_has_not_changed_stays_where_it_was_and_claims_what_is_not_seen(
+    rig, tmp_path, capsys
+):
+    assert heal(rig, 'walking', tmp_path / 'healed', '--json') == 0
+    document = json.loads(capsys.readouterr().out)
+    assert not document['findings'] and not document['changes']
+    before = load_orientation(rig / 'result' / 'rig_orientation.npz')
+    after = load_orientation(tmp_path / 'healed' / 'rig_orientation.npz')
+    np.testing.assert_array_equal(after.position_mm, before.position_mm)
+    np.testing.assert_array_equal(after.rotation, before.rotation)
+    assert after.calibration_ids == before.calibration_ids
+    assert document['orientation_id'] == after.orientation_id != before.orientation_id
+    assert document['common_motion']['numbers']['distance_mm'] > 0.05
+    of_b = before.covariance_rows([1])[:6]
+    claimed, before_claimed = (np.diagonal(one.covariance)[of_b] for one in (after, before))
+    assert (claimed > before_claimed).all()
 
 
 def test_rig_that_is_bumped_during_the_recording_is_told(rig, tmp_path, capsys):

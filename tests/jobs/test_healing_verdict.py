@@ -27,6 +27,7 @@ def outcome(*changes):
     checks = [
         healing._unused(SimpleNamespace(changes=(), complete=True), 1, RIG),
         healing._unused(SimpleNamespace(changes=changes, complete=True), 2, RIG),
+        healing._unseen_distortion(0.02, 0.1),
     ]
     diagnosis = SimpleNamespace(changes=(), probability=())
     errors = RigErrors(1e-4, 0.01, common_mm=0.2)
@@ -74,6 +75,7 @@ def test_rig_that_changed_during_the_recording_is_told():
     lines = _lines(Namespace(out='healed'), steady)
     assert 'no change of the rig is evident' in lines[0]
     assert lines[1] == healing.common_motion(0.3).sentence
+    assert lines[2] == steady.unseen_distortion.sentence
 
 
 def test_bodies_have_a_pose_with_three_markers_whose_ids_begin_at_0():
@@ -120,7 +122,7 @@ def test_distortion_that_a_model_cannot_take_is_diagnosed_and_does_not_pass():
     assert check.passed is False and check.place.fluoroscopes == ('a',)
     found = replace(
         outcome(),
-        checks=(check,),
+        checks=(check, healing._unseen_distortion(0.02, 0.1)),
         diagnosis=SimpleNamespace(changes=changes[:1], probability=(1,)),
     )
     lines = _lines(Namespace(out='out'), found)

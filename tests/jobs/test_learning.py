@@ -5,6 +5,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -88,6 +89,27 @@ def test_body_with_a_loose_marker_is_left_out(healthy):
     other = int(healthy.knee.bodies[1].target_id[0])
     with refused(Kind.MARKER_LOOSE):
         healthy.learn(moving(frames, other))
+
+
+def test_soft_body_is_left_out(healthy):
+    """Its markers move by less than ISO 16087 allows, and more than their deviations."""
+    rng = np.random.default_rng(4)
+
+    def soft(body):
+        moving_mm = rng.normal(0, 0.15, (2 * RATE_HZ, *body.xyz_mm.shape))
+        return SimpleNamespace(
+            name=body.name, target_id=body.target_id, xyz_mm=body.xyz_mm + moving_mm
+        )
+
+    first, second = healthy.knee.bodies
+    learned = healthy.learn(healthy.seen(SimpleNamespace(bodies=(soft(first), second))))
+    assert [body.name for body in learned.bodies] == [second.name]
+    found = learned.findings[0]
+    assert kinds(learned.findings) == [Kind.BODY_NOT_RIGID]
+    assert found.place.name == f'body {first.name}' and found.numbers['ratio'] > 1.5
+    assert found.numbers['mean_error_mm'] < 0.35
+    with refused(Kind.BODY_NOT_RIGID):
+        healthy.learn(healthy.seen(SimpleNamespace(bodies=(soft(first), soft(second)))))
 
 
 def test_body_that_is_not_seen_is_left_out(healthy):

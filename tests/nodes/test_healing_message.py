@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 from fluoro_calib_msgs.action import Heal
 
-from fluoro_calib_ros.jobs.healing import common_motion
+from fluoro_calib_ros.jobs.healing import _unseen_distortion, common_motion
 from fluoro_calib_ros.nodes.messages.healing import fill_healing
 
 
@@ -30,7 +30,9 @@ def test_message_tells_that_the_rig_changed_during_the_recording(meanwhile, mess
         healed=None,
         changed_meanwhile=meanwhile,
         common_motion=common_motion(0.3),
+        unseen_distortion=_unseen_distortion(0.02, 0.1),
     )
     result = Heal.Result()
     fill_healing(result, outcome, SimpleNamespace(orientation_id='rig-0'))
-    assert result.message == f'{message}; {common_motion(0.3).sentence}; verdict: fail'
+    unseen = f'{common_motion(0.3).sentence}; {outcome.unseen_distortion.sentence}'
+    assert result.message == f'{message}; {unseen}; verdict: fail'

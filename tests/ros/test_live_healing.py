@@ -412,15 +412,22 @@ def stream_of(rig, virtual, motion):
         yield [replace(f, stamp_ns=10**18 + f.number * 10**7) for f in pair]
 
 
-def test_healthy_rig_is_left_as_it_is(rig, graph, learned):
+def test_healthy_rig_stays_where_it_is_and_claims_what_is_not_seen(rig, graph, learned):
     client = graph.client
+    before = load_orientation(orientation_path(learned))
     graph.calibration_node(learned, heal_accept=True)
     answer = client.heal(seconds=1.0).get_result_async()
     client.stream(stream_of(rig, virtual_rig(SEED), rig.motion), RATE_HZ)
     result = client.result_of(answer, JOB_DEADLINE).result
     client.end_stream()
-    assert result.success and not result.orientation_id, result.message
-    assert 'no healed rig to accept' in client.call(Reset, 'accept_healing').message
+    assert result.success and not result.findings and not result.fluoroscope, result.message
+    after = load_orientation(orientation_path(learned))
+    assert after.orientation_id == result.orientation_id != before.orientation_id
+    assert after.calibration_ids == before.calibration_ids
+    np.testing.assert_array_equal(after.position_mm, before.position_mm)
+    np.testing.assert_array_equal(after.rotation, before.rotation)
+    of_b = before.covariance_rows([1])[:6]
+    assert (np.diagonal(after.covariance - before.covariance)[of_b] > 0).all()
 
 
 def test_rig_that_moves_while_it_is_recorded_is_not_accepted(rig, graph, learned):
@@ -501,8 +508,10 @@ def test_alarm_of_the_drift_watch_heals_the_rig(rig, graph, learned):
 
 
 def test_nothing_is_learned_after_an_alarm_of_the_drift_watch(rig, graph, calibrated):
+    """Nor after a restart of the node that has given it, and of the one that has heard it."""
     client = graph.client
-    graph.whole_chain(calibrated, learn_bodies=rig.bodies, learn_time=600.0)
+    parameters = {'learn_bodies': rig.bodies, 'learn_time': 600.0}
+    nodes = graph.whole_chain(calibrated, **parameters)
     points = client.listen('reconstruction/points_with_covariance')
 
     def told(message):
@@ -517,6 +526,12 @@ def test_nothing_is_learned_after_an_alarm_of_the_drift_watch(rig, graph, calibr
     of_rig.append(rig.frames)
     told('the drift watch has given an alarm')
     client.end_stream()
+    for name in ('reconstruction_node', 'calibration_node'):
+        assert nodes[name].end() == 0
+    client.statuses.clear()
+    graph.calibration_node(calibrated, **parameters)
+    graph.start('reconstruction_node')
+    told('the drift watch has given an alarm')
     assert not (calibrated / LEARNED_SHAPES).exists()
 
 

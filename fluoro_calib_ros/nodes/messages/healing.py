@@ -31,6 +31,7 @@ def fill_healing(result: Heal.Result, outcome: HealingOutcome, parent: RigOrient
         [
             *(what or ['no change is evident']),
             outcome.common_motion.sentence,
+            outcome.unseen_distortion.sentence,
             f'verdict: {outcome.verdict}',
         ]
     )

@@ -49,11 +49,14 @@ def _precision(evidence: Evidence, name: str) -> Check:
         if evidence.request.options.model_name != AUTO:
             advice = f'choose another model (--model auto), or {advice}'
     ratio = common.claimed_sd / noise if noise > 0 else np.inf
-    growth = 100 * (np.sqrt(1 + ratio**2) - 1)
+    told = 'residuals that its lack of fit explains: the image noise is not known'
+    if np.isfinite(ratio):
+        growth = 100 * (np.sqrt(1 + ratio**2) - 1)
+        told = f'an image noise of {noise:.2f} px: it makes the errors of corrected points '
+        told += f'{growth:.0f} % larger'
     return Check(
         Kind.PRECISION,
-        f'the correction has a standard deviation of {common.claimed_sd:.2f} px, at an image '
-        f'noise of {noise:.2f} px: it makes the errors of corrected points {growth:.0f} % larger',
+        f'the correction has a standard deviation of {common.claimed_sd:.2f} px, at {told}',
         Place((name,)),
         advice,
         numbers={'sd_px': common.claimed_sd, 'noise_px': noise, 'exposures': count},

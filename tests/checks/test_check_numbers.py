@@ -295,6 +295,7 @@ def test_precision_is_that_of_the_correction_over_the_noise(given, ratio, noise)
     assert found.value == pytest.approx(ratio) and found.limit == field_checks.MAX_RATIO
     assert found.numbers['noise_px'] == pytest.approx(noise)
     assert found.numbers['exposures'] == 8
+    assert 'inf' not in str(found)
 
 
 def test_achieved_deviation_joins_claim_halves_trend_and_variation():

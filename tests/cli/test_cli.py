@@ -25,7 +25,7 @@ from fluoro_calib_ros.jobs.simulation import write_bag
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 IMAGE = ('--image-size', '1024x1024')
-EXPOSURES = 8
+EXPOSURES = 6
 
 
 def command(*arguments, **options):

@@ -19,7 +19,7 @@ from fluoro_calib_ros.images.angle_maps import AngleMaps
 from fluoro_calib_ros.images.corrector import LIMIT_PX, ImageCorrector
 
 OK, OUTSIDE, INVALID = CorrectionStatus
-SIZE = (256, 256)
+SIZE = (512, 512)
 ANGLES = (-0.9, -0.2, 0.3, 1.0)
 WORST_PX = 0.1  # beyond the calibrated area
 

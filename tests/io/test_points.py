@@ -977,6 +977,13 @@ def test_wrong_poses_are_refused(tmp_path, row, cause):
     assert cause in refused(path)
 
 
+def test_file_without_an_image_point_is_refused(tmp_path):
+    path = tmp_path / 'points.csv'
+    path.write_text('bead_cam1_X,bead_cam1_Y,bead_cam2_X,bead_cam2_Y\nNaN,NaN,NaN,NaN\n')
+    with pytest.raises(DataError, match=r'points\.csv: the file has no image points'):
+        read_source(path, image_size=SIZE)
+
+
 def test_rate_is_that_of_the_stamps_also_where_exposures_are_missing():
     assert rate_of(np.array([4, 5, 7]), np.array([0, 4, 12]) * 10**6) == pytest.approx(250)
 

@@ -149,7 +149,7 @@ def in_folder(write: Callable[[Path], object], name: str = '*') -> bytes:
 @functools.cache
 def calibration(model: str = 'knn') -> FluoroscopeCalibration:
     """Return the calibration of a fluoroscope from a few exposures."""
-    exposures = simulate_exposures(rig(), 5, 1).frames
+    exposures = simulate_exposures(rig(), 3, 1).frames
     request = CalibrationOptions(model=model, k=5 if model == 'knn' else None, max_iterations=2)
     result = calibrate({'a': exposures['a']}, rig().phantom, request)
     return result.calibrations['a']

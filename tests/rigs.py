@@ -67,9 +67,14 @@ def _calibrated(name, count, options):
     return calibrate({name: exposures()[name][:count]}, rig().phantom, options)
 
 
+def short_calibration():
+    """A calibration of fluoroscope a that takes a fraction of a second; many tests share it."""
+    return calibrated('a', 6, max_iterations=2).calibrations['a']
+
+
 def true_calibrations(fluoroscopes, image_sd=0.25):
     """True calibrations by name of the fluoroscopes of a rig without distortion."""
-    one = calibrated('a', 5, model='parametric').calibrations['a']
+    one = short_calibration()
     return {
         f.name: replace(
             one,
@@ -221,7 +226,7 @@ def pincushion(name: str, image_size: tuple[int, int]) -> FluoroscopeCalibration
         'local_linear', 6, uv, 4 * x * (x**2).sum(axis=1, keepdims=True), 0.2, 0.0
     )
     return replace(
-        calibrated('a', 5, model='none').calibrations['a'],
+        short_calibration(),
         fluoroscope=name,
         model=model,
         image_size=image_size,

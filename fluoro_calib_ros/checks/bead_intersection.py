@@ -14,6 +14,7 @@ from ..estimation.result import CalibrationResult
 from ..exposures.frame import Frames
 from ..exposures.phantom import Phantom
 from ..photogrammetry.collinearity import project_with_jacobian
+from ..photogrammetry.network import similarity_directions
 from ..photogrammetry.noise import INLIER_Q
 from ..photogrammetry.rotations import matrix_from_quaternion
 
@@ -239,16 +240,7 @@ def _variance_along(direction: np.ndarray, covariance: np.ndarray) -> np.ndarray
 
 def _scale(beads: Beads) -> tuple[float, float]:
     """Return the scale - 1 of the similarity from survey to images, and its standard deviation."""
-    x = beads.survey_mm - beads.survey_mm.mean(axis=0)
-    design = np.zeros((len(x), 3, 7))
-    design[:, :, :3] = np.eye(3)  # translation
-    design[:, 0, 4] = x[:, 2]  # rotation
-    design[:, 0, 5] = -x[:, 1]
-    design[:, 1, 3] = -x[:, 2]
-    design[:, 1, 5] = x[:, 0]
-    design[:, 2, 3] = x[:, 1]
-    design[:, 2, 4] = -x[:, 0]
-    design[:, :, 6] = x  # scale
+    design = similarity_directions(beads.survey_mm, beads.survey_mm.mean(axis=0))
     information = np.linalg.inv(beads.total_covariance)
     normal = np.einsum('nai,nab,nbj->ij', design, information, design)
     right = np.einsum('nai,nab,nb->i', design, information, beads.misclosure)

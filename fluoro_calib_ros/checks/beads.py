@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import bdtrc, chdtri
 
+from ..bodies.rigid import by_pose
 from ..estimation.rounds import ResidualTable
 from ..findings import Kind, Place, first_few
 from .bead_intersection import Beads, distances, intersect, least_chi2_without_a_ray
@@ -132,7 +133,7 @@ class _Fit:
     def __init__(self, beads: Beads) -> None:
         self._beads = beads
         self._centre = beads.survey_mm.mean(axis=0)
-        self._design = _motions(beads.survey_mm - self._centre)
+        self._design = by_pose(beads.survey_mm - self._centre)
         self._information = np.linalg.inv(beads.total_covariance)
         half = self._information @ self._design
         self._normals = np.einsum('nai,naj->nij', self._design, half)
@@ -184,7 +185,7 @@ class _Fit:
         relative = motion - rest
         moved = self._design[own] @ relative
         size = float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
-        middle = _motions((survey[own].mean(axis=0) - self._centre)[None])[0]
+        middle = by_pose(survey[own].mean(axis=0) - self._centre)
         return DisplacedLayer(
             candidate.axis,
             border(candidate.start),
@@ -204,19 +205,6 @@ class _Fit:
     def _squares(self, left: np.ndarray, rows: np.ndarray | slice) -> np.ndarray:
         """Weighted squares (k,) of misclosures left (k, 3) of beads."""
         return np.einsum('na,nab,nb->n', left, self._information[rows], left)
-
-
-def _motions(x: np.ndarray) -> np.ndarray:
-    """Derivatives (n, 3, 6) of points x (n, 3) by translation and rotation."""
-    out = np.zeros((len(x), 3, MOTION))
-    out[:, :, :3] = np.eye(3)
-    out[:, 0, 4] = x[:, 2]
-    out[:, 0, 5] = -x[:, 1]
-    out[:, 1, 3] = -x[:, 2]
-    out[:, 1, 5] = x[:, 0]
-    out[:, 2, 3] = x[:, 1]
-    out[:, 2, 4] = -x[:, 0]
-    return out
 
 
 def _layers(coordinate: np.ndarray, sd: np.ndarray) -> np.ndarray:

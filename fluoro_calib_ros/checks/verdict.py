@@ -26,7 +26,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration, ids_of
 from ..errors import DataError
 from ..estimation.calibrate import adjust_with_calibrations
 from ..estimation.initial_network import nominal_interior
@@ -187,7 +187,7 @@ def validate(
     return Validation(
         verdict_of(checks),
         tuple(checks),
-        _identities(calibrations),
+        ids_of(calibrations),
         seconds=time.perf_counter() - began,
         achieved_sd_px={name: _achieved_sd(evidence, name, checks) for name in request.frames},
         notes=(*rig.notes, *trusted_shape(checks)),
@@ -222,7 +222,7 @@ def validate_or_report(
         return validate(request, calibrations, progress, rig)
     except DataError as error:
         check = Check(Kind.VALIDATION, f'the validation could not be made: {error}')
-        return Validation('cannot tell', (check,), _identities(calibrations), 0.0)
+        return Validation('cannot tell', (check,), ids_of(calibrations), 0.0)
 
 
 class _StepCounter:
@@ -247,7 +247,3 @@ def _used_frames(frames: Frames, result: CalibrationResult) -> dict[str, list[Fr
         used = {e.exposure for e in result.fluoroscopes[name].exposures}
         out[name] = sorted((f for f in of_fluoroscope if f.number in used), key=lambda f: f.number)
     return out
-
-
-def _identities(calibrations: Calibrations) -> dict[str, str]:
-    return {name: calibration.calibration_id for name, calibration in calibrations.items()}

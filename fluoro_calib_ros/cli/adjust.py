@@ -59,14 +59,14 @@ def run(arguments: argparse.Namespace) -> bool:
     """
     from ..io.calibration import disagreements
     from ..io.csv_table import read_names
+    from ..io.folder import check_output_folder
     from ..jobs.calibration import adjust
-    from ..jobs.result_folder import check_result_folder, save_result, written_document
+    from ..jobs.result_folder import RESULT_FOLDER, save_result, written_document
     from ..jobs.sources import read_calibrations, read_source, read_survey, select_calibrations
     from ..report.tables import summary_table
 
-    check_result_folder(
-        arguments.out, (arguments.source, arguments.phantom, arguments.calibration)
-    )
+    inputs = (arguments.source, arguments.phantom, arguments.calibration)
+    check_output_folder(arguments.out, RESULT_FOLDER, inputs)
     calibrations = read_calibrations(arguments.calibration)
     print_notes(disagreements(arguments.calibration, calibrations))
     known = read_names(arguments.calibration)

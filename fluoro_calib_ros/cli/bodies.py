@@ -83,14 +83,15 @@ def run(arguments: argparse.Namespace) -> None:
     """Write poses and joints of a recording. Raises DataError."""
     from ..io.bodies import read_bodies, read_joints
     from ..io.calibration import orientation_path
+    from ..io.folder import check_output_folder
     from ..io.learned_shapes import write_learned_shapes
-    from ..jobs.bodies import BodiesOptions, Film, check_bodies_folder, save_bodies, track_bodies
+    from ..jobs.bodies import BODIES_FOLDER, BodiesOptions, Film, save_bodies, track_bodies
     from ..jobs.learning import learn_shapes
     from ..jobs.sources import is_bag
 
     path = arguments.orientation or orientation_path(arguments.calibration)
     inputs = [arguments.source, arguments.calibration, path, arguments.bodies]
-    check_bodies_folder(arguments.out, [*inputs, arguments.joints or path])
+    check_output_folder(arguments.out, BODIES_FOLDER, [*inputs, arguments.joints or path])
     bodies = read_bodies(arguments.bodies)
     joints = read_joints(arguments.joints, bodies) if arguments.joints else ()
     recording, calibrations, orientation = read_oriented_source(arguments, path)

@@ -182,13 +182,14 @@ def run(arguments: argparse.Namespace) -> bool:
 
     Raises DataError.
     """
+    from ..io.folder import check_output_folder
     from ..io.radiographs import write_radiographs
     from ..jobs.calibration import run_calibration
-    from ..jobs.result_folder import check_result_folder, save_outcome, write_covariances
+    from ..jobs.result_folder import RESULT_FOLDER, save_outcome, write_covariances
 
     inputs = [arguments.source, arguments.phantom, *arguments.known_orientation]
     inputs += [arguments.decisions] if arguments.decisions else []
-    check_result_folder(arguments.out, inputs)
+    check_output_folder(arguments.out, RESULT_FOLDER, inputs)
     request, radiographs = _request(arguments)
     outcome = run_calibration(
         request,

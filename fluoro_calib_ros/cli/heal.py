@@ -50,9 +50,10 @@ def run(arguments: argparse.Namespace) -> bool:
     from ..errors import ErrorsAt
     from ..io.bodies import read_bodies
     from ..io.calibration import orientation_path
+    from ..io.folder import check_output_folder
     from ..jobs.healing import (
+        HEALING_FOLDER,
         HealingOptions,
-        check_healing_folder,
         heal_rig,
         healing_document,
         save_healing,
@@ -60,9 +61,8 @@ def run(arguments: argparse.Namespace) -> bool:
     from ..jobs.learning import learned_for
 
     path = arguments.orientation or orientation_path(arguments.calibration)
-    check_healing_folder(
-        arguments.out, [arguments.source, arguments.calibration, path, arguments.bodies or path]
-    )
+    inputs = [arguments.source, arguments.calibration, path, arguments.bodies or path]
+    check_output_folder(arguments.out, HEALING_FOLDER, inputs)
     bodies = read_bodies(arguments.bodies) if arguments.bodies else ()
     recording, calibrations, orientation = read_oriented_source(arguments, path)
     learned = None if bodies else learned_for(arguments.calibration, orientation)

@@ -448,3 +448,8 @@ def digest_of_sources(frames: Iterable[Frame], phantom: Phantom) -> str:
 
 
 Calibrations = Mapping[str, FluoroscopeCalibration]  # by fluoroscope
+
+
+def ids_of(calibrations: Calibrations) -> dict[str, str]:
+    """Return the ids of calibrations by fluoroscope."""
+    return {name: one.calibration_id for name, one in calibrations.items()}

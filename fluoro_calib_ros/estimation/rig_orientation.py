@@ -64,7 +64,7 @@ from .initial_network import (
     adjusted_with_precision,
 )
 from .pair_scatter import PairScatter, agreeing, displacements, functions_of_angles
-from .result import FluoroscopeResult, Targets
+from .result import FluoroscopeResult
 
 # Orientation of a rig whose fluoroscopes were calibrated with known orientations.
 
@@ -192,7 +192,7 @@ def orientation_of_capture(
     frames : mapping of str to sequence of Frame
         One or more of every fluoroscope; they need not be paired.
     phantom : Phantom
-        Survey of its targets, or the better known object points of a calibration (`phantom_of`).
+        Survey of its targets.
     calibrations : mapping of str to FluoroscopeCalibration
         Fixed.
     frame_id : str
@@ -306,15 +306,6 @@ def _seen_by_first(fixed: _FixedAdjustment) -> np.ndarray:
     exposure = network.exposure[rows]
     points = parameters.points_mm[network.point[rows]]
     return to_sensor(parameters.rotation[exposure], parameters.position_mm[exposure], points)
-
-
-def phantom_of(targets: Targets) -> Phantom:
-    """Phantom of the object points of a calibration, better known than by their survey.
-
-    The standard deviation of a target is the root mean square of those of its coordinates.
-    """
-    variance = np.trace(targets.covariance, axis1=1, axis2=2) / 3
-    return Phantom(targets.target_id, targets.xyz_mm, np.sqrt(variance))
 
 
 def _validate(frames: Frames, phantom: Phantom, calibrations: Calibrations) -> None:

@@ -88,7 +88,7 @@ class Block:
                 raise ValueError
             return list(map(kind, cells))
         except ValueError:
-            index = next(i for i, cell in enumerate(cells) if not _is_number(cell, kind))
+            index = next(i for i, cell in enumerate(cells) if not is_number(cell, kind))
             self.fail(index, f'{name} is {cells[index]!r}, not {expected}')
 
 
@@ -130,7 +130,7 @@ def decimal_point(cell: str) -> str:
     if cell.count(',') != 1 or '.' in cell:
         return cell
     changed = cell.replace(',', '.')
-    return changed if _is_number(changed, float) else cell
+    return changed if is_number(changed) else cell
 
 
 @dataclass(frozen=True)
@@ -182,7 +182,7 @@ _SUSPICIOUS = _FORMULA | {"'"}
 def as_text(cell: str) -> str:
     """Return a cell, with an apostrophe before one that a spreadsheet would run."""
     bare = cell.lstrip("'")
-    return f"'{cell}" if bare[:1] in _FORMULA and not _is_number(bare, float) else cell
+    return f"'{cell}" if bare[:1] in _FORMULA and not is_number(bare) else cell
 
 
 def _as_texts(row: Iterable[Any]) -> list[Any]:
@@ -297,7 +297,8 @@ def _check_widths(
         )
 
 
-def _is_number(cell: str, kind: Callable[[str], Any]) -> bool:
+def is_number(cell: str, kind: Callable[[str], Any] = float) -> bool:
+    """Return whether a cell is a number of a kind, as programs write it."""
     try:
         kind(cell)
     except ValueError:

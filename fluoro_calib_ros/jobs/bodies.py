@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,7 +29,7 @@ from ..images.overlay import BodyView, draw_bodies
 from ..io.access import PathLike, write_text
 from ..io.bodies import JointEntry, joint_table, shape_table
 from ..io.csv_table import Table, dataframe_of
-from ..io.folder import FolderKind, check_output_folder, replaced_folder
+from ..io.folder import FolderKind, replaced_folder
 from ..io.formats.bodies import write_joint_motion
 from ..io.image_reading import ImageSource
 from ..io.image_writing import write_video
@@ -469,11 +469,6 @@ BODIES_FOLDER = FolderKind(
     parts=(POSES, MOTION, SHAPES, JOINTS, OPENSIM, REPORT, 'film_*.mp4'),
     marks=(POSES,),
 )
-
-
-def check_bodies_folder(directory: PathLike, inputs: Iterable[PathLike]) -> None:
-    """Raise DataError unless the bodies of a recording may be written to a folder."""
-    check_output_folder(directory, BODIES_FOLDER, inputs)
 
 
 def save_bodies(

@@ -42,7 +42,7 @@ from ..io.access import PathLike
 from ..io.calibration import ORIENTATION_NAME as ORIENTATION
 from ..io.calibration import SUFFIX, save_calibration, save_orientation
 from ..io.documents import write_json
-from ..io.folder import FolderKind, check_output_folder, replaced_folder
+from ..io.folder import FolderKind, replaced_folder
 from ..io.learned_shapes import LEARNED_SHAPES, write_learned_shapes
 from ..io.versions import HEALING
 from ..photogrammetry.rig_orientation import RigOrientation
@@ -526,11 +526,6 @@ HEALING_FOLDER = FolderKind(
     parts=(HEALING, ORIENTATION, LEARNED_SHAPES, f'*{SUFFIX}'),
     marks=(HEALING,),
 )
-
-
-def check_healing_folder(directory: PathLike, inputs: Iterable[PathLike]) -> None:
-    """Raise DataError unless a healed rig may be written to a folder."""
-    check_output_folder(directory, HEALING_FOLDER, inputs)
 
 
 def save_healing(

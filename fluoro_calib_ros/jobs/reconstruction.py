@@ -13,7 +13,7 @@ import numpy as np
 
 from ..bodies.body import Body
 from ..checks.rig_watch import DriftVerdict, RecordingDriftWatch
-from ..correction.fluoroscope_calibration import Calibrations
+from ..correction.fluoroscope_calibration import Calibrations, ids_of
 from ..errors import DataError
 from ..exposures.frame import Frames
 from ..exposures.names import Names
@@ -180,9 +180,7 @@ def reconstruct(
 
 def check_orientation(orientation: RigOrientation, calibrations: Calibrations) -> None:
     """Raise DataError unless an orientation was determined with these calibrations."""
-    orientation.check_calibrations(
-        {name: calibration.calibration_id for name, calibration in calibrations.items()}
-    )
+    orientation.check_calibrations(ids_of(calibrations))
 
 
 def _drift_watch(

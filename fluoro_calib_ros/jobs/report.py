@@ -15,7 +15,7 @@ import numpy as np
 from jinja2 import UndefinedError
 
 from ..checks.comparison import Comparison, compare_calibrations
-from ..correction.fluoroscope_calibration import Calibrations
+from ..correction.fluoroscope_calibration import Calibrations, ids_of
 from ..errors import DataError
 from ..estimation.options import CalibrationRequest
 from ..findings import Finding, Kind, Place, Severity
@@ -163,7 +163,7 @@ def read_report_input(directory: PathLike) -> ReportInput:
     if orientation is not None and not belongs_to(orientation, calibrations):
         orientation = None
     verdict = read_result(directory, VALIDATION_NAME)
-    if verdict.get('calibration_id') != {n: c.calibration_id for n, c in present.items()}:
+    if verdict.get('calibration_id') != ids_of(present):
         verdict = {}
     changed = changed_since_verdict(directory, verdict)
     when = datetime.fromtimestamp((directory / RESULT).stat().st_mtime, timezone.utc)

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -174,11 +174,6 @@ def save_healed_version(
     save_healing(version_folder(directory, healed_id), outcome, parent, learned)
     write_learned_shapes(directory, learned.with_healed(healed_id))
     save_calibrations(directory, {**calibrations, **outcome.calibrations}, outcome.orientation)
-
-
-def check_result_folder(directory: PathLike, inputs: Iterable[PathLike] = ()) -> None:
-    """Raise DataError unless a result folder can be written there without harm to the inputs."""
-    check_output_folder(directory, RESULT_FOLDER, inputs)
 
 
 def _write_result(

@@ -23,9 +23,10 @@ from ..estimation.rounds import Round
 from ..exposures.frame import Frame
 from ..findings import Severity, sentences
 from ..io.calibration import save_orientation
+from ..io.folder import check_output_folder
 from ..jobs.calibration import CalibrationOutcome, Rig, run_in_worker_process
 from ..jobs.orientation import OrientationOutcome, orient
-from ..jobs.result_folder import belongs_to, check_result_folder
+from ..jobs.result_folder import RESULT_FOLDER, belongs_to
 from .calibration_settings import NOT_ACTIVE
 from .exposure_input import NodeParts, RigServices
 from .messages.self_calibration import (
@@ -294,7 +295,7 @@ class SelfCalibration(Job):
 
         Raises DataError and ValueError, also where the outcome could not be saved.
         """
-        check_result_folder(self._rig.directory)
+        check_output_folder(self._rig.directory, RESULT_FOLDER)
         job, rig = self._job_of(request)
 
         def on_round(label: str, last: Round) -> None:

@@ -22,7 +22,7 @@ from rclpy.task import Future
 
 from ..bodies.body import Body
 from ..bodies.shapes import LearnedShapes
-from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration, ids_of
 from ..errors import DataError
 from ..exposures.frame import Frame, validate_frame
 from ..io.versions import parent_folder, version_folder
@@ -235,7 +235,7 @@ class Healing(Job):
 
     def _check_unchanged(self, rig: _Rig) -> None:
         """Raise DataError where another rig is in use than the one that was healed."""
-        if rig.orientation is not self._output.orientation or _ids(rig.calibrations) != _ids(
+        if rig.orientation is not self._output.orientation or ids_of(rig.calibrations) != ids_of(
             self._output.calibrations
         ):
             raise DataError(CHANGED)
@@ -302,11 +302,7 @@ class Healing(Job):
     ) -> None:
         """Publish the orientation, and the calibrations that are not in use already."""
         self._healed = None
-        present = _ids(self._output.calibrations)
+        present = ids_of(self._output.calibrations)
         others = {n: c for n, c in calibrations.items() if c.calibration_id != present.get(n)}
         self._output.publish(others, orientation)
         wake(self._node)
-
-
-def _ids(calibrations: Mapping[str, FluoroscopeCalibration]) -> dict[str, str]:
-    return {name: one.calibration_id for name, one in calibrations.items()}

@@ -104,11 +104,6 @@ class KnownOrientation:
             raise DataError(f'known orientation: {name} is not {size} numbers above 0')
         object.__setattr__(self, name, numbers)
 
-    @property
-    def is_fixed(self) -> bool:
-        """Whether interior and exterior orientation are both fixed."""
-        return self.interior_sd is None and self.exterior_sd is None
-
     @classmethod
     def from_matrices(
         cls,

@@ -170,11 +170,6 @@ class RigOrientation:
         """Standard deviations (F, 3) of the rotations about the axes of the sensors [rad]."""
         return self._sd(slice(3, 6))
 
-    @property
-    def sd_interior(self) -> NDArray[np.float64]:
-        """Standard deviations (F, 3) of xp, yp, c [px]."""
-        return self._sd(slice(6, 9))
-
     def _sd(self, columns: slice) -> np.ndarray:
         return np.sqrt(np.diagonal(self.covariance).reshape(-1, ORIENTATION_SIZE)[:, columns])
 

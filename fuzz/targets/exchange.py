@@ -24,12 +24,9 @@ from ..harness import Target, both
 from ..seeds import frames, rig
 
 SETTINGS = FileSettings(image_size=(1024, 1024), units='mm', rate_hz=100.0)
-# These have targets of their own; C3D is read in another process.
-KINDS = tuple(
-    kind
-    for kind in registry.kinds(lambda f: f.read is not None)
-    if kind not in ('observations', 'phantom', 'known_orientation', 'c3d', 'xmalab_project')
-)
+# These have targets of their own; C3D and SLEAP are read in another process.
+OTHERS = ('observations', 'phantom', 'known_orientation', 'c3d', 'sleap', 'xmalab_project')
+KINDS = tuple(kind for kind in registry.kinds(lambda f: f.read is not None) if kind not in OTHERS)
 
 
 def _read(path: Path) -> None:

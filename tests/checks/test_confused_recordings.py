@@ -79,7 +79,10 @@ def poses():
 
 
 def seen(of_rig, of_b=None):
-    """Frames of the phantom; of_b(k, fluoroscope, pose) returns what b and the phantom do."""
+    """Frames of half of the beads that are seen.
+
+    of_b(k, fluoroscope, pose) returns what b and the phantom do.
+    """
     rng = np.random.default_rng(6)
     out = {f.name: [] for f in of_rig.fluoroscopes}
     for k, pose in enumerate(poses()):
@@ -89,7 +92,7 @@ def seen(of_rig, of_b=None):
                 camera, (turn, shift) = of_b(k, f, pose)
             points = of_rig.true_mm @ turn.T + shift
             ids, uv = detect_beads(rng, camera, points, of_rig.phantom.target_id, Detection())
-            out[f.name].append(Frame(f.name, k + 1, ids, uv, f.image_size))
+            out[f.name].append(Frame(f.name, k + 1, ids[::2], uv[::2], f.image_size))
     return out
 
 

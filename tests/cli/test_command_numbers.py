@@ -348,7 +348,7 @@ def test_calibrate_returns_whether_nothing_speaks_against_it(
     jobs = 'fluoro_calib_ros.jobs'
     monkeypatch.setattr(f'{jobs}.calibration.run_calibration', run_calibration)
     monkeypatch.setattr(f'{jobs}.result_folder.save_outcome', save_outcome)
-    monkeypatch.setattr(f'{jobs}.result_folder.check_result_folder', lambda *_: None)
+    monkeypatch.setattr('fluoro_calib_ros.io.folder.check_output_folder', lambda *_: None)
     monkeypatch.setattr(
         f'{jobs}.result_folder.write_covariances', lambda *words: asked.update(covariance=words)
     )

@@ -42,7 +42,7 @@ def write_study(folder, text):
 def rig(tmp_path_factory):
     """A rig, calibrated from its bag, and two trials: image points of ten exposures each."""
     folder = tmp_path_factory.mktemp('study') / 'rig'
-    more = ('--exposures', 8, '--test-exposures', 10, '--seconds', 0.05)
+    more = ('--exposures', 6, '--test-exposures', 10, '--seconds', 0.05)
     assert run('simulate', '--out', folder, *more) == 0
     calibrate = ('calibrate', folder / 'calibration', '--phantom', folder / 'phantom.csv')
     fast = ('--model', 'parametric', '--fast', '--max-iterations', 2)

@@ -62,7 +62,7 @@ def test_added_model_calibrates_saves_loads_and_looks_up(tmp_path):
 
 @pytest.mark.usefixtures('added')
 def test_number_of_neighbours_of_an_added_model_can_be_given():
-    frames = {'a': rigs.exposures()['a'][:8]}
+    frames = {'a': rigs.exposures()['a'][:4]}
     options = CalibrationOptions(NAME, k=5, max_iterations=1)
     assert calibrate(frames, rigs.rig().phantom, options).calibrations['a'].model.k == 5
 

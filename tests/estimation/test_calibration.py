@@ -67,8 +67,8 @@ def frames_of(name='a', count=15):
 
 
 def short(**options):
-    """Calibration of two rounds with the first eight exposures, shared by the tests."""
-    return rigs.calibrated(count=8, max_iterations=2, **options)
+    """Calibration of two rounds with the first six exposures, shared by the tests."""
+    return rigs.calibrated(count=6, max_iterations=2, **options)
 
 
 def rounds(count, **options):
@@ -254,7 +254,7 @@ def test_adjustment_and_model_are_of_the_same_round():
 
 def test_convergence_follows_the_tolerance():
     """F and G change by less than the tolerance in the last round, and by more before."""
-    history = rigs.calibrated(count=8, model='local_linear').history['a']
+    history = rigs.calibrated(count=6, model='local_linear').history['a']
 
     def change(now, before):
         return max(abs(now.F - before.F) / max(abs(now.F), now.G), abs(now.G - before.G) / now.G)
@@ -340,7 +340,7 @@ def test_unknown_options_are_refused(options):
 def test_fixed_interior_orientation_is_held_and_the_model_compensates():
     """Image centre and given principal distance to the last bit, without standard deviation."""
     job = calibrate(
-        frames_of(count=8), PHANTOM, rounds(2, interior='fixed'), principal_distance=4000.0
+        frames_of(count=6), PHANTOM, rounds(2, interior='fixed'), principal_distance=4000.0
     )
     np.testing.assert_array_equal(job.fluoroscopes['a'].interior, [511.5, 511.5, 4000.0])
     assert (
@@ -366,7 +366,7 @@ def test_principal_distance_is_only_a_start_value():
     assert found == pytest.approx(true, rel=0.04) and found != 3900.0
     one, other = (
         calibrate(
-            frames_of(count=8), PHANTOM, CalibrationOptions(model='none'), principal_distance=c
+            frames_of(count=6), PHANTOM, CalibrationOptions(model='none'), principal_distance=c
         )
         for c in (None, 3600.0)
     )
@@ -408,7 +408,7 @@ def test_exterior_orientations_are_those_of_the_rig():
 
 
 def test_same_observations_give_the_same_bits():
-    assert_same_bits(calibrate(frames_of(count=8), PHANTOM, rounds(2)), short())
+    assert_same_bits(calibrate(frames_of(count=6), PHANTOM, rounds(2)), short())
 
 
 @pytest.mark.parametrize('options', [{}, {'model': 'local_linear', 'k': 60}])
@@ -439,7 +439,7 @@ def test_digest_depends_on_the_observations():
 
 
 def test_sigma_of_one_changes_nothing():
-    frames = [replace(f, sigma=np.ones(len(f.target_id))) for f in frames_of(count=8)['a']]
+    frames = [replace(f, sigma=np.ones(len(f.target_id))) for f in frames_of(count=6)['a']]
     job = calibrate({'a': frames}, PHANTOM, rounds(2))
     np.testing.assert_array_equal(
         job.fluoroscopes['a'].interior, short().fluoroscopes['a'].interior
@@ -830,7 +830,7 @@ def test_anderson_acceleration_accepts_equal_iterates():
 def test_self_calibrate_gives_the_numbers_of_calibrate():
     """self_calibrate takes the output of measured_network."""
     with threadpool_limits(1):
-        run = self_calibrate(measured_network(frames_of(count=8), PHANTOM), rounds(2))
+        run = self_calibrate(measured_network(frames_of(count=6), PHANTOM), rounds(2))
     np.testing.assert_allclose(
         run.after.parameters.interior[0], short().fluoroscopes['a'].interior, rtol=1e-9
     )

@@ -123,7 +123,8 @@ def test_what_is_saved_is_looked_up_and_validated(outcome, motion, tmp_path):
     save_outcome(tmp_path, outcome)
     calibrations = load_calibrations(tmp_path)
     request = read_request(tmp_path, calibrations)
-    assert request.known_orientations['a'].is_fixed
+    held = request.known_orientations['a']
+    assert held.interior_sd is None and held.exterior_sd is None
     verdict = validate_or_report(
         replace(request, options=replace(request.options, model='none')), calibrations
     )

@@ -15,13 +15,11 @@ from rigs import calibrated, exposures, rig, run
 
 from fluoro_calib_ros.correction.registry import no_correction
 from fluoro_calib_ros.errors import DataError
-from fluoro_calib_ros.estimation.result import Targets
 from fluoro_calib_ros.estimation.rig_orientation import (
     MAX_PAIRS,
     _paired,
     orientation_and_scatter,
     orientation_of_capture,
-    phantom_of,
     standing_frames,
 )
 from fluoro_calib_ros.exposures.frame import Frame
@@ -209,8 +207,9 @@ def test_moving_phantom_is_refused():
 def test_more_precise_targets_give_a_more_precise_orientation():
     """The phantom consists of the object points of the calibration."""
     targets = calibrated('a').targets
-    better = phantom_of(targets)
-    assert isinstance(targets, Targets) and np.median(better.sd_mm) < 0.08
+    sd = np.sqrt(np.trace(targets.covariance, axis1=1, axis2=2) / 3)
+    assert np.median(sd) < 0.08
+    better = Phantom(targets.target_id, targets.xyz_mm, sd)
     frames = {
         n: [
             replace(f, target_id=f.target_id[keep], uv=f.uv[keep])

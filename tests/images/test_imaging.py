@@ -24,10 +24,12 @@ def image_of(radii: np.ndarray, blur_px: float, seed: int = 5) -> tuple[np.ndarr
     size = PITCH * across
     row, column = np.divmod(np.arange(len(radii)), across)
     uv = PITCH * (np.column_stack([column, row]) + 0.5) + rng.uniform(-3, 3, (len(radii), 2))
-    v, u = (np.mgrid[: FINE * size, : FINE * size] + 0.5) / FINE - 0.5
-    depth = np.zeros(u.shape)
+    place = (np.arange(FINE * size) + 0.5) / FINE - 0.5
+    depth = np.zeros((FINE * size, FINE * size))
     for (x, y), radius in zip(uv, radii):
-        depth += 2 * np.sqrt(np.maximum(radius**2 - (u - x) ** 2 - (v - y) ** 2, 0))
+        us, vs = (slice(*np.searchsorted(place, [c - radius, c + radius])) for c in (x, y))
+        square = (place[vs, None] - y) ** 2 + (place[us] - x) ** 2
+        depth[vs, us] += 2 * np.sqrt(np.maximum(radius**2 - square, 0))
     light = cv2.GaussianBlur(900 * np.exp(-ABSORBED * depth), (0, 0), FINE * blur_px)
     light = light.reshape(size, FINE, size, FINE).mean(axis=(1, 3))
     return rng.poisson(light).astype(np.float32), uv
@@ -84,7 +86,7 @@ def test_profile_of_small_shadows_that_move_is_an_estimate():
 
 @pytest.mark.parametrize('radius_px', [5.5, 8.0])
 def test_sizes_that_are_not_told_are_seen(radius_px):
-    radii = np.tile([5.5, 8.0, 8.0, 10.5], 9)
+    radii = np.tile([5.5, 8.0, 8.0, 10.5], 4)
     imaging, *_ = completed(radii, None, radius_px)
     size = imaging.size / np.median(imaging.size[radii == 8])
     np.testing.assert_allclose(size, radii / 8, rtol=0.05)
@@ -92,7 +94,7 @@ def test_sizes_that_are_not_told_are_seen(radius_px):
 
 @pytest.mark.parametrize('told', [True, False])
 def test_centres_of_beads_of_several_sizes_are_as_good_as_their_sigma(told):
-    radii = np.tile([5.5, 8.0, 10.5], 12)
+    radii = np.tile([5.5, 8.0, 10.5], 8)
     imaging, light, uv = completed(radii, radii / 8 if told else None, 8.0)
     beads = measure_beads(
         light,

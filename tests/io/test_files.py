@@ -46,6 +46,7 @@ from fluoro_calib_ros.jobs.sources import read_content
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 
 SIZE = (1024, 960)
+CALIBRATED = (256, 240)  # image of some_calibration: a small lookup grid
 OBSERVATIONS = 'fluoroscope,exposure,target_id,u,v,sigma\n'
 
 
@@ -89,7 +90,7 @@ def some_frames(exposures=5, targets=9):
 
 def some_calibration(name='a', n=400, **changes):
     rng = np.random.default_rng(5)
-    uv = rng.uniform(50, 900, (n, 2))
+    uv = rng.uniform(12, 225, (n, 2))
     model = (
         create_model('local_linear', 20, uv, np.sin(uv / 200) * 5, 0.08, 0.01)
         if n
@@ -97,8 +98,8 @@ def some_calibration(name='a', n=400, **changes):
     )
     values = dict(
         fluoroscope=name,
-        image_size=SIZE,
-        interior=np.array([510.1, 480.2, 2000.3]),
+        image_size=CALIBRATED,
+        interior=np.array([127.1, 120.2, 500.3]),
         interior_covariance=np.diag([1.0, 2.0, 3.0]),
         interior_estimated=True,
         model=model,
@@ -449,7 +450,7 @@ def test_calibration_round_trip_is_exact(tmp_path, calibration):
 def some_angle_field():
     rng = np.random.default_rng(4)
     grids = rng.uniform(0, 0.01, (14, 33, 33))
-    return AngleField(SIZE, np.linspace(-1, 1, 9), rng.normal(0, 1, (4, 2, 10)), grids)
+    return AngleField(CALIBRATED, np.linspace(-1, 1, 9), rng.normal(0, 1, (4, 2, 10)), grids)
 
 
 def test_calibration_that_changes_with_an_angle_is_kept_to_the_bit(tmp_path):
@@ -516,7 +517,7 @@ def test_noise_profile_is_read_to_the_last_bit(tmp_path):
     calibration = some_calibration(noise_profile=NoiseProfile(0.81, 1.37, 1.13))
     found = load_calibration(save_calibration(tmp_path, calibration))
     assert found.noise_profile == calibration.noise_profile
-    uv = np.array([[500.0, 500.0], [100.0, 900.0], [np.nan, 3.0]])
+    uv = np.array([[125.0, 125.0], [25.0, 225.0], [np.nan, 3.0]])
     sigma = found.correct(uv).sigma
     assert np.array_equal(sigma, calibration.correct(uv).sigma, equal_nan=True)
     alone = [found.correct(uv[:2], [1e-9, 1e-9]).sigma, found.image_sd_at(uv[:2])]
@@ -664,11 +665,11 @@ def corrected_rows(tmp_path, text, calibrations):
 def test_points_are_corrected_and_other_columns_kept(tmp_path):
     calibration = some_calibration()
     header, good, empty, off, outside = corrected_rows(
-        tmp_path, 'note,v,u\n kept ,500.25,400\n1,,3\n2,5,nan\n3,1,1\n', {'a': calibration}
+        tmp_path, 'note,v,u\n kept ,125.25,100\n1,,3\n2,5,nan\n3,1,1\n', {'a': calibration}
     )
     assert header == ['note', 'v', 'u', 'u_corrected', 'v_corrected', 'sigma', 'status']
-    wanted = calibration.correct([[400, 500.25]])
-    assert good[:3] == [' kept ', '500.25', '400'] and good[6] == 'OK'
+    wanted = calibration.correct([[100, 125.25]])
+    assert good[:3] == [' kept ', '125.25', '100'] and good[6] == 'OK'
     assert list(map(float, good[3:6])) == [*wanted.uv[0], wanted.sigma[0]]
     assert empty == ['1', '', '3', '', '', '', 'INVALID'] and off == [
         '2',
@@ -685,10 +686,10 @@ def test_points_are_corrected_and_other_columns_kept(tmp_path):
 def test_points_are_corrected_at_the_angle_of_their_row(tmp_path):
     calibration = some_calibration(angle_field=some_angle_field())
     _, one, two = corrected_rows(
-        tmp_path, 'u,v,angle_deg\n400,500,20\n400,500,\n', {'a': calibration}
+        tmp_path, 'u,v,angle_deg\n100,125,20\n100,125,\n', {'a': calibration}
     )
     for row, angle in ((one, np.radians(20)), (two, None)):
-        wanted = calibration.correct([[400, 500]], angle=angle)
+        wanted = calibration.correct([[100, 125]], angle=angle)
         assert list(map(float, row[3:6])) == pytest.approx([*wanted.uv[0], wanted.sigma[0]])
     assert one[3] != two[3]
 
@@ -696,11 +697,11 @@ def test_points_are_corrected_at_the_angle_of_their_row(tmp_path):
 def test_points_of_two_fluoroscopes_with_their_own_sigma(tmp_path):
     calibrations = {'a': some_calibration('a'), 'b': some_calibration('b', n=0)}
     header, one, two, three = corrected_rows(
-        tmp_path, 'fluoroscope,u,v,sigma\nb,10,20,0.5\na,300,400,\nb,10,5000,1\n', calibrations
+        tmp_path, 'fluoroscope,u,v,sigma\nb,10,20,0.5\na,75,100,\nb,10,5000,1\n', calibrations
     )
     assert header[4:] == ['u_corrected', 'v_corrected', 'sigma_corrected', 'status']
     assert one == ['b', '10', '20', '0.5', '10.0', '20.0', '0.5', 'OK']
-    assert float(two[6]) == calibrations['a'].correct([[300, 400]]).sigma[0]
+    assert float(two[6]) == calibrations['a'].correct([[75, 100]]).sigma[0]
     assert three[-1] == 'INVALID'
 
 

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import pytest
 import rigs
+from dicom_files import dicom
 
 from benchmarks.bead_images import bead_image
 from fluoro_calib_ros.errors import DataError
@@ -252,6 +253,15 @@ def test_archive_with_folders_on_two_processes(one, tmp_path, capfd):
     assert first == content_of(tmp_path / 'out2')
     assert set(first) == {name for name in content_of(source) if name.endswith(('png', 'avi'))}
     assert 'this is inside of' in said(capfd, source, one, source / 'out', '--recursive')
+
+
+def test_what_is_read_but_not_written_has_another_name_in_a_new_folder(one, corrector, tmp_path):
+    (tmp_path / 'in').mkdir()
+    dicom(tmp_path / 'in' / 'IM1.dcm', image_of()[None])
+    assert correct(tmp_path / 'in', one, tmp_path / 'out') == 0
+    (new,) = content_of(tmp_path / 'out').items()
+    assert new[0] == 'IM1.tif'
+    assert np.array_equal(decode(new[1]), corrector.correct(image_of()))
 
 
 def test_folder_with_a_damaged_file_keeps_going_if_asked_to(one, tmp_path, capfd):

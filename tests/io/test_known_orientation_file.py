@@ -47,7 +47,7 @@ def test_what_is_written_is_read_again(tmp_path):
     write_known_orientations(tmp_path / 'known.yaml', known)
     found = read_known_orientations(tmp_path / 'known.yaml')
     assert list(found) == ['a', 'b']
-    assert found['a'].is_fixed
+    assert found['a'].interior_sd is None and found['a'].exterior_sd is None
     assert found['b'].interior_sd == (1, 2, 3)
     assert found['b'].exterior_sd == (0.1, 1e-4)
     for name, one in known.items():

@@ -20,7 +20,6 @@ import pandas
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fluoro_calib_ros.bodies.body import BodyPoses
 from fluoro_calib_ros.bodies.joints import Joint, JointMotion
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.frame import Frame
@@ -37,7 +36,7 @@ from fluoro_calib_ros.io.formats.content import (
     Station,
     points_without_precision,
 )
-from fluoro_calib_ros.io.formats.tables import bodies_of_poses, table_of
+from fluoro_calib_ros.io.formats.tables import rate_of, table_of
 from fluoro_calib_ros.jobs.sources import read_source
 
 SIZE = (1024, 768)
@@ -978,32 +977,15 @@ def test_wrong_poses_are_refused(tmp_path, row, cause):
     assert cause in refused(path)
 
 
-def test_poses_become_bodies():
-    """The rate is that of the stamps, also where exposures are missing."""
-    rotation = Rotation.random(3, random_state=np.random.default_rng(1)).as_matrix()
-    poses = [
-        BodyPoses(
-            name,
-            np.array([4, 5, 7]),
-            np.array([0, 4, 12]) * 10**6,
-            rotation=rotation,
-            position_mm=np.arange(9.0).reshape(3, 3) + n,
-            covariance_noise=np.zeros((3, 6, 6)),
-            covariance_fixed=np.zeros((3, 6, 6)),
-            rig_root=np.zeros((3, 6, 0)),
-            markers=np.full(3, 4),
-            status=np.zeros(3, np.uint8),
-        )
-        for n, name in enumerate(('femur', 'tibia'))
-    ]
-    bodies = bodies_of_poses(poses)
-    assert bodies.names == ('femur', 'tibia') and bodies.rate_hz == pytest.approx(250)
-    np.testing.assert_array_equal(bodies.rotation[:, 1], rotation)
-    np.testing.assert_array_equal(bodies.translation_mm[:, 1], poses[1].position_mm)
-    other = dataclasses.replace(poses[1], number=np.array([4, 5, 6]))
-    for wrong in ([], [poses[0], other]):
-        with pytest.raises(DataError, match='one body at least'):
-            bodies_of_poses(wrong)
+def test_file_without_an_image_point_is_refused(tmp_path):
+    path = tmp_path / 'points.csv'
+    path.write_text('bead_cam1_X,bead_cam1_Y,bead_cam2_X,bead_cam2_Y\nNaN,NaN,NaN,NaN\n')
+    with pytest.raises(DataError, match=r'points\.csv: the file has no image points'):
+        read_source(path, image_size=SIZE)
+
+
+def test_rate_is_that_of_the_stamps_also_where_exposures_are_missing():
+    assert rate_of(np.array([4, 5, 7]), np.array([0, 4, 12]) * 10**6) == pytest.approx(250)
 
 
 # ---- lookup tables

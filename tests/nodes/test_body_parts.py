@@ -295,6 +295,7 @@ def test_diagnostics_of_a_body_from_unseen_to_lost():
     follow(follower, range(3), visible=('femur',))
     assert (tibia().level, tibia().values['status']) == (WARN, 'FAILED')
     assert tibia().values['since last seen [s]'] == ''
+    assert tibia().values['chi-squared over expectation'] == 'nan'
     follow(follower, range(3, 30))
     assert (tibia().level, tibia().values['status']) == (OK, 'OK')
     assert tibia().values['markers seen'] == 4

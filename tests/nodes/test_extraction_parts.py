@@ -91,6 +91,7 @@ def test_an_exposure_is_given_out_whole_or_when_its_partner_is_lost():
         ([1], [1], True),
         ([1], [], False),  # b may still come
         ([1, 2], [], False),  # b is an exposure late, as in a burst
+        ([1, 2, 3], [], False),  # b is as late as it may be
         ([1, 2, 3, 4], [], True),  # b is not waited for any longer
         ([1], [2], True),  # b has lost it
         ([], [3], False),

@@ -220,7 +220,7 @@ def test_wrong_arguments_of_ros_are_told_in_a_sentence(tmp_path, arguments, sent
     """The second would wait for ever."""
     os.mkfifo(tmp_path / 'pipe')
     words = [str(tmp_path / 'pipe') if word == 'PIPE' else word for word in arguments]
-    command = [sys.executable, '-m', 'fluoro_calib_ros.nodes.calibration_node', '--ros-args']
+    command = [sys.executable, '-m', 'fluoro_calib_ros.nodes.correction_node', '--ros-args']
     done = subprocess.run([*command, *words], capture_output=True, text=True, timeout=60)
     assert done.returncode == 1
     assert sentence in done.stderr and 'Traceback' not in done.stderr

@@ -99,6 +99,10 @@ def test_rate_is_of_the_readings_of_a_window():
     assert meter.hz == 50 / session_state.RATE_WINDOW_S
     meter.add(session_state.RATE_WINDOW_S + 1, 90)
     assert meter.hz == 40.0
+    uneven = RateMeter()
+    for seconds, count in ((0.0, 0), (1.0, 10), (2.0, 50)):
+        uneven.add(seconds, count)
+    assert uneven.hz == 25.0
     still = RateMeter()
     for _ in range(2):
         still.add(3.0, 7)

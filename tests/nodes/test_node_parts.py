@@ -239,16 +239,8 @@ def test_calibrations_wait_while_two_nodes_publish_them(calibration):
 # ---- orientation, and what requests may ask
 
 
-def test_orientation_of_outdated_calibrations_is_rejected(monkeypatch):
-    """A self-calibration may end while a capture is being adjusted."""
-    new, old = (
-        {name: SimpleNamespace(calibration_id=f'{name}-{age}') for name in 'ab'}
-        for age in ('new', 'old')
-    )
-    outcome = SimpleNamespace(
-        orientation=SimpleNamespace(fluoroscopes=('a', 'b'), calibration_ids=('a-old', 'b-old'))
-    )
-    output = SimpleNamespace(calibrations=dict(old), orientation=None)
+def orientation_service(output):
+    """The service orient of a rig of a and b, and what a request asks of it."""
     node = SimpleNamespace(
         create_timer=lambda *_, **__: None,
         destroy_timer=lambda _: None,
@@ -264,18 +256,38 @@ def test_orientation_of_outdated_calibrations_is_rejected(monkeypatch):
     parts = SimpleNamespace(
         node=node, rig=rig, exposures=None, output=output, files=None, requests=Requests()
     )
-    service = OrientationService(parts)
+    return OrientationService(parts), SimpleNamespace(timeout_sec=1.0, frames=1)
+
+
+def test_orientation_of_outdated_calibrations_is_rejected(monkeypatch):
+    """A self-calibration may end while a capture is being adjusted."""
+    new, old = (
+        {name: SimpleNamespace(calibration_id=f'{name}-{age}') for name in 'ab'}
+        for age in ('new', 'old')
+    )
+    outcome = SimpleNamespace(
+        orientation=SimpleNamespace(fluoroscopes=('a', 'b'), calibration_ids=('a-old', 'b-old'))
+    )
+    output = SimpleNamespace(calibrations=dict(old), orientation=None)
+    service, request = orientation_service(output)
 
     async def recalibrated():
         output.calibrations.update(new)
         return outcome
 
     monkeypatch.setattr(calibration_services, 'in_thread', lambda *_: (recalibrated(), None))
-    capture = service._orient(SimpleNamespace(timeout_sec=1.0, frames=1))
+    capture = service._orient(request)
     capture.send(None)  # it waits for its frames
     service.add({name: SimpleNamespace(fluoroscope=name) for name in 'ab'})
     with pytest.raises(DataError, match='the calibrations have changed meanwhile'):
         capture.send(None)
+
+
+def test_a_rig_that_is_not_calibrated_is_refused_before_the_capture():
+    output = SimpleNamespace(calibrations={'a': SimpleNamespace(calibration_id='a')})
+    service, request = orientation_service(output)
+    with pytest.raises(DataError, match='fluoroscope b is not calibrated yet'):
+        service._orient(request).send(None)
 
 
 @pytest.mark.parametrize(

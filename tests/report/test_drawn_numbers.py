@@ -30,7 +30,7 @@ from fluoro_calib_ros.report.figures import (
     phantom_figure,
     picture_bytes,
 )
-from fluoro_calib_ros.report.motion import _draw_gaps, points_figure
+from fluoro_calib_ros.report.motion import MAX_NAMED, _draw_gaps, points_figure
 from fluoro_calib_ros.report.report_figures import (
     bead_shifts,
     covered_cells,
@@ -550,3 +550,11 @@ def test_frames_without_times_are_shown_by_number():
     _draw_gaps(drawn, np.array([4]), np.array([[True]]), ['x'])
     (bar,) = [path.get_extents() for c in drawn.collections for path in c.get_paths()]
     assert (bar.x0, bar.x1) == (4, 5)
+
+
+@pytest.mark.parametrize('count', [MAX_NAMED, MAX_NAMED + 1])
+def test_as_many_targets_are_named_as_have_room(count):
+    drawn = axes()
+    _draw_gaps(drawn, np.array([0.0, 1.0]), np.ones((2, count), bool), ['x'] * count)
+    named = [label.get_text() for label in drawn.get_yticklabels()].count('x: 100 %')
+    assert named == (count if count <= MAX_NAMED else 0)

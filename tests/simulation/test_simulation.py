@@ -200,7 +200,7 @@ def test_noise_and_false_matches_have_the_given_size():
     rig = rigs.rig()
     for share, noise in ((0.01, 0.25), (0.2, 0.25), (0.0, 1.0)):
         error = errors_of_image_points(
-            rig, simulate_exposures(rig, 15, 6, Detection(noise, share))
+            rig, simulate_exposures(rig, 10, 6, Detection(noise, share))
         )
         size = np.linalg.norm(error, axis=1)
         false = size > 6 * noise  # beads of opposite faces may coincide even so

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
@@ -88,7 +88,7 @@ def full_text(msg_type: str) -> str:
     'MSG: package/Type', in the order in which rosbag2 finds them.
     """
     message_class(msg_type)
-    return _with_dependencies(msg_type, set())
+    return with_dependencies(msg_type, _own_definition, set())
 
 
 def to_cdr(message: Any, msg_type: str) -> bytes:
@@ -209,19 +209,27 @@ def _package_texts() -> dict[str, str]:
     }
 
 
-def _with_dependencies(msg_type: str, seen: set[str]) -> str:
-    """Return the definition of a type and of those it depends on, unless they were seen."""
+def _own_definition(msg_type: str) -> tuple[str, Iterable[Any]]:
     store = typestore()
     text = _package_texts().get(msg_type) or store.gendefhash(msg_type, {}, ros_version=2)[0]
-    for name in sorted(nested_types(store.fielddefs[msg_type][1])):
-        if name not in seen:
-            seen.add(name)
-            heading = f'\n{SEPARATOR}\nMSG: {name.replace("/msg/", "/")}\n'
-            text += heading + _with_dependencies(name, seen)
+    return text, store.fielddefs[msg_type][1]
+
+
+Definitions = Callable[[str], tuple[str, Iterable[Any]]]  # text and fields of a type
+
+
+def with_dependencies(name: str, definitions: Definitions, seen: set[str]) -> str:
+    """Return the definition of a type and of those it depends on, unless they were seen."""
+    text, fields = definitions(name)
+    for nested in sorted(_nested_types(fields)):
+        if nested not in seen:
+            seen.add(nested)
+            heading = f'\n{SEPARATOR}\nMSG: {nested.replace("/msg/", "/")}\n'
+            text += heading + with_dependencies(nested, definitions, seen)
     return text
 
 
-def nested_types(fields: Iterable[Any]) -> set[str]:
+def _nested_types(fields: Iterable[Any]) -> set[str]:
     """Return the names of the message types of fields, including those of array elements."""
     names = set()
     for _, description in fields:

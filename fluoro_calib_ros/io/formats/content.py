@@ -239,6 +239,14 @@ class FileSettings:
     wanted: tuple[str, ...] = tuple(PARTS)
     decisions: PathLike | None = None
 
+    def fluoroscope_of(self, name: str, where: object) -> str:
+        """Return the fluoroscope of a file of one camera that names it. Raises DataError."""
+        if len(self.fluoroscopes) == 1:
+            return self.fluoroscopes[0]
+        fluoroscope = self.names.fluoroscopes.get(name, name)
+        check_safe_name(fluoroscope, where)
+        return fluoroscope
+
     def image_size_of(self, where: object) -> tuple[int, int]:
         """Return the image size of a file that does not say it. Raises DataError without."""
         if self.image_size is None:

@@ -111,12 +111,8 @@ def _targets(header: dict[str, Row], first: int) -> list[str]:
 
 def _fluoroscope(path: Path, settings: FileSettings) -> str:
     """Return the fluoroscope of a file: <name>DLC_<network>.csv, CollectedData_<name>.csv."""
-    if len(settings.fluoroscopes) == 1:
-        return settings.fluoroscopes[0]
     name = path.stem.removeprefix('CollectedData_').split('DLC_')[0].rstrip('_') or path.stem
-    name = settings.names.fluoroscopes.get(name, name)
-    check_safe_name(name, path)
-    return name
+    return settings.fluoroscope_of(name, path)
 
 
 def _frame_number(row: Row, first: int) -> int:

@@ -23,7 +23,7 @@ from ...exposures.names import MAX_ID, Names, number_names, without_trivial
 from ...exposures.phantom import Phantom
 from ...limits import read_limits
 from ..access import read_text, write_text
-from ..csv_table import decimal_point
+from ..csv_table import decimal_point, is_number
 from .content import UNITS_MM, Content, FileSettings, Format, Sample, Written, from_units, in_units
 from .tables import MAX_SHOWN, Row, joined, separator_of, table_of
 
@@ -130,12 +130,12 @@ def _header(cells: Sequence[str]) -> _Layout | None:
 
 def _without_header(cells: Sequence[str]) -> tuple[str, ...]:
     """Return the names of the columns of a row without header, none for no such row."""
-    is_number = [_is_number(cell) for cell in cells]
-    if len(cells) == 3 and all(is_number):
+    numbers = [is_number(cell) for cell in cells]
+    if len(cells) == 3 and all(numbers):
         return 'x', 'y', 'z'
-    if len(cells) == 4 and all(is_number[1:]) and (cells[0].isdigit() or not is_number[0]):
+    if len(cells) == 4 and all(numbers[1:]) and (cells[0].isdigit() or not numbers[0]):
         return 'id', 'x', 'y', 'z'
-    if len(cells) == 4 and all(is_number[:3]) and not is_number[3]:
+    if len(cells) == 4 and all(numbers[:3]) and not numbers[3]:
         return 'x', 'y', 'z', 'id'
     return ()
 
@@ -149,14 +149,6 @@ def _of_numbers(rows: Sequence[Row]) -> _Layout:
             'x y z, id x y z or x y z name'
         )
     return _Layout({name: number for number, name in enumerate(names)})
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return '_' not in cell
 
 
 def _unit(path: Path, layout: _Layout, settings: FileSettings) -> float:
@@ -175,7 +167,7 @@ def _numbers(row: Row, layout: _Layout, names: Sequence[str]) -> list[float]:
     out = []
     for name in names:
         cell = row.cells[layout.columns[name]]
-        if not _is_number(cell) or not np.isfinite(float(cell)):
+        if not is_number(cell) or not np.isfinite(float(cell)):
             row.fail(f'{name} is {cell[:MAX_SHOWN]!r}, not a finite number')
         out.append(float(cell))
     return out

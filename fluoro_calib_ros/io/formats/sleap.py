@@ -103,14 +103,9 @@ def _targets(path: Path, arrays: dict[str, np.ndarray]) -> list[str]:
 
 def _fluoroscope(path: Path, settings: FileSettings) -> str:
     """Return the fluoroscope of a file, <project>.000_<video>.analysis.h5: its video."""
-    if len(settings.fluoroscopes) == 1:
-        return settings.fluoroscopes[0]
     name = path.name.removesuffix(path.suffix).removesuffix('.analysis')
     found = _OF_VIDEO.fullmatch(name)
-    name = found['video'] if found else name
-    name = settings.names.fluoroscopes.get(name, name)
-    check_safe_name(name, path)
-    return name
+    return settings.fluoroscope_of(found['video'] if found else name, path)
 
 
 def write(path: Path, content: Content, settings: FileSettings) -> Written:

@@ -16,7 +16,6 @@ from typing import NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from ...bodies.body import BodyPoses
 from ...errors import DataError
 from ...exposures.frame import Frame
 from ...exposures.names import without_trivial
@@ -273,22 +272,6 @@ def rate_of(frame: np.ndarray, stamp_ns: np.ndarray) -> float | None:
     whole = round(rate)
     # Stamps are rounded to nanoseconds, clocks to some millionths.
     return float(whole) if whole and abs(rate - whole) < 1e-5 * whole else float(rate)
-
-
-def bodies_of_poses(poses: Sequence[BodyPoses]) -> Bodies:
-    """Return the poses of bodies as a part of a Content; the rate is that of their stamps.
-
-    Raises DataError for no bodies and for poses of other exposures.
-    """
-    if not poses or any(not np.array_equal(p.number, poses[0].number) for p in poses):
-        raise DataError('poses of bodies are written of one body at least, and the same exposures')
-    return Bodies(
-        tuple(p.body for p in poses),
-        poses[0].number,
-        np.stack([p.rotation for p in poses], axis=1),
-        np.stack([p.position_mm for p in poses], axis=1),
-        rate_hz=rate_of(poses[0].number, poses[0].stamp_ns),
-    )
 
 
 def labels(content: Content) -> list[str]:

@@ -33,7 +33,7 @@ from rclpy.type_support import check_for_type_support
 
 from ...errors import DataError
 from ...io.access import read_text
-from ...io.bags.metadata import SEPARATOR, Definition, fields_of, known_definition, nested_types
+from ...io.bags.metadata import Definition, fields_of, known_definition, with_dependencies
 
 # Finding topics, and waiting for their other end.
 
@@ -170,21 +170,16 @@ def definition_of(name: str, type_hash: str) -> Definition:
     except DataError:
         pass
     try:
-        return Definition(_installed_text(name, set()), 'ros2msg', type_hash)
+        return Definition(with_dependencies(name, _installed, set()), 'ros2msg', type_hash)
     except (DataError, PackageNotFoundError, ValueError):
         return Definition('', 'ros2msg', type_hash)
 
 
-def _installed_text(name: str, seen: set[str]) -> str:
-    """Return the .msg file of a type and those of the types it depends on. Raises DataError."""
+def _installed(name: str) -> tuple[str, Iterable[Any]]:
+    """Return the .msg file of an installed type and its fields. Raises DataError."""
     package, _, kind = name.partition('/msg/')
     text = read_text(os.path.join(get_package_share_directory(package), 'msg', f'{kind}.msg'))
-    for nested in sorted(nested_types(fields_of(name, text, 'ros2msg')[name])):
-        if nested not in seen:
-            seen.add(nested)
-            heading = f'\n{SEPARATOR}\nMSG: {nested.replace("/msg/", "/")}\n'
-            text += heading + _installed_text(nested, seen)
-    return text
+    return text, fields_of(name, text, 'ros2msg')[name]
 
 
 # Quality of service of the topics.

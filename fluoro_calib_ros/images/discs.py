@@ -22,6 +22,7 @@ BORDER_PX = 0.7  # blur of the distances, for the pixels of the border
 MIN_RADIUS_PX = 3.0
 SIZES = (0.8, 1.25)  # of discs, over that of a typical one
 APART = 0.5  # radii between discs, below which they are one
+MIN_STRAIGHT = 3  # pairs of discs, that lie in a bar
 SAME = 0.1  # radii from a disc, within which a blob has the better place
 
 
@@ -40,7 +41,14 @@ def set_apart(
     distance = cv2.distanceTransform(mask, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     distance = cv2.GaussianBlur(distance, (0, 0), BORDER_PX)
     radius = float(np.median(distance[row, column]))
-    discs = _discs(mask, distance, radius) if radius >= MIN_RADIUS_PX else np.zeros((0, 2))
+    if radius < MIN_RADIUS_PX:
+        return uv, None
+    count, part = cv2.connectedComponents(mask)
+    # A part without a blob is noise or a border; one that is wider than a disc is a plate, a bone.
+    usable = np.isin(np.arange(count), part[row, column])
+    usable[part[distance > SIZES[1] * radius]] = usable[0] = False
+    discs = _discs(np.where(usable[part], distance, 0), radius)
+    discs = discs[~_in_bars(discs, distance, part, radius)]
     if not len(discs):
         return uv, None
     away, nearest = cKDTree(discs).query(uv)
@@ -49,19 +57,33 @@ def set_apart(
     return np.concatenate([uv[exact | (away > radius)], discs[~found]]), radius
 
 
-def _discs(mask: np.ndarray, distance: np.ndarray, radius: float) -> NDArray[np.float64]:
-    """Middles (n, 2) of the discs of about a radius in a mask (h, w) with distances inside it."""
-    count, part = cv2.connectedComponents(mask)
-    largest = np.zeros(count, dtype=np.float32)
-    np.maximum.at(largest, part[mask > 0], distance[mask > 0])
-    # A part that is wider than a disc is something else: a plate, a bone.
-    wide = largest > SIZES[1] * radius
+def _discs(distance: np.ndarray, radius: float) -> NDArray[np.float64]:
+    """Middles (n, 2) of discs of about a radius, by the distances (h, w) to the border."""
     size = 2 * int(APART * radius) + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
-    peaks = (distance >= cv2.dilate(distance, kernel)) & (distance > SIZES[0] * radius)
-    v, u = np.nonzero(peaks & ~wide[part])
+    v, u = np.nonzero((distance >= cv2.dilate(distance, kernel)) & (distance > SIZES[0] * radius))
     place = np.column_stack([u, v]).astype(float)
-    order = np.argsort(-distance[v, u], kind='stable')
-    place = place[order]
-    again = {two for _, two in sorted(cKDTree(place).query_pairs(APART * radius))}
+    place = place[np.argsort(-distance[v, u], kind='stable')]
+    again = {two for _, two in cKDTree(place).query_pairs(APART * radius)}
     return place[[number for number in range(len(place)) if number not in again]]
+
+
+def _in_bars(
+    discs: NDArray[np.float64], distance: np.ndarray, part: np.ndarray, radius: float
+) -> NDArray[np.bool_]:
+    """Return (n,) whether discs (n, 2) lie in bars, such as screws, that are as wide as a bead.
+
+    Half way between two discs the distance (h, w) to the border is less, in a bar it is not. Three
+    beads in a line have one such pair, so a part of the mask with fewer than three is no bar.
+    """
+    pair = cKDTree(discs).query_pairs(2 * radius, output_type='ndarray').reshape(-1, 2)
+    away = np.linalg.norm(discs[pair[:, 0]] - discs[pair[:, 1]], axis=1)
+    pair, away = pair[away > radius], away[away > radius]
+    label = part[tuple(discs.astype(int).T[::-1])]
+    column, row = np.rint(discs[pair].mean(axis=1)).astype(int).T
+    between = np.sqrt(np.maximum(radius**2 - away**2 / 4, 0))
+    straight = distance[row, column] > 0.5 * (radius + between)
+    size = int(part.max()) + 1
+    count = np.bincount(label[pair[straight, 0]], minlength=size)
+    total = np.bincount(label[pair[:, 0]], minlength=size)
+    return np.asarray((count >= MIN_STRAIGHT) & (2 * count > total))[label]

@@ -49,6 +49,23 @@ def test_nothing_is_found_in_what_is_wider_than_a_bead():
     np.testing.assert_array_equal(np.sort(uv, axis=0), np.sort(ALONE, axis=0))
 
 
+def test_a_bar_as_wide_as_a_bead_is_none():
+    light = light_of(ALONE, 8.0)
+    bar = np.ones((300, 300), np.float32)
+    cv2.line(bar, (120, 120), (200, 260), 0.2, 16)
+    light += cv2.GaussianBlur(bar, (0, 0), 1.2) - 1
+    blobs = np.concatenate([ALONE, [[160.0, 190.0]]])
+    uv, _ = set_apart(light, blobs)
+    np.testing.assert_array_equal(np.sort(uv, axis=0), np.sort(blobs, axis=0))
+
+
+def test_three_beads_in_a_line_are_three():
+    true = np.array([170.0, 180.0]) + np.outer([-0.8, 0, 0.8], [12.0, 9.0])
+    uv, _ = set_apart(light_of(np.concatenate([ALONE, true]), 15.0), np.r_[ALONE, true[1:2]])
+    assert len(uv) == len(ALONE) + 3
+    assert cKDTree(uv).query(true)[0].max() < 1.5
+
+
 def test_beads_of_few_pixels_stay_as_they_are():
     pair = np.array([[160.0, 170.0], [162.0, 170.0]])
     uv, radius = set_apart(light_of(np.concatenate([ALONE, pair]), 2.0), ALONE)

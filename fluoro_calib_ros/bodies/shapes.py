@@ -455,6 +455,13 @@ def _unchanged(body: Body, findings: Sequence[Finding]) -> EstimatedShape:
     )
 
 
+def _warning(body: Body, kind: Kind, cause: str, numbers: Mapping[str, float]) -> Finding:
+    """Return a warning about a body."""
+    return Finding(
+        kind, cause, place=_place(body), severity=Severity.WARNING, numbers=dict(numbers)
+    )
+
+
 def _place(body: Body, markers: Sequence[int] = ()) -> Place:
     return Place(target_id=tuple(int(i) for i in markers), name=f'body {body.name}')
 
@@ -525,12 +532,11 @@ def _contradictions(body: Body, places: BodyPlaces, adjustment: _Adjustment) -> 
             f'{ratio:.1f} times as much as their standard deviations'
         )
         findings.append(
-            Finding(
+            _warning(
+                body,
                 Kind.BODY_NOT_RIGID,
                 cause,
-                place=_place(body),
-                severity=Severity.WARNING,
-                numbers={'ratio': ratio, 'mean_error_mm': adjustment.mean_error_mm},
+                {'ratio': ratio, 'mean_error_mm': adjustment.mean_error_mm},
             )
         )
     for row in loose:
@@ -657,28 +663,14 @@ def _stability(body: Body, condition: float, mean_error_mm: float) -> list[Findi
             f'{condition:.0f} per m, at most {MAX_CONDITION:.0f} by ISO 16087): the rotation '
             'about it is weak'
         )
-        findings.append(
-            Finding(
-                Kind.BODY_ON_A_LINE,
-                cause,
-                place=_place(body),
-                severity=Severity.WARNING,
-                numbers={'condition_per_m': condition},
-            )
-        )
+        findings.append(_warning(body, Kind.BODY_ON_A_LINE, cause, {'condition_per_m': condition}))
     if mean_error_mm > MAX_MEAN_ERROR_MM:
         cause = (
             f'it is not rigid: its markers deviate from its shape by {mean_error_mm:.2g} mm '
             f'(RMS; at most {MAX_MEAN_ERROR_MM} mm by ISO 16087)'
         )
         findings.append(
-            Finding(
-                Kind.BODY_NOT_RIGID,
-                cause,
-                place=_place(body),
-                severity=Severity.WARNING,
-                numbers={'mean_error_mm': mean_error_mm},
-            )
+            _warning(body, Kind.BODY_NOT_RIGID, cause, {'mean_error_mm': mean_error_mm})
         )
     return findings
 

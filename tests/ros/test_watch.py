@@ -3,7 +3,11 @@
 
 """The dashboard's client and the calibration node: a session without the command ros2."""
 
+import os
+import signal
+
 import numpy as np
+import pytest
 from ros_graph import NAMES, standing
 from sensor_msgs.msg import Image
 
@@ -11,52 +15,75 @@ from fluoro_calib_ros.nodes.dashboard.watch import SessionClient
 from fluoro_calib_ros.nodes.runtime.topics import latched_qos
 
 
-def test_session_is_run_from_the_dashboard(graph, exposures, tmp_path, monkeypatch):
+@pytest.fixture
+def watch(graph):
+    watch = SessionClient(graph.namespace, graph.client.context)
+    graph.client._spinner.add_node(watch)
+    yield watch
+    graph.client._spinner.remove_node(watch)
+    watch.destroy_node()
+
+
+def test_session_is_run_from_the_dashboard(graph, watch, exposures, tmp_path):
     """It shows the exposures and what is missing, and captures, resets and calibrates."""
     node = graph.calibration_node(tmp_path / 'out', collect='request', phantm='mistyped')
     client = graph.client
     assert 'there is no parameter phantm, it has no effect; did you mean phantom?' in node.log
-    watch = SessionClient(graph.namespace, graph.client.context)
-    client._spinner.add_node(watch)
     pictures = []
     client.create_subscription(Image, 'a/coverage', pictures.append, latched_qos())
 
     def fluoroscope():
         return next((f for f in watch.state().fluoroscopes if f.name == 'a' and f.state), None)
 
+    client.wait_until(fluoroscope, what='the status of fluoroscope a')
+    assert fluoroscope().exposures == 0 and not fluoroscope().ready
+    assert fluoroscope().next_pose == 'show the phantom and keep it still'
+    watch.request('calibrate_fast')
+    client.wait_until(
+        lambda: any('calibrate failed' in line for line in watch.state().log),
+        what='the refusal of a calibration without exposures',
+    )
+    assert not watch.state().job
+
+    streams = [standing(exposures[name][0], 10**6) for name in NAMES]
+    client.stream(zip(*streams), rate=30.0)
+    watch.request('capture')
+    client.wait_until(lambda: fluoroscope().exposures == 1, what='the captured exposure')
+    client.wait_until(lambda: '14 more, with beads' in fluoroscope().next_pose)
+    client.wait_until(lambda: pictures, what='a picture of the coverage')
+    picture = pictures[-1]
+    colours = np.frombuffer(picture.data, np.uint8).reshape(picture.height, picture.width, 3)
+    green = (colours[: picture.width] == (60, 150, 70)).all(axis=2).mean()
+    assert abs(green - fluoroscope().coverage) < 0.05
+    client.wait_until(
+        lambda: 'ready: receiving a/target_observations, b/target_observations' in node.log,
+        what='the line that the node is ready',
+    )
+    watch.request('reset')
+    client.wait_until(lambda: fluoroscope().exposures == 0, what='the reset')
+    client.end_stream()
+    (state,) = watch.state().nodes
+    assert state.name == 'calibration_node'
+
+    assert node.end() == 0
+    client.wait_until(lambda: watch.state().nodes[0].level == 'silent')
+
+
+@pytest.mark.parametrize('action', ['capture', 'calibrate_fast'])
+def test_request_without_answer_is_reported(graph, watch, tmp_path, monkeypatch, action):
+    """A suspended node stands for every lost answer; what comes late is shown."""
+    monkeypatch.setattr('fluoro_calib_ros.nodes.dashboard.watch.ANSWER_S', 0.1)
+    node = graph.calibration_node(tmp_path / 'out', collect='request', capture_timeout=0.1)
+    wait = graph.client.wait_until
+    wait(lambda: watch.state().nodes, what='the node')
+    wait(lambda: watch.state().fluoroscopes, what='the fluoroscopes')
+    os.kill(node.pid, signal.SIGSTOP)
     try:
-        client.wait_until(fluoroscope, what='the status of fluoroscope a')
-        assert fluoroscope().exposures == 0 and not fluoroscope().ready
-        assert fluoroscope().next_pose == 'show the phantom and keep it still'
-        watch.request('calibrate_fast')
-        client.wait_until(
-            lambda: any('calibrate failed' in line for line in watch.state().log),
-            what='the refusal of a calibration without exposures',
-        )
+        watch.request(action)
+        wait(lambda: 'no answer yet' in watch.state().log[-1], what='the lost answer')
         assert not watch.state().job
-
-        streams = [standing(exposures[name][0], 10**6) for name in NAMES]
-        client.stream(zip(*streams), rate=30.0)
-        watch.request('capture')
-        client.wait_until(lambda: fluoroscope().exposures == 1, what='the captured exposure')
-        client.wait_until(lambda: '14 more, with beads' in fluoroscope().next_pose)
-        client.wait_until(lambda: pictures, what='a picture of the coverage')
-        picture = pictures[-1]
-        colours = np.frombuffer(picture.data, np.uint8).reshape(picture.height, picture.width, 3)
-        green = (colours[: picture.width] == (60, 150, 70)).all(axis=2).mean()
-        assert abs(green - fluoroscope().coverage) < 0.05
-        client.wait_until(
-            lambda: 'ready: receiving a/target_observations, b/target_observations' in node.log,
-            what='the line that the node is ready',
-        )
-        watch.request('reset')
-        client.wait_until(lambda: fluoroscope().exposures == 0, what='the reset')
-        client.end_stream()
-        (state,) = watch.state().nodes
-        assert state.name == 'calibration_node'
-
-        assert node.end() == 0
-        client.wait_until(lambda: watch.state().nodes[0].level == 'silent')
     finally:
-        client._spinner.remove_node(watch)
-        watch.destroy_node()
+        os.kill(node.pid, signal.SIGCONT)
+    failed = f'{action.removesuffix("_fast")} failed'
+    wait(lambda: failed in watch.state().log[-1], what='the late answer')
+    assert not watch.state().job

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -19,6 +20,8 @@ from rclpy.task import Future
 from ..messages.healing import healing_text
 from ..messages.self_calibration import feedback_text
 from .state import CALIBRATE, CALIBRATE_FAST, HEAL, Diagnosis
+
+NO_ANSWER = 'no answer yet; it may be lost: look at the state of the rig before you ask again'
 
 
 class _Kind(NamedTuple):
@@ -43,6 +46,8 @@ class Actions:
         self._lock = threading.RLock()
         self._goal: Any = None
         self._job = ''
+        self._running: _Kind | None = None
+        self._sent_at = 0.0
         calibrate = ActionClient(node, SelfCalibrate, 'self_calibrate')
         heal = ActionClient(node, Heal, 'heal')
         self._calibrate = _Kind(CALIBRATE, calibrate, 'calibrating', feedback_text)
@@ -75,6 +80,8 @@ class Actions:
                 self._say(f'{kind.name}: {self._job} already')
                 return
             self._job = kind.job
+            self._running = kind
+            self._sent_at = time.monotonic()
         self._set(job=kind.job)
         self._say(text)
         sent = kind.client.send_goal_async(
@@ -84,14 +91,31 @@ class Actions:
 
     # -- the executor's thread
 
+    def check(self, before: float) -> None:
+        """Give up what nobody carries out: a goal sent earlier and not accepted, or no server."""
+        with self._lock:
+            kind = self._running
+            if kind is None or not self._job:
+                return
+            if self._goal is None and self._sent_at < before:
+                self._end(f'{kind.name}: {NO_ANSWER}')
+            elif self._goal is not None and not kind.client.server_is_ready():
+                self._end(f'{kind.name} failed: the calibration node has ended')
+
+    def _end(self, text: str) -> None:
+        self._goal = None
+        self._job = ''
+        self._set(job='')
+        self._say(text)
+
     def _on_goal(self, kind: _Kind, future: Future) -> None:
         handle = future.result()
         if not handle.accepted:
-            self._job = ''
-            self._set(job='')
-            self._say(f'{kind.name}: refused, the calibration node does something else')
+            self._end(f'{kind.name}: refused, the calibration node does something else')
             return
-        self._goal = handle
+        with self._lock:
+            self._goal = handle
+            self._job = kind.job  # also where it was given up before
         handle.get_result_async().add_done_callback(partial(self._on_result, kind))
 
     def _on_result(self, kind: _Kind, future: Future) -> None:

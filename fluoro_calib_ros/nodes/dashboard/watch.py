@@ -21,6 +21,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from fluoro_calib_msgs.msg import CalibrationStatus
 from fluoro_calib_msgs.srv import Capture, Orient, Reset
+from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
@@ -29,7 +30,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
 from ..runtime.parameters import expand_path
-from .actions import Actions
+from .actions import NO_ANSWER, Actions
 from .state import (
     ACCEPT,
     CALIBRATE,
@@ -56,6 +57,7 @@ NODES = (
     'image_node',
 )
 SILENT_S = 5.0  # a node reports once a second
+ANSWER_S = 10.0  # capture and orient wait for 5 s unless the parameter capture_timeout says more
 ORIENT_FRAMES = 10  # captured by the key o
 LOG_LINES = 50  # that are kept
 STATES = {
@@ -91,6 +93,9 @@ class SessionClient(Node):
             **{name: self.create_client(Reset, name) for name in (RESET, ACCEPT, ROLL_BACK)},
         }
         self._actions = Actions(self, self._say, self._set)
+        self._asked: dict[Future, tuple[str, float]] = {}  # what waits for an answer, since when
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(1.0, self._check_answers, clock=steady)
 
     # -- the view's thread
 
@@ -137,11 +142,24 @@ class SessionClient(Node):
         }
         self._say(f'{action.replace("_", " ")} ...')
         future = client.call_async(requests.get(action, Reset.Request)())
+        self._asked[future] = action, time.monotonic()
         future.add_done_callback(partial(self._on_answer, action))
 
     # -- the executor's thread
 
+    def _check_answers(self) -> None:
+        """Tell what was asked in vain: answers are lost where a node ends or has just begun."""
+        before = time.monotonic() - ANSWER_S
+        with self._lock:
+            for future, (action, since) in list(self._asked.items()):
+                if since < before:
+                    del self._asked[future]
+                    self._say(f'{action.replace("_", " ")}: {NO_ANSWER}')
+            self._actions.check(before)
+
     def _on_answer(self, action: str, future: Future) -> None:
+        with self._lock:
+            self._asked.pop(future, None)
         answer = future.result()
         failed = '' if answer.success else ' failed'
         if answer.success and action in (ACCEPT, ROLL_BACK):

@@ -188,8 +188,12 @@ def _whole_group(
                 np.sqrt(squared_residuals(projection, f * phantom.xyz_mm[rows], frame.uv))
                 for f in (1.0, factor)
             )
-            votes[rows] += (scaled < AT * limit) & (own > OFF * limit)
-            votes[rows] -= own < AT * limit
+            is_multiple = (scaled < AT * limit) & (own > OFF * limit)
+            is_own = own < AT * limit
+            if is_multiple.any() and is_own.sum() < MIN_GROUP:
+                continue  # multiples alone are the phantom, larger and farther away
+            votes[rows] += is_multiple
+            votes[rows] -= is_own
             distances.append(float(np.linalg.norm(source - xyz[rows].mean(axis=0))))
         before, group = group, votes > 0
         if np.array_equal(before, group):

@@ -430,6 +430,20 @@ def test_difficult_input_is_accepted(kind):
     assert copied_exposures(RIGHT[kind]()) == []
 
 
+@pytest.mark.parametrize('seed', range(6))
+def test_few_targets_with_false_matches_have_one_unit(seed):
+    """Multiples alone are the phantom, larger and farther away."""
+    rng = np.random.default_rng(seed)
+    thin = []
+    for frame in frames():
+        keep = frame.target_id % 4 == 1
+        ids = frame.target_id[keep]
+        rows = rng.permutation(len(ids))[: round(0.4 * len(ids))]
+        ids[rows] = ids[rng.permutation(rows)]
+        thin.append(replace(frame, target_id=ids, uv=frame.uv[keep]))
+    assert mixed_units({'a': thin}, PHANTOM, is_suspicious=True) is None
+
+
 @pytest.mark.parametrize('seed', range(10))
 def test_random_rigs_with_strong_distortion_are_accepted(seed):
     strong = virtual_rig(seed, 2.0)

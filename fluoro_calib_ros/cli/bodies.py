@@ -114,7 +114,7 @@ def run(arguments: argparse.Namespace) -> None:
         rate=arguments.rate,
         neutral=neutral,
     )
-    with ErrorsAt(arguments.source), ProgressBar('bodies', 'exposure') as bar:
+    with ErrorsAt(arguments.source), ProgressBar('bodies', 'step') as bar:
         outcome = track_bodies(
             recording.frames,
             calibrations,
@@ -125,8 +125,10 @@ def run(arguments: argparse.Namespace) -> None:
             progress=bar,
         )
     if arguments.learn:
-        with ErrorsAt(arguments.source):
-            learned = learn_shapes(recording.frames, calibrations, orientation, bodies, options)
+        with ErrorsAt(arguments.source), ProgressBar('learned shapes', 'exposure') as bar:
+            learned = learn_shapes(
+                recording.frames, calibrations, orientation, bodies, options, bar
+            )
         write_learned_shapes(arguments.calibration, learned)
         names = ', '.join(body.name for body in learned.bodies)
         print_notes([f'{arguments.calibration}: shapes of {names} are learned'])

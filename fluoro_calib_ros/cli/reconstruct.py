@@ -19,7 +19,7 @@ from .arguments import (
     read_oriented_source,
     rigid_clusters,
 )
-from .output import print_note, print_notes, print_result, print_unpaired
+from .output import ProgressBar, print_note, print_notes, print_result, print_unpaired
 
 if TYPE_CHECKING:
     from ..jobs.reconstruction import ReconstructionOutcome
@@ -90,8 +90,8 @@ def run(arguments: argparse.Namespace) -> None:
         bodies=arguments.bodies,
         has_stamps=is_bag(arguments.source),
     )
-    with ErrorsAt(arguments.source):
-        outcome = reconstruct(frames, calibrations, orientation, options)
+    with ErrorsAt(arguments.source), ProgressBar('points', 'exposure') as bar:
+        outcome = reconstruct(frames, calibrations, orientation, options, bar)
     write_reconstruction(arguments.out, outcome.frames, recording.names)
     if arguments.figure is not None:
         from ..report.figures import png_bytes

@@ -23,7 +23,7 @@ from ..errors import DataError
 from ..findings import Finding, Kind, Place, Severity
 from ..options import option
 from .frame import Frame, Frames, cells_of
-from .pairing import CompletePairer, PairingOptions, recording_options
+from .pairing import CompletePairer, PairingOptions, RecordedPairing
 
 MIN_COMMON_TARGETS = 8  # with fewer targets in common two frames cannot be compared
 MAX_RECENT = 1000  # pairs that are remembered
@@ -228,7 +228,7 @@ def collect_recorded(
         Number of frames without partner by fluoroscope.
     """
     still = StillOptions()
-    pairer = CompletePairer(frames, recording_options(pair_by, tolerance_s))
+    pairer = CompletePairer(frames, RecordedPairing(pair_by, tolerance_s).unlimited())
     collector = ExposureCollector(frames, still)
     if mode == 'auto':
         mode = 'still' if any(_is_stream(f, still) for f in frames.values()) else 'all'

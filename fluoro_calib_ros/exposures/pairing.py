@@ -93,6 +93,12 @@ class RecordedPairing:
     def __post_init__(self) -> None:
         validate_options(self)
 
+    def unlimited(self) -> PairingOptions:
+        """Options of a pairer: all frames are there, so none has to be given up."""
+        return PairingOptions(
+            self.pair_by, self.pair_tolerance, waiting=UNLIMITED, patience=UNLIMITED
+        )
+
 
 class Pairer(Protocol):
     """Combines frames into exposures."""
@@ -126,22 +132,6 @@ def exposure_pairer(fluoroscopes: Iterable[str], options: PairingOptions | None 
     return PartialPairer(names, options)
 
 
-def recorded_pairer(
-    fluoroscopes: Iterable[str],
-    pair_by: str = 'frame_number',
-    tolerance_s: float = PairingOptions.tolerance_s,
-) -> Pairer:
-    """Pairer for the reconstruction of a recording, with waiting and patience unlimited."""
-    return exposure_pairer(fluoroscopes, recording_options(pair_by, tolerance_s))
-
-
-def recording_options(
-    pair_by: str = 'frame_number', tolerance_s: float = PairingOptions.tolerance_s
-) -> PairingOptions:
-    """Options for a recording: all its frames are there, so none has to be given up."""
-    return PairingOptions(pair_by, tolerance_s, waiting=UNLIMITED, patience=UNLIMITED)
-
-
 def disagreement_of_recording(frames: Mapping[str, Iterable[PairableFrame]]) -> str:
     """Return a sentence where recorded frames with the same number are far apart in time.
 
@@ -149,7 +139,7 @@ def disagreement_of_recording(frames: Mapping[str, Iterable[PairableFrame]]) -> 
     """
     if len(frames) < MIN_VIEWS:
         return ''
-    pairer = CompletePairer(frames, recording_options())
+    pairer = CompletePairer(frames, RecordedPairing().unlimited())
     pairer.stamps = StampAgreement(pairer.fluoroscopes, recent=None)
     recorded = [frame for of_fluoroscope in frames.values() for frame in of_fluoroscope]
     for frame in sorted(recorded, key=lambda f: (f.stamp_ns, f.number)):

@@ -285,7 +285,7 @@ def track_bodies(
     joints : sequence of JointEntry
     options : BodiesOptions, optional
     progress : callable, optional
-        Called with the number of exposures that are solved, and of all.
+        Called with the number of steps that are done, and of all: two for each exposure.
 
     Raises
     ------
@@ -296,7 +296,10 @@ def track_bodies(
     options = options or BodiesOptions()
     check_bodies(bodies)
     orientation = orientation_of_recorded(frames, orientation)
-    exposures, unpaired, _ = intersected(frames, calibrations, orientation, options)
+    step = progress or (lambda done, total: None)
+    exposures, unpaired, _ = intersected(
+        frames, calibrations, orientation, options, lambda done, total: step(done, 2 * total)
+    )
     shapes = [EstimatedShape(body, np.nan, np.nan, 0, ()) for body in bodies]
     if options.estimate_shapes:
         shapes = estimated_shapes(bodies, exposures)
@@ -309,8 +312,7 @@ def track_bodies(
         found = tracker.add(one.views, one.number, one.stamp_ns)
         if found is not None:
             tracked.append(found)
-        if progress is not None:
-            progress(count, len(exposures))
+        step(len(exposures) + count, 2 * len(exposures))
     tracked = tracker.smoothed() if lag is None else tracked + tracker.flush()
     poses = _poses(usable, tracked, options)
     at_rest = []
@@ -342,7 +344,11 @@ class IntersectedExposure:
 
 
 def intersected(
-    frames: Frames, calibrations: Calibrations, orientation: RigOrientation, options: BodiesOptions
+    frames: Frames,
+    calibrations: Calibrations,
+    orientation: RigOrientation,
+    options: BodiesOptions,
+    progress: Callable[[int, int], None] | None = None,
 ) -> tuple[list[IntersectedExposure], dict[str, int], DriftVerdict]:
     """Pair and intersect the frames of a recording.
 
@@ -350,7 +356,7 @@ def intersected(
     DataError.
     """
     names = orientation.fluoroscopes
-    paired, unpaired = pair_recording(frames, names, options.pair_by, options.pair_tolerance)
+    paired, unpaired = pair_recording(frames, names, options)
     if not paired:
         raise DataError(f'no frames of {" and ".join(names)} belong together by {options.pair_by}')
     intersector = Intersector(orientation, options.reject)
@@ -358,13 +364,15 @@ def intersected(
     sizes = {name: calibrations[name].image_size for name in names}
     watch = RecordingDriftWatch(orientation, sizes)
     out = []
-    for exposure in paired:
+    for count, exposure in enumerate(paired, 1):
         wide, _ = watch.widened(intersector)
         views, present = intersect_frames(exposure, calibrations, intersector, scatter, watch)
         stamp = present[0].stamp_ns
         if options.rate is not None:
             stamp = 1 + round(present[0].number * NS_PER_S / options.rate)
         out.append(IntersectedExposure(present[0].number, stamp, views, wide.orientation))
+        if progress is not None:
+            progress(count, len(paired))
     stamps = np.array([one.stamp_ns for one in out])
     if len(out) > 1 and not (np.diff(stamps) > 0).all():
         raise DataError(

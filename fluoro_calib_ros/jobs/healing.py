@@ -151,7 +151,7 @@ def heal_rig(
     orientation = orientation_of_recorded(frames, orientation)
     seen = frames_of_targets(frames, np.concatenate([body.target_id for body in bodies]))
     names = orientation.fluoroscopes
-    paired, _ = pair_recording(seen, names, options.pair_by, options.pair_tolerance)
+    paired, _ = pair_recording(seen, names, options)
     used, unused = _chosen(paired)
     rig = _Rig(calibrations, orientation, solvable_bodies(bodies))
     observed, poses = rig.observe(used)

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -41,6 +41,7 @@ def learn_shapes(
     orientation: RigOrientation,
     bodies: Sequence[Body],
     options: BodiesOptions | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> LearnedShapes:
     """Learn the shapes of bodies from a recording of a healthy rig.
 
@@ -54,6 +55,8 @@ def learn_shapes(
         Places of their markers may be unknown.
     options : BodiesOptions, optional
         How frames are paired.
+    progress : callable, optional
+        Called with the number of exposures that are intersected, and of all.
 
     Returns
     -------
@@ -75,7 +78,7 @@ def learn_shapes(
     recorded = orientation_of_recorded(frames, orientation)
     markers = np.concatenate([body.target_id for body in bodies])
     seen = frames_of_targets(frames, markers)
-    exposures, _, drift = intersected(seen, calibrations, recorded, options)
+    exposures, _, drift = intersected(seen, calibrations, recorded, options, progress)
     if drift.state is not None:
         raise DataError(replace(drift.finding, advice='no shapes are learned in a drift'))
     shapes = estimated_shapes(bodies, exposures)

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -119,6 +119,7 @@ def reconstruct(
     calibrations: Calibrations,
     orientation: RigOrientation,
     options: ReconstructionOptions | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> ReconstructionOutcome:
     """Correct and intersect the observed image points of a recording.
 
@@ -129,6 +130,8 @@ def reconstruct(
     calibrations : mapping of str to FluoroscopeCalibration
     orientation : RigOrientation
     options : ReconstructionOptions, optional
+    progress : callable, optional
+        Called with the number of exposures that are reconstructed, and of all.
 
     Raises
     ------
@@ -150,19 +153,19 @@ def reconstruct(
         frames,
         calibrations,
         intersector=intersector,
-        pair_by=options.pair_by,
+        pairing=options,
         watch=watch,
-        tolerance_s=options.pair_tolerance,
         scatter=scatter,
+        progress=progress,
     )
     if not found:
         raise DataError(f'no frames of {" and ".join(names)} belong together by {options.pair_by}')
-    wrong = mismatch(found, frames, calibrations, intersector, options.pair_by)
+    wrong = mismatch(found, frames, calibrations, intersector, options)
     if wrong is not None:
         raise DataError(wrong)
     cause = None
     if scatter.factor >= MAX_WIDENING:
-        cause = cause_of_misses(found, frames, calibrations, intersector, options.pair_by)
+        cause = cause_of_misses(found, frames, calibrations, intersector, options)
     disagreement = ''
     if options.has_stamps and options.pair_by == 'frame_number':
         disagreement = disagreement_of_recording({name: frames[name] for name in names})

@@ -29,6 +29,7 @@ from ..correction.fluoroscope_calibration import Calibrations
 from ..correction.registry import no_correction
 from ..errors import DataError
 from ..exposures.frame import Frame, Frames
+from ..exposures.pairing import RecordedPairing
 from ..findings import Finding, Kind
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
 from ..photogrammetry.rotations import cross_matrix
@@ -248,7 +249,7 @@ def mismatch(
     frames: Frames,
     calibrations: Calibrations,
     intersector: Intersector,
-    pair_by: str,
+    pairing: RecordedPairing,
 ) -> Finding | None:
     """Return why a reconstruction cannot be right, None where nothing is wrong with it."""
     share, total = share_rejected(found)
@@ -259,7 +260,7 @@ def mismatch(
         return None
     names = intersector.orientation.fluoroscopes
     for why, changed in _trials(frames, names, _largest(found)):
-        tried, _ = reconstruct_recording(changed, calibrations, intersector, pair_by)
+        tried, _ = reconstruct_recording(changed, calibrations, intersector, pairing)
         rejected, count = share_rejected(tried)
         if count >= MIN_POINTS and rejected < BETTER * share:
             return missing_rays(share, why)
@@ -271,7 +272,7 @@ def cause_of_misses(
     frames: Frames,
     calibrations: Calibrations,
     intersector: Intersector,
-    pair_by: str,
+    pairing: RecordedPairing,
 ) -> Finding | None:
     """Return why rays miss each other by more than they should, None where no trial tells it.
 
@@ -289,7 +290,7 @@ def cause_of_misses(
     misses = []
     for why, changed in trials:
         used = uncorrected if why is CORRECTED else calibrations
-        again, _ = reconstruct_recording(changed, used, intersector, pair_by)
+        again, _ = reconstruct_recording(changed, used, intersector, pairing)
         misses.append(_miss(again))
     best = int(np.argmin(misses))
     return trials[best][0] if misses[best] < limit else None

@@ -9,7 +9,7 @@ both give the same numbers.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
@@ -20,7 +20,7 @@ from ..correction.base import CorrectionStatus
 from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
 from ..errors import DataError
 from ..exposures.frame import Frame, Frames, image_size_error, repeated_target_error
-from ..exposures.pairing import PairingOptions, recorded_pairer
+from ..exposures.pairing import RecordedPairing, exposure_pairer
 from ..photogrammetry.noise import ObservedScatter
 from ..photogrammetry.rig_orientation import RigOrientation
 from .intersection import IntersectedPoints, Intersector
@@ -237,10 +237,10 @@ def reconstruct_recording(
     frames: Frames,
     calibrations: Calibrations,
     intersector: Intersector,
-    pair_by: str = 'frame_number',
+    pairing: RecordedPairing | None = None,
     watch: ExposureWatch | None = None,
-    tolerance_s: float = PairingOptions.tolerance_s,
     scatter: ObservedScatter | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> tuple[list[ReconstructedFrame], dict[str, int]]:
     """Reconstruct the exposures of a recording.
 
@@ -251,15 +251,15 @@ def reconstruct_recording(
     calibrations : mapping of str to FluoroscopeCalibration
     intersector : Intersector
         With three or more fluoroscopes, views of an exposure may be missing.
-    pair_by : {'frame_number', 'stamp'}
-        What the frames of an exposure have in common.
+    pairing : RecordedPairing, optional
+        What the frames of an exposure have in common; by default their number.
     watch : ExposureWatch, optional
         Examines the exposures.
-    tolerance_s : float
-        Largest difference between the stamps of an exposure [s].
     scatter : ObservedScatter, optional
         Learns the scatter of the recording, and widens the limit of false matches by it. Without
         it there is one all the same.
+    progress : callable, optional
+        Called with the number of exposures that are reconstructed, and of all.
 
     Returns
     -------
@@ -273,14 +273,14 @@ def reconstruct_recording(
     DataError
         As reconstruct_exposure, and where a fluoroscope of the rig has no frames.
     """
-    exposures, unpaired = pair_recording(
-        frames, intersector.orientation.fluoroscopes, pair_by, tolerance_s
-    )
+    names = intersector.orientation.fluoroscopes
+    exposures, unpaired = pair_recording(frames, names, pairing or RecordedPairing())
     scatter = scatter or ObservedScatter()
-    out = [
-        reconstruct_exposure(exposure, calibrations, intersector, watch, scatter)
-        for exposure in exposures
-    ]
+    out = []
+    for count, exposure in enumerate(exposures, 1):
+        out.append(reconstruct_exposure(exposure, calibrations, intersector, watch, scatter))
+        if progress is not None:
+            progress(count, len(exposures))
     return out, unpaired
 
 
@@ -296,7 +296,7 @@ def orientation_of_recorded(frames: Frames, orientation: RigOrientation) -> RigO
 
 
 def pair_recording(
-    frames: Frames, names: Sequence[str], pair_by: str, tolerance_s: float
+    frames: Frames, names: Sequence[str], pairing: RecordedPairing
 ) -> tuple[list[dict[str, Frame]], dict[str, int]]:
     """Pair the frames of a recording to exposures, in the order of time.
 
@@ -308,7 +308,7 @@ def pair_recording(
             raise DataError(
                 f'there are no frames of fluoroscope {name}, only of {", ".join(frames)}'
             )
-    pairer = recorded_pairer(names, pair_by, tolerance_s)
+    pairer = exposure_pairer(names, pairing.unlimited())
     ordered = sorted(
         (frame for name in names for frame in frames[name]), key=lambda f: (f.stamp_ns, f.number)
     )

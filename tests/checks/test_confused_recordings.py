@@ -23,6 +23,7 @@ from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.options import CalibrationRequest
 from fluoro_calib_ros.estimation.rig_orientation import orientation_and_scatter
 from fluoro_calib_ros.exposures.frame import Frame
+from fluoro_calib_ros.exposures.pairing import RecordedPairing
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.findings import Kind, Severity
 from fluoro_calib_ros.io.calibration import save_calibration, save_orientation
@@ -348,9 +349,9 @@ def test_rays_that_do_not_meet_are_refused_with_their_cause(case):
 def test_shift_that_is_found_is_the_one_that_was_made(field, step):
     shifted = changed(lambda f: replace(f, **{field: getattr(f, field) + step}), 'b')
     found = reconstruct_recording(
-        shifted, calibrations(), Intersector(orientation()), 'frame_number'
+        shifted, calibrations(), Intersector(orientation()), RecordedPairing()
     )[0]
-    given = (found, shifted, calibrations(), Intersector(orientation()), 'frame_number')
+    given = (found, shifted, calibrations(), Intersector(orientation()), RecordedPairing())
     why = mismatch(*given)
     assert why.kind is (Kind.FRAMES_SHIFTED if field == 'number' else Kind.IDS_SHIFTED)
     assert why.numbers['shift'] == step

@@ -12,8 +12,8 @@ import pytest
 from fluoro_calib_ros.exposures.pairing import (
     PairingOptions,
     PartialPairer,
+    RecordedPairing,
     exposure_pairer,
-    recorded_pairer,
 )
 
 MS = 1_000_000
@@ -100,7 +100,7 @@ def test_every_order_of_arrival_gives_each_exposure_once_and_in_order(by, lost):
     places = ''.join(name * len(of_one) for name, of_one in of_each.items())
     for order in set(itertools.permutations(places)):
         rows = {name: iter(of_one) for name, of_one in of_each.items()}
-        pairer = recorded_pairer('abc', by)
+        pairer = exposure_pairer('abc', RecordedPairing(by).unlimited())
         assert paired(pairer, [next(rows[name]) for name in order], flush=False) == wanted
         assert sum(pairer.unpaired.values()) == len(order) - sum(len(names) for _, names in wanted)
         assert sum(pairer.late.values()) == 0 and pairer.incomplete == sum(

@@ -14,6 +14,7 @@ from scipy.optimize import least_squares
 from fluoro_calib_ros.bodies.body import declared_bodies
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.frame import Frame
+from fluoro_calib_ros.exposures.pairing import RecordedPairing
 from fluoro_calib_ros.photogrammetry.noise import ObservedScatter
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
@@ -600,7 +601,9 @@ def test_recording_frame_by_frame():
     assert found[0].points.status.tolist() == [OK, SINGLE_VIEW, OK, SINGLE_VIEW]
     assert np.abs(found[1].points.xyz_mm - xyz).max() < 1.0
     by_time = {**frames, 'b': [replace(f, number=f.number + 10) for f in frames['b']]}
-    again, unpaired = reconstruct_recording(by_time, calibrations, intersector, 'stamp')
+    again, unpaired = reconstruct_recording(
+        by_time, calibrations, intersector, RecordedPairing('stamp')
+    )
     assert len(again) == 2 and unpaired == {'a': 1, 'b': 0}
     np.testing.assert_array_equal(again[1].points.xyz_mm, found[1].points.xyz_mm)
 

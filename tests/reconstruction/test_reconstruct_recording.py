@@ -15,6 +15,7 @@ from rigs import run, true_calibrations, true_orientation
 from fluoro_calib_ros.bodies.body import declared_bodies
 from fluoro_calib_ros.checks.drift_charts import ERROR, DriftOptions
 from fluoro_calib_ros.checks.rig_watch import RecordingDriftWatch, RigDriftWatch
+from fluoro_calib_ros.exposures.pairing import RecordedPairing
 from fluoro_calib_ros.findings import Kind, Severity
 from fluoro_calib_ros.io.calibration import save_calibration, save_orientation
 from fluoro_calib_ros.io.observations import write_observations_csv
@@ -163,7 +164,9 @@ def test_every_exposure_of_two_views_is_reconstructed(by, seed):
             ]
             for k, (name, of_one) in enumerate(kept.items())
         }
-    found, unpaired = reconstruct_recording(kept, calibrations, Intersector(orientation), by)
+    found, unpaired = reconstruct_recording(
+        kept, calibrations, Intersector(orientation), RecordedPairing(by)
+    )
     views = np.sum(list(there.values()), axis=0)
     rows = np.flatnonzero(views >= 2)
     start = frames['a'][0].stamp_ns

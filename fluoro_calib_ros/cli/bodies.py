@@ -127,7 +127,12 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.learn:
         with ErrorsAt(arguments.source), ProgressBar('learned shapes', 'exposure') as bar:
             learned = learn_shapes(
-                recording.frames, calibrations, orientation, bodies, options, bar
+                recording.frames,
+                calibrations,
+                orientation,
+                bodies,
+                options=options,
+                progress=bar,
             )
         write_learned_shapes(arguments.calibration, learned)
         names = ', '.join(body.name for body in learned.bodies)

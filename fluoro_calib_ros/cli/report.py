@@ -30,6 +30,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def check(arguments: argparse.Namespace, error: Callable[[str], NoReturn]) -> None:
     """Find the result folder; call error with a sentence where none is given."""
     arguments.directory = result_folder(arguments, error)
+    if arguments.pdf and arguments.directory.suffix == '.pdf':
+        error(f'--pdf writes DIR/report.pdf; it takes no name, such as {arguments.directory}')
 
 
 def run(arguments: argparse.Namespace) -> None:

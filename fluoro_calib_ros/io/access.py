@@ -26,8 +26,8 @@ _NOT_READ = (
     (b'\xd0\xcf\x11\xe0', 'an xls spreadsheet; save the table as CSV'),
     (
         b'\x89HDF',
-        'an HDF5 file; of these, analysis files of SLEAP are read, as image points; save others '
-        'as CSV (DeepLabCut: analyze_videos_converth5_to_csv)',
+        'an HDF5 file; of these, files of DeepLabCut and analysis files of SLEAP are read, as '
+        'image points; save others as CSV',
     ),
     (b'NO_OF_FRAMES\t', _QTM),
     (b'FILE_VERSION\t', _QTM),

@@ -18,6 +18,7 @@ from fluoro_calib_ros.bodies.healing import Cause
 from fluoro_calib_ros.checks.check import Check
 from fluoro_calib_ros.cli import bag, calibrate, convert, extract, heal, output, phantom, process
 from fluoro_calib_ros.cli import reconstruct as reconstruct_command
+from fluoro_calib_ros.cli import report as report_command
 from fluoro_calib_ros.cli import survey as survey_command
 from fluoro_calib_ros.cli.arguments import angle_of, cluster_of, result_folder
 from fluoro_calib_ros.cli.orient import exposure_numbers
@@ -106,6 +107,9 @@ def test_folders_angles_and_clusters_of_arguments():
     assert result_folder(Fake(directory=None, calibration='y'), wrong) == 'y'
     with pytest.raises(Wrong):
         result_folder(Fake(directory=None, calibration=None), wrong)
+    report_command.check(Fake(directory=Path('x.pdf'), calibration=None, pdf=False), wrong)
+    with pytest.raises(Wrong):
+        report_command.check(Fake(directory=Path('x.pdf'), calibration=None, pdf=True), wrong)
     assert angle_of(Fake(angle_deg=None)) is None
     assert angle_of(Fake(angle_deg=180.0)) == pytest.approx(np.pi)
     given = Fake(

@@ -8,6 +8,7 @@ import dataclasses
 import json
 import os
 import pathlib
+import pickle
 import re
 import struct
 import subprocess
@@ -245,6 +246,102 @@ def test_a_damaged_deeplabcut_table_is_refused(tmp_path, text, settings, cause):
         registry.read(path, settings)
 
 
+def with_attributes(item, **attributes):
+    for name, value in attributes.items():
+        item.attrs[name] = np.bytes_(value) if isinstance(value, (str, bytes)) else value
+
+
+def pandas_table(path, text, axes=None):
+    """The table of a CSV file as DeepLabCut stores predictions: to_hdf with format='table'."""
+    rows = [line.split(',') for line in text.splitlines()]
+    columns = list(zip(*(row[1:] for row in rows[:3])))
+    values = np.array([[float(cell or 'nan') for cell in row[1:]] for row in rows[3:]])
+    kind = [('index', '<i8'), ('values_block_0', '<f8', (values.shape[1],))]
+    table = np.array([(int(row[0]), v) for row, v in zip(rows[3:], values)], dtype=kind)
+    with h5py.File(path, 'w') as file:
+        group = file.create_group('df_with_missing')
+        group['table'] = table
+        axes = pickle.dumps([(1, columns)], 0) if axes is None else axes
+        with_attributes(group, pandas_type='frame_table', non_index_axes=axes)
+    return path
+
+
+def pandas_fixed(path, text, **attributes):
+    """The table of a CSV file as DeepLabCut stores labels: to_hdf, with levels of both axes."""
+    rows = [line.split(',') for line in text.splitlines()]
+    headers = sum(not row[1] for row in rows)
+    axes = {
+        'block0_items': [row[3:] for row in rows[:headers]],
+        'axis1': list(zip(*(row[:3] for row in rows[headers:]))),
+    }
+    with h5py.File(path, 'w') as file:
+        group = file.create_group('df_with_missing')
+        with_attributes(group, pandas_type='frame', nblocks=1)
+        for axis, levels in axes.items():
+            group.attrs[f'{axis}_nlevels'] = len(levels)
+            for level, cells in enumerate(levels):
+                names, labels = np.unique(cells, return_inverse=True)
+                group[f'{axis}_level{level}'] = names.astype('S')
+                group[f'{axis}_label{level}'] = labels.astype('i1')
+        group['block0_values'] = np.array(
+            [[float(cell or 'nan') for cell in row[3:]] for row in rows[headers:]]
+        )
+        with_attributes(group['block0_values'], transposed=1)
+        with_attributes(group, **attributes)
+    return path
+
+
+@pytest.mark.parametrize(('write', 'text'), [(pandas_table, PREDICTED), (pandas_fixed, LABELLED)])
+def test_hdf5_of_deeplabcut_is_what_its_csv_is(tmp_path, write, text):
+    settings = FileSettings(image_size=SIZE, fluoroscopes=('a',))
+    table = tmp_path / 'a.csv'
+    table.write_text(text)
+    expected = registry.read(table, settings)
+    content = registry.read(write(tmp_path / 'a.h5', text), settings)
+    assert_same_frames(content.observations, expected.observations)
+    assert content.names.targets == expected.names.targets
+    assert [note.partition(':')[2] for note in content.notes] == [
+        note.partition(':')[2] for note in expected.notes
+    ]
+
+
+class Trap:
+    """What makes a file where its pickle is loaded."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return open, (str(self.path), 'w')
+
+
+def test_no_pickle_of_a_file_of_deeplabcut_is_loaded(tmp_path):
+    axes = pickle.dumps([(1, Trap(tmp_path / 'trapped'))], 0)
+    path = pandas_table(tmp_path / 'a.h5', PREDICTED, axes)
+    with pytest.raises(DataError, match='its columns are stored by GLOBAL, which is not read'):
+        registry.read(path, SETTINGS)
+    assert not (tmp_path / 'trapped').exists()
+
+
+@pytest.mark.parametrize(
+    ('write', 'cause'),
+    [
+        (lambda p: pandas_table(p, PREDICTED, b'(lp0\n'), 'pickle exhausted before'),
+        (
+            lambda p: pandas_table(p, PREDICTED, pickle.dumps([(1, ['x'] * 6)], 0)),
+            'its columns ha',
+        ),
+        (lambda p: pandas_table(p, PREDICTED, pickle.dumps([(1, [('x', 'y')] * 6)], 0)), '2 head'),
+        (lambda p: pandas_fixed(p, LABELLED, nblocks=2), 'its columns are not of one kind'),
+        (lambda p: pandas_fixed(p, LABELLED, pandas_type='series'), 'it is a series of pandas'),
+    ],
+)
+def test_hdf5_of_pandas_that_is_not_of_deeplabcut_is_refused(tmp_path, write, cause):
+    with pytest.raises(DataError, match=cause) as error:
+        registry.read(write(tmp_path / 'a.h5'), SETTINGS)
+    assert '\n' not in str(error.value)
+
+
 SLEAP_UV = np.array(  # frames, tracks, nodes, x and y
     [
         [[[10.5, 20.25], [30, 40]], [[11, 21], [31, 41]]],
@@ -313,7 +410,6 @@ def test_a_folder_of_sleap_returns(tmp_path):
 @pytest.mark.parametrize(
     ('others', 'cause'),
     [
-        ({'df_with_missing': 1}, 'it is of DeepLabCut, whose column names are pickled'),
         ({'node_names': None}, 'it is no analysis file of SLEAP'),
         ({'node_names': np.array([b'hip'] * 2)}, 'two points have the same name'),
         ({'node_names': np.array([b'hip'])}, 'tracks, point_scores and node_names are of'),

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""DeepLabCut tables as CSV, one file a camera: predicted points, and points labelled by hand.
+"""DeepLabCut tables, one file a camera: predicted points, and points labelled by hand.
 
 The header has a row each for scorer, body part and coordinate, with several animals one for the
 individual, too. Rows are frames from 0, or the paths of labelled images, in one cell or in three.
-Pixel centres are at integers from (0, 0), v downwards.
+Pixel centres are at integers from (0, 0), v downwards. The table is CSV, or HDF5 of pandas.
 """
 
 from __future__ import annotations
@@ -17,11 +17,13 @@ from pathlib import Path
 
 import numpy as np
 
+from ...errors import DataError
 from ...exposures.frame import Frame, points_on_image
 from ...exposures.names import Names, number_names
 from ..access import atomic_file, check_safe_name, make_folder
 from ..csv_table import as_text
-from .content import Content, FileSettings, Format, Written
+from .content import Content, FileSettings, Format, Sample, Written
+from .reader_process import HDF5, hdf5_arrays
 from .tables import (
     Row,
     default_name,
@@ -41,7 +43,9 @@ _NUMBER = re.compile(r'\d+')
 
 def read(path: Path, settings: FileSettings) -> Content:
     """Read image points of one camera, named after the file. Raises DataError."""
-    rows = read_table(path, ',')
+    with path.open('rb') as file:
+        is_hdf5 = file.read(len(HDF5)) == HDF5
+    rows = _rows_of_hdf5(path) if is_hdf5 else read_table(path, ',')
     header = {row.cells[0].lower(): row for row in rows[: len(HEADER)] if _is_header(row)}
     body = rows[len(header) :]
     coords = header.get('coords')
@@ -85,6 +89,20 @@ def read(path: Path, settings: FileSettings) -> Content:
         names=Names(named_targets({name: ids[name] for name in targets})),
         notes=notes if unsure else (),
     )
+
+
+def _rows_of_hdf5(path: Path) -> list[Row]:
+    """Return the rows that a file has as CSV. Raises DataError."""
+    arrays = hdf5_arrays('deeplabcut', path)
+    levels = arrays['columns'].T.tolist()
+    # A table of several animals has the headers of HEADER, that of a single one no individuals.
+    names = HEADER if len(levels) == len(HEADER) else (HEADER[0], *HEADER[2:])
+    if len(levels) != len(names):
+        raise DataError(f'{path}: the columns have {len(levels)} headers, not those of DeepLabCut')
+    cells = [[name, *level] for name, level in zip(names, levels)]
+    values = [map(number_text, row) for row in arrays['values']]
+    cells += [[index, *row] for index, row in zip(arrays['index'].tolist(), values)]
+    return [Row(path, line, row) for line, row in enumerate(cells, 1)]
 
 
 def _is_header(row: Row) -> bool:
@@ -153,14 +171,18 @@ def _write_camera(path: Path, frames: Sequence[Frame], named: dict[int, str]) ->
             writer.writerow([frame.number, *cells])
 
 
+def _is_deeplabcut(sample: Sample) -> bool:
+    if sample.head.startswith(HDF5):
+        return b'pandas_type' in sample.head
+    is_table = any(line.lower().startswith('coords,') for line in sample.lines[: len(HEADER)])
+    return is_table and sample.first.lower().startswith('scorer,')
+
+
 FORMAT = Format(
     'deeplabcut',
     'DeepLabCut points',
     parts=('observations',),
-    recognise=lambda sample: (
-        sample.first.lower().startswith('scorer,')
-        and any(line.lower().startswith('coords,') for line in sample.lines[: len(HEADER)])
-    ),
+    recognise=_is_deeplabcut,
     read=read,
     write=write,
     looks_like='scorer,DLC_resnet50,DLC_resnet50,DLC_resnet50',

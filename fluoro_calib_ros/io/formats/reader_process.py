@@ -7,11 +7,12 @@ ezc3d and HDF5 trust what a file says about itself: a damaged one can make them 
 memory. Standard output is an .npz of arrays. Of C3D: labels, unit, rate, first, xyz (m, n, 3),
 residual (m, n), and rotation_labels, rotation_unit, rotation_rate, rotations (m, b, 4, 4). Of an
 analysis file of SLEAP: uv (m, t, n, 2) and score (m, t, n) of frames, tracks and nodes, and the
-names nodes and tracks.
+names nodes and tracks. Of a file of DeepLabCut: columns (n, levels), index (m,) and values (m, n).
 """
 
 from __future__ import annotations
 
+import importlib.util
 import io
 import json
 import os
@@ -24,7 +25,9 @@ import numpy as np
 
 from ...errors import DataError
 from ...processes import run_module, watch_parent
+from .pandas_hdf5 import is_pandas, table_arrays, texts
 
+HDF5 = b'\x89HDF\r\n\x1a\n'  # with which a file begins
 # Bytes of address space: for the program, for each byte of the file, and at most.
 BASE_MEMORY = 3 * 2**30
 MEMORY_OF_BYTE = 100
@@ -102,11 +105,6 @@ def sleap_arrays(path: str) -> dict[str, Any]:
     import h5py
 
     with h5py.File(path, 'r') as file:
-        if 'df_with_missing' in file:
-            raise ValueError(
-                'it is of DeepLabCut, whose column names are pickled, which could run any code: '
-                'save it as CSV with analyze_videos_converth5_to_csv'
-            )
         if 'tracks' not in file or 'node_names' not in file:
             raise ValueError(
                 'it is no analysis file of SLEAP, which has tracks and node_names; of a project, '
@@ -123,16 +121,23 @@ def sleap_arrays(path: str) -> dict[str, Any]:
         return {
             'uv': np.asarray(uv, dtype=float),
             'score': np.asarray(score, dtype=float),
-            'nodes': np.array(_texts(file['node_names']), dtype=str),
-            'tracks': np.array(_texts(file.get('track_names', [])), dtype=str),
+            'nodes': np.array(texts(file['node_names']), dtype=str),
+            'tracks': np.array(texts(file.get('track_names', [])), dtype=str),
         }
 
 
-def _texts(values: Any) -> list[str]:
-    return [v.decode() if isinstance(v, bytes) else str(v) for v in values]
+def deeplabcut_arrays(path: str) -> dict[str, Any]:
+    """Return the arrays of a table of DeepLabCut. Raises ValueError for any other file."""
+    import h5py
+
+    with h5py.File(path, 'r') as file:
+        tables = [group for group in file.values() if is_pandas(group)]
+        if len(tables) != 1:
+            raise ValueError('it is no file of DeepLabCut, which has one table of pandas')
+        return table_arrays(tables[0])
 
 
-READERS = {'c3d': c3d_arrays, 'sleap': sleap_arrays}
+READERS = {'c3d': c3d_arrays, 'sleap': sleap_arrays, 'deeplabcut': deeplabcut_arrays}
 
 
 def main() -> None:
@@ -158,6 +163,21 @@ def main() -> None:
 BASE_SECONDS = 10
 SECONDS_OF_BYTE = 1e-6
 MAX_SECONDS = 60
+
+
+def hdf5_arrays(kind: str, path: Path) -> dict[str, np.ndarray]:
+    """Return the arrays of an HDF5 file. Raises DataError, also where h5py is not installed."""
+    require_h5py(path)
+    return arrays_apart(kind, path, 'HDF5')
+
+
+def require_h5py(path: Path) -> None:
+    """Raise DataError where h5py is not installed."""
+    if importlib.util.find_spec('h5py') is None:
+        raise DataError(
+            f'{path}: HDF5 files need the package h5py: pip install h5py, or '
+            'fluoro_calib_ros[hdf5]'
+        )
 
 
 def arrays_apart(kind: str, path: Path, title: str) -> dict[str, np.ndarray]:

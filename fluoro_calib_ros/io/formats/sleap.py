@@ -8,12 +8,10 @@ Rows are frames from 0. Pixel centres are at integers from (0, 0), v downwards.
 
 from __future__ import annotations
 
-import importlib.util
 import io
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -22,29 +20,16 @@ from ...exposures.frame import Frame, points_on_image
 from ...exposures.names import Names, number_names
 from ..access import check_safe_name, make_folder, write_bytes
 from .content import Content, FileSettings, Format, Sample, Written
-from .reader_process import arrays_apart
+from .reader_process import HDF5, hdf5_arrays, require_h5py
 from .tables import default_name, named_targets, with_sigma_of_likelihood
 
-MAGIC = b'\x89HDF\r\n\x1a\n'
 LEAST_SCORE = 1e-6  # below it a point weighs nothing beside the others
 _OF_VIDEO = re.compile(r'.*\.\d{3}_(?P<video>.+)')  # <project>.<number of the video>_<video>
 
 
-def _h5py() -> Any:
-    """Return the module h5py. Raises DataError where it is not installed."""
-    if importlib.util.find_spec('h5py') is None:
-        raise DataError(
-            'files of SLEAP need the package h5py: pip install h5py, or fluoro_calib_ros[sleap]'
-        )
-    import h5py
-
-    return h5py
-
-
 def read(path: Path, settings: FileSettings) -> Content:
     """Read image points of one camera, named after the file. Raises DataError."""
-    _h5py()
-    arrays = arrays_apart('sleap', path, 'HDF5')
+    arrays = hdf5_arrays('sleap', path)
     uv = arrays['uv']
     score = arrays['score']
     targets = _targets(path, arrays)
@@ -113,17 +98,19 @@ def write(path: Path, content: Content, settings: FileSettings) -> Written:
     observations = content.observations or {}
     for name in observations:
         check_safe_name(name, path)
-    h5py = _h5py()
+    require_h5py(path)
     make_folder(path)
     named = content.names.target_names()
     written = tuple(str(path / f'{name}.analysis.h5') for name in observations)
     for file, frames in zip(written, observations.values()):
-        write_bytes(file, _content_of(h5py, frames, named))
+        write_bytes(file, _content_of(frames, named))
     return Written(written)
 
 
-def _content_of(h5py: Any, frames: Sequence[Frame], named: dict[int, str]) -> bytes:
+def _content_of(frames: Sequence[Frame], named: dict[int, str]) -> bytes:
     """Return an analysis file of one track, as SLEAP orders it, with scores of 1."""
+    import h5py
+
     ids = sorted({int(i) for frame in frames for i in frame.target_id})
     count = 1 + max(frame.number for frame in frames)
     uv = np.full((1, 2, len(ids), count), np.nan)
@@ -158,7 +145,7 @@ def _content_of(h5py: Any, frames: Sequence[Frame], named: dict[int, str]) -> by
 
 
 def _is_hdf5(sample: Sample) -> bool:
-    return sample.head.startswith(MAGIC)
+    return sample.head.startswith(HDF5)
 
 
 FORMAT = Format(

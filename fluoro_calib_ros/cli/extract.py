@@ -106,7 +106,8 @@ def _add_markers(group: argparse._ArgumentGroup) -> None:
         type=Path,
         metavar='FILE',
         help='ids and places of the markers in one exposure, to a pixel or two: '
-        'fluoroscope,exposure,target_id,u,v, or XMALab points; they are followed from it on',
+        'fluoroscope,exposure,target_id,u,v, or XMALab points; they are followed from it on, and '
+        'those of later exposures enter there, or are found again',
     )
     group.add_argument(
         '--calibration',

@@ -39,8 +39,9 @@ class MarkerPair:
     """Follows markers through the images of two calibrated fluoroscopes.
 
     orientation: that they belong to. first: ids and places in the first images, of two
-    fluoroscopes. bodies: shapes that are not given are learned from the images. Raises DataError
-    for other than two fluoroscopes, and for those without calibration.
+    fluoroscopes. bodies: shapes that are not given are learned from the images. later: ids of
+    markers whose places are given later. Raises DataError for other than two fluoroscopes, and for
+    those without calibration.
     """
 
     def __init__(
@@ -51,6 +52,7 @@ class MarkerPair:
         *,
         first: Mapping[str, FirstMarkers],
         bodies: Sequence[Body] = (),
+        later: Sequence[int] = (),
     ) -> None:
         names = [name for name in orientation.fluoroscopes if name in first]
         if len(names) != 2 or len(first) != 2:
@@ -60,16 +62,18 @@ class MarkerPair:
             )
         self.names = tuple(names)
         self.calibrations = {name: calibrations[name] for name in names}
+        entering = np.asarray(later, dtype=np.int64)
         self.target_id = np.unique(
             np.concatenate(
                 [
                     *(first[name].target_id for name in names),
                     *(body.target_id[body.known] for body in bodies),
+                    entering,
                 ]
             )
         )
         rigid = [body.target_id for body in bodies]
-        others = np.intersect1d(self.target_id, np.concatenate([self.target_id[:0], *rigid]))
+        others = np.intersect1d(self.target_id, np.concatenate([*rigid, entering]))
         self.trackers = {
             name: MarkerTracker(
                 options, first=first[name], later=np.setdiff1d(others, first[name].target_id)

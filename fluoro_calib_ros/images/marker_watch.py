@@ -229,16 +229,26 @@ def follow_beside(states: MarkerStates, frames: int) -> None:
     frames is the number of them since the image before.
     """
     motion = states.motion
+    unsettled = np.flatnonzero(~motion.settled).tolist()
+    beside = {row: velocity_beside(states, row) for row in unsettled}
+    for row, found in beside.items():
+        if found is not None:
+            velocity, spread = found
+            uv = motion.uv[row] + frames * (velocity - motion.velocity[row])
+            motion.redirect(row, uv, velocity, max(spread, SHIFTED_SD_PX))
+
+
+def velocity_beside(states: MarkerStates, row: int) -> tuple[np.ndarray, float] | None:
+    """Velocity (2,) of the markers beside one, and how much theirs differ; None without some."""
+    motion = states.motion
     known = np.flatnonzero(motion.settled & (states.unseen <= 1))
+    known = known[known != row]
     if len(known) < MIN_BESIDE:
-        return
-    for row in np.flatnonzero(~motion.settled).tolist():
-        away = np.linalg.norm(motion.uv[known] - motion.uv[row], axis=1)
-        beside = known[np.argsort(away, kind='stable')[:MIN_BESIDE]]
-        velocity = np.median(motion.velocity[beside], axis=0)
-        spread = float(np.abs(motion.velocity[beside] - velocity).max())
-        uv = motion.uv[row] + frames * (velocity - motion.velocity[row])
-        motion.redirect(row, uv, velocity, max(spread, SHIFTED_SD_PX))
+        return None
+    away = np.linalg.norm(motion.uv[known] - motion.uv[row], axis=1)
+    beside = known[np.argsort(away, kind='stable')[:MIN_BESIDE]]
+    velocity = np.median(motion.velocity[beside], axis=0)
+    return velocity, float(np.abs(motion.velocity[beside] - velocity).max())
 
 
 def shift_together(motion: Motion, found: Shadows, gate: float, frames: int) -> None:

@@ -22,6 +22,7 @@ from ..findings import Finding, Kind
 from ..options import option, validate_options
 from .marker_fit import MarkerMeasurement
 from .marker_intensity import (
+    FIRST_SD_PX,
     NOWHERE_PX,
     LightWindows,
     MarkerLook,
@@ -31,7 +32,13 @@ from .marker_intensity import (
     learn_start,
 )
 from .marker_motion import MarkerStates, MeasuredMarkers
-from .marker_watch import MarkerDoubts, MarkerWatch, follow_beside, shift_together
+from .marker_watch import (
+    MarkerDoubts,
+    MarkerWatch,
+    follow_beside,
+    shift_together,
+    velocity_beside,
+)
 from .shadow_fit import Profile
 
 
@@ -146,7 +153,7 @@ class MarkerTracker:
     """Follows markers through the images of one fluoroscope.
 
     first: ids and places in the first image; later (k,): ids of markers that are followed once
-    their places are suggested.
+    their places are given or suggested.
     """
 
     def __init__(
@@ -160,7 +167,7 @@ class MarkerTracker:
         self.first = first
         self.target_id = first.target_id  # of all markers
         if later is not None:
-            self.target_id = np.concatenate([first.target_id, later])
+            self.target_id = np.append(first.target_id, np.asarray(later, dtype=np.int64))
         self._rows = {number: row for row, number in enumerate(self.target_id.tolist())}
         self._followed: _Followed | None = None
         self._frame = 0
@@ -168,6 +175,7 @@ class MarkerTracker:
         self._images = 0  # since the first one
         self._led: np.ndarray | None = None
         self._suggested: list[tuple[np.ndarray, ...]] = []
+        self._given: FirstMarkers | None = None  # of the next image
 
     @property
     def profile(self) -> Profile | None:
@@ -194,6 +202,7 @@ class MarkerTracker:
             if followed is None:
                 raise
             self._advance(frame)
+            self._given = None
             nothing = MeasuredMarkers.nothing(len(self.target_id))
             return self._result(nothing, (), error.finding, begin)
         if followed is None:
@@ -201,7 +210,9 @@ class MarkerTracker:
             self._frame = frame
         else:
             self._advance(frame)
+        given = self._place_given()
         found, doubts = self._measure(image, frame)
+        doubts = self._believe(given, found, doubts)
         none_seen = Finding(Kind.NO_MARKERS, 'no marker is seen')
         return self._result(found, doubts, None if found.measured.any() else none_seen, begin)
 
@@ -253,6 +264,13 @@ class MarkerTracker:
     def shadows(self, image: np.ndarray) -> Shadows:
         """Return all shadows in an image that look like markers."""
         return self._known().search.everywhere(image)
+
+    def place(self, given: FirstMarkers) -> None:
+        """Follow markers from where a person sees them in the next image.
+
+        Their ids are then sure. A marker that is there anyway goes on as it is.
+        """
+        self._given = given
 
     def suggest(
         self,
@@ -322,6 +340,33 @@ class MarkerTracker:
         for suggested in self._suggested:
             states.motion.place(*suggested)
         self._suggested = []
+
+    def _place_given(self) -> NDArray[np.int64]:
+        """Put markers where a person sees them in this image; returns the rows of all of them."""
+        given, self._given = self._given, None
+        if given is None:
+            return np.zeros(0, dtype=np.int64)
+        rows = np.array([self._row(int(i)) for i in given.target_id])
+        states = self._known().states
+        motion = states.motion
+        away = np.linalg.norm(motion.uv[rows] - given.uv, axis=1)
+        reach = self.options.gate * np.sqrt(motion.variance[rows] + FIRST_SD_PX**2)
+        elsewhere = (states.unseen[rows] > 1) | (away > reach)
+        for row, uv in zip(rows[elsewhere], given.uv[elsewhere]):
+            velocity, _ = velocity_beside(states, row) or (np.zeros(2), 0.0)
+            motion.redirect(row, uv, velocity, FIRST_SD_PX)
+            states.unseen[row] = 1
+        return rows
+
+    def _believe(
+        self, given: np.ndarray, found: MeasuredMarkers, doubts: tuple[Finding, ...]
+    ) -> tuple[Finding, ...]:
+        """Take back the doubts in markers that a person has given; returns those that remain."""
+        sure = given[found.measured[given]]
+        for row in sure.tolist():
+            self._known().doubts.confirm(row)
+        ids = set(self.target_id[sure].tolist())
+        return tuple(doubt for doubt in doubts if ids.isdisjoint(doubt.place.target_id))
 
     def _measure(
         self, image: np.ndarray, frame: int

@@ -264,6 +264,7 @@ class MarkerSettings:
     calibrations: Calibrations = field(default_factory=dict)
     orientation: RigOrientation | None = None  #: of two fluoroscopes
     bodies: tuple[Body, ...] = ()  #: markers that are rigid together, of two fluoroscopes
+    later: tuple[int, ...] = ()  #: ids of markers whose places are given later
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -306,7 +307,11 @@ class MarkerFollower:
         settings = self._settings
         if len(first) == 1:
             self._trackers = {
-                name: MarkerTracker(settings.options, first=markers)
+                name: MarkerTracker(
+                    settings.options,
+                    first=markers,
+                    later=np.setdiff1d(settings.later, markers.target_id),
+                )
                 for name, markers in first.items()
             }
             return
@@ -318,8 +323,13 @@ class MarkerFollower:
             settings.options,
             first=first,
             bodies=settings.bodies,
+            later=settings.later,
         )
         self._trackers = self._pair.trackers
+
+    def place(self, fluoroscope: str, given: FirstMarkers) -> None:
+        """Follow markers of a view from where a person sees them in the next image."""
+        self._trackers[fluoroscope].place(given)
 
     def update(
         self,

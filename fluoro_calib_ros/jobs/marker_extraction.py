@@ -54,8 +54,8 @@ class MarkerRequest:
     """Image sequences of one or two fluoroscopes, and their markers."""
 
     sources: Mapping[str, Sequence[Path]]  #: images by fluoroscope
-    #: markers of one or more exposures, by fluoroscope; following begins with the first image that
-    #: has one
+    #: markers of one or more exposures, by fluoroscope; following begins with the first exposure
+    #: that every fluoroscope has some of; those of later ones enter there, or are found again
     first: Frames
     options: MarkerOptions = field(default_factory=MarkerOptions)
     #: of two fluoroscopes
@@ -291,6 +291,9 @@ class _Recording:
                     self._before[name] += 1
                 return
             self._follower = self._begin(images, first)
+        for name in images if self._results[self._names[0]] else ():
+            if exposure in self._given[name]:
+                self._follower.place(name, self._markers(name, exposure))
         arrays = {
             name: None if isinstance(image.image, DataError) else image.image
             for name, image in images.items()
@@ -315,14 +318,23 @@ class _Recording:
             return {}
         if self._start is None:
             return self._by_shape(images)
-        first = {}
-        for name in self._names:
-            frame = self._given[name][exposure]
-            try:
-                first[name] = FirstMarkers(frame.target_id, frame.uv)
-            except DataError as error:
-                raise DataError(f'fluoroscope {name}, exposure {exposure}: {error}') from None
-        return first
+        return {name: self._markers(name, exposure) for name in self._names}
+
+    def _markers(self, name: str, exposure: int) -> FirstMarkers:
+        """Return the given markers of an exposure. Raises DataError."""
+        frame = self._given[name][exposure]
+        try:
+            return FirstMarkers(frame.target_id, frame.uv)
+        except DataError as error:
+            raise DataError(f'fluoroscope {name}, exposure {exposure}: {error}') from None
+
+    def _given_later(self) -> tuple[int, ...]:
+        """Ids of markers that are given for exposures after the first one."""
+        if self._start is None:
+            return ()
+        frames = [f for of_view in self._given.values() for f in of_view.values()]
+        ids = [frame.target_id for frame in frames if frame.number > self._start]
+        return tuple(np.unique(np.concatenate(ids)).tolist()) if ids else ()
 
     def _by_shape(self, images: Mapping[str, SourceImage]) -> dict[str, FirstMarkers]:
         """Identify markers by the shapes of their bodies, in one of the first exposures."""
@@ -366,6 +378,7 @@ class _Recording:
                 request.calibrations,
                 request.orientation,
                 bodies=request.bodies,
+                later=self._given_later(),
             )
         )
 

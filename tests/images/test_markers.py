@@ -255,6 +255,50 @@ def test_markers_that_pass_keep_their_ids():
     assert np.abs(last.uv - true).max() < 0.3
 
 
+def test_a_marker_enters_where_a_person_sees_it_first():
+    ids, images = sequence()
+    first = given('a')
+    late, at = first.target_id[0], 9
+    others = FirstMarkers(first.target_id[1:], first.uv[1:])
+    tracker = MarkerTracker(OPTIONS, first=others, later=np.array([late]))
+    row = int(np.searchsorted(ids, late))
+    there = []
+    for number, of in enumerate(images, 1):
+        if number == at:
+            tracker.place(FirstMarkers([late], of['a'].uv[row : row + 1] + 0.5))
+        found = tracker.update(of['a'].image, number)
+        if number == at:
+            assert not found.doubtful[found.target_id == late].any()
+            assert all(late not in doubt.place.target_id for doubt in found.doubts)
+        uv = found.uv[(found.target_id == late) & ~found.doubtful]
+        there.append(len(uv) > 0)
+        assert not len(uv) or np.linalg.norm(uv - of['a'].uv[row]) < FAR_PX
+    assert not any(there[: at - 1]) and there[at - 1]
+    from_the_first = [late in f.target_id[~f.doubtful] for f in followed('a')[at - 1 :]]
+    assert sum(there) >= sum(from_the_first) - 2
+
+
+def test_a_person_sets_right_what_was_exchanged():
+    image, true = meeting(1, True)
+    tracker = MarkerTracker(first=FirstMarkers(np.arange(1, 6), true))
+    for number in range(1, 22):
+        image, true = meeting(number, True)
+        last = tracker.update(image, number)
+    assert last.doubtful[:2].all()
+    for number in range(22, 25):
+        image, true = meeting(number, True)
+        if number == 22:
+            tracker.place(FirstMarkers([1, 2], np.round(true[:2])))
+        last = tracker.update(image, number)
+        assert last.target_id.tolist() == [1, 2, 3, 4, 5] and not last.doubtful.any()
+        assert np.abs(last.uv - true).max() < 0.3
+    # The other way round, too: what a person says of two markers counts.
+    tracker.place(FirstMarkers([1, 2], np.round(meeting(25, True)[1][[1, 0]])))
+    image, true = meeting(25, True)
+    last = tracker.update(image, 25)
+    assert np.abs(last.uv[:2] - true[[1, 0]]).max() < 0.3
+
+
 def test_markers_are_found_again_after_images_without_any():
     ids, images = sequence()
     tracker = MarkerTracker(OPTIONS, first=given('a'))
@@ -375,6 +419,36 @@ def folder(tmp_path: Path) -> Path:
         save_calibration(tmp_path / 'result', each)
     save_orientation(tmp_path / 'result', orientation)
     return tmp_path
+
+
+@pytest.mark.parametrize('names', ['a', 'a,b'])
+def test_markers_enter_a_recording_where_they_are_given_first(folder, names):
+    """In the exposures after it, in both views, although no body says where they are."""
+    ids, images = sequence()
+    late = int(ids[2])
+    with open(folder / 'first.csv', newline='') as file:
+        rows = [row for row in csv.DictReader(file) if int(row['target_id']) != late]
+    for name in 'ab':
+        u, v = images[4][name].uv[2]
+        row = (name, 15, late, f'{u:.0f}', f'{v:.0f}')
+        rows.append(dict(zip(rows[0], row)))
+    with open(folder / 'first.csv', 'w', newline='') as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+    source = folder / 'images' if ',' in names else folder / 'images' / 'a'
+    words = ['extract', source, '--markers', folder / 'first.csv', '--shutter', 0.4]
+    words += ['--fluoroscope', names, '--out', folder / 'out.csv']
+    assert run(*words, *(('--calibration', folder / 'result') if ',' in names else ())) == 0
+    with open(folder / 'out.csv', newline='') as file:
+        found = [row for row in csv.DictReader(file) if int(row['target_id']) == late]
+    for name in names.split(','):
+        of_view = [row for row in found if row['fluoroscope'] == name]
+        assert min(int(row['exposure']) for row in of_view) == 15 and len(of_view) >= 4
+        for row in of_view:
+            true = images[int(row['exposure']) - 11][name].uv[2]
+            away = np.hypot(float(row['u']) - true[0], float(row['v']) - true[1])
+            assert away < FAR_PX or row['doubtful'] == '1'
 
 
 @pytest.mark.long

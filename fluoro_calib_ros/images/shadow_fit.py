@@ -18,7 +18,6 @@ from functools import cached_property, lru_cache
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 
 from .light import MIN_PIXELS, Cosines, Noise, Spectra, correlation_of
@@ -420,6 +419,7 @@ def _sd_of_centre(covariance: np.ndarray) -> np.ndarray:
 
 STEP = 0.2  # of the grid on which a profile is computed [px]
 TABLE_STEP = 0.05  # of the table of a profile [px]
+KERNEL_SIGMAS = 5.5  # at which a Gaussian is 3e-7
 REACH_SIGMAS = 3.2
 # Bounds of radius, blur [px], attenuation along the radius, and scattered light.
 LOW = (0.5, 0.35, 0.05, 0.0)
@@ -507,21 +507,25 @@ class Shadows:
 
 def _tabulated(profile: Profile) -> np.ndarray:
     """Absorbed shares and their derivatives (2, n) at multiples of TABLE_STEP from the centre."""
-    step = min(STEP, profile.radius_px / 4)
-    axis = np.arange(int(np.ceil((profile.reach_px + 3) / step)) + 4) * step
-    squared = axis[:, None] ** 2 + axis**2
-    quarter = profile.absorbed(squared)
+    parts = max(1, int(min(STEP, profile.radius_px / 4) / TABLE_STEP))
+    step = parts * TABLE_STEP
     # The blur of a square pixel has a variance of 1/12. Only the row through the centre is needed:
     # all columns are weighted to one row, which is blurred along itself.
     sigma = np.sqrt(profile.blur_px**2 + 1 / 12)
+    half = int(np.ceil(KERNEL_SIGMAS * sigma / step)) + 1
+    axis = np.arange(max(int(np.ceil((profile.reach_px + 3) / step)) + 4, half + 1)) * step
+    quarter = profile.absorbed(axis[:, None] ** 2 + axis**2)
     kernel = np.exp(-0.5 * (axis / sigma) ** 2)
-    row = quarter @ np.append(kernel[0], 2 * kernel[1:])
-    both_sides = np.concatenate([kernel[:0:-1], kernel])
-    blurred = np.convolve(np.concatenate([row[:0:-1], row]), both_sides / both_sides.sum() ** 2)
-    blurred = blurred[2 * len(axis) - 2 : 3 * len(axis) - 2]
-    spline = CubicSpline(axis, blurred, bc_type=((1, 0.0), (1, 0.0)))
-    wanted = np.arange(0, profile.reach_px + 2, TABLE_STEP)
-    return np.stack([spline(wanted), spline(wanted, 1)])
+    both = np.append(kernel[0], 2 * kernel[1:])
+    row = quarter @ (both / both.sum() ** 2)
+    row = np.concatenate([row[:0:-1], row])
+    # The blur is exact between the points of the row, too: a part of a step farther on.
+    away = np.arange(-half, half + 1) * step + np.arange(parts)[:, None] * TABLE_STEP
+    gauss = np.exp(-0.5 * (away / sigma) ** 2)
+    kernels = np.stack([gauss, -away / sigma**2 * gauss])
+    blurred = np.array([[np.convolve(row, one, mode='same') for one in two] for two in kernels])
+    table = blurred[:, :, len(axis) - 1 :].swapaxes(1, 2).reshape(2, -1)
+    return np.asarray(table[:, : int(np.ceil((profile.reach_px + 2) / TABLE_STEP))])
 
 
 def fit_profile(

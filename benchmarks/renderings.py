@@ -307,15 +307,26 @@ class Scene:
 
 
 def render(row: Row, rng: np.random.Generator) -> Scene:
-    """Render an image of a row."""
+    """Render an image of a row, with a target, a pose and a distortion of its own."""
     target = row.target(rng)
-    rotation, source = _pose(rng, row.tilt_deg)
-    bend = _Distortion(rng, row.distortion_px)
+    pose = random_pose(rng, row.tilt_deg)
+    return render_with(row, target, pose, Distortion(rng, row.distortion_px), rng)
+
+
+def render_with(
+    row: Row,
+    target: Target,
+    pose: tuple[np.ndarray, np.ndarray],
+    bend: Distortion,
+    rng: np.random.Generator,
+) -> Scene:
+    """Render an image of a target with a pose and a distortion."""
+    rotation, source = pose
     depth = np.zeros((SIZE, SIZE))
     hit = np.zeros((SIZE, SIZE))
     light = np.ones((SIZE, SIZE))
     centres = (target.xyz - source) @ rotation.T
-    uv = bend.observed(PRINCIPAL_PX * centres[:, :2] / centres[:, 2:] + (SIZE - 1) / 2)
+    uv = projected(centres, bend)
     if row.holes:
         light *= _perforated(bend, rotation, source, target)
     for centre, place, diameter in zip(centres, uv, target.diameter) if not row.holes else ():
@@ -328,11 +339,20 @@ def render(row: Row, rng: np.random.Generator) -> Scene:
         depth += BONE_PER_MM * _skeleton(row.anatomy, rng)
     light = light * np.exp(-depth) * _vignetting(rng)
     grey = _detected(light, row, rng)
-    inside = ((uv > 15) & (uv < SIZE - 16)).all(axis=1)
-    return Scene(grey, target, uv, inside & (_overlap(uv, target, centres) > 1.0))
+    return Scene(grey, target, uv, in_image(uv) & (_overlap(uv, target, centres) > 1.0))
 
 
-def _pose(rng: np.random.Generator, tilt_deg: float) -> tuple[np.ndarray, np.ndarray]:
+def projected(centres: np.ndarray, bend: Distortion) -> np.ndarray:
+    """Pixels (n, 2) of points (n, 3) in the frame of the sensor [mm]."""
+    return bend.observed(PRINCIPAL_PX * centres[:, :2] / centres[:, 2:] + (SIZE - 1) / 2)
+
+
+def in_image(uv: np.ndarray) -> NDArray[np.bool_]:
+    """Whether (n,) pixels are as far from the border as a shadow needs."""
+    return np.asarray(((uv > 15) & (uv < SIZE - 16)).all(axis=1))
+
+
+def random_pose(rng: np.random.Generator, tilt_deg: float) -> tuple[np.ndarray, np.ndarray]:
     """Rotation (3, 3) of the target to the sensor, and the place of the source (3,) [mm]."""
     if tilt_deg >= 180:
         rotation = Rotation.random(random_state=int(rng.integers(2**31))).as_matrix()
@@ -344,7 +364,7 @@ def _pose(rng: np.random.Generator, tilt_deg: float) -> tuple[np.ndarray, np.nda
     return rotation, -rotation.T @ shift
 
 
-class _Distortion:
+class Distortion:
     """Pincushion, S shape and a smooth rest; undistorted = observed - duv."""
 
     def __init__(self, rng: np.random.Generator, size_px: float) -> None:
@@ -369,7 +389,7 @@ class _Distortion:
         return out
 
 
-def _rays(bend: _Distortion, left: int, top: int, shape: tuple[int, int]) -> np.ndarray:
+def _rays(bend: Distortion, left: int, top: int, shape: tuple[int, int]) -> np.ndarray:
     """Unit vectors (h, w, SUB * SUB, 3) of rays through the points of pixels."""
     step = (np.arange(SUB) + 0.5) / SUB - 0.5
     height, width = shape
@@ -385,7 +405,7 @@ def _rays(bend: _Distortion, left: int, top: int, shape: tuple[int, int]) -> np.
 def _add_sphere(
     light: np.ndarray,
     hit: np.ndarray,
-    bend: _Distortion,
+    bend: Distortion,
     centre: np.ndarray,
     disc: tuple[np.ndarray, float],
 ) -> None:
@@ -405,7 +425,7 @@ def _add_sphere(
 
 
 def _perforated(
-    bend: _Distortion, rotation: np.ndarray, source: np.ndarray, target: Target
+    bend: Distortion, rotation: np.ndarray, source: np.ndarray, target: Target
 ) -> np.ndarray:
     """Light (h, w) behind a sheet of steel with holes, the mean over the points of pixels."""
     holes = cKDTree(target.xyz[:, :2])
@@ -448,7 +468,7 @@ def _plates(row: Row, rng: np.random.Generator) -> Iterator[tuple[np.ndarray, np
 
 
 def _plate(
-    bend: _Distortion,
+    bend: Distortion,
     rotation: np.ndarray,
     source: np.ndarray,
     plate: tuple[np.ndarray, np.ndarray],

@@ -61,7 +61,7 @@ from fluoro_calib_ros.nodes.runtime.topics import OBSERVATION_DEPTH, latched_qos
 ROOT = Path(__file__).parents[2]
 BAGS = ROOT / 'bags'
 DEADLINE = 60.0  # seconds; nothing takes a tenth of it on an idle machine
-JOB_DEADLINE = 240.0  # of a self-calibration, which has a low priority
+JOB_DEADLINE = 240.0  # of self-calibrations and extractions, which have a low priority
 NAMES = ('a', 'b')
 SUCCEEDED = GoalStatus.STATUS_SUCCEEDED
 CANCELED = GoalStatus.STATUS_CANCELED
@@ -384,7 +384,7 @@ class Client(Node):
             self.wait_until(lambda: number - came() < ahead, what='the nodes to keep up')
             self.publish_message(name, message)
 
-    def result_of(self, future, seconds=DEADLINE, what='an answer'):
+    def result_of(self, future, seconds=JOB_DEADLINE, what='an answer'):
         """Return the result of a future."""
         self.wait_until(future.done, seconds, what)
         return future.result()

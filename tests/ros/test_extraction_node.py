@@ -11,7 +11,7 @@ from fluoro_calib_msgs.srv import Calibrate
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rclpy.serialization import serialize_message
-from ros_graph import NAMES
+from ros_graph import JOB_DEADLINE, NAMES
 from sensor_msgs.msg import CompressedImage, Image
 
 from benchmarks.bead_images import bead_image
@@ -130,7 +130,9 @@ def observed(rig):
         for name in NAMES:
             rig.images[name].publish(raw(picture(name, number), number, name))
     found = {name: rig.messages[f'{name}/target_observations'] for name in NAMES}
-    rig.wait_until(lambda: all(len(f) == POSES for f in found.values()), what='observations')
+    rig.wait_until(
+        lambda: all(len(f) == POSES for f in found.values()), JOB_DEADLINE, 'observations'
+    )
     return {name: {m.frame_number: m for m in messages} for name, messages in found.items()}
 
 
@@ -232,7 +234,7 @@ def test_bad_images_are_said_and_counted_and_the_node_lives(rig, observed):
     found = rig.messages['a/target_observations']
     count = len(found)
     rig.images['a'].publish(raw(picture('a', 2), 200))
-    rig.wait_until(lambda: len(found) > count, what='the next good image')
+    rig.wait_until(lambda: len(found) > count, JOB_DEADLINE, 'the next good image')
     assert len(found) == count + 1 and len(found[-1].target_id) > 40
 
 
@@ -251,7 +253,7 @@ def test_overlay_is_drawn_for_subscribers_only(rig, observed):
     def came():
         count = len(found)
         rig.images['a'].publish(raw(picture('a', 3), next(numbers)))
-        rig.wait_until(lambda: len(found) > count, what='observations')
+        rig.wait_until(lambda: len(found) > count, JOB_DEADLINE, 'observations')
         return pictures
 
     rig.wait_until(came, what='the overlay: the node has found its reader')
@@ -285,7 +287,7 @@ def test_inactive_node_receives_no_images_and_starts_anew(rig, observed):
     found = rig.messages['a/target_observations']
     found.clear()
     rig.images['a'].publish(raw(picture('a', 4, dtype=np.uint16), 2000))
-    rig.wait_until(lambda: found, what='observations')
+    rig.wait_until(lambda: found, JOB_DEADLINE, 'observations')
     assert found[0].frame_number == 1
     assert rig.node.end() == 0 and 'Traceback' not in rig.node.log
 
@@ -303,7 +305,7 @@ def test_markers_of_the_simulator_are_followed(graph):
     simulator = graph.start(
         'simulator_node', {**only_a, **scene, 'wait_for_readers': 1}, wait=False
     )
-    graph.client.wait_until(lambda: found, what='the markers')
+    graph.client.wait_until(lambda: found, JOB_DEADLINE, 'the markers')
     assert simulator.wait() == 0, simulator.log
     true = dict(zip(tracking.marker_id.tolist(), tracking.frames['a'][0].uv))
     assert set(found[0].target_id) <= set(true) and len(found[0].target_id) > 20
@@ -323,7 +325,7 @@ def test_markers_are_followed_in_both_views_together(graph, calibrated):
     node = graph.start('extraction_node', together)
     scene = {'scene': 'markers', 'images': 'clean', 'rate': rate, 'frames': 2, 'noise': 0.0}
     simulator = graph.start('simulator_node', {**scene, 'wait_for_readers': 1}, wait=False)
-    graph.client.wait_until(lambda: all(found.values()), what='the markers of both views')
+    graph.client.wait_until(lambda: all(found.values()), JOB_DEADLINE, 'the markers of both views')
     assert simulator.wait() == 0, simulator.log
     for name in NAMES:
         true = dict(zip(tracking.marker_id.tolist(), tracking.frames[name][0].uv))
@@ -349,7 +351,7 @@ def test_bodies_give_the_ids_of_the_first_markers(graph, calibrated):
     node = graph.start('extraction_node', together)
     scene = {'scene': 'markers', 'images': 'clean', 'rate': rate, 'frames': 2, 'noise': 0.0}
     simulator = graph.start('simulator_node', {**scene, 'wait_for_readers': 1}, wait=False)
-    graph.client.wait_until(lambda: all(found.values()), what='the markers of both views')
+    graph.client.wait_until(lambda: all(found.values()), JOB_DEADLINE, 'the markers of both views')
     assert simulator.wait() == 0, simulator.log
     for name in NAMES:
         true = dict(zip(tracking.marker_id.tolist(), tracking.frames[name][0].uv))

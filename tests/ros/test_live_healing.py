@@ -122,7 +122,7 @@ class Rig:
         answer = self.client.heal(**fields).get_result_async()
         self.client.wait_until(lambda: self.client.feedback or answer.done(), what='the start')
         self.publish()
-        return self.client.result_of(answer, JOB_DEADLINE)
+        return self.client.result_of(answer)
 
     def stream(self, of_rig=None):
         """Yield pairs of frames of a knee that walks on and on, of the last rig of a list."""
@@ -386,7 +386,7 @@ def test_healed_rig_accepted_by_the_parameter_outlives_the_node(rig, graph, lear
     node = graph.calibration_node(learned, heal_accept=True)
     answer = client.heal(seconds=1.0).get_result_async()
     client.stream(rig.stream(), RATE_HZ)
-    result = client.result_of(answer, JOB_DEADLINE).result
+    result = client.result_of(answer).result
     client.end_stream()
     assert result.verdict == 'pass' and 'accepted and in use' in result.message
     client.wait_until(
@@ -418,7 +418,7 @@ def test_healthy_rig_stays_where_it_is_and_claims_what_is_not_seen(rig, graph, l
     graph.calibration_node(learned, heal_accept=True)
     answer = client.heal(seconds=1.0).get_result_async()
     client.stream(stream_of(rig, virtual_rig(SEED), rig.motion), RATE_HZ)
-    result = client.result_of(answer, JOB_DEADLINE).result
+    result = client.result_of(answer).result
     client.end_stream()
     assert result.success and not result.findings and not result.fluoroscope, result.message
     after = load_orientation(orientation_path(learned))
@@ -440,7 +440,7 @@ def test_rig_that_moves_while_it_is_recorded_is_not_accepted(rig, graph, learned
         stream_of(rig, bumped_rig(), rig.motion), stream_of(rig, virtual_rig(SEED), rig.motion)
     )
     client.stream((pair[row * BLOCKS // EXPOSURES % 2] for row, pair in enumerate(rigs)), RATE_HZ)
-    result = client.result_of(answer, JOB_DEADLINE).result
+    result = client.result_of(answer).result
     client.end_stream()
     assert result.success and result.verdict == 'fail' and result.checks, result.message
     refused = client.call(Reset, 'accept_healing')
@@ -456,7 +456,7 @@ def test_too_few_exposures_are_refused(rig, graph, learned):
     answer = client.heal(seconds=1.0).get_result_async()
     few = itertools.islice(stream_of(rig, bumped_rig(), rig.motion), 8)
     client.stream(few, RATE_HZ)
-    refused = client.result_of(answer, JOB_DEADLINE)
+    refused = client.result_of(answer)
     client.end_stream()
     assert refused.status == ABORTED
     assert refused.result.message.endswith('two views, 10 are needed')

@@ -27,13 +27,12 @@ from ..findings import Finding, Kind, Place, Severity, sentences
 from ..images.corrector import iterated
 from ..images.overlay import BodyView, draw_bodies
 from ..io.access import PathLike, write_text
-from ..io.bodies import JointEntry, joint_table, shape_table
+from ..io.bodies import JointEntry, joint_table, motion_table, pose_table, shape_table
 from ..io.csv_table import Table, dataframe_of
 from ..io.folder import FolderKind, replaced_folder
 from ..io.formats.bodies import write_joint_motion
 from ..io.image_reading import ImageSource
 from ..io.image_writing import write_video
-from ..io.poses import motion_table, pose_table
 from ..options import option
 from ..photogrammetry.collinearity import project
 from ..photogrammetry.noise import ObservedScatter

@@ -43,8 +43,7 @@ from ..io.calibration import ORIENTATION_NAME as ORIENTATION
 from ..io.calibration import SUFFIX, save_calibration, save_orientation
 from ..io.documents import write_json
 from ..io.folder import FolderKind, replaced_folder
-from ..io.learned_shapes import LEARNED_SHAPES, write_learned_shapes
-from ..io.versions import HEALING
+from ..io.versions import HEALING, LEARNED_SHAPES, write_learned_shapes
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.intersection import OK, OUTSIDE, Intersector
 from ..reconstruction.reconstruct import orientation_of_recorded, pair_recording

@@ -20,6 +20,7 @@ from ..exposures.phantom import Phantom
 from ..images.codec import encode
 from ..io.access import PathLike, make_folder, write_bytes, write_text
 from ..io.bags.writer import BagWriter
+from ..io.bodies import COLUMNS as POSE_COLUMNS
 from ..io.bodies import JOINT_COLUMNS as JOINT_COLUMNS
 from ..io.bodies import joint_definition, write_bodies
 from ..io.csv_table import write_table
@@ -28,7 +29,6 @@ from ..io.folder import FolderKind, replaced_folder
 from ..io.observations import COLUMNS as OBSERVATION_COLUMNS
 from ..io.observations import write_observations_csv
 from ..io.phantom import write_phantom
-from ..io.poses import COLUMNS as POSE_COLUMNS
 from ..options import option, validate_options
 from ..photogrammetry.rotations import quaternion_from_matrix
 from ..processes import OF_STREAM, WorkerProcess

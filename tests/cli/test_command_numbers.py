@@ -389,7 +389,7 @@ def test_reconstruct_says_by_how_much_its_limit_was_widened(
         plot=None,
     )
     monkeypatch.setattr('fluoro_calib_ros.jobs.reconstruction.reconstruct', lambda *_: made)
-    monkeypatch.setattr('fluoro_calib_ros.io.poses.write_reconstruction', lambda *_: None)
+    monkeypatch.setattr('fluoro_calib_ros.io.bodies.write_reconstruction', lambda *_: None)
     monkeypatch.setattr('fluoro_calib_ros.io.folder.check_output_file', lambda *_: None)
     recording = Fake(notes=(), frames={}, names=Names())
     monkeypatch.setattr(

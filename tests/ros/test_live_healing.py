@@ -19,7 +19,7 @@ from test_web import page
 from fluoro_calib_ros.checks.rig_watch import RigDriftWatch
 from fluoro_calib_ros.io.bodies import write_bodies
 from fluoro_calib_ros.io.calibration import load_calibrations, load_orientation, orientation_path
-from fluoro_calib_ros.io.learned_shapes import LEARNED_SHAPES, read_learned_shapes
+from fluoro_calib_ros.io.versions import LEARNED_SHAPES, read_learned_shapes
 from fluoro_calib_ros.jobs.healing import BLOCKS
 from fluoro_calib_ros.jobs.reconstruction import ReconstructionOptions
 from fluoro_calib_ros.jobs.simulation import write_bag

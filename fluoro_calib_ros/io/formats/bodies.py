@@ -30,8 +30,8 @@ from ...errors import DataError
 from ...exposures.phantom import first_repeated
 from ...photogrammetry.rotations import matrix_from_quaternion, quaternion_from_matrix
 from ..access import PathLike, atomic_file
+from ..bodies import COLUMNS as POSE_COLUMNS
 from ..csv_table import as_text, read_all
-from ..poses import COLUMNS as POSE_COLUMNS
 from .content import (
     Bodies,
     Content,

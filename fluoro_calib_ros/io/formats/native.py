@@ -22,14 +22,14 @@ from ...errors import DataError, ErrorsAt
 from ...exposures.names import Names, without_trivial
 from ...photogrammetry.known_orientation import KnownOrientation
 from ..access import PathLike, read_text, write_text
+from ..bodies import NAME_COLUMN
+from ..bodies import POINT_COLUMNS as POINTS
 from ..csv_table import read_all, write_table
 from ..documents import read_yaml
 from ..observations import COLUMNS as OBSERVATIONS
 from ..observations import corrections_of, read_named_observations, write_observations_csv
 from ..phantom import COLUMNS as PHANTOM
 from ..phantom import read_named_phantom, write_phantom
-from ..poses import NAME_COLUMN
-from ..poses import POINT_COLUMNS as POINTS
 from .content import (
     Camera,
     Content,

@@ -59,8 +59,7 @@ from .jobs.sources import (
     read_survey,
 )
 from .jobs.survey import SurveyOutcome, SurveyRequest, survey
-from .photogrammetry.known_orientation import KnownOrientation
-from .photogrammetry.rig_orientation import RigOrientation
+from .photogrammetry.rig_orientation import KnownOrientation, RigOrientation
 
 __all__ = [
     'BodiesOptions',

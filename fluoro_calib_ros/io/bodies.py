@@ -38,13 +38,14 @@ from numpy.typing import NDArray
 from ..bodies.anatomical_frames import (
     BODY_FRAME,
     AnatomicalFrame,
+    Convention,
+    convention,
     frame_of_axes,
     frame_of_landmarks,
     frame_of_quaternion,
 )
 from ..bodies.body import STATUS_NAMES as POSE_STATUS
 from ..bodies.body import Body, BodyPoses, check_bodies
-from ..bodies.joint_conventions import Convention, convention
 from ..bodies.joints import STATUS_NAMES, Joint, JointMotion, check_joints
 from ..bodies.tracking import TrackedExposure
 from ..errors import DataError, ErrorsAt

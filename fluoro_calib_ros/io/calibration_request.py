@@ -86,7 +86,7 @@ def read_request(
     where: object = 'the source'
     if frames is None:
         where = directory / OBSERVATIONS
-        frames = _read_frames(directory / OBSERVATIONS, calibrations)
+        frames = read_calibrated_frames(directory, calibrations)
     if phantom is None:
         phantom = read_phantom(_require_file(directory / PHANTOM, '--phantom'))
     for name, calibration in calibrations.items():
@@ -127,8 +127,9 @@ def _require_file(path: Path, option: str = '') -> Path:
     return path
 
 
-def _read_frames(path: Path, calibrations: Calibrations) -> dict[str, list[Frame]]:
-    """Read the frames of the calibrated fluoroscopes, with the image sizes of the calibrations."""
+def read_calibrated_frames(directory: Path, calibrations: Calibrations) -> dict[str, list[Frame]]:
+    """Read the frames that the calibrations in a folder were made from. Raises DataError."""
+    path = directory / OBSERVATIONS
     widths, heights = zip(*(c.image_size for c in calibrations.values()))
     found = read_observations_csv(_require_file(path, '--source'), (max(widths), max(heights)))
     frames: dict[str, list[Frame]] = {}

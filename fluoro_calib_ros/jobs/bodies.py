@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -81,15 +82,8 @@ def write_films(
         first = next(frames, None)
         if first is None:
             raise DataError(f'{source}: there is no image of an exposure with poses')
-        images = ImageSource('video', 0, _chained(first, frames), FILM_HZ)
+        images = ImageSource('video', 0, chain([first], frames), FILM_HZ)
         write_video(folder / f'film_{name}.mp4', images, lambda done, total: None)
-
-
-def _chained(
-    first: tuple[str, np.ndarray], rest: Iterator[tuple[str, np.ndarray]]
-) -> Iterator[tuple[str, np.ndarray]]:
-    yield first
-    yield from rest
 
 
 def _frames(

@@ -26,7 +26,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 
-from ..checks.comparison import Comparison
+from ..checks.comparison import Comparison, cell_centres
 from ..correction.base import Correction, CorrectionModel
 from ..exposures.phantom import Drawing
 from .tables import model_text
@@ -249,12 +249,8 @@ def _field_on_grid(
     model: CorrectionModel, image_size: Sequence[int], cells: int
 ) -> tuple[list[np.ndarray], Correction]:
     """Columns and rows of a regular grid over the image [px], and the Correction at its points."""
-    step = max(image_size) / cells
-    centres = [
-        -0.5 + step / 2 + step * np.arange(max(1, round(size / step))) for size in image_size
-    ]
-    u, v = np.meshgrid(*centres)
-    return centres, model.evaluate(np.column_stack([u.ravel(), v.ravel()]))
+    axes, centres = cell_centres(image_size, cells)
+    return axes, model.evaluate(centres)
 
 
 def _draw_image_frame(axes: Axes, image_size: Sequence[int]) -> None:

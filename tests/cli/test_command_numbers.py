@@ -608,9 +608,9 @@ def test_bag_commands_become_nodes_with_their_parameters(monkeypatch):
         source=Path('/x'),
         rate=2.0,
         loop=True,
-        start_offset=3,
+        start_offset=3.0,
         start_paused=False,
-        clock=0,
+        clock=0.0,
         topics=None,
     )
     bag._play(arguments)

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from rigs import kinds, refused, true_calibrations, true_orientation
 
-from fluoro_calib_ros.bodies.body import Body, declared_bodies
-from fluoro_calib_ros.bodies.rigid import fitted_pose
+from fluoro_calib_ros.bodies.body import Body, declared_bodies, fitted_pose
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.findings import Kind
 from fluoro_calib_ros.io.versions import (

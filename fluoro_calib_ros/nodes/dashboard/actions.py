@@ -16,8 +16,7 @@ from rclpy.action import ActionClient
 from rclpy.node import Node
 from rclpy.task import Future
 
-from ..messages.healing import healing_text
-from ..messages.self_calibration import feedback_text
+from ..messages.self_calibration import feedback_text, healing_text
 from .state import CALIBRATE, CALIBRATE_FAST, HEAL, Diagnosis
 
 

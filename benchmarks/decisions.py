@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fluoro_calib_ros.checks.doubtful import doubtful_observations
+from fluoro_calib_ros.checks.residual_tests import doubtful_observations
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.options import CalibrationRequest
 from fluoro_calib_ros.exposures.decisions import Doubtful, PointDecision, decided

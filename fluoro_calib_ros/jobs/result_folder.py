@@ -11,7 +11,7 @@ from typing import Any
 
 from ..bodies.shapes import LearnedShapes
 from ..checks.check import Check
-from ..checks.doubtful import doubtful_observations
+from ..checks.residual_tests import doubtful_observations
 from ..correction.fluoroscope_calibration import Calibrations
 from ..errors import DataError
 from ..estimation.result import CalibrationResult

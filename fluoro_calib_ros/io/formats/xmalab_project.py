@@ -255,8 +255,8 @@ class _Observations(_Part):
                 seen = ~np.isnan(uv).any(axis=1)
                 if seen.any():
                     where = f'{self._path}, trial {self._settings.trial}, frame {number}'
-                    points = (target_id[seen], uv[seen])
-                    frame = frame_of(where, name, number, *points, size)
+                    own, own_uv = target_id[seen], uv[seen]
+                    frame = frame_of(where, name, number, own, own_uv, image_size=size)
                     frames.setdefault(name, []).append(frame)
         return frames, named_targets(ids)
 

@@ -23,8 +23,7 @@ from fluoro_calib_ros.estimation.calibrate import calibrate
 from fluoro_calib_ros.estimation.initial_network import measured_network
 from fluoro_calib_ros.estimation.options import CalibrationOptions, model_choices
 from fluoro_calib_ros.exposures.frame import Frame
-from fluoro_calib_ros.simulation.exposures import Detection, simulate_exposures
-from fluoro_calib_ros.simulation.rig import VirtualRig, virtual_rig
+from fluoro_calib_ros.simulation.rig import Detection, VirtualRig, simulate_exposures, virtual_rig
 from tools.sections import write_section
 
 from . import adjustments, profiling, scaling

@@ -13,8 +13,7 @@ from fluoro_calib_ros.photogrammetry.network import Network
 from fluoro_calib_ros.photogrammetry.noise import Noise
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.photogrammetry.unknowns import Parameters
-from fluoro_calib_ros.simulation.exposures import phantom_poses
-from fluoro_calib_ros.simulation.rig import virtual_rig
+from fluoro_calib_ros.simulation.rig import phantom_poses, virtual_rig
 
 from .peers import ColmapAdjustment, with_datum
 from .timing import timed

@@ -132,9 +132,9 @@ def row_of(name: str, seed: int) -> str:
         folder = Path(text)
         rig.write(folder, row, rng)
         began = time.monotonic()
-        command = [sys.executable, '-m', 'fluoro_calib_ros.cli', 'calibrate', folder / 'images']
-        command += ['--phantom', folder / 'phantom.csv', '--fluoroscopes', 'a', '--json']
-        command += ['--out', folder / 'out']
+        command: list[str | Path] = [sys.executable, '-m', 'fluoro_calib_ros.cli', 'calibrate']
+        command += [folder / 'images', '--phantom', folder / 'phantom.csv', '--json']
+        command += ['--fluoroscopes', 'a', '--out', folder / 'out']
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         seconds = time.monotonic() - began
         if not done.stdout.startswith('{'):

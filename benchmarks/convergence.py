@@ -22,8 +22,7 @@ from benchmarks.precision import QUANTITIES, errors_of
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.calibrate import calibrate
 from fluoro_calib_ros.estimation.options import CalibrationOptions
-from fluoro_calib_ros.simulation.exposures import Detection, simulate_exposures
-from fluoro_calib_ros.simulation.rig import virtual_rig
+from fluoro_calib_ros.simulation.rig import Detection, simulate_exposures, virtual_rig
 from tools.sections import write_section
 
 # Mean normalised squared error above which a result is wrong. A single coordinate exceeds 5

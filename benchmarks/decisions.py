@@ -21,14 +21,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fluoro_calib_ros.checks.doubtful import doubtful_observations
+from fluoro_calib_ros.checks.residual_tests import doubtful_observations
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.options import CalibrationRequest
 from fluoro_calib_ros.exposures.decisions import Doubtful, PointDecision, decided
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.jobs.calibration import run_calibration
-from fluoro_calib_ros.simulation.exposures import Detection, simulate_exposures
-from fluoro_calib_ros.simulation.rig import VirtualRig, virtual_rig
+from fluoro_calib_ros.simulation.rig import Detection, VirtualRig, simulate_exposures, virtual_rig
 from tools.sections import show_section
 
 from .survey import Case, out_of_sample

@@ -45,8 +45,7 @@ from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.reconstruction.epipolar import EpipolarGeometry
 from fluoro_calib_ros.reconstruction.intersection import Intersector
 from fluoro_calib_ros.reconstruction.reconstruct import IntersectedViews, MatchedViews
-from fluoro_calib_ros.simulation.exposures import simulate_exposures
-from fluoro_calib_ros.simulation.rig import virtual_rig
+from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
 
 from .timing import table
 

@@ -31,8 +31,7 @@ from fluoro_calib_msgs.msg import TargetObservations
 from fluoro_calib_ros.demo.assessment import isolate_ros_graph
 from fluoro_calib_ros.nodes.messages.observations import message_from_frame
 from fluoro_calib_ros.nodes.runtime.topics import OBSERVATION_DEPTH, observations_qos
-from fluoro_calib_ros.simulation.exposures import simulate_tracking
-from fluoro_calib_ros.simulation.rig import virtual_rig
+from fluoro_calib_ros.simulation.rig import simulate_tracking, virtual_rig
 
 from .online import NAMES, Reader, _command, rig_of_the_simulator
 

@@ -37,13 +37,18 @@ from fluoro_calib_ros.estimation.result import CalibrationResult
 from fluoro_calib_ros.exposures.frame import Frame, points_on_image
 from fluoro_calib_ros.photogrammetry.adjustment import SolverOptions, adjust
 from fluoro_calib_ros.photogrammetry.noise import Noise
-from fluoro_calib_ros.photogrammetry.noise_estimation import adjust_and_estimate_noise
+from fluoro_calib_ros.photogrammetry.outliers import adjust_and_estimate_noise
 from fluoro_calib_ros.photogrammetry.precision import geometric_redundancy
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.photogrammetry.unknowns import Parameters
 from fluoro_calib_ros.report.report_figures import relative_costs
-from fluoro_calib_ros.simulation.exposures import Detection, SimulatedExposures, simulate_exposures
-from fluoro_calib_ros.simulation.rig import DistortionField, virtual_rig
+from fluoro_calib_ros.simulation.rig import (
+    Detection,
+    DistortionField,
+    SimulatedExposures,
+    simulate_exposures,
+    virtual_rig,
+)
 
 NOISE_PX = 0.25
 BEFORE = 'before'

@@ -38,9 +38,14 @@ from fluoro_calib_ros.images.matching import PhantomModel, match
 from fluoro_calib_ros.images.overlay import draw_overlay
 from fluoro_calib_ros.images.view import Lens
 from fluoro_calib_ros.jobs.calibration import adjust, run_calibration
-from fluoro_calib_ros.simulation.exposures import phantom_poses
 from fluoro_calib_ros.simulation.radiographs import CLEAN, HARD, RadiographSettings, Radiography
-from fluoro_calib_ros.simulation.rig import Pose, VirtualFluoroscope, VirtualRig, virtual_rig
+from fluoro_calib_ros.simulation.rig import (
+    Pose,
+    VirtualFluoroscope,
+    VirtualRig,
+    phantom_poses,
+    virtual_rig,
+)
 
 FIRST_RIG = 1000  # seeds below are those of development and tests
 IMAGES_OF_A_RIG = 5

@@ -85,7 +85,6 @@ from fluoro_calib_ros.nodes.runtime.topics import (
 )
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.processes import one_core
-from fluoro_calib_ros.simulation.exposures import phantom_poses, simulate_exposures
 from fluoro_calib_ros.simulation.marker_images import (
     FIRST_ID,
     MARKER_SETTINGS,
@@ -93,7 +92,13 @@ from fluoro_calib_ros.simulation.marker_images import (
     MarkerSequence,
     MovingMarkers,
 )
-from fluoro_calib_ros.simulation.rig import Pose, VirtualRig, virtual_rig
+from fluoro_calib_ros.simulation.rig import (
+    Pose,
+    VirtualRig,
+    phantom_poses,
+    simulate_exposures,
+    virtual_rig,
+)
 
 NAMES = ('a', 'b')
 SEED = 31

@@ -36,8 +36,7 @@ from fluoro_calib_ros.nodes.runtime.topics import (
     wait_until_acknowledged,
 )
 from fluoro_calib_ros.options import option
-from fluoro_calib_ros.simulation.exposures import simulate_exposures
-from fluoro_calib_ros.simulation.rig import virtual_rig
+from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
 
 from .relay import all_fatal
 

@@ -40,8 +40,7 @@ from fluoro_calib_ros.correction.fluoroscope_calibration import FluoroscopeCalib
 from fluoro_calib_ros.estimation.calibrate import calibrate
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.images.corrector import ImageCorrector
-from fluoro_calib_ros.simulation.exposures import simulate_exposures
-from fluoro_calib_ros.simulation.rig import virtual_rig
+from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
 from tools.sections import show_section
 
 from .timing import table, timed

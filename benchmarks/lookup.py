@@ -25,8 +25,7 @@ from fluoro_calib_ros.correction.grid import CorrectionGrid
 from fluoro_calib_ros.correction.registry import selectable_models
 from fluoro_calib_ros.estimation.calibrate import calibrate
 from fluoro_calib_ros.estimation.options import CalibrationOptions
-from fluoro_calib_ros.simulation.exposures import Detection, simulate_exposures
-from fluoro_calib_ros.simulation.rig import virtual_rig
+from fluoro_calib_ros.simulation.rig import Detection, simulate_exposures, virtual_rig
 
 from .timing import section, timed
 

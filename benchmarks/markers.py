@@ -42,7 +42,6 @@ from fluoro_calib_ros.images.marker_pair import MarkerPair
 from fluoro_calib_ros.images.markers import FirstMarkers, MarkerFrame, MarkerOptions, MarkerTracker
 from fluoro_calib_ros.images.overlay import draw_markers
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
-from fluoro_calib_ros.simulation.exposures import simulate_exposures
 from fluoro_calib_ros.simulation.marker_images import (
     HARD_MARKER_SETTINGS,
     MARKER_SETTINGS,
@@ -53,7 +52,7 @@ from fluoro_calib_ros.simulation.marker_images import (
     MovingMarkers,
 )
 from fluoro_calib_ros.simulation.radiographs import RadiographSettings
-from fluoro_calib_ros.simulation.rig import VirtualRig, virtual_rig
+from fluoro_calib_ros.simulation.rig import VirtualRig, simulate_exposures, virtual_rig
 
 FIRST_RIG = 2000  # seeds below are those of development and tests
 FRAMES_OF_A_SEQUENCE = 250

@@ -28,8 +28,13 @@ from fluoro_calib_ros.estimation.estimator import gauge_basis, gauge_coefficient
 from fluoro_calib_ros.estimation.options import CalibrationOptions
 from fluoro_calib_ros.estimation.result import CalibrationResult
 from fluoro_calib_ros.exposures.frame import Frame
-from fluoro_calib_ros.simulation.exposures import SimulatedExposures, simulate_exposures
-from fluoro_calib_ros.simulation.rig import StreamStart, VirtualRig, virtual_rig
+from fluoro_calib_ros.simulation.rig import (
+    SimulatedExposures,
+    StreamStart,
+    VirtualRig,
+    simulate_exposures,
+    virtual_rig,
+)
 from tools.sections import write_section
 
 from .timing import section, timed

@@ -61,8 +61,7 @@ from fluoro_calib_ros.nodes.messages.rig_orientation import message_from_orienta
 from fluoro_calib_ros.nodes.runtime.streams import FaultHandlers, StreamReader
 from fluoro_calib_ros.nodes.runtime.topics import latched_qos, observations_qos
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation as Orientation
-from fluoro_calib_ros.simulation.exposures import simulate_exposures, simulate_tracking
-from fluoro_calib_ros.simulation.rig import virtual_rig
+from fluoro_calib_ros.simulation.rig import simulate_exposures, simulate_tracking, virtual_rig
 from tools.sections import show_section
 
 from .timing import table

@@ -27,8 +27,14 @@ from fluoro_calib_ros.estimation.estimator import gauge_coefficients
 from fluoro_calib_ros.estimation.options import CalibrationOptions
 from fluoro_calib_ros.estimation.result import CalibrationResult
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_quaternion, matrix_from_vector
-from fluoro_calib_ros.simulation.exposures import Detection, SimulatedExposures, simulate_exposures
-from fluoro_calib_ros.simulation.rig import VirtualFluoroscope, VirtualRig, virtual_rig
+from fluoro_calib_ros.simulation.rig import (
+    Detection,
+    SimulatedExposures,
+    VirtualFluoroscope,
+    VirtualRig,
+    simulate_exposures,
+    virtual_rig,
+)
 from tools.sections import write_section
 
 QUANTITIES = ('xp', 'yp', 'c', 'T', 'q', 'object points')

@@ -30,13 +30,14 @@ from fluoro_calib_ros.estimation.rig_orientation import (
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.reconstruction.intersection import Intersector
 from fluoro_calib_ros.reconstruction.reconstruct import ReconstructedFrame, reconstruct_recording
-from fluoro_calib_ros.simulation.exposures import (
+from fluoro_calib_ros.simulation.rig import (
     Detection,
+    VirtualRig,
     detect_beads,
     simulate_exposures,
     simulate_tracking,
+    virtual_rig,
 )
-from fluoro_calib_ros.simulation.rig import VirtualRig, virtual_rig
 
 EXPOSURES = 15
 NOISE_PX = 0.25

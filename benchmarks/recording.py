@@ -36,8 +36,7 @@ from sensor_msgs.msg import Image
 from fluoro_calib_ros.demo.assessment import isolate_ros_graph
 from fluoro_calib_ros.io.bags.reader import iterate_messages
 from fluoro_calib_ros.nodes.messages.observations import message_from_frame
-from fluoro_calib_ros.simulation.exposures import simulate_tracking
-from fluoro_calib_ros.simulation.rig import virtual_rig
+from fluoro_calib_ros.simulation.rig import simulate_tracking, virtual_rig
 
 from .timing import table
 

@@ -20,8 +20,13 @@ import numpy as np
 from fluoro_calib_ros.estimation.calibrate import adjust_with_calibrations, calibrate
 from fluoro_calib_ros.estimation.options import CalibrationOptions
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
-from fluoro_calib_ros.simulation.exposures import SimulatedExposures, simulate_exposures
-from fluoro_calib_ros.simulation.rig import StreamStart, VirtualRig, virtual_rig
+from fluoro_calib_ros.simulation.rig import (
+    SimulatedExposures,
+    StreamStart,
+    VirtualRig,
+    simulate_exposures,
+    virtual_rig,
+)
 
 METHODS = {
     'separate': (False, 'none'),

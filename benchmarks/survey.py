@@ -28,9 +28,8 @@ from fluoro_calib_ros.findings import Kind
 from fluoro_calib_ros.jobs.calibration import run_calibration
 from fluoro_calib_ros.jobs.reconstruction import ReconstructionOptions, reconstruct
 from fluoro_calib_ros.jobs.survey import SurveyOutcome, SurveyRequest, survey
-from fluoro_calib_ros.simulation.exposures import Detection, simulate_exposures
 from fluoro_calib_ros.simulation.rig import BEADS as CUBE_BEADS
-from fluoro_calib_ros.simulation.rig import VirtualRig, virtual_rig
+from fluoro_calib_ros.simulation.rig import Detection, VirtualRig, simulate_exposures, virtual_rig
 from tools.sections import show_section
 
 GROWN = 1.003

@@ -31,10 +31,17 @@ from fluoro_calib_ros.estimation.initial_network import (
 from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
 from fluoro_calib_ros.exposures.frame import Frame, MovingPoints, points_on_image
 from fluoro_calib_ros.exposures.phantom import Phantom
-from fluoro_calib_ros.photogrammetry.known_orientation import KnownOrientation
+from fluoro_calib_ros.photogrammetry.rig_orientation import KnownOrientation
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
-from fluoro_calib_ros.simulation.exposures import Detection, detect_beads, simulate_exposures
-from fluoro_calib_ros.simulation.rig import Pose, VirtualFluoroscope, VirtualRig, virtual_rig
+from fluoro_calib_ros.simulation.rig import (
+    Detection,
+    Pose,
+    VirtualFluoroscope,
+    VirtualRig,
+    detect_beads,
+    simulate_exposures,
+    virtual_rig,
+)
 
 GRID_IDS = 1000  # first id of the grid
 TESTED = 40

@@ -40,8 +40,7 @@ from fluoro_calib_ros.correction.fluoroscope_calibration import FluoroscopeCalib
 from fluoro_calib_ros.estimation.calibrate import calibrate
 from fluoro_calib_ros.images.angle_maps import AngleMaps
 from fluoro_calib_ros.jobs.image_correction import ImageCorrectionRequest, run_image_correction
-from fluoro_calib_ros.simulation.exposures import simulate_exposures
-from fluoro_calib_ros.simulation.rig import virtual_rig
+from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
 from tools.sections import show_section
 
 from .images import WIDE, _cpu, _stream_figures, wait

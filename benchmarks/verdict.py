@@ -26,8 +26,7 @@ from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationR
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.report.tables import markdown_table
-from fluoro_calib_ros.simulation.exposures import simulate_exposures
-from fluoro_calib_ros.simulation.rig import virtual_rig
+from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
 from tools.sections import write_section
 
 FIRST_SEED = 5018  # rigs that were not used to set a limit

@@ -32,13 +32,12 @@ from .exposures.names import Names
 from .exposures.phantom import Phantom
 from .findings import Finding, Kind, Severity
 from .io.access import PathLike
-from .io.bodies import JointEntry, read_bodies, read_joints, write_bodies
+from .io.bodies import JointEntry, read_bodies, read_joints, write_bodies, write_reconstruction
 from .io.calibration import load_orientation, save_orientation
 from .io.calibration_request import read_request
 from .io.formats.content import FileSettings
-from .io.learned_shapes import read_learned_shapes, write_learned_shapes
 from .io.phantom import read_moving_points, read_phantom, write_phantom
-from .io.poses import write_reconstruction
+from .io.versions import read_learned_shapes, write_learned_shapes
 from .jobs.bodies import BodiesOptions, BodiesOutcome, save_bodies, track_bodies
 from .jobs.calibration import CalibrationOutcome, adjust, run_calibration
 from .jobs.conversion import ConversionRequest, convert
@@ -60,8 +59,7 @@ from .jobs.sources import (
     read_survey,
 )
 from .jobs.survey import SurveyOutcome, SurveyRequest, survey
-from .photogrammetry.known_orientation import KnownOrientation
-from .photogrammetry.rig_orientation import RigOrientation
+from .photogrammetry.rig_orientation import KnownOrientation, RigOrientation
 
 __all__ = [
     'BodiesOptions',

@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 
@@ -29,61 +30,6 @@ _REMEDIES = {
 
 # Modules that a user knows as a command.
 COMMANDS = {'watch': 'fluoro-calib watch'}
-
-
-def calibration_node() -> None:
-    """Run the calibration node."""
-    _run('nodes.calibration_node')
-
-
-def extraction_node() -> None:
-    """Run the extraction node."""
-    _run('nodes.extraction_node')
-
-
-def correction_node() -> None:
-    """Run the correction node."""
-    _run('nodes.correction_node')
-
-
-def reconstruction_node() -> None:
-    """Run the reconstruction node."""
-    _run('nodes.reconstruction_node')
-
-
-def image_node() -> None:
-    """Run the image node."""
-    _run('nodes.image_node')
-
-
-def player_node() -> None:
-    """Run the player."""
-    _run('nodes.player_node')
-
-
-def recorder_node() -> None:
-    """Run the recorder."""
-    _run('nodes.recorder_node')
-
-
-def simulator_node() -> None:
-    """Run the simulator."""
-    _run('nodes.simulator_node')
-
-
-def bridge_node() -> None:
-    """Run the bridge to Foxglove."""
-    _run('nodes.bridge_node')
-
-
-def watch() -> None:
-    """Run the dashboard."""
-    _run('nodes.dashboard.watch')
-
-
-def demo() -> None:
-    """Run the demo."""
-    _run('demo.demo')
 
 
 def missing_module_message(program: str, module: str) -> str:
@@ -114,3 +60,16 @@ def _run(module: str) -> None:
         without_ros = error.name.startswith(_MESSAGES) and find_spec('rclpy') is None
         sys.exit(missing_module_message(program, 'rclpy' if without_ros else error.name))
     sys.exit(main())
+
+
+calibration_node = partial(_run, 'nodes.calibration_node')
+extraction_node = partial(_run, 'nodes.extraction_node')
+correction_node = partial(_run, 'nodes.correction_node')
+reconstruction_node = partial(_run, 'nodes.reconstruction_node')
+image_node = partial(_run, 'nodes.image_node')
+player_node = partial(_run, 'nodes.player_node')
+recorder_node = partial(_run, 'nodes.recorder_node')
+simulator_node = partial(_run, 'nodes.simulator_node')
+bridge_node = partial(_run, 'nodes.bridge_node')
+watch = partial(_run, 'nodes.dashboard.watch')
+demo = partial(_run, 'demo.demo')

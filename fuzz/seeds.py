@@ -23,8 +23,7 @@ from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.io.bags.metadata import known_definition, message_from_frame
 from fluoro_calib_ros.io.bags.writer import BagWriter
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
-from fluoro_calib_ros.simulation.exposures import simulate_exposures
-from fluoro_calib_ros.simulation.rig import VirtualRig, virtual_rig
+from fluoro_calib_ros.simulation.rig import VirtualRig, simulate_exposures, virtual_rig
 
 SEPARATOR = b'\n--- '  # before the name of a member of a flattened archive
 TARGETS = 6

@@ -22,8 +22,12 @@ from fluoro_calib_ros.photogrammetry.network import Network
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.photogrammetry.unknowns import Parameters
-from fluoro_calib_ros.simulation.exposures import phantom_poses, simulate_exposures
-from fluoro_calib_ros.simulation.rig import looking_at_origin, virtual_rig
+from fluoro_calib_ros.simulation.rig import (
+    looking_at_origin,
+    phantom_poses,
+    simulate_exposures,
+    virtual_rig,
+)
 
 
 @contextlib.contextmanager

@@ -56,7 +56,7 @@ from fluoro_calib_ros.jobs import report as comparing
 from fluoro_calib_ros.jobs.calibration import _without_copies, _without_shared
 from fluoro_calib_ros.jobs.followers import MarkerFollower, _wrong_start
 from fluoro_calib_ros.jobs.sources import read_content
-from fluoro_calib_ros.photogrammetry.known_orientation import KnownOrientation
+from fluoro_calib_ros.photogrammetry.rig_orientation import KnownOrientation
 from fluoro_calib_ros.reconstruction import epipolar
 
 PHANTOM = rig().phantom

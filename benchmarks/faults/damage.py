@@ -23,8 +23,7 @@ from fluoro_calib_ros.io.bags.metadata import (
 from fluoro_calib_ros.io.bags.reader import iterate_messages
 from fluoro_calib_ros.io.bags.recording import Recording, RecordingOptions, TopicToRecord
 from fluoro_calib_ros.io.bags.salvage import recover_bag
-from fluoro_calib_ros.simulation.exposures import simulate_tracking
-from fluoro_calib_ros.simulation.rig import StreamStart, virtual_rig
+from fluoro_calib_ros.simulation.rig import StreamStart, simulate_tracking, virtual_rig
 
 from ..timing import section
 

@@ -21,8 +21,7 @@ from types import TracebackType
 from typing import Any
 
 from fluoro_calib_ros.jobs.simulation import write_bag
-from fluoro_calib_ros.simulation.exposures import simulate_tracking
-from fluoro_calib_ros.simulation.rig import StreamStart, virtual_rig
+from fluoro_calib_ros.simulation.rig import StreamStart, simulate_tracking, virtual_rig
 
 from ..timing import section
 from .network import Network, Quality

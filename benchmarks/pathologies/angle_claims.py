@@ -30,9 +30,8 @@ from fluoro_calib_ros.correction.calibration_record import HARMONICS
 from fluoro_calib_ros.correction.series import Functions
 from fluoro_calib_ros.correction.terms import CUBIC
 from fluoro_calib_ros.estimation import fluoroscope_terms
-from fluoro_calib_ros.estimation.angle_fit import field_of
 from fluoro_calib_ros.estimation.calibrate import calibrate
-from fluoro_calib_ros.estimation.exposure_terms import TERMS
+from fluoro_calib_ros.estimation.exposure_terms import TERMS, field_of
 from fluoro_calib_ros.estimation.options import CalibrationOptions
 
 from .angle_errors import errors_at_angles

@@ -22,8 +22,10 @@ from fluoro_calib_ros.correction.terms import CUBIC
 from fluoro_calib_ros.estimation.fixed_calibration import SolvedNetwork
 from fluoro_calib_ros.estimation.fluoroscope_terms import RINGS
 from fluoro_calib_ros.estimation.rounds import SelfCalibration
-from fluoro_calib_ros.photogrammetry.additional_parameters import AdditionalParameters
-from fluoro_calib_ros.photogrammetry.collinearity import project_with_jacobian
+from fluoro_calib_ros.photogrammetry.collinearity import (
+    AdditionalParameters,
+    project_with_jacobian,
+)
 
 JITTER = 1e-14  # px^2, keeps covariances positive definite
 EXTERIOR = 6

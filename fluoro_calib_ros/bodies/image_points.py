@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
 from ..reconstruction.intersection import OK, OUTSIDE
 from ..reconstruction.reconstruct import IntersectedViews
-from .rigid import by_pose
+from .body import by_pose
 
 
 @dataclass(frozen=True)

@@ -26,9 +26,8 @@ from scipy.spatial.transform import Rotation
 
 from ..errors import DataError
 from ..photogrammetry.rotations import cross_matrix, matrix_from_vector
-from .anatomical_frames import AXES, BODY_FRAME, AnatomicalFrame
+from .anatomical_frames import AXES, BODY_FRAME, AnatomicalFrame, Convention, convention
 from .body import BodyPoses, PoseStatus
-from .joint_conventions import Convention, convention
 
 # Distance from gimbal lock in standard deviations: the first angle has one of 0.2 rad (11 degrees)
 # there, and one of its errors in two million crosses the lock.
@@ -68,7 +67,7 @@ class Joint:
     name, proximal, distal : str
         Of the joint and its bodies.
     convention : str
-        Name in `joint_conventions.CONVENTIONS`.
+        Name in `anatomical_frames.CONVENTIONS`.
     proximal_frame, distal_frame : AnatomicalFrame
     side : {'left', 'right', ''}
         '' only where the convention has no sides.

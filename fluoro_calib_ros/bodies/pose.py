@@ -36,10 +36,9 @@ from scipy.special import chdtri, erfc
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import cross_matrix, vector_from_matrix
 from ..reconstruction.reconstruct import IntersectedViews
-from .body import POSE_SIZE, Body
+from .body import POSE_SIZE, Body, robust_pose
 from .image_points import Cameras, ImagePoints, Linear
 from .motion import PoseInformation, turn_of_twists, twist_between
-from .rigid import robust_pose
 
 MAX_STEPS = 8
 # Square of the next step in standard deviations below which the iteration ends. A step of

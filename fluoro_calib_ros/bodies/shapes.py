@@ -30,8 +30,7 @@ from scipy.special import chdtri
 from ..errors import DataError
 from ..findings import Finding, Kind, Place, Severity
 from ..photogrammetry.rotations import cross_matrix
-from .body import POSE_SIZE, Body
-from .rigid import by_pose, fitted_pose
+from .body import POSE_SIZE, Body, by_pose, fitted_pose
 
 ROUNDS = 4  # the problem is nearly linear once poses are known
 # Share of the places of a marker that may be false matches, and are left out: of 1 % false image

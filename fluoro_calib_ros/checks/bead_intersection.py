@@ -175,7 +175,9 @@ def distances(beads: Beads) -> DistanceComparison:
     length = np.linalg.norm(surveyed, axis=1)
     direction = surveyed / np.maximum(length, 1e-9)[:, None]
     total = beads.total_covariance
-    variance = np.stack([_variance_along(direction, total[k]) for k in (i, j)])
+    variance = np.stack(
+        [np.einsum('na,nab,nb->n', direction, total[k], direction) for k in (i, j)]
+    )
     error = np.linalg.norm(found, axis=1) - length
     scale, scale_sd = _scale(beads)
     return DistanceComparison(
@@ -231,11 +233,6 @@ def _rays(job: CalibrationResult, frames: Frames) -> Rays:
                 )
             )
     return Rays(*(np.concatenate(column) for column in zip(*parts)))
-
-
-def _variance_along(direction: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Return the variances (n,) along directions (n, 3) of covariances (n, 3, 3)."""
-    return np.einsum('na,nab,nb->n', direction, covariance, direction)
 
 
 def _scale(beads: Beads) -> tuple[float, float]:

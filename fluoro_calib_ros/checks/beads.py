@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import bdtrc, chdtri
 
-from ..bodies.rigid import by_pose
+from ..bodies.body import by_pose
 from ..estimation.rounds import ResidualTable
 from ..findings import Kind, Place, first_few
 from .bead_intersection import Beads, distances, intersect, least_chi2_without_a_ray

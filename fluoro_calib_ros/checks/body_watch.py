@@ -29,10 +29,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri, erfc
 
-from ..bodies.body import POSE_SIZE, Body, check_bodies
+from ..bodies.body import POSE_SIZE, Body, check_bodies, fitted_pose
 from ..bodies.image_points import Cameras, ImagePoints, Linear
 from ..bodies.pose import marker_sums
-from ..bodies.rigid import fitted_pose
 from ..bodies.shapes import learned_shape
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.reconstruct import IntersectedViews

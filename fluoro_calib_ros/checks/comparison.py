@@ -205,7 +205,7 @@ def compare_calibrations(
     if first.image_size != second.image_size:
         sizes = [f'{w} x {h} px' for w, h in (first.image_size, second.image_size)]
         raise DataError(f'fluoroscope {name}: the images are {sizes[0]} and {sizes[1]}')
-    uv = _cells(first.image_size)
+    _, uv = cell_centres(first.image_size, CELLS)
     fields = at_common_angle(uv, first, second)
     common = ~(fields[0].outside | fields[1].outside)
     if common.sum() < MIN_COMMON:
@@ -247,12 +247,15 @@ def _interior_difference(
     return second - first
 
 
-def _cells(image_size: tuple[int, int]) -> np.ndarray:
-    """Return centres (n, 2) of cells over the image."""
-    step = max(image_size) / CELLS
+def cell_centres(image_size: Sequence[int], cells: int) -> tuple[list[np.ndarray], np.ndarray]:
+    """Return columns and rows of the centres of cells over an image, and the centres (n, 2).
+
+    cells: along the longer side.
+    """
+    step = max(image_size) / cells
     axes = [-0.5 + step / 2 + step * np.arange(max(1, round(size / step))) for size in image_size]
     u, v = np.meshgrid(*axes)
-    return np.column_stack([u.ravel(), v.ravel()])
+    return axes, np.column_stack([u.ravel(), v.ravel()])
 
 
 def _test(difference: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:

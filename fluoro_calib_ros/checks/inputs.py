@@ -29,9 +29,9 @@ from ..exposures.frame import Frame, Frames, validate_frame
 from ..exposures.phantom import Phantom
 from ..findings import Finding, Kind, Place, first_few
 from ..photogrammetry.collinearity import project
-from ..photogrammetry.known_orientation import KnownOrientation
 from ..photogrammetry.plane_resection import flatness, plane_of, robust_homography
 from ..photogrammetry.resection import MIN_FLATNESS, decompose, robust_dlt, squared_residuals
+from ..photogrammetry.rig_orientation import KnownOrientation
 from .mixed_units import DISTANCES_MM, FIT, UNITS, mixed_units
 
 MAX_TESTED = 3  # exposures of a fluoroscope, those with the most targets

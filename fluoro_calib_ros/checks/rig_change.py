@@ -78,7 +78,7 @@ class RigChange:
         self._open: list[list[tuple[np.ndarray, ...]]] = [[] for _ in self._pairs]
         self._blocks: deque[_Rays] = deque(maxlen=WINDOW)
         self._has_met = False
-        self._apart = 0  # blocks in a row whose rays are apart
+        self.blocks_apart = 0  #: blocks in a row whose rays are apart
 
     def add(
         self,
@@ -118,7 +118,7 @@ class RigChange:
             return
         self._blocks.append(rays)
         is_apart = bool(rays.is_apart.mean() > MOST)
-        self._apart = self._apart + 1 if is_apart else 0
+        self.blocks_apart = self.blocks_apart + 1 if is_apart else 0
         self._has_met |= not is_apart
 
     @property
@@ -127,14 +127,9 @@ class RigChange:
 
         Rays that have never met are confused, or the rig is another one.
         """
-        if not self._has_met or self._apart < KNOCKED_BLOCKS:
+        if not self._has_met or self.blocks_apart < KNOCKED_BLOCKS:
             return 0.0
         return float(self._blocks[-1].is_apart.mean())
-
-    @property
-    def blocks_apart(self) -> int:
-        """Blocks in a row whose rays are apart."""
-        return self._apart
 
     def _median(self, number: int, columns: list[np.ndarray]) -> _Rays:
         """Return the median residual of each marker in a block: false matches do not count."""

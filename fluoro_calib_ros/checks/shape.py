@@ -28,7 +28,7 @@ from scipy.special import chdtri
 from ..estimation.exposure_terms import VARYING, exposure_functions
 from ..estimation.fixed_calibration import SolvedNetwork
 from ..findings import Finding, Kind, Place, Severity
-from ..photogrammetry.additional_parameters import AdditionalParameters
+from ..photogrammetry.collinearity import AdditionalParameters
 from ..photogrammetry.elimination import factorize
 from ..photogrammetry.network import Network
 from ..photogrammetry.normal_equations import normal_equations

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from ..errors import DataError, printable, shortened
+from ..limits import ReadLimits, use_read_limits
 from . import (
     adjust,
     bag,
@@ -35,7 +36,7 @@ from . import (
     validate,
     watch,
 )
-from .arguments import add_read_limits, set_read_limits
+from .arguments import add_read_limits, options_of
 from .output import print_status, styled, terminated_by_signals
 from .rig import add_rig, find_rig
 
@@ -244,7 +245,7 @@ def _run(words: list[str]) -> None:
     command = _command_of(words)
     try:
         options = parse_words(words)
-        set_read_limits(options)
+        use_read_limits(options_of(ReadLimits, options))
         if options.rig_file is not None:
             print_status(f'defaults of {options.rig_file.path}')
         passed = options.module.run(options)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from ..errors import ErrorsAt
 from ..io.rig_file import NAME
-from ..limits import ReadLimits, use_read_limits
+from ..limits import ReadLimits
 from ..options import Option, declared
 from .rig import JointOfRig
 
@@ -236,11 +236,6 @@ def add_read_limits(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('limits of what is read')
     metavar = {'metavar': 'N'}
     add_options(group, ReadLimits, READ_LIMITS, **dict.fromkeys(READ_LIMITS, metavar))
-
-
-def set_read_limits(arguments: argparse.Namespace) -> None:
-    """Use the limits of the arguments, the default ones for a command that has none."""
-    use_read_limits(options_of(ReadLimits, arguments))
 
 
 def _number(option: Option, kind: type) -> Callable[[str], Any]:

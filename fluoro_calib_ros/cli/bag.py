@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from ..errors import printable
-from .arguments import add_options, add_out, names, number_in, options_of
+from .arguments import add_options, add_out, names, options_of
 from .output import print_result
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ EXAMPLE = 'fluoro-calib bag recover cut.mcap --out recovered'
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    from ..io.bags.recording import RecordingOptions
+    from ..io.bags.recording import PlayingOptions, RecordingOptions
 
     actions = parser.add_subparsers(dest='action', required=True, metavar='ACTION')
     recover = _add_action(
@@ -53,32 +53,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     play.add_argument('source', type=Path, metavar='SOURCE', help='bag (file or folder)')
     play.add_argument('--topics', type=names, metavar='T,T', help='topics to play (default: all)')
-    play.add_argument(
-        '--rate',
-        type=number_in(0.001, 1e6),
-        default=1.0,
-        help='speed relative to the recording (default: 1)',
-    )
-    play.add_argument('--loop', action='store_true', help='play over and over')
-    play.add_argument(
-        '--start-offset',
-        type=number_in(0, 1e9),
-        default=0.0,
-        metavar='S',
-        help='begin so long after the first message [s]; latched messages before are given first',
-    )
-    play.add_argument(
-        '--start-paused',
-        action='store_true',
-        help='wait for the services player_node/pause (data: false) or player_node/step',
-    )
-    play.add_argument(
-        '--clock',
-        type=number_in(0, 1000),
-        default=0.0,
-        metavar='HZ',
-        help='publish the time of the recording on /clock at this rate (default: not at all)',
-    )
+    metavars = {'start_offset': {'metavar': 'S'}, 'clock': {'metavar': 'HZ'}}
+    add_options(play, PlayingOptions, **metavars)
 
 
 def _add_action(actions: Any, name: str, text: str) -> argparse.ArgumentParser:
@@ -155,14 +131,10 @@ def _record(arguments: argparse.Namespace) -> None:
 
 
 def _play(arguments: argparse.Namespace) -> None:
-    parameters = {
-        'bag': str(arguments.source.absolute()),
-        'rate': arguments.rate,
-        'loop': arguments.loop,
-        'start_offset': float(arguments.start_offset),
-        'start_paused': arguments.start_paused,
-        'clock': float(arguments.clock),
-    }
+    from ..io.bags.recording import PlayingOptions
+
+    parameters = dataclasses.asdict(options_of(PlayingOptions, arguments))
+    parameters['bag'] = str(arguments.source.absolute())
     if arguments.topics:
         parameters['topics'] = arguments.topics
     become_node('player_node', parameters)

@@ -84,7 +84,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..io.bodies import read_bodies, read_joints
     from ..io.calibration import orientation_path
     from ..io.folder import check_output_folder
-    from ..io.learned_shapes import write_learned_shapes
+    from ..io.versions import write_learned_shapes
     from ..jobs.bodies import BODIES_FOLDER, BodiesOptions, Film, save_bodies, track_bodies
     from ..jobs.learning import learn_shapes
     from ..jobs.sources import is_bag

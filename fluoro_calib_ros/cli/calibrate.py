@@ -43,7 +43,7 @@ from .output import (
 
 if TYPE_CHECKING:
     from ..estimation.options import CalibrationRequest
-    from ..io.radiographs import Radiographs
+    from ..io.calibration_request import Radiographs
     from ..jobs.calibration import CalibrationOutcome
     from ..jobs.sources import Recording, Survey
 
@@ -182,8 +182,8 @@ def run(arguments: argparse.Namespace) -> bool:
 
     Raises DataError.
     """
+    from ..io.calibration_request import write_radiographs
     from ..io.folder import check_output_folder
-    from ..io.radiographs import write_radiographs
     from ..jobs.calibration import run_calibration
     from ..jobs.result_folder import RESULT_FOLDER, save_outcome, write_covariances
 

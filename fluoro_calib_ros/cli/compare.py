@@ -32,7 +32,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..io.access import write_bytes
     from ..io.folder import check_output_file
     from ..jobs.report import compare_folders
-    from ..report.comparison import comparison_document, comparison_png, comparison_text
+    from ..report.figures import comparison_document, comparison_png, comparison_text
 
     if arguments.figure is not None:
         check_output_file(arguments.figure, (arguments.first, arguments.second))

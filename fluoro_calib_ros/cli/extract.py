@@ -183,7 +183,7 @@ def _run_phantom(arguments: argparse.Namespace) -> None:
     """Extract the beads of a phantom. Raises DataError."""
     from ..io.access import check_safe_name
     from ..io.folder import check_output_file
-    from ..io.observations import write_extracted
+    from ..io.observations import FLAGS, write_extracted
     from ..jobs.extraction import ExtractionRequest, run_extraction
     from ..jobs.image_sources import ImageAngles
     from ..jobs.sources import read_survey
@@ -208,8 +208,8 @@ def _run_phantom(arguments: argparse.Namespace) -> None:
     )
     with ProgressBar('extract') as bar:
         outcome = run_extraction(request, bar)
-    observed = [(r.frame, r.overlapped) for r in outcome.results if r.frame is not None]
-    write_extracted(arguments.out, observed, survey.names.target_names())
+    observed = [(r.frame, [r.overlapped]) for r in outcome.results if r.frame is not None]
+    write_extracted(arguments.out, observed, survey.names.target_names(), FLAGS[:1])
     for result in outcome.refused:
         print_note(f'not used: {result.finding}')
     print_notes(outcome.notes)
@@ -257,7 +257,7 @@ def _run_markers(arguments: argparse.Namespace) -> None:
     from ..io.access import check_safe_name
     from ..io.decisions import DOUBTFUL, doubtful_table
     from ..io.folder import check_output_file
-    from ..io.observations import write_markers
+    from ..io.observations import write_extracted
     from ..jobs.marker_extraction import doubtful_ids, run_marker_extraction
 
     for name in arguments.fluoroscope:
@@ -275,7 +275,8 @@ def _run_markers(arguments: argparse.Namespace) -> None:
     request = _marker_request(arguments)
     with ProgressBar('extract') as bar:
         outcome = run_marker_extraction(request, bar)
-    write_markers(arguments.out, outcome.frames(), request.target_names)
+    found = [(frame, flags) for frame, *flags in outcome.frames()]
+    write_extracted(arguments.out, found, request.target_names)
     for name, results in outcome.results.items():
         for result in results:
             if result.markers.reason:

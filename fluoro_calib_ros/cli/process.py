@@ -24,13 +24,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from ..errors import DataError, shortened
-from ..io.study_file import NAME as STUDY
+from ..io.rig_file import STUDY
 from .output import print_result, print_status
 
 if TYPE_CHECKING:
     import subprocess
 
-    from ..io.study_file import Options, StudyFile, Trial
+    from ..io.rig_file import Options, StudyFile, Trial
     from ..processes import Programs
 
 NAME = 'process'
@@ -117,7 +117,7 @@ Parse = Callable[[Sequence[str], Callable[[str], NoReturn]], argparse.Namespace]
 
 def run(arguments: argparse.Namespace) -> bool:
     """Process a study; return whether all its verdicts are pass. Raises DataError."""
-    from ..io.study_file import read_study
+    from ..io.rig_file import read_study
 
     study = read_study(arguments.study)
     with working_directory(study.folder):

@@ -70,9 +70,9 @@ def check(arguments: argparse.Namespace, error: Callable[[str], NoReturn]) -> No
 def run(arguments: argparse.Namespace) -> None:
     """Write the points of a recording. Raises DataError."""
     from ..io.access import write_bytes
+    from ..io.bodies import write_reconstruction
     from ..io.calibration import orientation_path
     from ..io.folder import check_output_file
-    from ..io.poses import write_reconstruction
     from ..jobs.reconstruction import ReconstructionOptions, reconstruct
     from ..jobs.sources import is_bag
 

@@ -36,8 +36,7 @@ def check(arguments: argparse.Namespace, error: Callable[[str], NoReturn]) -> No
 
 def run(arguments: argparse.Namespace) -> None:
     """Write DIR/report.html, and print it. Raises DataError."""
-    from ..jobs.printing import print_page
-    from ..jobs.report import write_report
+    from ..jobs.report import print_page, write_report
     from ..jobs.result_folder import REPORT_PDF
 
     path = write_report(arguments.directory)

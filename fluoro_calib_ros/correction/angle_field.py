@@ -8,7 +8,7 @@ C-arm: its components are cosines and sines of the angle; what the arm itself ma
 second harmonic (Fahrig et al., "Three-dimensional computed tomographic reconstruction using a
 C-arm mounted XRII: correction of image intensifier distortion", Medical Physics 24, 1997).
 The correction is that of a calibration plus a sum of these harmonics, less their mean over the
-exposures, each with a field of its own (see `angle_fit`).
+exposures, each with a field of its own (see `exposure_terms`).
 """
 
 from __future__ import annotations

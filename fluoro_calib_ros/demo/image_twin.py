@@ -34,9 +34,8 @@ from ..nodes.demo_client import DemoClient, DemoError
 from ..report.figures import png_bytes
 from ..report.motion import joint_figure
 from ..report.tables import markdown_table
-from ..simulation.exposures import simulate_exposures
 from ..simulation.knee import LANDING_HZ, LANDING_S, landing, simulate_knee, virtual_knee
-from ..simulation.rig import VirtualRig, virtual_rig
+from ..simulation.rig import VirtualRig, simulate_exposures, virtual_rig
 from .assessment import NodeProcesses, calibration_errors
 
 NAMESPACE = 'images'

@@ -24,8 +24,8 @@ from ..photogrammetry.adjustment import Adjustment, SolverOptions, adjust
 from ..photogrammetry.elimination import factorize
 from ..photogrammetry.network import Network, in_determined_datum
 from ..photogrammetry.noise import Noise
-from ..photogrammetry.noise_estimation import SETTLED, estimate_noise
 from ..photogrammetry.normal_equations import normal_equations
+from ..photogrammetry.outliers import SETTLED, estimate_noise
 from ..photogrammetry.precision import Precision, covariance_blocks, residual_covariance
 from .estimator import AdjustedTerms, RegressionStep
 from .initial_network import Measured, adjusted_with_precision, undetermined, with_additional

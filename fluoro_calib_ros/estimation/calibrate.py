@@ -25,13 +25,13 @@ from ..exposures.frame import Frames, validate_frame
 from ..exposures.phantom import Phantom
 from ..findings import Finding
 from ..photogrammetry.adjustment import Adjustment
-from ..photogrammetry.known_orientation import KnownOrientation
 from ..photogrammetry.noise import MIN_REDUNDANCY
 from ..photogrammetry.precision import (
     Precision,
     geometric_redundancy,
     precision_with_fixed_interiors,
 )
+from ..photogrammetry.rig_orientation import KnownOrientation
 from ..photogrammetry.rotations import quaternion_from_matrix
 from .constraints import relative_orientations
 from .fixed_calibration import (

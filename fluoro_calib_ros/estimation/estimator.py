@@ -37,7 +37,7 @@ from scipy.optimize import least_squares
 
 from ..correction.terms import CUBIC, cubic_terms, polynomial_coefficients, polynomial_powers
 from ..photogrammetry.noise import INLIER_Q
-from ..photogrammetry.noise_estimation import SETTLED
+from ..photogrammetry.outliers import SETTLED
 from ..photogrammetry.rotations import matrix_from_vector
 from .lack_of_fit import LeftOut
 

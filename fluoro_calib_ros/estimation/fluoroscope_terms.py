@@ -14,11 +14,18 @@ from scipy.linalg import block_diag
 
 from ..correction.series import Functions, Series, sd_over_image, without_absent_bands
 from ..correction.terms import CUBIC
-from ..photogrammetry.additional_parameters import AdditionalParameters
+from ..photogrammetry.collinearity import AdditionalParameters
 from ..photogrammetry.precision import information_of_additional
-from .angle_fit import AngleFit, SeriesWithExposures, can_be_fitted, fit_angles
 from .estimator import AdjustmentProblem, coefficients_of, prior_of_additional
-from .exposure_terms import ExposureTerms, variance_between_exposures, without_exposure_terms
+from .exposure_terms import (
+    AngleFit,
+    ExposureTerms,
+    SeriesWithExposures,
+    can_be_fitted,
+    fit_angles,
+    variance_between_exposures,
+    without_exposure_terms,
+)
 from .lack_of_fit import FittedPoints, LeftOut, LeftOutInPlaces
 from .local_signal import correlation_beyond
 from .priors import (

@@ -17,16 +17,16 @@ from ..exposures.frame import Frame, Frames, angles_of, validate_frame
 from ..exposures.phantom import Phantom
 from ..findings import Finding, Kind, Place, Severity
 from ..photogrammetry.adjustment import Adjustment, SolverOptions, adjust
-from ..photogrammetry.known_orientation import (
-    ExteriorPrior,
-    KnownOrientation,
-)
 from ..photogrammetry.network import Network
 from ..photogrammetry.noise import Noise
-from ..photogrammetry.noise_estimation import adjust_and_estimate_noise
+from ..photogrammetry.outliers import adjust_and_estimate_noise
 from ..photogrammetry.plane_resection import flatness, plane_of, tilt_of
 from ..photogrammetry.precision import Precision, precision
 from ..photogrammetry.resection import MIN_FLATNESS, Resection, refine_resection, resection_at
+from ..photogrammetry.rig_orientation import (
+    ExteriorPrior,
+    KnownOrientation,
+)
 from ..photogrammetry.rotations import rotation_angle
 from ..photogrammetry.unknowns import EXTERIOR_SIZE, RIGID_SD_MM, RIGID_SD_RAD, Parameters
 from .priors import Prior

@@ -35,9 +35,9 @@ from ..exposures.names import Names
 from ..exposures.phantom import Phantom
 from ..limits import MAX_NEIGHBOURS
 from ..options import option, validate_options
-from ..photogrammetry.known_orientation import KnownOrientation
 from ..photogrammetry.network import DATUMS
 from ..photogrammetry.noise import LOSSES
+from ..photogrammetry.rig_orientation import KnownOrientation
 from .estimator import (
     Estimator,
     RegressionStep,

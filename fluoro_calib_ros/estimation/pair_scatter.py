@@ -31,7 +31,7 @@ from ..photogrammetry.unknowns import (
     discrepancies,
     mean_pose,
 )
-from .angle_fit import can_be_fitted
+from .exposure_terms import can_be_fitted
 
 # A pair of exposures is left out of the mean where its deviation is so many times its standard
 # deviation, and so many times the median of all pairs; at most this share of them is.

@@ -21,8 +21,8 @@ from scipy.special import stdtrit
 
 from ..correction.series import Functions, Series, sd_over_image
 from ..correction.terms import HIGHEST, expert_terms
-from ..photogrammetry.additional_parameters import AdditionalParameters
-from ..photogrammetry.noise_estimation import LOOSE
+from ..photogrammetry.collinearity import AdditionalParameters
+from ..photogrammetry.outliers import LOOSE
 from ..photogrammetry.precision import information_of_additional
 from .estimator import (
     AdjustedTerms,

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from ..photogrammetry.adjustment import Adjustment
-from .angle_fit import can_be_fitted
 from .estimator import coefficients_of
-from .exposure_terms import ExposureTerms, exposure_functions, variation
+from .exposure_terms import ExposureTerms, can_be_fitted, exposure_functions, variation
 from .fluoroscope_terms import FluoroscopeTerms, SeriesEquations
 from .lack_of_fit import LARGEST_SD, FittedPoints, areas_of_rejected
 from .priors import Prior, most_likely_prior, prior_precision, with_more_places, with_shown_places

@@ -147,7 +147,46 @@ def disagreement_of_recording(frames: Mapping[str, Iterable[PairableFrame]]) -> 
     return pairer.stamps.disagreement()
 
 
-class CompletePairer:
+class _Counts:
+    """What a pairer pairs, and what it counts; see Pairer."""
+
+    def __init__(self, fluoroscopes: Iterable[str], options: PairingOptions | None = None) -> None:
+        options = options or PairingOptions()
+        self.fluoroscopes = tuple(fluoroscopes)
+        self.unpaired = dict.fromkeys(self.fluoroscopes, 0)
+        self.late = dict.fromkeys(self.fluoroscopes, 0)
+        self.incomplete = 0
+        self.silent: frozenset[str] = frozenset()
+        self.stamps = StampAgreement(self.fluoroscopes)
+        self._by_number = options.by_number
+        self._exposures = 0
+        self.use(options)
+
+    def use(self, options: PairingOptions) -> None:
+        """Use other limits from now on. Raises ValueError where pair_by is another one."""
+        if options.by_number != self._by_number:
+            raise ValueError('pair_by cannot change while frames are being paired')
+        self._tolerance = options.tolerance_ns
+        self._max_waiting = options.waiting
+
+    def _count_late(self, name: str) -> None:
+        self.late[name] += 1
+        self.unpaired[name] += 1
+
+    def _counted(self, exposure: Exposure) -> Exposure:
+        """Count an exposure, and return it.
+
+        Frames that are paired by stamp may be numbered differently, or not at all: they get the
+        number of the exposure.
+        """
+        self._exposures += 1
+        if self._by_number:
+            self.stamps.add(exposure)
+            return exposure
+        return {name: replace(frame, number=self._exposures) for name, frame in exposure.items()}
+
+
+class CompletePairer(_Counts):
     """Pairer of exposures with a frame of every fluoroscope.
 
     Frames belong together by number, or by stamp within the tolerance. Of each fluoroscope the
@@ -158,27 +197,12 @@ class CompletePairer:
     """
 
     def __init__(self, fluoroscopes: Iterable[str], options: PairingOptions | None = None) -> None:
-        options = options or PairingOptions()
-        self.fluoroscopes = tuple(fluoroscopes)
-        self._by_number = options.by_number
-        self.use(options)
-        self._exposures = 0
+        super().__init__(fluoroscopes, options)
         self._waiting: dict[str, OrderedDict[int, Any]] = {
             name: OrderedDict() for name in self.fluoroscopes
         }
         # Key of the last displaced frame.
         self._displaced: dict[str, int | None] = dict.fromkeys(self.fluoroscopes)
-        self.unpaired = dict.fromkeys(self.fluoroscopes, 0)
-        self.late = dict.fromkeys(self.fluoroscopes, 0)
-        self.incomplete = 0
-        self.silent: frozenset[str] = frozenset()
-        self.stamps = StampAgreement(self.fluoroscopes)
-
-    def use(self, options: PairingOptions) -> None:
-        """Use other limits from now on. Raises ValueError where pair_by is another one."""
-        _check_same_key(self._by_number, options)
-        self._tolerance = options.tolerance_ns
-        self._max_waiting = options.waiting
 
     def add(self, frame: PairableFrame) -> Sequence[Exposure]:
         """Add a frame; returns the exposure that it completes, or none."""
@@ -186,8 +210,7 @@ class CompletePairer:
         waiting = self._waiting[name]
         key = frame.number if self._by_number else frame.stamp_ns
         if self._is_late(name, key):
-            self.late[name] += 1
-            self.unpaired[name] += 1
+            self._count_late(name)
             return ()
         if key in waiting:
             self.unpaired[name] += 1  # the frame with the same key that is replaced
@@ -213,11 +236,7 @@ class CompletePairer:
         for name, partner in partners.items():
             if partner is not None:
                 del self._waiting[name][partner]
-        self._exposures += 1
-        if self._by_number:
-            self.stamps.add(exposure)
-            return exposure
-        return _renumbered(exposure, self._exposures)
+        return self._counted(exposure)
 
     def _is_late(self, fluoroscope: str, key: int) -> bool:
         """Whether a partner of the frame with that key was displaced already.
@@ -252,7 +271,7 @@ class CompletePairer:
         return ()
 
 
-class PartialPairer:
+class PartialPairer(_Counts):
     """Pairer of exposures with frames of two or more of three or more fluoroscopes.
 
     Exposures are ready in the order of time, each once. Frames belong together by number, or by
@@ -266,16 +285,8 @@ class PartialPairer:
     """
 
     def __init__(self, fluoroscopes: Iterable[str], options: PairingOptions | None = None) -> None:
-        options = options or PairingOptions()
-        self.fluoroscopes = tuple(fluoroscopes)
-        self._by_number = options.by_number
         self._recent: deque[int] = deque()  # keys of the last exposures
-        self.use(options)
-        self._exposures = 0
-        self.unpaired = dict.fromkeys(self.fluoroscopes, 0)
-        self.late = dict.fromkeys(self.fluoroscopes, 0)
-        self.incomplete = 0
-        self.stamps = StampAgreement(self.fluoroscopes)
+        super().__init__(fluoroscopes, options)
         self._start()
 
     def _start(self) -> None:
@@ -289,13 +300,12 @@ class PartialPairer:
         # Key up to which exposures went out without the fluoroscope.
         self._passed: dict[str, float] = dict.fromkeys(self.fluoroscopes, float('-inf'))
         self._recent.clear()
-        self.silent: frozenset[str] = frozenset()
+        self.silent = frozenset()
 
     def use(self, options: PairingOptions) -> None:
         """Use other limits from now on. Raises ValueError where pair_by is another one."""
-        _check_same_key(self._by_number, options)
+        super().use(options)
         self._tolerance = 0 if self._by_number else options.tolerance_ns
-        self._max_waiting = options.waiting
         self._patience = options.patience
         self._recent = deque(self._recent.copy(), maxlen=self._patience)
 
@@ -326,10 +336,6 @@ class PartialPairer:
             self.unpaired[name] += 1
             ready += self._release()
         return ready
-
-    def _count_late(self, name: str) -> None:
-        self.late[name] += 1
-        self.unpaired[name] += 1
 
     def _is_restart(self, key: int, stamp_ns: int, last: int, last_ns: int) -> bool:
         """Whether a frame that is not after the last one of its stream starts a new stream.
@@ -385,12 +391,8 @@ class PartialPairer:
             for name in self.fluoroscopes:
                 if name not in exposure:
                     self._passed[name] = end
-        self._exposures += 1
         self._recent.append(end - self._tolerance)
-        if self._by_number:
-            self.stamps.add(exposure)
-            return [exposure]
-        return [_renumbered(exposure, self._exposures)]
+        return [self._counted(exposure)]
 
     def flush(self) -> list[Exposure]:
         """Stop waiting and start anew; returns the exposures that were waiting."""
@@ -402,17 +404,3 @@ class PartialPairer:
             ready += self._pop_exposure(names, end)
         self._start()
         return ready
-
-
-def _check_same_key(by_number: bool, options: PairingOptions) -> None:
-    """Raise ValueError where options pair by another key than the frames that are waiting."""
-    if options.by_number != by_number:
-        raise ValueError('pair_by cannot change while frames are being paired')
-
-
-def _renumbered(exposure: Exposure, number: int) -> Exposure:
-    """The exposure with this frame number.
-
-    Frames that are paired by stamp may be numbered differently, or not at all.
-    """
-    return {name: replace(frame, number=number) for name, frame in exposure.items()}

@@ -23,8 +23,7 @@ import numpy as np
 from scipy.spatial.distance import pdist
 from scipy.special import chdtri, erfc
 
-from ..bodies.body import POSE_SIZE, Body
-from ..bodies.rigid import fitted_pose
+from ..bodies.body import POSE_SIZE, Body, fitted_pose
 from ..correction.fluoroscope_calibration import Calibrations
 from ..errors import DataError
 from ..photogrammetry.rig_orientation import RigOrientation

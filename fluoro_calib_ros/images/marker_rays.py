@@ -11,9 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bodies.body import Body
+from ..bodies.body import Body, by_pose
 from ..bodies.motion import POSE
-from ..bodies.rigid import by_pose
 from ..bodies.shapes import learned_shape
 from ..bodies.tracking import BodyTracker
 from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration

@@ -24,8 +24,7 @@ from ..findings import Kind
 from ..photogrammetry.rotations import rotation_angle
 from .growth import Match, Seen, grow, settle, start_view
 from .lattice import FlatGrid, GridPose, grid_poses
-from .pose_search import Triples, local_poses, nearby_map, triples_of
-from .search_length import enough_seeds
+from .pose_search import Triples, enough_seeds, local_poses, nearby_map, triples_of
 from .view import Lens, View, fit_view
 
 MIN_BEADS = 10
@@ -45,7 +44,7 @@ MARGIN_BEADS = 8
 # and limits of the scale by the extent of what is seen. The first finds most poses, the second and
 # third find those that see all faces of a phantom from the edge. The others find a phantom with
 # other things around it, and a small part of a phantom. Beads are tried until a right pose would
-# have been found (search_length.py); the third is for phantoms with which so many are not enough.
+# have been found (pose_search.py); the third is for phantoms with which so many are not enough.
 LEVELS = (
     (8, 6, (0, 8), (0.85, 1.4)),
     (8, 6, (8, 80), (0.85, 1.4)),

@@ -11,6 +11,7 @@ import secrets
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import IO, Any
 
 from ..errors import DataError
@@ -43,6 +44,15 @@ PathLike = str | os.PathLike[str]
 def os_error_reason(error: OSError) -> str:
     """Return the reason of an OSError in a few words, in lower case."""
     return (error.strerror or type(error).__name__).lower()
+
+
+@contextmanager
+def os_errors(path: object, what: str) -> Iterator[None]:
+    """Raise DataError for an OSError; what: what cannot be done with the path, in words."""
+    try:
+        yield
+    except OSError as error:
+        raise DataError(f'{path}: {what} ({os_error_reason(error)})') from None
 
 
 def check_regular_file(path: PathLike) -> None:
@@ -182,6 +192,12 @@ def atomic_file(path: PathLike, mode: str = 'wb') -> Iterator[IO[Any]]:
     except BaseException:
         _remove(temporary)
         raise
+
+
+def delete_file(path: Path) -> None:
+    """Delete a file, if it exists. Raises DataError where that is not possible."""
+    with os_errors(path, 'cannot be deleted'):
+        path.unlink(missing_ok=True)
 
 
 def write_bytes(path: PathLike, content: bytes) -> None:

@@ -8,6 +8,7 @@ A validation reads them; see docs/verdict.md.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +20,8 @@ from ..errors import DataError, ErrorsAt
 from ..estimation.options import CalibrationOptions, CalibrationRequest
 from ..exposures.frame import Frame, Frames, validate_frame
 from ..exposures.phantom import Phantom
-from .access import PathLike
+from ..images.codec import JPEG_START
+from .access import PathLike, check_safe_name, make_folder, read_bytes, write_bytes
 from .calibration import KNOWN_ORIENTATION, OBSERVATIONS, OPTIONS, PHANTOM
 from .csv_table import read_names, write_names
 from .documents import read_json, write_json
@@ -84,7 +86,7 @@ def read_request(
     where: object = 'the source'
     if frames is None:
         where = directory / OBSERVATIONS
-        frames = _read_frames(directory / OBSERVATIONS, calibrations)
+        frames = read_calibrated_frames(directory, calibrations)
     if phantom is None:
         phantom = read_phantom(_require_file(directory / PHANTOM, '--phantom'))
     for name, calibration in calibrations.items():
@@ -125,8 +127,9 @@ def _require_file(path: Path, option: str = '') -> Path:
     return path
 
 
-def _read_frames(path: Path, calibrations: Calibrations) -> dict[str, list[Frame]]:
-    """Read the frames of the calibrated fluoroscopes, with the image sizes of the calibrations."""
+def read_calibrated_frames(directory: Path, calibrations: Calibrations) -> dict[str, list[Frame]]:
+    """Read the frames that the calibrations in a folder were made from. Raises DataError."""
+    path = directory / OBSERVATIONS
     widths, heights = zip(*(c.image_size for c in calibrations.values()))
     found = read_observations_csv(_require_file(path, '--source'), (max(widths), max(heights)))
     frames: dict[str, list[Frame]] = {}
@@ -162,3 +165,48 @@ def read_options(path: Path) -> tuple[CalibrationOptions, bool, float | None]:
             f'(joint or principal_distance is wrong)'
         )
     return options, joint, distance
+
+
+# The folder DIR/radiographs: small JPEGs of the exposures that were found in images.
+#
+# A file is named <fluoroscope>_<exposure>.jpg.
+
+RADIOGRAPHS = 'radiographs'
+MAX_BYTES = 2**20  # of a file: grey pixels of 512 x 512 px have a quarter of it
+
+Radiographs = Mapping[str, Mapping[int, bytes]]  # JPEG by fluoroscope and exposure
+
+
+def write_radiographs(directory: PathLike, radiographs: Radiographs) -> None:
+    """Write the radiographs of a result into its folder. Raises DataError."""
+    if any(radiographs.values()):
+        make_folder(Path(directory) / RADIOGRAPHS)
+    for name, of_exposures in radiographs.items():
+        check_safe_name(name, directory)
+        for exposure, content in of_exposures.items():
+            write_bytes(_path(directory, name, exposure), content)
+
+
+def read_radiographs(
+    directory: PathLike, wanted: Iterable[tuple[str, int]]
+) -> dict[str, dict[int, bytes]]:
+    """Return the radiographs that are there, of the wanted fluoroscopes and exposures.
+
+    Raises DataError for a file that is too large or no JPEG.
+    """
+    found: dict[str, dict[int, bytes]] = {}
+    for name, exposure in wanted:
+        path = _path(directory, name, exposure)
+        if not path.is_file():
+            continue
+        if path.stat().st_size > MAX_BYTES:
+            raise DataError(f'{path}: this is no small radiograph, it has over {MAX_BYTES} bytes')
+        content = read_bytes(path)
+        if not content.startswith(JPEG_START):
+            raise DataError(f'{path}: this is no JPEG image')
+        found.setdefault(name, {})[exposure] = content
+    return found
+
+
+def _path(directory: PathLike, name: str, exposure: int) -> Path:
+    return Path(directory) / RADIOGRAPHS / f'{name}_{exposure}.jpg'

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from ..errors import DataError
 from ..exposures.names import MAX_ID, Names, number_names
 from ..limits import MAX_ROWS_CSV
-from .access import PathLike, atomic_file, check_rows, check_safe_name, os_error_reason, read_text
+from .access import PathLike, atomic_file, check_rows, check_safe_name, delete_file, read_text
 
 if TYPE_CHECKING:
     import pandas
@@ -377,10 +377,7 @@ def write_names(directory: PathLike, names: Names) -> None:
     """
     path = Path(directory) / NAMES_FILE
     if not names:
-        try:
-            path.unlink(missing_ok=True)
-        except OSError as error:
-            raise DataError(f'{path}: cannot be deleted ({os_error_reason(error)})') from None
+        delete_file(path)
         return
     rows = (
         [kind, identity, name]

@@ -57,7 +57,8 @@ def read_decisions(path: PathLike, names: Names) -> list[PointDecision]:
     """
     out = []
     for block in read_blocks(path, REQUIRED):
-        columns = {name: block.strings(name) for name in (*REQUIRED, *_optional(block))}
+        known = [name for name in (*REQUIRED, 'last_exposure') if name in block]
+        columns = {name: block.strings(name) for name in known}
         for index, given in enumerate(columns['decision']):
             words = ' '.join(given.replace('_', ' ').lower().split())
             if not words:
@@ -85,10 +86,6 @@ def read_decisions(path: PathLike, names: Names) -> list[PointDecision]:
                 )
             )
     return out
-
-
-def _optional(block: Block) -> tuple[str, ...]:
-    return tuple(name for name in ('last_exposure',) if name in block.header)
 
 
 def _new_id(block: Block, index: int, row: Mapping[str, str], names: Names) -> int:

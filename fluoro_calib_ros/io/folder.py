@@ -26,7 +26,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 
 from ..errors import DataError
-from .access import PathLike, make_folder, os_error_reason, sync_folder
+from .access import PathLike, make_folder, os_error_reason, os_errors, sync_folder
 
 PREVIOUS = '.previous'
 # Ends of the names of files that are read from a folder: of a bag, or a result.
@@ -158,16 +158,15 @@ def temporary_folder(path: PathLike) -> Iterator[Path]:
     parent, name = os.path.split(os.path.abspath(path))
     folder = _hidden(os.path.join(parent, name), 'tmp')
     try:
-        for leftover in _leftovers(parent, name):
-            if leftover.endswith('.tmp') and not _is_locked(leftover):
-                shutil.rmtree(leftover)
-        lock = _make_locked(folder)
-        try:
-            yield Path(folder)
-        finally:
-            os.close(lock)
-    except OSError as error:
-        raise DataError(f'{path}: cannot be written ({os_error_reason(error)})') from None
+        with os_errors(path, 'cannot be written'):
+            for leftover in _leftovers(parent, name):
+                if leftover.endswith('.tmp') and not _is_locked(leftover):
+                    shutil.rmtree(leftover)
+            lock = _make_locked(folder)
+            try:
+                yield Path(folder)
+            finally:
+                os.close(lock)
     finally:
         _delete(folder)
 
@@ -179,16 +178,11 @@ def clean_up(path: PathLike) -> None:
     """
     target = os.path.realpath(path)
     parent = os.path.dirname(target)
-    try:
+    with os_errors(path, 'what an earlier run left behind cannot be cleaned up'):
         for folder in (parent, target):
             for leftover in _leftovers(folder, os.path.basename(target)):
                 if not _is_locked(leftover):
                     _settle(leftover, target)
-    except OSError as error:
-        raise DataError(
-            f'{path}: what an earlier run left behind cannot be cleaned up '
-            f'({os_error_reason(error)})'
-        ) from None
 
 
 def _settle(leftover: str, target: str) -> None:
@@ -355,14 +349,12 @@ def _check_kind(folder: str, kind: FolderKind) -> None:
     """Raise DataError for a folder that holds something, but is not of this kind."""
     if not os.path.lexists(folder):
         return
-    try:
+    with os_errors(folder, 'cannot be read'):
         names = [
             name
             for name in os.listdir(folder)
             if name[0] != '.' and not _is_of_kind(os.path.join(folder, name), kind)
         ]
-    except OSError as error:
-        raise DataError(f'{folder}: cannot be read ({os_error_reason(error)})') from None
     if names and not any(kind.is_marked_by(name) for name in names):
         raise DataError(
             f'{folder}: this is not {kind.title}, it holds {min(names)}; it is not overwritten'
@@ -378,10 +370,8 @@ def _check_writable(path: PathLike, target: str) -> None:
         raise DataError(f'{path}: {folder} is {_what(folder)}, not a folder')
     probe = os.path.join(folder, f'.{secrets.token_hex(8)}.tmp')
     try:
-        with open(probe, 'xb') as file:
+        with os_errors(path, 'cannot be written'), open(probe, 'xb') as file:
             file.write(b'0')
-    except OSError as error:
-        raise DataError(f'{path}: cannot be written ({os_error_reason(error)})') from None
     finally:
         with suppress(OSError):
             os.unlink(probe)

@@ -356,39 +356,19 @@ def _csv_rows(
 DECIMALS = 4  # of a pixel, and of its standard deviation
 
 
+FLAGS = ('overlapped', 'doubtful')
+
+
 def write_extracted(
     path: PathLike,
-    frames: Iterable[tuple[Frame, np.ndarray]],
-    target_names: Mapping[int, str],
-) -> None:
-    """Write frames, each with its flags (n,) of overlapped beads, to a CSV file.
-
-    Beads with a name are written by it. Raises DataError where the file cannot be written.
-    """
-    flagged = [(frame, [overlapped]) for frame, overlapped in frames]
-    _write(path, flagged, ('overlapped',), target_names)
-
-
-def write_markers(
-    path: PathLike,
-    frames: Iterable[tuple[Frame, np.ndarray, np.ndarray]],
-    target_names: Mapping[int, str],
-) -> None:
-    """Write frames, with flags (n,) of overlapped markers and of doubtful ids, to a CSV file.
-
-    Markers with a name are written by it. Raises DataError where the file cannot be written.
-    """
-    flagged = [(frame, [overlapped, doubtful]) for frame, overlapped, doubtful in frames]
-    _write(path, flagged, ('overlapped', 'doubtful'), target_names)
-
-
-def _write(
-    path: PathLike,
     frames: Sequence[tuple[Frame, Sequence[np.ndarray]]],
-    flags: tuple[str, ...],
     target_names: Mapping[int, str],
+    flags: tuple[str, ...] = FLAGS,
 ) -> None:
-    """Write frames with their flags, and with the angle if any frame has one."""
+    """Write frames, each with its flags (n,), to a CSV file, and the angle if any frame has one.
+
+    Targets with a name are written by it. Raises DataError where the file cannot be written.
+    """
     with_angle = any(frame.angle is not None for frame, _ in frames)
     rows = (
         [*row, _angle_cell(frame)] if with_angle else row

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from ..errors import DataError, ErrorsAt
 from ..images.codec import check_size
-from .access import check_regular_file, os_error_reason
+from .access import check_regular_file, os_error_reason, os_errors
 
 # Transfer syntaxes (PS3.5, annex A) that are read: implicit and explicit little endian, explicit
 # big endian, RLE. A deflated file could be of any size when it is decompressed.
@@ -243,15 +243,12 @@ def read_cine_header(path: Path) -> CineHeader:
 
 def read_cine_images(path: Path, header: CineHeader) -> Iterator[tuple[str, np.ndarray]]:
     """Yield place and image (h, w) of uint8 or uint16, one after the other. Raises DataError."""
-    try:
-        with open(path, 'rb') as file:
-            for number, offset in enumerate(header.offsets.tolist(), 1):
-                where = f'{path}, frame {number}'
-                with ErrorsAt(where):
-                    image = _image(file, offset, header)
-                yield where, image
-    except OSError as error:
-        raise DataError(f'cannot be read ({os_error_reason(error)})', at=path) from None
+    with os_errors(path, 'cannot be read'), open(path, 'rb') as file:
+        for number, offset in enumerate(header.offsets.tolist(), 1):
+            where = f'{path}, frame {number}'
+            with ErrorsAt(where):
+                image = _image(file, offset, header)
+            yield where, image
 
 
 def _cine_header(file: BinaryIO, size: int) -> CineHeader:

@@ -15,7 +15,6 @@ from ..checks.check import Check, Validation
 from ..checks.rig_watch import DriftVerdict
 from ..correction.calibration_record import Field
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
-from ..errors import DataError
 from ..estimation.constraints import RelativeOrientation
 from ..estimation.fixed_calibration import JointPrecision
 from ..estimation.result import CalibrationResult, FluoroscopeResult
@@ -23,7 +22,7 @@ from ..estimation.rounds import AdjustmentStatistics, ResidualTable, Round
 from ..findings import Finding, Severity, sentences
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import quaternion_from_matrix
-from .access import PathLike, os_error_reason
+from .access import PathLike, delete_file
 from .arrays import Layout, read_arrays, to_arrays, write_arrays
 from .calibration import VALIDATION_NAME, with_digests
 from .csv_table import Table
@@ -235,26 +234,11 @@ def drift_document(verdict: DriftVerdict | None, begin_ns: int) -> dict[str, Any
         'level_at_end': verdict.level_at_end,
         'watched_s': verdict.watched_s,
     }
-    names = {
-        'fluoroscope': 'fluoroscope',
-        'place': 'place',
-        'area_px': 'area',
-        'size_px': 'size',
-        'sd_px': 'sd',
-        'direction': 'direction',
-        'against': 'against',
-        'source': 'source',
-        'evidence': 'evidence',
-        'threshold_warn': 'threshold_warn',
-        'threshold_error': 'threshold_error',
-        'observations': 'observations',
-    }
-    out.update(
-        {
-            key: getattr(verdict.state, name) if verdict.state else None
-            for key, name in names.items()
-        }
-    )
+    for key in (
+        *('fluoroscope', 'place', 'area_px', 'size_px', 'sd_px', 'direction', 'against', 'source'),
+        *('evidence', 'threshold_warn', 'threshold_error', 'observations'),
+    ):
+        out[key] = getattr(verdict.state, key.removesuffix('_px')) if verdict.state else None
     for key, stamp_ns in (('found', verdict.found_ns), ('began', verdict.began_ns)):
         out[f'{key}_stamp_ns'] = stamp_ns
         out[f'{key}_s'] = None if stamp_ns is None else (stamp_ns - begin_ns) / 1e9
@@ -298,11 +282,7 @@ def write_validation(directory: PathLike, validation: Validation) -> dict[str, A
 
 def delete_validation(directory: PathLike) -> None:
     """Delete validation.json from a folder, if it exists. Raises DataError."""
-    path = Path(directory) / VALIDATION_NAME
-    try:
-        path.unlink(missing_ok=True)
-    except OSError as error:
-        raise DataError(f'{path}: cannot be deleted ({os_error_reason(error)})') from None
+    delete_file(Path(directory) / VALIDATION_NAME)
 
 
 # Tables of a result as CSV files, and covariance matrices (docs/files.md).

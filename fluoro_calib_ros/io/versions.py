@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Versions of a rig below the folder of its calibrations.
+"""What is kept of a rig beside its calibrations: versions, drift alarm, learned shapes.
 
 A version is a folder with calibrations and orientation, named by the orientation. Those that were
 healed contain healing.json, which names their parent.
@@ -9,12 +9,19 @@ healed contain healing.json, which names their parent.
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
+from typing import Any
 
-from ..errors import DataError
+import numpy as np
+
+from ..bodies.body import Body, check_bodies
+from ..bodies.shapes import LearnedShapes
+from ..errors import DataError, ErrorsAt
 from ..photogrammetry.rig_orientation import RigOrientation
-from .calibration import load_orientation, orientation_path
-from .documents import read_json
+from .access import PathLike
+from .calibration import edited, load_orientation, orientation_path, with_digest
+from .documents import read_json, write_json
 
 VERSIONS = 'versions'  # folder below that of the calibrations
 HEALING = 'healing.json'
@@ -52,3 +59,103 @@ def calibrated_orientation(directory: Path, orientation: RigOrientation) -> RigO
         except DataError:
             return None
     return known
+
+
+# An alarm of the drift watch: drift_alarm.json beside the calibrations that it is about.
+
+DRIFT_ALARM = 'drift_alarm.json'
+
+
+def write_drift_alarm(directory: PathLike, orientation_id: str, cause: str) -> None:
+    """Write that the drift watch has given an alarm of an orientation. Raises DataError."""
+    document = {'version': 1, 'orientation_id': orientation_id, 'cause': cause}
+    write_json(Path(directory) / DRIFT_ALARM, document)
+
+
+def has_drift_alarm(directory: PathLike, orientation_id: str) -> bool:
+    """Return whether there was an alarm of an orientation. Raises DataError."""
+    path = Path(directory) / DRIFT_ALARM
+    return os.path.exists(path) and read_json(path).get('orientation_id') == orientation_id
+
+
+# Shapes of bodies that a healthy rig has learned: learned_shapes.json beside its calibrations.
+
+LEARNED_SHAPES = 'learned_shapes.json'
+VERSION = 1
+
+
+def write_learned_shapes(directory: PathLike, learned: LearnedShapes) -> None:
+    """Write learned shapes into a folder, to be read with the same values. Raises DataError."""
+    bodies = [
+        {
+            'body': body.name,
+            'marker': body.target_id,
+            'xyz_mm': body.xyz_mm,
+            'sd_mm': body.sd_mm,
+            'covariance_mm2': body.covariance_mm2,
+        }
+        for body in learned.bodies
+    ]
+    document = {
+        'version': VERSION,
+        'orientation_ids': learned.orientation_ids,
+        'calibration_ids': learned.calibration_ids,
+        'begin_ns': learned.begin_ns,
+        'end_ns': learned.end_ns,
+        'exposures': learned.exposures,
+        'bodies': bodies,
+    }
+    write_json(Path(directory) / LEARNED_SHAPES, with_digest(document))
+
+
+def has_learned_shapes(directory: PathLike) -> bool:
+    """Return whether a folder contains learned shapes."""
+    return os.path.exists(Path(directory) / LEARNED_SHAPES)
+
+
+def read_learned_shapes(directory: PathLike) -> LearnedShapes:
+    """Read the learned shapes of a folder. Raises DataError, also for a file that was edited."""
+    path = Path(directory) / LEARNED_SHAPES
+    document = read_json(path)
+    if document.get('version') != VERSION:
+        raise DataError(
+            f'{path}: version {document.get("version")} of learned shapes is not known, only '
+            f'{VERSION}'
+        )
+    found = edited(directory, document, LEARNED_SHAPES)
+    if found is not None:
+        raise DataError(found)
+    with ErrorsAt(path):
+        try:
+            learned = LearnedShapes(
+                bodies=tuple(_body(one) for one in document['bodies']),
+                orientation_ids=tuple(document['orientation_ids']),
+                calibration_ids=dict(document['calibration_ids']),
+                begin_ns=int(document['begin_ns']),
+                end_ns=int(document['end_ns']),
+                exposures=int(document['exposures']),
+            )
+        except (KeyError, TypeError, ValueError) as error:  # DataError among them
+            raise (
+                error
+                if isinstance(error, DataError)
+                else DataError(f'this is not a file of learned shapes ({error})')
+            ) from None
+        check_bodies(learned.bodies)
+    return learned
+
+
+def _body(document: Any) -> Body:
+    """Return a body. Raises DataError, KeyError, TypeError and ValueError."""
+    markers = np.array(document['marker'], dtype=np.int64)
+    size = 3 * len(markers)
+    covariance = np.array(document['covariance_mm2'], dtype=float)
+    if covariance.shape != (size, size) or not np.isfinite(covariance).all():
+        raise DataError(f'the covariance of {document["body"]} is not {size} x {size} numbers')
+    return Body(
+        str(document['body']),
+        markers,
+        np.array(document['xyz_mm'], dtype=float),
+        np.array(document['sd_mm'], dtype=float),
+        covariance_mm2=covariance,
+    )

@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,13 +28,12 @@ from ..findings import Finding, Kind, Place, Severity, sentences
 from ..images.corrector import iterated
 from ..images.overlay import BodyView, draw_bodies
 from ..io.access import PathLike, write_text
-from ..io.bodies import JointEntry, joint_table, shape_table
+from ..io.bodies import JointEntry, joint_table, motion_table, pose_table, shape_table
 from ..io.csv_table import Table, dataframe_of
 from ..io.folder import FolderKind, replaced_folder
 from ..io.formats.bodies import write_joint_motion
 from ..io.image_reading import ImageSource
 from ..io.image_writing import write_video
-from ..io.poses import motion_table, pose_table
 from ..options import option
 from ..photogrammetry.collinearity import project
 from ..photogrammetry.noise import ObservedScatter
@@ -82,15 +82,8 @@ def write_films(
         first = next(frames, None)
         if first is None:
             raise DataError(f'{source}: there is no image of an exposure with poses')
-        images = ImageSource('video', 0, _chained(first, frames), FILM_HZ)
+        images = ImageSource('video', 0, chain([first], frames), FILM_HZ)
         write_video(folder / f'film_{name}.mp4', images, lambda done, total: None)
-
-
-def _chained(
-    first: tuple[str, np.ndarray], rest: Iterator[tuple[str, np.ndarray]]
-) -> Iterator[tuple[str, np.ndarray]]:
-    yield first
-    yield from rest
 
 
 def _frames(

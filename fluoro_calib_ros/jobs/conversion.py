@@ -31,6 +31,7 @@ from ..io.calibration import (
 )
 from ..io.calibration import PHANTOM as PHANTOM_FILE
 from ..io.calibration import RESULT_NAME as RESULT
+from ..io.calibration_request import read_calibrated_frames
 from ..io.csv_table import read_names
 from ..io.documents import read_json
 from ..io.formats import registry
@@ -44,7 +45,6 @@ from ..io.formats.content import (
     Written,
     camera_at,
 )
-from ..io.observations import read_observations_csv
 from ..io.phantom import read_phantom
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import matrix_from_quaternion
@@ -315,7 +315,7 @@ def result_content(
     if 'survey' in wanted and (directory / PHANTOM_FILE).exists():
         found['survey'] = read_phantom(directory / PHANTOM_FILE)
     if 'observations' in wanted and (directory / OBSERVATIONS).exists():
-        found['observations'] = _observations(directory, calibrations)
+        found['observations'] = read_calibrated_frames(directory, calibrations)
     return Content(**found)
 
 
@@ -385,18 +385,6 @@ def _lookup(calibration: FluoroscopeCalibration) -> np.ndarray:
     """Return the observed pixel (2, h, w) of every corrected one, NaN outside the support."""
     corrector = ImageCorrector(calibration)
     return np.where(corrector.status == CorrectionStatus.OK, corrector.source, np.float32(np.nan))
-
-
-def _observations(directory: Path, calibrations: Calibrations) -> dict[str, list[Frame]]:
-    """Return the frames that the calibrations were made from."""
-    sizes = [c.image_size for c in calibrations.values()]
-    largest = (max(w for w, _ in sizes), max(h for _, h in sizes))
-    found = read_observations_csv(directory / OBSERVATIONS, largest)
-    return {
-        name: [replace(f, image_size=calibrations[name].image_size) for f in frames]
-        for name, frames in found.items()
-        if name in calibrations
-    }
 
 
 def _phantom_poses(

@@ -15,7 +15,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ..bodies.body import Body, check_bodies, solvable_bodies
+from ..bodies.body import Body, check_bodies, robust_pose, solvable_bodies
 from ..bodies.healing import (
     OF_RIG,
     SURE_OF_CAUSE,
@@ -28,7 +28,6 @@ from ..bodies.healing import (
     unseen_distortion,
 )
 from ..bodies.rig_adjustment import ObservedBodies, Poses, RigAdjustment, RigErrors, rig_errors
-from ..bodies.rigid import robust_pose
 from ..bodies.shapes import LearnedShapes
 from ..checks.check import Check, verdict_of
 from ..correction.base import CorrectionStatus
@@ -43,8 +42,7 @@ from ..io.calibration import ORIENTATION_NAME as ORIENTATION
 from ..io.calibration import SUFFIX, save_calibration, save_orientation
 from ..io.documents import write_json
 from ..io.folder import FolderKind, replaced_folder
-from ..io.learned_shapes import LEARNED_SHAPES, write_learned_shapes
-from ..io.versions import HEALING
+from ..io.versions import HEALING, LEARNED_SHAPES, write_learned_shapes
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.intersection import OK, OUTSIDE, Intersector
 from ..reconstruction.reconstruct import orientation_of_recorded, pair_recording

@@ -17,7 +17,7 @@ from ..errors import DataError, ErrorsAt
 from ..exposures.frame import Frames, frames_of_targets
 from ..findings import Kind
 from ..io.access import PathLike
-from ..io.learned_shapes import has_learned_shapes, read_learned_shapes
+from ..io.versions import has_learned_shapes, read_learned_shapes
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.reconstruct import orientation_of_recorded
 from .bodies import BodiesOptions, estimated_shapes, intersected

@@ -19,7 +19,7 @@ from ..exposures.frame import Frames
 from ..exposures.names import Names
 from ..exposures.pairing import RecordedPairing, disagreement_of_recording
 from ..findings import Finding, Kind, Severity
-from ..io.poses import point_table
+from ..io.bodies import point_table
 from ..options import option
 from ..photogrammetry.noise import MAX_WIDENING, ObservedScatter
 from ..photogrammetry.rig_orientation import RigOrientation

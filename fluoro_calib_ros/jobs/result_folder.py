@@ -11,7 +11,7 @@ from typing import Any
 
 from ..bodies.shapes import LearnedShapes
 from ..checks.check import Check
-from ..checks.doubtful import doubtful_observations
+from ..checks.residual_tests import doubtful_observations
 from ..correction.fluoroscope_calibration import Calibrations
 from ..errors import DataError
 from ..estimation.result import CalibrationResult
@@ -36,16 +36,14 @@ from ..io.calibration import (
 )
 from ..io.calibration import ORIENTATION_NAME as ORIENTATION
 from ..io.calibration import RESULT_NAME as RESULT
-from ..io.calibration_request import write_request
+from ..io.calibration_request import RADIOGRAPHS, write_request
 from ..io.decisions import DOUBTFUL, doubtful_table
 from ..io.documents import write_json
 from ..io.folder import FolderKind, check_output_folder, replaced_folder
-from ..io.learned_shapes import write_learned_shapes
-from ..io.radiographs import RADIOGRAPHS
 from ..io.result_document import NAMES as TABLES
 from ..io.result_document import SUFFIX as COVARIANCE
 from ..io.result_document import result_document, result_tables, write_covariance, write_validation
-from ..io.versions import version_folder
+from ..io.versions import version_folder, write_learned_shapes
 from ..photogrammetry.rig_orientation import RigOrientation
 from .calibration import CalibrationOutcome
 from .healing import HealingOutcome, save_healing

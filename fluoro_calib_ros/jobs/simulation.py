@@ -20,6 +20,7 @@ from ..exposures.phantom import Phantom
 from ..images.codec import encode
 from ..io.access import PathLike, make_folder, write_bytes, write_text
 from ..io.bags.writer import BagWriter
+from ..io.bodies import COLUMNS as POSE_COLUMNS
 from ..io.bodies import JOINT_COLUMNS as JOINT_COLUMNS
 from ..io.bodies import joint_definition, write_bodies
 from ..io.csv_table import write_table
@@ -28,17 +29,9 @@ from ..io.folder import FolderKind, replaced_folder
 from ..io.observations import COLUMNS as OBSERVATION_COLUMNS
 from ..io.observations import write_observations_csv
 from ..io.phantom import write_phantom
-from ..io.poses import COLUMNS as POSE_COLUMNS
 from ..options import option, validate_options
 from ..photogrammetry.rotations import quaternion_from_matrix
 from ..processes import OF_STREAM, WorkerProcess
-from ..simulation.exposures import (
-    Detection,
-    SimulatedExposures,
-    SimulatedTracking,
-    simulate_exposures,
-    simulate_tracking,
-)
 from ..simulation.knee import JOINT as KNEE
 from ..simulation.knee import (
     LANDING_HZ,
@@ -60,10 +53,15 @@ from ..simulation.marker_images import (
 from ..simulation.radiographs import CLEAN, HARD, RadiographSettings, Radiography
 from ..simulation.rig import (
     START_NS,
+    Detection,
     Pose,
+    SimulatedExposures,
+    SimulatedTracking,
     StreamStart,
     VirtualFluoroscope,
     VirtualRig,
+    simulate_exposures,
+    simulate_tracking,
     virtual_rig,
 )
 
@@ -444,7 +442,7 @@ def _write(
     detection = Detection(options.noise, options.false_matches)
     calibration = simulate_exposures(rig, options.exposures, options.seed, detection)
     write_exposures(directory, 'calibration', rig, calibration)
-    settings = {'clean': CLEAN, 'hard': HARD}.get(options.images)
+    settings = SETTINGS.get(options.images)
     if settings is not None:
         write_radiographs(directory, rig, calibration, settings, progress)
     if options.marker_images:

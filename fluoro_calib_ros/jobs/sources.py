@@ -38,7 +38,7 @@ from ..io.observations import (
     points_of_frames,
     read_points,
 )
-from ..photogrammetry.known_orientation import KnownOrientation
+from ..photogrammetry.rig_orientation import KnownOrientation
 
 if TYPE_CHECKING:
     import pandas

@@ -58,7 +58,7 @@ class AngleInput:
 
         faults: of its other topics.
         """
-        reader = node.create_reader(self._guarded(faults))
+        reader = node.create_reader(faults)
         if self._angles.joints:
             reader.subscribe(
                 JointState,
@@ -69,35 +69,18 @@ class AngleInput:
                 max_bytes=MAX_BYTES,
             )
             # An exposure that waits among others must not get the angle of the first of them.
-            reader.take_first(TOPIC)
+            reader.take_first(TOPIC, self._faults(faults))
         return reader
 
-    def _guarded(self, faults: FaultHandlers) -> FaultHandlers:
-        """Return the handlers of a reader, but for faults of the states of joints."""
-
-        def undecodable(topic: str) -> None:
-            if topic == TOPIC:
-                self._refuse(f'a message on {TOPIC} cannot be decoded')
-            else:
-                faults.undecodable(topic)
-
-        def callback_error(topic: str, error: Exception) -> None:
-            if topic == TOPIC:
-                self._refuse(f'a message on {TOPIC} is lost by an internal error: {error!r}')
-            else:
-                faults.callback_error(topic, error)
-
-        def too_large(topic: str, size: int) -> None:
-            if topic == TOPIC:
-                self._refuse(f'a message on {TOPIC} has {size} bytes, more than are read')
-            elif faults.too_large is not None:
-                faults.too_large(topic, size)
-
-        def overrun(topic: str, count: int) -> None:
-            if topic != TOPIC and faults.overrun is not None:
-                faults.overrun(topic, count)
-
-        return FaultHandlers(undecodable, callback_error, faults.reader_error, too_large, overrun)
+    def _faults(self, faults: FaultHandlers) -> FaultHandlers:
+        """Return the handlers of the states of joints; faults: of the other topics."""
+        on = f'a message on {TOPIC}'
+        return FaultHandlers(
+            lambda _: self._refuse(f'{on} cannot be decoded'),
+            lambda _, error: self._refuse(f'{on} is lost by an internal error: {error!r}'),
+            faults.reader_error,
+            lambda _, size: self._refuse(f'{on} has {size} bytes, more than are read'),
+        )
 
     def of_frame(self, name: str, stamp_ns: int, needed: bool) -> float | None:
         """Return the angle of an exposure [rad], None where it is unknown.

@@ -22,6 +22,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 from urllib.parse import parse_qs, quote, urlsplit
 
@@ -316,10 +317,7 @@ def _foxglove() -> Any:
     return foxglove
 
 
-def main(args: Sequence[str] | None = None) -> None:
-    """Run the node."""
-    run(BridgeNode, args)
-
+main = partial(run, BridgeNode)
 
 if __name__ == '__main__':
     main()

@@ -16,7 +16,7 @@ that are learned (shape_learning).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
 
 from fluoro_calib_msgs.msg import DriftStatus, TargetObservations
@@ -40,11 +40,10 @@ from .healing_services import Healing
 from .messages.observations import NS_PER_S, ObservedFrame, decode_target_observations
 from .messages.status import FluoroscopeProgress
 from .runtime.diagnostics import RefusalLog, Status, health_of
-from .runtime.lifecycle import StreamNode
+from .runtime.lifecycle import StreamNode, stream_faults
 from .runtime.main import run
 from .runtime.parameters import declare_groups, declare_read_limits, follow_groups
 from .runtime.services import Requests, create_services, wake
-from .runtime.stream import stream_faults
 from .runtime.topics import observations_qos
 from .shape_learning import ShapeLearning
 
@@ -222,10 +221,7 @@ class CalibrationNode(StreamNode):
         )
 
 
-def main(args: Sequence[str] | None = None) -> None:
-    """Run the node."""
-    run(CalibrationNode, args)
-
+main = partial(run, CalibrationNode)
 
 if __name__ == '__main__':
     main()

@@ -24,8 +24,8 @@ from .messages.image import colour_message
 from .messages.rig_orientation import message_from_orientation
 from .messages.status import FluoroscopeProgress, message_from_progress
 from .runtime.diagnostics import OK, Health, fault, warning
-from .runtime.lifecycle import StreamNode
-from .runtime.stream import (
+from .runtime.lifecycle import (
+    StreamNode,
     StreamState,
     inactive_node,
     incompatible_publisher,

@@ -33,7 +33,6 @@ from .messages.self_calibration import (
     Request,
     Result,
     feedback_of_round,
-    feedback_of_step,
     fill_result,
     fill_verdict,
     options_of_request,
@@ -308,7 +307,9 @@ class SelfCalibration(Job):
                 validate=request.validate,
                 rig=rig,
                 progress=on_round,
-                report_step=lambda *step: tell(feedback_of_step(*step)),
+                report_step=lambda stage, step, steps: tell(
+                    SelfCalibrate.Feedback(stage=stage, step=step, steps=steps)
+                ),
                 raise_if_cancelled=lambda: self._raise_if_cancelled(is_cancel_requested()),
             )
 

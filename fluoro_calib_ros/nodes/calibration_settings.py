@@ -47,7 +47,7 @@ from .runtime.parameters import (
     group,
     groups_of,
 )
-from .runtime.services import ServiceEntry
+from .runtime.services import telling_service
 
 NOT_ACTIVE = 'the node is not active, so no frames come in'
 COLLECT_MODES = ('still', 'request')
@@ -211,8 +211,14 @@ class CalibrationFiles:
         self._output = output
         self._logger = logger
         self.services = (
-            ServiceEntry('save_calibration', SaveCalibration, self._on_save),
-            ServiceEntry('load_calibration', LoadCalibration, self._on_load),
+            telling_service('save_calibration', SaveCalibration, 'not saved', self._save, logger),
+            telling_service(
+                'load_calibration',
+                LoadCalibration,
+                'not loaded, the calibration in use stays',
+                self._load,
+                logger,
+            ),
         )
 
     def load_at_start(self) -> None:
@@ -247,44 +253,26 @@ class CalibrationFiles:
                 'save_calibration'
             )
 
-    def _on_save(
-        self, request: SaveCalibration.Request, response: SaveCalibration.Response
-    ) -> SaveCalibration.Response:
+    def _save(self, request: SaveCalibration.Request) -> str:
         calibrations = self._output.calibrations
-        try:
-            directory = self._directory_of(request)
-            if not calibrations:
-                raise DataError('there is no calibration to save')
-            check_folders(directory, self._rig.directory, self._rig.settings().limits.max_folders)
-            save_calibrations(directory, calibrations, self._output.orientation)
-        except (DataError, OSError) as error:
-            response.message = f'not saved: {error}'
-            self._logger.error(response.message)
-            return response
+        directory = self._directory_of(request)
+        if not calibrations:
+            raise DataError('there is no calibration to save')
+        check_folders(directory, self._rig.directory, self._rig.settings().limits.max_folders)
+        save_calibrations(directory, calibrations, self._output.orientation)
         if directory == self._rig.directory:
             self._output.save_fault = ''
-        response.success = True
-        response.message = f'{", ".join(calibrations)} saved to {directory}'
-        return response
+        return f'{", ".join(calibrations)} saved to {directory}'
 
-    def _on_load(
-        self, request: LoadCalibration.Request, response: LoadCalibration.Response
-    ) -> LoadCalibration.Response:
-        try:
-            directory = self._directory_of(request)
-            loaded, orientation = self.load(directory)
-            if not loaded:
-                raise DataError(
-                    f'{directory}: there is no calibration of {", ".join(self._rig.names)}'
-                )
-        except (DataError, OSError) as error:
-            response.message = f'not loaded, the calibration in use stays: {error}'
-            self._logger.error(response.message)
-            return response
+    def _load(self, request: LoadCalibration.Request) -> str:
+        directory = self._directory_of(request)
+        loaded, orientation = self.load(directory)
+        if not loaded:
+            raise DataError(
+                f'{directory}: there is no calibration of {", ".join(self._rig.names)}'
+            )
         self._output.publish(loaded, orientation)
-        response.success = True
-        response.message = f'{", ".join(loaded)} loaded from {directory}'
-        return response
+        return f'{", ".join(loaded)} loaded from {directory}'
 
     def _directory_of(self, request: Any) -> Path:
         """Return the folder of a request. Raises DataError."""

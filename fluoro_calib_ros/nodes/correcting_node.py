@@ -17,19 +17,18 @@ from ..io.calibration import SUFFIX, disagreements, load_calibrations
 from .angle_input import AngleInput, beyond_text
 from .calibration_input import CalibrationInput
 from .runtime.diagnostics import (
-    OK,
     Health,
     RefusalLog,
     Status,
     fault,
     health_of,
+    healthy,
     one_line,
     warning,
 )
-from .runtime.lifecycle import StreamNode
-from .runtime.parameters import CalibratedParameters, expand_path
-from .runtime.stream import (
+from .runtime.lifecycle import (
     Stream,
+    StreamNode,
     StreamState,
     inactive_node,
     incompatible_publisher,
@@ -40,6 +39,7 @@ from .runtime.stream import (
     stalled_stream,
     stream_faults,
 )
+from .runtime.parameters import CalibratedParameters, expand_path
 from .runtime.streams import FaultHandlers
 
 FILES = f'*{SUFFIX}'
@@ -97,11 +97,6 @@ def doubtful_angle(state: CorrectingState) -> Health | None:
     return warning(f'{beyond_text(angle, field.angles)}: {state.beyond}')
 
 
-def correcting(state: CorrectingState) -> Health:
-    """Nothing is wrong."""
-    return Health(OK, 'correcting')
-
-
 CONDITIONS = (
     lost_messages,
     several_nodes,
@@ -113,7 +108,7 @@ CONDITIONS = (
     overrun_input,
     refused_messages,
     doubtful_angle,
-    correcting,
+    healthy('correcting'),
 )
 
 

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -185,10 +185,7 @@ class CorrectionNode(CorrectingNode):
         )
 
 
-def main(args: Sequence[str] | None = None) -> None:
-    """Run the node."""
-    run(CorrectionNode, args)
-
+main = partial(run, CorrectionNode)
 
 if __name__ == '__main__':
     main()

@@ -68,7 +68,9 @@ class DemoClient(Node):
         self._streams = StreamReader(
             self,
             FaultHandlers(
-                self._on_undecodable,
+                lambda topic: self.get_logger().error(
+                    f'topic {topic}: a message cannot be decoded'
+                ),
                 lambda topic, error: self.get_logger().error(f'topic {topic}: {error!r}'),
                 lambda text: self.get_logger().error(text),
             ),
@@ -177,26 +179,21 @@ class DemoClient(Node):
                 lambda message, name=name: self.exposures.update({name: message.exposures}),
                 10,
             )
-            self.create_subscription(
-                FluoroscopeCalibration,
-                f'{name}/calibration',
-                lambda message, name=name: self._calibrations.update({name: message}),
-                latched_qos(),
-            )
-            self.create_subscription(
-                CameraInfo,
-                f'{name}/camera_info',
-                lambda message, name=name: self._camera_infos.update({name: message}),
-                latched_qos(),
-            )
+            for kind, topic, newest in (
+                (FluoroscopeCalibration, 'calibration', self._calibrations),
+                (CameraInfo, 'camera_info', self._camera_infos),
+            ):
+                self.create_subscription(
+                    kind,
+                    f'{name}/{topic}',
+                    lambda message, newest=newest, name=name: newest.update({name: message}),
+                    latched_qos(),
+                )
 
     def _add_joints(self, message: JointAngles) -> None:
         """Keep motion of joints whose bodies are there."""
         if message.status[0] != JointAngles.FAILED:
             self.joint_angles.append(message)
-
-    def _on_undecodable(self, topic: str) -> None:
-        self.get_logger().error(f'topic {topic}: a message cannot be decoded')
 
     def _on_diagnostics(self, array: DiagnosticArray) -> None:
         for status in array.status:

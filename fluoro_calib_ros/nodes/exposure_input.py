@@ -31,10 +31,9 @@ from .calibration_settings import (
 from .messages.observations import ObservedFrame, frame_from_observed
 from .messages.status import Collected
 from .runtime.diagnostics import Logger, RateLimitedLogger, RefusalLog
-from .runtime.lifecycle import StreamNode
+from .runtime.lifecycle import Stream, StreamNode
 from .runtime.parameters import check_timeout
 from .runtime.services import Requests, ServiceEntry, within
-from .runtime.stream import Stream
 
 
 def _no_angle() -> None:

@@ -51,7 +51,7 @@ from .image_stream import (
 from .messages.image import message_from_image, use_single_thread
 from .messages.observations import NS_PER_S, message_from_frame, uint32_field
 from .runtime.diagnostics import Logger, RefusalLog, StartError, Status, health_of
-from .runtime.lifecycle import StreamNode
+from .runtime.lifecycle import StreamNode, remember, stream_faults
 from .runtime.main import run
 from .runtime.parameters import (
     READ_LIMITS,
@@ -62,7 +62,6 @@ from .runtime.parameters import (
     group,
     groups_of,
 )
-from .runtime.stream import remember, stream_faults
 from .runtime.topics import images_qos, observations_qos
 
 MODES = ('phantom', 'markers')
@@ -387,10 +386,7 @@ class ExtractionNode(StreamNode):
         return Status(name, *health, values)
 
 
-def main(args: Sequence[str] | None = None) -> None:
-    """Run the node."""
-    run(ExtractionNode, args)
-
+main = partial(run, ExtractionNode)
 
 if __name__ == '__main__':
     main()

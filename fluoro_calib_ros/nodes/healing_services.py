@@ -34,9 +34,9 @@ from ..processes import in_worker_process
 from .calibration_services import Job
 from .calibration_settings import NOT_ACTIVE, check_folders
 from .exposure_input import NodeParts
-from .messages.healing import fill_healing
 from .messages.observations import ObservedFrame, frame_from_observed
-from .runtime.services import ServiceEntry, in_thread, wake, within
+from .messages.self_calibration import fill_healing
+from .runtime.services import in_thread, telling_service, wake, within
 
 MAX_FRAMES = 20_000  # of a fluoroscope that are collected, whatever its rate
 MAX_SECONDS = 60.0
@@ -133,8 +133,12 @@ class Healing(Job):
         self._collection: MarkerCollection | None = None
         self._healed: tuple[HealingOutcome, _Rig] | None = None  # to be accepted
         self.services = (
-            ServiceEntry('accept_healing', Reset, self._on_accept),
-            ServiceEntry('roll_back_healing', Reset, self._on_roll_back),
+            telling_service(
+                'accept_healing', Reset, 'not accepted', lambda _: self._accept(), self._logger
+            ),
+            telling_service(
+                'roll_back_healing', Reset, 'not rolled back', self._roll_back, self._logger
+            ),
         )
 
     def add(self, name: str, observed: ObservedFrame, angle: Callable[[], float | None]) -> None:
@@ -242,25 +246,6 @@ class Healing(Job):
 
     # -- versions
 
-    def _on_accept(self, _: Reset.Request, response: Reset.Response) -> Reset.Response:
-        return self._told(response, 'not accepted', self._accept)
-
-    def _on_roll_back(self, _: Reset.Request, response: Reset.Response) -> Reset.Response:
-        return self._told(response, 'not rolled back', self._roll_back)
-
-    def _told(
-        self, response: Reset.Response, refused: str, act: Callable[[], str]
-    ) -> Reset.Response:
-        try:
-            response.message = act()
-        except (DataError, OSError) as error:
-            response.message = f'{refused}: {error}'
-            self._logger.error(response.message)
-            return response
-        response.success = True
-        self._logger.info(response.message)
-        return response
-
     def _accept(self) -> str:
         """Save, use and publish the healed rig; returns what was done. Raises DataError."""
         if self._healed is None:
@@ -285,7 +270,7 @@ class Healing(Job):
             f'{rig.orientation.orientation_id}'
         )
 
-    def _roll_back(self) -> str:
+    def _roll_back(self, _: Reset.Request) -> str:
         """Return to the parent of the healed rig in use. Raises DataError."""
         directory = self._rig.directory
         healed = self._output.orientation

@@ -10,7 +10,7 @@ also receives the joint states that give the angle of its C-arm.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 
@@ -215,10 +215,7 @@ class ImageNode(CorrectingNode):
             stream.compressed += 1
 
 
-def main(args: Sequence[str] | None = None) -> None:
-    """Run the node."""
-    run(ImageNode, args)
-
+main = partial(run, ImageNode)
 
 if __name__ == '__main__':
     main()

@@ -20,8 +20,8 @@ from ..jobs.followers import MakeFollower, Observations, follower_process
 from ..processes import LentArrays, WorkerProcess
 from .angle_input import AngleInput
 from .messages.image import IMAGE_REFUSALS, ImageConverter
-from .runtime.diagnostics import OK, Health, RefusalLog, Refused, warning
-from .runtime.stream import (
+from .runtime.diagnostics import Health, RefusalLog, Refused, healthy, warning
+from .runtime.lifecycle import (
     Stream,
     StreamState,
     inactive_node,
@@ -160,11 +160,6 @@ def unknown_angle(state: ImageState) -> Health | None:
     )
 
 
-def extracting(state: ImageState) -> Health:
-    """Nothing is wrong."""
-    return Health(OK, 'extracting')
-
-
 CONDITIONS = (
     lost_messages,
     incompatible_publisher,
@@ -176,7 +171,7 @@ CONDITIONS = (
     empty_image,
     unknown_angle,
     refused_messages,
-    extracting,
+    healthy('extracting'),
 )
 
 

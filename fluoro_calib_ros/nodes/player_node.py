@@ -8,8 +8,8 @@ from __future__ import annotations
 import threading
 import time
 import traceback
-from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import rclpy
 from rclpy.exceptions import NameValidationException
@@ -20,6 +20,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from ..errors import DataError
 from ..io.bags.reader import TopicInfo, iterate_messages, topics_of
+from ..io.bags.recording import PlayingOptions
 from ..options import option
 from .runtime.diagnostics import StartError, Trace, one_line
 from .runtime.main import run
@@ -114,36 +115,16 @@ OTHER_STREAMS = ('CorrectedObservations', 'Image', 'CompressedImage')
 
 
 @dataclass(frozen=True)
-class PlayerParameters:
+class PlayerParameters(PlayingOptions):
     """Parameters of the player."""
 
     bag: str = option('', 'bag to play: an .mcap file or a folder of rosbag2')
-    rate: float = option(1.0, 'speed relative to the recording', minimum=0.001, maximum=1e6)
-    loop: bool = option(False, 'whether the bag is played over and over')
     wait_for_readers: int = option(
         1,
         'subscriptions to wait for, of every topic with target observations; without any, one of '
         'every topic with corrected observations or images, or else of all topics',
         minimum=0,
         maximum=100,
-    )
-    start_offset: float = option(
-        0.0,
-        'time after the first message at which playing begins; latched messages before are given '
-        'first',
-        minimum=0.0,
-        maximum=1e9,
-        unit='s',
-    )
-    start_paused: bool = option(
-        False, 'whether to wait for the services ~/pause (data: false) or ~/step'
-    )
-    clock: float = option(
-        0.0,
-        'rate at which the time of the recording is published on /clock; 0: not at all',
-        minimum=0.0,
-        maximum=1000.0,
-        unit='Hz',
     )
     strip_prefix: str = option('', 'prefix removed from recorded topics')
     topics: tuple[str, ...] = option(('',), 'topics to play; empty: all')
@@ -332,10 +313,7 @@ def is_latched(info: TopicInfo) -> bool:
     return any(profile.get('durability') == 'transient_local' for profile in info.offered_qos)
 
 
-def main(args: Sequence[str] | None = None) -> None:
-    """Run the node."""
-    run(PlayerNode, args)
-
+main = partial(run, PlayerNode)
 
 if __name__ == '__main__':
     main()

@@ -16,8 +16,7 @@ from fluoro_calib_msgs.msg import Retraction
 from .messages.observations import nanoseconds_from_stamp, stamp_from_nanoseconds, uint32_field
 from .messages.points import PointsContent
 from .runtime.diagnostics import RefusalLog
-from .runtime.lifecycle import StreamNode
-from .runtime.stream import remember
+from .runtime.lifecycle import StreamNode, remember
 from .runtime.topics import observations_qos
 
 TOPIC = 'retractions'

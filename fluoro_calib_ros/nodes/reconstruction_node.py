@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 
@@ -43,7 +43,7 @@ from .reconstruction_output import (
 )
 from .rig_input import BodyFollower, BodyParameters, Rig, RigInput, read_body_files
 from .runtime.diagnostics import LatencyWindow, RefusalLog, Refused, Status, health_of
-from .runtime.lifecycle import StreamNode
+from .runtime.lifecycle import Stream, StreamNode, stream_faults
 from .runtime.main import run
 from .runtime.parameters import (
     READ_LIMITS,
@@ -51,7 +51,6 @@ from .runtime.parameters import (
     ParameterGroup,
     declare_read_limits,
 )
-from .runtime.stream import Stream, stream_faults
 from .runtime.topics import latched_qos, observations_qos
 
 VIEWS = 'corrected_observations'
@@ -389,10 +388,7 @@ def _corrected_view(frame: CorrectedFrame) -> CorrectedView:
     )
 
 
-def main(args: Sequence[str] | None = None) -> None:
-    """Run the node."""
-    run(ReconstructionNode, args)
-
+main = partial(run, ReconstructionNode)
 
 if __name__ == '__main__':
     main()

@@ -15,12 +15,13 @@ from fluoro_calib_msgs.msg import BodyPoses, JointAngles, ReconstructedPoints
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rclpy.publisher import Publisher
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState, PointCloud2
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import MarkerArray
 
 from ..bodies.body import STATUS_NAMES, Body, PoseStatus
-from ..bodies.joint_tracking import JointTracker
+from ..bodies.tracking import JointTracker
 from ..exposures.pairing import Pairer
 from ..reconstruction.epipolar import RecentMisses
 from ..reconstruction.intersection import FAILED, OUTSIDE, REJECTED, SINGLE_VIEW, IntersectedPoints
@@ -39,16 +40,26 @@ from .messages.points import (
     PointsContent,
     ellipsoid_markers,
     encode_reconstructed_points,
-    message_from_points,
     mocap_markers,
     point_cloud,
 )
 from .rig_input import BodiesState, BodyFollower, RigInput
-from .runtime.diagnostics import OK, WARN, Health, RecentCounts, Status, fault, health_of, warning
-from .runtime.lifecycle import StreamNode
-from .runtime.stream import (
+from .runtime.diagnostics import (
+    OK,
+    WARN,
+    Health,
+    RecentCounts,
+    Status,
+    counted,
+    fault,
+    health_of,
+    healthy,
+    warning,
+)
+from .runtime.lifecycle import (
     InputState,
     Stream,
+    StreamNode,
     inactive_node,
     incompatible_publisher,
     lost_messages,
@@ -118,7 +129,8 @@ class PointsOutput:
         ]
         if not wanted:
             return
-        message = message_from_points(content)
+        data = encode_reconstructed_points(content)
+        message = deserialize_message(data, ReconstructedPoints)
         good = np.flatnonzero(content.points.status <= OUTSIDE)
         if 'points' in wanted:
             self._outputs['points'].publish(point_cloud(message, good))
@@ -235,14 +247,12 @@ def silent_fluoroscopes(state: ReconstructionState) -> Health | None:
     )
 
 
-def foreign_calibrations(state: ReconstructionState) -> Health | None:
-    """Views were corrected with calibrations of no known orientation."""
-    count = state.recent['without_orientation']
-    corrected = (
-        f'{count} exposures in the last minute were corrected with calibrations to which no '
-        'orientation of the rig belongs'
-    )
-    return warning(corrected if count else '')
+# Views were corrected with calibrations of no known orientation.
+foreign_calibrations = counted(
+    'without_orientation',
+    '{count} exposures in the last minute were corrected with calibrations to which no '
+    'orientation of the rig belongs',
+)
 
 
 def distant_stamps(state: ReconstructionState) -> Health | None:
@@ -250,18 +260,10 @@ def distant_stamps(state: ReconstructionState) -> Health | None:
     return warning(state.pairer.stamps.disagreement())
 
 
-def incomplete_exposures(state: ReconstructionState) -> Health | None:
-    """Exposures have some of the views only."""
-    count = state.recent['incomplete']
-    text = f'{count} exposures without all fluoroscopes in the last minute'
-    return warning(text if count else '')
-
-
-def reconstructing(state: ReconstructionState) -> Health:
-    """Nothing is wrong."""
-    return Health(OK, 'reconstructing')
-
-
+# Exposures have some of the views only.
+incomplete_exposures = counted(
+    'incomplete', '{count} exposures without all fluoroscopes in the last minute'
+)
 STREAM_CONDITIONS = (
     missing_publishers,
     missed_rays,
@@ -272,7 +274,7 @@ STREAM_CONDITIONS = (
     overrun_input,
     unpaired_frames,
     incomplete_exposures,
-    reconstructing,
+    healthy('reconstructing'),
 )
 CONDITIONS = (
     lost_messages,
@@ -336,18 +338,13 @@ def ambiguous_body(state: BodyState) -> Health | None:
     return warning(text if state.status == PoseStatus.AMBIGUOUS else '')
 
 
-def tracked_body(state: BodyState) -> Health:
-    """Nothing is wrong."""
-    return Health(OK, 'tracked')
-
-
 BODY_CONDITIONS = (
     exposures_without_time,
     unseen_body,
     lost_body,
     predicted_body,
     ambiguous_body,
-    tracked_body,
+    healthy('tracked'),
 )
 
 
@@ -361,12 +358,7 @@ def awaited_neutral(joint: JointTracker) -> Health | None:
     return warning('no angles before the end of the neutral trial' if joint.needs_neutral else '')
 
 
-def followed_joint(joint: JointTracker) -> Health:
-    """Nothing is wrong."""
-    return Health(OK, 'followed')
-
-
-JOINT_CONDITIONS = (failed_neutral, awaited_neutral, followed_joint)
+JOINT_CONDITIONS = (failed_neutral, awaited_neutral, healthy('followed'))
 
 
 def statuses_of(follower: BodyFollower, counts: RecentCounts) -> list[Status]:

@@ -9,6 +9,7 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 from rclpy.duration import Duration
@@ -19,7 +20,6 @@ from ..errors import DataError
 from ..io.bags.recording import MEGABYTE, Recording, RecordingOptions, TopicToRecord, lost_text
 from ..options import option
 from .runtime.diagnostics import (
-    OK,
     DiagnosticsPublisher,
     Health,
     RateLimitedLogger,
@@ -27,6 +27,7 @@ from .runtime.diagnostics import (
     Status,
     fault,
     health_of,
+    healthy,
     warning,
 )
 from .runtime.main import run
@@ -81,12 +82,7 @@ def overrun_input(state: RecorderState) -> Health | None:
     return warning(state.overrun)
 
 
-def running(state: RecorderState) -> Health:
-    """Nothing is wrong."""
-    return Health(OK, 'recording')
-
-
-CONDITIONS = (failed_recording, dropped_messages, overrun_input, running)
+CONDITIONS = (failed_recording, dropped_messages, overrun_input, healthy('recording'))
 
 
 class RecorderNode(ParameterNode):
@@ -251,10 +247,7 @@ def type_hash_text(publisher: TopicEndpointInfo) -> str:
     return f'RIHS01_{bytes(found.value).hex()}'
 
 
-def main(args: Sequence[str] | None = None) -> None:
-    """Run the node."""
-    run(RecorderNode, args)
-
+main = partial(run, RecorderNode)
 
 if __name__ == '__main__':
     main()

@@ -16,8 +16,7 @@ from fluoro_calib_msgs.msg import RigOrientation
 from numpy.typing import NDArray
 
 from ..bodies.body import Body, solvable_bodies
-from ..bodies.joint_tracking import JointTracker
-from ..bodies.tracking import BodyTracker, TrackedExposure, poses_of, twists_of
+from ..bodies.tracking import BodyTracker, JointTracker, TrackedExposure, poses_of, twists_of
 from ..checks.rig_watch import RigDriftWatch
 from ..errors import DataError
 from ..io.bodies import JointEntry, read_bodies, read_joints

@@ -19,8 +19,7 @@ from ..bodies.body import Body
 from ..bodies.shapes import LearnedShapes
 from ..errors import DataError, ErrorsAt
 from ..io.bodies import read_bodies
-from ..io.drift_alarm import has_drift_alarm, write_drift_alarm
-from ..io.learned_shapes import write_learned_shapes
+from ..io.versions import has_drift_alarm, write_drift_alarm, write_learned_shapes
 from ..jobs.bodies import BodiesOptions
 from ..jobs.learning import DRIFTED, learn_shapes, learned_for
 from ..jobs.result_folder import belongs_to

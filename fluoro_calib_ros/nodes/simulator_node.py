@@ -9,8 +9,9 @@ import math
 import threading
 import time
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import rclpy
@@ -22,15 +23,15 @@ from ..exposures.frame import Frame
 from ..jobs.simulation import MARKER_ATTENUATION, MARKER_MM, SETTINGS, RenderedScene, Renderers
 from ..options import option
 from ..photogrammetry.rotations import matrix_from_vector, vector_from_matrix
-from ..simulation.exposures import (
+from ..simulation.rig import (
     CLUSTER_MARKERS,
     Detection,
     detect_beads,
     phantom_poses,
     simulate_grid,
     simulate_tracking,
+    virtual_rig,
 )
-from ..simulation.rig import virtual_rig
 from .messages.image import message_from_image
 from .messages.observations import message_from_frame, set_number_and_stamp, stamp_from_nanoseconds
 from .runtime.diagnostics import StartError, Trace
@@ -289,10 +290,7 @@ class SimulatorNode(ParameterNode):
         self._worker.join(2.0)
 
 
-def main(args: Sequence[str] | None = None) -> None:
-    """Run the node."""
-    run(SimulatorNode, args)
-
+main = partial(run, SimulatorNode)
 
 if __name__ == '__main__':
     main()

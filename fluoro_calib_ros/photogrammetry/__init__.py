@@ -5,6 +5,6 @@
 
 The functions take and return numpy arrays and frozen dataclasses. A bundle adjustment passes
 through these modules: `network` (data), `unknowns` (layout and values), `normal_equations`,
-`elimination` (solution), `adjustment` (Levenberg-Marquardt), `noise_estimation` (around it),
+`elimination` (solution), `adjustment` (Levenberg-Marquardt), `outliers` (noise around it),
 `precision`, then `diagnosis` and `outliers`.
 """

@@ -6,7 +6,7 @@
 Maximum likelihood of the image points (Student-t, Huber or Gaussian) and of the surveyed
 coordinates (Gaussian; they define the datum unless inner constraints do), for a given noise model.
 Levenberg-Marquardt with Nielsen's damping (Madsen, Nielsen and Tingleff, "Methods for non-linear
-least squares problems", DTU 2004), iteratively reweighted. `noise_estimation` estimates the noise
+least squares problems", DTU 2004), iteratively reweighted. `outliers` estimates the noise
 model around it.
 """
 

@@ -9,10 +9,17 @@ the rotation phantom -> sensor, (xp, yp, c) the interior orientation [px]. A rot
 the left, R -> exp([w]x) R, so that dX/dw = -[X]x.
 """
 
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
+from scipy.linalg import blas
 
-from .rotations import cross_matrix
+from .rotations import cross_matrix, mirror_lower
 
 
 def to_sensor(
@@ -84,3 +91,276 @@ def project_with_jacobian(
     d_interior[:, 1, 1] = 1.0
     d_interior[:, :, 2] = ratio
     return uv, d_exterior, d_point, d_interior
+
+
+# Additional parameters: a correction of the image points that is linear in its coefficients.
+#
+# The coefficients are unknowns of the adjustment. The functions are evaluated at observed pixels,
+# so they do not change while the unknowns are adjusted. A Gaussian prior (mean zero) on the
+# coefficients makes the correction a signal in the sense of least-squares collocation (Moritz,
+# "Advanced Physical Geodesy", Wichmann 1980, part B).
+
+ALL = slice(None)
+
+
+@dataclass(frozen=True)
+class GroupedFunctions:
+    """Further functions with coefficients of their own in every group of image points.
+
+    values (N, 2, t): the functions at the image points, shared by u and v; group (N,): group of
+    each image point, ascending from 0. The coefficients of one group stand after those of the one
+    before.
+    """
+
+    values: np.ndarray
+    group: np.ndarray
+
+    @property
+    def count(self) -> int:
+        """Number of coefficients."""
+        return (int(self.group[-1]) + 1) * self.values.shape[2]
+
+    def split(self, of_coefficients: np.ndarray) -> np.ndarray:
+        """Values (..., count) of the coefficients as (..., groups, t)."""
+        return of_coefficients.reshape(*of_coefficients.shape[:-1], -1, self.values.shape[2])
+
+
+@dataclass(frozen=True)
+class _Ordered:
+    """Functions (N, k) of the image points in the order of an index, and where it changes."""
+
+    index: np.ndarray
+    order: np.ndarray | slice
+    functions: np.ndarray
+    groups: list[tuple[int, int, int]]
+
+
+@dataclass(frozen=True)
+class AdditionalParameters:
+    """Functions and prior of the additional parameters of one fluoroscope."""
+
+    #: (N, 2, p) values of the functions at the N image points of the fluoroscope. (N, k): the same
+    #: functions for u and v with separate coefficients, p = 2 k, those of u first. (N, 2, p):
+    #: coefficients shared by u and v
+    functions: NDArray[np.float64]
+    prior: NDArray[np.float64]  #: (P, P) precision matrix of the coefficients; zeros for no prior
+    #: with functions (N, k): functions of groups of image points; their coefficients are the last
+    #: ones
+    own: GroupedFunctions | None = None
+
+    @property
+    def _common(self) -> int:
+        """Number of coefficients that all image points have in common."""
+        return self.functions.shape[-1] * (2 if self.functions.ndim == 2 else 1)
+
+    @property
+    def count(self) -> int:
+        """Number P of coefficients."""
+        return self._common + (0 if self.own is None else self.own.count)
+
+    @cached_property
+    def _contiguous(self) -> np.ndarray:
+        """Functions (2, N, p) of u and v: strided products take four times as long."""
+        return np.ascontiguousarray(self.functions.transpose(1, 0, 2))
+
+    def _by_axis(self) -> list[tuple[np.ndarray, slice]]:
+        """Functions (N, p or k) of u and of v, and the columns of their coefficients."""
+        if self.functions.ndim == 3:
+            return [(self._contiguous[axis], ALL) for axis in (0, 1)]
+        k = self.functions.shape[1]
+        return [(self.functions, slice(axis * k, (axis + 1) * k)) for axis in (0, 1)]
+
+    def correction(self, coefficients: np.ndarray) -> NDArray[np.float64]:
+        """Corrections (N, 2) [px] for coefficients (P,)."""
+        common = coefficients[: self._common]
+        out = np.stack([f @ common[columns] for f, columns in self._by_axis()], axis=1)
+        if self.own is not None:
+            of_point = self.own.split(coefficients[self._common :])[self.own.group]
+            out += (self.own.values @ of_point[:, :, None])[:, :, 0]
+        return out
+
+    def normal_matrix(self, weight: np.ndarray) -> np.ndarray:
+        """Normal matrix (P, P) of the coefficients for weights (N,) of the image points."""
+        out = np.zeros((self.count, self.count))
+        if self.functions.ndim == 2:
+            k = self.functions.shape[1]
+            if k:  # BLAS reports empty matrices as an error
+                weighted = np.sqrt(weight)[:, None] * self.functions
+                # BLAS stores by columns, so the transpose needs no copy.
+                lower = blas.dsyrk(1.0, weighted.T, lower=1)
+                out[:k, :k] = mirror_lower(lower)
+                out[k : 2 * k, k : 2 * k] = out[:k, :k]
+            if self.own is not None:
+                self._add_own(self.own, weight, out)
+            return out
+        lower = out.T
+        for f, _ in self._by_axis():
+            weighted = np.sqrt(weight)[:, None] * f
+            lower = blas.dsyrk(1.0, weighted.T, beta=1.0, c=lower, lower=1, overwrite_c=1)
+        return mirror_lower(lower)
+
+    def _add_own(self, own: GroupedFunctions, weight: np.ndarray, out: np.ndarray) -> None:
+        """Fill in the rows and columns of functions of groups in a normal matrix."""
+        weighted = weight[:, None, None] * own.values
+        groups = int(own.group[-1]) + 1
+        products = self.grouped_products(own.group, groups, weighted)
+        rows = products.reshape(own.count, self.count)
+        out[self._common :] = rows
+        out[: self._common, self._common :] = rows[:, : self._common].T
+
+    def right_side(self, values: np.ndarray) -> np.ndarray:
+        """Sum (P,) over the image points of the functions times values (N, 2)."""
+        out = np.zeros(self.count)
+        for axis, (f, columns) in enumerate(self._by_axis()):
+            out[: self._common][columns] += values[:, axis] @ f
+        if self.own is not None:
+            of_point = (values[:, None] @ self.own.values)[:, 0]
+            np.add.at(self.own.split(out[self._common :]), self.own.group, of_point)
+        return out
+
+    def _ordered(self, index: np.ndarray) -> _Ordered:
+        """Functions (N, k) in the order of an index (N,); the last unordered one is kept."""
+        kept: _Ordered | None = self.__dict__.get('_kept')
+        if kept is not None and np.array_equal(kept.index, index):
+            return kept
+        steps = np.diff(index)
+        if np.all(steps >= 0):
+            return _Ordered(index, ALL, self.functions, _groups(index))
+        order = np.argsort(index, kind='stable')
+        made = _Ordered(index, order, self.functions[order], _groups(index[order]))
+        self.__dict__['_kept'] = made
+        return made
+
+    def grouped_products(self, index: np.ndarray, count: int, a: np.ndarray) -> np.ndarray:
+        """Sums (count, q, P) of a^T times functions over image points with the same index.
+
+        index (N,) from 0 to count - 1; a (N, 2, q) weighted derivatives by other unknowns.
+        """
+        n, _, q = a.shape
+        out = np.zeros((count, q, self.count))
+        if self.functions.ndim == 2:
+            k = self.functions.shape[1]
+            ordered = self._ordered(index)
+            both = a.reshape(n, 2 * q)[ordered.order]
+            for start, stop, group in ordered.groups:
+                found = both[start:stop].T @ ordered.functions[start:stop]
+                out[group, :, :k] = found[:q]
+                out[group, :, k : 2 * k] = found[q:]
+        else:
+            rows = (index[:, None] * q + np.arange(q)).ravel()
+            starts = np.arange(0, n * q + 1, q)
+            flat = out.reshape(count * q, -1)
+            for axis in (0, 1):
+                shape = (count * q, n)
+                gather = sparse.csc_matrix((a[:, axis].ravel(), rows, starts), shape=shape)
+                flat += gather @ self._contiguous[axis]
+        if self.own is not None:
+            own = self.own
+            groups = int(own.group[-1]) + 1
+            products = (a.transpose(0, 2, 1) @ own.values).reshape(n, -1)
+            pairs = index * groups + own.group
+            gather = sparse.csc_matrix(
+                (np.ones(n), pairs, np.arange(n + 1)), shape=(count * groups, n)
+            )
+            sums = (gather @ products).reshape(count, groups, q, -1)
+            out[:, :, self._common :] = sums.transpose(0, 2, 1, 3).reshape(count, q, -1)
+        return out
+
+    def correction_covariance(self, covariance: np.ndarray, part: slice = ALL) -> np.ndarray:
+        """Covariances (n, 2, 2) [px^2] of the corrections at image points `part`.
+
+        covariance (P, P) of the coefficients.
+        """
+        (fu, cu), (fv, cv) = ((f[part], columns) for f, columns in self._by_axis())
+        common = covariance[: self._common, : self._common]
+        out = np.empty((len(fu), 2, 2))
+        for i, (f, columns) in enumerate(((fu, cu), (fv, cv))):
+            out[:, i, i] = np.einsum('np,np->n', f @ common[columns, columns], f)
+        out[:, 0, 1] = np.einsum('np,np->n', fu @ common[cu, cv], fv)
+        out[:, 1, 0] = out[:, 0, 1]
+        if self.own is not None:
+            out += self._own_covariance(self.own, covariance, part)
+        return out
+
+    def correction_variance(
+        self, covariance: np.ndarray, part: slice = ALL
+    ) -> NDArray[np.float64]:
+        """Traces (n,) [px^2] of `correction_covariance`, for half to a third of its work."""
+        common = covariance[: self._common, : self._common]
+        if self.functions.ndim == 2:
+            f = self.functions[part]
+            k = f.shape[1]
+            out = np.einsum('np,np->n', f @ (common[:k, :k] + common[k:, k:]), f)
+        else:
+            out = np.zeros(len(self.functions[part]))
+            for f, _ in self._by_axis():
+                out += np.einsum('np,np->n', f[part] @ common, f[part])
+        if self.own is not None:
+            own = self._own_covariance(self.own, covariance, part)
+            out += np.trace(own, axis1=1, axis2=2)
+        return out
+
+    def _own_covariance(
+        self, own: GroupedFunctions, covariance: np.ndarray, part: slice
+    ) -> np.ndarray:
+        """What functions of groups add (n, 2, 2) to the covariances of the corrections."""
+        values = own.values[part]
+        group = own.group[part]
+        t = own.values.shape[2]
+        rows = covariance[self._common :]
+        with_common = rows[:, : self._common].reshape(-1, t, self._common)
+        mixed = values @ self._common_cross_covariance(with_common, group, part)
+        groups = np.arange(len(with_common))
+        blocks = rows[:, self._common :].reshape(len(groups), t, len(groups), t)
+        blocks = blocks[groups, :, groups]
+        return (
+            mixed + mixed.transpose(0, 2, 1) + values @ blocks[group] @ values.transpose(0, 2, 1)
+        )
+
+    def cross_covariance(
+        self, covariance: np.ndarray, index: np.ndarray, part: slice = ALL
+    ) -> np.ndarray:
+        """Covariances (n, q, 2) of other unknowns with the corrections at image points `part`.
+
+        covariance (k, q, P) of k sets of other unknowns with the coefficients; index (n,) of the
+        set that belongs to each image point.
+        """
+        out = self._common_cross_covariance(covariance[:, :, : self._common], index, part)
+        if self.own is not None:
+            by_group = self.own.split(covariance[:, :, self._common :])
+            of_point = by_group[index, :, self.own.group[part]]
+            out += of_point @ self.own.values[part].transpose(0, 2, 1)
+        return out
+
+    def _common_cross_covariance(
+        self, covariance: np.ndarray, index: np.ndarray, part: slice
+    ) -> np.ndarray:
+        """Covariances (n, q, 2) as cross_covariance, of the common functions alone."""
+        sets, q, _ = covariance.shape
+        n = len(index)
+        order = np.argsort(index, kind='stable')
+        groups = _groups(index[order])
+        out = np.empty((n, q, 2))
+        if self.functions.ndim == 2:
+            k = self.functions.shape[1]
+            f = self.functions[part]
+            f = f if np.all(np.diff(order) == 1) else f[order]
+            both = covariance.reshape(sets, 2 * q, k)  # of every unknown, u first
+            found = np.empty((n, 2 * q))
+            for start, stop, group in groups:
+                np.matmul(f[start:stop], both[group].T, out=found[start:stop])
+            out[order] = found.reshape(n, q, 2)
+            return out
+        for axis in (0, 1):
+            ordered = self._contiguous[axis][part][order]
+            of_axis = np.empty((n, q))
+            for start, stop, group in groups:
+                np.matmul(ordered[start:stop], covariance[group].T, out=of_axis[start:stop])
+            out[order, :, axis] = of_axis
+        return out
+
+
+def _groups(index: np.ndarray) -> list[tuple[int, int, int]]:
+    """First row, row after the last, and value of every value of an ascending index (n,)."""
+    starts = np.flatnonzero(np.diff(index, prepend=-1)).tolist()
+    return list(zip(starts, [*starts[1:], len(index)], index[starts].tolist()))

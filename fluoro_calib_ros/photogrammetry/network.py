@@ -22,8 +22,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from .additional_parameters import AdditionalParameters
-from .known_orientation import ExteriorPrior
+from .collinearity import AdditionalParameters
+from .rig_orientation import ExteriorPrior
 from .rotations import cross_matrix, matrix_from_vector
 from .unknowns import (
     INTERIOR_SIZE,

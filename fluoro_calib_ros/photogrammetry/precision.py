@@ -15,9 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .additional_parameters import AdditionalParameters
 from .adjustment import Adjustment
-from .collinearity import project_with_jacobian
+from .collinearity import AdditionalParameters, project_with_jacobian
 from .elimination import CovarianceBlocks, Elimination, FactorizedNormalMatrix, factorize
 from .network import Gauge, Network, STransformation
 from .noise import Noise

@@ -10,12 +10,13 @@ colours are those of Okabe and Ito, which colour-blind people can tell apart.
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import matplotlib
 import numpy as np
+from matplotlib import style
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -25,6 +26,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 
+from ..checks.comparison import Comparison, cell_centres
 from ..correction.base import Correction, CorrectionModel
 from ..exposures.phantom import Drawing
 from .tables import model_text
@@ -247,12 +249,8 @@ def _field_on_grid(
     model: CorrectionModel, image_size: Sequence[int], cells: int
 ) -> tuple[list[np.ndarray], Correction]:
     """Columns and rows of a regular grid over the image [px], and the Correction at its points."""
-    step = max(image_size) / cells
-    centres = [
-        -0.5 + step / 2 + step * np.arange(max(1, round(size / step))) for size in image_size
-    ]
-    u, v = np.meshgrid(*centres)
-    return centres, model.evaluate(np.column_stack([u.ravel(), v.ravel()]))
+    axes, centres = cell_centres(image_size, cells)
+    return axes, model.evaluate(centres)
 
 
 def _draw_image_frame(axes: Axes, image_size: Sequence[int]) -> None:
@@ -311,3 +309,94 @@ def _round_down(value: float) -> float:
     power = 10.0 ** np.floor(np.log10(value))
     digits = [digit for digit in ROUND_NUMBERS if digit * power <= value * (1 + 1e-9)]
     return float(power * max(digits))
+
+
+# What changed between two calibrations.
+
+ARROWS = 16  # along the longer side of the image
+
+
+def comparison_document(comparison: Comparison, mm_per_px: float | None) -> dict[str, Any]:
+    """Return a Comparison as a dict; mm_per_px is the scale at the phantom."""
+    largest, place = comparison.largest
+    scale = float('nan') if mm_per_px is None else mm_per_px
+    return {
+        'interior_px': comparison.interior,
+        'interior_sd_px': comparison.interior_sd,
+        'interior_changed': comparison.interior_changed,
+        'rms_px': comparison.rms_px,
+        'rms_mm': comparison.rms_px * scale,
+        'largest_px': largest,
+        'largest_mm': largest * scale,
+        'largest_at': list(place),
+        'share_significant': float(comparison.significant.mean()),
+        'field_changed': comparison.field_changed,
+    }
+
+
+def comparison_text(comparison: Comparison, mm_per_px: float | None) -> str:
+    """Return what changed in a few lines."""
+    largest, (u, v) = comparison.largest
+
+    def with_mm(pixels: float) -> str:
+        mm = '' if mm_per_px is None else f' ({pixels * mm_per_px:.3f} mm at the phantom)'
+        return f'{pixels:.3f} px{mm}'
+
+    verdicts = {True: 'significant', False: 'not significant'}
+    parts = [
+        f'{label} {value:+.2f} (sd {sd:.2f})'
+        for label, value, sd in zip(('xp', 'yp', 'c'), comparison.interior, comparison.interior_sd)
+    ]
+    share = 100 * comparison.significant.mean()
+    return '\n'.join(
+        [
+            f'fluoroscope {comparison.fluoroscope}',
+            f'  distortion: RMS {with_mm(comparison.rms_px)}, largest {with_mm(largest)} at '
+            f'column {u:.0f}, row {v:.0f}',
+            f'  significant in {share:.0f} % of the image: {verdicts[comparison.field_changed]}',
+            f'  interior orientation, both in one gauge [px]: {", ".join(parts)}: '
+            f'{verdicts[comparison.interior_changed]}',
+        ]
+    )
+
+
+def comparison_png(comparisons: Mapping[str, Comparison]) -> bytes:
+    """Return the differences of the fields of all fluoroscopes as a PNG file."""
+    with style.context(['default', STYLE]):
+        return png_bytes(_figure(list(comparisons.values())))
+
+
+def _figure(comparisons: Sequence[Comparison]) -> Figure:
+    """Arrows over the size of the difference; dots where it is significant."""
+    figure = new_figure(7.5 * len(comparisons), 7, 'Difference of the corrections, without gauge')
+    panels = figure.subplots(1, len(comparisons), squeeze=False)[0]
+    for axes, comparison in zip(panels, comparisons):
+        width, height = comparison.image_size
+        step = max(width, height) / ARROWS
+        mesh = axes.scatter(
+            *comparison.uv.T, c=comparison.size, cmap='YlOrRd', s=40, marker='s', vmin=0
+        )
+        figure.colorbar(mesh, ax=axes, label='difference [px]')
+        marked = comparison.uv[comparison.significant]
+        axes.plot(*marked.T, '.', color=BLACK, markersize=2)
+        keys = np.floor(comparison.uv / step).astype(int)
+        _, first = np.unique(keys, axis=0, return_index=True)
+        # A difference far below its standard deviation is shown as small as it is.
+        longest = max(float(comparison.size.max()), float(np.median(comparison.sd)))
+        factor = 0.8 * step / longest
+        factor = float(f'{factor:.1g}')
+        axes.quiver(
+            *comparison.uv[first].T,
+            *(factor * comparison.duv[first].T),
+            angles='xy',
+            scale_units='xy',
+            scale=1,
+            width=0.003,
+        )
+        axes.set_xlim(-0.5, width - 0.5)
+        axes.set_ylim(height - 0.5, -0.5)
+        axes.set(aspect='equal', xlabel='column u [px]', ylabel='row v [px]')
+        axes.set_title(
+            f'{comparison.fluoroscope}: arrows magnified {factor:g} times,\ndots: significant'
+        )
+    return figure

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib import style
@@ -39,8 +38,6 @@ from .figures import (
 from .residuals import Residuals, histogram_figure, position_figure
 from .tables import model_text
 
-MARKER: dict[str, Any] = {'marker': 'o', 'markersize': 4}
-
 
 def relative_costs(run: SelfCalibration) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """F (n+1,), G (n,) and recorded G (n,) of the n rounds, in percent of their first values.
@@ -71,9 +68,19 @@ def cost_figure(run: SelfCalibration) -> Figure:
     )
     left, middle, right = figure.subplots(1, 3)
     f, g, recorded = relative_costs(run)
-    _plot_costs(left, f, g, recorded)
-    _plot_mean(middle, (f[:-1] + g) / 2)
-    _plot_change(right, [r.change for r in run.history])
+    label = 'G as recorded (in units of the noise\nvariance, which decreases with F)'
+    left.plot(range(len(recorded)), recorded, ':', color=RED, label=label)
+    label = 'G: regression (weighted square sum of\nthe cross-validation, in one unit)'
+    _curve(left, g.tolist(), RED, label)
+    _curve(left, f.tolist(), BLUE, 'F: bundle adjustment\n(weighted square sum of residuals)')
+    left.set(title='Relative cost', ylabel='cost [% of iteration 0]')
+    label = 'mean of F and G (solid lines on the left),\nin percent, with equal weights'
+    _curve(middle, ((f[:-1] + g) / 2).tolist(), BLACK, label)
+    middle.set(title='Weighted average of both costs', ylabel='cost [% of iteration 0]')
+    label = 'change of the correction in the\nnext iteration'
+    _curve(right, [r.change for r in run.history], BLACK, label, 1)
+    right.axhline(SETTLED_PX, color=GREY, linestyle='--', label=f'tolerance: {SETTLED_PX:g} px')
+    right.set(title='Convergence of the correction', ylabel='RMS change of the correction [px]')
     n = len(g)
     for axes in (left, middle, right):
         axes.set(
@@ -90,56 +97,10 @@ def cost_figure(run: SelfCalibration) -> Figure:
     return figure
 
 
-def _plot_costs(axes: Axes, f: np.ndarray, g: np.ndarray, recorded: np.ndarray) -> None:
-    axes.plot(
-        range(len(recorded)),
-        recorded,
-        ':',
-        color=RED,
-        label='G as recorded (in units of the noise\nvariance, which decreases with F)',
-    )
-    axes.plot(
-        range(len(g)),
-        g,
-        '-',
-        color=RED,
-        label='G: regression (weighted square sum of\nthe cross-validation, in one unit)',
-        **MARKER,
-    )
-    axes.plot(
-        range(len(f)),
-        f,
-        '-',
-        color=BLUE,
-        label='F: bundle adjustment\n(weighted square sum of residuals)',
-        **MARKER,
-    )
-    axes.set(title='Relative cost', ylabel='cost [% of iteration 0]')
-
-
-def _plot_mean(axes: Axes, mean: np.ndarray) -> None:
-    axes.plot(
-        range(len(mean)),
-        mean,
-        '-',
-        color=BLACK,
-        label='mean of F and G (solid lines on the left),\nin percent, with equal weights',
-        **MARKER,
-    )
-    axes.set(title='Weighted average of both costs', ylabel='cost [% of iteration 0]')
-
-
-def _plot_change(axes: Axes, change: Sequence[float]) -> None:
-    axes.plot(
-        range(1, len(change) + 1),
-        change,
-        '-',
-        color=BLACK,
-        label='change of the correction in the\nnext iteration',
-        **MARKER,
-    )
-    axes.axhline(SETTLED_PX, color=GREY, linestyle='--', label=f'tolerance: {SETTLED_PX:g} px')
-    axes.set(title='Convergence of the correction', ylabel='RMS change of the correction [px]')
+def _curve(axes: Axes, values: Sequence[float], colour: str, label: str, first: int = 0) -> None:
+    """Draw a value for each iteration from the first one on."""
+    iterations = range(first, first + len(values))
+    axes.plot(iterations, values, '-', color=colour, label=label, marker='o', markersize=4)
 
 
 def _names_text(names: Sequence[str]) -> str:

@@ -20,8 +20,7 @@ from ..bodies.body import Body
 from ..bodies.joints import Joint
 from ..exposures.frame import Frame
 from ..photogrammetry.rotations import matrix_from_vector
-from .exposures import image_frames
-from .rig import StreamStart, VirtualRig
+from .rig import StreamStart, VirtualRig, image_frames
 
 CT_SD_MM = 0.1  # of a coordinate of a marker
 SIDE = 'right'

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from fluoro_calib_ros.io.formats.native import read_known_orientations, write_known_orientations
-from fluoro_calib_ros.photogrammetry.known_orientation import KnownOrientation
+from fluoro_calib_ros.photogrammetry.rig_orientation import KnownOrientation
 
 from ..harness import Target
 from ..seeds import written

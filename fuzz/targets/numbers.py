@@ -20,7 +20,7 @@ from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.io.observations import read_observations_csv, write_observations_csv
 from fluoro_calib_ros.io.phantom import read_phantom, write_phantom
 from fluoro_calib_ros.jobs.calibration import run_calibration
-from fluoro_calib_ros.simulation.exposures import simulate_exposures
+from fluoro_calib_ros.simulation.rig import simulate_exposures
 
 from ..harness import Target
 from ..seeds import rig

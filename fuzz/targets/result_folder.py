@@ -18,7 +18,7 @@ from fluoro_calib_ros.jobs.conversion import stations_of
 from fluoro_calib_ros.jobs.report import write_report
 from fluoro_calib_ros.jobs.result_folder import save_outcome
 from fluoro_calib_ros.report import html
-from fluoro_calib_ros.simulation.exposures import simulate_exposures
+from fluoro_calib_ros.simulation.rig import simulate_exposures
 
 from ..harness import Target, both
 from ..seeds import rig

@@ -10,8 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from fluoro_calib_ros.bodies.body import BodyPoses, PoseStatus
-from fluoro_calib_ros.bodies.joint_tracking import MAX_NEUTRAL, JointTracker
 from fluoro_calib_ros.bodies.joints import Joint, JointStatus, joint_motion, with_neutral
+from fluoro_calib_ros.bodies.tracking import MAX_NEUTRAL, JointTracker
 from fluoro_calib_ros.errors import DataError
 
 COUNT = 40

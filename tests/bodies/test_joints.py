@@ -11,14 +11,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from fluoro_calib_ros.bodies.anatomical_frames import (
+    CONVENTIONS,
     LANDMARK_FRAMES,
     AnatomicalFrame,
+    convention,
     frame_of_axes,
     frame_of_landmarks,
     frame_of_quaternion,
 )
 from fluoro_calib_ros.bodies.body import BodyPoses, PoseStatus
-from fluoro_calib_ros.bodies.joint_conventions import CONVENTIONS, convention
 from fluoro_calib_ros.bodies.joints import (
     Joint,
     JointStatus,

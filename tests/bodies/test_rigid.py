@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fluoro_calib_ros.bodies.rigid import fitted_pose, robust_pose
+from fluoro_calib_ros.bodies.body import fitted_pose, robust_pose
 
 
 @pytest.mark.parametrize('count, false', [(3, 0), (4, 1), (6, 2), (12, 5)])

@@ -10,8 +10,7 @@ import pytest
 from rigs import kinds
 from scipy.spatial.transform import Rotation
 
-from fluoro_calib_ros.bodies.body import Body
-from fluoro_calib_ros.bodies.rigid import fitted_pose
+from fluoro_calib_ros.bodies.body import Body, fitted_pose
 from fluoro_calib_ros.bodies.shapes import BodyPlaces, condition_number, estimate_shape
 from fluoro_calib_ros.findings import Kind
 from fluoro_calib_ros.photogrammetry.rotations import vector_from_matrix

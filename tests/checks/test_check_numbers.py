@@ -16,11 +16,12 @@ from fluoro_calib_ros.checks.bead_intersection import Beads, _scale, distances
 from fluoro_calib_ros.checks.beads import _layers, _sums, rejected_beads
 from fluoro_calib_ros.checks.check import Check, more_exposures, verdict_of
 from fluoro_calib_ros.checks.comparison import (
+    CELLS,
     Comparison,
     FieldDifference,
-    _cells,
     _difference,
     _test,
+    cell_centres,
     image_grid,
     orientation_fields,
     place_name,
@@ -409,7 +410,7 @@ def test_grids_lie_evenly_over_the_image():
     grid = image_grid((480, 240))
     assert grid[0].tolist() == [9.5, 4.5] and grid[-1].tolist() == [469.5, 234.5]
     assert grid[1].tolist() == [29.5, 4.5]
-    cells = _cells((640, 320))
+    _, cells = cell_centres((640, 320), CELLS)
     assert cells[0].tolist() == [4.5, 4.5] and cells[-1].tolist() == [634.5, 314.5]
     assert len(cells) == 64 * 32
     names = [place_name(uv, (90, 90)) for uv in ((5, 5), (45, 45), (80, 45), (45, 80))]

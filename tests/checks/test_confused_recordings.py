@@ -49,8 +49,7 @@ from fluoro_calib_ros.reconstruction.intersection import (
 )
 from fluoro_calib_ros.reconstruction.reconstruct import reconstruct_recording
 from fluoro_calib_ros.report import html as html_report
-from fluoro_calib_ros.simulation.exposures import Detection, detect_beads, phantom_poses
-from fluoro_calib_ros.simulation.rig import virtual_rig
+from fluoro_calib_ros.simulation.rig import Detection, detect_beads, phantom_poses, virtual_rig
 
 SIZE = 1024
 COUNT = 8

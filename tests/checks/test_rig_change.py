@@ -20,8 +20,7 @@ from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.reconstruction.epipolar import EpipolarGeometry
 from fluoro_calib_ros.reconstruction.intersection import Intersector
 from fluoro_calib_ros.reconstruction.reconstruct import reconstruct_exposure, reconstruct_recording
-from fluoro_calib_ros.simulation.exposures import simulate_tracking
-from fluoro_calib_ros.simulation.rig import virtual_rig
+from fluoro_calib_ros.simulation.rig import simulate_tracking, virtual_rig
 
 NOISE_PX = 0.25
 RATE_HZ = 30.0

@@ -24,8 +24,7 @@ from fluoro_calib_ros.estimation.calibrate import adjust_with_calibrations, cali
 from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.findings import Kind, Severity
-from fluoro_calib_ros.simulation.exposures import simulate_exposures
-from fluoro_calib_ros.simulation.rig import virtual_rig
+from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
 
 
 @functools.cache

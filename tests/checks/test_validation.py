@@ -49,8 +49,7 @@ from fluoro_calib_ros.io.calibration import load_calibrations, save_calibration
 from fluoro_calib_ros.io.calibration_request import read_request, write_request
 from fluoro_calib_ros.io.result_document import validation_document
 from fluoro_calib_ros.report.tables import verdict_text
-from fluoro_calib_ros.simulation.exposures import Detection, simulate_exposures
-from fluoro_calib_ros.simulation.rig import virtual_rig
+from fluoro_calib_ros.simulation.rig import Detection, simulate_exposures, virtual_rig
 
 pytestmark = pytest.mark.long
 

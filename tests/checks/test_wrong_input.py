@@ -34,8 +34,7 @@ from fluoro_calib_ros.io.observations import write_observations_csv
 from fluoro_calib_ros.io.phantom import write_phantom
 from fluoro_calib_ros.jobs.calibration import run_calibration
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector, rotation_angle
-from fluoro_calib_ros.simulation.exposures import Detection, simulate_exposures
-from fluoro_calib_ros.simulation.rig import virtual_rig
+from fluoro_calib_ros.simulation.rig import Detection, simulate_exposures, virtual_rig
 
 FAST = CalibrationOptions(model='none')
 PHANTOM = rig().phantom

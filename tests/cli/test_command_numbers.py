@@ -393,7 +393,7 @@ def test_reconstruct_says_by_how_much_its_limit_was_widened(
         plot=None,
     )
     monkeypatch.setattr('fluoro_calib_ros.jobs.reconstruction.reconstruct', lambda *_: made)
-    monkeypatch.setattr('fluoro_calib_ros.io.poses.write_reconstruction', lambda *_: None)
+    monkeypatch.setattr('fluoro_calib_ros.io.bodies.write_reconstruction', lambda *_: None)
     monkeypatch.setattr('fluoro_calib_ros.io.folder.check_output_file', lambda *_: None)
     recording = Fake(notes=(), frames={}, names=Names())
     monkeypatch.setattr(
@@ -612,9 +612,9 @@ def test_bag_commands_become_nodes_with_their_parameters(monkeypatch):
         source=Path('/x'),
         rate=2.0,
         loop=True,
-        start_offset=3,
+        start_offset=3.0,
         start_paused=False,
-        clock=0,
+        clock=0.0,
         topics=None,
     )
     bag._play(arguments)

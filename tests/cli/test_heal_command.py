@@ -12,7 +12,7 @@ import pytest
 from rigs import run
 
 from fluoro_calib_ros.io.calibration import load_orientation
-from fluoro_calib_ros.io.learned_shapes import LEARNED_SHAPES, read_learned_shapes
+from fluoro_calib_ros.io.versions import LEARNED_SHAPES, read_learned_shapes
 from fluoro_calib_ros.jobs.simulation import write_knee_recording
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.simulation.knee import simulate_knee, virtual_knee, walking

@@ -20,7 +20,7 @@ from fluoro_calib_ros.cli.process import STATE, Done, _Work, trial_row
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.io.calibration import load_calibration
 from fluoro_calib_ros.io.csv_table import write_table
-from fluoro_calib_ros.io.study_file import read_study
+from fluoro_calib_ros.io.rig_file import read_study
 
 STUDY = """
 trials = ["trials/*.csv"]

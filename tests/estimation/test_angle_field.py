@@ -15,8 +15,8 @@ from fluoro_calib_ros.correction.base import CorrectionStatus
 from fluoro_calib_ros.correction.calibration_record import HARMONICS, SD_GRID, VARIANCES
 from fluoro_calib_ros.correction.series import Functions
 from fluoro_calib_ros.errors import DataError
-from fluoro_calib_ros.estimation.angle_fit import can_be_fitted
 from fluoro_calib_ros.estimation.calibrate import adjust_with_calibrations, calibrate
+from fluoro_calib_ros.estimation.exposure_terms import can_be_fitted
 
 SIZE = (800, 600)
 ANGLES = np.deg2rad([-80.0, -50.0, -35.0, -10.0, 5.0, 30.0, 60.0, 85.0])

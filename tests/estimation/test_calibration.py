@@ -26,8 +26,13 @@ from fluoro_calib_ros.photogrammetry.rotations import (
     matrix_from_vector,
     rotation_angle,
 )
-from fluoro_calib_ros.simulation.exposures import Detection, detect_beads, simulate_exposures
-from fluoro_calib_ros.simulation.rig import StreamStart, virtual_rig
+from fluoro_calib_ros.simulation.rig import (
+    Detection,
+    StreamStart,
+    detect_beads,
+    simulate_exposures,
+    virtual_rig,
+)
 
 OK, OUTSIDE, INVALID = CorrectionStatus
 

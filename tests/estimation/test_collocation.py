@@ -37,7 +37,6 @@ from fluoro_calib_ros.correction.terms import (
 )
 from fluoro_calib_ros.estimation.calibrate import adjust_with_calibrations, calibrate
 from fluoro_calib_ros.estimation.collocation import CollocationTerms, EarlierTerms
-from fluoro_calib_ros.estimation.combined_adjustment import calibrate_by_adjustment
 from fluoro_calib_ros.estimation.estimator import AdjustmentProblem, GaugeKind, gauge_basis
 from fluoro_calib_ros.estimation.fluoroscope_terms import FluoroscopeTerms
 from fluoro_calib_ros.estimation.initial_network import (
@@ -55,7 +54,7 @@ from fluoro_calib_ros.estimation.priors import (
     starting_prior,
 )
 from fluoro_calib_ros.estimation.refinements import START_MODES
-from fluoro_calib_ros.estimation.self_calibration import estimator_of
+from fluoro_calib_ros.estimation.self_calibration import calibrate_by_adjustment, estimator_of
 from fluoro_calib_ros.estimation.signal import (
     Ripples,
     Signal,
@@ -64,22 +63,21 @@ from fluoro_calib_ros.estimation.signal import (
     shown_ripples,
     spectral_density,
 )
-from fluoro_calib_ros.photogrammetry.additional_parameters import (
-    AdditionalParameters,
-    GroupedFunctions,
-)
 from fluoro_calib_ros.photogrammetry.adjustment import (
     SolverOptions,
     adjust,
     residuals_and_q,
     total_cost,
 )
+from fluoro_calib_ros.photogrammetry.collinearity import (
+    AdditionalParameters,
+    GroupedFunctions,
+)
 from fluoro_calib_ros.photogrammetry.elimination import (
     EliminateExposures,
     EliminatePoints,
     factorize,
 )
-from fluoro_calib_ros.photogrammetry.known_orientation import ExteriorPrior
 from fluoro_calib_ros.photogrammetry.noise import Noise
 from fluoro_calib_ros.photogrammetry.normal_equations import normal_equations, right_sides
 from fluoro_calib_ros.photogrammetry.precision import (
@@ -90,8 +88,13 @@ from fluoro_calib_ros.photogrammetry.precision import (
     solved_additional,
     variance_of_projection,
 )
-from fluoro_calib_ros.simulation.exposures import simulate_exposures
-from fluoro_calib_ros.simulation.rig import DistortionField, StreamStart, virtual_rig
+from fluoro_calib_ros.photogrammetry.rig_orientation import ExteriorPrior
+from fluoro_calib_ros.simulation.rig import (
+    DistortionField,
+    StreamStart,
+    simulate_exposures,
+    virtual_rig,
+)
 
 sys.path.append(str(Path(__file__).resolve().parents[2]))  # benchmarks are not installed
 

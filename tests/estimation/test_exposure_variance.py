@@ -15,9 +15,12 @@ from fluoro_calib_ros.estimation.exposure_terms import (
     exposure_functions,
     variance_between_exposures,
 )
-from fluoro_calib_ros.photogrammetry.additional_parameters import AdditionalParameters
 from fluoro_calib_ros.photogrammetry.adjustment import adjust
-from fluoro_calib_ros.photogrammetry.collinearity import project, project_with_jacobian
+from fluoro_calib_ros.photogrammetry.collinearity import (
+    AdditionalParameters,
+    project,
+    project_with_jacobian,
+)
 from fluoro_calib_ros.photogrammetry.elimination import factorize
 from fluoro_calib_ros.photogrammetry.noise import Noise
 from fluoro_calib_ros.photogrammetry.normal_equations import normal_equations

@@ -39,7 +39,7 @@ from fluoro_calib_ros.photogrammetry.plane_resection import (
     robust_homography,
 )
 from fluoro_calib_ros.photogrammetry.rotations import rotation_angle
-from fluoro_calib_ros.simulation.exposures import Detection, simulate_exposures
+from fluoro_calib_ros.simulation.rig import Detection, simulate_exposures
 
 POINTS = grid_points(12, 12, 23.0)
 SURVEY = grid_survey(POINTS)

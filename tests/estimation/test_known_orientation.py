@@ -24,10 +24,10 @@ from fluoro_calib_ros.io.observations import write_observations_csv
 from fluoro_calib_ros.jobs.calibration import run_calibration
 from fluoro_calib_ros.jobs.result_folder import save_outcome
 from fluoro_calib_ros.photogrammetry.adjustment import adjust
-from fluoro_calib_ros.photogrammetry.known_orientation import ExteriorPrior, KnownOrientation
 from fluoro_calib_ros.photogrammetry.noise import Noise
 from fluoro_calib_ros.photogrammetry.precision import precision
-from fluoro_calib_ros.simulation.exposures import Detection, detect_beads
+from fluoro_calib_ros.photogrammetry.rig_orientation import ExteriorPrior, KnownOrientation
+from fluoro_calib_ros.simulation.rig import Detection, detect_beads
 
 PLAIN = CalibrationOptions(model='none')
 

@@ -40,14 +40,15 @@ from fluoro_calib_ros.photogrammetry.rig_orientation import (
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector, vector_from_matrix
 from fluoro_calib_ros.reconstruction.intersection import OK, Intersector
 from fluoro_calib_ros.reconstruction.reconstruct import reconstruct_recording
-from fluoro_calib_ros.simulation.exposures import (
+from fluoro_calib_ros.simulation.rig import (
     Detection,
+    VirtualRig,
     detect_beads,
     phantom_poses,
     simulate_exposures,
     simulate_tracking,
+    virtual_rig,
 )
-from fluoro_calib_ros.simulation.rig import VirtualRig, virtual_rig
 
 pytestmark = pytest.mark.long
 

@@ -24,7 +24,7 @@ from fluoro_calib_ros.estimation.lack_of_fit import (
     sd_with_lack_of_fit,
 )
 from fluoro_calib_ros.estimation.signal import Signal, spectral_density
-from fluoro_calib_ros.photogrammetry.additional_parameters import AdditionalParameters
+from fluoro_calib_ros.photogrammetry.collinearity import AdditionalParameters
 
 SIZE = (800, 600)
 INTERIOR = np.array([410.0, 290.0, 2900.0])

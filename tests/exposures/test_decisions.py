@@ -11,7 +11,7 @@ import pytest
 from rigs import calibrated, exposures, rig, run
 
 from fluoro_calib_ros.checks.check import Check
-from fluoro_calib_ros.checks.doubtful import doubtful_observations
+from fluoro_calib_ros.checks.residual_tests import doubtful_observations
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.calibrate import calibrate
 from fluoro_calib_ros.estimation.options import CalibrationOptions

@@ -27,9 +27,8 @@ from fluoro_calib_ros.images.measurement import measure_beads
 from fluoro_calib_ros.images.shadow_fit import Profile
 from fluoro_calib_ros.images.view import Lens, View, exponents, fit_view, may_be_found
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
-from fluoro_calib_ros.simulation.exposures import phantom_poses
 from fluoro_calib_ros.simulation.radiographs import HARD, Radiography
-from fluoro_calib_ros.simulation.rig import VirtualRig, virtual_rig
+from fluoro_calib_ros.simulation.rig import VirtualRig, phantom_poses, virtual_rig
 
 LENS = Lens((1024, 1024), 4000.0)
 

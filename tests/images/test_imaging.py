@@ -8,9 +8,14 @@ import numpy as np
 import pytest
 
 from fluoro_calib_ros.images.detection import field_of_view
-from fluoro_calib_ros.images.imaging import Expected, Imaging, first_imaging
 from fluoro_calib_ros.images.light import Light, estimate_noise
-from fluoro_calib_ros.images.measurement import estimate_profile, measure_beads
+from fluoro_calib_ros.images.measurement import (
+    Expected,
+    Imaging,
+    estimate_profile,
+    first_imaging,
+    measure_beads,
+)
 
 FINE = 4  # points across a pixel
 PITCH = 60

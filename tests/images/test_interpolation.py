@@ -6,7 +6,7 @@
 import numpy as np
 import pytest
 
-from fluoro_calib_ros.images.interpolation import interpolated
+from fluoro_calib_ros.images.growth import interpolated
 
 LENGTH_PX = 250.0
 

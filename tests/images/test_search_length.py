@@ -11,7 +11,7 @@ from rigs import refused
 from fluoro_calib_ros.findings import Kind
 from fluoro_calib_ros.images import matching
 from fluoro_calib_ros.images.growth import Seen
-from fluoro_calib_ros.images.search_length import enough_seeds
+from fluoro_calib_ros.images.pose_search import enough_seeds
 from fluoro_calib_ros.images.view import Lens
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 

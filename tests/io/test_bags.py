@@ -60,10 +60,15 @@ def some_frames(number=6):
     return [frame(name, i, sigma=i % 2 == 0) for i in range(number) for name in 'ab']
 
 
-def write_bag(path, frames=None, **options):
+def write_bag(path, frames=None, split_bytes=0, **options):
+    """split_bytes: size after which the next file is begun; 0: never."""
     with BagWriter(path, **options) as writer:
         for one in some_frames() if frames is None else frames:
+            if split_bytes and writer.file_bytes >= split_bytes:
+                writer.split()
             writer.write_frame(one)
+            if split_bytes:
+                writer.flush()
     return str(path)
 
 

@@ -23,7 +23,7 @@ from fluoro_calib_ros.io.calibration import load_calibration, save_calibration
 from fluoro_calib_ros.io.documents import parse_yaml
 from fluoro_calib_ros.io.formats.native import read_known_orientations
 from fluoro_calib_ros.jobs.simulation import write_bag
-from fluoro_calib_ros.simulation.exposures import simulate_exposures
+from fluoro_calib_ros.simulation.rig import simulate_exposures
 
 MEGABYTES = 40
 

@@ -219,7 +219,7 @@ def test_mayacam1_has_five_rows(tmp_path, count):
 def test_coefficients_of_dlt_without_an_image_size_are_refused(tmp_path):
     path = tmp_path / 'dlt.csv'
     registry.write(path, 'dlt', Content(cameras=cameras()), MM)
-    with pytest.raises(DataError, match='do not contain the image size, --image-size WxH'):
+    with pytest.raises(DataError, match='does not contain the image size, --image-size WxH'):
         registry.read(path, FileSettings(units='mm'))
 
 

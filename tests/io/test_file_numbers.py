@@ -20,6 +20,7 @@ from fluoro_calib_ros.exposures.names import Names
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.images.codec import decode
 from fluoro_calib_ros.io import image_reading, image_writing, recordings
+from fluoro_calib_ros.io.bodies import COLUMNS, POINT_COLUMNS, point_table, pose_table
 from fluoro_calib_ros.io.calibration_request import (
     VERSION,
     read_options,
@@ -27,7 +28,6 @@ from fluoro_calib_ros.io.calibration_request import (
     write_request,
 )
 from fluoro_calib_ros.io.observations import correct_points, points_of_frames
-from fluoro_calib_ros.io.poses import COLUMNS, POINT_COLUMNS, point_table, pose_table
 from fluoro_calib_ros.io.recordings import DicomHeader, _cine_rate, _dicom_rate, _grey
 from fluoro_calib_ros.io.result_document import drift_document
 from fluoro_calib_ros.reconstruction.intersection import OK, REJECTED, STATUS_NAMES

@@ -9,7 +9,7 @@ import pytest
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.io.formats.native import read_known_orientations, write_known_orientations
 from fluoro_calib_ros.photogrammetry.collinearity import project
-from fluoro_calib_ros.photogrammetry.known_orientation import KnownOrientation
+from fluoro_calib_ros.photogrammetry.rig_orientation import KnownOrientation
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 
 K = np.array([[4000.0, 0, 500], [0, 4000, 520], [0, 0, 1]])

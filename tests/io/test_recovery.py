@@ -32,8 +32,7 @@ from fluoro_calib_ros.io.bags.salvage import FileSalvage, _decompressed, recover
 from fluoro_calib_ros.io.bags.writer import BagWriter
 from fluoro_calib_ros.jobs.simulation import write_bag
 from fluoro_calib_ros.limits import MAX_CHUNK
-from fluoro_calib_ros.simulation.exposures import simulate_tracking
-from fluoro_calib_ros.simulation.rig import StreamStart, virtual_rig
+from fluoro_calib_ros.simulation.rig import StreamStart, simulate_tracking, virtual_rig
 
 START = 10**18
 
@@ -191,9 +190,12 @@ def test_recovered_bag_is_a_bag_for_others(tmp_path, bag, frames):
 
 def test_split_bag_with_a_lost_file(tmp_path, frames):
     path = tmp_path / 'bag'
-    with BagWriter(path, split_bytes=2000) as bag:
+    with BagWriter(path) as bag:
         for frame in frames['a']:
+            if bag.file_bytes >= 2000:
+                bag.split()
             bag.write_frame(frame)
+            bag.flush()
     files = sorted(path.glob('*.mcap'))
     assert len(files) > 3
     files[1].unlink()

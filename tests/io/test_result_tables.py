@@ -13,8 +13,7 @@ from fluoro_calib_ros.estimation.calibrate import adjust_with_calibrations, cali
 from fluoro_calib_ros.estimation.options import CalibrationOptions
 from fluoro_calib_ros.io.result_document import NAMES
 from fluoro_calib_ros.jobs.result_folder import save_result
-from fluoro_calib_ros.simulation.exposures import Detection, simulate_exposures
-from fluoro_calib_ros.simulation.rig import virtual_rig
+from fluoro_calib_ros.simulation.rig import Detection, simulate_exposures, virtual_rig
 
 
 @pytest.fixture(scope='module')

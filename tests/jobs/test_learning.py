@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 from rigs import kinds, refused, true_calibrations, true_orientation
 
-from fluoro_calib_ros.bodies.body import Body, declared_bodies
-from fluoro_calib_ros.bodies.rigid import fitted_pose
+from fluoro_calib_ros.bodies.body import Body, declared_bodies, fitted_pose
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.findings import Kind
-from fluoro_calib_ros.io.learned_shapes import (
+from fluoro_calib_ros.io.versions import (
     LEARNED_SHAPES,
     read_learned_shapes,
     write_learned_shapes,

@@ -24,8 +24,8 @@ from fluoro_calib_ros.nodes.runtime.diagnostics import (
     fault,
     health_of,
 )
+from fluoro_calib_ros.nodes.runtime.lifecycle import Stream, stream_faults
 from fluoro_calib_ros.nodes.runtime.services import Requests, ServiceEntry, create_services
-from fluoro_calib_ros.nodes.runtime.stream import Stream, stream_faults
 
 LOGGER = SimpleNamespace(warning=lambda text: None, error=lambda text: None)
 

@@ -9,7 +9,7 @@ import pytest
 from fluoro_calib_msgs.action import Heal
 
 from fluoro_calib_ros.jobs.healing import _unseen_distortion, common_motion
-from fluoro_calib_ros.nodes.messages.healing import fill_healing
+from fluoro_calib_ros.nodes.messages.self_calibration import fill_healing
 
 
 @pytest.mark.parametrize(

@@ -289,16 +289,14 @@ def test_faults_of_joint_states_are_not_those_of_the_stream():
     told = []
     names = ('undecodable', 'callback_error', 'reader_error', 'too_large', 'overrun')
     given = Fake(**{n: lambda *words, n=n: told.append((n, *words)) for n in names})
-    guarded = made._guarded(given)
+    guarded = made._faults(given)
     guarded.undecodable('joint_states')
     guarded.too_large('joint_states', 5)
     guarded.callback_error('joint_states', KeyError())
-    guarded.overrun('joint_states', 4)
     assert made.values('a')['joint states refused'] == 3 and not told
-    guarded.undecodable('a/x')
-    guarded.too_large('a/x', 5)
-    guarded.overrun('a/x', 4)
-    assert told == [('undecodable', 'a/x'), ('too_large', 'a/x', 5), ('overrun', 'a/x', 4)]
+    assert guarded.overrun is None
+    guarded.reader_error('the thread')
+    assert told == [('reader_error', 'the thread')]
 
 
 def test_nearest_calibrated_angle_is_round_the_circle():

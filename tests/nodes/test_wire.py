@@ -20,12 +20,13 @@ from fluoro_calib_ros.nodes.messages.observations import (
     decode_target_observations,
     encode_corrected_observations,
     float64_field,
+    stamp_from_nanoseconds,
+    uint8_field,
     uint32_field,
 )
 from fluoro_calib_ros.nodes.messages.points import (
     PointsContent,
     encode_reconstructed_points,
-    message_from_points,
 )
 from fluoro_calib_ros.reconstruction.intersection import IntersectedPoints
 
@@ -39,6 +40,31 @@ SIZES = [
     for sigma in (False, True)
     for frame_id in ('', 'a', 'a_optical', 'röntgen', 'x' * 256)
 ]
+
+
+# Field of each term of the covariance, and its index in the flattened matrix.
+_COVARIANCE = {'cov_xx': 0, 'cov_xy': 1, 'cov_xz': 2, 'cov_yy': 4, 'cov_yz': 5, 'cov_zz': 8}
+
+
+def message_from_points(content):
+    """The message of reconstructed points, field by field."""
+    orientation = content.orientation
+    points = content.points
+    message = ReconstructedPoints()
+    message.header.stamp = stamp_from_nanoseconds(content.stamp_ns)
+    message.header.frame_id = orientation.frame_id
+    message.frame_number = content.frame_number
+    message.target_id = uint32_field(content.target_id)
+    message.x, message.y, message.z = (float64_field(column) for column in points.xyz_mm.T / 1000)
+    terms = points.covariance.reshape(-1, 9).T * 1e-6
+    for name, row in _COVARIANCE.items():
+        setattr(message, name, float64_field(terms[row]))
+    message.residual = float64_field(points.residual)
+    message.rays = uint8_field(points.rays)
+    message.status = uint8_field(points.status)
+    message.orientation_id = content.orientation_id
+    message.calibration_id = list(orientation.calibration_ids)
+    return message
 
 
 def observed(n, frame_id='a_optical', sigma=True):

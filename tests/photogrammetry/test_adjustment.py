@@ -16,21 +16,20 @@ from fluoro_calib_ros.correction.series import Functions
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.initial_network import adjusted_with_precision
 from fluoro_calib_ros.estimation.priors import gauge_precision
-from fluoro_calib_ros.photogrammetry.additional_parameters import AdditionalParameters
 from fluoro_calib_ros.photogrammetry.adjustment import (
     SolverOptions,
     adjust,
     residuals_and_q,
     total_cost,
 )
-from fluoro_calib_ros.photogrammetry.collinearity import project
+from fluoro_calib_ros.photogrammetry.collinearity import AdditionalParameters, project
 from fluoro_calib_ros.photogrammetry.elimination import (
     EliminateExposures,
     EliminatePoints,
     choose_elimination,
 )
 from fluoro_calib_ros.photogrammetry.noise import LOSSES, Noise
-from fluoro_calib_ros.photogrammetry.noise_estimation import adjust_and_estimate_noise
+from fluoro_calib_ros.photogrammetry.outliers import adjust_and_estimate_noise
 from fluoro_calib_ros.photogrammetry.precision import geometric_redundancy, precision
 from fluoro_calib_ros.photogrammetry.rotations import rotation_angle
 

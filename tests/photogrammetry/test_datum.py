@@ -16,7 +16,7 @@ from fluoro_calib_ros.photogrammetry.collinearity import project
 from fluoro_calib_ros.photogrammetry.elimination import EliminateExposures, EliminatePoints
 from fluoro_calib_ros.photogrammetry.network import similarity_directions
 from fluoro_calib_ros.photogrammetry.noise import LOSSES, Noise
-from fluoro_calib_ros.photogrammetry.noise_estimation import adjust_and_estimate_noise
+from fluoro_calib_ros.photogrammetry.outliers import adjust_and_estimate_noise
 from fluoro_calib_ros.photogrammetry.precision import precision
 from fluoro_calib_ros.photogrammetry.rotations import rotation_angle
 from fluoro_calib_ros.photogrammetry.unknowns import RelativeConstraint

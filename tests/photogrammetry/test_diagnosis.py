@@ -29,11 +29,10 @@ from fluoro_calib_ros.photogrammetry.diagnosis import (
     undetermined_interiors,
 )
 from fluoro_calib_ros.photogrammetry.noise import Noise
-from fluoro_calib_ros.photogrammetry.noise_estimation import adjust_and_estimate_noise
+from fluoro_calib_ros.photogrammetry.outliers import adjust_and_estimate_noise
 from fluoro_calib_ros.photogrammetry.precision import precision
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
-from fluoro_calib_ros.simulation.exposures import simulate_exposures
-from fluoro_calib_ros.simulation.rig import looking_at_origin, virtual_rig
+from fluoro_calib_ros.simulation.rig import looking_at_origin, simulate_exposures, virtual_rig
 
 SOURCE = np.array([0.0, -1500.0, 0.0])
 INTERIOR = np.array([511.5, 511.5, 4000.0])

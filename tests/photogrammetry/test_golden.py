@@ -23,8 +23,7 @@ from fluoro_calib_ros.estimation.options import CalibrationOptions
 from fluoro_calib_ros.photogrammetry.adjustment import SolverOptions, adjust
 from fluoro_calib_ros.photogrammetry.noise import Noise
 from fluoro_calib_ros.photogrammetry.precision import precision
-from fluoro_calib_ros.simulation.exposures import Detection, simulate_exposures
-from fluoro_calib_ros.simulation.rig import virtual_rig
+from fluoro_calib_ros.simulation.rig import Detection, simulate_exposures, virtual_rig
 
 sys.path.append(str(Path(__file__).resolve().parents[2]))  # benchmarks are not installed
 from benchmarks.peers import TIGHT, ColmapAdjustment, drop_rarely_seen_points, with_datum

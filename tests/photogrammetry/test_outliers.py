@@ -13,9 +13,9 @@ from threadpoolctl import threadpool_limits
 
 from fluoro_calib_ros.photogrammetry.collinearity import project
 from fluoro_calib_ros.photogrammetry.noise import Noise
-from fluoro_calib_ros.photogrammetry.noise_estimation import adjust_and_estimate_noise
 from fluoro_calib_ros.photogrammetry.outliers import (
     _f_limit,
+    adjust_and_estimate_noise,
     find_outliers,
     image_statistics,
     target_statistics,

@@ -10,17 +10,16 @@ import pytest
 import rigs
 from threadpoolctl import threadpool_limits
 
-from fluoro_calib_ros.photogrammetry.additional_parameters import AdditionalParameters
 from fluoro_calib_ros.photogrammetry.adjustment import (
     SolverOptions,
     adjust,
     residuals_and_q,
     total_cost,
 )
-from fluoro_calib_ros.photogrammetry.collinearity import project
+from fluoro_calib_ros.photogrammetry.collinearity import AdditionalParameters, project
 from fluoro_calib_ros.photogrammetry.elimination import EliminateExposures, EliminatePoints
 from fluoro_calib_ros.photogrammetry.noise import LOSSES, Noise
-from fluoro_calib_ros.photogrammetry.noise_estimation import adjust_and_estimate_noise
+from fluoro_calib_ros.photogrammetry.outliers import adjust_and_estimate_noise
 from fluoro_calib_ros.photogrammetry.precision import precision
 from fluoro_calib_ros.photogrammetry.rotations import (
     matrix_from_vector,

@@ -28,8 +28,7 @@ from fluoro_calib_ros.reconstruction.reconstruct import (
     reconstruct_recording,
     watch_exposure,
 )
-from fluoro_calib_ros.simulation.exposures import simulate_tracking
-from fluoro_calib_ros.simulation.rig import virtual_rig
+from fluoro_calib_ros.simulation.rig import simulate_tracking, virtual_rig
 
 NOISE_PX = 0.25
 CLUSTERS = ('tibia: 1001 1002 1003 1004 1005 1006', 'femur: 1013 1014 1015 1016 1017 1018')

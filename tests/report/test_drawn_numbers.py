@@ -18,14 +18,12 @@ from fluoro_calib_ros.exposures.names import Names
 from fluoro_calib_ros.exposures.phantom import Drawing, Phantom
 from fluoro_calib_ros.reconstruction.intersection import OK, REJECTED
 from fluoro_calib_ros.report import html
-from fluoro_calib_ros.report.comparison import (
-    _figure,
-    comparison_document,
-    comparison_text,
-)
 from fluoro_calib_ros.report.figures import (
     MARGIN,
     Scale,
+    _figure,
+    comparison_document,
+    comparison_text,
     distortion_figure,
     phantom_figure,
     picture_bytes,

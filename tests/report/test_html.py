@@ -19,8 +19,7 @@ from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
 from fluoro_calib_ros.exposures.names import Names
 from fluoro_calib_ros.images.codec import encode
-from fluoro_calib_ros.io.calibration_request import write_request
-from fluoro_calib_ros.io.radiographs import write_radiographs
+from fluoro_calib_ros.io.calibration_request import write_radiographs, write_request
 from fluoro_calib_ros.jobs.calibration import CalibrationOutcome, run_calibration
 from fluoro_calib_ros.jobs.report import read_report_input
 from fluoro_calib_ros.jobs.result_folder import save_outcome, save_result

@@ -10,7 +10,7 @@ import pytest
 from rigs import run
 
 from fluoro_calib_ros.errors import DataError
-from fluoro_calib_ros.jobs.printing import BROWSERS, find_browser, print_page
+from fluoro_calib_ros.jobs.report import BROWSERS, find_browser, print_page
 
 PRINTS = """
 for word in "$@"; do

@@ -21,8 +21,7 @@ from fluoro_calib_ros.report.figures import STYLE
 from fluoro_calib_ros.report.report_figures import relative_costs, write_figures
 from fluoro_calib_ros.report.residuals import normalised_residuals
 from fluoro_calib_ros.report.tables import markdown_table, summary_table
-from fluoro_calib_ros.simulation.exposures import simulate_exposures
-from fluoro_calib_ros.simulation.rig import virtual_rig
+from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
 
 OF_FLUOROSCOPE = ('residuals_histogram', 'residuals_position', 'distortion')
 QUICK = {'model': 'local_linear', 'k': 30, 'max_iterations': 3}

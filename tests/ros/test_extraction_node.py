@@ -27,8 +27,7 @@ from fluoro_calib_ros.jobs.extraction import ExtractionRequest, run_extraction
 from fluoro_calib_ros.nodes.messages.observations import stamp_from_nanoseconds
 from fluoro_calib_ros.nodes.runtime.topics import images_qos
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
-from fluoro_calib_ros.simulation.exposures import simulate_tracking
-from fluoro_calib_ros.simulation.rig import virtual_rig
+from fluoro_calib_ros.simulation.rig import simulate_tracking, virtual_rig
 
 SIZE = 400
 BEADS = np.random.default_rng(5).uniform(-60, 60, (48, 3))

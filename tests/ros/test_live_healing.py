@@ -10,7 +10,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from fluoro_calib_msgs.msg import ReconstructedPoints
 from fluoro_calib_msgs.srv import Reset
+from rclpy.serialization import deserialize_message
 from rigs import run
 from ros_graph import ABORTED, CANCELED, JOB_DEADLINE, NAMES, SUCCEEDED, value_of
 from test_reconstruction import coordinates
@@ -19,12 +21,12 @@ from test_web import page
 from fluoro_calib_ros.checks.rig_watch import RigDriftWatch
 from fluoro_calib_ros.io.bodies import write_bodies
 from fluoro_calib_ros.io.calibration import load_calibrations, load_orientation, orientation_path
-from fluoro_calib_ros.io.learned_shapes import LEARNED_SHAPES, read_learned_shapes
+from fluoro_calib_ros.io.versions import LEARNED_SHAPES, read_learned_shapes
 from fluoro_calib_ros.jobs.healing import BLOCKS
 from fluoro_calib_ros.jobs.reconstruction import ReconstructionOptions
 from fluoro_calib_ros.jobs.simulation import write_bag
 from fluoro_calib_ros.nodes.messages.observations import message_from_frame
-from fluoro_calib_ros.nodes.messages.points import PointsContent, message_from_points
+from fluoro_calib_ros.nodes.messages.points import PointsContent, encode_reconstructed_points
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.reconstruction.intersection import Intersector
 from fluoro_calib_ros.reconstruction.reconstruct import reconstruct_recording
@@ -224,7 +226,8 @@ def test_deviations_between_alarm_and_healing_are_those_of_the_recording(rig):
             target_id=frame.target_id,
             points=frame.points,
         )
-        expected = message_from_points(content)
+        data = encode_reconstructed_points(content)
+        expected = deserialize_message(data, ReconstructedPoints)
         for name in COVARIANCE:
             assert getattr(message, name).tobytes() == getattr(expected, name).tobytes()
     assert found_share(points[:10]) < 0.1, 'views that do not fit give no points'

@@ -17,12 +17,14 @@ from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.jobs.simulation import write_bag
 from fluoro_calib_ros.nodes.messages.observations import message_from_frame
 from fluoro_calib_ros.nodes.runtime.topics import observations_qos
-from fluoro_calib_ros.simulation.exposures import (
+from fluoro_calib_ros.simulation.rig import (
+    START_NS,
+    StreamStart,
     detect_beads,
     simulate_exposures,
     simulate_tracking,
+    virtual_rig,
 )
-from fluoro_calib_ros.simulation.rig import START_NS, StreamStart, virtual_rig
 
 THREE = ('a', 'b', 'c')
 POSES = 9

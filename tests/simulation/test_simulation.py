@@ -13,15 +13,17 @@ from fluoro_calib_ros.exposures.collector import Coverage
 from fluoro_calib_ros.exposures.frame import points_on_image, validate_frame
 from fluoro_calib_ros.photogrammetry.collinearity import project
 from fluoro_calib_ros.photogrammetry.rotations import rotation_angle
-from fluoro_calib_ros.simulation.exposures import Detection, simulate_exposures, simulate_tracking
 from fluoro_calib_ros.simulation.rig import (
     BEADS,
     CUBE_MM,
     IMAGE_SIZE,
     START_NS,
+    Detection,
     StreamStart,
     looking_at_origin,
     random_field,
+    simulate_exposures,
+    simulate_tracking,
     virtual_rig,
 )
 

@@ -25,7 +25,7 @@ from mcap.summary import Summary
 
 from ...errors import DataError
 from ...limits import MAX_CHUNK, MAX_TOPICS
-from ..access import PathLike, check_regular_file, os_error_reason
+from ..access import PathLike, check_regular_file, os_errors
 from ..documents import read_yaml
 from .metadata import to_yaml
 
@@ -115,13 +115,11 @@ def _open_checked(path: str) -> Iterator[BinaryIO]:
     """Open a file and check both of its ends; errors of the MCAP reader become DataError."""
     try:
         check_regular_file(path)
-        with open(path, 'rb') as file:
+        with os_errors(path, 'the bag cannot be read'), open(path, 'rb') as file:
             _check_ends(path, file)
             yield file
     except DataError:
         raise
-    except OSError as error:
-        raise DataError(f'{path}: the bag cannot be read ({os_error_reason(error)})') from None
     except (EndOfFile, struct.error):
         raise DataError(f'{path}: the bag is damaged, a record ends too early') from None
     except Exception as error:  # damaged bytes make the reader raise almost anything
@@ -192,26 +190,16 @@ def _unindexed_messages(file: BinaryIO, topics: Collection[str] | None) -> Itera
 
     They are read one after the other if that is their order, else sorted in memory.
     """
-    ordered = _scan(file).ordered
-    messages = _messages_in_file_order(file, topics)
-    yield from messages if ordered else sorted(messages, key=lambda message: message.log_time_ns)
-
-
-def _messages_in_file_order(
-    file: BinaryIO, topics: Collection[str] | None
-) -> Iterator[BagMessage]:
-    type_names: dict[int, str] = {}
-    channels: dict[int, Channel] = {}
-    for record in _records(file):
-        if isinstance(record, Schema):
-            type_names[record.id] = record.name
-        elif isinstance(record, Channel):
-            channels[record.id] = record
-        elif isinstance(record, Message):
-            channel = channels[record.channel_id]
-            if topics is None or channel.topic in topics:
-                name = type_names.get(channel.schema_id, '')
-                yield BagMessage(channel.topic, name, record.log_time, record.data)
+    scan = _scan(file)
+    types = {number: schema.name for number, schema in scan.schemas.items()}
+    messages = (
+        BagMessage(channel.topic, types.get(channel.schema_id, ''), record.log_time, record.data)
+        for record in _records(file)
+        if isinstance(record, Message)
+        for channel in (scan.channels[record.channel_id],)
+        if topics is None or channel.topic in topics
+    )
+    yield from messages if scan.ordered else sorted(messages, key=lambda m: m.log_time_ns)
 
 
 def _scan(file: BinaryIO) -> _Scan:
@@ -271,12 +259,8 @@ def candidate_files(source: PathLike) -> list[str]:
 
 def _files_in(source: PathLike) -> list[str]:
     """Return the paths of the .mcap files in a folder, in the order of their numbers."""
-    try:
+    with os_errors(source, 'the folder cannot be read'):
         names = [name for name in os.listdir(source) if name.endswith('.mcap') and name[0] != '.']
-    except OSError as error:
-        raise DataError(
-            f'{source}: the folder cannot be read ({os_error_reason(error)})'
-        ) from None
     if not names:
         raise DataError(
             f'{source}: this folder is not a bag, it has neither metadata.yaml nor an .mcap file'

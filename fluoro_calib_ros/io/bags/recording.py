@@ -1,7 +1,10 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Record messages as they come: queued, written by a thread, and flushed to disk regularly."""
+"""Record messages as they come: queued, written by a thread, and flushed to disk regularly.
+
+Also the options of playing them.
+"""
 
 from __future__ import annotations
 
@@ -51,6 +54,32 @@ class RecordingOptions:
 
     def __post_init__(self) -> None:
         validate_options(self)
+
+
+@dataclass(frozen=True)
+class PlayingOptions:
+    """Options of playing a bag."""
+
+    rate: float = option(1.0, 'speed relative to the recording', minimum=0.001, maximum=1e6)
+    loop: bool = option(False, 'whether the bag is played over and over')
+    start_offset: float = option(
+        0.0,
+        'time after the first message at which playing begins; latched messages before are given '
+        'first',
+        minimum=0.0,
+        maximum=1e9,
+        unit='s',
+    )
+    start_paused: bool = option(
+        False, 'whether to wait for the services ~/pause (data: false) or ~/step'
+    )
+    clock: float = option(
+        0.0,
+        'rate at which the time of the recording is published on /clock; 0: not at all',
+        minimum=0.0,
+        maximum=1000.0,
+        unit='Hz',
+    )
 
 
 class TopicToRecord(NamedTuple):

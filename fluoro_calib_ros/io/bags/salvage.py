@@ -141,7 +141,8 @@ class FileSalvage:
             if end is None or data[position] == Opcode.CHUNK or _looks_like_chunk(data, position):
                 chunk = _chunk_at(data, position)
                 if chunk is not None:
-                    yield from self._messages_of(chunk.content)
+                    for opcode, start, behind in _records_of(chunk.content):
+                        yield from self._record(opcode, bytes(chunk.content[start:behind]))
                     position = chunk.end
                     continue
                 self._note_lost_chunk(data, position, end)
@@ -177,15 +178,6 @@ class FileSalvage:
             if start >= position and _chunk_at(data, start) is not None:
                 return start
         return len(data)
-
-    def _messages_of(self, content: bytes | memoryview) -> Iterator[SalvagedMessage]:
-        """Yield the messages of an intact chunk."""
-        position = 0
-        while position + RECORD.size <= len(content):
-            opcode, length = RECORD.unpack_from(content, position)
-            position += RECORD.size
-            yield from self._record(opcode, bytes(content[position : position + length]))
-            position += length
 
     def _record(self, opcode: int, content: bytes) -> Iterator[SalvagedMessage]:
         """Yield the message of a record, if it is one; remember schemas and channels."""
@@ -243,12 +235,8 @@ class FileSalvage:
             return
         if zlib.crc32(data[start : footer + FOOTER.size - 4]) != checksum:
             return
-        position = start
-        while position < footer:
-            opcode, length = RECORD.unpack_from(data, position)
-            position += RECORD.size
-            content = data[position : position + length]
-            position += length
+        for opcode, position, behind in _records_of(data, start, footer):
+            content = data[position:behind]
             if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 self._define(opcode, content)
             elif opcode == Opcode.STATISTICS:
@@ -295,6 +283,16 @@ class FileSalvage:
             cause, start_ns, lost = self._open_damage
             self.damages.append(Damage(self.path, cause, start_ns, next_ns, lost))
             self._open_damage = None
+
+
+def _records_of(
+    content: bytes | memoryview | mmap.mmap, position: int = 0, end: int | None = None
+) -> Iterator[tuple[int, int, int]]:
+    """Yield opcode, beginning and end of the records between two positions."""
+    while position + RECORD.size <= (len(content) if end is None else end):
+        opcode, length = RECORD.unpack_from(content, position)
+        position += RECORD.size + length
+        yield opcode, position - length, position
 
 
 def _looks_like_chunk(data: mmap.mmap, position: int) -> bool:
@@ -351,13 +349,11 @@ def _decompressed(compression: bytes, data: memoryview, size: int) -> bytes | No
 
 def _is_whole(content: bytes) -> bool:
     """Return whether a chunk without checksum consists of whole records."""
-    position = 0
-    while position + RECORD.size <= len(content):
-        opcode, length = RECORD.unpack_from(content, position)
-        if opcode not in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
-            return False
-        position += RECORD.size + length
-    return position == len(content)
+    known = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
+    records = list(_records_of(content))
+    if not records or any(opcode not in known for opcode, *_ in records):
+        return False
+    return records[-1][-1] == len(content)
 
 
 # Recover a bag: all intact messages of a damaged or cut-off one, written as a valid bag.

@@ -13,15 +13,15 @@ import os
 import re
 import secrets
 import shutil
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable
+from contextlib import suppress
 from typing import Any, BinaryIO
 
 from mcap.writer import CompressionType, Writer
 
 from ...errors import DataError
 from ...exposures.frame import Frame
-from ..access import PathLike, os_error_reason, sync_folder, write_text
+from ..access import PathLike, os_errors, sync_folder, write_text
 from .metadata import (
     NO_MESSAGE_NS,
     PROFILES,
@@ -38,6 +38,7 @@ from .metadata import (
 )
 
 LIBRARY = 'fluoro_calib_ros'
+NOT_WRITTEN = 'the bag cannot be written'
 CHUNK_SIZE = 768 * 1024  # that of rosbag2 [bytes]
 _TOPIC_NAME = re.compile(r'(/[A-Za-z_][A-Za-z0-9_]*)+')
 
@@ -59,8 +60,6 @@ class BagWriter:
     live : bool
         For recording: the bag is written under its own name, and what was written before an
         exception is kept.
-    split_bytes : int
-        Size of a file [bytes] after which the next one is begun; 0 for a single file.
 
     Raises
     ------
@@ -69,18 +68,11 @@ class BagWriter:
         an invalid topic, type or message.
     """
 
-    def __init__(
-        self,
-        path: PathLike,
-        overwrite: bool = False,
-        live: bool = False,
-        split_bytes: int = 0,
-    ) -> None:
+    def __init__(self, path: PathLike, overwrite: bool = False, live: bool = False) -> None:
         self.path = os.path.abspath(path)
         self.name = os.path.basename(self.path)
         self._overwrite = overwrite
         self._live = live
-        self._split_bytes = split_bytes
         self._folder = self.path
         if not live:
             hidden = f'.{self.name}.{secrets.token_hex(8)}.tmp'
@@ -95,7 +87,7 @@ class BagWriter:
     def __enter__(self) -> BagWriter:
         check_replaceable(self.path, self._overwrite)
         try:
-            with _writing(self.path):
+            with os_errors(self.path, NOT_WRITTEN):
                 if self._live and os.path.isdir(self.path):
                     shutil.rmtree(self.path)
                 os.makedirs(self._folder)
@@ -110,7 +102,7 @@ class BagWriter:
             self._abandon()
             return
         try:
-            with _writing(self.path):
+            with os_errors(self.path, NOT_WRITTEN):
                 self._close_file()
                 document = bag_metadata(self._topics.values(), self._files, self._total)
                 text = to_yaml({'rosbag2_bagfile_information': document}) + '\n'
@@ -158,16 +150,13 @@ class BagWriter:
                 raise DataError(
                     f'{self.path}, topic {topic}: {time_ns} ns is not a time that a bag can hold'
                 )
-        with _writing(self.path):
+        with os_errors(self.path, NOT_WRITTEN):
             entry = self._topics.get(topic) or self.add_topic(topic, msg_type, qos)
             if entry.msg_type != msg_type:
                 raise DataError(
                     f'{self.path}, topic {topic}: a message of type {msg_type} does not belong to '
                     f'this topic of type {entry.msg_type}'
                 )
-            if self._file_is_full():
-                self._close_file()
-                self._open_file()
             self._mcap.add_message(entry.channel, received, data, sent)
         entry.count += 1
         self._files[-1].add(received)
@@ -214,7 +203,7 @@ class BagWriter:
 
         to_disk: they survive a power failure, too.
         """
-        with _writing(self.path):
+        with os_errors(self.path, NOT_WRITTEN):
             self._mcap.flush()
             self._file.flush()
             if to_disk:
@@ -232,23 +221,17 @@ class BagWriter:
 
     def split(self) -> None:
         """Close the file and begin the next one."""
-        with _writing(self.path):
+        with os_errors(self.path, NOT_WRITTEN):
             self._close_file()
             self._open_file()
-
-    def _file_is_full(self) -> bool:
-        return bool(
-            self._split_bytes and self._files[-1].count and self._file.tell() >= self._split_bytes
-        )
 
     def _open_file(self) -> None:
         name = f'{self.name}_{len(self._files)}.mcap'
         self._files.append(FileSpan(name))
         self._file = open(os.path.join(self._folder, name), 'xb')  # noqa: SIM115
-        chunk_size = min(CHUNK_SIZE, self._split_bytes or CHUNK_SIZE)  # a file grows by chunks
         self._mcap = Writer(
             self._file,
-            chunk_size=chunk_size,
+            chunk_size=CHUNK_SIZE,
             compression=CompressionType.ZSTD,
             enable_crcs=True,
             enable_data_crcs=True,
@@ -330,12 +313,3 @@ def _put_in_place(folder: str, path: str, overwrite: bool) -> None:
     sync_folder(os.path.dirname(path))
     if replaced:
         shutil.rmtree(old, ignore_errors=True)
-
-
-@contextmanager
-def _writing(path: str) -> Iterator[None]:
-    """Raise DataError for an OSError while a bag is written."""
-    try:
-        yield
-    except OSError as error:
-        raise DataError(f'{path}: the bag cannot be written ({os_error_reason(error)})') from None

@@ -30,8 +30,8 @@ from ...errors import DataError
 from ...exposures.phantom import first_repeated
 from ...photogrammetry.rotations import matrix_from_quaternion, quaternion_from_matrix
 from ..access import PathLike, atomic_file
+from ..bodies import COLUMNS as POSE_COLUMNS
 from ..csv_table import as_text, read_all
-from ..poses import COLUMNS as POSE_COLUMNS
 from .content import (
     Bodies,
     Content,
@@ -133,7 +133,6 @@ RIGIDBODY = Format(
     recognise=lambda sample: '_R11' in sample.first and '_TX' in sample.first,
     read=_read_xmalab,
     write=_write_xmalab,
-    looks_like='Frame,femur_R11,femur_R12,...,femur_TX,femur_TY,femur_TZ,femur_1',
     says_units=False,
 )
 
@@ -165,7 +164,6 @@ AUTOSCOPER = Format(
     recognise=lambda sample: sample.suffix == '.tra',
     read=None,
     write=_write_autoscoper,
-    looks_like='rows of 16 numbers a body',
     says_units=False,
 )
 
@@ -217,7 +215,6 @@ POSES = Format(
     recognise=lambda sample: sample.first.startswith(','.join(_POSES)),
     read=_read_poses,
     write=None,
-    looks_like=','.join(_POSES),
 )
 
 
@@ -303,5 +300,4 @@ OPENSIM = Format(
     recognise=lambda sample: sample.suffix in ('.sto', '.mot') and END in sample.lines,
     read=None,
     write=write,
-    looks_like='a header that ends with endheader',
 )

@@ -309,6 +309,5 @@ FORMAT = Format(
     recognise=lambda sample: sample.suffix in WIDTHS,
     read=read,
     write=write,
-    looks_like='NAME.pho, NAME.iop, NAME.eop, NAME.xyz',
     says_units=False,
 )

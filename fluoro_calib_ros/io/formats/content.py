@@ -319,7 +319,6 @@ class Format:
     read: Reader | None
     #: writes a part of a Content; None where the format is only read; raises DataError
     write: Writer | None
-    looks_like: str  #: how a file of the format begins, for messages
     says_units: bool = True  #: whether the format says the unit of its lengths, or has none
     one_camera: bool = False  #: whether a file of image points is of one fluoroscope
 

@@ -20,16 +20,16 @@ import yaml
 
 from ...errors import DataError, ErrorsAt
 from ...exposures.names import Names, without_trivial
-from ...photogrammetry.known_orientation import KnownOrientation
+from ...photogrammetry.rig_orientation import KnownOrientation
 from ..access import PathLike, read_text, write_text
+from ..bodies import NAME_COLUMN
+from ..bodies import POINT_COLUMNS as POINTS
 from ..csv_table import read_all, write_table
 from ..documents import read_yaml
 from ..observations import COLUMNS as OBSERVATIONS
 from ..observations import corrections_of, read_named_observations, write_observations_csv
 from ..phantom import COLUMNS as PHANTOM
 from ..phantom import read_named_phantom, write_phantom
-from ..poses import NAME_COLUMN
-from ..poses import POINT_COLUMNS as POINTS
 from .content import (
     Camera,
     Content,
@@ -179,7 +179,6 @@ FORMATS = (
         recognise=lambda sample: _has_columns(sample, OBSERVATIONS),
         read=_read_observations,
         write=_write_observations,
-        looks_like=','.join(OBSERVATIONS),
     ),
     Format(
         'phantom',
@@ -188,7 +187,6 @@ FORMATS = (
         recognise=lambda sample: _has_columns(sample, PHANTOM),
         read=_read_phantom,
         write=_write_phantom,
-        looks_like=','.join(PHANTOM),
     ),
     Format(
         'points',
@@ -197,7 +195,6 @@ FORMATS = (
         recognise=lambda sample: _has_columns(sample, POINTS_NEEDED),
         read=_read_points,
         write=_write_points,
-        looks_like=','.join(POINTS),
     ),
     Format(
         'grid',
@@ -206,7 +203,6 @@ FORMATS = (
         recognise=lambda sample: _has_columns(sample, GRID),
         read=_read_grid,
         write=_write_grid,
-        looks_like=','.join(GRID),
     ),
 )
 
@@ -254,7 +250,6 @@ KNOWN_ORIENTATION = Format(
     recognise=recognise,
     read=read,
     write=write,
-    looks_like='fluoroscopes: with K, R and t_mm',
 )
 
 

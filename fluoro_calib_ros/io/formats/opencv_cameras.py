@@ -146,7 +146,6 @@ OPENCV = Format(
     recognise=_is_opencv,
     read=_read_opencv,
     write=_write_opencv,
-    looks_like='%YAML:1.0, camera_matrix',
     says_units=False,
 )
 
@@ -252,7 +251,6 @@ ANIPOSE = Format(
     recognise=_is_anipose,
     read=_read_anipose,
     write=_write_anipose,
-    looks_like='[cam_0] with a matrix',
     says_units=False,
 )
 
@@ -351,5 +349,4 @@ CAMERA_INFO = Format(
     recognise=_is_camera_info,
     read=_read_camera_info,
     write=_write_camera_info,
-    looks_like='image_width: 1024, camera_matrix: ...',
 )

@@ -207,7 +207,6 @@ COORDINATES = Format(
     recognise=_is_coordinates,
     read=_read_coordinates,
     write=None,
-    looks_like='x y z, id x y z, or a header such as id,x_mm,y_mm,z_mm,sd_mm,diameter_mm',
     says_units=False,
 )
 
@@ -307,6 +306,5 @@ FRAMESPEC = Format(
     recognise=_is_framespec,
     read=_read_framespec,
     write=_write_framespec,
-    looks_like='x y z, then rows -1.27,0,6.35,bead01',
     says_units=False,
 )

@@ -30,7 +30,6 @@ from typing import Any
 import numpy as np
 
 from ...errors import DataError
-from ...exposures.names import Names, number_names
 from ..access import atomic_file, read_bytes, read_text, write_bytes
 from ..csv_table import as_text
 from .content import (
@@ -55,8 +54,8 @@ from .tables import (
     frames_of,
     joined,
     labels,
-    named_targets,
     number_text,
+    numbered_targets,
     points_of,
     read_frames,
     require_width,
@@ -107,19 +106,19 @@ def _points(path: Path, arrays: dict[str, np.ndarray], settings: FileSettings) -
     names = names[: xyz.shape[1]]
     if len(set(names)) < xyz.shape[1]:
         raise DataError(f'{path}: {xyz.shape[1]} points, but {len(set(names))} different names')
-    ids = number_names(names, settings.names.targets)
+    target_id, named = numbered_targets(names, settings.names.targets)
     xyz = np.where((residual < 0)[..., None], np.nan, xyz * mm)
     xyz[np.isnan(xyz).any(axis=2)] = np.nan
     sd = np.where(residual > 0, residual * mm, np.nan)
     points = Points(
         int(arrays['first']) + np.arange(len(xyz)),
-        np.array([ids[name] for name in names], dtype=np.int64),
+        target_id,
         xyz_mm=xyz,
         sd_mm=sd,
         residual_px=np.full(sd.shape, np.nan),
         rate_hz=float(arrays['rate']),
     )
-    return Content(points=points, names=Names(named_targets({n: ids[n] for n in names})))
+    return Content(points=points, names=named)
 
 
 def _bodies(path: Path, arrays: dict[str, np.ndarray], settings: FileSettings) -> Bodies:
@@ -250,7 +249,6 @@ C3D = Format(
     recognise=lambda sample: sample.suffix == '.c3d' and sample.head[1:2] == bytes([_MAGIC]),
     read=read_c3d,
     write=write_c3d,
-    looks_like='a binary file of c3d.org',
 )
 
 
@@ -272,7 +270,7 @@ def _read_xmalab3d(path: Path, settings: FileSettings) -> Content:
     targets = _targets(header, first)
     require_width(body, 3 * len(targets) + first, 'the header')
     mm = settings.unit_read(path)
-    ids = number_names(targets, settings.names.targets)
+    target_id, named = numbered_targets(targets, settings.names.targets)
     frame = frame_numbers(body, first)
     for before, row, number in zip(frame, body[1:], frame[1:]):
         if number <= before:
@@ -280,9 +278,7 @@ def _read_xmalab3d(path: Path, settings: FileSettings) -> Content:
     values = np.array([row.numbers_or_nan(first) for row in body])
     xyz = from_units(values.reshape(len(body), -1, 3), mm)
     xyz[np.isnan(xyz).any(axis=2)] = np.nan
-    target_id = np.array([ids[name] for name in targets], dtype=np.int64)
     points = points_without_precision(np.array(frame), target_id, xyz, settings.rate_hz)
-    named = Names(named_targets({name: ids[name] for name in targets}))
     return Content(points=points, names=named)
 
 
@@ -320,7 +316,6 @@ XMALAB3D = Format(
     recognise=_is_xmalab3d,
     read=_read_xmalab3d,
     write=_write_xmalab3d,
-    looks_like='Frame,bead01_X,bead01_Y,bead01_Z',
     says_units=False,
 )
 
@@ -369,15 +364,10 @@ def _read_trc(path: Path, settings: FileSettings) -> Content:
             xyz.append(_coordinates(row, count))
     if not frame:
         raise DataError(f'{path}: the file has no frames')
-    ids = number_names(names, settings.names.targets)
+    target_id, named = numbered_targets(names, settings.names.targets)
+    xyz_mm = from_units(np.array(xyz), mm)
     return Content(
-        points=points_without_precision(
-            np.array(frame),
-            np.array([ids[name] for name in names], dtype=np.int64),
-            from_units(np.array(xyz), mm),
-            rate,
-        ),
-        names=Names(named_targets({name: ids[name] for name in names})),
+        points=points_without_precision(np.array(frame), target_id, xyz_mm, rate), names=named
     )
 
 
@@ -423,5 +413,4 @@ TRC = Format(
     recognise=lambda sample: sample.first.startswith('PathFileType'),
     read=_read_trc,
     write=_write_trc,
-    looks_like='PathFileType  4  (X/Y/Z)',
 )

@@ -23,11 +23,12 @@ from ..access import (
     kind_not_read,
     os_error_reason,
 )
-from . import bundle, deeplabcut, native, sleap, xmalab_points, xmalab_project
+from . import bundle, native, xmalab_points, xmalab_project
 from .bodies import AUTOSCOPER, OPENSIM, POSES, RIGIDBODY
 from .content import PARTS, Content, FileSettings, Format, Sample, Written, has_content
 from .opencv_cameras import ANIPOSE, CAMERA_INFO, OPENCV
 from .phantoms import COORDINATES, FRAMESPEC
+from .point_networks import DEEPLABCUT, SLEAP
 from .points import C3D, TRC, XMALAB3D
 from .xmalab_cameras import DLT, LOOKUP, MAYACAM1, MAYACAM2
 
@@ -42,8 +43,8 @@ FORMATS: dict[str, Format] = {
         *native.FORMATS,
         native.KNOWN_ORIENTATION,
         xmalab_points.FORMAT,
-        deeplabcut.FORMAT,
-        sleap.FORMAT,
+        DEEPLABCUT,
+        SLEAP,
         xmalab_project.FORMAT,
         FRAMESPEC,
         RIGIDBODY,

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import DataError
-from ...exposures.frame import Frame
-from ...exposures.names import without_trivial
+from ...exposures.frame import Frame, points_on_image
+from ...exposures.names import Names, number_names, without_trivial
 from ...limits import MAX_ROWS
 from ..access import PathLike, atomic_file, check_rows, read_text
 from ..csv_table import decimal_point
@@ -44,6 +44,28 @@ def with_sigma_of_likelihood(
     return [replace(frame, sigma=1.0 / values) for frame, values in zip(frames, likelihood)]
 
 
+def frame_of(
+    where: object,
+    fluoroscope: str,
+    number: int,
+    target_id: NDArray[np.int64],
+    uv: NDArray[np.float64],
+    image_size: tuple[int, int],
+) -> Frame:
+    """Return the frame of image points of a file.
+
+    Raises DataError, beginning with where, for a point off the image.
+    """
+    on_image = points_on_image(uv, image_size)
+    if not on_image.all():
+        u, v = uv[np.argmin(on_image)]
+        raise DataError(
+            f'{where}: the point ({u:g}, {v:g}) is off the image of {image_size[0]} x '
+            f'{image_size[1]} px'
+        )
+    return Frame(fluoroscope, number, target_id, uv, image_size, frame_id=f'{fluoroscope}_optical')
+
+
 @dataclass(frozen=True)
 class Row:
     """A row of a table: its number in the file, counted from 1, and its cells without blanks."""
@@ -54,7 +76,12 @@ class Row:
 
     def fail(self, cause: str) -> NoReturn:
         """Raise DataError for the row."""
-        raise DataError(f'{self.path}, row {self.line}: {cause}')
+        raise DataError(f'{self.place}: {cause}')
+
+    @property
+    def place(self) -> str:
+        """File and row, in words."""
+        return f'{self.path}, row {self.line}'
 
     def numbers(self, first: int = 0) -> list[float]:
         """Return the cells from the given one on as finite numbers. Raises DataError."""
@@ -186,6 +213,24 @@ def default_name(target_id: int) -> str:
 def named_targets(ids: Mapping[str, int]) -> dict[str, int]:
     """Return the ids of the names that a person has given."""
     return {name: i for name, i in without_trivial(ids).items() if name != default_name(i)}
+
+
+def numbered_targets(
+    targets: Sequence[str], known: Mapping[str, int]
+) -> tuple[NDArray[np.int64], Names]:
+    """Return the ids (n,) of targets that a file names, and the names that a person has given."""
+    ids = number_names(targets, known)
+    own = {name: ids[name] for name in targets}
+    return np.array([own[name] for name in targets], dtype=np.int64), Names(named_targets(own))
+
+
+def are_numbers(lines: Sequence[str], rows: int, columns: int = 0) -> bool:
+    """Return whether a file has so many rows of as many numbers, of columns if it is not 0."""
+    try:
+        widths = {len([float(cell) for cell in line.split(',')]) for line in lines}
+    except ValueError:
+        return False
+    return len(lines) == rows and len(widths) == 1 and columns in (0, *widths)
 
 
 MAX_FRAMES = 10**6

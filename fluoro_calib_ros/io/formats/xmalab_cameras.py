@@ -47,7 +47,15 @@ from .content import (
     refuse_distortion,
     write_cameras,
 )
-from .tables import Row, joined, number_text, read_table, require_width, separator_of
+from .tables import (
+    Row,
+    are_numbers,
+    joined,
+    number_text,
+    read_table,
+    require_width,
+    separator_of,
+)
 
 _MAYACAM2 = '_MayaCam2.txt'
 _TITLES = {1: 'image size', 4: 'camera matrix', 9: 'rotation', 14: 'translation'}
@@ -140,7 +148,6 @@ MAYACAM2 = Format(
     recognise=lambda sample: sample.first == 'image size',
     read=_read_mayacam2,
     write=_write_mayacam2,
-    looks_like='image size, 1024,1024, (blank), camera matrix, ...',
     says_units=False,
 )
 
@@ -156,16 +163,6 @@ MAYACAM2 = Format(
 _MAYACAM1 = '_MayaCam.csv'
 _DEFAULT_SIZE = 1024
 _ROWS_MAYACAM1 = 5  # numbers of three columns each
-
-
-def _is_mayacam1(sample: Sample) -> bool:
-    """Return whether the file has just five rows of three numbers."""
-    if len(sample.lines) != _ROWS_MAYACAM1:
-        return False
-    try:
-        return all(len([float(c) for c in line.split(',')]) == 3 for line in sample.lines)
-    except ValueError:
-        return False
 
 
 def _read_mayacam1(path: Path, settings: FileSettings) -> Content:
@@ -201,10 +198,9 @@ MAYACAM1 = Format(
     'mayacam1',
     'MayaCam 1.0',
     parts=('cameras',),
-    recognise=_is_mayacam1,
+    recognise=lambda sample: are_numbers(sample.lines, _ROWS_MAYACAM1, 3),
     read=_read_mayacam1,
     write=None,
-    looks_like='five rows of three numbers',
     says_units=False,
 )
 
@@ -221,17 +217,6 @@ MAYACAM1 = Format(
 _ROWS_DLT = 11  # coefficients of the direct linear transformation
 
 
-def _is_dlt(sample: Sample) -> bool:
-    """Return whether the file has eleven rows of as many numbers."""
-    if len(sample.lines) != _ROWS_DLT:
-        return False
-    try:
-        widths = {len([float(cell) for cell in line.split(',')]) for line in sample.lines}
-    except ValueError:
-        return False
-    return len(widths) == 1
-
-
 def _read_dlt(path: Path, settings: FileSettings) -> Content:
     """Read the cameras, which are called cam1, cam2, ... unless settings name them.
 
@@ -243,10 +228,7 @@ def _read_dlt(path: Path, settings: FileSettings) -> Content:
             f'{path}: {len(rows)} rows, but there are {_ROWS_DLT} coefficients of a DLT'
         )
     require_width(rows, len(rows[0].cells), 'the first row')
-    if settings.image_size is None:
-        raise DataError(
-            f'{path}: DLT coefficients do not contain the image size, --image-size WxH is needed'
-        )
+    size = settings.image_size_of(path)
     mm = settings.unit_read(path)
     columns = np.array([row.numbers() for row in rows]).T
     names = settings.fluoroscopes
@@ -255,11 +237,11 @@ def _read_dlt(path: Path, settings: FileSettings) -> Content:
     ones = np.ones((len(columns), 1))
     projections = np.concatenate([columns, ones], axis=1).reshape(-1, 3, 4)
     downwards = bool((np.linalg.det(projections[:, :, :3]) > 0).all())
-    to_ours = np.linalg.inv(_file_pixels(settings.image_size, downwards))
+    to_ours = np.linalg.inv(_file_pixels(size, downwards))
     cameras = []
     for name, projection in zip(names, projections):
         try:
-            cameras.append(_dlt_camera(name, to_ours @ projection, settings.image_size, mm))
+            cameras.append(_dlt_camera(name, to_ours @ projection, size, mm))
         except ValueError as error:
             raise DataError(f'{path}, {name}: {error}') from None
     note = f'{path}: rows count downwards, as in DLTdv8, or the origin would be behind the cameras'
@@ -315,10 +297,9 @@ DLT = Format(
     'dlt',
     'DLT coefficients',
     parts=('cameras',),
-    recognise=_is_dlt,
+    recognise=lambda sample: are_numbers(sample.lines, _ROWS_DLT),
     read=_read_dlt,
     write=_write_dlt,
-    looks_like='eleven rows of numbers',
     says_units=False,
 )
 
@@ -331,10 +312,7 @@ _MIN_COLUMNS = 32  # narrower tables are something else
 def recognise(sample: Sample) -> bool:
     """Return whether the first row has as many numbers as an image has columns."""
     cells = sample.first.split(',')[:_MIN_COLUMNS]
-    try:
-        return len([float(cell) for cell in cells]) == _MIN_COLUMNS
-    except ValueError:
-        return False
+    return are_numbers([','.join(cells)], 1, _MIN_COLUMNS)
 
 
 def read(path: Path, settings: FileSettings) -> Content:
@@ -403,5 +381,4 @@ LOOKUP = Format(
     recognise=recognise,
     read=read,
     write=write,
-    looks_like='twice as many rows of numbers as the image has',
 )

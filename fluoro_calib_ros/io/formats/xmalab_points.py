@@ -22,7 +22,6 @@ import numpy as np
 
 from ...errors import DataError
 from ...exposures.frame import Frame, points_on_image
-from ...exposures.names import Names, number_names
 from ..access import atomic_file
 from ..csv_table import as_text
 from .content import Content, FileSettings, Format, Written
@@ -31,8 +30,9 @@ from .tables import (
     Row,
     default_name,
     frame_numbers,
+    frame_of,
     joined,
-    named_targets,
+    numbered_targets,
     read_frames,
     require_width,
 )
@@ -46,13 +46,11 @@ def read(path: Path, settings: FileSettings) -> Content:
     top, body, first = read_frames(path)
     header, offsets = _header(top, first)
     require_width(body, len(header) + offsets + first, 'the header')
-    targets = list(dict.fromkeys(name for name, _ in header[::2]))
     cameras = sorted({camera for _, camera in header})
-    ids = number_names(targets, settings.names.targets)
+    column_id, names = numbered_targets([name for name, _ in header[::2]], settings.names.targets)
     labels = _labels(cameras, settings)
     frames: dict[str, list[Frame]] = {labels[camera]: [] for camera in cameras}
     column_camera = np.array([camera for _, camera in header[::2]])
-    column_id = np.array([ids[name] for name, _ in header[::2]], dtype=np.int64)
     size = settings.image_size_of(path)
     for number, row in zip(frame_numbers(body, first), body):
         _check_offsets(row, first, offsets)
@@ -61,19 +59,12 @@ def read(path: Path, settings: FileSettings) -> Content:
         for camera in cameras:
             used = (column_camera == camera) & ~np.isnan(uv).any(axis=1)
             if used.any():
-                frames[labels[camera]].append(
-                    Frame(
-                        labels[camera],
-                        number,
-                        column_id[used],
-                        uv[used],
-                        size,
-                        frame_id=f'{labels[camera]}_optical',
-                    )
-                )
+                name = labels[camera]
+                points = (column_id[used], uv[used])
+                frames[name].append(frame_of(row.place, name, number, *points, size))
     return Content(
         observations={name: of_camera for name, of_camera in frames.items() if of_camera},
-        names=Names(named_targets({name: ids[name] for name in targets})),
+        names=names,
         notes=_origin_notes(path, top, settings),
     )
 
@@ -219,5 +210,4 @@ FORMAT = Format(
     recognise=lambda sample: re.search(r'_cam_?\d+_[XY]\b', sample.first, re.I) is not None,
     read=read,
     write=write,
-    looks_like='bead01_cam1_X,bead01_cam1_Y,bead01_cam2_X,bead01_cam2_Y',
 )

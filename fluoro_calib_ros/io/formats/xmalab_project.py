@@ -24,15 +24,15 @@ from xml.etree import ElementTree
 import numpy as np
 
 from ...errors import DataError, ErrorsAt
-from ...exposures.frame import Frame, points_on_image
+from ...exposures.frame import Frame
 from ...exposures.names import Names, number_names, safe_names, without_trivial
 from ...images.codec import check_size, declared_size
 from ...limits import MAX_MEMBER, read_limits
-from ..access import os_error_reason
+from ..access import os_errors
 from ..documents import parse_xml
 from .content import Camera, Content, FileSettings, Format, Station, check_matrix, check_rotation
 from .phantoms import content_of
-from .tables import Row, default_name, named_targets, table_of
+from .tables import Row, default_name, frame_of, named_targets, table_of
 
 _SEEN = 0  # a marker is seen where its status is above
 _INLIER = 1  # flag of a grid point that is used
@@ -154,14 +154,21 @@ class _Project:
             ) from None
 
 
-class _Observations:
-    """Points of a project: those of its calibration object, or those of the markers of a trial."""
+class _Part:
+    """A part of a project."""
 
-    def __init__(self, project: _Project, survey: Content) -> None:
+    def __init__(self, project: _Project) -> None:
         self._project = project
         self._settings = project.settings
         self._files = project.archive
         self._path = project.archive.path
+
+
+class _Observations(_Part):
+    """Points of a project: those of its calibration object, or those of the markers of a trial."""
+
+    def __init__(self, project: _Project, survey: Content) -> None:
+        super().__init__(project)
         self._survey = survey
 
     def of_phantom(self) -> tuple[dict[str, list[Frame]], dict[str, int]]:
@@ -201,31 +208,14 @@ class _Observations:
                 f'calibration object has {count} beads'
             )
         used = (inlier[:, 0] == _INLIER) & ~(uv == NO_POINT).all(axis=1)
-        return self._frame(file, name, number, (self._bead_ids(count)[used], uv[used]), size)
+        points = (self._bead_ids(count)[used], uv[used])
+        return frame_of(f'{self._path}, {file}', name, number, *points, size)
 
     def _bead_ids(self, count: int) -> np.ndarray:
         """Return the ids of the beads in the order of the frame specification."""
         if self._survey.names.targets:
             return np.array(list(self._survey.names.targets.values()), dtype=np.int64)
         return np.arange(1, count + 1)
-
-    def _frame(
-        self,
-        file: str,
-        name: str,
-        number: int,
-        points: tuple[np.ndarray, np.ndarray],
-        size: tuple[int, int],
-    ) -> Frame:
-        ids, uv = points
-        on_image = points_on_image(uv, size)
-        if not on_image.all():
-            index = int(np.argmin(on_image))
-            raise DataError(
-                f'{self._path}, {file}: the point ({uv[index, 0]:g}, {uv[index, 1]:g}) is off the '
-                f'image of {size[0]} x {size[1]} px'
-            )
-        return Frame(name, number, ids, uv, size, frame_id=f'{name}_optical')
 
     def of_trial(self) -> tuple[dict[str, list[Frame]], dict[str, int]]:
         """Return the frames of the markers of a trial, and the names of the markers."""
@@ -264,25 +254,15 @@ class _Observations:
             for number, uv in enumerate(points[:, column], 1):
                 seen = ~np.isnan(uv).any(axis=1)
                 if seen.any():
-                    frame = self._frame(
-                        f'trial {self._settings.trial}, frame {number}',
-                        name,
-                        number,
-                        (target_id[seen], uv[seen]),
-                        size,
-                    )
+                    where = f'{self._path}, trial {self._settings.trial}, frame {number}'
+                    own, own_uv = target_id[seen], uv[seen]
+                    frame = frame_of(where, name, number, own, own_uv, image_size=size)
                     frames.setdefault(name, []).append(frame)
         return frames, named_targets(ids)
 
 
-class _Calibration:
+class _Calibration(_Part):
     """Calibrated cameras, their poses and undistortion grids of a project."""
-
-    def __init__(self, project: _Project) -> None:
-        self._project = project
-        self._settings = project.settings
-        self._files = project.archive
-        self._path = project.archive.path
 
     def stations(self, mm: float) -> Iterator[Station]:
         """Yield the pose of every calibrated image."""
@@ -372,7 +352,6 @@ FORMAT = Format(
     recognise=lambda sample: sample.suffix == '.xma' and sample.head.startswith(b'PK'),
     read=read,
     write=None,
-    looks_like='a ZIP file with project.xml',
     says_units=False,
 )
 
@@ -392,9 +371,8 @@ class ProjectArchive:
     def __init__(self, path: Path) -> None:
         self.path = path
         try:
-            self._archive = zipfile.ZipFile(path)
-        except OSError as error:
-            raise DataError(f'{path}: cannot be read ({os_error_reason(error)})') from None
+            with os_errors(path, 'cannot be read'):
+                self._archive = zipfile.ZipFile(path)
         except zipfile.BadZipFile:
             raise DataError(
                 f'{path}: this is not an XMALab project, which is a ZIP file'

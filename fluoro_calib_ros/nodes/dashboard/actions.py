@@ -17,8 +17,7 @@ from rclpy.action import ActionClient
 from rclpy.node import Node
 from rclpy.task import Future
 
-from ..messages.healing import healing_text
-from ..messages.self_calibration import feedback_text
+from ..messages.self_calibration import feedback_text, healing_text
 from .state import CALIBRATE, CALIBRATE_FAST, HEAL, Diagnosis
 
 NO_ANSWER = 'no answer yet; it may be lost: look at the state of the rig before you ask again'

@@ -23,17 +23,12 @@ from .observations import (
     TIME,
     UINT32,
     columns_bytes,
-    float64_field,
-    stamp_from_nanoseconds,
     string_bytes,
     string_sequence_bytes,
     uint8_field,
-    uint32_field,
 )
 
-# Field of each term of the covariance, and its index in the flattened matrix.
-_COVARIANCE = {'cov_xx': 0, 'cov_xy': 1, 'cov_xz': 2, 'cov_yy': 4, 'cov_yz': 5, 'cov_zz': 8}
-_TERMS = list(_COVARIANCE.values())
+_TERMS = [0, 1, 2, 4, 5, 8]  # of a flattened covariance: xx, xy, xz, yy, yz, zz
 _SYMMETRIC = (
     'cov_xx',
     'cov_xy',
@@ -57,27 +52,6 @@ class PointsContent(NamedTuple):
     orientation: RigOrientation  #: orientation with which the points were intersected
     target_id: np.ndarray  #: (n,)
     points: IntersectedPoints  #: n points
-
-
-def message_from_points(content: PointsContent) -> ReconstructedPoints:
-    """Return the message of reconstructed points."""
-    orientation = content.orientation
-    points = content.points
-    message = ReconstructedPoints()
-    message.header.stamp = stamp_from_nanoseconds(content.stamp_ns)
-    message.header.frame_id = orientation.frame_id
-    message.frame_number = content.frame_number
-    message.target_id = uint32_field(content.target_id)
-    message.x, message.y, message.z = (float64_field(column) for column in points.xyz_mm.T / 1000)
-    terms = points.covariance.reshape(-1, 9).T * 1e-6
-    for name, row in _COVARIANCE.items():
-        setattr(message, name, float64_field(terms[row]))
-    message.residual = float64_field(points.residual)
-    message.rays = uint8_field(points.rays)
-    message.status = uint8_field(points.status)
-    message.orientation_id = content.orientation_id
-    message.calibration_id = list(orientation.calibration_ids)
-    return message
 
 
 def encode_reconstructed_points(content: PointsContent) -> bytes:

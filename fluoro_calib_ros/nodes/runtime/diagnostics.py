@@ -48,6 +48,9 @@ MAX_TRACE = 20_000  # characters
 rcutils_logger._internal_callers.append(os.path.realpath(__file__))
 
 
+_LEVELS = ('debug', 'info', 'warning', 'error', 'fatal')  # methods of a logger
+
+
 class PrintableLogger:
     """Logger of a node: what names and texts of others contain stays in its line.
 
@@ -58,27 +61,10 @@ class PrintableLogger:
         self._logger = logger
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self._logger, name)
-
-    def debug(self, text: str, **options: Any) -> None:
-        """Log for debugging."""
-        self._logger.debug(log_line(text), **options)
-
-    def info(self, text: str, **options: Any) -> None:
-        """Log what happened."""
-        self._logger.info(log_line(text), **options)
-
-    def warning(self, text: str, **options: Any) -> None:
-        """Log a warning."""
-        self._logger.warning(log_line(text), **options)
-
-    def error(self, text: str, **options: Any) -> None:
-        """Log an error."""
-        self._logger.error(log_line(text), **options)
-
-    def fatal(self, text: str, **options: Any) -> None:
-        """Log why the node ends."""
-        self._logger.fatal(log_line(text), **options)
+        method = getattr(self._logger, name)
+        if name not in _LEVELS:
+            return method
+        return lambda text, **options: method(log_line(text), **options)
 
 
 class Trace(str):
@@ -318,6 +304,18 @@ def warning(message: str) -> Health | None:
 def fault(message: str) -> Health | None:
     """Return an ERROR, None for an empty message."""
     return Health(ERROR, message) if message else None
+
+
+def healthy(message: str) -> Callable[[Any], Health]:
+    """Return the condition that nothing is wrong, which holds always."""
+    return lambda state: Health(OK, message)
+
+
+def counted(name: str, text: str) -> Callable[[Any], Health | None]:
+    """Return the condition that something was counted within the last minute, told by {count}."""
+    return lambda state: warning(
+        text.format(count=state.recent[name]) if state.recent[name] else ''
+    )
 
 
 # Returns what is to be said about a state, None where the condition does not hold.

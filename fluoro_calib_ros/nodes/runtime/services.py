@@ -18,10 +18,9 @@ from rclpy.node import Node
 from rclpy.service import Service
 from rclpy.task import Future
 
+from ...errors import DataError
 from ...limits import MAX_TEXT
-from .diagnostics import (
-    one_line,
-)
+from .diagnostics import Logger, one_line
 from .parameters import ParameterNode
 from .topics import services_qos
 
@@ -94,6 +93,28 @@ class ServiceEntry(NamedTuple):
     name: str
     kind: type
     handler: Callable[[Any, Any], Any]
+
+
+def telling_service(
+    name: str, kind: type, refused: str, act: Callable[[Any], str], logger: Logger
+) -> ServiceEntry:
+    """Return a service that does what is asked, and answers what was done or why it was not.
+
+    act may raise DataError and OSError; refused is what is said before the reason.
+    """
+
+    def answer(request: Any, response: Any) -> Any:
+        try:
+            response.message = act(request)
+        except (DataError, OSError) as error:
+            response.message = f'{refused}: {error}'
+            logger.error(response.message)
+            return response
+        response.success = True
+        logger.info(response.message)
+        return response
+
+    return ServiceEntry(name, kind, answer)
 
 
 def create_services(

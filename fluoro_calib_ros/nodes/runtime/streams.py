@@ -114,6 +114,7 @@ class StreamReader:
     def __init__(self, node: Node, faults: FaultHandlers) -> None:
         self._node = node
         self._faults = faults
+        self._faults_of: dict[str, FaultHandlers] = {}  # of topics that have their own
         self._group = _ReaderGroup()
         self._routes: list[_Route] = []
         self._max_bytes: dict[str, int] = {}  # by topic
@@ -162,9 +163,16 @@ class StreamReader:
         decode = decode or (lambda data: deserialize_message(data, kind))
         self._routes.append(_Route.of(topic, subscription, decode, callback))
 
-    def take_first(self, topic: str) -> None:
-        """Handle what is pending of a subscribed topic before each message of the others."""
+    def take_first(self, topic: str, faults: FaultHandlers) -> None:
+        """Handle what is pending of a subscribed topic before each message of the others.
+
+        faults: of this topic.
+        """
         self._first.add(topic)
+        self._faults_of[topic] = faults
+
+    def _of(self, topic: str) -> FaultHandlers:
+        return self._faults_of.get(topic, self._faults)
 
     def topics(self) -> dict[str, bool]:
         """Return the subscribed topics by relative name, and whether each has a publisher."""
@@ -280,10 +288,11 @@ class StreamReader:
 
     def _drop(self, topic: str, size: int) -> None:
         """Count a message that is too large."""
-        if self._faults.too_large is None:
-            self._faults.undecodable(topic)
+        faults = self._of(topic)
+        if faults.too_large is None:
+            faults.undecodable(topic)
         else:
-            self._faults.too_large(topic, size)
+            faults.too_large(topic, size)
 
     def _drain(self, route: _Route, first: list[_Route], most: int) -> None:
         """Handle the pending messages of a subscription, at most so many of them.
@@ -305,13 +314,14 @@ class StreamReader:
 
     def _count_overrun(self, route: _Route, number: int | None) -> None:
         """Count the messages before one with that number that did not arrive."""
-        if self._faults.overrun is None or number is None or route.is_latched:
+        faults = self._of(route.topic)
+        if faults.overrun is None or number is None or route.is_latched:
             return
         lost = number - self._sequence.get(route.topic, number - 1) - 1
         self._sequence[route.topic] = number
         # Each of several publishers has numbers of its own; so has one that was started again.
         if lost > 0 and self._node.count_publishers(route.subscription.topic_name) == 1:
-            self._faults.overrun(route.topic, lost)
+            faults.overrun(route.topic, lost)
 
     def _handle(self, route: _Route, data: bytes, info: dict[str, Any]) -> None:
         if len(data) > self._max_bytes[route.topic]:
@@ -323,10 +333,10 @@ class StreamReader:
             self._drop(route.topic, len(data))
             return
         except DECODING_ERRORS:
-            self._faults.undecodable(route.topic)
+            self._of(route.topic).undecodable(route.topic)
             return
         try:
             route.callback(message, info)
         except Exception as error:  # this message is lost, the next ones are not
             if not self._stopping.is_set() and self._node.context.ok():
-                self._faults.callback_error(route.topic, error)
+                self._of(route.topic).callback_error(route.topic, error)

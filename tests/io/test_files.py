@@ -305,7 +305,9 @@ def test_texts_of_other_programs_that_are_not_read_are_named(tmp_path, text, rem
 
 def test_hdf5_that_is_no_table_is_named(tmp_path):
     path = text_file(tmp_path, 'points.h5', b'\x89HDF\r\n\x1a\n' + bytes(range(256)))
-    assert 'HDF5 file; of these, analysis files of SLEAP' in message_of(read_phantom, path)
+    assert 'HDF5 file; of these, files of DeepLabCut and analysis' in message_of(
+        read_phantom, path
+    )
     settings = FileSettings(image_size=(100, 100))
     assert 'this HDF5 file cannot be' in message_of(lambda p: registry.read(p, settings), path)
 

@@ -206,7 +206,12 @@ def _measured(
     measured = _Measured(rows, beads, reasons, predicted, nearby.sd_px[rows])
     assert imaging is not None
     extraction = _checked(detections, found, view, measured, imaging)
-    return _with_support(extraction, model, rows)
+    extraction = _with_support(extraction, model, rows)
+    # What was measured are shadows; observations are of the centres of beads.
+    radius_px = imaging.profile.border_px * (shadows.radius * size)
+    of_bead = radius_px[np.searchsorted(rows, extraction.bead)]
+    shift = view.shadow_shift(model.xyz[extraction.bead], of_bead)
+    return replace(extraction, uv=extraction.uv - shift)
 
 
 @dataclass(frozen=True)

@@ -441,6 +441,16 @@ class Profile:
         """Distance from the centre at which the shadow has ended [px]."""
         return self.radius_px + REACH_SIGMAS * self.blur_px
 
+    @cached_property
+    def border_px(self) -> float:
+        """Distance from the centre at which the place of a shadow is measured, RMS [px].
+
+        Light tells the place where it changes.
+        """
+        distance = np.arange(0.0, self.reach_px, TABLE_STEP)
+        weight = self.shadow(distance)[1] ** 2 * distance
+        return float(np.sqrt((weight * distance**2).sum() / weight.sum()))
+
     def sized(self, size: float) -> Profile:
         """Return the profile of a bead of another relative size, which absorbs more, or less."""
         attenuation = self.attenuation * size

@@ -27,6 +27,7 @@ PRIOR_SD = (0.01, 0.012, 0.03, 0.008, 0.008, 0.003, 0.003)
 TAIL = 2.5  # residual, in robust standard deviations, at which the weight is halved
 POSE = 7  # unknowns before the coefficients: rotation, shift, log of the principal distance
 DAMPING = 1e-6
+CONTOUR = 12  # points of the border of a shadow
 
 
 @dataclass(frozen=True)
@@ -92,6 +93,34 @@ class View:
         z = np.where(x[:, 2] > 1e-9, x[:, 2], np.nan)
         ideal = self.lens.centre + self.principal_distance_px * x[:, :2] / z[:, None]
         return ideal + self._distortion(ideal)[0]
+
+    def shadow_shift(self, xyz: np.ndarray, radius_px: np.ndarray) -> NDArray[np.float64]:
+        """Places (n, 2) of the shadows of spheres less those of their projected centres [px].
+
+        xyz (n, 3) [mm]; radius_px (n,). The rays that touch a sphere form a cone, whose section is
+        an ellipse that is not about the projected centre (Luhmann, "Eccentricity in images of
+        circular and spherical targets and its impact on spatial intersection", Photogrammetric
+        Record 29, 2014), and the distortion bends it. The fit of a circle to its border is shifted
+        by twice the mean of the displacements along the normals.
+        """
+        x = (xyz - self.position) @ self.rotation.T
+        distance = np.linalg.norm(x, axis=1, keepdims=True)
+        radius = np.asarray(radius_px)[:, None] * x[:, 2:] / self.principal_distance_px
+        sine2 = (radius / distance) ** 2
+        across = np.stack([x[:, 2], np.zeros(len(x)), -x[:, 0]], axis=1)
+        across /= np.linalg.norm(across, axis=1, keepdims=True)
+        down = np.cross(x / distance, across)
+        turn = 2 * np.pi * np.arange(CONTOUR) / CONTOUR
+        normal = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+        rays = (1 - sine2)[:, None] * x[:, None] + (radius * np.sqrt(1 - sine2))[:, None] * (
+            normal[:, :1] * across[:, None] + normal[:, 1:] * down[:, None]
+        )
+        points = np.concatenate([x[:, None], rays], axis=1)
+        ideal = self.lens.centre + self.principal_distance_px * points[..., :2] / points[..., 2:]
+        bent = self._distortion(ideal.reshape(-1, 2))[0].reshape(ideal.shape)
+        away = (ideal + bent)[:, 1:] - (ideal + bent)[:, :1]
+        along = np.einsum('nkc,kc->nk', away, normal)
+        return np.asarray(2 / CONTOUR * along @ normal)
 
     def depth(self, xyz: np.ndarray) -> np.ndarray:
         """Distances (n,) of points (n, 3) from the source along the axis [mm]."""

@@ -26,6 +26,43 @@ from fluoro_calib_ros.images.marker_watch import (
     MarkerDoubts,
     follow_beside,
 )
+from fluoro_calib_ros.images.shadow_fit import Profile
+from fluoro_calib_ros.images.view import Lens, View
+
+
+def view(coefficients=np.zeros((2, 5))):
+    lens = Lens((1024, 1024), 2000.0)
+    return View(lens, np.eye(3), np.array([0.0, 0.0, -1000.0]), 2000.0, coefficients, 2)
+
+
+def test_shadow_of_a_sphere_lies_farther_out_than_its_centre():
+    """An ellipse, whose middle is half way between the rays that touch the sphere."""
+    sphere = np.array([[300.0, 0.0, 0.0], [0.0, -200.0, 0.0], [0.0, 0.0, 0.0]])
+    shift = view().shadow_shift(sphere, np.full(3, 40.0))  # 20 mm at 1 m
+    for row, (column, away) in enumerate(((0, 300.0), (1, -200.0))):
+        angle = np.arctan(away / 1000)
+        wide = np.arcsin(20 / np.hypot(away, 1000))
+        middle = 1000 * (np.tan(angle + wide) + np.tan(angle - wide))
+        assert shift[row, column] == pytest.approx(middle - 2 * away, rel=0.02)
+    assert np.abs(shift[[0, 1], [1, 0]]).max() < 1e-6 and np.abs(shift[2]).max() < 1e-9
+
+
+def test_shadow_is_shifted_where_the_distortion_bends():
+    """By r^2 (3 u_xx + u_yy + 2 v_xy) / 8, which a stretch of the image does not do."""
+    half = 512.0
+    stretch = np.array([[5.0, 3, 0, 0, 0], [2.0, -4, 0, 0, 0]])
+    bends = np.array([[0.0, 0, 7.0, 0, -2], [0.0, 0, 0, 5.0, 0]])  # x^2, x y, y^2
+    middle = np.zeros((1, 3))
+    assert np.abs(view(stretch).shadow_shift(middle, np.array([20.0]))).max() < 1e-9
+    shift = view(bends).shadow_shift(middle, np.array([20.0]))[0]
+    expected = 20.0**2 * (3 * 14 + 2 * -2 + 2 * 5) / half**2 / 8
+    assert shift[0] == pytest.approx(expected, rel=0.01) and abs(shift[1]) < 1e-9
+
+
+def test_border_of_a_shadow_is_where_its_light_changes():
+    sharp = Profile(20.0, 0.35, 6.0)
+    assert sharp.border_px == pytest.approx(20.0, abs=0.5)
+    assert 0 < Profile(20.0, 0.35, 0.1).border_px < sharp.border_px
 
 
 def seen(uv, shape=(60, 80), radius=2.0):

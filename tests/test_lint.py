@@ -79,8 +79,8 @@ def nodes():
     gc.disable()  # it would look through all trees again and again, and find nothing
     try:
         return [
-            (path.relative_to(ROOT), node)
-            for path in SOURCES
+            (name, node)
+            for name, path in ((path.relative_to(ROOT), path) for path in SOURCES)
             for node in ast.walk(ast.parse(path.read_text()))
             if isinstance(node, kinds)
         ]

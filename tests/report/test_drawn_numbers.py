@@ -348,14 +348,17 @@ def test_distances_of_the_phantom_are_along_the_axis():
 
 
 def test_beams_meet_at_their_angle():
+    """Sources are as far apart as they are, wherever the origin of the frame is."""
+    turned = [[0, 0, 1.0], [0, 1, 0], [-0.8, 0, 0.6]]
     orientation = Fake(
-        fluoroscopes=('a', 'b'),
-        rotation=np.array([np.eye(3), [[0, 0, 1.0], [0, 1, 0], [-0.8, 0, 0.6]]]),
-        position_mm=np.array([[0.0, 0, 0], [30, 40, 0]]),
+        fluoroscopes=('a', 'b', 'c'),
+        rotation=np.array([np.eye(3), turned, np.diag([1.0, -1, -1])]),
+        position_mm=np.array([[100.0, -200, 50], [130, -160, 50], [100, -200, 950]]),
     )
-    ((names, degrees, between),) = beams(orientation)
-    assert names == 'a and b' and between == 50
-    assert degrees == pytest.approx(np.degrees(np.arccos(0.6)))
+    names, degrees, between = zip(*beams(orientation))
+    assert names == ('a and b', 'a and c', 'b and c')
+    assert between == pytest.approx([50, 900, np.hypot(50, 900)])
+    assert degrees == pytest.approx(np.degrees(np.arccos([0.6, -1, -0.6])))
 
 
 def test_share_of_the_image_that_is_not_calibrated():

@@ -187,7 +187,9 @@ def test_map_of_residuals_has_arrows_of_inliers_and_crosses():
 
 
 def test_bars_of_exposures_are_rms_and_beads():
-    upper, lower = exposure_bars(some_residuals(), 'a').axes
+    figure = exposure_bars(some_residuals(), 'a')
+    upper, lower = figure.axes
+    assert figure.get_figwidth() > figure.get_figheight()  # for many exposures
     assert [bar.get_height() for bar in upper.patches] == pytest.approx([np.sqrt(2 / 3), 0.5])
     assert [bar.get_height() for bar in lower.patches] == [3, 2]
     median = (np.sqrt(2 / 3) + 0.5) / 2
@@ -532,6 +534,7 @@ def frame(number, found, stamp_s):
 def test_figure_of_points_shows_when_each_was_found_and_its_sd():
     frames = [frame(n, [True, n != 2], 100 + 0.5 * n) for n in (1, 2, 3)]
     figure = points_figure(frames, {5: 'knee'})
+    assert figure.get_figwidth() > figure.get_figheight()  # paths, then when, then how well
     seen, known = figure.subfigs[1].axes
     labels = [label.get_text() for label in seen.get_yticklabels()]
     assert labels == ['knee: 100 %', '6: 67 %']

@@ -5,12 +5,15 @@
 
 import functools
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
+import pytest
 from rigs import true_calibrations, true_orientation
 
 from fluoro_calib_ros.bodies.body import Body
 from fluoro_calib_ros.checks.drift_charts import ERROR
+from fluoro_calib_ros.checks.rig_change import RigChange
 from fluoro_calib_ros.checks.rig_watch import RigDriftWatch
 from fluoro_calib_ros.findings import Kind
 from fluoro_calib_ros.jobs.bodies import BodiesOptions, track_bodies
@@ -107,6 +110,62 @@ def test_derivatives_are_those_of_differences():
             found.append(residuals.residual)
         difference = (found[0] - found[1]) / (2 * step)
         np.testing.assert_allclose(told[:, column], difference, rtol=0.02, atol=0.02)
+
+
+@pytest.fixture(scope='module')
+def geometry():
+    fluoroscopes = virtual_rig(2, strength=0.0, names=('a', 'b'), between_deg=60.0).fluoroscopes
+    orientation = true_orientation(fluoroscopes, true_calibrations(fluoroscopes, NOISE_PX))
+    return orientation, EpipolarGeometry(orientation, 'a', 'b')
+
+
+def shown_blocks(geometry, blocks):
+    """What blocks of five exposures show; each: what the rays of its markers miss by [px]."""
+    orientation, pair = geometry
+    change = RigChange(orientation, [(0, 1, pair)])
+    for missed in blocks:
+        for row in np.broadcast_to(missed, (5, np.shape(missed)[-1])):
+            uv = np.linspace([300.0, 700.0], [600.0, 400.0], len(row))
+            found = SimpleNamespace(residual=row, sd_total=np.ones(len(row)))
+            change.add(0, np.arange(len(row)), (uv, uv), found, np.full(len(row), 0.1))
+        change.close()
+    return change
+
+
+MEETS, APART = [0.1] * 4, [9.0] * 4
+
+
+@pytest.mark.parametrize(
+    ('blocks', 'share', 'apart'),
+    [
+        ([MEETS, APART], 0.0, 1),
+        ([MEETS, APART, APART], 1.0, 2),
+        ([MEETS, APART, [9.0, -9.0, 0.1, 9.0]], 0.75, 2),
+        ([MEETS, APART, [9.0, 0.1, 0.1, 9.0]], 0.0, 0),  # as many meet
+        ([MEETS, APART, MEETS, APART], 0.0, 1),
+        ([APART, APART, APART], 0.0, 3),  # confused, as they have never met
+        ([MEETS, APART[:2], APART[:2]], 0.0, 0),  # too few markers
+        ([MEETS, APART[:3], APART[:3]], 1.0, 2),
+        ([MEETS, [APART, APART, MEETS, MEETS, MEETS]] * 2, 0.0, 0),  # false matches of some
+    ],
+)
+def test_knock_is_shown_by_two_blocks_in_which_most_rays_are_apart(geometry, blocks, share, apart):
+    change = shown_blocks(geometry, blocks)
+    assert (change.share_apart, change.blocks_apart) == (share, apart)
+
+
+def test_what_is_added_grows_with_what_the_rays_show(geometry):
+    """Of the newest blocks only; nothing is known without a block of enough markers."""
+    assert shown_blocks(geometry, [APART[:2]]).addition(1) is None
+    change = shown_blocks(geometry, [APART, MEETS, MEETS])
+    newest, all_three = change.addition(2), change.addition(3)
+    capped = (3 * 0.1) ** 2 / 0.455  # three robust standard deviations; 0.455: median chi-squared
+    assert newest.miss == pytest.approx(0.1)
+    assert all_three.miss == pytest.approx(np.sqrt((capped + 2 * 0.1**2) / 3))
+    assert np.trace(all_three.covariance) > np.trace(newest.covariance)
+    assert change.addition(0).miss == change.addition(1).miss == newest.miss
+    np.testing.assert_array_equal(newest.covariance, newest.covariance.T)
+    assert np.linalg.eigvalsh(newest.covariance).min() > -1e-12
 
 
 def test_points_of_a_knocked_rig_are_found_with_honest_deviations():

@@ -32,7 +32,7 @@ from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.findings import Kind, Place, Severity
 from fluoro_calib_ros.io.observations import write_observations_csv
 from fluoro_calib_ros.io.phantom import write_phantom
-from fluoro_calib_ros.jobs.calibration import run_calibration
+from fluoro_calib_ros.jobs.calibration import _without_shared, run_calibration
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector, rotation_angle
 from fluoro_calib_ros.simulation.rig import Detection, simulate_exposures, virtual_rig
 
@@ -278,6 +278,20 @@ def test_an_exposure_that_two_fluoroscopes_share_is_left_out_of_both():
     assert found.kind is Kind.SHARED_EXPOSURE and found.severity is Severity.NOTE
     assert found.place == Place(('a', 'b'), (4,))
     assert all(len(f.exposures) == 7 for f in outcome.result.fluoroscopes.values())
+
+
+@pytest.mark.parametrize('shared', [2, 3])
+def test_up_to_a_third_of_the_exposures_may_be_shared(shared):
+    """Of six; with more, one recording has been given for both."""
+    seen = {name: list(of_one)[:6] for name, of_one in recording(8).items()}
+    seen['b'][:shared] = [replace(one, fluoroscope='b') for one in seen['a'][:shared]]
+    if shared == 3:
+        with refused(Kind.SHARED_EXPOSURE, exposures=3):
+            _without_shared(seen)
+        return
+    left, found = _without_shared(seen)
+    assert [found[k].place.exposures for k in (0, 1)] == [(1,), (2,)] and len(found) == 2
+    assert [f.number for f in left['a']] == [f.number for f in left['b']] == [3, 4, 5, 6]
 
 
 def test_one_fluoroscope_with_two_ways_to_write_its_name_is_refused():

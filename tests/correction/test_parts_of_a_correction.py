@@ -24,6 +24,7 @@ from fluoro_calib_ros.correction.grid_cells import (
     errors_where_curved,
 )
 from fluoro_calib_ros.correction.neighbours import KnnModel, blocks_with_candidates
+from fluoro_calib_ros.correction.registry import create_model
 from fluoro_calib_ros.correction.series import MARGIN, Functions, without_absent_bands
 
 SIZE = (320, 240)
@@ -46,6 +47,27 @@ def test_angle_adds_its_change_and_variance_to_the_correction():
     mean, variance = turned.angle_field.change(UV, np.nan)
     np.testing.assert_allclose(unknown.duv, plain.duv + mean, atol=1e-12)
     np.testing.assert_allclose(unknown.sd**2, plain.sd**2 + variance, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ('kind', 'k', 'changed'),
+    [
+        ('knn', 3, {'train_duv': np.zeros((29, 2))}),
+        ('knn', 3, {'train_uv': np.where(UV.max() == UV, np.nan, UV)}),
+        ('knn', 3, {'train_duv': np.where(UV.max() == UV, np.inf, 0.0)}),
+        ('knn', 0, {}),
+        ('knn', 31, {}),
+        ('parametric', 0, {}),
+        ('no such kind', 3, {}),
+    ],
+)
+def test_content_that_is_no_correction_is_refused(kind, k, changed):
+    """A damaged file or message gives no model, rather than one that corrects by garbage."""
+    content = {'train_uv': UV, 'train_duv': np.zeros((30, 2))}
+    for possible in (1, 30):
+        assert create_model('knn', possible, **content).k == possible
+    with pytest.raises(ValueError):
+        create_model(kind, k, **{**content, **changed})
 
 
 @pytest.mark.parametrize(

@@ -22,6 +22,7 @@ from fluoro_calib_ros.correction.fluoroscope_calibration import (
 from fluoro_calib_ros.correction.registry import create_model, no_correction
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.frame import Frame
+from fluoro_calib_ros.exposures.names import Names
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.io.access import atomic_file, write_bytes, write_text
 from fluoro_calib_ros.io.calibration import (
@@ -36,6 +37,7 @@ from fluoro_calib_ros.io.formats import registry
 from fluoro_calib_ros.io.formats.content import FileSettings
 from fluoro_calib_ros.io.observations import (
     correct_points,
+    read_named_observations,
     read_observations_csv,
     read_points,
     write_observations_csv,
@@ -396,6 +398,21 @@ def test_observation_errors_name_row_and_cause(tmp_path, row, sentence):
     path = text_file(tmp_path, 'o.csv', header + rows)
     said = message_of(read_observations_csv, path, SIZE)
     assert said.startswith(path) and sentence in said
+
+
+@pytest.mark.parametrize('off', [0, 1, 5, 6])
+def test_up_to_a_twentieth_of_the_points_may_be_off_the_image(tmp_path, off):
+    """Of 100; the first is named, and the others are counted."""
+    rows = [f'a,{i // 50},{i % 50},{2000 if 20 <= i < 20 + off else 7},1,\n' for i in range(100)]
+    path = text_file(tmp_path, 'o.csv', OBSERVATIONS + ''.join(rows))
+    if off == 6:
+        assert 'row 22: ' in message_of(read_named_observations, path, SIZE, Names())
+        return
+    frames, _, said = read_named_observations(path, SIZE, Names())
+    left = np.concatenate([frame.target_id for frame in frames['a']])
+    assert left.tolist() == [i % 50 for i in range(100) if not 20 <= i < 20 + off]
+    assert ('row 22: ' in said, ', and 4 more' in said) == (off > 0, off == 5)
+    assert ' more' not in said or off == 5
 
 
 def test_row_number_is_exact_in_a_large_file(tmp_path):

@@ -12,9 +12,12 @@ import rigs
 from rclpy.serialization import deserialize_message, serialize_message
 from scipy.spatial.transform import Rotation
 
+from fluoro_calib_ros.bodies.anatomical_frames import AnatomicalFrame
 from fluoro_calib_ros.bodies.body import Body, BodyPoses, PoseStatus
+from fluoro_calib_ros.bodies.joints import Joint
 from fluoro_calib_ros.bodies.tracking import BodyTracker, poses_of, twists_of
 from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.io.bodies import JointEntry
 from fluoro_calib_ros.nodes.messages.bodies import (
     AXIS_MM,
     BodiesContent,
@@ -272,6 +275,24 @@ def test_new_tracker_first_gives_what_waits(change):
     assert {one.orientation_id for one in rest} == {'rig-1'}
     found = follow(follower, range(row + 1, row + 7), number)
     assert found[0].frame_number == row + 1 and found[0].orientation_id == f'rig-{number}'
+
+
+def test_angles_of_a_joint_are_those_from_its_neutral_trial_on():
+    """Axes of the tibia are 0.3 rad off; a recording that begins anew has its own trial."""
+    off = AnatomicalFrame(Rotation.from_euler('x', 0.3).as_matrix(), np.zeros(3))
+    joint = Joint('knee', 'femur', 'tibia', 'cardan_xyz', distal_frame=off)
+    free, zeroed = (
+        BodyFollower(BODIES, [JointEntry(joint, neutral)], lag=0) for neutral in (None, (2, 4))
+    )
+    for content in follow(free, range(3)):
+        assert content.joints[0].angles == pytest.approx(np.array([[0.3, 0, 0]]), abs=1e-3)
+        names = [f'knee_{name}' for name in content.joints[0].angle_names]
+        assert list(joint_state(content).name) == names
+    for _ in range(2):
+        found = follow(zeroed, range(6))
+        assert [len(joint_state(content).position) for content in found] == [0, 0, 0, 3, 3, 3]
+        for content in found[3:]:
+            assert joint_state(content).position == pytest.approx([0, 0, 0], abs=1e-3)
 
 
 def test_exposure_with_the_stamp_of_the_one_before_is_counted():

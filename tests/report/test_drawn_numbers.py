@@ -185,7 +185,9 @@ def test_map_of_residuals_has_arrows_of_inliers_and_crosses():
 
 
 def test_bars_of_exposures_are_rms_and_beads():
-    upper, lower = exposure_bars(some_residuals(), 'a').axes
+    figure = exposure_bars(some_residuals(), 'a')
+    upper, lower = figure.axes
+    assert figure.get_figwidth() > figure.get_figheight()  # for many exposures
     assert [bar.get_height() for bar in upper.patches] == pytest.approx([np.sqrt(2 / 3), 0.5])
     assert [bar.get_height() for bar in lower.patches] == [3, 2]
     median = (np.sqrt(2 / 3) + 0.5) / 2
@@ -346,14 +348,17 @@ def test_distances_of_the_phantom_are_along_the_axis():
 
 
 def test_beams_meet_at_their_angle():
+    """Sources are as far apart as they are, wherever the origin of the frame is."""
+    turned = [[0, 0, 1.0], [0, 1, 0], [-0.8, 0, 0.6]]
     orientation = Fake(
-        fluoroscopes=('a', 'b'),
-        rotation=np.array([np.eye(3), [[0, 0, 1.0], [0, 1, 0], [-0.8, 0, 0.6]]]),
-        position_mm=np.array([[0.0, 0, 0], [30, 40, 0]]),
+        fluoroscopes=('a', 'b', 'c'),
+        rotation=np.array([np.eye(3), turned, np.diag([1.0, -1, -1])]),
+        position_mm=np.array([[100.0, -200, 50], [130, -160, 50], [100, -200, 950]]),
     )
-    ((names, degrees, between),) = beams(orientation)
-    assert names == 'a and b' and between == 50
-    assert degrees == pytest.approx(np.degrees(np.arccos(0.6)))
+    names, degrees, between = zip(*beams(orientation))
+    assert names == ('a and b', 'a and c', 'b and c')
+    assert between == pytest.approx([50, 900, np.hypot(50, 900)])
+    assert degrees == pytest.approx(np.degrees(np.arccos([0.6, -1, -0.6])))
 
 
 def test_share_of_the_image_that_is_not_calibrated():
@@ -527,6 +532,7 @@ def frame(number, found, stamp_s):
 def test_figure_of_points_shows_when_each_was_found_and_its_sd():
     frames = [frame(n, [True, n != 2], 100 + 0.5 * n) for n in (1, 2, 3)]
     figure = points_figure(frames, {5: 'knee'})
+    assert figure.get_figwidth() > figure.get_figheight()  # paths, then when, then how well
     seen, known = figure.subfigs[1].axes
     labels = [label.get_text() for label in seen.get_yticklabels()]
     assert labels == ['knee: 100 %', '6: 67 %']

@@ -17,6 +17,7 @@ import copy
 import json
 import os
 import random
+import resource
 import shutil
 import signal
 import sys
@@ -37,7 +38,9 @@ LEFT_OUT = ('.git', '.venv', '.build', '.*_cache', '.hypothesis', '.mutants.json
 MAX_TESTS_S = 40.0  # of the tests that a bug is shown to
 FIRST = 12  # tests that a bug is shown to before all of them
 RECORD_S = 3600.0
-MIN_LIMIT_S = 60.0  # after which a test that takes longer than without the bug has caught it
+MIN_LIMIT_S = 60.0  # of CPU time, after which a test has caught a bug
+WAITING = 10.0
+NO_TESTS = 5  # exit status of pytest
 THREADS = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS')
 SWAPPED: dict[type, type] = {
     ast.Add: ast.Sub,
@@ -184,16 +187,21 @@ class Recorder:
         self.seconds[report.nodeid] += report.duration
 
 
-def in_child(work: Any, limit_s: float) -> int | None:
-    """Return the exit status of work() in a child process; None where it takes too long."""
+def in_child(work: Any, limit_s: float) -> int:
+    """Return the exit status of work() in a child process, negative where it took too long.
+
+    The limit is one of CPU time: on a busy machine time passes without any. A child that waits for
+    ever takes none, and is ended after WAITING times as long.
+    """
     pid = os.fork()
     if pid == 0:
         os.setsid()
+        resource.setrlimit(resource.RLIMIT_CPU, (int(limit_s), int(limit_s) + 1))
         with open(os.devnull, 'w') as null:
             os.dup2(null.fileno(), 1)
             os.dup2(null.fileno(), 2)
         os._exit(int(work()))
-    end = time.monotonic() + limit_s
+    end = time.monotonic() + WAITING * limit_s
     while time.monotonic() < end:
         done, status = os.waitpid(pid, os.WNOHANG)
         if done:
@@ -201,7 +209,7 @@ def in_child(work: Any, limit_s: float) -> int | None:
         time.sleep(0.02)
     os.killpg(pid, signal.SIGKILL)
     os.waitpid(pid, 0)
-    return None
+    return -signal.SIGKILL
 
 
 def record(folders: Sequence[str]) -> int:
@@ -267,7 +275,7 @@ def is_caught(bug: Bug, tests: Sequence[str], folder: Path, limit_s: float) -> b
         compiled.unlink()
     path.write_bytes(before[: bug.begin] + bug.new.encode() + before[bug.end :])
     try:
-        return in_child(run, limit_s) != 0
+        return in_child(run, limit_s) not in (0, NO_TESTS)
     finally:
         path.write_bytes(before)
         os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))

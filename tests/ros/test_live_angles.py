@@ -304,7 +304,7 @@ def test_states_are_taken_before_each_image_that_waits(graph):
         )
         outputs[topic] = client.create_publisher(JointState, topic, QoSProfile(depth=10))
         client.wait_until(outputs[topic].get_subscription_count, what=topic)
-    reader.take_first('first')
+    reader.take_first('first', faults)
     for number in range(3):
         outputs['slow'].publish(JointState(name=[f'{number}']))
         outputs['first'].publish(JointState(name=[f'{number}']))

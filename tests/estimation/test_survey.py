@@ -34,7 +34,7 @@ from fluoro_calib_ros.jobs import survey as surveying
 from fluoro_calib_ros.jobs.calibration import run_calibration
 from fluoro_calib_ros.jobs.survey import SurveyRequest, survey
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
-from fluoro_calib_ros.simulation import exposures as simulated
+from fluoro_calib_ros.simulation import rig as simulated
 from fluoro_calib_ros.simulation.rig import virtual_rig
 
 GROWN = 1.003  # the phantom in hand over its drawing

@@ -8,7 +8,6 @@ import dataclasses
 import json
 import os
 import pathlib
-import pickle
 import re
 import struct
 import subprocess
@@ -255,6 +254,22 @@ def with_attributes(item, **attributes):
         item.attrs[name] = np.bytes_(value) if isinstance(value, (str, bytes)) else value
 
 
+def stored(columns):
+    """The axis of columns as pandas stores it: instructions of protocol 0, each text once."""
+    known = {}
+
+    def cell(name):
+        if name in known:
+            return f'g{known[name]}\n'
+        known[name] = len(known)
+        return f'V{name}\np{known[name]}\n'
+
+    names = (
+        f'({"".join(map(cell, one))}t' if isinstance(one, tuple) else cell(one) for one in columns
+    )
+    return f'(l(I1\n(l{"".join(f"{name}a" for name in names)}ta.'
+
+
 def pandas_table(path, text, axes=None):
     """The table of a CSV file as DeepLabCut stores predictions: to_hdf with format='table'."""
     rows = [line.split(',') for line in text.splitlines()]
@@ -265,7 +280,7 @@ def pandas_table(path, text, axes=None):
     with h5py.File(path, 'w') as file:
         group = file.create_group('df_with_missing')
         group['table'] = table
-        axes = pickle.dumps([(1, columns)], 0) if axes is None else axes
+        axes = stored(columns) if axes is None else axes
         with_attributes(group, pandas_type='frame_table', non_index_axes=axes)
     return path
 
@@ -309,18 +324,9 @@ def test_hdf5_of_deeplabcut_is_what_its_csv_is(tmp_path, write, text):
     ]
 
 
-class Trap:
-    """What makes a file where its pickle is loaded."""
-
-    def __init__(self, path):
-        self.path = path
-
-    def __reduce__(self):
-        return open, (str(self.path), 'w')
-
-
-def test_no_pickle_of_a_file_of_deeplabcut_is_loaded(tmp_path):
-    axes = pickle.dumps([(1, Trap(tmp_path / 'trapped'))], 0)
+def test_no_code_of_a_file_of_deeplabcut_is_run(tmp_path):
+    """Instructions that make a file where they are carried out: open(path, 'w')."""
+    axes = f'(l(I1\ncbuiltins\nopen\n(V{tmp_path / "trapped"}\nVw\ntRta.'
     path = pandas_table(tmp_path / 'a.h5', PREDICTED, axes)
     with pytest.raises(DataError, match='its columns are stored by GLOBAL, which is not read'):
         registry.read(path, SETTINGS)
@@ -332,10 +338,10 @@ def test_no_pickle_of_a_file_of_deeplabcut_is_loaded(tmp_path):
     [
         (lambda p: pandas_table(p, PREDICTED, b'(lp0\n'), 'pickle exhausted before'),
         (
-            lambda p: pandas_table(p, PREDICTED, pickle.dumps([(1, ['x'] * 6)], 0)),
+            lambda p: pandas_table(p, PREDICTED, stored(['x'] * 6)),
             'its columns ha',
         ),
-        (lambda p: pandas_table(p, PREDICTED, pickle.dumps([(1, [('x', 'y')] * 6)], 0)), '2 head'),
+        (lambda p: pandas_table(p, PREDICTED, stored([('x', 'y')] * 6)), '2 head'),
         (lambda p: pandas_fixed(p, LABELLED, nblocks=2), 'its columns are not of one kind'),
         (lambda p: pandas_fixed(p, LABELLED, pandas_type='series'), 'it is a series of pandas'),
     ],

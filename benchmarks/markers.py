@@ -38,7 +38,7 @@ from fluoro_calib_ros.correction.fluoroscope_calibration import FluoroscopeCalib
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.images.marker_decisions import revise
 from fluoro_calib_ros.images.marker_ids import identify_markers
-from fluoro_calib_ros.images.marker_pair import MarkerPair
+from fluoro_calib_ros.images.marker_views import MarkerViews
 from fluoro_calib_ros.images.markers import FirstMarkers, MarkerFrame, MarkerOptions, MarkerTracker
 from fluoro_calib_ros.images.overlay import draw_markers
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
@@ -220,12 +220,12 @@ def follow(kind: str, number: int, frames: int) -> tuple[Record, Record]:
     final = Record()
     views: dict[str, list[MarkerFrame]] = {'a': [], 'b': []}
     truth: dict[str, list[MarkerImage]] = {'a': [], 'b': []}
-    follower: MarkerPair | None = None
+    follower: MarkerViews | None = None
     with threadpool_limits(1):
         for exposure, images in enumerate(sequence, 1):
             if follower is None:
                 first = {name: first_markers(rng, ids, image) for name, image in images.items()}
-                follower = MarkerPair(
+                follower = MarkerViews(
                     calibrations, orientation, options, first=first, bodies=bodies
                 )
             found = follower.update({n: image.image for n, image in images.items()}, exposure)

@@ -66,6 +66,45 @@ class MarkerExposure:
         return np.asarray((self.agree & ~self.doubtful).sum(axis=0) >= 2)
 
 
+@dataclass(frozen=True)
+class MarkerPlaces:
+    """Places (n, 3) of markers [mm], NaN for unknown; covariances (n, 3, 3)."""
+
+    xyz_mm: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+
+    @classmethod
+    def nowhere(cls, count: int) -> MarkerPlaces:
+        """Return unknown places."""
+        return cls(np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan))
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Whether (n,) it is known where a marker is."""
+        return np.asarray(np.isfinite(self.xyz_mm).all(axis=1))
+
+    def filled(self, others: MarkerPlaces) -> MarkerPlaces:
+        """Return these places, and others where they are unknown."""
+        known = self.known
+        if known.all() or not others.known.any():
+            return self
+        return MarkerPlaces(
+            np.where(known[:, None], self.xyz_mm, others.xyz_mm),
+            np.where(known[:, None, None], self.covariance, others.covariance),
+        )
+
+    def moved_on(self, before: MarkerPlaces, share: float) -> MarkerPlaces:
+        """Return where markers are expected that moved from other places to these.
+
+        share: of the time between them, in which they go on.
+        """
+        way = share * (self.xyz_mm - before.xyz_mm)
+        wider = (1 + share) ** 2 * self.covariance + share**2 * before.covariance
+        # What they may do otherwise than go on is like the way itself, along any axis.
+        unsteady = np.sum(way * way, axis=1)[:, None, None] / 3 * np.eye(3)
+        return MarkerPlaces(self.xyz_mm + way, wider + unsteady)
+
+
 class MarkerRays:
     """Rays of markers in calibrated views.
 
@@ -119,6 +158,21 @@ class MarkerRays:
         sigma[view] = sigma[view, ::-1]
         _, standardised = self._fit.intersect(uv, sigma)
         return standardised[view]
+
+    def by_others(self, exposure: MarkerExposure, view: int) -> MarkerPlaces:
+        """Places where two views and more, without this one, agree that markers are."""
+        out = MarkerPlaces.nowhere(len(self._target_id))
+        uv = exposure.corrected.copy()
+        uv[view] = np.nan
+        rows = np.flatnonzero(np.isfinite(uv).all(axis=2).sum(axis=0) >= 2)
+        if not len(rows):
+            return out
+        points, standardised = self._fit.intersect(uv[:, rows], exposure.sigma[:, rows])
+        agree = np.isfinite(points.xyz_mm).all(axis=1)
+        agree &= np.nanmax(standardised, axis=0, initial=0.0) < AGREE
+        out.xyz_mm[rows[agree]] = points.xyz_mm[agree]
+        out.covariance[rows[agree]] = points.covariance[agree]
+        return out
 
     def project(
         self, view: int, xyz_mm: np.ndarray, angles: Mapping[str, float | None]
@@ -231,19 +285,6 @@ LEARNED = 40  # exposures from which the shape of a body is learned
 FRAME_NS = 10_000_000  # time of an exposure for the filter, which adapts to any
 
 
-@dataclass(frozen=True)
-class BodyMarkers:
-    """Places (n, 3) of markers by their bodies [mm], NaN for unknown; covariances (n, 3, 3)."""
-
-    xyz_mm: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-
-    @property
-    def known(self) -> NDArray[np.bool_]:
-        """Whether (n,) a body says where a marker is."""
-        return np.asarray(np.isfinite(self.xyz_mm).all(axis=1))
-
-
 class MarkerBodies:
     """All rigid bodies of markers.
 
@@ -268,10 +309,7 @@ class MarkerBodies:
         self._tracker: BodyTracker | None = None
         if self._bodies:
             self._tracker = BodyTracker(orientation, [_placed(body) for body in self._bodies])
-        self.present = self._nowhere()
-
-    def _nowhere(self) -> BodyMarkers:
-        return BodyMarkers(np.full((self._count, 3), np.nan), np.full((self._count, 3, 3), np.nan))
+        self.present = MarkerPlaces.nowhere(self._count)
 
     def lost(self) -> tuple[Body, ...]:
         """Bodies whose pose is not known."""
@@ -280,7 +318,7 @@ class MarkerBodies:
         alive = self._tracker.filter.alive.tolist()
         return tuple(body for body, is_alive in zip(self._bodies, alive) if not is_alive)
 
-    def predicted(self, frame: int) -> BodyMarkers:
+    def predicted(self, frame: int) -> MarkerPlaces:
         """Where markers are expected in the next exposure."""
         if self._tracker is None:
             return self.present
@@ -323,10 +361,10 @@ class MarkerBodies:
 
     def _placed(
         self, rotation: np.ndarray, centre: np.ndarray, covariance: np.ndarray
-    ) -> BodyMarkers:
+    ) -> MarkerPlaces:
         """Places of markers at poses of the bodies."""
         assert self._tracker is not None
-        out = self._nowhere()
+        out = MarkerPlaces.nowhere(self._count)
         for number, (body, rows) in enumerate(zip(self._bodies, self._rows)):
             if not np.isfinite(rotation[number]).all():
                 continue

@@ -23,7 +23,7 @@ from .marker_decisions import BodyDecisions, DecidedView, Decision, RayDecisions
 from .marker_ids import MAX_SHADOWS, find_bodies, identifiable
 from .marker_intensity import FIRST_SD_PX, check_image
 from .marker_points import CalibratedRig
-from .marker_rays import MarkerBodies, MarkerExposure, MarkerRays
+from .marker_rays import MarkerBodies, MarkerExposure, MarkerPlaces, MarkerRays
 from .markers import FirstMarkers, MarkerFrame, MarkerOptions, MarkerTracker
 
 
@@ -145,6 +145,8 @@ class JoinedViews:
         self._bodies = MarkerBodies(rig.orientation, target_id, bodies)
         self._by_body = [BodyDecisions(view) for view in self._views]
         self._by_rays = [RayDecisions(view, self._rays) for view in self._views]
+        nowhere = MarkerPlaces.nowhere(len(target_id))
+        self._told = [_Told(nowhere, nowhere) for _ in self._views]
         self._frame = 0
         self._searched = 0  # last exposure in which lost bodies were searched
         # Of the C-arms [rad], in the last exposure and in the one before.
@@ -194,16 +196,17 @@ class JoinedViews:
         """Offer each view predictions of the markers that it is not sure of."""
         before = self._bodies.present
         now = self._bodies.predicted(frame)
-        known = now.known & before.known
-        for view in self._views:
+        for view, told in zip(self._views, self._told):
+            here = now.filled(told.expected(frame))
+            last = before.filled(told.places)
             rows = np.searchsorted(self._target_id, view.tracker.unsure())
-            rows = rows[known[rows]]
+            rows = rows[(here.known & last.known)[rows]]
             if not len(rows):
                 continue
-            uv = self._rays.project(view.view, now.xyz_mm[rows], self._angles)
-            uv_before = self._rays.project(view.view, before.xyz_mm[rows], self._angles_before)
+            uv = self._rays.project(view.view, here.xyz_mm[rows], self._angles)
+            uv_before = self._rays.project(view.view, last.xyz_mm[rows], self._angles_before)
             velocity = (uv - uv_before) / (frame - self._frame)
-            sd = self._rays.spread(view.view, now.xyz_mm[rows], now.covariance[rows])
+            sd = self._rays.spread(view.view, here.xyz_mm[rows], here.covariance[rows])
             view.tracker.suggest(self._target_id[rows], uv, velocity, sd)
 
     def _search(self, images: Mapping[str, np.ndarray | None], frame: int) -> None:
@@ -234,16 +237,42 @@ class JoinedViews:
         return view.tracker.shadows(image).strongest(MAX_SHADOWS).uv
 
     def _decide(self, exposure: MarkerExposure, frame: int) -> tuple[Decision, ...]:
-        """Confirm, exchange or drop ids, by bodies where these say a place."""
+        """Confirm, exchange or drop ids, by bodies where these say a place.
+
+        Markers of no body are where two views and more say that the one of another view is.
+        """
         out: list[Decision] = []
-        expected = self._bodies.present
-        for view, by_body in enumerate(self._by_body):
-            place = self._rays.project(view, expected.xyz_mm, self._angles)
-            sd = self._rays.spread(view, expected.xyz_mm, expected.covariance)
+        self._told = [
+            told.next(self._rays.by_others(exposure, view), frame)
+            for view, told in enumerate(self._told)
+        ]
+        expected = [self._bodies.present.filled(told.places) for told in self._told]
+        for view, (by_body, of_view) in enumerate(zip(self._by_body, expected)):
+            place = self._rays.project(view, of_view.xyz_mm, self._angles)
+            sd = self._rays.spread(view, of_view.xyz_mm, of_view.covariance)
             out += by_body.decide(exposure, place, sd, frame)
-        for by_rays in self._by_rays:
-            out += by_rays.decide(exposure, expected.known, frame)
+        for by_rays, of_view in zip(self._by_rays, expected):
+            out += by_rays.decide(exposure, of_view.known, frame)
         return tuple(out)
+
+
+@dataclass(frozen=True)
+class _Told:
+    """Where the other views say that the markers of a view are, in the last two exposures."""
+
+    places: MarkerPlaces
+    before: MarkerPlaces
+    frame: int = 0
+    frame_before: int = 0
+
+    def next(self, places: MarkerPlaces, frame: int) -> _Told:
+        """Return what is told with another exposure."""
+        return _Told(places, self.places, frame, self.frame)
+
+    def expected(self, frame: int) -> MarkerPlaces:
+        """Return where the markers are expected in the next exposure."""
+        share = (frame - self.frame) / max(self.frame - self.frame_before, 1)
+        return self.places.moved_on(self.before, share)
 
 
 def _offer(found: FirstMarkers, tracker: MarkerTracker) -> None:

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import pytest
 import rigs
+from marker_scenes import SCENE, SIZE, covered, small_rig
 from rigs import run
 
 from fluoro_calib_ros.bodies.body import Body, declared_bodies
@@ -44,40 +45,20 @@ from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.simulation.marker_images import (
     MARKER_SETTINGS,
     MarkerImage,
-    MarkerScene,
     MarkerSequence,
     MovingMarkers,
 )
-from fluoro_calib_ros.simulation.rig import DistortionField, VirtualRig, virtual_rig
+from fluoro_calib_ros.simulation.rig import VirtualRig
 
-SIZE = 288
 FRAMES = 30
 SEED = 26  # markers cross in both views, and are apart in the first images
-SCENE = MarkerScene(
-    clusters=2, markers=4, spread_mm=13.0, apart_mm=26.0, speed_mm=0.9, hidden=0.06
-)
 OPTIONS = MarkerOptions(shutter=SCENE.shutter)
 FAR_PX = 1.0  # from the truth, beyond which a centre is that of something else
 
 
 @cache
 def rig() -> VirtualRig:
-    """A rig with small images and no distortion."""
-    straight = DistortionField(np.zeros(2), 0.0, np.zeros(2), 0.0, np.zeros((0, 5)))
-    middle = (SIZE - 1) / 2
-    found = virtual_rig(3)
-    return replace(
-        found,
-        fluoroscopes=tuple(
-            replace(
-                f,
-                interior=np.array([middle, middle, 4000.0]),
-                image_size=(SIZE, SIZE),
-                distortion=straight,
-            )
-            for f in found.fluoroscopes
-        ),
-    )
+    return small_rig()
 
 
 @cache
@@ -690,22 +671,9 @@ def test_a_body_is_found_among_other_shadows_in_any_pose_and_not_where_it_is_abs
     assert not found and len(missing) == 1
 
 
-def covered(images: dict[str, MarkerImage], rows: slice) -> dict[str, np.ndarray]:
-    """Images of an exposure without some of the markers."""
-    out = {}
-    rng = np.random.default_rng(3)
-    for name, of in images.items():
-        light = of.image.astype(np.float32)
-        noise = np.median(np.abs(light - cv2.GaussianBlur(light, (0, 0), 3))) / 0.6745
-        marks = np.zeros((SIZE, SIZE), np.uint8)
-        for place in np.rint(of.uv[rows]).astype(int).tolist():
-            cv2.circle(marks, place, 6, 255, -1)
-        plain = light.copy()
-        for _ in range(20):
-            plain = np.where(marks > 0, cv2.blur(plain, (15, 15)), light)
-        plain += np.where(marks > 0, rng.normal(0, noise, plain.shape), 0.0).astype(np.float32)
-        out[name] = np.clip(plain, 0, 65535).astype(np.uint16)
-    return out
+def without_second_body(images: dict[str, MarkerImage]) -> dict[str, np.ndarray]:
+    """Images of an exposure without the markers of the second body."""
+    return {name: covered(of, np.s_[4:]) for name, of in images.items()}
 
 
 @pytest.mark.parametrize('covered_until', [0, 6])
@@ -722,7 +690,7 @@ def test_bodies_are_found_by_their_shapes_and_join_when_they_appear(covered_unti
     right = np.zeros((FRAMES, 2), dtype=int)
     for number, of in enumerate(images, 2):
         hidden = number < 2 + covered_until
-        shown = covered(of, np.s_[4:]) if hidden else {n: each.image for n, each in of.items()}
+        shown = without_second_body(of) if hidden else {n: each.image for n, each in of.items()}
         for name, found in follower.extract(shown, number).items():
             assert not found.reason
             row = np.searchsorted(ids, found.target_id)
@@ -745,7 +713,7 @@ def test_a_body_is_found_again_where_it_comes_back():
     found = 0
     for number, of in enumerate(images, 1):
         hidden = 8 <= number < 18
-        shown = covered(of, np.s_[4:]) if hidden else {n: each.image for n, each in of.items()}
+        shown = without_second_body(of) if hidden else {n: each.image for n, each in of.items()}
         result = views.update(shown, number)
         for name, view in result.views.items():
             row = np.searchsorted(ids, view.target_id)

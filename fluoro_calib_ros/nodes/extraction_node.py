@@ -200,9 +200,6 @@ def _joined(settings: ExtractionSettings, first: Mapping[str, FirstMarkers]) -> 
             f'calibration_directory: two fluoroscopes or more are followed together, not '
             f'{len(names)} ({", ".join(names)})'
         )
-    absent = [name for name in names if name not in first]
-    if first and absent:
-        raise DataError(f'parameter markers: there are no markers of {", ".join(absent)}')
     calibrations = read_calibrations(folder, names)
     orientation = load_orientation(orientation_path(folder)).subset(names)
     bodies = settings.node.rigid_bodies()

@@ -7,17 +7,24 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
-import rigs
-from marker_scenes import SCENE, SIZE, covered, small_rig
+from marker_scenes import (
+    SCENE,
+    SIZE,
+    THREE,
+    bodies,
+    calibration,
+    covered,
+    ids,
+    rig,
+    save_three,
+    sequence,
+)
 from rigs import run
 
 from fluoro_calib_ros.bodies.body import Body
-from fluoro_calib_ros.correction.fluoroscope_calibration import FluoroscopeCalibration
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.findings import Kind
 from fluoro_calib_ros.images.codec import encode
@@ -27,56 +34,15 @@ from fluoro_calib_ros.images.marker_rays import AGREE, RayFit
 from fluoro_calib_ros.images.marker_views import MarkerViews
 from fluoro_calib_ros.images.markers import FirstMarkers, MarkerFrame, MarkerOptions
 from fluoro_calib_ros.io.bodies import write_bodies
-from fluoro_calib_ros.io.calibration import save_calibration, save_orientation
 from fluoro_calib_ros.io.observations import read_observations_csv
 from fluoro_calib_ros.jobs.followers import MarkerSettings
-from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.simulation.marker_images import (
-    MARKER_SETTINGS,
     MarkerImage,
-    MarkerSequence,
-    MovingMarkers,
 )
-from fluoro_calib_ros.simulation.rig import VirtualRig
 
-THREE = 'abc'
-FRAMES = 24
-SEED = 26
 OPTIONS = MarkerOptions(shutter=SCENE.shutter, search_every=3)
 FAR_PX = 1.0  # from the truth, beyond which a centre is that of something else
-
-
-@cache
-def rig() -> VirtualRig:
-    return small_rig(THREE, between_deg=60.0)
-
-
-@cache
-def sequence() -> tuple[dict[str, MarkerImage], ...]:
-    """Images of all exposures by fluoroscope."""
-    settings = replace(MARKER_SETTINGS, round_field=False)
-    images = MarkerSequence(rig(), MovingMarkers(SCENE, SEED), settings, FRAMES, SEED)
-    return tuple(dict(of) for of in images)
-
-
-def ids() -> np.ndarray:
-    return MovingMarkers(SCENE, SEED).target_id
-
-
-@cache
-def calibration() -> tuple[dict[str, FluoroscopeCalibration], RigOrientation]:
-    calibrations = {
-        name: replace(each, image_size=(SIZE, SIZE))
-        for name, each in rigs.true_calibrations(rig().fluoroscopes, 0.05).items()
-    }
-    return calibrations, rigs.true_orientation(rig().fluoroscopes, calibrations)
-
-
-def bodies() -> tuple[Body, ...]:
-    local = MovingMarkers(SCENE, SEED).local_mm
-    sd = np.full(4, 0.05)
-    return Body('one', ids()[:4], local[:4], sd), Body('two', ids()[4:], local[4:], sd)
 
 
 def given(name: str) -> FirstMarkers:
@@ -297,8 +263,7 @@ def test_what_cannot_be_followed_together_is_said():
 
 def test_the_command_follows_three_fluoroscopes(tmp_path, capsys):
     """A folder for each, ids from bodies.csv."""
-    calibrations, orientation = calibration()
-    save_all(tmp_path / 'result', calibrations, orientation)
+    save_three(tmp_path / 'result')
     write_bodies(tmp_path / 'bodies.csv', bodies())
     for number, of in enumerate(sequence()[:6], 1):
         for name, image in of.items():
@@ -318,12 +283,3 @@ def test_the_command_follows_three_fluoroscopes(tmp_path, capsys):
     two_sources = [tmp_path / 'images' / name for name in 'ab']
     assert run('extract', *two_sources, *words) == 2
     assert 'one SOURCE for each fluoroscope' in capsys.readouterr().err
-
-
-def save_all(
-    folder: Path, calibrations: dict[str, FluoroscopeCalibration], orientation: RigOrientation
-) -> None:
-    folder.mkdir()
-    for each in calibrations.values():
-        save_calibration(folder, each)
-    save_orientation(folder, orientation)

@@ -159,15 +159,20 @@ class MarkerRays:
         _, standardised = self._fit.intersect(uv, sigma)
         return standardised[view]
 
-    def by_others(self, exposure: MarkerExposure, view: int) -> MarkerPlaces:
-        """Places where two views and more, without this one, agree that markers are."""
+    def by_others(self, exposure: MarkerExposure, view: int, wanted: np.ndarray) -> MarkerPlaces:
+        """Places where two views and more, without this one, agree that markers are.
+
+        wanted (n,): of these markers.
+        """
         out = MarkerPlaces.nowhere(len(self._target_id))
-        uv = exposure.corrected.copy()
-        uv[view] = np.nan
-        rows = np.flatnonzero(np.isfinite(uv).all(axis=2).sum(axis=0) >= 2)
+        seen = np.asarray(np.isfinite(exposure.corrected).all(axis=2))
+        seen[view] = False
+        rows = np.flatnonzero(wanted & (seen.sum(axis=0) >= 2))
         if not len(rows):
             return out
-        points, standardised = self._fit.intersect(uv[:, rows], exposure.sigma[:, rows])
+        uv = exposure.corrected[:, rows]  # a copy
+        uv[view] = np.nan
+        points, standardised = self._fit.intersect(uv, exposure.sigma[:, rows])
         agree = np.isfinite(points.xyz_mm).all(axis=1)
         agree &= np.nanmax(standardised, axis=0, initial=0.0) < AGREE
         out.xyz_mm[rows[agree]] = points.xyz_mm[agree]

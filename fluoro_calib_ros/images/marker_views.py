@@ -242,8 +242,9 @@ class JoinedViews:
         Markers of no body are where two views and more say that the one of another view is.
         """
         out: list[Decision] = []
+        free = ~self._bodies.present.known
         self._told = [
-            told.next(self._rays.by_others(exposure, view), frame)
+            told.next(self._rays.by_others(exposure, view, free), frame)
             for view, told in enumerate(self._told)
         ]
         expected = [self._bodies.present.filled(told.places) for told in self._told]

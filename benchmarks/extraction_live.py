@@ -523,11 +523,12 @@ class ChainReader(Node):
 
         def note(message: Any, info: Mapping[str, int]) -> None:
             stamp = nanoseconds_from_stamp(message.header.stamp)
-            came[stamp] = info['source_timestamp']
+            came.setdefault(stamp, info['source_timestamp'])  # poses come again if taken back
             if kind is TargetObservations:
                 self.observed[topic.partition('/')[0]].append(message)
             if kind is BodyPoses:
-                self.tracked[stamp] = sum(s != BodyPoses.FAILED for s in message.status)
+                known = sum(s != BodyPoses.FAILED for s in message.status)
+                self.tracked.setdefault(stamp, known)
 
         self.create_subscription(kind, topic, note, observations_qos())
 

@@ -56,8 +56,8 @@ from fluoro_calib_ros.images.codec import encode
 from fluoro_calib_ros.images.marker_fit import MarkerMeasurement
 from fluoro_calib_ros.images.marker_intensity import MarkerSearch
 from fluoro_calib_ros.images.marker_motion import MarkerStates
-from fluoro_calib_ros.images.marker_pair import MarkerPair
-from fluoro_calib_ros.images.marker_rays import MarkerBodies, PairRays
+from fluoro_calib_ros.images.marker_rays import MarkerBodies, MarkerRays
+from fluoro_calib_ros.images.marker_views import JoinedViews
 from fluoro_calib_ros.images.marker_watch import MarkerWatch
 from fluoro_calib_ros.io.bags.reader import iterate_messages
 from fluoro_calib_ros.io.bags.writer import BagWriter
@@ -431,16 +431,16 @@ PLAYED = 'played.npy'  # stamps of the exposures that were played
 TICKS = os.sysconf('SC_CLK_TCK')
 # What an exposure of two images is spent on in the process that follows markers.
 PARTS: dict[str, tuple[tuple[type, str], ...]] = {
-    'predict': ((MarkerStates, 'advance'), (MarkerPair, '_suggest')),
-    'search': ((MarkerSearch, 'shadows'), (MarkerPair, '_search')),
+    'predict': ((MarkerStates, 'advance'), (JoinedViews, '_suggest')),
+    'search': ((MarkerSearch, 'shadows'), (JoinedViews, '_search')),
     'fit': ((MarkerMeasurement, 'measure'),),
     'ids': (
-        (MarkerPair, '_decide'),
+        (JoinedViews, '_decide'),
         *((MarkerWatch, n) for n in ('shadows_met', 'found_again', 'other_shadows')),
         (MarkerWatch, 'moving_alone'),
     ),
     'rays and bodies': (
-        (PairRays, 'intersect'),
+        (MarkerRays, 'intersect'),
         (MarkerBodies, 'update'),
         (MarkerBodies, 'learn'),
     ),
@@ -523,11 +523,12 @@ class ChainReader(Node):
 
         def note(message: Any, info: Mapping[str, int]) -> None:
             stamp = nanoseconds_from_stamp(message.header.stamp)
-            came[stamp] = info['source_timestamp']
+            came.setdefault(stamp, info['source_timestamp'])  # poses come again if taken back
             if kind is TargetObservations:
                 self.observed[topic.partition('/')[0]].append(message)
             if kind is BodyPoses:
-                self.tracked[stamp] = sum(s != BodyPoses.FAILED for s in message.status)
+                known = sum(s != BodyPoses.FAILED for s in message.status)
+                self.tracked.setdefault(stamp, known)
 
         self.create_subscription(kind, topic, note, observations_qos())
 

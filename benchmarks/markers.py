@@ -1,15 +1,16 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Following of markers in two views: ids, precision and speed.
+"""Following of markers in two views and more: ids, precision and speed.
 
     python -m benchmarks.markers --frames 500           all settings, as the table of
                                                         docs/how_good.md
+    python -m benchmarks.markers --frames 100 --sets usual --views 3    the same in three views
     python -m benchmarks.markers --start 3              ids by shapes alone, in 3 rigs of each set
     python -m benchmarks.markers --speed                seconds of a core, and where they go
     python -m benchmarks.markers --picture PATH         an image with its overlay
 
-30 markers in five bones, 1024 x 1024 px, two views with distortion, calibrated from simulated
+30 markers in five bones, 1024 x 1024 px, views with distortion, calibrated from simulated
 exposures of a phantom with noise. Settings of renderer and motion are drawn for every sequence.
 The Cramer-Rao bound is that of the rendered light: its derivatives by the place of a marker,
 against the variance of photons, with unknown depth of the shadow and a background of degree 2, for
@@ -29,19 +30,22 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from scipy.spatial.distance import cdist
+from scipy.spatial.distance import cdist, pdist
 from threadpoolctl import threadpool_limits
 
 from fluoro_calib_ros.api import calibrate
 from fluoro_calib_ros.bodies.body import Body, declared_bodies
 from fluoro_calib_ros.correction.fluoroscope_calibration import FluoroscopeCalibration
 from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.images.marker_decisions import revise
 from fluoro_calib_ros.images.marker_ids import identify_markers
-from fluoro_calib_ros.images.marker_pair import MarkerPair
+from fluoro_calib_ros.images.marker_views import MarkerViews
 from fluoro_calib_ros.images.markers import FirstMarkers, MarkerFrame, MarkerOptions, MarkerTracker
 from fluoro_calib_ros.images.overlay import draw_markers
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
+from fluoro_calib_ros.reconstruction.intersection import OUTSIDE, Intersector
+from fluoro_calib_ros.reconstruction.reconstruct import ReconstructedFrame, reconstruct_exposure
 from fluoro_calib_ros.simulation.marker_images import (
     HARD_MARKER_SETTINGS,
     MARKER_SETTINGS,
@@ -52,10 +56,16 @@ from fluoro_calib_ros.simulation.marker_images import (
     MovingMarkers,
 )
 from fluoro_calib_ros.simulation.radiographs import RadiographSettings
-from fluoro_calib_ros.simulation.rig import VirtualRig, simulate_exposures, virtual_rig
+from fluoro_calib_ros.simulation.rig import (
+    BETWEEN_DEG,
+    VirtualRig,
+    simulate_exposures,
+    virtual_rig,
+)
 
 FIRST_RIG = 2000  # seeds below are those of development and tests
 FRAMES_OF_A_SEQUENCE = 250
+BETWEEN_THREE_DEG = 60.0  # angle between neighbouring ones of three fluoroscopes
 FALSE_PX = 1.5
 ALONE_PX = 14.0
 BOUND_EVERY = 50
@@ -106,6 +116,10 @@ class Record:
     sigma: list[np.ndarray] = field(default_factory=list)
     free: list[np.ndarray] = field(default_factory=list)
     bound: list[np.ndarray] = field(default_factory=list)
+    points: int = 0  # markers that two views and more see
+    intersected: int = 0
+    distance: list[np.ndarray] = field(default_factory=list)
+    residual: list[np.ndarray] = field(default_factory=list)
 
     def add(self, found: MarkerFrame, ids: np.ndarray, image: MarkerImage) -> None:
         """Compare the markers of an image with the truth."""
@@ -126,6 +140,35 @@ class Record:
         self.error.append(away[~wrong])
         self.sigma.append(found.sigma[~wrong])
         self.free.append((alone & image.seen)[row][~wrong])
+
+    def add_points(
+        self, found: ReconstructedFrame, seen: np.ndarray, markers: MovingMarkers
+    ) -> None:
+        """Compare distances between the points of a body with the truth.
+
+        seen (n,): views that see a marker.
+        """
+        good = found.points.status <= OUTSIDE
+        self.points += int(np.count_nonzero(seen >= 2))
+        self.intersected += int(np.count_nonzero(good))
+        self.residual.append(found.points.residual[good])
+        rows = np.searchsorted(markers.target_id, found.target_id[good])
+        for cluster in np.unique(markers.cluster):
+            own = markers.cluster[rows] == cluster
+            if np.count_nonzero(own) > 1:
+                true = pdist(markers.local_mm[rows[own]])
+                self.distance.append(pdist(found.points.xyz_mm[good][own]) - true)
+
+    def in_space(self) -> str:
+        """Return what is true of the points in space."""
+        distance = np.concatenate(self.distance)
+        residual = np.concatenate(self.residual)
+        return (
+            f'points of {self.points}: {self.intersected / self.points:.2%}, distances of markers '
+            f'of a body RMSE {np.sqrt(np.mean(distance**2)):.4f} mm, by the median '
+            f'{np.median(np.abs(distance)) / 0.6745:.4f} mm, residual (RMS) '
+            f'{np.sqrt(np.mean(residual**2)):.3f} px'
+        )
 
     def line(self, kind: str) -> str:
         """Return a row of the table."""
@@ -187,11 +230,22 @@ def bounds(radiography: MarkerRadiography, frame: int, true: np.ndarray) -> np.n
     return out
 
 
+def bounds_of(radiography: MarkerRadiography, truth: list[MarkerImage]) -> list[np.ndarray]:
+    """Cramer-Rao bounds of markers that are seen, in some of the exposures of a view."""
+    out = []
+    for exposure in range(BOUND_EVERY, len(truth) + 1, BOUND_EVERY):
+        image = truth[exposure - 1]
+        found = bounds(radiography, exposure, image.uv)
+        out.append(found[np.isfinite(found) & image.seen])
+    return out
+
+
 def calibrated(
-    seed: int,
+    seed: int, names: str = 'ab'
 ) -> tuple[VirtualRig, Mapping[str, FluoroscopeCalibration], RigOrientation]:
     """A rig, and its joint calibration from 15 simulated exposures of each fluoroscope."""
-    rig = virtual_rig(seed)
+    between = BETWEEN_DEG if len(names) == 2 else BETWEEN_THREE_DEG
+    rig = virtual_rig(seed, names=names, between_deg=between)
     outcome = calibrate(simulate_exposures(rig, 15, seed).frames, rig.phantom, joint=True)
     assert outcome.orientation is not None
     return rig, outcome.calibrations, outcome.orientation
@@ -203,11 +257,17 @@ def first_markers(rng: np.random.Generator, ids: np.ndarray, image: MarkerImage)
     return FirstMarkers(ids[image.seen], uv + rng.normal(0, GIVEN_SD_PX, uv.shape))
 
 
-def follow(kind: str, number: int, frames: int) -> tuple[Record, Record]:
-    """Follow a sequence; returns what was true live, and after later decisions."""
+def follow(
+    kind: str, number: int, frames: int, names: str = 'ab', start: bool = False
+) -> tuple[Record, Record]:
+    """Follow a sequence; returns what was true live, and after later decisions.
+
+    start: the shapes of the bodies give the ids; else the first places are given.
+    """
     rng = np.random.default_rng([SEED, number, SETS.index(kind)])
     scene, settings = settings_of(rng, kind)
-    rig, calibrations, orientation = calibrated(FIRST_RIG + 10 * number + SETS.index(kind))
+    seed = FIRST_RIG + 10 * number + SETS.index(kind)
+    rig, calibrations, orientation = calibrated(seed, names)
     markers = MovingMarkers(scene, SEED + 10 * number + SETS.index(kind))
     sequence = MarkerSequence(rig, markers, settings, frames, SEED + number)
     ids = markers.target_id
@@ -218,14 +278,18 @@ def follow(kind: str, number: int, frames: int) -> tuple[Record, Record]:
     options = MarkerOptions(shutter=scene.shutter)
     live = Record()
     final = Record()
-    views: dict[str, list[MarkerFrame]] = {'a': [], 'b': []}
-    truth: dict[str, list[MarkerImage]] = {'a': [], 'b': []}
-    follower: MarkerPair | None = None
+    views: dict[str, list[MarkerFrame]] = {name: [] for name in names}
+    truth: dict[str, list[MarkerImage]] = {name: [] for name in names}
+    follower: MarkerViews | None = None
     with threadpool_limits(1):
         for exposure, images in enumerate(sequence, 1):
             if follower is None:
                 first = {name: first_markers(rng, ids, image) for name, image in images.items()}
-                follower = MarkerPair(
+                if start:
+                    bodies = known_bodies(markers)
+                    shown = {name: image.image for name, image in images.items()}
+                    first = identify_markers(shown, calibrations, orientation, bodies)
+                follower = MarkerViews(
                     calibrations, orientation, options, first=first, bodies=bodies
                 )
             found = follower.update({n: image.image for n, image in images.items()}, exposure)
@@ -240,18 +304,49 @@ def follow(kind: str, number: int, frames: int) -> tuple[Record, Record]:
     for name in views:
         for view, image in zip(views[name], truth[name]):
             final.add(view, ids, image)
+    for found_in_space, seen in zip(
+        in_space(views, calibrations, orientation), zip(*truth.values()), strict=True
+    ):
+        count = np.sum([image.seen for image in seen], axis=0)
+        final.add_points(found_in_space, count, markers)
     for fluoroscope in rig.fluoroscopes:
         radiography = MarkerRadiography(fluoroscope, markers, settings, frames, SEED + number)
-        for exposure in range(BOUND_EVERY, frames + 1, BOUND_EVERY):
-            image = truth[fluoroscope.name][exposure - 1]
-            found_bounds = bounds(radiography, exposure, image.uv)
-            good = np.isfinite(found_bounds) & image.seen
-            live.bound.append(found_bounds[good])
-            final.bound.append(found_bounds[good])
+        found_bounds = bounds_of(radiography, truth[fluoroscope.name])
+        live.bound += found_bounds
+        final.bound += found_bounds
     return live, final
 
 
-def measure_start(kind: str, rigs: int) -> None:
+def in_space(
+    views: Mapping[str, list[MarkerFrame]],
+    calibrations: Mapping[str, FluoroscopeCalibration],
+    orientation: RigOrientation,
+) -> list[ReconstructedFrame]:
+    """Points of all exposures, without markers whose id is doubtful."""
+    intersector = Intersector(orientation)
+    out = []
+    for number, exposure in enumerate(zip(*views.values(), strict=True), 1):
+        frames = {}
+        for name, found in zip(views, exposure):
+            sure = ~found.doubtful
+            size = calibrations[name].image_size
+            uv, sigma = found.uv[sure], found.sigma[sure]
+            frames[name] = Frame(name, number, found.target_id[sure], uv, size, sigma=sigma)
+        out.append(reconstruct_exposure(frames, calibrations, intersector))
+    return out
+
+
+def known_bodies(markers: MovingMarkers) -> tuple[Body, ...]:
+    """Bodies of known shapes."""
+    out = []
+    for cluster in range(markers.scene.clusters):
+        own = markers.cluster == cluster
+        sd = np.full(np.count_nonzero(own), SHAPE_SD_MM)
+        out.append(Body(f'{cluster}', markers.target_id[own], markers.local_mm[own], sd))
+    return tuple(out)
+
+
+def measure_start(kind: str, rigs: int, names: str = 'ab') -> None:
     """Print how many bodies are found by their shapes in single exposures, and wrong ids."""
     found = ids = wrong = bodies = 0
     seconds = []
@@ -259,13 +354,9 @@ def measure_start(kind: str, rigs: int) -> None:
         rng = np.random.default_rng([SEED, number, SETS.index(kind)])
         scene, settings = settings_of(rng, kind)
         seed = 900 + 10 * number + SETS.index(kind)
-        rig, calibrations, orientation = calibrated(FIRST_RIG + seed)
+        rig, calibrations, orientation = calibrated(FIRST_RIG + seed, names)
         markers = MovingMarkers(scene, SEED + seed)
-        known = []
-        for cluster in range(scene.clusters):
-            own = markers.cluster == cluster
-            sd = np.full(np.count_nonzero(own), SHAPE_SD_MM)
-            known.append(Body(f'{cluster}', markers.target_id[own], markers.local_mm[own], sd))
+        known = known_bodies(markers)
         views = {
             f.name: MarkerRadiography(f, markers, settings, FRAMES_OF_A_SEQUENCE, SEED + number)
             for f in rig.fluoroscopes
@@ -363,22 +454,27 @@ def main() -> None:
     )
     parser.add_argument('--frames', type=int, default=0, metavar='N', help='exposures of a set')
     parser.add_argument('--sets', nargs='+', default=SETS, choices=SETS)
+    parser.add_argument('--views', type=int, default=2, choices=(2, 3))
+    parser.add_argument('--by-shapes', action='store_true', help='first ids by bodies, not given')
     parser.add_argument('--start', type=int, default=0, metavar='N', help='rigs of a set')
     parser.add_argument('--speed', action='store_true')
     parser.add_argument('--picture', type=Path)
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
+    names = 'abc'[: arguments.views]
     if arguments.frames:
         for kind in arguments.sets:
             records = []
             for number, start in enumerate(range(0, arguments.frames, FRAMES_OF_A_SEQUENCE)):
                 frames = min(FRAMES_OF_A_SEQUENCE, arguments.frames - start)
-                records.append(follow(kind, number, frames))
+                records.append(follow(kind, number, frames, names, arguments.by_shapes))
                 print('   ', records[-1][1].line(f'{kind} {number}'), flush=True)
             print(joined([live for live, _ in records]).line(f'{kind}, live'), flush=True)
-            print(joined([final for _, final in records]).line(f'{kind}, revised'), flush=True)
+            revised = joined([final for _, final in records])
+            print(revised.line(f'{kind}, revised'), flush=True)
+            print(f'{kind}, in space: {revised.in_space()}', flush=True)
     for kind in arguments.sets if arguments.start else ():
-        measure_start(kind, arguments.start)
+        measure_start(kind, arguments.start, names)
     if arguments.speed:
         measure_speed()
     if arguments.picture:

@@ -874,7 +874,7 @@ SENTENCES = {
         'recording, or calibrate with the phantom'
     ),
     Kind.NO_MARKERS: 'no markers were seen',
-    Kind.OTHER_VIEW_MISSING: 'the other view is missing',
+    Kind.OTHER_VIEW_MISSING: 'the view of b is missing',
     Kind.NOT_WATCHED: (
         'the file does not contain the times of its exposures, a drift cannot be detected'
     ),

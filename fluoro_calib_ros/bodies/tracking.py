@@ -364,7 +364,7 @@ class JointTracker:
             self._collect(proximal, distal)
         motion = joint_motion(self.joint, proximal, distal, self._last)
         if self.needs_neutral:
-            return _unknown(motion)
+            return unknown_motion(motion)
         if motion.status[0] in _FIRM:
             self._last = motion.angles[0]
         return motion
@@ -399,8 +399,8 @@ def _joined(poses: Sequence[BodyPoses]) -> BodyPoses:
     return replace(poses[0], **joined)
 
 
-def _unknown(motion: JointMotion) -> JointMotion:
-    """The same exposures without angles and translations."""
+def unknown_motion(motion: JointMotion) -> JointMotion:
+    """Return the same exposures without angles and translations."""
     return replace(
         motion,
         angles=np.full_like(motion.angles, np.nan),

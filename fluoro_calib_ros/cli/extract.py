@@ -69,8 +69,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         required=True,
         type=names,
         metavar='NAME',
-        help='of the images; A,B for markers of two calibrated fluoroscopes, with one SOURCE for '
-        'each, or one that has a folder or a topic of each',
+        help='of the images; A,B or more for markers of calibrated fluoroscopes, with one SOURCE '
+        'for each, or one that has a folder or a topic of each',
     )
     add_out(parser, 'file of observations to write', 'CSV')
     add_principal_distance(
@@ -113,13 +113,13 @@ def _add_markers(group: argparse._ArgumentGroup) -> None:
         '--calibration',
         type=Path,
         metavar='DIR',
-        help='result folder of calibrate, for two fluoroscopes that are followed together',
+        help='result folder of calibrate, for fluoroscopes that are followed together',
     )
     add_orientation(group)
     add_clusters(
         group,
         "markers that are rigid together, such as 'tibia: 1001 1002 1003'; with two "
-        'fluoroscopes, they predict and check each other; may be repeated',
+        'fluoroscopes or more, they predict and check each other; may be repeated',
     )
     group.add_argument(
         '--cluster-shapes',
@@ -153,16 +153,15 @@ def check(arguments: argparse.Namespace, error: Callable[[str], NoReturn]) -> No
         if arguments.rigid:
             error('--cluster is for --markers')
         return
-    if len(arguments.fluoroscope) > 2:
-        error('--fluoroscope: markers are followed with one or two fluoroscopes')
-    if len(arguments.fluoroscope) == 2:
+    if len(arguments.fluoroscope) > 1:
         if arguments.calibration is None:
-            error('markers of two fluoroscopes are followed with their --calibration')
-        if len(arguments.sources) > 2:
-            error('give one SOURCE for each fluoroscope, or one for both')
+            error('markers of several fluoroscopes are followed with their --calibration')
+        if len(arguments.sources) not in (1, len(arguments.fluoroscope)):
+            error('give one SOURCE for each fluoroscope, or one for all')
     elif arguments.rigid or arguments.bodies is not None:
         error(
-            'rigid bodies are for two fluoroscopes, the --fluoroscope A,B and their --calibration'
+            'rigid bodies are for two fluoroscopes or more, the --fluoroscope A,B and their '
+            '--calibration'
         )
 
 
@@ -334,7 +333,7 @@ def _marker_request(arguments: argparse.Namespace) -> MarkerRequest:
         target_names = target_names or survey.names.target_names()
     calibrations = {}
     orientation = None
-    if len(sources) == 2:
+    if len(sources) > 1:
         calibrations = read_calibrations(arguments.calibration, arguments.fluoroscope)
         path = arguments.orientation or orientation_path(arguments.calibration)
         orientation = load_orientation(path).subset(arguments.fluoroscope)

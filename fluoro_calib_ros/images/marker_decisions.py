@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from .marker_rays import AGREE, PairExposure, PairRays
+from .marker_rays import AGREE, MarkerExposure, MarkerRays
 from .markers import MarkerFrame, MarkerTracker
 
 
 @dataclass(frozen=True)
 class Decision:
-    """What the other view, or its body, says of a doubtful id."""
+    """What other views, or its body, say of a doubtful id."""
 
     kind: str  #: {'confirmed', 'exchanged', 'dropped'}
     fluoroscope: str
@@ -70,12 +70,12 @@ class ViewCounts:
 
 @dataclass(frozen=True)
 class DecidedView:
-    """One of two views, whose ids are decided on."""
+    """One of several views, whose ids are decided on."""
 
-    view: int  #: 0 or 1, its row in an exposure
+    view: int  #: its row in an exposure
     name: str  #: of the fluoroscope
     tracker: MarkerTracker
-    target_id: NDArray[np.int64]  #: (n,), of the markers of both views, ascending
+    target_id: NDArray[np.int64]  #: (n,), of the markers of all views, ascending
     counts: ViewCounts  #: by row of these
 
     def ids(self, *rows: int) -> tuple[int, ...]:
@@ -113,7 +113,7 @@ class DecidedView:
     def revised(
         self, found: MarkerFrame, decisions: Sequence[Decision], frame: int
     ) -> MarkerFrame:
-        """Return the markers of the view after decisions on both, with the doubts left."""
+        """Return the markers of the view after decisions on all, with the doubts left."""
         for decision in decisions:
             if decision.fluoroscope == self.name and decision.since <= frame:
                 found = revise(found, decision)
@@ -211,7 +211,7 @@ class BodyDecisions:
         self._seen_right = np.zeros(len(view.target_id), dtype=int)  # last image in the place
 
     def decide(
-        self, exposure: PairExposure, place: np.ndarray, sd: np.ndarray, frame: int
+        self, exposure: MarkerExposure, place: np.ndarray, sd: np.ndarray, frame: int
     ) -> list[Decision]:
         """Confirm, exchange or drop ids by places (n, 2) of markers [px], NaN for unknown.
 
@@ -293,18 +293,19 @@ MAX_COST = 50.0  # of a squared distance; and of evidence, from which it decides
 class RayDecisions:
     """Decides on the ids of a view by the epipolar distances of both ways round."""
 
-    def __init__(self, view: DecidedView, rays: PairRays) -> None:
+    def __init__(self, view: DecidedView, rays: MarkerRays) -> None:
         self._view = view
         self._rays = rays
         # By two rows: what speaks against their exchange, and since when it is not believed.
         self._evidence: dict[tuple[int, int], float] = {}
         self._kept: dict[tuple[int, int], int] = {}
 
-    def decide(self, exposure: PairExposure, known: np.ndarray, frame: int) -> list[Decision]:
+    def decide(self, exposure: MarkerExposure, known: np.ndarray, frame: int) -> list[Decision]:
         """Confirm or exchange ids; known (n,) are those that bodies decide on."""
         view = self._view
         out: list[Decision] = []
-        both = np.isfinite(exposure.standardised) & ~known
+        lack = exposure.standardised[view.view]
+        both = np.isfinite(lack) & ~known
         for row in np.flatnonzero(both & exposure.doubtful[view.view]).tolist():
             (number,) = view.ids(row)
             if view.tracker.doubted_since(number) is None:
@@ -316,22 +317,23 @@ class RayDecisions:
                 if other > row:
                     out += self._both_ways(exposure, (row, other), frame)
             if not others and not partners - {number}:
-                agrees = bool(exposure.standardised[row] < AGREE)
+                agrees = bool(lack[row] < AGREE)
                 if view.counts.agree(row, agrees, frame) >= DECIDED_ALONE:
                     out.append(view.confirm(row, frame))
         rows = np.flatnonzero(both)
-        bad = exposure.standardised[rows] > DISAGREE
+        bad = lack[rows] > DISAGREE
         view.counts.disagree(bad, rows)
         view.doubt(rows[bad], frame)
         return out
 
     def _both_ways(
-        self, exposure: PairExposure, rows: tuple[int, int], frame: int
+        self, exposure: MarkerExposure, rows: tuple[int, int], frame: int
     ) -> list[Decision]:
         """Weigh the epipolar distances of two markers of a view against those exchanged."""
         view = self._view
         other = self._rays.exchanged(exposure, view.view, rows)
-        keep = np.minimum(exposure.standardised[list(rows)] ** 2, MAX_COST).sum()
+        lack = exposure.standardised[view.view, list(rows)]
+        keep = np.minimum(lack**2, MAX_COST).sum()
         change = np.minimum(np.nan_to_num(other, nan=np.inf) ** 2, MAX_COST).sum()
         if change < keep or rows not in self._evidence:
             self._kept[rows] = frame

@@ -3,13 +3,12 @@
 
 """Ids of markers from the shapes of their rigid bodies, in the images of one exposure.
 
-Round shadows of both views are intersected, each with each, as far as their rays meet (epipolar
-distance). Among these points in space, the members of a body are those with its distances: a
-search with backtracking, in the manner of the interpretation trees of Grimson and Lozano-Perez
-("Localizing overlapping parts by searching the interpretation tree", IEEE PAMI 9, 1987). The
-mirror image of a body has the same distances, and is excluded by the rotation that fits. A
-body that fits in two ways is refused, and one that would be found as well among as many points
-anywhere.
+Rays of round shadows are intersected. Among these points in space, the members of a body are those
+with its distances: a search with backtracking, in the manner of the interpretation trees of
+Grimson and Lozano-Perez ("Localizing overlapping parts by searching the interpretation tree", IEEE
+PAMI 9, 1987). The mirror image of a body has the same distances, and is excluded by the rotation
+that fits. A body that fits in two ways is refused, and one that would be found as well among as
+many points anywhere.
 """
 
 from __future__ import annotations
@@ -27,8 +26,6 @@ from ..bodies.body import POSE_SIZE, Body, fitted_pose
 from ..correction.fluoroscope_calibration import Calibrations
 from ..errors import DataError
 from ..photogrammetry.rig_orientation import RigOrientation
-from ..reconstruction.epipolar import EpipolarGeometry
-from ..reconstruction.intersection import OK, OUTSIDE, Intersector
 from .marker_intensity import (
     MARKER_SCALES,
     FilteredLight,
@@ -36,11 +33,11 @@ from .marker_intensity import (
     filter_image,
     first_shadows,
 )
-from .marker_rays import AGREE, project_observed
+from .marker_points import CalibratedRig, ShadowPoints, all_among, shadow_points
+from .marker_rays import project_observed
 from .markers import FirstMarkers
 
 SHARE = 0.4  # of the response to a typical marker
-SHADOW_SD_PX = 0.25  # of the place of a shadow that is not measured
 REJECT = 4.0  # standardised deviation above which a distance is not that of two members
 CHANCE = float(erfc(REJECT / 2**0.5))  # of the same deviation
 MIN_MEMBERS = 4
@@ -54,24 +51,6 @@ MAX_STEPS = 200_000  # of the search
 # for what fits ends the search for fewer members, and at most 64.
 PART_AT_ONCE = 8
 MAX_AT_ONCE = 64
-
-
-@dataclass(frozen=True)
-class CalibratedRig:
-    """Orientation and calibrations of two fluoroscopes, and the angles of their C-arms [rad]."""
-
-    orientation: RigOrientation
-    calibrations: Calibrations
-    angles: Mapping[str, float | None]
-
-
-@dataclass(frozen=True)
-class _Points:
-    """Points (n, 3) in space [mm], variances (n,) of them, and rows (n, 2) of their shadows."""
-
-    xyz: np.ndarray
-    variance: np.ndarray  # in the direction in which it is largest
-    pairs: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -103,10 +82,10 @@ def identify_markers(
     Parameters
     ----------
     images : mapping of str to ndarray
-        Of two fluoroscopes.
+        Of two fluoroscopes or more.
     calibrations : mapping of str to FluoroscopeCalibration
     orientation : RigOrientation
-        Of these two.
+        Of these.
     bodies : sequence of Body
         Of known shapes.
     angles : mapping of str to float or None, optional
@@ -115,13 +94,14 @@ def identify_markers(
     Returns
     -------
     dict of str to FirstMarkers
-        By fluoroscope, of the bodies that are found. Members that are not seen are where their
-        body says.
+        By fluoroscope, of the bodies that are found and that it sees. Members that are not seen
+        are where their body says.
 
     Raises
     ------
     DataError
-        Where none of the bodies is found, or fits in one way only.
+        Where none of the bodies is found, or fits in one way only, and where a fluoroscope sees
+        none of those that are found.
     """
     names = list(orientation.fluoroscopes)
     bodies = identifiable(bodies)
@@ -155,6 +135,9 @@ def identify_markers(
         reason = reason or missing[0]
     if not best and reason is not None:
         raise reason
+    for name in names:
+        if name not in best:
+            raise DataError(f'fluoroscope {name} sees none of the bodies that others see')
     return best
 
 
@@ -172,12 +155,14 @@ def _count(found: Mapping[str, FirstMarkers]) -> int:
 def find_bodies(
     shadows: Sequence[np.ndarray], rig: CalibratedRig, bodies: Sequence[Body]
 ) -> tuple[dict[str, FirstMarkers], list[DataError]]:
-    """Find bodies among shadows (k, 2) of both views; return their markers, and why not all."""
-    points = _points(shadows, rig)
+    """Find bodies among shadows (k, 2) of all views; return their markers, and why not all.
+
+    Views that see none of the bodies are left out.
+    """
+    points = shadow_points(shadows, rig)
     fits: list[tuple[Body, _Fit]] = []
     missing = []
-    pairs = points.pairs
-    free = np.ones(len(pairs), dtype=bool)
+    free = np.ones(len(points.xyz), dtype=bool)
     for body in sorted(bodies, key=lambda body: -len(body.target_id)):
         try:
             fit = _fit(body, points, free)
@@ -185,45 +170,18 @@ def find_bodies(
             missing.append(error)
             continue
         fits.append((body, fit))
-        taken = pairs[fit.point[fit.point >= 0]]
+        taken = points.shadow[fit.point[fit.point >= 0]]
         # A shadow is that of one marker, except where two lie behind each other.
-        free &= ~(np.isin(pairs[:, 0], taken[:, 0]) & np.isin(pairs[:, 1], taken[:, 1]))
-    if not fits:
-        return {}, missing
-    found = {
-        name: _first(view, rig, fits, points, shadows[view])
-        for view, name in enumerate(rig.orientation.fluoroscopes)
-    }
+        free &= ~all_among(points.shadow, taken)
+    found = {}
+    for view, name in enumerate(rig.orientation.fluoroscopes):
+        first = _first(view, rig, fits, points, shadows[view])
+        if first is not None:
+            found[name] = first
     return found, missing
 
 
-def _points(shadows: Sequence[np.ndarray], rig: CalibratedRig) -> _Points:
-    """Points where rays of shadows meet."""
-    orientation = rig.orientation
-    names = orientation.fluoroscopes
-    corrected = [
-        rig.calibrations[name].correct(uv, angle=rig.angles.get(name))
-        for name, uv in zip(names, shadows)
-    ]
-    a, b = np.indices((len(shadows[0]), len(shadows[1]))).reshape(2, -1)
-    uv = np.stack([corrected[0].uv[a], corrected[1].uv[b]])
-    sigma = np.hypot(np.stack([corrected[0].sigma[a], corrected[1].sigma[b]]), SHADOW_SD_PX)
-    rays = EpipolarGeometry(orientation, *names).residuals(uv[0], uv[1], sigma[0], sigma[1])
-    near = np.abs(rays.residual) < AGREE * rays.sd_total
-    uv = uv[:, near]
-    sigma = sigma[:, near]
-    a = a[near]
-    b = b[near]
-    intersector = Intersector(orientation, None)
-    points = intersector.intersect(uv, sigma)
-    good = np.isin(points.status, (OK, OUTSIDE)) & (points.standardised < AGREE)
-    # Errors of orientation and correction are the same for all members of a body, nearly.
-    alone = intersector.intersect(uv[:, good], np.full((2, good.sum()), SHADOW_SD_PX))
-    variance = np.linalg.eigvalsh(alone.covariance_noise)[:, -1]
-    return _Points(points.xyz_mm[good], variance, np.column_stack([a, b])[good])
-
-
-def _fit(body: Body, points: _Points, free: np.ndarray) -> _Fit:
+def _fit(body: Body, points: ShadowPoints, free: np.ndarray) -> _Fit:
     """Find the members of a body among points. Raises DataError."""
     search = _Search(body, points, free)
     search.run()
@@ -274,7 +232,7 @@ def _by_chance(body: Body, fit: _Fit, xyz: np.ndarray) -> float:
 class _Search:
     """Search of a body with backtracking: members are points with the right distances."""
 
-    def __init__(self, body: Body, points: _Points, free: np.ndarray) -> None:
+    def __init__(self, body: Body, points: ShadowPoints, free: np.ndarray) -> None:
         self.body = body
         self.points = points
         xyz = points.xyz
@@ -361,22 +319,27 @@ def _first(
     view: int,
     rig: CalibratedRig,
     fits: Sequence[tuple[Body, _Fit]],
-    points: _Points,
+    points: ShadowPoints,
     shadows: np.ndarray,
-) -> FirstMarkers:
-    """Return the markers of a view with these shadows."""
+) -> FirstMarkers | None:
+    """Return the markers of a view with these shadows, None where it sees none of the bodies."""
     name = rig.orientation.fluoroscopes[view]
     calibration = rig.calibrations[name]
-    ids = []
-    places = []
+    ids = [np.zeros(0, dtype=np.int64)]
+    places = [np.zeros((0, 2))]
     for body, fit in fits:
         chosen = fit.point >= 0
+        shadow = points.shadow[fit.point[chosen], view]
+        seen = shadow >= 0
+        if np.count_nonzero(seen) < MIN_SHARE * len(shadow):
+            continue
         rotation, shift = fitted_pose(body.xyz_mm[chosen], points.xyz[fit.point[chosen]])
         members = body.xyz_mm @ rotation.T + shift
         place = project_observed(rig.orientation, view, calibration, members, rig.angles.get(name))
-        place[chosen] = shadows[points.pairs[fit.point[chosen], view]]
+        place[np.flatnonzero(chosen)[seen]] = shadows[shadow[seen]]
         width, height = calibration.image_size
         inside = ((place > 0) & (place < np.array([width - 1, height - 1]))).all(axis=1)
         ids.append(np.asarray(body.target_id)[inside])
         places.append(place[inside])
-    return FirstMarkers(np.concatenate(ids), np.concatenate(places))
+    found = np.concatenate(ids)
+    return FirstMarkers(found, np.concatenate(places)) if len(found) else None

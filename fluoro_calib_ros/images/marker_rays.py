@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Rays of markers in two views, and the rigid bodies that they belong to."""
+"""Rays of markers in several views, and the rigid bodies that they belong to."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,30 +17,37 @@ from ..bodies.shapes import learned_shape
 from ..bodies.tracking import BodyTracker
 from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
 from ..photogrammetry.rig_orientation import RigOrientation
-from ..reconstruction.intersection import Intersector
+from ..reconstruction.intersection import (
+    IntersectedPoints,
+    Intersector,
+    largest_lack_of_fit,
+)
 from ..reconstruction.reconstruct import IntersectedViews, MatchedViews
 from .markers import MarkerFrame
 
-AGREE = 4.0  # standardised epipolar distance up to which two rays belong together
+AGREE = 4.0  # standardised lack of fit up to which rays belong together
 SYSTEMATIC_PX = 0.1  # of a corrected image point, beyond its standard deviation
 
 
 @dataclass(frozen=True)
-class PairExposure:
-    """Markers of one exposure in all views, by row of all ids."""
+class MarkerExposure:
+    """Markers of one exposure in all F views, by row of all ids."""
 
-    observed: NDArray[np.float64]  #: (2, n, 2) [px], NaN where a view does not see a marker
-    doubtful: NDArray[np.bool_]  #: (2, n)
+    observed: NDArray[np.float64]  #: (F, n, 2) [px], NaN where a view does not see a marker
+    doubtful: NDArray[np.bool_]  #: (F, n)
     intersected: IntersectedViews  #: corrected image points and the places of the markers
+    #: (F, n) standardised lack of fit of the rays that one belongs to, NaN where there is none;
+    #: of two rays their epipolar distance; that of a false ray among others is that of all
+    standardised: NDArray[np.float64]
 
     @property
     def corrected(self) -> NDArray[np.float64]:
-        """Corrected image points (2, n, 2) [px]."""
+        """Corrected image points (F, n, 2) [px]."""
         return self.intersected.views.uv
 
     @property
     def sigma(self) -> NDArray[np.float64]:
-        """Standard deviations (2, n) of the corrected image points [px]."""
+        """Standard deviations (F, n) of the corrected image points [px]."""
         return self.intersected.views.sigma
 
     @property
@@ -49,25 +56,59 @@ class PairExposure:
         return self.intersected.points.xyz_mm
 
     @property
-    def standardised(self) -> NDArray[np.float64]:
-        """Epipolar distances (n,) over their standard deviations."""
-        return self.intersected.points.standardised
-
-    @property
-    def agree(self) -> np.ndarray:
-        """Return (n,) whether both rays of a marker meet."""
+    def agree(self) -> NDArray[np.bool_]:
+        """Return (F, n) whether a ray meets others of its marker."""
         return (self.standardised < AGREE) & np.isfinite(self.xyz_mm).all(axis=1)
 
     @property
-    def sure(self) -> np.ndarray:
-        """Return (n,) whether both rays of a marker meet, and no view doubts its id."""
-        return self.agree & ~self.doubtful.any(axis=0)
+    def sure(self) -> NDArray[np.bool_]:
+        """Return (n,) whether rays of a marker meet, of views that do not doubt its id."""
+        return np.asarray((self.agree & ~self.doubtful).sum(axis=0) >= 2)
 
 
-class PairRays:
-    """Rays of markers in two calibrated views.
+@dataclass(frozen=True)
+class MarkerPlaces:
+    """Places (n, 3) of markers [mm], NaN for unknown; covariances (n, 3, 3)."""
 
-    orientation: that they belong to. names: the two fluoroscopes. target_id: (n,) of all markers,
+    xyz_mm: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+
+    @classmethod
+    def nowhere(cls, count: int) -> MarkerPlaces:
+        """Return unknown places."""
+        return cls(np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan))
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Whether (n,) it is known where a marker is."""
+        return np.asarray(np.isfinite(self.xyz_mm).all(axis=1))
+
+    def filled(self, others: MarkerPlaces) -> MarkerPlaces:
+        """Return these places, and others where they are unknown."""
+        known = self.known
+        if known.all() or not others.known.any():
+            return self
+        return MarkerPlaces(
+            np.where(known[:, None], self.xyz_mm, others.xyz_mm),
+            np.where(known[:, None, None], self.covariance, others.covariance),
+        )
+
+    def moved_on(self, before: MarkerPlaces, share: float) -> MarkerPlaces:
+        """Return where markers are expected that moved from other places to these.
+
+        share: of the time between them, in which they go on.
+        """
+        way = share * (self.xyz_mm - before.xyz_mm)
+        wider = (1 + share) ** 2 * self.covariance + share**2 * before.covariance
+        # What they may do otherwise than go on is like the way itself, along any axis.
+        unsteady = np.sum(way * way, axis=1)[:, None, None] / 3 * np.eye(3)
+        return MarkerPlaces(self.xyz_mm + way, wider + unsteady)
+
+
+class MarkerRays:
+    """Rays of markers in calibrated views.
+
+    orientation: that they belong to. names: the fluoroscopes. target_id: (n,) of all markers,
     ascending.
     """
 
@@ -81,17 +122,17 @@ class PairRays:
         self._calibrations = calibrations
         self._names = names
         self._target_id = target_id
-        self._intersector = Intersector(orientation.subset(names), None)
+        self._fit = RayFit(orientation.subset(names))
 
     def intersect(
         self, views: Mapping[str, MarkerFrame], angles: Mapping[str, float | None]
-    ) -> PairExposure:
+    ) -> MarkerExposure:
         """Correct and intersect the markers of an exposure at angles [rad]."""
-        n = len(self._target_id)
-        observed = np.full((2, n, 2), np.nan)
-        corrected = np.full((2, n, 2), np.nan)
-        sigma, correction_sd = np.full((2, 2, n), np.nan)
-        doubtful = np.zeros((2, n), dtype=bool)
+        shape = (len(self._names), len(self._target_id))
+        observed = np.full((*shape, 2), np.nan)
+        corrected = np.full((*shape, 2), np.nan)
+        sigma, correction_sd = np.full((2, *shape), np.nan)
+        doubtful = np.zeros(shape, dtype=bool)
         for view, name in enumerate(self._names):
             found = views[name]
             rows = np.searchsorted(self._target_id, found.target_id)
@@ -103,19 +144,40 @@ class PairRays:
             sigma[view, rows] = np.hypot(total, SYSTEMATIC_PX)
             correction_sd[view, rows] = np.hypot(sd, SYSTEMATIC_PX)
             doubtful[view, rows] = found.doubtful
-        points = self._intersector.intersect(corrected, sigma)
+        points, standardised = self._fit.intersect(corrected, sigma)
         outside = np.zeros(sigma.shape, dtype=bool)
         matched = MatchedViews(self._target_id, corrected, sigma, correction_sd, outside)
-        return PairExposure(observed, doubtful, IntersectedViews(matched, points))
+        return MarkerExposure(observed, doubtful, IntersectedViews(matched, points), standardised)
 
-    def exchanged(self, exposure: PairExposure, view: int, rows: Sequence[int]) -> np.ndarray:
-        """Standardised epipolar distances (2,) of two markers if a view exchanged them."""
+    def exchanged(self, exposure: MarkerExposure, view: int, rows: Sequence[int]) -> np.ndarray:
+        """Standardised lack of fit (2,) of two markers of a view if it exchanged them."""
         pair = list(rows)
         uv = exposure.corrected[:, pair].copy()
         sigma = exposure.sigma[:, pair].copy()
         uv[view] = uv[view, ::-1]
         sigma[view] = sigma[view, ::-1]
-        return self._intersector.intersect(uv, sigma).standardised
+        _, standardised = self._fit.intersect(uv, sigma)
+        return standardised[view]
+
+    def by_others(self, exposure: MarkerExposure, view: int, wanted: np.ndarray) -> MarkerPlaces:
+        """Places where two views and more, without this one, agree that markers are.
+
+        wanted (n,): of these markers.
+        """
+        out = MarkerPlaces.nowhere(len(self._target_id))
+        seen = np.asarray(np.isfinite(exposure.corrected).all(axis=2))
+        seen[view] = False
+        rows = np.flatnonzero(wanted & (seen.sum(axis=0) >= 2))
+        if not len(rows):
+            return out
+        uv = exposure.corrected[:, rows]  # a copy
+        uv[view] = np.nan
+        points, standardised = self._fit.intersect(uv, exposure.sigma[:, rows])
+        agree = np.isfinite(points.xyz_mm).all(axis=1)
+        agree &= np.nanmax(standardised, axis=0, initial=0.0) < AGREE
+        out.xyz_mm[rows[agree]] = points.xyz_mm[agree]
+        out.covariance[rows[agree]] = points.covariance[agree]
+        return out
 
     def project(
         self, view: int, xyz_mm: np.ndarray, angles: Mapping[str, float | None]
@@ -129,7 +191,7 @@ class PairRays:
         known = np.isfinite(xyz_mm).all(axis=1)
         if known.any():
             uv[known] = project_observed(
-                self._intersector.orientation,
+                self._fit.orientation,
                 view,
                 self._calibrations[name],
                 xyz_mm[known],
@@ -142,13 +204,54 @@ class PairRays:
 
         covariance (k, 3, 3) is that of the points [mm^2].
         """
-        rig = self._intersector.orientation
+        rig = self._fit.orientation
         axes = rig.rotation[view]
         sensor = (xyz_mm - rig.position_mm[view]) @ axes.T
         depth = sensor[:, 2, None, None]
         slope = rig.interior[view, 2] / depth * (axes[:2] - sensor[:, :2, None] / depth * axes[2])
         variance = np.trace(slope @ covariance @ np.swapaxes(slope, 1, 2), axis1=1, axis2=2)
         return np.asarray(np.sqrt(variance / 2))
+
+
+class RayFit:
+    """Intersects rays, and says which of them belong together.
+
+    Of three rays and more, a false one is dropped where the others agree without it.
+    """
+
+    def __init__(self, orientation: RigOrientation) -> None:
+        self.orientation = orientation
+        self._all = Intersector(orientation, None)
+        self._without_false = Intersector(orientation, AGREE)
+        limits = largest_lack_of_fit(AGREE, len(orientation.fluoroscopes))
+        # By the number of rays: AGREE means the same probability for any number of them.
+        self._scale = limits[2] / limits
+
+    def intersect(
+        self, uv: np.ndarray, sigma: np.ndarray
+    ) -> tuple[IntersectedPoints, NDArray[np.float64]]:
+        """Intersect image points uv (F, n, 2) of standard deviations sigma (F, n) [px].
+
+        Also returns the standardised lack of fit (F, n), see MarkerExposure.
+        """
+        points = self._all.intersect(uv, sigma)
+        seen = np.isfinite(uv).all(axis=2)
+        standardised = np.where(seen, points.standardised * self._scale[points.rays], np.nan)
+        misses = ~(points.standardised * self._scale[points.rays] < AGREE)
+        rows = np.flatnonzero((points.rays > 2) & misses)
+        if not len(rows):
+            return points, standardised
+        fewer = self._without_false.intersect(uv[:, rows], sigma[:, rows])
+        found = fewer.dropped_view >= 0
+        kept = rows[found]
+        others = np.arange(len(uv))[:, None] != fewer.dropped_view[found]
+        lack = (fewer.standardised * self._scale[fewer.rays])[found]
+        standardised[:, kept] = np.where(others & seen[:, kept], lack, standardised[:, kept])
+        values = {}
+        for field in fields(IntersectedPoints):
+            values[field.name] = getattr(points, field.name).copy()
+            values[field.name][kept] = getattr(fewer, field.name)[found]
+        return IntersectedPoints(**values), standardised
 
 
 STEPS = 3  # the correction changes slowly
@@ -187,23 +290,10 @@ LEARNED = 40  # exposures from which the shape of a body is learned
 FRAME_NS = 10_000_000  # time of an exposure for the filter, which adapts to any
 
 
-@dataclass(frozen=True)
-class BodyMarkers:
-    """Places (n, 3) of markers by their bodies [mm], NaN for unknown; covariances (n, 3, 3)."""
-
-    xyz_mm: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-
-    @property
-    def known(self) -> NDArray[np.bool_]:
-        """Whether (n,) a body says where a marker is."""
-        return np.asarray(np.isfinite(self.xyz_mm).all(axis=1))
-
-
 class MarkerBodies:
     """All rigid bodies of markers.
 
-    orientation: of the two fluoroscopes. target_id: (n,) of all markers, ascending. bodies: shapes
+    orientation: of the fluoroscopes. target_id: (n,) of all markers, ascending. bodies: shapes
     that are not given are learned; bodies of too few markers are ignored.
     """
 
@@ -224,10 +314,7 @@ class MarkerBodies:
         self._tracker: BodyTracker | None = None
         if self._bodies:
             self._tracker = BodyTracker(orientation, [_placed(body) for body in self._bodies])
-        self.present = self._nowhere()
-
-    def _nowhere(self) -> BodyMarkers:
-        return BodyMarkers(np.full((self._count, 3), np.nan), np.full((self._count, 3, 3), np.nan))
+        self.present = MarkerPlaces.nowhere(self._count)
 
     def lost(self) -> tuple[Body, ...]:
         """Bodies whose pose is not known."""
@@ -236,7 +323,7 @@ class MarkerBodies:
         alive = self._tracker.filter.alive.tolist()
         return tuple(body for body, is_alive in zip(self._bodies, alive) if not is_alive)
 
-    def predicted(self, frame: int) -> BodyMarkers:
+    def predicted(self, frame: int) -> MarkerPlaces:
         """Where markers are expected in the next exposure."""
         if self._tracker is None:
             return self.present
@@ -246,7 +333,7 @@ class MarkerBodies:
         out = self._placed(rotation, expected.centre_mm, expected.covariance)
         return replace(out, covariance=out.covariance + RIGID_MM**2 * np.eye(3))
 
-    def update(self, exposure: PairExposure, frame: int) -> None:
+    def update(self, exposure: MarkerExposure, frame: int) -> None:
         """Set where markers are at present, by the rays of those without a doubt."""
         if self._tracker is None:
             return
@@ -260,17 +347,17 @@ class MarkerBodies:
             covariance = found.covariance[:, POSE, POSE]
             self.present = self._placed(found.rotation, found.centre_mm, covariance)
 
-    def _usable(self, exposure: PairExposure) -> np.ndarray:
-        """Image points (2, n) whose ids are believed."""
+    def _usable(self, exposure: MarkerExposure) -> np.ndarray:
+        """Image points (F, n) whose ids are believed."""
         assert self._tracker is not None
         seen = np.isfinite(exposure.corrected).all(axis=2)
         out = seen & ~exposure.doubtful & (exposure.agree | (seen.sum(axis=0) < 2))
         for body, rows, alive in zip(self._bodies, self._rows, self._tracker.filter.alive):
-            agree = exposure.agree[rows] & body.known
+            agree = exposure.agree[:, rows] & body.known
             if (
                 not alive
                 and np.count_nonzero(exposure.sure[rows] & body.known) < MIN_MEMBERS
-                and np.count_nonzero(agree) > MIN_MEMBERS
+                and np.count_nonzero(agree.any(axis=0)) > MIN_MEMBERS
             ):
                 # Doubtful ids that fit the shape of the body support each other.
                 out[:, rows] = agree
@@ -279,10 +366,10 @@ class MarkerBodies:
 
     def _placed(
         self, rotation: np.ndarray, centre: np.ndarray, covariance: np.ndarray
-    ) -> BodyMarkers:
+    ) -> MarkerPlaces:
         """Places of markers at poses of the bodies."""
         assert self._tracker is not None
-        out = self._nowhere()
+        out = MarkerPlaces.nowhere(self._count)
         for number, (body, rows) in enumerate(zip(self._bodies, self._rows)):
             if not np.isfinite(rotation[number]).all():
                 continue
@@ -293,7 +380,7 @@ class MarkerBodies:
             out.covariance[rows] = d @ covariance[number] @ np.swapaxes(d, 1, 2)
         return out
 
-    def learn(self, exposure: PairExposure, sure: np.ndarray) -> None:
+    def learn(self, exposure: MarkerExposure, sure: np.ndarray) -> None:
         """Improve the shapes by an exposure, of which sure (n,) markers are trusted."""
         if self._tracker is None:
             return

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from typing import Protocol
@@ -28,8 +28,8 @@ from ..images.extraction import Extraction, Nearby, extract_beads
 from ..images.following import Far, moved_on
 from ..images.marker_decisions import Decision, EarlierImages, Retraction
 from ..images.marker_ids import identifiable, identify_markers
-from ..images.marker_pair import MarkerPair, PairFrame
-from ..images.markers import FirstMarkers, MarkerFrame, MarkerOptions, MarkerTracker
+from ..images.marker_views import MarkerViews, ViewsFrame
+from ..images.markers import FirstMarkers, MarkerFrame, MarkerOptions
 from ..images.matching import PhantomModel
 from ..images.overlay import draw_markers, draw_overlay
 from ..images.view import Lens, View, assumed_lens, may_be_found, shared_lens
@@ -73,7 +73,7 @@ class Observations:
 
 
 class Follower(Protocol):
-    """Extracts the targets of one fluoroscope, or of two together, exposure after exposure."""
+    """Extracts the targets of one fluoroscope, or of several together, by exposures."""
 
     def extract(
         self,
@@ -256,14 +256,13 @@ DECIDED = {
 class MarkerSettings:
     """What a MarkerFollower is made of."""
 
-    #: ids and places in the first images of one fluoroscope, or of two; empty: the shapes of the
-    #: bodies tell them
+    #: ids and places in the first images by fluoroscope; empty: the shapes of the bodies tell them
     first: Mapping[str, FirstMarkers]
     options: MarkerOptions = field(default_factory=MarkerOptions)
-    #: of two fluoroscopes
+    #: of several fluoroscopes
     calibrations: Calibrations = field(default_factory=dict)
-    orientation: RigOrientation | None = None  #: of two fluoroscopes
-    bodies: tuple[Body, ...] = ()  #: markers that are rigid together, of two fluoroscopes
+    orientation: RigOrientation | None = None  #: of several fluoroscopes
+    bodies: tuple[Body, ...] = ()  #: markers that are rigid together, of several fluoroscopes
     later: tuple[int, ...] = ()  #: ids of markers whose places are given later
 
     @property
@@ -274,12 +273,12 @@ class MarkerSettings:
         return self.orientation.fluoroscopes
 
     def __call__(self) -> MarkerFollower:
-        """Return a new MarkerFollower. Raises DataError as MarkerPair."""
+        """Return a new MarkerFollower. Raises DataError as MarkerViews."""
         return MarkerFollower(self)
 
 
 class MarkerFollower:
-    """Follows markers in one view, or in two that help each other.
+    """Follows markers in one view, or in several that help each other.
 
     update() follows them from the first call on; extract() waits for images in which they are
     where they are said to be.
@@ -297,27 +296,14 @@ class MarkerFollower:
 
     def _renew(self) -> None:
         """Begin again. Raises DataError."""
-        self._pair: MarkerPair | None = None
-        self._trackers: dict[str, MarkerTracker] = {}
+        self._views: MarkerViews | None = None
         if self._settings.first:
             self._follow(self._settings.first)
 
     def _follow(self, first: Mapping[str, FirstMarkers]) -> None:
         """Follow markers from their first places on. Raises DataError."""
         settings = self._settings
-        if len(first) == 1:
-            self._trackers = {
-                name: MarkerTracker(
-                    settings.options,
-                    first=markers,
-                    later=np.setdiff1d(settings.later, markers.target_id),
-                )
-                for name, markers in first.items()
-            }
-            return
-        if settings.orientation is None:
-            raise DataError('two fluoroscopes are followed together only with their calibration')
-        self._pair = MarkerPair(
+        self._views = MarkerViews(
             settings.calibrations,
             settings.orientation,
             settings.options,
@@ -325,26 +311,27 @@ class MarkerFollower:
             bodies=settings.bodies,
             later=settings.later,
         )
-        self._trackers = self._pair.trackers
 
     def place(self, fluoroscope: str, given: FirstMarkers) -> None:
         """Follow markers of a view from where a person sees them in the next image."""
-        self._trackers[fluoroscope].place(given)
+        self._begun_views.trackers[fluoroscope].place(given)
 
     def update(
         self,
         images: Mapping[str, np.ndarray | None],
         number: int,
         angles: Mapping[str, float | None] | None = None,
-    ) -> PairFrame:
+    ) -> ViewsFrame:
         """Return the markers in the images of an exposure; None: an image that cannot be read.
 
         Parameters are those of Follower. Raises DataError.
         """
-        if self._pair is not None:
-            return self._pair.update(images, number, angles)
-        ((name, tracker),) = self._trackers.items()
-        return PairFrame({name: tracker.update(images[name], number)})
+        return self._begun_views.update(images, number, angles)
+
+    @property
+    def _begun_views(self) -> MarkerViews:
+        assert self._views is not None
+        return self._views
 
     def extract(
         self,
@@ -366,11 +353,12 @@ class MarkerFollower:
         overlays: Collection[str],
         angles: Mapping[str, float | None] | None,
     ) -> dict[str, Observations]:
-        if not self._begun and len(images) < len(self._settings.names):
-            missing = Finding(Kind.OTHER_VIEW_MISSING, 'the other view is missing')
+        absent = [name for name in self._settings.names if name not in images]
+        if not self._begun and absent:
+            missing = _missing_views(absent)
             return {name: Observations(finding=missing) for name in images}
         try:
-            if not self._trackers:
+            if self._views is None:
                 self._identify(images, angles)
             exposure = self.update(images, number, angles)
             if not self._begun:
@@ -387,7 +375,7 @@ class MarkerFollower:
         out = {}
         for name, image in images.items():
             found = exposure.views[name]
-            result = _observed(found, len(self._trackers[name].target_id))
+            result = _observed(found, len(self._begun_views.trackers[name].target_id))
             decided = [d for d in exposure.decisions if d.fluoroscope == name]
             earlier = self._earlier[name]
             retracted = [one for d in decided for one in earlier.revise(d)]
@@ -410,15 +398,23 @@ class MarkerFollower:
             )
         )
 
-    def _check_start(self, exposure: PairFrame) -> None:
+    def _check_start(self, exposure: ViewsFrame) -> None:
         """Begin, or wait for another exposure. Raises DataError."""
         for name, view in exposure.views.items():
-            problem = _wrong_start(view, len(self._trackers[name].first.target_id))
+            given = self._begun_views.trackers[name].first
+            problem = _wrong_start(view, len(given.target_id))
             if problem is not None:
                 self._renew()
-                place = Place((name,)) if self._pair is not None else Place()
+                place = Place((name,)) if len(exposure.views) > 1 else Place()
                 raise DataError(replace(problem, place=place))
         self._begun = True
+
+
+def _missing_views(names: Sequence[str]) -> Finding:
+    """Return the finding that the first exposure lacks views."""
+    several = f'views of {", ".join(names)} are' if len(names) > 1 else f'view of {names[0]} is'
+    place = Place(tuple(names), name='')
+    return Finding(Kind.OTHER_VIEW_MISSING, f'the {several} missing', place)
 
 
 def _wrong_start(found: MarkerFrame, expected: int) -> Finding | None:

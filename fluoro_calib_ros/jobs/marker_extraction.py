@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The marker job: image sequences of one or two fluoroscopes to observations of markers.
+"""The marker job: image sequences of fluoroscopes to observations of markers.
 
-Images are read ahead in threads, since decoding takes as long as following. Two calibrated views
-are followed together, image by image, because each predicts and checks the other; what they decide
+Images are read ahead in threads, since decoding takes as long as following. Calibrated views are
+followed together, image by image, because each predicts and checks the others; what they decide
 later on an earlier doubt is written into the earlier images.
 """
 
@@ -51,18 +51,18 @@ AHEAD = 3  # images that are read before they are wanted
 
 @dataclass(frozen=True)
 class MarkerRequest:
-    """Image sequences of one or two fluoroscopes, and their markers."""
+    """Image sequences of one fluoroscope or several, and their markers."""
 
     sources: Mapping[str, Sequence[Path]]  #: images by fluoroscope
     #: markers of one or more exposures, by fluoroscope; following begins with the first exposure
     #: that every fluoroscope has some of; those of later ones enter there, or are found again
     first: Frames
     options: MarkerOptions = field(default_factory=MarkerOptions)
-    #: of two fluoroscopes
+    #: of several fluoroscopes
     calibrations: Calibrations = field(default_factory=dict)
-    orientation: RigOrientation | None = None  #: of two fluoroscopes
-    #: markers that are rigid together, of two fluoroscopes; known shapes give the ids where no
-    #: markers are given
+    orientation: RigOrientation | None = None  #: of several fluoroscopes
+    #: markers that are rigid together, of several fluoroscopes; known shapes give the ids where
+    #: no markers are given
     bodies: tuple[Body, ...] = ()
     overlay: Path | None = None  #: folder for pictures
     #: names of markers, for pictures
@@ -100,7 +100,7 @@ class MarkerOutcome:
 
     #: by fluoroscope, in the order of the exposures
     results: Mapping[str, tuple[MarkerImageResult, ...]]
-    #: what the two views decided on doubtful ids; the results obey them
+    #: what the views decided on doubtful ids; the results obey them
     decisions: tuple[Decision, ...]
     image_size: Mapping[str, tuple[int, int]]
     #: images before the first one with given markers, which were not used
@@ -177,7 +177,7 @@ def sequences(
 ) -> tuple[dict[str, list[Path]], tuple[int, int]]:
     """Return the sources of each fluoroscope, and the size of the first image [px].
 
-    Two fluoroscopes have one source each, or share a folder with a folder for each, or a bag.
+    Several fluoroscopes have one source each, or share a folder with a folder for each, or a bag.
     Raises DataError.
     """
     if len(fluoroscopes) == 1:
@@ -197,7 +197,7 @@ def sequences(
         if not folders and not is_image_bag(sources[0]):
             raise DataError(
                 f'{sources[0]}: images of {" and ".join(fluoroscopes)} are expected in a folder '
-                'for each, in a bag, or in two sources'
+                'for each, in a bag, or in a source for each'
             )
     first = next(open_sources(out[fluoroscopes[0]], fluoroscopes[0]).images(), None)
     if first is None:
@@ -223,7 +223,7 @@ def shaped(bodies: Sequence[Body], phantom: Phantom, path: Path) -> tuple[Body, 
 def run_marker_extraction(
     request: MarkerRequest, progress: Progress | None = None
 ) -> MarkerOutcome:
-    """Follow markers through the images of one or two fluoroscopes.
+    """Follow markers through the images of one fluoroscope or several.
 
     A damaged image, or one of another size, is passed over, and its result says why. progress is
     called after every exposure with the number of those that are done, and their total, and again

@@ -191,9 +191,12 @@ class DemoClient(Node):
                 )
 
     def _add_joints(self, message: JointAngles) -> None:
-        """Keep motion of joints whose bodies are there."""
+        """Keep motion of joints whose bodies are there, until it is taken back."""
         if message.status[0] != JointAngles.FAILED:
             self.joint_angles.append(message)
+        else:
+            stamp = message.header.stamp
+            self.joint_angles = [m for m in self.joint_angles if m.header.stamp != stamp]
 
     def _on_diagnostics(self, array: DiagnosticArray) -> None:
         for status in array.status:

@@ -90,19 +90,20 @@ class ExtractionParameters(ManagedParameters):
     )
     calibration_directory: str = option(
         '',
-        'for the mode markers: folder with the calibrations and the orientation of both '
+        'for the mode markers: folder with the calibrations and the orientation of all '
         'fluoroscopes, whose views then decide together on ids that may have been exchanged; '
         'empty: each view by itself',
     )
     clusters: tuple[str, ...] = option(
         ('',),
-        "for the mode markers and two views: rigid clusters, each a text such as 'tibia: 1001 "
-        "1002 1003 1004'",
+        'for the mode markers and two views or more: rigid clusters, each a text such as '
+        "'tibia: 1001 1002 1003 1004'",
     )
     bodies: str = option(
         '',
-        'for the mode markers and two views: bodies.csv with rigid bodies and the places of their '
-        'markers, in the place of clusters; without the file markers, the shapes give the ids',
+        'for the mode markers and two views or more: bodies.csv with rigid bodies and the places '
+        'of their markers, in the place of clusters; without the file markers, the shapes give '
+        'the ids',
     )
     principal_distance: float = option(
         0.0,
@@ -151,7 +152,7 @@ PARAMETERS = (*groups_of(ExtractionSettings).values(), READ_LIMITS)
 
 
 def read_followers(settings: ExtractionSettings, logger: Logger) -> Sequence[MakeFollower]:
-    """Return what makes the followers: one for each view, or one for both. Raises StartError."""
+    """Return what makes the followers: one for each view, or one for all. Raises StartError."""
     mode = settings.node.mode
     path = settings.node.phantom if mode == 'phantom' else settings.node.markers
     by_shape = mode == 'markers' and settings.node.bodies and settings.node.calibration_directory
@@ -163,7 +164,7 @@ def read_followers(settings: ExtractionSettings, logger: Logger) -> Sequence[Mak
             return _of_phantom(expand_path(path), settings.node, logger)
         first = _first_markers(expand_path(path), settings.node.fluoroscopes) if path else {}
         if settings.node.calibration_directory:
-            return [_of_pair(settings, first)]
+            return [_joined(settings, first)]
         return [
             MarkerSettings({name: markers}, settings.following) for name, markers in first.items()
         ]
@@ -193,24 +194,24 @@ def _first_markers(path: Path, names: Sequence[str]) -> dict[str, FirstMarkers]:
     return out
 
 
-def _of_pair(settings: ExtractionSettings, first: Mapping[str, FirstMarkers]) -> MarkerSettings:
-    """Read what two views need to be followed together. Raises DataError."""
+def _joined(settings: ExtractionSettings, first: Mapping[str, FirstMarkers]) -> MarkerSettings:
+    """Read what views need to be followed together. Raises DataError."""
     names = settings.node.fluoroscopes
     folder = expand_path(settings.node.calibration_directory)
-    if len(names) != 2:
+    if len(names) < 2:
         raise DataError(
-            f'calibration_directory: two fluoroscopes are followed together, not {len(names)} '
-            f'({", ".join(names)})'
+            f'calibration_directory: two fluoroscopes or more are followed together, not '
+            f'{len(names)} ({", ".join(names)})'
         )
     calibrations = read_calibrations(folder, names)
     orientation = load_orientation(orientation_path(folder)).subset(names)
     bodies = settings.node.rigid_bodies()
     if settings.node.bodies:
         bodies = read_bodies(expand_path(settings.node.bodies))
-    pair = MarkerSettings(first, settings.following, calibrations, orientation, bodies=bodies)
+    joined = MarkerSettings(first, settings.following, calibrations, orientation, bodies=bodies)
     check_orientation(orientation, calibrations)
-    pair()  # refuses what does not belong together before the node starts
-    return pair
+    joined()  # refuses what does not belong together before the node starts
+    return joined
 
 
 __all__ = ['PARAMETERS', 'ExtractionNode', 'main']
@@ -233,7 +234,7 @@ class ExtractionNode(StreamNode):
         self._inputs = INPUTS[settings.node.inputs]
         AngleInput(settings.angles, self.names, self.limited_logger)  # refuses unknown joints
         self._followers = read_followers(settings, self.get_logger())
-        # By which the images of two views are predicted: only for them, angles are needed.
+        # By which the images of several views are predicted: only for them, angles are needed.
         self._calibrations = {
             name: calibration
             for follower in self._followers
@@ -260,7 +261,7 @@ class ExtractionNode(StreamNode):
 
     def _make_workers(self) -> ExtractionWorkers:
         size = self._settings.node.queue_size
-        # One view of a pair waits for the other.
+        # One view waits for the others.
         size = max(size, LATE + 1) if self._calibrations else size
         return ExtractionWorkers(self.streams, size, self._is_overlay_wanted, self._finish)
 

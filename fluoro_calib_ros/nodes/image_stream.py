@@ -272,7 +272,7 @@ def _is_complete(views: Mapping[str, Mapping[int, object]]) -> bool:
     return overdue or all(number in items or items for items in views.values())
 
 
-PATIENCE_S = 5.0  # with the other view of an exposure, unless LATE exposures come before
+PATIENCE_S = 5.0  # with the other views of an exposure, unless LATE exposures come before
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,8 @@ from functools import partial
 import numpy as np
 from fluoro_calib_msgs.msg import Retraction
 
+from .body_retractions import BodyRetractions
+from .messages.bodies import BodiesContent
 from .messages.observations import nanoseconds_from_stamp, stamp_from_nanoseconds, uint32_field
 from .messages.points import PointsContent
 from .runtime.diagnostics import RefusalLog
@@ -36,7 +38,8 @@ class PointRetractions:
         self._exposures: OrderedDict[tuple[str, int], PointsContent] = OrderedDict()
         self._early: OrderedDict[tuple[str, int], Retraction] = OrderedDict()
         self._lock = threading.Lock()  # views and retractions come in two threads
-        self.count = 0  #: points that were taken back
+        self.bodies = BodyRetractions(_nowhere)  #: whose poses are by these points
+        self._count = 0  # points that were taken back
 
     def listen(self, name: str, refusals: RefusalLog) -> None:
         """Receive what is taken back of a fluoroscope."""
@@ -69,4 +72,13 @@ class PointRetractions:
         out.header.stamp = stamp_from_nanoseconds(content.stamp_ns)
         out.header.frame_id = content.orientation.frame_id
         self._output.publish(out)
-        self.count += len(wrong)
+        self._count += len(wrong)
+        self.bodies.take_back(content.stamp_ns, wrong.tolist())
+
+    def values(self) -> dict[str, int]:
+        """Return the counts for the diagnostics."""
+        return {'points retracted': self._count, 'poses retracted': self.bodies.count}
+
+
+def _nowhere(content: BodiesContent) -> None:
+    """Publish no bodies."""

@@ -26,6 +26,7 @@ from ..options import option
 from ..reconstruction.epipolar import RecentMisses
 from ..reconstruction.intersection import OUTSIDE
 from ..reconstruction.reconstruct import CorrectedView, intersect_exposure, watch_exposure
+from .body_retractions import BodyRetractions
 from .drift_monitor import DriftMonitor, DriftParameters
 from .frame_validation import CORRECTED_REFUSALS, validate_corrected, with_limit
 from .messages.fluoroscope_calibration import image_size_of
@@ -212,6 +213,7 @@ class ReconstructionNode(StreamNode):
             self._follower = BodyFollower(bodies, joints, self._body_parameters.body_lag)
             names = [body.name for body in bodies]
             self._bodies_output = BodiesOutput(self, names, bool(joints), self._settings.rig_frame)
+            self._retractions.bodies = BodyRetractions(self._bodies_output.publish_own)
 
     def _create_inputs(self) -> None:
         for topic, callback in (
@@ -322,6 +324,7 @@ class ReconstructionNode(StreamNode):
             following = rig._replace(intersector=wide)
             for bodies in self._follower.add(found, following, number, first.stamp_ns):
                 self._bodies_output.publish(bodies)
+                self._retractions.bodies.note(bodies)
         if rig.watch is not None:
             watch_exposure(rig.watch, first.stamp_ns, found)
 
@@ -367,7 +370,7 @@ class ReconstructionNode(StreamNode):
             'frames late': sum(self._pairer.late.values()),
             **self._refusals.values(CORRECTED_REFUSALS),
             **self._points.values(),
-            'points retracted': self._retractions.count,
+            **self._retractions.values(),
             'limit of false matches widened by': round(rig.scatter.factor, 2) if rig else 1.0,
             'last fault': self._refusals.last_fault,
             'orientation': rig.orientation_id if rig else '',

@@ -170,8 +170,7 @@ class BodiesOutput:
 
     def publish(self, content: BodiesContent) -> None:
         """Publish an exposure; standard types only while they have subscribers."""
-        message = message_from_bodies(content)
-        self._bodies.publish(message)
+        message = self.publish_own(content)
         if self._transforms.get_subscription_count():
             transforms = transforms_of_bodies(content, message, self._rig_frame)
             self._transforms.publish(transforms)
@@ -183,11 +182,16 @@ class BodiesOutput:
         for form, make in self._forms:
             if form.get_subscription_count():
                 form.publish(make(content, message))
-        if self._joints is None or self._joint_states is None:
-            return
-        self._joints.publish(message_from_joints(content))
-        if self._joint_states.get_subscription_count():
+        if self._joint_states is not None and self._joint_states.get_subscription_count():
             self._joint_states.publish(joint_state(content))
+
+    def publish_own(self, content: BodiesContent) -> BodyPoses:
+        """Publish the messages that have a status; returns that of the poses."""
+        message = message_from_bodies(content)
+        self._bodies.publish(message)
+        if self._joints is not None and content.joints:
+            self._joints.publish(message_from_joints(content))
+        return message
 
 
 NO_ORIENTATION = (

@@ -341,6 +341,10 @@ class BodyFollower:
                 one.add(by_name[one.joint.proximal], by_name[one.joint.distal])
                 for one in self.joints
             ],
+            used=[
+                body.target_id[used[: len(body.target_id)]]
+                for body, used in zip(self.bodies, found.frame.used)
+            ],
         )
 
     def _note(self, found: TrackedExposure) -> None:

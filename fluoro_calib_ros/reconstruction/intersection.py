@@ -152,7 +152,7 @@ class Intersector:
         self._by_orientation = _by_independent_unknowns(
             _derivative_functions(orientation), orientation.covariance_root()
         )
-        self._limit = _limits(np.inf if reject is None else float(reject), count)
+        self._limit = largest_lack_of_fit(np.inf if reject is None else float(reject), count)
         self._median = _medians(count)
 
     def intersect(
@@ -417,7 +417,7 @@ def _inverse(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return (cofactors / determinant[:, None]).reshape(-1, 3, 3), determinant / mean**3
 
 
-def _limits(reject: float, count: int) -> np.ndarray:
+def largest_lack_of_fit(reject: float, count: int) -> np.ndarray:
     """Largest standardised lack of fit (count + 1,) of points of 0, 1, ... rays that agree.
 
     Q = r^T W r is chi-square with 2 rays - 3 degrees of freedom, and the lack of fit is the root

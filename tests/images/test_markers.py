@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import pytest
 import rigs
+from marker_scenes import SCENE, SIZE, covered, small_rig
 from rigs import run
 
 from fluoro_calib_ros.bodies.body import Body, declared_bodies
@@ -26,9 +27,10 @@ from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.findings import Finding, Kind
 from fluoro_calib_ros.images.codec import encode
 from fluoro_calib_ros.images.marker_decisions import Decision, revise
-from fluoro_calib_ros.images.marker_ids import CalibratedRig, find_bodies, identify_markers
-from fluoro_calib_ros.images.marker_pair import MarkerPair, PairFrame
+from fluoro_calib_ros.images.marker_ids import find_bodies, identify_markers
+from fluoro_calib_ros.images.marker_points import CalibratedRig
 from fluoro_calib_ros.images.marker_rays import project_observed
+from fluoro_calib_ros.images.marker_views import MarkerViews, ViewsFrame
 from fluoro_calib_ros.images.markers import FirstMarkers, MarkerFrame, MarkerOptions, MarkerTracker
 from fluoro_calib_ros.images.overlay import draw_markers
 from fluoro_calib_ros.io.bags.metadata import message_class
@@ -43,40 +45,20 @@ from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.simulation.marker_images import (
     MARKER_SETTINGS,
     MarkerImage,
-    MarkerScene,
     MarkerSequence,
     MovingMarkers,
 )
-from fluoro_calib_ros.simulation.rig import DistortionField, VirtualRig, virtual_rig
+from fluoro_calib_ros.simulation.rig import VirtualRig
 
-SIZE = 288
 FRAMES = 30
 SEED = 26  # markers cross in both views, and are apart in the first images
-SCENE = MarkerScene(
-    clusters=2, markers=4, spread_mm=13.0, apart_mm=26.0, speed_mm=0.9, hidden=0.06
-)
 OPTIONS = MarkerOptions(shutter=SCENE.shutter)
 FAR_PX = 1.0  # from the truth, beyond which a centre is that of something else
 
 
 @cache
 def rig() -> VirtualRig:
-    """A rig with small images and no distortion."""
-    straight = DistortionField(np.zeros(2), 0.0, np.zeros(2), 0.0, np.zeros((0, 5)))
-    middle = (SIZE - 1) / 2
-    found = virtual_rig(3)
-    return replace(
-        found,
-        fluoroscopes=tuple(
-            replace(
-                f,
-                interior=np.array([middle, middle, 4000.0]),
-                image_size=(SIZE, SIZE),
-                distortion=straight,
-            )
-            for f in found.fluoroscopes
-        ),
-    )
+    return small_rig()
 
 
 @cache
@@ -157,14 +139,14 @@ def followed_bodies() -> tuple[Body, ...]:
 
 
 @cache
-def followed_in_both() -> tuple[PairFrame, ...]:
+def followed_in_both() -> tuple[ViewsFrame, ...]:
     _, images = sequence()
     calibrations, orientation = calibration()
     bodies = followed_bodies()
     first = {name: given(name) for name in 'ab'}
-    pair = MarkerPair(calibrations, orientation, OPTIONS, first=first, bodies=bodies)
+    views = MarkerViews(calibrations, orientation, OPTIONS, first=first, bodies=bodies)
     return tuple(
-        pair.update({name: image.image for name, image in of.items()}, number)
+        views.update({name: image.image for name, image in of.items()}, number)
         for number, of in enumerate(images, 1)
     )
 
@@ -321,9 +303,9 @@ def test_two_views_live_are_followed_as_in_a_recording():
     first = {name: given(name) for name in 'ab'}
     bodies = followed_bodies()
     live = MarkerSettings(first, OPTIONS, calibrations, orientation, bodies)()
-    pair = MarkerPair(calibrations, orientation, OPTIONS, first=first, bodies=bodies)
+    views = MarkerViews(calibrations, orientation, OPTIONS, first=first, bodies=bodies)
     alone = live.extract({'a': images[0]['a'].image}, 1)
-    assert alone['a'].reason == 'the other view is missing'
+    assert alone['a'].reason == 'the view of b is missing'
     empty = {name: np.full((SIZE, SIZE), 20000, np.uint16) for name in 'ab'}
     assert live.extract(empty, 1)['a'].reason  # and waits for the markers
     for number, of in enumerate(images[:4], 2):
@@ -331,7 +313,7 @@ def test_two_views_live_are_followed_as_in_a_recording():
         if number == 4:
             del seen['b']
         found = live.extract(seen, number, ['a'])
-        expected = pair.update(seen, number)
+        expected = views.update(seen, number)
         assert set(found) == set(seen)
         for name, result in found.items():
             assert not result.reason
@@ -517,7 +499,9 @@ def test_the_command_refuses_what_does_not_fit(folder, capsys):
     markers = ('--markers', folder / 'first.csv')
     assert 'with their --calibration' in said(*markers, '--fluoroscope', 'a,b')
     bodies = ('--bodies', folder / 'bodies.csv')
-    assert 'bodies are for two fluoroscopes' in said(*markers, *bodies, '--fluoroscope', 'a')
+    assert 'bodies are for two fluoroscopes or more' in said(
+        *markers, *bodies, '--fluoroscope', 'a'
+    )
     assert 'as --cluster does' in said(*bodies, '--cluster', 'one: 1 2', '--fluoroscope', 'a,b')
     write_bodies(folder / 'bodies.csv', followed_bodies())
     two = ('--fluoroscope', 'a,b', '--calibration', folder / 'result')
@@ -602,8 +586,8 @@ def angles_of_exposure(number: int) -> dict[str, float | None]:
     return {name: angle_at(name, number) for name in 'ab'}
 
 
-def followed_while_turning(known: bool) -> list[PairFrame]:
-    pair = MarkerPair(
+def followed_while_turning(known: bool) -> list[ViewsFrame]:
+    views = MarkerViews(
         turning(),
         turning_orientation(),
         OPTIONS,
@@ -611,12 +595,12 @@ def followed_while_turning(known: bool) -> list[PairFrame]:
         bodies=followed_bodies(),
     )
     return [
-        pair.update(dict(images), number, angles_of_exposure(number) if known else None)
+        views.update(dict(images), number, angles_of_exposure(number) if known else None)
         for number, images in enumerate(turned_images(), 1)
     ]
 
 
-def decided(frames: Iterable[PairFrame]) -> list[tuple[str, str, tuple[int, ...]]]:
+def decided(frames: Iterable[ViewsFrame]) -> list[tuple[str, str, tuple[int, ...]]]:
     return [(d.kind, d.fluoroscope, d.target_id) for of in frames for d in of.decisions]
 
 
@@ -687,22 +671,9 @@ def test_a_body_is_found_among_other_shadows_in_any_pose_and_not_where_it_is_abs
     assert not found and len(missing) == 1
 
 
-def covered(images: dict[str, MarkerImage], rows: slice) -> dict[str, np.ndarray]:
-    """Images of an exposure without some of the markers."""
-    out = {}
-    rng = np.random.default_rng(3)
-    for name, of in images.items():
-        light = of.image.astype(np.float32)
-        noise = np.median(np.abs(light - cv2.GaussianBlur(light, (0, 0), 3))) / 0.6745
-        marks = np.zeros((SIZE, SIZE), np.uint8)
-        for place in np.rint(of.uv[rows]).astype(int).tolist():
-            cv2.circle(marks, place, 6, 255, -1)
-        plain = light.copy()
-        for _ in range(20):
-            plain = np.where(marks > 0, cv2.blur(plain, (15, 15)), light)
-        plain += np.where(marks > 0, rng.normal(0, noise, plain.shape), 0.0).astype(np.float32)
-        out[name] = np.clip(plain, 0, 65535).astype(np.uint16)
-    return out
+def without_second_body(images: dict[str, MarkerImage]) -> dict[str, np.ndarray]:
+    """Images of an exposure without the markers of the second body."""
+    return {name: covered(of, np.s_[4:]) for name, of in images.items()}
 
 
 @pytest.mark.parametrize('covered_until', [0, 6])
@@ -719,7 +690,7 @@ def test_bodies_are_found_by_their_shapes_and_join_when_they_appear(covered_unti
     right = np.zeros((FRAMES, 2), dtype=int)
     for number, of in enumerate(images, 2):
         hidden = number < 2 + covered_until
-        shown = covered(of, np.s_[4:]) if hidden else {n: each.image for n, each in of.items()}
+        shown = without_second_body(of) if hidden else {n: each.image for n, each in of.items()}
         for name, found in follower.extract(shown, number).items():
             assert not found.reason
             row = np.searchsorted(ids, found.target_id)
@@ -738,12 +709,12 @@ def test_a_body_is_found_again_where_it_comes_back():
     calibrations, orientation = calibration()
     first = {name: given(name) for name in 'ab'}
     options = replace(OPTIONS, search_every=3)
-    pair = MarkerPair(calibrations, orientation, options, first=first, bodies=known_bodies())
+    views = MarkerViews(calibrations, orientation, options, first=first, bodies=known_bodies())
     found = 0
     for number, of in enumerate(images, 1):
         hidden = 8 <= number < 18
-        shown = covered(of, np.s_[4:]) if hidden else {n: each.image for n, each in of.items()}
-        result = pair.update(shown, number)
+        shown = without_second_body(of) if hidden else {n: each.image for n, each in of.items()}
+        result = views.update(shown, number)
         for name, view in result.views.items():
             row = np.searchsorted(ids, view.target_id)
             away = np.linalg.norm(view.uv - of[name].uv[row], axis=1)
@@ -758,9 +729,9 @@ def test_markers_of_no_body_are_followed():
     ids, images = sequence()
     calibrations, orientation = calibration()
     first = {name: given(name) for name in 'ab'}
-    pair = MarkerPair(calibrations, orientation, OPTIONS, first=first, bodies=known_bodies()[:1])
+    views = MarkerViews(calibrations, orientation, OPTIONS, first=first, bodies=known_bodies()[:1])
     for number, of in enumerate(images, 1):
-        result = pair.update({n: each.image for n, each in of.items()}, number)
+        result = views.update({n: each.image for n, each in of.items()}, number)
     for name, view in result.views.items():
         away = np.linalg.norm(
             view.uv - images[-1][name].uv[np.searchsorted(ids, view.target_id)], axis=1

@@ -4,6 +4,7 @@
 """Bodies and joints of the reconstruction node without a graph: messages, files, who follows."""
 
 import re
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,12 +19,14 @@ from fluoro_calib_ros.bodies.joints import Joint
 from fluoro_calib_ros.bodies.tracking import BodyTracker, poses_of, twists_of
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.io.bodies import JointEntry
+from fluoro_calib_ros.nodes.body_retractions import BodyRetractions
 from fluoro_calib_ros.nodes.messages.bodies import (
     AXIS_MM,
     BodiesContent,
     body_markers,
     joint_state,
     message_from_bodies,
+    message_from_joints,
     odometry,
     pose_with_covariance,
     transforms_of_bodies,
@@ -130,6 +133,7 @@ def content_of(rotation, position_mm=(0, 0, 0), covariance=None, status=PoseStat
         twist=twist,
         twist_covariance=np.diag([1e6, 4e6, 9e6, 1, 4, 9.0])[None],
         joints=[],
+        used=[BODIES[0].target_id],
     )
 
 
@@ -293,6 +297,66 @@ def test_angles_of_a_joint_are_those_from_its_neutral_trial_on():
         assert [len(joint_state(content).position) for content in found] == [0, 0, 0, 3, 3, 3]
         for content in found[3:]:
             assert joint_state(content).position == pytest.approx([0, 0, 0], abs=1e-3)
+
+
+def taken_back(lag=0, rows=range(4)):
+    """A follower, what takes poses back, and what it publishes, after some exposures."""
+    joint = Joint('knee', 'femur', 'tibia', 'cardan_xyz')
+    follower = BodyFollower(BODIES, [JointEntry(joint, None)], lag)
+    published = []
+    retractions = BodyRetractions(published.append)
+    for content in follow(follower, rows, rng=np.random.default_rng(3)):
+        retractions.note(content)
+    return follower, retractions, published
+
+
+def test_a_pose_by_a_marker_that_is_taken_back_is_not_known_any_more():
+    _, retractions, published = taken_back()
+    retractions.take_back(stamp(2), [99])  # of no body
+    retractions.take_back(stamp(2), [12])
+    retractions.take_back(stamp(2), [12, 13])  # the same pose
+    assert retractions.count == len(published) == 1
+    message = message_from_bodies(published[0])
+    assert message.header.stamp == message_from_bodies(follow_one(2)).header.stamp
+    assert message.frame_number == 3 and message.body == ['tibia']
+    assert list(message.status) == [message.FAILED] and list(message.markers) == [0]
+    assert np.isnan([*message.x, *message.qw, *message.covariance]).all()
+    angles = message_from_joints(published[0])
+    assert angles.joint == ['knee'] and list(angles.status) == [angles.FAILED]
+    assert np.isnan([*angles.angle, *angles.translation, *angles.covariance]).all()
+    retractions.take_back(stamp(2), [1])
+    assert message_from_bodies(published[1]).body == ['femur']
+
+
+def follow_one(row):
+    follower = BodyFollower(BODIES, [], 0)
+    return follow(follower, [row])[0]
+
+
+def test_a_pose_that_rejected_the_marker_stays():
+    follower = BodyFollower(BODIES, [], 0)
+    published = []
+    retractions = BodyRetractions(published.append)
+    wrong = exposure(0)
+    uv = wrong.views.uv.copy()
+    uv[:, wrong.views.target_id == 12] += 60.0
+    points = Intersector(orientation(), None).intersect(uv, wrong.views.sigma)
+    wrong = replace(wrong, views=replace(wrong.views, uv=uv), points=points)
+    for content in follower.add(wrong, rig(), 1, stamp(0)):
+        retractions.note(content)
+    retractions.take_back(stamp(0), [12])
+    assert not published
+    retractions.take_back(stamp(0), [13])
+    assert [one.body for one in published[0].poses] == ['tibia']
+
+
+def test_a_pose_that_waits_for_later_exposures_is_taken_back_after_it_is_published():
+    follower, retractions, published = taken_back(lag=2)
+    retractions.take_back(stamp(3), [1])
+    assert not published
+    for content in follow(follower, range(4, 6)):
+        retractions.note(content)
+    assert [(one.frame_number, one.bodies[0].name) for one in published] == [(4, 'femur')]
 
 
 def test_exposure_with_the_stamp_of_the_one_before_is_counted():

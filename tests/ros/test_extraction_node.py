@@ -377,7 +377,7 @@ def test_views_that_cannot_be_followed_together_are_refused(graph, calibrated):
     write_observations_csv(markers, {name: tracking.frames[name][:1] for name in NAMES})
     together = {'mode': 'markers', 'markers': markers, 'calibration_directory': calibrated}
     for more, sentence in (
-        ({'fluoroscopes': '[a]'}, 'two fluoroscopes are followed together, not 1'),
+        ({'fluoroscopes': '[a]'}, 'two fluoroscopes or more are followed together, not 1'),
         ({'calibration_directory': graph.directory / 'nothing'}, 'nothing'),
         ({'clusters': '[tibia]'}, 'does not declare a body'),
         ({'bodies': graph.directory / 'nowhere.csv'}, 'nowhere.csv'),

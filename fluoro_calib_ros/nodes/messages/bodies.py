@@ -62,6 +62,7 @@ class BodiesContent(NamedTuple):
     twist: NDArray[np.float64]
     twist_covariance: NDArray[np.float64]
     joints: Sequence[JointMotion]  #: of this exposure
+    used: Sequence[NDArray[np.int64]]  #: ids of the markers that each pose is by
 
     def header(self, frame_id: str = '') -> Header:
         """Return the header, by default with the frame of the orientation."""

@@ -1,0 +1,152 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Points in space where the rays of round shadows of several views meet.
+
+Shadows of every two views are intersected, each with each, as far as their rays meet (epipolar
+distance), and joined by those of further views that lie on the point. A point of fewer views is
+left out where points of more views explain all its shadows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from ..correction.fluoroscope_calibration import Calibrations, CorrectedPoints
+from ..photogrammetry.rig_orientation import RigOrientation
+from ..reconstruction.epipolar import EpipolarGeometry
+from ..reconstruction.intersection import OK, OUTSIDE, IntersectedPoints
+from .marker_rays import AGREE, RayFit, project_observed
+
+SHADOW_SD_PX = 0.25  # of the place of a shadow that is not measured
+
+
+@dataclass(frozen=True)
+class CalibratedRig:
+    """Orientation and calibrations of fluoroscopes, and the angles of their C-arms [rad]."""
+
+    orientation: RigOrientation
+    calibrations: Calibrations
+    angles: Mapping[str, float | None]
+
+
+@dataclass(frozen=True)
+class ShadowPoints:
+    """Points in space where rays of shadows meet."""
+
+    xyz: NDArray[np.float64]  #: (n, 3) [mm]
+    variance: NDArray[np.float64]  #: (n,) in the direction in which it is largest [mm^2]
+    shadow: NDArray[np.int64]  #: (n, F) row of the shadow in each view, -1 where there is none
+
+
+def all_among(shadow: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Whether all shadows (n, F) of points are also shadows (k, F) of other points."""
+    among = [np.isin(mine, theirs) for mine, theirs in zip(shadow.T, others.T)]
+    return np.asarray((np.column_stack(among) | (shadow < 0)).all(axis=1))
+
+
+def shadow_points(shadows: Sequence[np.ndarray], rig: CalibratedRig) -> ShadowPoints:
+    """Points where rays of shadows (k, 2) of all views [px] meet."""
+    names = rig.orientation.fluoroscopes
+    rays = _Rays(
+        [
+            rig.calibrations[name].correct(uv, angle=rig.angles.get(name))
+            for name, uv in zip(names, shadows)
+        ],
+        rig.orientation,
+    )
+    shadow = rays.pairs()
+    points, agree = rays.intersect(shadow)
+    shadow, xyz = shadow[agree], points.xyz_mm[agree]
+    for view, name in enumerate(names):
+        open_rows = np.flatnonzero(shadow[:, view] < 0)
+        if not len(open_rows) or not len(shadows[view]):
+            continue
+        calibration = rig.calibrations[name]
+        place = project_observed(
+            rig.orientation, view, calibration, xyz[open_rows], rig.angles.get(name)
+        )
+        _, nearest = cKDTree(shadows[view]).query(place)
+        joined = shadow[open_rows]
+        joined[:, view] = nearest
+        points, agree = rays.intersect(joined)
+        shadow[open_rows[agree]] = joined[agree]
+        xyz[open_rows[agree]] = points.xyz_mm[agree]
+    kept = _explaining(shadow)
+    shadow, xyz = shadow[kept], xyz[kept]
+    return ShadowPoints(xyz, rays.variance(shadow), shadow)
+
+
+def _explaining(shadow: np.ndarray) -> np.ndarray:
+    """Rows (k,) of points that are needed to explain shadows (n, F), each once."""
+    _, once = np.unique(shadow, axis=0, return_index=True)
+    rows = np.sort(once)
+    count = (shadow[rows] >= 0).sum(axis=1)
+    keep = np.ones(len(rows), dtype=bool)
+    for rays in range(shadow.shape[1], 2, -1):
+        more = shadow[rows[keep & (count >= rays)]]
+        keep &= (count >= rays) | ~all_among(shadow[rows], more)
+    return rows[keep]
+
+
+class _Rays:
+    """Rays of corrected shadows of all views."""
+
+    def __init__(self, corrected: Sequence[CorrectedPoints], orientation: RigOrientation) -> None:
+        self._corrected = corrected
+        self._orientation = orientation
+        self._fit = RayFit(orientation)
+
+    def pairs(self) -> np.ndarray:
+        """Rows (n, F) of the shadows of every two views whose rays meet, -1 for other views."""
+        names = self._orientation.fluoroscopes
+        out = [np.zeros((0, len(names)), dtype=np.int64)]
+        for one, other in combinations(range(len(names)), 2):
+            views = self._corrected[one], self._corrected[other]
+            a, b = np.indices((len(views[0].uv), len(views[1].uv))).reshape(2, -1)
+            uv = np.stack([views[0].uv[a], views[1].uv[b]])
+            sigma = np.hypot(np.stack([views[0].sigma[a], views[1].sigma[b]]), SHADOW_SD_PX)
+            geometry = EpipolarGeometry(self._orientation, names[one], names[other])
+            rays = geometry.residuals(uv[0], uv[1], sigma[0], sigma[1])
+            near = np.abs(rays.residual) < AGREE * rays.sd_total
+            shadow = np.full((np.count_nonzero(near), len(names)), -1)
+            shadow[:, one] = a[near]
+            shadow[:, other] = b[near]
+            out.append(shadow)
+        return np.concatenate(out)
+
+    def intersect(self, shadow: np.ndarray) -> tuple[IntersectedPoints, np.ndarray]:
+        """Points of shadows (n, F), and whether (n,) all their rays meet."""
+        uv = self._uv(shadow)
+        sigma = np.full(uv.shape[:2], np.nan)
+        for view, (of_view, row) in enumerate(zip(self._corrected, shadow.T)):
+            there = row >= 0
+            sigma[view, there] = np.hypot(of_view.sigma[row[there]], SHADOW_SD_PX)
+        points, lack = self._fit.intersect(uv, sigma)
+        agree = np.isin(points.status, (OK, OUTSIDE)) & ((lack < AGREE) | (shadow.T < 0)).all(
+            axis=0
+        )
+        return points, agree
+
+    def variance(self, shadow: np.ndarray) -> np.ndarray:
+        """Variances (n,) of points of shadows (n, F), in the direction of the largest one [mm^2].
+
+        Errors of orientation and correction are the same for all members of a body, nearly.
+        """
+        uv = self._uv(shadow)
+        points, _ = self._fit.intersect(uv, np.full(uv.shape[:2], SHADOW_SD_PX))
+        return np.asarray(np.linalg.eigvalsh(points.covariance_noise)[:, -1])
+
+    def _uv(self, shadow: np.ndarray) -> np.ndarray:
+        """Corrected image points (F, n, 2) [px], NaN where there is no shadow."""
+        uv = np.full((shadow.shape[1], len(shadow), 2), np.nan)
+        for view, (of_view, row) in enumerate(zip(self._corrected, shadow.T)):
+            there = row >= 0
+            uv[view, there] = of_view.uv[row[there]]
+        return uv

@@ -1,0 +1,286 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Follow markers in several views together: each view checks and predicts the others.
+
+The image points of all views are corrected and intersected (`reconstruction`). Rays that do not
+meet, and a marker that is not where its rigid body says, reveal a wrong id. The predicted pose of
+a body tells where its markers are to be expected, also those that a view does not see.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..bodies.body import Body
+from ..correction.fluoroscope_calibration import Calibrations
+from ..errors import DataError
+from ..photogrammetry.rig_orientation import RigOrientation
+from .marker_decisions import BodyDecisions, DecidedView, Decision, RayDecisions, ViewCounts
+from .marker_ids import MAX_SHADOWS, find_bodies, identifiable
+from .marker_intensity import FIRST_SD_PX, check_image
+from .marker_points import CalibratedRig
+from .marker_rays import MarkerBodies, MarkerExposure, MarkerPlaces, MarkerRays
+from .markers import FirstMarkers, MarkerFrame, MarkerOptions, MarkerTracker
+
+
+@dataclass(frozen=True)
+class ViewsFrame:
+    """Markers of one exposure of all fluoroscopes."""
+
+    views: Mapping[str, MarkerFrame]  #: by fluoroscope
+    #: they hold for the images since the doubt began; the views of this exposure obey them
+    decisions: tuple[Decision, ...] = ()
+
+
+class MarkerViews:
+    """Follows markers through the images of one fluoroscope, or of several that are calibrated.
+
+    orientation: that they belong to; None for one fluoroscope. first: ids and places in the first
+    images, by fluoroscope. bodies: shapes that are not given are learned from the images. later:
+    ids of markers whose places are given later. Raises DataError for several fluoroscopes without
+    orientation, and for those that it does not have.
+    """
+
+    def __init__(
+        self,
+        calibrations: Calibrations,
+        orientation: RigOrientation | None,
+        options: MarkerOptions | None = None,
+        *,
+        first: Mapping[str, FirstMarkers],
+        bodies: Sequence[Body] = (),
+        later: Sequence[int] = (),
+    ) -> None:
+        self.names = _names(first, orientation)
+        entering = np.asarray(later, dtype=np.int64)
+        self.target_id = np.unique(
+            np.concatenate(
+                [
+                    *(first[name].target_id for name in self.names),
+                    *(body.target_id[body.known] for body in bodies),
+                    entering,
+                ]
+            )
+        )
+        rigid = [body.target_id for body in bodies]
+        others = np.intersect1d(self.target_id, np.concatenate([*rigid, entering]))
+        self.trackers = {
+            name: MarkerTracker(
+                options, first=first[name], later=np.setdiff1d(others, first[name].target_id)
+            )
+            for name in self.names
+        }
+        self._joined: JoinedViews | None = None
+        if orientation is not None and len(self.names) > 1:
+            rig = CalibratedRig(
+                orientation.subset(self.names),
+                {name: calibrations[name] for name in self.names},
+                angles={},
+            )
+            self._joined = JoinedViews(self.trackers, rig, self.target_id, bodies)
+
+    def update(
+        self,
+        images: Mapping[str, np.ndarray | None],
+        frame: int,
+        angles: Mapping[str, float | None] | None = None,
+    ) -> ViewsFrame:
+        """Measure the markers of the next images.
+
+        images by fluoroscope; some may be missing, after the first exposure. frame is the number
+        of the exposure, above that of the one before. angles [rad] are those of the C-arms, for
+        corrections that change with them; None where they are unknown. Raises DataError as
+        MarkerTracker.update, and for an image of another size than the calibration's.
+        """
+        joined = self._joined
+        if joined is not None:
+            joined.expect(images, frame, angles or {})
+        found = {
+            name: tracker.update(images.get(name), frame)
+            for name, tracker in self.trackers.items()
+        }
+        return ViewsFrame(found) if joined is None else joined.decided(found, frame)
+
+
+def _names(
+    first: Mapping[str, FirstMarkers], orientation: RigOrientation | None
+) -> tuple[str, ...]:
+    """Fluoroscopes that are followed, in the order of the orientation. Raises DataError."""
+    if len(first) > 1 and orientation is None:
+        raise DataError('several fluoroscopes are followed together only with their calibration')
+    known = tuple(first) if orientation is None else orientation.fluoroscopes
+    names = tuple(name for name in known if name in first)
+    if not names or len(names) != len(first):
+        raise DataError(
+            f'markers of {", ".join(first) or "no fluoroscope"} were given, but fluoroscopes of '
+            f'{", ".join(known) or "no orientation"} are followed together'
+        )
+    return names
+
+
+class JoinedViews:
+    """What calibrated views know together: predictions before, and decisions after an exposure.
+
+    target_id: (n,) of the markers of all views, ascending.
+    """
+
+    def __init__(
+        self,
+        trackers: Mapping[str, MarkerTracker],
+        rig: CalibratedRig,
+        target_id: np.ndarray,
+        bodies: Sequence[Body],
+    ) -> None:
+        self._views = [
+            DecidedView(view, name, tracker, target_id, ViewCounts(len(target_id)))
+            for view, (name, tracker) in enumerate(trackers.items())
+        ]
+        self._target_id = target_id
+        self._rig = rig
+        self._rays = MarkerRays(rig.calibrations, rig.orientation, list(trackers), target_id)
+        self._bodies = MarkerBodies(rig.orientation, target_id, bodies)
+        self._by_body = [BodyDecisions(view) for view in self._views]
+        self._by_rays = [RayDecisions(view, self._rays) for view in self._views]
+        nowhere = MarkerPlaces.nowhere(len(target_id))
+        self._told = [_Told(nowhere, nowhere) for _ in self._views]
+        self._frame = 0
+        self._searched = 0  # last exposure in which lost bodies were searched
+        # Of the C-arms [rad], in the last exposure and in the one before.
+        self._angles: Mapping[str, float | None] = {}
+        self._angles_before: Mapping[str, float | None] = {}
+
+    def expect(
+        self,
+        images: Mapping[str, np.ndarray | None],
+        frame: int,
+        angles: Mapping[str, float | None],
+    ) -> None:
+        """Tell the views where to look in the next images. Raises DataError for other sizes."""
+        if self._frame == 0:
+            self._check_sizes(images)
+        self._angles_before, self._angles = self._angles, dict(angles)
+        if self._frame:
+            self._suggest(frame)
+            self._search(images, frame)
+
+    def decided(self, found: Mapping[str, MarkerFrame], frame: int) -> ViewsFrame:
+        """Return the markers of the views, after what they say of each other."""
+        exposure = self._rays.intersect(found, self._angles)
+        self._bodies.update(exposure, frame)
+        decisions = self._decide(exposure, frame)
+        decided = [number for decision in decisions for number in decision.target_id]
+        self._bodies.learn(exposure, exposure.sure & ~np.isin(self._target_id, decided))
+        self._frame = frame
+        revised = {
+            view.name: view.revised(found[view.name], decisions, frame) for view in self._views
+        }
+        return ViewsFrame(revised, decisions)
+
+    def _check_sizes(self, images: Mapping[str, np.ndarray | None]) -> None:
+        """Raise DataError for an image of another size than the calibration's."""
+        for view in self._views:
+            image = images.get(view.name)
+            expected = self._rig.calibrations[view.name].image_size
+            if image is not None and image.shape[::-1] != tuple(expected):
+                width, height = image.shape[::-1]
+                raise DataError(
+                    f'fluoroscope {view.name}: the image is {width} x {height} px, but the '
+                    f'calibration is for {expected[0]} x {expected[1]} px'
+                )
+
+    def _suggest(self, frame: int) -> None:
+        """Offer each view predictions of the markers that it is not sure of."""
+        before = self._bodies.present
+        now = self._bodies.predicted(frame)
+        for view, told in zip(self._views, self._told):
+            here = now.filled(told.expected(frame))
+            last = before.filled(told.places)
+            rows = np.searchsorted(self._target_id, view.tracker.unsure())
+            rows = rows[(here.known & last.known)[rows]]
+            if not len(rows):
+                continue
+            uv = self._rays.project(view.view, here.xyz_mm[rows], self._angles)
+            uv_before = self._rays.project(view.view, last.xyz_mm[rows], self._angles_before)
+            velocity = (uv - uv_before) / (frame - self._frame)
+            sd = self._rays.spread(view.view, here.xyz_mm[rows], here.covariance[rows])
+            view.tracker.suggest(self._target_id[rows], uv, velocity, sd)
+
+    def _search(self, images: Mapping[str, np.ndarray | None], frame: int) -> None:
+        """Look in the whole images for bodies whose pose is lost, by their shapes."""
+        every = self._views[0].tracker.options.search_every
+        lost = identifiable(self._bodies.lost())
+        if not lost or (self._searched and frame - self._searched < every):
+            return
+        shadows = [self._shadows(view, images.get(view.name)) for view in self._views]
+        if sum(of_view is not None for of_view in shadows) < 2:
+            return
+        self._searched = frame
+        rig = replace(self._rig, angles=self._angles)
+        seen = [np.zeros((0, 2)) if of_view is None else of_view for of_view in shadows]
+        found, _ = find_bodies(seen, rig, lost)
+        for view in self._views:
+            if view.name in found:
+                _offer(found[view.name], view.tracker)
+
+    def _shadows(self, view: DecidedView, image: np.ndarray | None) -> np.ndarray | None:
+        """Places (k, 2) of shadows in a view [px], None where there is no image."""
+        if image is None:
+            return None
+        try:
+            check_image(image, self._rig.calibrations[view.name].image_size)
+        except DataError:  # which the tracker tells
+            return None
+        return view.tracker.shadows(image).strongest(MAX_SHADOWS).uv
+
+    def _decide(self, exposure: MarkerExposure, frame: int) -> tuple[Decision, ...]:
+        """Confirm, exchange or drop ids, by bodies where these say a place.
+
+        Markers of no body are where two views and more say that the one of another view is.
+        """
+        out: list[Decision] = []
+        free = ~self._bodies.present.known
+        self._told = [
+            told.next(self._rays.by_others(exposure, view, free), frame)
+            for view, told in enumerate(self._told)
+        ]
+        expected = [self._bodies.present.filled(told.places) for told in self._told]
+        for view, (by_body, of_view) in enumerate(zip(self._by_body, expected)):
+            place = self._rays.project(view, of_view.xyz_mm, self._angles)
+            sd = self._rays.spread(view, of_view.xyz_mm, of_view.covariance)
+            out += by_body.decide(exposure, place, sd, frame)
+        for by_rays, of_view in zip(self._by_rays, expected):
+            out += by_rays.decide(exposure, of_view.known, frame)
+        return tuple(out)
+
+
+@dataclass(frozen=True)
+class _Told:
+    """Where the other views say that the markers of a view are, in the last two exposures."""
+
+    places: MarkerPlaces
+    before: MarkerPlaces
+    frame: int = 0
+    frame_before: int = 0
+
+    def next(self, places: MarkerPlaces, frame: int) -> _Told:
+        """Return what is told with another exposure."""
+        return _Told(places, self.places, frame, self.frame)
+
+    def expected(self, frame: int) -> MarkerPlaces:
+        """Return where the markers are expected in the next exposure."""
+        share = (frame - self.frame) / max(self.frame - self.frame_before, 1)
+        return self.places.moved_on(self.before, share)
+
+
+def _offer(found: FirstMarkers, tracker: MarkerTracker) -> None:
+    """Tell a view where markers are that it does not see."""
+    unseen = np.isin(found.target_id, tracker.unseen())
+    for number in found.target_id[unseen].tolist():
+        tracker.forget(number)
+    uv = found.uv[unseen]
+    sd = np.full(len(uv), FIRST_SD_PX)
+    tracker.suggest(found.target_id[unseen], uv, np.zeros_like(uv), sd)

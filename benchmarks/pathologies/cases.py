@@ -8,7 +8,15 @@ from dataclasses import dataclass, field
 
 from . import phantoms
 from .fields import BASE, Bumps, CurvedScreen, Magnetic, Step, ThinPlate, Waves
-from .noise import ByExposure, FalseMatches, Gaussian, Heteroscedastic, StudentT, WholePixels
+from .noise import (
+    ByExposure,
+    FalseMatches,
+    Gaussian,
+    Heteroscedastic,
+    Overlapping,
+    StudentT,
+    WholePixels,
+)
 
 
 @dataclass(frozen=True)
@@ -114,6 +122,7 @@ CASES = (
     Case('strong field', 'base', parts=(CurvedScreen(30), Magnetic(8), ThinPlate(12, 2.0))),
     Case('no distortion', 'base', parts=()),
     Case('sigma known', 'base', sigma_known=True),
+    Case('sharp beads', 'base', noise=Overlapping(), beads=400, sigma_known=True),
     Case('long source', 'base', c=6.0, distance=2200.0),
     Case('short source', 'base', c=2.2, distance=800.0),
     Case('2048 px', 'base', side=2048, noise=Gaussian(0.4)),

@@ -72,6 +72,7 @@ class Image:
     clean: np.ndarray
     correction: np.ndarray
     false: np.ndarray
+    sigma: np.ndarray | None
 
 
 @dataclass(frozen=True)
@@ -93,9 +94,6 @@ class Scene:
         """Frames for the calibration, by fluoroscope."""
         out = {name: [] for name in NAMES}
         for image in self.images:
-            sigma = None
-            if self.case.sigma_known:
-                sigma = np.full(len(image.rows), self.case.noise.sd)
             out[NAMES[image.camera]].append(
                 Frame(
                     NAMES[image.camera],
@@ -103,7 +101,7 @@ class Scene:
                     image.rows + 1,
                     image.observed,
                     (self.case.side, self.case.side),
-                    sigma,
+                    image.sigma,
                     angle=self.angles[image.number - 1] if self.case.angle_known else None,
                 )
             )
@@ -206,6 +204,7 @@ def _image(case, rng, f, camera, true_mm, pose, number):
         half = rng.random(len(points)) < 0.5
         points = points + half[:, None] * rng.normal(0, case.moved[1], 3)
     observed = distortion.observed(camera.ideal(points, pose))
+    sds = case.noise.sds(observed) if case.sigma_known else None
     observed = case.noise(rng, observed, case.side)
     visible = _on_image(case, observed)
     if case.blind is not None:
@@ -214,4 +213,5 @@ def _image(case, rng, f, camera, true_mm, pose, number):
     clean = observed[rows]
     seen, false = case.false(rng, clean, case.side)
     seen = np.clip(seen, EDGE, case.side - 1 - EDGE)
-    return Image(f, number, rows, seen, clean, distortion.correction(clean), false)
+    sigma = None if sds is None else sds[rows]
+    return Image(f, number, rows, seen, clean, distortion.correction(clean), false, sigma)

@@ -24,6 +24,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
@@ -204,14 +205,15 @@ class _Pieces:
 
 
 def in_worker_process(
-    function: Callable[..., Any],
+    function: Callable[..., Any] | str,
     *arguments: Any,
     progress: Callable[..., None] | None = None,
     raise_if_cancelled: Callable[[], None] | None = None,
 ) -> Any:
     """Return the result of one call of a function in a process with the resources of a job.
 
-    The function is one of a module. Errors are those of a call of a WorkerProcess.
+    The function is one of a module, or 'module:function' of this package, which only the process
+    imports. Errors are those of a call of a WorkerProcess.
     """
     process = WorkerProcess(partial(_given, function), 'the worker process', OF_JOB)
     try:
@@ -220,8 +222,12 @@ def in_worker_process(
         process.close()
 
 
-def _given(function: Callable[..., Any]) -> Callable[..., Any]:
-    return function
+def _given(function: Callable[..., Any] | str) -> Callable[..., Any]:
+    if not isinstance(function, str):
+        return function
+    module, _, name = function.partition(':')
+    found: Callable[..., Any] = getattr(import_module(f'.{module}', __package__), name)
+    return found
 
 
 class LentArrays:

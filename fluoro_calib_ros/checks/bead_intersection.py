@@ -219,16 +219,13 @@ def _rays(job: CalibrationResult, frames: Frames) -> Rays:
             frame = by_number[e.exposure]
             n = len(frame.target_id)
             correction = calibration.correction(frame.uv, frame.angle)
-            sigma = calibration.image_sd_at(frame.uv)
-            if frame.sigma is not None:
-                sigma = calibration.sigma0 * frame.sigma
             parts.append(
                 (
                     np.broadcast_to(matrix_from_quaternion(e.quaternion_wxyz), (n, 3, 3)),
                     np.broadcast_to(e.position_mm, (n, 3)),
                     np.broadcast_to(figures.interior, (n, 3)),
                     frame.uv - correction.duv,
-                    sigma**2 + correction.sd**2,
+                    calibration.noise_sd(frame) ** 2 + correction.sd**2,
                     frame.target_id,
                 )
             )

@@ -30,6 +30,7 @@ from .residual_tests import (
     Residuals,
     ResidualTrend,
     common_trend,
+    noise_of,
     rejected_exposure,
     rejected_trend,
     residuals_of,
@@ -97,7 +98,7 @@ class Evidence:
     def _common_trend(self, name: str) -> CommonTrend:
         calibration = self.calibrations[name]
         residuals = residuals_of(self.result, name, self.frames[name])
-        noise = calibration.image_sd_at(residuals.uv)
+        noise = noise_of(residuals, calibration, self.frames[name])
         inliers = residuals.inliers(noise)
         claimed = float(
             np.sqrt(np.mean(calibration.correction(inliers.uv, inliers.angle).sd ** 2))

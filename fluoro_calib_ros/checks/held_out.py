@@ -21,7 +21,7 @@ from ..findings import Finding, Kind, Place
 from ..photogrammetry.noise import INLIER_Q
 from .calibration_evidence import Evidence, Subject
 from .check import GOOD_EXPOSURES, Check, more_exposures, too_little_data
-from .residual_tests import RejectedExposure, residuals_of
+from .residual_tests import RejectedExposure, noise_of, residuals_of
 
 # Doubts whether exposures fit calibrations that are fixed.
 #
@@ -132,6 +132,9 @@ class ExposureSums(NamedTuple):
 
     number: int  #: of the exposure
     points: int
+    #: sum of the weights by which points count, one where their noise is that of the fluoroscope;
+    #: what is said to be less precise may have larger residuals
+    weight: float
     #: squared residuals [px^2] with a calibration that has not used the exposure, and with one
     #: that has; the same exposures are adjusted in the same way, so that the adjustment absorbs
     #: the same part of the residuals
@@ -180,10 +183,12 @@ def _hold_out(
             raise DataError(
                 f'fluoroscope {name}: an exposure does not fit a calibration without it'
             )
-        sd = evidence.calibrations[name].image_sd_at(outside.uv)
-        squared_outside = outside.capped(sd)
-        squared_inside = inside.capped(sd)
-        predicted = 2 * calibrations[name].correction(outside.uv, outside.angle).sd ** 2
+        sd = noise_of(inside, evidence.calibrations[name], frames[name])
+        factor = sd / evidence.calibrations[name].image_sd
+        squared_outside = outside.capped(sd) / factor**2
+        squared_inside = inside.capped(sd) / factor**2
+        predicted = 2 * (calibrations[name].correction(outside.uv, outside.angle).sd / factor) ** 2
+        r = outside.r / factor[:, None]
         out[name] = []
         for row, number in enumerate(outside.numbers):
             points = outside.exposure == row
@@ -191,10 +196,11 @@ def _hold_out(
                 ExposureSums(
                     int(number),
                     points.sum(),
+                    weight=np.sum(factor[points] ** -2),
                     outside=squared_outside[points].sum(),
                     inside=squared_inside[points].sum(),
                     predicted=predicted[points].sum(),
-                    white=_white(outside.uv[points], outside.r[points], sd[points]),
+                    white=_white(outside.uv[points], r[points], (sd / factor)[points]),
                 )
             )
     return out
@@ -215,9 +221,9 @@ def _white(uv: np.ndarray, r: np.ndarray, sd: np.ndarray) -> float:
 def _checks(evidence: Evidence, name: str, sums: Sequence[ExposureSums]) -> list[Check]:
     common = evidence.trends[name]
     count = len(evidence.frames[name])
-    number, n, outside, inside, predicted, white = (np.array(column) for column in zip(*sums))
+    number, n, weight, outside, inside, predicted, white = map(np.array, zip(*sums))
     # A trend that is left in sample is not noise.
-    noise = np.maximum(inside - 2 * n * common.trend.size**2, MIN_NOISE * inside)
+    noise = np.maximum(inside - 2 * weight * common.trend.size**2, MIN_NOISE * inside)
     value = float(np.sqrt(outside.sum() / (2 * n.sum())))
     expected = float(np.sqrt((noise + predicted).sum() / (2 * n.sum())))
     limit = 1 + MARGIN * np.sqrt(GOOD_EXPOSURES / count)

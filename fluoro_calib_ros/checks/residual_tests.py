@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from scipy import special
 from scipy.spatial import cKDTree
 
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..estimation.lack_of_fit import LARGEST_SD, FittedPoints, areas_of_rejected
 from ..estimation.result import CalibrationResult
 from ..estimation.rounds import ResidualTable
@@ -195,6 +196,14 @@ def residuals_of(job: CalibrationResult, name: str, frames: Sequence[Frame]) -> 
         numbers=np.array([e.exposure for e in figures.exposures]),
         angles=angles_of(by_number[e.exposure] for e in figures.exposures),
     )
+
+
+def noise_of(
+    residuals: Residuals, calibration: FluoroscopeCalibration, frames: Sequence[Frame]
+) -> NDArray[np.float64]:
+    """Return the standard deviations (n,) [px] of the noise of residuals of frames."""
+    by_number = {frame.number: frame.sorted() for frame in frames}
+    return np.concatenate([calibration.noise_sd(by_number[n]) for n in residuals.numbers])
 
 
 def common_trend(residuals: Residuals, image_size: tuple[int, int]) -> ResidualTrend:

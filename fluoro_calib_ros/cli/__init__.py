@@ -85,31 +85,43 @@ RARE = (
 class _Parser(argparse.ArgumentParser):
     """A parser of a command, with a short help, and a suggestion for a misspelt choice."""
 
+    def format_usage(self) -> str:
+        """Return the usage without the groups of RARE."""
+        formatter = self._get_formatter()
+        self._add_usage(formatter)
+        return formatter.format_help()
+
     def format_help(self) -> str:
         """Return the help without the groups of RARE."""
-        hidden = [group for group in self._action_groups if group.title in RARE]
-        rare = [action for group in hidden for action in group._group_actions]
-        if not rare:
-            return super().format_help()
         formatter = self._get_formatter()
+        self._add_usage(formatter)
+        formatter.add_text(self.description)
+        for group in self._action_groups:
+            if group.title not in RARE:
+                formatter.start_section(group.title)
+                formatter.add_text(group.description)
+                formatter.add_arguments(group._group_actions)
+                formatter.end_section()
+        hidden = [group for group in self._action_groups if group.title in RARE]
+        if hidden:
+            count = sum(len(group._group_actions) for group in hidden)
+            titles = ', '.join(str(group.title) for group in hidden)
+            formatter.add_text(f'--help-all shows {count} more options: {titles}')
+        formatter.add_text(self.epilog)
+        return formatter.format_help()
+
+    def _add_usage(self, formatter: argparse.HelpFormatter) -> None:
+        """Add the usage without the groups of RARE."""
+        rare = [
+            a for group in self._action_groups if group.title in RARE for a in group._group_actions
+        ]
+        shown = [action for action in self._actions if action not in rare]
         exclusive = [
             group
             for group in self._mutually_exclusive_groups
             if not any(action in rare for action in group._group_actions)
         ]
-        shown = [action for action in self._actions if action not in rare]
         formatter.add_usage(self.usage, shown, exclusive)
-        formatter.add_text(self.description)
-        for group in self._action_groups:
-            if group not in hidden:
-                formatter.start_section(group.title)
-                formatter.add_text(group.description)
-                formatter.add_arguments(group._group_actions)
-                formatter.end_section()
-        titles = ', '.join(str(group.title) for group in hidden)
-        formatter.add_text(f'--help-all shows {len(rare)} more options: {titles}')
-        formatter.add_text(self.epilog)
-        return formatter.format_help()
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         try:

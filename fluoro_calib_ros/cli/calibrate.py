@@ -317,7 +317,8 @@ def _report(directory: Path) -> str | None:
     from ..jobs.report import write_report
 
     try:
-        return write_report(directory)
+        with ProgressBar('report', 'picture') as bar:
+            return write_report(directory, bar)
     except DataError as error:
         print_note(f'no report: {error}')
         return None

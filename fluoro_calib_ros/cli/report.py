@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import NoReturn
 
 from .arguments import add_result_folder, result_folder
-from .output import print_result
+from .output import ProgressBar, print_result
 
 NAME = 'report'
 HELP = 'Write the report of a calibration as one HTML file to hand on.'
@@ -39,7 +39,8 @@ def run(arguments: argparse.Namespace) -> None:
     from ..jobs.report import print_page, write_report
     from ..jobs.result_folder import REPORT_PDF
 
-    path = write_report(arguments.directory)
+    with ProgressBar('report', 'picture') as bar:
+        path = write_report(arguments.directory, bar)
     document = {'out': path}
     if arguments.pdf:
         document['pdf'] = str(arguments.directory / REPORT_PDF)

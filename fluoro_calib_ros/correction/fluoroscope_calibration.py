@@ -236,6 +236,12 @@ class FluoroscopeCalibration:
         """Return the standard deviations (n,) [px] of image coordinates at pixels uv (n, 2)."""
         return self.image_sd * self.noise_factors(uv)
 
+    def noise_sd(self, frame: Frame) -> np.ndarray:
+        """Return the standard deviations (n,) [px] of the image coordinates of a frame."""
+        if frame.sigma is None:
+            return self.image_sd_at(frame.uv)
+        return self.sigma0 * np.asarray(frame.sigma)
+
     @cached_property
     def grid(self) -> CorrectionGrid:
         """Lookup grid of the model, built at its first use."""

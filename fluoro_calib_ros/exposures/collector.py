@@ -11,7 +11,7 @@ they know, and take their time. Their mean is one exposure.
 
 from __future__ import annotations
 
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -27,6 +27,7 @@ from .pairing import CompletePairer, PairingOptions, RecordedPairing
 
 MIN_COMMON_TARGETS = 8  # with fewer targets in common two frames cannot be compared
 MAX_RECENT = 1000  # pairs that are remembered
+MAX_RECENT_RADIOGRAPHS = 32  # of a fluoroscope, whose frames may come later
 MAX_GAP = 10  # a gap in a stream is at most this many times the still time
 
 COLLECT_MODES = ('auto', 'all', 'still')  # of recordings
@@ -198,6 +199,46 @@ class ExposureCollector:
             name: [pair[name] for pair in self.exposures]
             for name in self.fluoroscopes
             if not wanted or name in wanted
+        }
+
+
+class RadiographCollector:
+    """Small radiographs of the exposures that are collected, for their report.
+
+    They come as messages of their own, before or after the frames with the same stamps.
+    """
+
+    def __init__(self, names: Iterable[str]) -> None:
+        self._recent: dict[str, OrderedDict[int, bytes]] = {n: OrderedDict() for n in names}
+        self._wanted: dict[str, dict[int, bytes]] = {name: {} for name in self._recent}
+
+    def add(self, name: str, stamp_ns: int, jpeg: bytes) -> None:
+        """Keep a radiograph: of a collected frame, or as one of the last."""
+        if stamp_ns in self._wanted[name]:
+            self._wanted[name][stamp_ns] = jpeg
+        else:
+            recent = self._recent[name]
+            recent[stamp_ns] = jpeg
+            if len(recent) > MAX_RECENT_RADIOGRAPHS:
+                recent.popitem(last=False)
+
+    def want(self, exposures: Iterable[Pair]) -> None:
+        """Keep the radiographs of the frames of all collected exposures, once they come."""
+        pairs = tuple(exposures)
+        for name, recent in self._recent.items():
+            kept = self._wanted[name]
+            stamps = [pair[name].stamp_ns for pair in pairs]
+            self._wanted[name] = {t: kept.get(t) or recent.pop(t, b'') for t in stamps}
+
+    def of(self, frames: Frames) -> dict[str, dict[int, bytes]]:
+        """Return the radiographs that came of frames, by fluoroscope and exposure."""
+        return {
+            name: {
+                frame.number: jpeg
+                for frame in own
+                if (jpeg := self._wanted[name].get(frame.stamp_ns))
+            }
+            for name, own in frames.items()
         }
 
 

@@ -9,7 +9,7 @@ import os
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -119,9 +119,10 @@ def _not_a_result(directory: PathLike, error: Exception) -> DataError:
     )
 
 
-def write_report(directory: PathLike) -> str:
+def write_report(directory: PathLike, progress: Callable[[int, int], object] | None = None) -> str:
     """Write DIR/report.html from the result folder of a calibration, and return its path.
 
+    progress is called with the number of pictures that are drawn and that of all.
     Raises DataError for a folder that is not the result of a calibration, and where the file
     cannot be written.
     """
@@ -129,7 +130,7 @@ def write_report(directory: PathLike) -> str:
     given = read_report_input(directory)
     try:
         with np.errstate(all='ignore'):  # giant numbers of a damaged result
-            text = report_html(given)
+            text = report_html(given, progress)
     except NOT_A_RESULT as error:
         raise _not_a_result(directory, error) from None
     write_text(path, text)

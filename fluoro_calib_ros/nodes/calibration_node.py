@@ -23,8 +23,10 @@ from fluoro_calib_msgs.msg import DriftStatus, TargetObservations
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.lifecycle.node import LifecycleState
+from sensor_msgs.msg import CompressedImage
 
 from ..exposures.frame import Frame
+from ..io.calibration_request import MAX_BYTES
 from .angle_input import AngleInput
 from .calibration_output import CONDITIONS, CalibrationOutput, FluoroscopeState
 from .calibration_services import OrientationService, SelfCalibration
@@ -34,7 +36,7 @@ from .calibration_settings import (
     CalibrationSettings,
     read_rig,
 )
-from .exposure_input import CollectServices, ExposureInput, NodeParts
+from .exposure_input import RADIOGRAPH, CollectServices, ExposureInput, NodeParts
 from .frame_validation import with_limit
 from .healing_services import Healing
 from .messages.observations import NS_PER_S, ObservedFrame, decode_target_observations
@@ -126,6 +128,13 @@ class CalibrationNode(StreamNode):
         reader = self._angles.create_reader(self, faults)
         for name in self._rig.names:
             reader.subscribe(
+                CompressedImage,
+                f'{name}/{RADIOGRAPH}',
+                partial(self._on_radiograph, name),
+                observations_qos(),
+                max_bytes=MAX_BYTES,
+            )
+            reader.subscribe(
                 TargetObservations,
                 f'{name}/{OBSERVATIONS}',
                 partial(self._on_frame, name),
@@ -164,6 +173,9 @@ class CalibrationNode(StreamNode):
         self._exposures.add(name, frame, angle)
         self._healing.add(name, frame, angle)
         self._learning.add(name, frame, angle)
+
+    def _on_radiograph(self, name: str, message: CompressedImage, _: Mapping[str, int]) -> None:
+        self._exposures.add_radiograph(name, message)
 
     def _on_pair(self, pair: Mapping[str, Frame]) -> None:
         self._orienting.add(pair)

@@ -27,6 +27,7 @@ from ..io.folder import check_output_folder
 from ..jobs.calibration import CalibrationOutcome, Rig, run_in_worker_process
 from ..jobs.orientation import OrientationOutcome, orient
 from ..jobs.result_folder import RESULT_FOLDER, belongs_to
+from ..processes import in_worker_process
 from .calibration_settings import NOT_ACTIVE
 from .exposure_input import NodeParts, RigServices
 from .messages.self_calibration import (
@@ -278,6 +279,8 @@ class SelfCalibration(Job):
         try:
             outcome = await self._start(request, tell, is_cancel_requested)
             self._use(outcome, result)
+            if request.validate and not self._output.save_fault:
+                await self._write_report()
         except (DataError, ValueError, OSError) as error:
             self._output.refused.update(dict.fromkeys(self.running, str(error)))
             raise
@@ -317,6 +320,23 @@ class SelfCalibration(Job):
         done, self._thread = in_thread(self._node, run)
         return done
 
+    async def _write_report(self) -> None:
+        """Write the report of the calibration that is saved, if that is possible."""
+        written, self._thread = in_thread(
+            self._node,
+            lambda: in_worker_process(
+                'jobs.report:write_report',  # imports matplotlib
+                self._rig.directory,
+                raise_if_cancelled=lambda: self._raise_if_cancelled(False),
+            ),
+        )
+        try:
+            self._logger.info(f'report: {await written}')
+        except Cancelled:
+            self._logger.info('the node ends: no report of the calibration is written')
+        except (DataError, ValueError, OSError, RuntimeError) as error:
+            self._logger.warning(f'no report of the calibration: {error}')
+
     def _job_of(self, request: Request) -> tuple[CalibrationRequest, Rig]:
         """Return the job of a request, and the fluoroscopes that it leaves as they are.
 
@@ -344,7 +364,8 @@ class SelfCalibration(Job):
             name: replace(calibration, seconds=outcome.result.seconds)
             for name, calibration in outcome.result.calibrations.items()
         }
-        orientation, fault = self._files.save_outcome(outcome)
+        radiographs = self._exposures.radiographs(outcome.request.frames)
+        orientation, fault = self._files.save_outcome(outcome, radiographs)
         if orientation is None:
             self._output.orientation = None
         self._output.publish(calibrations, orientation)

@@ -30,6 +30,7 @@ from ..io.calibration import (
     load_orientation,
     orientation_path,
 )
+from ..io.calibration_request import Radiographs, write_radiographs
 from ..io.phantom import read_phantom
 from ..jobs.calibration import CalibrationOutcome
 from ..jobs.result_folder import belongs_to, kept_orientation, save_calibrations, save_outcome
@@ -237,15 +238,25 @@ class CalibrationFiles:
             self._output.publish(loaded, orientation)
             self._logger.info(f'calibration of {", ".join(loaded)} loaded from {directory}')
 
-    def save_outcome(self, outcome: CalibrationOutcome) -> tuple[RigOrientation | None, str]:
-        """Save the outcome of a job; returns the orientation to use, and why it is not saved.
+    def save_outcome(
+        self, outcome: CalibrationOutcome, radiographs: Radiographs
+    ) -> tuple[RigOrientation | None, str]:
+        """Save the outcome of a job with radiographs for its report.
+
+        Returns the orientation to use, and why it is not saved.
 
         What a calibration has cost is not lost where its folder cannot be written any more: the
         outcome is used and published all the same.
         """
         present = self._output.orientation
         try:
-            return save_outcome(self._rig.directory, outcome, present), ''
+            kept = save_outcome(
+                self._rig.directory,
+                outcome,
+                present,
+                lambda folder: write_radiographs(folder, radiographs),
+            )
+            return kept, ''
         except DataError as error:
             orientation = kept_orientation(present, outcome.orientation, outcome.calibrations)
             return orientation, (

@@ -76,12 +76,11 @@ class CorrectionNode(CorrectingNode):
 
     def create_outputs(self) -> None:
         """Make the outputs and subscribe to calibrations."""
-        self._corrected = {}
+        self._corrected = self.create_outputs_of(
+            self.names, CorrectedObservations, 'corrected_observations', observations_qos
+        )
         self._info = {}
         for name in self.names:
-            self._corrected[name] = self.create_output(
-                CorrectedObservations, f'{name}/corrected_observations', observations_qos()
-            )
             info = self.create_publisher(CameraInfo, f'{name}/camera_info', latched_qos())
             self._info[name] = self.own(info, self.destroy_publisher, info)
         self.subscribe_calibrations()

@@ -14,13 +14,15 @@ import numpy as np
 from fluoro_calib_msgs.srv import Capture, Reset
 from rclpy.parameter import Parameter
 from rclpy.task import Future
+from sensor_msgs.msg import CompressedImage
 
 from ..errors import DataError
 from ..estimation.initial_network import MIN_TARGETS_OF_EXPOSURE
-from ..exposures.collector import ExposureCollector, readiness
-from ..exposures.frame import Frame, validate_frame
+from ..exposures.collector import ExposureCollector, RadiographCollector, readiness
+from ..exposures.frame import Frame, Frames, validate_frame
 from ..exposures.pairing import CompletePairer
 from ..exposures.phantom import Phantom
+from ..images.codec import JPEG_START
 from .calibration_output import CalibrationOutput
 from .calibration_settings import (
     NOT_ACTIVE,
@@ -28,7 +30,7 @@ from .calibration_settings import (
     CalibrationSettings,
     RigSetup,
 )
-from .messages.observations import ObservedFrame, frame_from_observed
+from .messages.observations import NS_PER_S, ObservedFrame, frame_from_observed
 from .messages.status import Collected
 from .runtime.diagnostics import Logger, RateLimitedLogger, RefusalLog
 from .runtime.lifecycle import Stream, StreamNode
@@ -48,6 +50,9 @@ class PhantomStream(Stream):
         self.image_size: tuple[int, int] | None = None
         self.other_targets: bytes | None = None  # ids of the last frame without the phantom
         self.is_other_object_logged = False
+
+
+RADIOGRAPH = 'radiograph'
 
 
 class ExposureInput:
@@ -101,6 +106,7 @@ class ExposureInput:
     def _start(self) -> None:
         self._pairer = CompletePairer(self._names, self._settings.pairing)
         self._collector = ExposureCollector(self._names, self._settings.still)
+        self._radiographs = RadiographCollector(self._names)
 
     # -- the executor's thread
 
@@ -124,6 +130,11 @@ class ExposureInput:
         """Return the collected frames of fluoroscopes, by default of all. Raises DataError."""
         with self._lock:
             return self._collector.frames(fluoroscopes)
+
+    def radiographs(self, frames: Frames) -> dict[str, dict[int, bytes]]:
+        """Return small radiographs of collected frames, by fluoroscope and exposure."""
+        with self._lock:
+            return self._radiographs.of(frames)
 
     def collected(self, name: str) -> Collected:
         """Return what is collected of a fluoroscope."""
@@ -190,6 +201,16 @@ class ExposureInput:
         except DataError as error:
             stream.refusals.refuse(error)
 
+    def add_radiograph(self, name: str, message: CompressedImage) -> None:
+        """Take a small radiograph; what is no JPEG is refused."""
+        jpeg = bytes(message.data)
+        if not jpeg.startswith(JPEG_START):
+            self.streams[name].refusals.refuse(DataError(f'{name}/{RADIOGRAPH}: this is no JPEG'))
+            return
+        stamp = message.header.stamp
+        with self._lock:
+            self._radiographs.add(name, NS_PER_S * stamp.sec + stamp.nanosec, jpeg)
+
     def _validated(
         self,
         stream: PhantomStream,
@@ -243,6 +264,7 @@ class ExposureInput:
         else:
             return
         if not refusal:
+            self._radiographs.want(collector.exposures)
             self._log_collected(pair)
 
     def _refuse_full(self, exposures: int) -> None:

@@ -9,6 +9,7 @@ own that extracts. Where images come faster than they are extracted, whole expos
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -16,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 from fluoro_calib_msgs.msg import Retraction, TargetObservations
-from rclpy.publisher import Publisher
 from sensor_msgs.msg import CompressedImage, Image
+from std_msgs.msg import Header
 
 from ..bodies.body import Body, declared_bodies
 from ..errors import DataError
@@ -26,8 +27,10 @@ from ..exposures.frame import Frame
 from ..exposures.pairing import PairingOptions
 from ..exposures.stamps import ExposureNumbers
 from ..images.markers import FirstMarkers, MarkerOptions
+from ..images.overlay import small_jpeg
 from ..io.bodies import read_bodies
 from ..io.calibration import load_orientation, orientation_path
+from ..jobs.extraction import RADIOGRAPH_PX
 from ..jobs.followers import (
     REVISED,
     MakeFollower,
@@ -213,8 +216,10 @@ def _joined(settings: ExtractionSettings, first: Mapping[str, FirstMarkers]) -> 
 
 __all__ = ['PARAMETERS', 'ExtractionNode', 'main']
 
+OBSERVATIONS = 'target_observations'
 OVERLAY = 'image_overlay'
 RETRACTIONS = 'retractions'
+RADIOGRAPH = 'radiograph'
 
 
 class ExtractionNode(StreamNode):
@@ -264,17 +269,11 @@ class ExtractionNode(StreamNode):
 
     def create_outputs(self) -> None:
         """Make the outputs."""
-        self._observations: dict[str, Publisher] = {}
-        self._overlays: dict[str, Publisher] = {}
-        self._retractions: dict[str, Publisher] = {}
-        for name in self.names:
-            self._observations[name] = self.create_output(
-                TargetObservations, f'{name}/target_observations', observations_qos()
-            )
-            self._overlays[name] = self.create_output(Image, f'{name}/{OVERLAY}', images_qos())
-            self._retractions[name] = self.create_output(
-                Retraction, f'{name}/{RETRACTIONS}', observations_qos()
-            )
+        outputs = partial(self.create_outputs_of, self.names)
+        self._observations = outputs(TargetObservations, OBSERVATIONS, observations_qos)
+        self._overlays = outputs(Image, OVERLAY, images_qos)
+        self._retractions = outputs(Retraction, RETRACTIONS, observations_qos)
+        self._radiographs = outputs(CompressedImage, RADIOGRAPH, observations_qos)
 
     def create_readers(self) -> None:
         """Receive the images of all fluoroscopes in one thread, and number them."""
@@ -325,6 +324,7 @@ class ExtractionNode(StreamNode):
         """Publish what was found in an image, and count it."""
         header = task.message.header
         if not found.reason:
+            self._publish_radiograph(stream.name, header, image)
             frame = Frame(
                 stream.name,
                 task.number,
@@ -343,6 +343,13 @@ class ExtractionNode(StreamNode):
             self._overlays[stream.name].publish(
                 message_from_image(header, np.ascontiguousarray(found.picture))
             )
+
+    def _publish_radiograph(self, name: str, header: Header, image: np.ndarray) -> None:
+        """Publish a small picture of an image in which the phantom was found, where wanted."""
+        publisher = self._radiographs[name]
+        if self._settings.node.mode == 'phantom' and publisher.get_subscription_count():
+            jpeg = array('B', small_jpeg(image, RADIOGRAPH_PX))
+            publisher.publish(CompressedImage(header=header, format='jpeg', data=jpeg))
 
     def _retract(self, stream: ImageStream, task: Task, found: Observations) -> None:
         """Publish which ids of earlier images are taken back."""

@@ -10,13 +10,11 @@ also receives the joint states that give the angle of its C-arm.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 
 from builtin_interfaces.msg import Time
-from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
@@ -132,19 +130,15 @@ class ImageNode(CorrectingNode):
 
     def create_outputs(self) -> None:
         """Make the outputs and subscribe to calibrations."""
-        self._images = self._create_outputs(Image, CORRECTED)
-        self._compressed = self._create_outputs(CompressedImage, f'{CORRECTED}/compressed')
+        outputs = partial(self.create_outputs_of, self.names)
+        self._images = outputs(Image, CORRECTED, images_qos)
+        self._compressed = outputs(CompressedImage, f'{CORRECTED}/compressed', images_qos)
         # image_transport looks for the CameraInfo in the namespace of the image. The correction
         # node publishes there, too, latched, and subscribers ask for that.
-        beside = self._create_outputs(CameraInfo, 'camera_info', latched_qos)
-        below = self._create_outputs(CameraInfo, f'{CORRECTED}/camera_info')
+        beside = outputs(CameraInfo, 'camera_info', latched_qos)
+        below = outputs(CameraInfo, f'{CORRECTED}/camera_info', images_qos)
         self._infos = {name: (beside[name], below[name]) for name in self.names}
         self.subscribe_calibrations()
-
-    def _create_outputs(
-        self, kind: type, topic: str, qos: Callable[[], QoSProfile] = images_qos
-    ) -> dict[str, Publisher]:
-        return {name: self.create_output(kind, f'{name}/{topic}', qos()) for name in self.names}
 
     def create_readers(self) -> None:
         """Receive images, those of each fluoroscope in a thread of its own."""

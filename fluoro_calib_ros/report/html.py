@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import base64
 import platform
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -73,14 +73,23 @@ class ReportInput:
     radiographs: Mapping[str, Mapping[int, bytes]] = field(default_factory=dict)
 
 
-def report_html(given: ReportInput) -> str:
-    """Return the report as HTML: pictures inside, no reference to anything outside."""
+def report_html(given: ReportInput, progress: Callable[[int, int], object] | None = None) -> str:
+    """Return the report as HTML: pictures inside, no reference to anything outside.
+
+    progress is called with the number of pictures that are drawn and that of all.
+    """
     residuals = {name: _residuals(given, name) for name in given.calibrations}
     with style.context(['default', STYLE]):
         scale = common_scale(
             (c.model, c.image_size) for c in given.calibrations.values() if c.model.kind != 'none'
         )
-        pictures = {name: _pictures(given, name, residuals[name], scale) for name in residuals}
+        figures = {name: _figures(given, name, residuals[name], scale) for name in residuals}
+        pictures: dict[str, list[tuple[str, str]]] = {name: [] for name in residuals}
+        drawn = [(name, *each) for name, own in figures.items() for each in own]
+        for done, (name, title, figure) in enumerate(drawn):
+            if progress is not None:
+                progress(done, len(drawn))
+            pictures[name].append((title, svg_text(figure)))
         beads = _bead_picture(given)
     return page(
         'report.html',
@@ -293,10 +302,10 @@ def _correlation(covariance: np.ndarray) -> list[list[float]]:
     return (covariance / scale).tolist()
 
 
-def _pictures(
+def _figures(
     given: ReportInput, name: str, residuals: Residuals, scale: Scale
-) -> list[tuple[str, str]]:
-    """Return title and SVG (base64) of the pictures of a fluoroscope."""
+) -> list[tuple[str, Figure]]:
+    """Return titles and pictures of a fluoroscope."""
     calibration = given.calibrations[name]
     size = calibration.image_size
     figures: list[tuple[str, Figure]] = []
@@ -312,7 +321,7 @@ def _pictures(
             ('RMS and number of beads by exposure', exposure_bars(residuals, name)),
             ('Distribution of the residuals', distribution(residuals, name)),
         ]
-    return [(title, svg_text(figure)) for title, figure in figures]
+    return figures
 
 
 def svg_text(figure: Figure) -> str:

@@ -332,7 +332,9 @@ def test_white_part_is_half_the_squared_difference_of_neighbours():
 
 
 def sums(number, outside, inside, predicted, points=50):
-    return held_out.ExposureSums(number, points, outside, inside, predicted, white=inside)
+    return held_out.ExposureSums(
+        number, points, points, outside, inside, predicted=predicted, white=inside
+    )
 
 
 def test_exposures_held_out_are_expected_to_have_noise_and_error_of_the_correction():

@@ -26,6 +26,7 @@ from fluoro_calib_ros.checks.calibration_evidence import Evidence, Subject
 from fluoro_calib_ros.checks.check import Check, Validation, verdict_of
 from fluoro_calib_ros.checks.comparison import difference, orientation_fields, place_name
 from fluoro_calib_ros.checks.field_checks import PRECISION, TRENDS
+from fluoro_calib_ros.checks.held_out import HELD_OUT
 from fluoro_calib_ros.checks.residual_tests import (
     FALSE_ALARM,
     Residuals,
@@ -324,6 +325,28 @@ def test_new_check_is_one_subject(monkeypatch):
     (check,) = found.checks
     assert (check.name, check.place.fluoroscope, check.limit) == ('exposures', 'a', 15.0)
     assert found.verdict == 'pass' and steps[1:] == [('counting', 1, 2)]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(('claimed', 'passes'), [(2.0, True), (0.25, False)])
+def test_points_that_are_said_to_be_imprecise_are_no_misfit_of_their_exposure(
+    monkeypatch, claimed, passes
+):
+    """As beads in front of each other in images: a quarter of one exposure has an sd of 2 px."""
+    monkeypatch.setattr(verdict_module, 'SUBJECTS', (HELD_OUT,))
+    rng = np.random.default_rng(8)
+    frames = [replace(f, sigma=np.full(len(f.uv), 0.25)) for f in exposures()['a']]
+    fifth = frames[4]
+    some = np.arange(len(fifth.uv)) % 4 == 0
+    noise = rng.normal(0, 2.0, fifth.uv.shape) * some[:, None]
+    sigma = np.where(some, claimed, fifth.sigma)
+    frames[4] = replace(fifth, uv=fifth.uv + noise, sigma=sigma)
+    request = CalibrationRequest({'a': frames}, rig().phantom, CalibrationOptions(**LOCAL))
+    calibrations = calibrate(request.frames, request.phantom, request.options).calibrations
+    found = validate(request, calibrations)
+    (check,) = [check for check in found.checks if check.kind is Kind.EXPOSURES]
+    assert check.place.exposures == (5,) or passes
+    assert check.passed == passes
 
 
 def test_points_more_precise_than_the_survey_are_not_rejected_in_a_few_exposures():

@@ -440,6 +440,8 @@ def test_help_is_short_and_help_all_whole(capsys):
     assert '--help-all shows' in texts['--help'] and 'limits of what is read' in texts['--help']
     assert '--max-file-mb' in texts['--help-all'] and '--known-orientation' in texts['--help-all']
     assert texts['--help'].count('\n') < 0.6 * texts['--help-all'].count('\n')
+    usage = said(capsys, ('calibrate',), status=2)
+    assert '--fast' in usage and '--max-file-mb' not in usage
     for command in COMMANDS:
         (commands,) = (a for a in make_parser(command.NAME)._actions if a.dest == 'command')
         for group in commands.choices[command.NAME]._action_groups:

@@ -500,18 +500,17 @@ def test_shifts_of_beads_are_named_by_their_significance(monkeypatch):
 
 
 def test_pictures_are_those_that_there_is_something_to_show_for(monkeypatch):
-    monkeypatch.setattr(html, 'svg_text', lambda figure: '')
     for name in ('distortion_figure', 'residual_map', 'exposure_bars', 'distribution'):
         monkeypatch.setattr(html, name, lambda *_: None)
     empty = {'model': rigs.no_correction(), 'train_exposure': np.zeros(0, dtype=int)}
     none = replace(rigs.pincushion('a', SIZE), **empty)
     scale = Scale(1.0, 1.0)
-    titles = [title for title, _ in html._pictures(given(), 'a', some_residuals(), scale)]
+    titles = [title for title, _ in html._figures(given(), 'a', some_residuals(), scale)]
     assert len(titles) == 5 and titles[0].startswith('Distortion')
     without = given(calibrations={'a': none})
-    assert [t for t, _ in html._pictures(without, 'a', some_residuals(), scale)] == titles[1:]
+    assert [t for t, _ in html._figures(without, 'a', some_residuals(), scale)] == titles[1:]
     nothing = replace(some_residuals(), inlier=np.zeros(6, bool))
-    assert [t for t, _ in html._pictures(given(), 'a', nothing, scale)] == titles[:1]
+    assert [t for t, _ in html._figures(given(), 'a', nothing, scale)] == titles[:1]
 
 
 # ---- points in space

@@ -18,12 +18,14 @@ from benchmarks.bead_images import bead_image
 from fluoro_calib_ros.bodies.body import Body
 from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
 from fluoro_calib_ros.exposures.phantom import Phantom
-from fluoro_calib_ros.images.codec import encode
+from fluoro_calib_ros.images.codec import decode, encode
 from fluoro_calib_ros.io.bodies import write_bodies
+from fluoro_calib_ros.io.calibration_request import RADIOGRAPHS
 from fluoro_calib_ros.io.observations import write_observations_csv
 from fluoro_calib_ros.io.phantom import read_phantom, write_phantom
 from fluoro_calib_ros.jobs.calibration import run_calibration
 from fluoro_calib_ros.jobs.extraction import ExtractionRequest, run_extraction
+from fluoro_calib_ros.jobs.report import write_report
 from fluoro_calib_ros.nodes.messages.observations import stamp_from_nanoseconds
 from fluoro_calib_ros.nodes.runtime.topics import images_qos
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
@@ -174,6 +176,15 @@ def test_calibration_is_that_of_the_command(rig, observed, frames_by_command):
         live = [answer.xp[f], answer.yp[f], answer.c[f]]
         assert np.abs(calibration.interior - live).max() < 1e-2
         assert answer.observations[f] == sum(len(f.target_id) for f in frames_by_command[name])
+    folder = rig.folder / 'calibrations'
+    for name in NAMES:
+        for number in range(1, POSES + 1):
+            radiograph = decode((folder / RADIOGRAPHS / f'{name}_{number}.jpg').read_bytes())
+            shown = picture(name, number).astype(float)
+            assert np.corrcoef(radiograph.ravel(), shown.ravel())[0, 1] > 0.98
+    write_report(folder)
+    report = (folder / 'report.html').read_text(encoding='utf-8')
+    assert report.count('"/9j/') == len(NAMES) * POSES
 
 
 BAD = {  # number of the image, publisher, message, key of the diagnostics, what is said

@@ -4,6 +4,7 @@
 """The verdict on a calibration in the answer of a job that asks for it."""
 
 import json
+from html import escape
 
 from fluoro_calib_msgs.srv import Calibrate
 from ros_graph import SUCCEEDED
@@ -29,8 +30,11 @@ def test_job_reports_the_verdict_on_request(rig):  # noqa: F811
     assert document['findings'] == list(done.result.findings)
     assert document['calibration_id'] == {'b': done.result.calibration_id[0]}
 
+    report = (rig.folder / 'report.html').read_text(encoding='utf-8')
+    assert done.result.calibration_id[0] in report
+    assert escape(done.result.findings[0]).partition(': ')[2][:60] in report
+
     answer = client.call(Calibrate, 'calibrate', model='none', fluoroscopes=['b'])
     assert answer.success and answer.verdict == '' and not answer.findings
-    assert not (rig.folder / 'validation.json').exists(), (
-        'that was the verdict on an earlier calibration'
-    )
+    for name in ('validation.json', 'report.html'):
+        assert not (rig.folder / name).exists(), 'that is of an earlier calibration'

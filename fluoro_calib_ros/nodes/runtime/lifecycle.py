@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 import traceback
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -174,6 +174,12 @@ class StreamNode(ManagedNode):
             kind, topic, qos, qos_overriding_options=qos_overrides()
         )
         return self.own(publisher, self.destroy_publisher, publisher)
+
+    def create_outputs_of(
+        self, names: Iterable[str], kind: type, topic: str, qos: Callable[[], QoSProfile]
+    ) -> dict[str, Publisher]:
+        """Make the publishers <name>/<topic> of several fluoroscopes, by name."""
+        return {name: self.create_output(kind, f'{name}/{topic}', qos()) for name in names}
 
     def create_input(
         self,

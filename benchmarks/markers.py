@@ -3,7 +3,7 @@
 
 """Following of markers in two views and more: ids, precision and speed.
 
-    python -m benchmarks.markers --frames 500           all settings, as the table of
+    python -m benchmarks.markers --frames 200           all settings, as the table of
                                                         docs/how_good.md
     python -m benchmarks.markers --frames 100 --sets usual --views 3    the same in three views
     python -m benchmarks.markers --start 3              ids by shapes alone, in 3 rigs of each set

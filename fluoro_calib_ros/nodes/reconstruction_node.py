@@ -26,14 +26,12 @@ from ..options import option
 from ..reconstruction.epipolar import RecentMisses
 from ..reconstruction.intersection import OUTSIDE
 from ..reconstruction.reconstruct import CorrectedView, intersect_exposure, watch_exposure
-from .body_retractions import BodyRetractions
 from .drift_monitor import DriftMonitor, DriftParameters
 from .frame_validation import CORRECTED_REFUSALS, validate_corrected, with_limit
 from .messages.fluoroscope_calibration import image_size_of
 from .messages.observations import NS_PER_S, CorrectedFrame, decode_corrected_observations
 from .messages.points import PointsContent
 from .messages.rig_orientation import message_from_orientation, transforms_of_orientation
-from .point_retractions import PointRetractions
 from .reconstruction_output import (
     CONDITIONS,
     BodiesOutput,
@@ -42,6 +40,7 @@ from .reconstruction_output import (
     ReconstructionState,
     statuses_of,
 )
+from .retractions import BodyRetractions, PointRetractions
 from .rig_input import BodyFollower, BodyParameters, Rig, RigInput, read_body_files
 from .runtime.diagnostics import LatencyWindow, RefusalLog, Refused, Status, health_of
 from .runtime.lifecycle import Stream, StreamNode, stream_faults

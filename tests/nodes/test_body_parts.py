@@ -19,7 +19,6 @@ from fluoro_calib_ros.bodies.joints import Joint
 from fluoro_calib_ros.bodies.tracking import BodyTracker, poses_of, twists_of
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.io.bodies import JointEntry
-from fluoro_calib_ros.nodes.body_retractions import BodyRetractions
 from fluoro_calib_ros.nodes.messages.bodies import (
     AXIS_MM,
     BodiesContent,
@@ -32,6 +31,7 @@ from fluoro_calib_ros.nodes.messages.bodies import (
     transforms_of_bodies,
 )
 from fluoro_calib_ros.nodes.reconstruction_output import statuses_of
+from fluoro_calib_ros.nodes.retractions import BodyRetractions
 from fluoro_calib_ros.nodes.rig_input import BodyFollower, BodyParameters, Rig, read_body_files
 from fluoro_calib_ros.nodes.runtime.diagnostics import OK, WARN, RecentCounts
 from fluoro_calib_ros.photogrammetry.noise import ObservedScatter

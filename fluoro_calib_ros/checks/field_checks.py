@@ -52,11 +52,11 @@ def _precision(evidence: Evidence, name: str) -> Check:
     told = 'residuals that its lack of fit explains: the image noise is not known'
     if np.isfinite(ratio):
         growth = 100 * (np.sqrt(1 + ratio**2) - 1)
-        told = f'an image noise of {noise:.2f} px: it makes the errors of corrected points '
+        told = f'an image noise of {noise:.3f} px: it makes the errors of corrected points '
         told += f'{growth:.0f} % larger'
     return Check(
         Kind.PRECISION,
-        f'the correction has a standard deviation of {common.claimed_sd:.2f} px, at {told}',
+        f'the correction has a standard deviation of {common.claimed_sd:.3f} px, at {told}',
         Place((name,)),
         advice,
         numbers={'sd_px': common.claimed_sd, 'noise_px': noise, 'exposures': count},
@@ -98,7 +98,7 @@ def _variation(evidence: Evidence, name: str) -> Check:
         return too_little_data(Kind.VARIATION, name, reason, count)
     return Check(
         Kind.VARIATION,
-        f'the distortion differs between exposures by {found.size_px:.2f} px '
+        f'the distortion differs between exposures by {found.size_px:.3f} px '
         f'(chi2/dof {found.chi2_per_dof:.2f}, constant up to {VARYING:.2f})',
         Place((name,)),
         f'{_angles(evidence, name)}, a lens that was focused or zoomed, a source or detector '
@@ -166,7 +166,7 @@ def _agreement(
     return Check(
         Kind.HALVES,
         'two halves of the exposures give corrections that differ by '
-        f'{found.rms_px:.2f} px, where {expected:.2f} px is predicted, most at '
+        f'{found.rms_px:.3f} px, where {expected:.3f} px is predicted, most at '
         f'{describe_place(found.worst, one.image_size)}',
         Place.at(name, found.worst),
         f'{more_exposures(count)} that show beads there, and see that phantom and fluoroscope '
@@ -204,7 +204,7 @@ def _whiteness(evidence: Evidence, name: str, common: CommonTrend) -> Check:
     where = describe_place(trend.place, evidence.calibrations[name].image_size)
     return Check(
         Kind.WHITENESS,
-        f'the residuals have a trend of {trend.size:.2f} px, most at {where}',
+        f'the residuals have a trend of {trend.size:.3f} px, most at {where}',
         Place.at(name, trend.place),
         _advice(evidence.request.options.model_name, model, len(evidence.frames[name])),
         value=trend.size,
@@ -233,7 +233,7 @@ def _worst_area(evidence: Evidence, name: str, common: CommonTrend) -> Check:
     claimed = max(float(calibration.model.evaluate(trend.place[None]).sd[0]), common.claimed_sd)
     return Check(
         Kind.WORST_AREA,
-        f'the worst mean residual of an area, {trend.cell_size:.2f} px, is at '
+        f'the worst mean residual of an area, {trend.cell_size:.3f} px, is at '
         f'{describe_place(trend.place, calibration.image_size)}',
         Place.at(name, trend.place),
         f'{more_exposures(len(evidence.frames[name]))} that show beads there, or choose '
@@ -250,7 +250,7 @@ def _rejected_area(evidence: Evidence, name: str, rejected: RejectedTrend) -> Ch
     return Check(
         Kind.WORST_AREA,
         f'{rejected.points} image points of different exposures were '
-        f'rejected as false matches, but agree: {rejected.size:.2f} px on average at '
+        f'rejected as false matches, but agree: {rejected.size:.3f} px on average at '
         f'{describe_place(rejected.place, size)}',
         Place.at(name, rejected.place),
         'the correction model does not follow the distortion there; '
@@ -270,8 +270,8 @@ def _drift(evidence: Evidence, name: str, common: CommonTrend) -> Check:
     whole = change.size > change.limit or change.cell_size <= change.cell_limit
     return Check(
         Kind.DRIFT,
-        f'earlier and later exposures differ by {change.size:.2f} px, '
-        f'most at {describe_place(change.place, size)} by {change.cell_size:.2f} px',
+        f'earlier and later exposures differ by {change.size:.3f} px, '
+        f'most at {describe_place(change.place, size)} by {change.cell_size:.3f} px',
         Place.at(name, change.place),
         'the distortion has changed between the exposures; take all of them again in one '
         'session, with nothing switched, moved or warming up',

@@ -355,7 +355,7 @@ def _check(found: RigFindings, pairs: PairScatter) -> Check:
     wrong = [one for one in wrong if one.kind in (Kind.PAIRS_CONTRADICT, Kind.RIG_MOVED)]
     cause = (
         f'the relative orientation of fluoroscopes {a} and {b} differs between the exposures by '
-        f'{off:.2f} px, {pairs.unexplained:.1f} times its standard deviation'
+        f'{off:.3f} px, {pairs.unexplained:.1f} times its standard deviation'
     )
     return Check(
         Kind.ORIENTATION,

@@ -713,7 +713,9 @@ def test_damaged_c3d_is_refused(tmp_path):
     path = tmp_path / 'points.c3d'
     registry.write(path, 'c3d', Content(points=points(), names=NAMED), FileSettings())
     whole = path.read_bytes()
-    for length in (100, 700, len(whole) - 512):
+    count, _, first, last = struct.unpack_from('<4H', whole, 2)
+    end = (whole[16] - 1) * 512 + (last - first + 1) * count * 16  # four float32 a point
+    for length in (100, 700, end - 1):
         path.write_bytes(whole[:length])
         assert 'this C3D file is truncated' in refused(path)
     place = whole.index(b'LABELS')

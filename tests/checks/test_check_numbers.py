@@ -228,11 +228,14 @@ def test_residuals_may_be_as_large_as_their_sigma_says():
     assert found.numbers['limit_px'] == 4.0
 
 
-@pytest.mark.parametrize(('offset', 'is_off'), [(900.0, False), (1100.0, True)])
-def test_principal_point_is_within_an_image_of_the_middle(offset, is_off):
-    interior = np.array([511.5 + offset, 383.5, 4000.0])
-    made = figures(interior=interior)
-    found = found_in(made, calibration(interior=interior))
+@pytest.mark.parametrize(
+    ('offset', 'about_middle', 'is_off'),
+    [(900.0, 900.0, False), (1100.0, 1100.0, True), (900.0, 1100.0, False), (1100.0, 900.0, False)],
+)
+def test_principal_point_is_within_an_image_of_the_middle(offset, about_middle, is_off):
+    """In its own gauge, or in that of a correction about the middle of the image."""
+    own, other = (np.array([511.5 + each, 383.5, 4000.0]) for each in (offset, about_middle))
+    found = found_in(figures(interior=own), calibration(interior=other))
     assert kinds(found) == ([Kind.PRINCIPAL_POINT_OFF] if is_off else [])
     if is_off:
         assert found[0].numbers['offset_px'] == pytest.approx(offset, rel=0.1)

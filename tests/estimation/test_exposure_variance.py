@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 import rigs
 
+from fluoro_calib_ros.estimation.collocation import CollocationTerms
+from fluoro_calib_ros.estimation.estimator import AdjustmentProblem, GaugeKind
 from fluoro_calib_ros.estimation.exposure_terms import (
     ExposureTerms,
     estimates_beside_free_points,
@@ -143,3 +145,27 @@ def test_terms_of_exposures_are_found_beside_free_points(case):
     free, surveyed = estimated_size(varying, found.parameters)
     assert free == pytest.approx(SIZE_PX, rel=0.15)
     assert surveyed == pytest.approx(SIZE_PX, rel=0.15)
+
+
+def test_a_self_calibration_renews_its_terms_of_exposures_until_they_settle(case):
+    network, found, _, _, true = case
+    rng = np.random.default_rng(5)
+    coefficients = rng.normal(0, np.sqrt(true.variance), (EXPOSURES, len(true.variance)))
+    network = replace(network, uv=network.uv + true.values @ coefficients.ravel())
+    problem = AdjustmentProblem(network, [SIZE], found, (GaugeKind.FULL,))
+    terms = CollocationTerms(problem, modes=0)
+    terms._refinements = []
+    terms.parts[0].own = ExposureTerms(true.functions.values, network.exposure, 0.3 * SIZE_PX)
+    parameters = replace(found.parameters, additional=terms.zeros())
+    sizes = []
+    for _ in range(5):
+        varying = terms.with_additional(network)
+        adjusted = adjust(varying, parameters, noise=Noise('gaussian', 0.3))
+        parameters = adjusted.parameters
+        matrix = factorize(varying, normal_equations(varying, parameters, 0.0, adjusted.noise))
+        terms.renew(varying, matrix, adjusted)
+        sizes.append(terms.parts[0].own.size_px)
+    # The mean over the exposures is no difference between them.
+    there = np.sqrt(np.sum(np.var(coefficients, axis=0, ddof=1)))
+    assert sizes[-1] == pytest.approx(there, rel=0.1)
+    assert sizes[-1] == sizes[-2]

@@ -230,7 +230,12 @@ def test_residuals_may_be_as_large_as_their_sigma_says():
 
 @pytest.mark.parametrize(
     ('offset', 'about_middle', 'is_off'),
-    [(900.0, 900.0, False), (1100.0, 1100.0, True), (900.0, 1100.0, False), (1100.0, 900.0, False)],
+    [
+        (900.0, 900.0, False),
+        (1100.0, 1100.0, True),
+        (900.0, 1100.0, False),
+        (1100.0, 900.0, False),
+    ],
 )
 def test_principal_point_is_within_an_image_of_the_middle(offset, about_middle, is_off):
     """In its own gauge, or in that of a correction about the middle of the image."""

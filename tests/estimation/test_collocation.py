@@ -54,7 +54,11 @@ from fluoro_calib_ros.estimation.priors import (
     starting_prior,
 )
 from fluoro_calib_ros.estimation.refinements import START_MODES
-from fluoro_calib_ros.estimation.self_calibration import calibrate_by_adjustment, estimator_of
+from fluoro_calib_ros.estimation.self_calibration import (
+    adjust_with_terms,
+    calibrate_by_adjustment,
+    estimator_of,
+)
 from fluoro_calib_ros.estimation.signal import (
     Ripples,
     Signal,
@@ -766,6 +770,22 @@ def test_gauge_settles_where_its_steps_move_the_principal_point(feedback):
     for _ in range(12):
         part.use_interior(settled + feedback * (part.interior - settled))
     assert np.abs(part.interior - settled).max() < 0.01
+
+
+def test_reported_changes_of_the_correction_vanish_as_its_terms_settle():
+    network, truth = rigs.small_network(8, 60)
+    bent = 3.0 * ((network.uv - 511.5) / 512) ** 2
+    network = replace(network, uv=network.uv + bent)
+    before = adjust(network, truth)
+    problem = AdjustmentProblem(network, [(1024, 1024)], before, (GaugeKind.FULL,))
+    terms = CollocationTerms(problem, modes=0)
+    changes = []
+    _, _, converged = adjust_with_terms(
+        network, before, terms, 20, lambda _, change: changes.append(change)
+    )
+    assert converged and 2 < len(changes) < 20
+    assert 0.2 < changes[0] < 3.0
+    assert changes[-1] < 0.02 * changes[0]
 
 
 @pytest.mark.long

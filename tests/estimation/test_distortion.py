@@ -12,6 +12,7 @@ from scipy.spatial import ConvexHull, Delaunay
 from sklearn.model_selection import GridSearchCV, GroupKFold, PredefinedSplit
 from sklearn.neighbors import KNeighborsRegressor
 
+from fluoro_calib_ros.correction.calibration_record import SD_GRID
 from fluoro_calib_ros.correction.neighbours import (
     KnnModel,
     LocalLinearModel,
@@ -21,6 +22,7 @@ from fluoro_calib_ros.correction.neighbours import (
     least_squares_map,
 )
 from fluoro_calib_ros.correction.registry import MODELS, create_model, no_correction
+from fluoro_calib_ros.correction.series import Functions, Series
 from fluoro_calib_ros.estimation.estimator import (
     GaugeKind,
     TrainingPoints,
@@ -440,6 +442,15 @@ def test_regression_smooths_as_its_model_predicts(kind):
         atol=1e-9,
     )
     assert np.abs(regressor.smooth(values)).max() < 10
+
+
+def test_model_beside_a_series_is_the_sum_of_both():
+    regressor, values = chosen('hybrid')
+    coefficients = np.array([[1.0, 30.0, -20.0], [-2.0, 10.0, 40.0]])
+    series = Series(Functions(SIZE, 1), coefficients, np.zeros((SD_GRID, SD_GRID)))
+    uv = regressor.points.uv
+    found = regressor.model(values, series).predict(uv)
+    np.testing.assert_allclose(found, regressor.smooth(values) + series.predict(uv), atol=1e-9)
 
 
 def test_chosen_k_has_the_smallest_score():

@@ -20,6 +20,7 @@ from fluoro_calib_ros.estimation.exposure_terms import (
 from fluoro_calib_ros.estimation.lack_of_fit import (
     FittedPoints,
     LeftOut,
+    _growth,
     sd_of_rejected,
     sd_with_lack_of_fit,
 )
@@ -152,6 +153,19 @@ def test_residuals_bound_the_variance_beyond_a_series():
     # Ripples too short for the distance of the points cannot be excluded.
     short = LeftOut(0.5, np.zeros_like)
     assert np.median(sd_with_lack_of_fit(points, series, short)) == pytest.approx(0.5)
+
+
+def test_products_of_neighbours_are_extrapolated_to_no_distance():
+    distance = np.random.default_rng(7).uniform(10, 40, (50, 5))
+    distance[:, -1] = 1e3
+    near = np.arange(5) < 4  # the last are of the same exposure
+    other = np.broadcast_to(near, distance.shape)
+    product = np.where(other, 1 - (distance / 100) ** 2, -50.0)
+    expected = 1 / product[other].mean()
+    assert _growth(product, distance, other) == pytest.approx(expected)
+    assert _growth(-product, distance, other) == 1.0
+    assert _growth(0.94 - product, distance, other) == 1.0  # it grows with the distance
+    assert _growth(product, np.full_like(distance, 20.0), other) == 1.0
 
 
 def test_correlation_of_what_a_series_leaves_out():

@@ -88,6 +88,9 @@ def test_single_beads_and_noise_are_no_layer(shape):
         assert displaced_layer(beads) is None
         check = compare_with_survey(beads)[0]
         assert 4 <= len(check.place.target_id) <= 5 and 'shift_mm' not in check.numbers
+        worst = check.place.target_id[0]
+        assert check.value == pytest.approx(2 * np.sqrt(3), abs=0.5)
+        assert f'bead {worst} is wrong by {check.value:.1f} mm' in check.cause
 
 
 @pytest.mark.parametrize('shape', [plates, cloud])

@@ -56,7 +56,7 @@ SWAPPED: dict[type, type] = {
     ast.Or: ast.And,
 }
 NAMES = {'min': 'max', 'max': 'min', 'argmin': 'argmax', 'argmax': 'argmin', 'sin': 'cos'}
-COMMUTATIVE = ('min', 'max', 'minimum', 'maximum', 'hypot', 'allclose', 'array_equal')
+COMMUTATIVE = ('min', 'max', 'minimum', 'maximum', 'np.clip', 'hypot', 'allclose', 'array_equal')
 LEAVING = (ast.Raise, ast.Return, ast.Continue)
 
 
@@ -103,11 +103,13 @@ def bugs_of(node: ast.AST) -> Iterator[tuple[str, ast.AST, ast.AST]]:
         elif node.attr in NAMES:
             yield 'function', node, changed(attr=NAMES[node.attr])
     elif isinstance(node, ast.Call) and len(node.args) >= 2:
-        name = ast.unparse(node.func).split('.')[-1]
+        name = ast.unparse(node.func)
+        is_commutative = not {name, name.split('.')[-1]}.isdisjoint(COMMUTATIVE)
         starred = any(isinstance(a, (ast.Starred, ast.GeneratorExp)) for a in node.args)
-        if name not in COMMUTATIVE and not starred:
+        if not is_commutative and not starred:
             first, second, *others = node.args
-            yield 'arguments', node, changed(args=[second, first, *others])
+            if ast.dump(first) != ast.dump(second):
+                yield 'arguments', node, changed(args=[second, first, *others])
     elif isinstance(node, ast.If) and not node.orelse and isinstance(node.body[-1], LEAVING):
         yield 'guard', node.test, ast.Constant(False)
     elif isinstance(node, ast.Raise):

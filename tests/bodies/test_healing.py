@@ -21,6 +21,7 @@ from fluoro_calib_ros.bodies.rig_adjustment import (
     ObservedBodies,
     Poses,
     RigAdjustment,
+    _errors,
     _Linear,
     rig_errors,
 )
@@ -114,6 +115,18 @@ def test_derivatives_are_those_of_differences():
             back = replace(poses, centre_mm=poses.centre_mm - step)
             found = (residual(values, back) - residual(values, ahead))[:, row] / 2e-4
             np.testing.assert_allclose(linear.by_pose(row)[..., axis], found, atol=1e-5)
+
+
+def test_errors_of_points_are_of_their_scale_of_each_and_of_all_together():
+    rng = np.random.default_rng(3)
+    points = rng.uniform(-50, 50, (20, 3))
+    arm = points - points.mean(axis=0)
+    shift = np.tile([0.3, 0.0, 0.4], 20)
+    turn = np.cross([0.0, 0.01, 0.0], arm).ravel()
+    found = _errors(points, np.stack([shift, turn, 1e-3 * arm.ravel()], axis=1))
+    assert found.scale == pytest.approx(1e-3)
+    assert found.place_mm == pytest.approx(1e-3 * np.sqrt(np.mean(arm**2)))
+    assert found.common_mm == pytest.approx(np.sqrt(0.5**2 + np.sum(turn**2) / 20))
 
 
 def test_error_of_a_correction_counts_once():

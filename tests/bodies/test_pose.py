@@ -210,6 +210,26 @@ def test_two_markers_give_no_pose_alone():
     assert not found.alone[0] and np.isnan(found.rotation).all()
 
 
+def test_a_prediction_that_all_markers_contradict_rejects_none():
+    """A body that has been hit, of which the exposure alone does not give the pose."""
+    rng = np.random.default_rng(8)
+    rig = orientation()
+    given = body(rng, 4)
+    points = given.xyz_mm - given.centre
+    uv = project(rig, points + [2.0, -1.0, 2.0]) + rng.normal(0, 0.2, (2, 4, 2))
+    uv[:, 2:] = np.nan
+    start = Prediction(
+        np.eye(3)[None],
+        np.zeros((1, 3)),
+        np.diag([0.1**2] * 3 + [1e-3**2] * 3)[None],
+        known=np.ones(1, dtype=bool),
+        weak=np.ones(1, dtype=int),
+    )
+    found = PoseSolver(rig, [given]).solve(exposure(rig, given.target_id, uv, Noise(0.2)), start)
+    assert not found.alone[0]
+    assert found.used[0].tolist() == [True, True, False, False]
+
+
 def test_markers_on_a_line_give_no_rotation_about_it():
     rng = np.random.default_rng(7)
     rig = orientation()

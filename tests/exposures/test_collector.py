@@ -348,6 +348,16 @@ def test_empty_areas_are_named_the_emptiest_first():
     assert readiness(10, coverage).advice.startswith('5 more, ')
 
 
+@pytest.mark.parametrize(('columns', 'missing'), [(29, (2, 5, 8)), (30, ())])
+def test_areas_are_named_below_85_percent(columns, missing):
+    """The last area has 11 of 32 columns; a point covers the column beside it, too."""
+    coverage = Coverage(SIZE)
+    width, height = np.array(SIZE) / 32
+    u, v = np.meshgrid((np.arange(columns) + 0.5) * width, (np.arange(32) + 0.5) * height)
+    coverage.add(np.stack([u.ravel(), v.ravel()], axis=1) - 0.5)
+    assert coverage.missing_areas == missing
+
+
 def test_a_round_field_of_view_has_no_corners():
     """Those of an image intensifier hold no bead, whatever is shown."""
     whole = Coverage(SIZE)

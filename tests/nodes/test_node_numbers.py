@@ -53,6 +53,7 @@ from fluoro_calib_ros.nodes.image_stream import ExposureQueue, ImageStream
 from fluoro_calib_ros.nodes.reconstruction_output import PointsCounter
 from fluoro_calib_ros.nodes.recorder_node import qos_document, type_hash_text
 from fluoro_calib_ros.nodes.rig_input import RigInput
+from fluoro_calib_ros.nodes.runtime import diagnostics
 from fluoro_calib_ros.nodes.runtime.diagnostics import (
     WARN,
     RateLimitedLogger,
@@ -85,6 +86,28 @@ class Log:
 
 def refusals():
     return RefusalLog('frame', RateLimitedLogger(Log()))
+
+
+def test_log_takes_a_burst_then_a_message_a_second_and_counts_the_others(monkeypatch):
+    now = 0.0
+    monkeypatch.setattr(diagnostics, 'time', Fake(monotonic=lambda: now))
+    log = Log()
+    limited = RateLimitedLogger(log)
+    for _ in range(25):
+        limited.warning('late')
+    assert log.lines == {'warning': 20}
+    now = 0.9
+    limited.error('lost')
+    assert log.lines == {'warning': 20}
+    now = 1.1
+    limited.error('lost')
+    limited.error('lost')
+    assert log.lines == {'warning': 20, 'error': 1} and '(6 similar' in log.texts[-1]
+    now = 1000.0  # silence is no credit beyond a burst
+    for _ in range(25):
+        limited.warning('late')
+    assert log.lines == {'warning': 40, 'error': 1}
+    assert '(1 similar' in log.texts[21] and log.texts[22] == 'late'
 
 
 # ---- dashboard

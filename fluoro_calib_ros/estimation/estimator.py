@@ -385,8 +385,7 @@ def coefficients_of(adjustment: Adjustment) -> tuple[np.ndarray, ...]:
 def prior_of_additional(network: Network, f: int) -> NDArray[np.float64]:
     """Prior precision matrix (p, p) of the additional parameters of fluoroscope f."""
     additional = network.additional[f]
-    if additional is None:
-        raise ValueError(f'fluoroscope number {f} has no additional parameters')
+    assert additional is not None
     return additional.prior
 
 

@@ -4,6 +4,7 @@
 """Figures of the demonstration, of results whose errors are known."""
 
 import json
+import re
 from pathlib import Path
 from types import SimpleNamespace as Fake
 
@@ -11,7 +12,9 @@ import numpy as np
 import pytest
 
 from fluoro_calib_ros.demo import assessment
+from fluoro_calib_ros.demo.image_twin import LiveKnee
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
+from fluoro_calib_ros.simulation.knee import landing, virtual_knee
 from fluoro_calib_ros.simulation.rig import DistortionField
 
 BAGS = Path(__file__).parents[2] / 'bags'
@@ -107,3 +110,27 @@ def test_a_calibration_has_the_error_that_its_correction_leaves(truth):
     ]
     assert left[0] < 1e-6
     assert left[1] == pytest.approx(0.1 * left[2], rel=0.05) and left[2] > 0.3
+
+
+def test_live_angles_are_compared_with_those_of_the_same_frame(tmp_path):
+    live = LiveKnee.__new__(LiveKnee)
+    live._knee = virtual_knee(1)
+    live._truth = landing(live._knee, np.arange(40) / 40)
+    off = np.radians([1.0, -2.0, 0.5])
+    sd = np.append(np.radians([0.5, 1.0, 0.25]), [1e-3] * 3)  # [rad] and [m]
+    messages = [
+        Fake(
+            frame_number=number,
+            header=Fake(stamp=Fake(sec=7, nanosec=number)),
+            angle=live._truth.angles[number - 1] + off if number != 9 else np.full(3, np.nan),
+            translation=np.zeros(3),
+            covariance=np.diag(sd**2).ravel(),
+            status=[0],
+        )
+        for number in (5, 9, 31, 12)
+    ]
+    line = live.assess(messages, tmp_path / 'knee.png')
+    assert (tmp_path / 'knee.png').stat().st_size > 1000
+    count, total, *figures = map(float, re.findall(r'\d+(?:\.\d+)?', line.partition('; pic')[0]))
+    assert (count, total) == (3, 40)
+    assert figures == [1.0, 2.0, 0.5, 4.0]  # RMSE of each angle, squared error over its variance

@@ -38,7 +38,16 @@ def test_statistics_of_an_adjustment(calibrated):
     assert statistics.variance_factor == pytest.approx(1, abs=0.12)
     assert statistics.sigma0 == pytest.approx(0.25, rel=0.1)
     assert 0 <= statistics.least_redundancy < statistics.mean_redundancy < 1
-    assert statistics.outliers == (~calibrated[0].runs['a'].after.inliers).sum()
+    run = calibrated[0].runs['a']
+    assert statistics.outliers == (~run.after.inliers).sum()
+    network = run.measured.network
+    of_survey = (run.after.parameters.points_mm - network.survey_mm) / network.survey_sd_mm[
+        :, None
+    ]
+    of_image = run.after.noise.weight(run.after.q) @ run.after.q
+    square = statistics.variance_factor * statistics.degrees_of_freedom
+    assert square == pytest.approx(of_image + np.sum(of_survey**2))
+    assert np.sum(of_survey**2) > 1e-3 * of_image
 
 
 def test_tables_contain_what_the_result_says(calibrated, tmp_path):

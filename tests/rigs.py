@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from fluoro_calib_ros.cli import main
-from fluoro_calib_ros.correction.angle_field import PACKED_SHAPES, AngleField
+from fluoro_calib_ros.correction.angle_field import AngleField
+from fluoro_calib_ros.correction.calibration_record import HARMONICS, SD_GRID, TERMS, VARIANCES
 from fluoro_calib_ros.correction.fluoroscope_calibration import FluoroscopeCalibration
 from fluoro_calib_ros.correction.registry import create_model, no_correction
 from fluoro_calib_ros.errors import DataError
@@ -245,12 +246,11 @@ def turning(
 
     Calibrated are angles of up to +-degrees; size_px: of the coefficients of each harmonic.
     """
-    _, coefficients, variances = PACKED_SHAPES
     rng = np.random.default_rng(5)
     field = AngleField(
         calibration.image_size,
         np.deg2rad(np.linspace(-degrees, degrees, 9)),
-        rng.normal(0, size_px, coefficients),
-        rng.uniform(0, 1e-3, variances),
+        rng.normal(0, size_px, (HARMONICS, 2, TERMS)),
+        rng.uniform(0, 1e-3, (VARIANCES, SD_GRID, SD_GRID)),
     )
     return replace(calibration, angle_field=field)

@@ -21,14 +21,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import map_coordinates
 
-from .calibration_record import HARMONICS, ORDERS, SD_GRID, TERMS, VARIANCES
+from .calibration_record import HARMONICS, ORDERS, SD_GRID, VARIANCES
 from .series import Functions, Series, sd_grid_pixels
 from .terms import CUBIC
 
 PAIRS = [(j, k) for j in range(HARMONICS) for k in range(j, HARMONICS)]
 MAX_DISTANCE = np.deg2rad(15)  # of an angle from the next one that was calibrated
-# Of the arrays that `packed_angles` gives; None: as many as there are exposures.
-PACKED_SHAPES = (None, (HARMONICS, 2, TERMS), (VARIANCES, SD_GRID, SD_GRID))
 
 
 def harmonics(angle: ArrayLike) -> np.ndarray:

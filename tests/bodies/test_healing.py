@@ -4,6 +4,7 @@
 """What has changed in a rig, by the bodies that it sees; views are made without the package."""
 
 from dataclasses import replace
+from types import SimpleNamespace as Fake
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from fluoro_calib_ros.bodies.rig_adjustment import (
     RigAdjustment,
     _errors,
     _Linear,
+    _Mixture,
     rig_errors,
 )
 
@@ -115,6 +117,27 @@ def test_derivatives_are_those_of_differences():
             back = replace(poses, centre_mm=poses.centre_mm - step)
             found = (residual(values, back) - residual(values, ahead))[:, row] / 2e-4
             np.testing.assert_allclose(linear.by_pose(row)[..., axis], found, atol=1e-5)
+
+
+def test_inliers_are_told_from_false_matches_that_lie_anywhere():
+    """One of a hundred, with the density of the image area."""
+    residual = np.array([[0.1, 0.2], [0.8, -0.3], [1.5, 1.0]])[None, None, :, None]
+    variance = np.array([0.04, 0.09, 0.16])[None, None, :, None]
+    scale = np.array([[[1.0, 2.0, 1.0]]])
+    area = 1e6
+    found = _Mixture.of(
+        Fake(_area=area),
+        Fake(residual=residual, good=np.ones((1, 1, 3, 1), dtype=bool)),
+        Fake(variance=variance),
+        Fake(inflation=scale),
+    )
+    of_noise = variance * scale[..., None] ** 2
+    square = np.sum(residual**2, axis=-1) / of_noise
+    density = 0.99 * np.exp(-square / 2) / (2 * np.pi * of_noise)
+    np.testing.assert_allclose(found.inlier(), density / (density + 0.01 / area))
+    # The likelihood, less that of a residual of 0 without the scale.
+    likelihood = (density + 0.01 / area) * 2 * np.pi * variance / 0.99
+    assert found.loss == pytest.approx(-2 * np.log(likelihood).sum())
 
 
 def test_errors_of_points_are_of_their_scale_of_each_and_of_all_together():

@@ -50,6 +50,7 @@ from fluoro_calib_ros.checks.pair_watch import LAGS, PairWatch, SystematicErrorF
 from fluoro_calib_ros.checks.rig import doubtful, motion_between_stamps
 from fluoro_calib_ros.checks.rig_watch import RigDriftWatch
 from fluoro_calib_ros.correction.base import Correction
+from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.findings import Finding, Kind, Place, Severity
@@ -218,6 +219,17 @@ def found_in(made, held=None, sigma=None):
 )
 def test_impossible_results_are_found_at_their_limits(changes, kind):
     assert kinds(found_in(figures(**changes))) == ([] if kind is None else [kind])
+
+
+def test_sigma_is_plausible_within_its_limits():
+    low, high = inputs.SIGMA_PX
+    inputs._validate_sigma(frame(sigma=np.linspace(low, high, 20)))
+    for wrong in (np.nextafter(low, 0), np.nextafter(high, np.inf)):
+        with pytest.raises(DataError) as refused:
+            inputs._validate_sigma(frame(sigma=np.append(np.ones(19), wrong)))
+        assert refused.value.finding.kind is Kind.IMPLAUSIBLE_NUMBER
+        assert refused.value.finding.numbers == {'sigma_px': wrong}
+        assert refused.value.finding.place.target_id == (19,)
 
 
 def test_residuals_may_be_as_large_as_their_sigma_says():

@@ -194,7 +194,7 @@ CLUSTER = ['tibia: 1 2 3']
         ({**PAIR, 'cluster_shapes': 's.csv'}, True),
         ({**PAIR, 'calibration': None}, True),
         ({**PAIR, 'sources': ['x', 'y', 'z']}, True),
-        ({**PAIR, 'fluoroscope': ['a', 'b', 'c']}, True),
+        ({**PAIR, 'fluoroscope': ['a', 'b', 'c']}, False),
     ],
 )
 def test_arguments_of_extract_that_exclude_each_other(changes, is_wrong):

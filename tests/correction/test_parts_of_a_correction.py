@@ -41,6 +41,8 @@ def test_angle_adds_its_change_and_variance_to_the_correction():
         assert np.abs(change).max() > 0.1
         np.testing.assert_allclose(found.sd**2, plain.sd**2 + variance, atol=1e-12)
         assert np.array_equal(found.outside, plain.outside)
+        exact = turned.correct(UV, exact=True, angle=angle)
+        np.testing.assert_allclose(exact.uv, UV - found.duv, atol=1e-12)
     beyond = turned.correction(UV, np.deg2rad(80))
     assert beyond.outside.all()
     unknown = turned.correction(UV)

@@ -75,10 +75,10 @@ def test_image_errors_are_what_no_projective_map_explains(truth):
         for name, noise in (('a', 0.5), ('b', 0.1)):
             ideal = assessment._ideal_projection(rig[name], xyz)
             observed = ideal + rng.normal(0, 5 * noise, ideal.shape)
-            # Another sensor plane: a calibration is known up to that.
-            turned = ideal @ [[1.02, 0.03], [-0.02, 0.97]] + [12.0, -7.0]
+            # Another sensor plane: a calibration is known up to that. Errors are of the true one.
+            turned = 1.5 * ideal @ [[1.02, 0.03], [-0.02, 0.97]] + [12.0, -7.0]
             turned = turned / (1 + turned @ [[2e-5], [-1e-5]])
-            turned += rng.normal(0, noise, ideal.shape)
+            turned += rng.normal(0, 1.5 * noise, ideal.shape)
             sent[name, frame] = (Fake(u=observed[:, 0], v=observed[:, 1]), 0)
             corrected[name, frame] = (Fake(u=turned[:, 0], v=turned[:, 1], target_id=ids), 0)
     errors = assessment.image_errors(BAGS, ['a', 'b'], sent, corrected)

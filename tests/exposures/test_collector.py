@@ -273,6 +273,16 @@ def test_unpaired_frames_are_left_out_and_counted():
     assert unpaired == {'a': 1, 'b': 1}
 
 
+@pytest.mark.parametrize(('gap_ms', 'count'), [(10, 0), (10_000, 2)])
+def test_two_frames_are_exposures_unless_they_are_a_stream(gap_ms, count):
+    """Within the time that the phantom has to be still, nobody moves it to another pose."""
+    frames = {
+        name: [frame(name, 1 + i, i * gap_ms, shift=50.0 * i) for i in range(2)] for name in 'ab'
+    }
+    kept, _ = collect_recorded(frames)
+    assert [len(kept[name]) for name in 'ab'] == [count, count]
+
+
 def test_empty_recording():
     assert collect_recorded({'a': [], 'b': []}) == ({'a': [], 'b': []}, {'a': 0, 'b': 0})
 

@@ -177,6 +177,16 @@ def test_a_silent_fluoroscope_is_awaited_once_and_resumed(by):
     assert pairer.incomplete == 20 and pairer.unpaired == {'a': 0, 'b': 0, 'c': 1}
 
 
+@pytest.mark.parametrize(('row', 'is_awaited'), [(14, False), (15, True)])
+def test_a_silent_fluoroscope_is_awaited_if_it_lags_by_no_more_than_the_patience(row, is_awaited):
+    pairer = exposure_pairer('abc', PairingOptions(patience=5))
+    for other in range(20):
+        paired(pairer, [frame(name, other) for name in 'ab'], flush=False)
+    assert pairer.silent == {'c'}
+    paired(pairer, [frame('c', row)], flush=False)
+    assert pairer.silent == (set() if is_awaited else {'c'}) and pairer.late['c'] == 1
+
+
 def test_a_fluoroscope_that_lags_for_good_does_not_delay_the_others():
     """Far behind, or numbered differently: its frames are counted."""
     for first in (-1000, 1000, 10**6):

@@ -58,6 +58,8 @@ def test_third_fluoroscope_is_compared_too():
 
 def test_frames_without_stamps_are_not_compared():
     assert not disagreement_of_recording(recording(a={}, b={'origin_ns': 0}))
+    third = recording(a={}, b={'origin_ns': 0}, c={'delay_ns': INTERVAL})
+    assert 'a and c' in disagreement_of_recording(third)
 
 
 def test_few_exposures_say_nothing():

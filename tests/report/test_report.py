@@ -180,6 +180,8 @@ def test_summary_holds_the_numbers(job):
     ]
     assert line['observations'] == [str(x.observations) for x in (a, b)]
     assert line['inliers'][::3] == [str(x.inliers) for x in (a, b)]
+    shares = [f'({100 * x.inliers / x.observations:.1f}' for x in (a, b)]
+    assert line['inliers'][1::3] == shares
     model = job.calibrations['a'].model
     assert float(line['median sd of the correction [px]'][0]) == pytest.approx(
         np.median(model.evaluate(model.train_uv).sd), abs=5e-4

@@ -462,7 +462,7 @@ def without_repeats(
 def _groups(images: Mapping[str, Mapping[int, Frame]]) -> list[list[int]]:
     """Numbers of the exposures of each pose, in order."""
     numbers = sorted({number for of_one in images.values() for number in of_one})
-    tables = [_Table(list(of_one.values())) for of_one in images.values()]
+    tables = [_Table(list(of_one.values())) for of_one in images.values() if of_one]
     groups: list[list[int]] = []
     for number in numbers:
         first = np.array([group[0] for group in groups], dtype=np.int64)

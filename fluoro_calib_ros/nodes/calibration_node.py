@@ -26,7 +26,6 @@ from rclpy.lifecycle.node import LifecycleState
 from sensor_msgs.msg import CompressedImage
 
 from ..exposures.frame import Frame
-from ..io.calibration_request import MAX_BYTES
 from .angle_input import AngleInput
 from .calibration_output import CONDITIONS, CalibrationOutput, FluoroscopeState
 from .calibration_services import OrientationService, SelfCalibration
@@ -120,6 +119,11 @@ class CalibrationNode(StreamNode):
             topic, callback = 'reconstruction/drift', self._learning.on_drift
             refusals = RefusalLog(topic, self.limited_logger)
             self.create_input(DriftStatus, topic, callback, observations_qos(), refusals)
+        for name in rig.names:
+            refusals = self._exposures.streams[name].refusals
+            on_radiograph = partial(self._exposures.add_radiograph, name)
+            topic = f'{name}/{RADIOGRAPH}'
+            self.create_input(CompressedImage, topic, on_radiograph, observations_qos(), refusals)
         files.load_at_start()
 
     def create_readers(self) -> None:
@@ -127,13 +131,6 @@ class CalibrationNode(StreamNode):
         faults = stream_faults(self._exposures.streams, self.fail)
         reader = self._angles.create_reader(self, faults)
         for name in self._rig.names:
-            reader.subscribe(
-                CompressedImage,
-                f'{name}/{RADIOGRAPH}',
-                partial(self._on_radiograph, name),
-                observations_qos(),
-                max_bytes=MAX_BYTES,
-            )
             reader.subscribe(
                 TargetObservations,
                 f'{name}/{OBSERVATIONS}',
@@ -173,9 +170,6 @@ class CalibrationNode(StreamNode):
         self._exposures.add(name, frame, angle)
         self._healing.add(name, frame, angle)
         self._learning.add(name, frame, angle)
-
-    def _on_radiograph(self, name: str, message: CompressedImage, _: Mapping[str, int]) -> None:
-        self._exposures.add_radiograph(name, message)
 
     def _on_pair(self, pair: Mapping[str, Frame]) -> None:
         self._orienting.add(pair)

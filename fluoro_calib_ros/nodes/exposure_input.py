@@ -23,6 +23,7 @@ from ..exposures.frame import Frame, Frames, validate_frame
 from ..exposures.pairing import CompletePairer
 from ..exposures.phantom import Phantom
 from ..images.codec import JPEG_START
+from ..io.calibration_request import MAX_BYTES
 from .calibration_output import CalibrationOutput
 from .calibration_settings import (
     NOT_ACTIVE,
@@ -202,10 +203,11 @@ class ExposureInput:
             stream.refusals.refuse(error)
 
     def add_radiograph(self, name: str, message: CompressedImage) -> None:
-        """Take a small radiograph; what is no JPEG is refused."""
+        """Take a small radiograph; what is none is refused."""
         jpeg = bytes(message.data)
-        if not jpeg.startswith(JPEG_START):
-            self.streams[name].refusals.refuse(DataError(f'{name}/{RADIOGRAPH}: this is no JPEG'))
+        if len(jpeg) > MAX_BYTES or not jpeg.startswith(JPEG_START):
+            error = DataError(f'{name}/{RADIOGRAPH}: this is no small JPEG')
+            self.streams[name].refusals.refuse(error)
             return
         stamp = message.header.stamp
         with self._lock:

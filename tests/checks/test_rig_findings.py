@@ -197,7 +197,7 @@ def test_check_of_a_rig_is_the_scatter_of_each_pair_against_noise_and_prediction
     assert of_b.numbers == {'ratio': 2.5, 'noise_px': 0.3}
     assert (of_c.value, of_c.limit) == (0.4, 0.8) and of_c.passed
     assert of_c.place == Place(('a', 'c'), name=ORIENTED)
-    assert '0.40 px, 0.8 times' in of_c.cause and of_c.advice == rig.CAPTURE
+    assert '0.400 px, 0.8 times' in of_c.cause and of_c.advice == rig.CAPTURE
     (of_b, _) = check_rig(
         RigFindings(
             ('a', 'b', 'c'),

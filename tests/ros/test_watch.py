@@ -40,7 +40,7 @@ def test_session_is_run_from_the_dashboard(graph, watch, exposures, tmp_path):
     assert fluoroscope().next_pose == 'show the phantom and keep it still'
     watch.request('calibrate_fast')
     client.wait_until(
-        lambda: any('calibrate failed' in line for line in watch.state().log),
+        lambda: any('0 exposures are too few' in line for line in watch.state().log),
         what='the refusal of a calibration without exposures',
     )
     assert not watch.state().job

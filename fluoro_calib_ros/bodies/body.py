@@ -14,6 +14,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..brief import brief_repr
 from ..errors import DataError
 from ..photogrammetry.rotations import cross_matrix
 
@@ -42,6 +43,8 @@ class Body:
     covariance_mm2 : (3 m, 3 m) ndarray
         Of the coordinates relative to each other; by default sd_mm, independent of each other.
     """
+
+    __repr__ = brief_repr
 
     name: str
     target_id: NDArray[np.int64]
@@ -221,6 +224,8 @@ class BodyPoses:
     status : (T,) ndarray
         PoseStatus as uint8.
     """
+
+    __repr__ = brief_repr
 
     body: str
     number: NDArray[np.int64]

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from ..brief import brief_repr
 from ..errors import DataError
 from ..photogrammetry.rotations import cross_matrix, matrix_from_vector
 from .anatomical_frames import AXES, BODY_FRAME, AnatomicalFrame, Convention, convention
@@ -75,6 +76,8 @@ class Joint:
         Of the neutral rotation, about the proximal axes [rad^2].
     """
 
+    __repr__ = brief_repr
+
     name: str
     proximal: str
     distal: str
@@ -113,6 +116,8 @@ class JointMotion:
     status : (T,) ndarray
         JointStatus as uint8.
     """
+
+    __repr__ = brief_repr
 
     joint: Joint
     number: NDArray[np.int64]

@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from ..brief import brief_repr
 from ..errors import DataError
 from ..findings import Finding, Kind, Place, Severity
 from ..photogrammetry.rotations import cross_matrix
@@ -86,6 +87,8 @@ class EstimatedShape:
 @dataclass(frozen=True)
 class LearnedShapes:
     """Shapes of bodies as a healthy rig has seen them."""
+
+    __repr__ = brief_repr
 
     #: with the covariance of their coordinates; without markers that were not seen
     bodies: tuple[Body, ...]

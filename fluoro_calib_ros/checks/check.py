@@ -9,6 +9,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
+from ..brief import brief_repr
 from ..findings import Finding, Kind, Place, Severity, sentence_of
 
 GOOD_EXPOSURES = 15  # with fewer, more exposures are the first advice
@@ -80,6 +81,8 @@ class Validation:
     notes : tuple of Finding
         What a user has to know beside the verdict, such as what it takes on trust.
     """
+
+    __repr__ = brief_repr
 
     verdict: str
     checks: tuple[Check, ...]

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..brief import brief_repr
 from ..errors import DataError
 from ..exposures.frame import Frame, points_on_image
 from ..exposures.phantom import Phantom
@@ -104,6 +105,8 @@ class CorrectedPoints:
     `CorrectionStatus`. uv and sigma are NaN where the status is INVALID.
     """
 
+    __repr__ = brief_repr
+
     uv: np.ndarray
     sigma: np.ndarray
     status: np.ndarray
@@ -126,6 +129,8 @@ class FluoroscopeCalibration:
     seconds : float
         Time the calibration took; NaN where it was read from a file.
     """
+
+    __repr__ = brief_repr
 
     fluoroscope: str
     image_size: tuple[int, int]

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..brief import brief_repr
 from ..correction.registry import (
     LookupModel,
     grid_nodes,
@@ -355,6 +356,8 @@ class CalibrationRequest:
     about : mapping of str to str
         What the report says of rig and input, such as site and operator; no calculation uses it.
     """
+
+    __repr__ = brief_repr
 
     frames: Frames
     phantom: Phantom

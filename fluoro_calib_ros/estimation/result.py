@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from ..brief import brief_repr
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..exposures.phantom import Phantom
 from ..findings import Finding
@@ -101,6 +102,8 @@ class CalibrationResult:
     solved : dict of str to SolvedNetwork
         What the covariance matrix of all unknowns is computed from, by the names of the history.
     """
+
+    __repr__ = brief_repr
 
     fluoroscopes: dict[str, FluoroscopeResult]
     calibrations: dict[str, FluoroscopeCalibration]

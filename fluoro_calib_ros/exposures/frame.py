@@ -23,6 +23,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..brief import brief_repr
 from ..errors import DataError
 from ..findings import Finding, Kind, Place, Severity, first_few
 from .phantom import Phantom, first_repeated, is_positive
@@ -54,6 +55,8 @@ class Frame:
         Angle of the C-arm [rad], None where it is unknown. It is rounded to a microdegree, so that
         files in degrees give the same numbers.
     """
+
+    __repr__ = brief_repr
 
     fluoroscope: str
     number: int
@@ -282,6 +285,8 @@ class MovingPoints:
     sd_mm : (n,) ndarray
         Standard deviation of each coordinate [mm].
     """
+
+    __repr__ = brief_repr
 
     exposure: NDArray[np.int64]
     target_id: NDArray[np.int64]

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..brief import brief_repr
 from ..errors import DataError
 from ..findings import Kind
 
@@ -39,6 +40,8 @@ class Phantom:
     diameter_mm : (n,) ndarray, optional
         Of the beads [mm], where it is known.
     """
+
+    __repr__ = brief_repr
 
     target_id: NDArray[np.int64]
     xyz_mm: NDArray[np.float64]

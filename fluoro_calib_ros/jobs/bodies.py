@@ -19,6 +19,7 @@ from ..bodies.butterworth import filtered_poses
 from ..bodies.joints import JointMotion, joint_motion, with_neutral
 from ..bodies.shapes import EstimatedShape, estimate_shape, places_of
 from ..bodies.tracking import BodyTracker, TrackedExposure, poses_alone, poses_of
+from ..brief import brief_repr
 from ..checks.rig_watch import DriftVerdict, RecordingDriftWatch
 from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
 from ..errors import DataError
@@ -181,6 +182,8 @@ class BodiesOutcome:
         Frames without partner, by fluoroscope.
     findings : tuple of Finding
     """
+
+    __repr__ = brief_repr
 
     shapes: tuple[EstimatedShape, ...]
     exposures: list[TrackedExposure]

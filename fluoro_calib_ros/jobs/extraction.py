@@ -13,6 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from ..brief import brief_repr
 from ..errors import DataError
 from ..exposures.frame import Frame
 from ..exposures.phantom import Phantom
@@ -80,6 +81,8 @@ class ExtractionRequest:
         Whether results keep their images, reduced to RADIOGRAPH_PX.
     """
 
+    __repr__ = brief_repr
+
     sources: Sequence[Path]
     phantom: Phantom
     fluoroscope: str
@@ -95,6 +98,8 @@ class ExtractionRequest:
 @dataclass(frozen=True)
 class ExtractionOutcome:
     """Results of all images of a fluoroscope, in the order of their exposures, and notes."""
+
+    __repr__ = brief_repr
 
     fluoroscope: str
     results: tuple[ImageResult, ...]

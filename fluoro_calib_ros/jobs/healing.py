@@ -29,6 +29,7 @@ from ..bodies.healing import (
 )
 from ..bodies.rig_adjustment import ObservedBodies, Poses, RigAdjustment, RigErrors, rig_errors
 from ..bodies.shapes import LearnedShapes
+from ..brief import brief_repr
 from ..checks.check import Check, verdict_of
 from ..correction.base import CorrectionStatus
 from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration, with_drift
@@ -88,6 +89,8 @@ class HealingOutcome:
     exposures : int
         That were used for the diagnosis.
     """
+
+    __repr__ = brief_repr
 
     diagnosis: Diagnosis
     healed: HealedRig | None

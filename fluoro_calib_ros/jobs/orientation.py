@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtri
 
+from ..brief import brief_repr
 from ..checks.held_out import uncorrected
 from ..checks.inputs import require_phantom
 from ..correction.fluoroscope_calibration import Calibrations
@@ -46,6 +47,8 @@ class OrientationOutcome:
     findings : tuple of Finding
         What is doubtful about it, and what has changed.
     """
+
+    __repr__ = brief_repr
 
     orientation: RigOrientation
     targets: int

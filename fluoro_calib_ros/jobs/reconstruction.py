@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..bodies.body import Body
+from ..brief import brief_repr
 from ..checks.rig_watch import DriftVerdict, RecordingDriftWatch
 from ..correction.fluoroscope_calibration import Calibrations, ids_of
 from ..errors import DataError
@@ -79,6 +80,8 @@ class ReconstructionOutcome:
     cause : Finding or None
         Why, where the factor is the largest and a trial tells it.
     """
+
+    __repr__ = brief_repr
 
     frames: list[ReconstructedFrame]
     unpaired: Mapping[str, int]

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..brief import brief_repr
 from ..correction.angle_field import note_on_angles
 from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
 from ..errors import DataError, ErrorsAt
@@ -128,6 +129,8 @@ class BagSelection:
 @dataclass(frozen=True)
 class Survey:
     """A phantom, the names of its beads, and what a user has to know about them."""
+
+    __repr__ = brief_repr
 
     phantom: Phantom
     names: Names

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from ..brief import brief_repr
 from ..checks.check import Check, Validation, verdict_of
 from ..checks.survey import (
     check_survey,
@@ -59,6 +60,8 @@ class SurveyRequest:
         Whether beads that cannot be surveyed keep their given coordinates; else they are left out.
     """
 
+    __repr__ = brief_repr
+
     frames: Frames
     given: Phantom
     distances: Sequence[MeasuredDistance] = ()
@@ -93,6 +96,8 @@ class SurveyOutcome:
     result : CalibrationResult
         The self-calibration behind it.
     """
+
+    __repr__ = brief_repr
 
     phantom: Phantom
     beads: SurveyedBeads

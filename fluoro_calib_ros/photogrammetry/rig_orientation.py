@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..brief import brief_repr
 from ..errors import DataError
 from .collinearity import project_with_jacobian
 from .rotations import (
@@ -74,6 +75,8 @@ class RigOrientation:
     orientation_id : str
         Digest of the content.
     """
+
+    __repr__ = brief_repr
 
     fluoroscopes: tuple[str, ...]
     interior: NDArray[np.float64]
@@ -412,6 +415,8 @@ class KnownOrientation:
         Standard deviations of each coordinate of the source [mm] and of each angle [rad]; None:
         they are fixed.
     """
+
+    __repr__ = brief_repr
 
     interior: NDArray[np.float64]
     rotation: NDArray[np.float64]

@@ -8,6 +8,7 @@ import os
 import sys
 
 import pytest
+from dds_ports import own_ports
 
 try:
     from xdist.scheduler import LoadFileScheduling
@@ -32,6 +33,13 @@ def pytest_collection_finish() -> None:
     """Collect garbage again, but not that of the tests and modules, which stay."""
     gc.freeze()
     gc.enable()
+
+
+@pytest.fixture(scope='session', autouse=True)
+def ports(tmp_path_factory):
+    """Reserve ports before any test makes a node: Fast DDS reads its profile once."""
+    with own_ports(tmp_path_factory.mktemp('dds')):
+        yield
 
 
 ROS = ('tests/ros 1', 'tests/ros 2')

@@ -9,8 +9,9 @@ import shutil
 import subprocess
 
 import pytest
+from dds_ports import free_domain
 from node_server import NodeServer
-from ros_graph import BAGS, ROOT, Graph, entry_point, free_domain
+from ros_graph import BAGS, ROOT, Graph, entry_point
 
 from fluoro_calib_ros.io.bags.reader import read_frames
 

@@ -5,20 +5,18 @@
 deadline.
 """
 
-import fcntl
 import itertools
 import os
 import signal
-import socket
 import subprocess
 import sys
-import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
 import rclpy
 from action_msgs.msg import GoalStatus
+from dds_ports import free_domain
 from diagnostic_msgs.msg import DiagnosticArray
 from fluoro_calib_msgs.action import Heal, SelfCalibrate
 from fluoro_calib_msgs.msg import (
@@ -99,40 +97,6 @@ SERVICES = {
     'roll_back_healing': Reset,
     'save_calibration': SaveCalibration,
 }
-
-
-def domains_with_stale_ports():
-    """Return the ROS domains of which processes have left ports in shared memory."""
-    names = os.listdir('/dev/shm')
-    ports = (name.removeprefix('fastrtps_port') for name in names)
-    return {(int(port) - 7400) // 250 for port in ports if port.isdecimal()}
-
-
-_next_domain = itertools.count(os.getpid())
-
-
-def free_domain():
-    """Return an unused ROS domain of this machine, and the open lock file that reserves it.
-
-    The domain used last comes up again last, and behind all others one in which a killed process
-    has left ports in shared memory: Fast DDS may take them for broken ones, and messages are lost.
-    """
-    first = next(_next_domain)
-    domains = [1 + (first + i) % 100 for i in range(100)]
-    stale = domains_with_stale_ports()
-    for domain in sorted(domains, key=stale.__contains__):
-        path = Path(tempfile.gettempdir()) / f'fluoro_calib_test_domain_{domain}.lock'
-        lock = open(path, 'a')  # noqa: SIM115 the lock is held by the caller
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # other sessions of these tests
-            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as port:
-                port.bind(
-                    ('', 7400 + 250 * domain + 10)
-                )  # any other first participant of the domain
-            return domain, lock
-        except OSError:
-            lock.close()
-    raise RuntimeError('all ROS domains from 1 to 100 are in use on this machine')
 
 
 def lost_ports(name, pid):

@@ -6,6 +6,7 @@
 import contextlib
 import functools
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from fluoro_calib_ros.correction.registry import create_model, no_correction
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.calibrate import calibrate
 from fluoro_calib_ros.estimation.options import CalibrationOptions
+from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.photogrammetry.collinearity import project, project_with_jacobian
 from fluoro_calib_ros.photogrammetry.network import Network
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
@@ -48,6 +50,37 @@ def refused(kind, **numbers):
 def kinds(findings):
     """Kinds of findings, in their order."""
     return [found.kind for found in findings]
+
+
+def adjusted(noise_px, **rmse):
+    """Return what checks take of an adjustment of frames of two points: result, calibrations,
+    frames.
+
+    noise_px: of the calibrations. rmse: {fluoroscope: (before, after)} of its residuals [px].
+    """
+    names = [*rmse]
+    frames = {
+        n: [Frame(n, 1, np.array([3, 7]), np.full((2, 2), 500.0), (1024, 1024))] for n in names
+    }
+    table = SimpleNamespace(
+        fluoroscope=np.repeat(names, 2),
+        exposure=np.ones(2 * len(names), dtype=int),
+        target_id=np.tile([3, 7], len(names)),
+        residual=np.concatenate([np.full((2, 2), after) for _, after in rmse.values()]),
+        outlier=np.zeros(2 * len(names), dtype=bool),
+    )
+    figures = {
+        n: SimpleNamespace(rmse_before=np.full(2, before), rmse_after=np.full(2, after))
+        for n, (before, after) in rmse.items()
+    }
+    noise = SimpleNamespace(
+        noise_sd=lambda frame: np.full(2, noise_px) if frame.sigma is None else frame.sigma
+    )
+    return (
+        SimpleNamespace(fluoroscopes=figures, residuals=table),
+        dict.fromkeys(names, noise),
+        frames,
+    )
 
 
 @functools.cache

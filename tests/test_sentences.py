@@ -15,7 +15,15 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from rigs import calibrated, exposures, rig, small_network, true_calibrations, true_orientation
+from rigs import (
+    adjusted,
+    calibrated,
+    exposures,
+    rig,
+    small_network,
+    true_calibrations,
+    true_orientation,
+)
 
 from fluoro_calib_ros.bodies.body import Body
 from fluoro_calib_ros.bodies.healing import Cause, Change
@@ -266,6 +274,12 @@ def principal_distance():
         return plausibility._wrong_given_distance(calibration)
 
 
+def corrected_already():
+    result, *others = adjusted(0.25, a=(2.0, 2.0))
+    without, *_ = adjusted(0.25, a=(2.0, 0.2))
+    return held_fit.corrected_already(result, without, *others)
+
+
 def principal_point():
     calibration = true_calibrations(rig().fluoroscopes)['a']
     interior = np.array([4000.0, 500.0, 4000.0])
@@ -445,15 +459,8 @@ MAKERS = {
     ),
     Kind.PRINCIPAL_POINT_OFF: principal_point,
     Kind.WRONG_PRINCIPAL_DISTANCE: principal_distance,
-    Kind.CORRECTED_ALREADY: lambda: held_fit.corrected_already(
-        Fake(fluoroscopes={'a': Fake(rmse_after=(2.0, 2.0))}),
-        Fake(fluoroscopes={'a': Fake(rmse_after=(0.2, 0.2))}),
-        {'a': Fake(image_sd=0.25)},
-    ),
-    Kind.POOR_CALIBRATION_FIT: lambda: held_fit.poor_fits(
-        Fake(fluoroscopes={'a': Fake(rmse_after=(2.0, 2.0), rmse_before=(2.0, 2.0))}),
-        {'a': Fake(image_sd=0.25)},
-    )[0],
+    Kind.CORRECTED_ALREADY: corrected_already,
+    Kind.POOR_CALIBRATION_FIT: lambda: held_fit.poor_fits(*adjusted(0.25, a=(2.0, 2.0)))[0],
     Kind.NO_COMMON_TARGETS: lambda: epipolar.UNMATCHED,
     Kind.PAIRS_CONTRADICT: lambda: about_pairs(unexplained=20.0),
     Kind.PAIRS_EXCLUDED: lambda: about_pairs(used=np.arange(8) != 4),

@@ -17,6 +17,8 @@ from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibr
 from ..correction.registry import no_correction
 from ..errors import DataError
 from ..estimation.result import CalibrationResult
+from ..estimation.rounds import ResidualTable
+from ..exposures.frame import Frame, Frames
 from ..findings import Finding, Kind, Place
 from ..photogrammetry.noise import INLIER_Q
 from .calibration_evidence import Evidence, Subject
@@ -29,7 +31,7 @@ from .residual_tests import RejectedExposure, noise_of, residuals_of
 # more, it is not theirs: the image has changed, the fluoroscopes are interchanged, or the image
 # points are corrected already.
 
-MAX_NOISE = 2.0  # RMSE over the noise of an image coordinate of the calibration
+MAX_NOISE = 2.0  # RMSE of image points over their noise
 CORRECTED = 0.6  # RMSE without the correction over that with it, of points that are corrected
 
 
@@ -46,24 +48,51 @@ def uncorrected(calibrations: Calibrations) -> dict[str, FluoroscopeCalibration]
     }
 
 
-def misfits(result: CalibrationResult, calibrations: Calibrations) -> dict[str, float]:
-    """Return the RMSE over the noise of each fluoroscope whose exposures a calibration misfits."""
+def misfits(
+    result: CalibrationResult, calibrations: Calibrations, frames: Frames
+) -> dict[str, float]:
+    """Return the residuals over their noise of each fluoroscope that its calibration misfits."""
     ratios = {
-        name: _rmse(figures.rmse_after) / calibrations[name].image_sd
-        for name, figures in result.fluoroscopes.items()
+        name: _lack_of_fit(result.residuals, calibrations[name], (name, frames[name]))
+        for name in result.fluoroscopes
     }
     return {name: ratio for name, ratio in ratios.items() if ratio > MAX_NOISE}
 
 
+def _lack_of_fit(
+    table: ResidualTable | None,
+    calibration: FluoroscopeCalibration,
+    seen: tuple[str, Sequence[Frame]],
+) -> float:
+    """Return the RMSE of image points that are no false matches, over their noise.
+
+    seen: a fluoroscope, and its frames. NaN where residuals were not kept.
+    """
+    if table is None:
+        return float('nan')
+    name, frames = seen
+    ratios = []
+    for frame in frames:
+        rows = (table.fluoroscope == name) & (table.exposure == frame.number) & ~table.outlier
+        ordered = frame.sorted()
+        place = np.searchsorted(ordered.target_id, table.target_id[rows])
+        noise = calibration.noise_sd(ordered)[place]
+        ratios.append(table.residual[rows] / noise[:, None])
+    return _rmse(np.concatenate(ratios))
+
+
 def corrected_already(
-    result: CalibrationResult, without: CalibrationResult, calibrations: Calibrations
+    result: CalibrationResult,
+    without: CalibrationResult,
+    calibrations: Calibrations,
+    frames: Frames,
 ) -> Finding | None:
     """Return a finding on the fluoroscopes whose image points are corrected already.
 
     without: the adjustment with the `uncorrected` calibrations, which fits their exposures.
     """
-    fit = misfits(without, calibrations)
-    names = [name for name in misfits(result, calibrations) if name not in fit]
+    fit = misfits(without, calibrations, frames)
+    names = [name for name in misfits(result, calibrations, frames) if name not in fit]
     if not names:
         return None
     one, other = (
@@ -84,15 +113,14 @@ def _rmse(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def poor_fits(result: CalibrationResult, calibrations: Calibrations) -> list[Finding]:
+def poor_fits(
+    result: CalibrationResult, calibrations: Calibrations, frames: Frames
+) -> list[Finding]:
     """Return a finding for every fluoroscope whose exposures its calibration does not fit."""
     out = []
-    for name, figures in result.fluoroscopes.items():
-        after = _rmse(figures.rmse_after)
-        noise = calibrations[name].image_sd
-        if after <= MAX_NOISE * noise:
-            continue
-        before = _rmse(figures.rmse_before)
+    for name, ratio in misfits(result, calibrations, frames).items():
+        after = _rmse(result.fluoroscopes[name].rmse_after)
+        before = _rmse(result.fluoroscopes[name].rmse_before)
         kind = Kind.POOR_CALIBRATION_FIT
         why = 'the image has changed, or the calibration is that of another fluoroscope'
         if before < CORRECTED * after:
@@ -101,11 +129,11 @@ def poor_fits(result: CalibrationResult, calibrations: Calibrations) -> list[Fin
         out.append(
             Finding(
                 kind,
-                f'RMSE {after:.2f} px with the calibration fixed, {after / noise:.1f} times the '
-                'noise with which it was determined',
+                f'RMSE {after:.2f} px with the calibration fixed, {ratio:.1f} times the noise '
+                'with which it was determined',
                 Place((name,)),
                 why,
-                numbers={'rmse_px': after, 'ratio': after / noise},
+                numbers={'rmse_px': after, 'ratio': ratio},
             )
         )
     return out

@@ -90,12 +90,12 @@ def adjust(
     cleaned, strays = frames_without_strays(frames, phantom)
     require_phantom(cleaned, phantom)
     result = adjust_with_calibrations(cleaned, phantom, used, loss)
-    if misfits(result, used):
+    if misfits(result, used, cleaned):
         without = adjust_with_calibrations(cleaned, phantom, uncorrected(used), loss)
-        corrected = corrected_already(result, without, used)
+        corrected = corrected_already(result, without, used, cleaned)
         if corrected is not None:
             raise DataError(corrected)
-    findings = (*strays, *result.findings, *poor_fits(result, used))
+    findings = (*strays, *result.findings, *poor_fits(result, used, cleaned))
     return replace(result, findings=findings)
 
 

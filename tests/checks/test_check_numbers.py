@@ -392,24 +392,15 @@ def test_rejected_points_that_agree_are_told_where_no_exposure_stands_out(
         assert of_one.unit == '1' and of_one.passed is (outside < 50)
 
 
-def adjusted(**rmse):
-    return Fake(
-        fluoroscopes={
-            name: Fake(rmse_before=np.full(2, before), rmse_after=np.full(2, after))
-            for name, (before, after) in rmse.items()
-        }
-    )
-
-
 def test_fit_is_poor_from_a_multiple_of_the_noise_and_corrected_if_it_was_better_before():
-    noise = {name: Fake(image_sd=0.5) for name in 'abc'}
     limit = held_out.MAX_NOISE * 0.5
-    result = adjusted(
+    adjusted = rigs.adjusted(
+        0.5,
         a=(9.0, 0.99 * limit),
         b=(held_out.CORRECTED * 1.01 * 1.01 * limit, 1.01 * limit),
         c=(held_out.CORRECTED * 0.99 * 1.01 * limit, 1.01 * limit),
     )
-    found = held_out.poor_fits(result, noise)
+    found = held_out.poor_fits(*adjusted)
     assert kinds(found) == [Kind.POOR_CALIBRATION_FIT, Kind.CORRECTED_ALREADY]
     assert [one.place.fluoroscopes for one in found] == [('b',), ('c',)]
     for one in found:
@@ -417,12 +408,13 @@ def test_fit_is_poor_from_a_multiple_of_the_noise_and_corrected_if_it_was_better
         assert one.numbers['ratio'] == pytest.approx(1.01 * held_out.MAX_NOISE)
 
 
-def test_misfits_are_of_residuals_over_the_noise():
-    result = Fake(
-        fluoroscopes={n: Fake(rmse_after=np.array(r)) for n, r in (('a', [3, 4]), ('b', [1, 1]))}
-    )
-    noise = {'a': Fake(image_sd=1.0), 'b': Fake(image_sd=0.5)}
-    assert misfits(result, noise) == {'a': pytest.approx(np.sqrt(12.5))}
+def test_misfits_are_of_residuals_over_the_noise_of_each_image_point():
+    result, calibrations, frames = rigs.adjusted(0.5, a=(9.0, 1.2), b=(9.0, 0.9))
+    assert misfits(result, calibrations, frames) == {'a': pytest.approx(2.4)}
+    frames['a'] = [replace(frames['a'][0], sigma=np.array([0.5, 50.0]))]
+    assert not misfits(result, calibrations, frames)
+    result.residuals.outlier[1] = True
+    assert misfits(result, calibrations, frames) == {'a': pytest.approx(2.4)}
 
 
 # ---- comparison

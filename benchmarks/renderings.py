@@ -427,26 +427,32 @@ def _add_sphere(
 def _perforated(
     bend: Distortion, rotation: np.ndarray, source: np.ndarray, target: Target
 ) -> np.ndarray:
-    """Light (h, w) behind a sheet of steel with holes, the mean over the points of pixels."""
+    """Light (h, w) behind a sheet of steel with holes, the mean over the quarters of pixels.
+
+    Of a quarter on the border of a hole, a part is metal. Without that, centres would be off by
+    0.03 px.
+    """
     holes = cKDTree(target.xyz[:, :2])
     step = (np.arange(2) + 0.5) / 2 - 0.5
     light = np.zeros((SIZE, SIZE))
     reach = np.abs(target.xyz[:, :2]).max(axis=0) + target.diameter.min()
-    largest = target.diameter.max() / 2
+    largest = target.diameter.max() / 2 + 1.0
     radius = np.append(target.diameter / 2, 0.0)
     for b, a in product(step, step):
         v, u = np.mgrid[:SIZE, :SIZE]
         xy = (bend.undistorted(np.stack([u + a, v + b], -1)) - (SIZE - 1) / 2) / PRINCIPAL_PX
         ray = np.concatenate([xy, np.ones((SIZE, SIZE, 1))], -1) @ rotation
-        metal = np.zeros((SIZE, SIZE))
+        slant = np.linalg.norm(ray, axis=-1) / np.abs(ray[..., 2])
+        passed = np.ones((SIZE, SIZE))
         for face in (-0.5, 0.5):
             way = (face * SHEET_MM - source[2]) / ray[..., 2]
             place = source[:2] + way[..., None] * ray[..., :2]
             away, nearest = holes.query(place, distance_upper_bound=largest)
             on_sheet = (np.abs(place) < reach).all(axis=-1)
-            metal += 0.5 * (on_sheet & (away > radius[nearest]))
-        slant = np.linalg.norm(ray, axis=-1) / np.abs(ray[..., 2])
-        light += np.exp(-STEEL_PER_MM * SHEET_MM * slant * metal) / 4
+            quarter_mm = 0.5 * np.abs(way) / PRINCIPAL_PX
+            metal = np.clip(0.5 + (away - radius[nearest]) / quarter_mm, 0, 1) * on_sheet
+            passed *= 1 - metal + metal * np.exp(-STEEL_PER_MM * SHEET_MM / 2 * slant)
+        light += passed / 4
     return light
 
 

@@ -22,6 +22,7 @@ from .shadow_fit import (
     DEPTH_SD,
     DISTURBED,
     MARGIN_PX,
+    MIN_INSIDE,
     MIN_PASSED,
     TERMS,
     UNDISTURBED,
@@ -140,8 +141,19 @@ def lack_of_fit(
     noise: Noise,
     size: np.ndarray,
 ) -> NDArray[np.float64]:
-    """Mean squared residuals (n,) over the noise of beads of some sizes (n,)."""
-    fit = _BeadFit(light, uv, relative_radius, profile=profile, noise=noise, size=size)
+    """Mean squared residuals (n,) over the noise of beads of some sizes (n,).
+
+    No window is smaller than that of a typical bead: a small shadow has to explain what is there.
+    """
+    fit = _BeadFit(
+        light,
+        uv,
+        relative_radius,
+        profile=profile,
+        noise=noise,
+        size=size,
+        reach_px=profile.reach_px,
+    )
     fit.run(FIRST_STEPS)
     return fit.misfit
 
@@ -166,7 +178,8 @@ class _BeadFit(ShadowFit):
         step = np.log1p(RADIUS_SD)
         kinds, self.kind = np.unique(np.rint(np.log(self.size) / step), return_inverse=True)
         self.shadows = Shadows([profile.sized(float(np.exp(step * one))) for one in kinds])
-        reach = max(profile.reach_px, reach_px) * float(self.radius.max(initial=1.0))
+        own_reach = np.maximum(profile.reach_px * self.size, reach_px) * self.stretch
+        reach = float(own_reach.max(initial=profile.reach_px))
         window = reach + MARGIN_PX
         super().__init__(
             SETTINGS, profile, noise=noise, uv=uv, depth=np.ones(len(uv)), window_px=window
@@ -174,8 +187,10 @@ class _BeadFit(ShadowFit):
         self.measured = np.zeros(len(uv), dtype=bool)
         self.disturbed = np.zeros(len(uv), dtype=bool)
         self.plane_only = False
+        self.residual = np.zeros((len(uv), len(self.offset)), dtype=np.float32)  # of the last step
+        self.counted = np.zeros(self.residual.shape, dtype=bool)
         self._set_groups(self._near(window + reach))
-        self._read(light)
+        self._read(light, own_reach + MARGIN_PX)
 
     def _near(self, together: float) -> np.ndarray:
         """Neighbours (n, k) of the beads, -1 for none; notes the distances of the nearest."""
@@ -191,18 +206,20 @@ class _BeadFit(ShadowFit):
         self.distance = np.where(other, distance, np.inf).min(axis=1)
         return near[:, : count - 1]
 
-    def _read(self, light: Light) -> None:
-        """Read the windows (n, m) around the beads."""
+    def _read(self, light: Light, window_px: np.ndarray) -> None:
+        """Read the windows (n, m) around the beads, each with a radius (n,) of its own."""
         height, width = light.grey.shape
         places = self.middle[:, None] + self.offset
         inside = ((places >= 0) & (places < (width, height))).all(axis=2)
+        own = (self.offset * self.offset).sum(axis=1) <= window_px[:, None] ** 2
         column = np.clip(places[..., 0], 0, width - 1)
         row = np.clip(places[..., 1], 0, height - 1)
         valid = inside & light.field[row, column]
         grey = light.grey[row, column].astype(np.float32)
         self.low = light.low
         self.high = light.high
-        self._set_windows(grey, valid, bright=np.where(valid, grey, 0.0))
+        self._set_windows(grey, valid & own, bright=np.where(valid, grey, 0.0))
+        self.usable = self.valid.sum(axis=1) >= MIN_INSIDE * own.sum(axis=1)
 
     def run(self, steps: int) -> None:
         """Take Gauss-Newton steps; the last one gives standard deviations as well."""
@@ -313,6 +330,8 @@ class _BeadFit(ShadowFit):
         if final:
             self._note_precision(rows, equations)
             self.measured[rows] = self.usable[rows] & np.isfinite(self.sigma[rows])
+            self.residual[rows] = equations.residual
+            self.counted[rows] = equations.valid
         return np.linalg.solve(equations.matrix, equations.right[..., None])[..., 0]
 
     def absorbed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -331,11 +350,31 @@ class _BeadFit(ShadowFit):
         """Return what was measured."""
         measured = self.measured & np.isfinite(self.uv).all(axis=1)
         typical = float(np.median(self.misfit[measured])) if measured.any() else 1.0
-        beads = self._beads(measured, typical)
+        beads = self._beads(measured, typical, self._noise(measured))
         return replace(
             beads,
             sigma=np.hypot(beads.sigma, self._moved_by_radius()),
         )
+
+    def _noise(self, measured: np.ndarray) -> NDArray[np.float64]:
+        """Lack of fit (n,) beyond what the windows of usual beads show alike.
+
+        Where the shadow is not quite that of a sphere, residuals are alike in all windows. They
+        move no centre against the others, and are no noise.
+        """
+        usual = measured & (self.strength == 0)
+        usual &= self.misfit <= np.median(self.misfit[usual]) if usual.any() else usual
+        n = int(usual.sum())
+        if n < 2:
+            return self.misfit
+        common = self.residual[usual].sum(axis=0)
+        common /= np.maximum(self.counted[usual].sum(axis=0), 1)
+        whole = (self.residual**2 * self.counted).sum(axis=1)
+        rest = ((self.residual - common) ** 2 * self.counted).sum(axis=1)
+        # The mean of n windows has a share of their noise, and is subtracted from each.
+        rest *= np.where(usual, n / (n - 1), n / (n + 1))
+        share = np.minimum(rest / np.maximum(whole, 1e-12), 1.0)
+        return np.where(self.strength > 0, 1.0, share) * self.misfit
 
     def _moved_by_radius(self) -> NDArray[np.float64]:
         """Standard deviations (n,) of centres from that of the radius, 0 for beads alone.

@@ -282,27 +282,32 @@ class ShadowFit(ABC):
     def _add_texture(self) -> None:
         """Give beads a background beyond the polynomial where pixels say so."""
         usual = self.typical()
-        spectra = []
-        usual_residuals = []
+        parts = []
         for rows, near in self.groups:
             light, jacobian = self._model(rows, near)
             grey = self.grey[rows]
             valid = self._valid(rows, grey, light)
-            weight = valid / self.noise.variance(light)
-            residual = grey - light
-            spectra.append(
-                self.cosines.spectra(
-                    jacobian[:, 0], jacobian=jacobian, weight=weight, residual=residual
-                )
-            )
+            root = np.sqrt(valid / self.noise.variance(light)).astype(DTYPE)
             plain = np.flatnonzero(self.misfit[rows] <= usual)[:CORRELATED]
-            usual_residuals.append((residual[plain] * np.sqrt(weight[plain]), valid[plain]))
-        residual, valid = map(np.concatenate, zip(*usual_residuals))
-        self.correlation = self._correlation(residual, valid)
+            parts.append((jacobian, root, (grey - light) * root, plain))
+        residual, valid = (
+            np.concatenate([part[each][part[3]] for part in parts]) for each in (2, 1)
+        )
+        valid = valid > 0
         # Where the shadow is not quite that of a sphere, all windows show it: that is no noise.
         common = residual.sum(axis=0) / np.maximum(valid.sum(axis=0), 1)
+        self.correlation = self._correlation((residual - common) * valid, valid)
+        spectra = [
+            self.cosines.spectra(
+                jacobian[:, 0],
+                jacobian=jacobian,
+                weight=root * root,
+                residual=(standardised - common * (root > 0)) / np.maximum(root, 1e-12),
+            )
+            for jacobian, root, standardised, _ in parts
+        ]
         # The waves are longer than the noise is correlated.
-        excess = float(self._correlation((residual - common) * valid, valid).sum())
+        excess = float(self.correlation.sum())
         rows = np.concatenate([rows for rows, _ in self.groups])
         self.strength[rows] = Spectra.joined(spectra).strengths(excess)
 
@@ -383,14 +388,24 @@ class ShadowFit(ABC):
             independent += float(np.sum(image * image))
         return max(correlated / max(independent, 1e-300), 1.0)
 
-    def _beads(self, measured: np.ndarray, typical: float) -> Beads:
-        """Return what was measured, given the usual lack of fit."""
+    def _beads(
+        self, measured: np.ndarray, typical: float, noise: np.ndarray | None = None
+    ) -> Beads:
+        """Return what was measured, given the usual lack of fit.
+
+        noise: (n,) the part of the lack of fit that is noise; None for all of it.
+        """
         pixels = self.valid.sum(axis=1)
         pooled_freedom = self.settings.pooled
         # The noise of one window is known to some 10 %; that of all windows helps.
-        pooled = (self.misfit * pixels + typical * pooled_freedom) / (pixels + pooled_freedom)
+        usual = typical
+        if noise is None:
+            noise = self.misfit
+        elif measured.any():
+            usual = float(np.median(noise[measured]))
+        pooled = (noise * pixels + usual * pooled_freedom) / (pixels + pooled_freedom)
         by_correlation = ((self.inflation or 1.0) - 1) * self.noise_sigma**2
-        factor = np.sqrt(np.maximum(pooled, typical))
+        factor = np.sqrt(np.maximum(pooled, usual))
         # Where shadows cross, their model is less right than its noise says.
         touching = self.distance < 2 * self.profile.radius_px
         factor = np.where(touching, self.settings.crossed * factor, factor)

@@ -153,3 +153,53 @@ def test_field_of_view_goes_on_beyond_a_plate_and_ends_before_letters():
     light[370:392, 20:110] = 180
     assert field_of_view(light, 3.0)[both].all()
     assert not field_of_view(light, 3.0)[360:, :120].any()
+
+
+def measured_in(
+    image: np.ndarray, uv: np.ndarray, size: np.ndarray, radius_px: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Errors (n, 2) of centres and their standard deviations (n,) [px], sizes (n,) being told."""
+    n = len(uv)
+    light = Light(image, np.ones(image.shape, bool))
+    noise = estimate_noise(image, light.field)
+    shadows = Expected(np.arange(n), uv, np.ones(n), np.ones(n, bool), np.ones(n, bool))
+    imaging = first_imaging(light, noise, shadows, radius_px, size=size)
+    beads = measure_beads(
+        light, uv + 0.2, np.ones(n), profile=imaging.profile, noise=noise, size=size
+    )
+    return beads.uv - uv, beads.sigma
+
+
+def test_what_all_shadows_have_in_common_is_no_noise():
+    """Holes of a thick plate that is tilted: two discs, one for each face."""
+    off = []
+    rng = np.random.default_rng(7)
+    across, count = 8, 64
+    row, column = np.divmod(np.arange(count), across)
+    place = (np.arange(FINE * PITCH * across) + 0.5) / FINE - 0.5
+    for _ in range(2):
+        uv = PITCH * (np.column_stack([column, row]) + 0.5) + rng.uniform(-3, 3, (count, 2))
+        light = np.full((len(place), len(place)), 400.0)
+        for x, y in uv:
+            us, vs = (slice(*np.searchsorted(place, [c - 10, c + 10])) for c in (x, y))
+            for side in (-1, 1):
+                square = (place[vs, None] - y - side * 0.5) ** 2 + (place[us] - x - side) ** 2
+                light[vs, us] *= np.where(square < 6.0**2, 0.6, 1.0)
+        light = cv2.GaussianBlur(light, (0, 0), FINE * 1.2)
+        light = light.reshape(PITCH * across, FINE, PITCH * across, FINE).mean(axis=(1, 3))
+        image = rng.poisson(light).astype(np.float32)
+        error, sigma = measured_in(image, uv, np.ones(count), 6.0)
+        off.append(error / sigma[:, None])
+    assert 0.85 < np.sqrt(np.mean(np.square(off))) < 1.2
+
+
+def test_window_of_a_bead_is_not_that_of_the_largest():
+    """The edge of a plate lies 14 px beside small beads, and within the window of large ones."""
+    radii = np.full(36, 6.0)
+    radii[-3:] = 12.0  # not in the first column
+    image, uv = image_of(radii, 1.2)
+    right = int(np.ceil(uv[::6, 0].max())) + 14
+    image[:, right : right + 12] *= 0.5
+    error, sigma = measured_in(image, uv, radii / 6, 6.0)
+    assert np.abs(error[::6]).max() < 0.08
+    assert sigma[:30:6].max() < 1.3 * np.median(sigma[:30])

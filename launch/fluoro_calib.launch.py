@@ -19,7 +19,7 @@ from ament_index_python.packages import (
     get_package_share_directory,
 )
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch_ros.actions import Node, SetParameter
 
 from fluoro_calib_ros.errors import DataError
@@ -140,14 +140,14 @@ OF_NODE = {
 }
 
 
-def shut_down_if_not_started(event, context):
-    """Shut down where a node could not start, such as with a wrong phantom: exit status 1.
+def fail_if_not_started(event, context):
+    """Raise where a node could not start, such as with a wrong phantom: its exit status is 1.
 
-    A node that crashes later leaves the others running.
+    Launch ends the other nodes then, and its own exit status is 1. A node that crashes later
+    leaves the others running.
     """
     if event.returncode == 1:
-        return [Shutdown(reason=f'{event.process_name} could not start')]
-    return None
+        raise RuntimeError(f'{event.process_name} could not start')
 
 
 def with_rig(values):
@@ -230,7 +230,7 @@ def nodes_of_rig(context):
             arguments=['--ros-args', '--log-level', values['log_level']],
             respawn=values['respawn'] == 'true',
             respawn_delay=1.0,
-            on_exit=shut_down_if_not_started if needed else None,
+            on_exit=fail_if_not_started if needed else None,
         )
 
     def configured(executable, needed=False):

@@ -4,6 +4,7 @@
 """The shipped launch files on real launch, where that is installed: tests/ros/launch/."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -69,3 +70,12 @@ def test_wrong_argument_ends_launch_before_a_node_is_started(run, tmp_path, argu
     assert sentence.replace('RIG', str(rig)) in output
     assert 'Traceback' not in output
     assert 'process started' not in output
+
+
+def test_launch_fails_where_a_node_cannot_start(run, tmp_path):
+    status, output = run('-c', LAUNCH_RIG, f'phantom:={tmp_path}/none.csv', 'rviz:=false')
+    assert status == 1, output
+    assert 'none.csv: there is no such file' in output
+    assert re.search(r'calibration_node-\d+ could not start', output)
+    assert re.findall(r'exit code \d+', output) == ['exit code 1']
+    assert output.count('process has finished cleanly') == 2, output  # the other nodes

@@ -37,6 +37,7 @@ MIN_INSIDE = 0.6  # of a window that lies in the field
 FINE = 3  # points across a pixel of the grid on which shadows that touch are blurred
 OVERLAP = 0.85  # times both reaches; shadows that are nearer overlap
 DISTURBED = 1.6  # lack of fit from which pixels with large residuals count less
+AT_ONCE = 500  # windows whose waves are in memory, some 80 MB
 CORRELATED = 60  # windows that tell the correlation of the noise
 INFLUENCES = 20  # beads of whose pixels the influence is computed
 UNDISTURBED = 4.0  # times the median lack of fit, of a window without anything else
@@ -282,34 +283,40 @@ class ShadowFit(ABC):
     def _add_texture(self) -> None:
         """Give beads a background beyond the polynomial where pixels say so."""
         usual = self.typical()
-        parts = []
-        for rows, near in self.groups:
-            light, jacobian = self._model(rows, near)
-            grey = self.grey[rows]
-            valid = self._valid(rows, grey, light)
-            root = np.sqrt(valid / self.noise.variance(light)).astype(DTYPE)
-            plain = np.flatnonzero(self.misfit[rows] <= usual)[:CORRELATED]
-            parts.append((jacobian, root, (grey - light) * root, plain))
-        residual, valid = (
-            np.concatenate([part[each][part[3]] for part in parts]) for each in (2, 1)
+        parts = [self._standardised(rows, near) for rows, near in self.groups]
+        plain = [
+            np.flatnonzero(self.misfit[rows] <= usual)[:CORRELATED] for rows, _ in self.groups
+        ]
+        residual, root = (
+            np.concatenate([part[each][chosen] for part, chosen in zip(parts, plain)])
+            for each in (0, 1)
         )
-        valid = valid > 0
+        valid = root > 0
         # Where the shadow is not quite that of a sphere, all windows show it: that is no noise.
         common = residual.sum(axis=0) / np.maximum(valid.sum(axis=0), 1)
         self.correlation = self._correlation((residual - common) * valid, valid)
-        spectra = [
-            self.cosines.spectra(
-                jacobian[:, 0],
-                jacobian=jacobian,
-                weight=root * root,
-                residual=(standardised - common * (root > 0)) / np.maximum(root, 1e-12),
-            )
-            for jacobian, root, standardised, _ in parts
-        ]
+        spectra = []
+        for (rows, near), (residual, root) in zip(self.groups, parts):
+            for some in np.array_split(np.arange(len(rows)), len(rows) // AT_ONCE + 1):
+                _, jacobian = self._model(rows[some], near[some])
+                # In double precision: waves that a small window hardly sees are nearly alike.
+                rest = (residual[some] - common) / np.maximum(root[some], 1e-12)
+                spectra.append(
+                    self.cosines.spectra(
+                        jacobian[:, 0], jacobian=jacobian, weight=root[some] ** 2, residual=rest
+                    )
+                )
         # The waves are longer than the noise is correlated.
         excess = float(self.correlation.sum())
         rows = np.concatenate([rows for rows, _ in self.groups])
         self.strength[rows] = Spectra.joined(spectra).strengths(excess)
+
+    def _standardised(self, rows: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Residuals (g, m) over the noise, and roots (g, m) of weights; 0 for invalid pixels."""
+        light, _ = self._model(rows, near)
+        grey = self.grey[rows]
+        root = self._valid(rows, grey, light) / np.sqrt(self.noise.variance(light), dtype=DTYPE)
+        return (grey - light) * root, root
 
     def _correlation(self, residual: np.ndarray, valid: np.ndarray) -> NDArray[np.float64]:
         """Correlation of the noise from standardised residuals (g, m) of windows.

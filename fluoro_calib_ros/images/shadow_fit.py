@@ -376,7 +376,7 @@ class ShadowFit(ABC):
             # The influence of pixels on a centre: noise of neighbouring pixels adds up.
             plain = equations.plain[:INFLUENCES]
             influence = np.linalg.solve(plain, equations.weighted[:INFLUENCES])[:, TERMS]
-            self.inflation = self._inflation(influence, self.correlation)
+            self.inflation = _inflation(self._images(influence), self.correlation)
         return inverse
 
     def _images(self, windows: np.ndarray) -> np.ndarray:
@@ -385,15 +385,6 @@ class ShadowFit(ABC):
         images = np.zeros((len(windows), 2 * half + 1, 2 * half + 1))
         images[:, self.offset[:, 1] + half, self.offset[:, 0] + half] = windows
         return images
-
-    def _inflation(self, influence: np.ndarray, correlation: np.ndarray) -> float:
-        """Return the factor on variances for correlated noise; influence (g, m) of pixels."""
-        correlated = independent = 0.0
-        for image in self._images(influence):
-            spread = cv2.filter2D(image, cv2.CV_64F, correlation, borderType=cv2.BORDER_CONSTANT)
-            correlated += float(np.sum(image * spread))
-            independent += float(np.sum(image * image))
-        return max(correlated / max(independent, 1e-300), 1.0)
 
     def _beads(
         self, measured: np.ndarray, typical: float, noise: np.ndarray | None = None
@@ -425,6 +416,16 @@ class ShadowFit(ABC):
             overlapped=self.distance < 2 * self.profile.reach_px * OVERLAP,
             measured=measured,
         )
+
+
+def _inflation(influence: np.ndarray, correlation: np.ndarray) -> float:
+    """Return the factor on variances for correlated noise; influence (g, w, w) of pixels."""
+    correlated = independent = 0.0
+    for image in influence:
+        spread = cv2.filter2D(image, cv2.CV_64F, correlation, borderType=cv2.BORDER_CONSTANT)
+        correlated += float(np.sum(image * spread))
+        independent += float(np.sum(image * image))
+    return max(correlated / max(independent, 1e-300), 1.0)
 
 
 def _sd_of_centre(covariance: np.ndarray) -> np.ndarray:

@@ -39,7 +39,9 @@ from fluoro_calib_ros.images.overlay import draw_overlay
 from fluoro_calib_ros.images.view import Lens
 from tools.sections import write_section
 
-SIZE = 1024  # [px]
+SIZE = 1024  # of an image [px]
+MARGIN = 10  # pixels around it that are rendered, too, since light is blurred across its border
+WHOLE = (SIZE + 2 * MARGIN, SIZE + 2 * MARGIN)
 PRINCIPAL_PX = 4500.0
 DISTANCE_MM = 900.0
 STEEL_PER_MM = 0.55  # attenuation at some 70 keV
@@ -322,9 +324,9 @@ def render_with(
 ) -> Scene:
     """Render an image of a target with a pose and a distortion."""
     rotation, source = pose
-    depth = np.zeros((SIZE, SIZE))
-    hit = np.zeros((SIZE, SIZE))
-    light = np.ones((SIZE, SIZE))
+    depth = np.zeros(WHOLE)
+    hit = np.zeros(WHOLE)
+    light = np.ones(WHOLE)
     centres = (target.xyz - source) @ rotation.T
     uv = projected(centres, bend)
     if row.holes:
@@ -345,6 +347,11 @@ def render_with(
 def projected(centres: np.ndarray, bend: Distortion) -> np.ndarray:
     """Pixels (n, 2) of points (n, 3) in the frame of the sensor [mm]."""
     return bend.observed(PRINCIPAL_PX * centres[:, :2] / centres[:, 2:] + (SIZE - 1) / 2)
+
+
+def _pixels() -> np.ndarray:
+    """Rows and columns (2, h, w) of the pixels that are rendered."""
+    return np.mgrid[-MARGIN : SIZE + MARGIN, -MARGIN : SIZE + MARGIN]
 
 
 def in_image(uv: np.ndarray) -> NDArray[np.bool_]:
@@ -412,16 +419,17 @@ def _add_sphere(
     """Attenuate light by a sphere: disc is its place [px] and its radius [mm]."""
     place, radius = disc
     reach = int(np.ceil(PRINCIPAL_PX * radius / centre[2])) + 4
-    left, top = (int(x) for x in np.maximum(np.floor(place) - reach, 0))
-    right, bottom = (int(x) for x in np.minimum(np.floor(place) + reach + 1, SIZE))
+    left, top = (int(x) for x in np.maximum(np.floor(place) - reach, -MARGIN))
+    right, bottom = (int(x) for x in np.minimum(np.floor(place) + reach + 1, SIZE + MARGIN))
     if right <= left or bottom <= top:
         return
     ray = _rays(bend, left, top, (bottom - top, right - left))
     along = ray @ centre
     chord = 2 * np.sqrt(np.maximum(radius**2 - (centre @ centre - along**2), 0))
     passed = np.exp(-STEEL_PER_MM * chord)
-    light[top:bottom, left:right] *= passed.mean(axis=-1)
-    hit[top:bottom, left:right] += (chord > 0).any(axis=-1)
+    window = np.s_[top + MARGIN : bottom + MARGIN, left + MARGIN : right + MARGIN]
+    light[window] *= passed.mean(axis=-1)
+    hit[window] += (chord > 0).any(axis=-1)
 
 
 def _perforated(
@@ -434,16 +442,16 @@ def _perforated(
     """
     holes = cKDTree(target.xyz[:, :2])
     step = (np.arange(2) + 0.5) / 2 - 0.5
-    light = np.zeros((SIZE, SIZE))
+    light = np.zeros(WHOLE)
     reach = np.abs(target.xyz[:, :2]).max(axis=0) + target.diameter.min()
     largest = target.diameter.max() / 2 + 1.0
     radius = np.append(target.diameter / 2, 0.0)
     for b, a in product(step, step):
-        v, u = np.mgrid[:SIZE, :SIZE]
+        v, u = _pixels()
         xy = (bend.undistorted(np.stack([u + a, v + b], -1)) - (SIZE - 1) / 2) / PRINCIPAL_PX
-        ray = np.concatenate([xy, np.ones((SIZE, SIZE, 1))], -1) @ rotation
+        ray = np.concatenate([xy, np.ones((*WHOLE, 1))], -1) @ rotation
         slant = np.linalg.norm(ray, axis=-1) / np.abs(ray[..., 2])
-        passed = np.ones((SIZE, SIZE))
+        passed = np.ones(WHOLE)
         for face in (-0.5, 0.5):
             way = (face * SHEET_MM - source[2]) / ray[..., 2]
             place = source[:2] + way[..., None] * ray[..., :2]
@@ -481,9 +489,9 @@ def _plate(
 ) -> np.ndarray:
     """Lengths (h, w) [mm] of rays in a plate of the phantom."""
     middle, half = plate
-    v, u = np.mgrid[:SIZE, :SIZE]
+    v, u = _pixels()
     xy = (bend.undistorted(np.stack([u, v], -1).astype(float)) - (SIZE - 1) / 2) / PRINCIPAL_PX
-    ray = np.concatenate([xy, np.ones((SIZE, SIZE, 1))], -1) @ rotation
+    ray = np.concatenate([xy, np.ones((*WHOLE, 1))], -1) @ rotation
     ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
     with np.errstate(divide='ignore', invalid='ignore'):
         first = (middle - half - source) / ray
@@ -495,14 +503,14 @@ def _plate(
 
 def _bone(rng: np.random.Generator) -> np.ndarray:
     """Lengths (h, w) [mm] of rays in a shaft of bone with a spongy texture."""
-    v, u = np.mgrid[:SIZE, :SIZE]
+    v, u = _pixels()
     angle = rng.uniform(0, np.pi)
     across = (u - SIZE / 2) * np.cos(angle) + (v - SIZE / 2) * np.sin(angle)
     shaft = 2 * np.sqrt(np.maximum(110.0**2 - across**2, 0)) / 15
     hollow = 2 * np.sqrt(np.maximum(70.0**2 - across**2, 0)) / 15
-    texture = np.zeros((SIZE, SIZE))
+    texture = np.zeros(WHOLE)
     for blur in (2.5, 6.0, 14.0):
-        noise = cv2.GaussianBlur(rng.normal(size=(SIZE, SIZE)), (0, 0), blur)
+        noise = cv2.GaussianBlur(rng.normal(size=WHOLE), (0, 0), blur)
         texture += noise / noise.std()
     return shaft - 0.7 * hollow + 0.5 * texture * (shaft > 0)
 
@@ -516,15 +524,15 @@ def _skeleton(part: str, rng: np.random.Generator) -> np.ndarray:
     bones = _hand(rng) if part == 'hand' else _spine(rng)
     turn = rng.uniform(0, 2 * np.pi)
     scale = rng.uniform(0.7, 1.2)
-    v, u = np.mgrid[:SIZE, :SIZE] - (SIZE - 1) / 2
+    v, u = _pixels() - (SIZE - 1) / 2
     x = (u * np.cos(turn) + v * np.sin(turn)) / scale
     y = (v * np.cos(turn) - u * np.sin(turn)) / scale
-    depth = np.zeros((SIZE, SIZE))
+    depth = np.zeros(WHOLE)
     for middle_x, middle_y, half_x, half_y, mm in bones:
         inside = 1 - ((x - middle_x) / half_x) ** 2 - ((y - middle_y) / half_y) ** 2
         marrow = np.maximum(inside - 0.3, 0)
         depth += mm * (np.sqrt(np.maximum(inside, 0)) - 0.7 * np.sqrt(marrow))
-    texture = cv2.GaussianBlur(rng.normal(size=(SIZE, SIZE)), (0, 0), 2.5)
+    texture = cv2.GaussianBlur(rng.normal(size=WHOLE), (0, 0), 2.5)
     return depth * (1 + 0.15 * texture / texture.std())
 
 
@@ -554,7 +562,7 @@ def _spine(rng: np.random.Generator) -> Iterator[tuple[float, float, float, floa
 
 
 def _vignetting(rng: np.random.Generator) -> np.ndarray:
-    v, u = np.mgrid[:SIZE, :SIZE] / SIZE - 0.5
+    v, u = _pixels() / SIZE - 0.5
     return 1 - rng.uniform(0.1, 0.4) * (u * u + v * v)
 
 
@@ -567,6 +575,7 @@ def _detected(light: np.ndarray, row: Row, rng: np.random.Generator) -> NDArray[
     if row.unsharp:
         grey = grey + row.unsharp * (grey - cv2.GaussianBlur(grey, (0, 0), 3))
     image = np.clip(np.rint(grey), 0, 255).astype(np.uint8)
+    image = np.ascontiguousarray(image[MARGIN:-MARGIN, MARGIN:-MARGIN])
     if row.jpeg:
         _, data = cv2.imencode('.jpg', image, [cv2.IMWRITE_JPEG_QUALITY, row.jpeg])
         image = np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE), dtype=np.uint8)

@@ -265,6 +265,8 @@ def test_wrong_study_is_named_with_its_key(tmp_path, text, words):
         ('[reconstruct]\nreject = "x"\n', ['table reconstruct', '--reject', "'x'"]),
         ('[reconstruct]\nrejct = 3\n', ['table reconstruct', '--rejct']),
         ('[reconstruct]\nout = "here"\n', ['table reconstruct', 'out', 'follows']),
+        ('[reconstruct]\nhelp-all = true\n', ['table reconstruct', 'help-all', 'follows']),
+        ('[reconstruct]\nhelp_all = true\n', ['table reconstruct', 'help_all', 'follows']),
         ('[reconstruct]\nreject = {a = 1}\n', ['table reconstruct', 'reject']),
         ('[bodies]\njoints = "j"\n', ['table bodies', '--bodies']),
     ],

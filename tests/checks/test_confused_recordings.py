@@ -201,7 +201,9 @@ def test_a_pair_between_which_the_phantom_moved_is_left_out_and_named():
     assert usable and found.kind is Kind.PAIRS_EXCLUDED and found.severity is Severity.WARNING
     assert found.place.fluoroscopes == ('a', 'b') and found.place.exposures == (5,)
     found, _ = orientation_and_scatter(bumped, rig().phantom, calibrations())
-    good, _ = orientation_and_scatter(frames(), rig().phantom, calibrations())
+    named = {name: replace(one, frame_id=f'tube_{name}') for name, one in calibrations().items()}
+    good, _ = orientation_and_scatter(frames(), rig().phantom, named)
+    assert (found.frame_id, good.frame_id) == ('a_optical', 'tube_a')
     assert found.exposures == COUNT - 1
     base = [np.linalg.norm(o.position_mm[1] - o.position_mm[0]) for o in (found, good)]
     assert abs(base[0] - base[1]) < 0.5

@@ -18,7 +18,7 @@ from rigs import run
 from fluoro_calib_ros import processes
 from fluoro_calib_ros.cli.process import STATE, Done, _Work, trial_row
 from fluoro_calib_ros.errors import DataError
-from fluoro_calib_ros.io.calibration import load_calibration
+from fluoro_calib_ros.io.calibration import load_calibration, with_digests
 from fluoro_calib_ros.io.csv_table import write_table
 from fluoro_calib_ros.io.rig_file import read_study
 
@@ -134,6 +134,14 @@ def test_trials_are_processed_once_and_again_where_something_changed(study, fork
     trc = {'trials/walk/points.trc', 'trials/run/points.trc'}
     assert changed_by(study) == (trc, 3)
     assert changed_by(study, '--again') == (everything, 3)
+    (study / 'trials' / 'walk.csv').unlink()
+    (study / 'study.toml').write_text(text.partition('[convert')[0])
+    given = load_result_ids(study / 'result')
+    document = {'verdict': 'pass', 'checks': [], 'findings': [], 'calibration_id': given}
+    document = with_digests(study / 'result', document, 'ab')
+    (study / 'result' / 'validation.json').write_text(json.dumps(document))
+    assert changed_by(study) == ({'trials/run/points.csv'}, 0)
+    assert [row['verdict'] for row in rows_of(study).values()] == ['pass']
 
 
 def test_a_trial_that_fails_does_not_stop_the_others(study, capsys, forked):
@@ -259,6 +267,8 @@ def test_wrong_study_is_named_with_its_key(tmp_path, text, words):
         ('[reconstruct]\nreject = "x"\n', ['table reconstruct', '--reject', "'x'"]),
         ('[reconstruct]\nrejct = 3\n', ['table reconstruct', '--rejct']),
         ('[reconstruct]\nout = "here"\n', ['table reconstruct', 'out', 'follows']),
+        ('[reconstruct]\nhelp-all = true\n', ['table reconstruct', 'help-all', 'follows']),
+        ('[reconstruct]\nhelp_all = true\n', ['table reconstruct', 'help_all', 'follows']),
         ('[reconstruct]\nreject = {a = 1}\n', ['table reconstruct', 'reject']),
         ('[bodies]\njoints = "j"\n', ['table bodies', '--bodies']),
     ],

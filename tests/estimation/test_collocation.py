@@ -432,6 +432,8 @@ def test_residuals_show_the_band_of_ripples(wavelength, count):
     assert min(found.bands) < band < max(found.bands)
     assert len(found.bands) <= 9
     assert shown_ripples((1024, 1024), uv, wave, exposure, 48) is None
+    larger = shown_ripples((1024, 1024), uv, 4 * wave, exposure, 10)
+    assert larger.variances == pytest.approx(16 * np.array(found.variances), rel=1e-9)
 
 
 @pytest.mark.parametrize('exposures', [3, 15])

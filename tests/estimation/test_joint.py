@@ -18,6 +18,7 @@ from fluoro_calib_ros.estimation.calibrate import calibrate
 from fluoro_calib_ros.estimation.constraints import paired_exposures, with_constraints
 from fluoro_calib_ros.estimation.initial_network import measured_network
 from fluoro_calib_ros.estimation.options import CalibrationOptions
+from fluoro_calib_ros.estimation.pair_scatter import functions_of_angles
 from fluoro_calib_ros.findings import Kind
 from fluoro_calib_ros.io.documents import json_text
 from fluoro_calib_ros.io.observations import write_observations_csv
@@ -237,3 +238,18 @@ def test_command_line_constrains_the_relative_orientation(files):
     document = json.loads((files[1] / 'result.json').read_text())
     assert document['relative_orientation']['constraint'] == 'hard'
     assert max(document['relative_orientation']['scatter_mm']) < 1e-3
+
+
+@pytest.mark.parametrize(
+    ('pairs', 'of_one', 'of_two'),
+    [(3, 1, 1), (5, 1, 1), (6, 3, 1), (9, 3, 1), (10, 5, 5), (17, 5, 5), (18, 5, 9)],
+)
+def test_functions_of_the_angle_have_two_pairs_each(pairs, of_one, of_two):
+    """One is constant, each order of the harmonics adds two for every angle that is its own."""
+    angles = np.linspace(-1.0, 1.2, pairs)
+    unknown = np.full(pairs, np.nan)
+    for other, columns in ((angles, of_one), (angles**2 - 1, of_two), (unknown, of_one)):
+        found = functions_of_angles([angles, other])
+        assert found.shape == (pairs, columns)
+        assert np.linalg.matrix_rank(found) == columns
+        np.testing.assert_array_equal(found[:, 0], 1)

@@ -356,6 +356,7 @@ def test_empty_areas_are_named_the_emptiest_first():
     assert not found.ready and found.areas == (2, 5)  # the right column from the top
     assert 'in the upper right corner and at the right edge' in found.advice
     assert readiness(10, coverage).advice.startswith('5 more, ')
+    assert not any(c.isdigit() for c in found.advice)  # enough exposures
 
 
 @pytest.mark.parametrize(('columns', 'missing'), [(29, (2, 5, 8)), (30, ())])

@@ -174,18 +174,28 @@ def test_change_as_large_as_the_image_leaves_it_empty(size, size_px):
     assert corrector.mask.mean() < 0.5
 
 
-@pytest.mark.parametrize('steepness', [0.9, 1.8])
-def test_folds_are_left_empty_at_an_angle(steepness):
-    """Where the correction of the mean folds, and where only the change makes it fold."""
-    size = (96, 96)
-    places = np.meshgrid(*[np.linspace(0, 95, 25)] * 2)
-    uv = np.stack(places, axis=-1).reshape(-1, 2)
+def steep(size, steepness):
+    """A calibration whose correction grows by so many pixels a pixel in the middle."""
+    u, v = (np.linspace(0, side - 1, 25) for side in size)
+    uv = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
     duv = np.zeros_like(uv)
     duv[:, 0] = np.clip(steepness * (uv[:, 0] - 48), -18, 18)
     model = create_model('local_linear', 6, uv, duv, 0.2, 0.0)
-    mean = replace(
-        rigs.pincushion('a', size), model=model, train_exposure=np.zeros(len(uv), dtype=np.int64)
-    )
-    corrector = AngleMaps(rigs.turning(mean, size_px=2.0)).at(0.6)
+    exposure = np.zeros(len(uv), dtype=np.int64)
+    return replace(rigs.pincushion('a', size), model=model, train_exposure=exposure)
+
+
+@pytest.mark.parametrize('steepness', [0.9, 1.8])
+def test_folds_are_left_empty_at_an_angle(steepness):
+    """Where the correction of the mean folds, and where only the change makes it fold."""
+    corrector = AngleMaps(rigs.turning(steep((96, 96), steepness), size_px=2.0)).at(0.6)
     assert corrector.mask.any() and not corrector.mask.all()
     assert np.nanmin(np.diff(corrector.source[0], axis=1)) > 0
+
+
+@pytest.mark.parametrize('height', [40, 300])
+def test_what_the_mean_leaves_empty_stays_empty_where_hardly_anything_changes(height):
+    found = AngleMaps(rigs.turning(steep((96, height), 0.9), size_px=0.01))
+    folded = ~found.mean.mask[:, 30:66]  # in the middle, between columns that have a source
+    assert 0 < folded.mean() < 0.2
+    assert not found.at(0.6).mask[:, 30:66][folded].any()

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from fluoro_calib_ros.correction.registry import create_model
 from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.findings import Kind
 from fluoro_calib_ros.nodes.calibration_settings import check_folders
 from fluoro_calib_ros.nodes.exposure_input import ExposureInput
 from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import (
@@ -90,6 +91,15 @@ def test_changed_orientation_is_refused(field):
     values = getattr(message, field)
     values[0] *= 1 + 1e-9
     with pytest.raises(DataError, match=r'does not match its id|not symmetric'):
+        orientation_from_message(message)
+
+
+@pytest.mark.parametrize('field', ['x', 'qw', 'c', 'covariance'])
+@pytest.mark.parametrize('length', [0, 1])
+def test_array_of_another_length_is_refused(field, length):
+    message = message_from_orientation(orientation(np.random.default_rng(1)))
+    setattr(message, field, getattr(message, field)[:length])
+    with rigs.refused(Kind.DATA):
         orientation_from_message(message)
 
 

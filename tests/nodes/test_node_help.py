@@ -4,6 +4,7 @@
 """--help of the nodes, and parameters that they do not have."""
 
 import importlib
+import re
 import subprocess
 import sys
 from importlib.machinery import ModuleSpec
@@ -11,8 +12,9 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
-from fluoro_calib_ros.nodes.runtime.main import asks_for_help, help_text
+from fluoro_calib_ros.nodes.runtime.main import _description, asks_for_help, help_text
 from fluoro_calib_ros.nodes.runtime.parameters import parameters_of, unknown_parameters
+from fluoro_calib_ros.options import Option
 
 NODES = (
     'bridge_node',
@@ -61,6 +63,20 @@ def test_unknown_parameters_are_told_with_what_was_meant():
         'there is no parameter phantm, it has no effect; did you mean phantom?',
         'there is no parameter zzz, it has no effect; --help lists the parameters',
     ]
+
+
+@pytest.mark.parametrize(
+    ('bounds', 'ends'),
+    [
+        ({'minimum': 1, 'maximum': 250.5}, ['1', '250.5']),
+        ({'minimum': 1}, []),
+        ({'maximum': 250.5}, []),
+        ({}, []),
+    ],
+)
+def test_help_tells_the_range_of_a_parameter(bounds, ends):
+    text = _description(Option('rate', 7, 'frames', **bounds))
+    assert re.findall(r'[\d.]+', text) == [*ends, '7']
 
 
 @pytest.mark.parametrize(

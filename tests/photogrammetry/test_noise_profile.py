@@ -82,6 +82,11 @@ def test_few_image_points_show_no_profile(count):
     assert fitted_profile(*drawn(np.random.default_rng(4), 3.0, count), SIZE) is None
 
 
+def test_a_hundred_image_points_are_enough_for_a_profile():
+    found = fitted_profile(*drawn(np.random.default_rng(4), 3.0, 100), SIZE)
+    assert 1.5 < found.rim / found.middle < 6
+
+
 @pytest.mark.parametrize('zeros', [slice(None), slice(100)])
 def test_errors_of_zero_show_no_profile(zeros):
     uv, squares = drawn(np.random.default_rng(5), 1.0)

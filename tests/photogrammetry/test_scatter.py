@@ -50,6 +50,15 @@ def test_error_in_common_is_no_scatter():
     assert widening(size, LIMIT) > 1.5
 
 
+@pytest.mark.parametrize('common', [0.2, 0.5, 0.8])
+def test_variance_in_common_counts_for_what_it_is(common):
+    """An error in common of three of its standard deviations is what chance explains."""
+    count = 10**5  # the rest is known well
+    size = np.full(count, 2.9)
+    chance = (1 - common) + common * 3.0**2
+    assert widening(size, LIMIT, common) == pytest.approx(max(1, 2.9 / chance**0.5), rel=0.01)
+
+
 def test_limit_is_bounded():
     assert widening(np.full(500, 30.0), 40.0) == MAX_WIDENING
 

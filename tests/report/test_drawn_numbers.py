@@ -237,6 +237,16 @@ def test_parts_of_the_image_without_beads_are_named():
     assert missing_sides(uv[uv[:, 1] > 60], SIZE)[:2] == ['upper left', 'upper centre']
 
 
+@pytest.mark.parametrize(('rows', 'missing'), [(3, 9), (4, 6)])
+def test_a_side_of_which_half_is_covered_is_not_missing(rows, missing):
+    """The upper third has ten rows of cells; a point covers the row below it, too."""
+    width, height = np.array(SIZE) / 32
+    u, v = np.meshgrid((np.arange(32) + 0.5) * width, (np.arange(rows) + 0.5) * height)
+    uv = np.column_stack([u.ravel(), v.ravel()]) - 0.5
+    assert covered_cells(uv, SIZE).any(axis=1).sum() == rows + 1
+    assert len(missing_sides(uv, SIZE)) == missing
+
+
 def test_figure_of_a_distortion_keeps_the_shape_of_the_image():
     model = rigs.pincushion('a', (640, 200)).model
     figure = distortion_figure(model, 'a', (640, 200), True, Scale(4.0, 0.5))

@@ -24,7 +24,7 @@ from fluoro_calib_ros.jobs.calibration import CalibrationOutcome, run_calibratio
 from fluoro_calib_ros.jobs.report import read_report_input
 from fluoro_calib_ros.jobs.result_folder import save_outcome, save_result
 from fluoro_calib_ros.report import html as html_report
-from fluoro_calib_ros.report.figures import MAX_VECTORS, new_figure, svg_bytes
+from fluoro_calib_ros.report.figures import MAX_VECTORS, common_scale, new_figure, svg_bytes
 from fluoro_calib_ros.report.residuals import position_figure
 from fluoro_calib_ros.report.rig_geometry import beams, phantom_distance
 
@@ -114,6 +114,24 @@ def test_distortion_of_an_outcome_is_a_figure(folder):
     outcome = CalibrationOutcome(request, calibrated('a', 6, **OPTIONS))
     assert 'Fluoroscope a: estimated distortion' in outcome.plot('a').get_suptitle()
     assert outcome.summary().startswith('Fluoroscope') and 'Verdict' not in outcome.summary()
+
+
+def test_distortion_is_drawn_to_the_scale_of_the_largest(folder, monkeypatch, without_pictures):
+    given = read_report_input(folder)
+    model = given.calibrations['a'].model
+    scales = []
+    draw = html_report.distortion_figure
+
+    def drawn(*arguments):
+        scales.append(arguments[-1])
+        return draw(*arguments)
+
+    monkeypatch.setattr(html_report, 'distortion_figure', drawn)
+    html_report.report_html(given)
+    (scale,) = scales
+    largest = np.hypot(*model.train_duv.T).max()
+    assert scale.magnitude_px == pytest.approx(largest, rel=0.3)
+    assert scale == common_scale([(model, given.calibrations['a'].image_size)])
 
 
 def test_many_marks_are_pixels_and_few_are_vectors():

@@ -57,7 +57,7 @@ from fluoro_calib_ros.jobs.calibration import _without_copies, _without_shared
 from fluoro_calib_ros.jobs.followers import MarkerFollower, _wrong_start
 from fluoro_calib_ros.jobs.sources import read_content
 from fluoro_calib_ros.photogrammetry.rig_orientation import KnownOrientation
-from fluoro_calib_ros.reconstruction import epipolar
+from fluoro_calib_ros.reconstruction import epipolar, observed_noise
 
 PHANTOM = rig().phantom
 CORNERS = np.array([[-15.0, -12, -3], [14, -10, 5], [2, 16, -8], [-6, 3, 15], [11, 8, 10]])
@@ -455,6 +455,7 @@ MAKERS = {
         {'a': Fake(image_sd=0.25)},
     )[0],
     Kind.NO_COMMON_TARGETS: lambda: epipolar.UNMATCHED,
+    Kind.NOISE_OBSERVED: lambda: observed_noise._finding(4.0, [Fake(image_sd=0.05)]),
     Kind.PAIRS_CONTRADICT: lambda: about_pairs(unexplained=20.0),
     Kind.PAIRS_EXCLUDED: lambda: about_pairs(used=np.arange(8) != 4),
     Kind.RAYS_DO_NOT_MEET: lambda: epipolar.missing_rays(0.9, epipolar.UNKNOWN),
@@ -728,6 +729,10 @@ SENTENCES = {
     Kind.NO_COMMON_TARGETS: (
         'no target is seen by two fluoroscopes in one exposure: the target ids of the '
         'fluoroscopes, or the numbers of their frames, do not belong together'
+    ),
+    Kind.NOISE_OBSERVED: (
+        'the image points have no sigma, and their rays show a noise of # px where the '
+        'calibration has # px; that of the rays is taken: give their sigma, if it is known'
     ),
     Kind.PAIRS_CONTRADICT: (
         'orientation of the rig: the exposures contradict each other: the relative orientation '

@@ -96,6 +96,7 @@ class Kind(str, Enum):
 
     # Orientation of the rig.
     NO_COMMON_TARGETS = 'no_common_targets'
+    NOISE_OBSERVED = 'noise_observed'
     PAIRS_CONTRADICT = 'pairs_contradict'
     PAIRS_EXCLUDED = 'pairs_excluded'
     RAYS_DO_NOT_MEET = 'rays_do_not_meet'

@@ -65,7 +65,7 @@ from fluoro_calib_ros.jobs.calibration import _without_copies, _without_shared
 from fluoro_calib_ros.jobs.followers import MarkerFollower, _wrong_start
 from fluoro_calib_ros.jobs.sources import read_content
 from fluoro_calib_ros.photogrammetry.rig_orientation import KnownOrientation
-from fluoro_calib_ros.reconstruction import epipolar
+from fluoro_calib_ros.reconstruction import epipolar, observed_noise
 
 PHANTOM = rig().phantom
 CORNERS = np.array([[-15.0, -12, -3], [14, -10, 5], [2, 16, -8], [-6, 3, 15], [11, 8, 10]])
@@ -462,6 +462,7 @@ MAKERS = {
     Kind.CORRECTED_ALREADY: corrected_already,
     Kind.POOR_CALIBRATION_FIT: lambda: held_fit.poor_fits(*adjusted(0.25, a=(2.0, 2.0)))[0],
     Kind.NO_COMMON_TARGETS: lambda: epipolar.UNMATCHED,
+    Kind.NOISE_OBSERVED: lambda: observed_noise._finding(4.0, [Fake(image_sd=0.05)]),
     Kind.PAIRS_CONTRADICT: lambda: about_pairs(unexplained=20.0),
     Kind.PAIRS_EXCLUDED: lambda: about_pairs(used=np.arange(8) != 4),
     Kind.RAYS_DO_NOT_MEET: lambda: epipolar.missing_rays(0.9, epipolar.UNKNOWN),
@@ -735,6 +736,10 @@ SENTENCES = {
     Kind.NO_COMMON_TARGETS: (
         'no target is seen by two fluoroscopes in one exposure: the target ids of the '
         'fluoroscopes, or the numbers of their frames, do not belong together'
+    ),
+    Kind.NOISE_OBSERVED: (
+        'the image points have no sigma, and their rays show a noise of # px where the '
+        'calibration has # px; that of the rays is taken: give their sigma, if it is known'
     ),
     Kind.PAIRS_CONTRADICT: (
         'orientation of the rig: the exposures contradict each other: the relative orientation '

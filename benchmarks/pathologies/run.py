@@ -68,7 +68,9 @@ def main(arguments=None):
     parser = argparse.ArgumentParser(prog='python -m benchmarks.pathologies.run')
     parser.add_argument('--seeds', type=int, default=2, help='seeds of each case (default: 2)')
     parser.add_argument('--first', type=int, default=1, help='first seed (default: 1)')
-    parser.add_argument('--cases', default='', help='names of cases or groups, comma separated')
+    parser.add_argument(
+        '--cases', nargs='+', default=[], help='names of cases or groups, or lists with commas'
+    )
     parser.add_argument('--model', help='correction model of all cases')
     parser.add_argument('--no-verdict', action='store_true', help='do not validate')
     parser.add_argument('--processes', type=int, default=2)
@@ -77,8 +79,7 @@ def main(arguments=None):
     parser.add_argument('--resume', action='store_true', help='keep results that are there')
     parser.add_argument('--note', default='', help='a paragraph for the page')
     options = parser.parse_args(arguments)
-    wanted = {name.strip() for name in options.cases.split(',') if name.strip()}
-    cases = [case for case in CASES if not wanted or {case.name, case.group} & wanted]
+    cases = chosen(options.cases)
     if not cases:
         parser.error(f'no case is called {options.cases}')
     options.results.parent.mkdir(parents=True, exist_ok=True)
@@ -97,10 +98,19 @@ def main(arguments=None):
                 file.write(json.dumps(result) + '\n')
             print(f'{number}/{len(jobs)} {summary(result)}', file=sys.stderr, flush=True)
     text = page(read(options.results), cases, options.note)
-    if wanted:
+    if options.cases:
         print(text)
     else:
         options.out.write_text(text)
+
+
+def chosen(texts):
+    """Cases of names, groups or lists of them with commas, which a name may have, too."""
+    known = {word for case in CASES for word in (case.name, case.group)}
+    wanted = set()
+    for text in texts:
+        wanted |= {text} if text in known else {name.strip() for name in text.split(',')}
+    return [case for case in CASES if not texts or {case.name, case.group} & wanted]
 
 
 def read(path):

@@ -52,6 +52,9 @@ LINEAR_RAD = 0.05
 ALONE_SD_RAD = LINEAR_RAD / 2
 # Smallest eigenvalue of a normal matrix of unit diagonal that counts as regular.
 SINGULAR = 1e-11
+# One below which others do not predict a marker, and with which a matrix is held that may be
+# singular: far above rounding, which a constant beside large elements is not.
+WEAK = 1e-9
 _EYE_3 = np.eye(3)
 _EYE_6 = np.eye(POSE_SIZE)
 
@@ -352,9 +355,8 @@ class PoseSolver:
         gradient = gradient[suspect]
         others = normal[suspect, None] - by_marker[suspect]
         # A marker that the others do not predict is tested by its own rays only.
-        scale = np.sqrt(np.maximum(np.diagonal(others, axis1=2, axis2=3), 1e-12))
-        unit = others / (scale[..., :, None] * scale[..., None, :])
-        predicted = np.linalg.eigvalsh(unit)[..., 0] > 1e-9
+        unit, scale = _of_unit_diagonal(others)
+        predicted = np.linalg.eigvalsh(unit)[..., 0] > WEAK
         inverse = np.linalg.inv(np.where(predicted[..., None, None], unit, _EYE_6))
         reduced = gradient / scale
         gain = np.sum(reduced * (inverse @ reduced[..., None])[..., 0], axis=-1)
@@ -370,7 +372,9 @@ class PoseSolver:
         held, away = _pull_of(prediction, (solution.rotation, solution.centre))
         held = held[suspect]
         pulled = (held @ away[suspect, :, None])[:, None, :, 0] - gradient
-        rest = np.linalg.inv(others + held[:, None] + 1e-9 * _EYE_6)
+        unit, scale = _of_unit_diagonal(others + held[:, None])
+        pulled = pulled / scale
+        rest = np.linalg.inv(unit + WEAK * _EYE_6)
         left = own[suspect] + np.sum(pulled * (rest @ pulled[..., None])[..., 0], axis=-1)
         worst = np.argmax(np.where(excess > 1, left, -np.inf), axis=1)
         wrong = np.flatnonzero((excess > 1).any(axis=1))
@@ -452,10 +456,17 @@ def _growth_by_rig(
     pulled = (np.swapaxes(by_place * weight[..., None, None], 3, 4) @ by_rig).sum(axis=2)
     d = linear.by_pose[rows]
     right = (np.swapaxes(d, 2, 3) @ solution.marker.m[rows] @ pulled).sum(axis=1)
-    regular = normal[rows] + 1e-9 * _EYE_6
-    taken = by_place @ (d @ np.linalg.solve(regular, right)[:, None])[:, :, None]
+    unit, scale = _of_unit_diagonal(normal[rows])
+    moved = np.linalg.solve(unit + WEAK * _EYE_6, right / scale[..., None]) / scale[..., None]
+    taken = by_place @ (d @ moved[:, None])[:, :, None]
     squares = np.sum((by_rig - taken) ** 2, axis=(3, 4)) * weight
     return 1 + squares.sum(axis=2) / np.maximum(2 * points.seen[rows].sum(axis=2), 1)
+
+
+def _of_unit_diagonal(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Normal matrices (..., 6, 6) in units in which their diagonal is 1, and these (..., 6)."""
+    scale = np.sqrt(np.maximum(np.diagonal(normal, axis1=-2, axis2=-1), 1e-12))
+    return normal / (scale[..., :, None] * scale[..., None, :]), scale
 
 
 def _own_squares(marker: _Marker, variance: np.ndarray) -> np.ndarray:

@@ -25,6 +25,7 @@ from ..exposures.frame import Frame, Frames
 from ..exposures.phantom import Phantom
 from .check import Check
 from .residual_tests import (
+    CELLS,
     RejectedExposure,
     RejectedTrend,
     Residuals,
@@ -34,6 +35,7 @@ from .residual_tests import (
     rejected_exposure,
     rejected_trend,
     residuals_of,
+    unexplained,
 )
 
 # The calibration of a part has at most so many rounds: with few exposures it converges slowly, and
@@ -105,11 +107,15 @@ class Evidence:
         )
         size = calibration.image_size
         rejected = residuals.rejected(noise)
+        area = rejected_trend(rejected, inliers, size)
+        # What the correction does not follow in an area, no exposure is blamed for.
+        if area is not None and area.size > area.limit:
+            rejected = unexplained(rejected, max(size) / CELLS / 2)
         return CommonTrend(
             inliers,
             common_trend(inliers, size),
             claimed,
-            rejected_trend(rejected, inliers, size),
+            area,
             rejected_exposure(rejected, inliers),
         )
 

@@ -10,18 +10,19 @@ area also fails where image points of different exposures were rejected though t
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from ..correction.base import CorrectionModel
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError
-from ..estimation.exposure_terms import VARYING
+from ..estimation.exposure_terms import MIN_POINTS, VARYING
 from ..estimation.initial_network import MIN_EXPOSURES
 from ..estimation.options import AUTO
 from ..exposures.frame import angles_of
 from ..findings import Kind, Place
-from .calibration_evidence import CommonTrend, Evidence, Subject
+from .calibration_evidence import MIN_VARYING_EXPOSURES, CommonTrend, Evidence, Subject
 from .check import Check, more_exposures, too_little_data
 from .comparison import describe_place, difference
 from .residual_tests import RejectedTrend, change_of_trend
@@ -90,12 +91,23 @@ def check_variation(evidence: Evidence, names: Sequence[str]) -> list[Check]:
     return [_variation(evidence, name) for name in names]
 
 
+def _too_few_points(evidence: Evidence, name: str) -> Check:
+    """Check that could not be made; further exposures with as few image points do not help."""
+    count = len(evidence.frames[name])
+    reason = f'fewer than {MIN_VARYING_EXPOSURES} exposures have {MIN_POINTS} image points'
+    check = too_little_data(Kind.VARIATION, name, reason, count)
+    if len(evidence.phantom.target_id) < MIN_POINTS:
+        return replace(check, advice=f'take a phantom of {MIN_POINTS} beads or more')
+    if count < MIN_VARYING_EXPOSURES:
+        return check
+    return replace(check, advice='take exposures that show more beads each')
+
+
 def _variation(evidence: Evidence, name: str) -> Check:
     count = len(evidence.frames[name])
     found = evidence.variations[name]
     if found is None:
-        reason = 'too few exposures have enough image points'
-        return too_little_data(Kind.VARIATION, name, reason, count)
+        return _too_few_points(evidence, name)
     return Check(
         Kind.VARIATION,
         f'the distortion differs between exposures by {found.size_px:.3f} px '

@@ -24,7 +24,12 @@ from scipy import special
 from scipy.spatial import cKDTree
 
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
-from ..estimation.lack_of_fit import LARGEST_SD, FittedPoints, areas_of_rejected
+from ..estimation.lack_of_fit import (
+    LARGEST_SD,
+    MIN_EXPOSURES,
+    FittedPoints,
+    areas_of_rejected,
+)
 from ..estimation.result import CalibrationResult
 from ..estimation.rounds import ResidualTable
 from ..exposures.decisions import Doubtful
@@ -244,6 +249,34 @@ def rejected_trend(
     return RejectedTrend(
         worst.size_px, worst.limit_px, rejected.uv[worst.rows].mean(axis=0), len(worst.rows)
     )
+
+
+def unexplained(rejected: Residuals, reach: float) -> Residuals:
+    """Return the rejected image points but for those of exposures that agree with the others.
+
+    Where the nearest rejected points of MIN_EXPOSURES other exposures, up to a distance of reach
+    [px], are displaced as those of an exposure are, it is not the exposure that differs. Residuals
+    of false matches have any direction.
+    """
+    limit = special.ndtri(1 - FALSE_ALARM)
+    keep = np.ones(len(rejected.r), dtype=bool)
+    for row in range(len(rejected.numbers)):
+        own = np.flatnonzero(rejected.exposure == row)
+        others = np.flatnonzero(rejected.exposure != row)
+        if not len(own) or not len(others):
+            continue
+        distance, near = cKDTree(rejected.uv[others]).query(rejected.uv[own])
+        close = distance <= reach
+        # What is near one point of another exposure counts together: it has one direction.
+        sums = np.zeros((len(others), 2))
+        np.add.at(sums, near[close], rejected.r[own[close]])
+        r = rejected.r[others]
+        along = np.sum(sums * r, axis=1)
+        sd = np.sqrt(np.sum(np.sum(sums**2, axis=1) * np.sum(r**2, axis=1)) / 2)
+        agreeing = len(np.unique(rejected.exposure[others[along > 0]]))
+        if agreeing >= MIN_EXPOSURES and along.sum() > limit * sd:
+            keep[own[close]] = False
+    return rejected._part(keep)
 
 
 def rejected_exposure(rejected: Residuals, inliers: Residuals) -> RejectedExposure | None:

@@ -144,6 +144,8 @@ def run(arguments: argparse.Namespace) -> None:
             film = Film(arguments.film, calibrations, views, bar)
         save_bodies(arguments.out, outcome, arguments.report, film)
     print_unpaired(arguments.source, outcome.unpaired)
+    if outcome.noise is not None:
+        print_notes([f'{arguments.source}: {outcome.noise.sentence}'])
     print_findings(outcome.findings, 'doubtful: ')
     _print(arguments, outcome)
 

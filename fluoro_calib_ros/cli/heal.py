@@ -79,6 +79,8 @@ def run(arguments: argparse.Namespace) -> bool:
         )
     if outcome.healed is not None:
         save_healing(arguments.out, outcome, orientation, learned)
+    if outcome.noise is not None:
+        print_notes([f'{arguments.source}: {outcome.noise.sentence}'])
     print_findings(outcome.findings, 'changed: ')
     document = healing_document(outcome, orientation)
     print_result(arguments, document, '\n'.join(_lines(arguments, outcome)))

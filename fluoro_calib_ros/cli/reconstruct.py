@@ -102,6 +102,8 @@ def run(arguments: argparse.Namespace) -> None:
         print_note(f'{arguments.source}: {outcome.disagreement}')
     if outcome.drift is not None and outcome.drift.widening is not None:
         print_note(f'{arguments.source}: {outcome.drift.widening.sentence}')
+    if outcome.noise is not None:
+        print_note(f'{arguments.source}: {outcome.noise.sentence}')
     if outcome.widening > 1:
         check = (
             'check the sigma of the image points, whether they are corrected already or count '
@@ -118,7 +120,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _print(arguments: argparse.Namespace, outcome: ReconstructionOutcome) -> None:
     """Print what was reconstructed."""
-    from ..io.result_document import drift_document, orientation_document
+    from ..io.result_document import drift_document, finding_document, orientation_document
 
     counts = outcome.status_counts
     total = sum(counts.values())
@@ -130,6 +132,7 @@ def _print(arguments: argparse.Namespace, outcome: ReconstructionOutcome) -> Non
         'points': total,
         'status': counts,
         'unpaired': outcome.unpaired,
+        'noise': None if outcome.noise is None else finding_document(outcome.noise),
         'widening': outcome.widening,
         'drift': drift_document(outcome.drift, outcome.frames[0].stamp_ns),
         'orientation': orientation_document(outcome.orientation),

@@ -40,6 +40,7 @@ from ..photogrammetry.collinearity import project
 from ..photogrammetry.noise import ObservedScatter
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.intersection import OK, OUTSIDE, Intersector
+from ..reconstruction.observed_noise import with_observed_noise
 from ..reconstruction.reconstruct import (
     IntersectedViews,
     intersect_frames,
@@ -181,6 +182,8 @@ class BodiesOutcome:
     unpaired : mapping of str to int
         Frames without partner, by fluoroscope.
     findings : tuple of Finding
+    noise : Finding or None
+        Set where image points have no sigma, and their rays show more noise than the calibration.
     """
 
     __repr__ = brief_repr
@@ -191,6 +194,7 @@ class BodiesOutcome:
     joints: list[JointMotion]
     unpaired: Mapping[str, int]
     findings: tuple[Finding, ...]
+    noise: Finding | None = None
 
     @property
     def bodies(self) -> tuple[Body, ...]:
@@ -293,9 +297,10 @@ def track_bodies(
     check_bodies(bodies)
     orientation = orientation_of_recorded(frames, orientation)
     step = progress or (lambda done, total: None)
-    exposures, unpaired, _ = intersected(
+    recording = intersected(
         frames, calibrations, orientation, options, lambda done, total: step(done, 2 * total)
     )
+    exposures = recording.exposures
     shapes = [EstimatedShape(body, np.nan, np.nan, 0, ()) for body in bodies]
     if options.estimate_shapes:
         shapes = estimated_shapes(bodies, exposures)
@@ -324,8 +329,9 @@ def track_bodies(
         tracked,
         poses=poses,
         joints=_joints(joints, poses, at_rest or poses),
-        unpaired=unpaired,
+        unpaired=recording.unpaired,
         findings=tuple(findings),
+        noise=recording.noise,
     )
 
 
@@ -339,19 +345,26 @@ class IntersectedExposure:
     orientation: RigOrientation  #: with what an alarm of the drift watch adds to its covariance
 
 
+@dataclass(frozen=True)
+class IntersectedRecording:
+    """The exposures of a recording, and what is known of it."""
+
+    exposures: list[IntersectedExposure]
+    unpaired: Mapping[str, int]  #: frames without partner, by fluoroscope
+    drift: DriftVerdict  #: what the drift watch says
+    noise: Finding | None  #: on image points without sigma, where they are not as precise as beads
+
+
 def intersected(
     frames: Frames,
     calibrations: Calibrations,
     orientation: RigOrientation,
     options: BodiesOptions,
     progress: Callable[[int, int], None] | None = None,
-) -> tuple[list[IntersectedExposure], dict[str, int], DriftVerdict]:
-    """Pair and intersect the frames of a recording.
-
-    Also returns the frames without partner, by fluoroscope, and what the drift watch says. Raises
-    DataError.
-    """
+) -> IntersectedRecording:
+    """Pair and intersect the frames of a recording. Raises DataError."""
     names = orientation.fluoroscopes
+    frames, noise = with_observed_noise(frames, calibrations, orientation, options)
     paired, unpaired = pair_recording(frames, names, options)
     if not paired:
         raise DataError(f'no frames of {" and ".join(names)} belong together by {options.pair_by}')
@@ -374,7 +387,7 @@ def intersected(
         raise DataError(
             'the exposures have no times, or not in their order; give the rate of the recording'
         )
-    return out, unpaired, watch.verdict()
+    return IntersectedRecording(out, unpaired, watch.verdict(), noise)
 
 
 def estimated_shapes(
@@ -424,7 +437,7 @@ def _poses_alone(
     options: BodiesOptions,
 ) -> list[BodyPoses]:
     """Poses that the exposures of another recording give alone. Raises DataError."""
-    exposures, _, _ = intersected(frames, calibrations, orientation, options)
+    exposures = intersected(frames, calibrations, orientation, options).exposures
     tracker = BodyTracker(orientation, bodies, options.reject)
     tracked = [tracker.add(one.views, one.number, one.stamp_ns) for one in exposures]
     return poses_alone(bodies, [one for one in tracked if one is not None])

@@ -46,6 +46,7 @@ from ..io.folder import FolderKind, replaced_folder
 from ..io.versions import HEALING, LEARNED_SHAPES, write_learned_shapes
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.intersection import OK, OUTSIDE, Intersector
+from ..reconstruction.observed_noise import with_observed_noise
 from ..reconstruction.reconstruct import orientation_of_recorded, pair_recording
 
 BLOCKS = 10  # of a recording, used in turn for the diagnosis and for its verdict
@@ -88,6 +89,8 @@ class HealingOutcome:
         What has changed.
     exposures : int
         That were used for the diagnosis.
+    noise : Finding or None
+        Set where image points have no sigma, and their rays show more noise than the calibration.
     """
 
     __repr__ = brief_repr
@@ -103,6 +106,7 @@ class HealingOutcome:
     checks: tuple[Check, ...]
     findings: tuple[Finding, ...]
     exposures: int
+    noise: Finding | None = None
 
     @property
     def unseen_distortion(self) -> Check:
@@ -150,9 +154,7 @@ def heal_rig(
     step = progress or (lambda done, total: None)
     check_bodies(bodies)
     orientation = orientation_of_recorded(frames, orientation)
-    seen = frames_of_targets(frames, np.concatenate([body.target_id for body in bodies]))
-    names = orientation.fluoroscopes
-    paired, _ = pair_recording(seen, names, options)
+    paired, noise = _exposures_of(frames, calibrations, orientation, bodies, options)
     used, unused = _chosen(paired)
     rig = _Rig(calibrations, orientation, solvable_bodies(bodies))
     observed, poses = rig.observe(used)
@@ -190,7 +192,25 @@ def heal_rig(
         checks=tuple(checks),
         findings=tuple(_finding(change, rig, diagnosis) for change in diagnosis.changes),
         exposures=len(used),
+        noise=noise,
     )
+
+
+def _exposures_of(
+    frames: Frames,
+    calibrations: Calibrations,
+    orientation: RigOrientation,
+    bodies: Sequence[Body],
+    options: HealingOptions,
+) -> tuple[list[dict[str, Frame]], Finding | None]:
+    """Return the exposures of bodies, and a finding on their noise. Raises DataError."""
+    markers = np.concatenate([body.target_id for body in bodies])
+    given = frames_of_targets(frames, markers)
+    seen, noise = with_observed_noise(
+        given, calibrations, orientation, options, must_explain=False
+    )
+    paired, _ = pair_recording(seen, orientation.fluoroscopes, options)
+    return paired, noise
 
 
 def _check_seen(poses: Poses) -> None:

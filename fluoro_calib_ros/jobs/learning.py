@@ -78,7 +78,9 @@ def learn_shapes(
     recorded = orientation_of_recorded(frames, orientation)
     markers = np.concatenate([body.target_id for body in bodies])
     seen = frames_of_targets(frames, markers)
-    exposures, _, drift = intersected(seen, calibrations, recorded, options, progress)
+    found = intersected(seen, calibrations, recorded, options, progress)
+    exposures = found.exposures
+    drift = found.drift
     if drift.state is not None:
         raise DataError(replace(drift.finding, advice='no shapes are learned in a drift'))
     shapes = estimated_shapes(bodies, exposures)

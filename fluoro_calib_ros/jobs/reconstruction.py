@@ -26,6 +26,7 @@ from ..photogrammetry.noise import MAX_WIDENING, ObservedScatter
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.epipolar import cause_of_misses, mismatch
 from ..reconstruction.intersection import STATUS_NAMES, Intersector
+from ..reconstruction.observed_noise import with_observed_noise
 from ..reconstruction.reconstruct import (
     ReconstructedFrame,
     orientation_of_recorded,
@@ -79,6 +80,8 @@ class ReconstructionOutcome:
         more than their standard deviations allow.
     cause : Finding or None
         Why, where the factor is the largest and a trial tells it.
+    noise : Finding or None
+        Set where image points have no sigma, and their rays show more noise than the calibration.
     """
 
     __repr__ = brief_repr
@@ -90,6 +93,7 @@ class ReconstructionOutcome:
     disagreement: str = ''
     widening: float = 1.0
     cause: Finding | None = None
+    noise: Finding | None = None
 
     def to_dataframe(self, names: Names | None = None) -> pandas.DataFrame:
         """Return the points as a pandas DataFrame, with a column name where targets have names.
@@ -149,6 +153,7 @@ def reconstruct(
         )
     orientation = orientation_of_recorded(frames, orientation)
     names = orientation.fluoroscopes
+    frames, noise = with_observed_noise(frames, calibrations, orientation, options)
     watch, drift = _drift_watch(orientation, calibrations, options)
     scatter = ObservedScatter()
     intersector = Intersector(orientation, options.reject)
@@ -181,6 +186,7 @@ def reconstruct(
         disagreement=disagreement,
         widening=scatter.factor,
         cause=cause,
+        noise=noise,
     )
 
 

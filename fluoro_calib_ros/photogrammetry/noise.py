@@ -45,12 +45,11 @@ WINDOW = 2000  # latest errors of a recording that count
 RENEWED = 0.1  # part of them after which the factor is calculated anew
 
 
-def widening(size: NDArray[np.float64], limit: float, common: float = 0.0) -> float:
-    """Factor of 1 or more by which errors scatter beyond what is stated and beyond chance.
+def trimmed_scale(size: NDArray[np.float64], limit: float) -> tuple[float, int]:
+    """Return the scale of 1 or more of errors without the gross ones, and how many are left.
 
-    size: (n,) absolute errors over the median that is expected of them. limit: size beyond which
-    an error is gross. common: part of the stated variance that all errors have in common: it may
-    be far off in all of them, and still as stated.
+    size, limit: as of `widening`. With fewer errors than MIN_ERRORS, the scale is 1 and none are
+    left.
     """
     size = size[np.isfinite(size)]
     scale = 1.0
@@ -58,11 +57,24 @@ def widening(size: NDArray[np.float64], limit: float, common: float = 0.0) -> fl
     for _ in range(ITERATIONS):
         inside = size[size <= limit * scale]
         if len(inside) < MIN_ERRORS:
-            return 1.0
+            return 1.0, 0
         if len(inside) == count:
             break
         count = len(inside)
         scale = max(1.0, float(np.median(inside)))
+    return scale, count
+
+
+def widening(size: NDArray[np.float64], limit: float, common: float = 0.0) -> float:
+    """Factor of 1 or more by which errors scatter beyond what is stated and beyond chance.
+
+    size: (n,) absolute errors over the median that is expected of them. limit: size beyond which
+    an error is gross. common: part of the stated variance that all errors have in common: it may
+    be far off in all of them, and still as stated.
+    """
+    scale, count = trimmed_scale(size, limit)
+    if not count:
+        return 1.0
     chance = (1 - common) * (1 + SURE * MEDIAN_SD / np.sqrt(count)) ** 2 + common * SURE**2
     return float(np.clip(scale / np.sqrt(chance), 1.0, MAX_WIDENING))
 

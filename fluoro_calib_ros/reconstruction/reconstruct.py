@@ -205,7 +205,7 @@ def intersect_frames(
     """
     frames = [exposure.get(name) for name in intersector.orientation.fluoroscopes]
     views = [
-        None if frame is None else _corrected_view(frame, calibrations[frame.fluoroscope])
+        None if frame is None else corrected_view(frame, calibrations[frame.fluoroscope])
         for frame in frames
     ]
     present = [frame for frame in frames if frame is not None]
@@ -217,8 +217,8 @@ def intersect_frames(
     return found, present
 
 
-def _corrected_view(frame: Frame, calibration: FluoroscopeCalibration) -> CorrectedView:
-    """Correct a frame. Raises DataError."""
+def corrected_view(frame: Frame, calibration: FluoroscopeCalibration) -> CorrectedView:
+    """Correct a frame. Raises DataError for another image size, and for a repeated target."""
     where = f'fluoroscope {frame.fluoroscope}, frame {frame.number}'
     error = image_size_error(frame.image_size, calibration.image_size)
     error = error or repeated_target_error(frame.target_id)

@@ -178,14 +178,18 @@ class DistortionField:
         return out
 
     def distort(self, uv: ArrayLike) -> np.ndarray:
-        """Observed pixels (n, 2) of undistorted ones uv (n, 2), by fixed-point iteration."""
+        """Observed pixels (n, 2) of undistorted ones uv (n, 2), by fixed-point iteration.
+
+        Far beyond the image it may diverge; these are NaN or infinite.
+        """
         uv = np.asarray(uv, dtype=float)
-        observed = uv + self(uv)
-        for _ in range(MAX_ITERATIONS):
-            last = observed
-            observed = uv + self(observed)
-            if np.max(np.abs(observed - last), initial=0.0) < TOLERANCE_PX:
-                break
+        with np.errstate(over='ignore', invalid='ignore'):
+            observed = uv + self(uv)
+            for _ in range(MAX_ITERATIONS):
+                last = observed
+                observed = uv + self(observed)
+                if np.max(np.abs(observed - last), initial=0.0) < TOLERANCE_PX:
+                    break
         return observed
 
 

@@ -200,6 +200,23 @@ def test_true_markers_are_kept():
     assert sum(kept) >= 150 * 6 - 3  # 1 of 16,000 markers is beyond four standard deviations
 
 
+def test_markers_that_contradict_each_other_by_far_leave_a_frame_without_a_pose():
+    """Precise markers that all disagree are excluded until the rest is singular."""
+    rng = np.random.default_rng(9)
+    rig = orientation()
+    left = []
+    for _ in range(60):
+        given = body(rng, 4)
+        rotation, centre = random_pose(rng)
+        points = (given.xyz_mm - given.centre) @ rotation.T + centre
+        uv = project(rig, points) + rng.normal(0, 0.2, (2, 4, 2))
+        seen = exposure(rig, given.target_id, uv, Noise(0.005), reject=None)
+        found = PoseSolver(rig, [given]).solve(seen, UNKNOWN)
+        assert np.isfinite(found.rotation).all() == found.alone[0]
+        left.append(found.used.sum())
+    assert np.count_nonzero(np.array(left) < 3) > 40
+
+
 def test_two_markers_give_no_pose_alone():
     rng = np.random.default_rng(6)
     rig = orientation()

@@ -322,6 +322,23 @@ def test_precision_is_that_of_the_correction_over_the_noise(given, ratio, noise)
     assert 'inf' not in str(found)
 
 
+def test_variation_of_few_points_in_each_exposure_is_not_cured_by_more_exposures():
+    def made(beads, exposures):
+        evidence = Fake(
+            frames={'a': [None] * exposures},
+            phantom=Fake(target_id=np.arange(beads)),
+            variations={'a': None},
+        )
+        (check,) = field_checks.check_variation(evidence, ['a'])
+        assert check.kind is Kind.VARIATION and check.passed is None
+        return check.advice
+
+    more = more_exposures(3)
+    assert made(503, 3) == more
+    assert len({made(24, 3), made(24, 16), made(503, 16), more}) == 3
+    assert made(24, 16) == made(24, 3) and made(503, 16) != more
+
+
 def test_achieved_deviation_joins_claim_halves_trend_and_variation():
     given = Fake(trends={'a': Fake(claimed_sd=0.3)})
     checks = [

@@ -17,6 +17,7 @@ from fluoro_calib_ros.checks.residual_tests import (
     change_of_trend,
     common_trend,
     rejected_exposure,
+    unexplained,
 )
 from fluoro_calib_ros.checks.rig import doubtful
 from fluoro_calib_ros.estimation.pair_scatter import PairScatter
@@ -169,6 +170,36 @@ def test_rejected_points_of_an_exposure_agree_where_neighbours_are_alike():
     false = rejected_exposure(given._part(exposure == 0), fitted)
     assert false.number == 4 and false.agreement < false.limit
     assert rejected_exposure(given._part(exposure == 2), fitted) is None
+
+
+def corner_of_exposures(alike, rng):
+    """Rejected points of six exposures in a corner, and far away of the first; some are alike."""
+    exposure = np.repeat(np.arange(6), [20, 4, 4, 4, 4, 4])
+    uv = rng.uniform(900, 1000, (40, 2))
+    uv[:6] -= 800
+    angle = rng.uniform(0, 2 * np.pi, 40)
+    r = 5 * np.column_stack([np.cos(angle), np.sin(angle)])
+    r[np.isin(exposure, alike)] = [4.0, 3.0]
+    return Residuals(uv, r, exposure, np.arange(40), np.arange(6), np.full(6, np.nan))
+
+
+def test_an_exposure_is_not_blamed_for_what_other_exposures_show_too():
+    given = corner_of_exposures(range(6), np.random.default_rng(3))
+    fitted = given._part(np.zeros(40, dtype=bool))
+    assert rejected_exposure(given, fitted).number == 0
+    left = unexplained(given, 64.0)
+    assert left.exposure.tolist() == [0] * 6 + [1] * 4 + [2] * 4 + [3] * 4 + [4] * 4 + [5] * 4
+    assert left.uv[:6].max() < 300
+
+
+@pytest.mark.parametrize('alike', [[0], [0, 1]])
+def test_an_exposure_that_differs_is_blamed_among_false_matches_or_with_one_other(alike):
+    rng = np.random.default_rng(5)
+    kept = [
+        np.count_nonzero(unexplained(corner_of_exposures(alike, rng), 64.0).exposure == 0) == 20
+        for _ in range(300)
+    ]
+    assert np.mean(kept) > 0.99
 
 
 def test_inverse_of_an_open_rotation_is_large_and_not_negative():

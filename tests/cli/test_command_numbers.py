@@ -390,6 +390,7 @@ def test_reconstruct_says_by_how_much_its_limit_was_widened(
         widening=widening,
         drift=Fake(widening=None),
         cause=None,
+        noise=None,
         plot=None,
     )
     monkeypatch.setattr('fluoro_calib_ros.jobs.reconstruction.reconstruct', lambda *_: made)

@@ -1,0 +1,162 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The noise of image points without sigma, as the rays of a recording show it.
+
+Where an image point has no sigma, that of the calibration is taken: of beads, as they were
+measured. Markers that another program has measured may scatter several times as much, so that true
+points are rejected and standard deviations are too small. Epipolar residuals of one target in
+consecutive exposures, between which it hardly moves, have the errors of the rig and of the
+correction in common, and differ by the noise alone (von Neumann, "Distribution of the ratio of the
+mean square successive difference to the variance", Annals of Mathematical Statistics 12, 1941). It
+is taken only if it also explains the residuals themselves. Noise below that of the calibration is
+not: tracks may be smoothed, and then have their errors in common.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
+from ..exposures.frame import Frame, Frames
+from ..exposures.pairing import RecordedPairing
+from ..findings import Finding, Kind, Severity
+from ..photogrammetry.noise import MEDIAN_SD, SURE, trimmed_scale
+from ..photogrammetry.rig_orientation import RigOrientation
+from .epipolar import EpipolarGeometry
+from .reconstruct import corrected_view, match_views, pair_recording
+
+MAX_PAIRS = 200  # of consecutive exposures, evenly spread over a recording
+MIN_DIFFERENCES = 30
+GROSS = 4.0  # standard deviations of a difference, beyond which it is of a false match
+NEAR = 1 / 32  # of the width of an image: errors of the correction are the same at such a distance
+# Noise over that of the calibration from which it is taken: less does no harm.
+MIN_FACTOR = 1.25
+# Residuals over what the noise explains, up to which nothing else need be wrong.
+MAX_UNEXPLAINED = 1.5
+NORMAL_MEDIAN = 0.6745  # of the absolute value of a standard normal variable
+
+
+class _Residuals(NamedTuple):
+    """Epipolar residuals of an exposure by pair of views and target."""
+
+    key: NDArray[np.int64]  # (n, 2) pair of views, target id
+    place: NDArray[np.float64]  # (n, 4) image points in both views over the widths of the images
+    value: NDArray[np.float64]  # (n,) [px]
+    noise_sd: NDArray[np.float64]  # (n,) by the noise of the calibration [px]
+    other_sd: NDArray[np.float64]  # (n,) by correction and rig [px]
+
+
+def with_observed_noise(
+    frames: Frames,
+    calibrations: Calibrations,
+    orientation: RigOrientation,
+    pairing: RecordedPairing | None = None,
+    must_explain: bool = True,
+) -> tuple[Frames, Finding | None]:
+    """Give the image points of a recording the noise that they show.
+
+    must_explain: False where rays may miss each other for another reason, too, such as a rig that
+    has changed. Returns the frames with sigma and a finding on it; or those that were given, and
+    None, where any have sigma, where they scatter as the calibration says, and where it cannot be
+    told. Raises DataError for frames that cannot be corrected.
+    """
+    names = orientation.fluoroscopes
+    given = [frame for name in names for frame in frames.get(name, ())]
+    if any(frame.sigma is not None for frame in given):
+        return frames, None
+    exposures, _ = pair_recording(frames, names, pairing or RecordedPairing())
+    if len(exposures) < 2:
+        return frames, None
+    count = min(MAX_PAIRS, len(exposures) - 1)
+    starts = np.unique(np.linspace(0, len(exposures) - 2, count).astype(int)).tolist()
+    rows = {*starts, *(start + 1 for start in starts)}
+    found = {row: _residuals(exposures[row], calibrations, orientation) for row in rows}
+    factor = _factor([(found[start], found[start + 1]) for start in starts])
+    if factor < MIN_FACTOR or (must_explain and not _explains(factor, list(found.values()))):
+        return frames, None
+    changed = {
+        name: [
+            replace(frame, sigma=factor * calibrations[name].image_sd_at(frame.uv))
+            for frame in of_one
+        ]
+        for name, of_one in frames.items()
+        if name in names
+    }
+    return {**frames, **changed}, _finding(factor, [calibrations[name] for name in names])
+
+
+def _finding(factor: float, calibrations: Sequence[FluoroscopeCalibration]) -> Finding:
+    stated = float(np.mean([calibration.image_sd for calibration in calibrations]))
+    return Finding(
+        Kind.NOISE_OBSERVED,
+        f'the image points have no sigma, and their rays show a noise of {factor * stated:.2g} px '
+        f'where the calibration has {stated:.2g} px; that of the rays is taken',
+        advice='give their sigma, if it is known',
+        severity=Severity.NOTE,
+        numbers={'noise_px': factor * stated, 'calibration_px': stated},
+    )
+
+
+def _factor(pairs: Sequence[tuple[_Residuals, _Residuals]]) -> float:
+    """Return the noise in consecutive exposures over that of the calibration, 1 where unknown."""
+    differences = np.concatenate([_differences(*pair) for pair in pairs])
+    factor, count = trimmed_scale(differences / NORMAL_MEDIAN, GROSS / NORMAL_MEDIAN)
+    if count < MIN_DIFFERENCES:
+        return 1.0
+    # A residual is in two differences.
+    chance = 1 + SURE * MEDIAN_SD / np.sqrt(count / 2)
+    return factor if factor > chance else 1.0
+
+
+def _explains(factor: float, found: Sequence[_Residuals]) -> bool:
+    """Whether residuals are what noise by a factor above that of the calibration makes them."""
+    size = [np.abs(one.value) / np.hypot(factor * one.noise_sd, one.other_sd) for one in found]
+    return bool(np.median(np.concatenate(size)) <= MAX_UNEXPLAINED * NORMAL_MEDIAN)
+
+
+def _differences(one: _Residuals, other: _Residuals) -> NDArray[np.float64]:
+    """Differences (m,) of the residuals of targets that hardly move, over those of noise."""
+    keys = {tuple(key): row for row, key in enumerate(other.key.tolist())}
+    rows = [(i, keys[tuple(key)]) for i, key in enumerate(one.key.tolist()) if tuple(key) in keys]
+    i, j = np.array(rows, dtype=int).reshape(-1, 2).T
+    near = (np.abs(one.place[i] - other.place[j]) <= NEAR).all(axis=1)
+    i, j = i[near], j[near]
+    sd = np.hypot(one.noise_sd[i], other.noise_sd[j])
+    return np.asarray(np.abs(one.value[i] - other.value[j]) / sd)
+
+
+def _residuals(
+    exposure: Mapping[str, Frame], calibrations: Calibrations, orientation: RigOrientation
+) -> _Residuals:
+    """Return the epipolar residuals of all pairs of views within the calibrated areas."""
+    names = [name for name in orientation.fluoroscopes if name in exposure]
+    views = match_views([corrected_view(exposure[name], calibrations[name]) for name in names])
+    noise = np.sqrt(np.maximum(views.sigma**2 - views.correction_sd**2, 0.0))
+    widths = [calibrations[name].image_size[0] for name in names]
+    parts = []
+    for number, (a, b) in enumerate(combinations(range(len(names)), 2)):
+        rows = np.flatnonzero(
+            np.isfinite(views.uv[[a, b]]).all(axis=(0, 2)) & ~views.outside[[a, b]].any(axis=0)
+        )
+        geometry = EpipolarGeometry(orientation, names[a], names[b])
+        uv = views.uv[a, rows], views.uv[b, rows]
+        of_noise = geometry.residuals(*uv, noise[a, rows], noise[b, rows])
+        whole = geometry.residuals(*uv, views.sigma[a, rows], views.sigma[b, rows])
+        pair = np.full(len(rows), number)
+        parts.append(
+            _Residuals(
+                np.column_stack([pair, views.target_id[rows]]),
+                np.column_stack([uv[0] / widths[a], uv[1] / widths[b]]),
+                of_noise.residual,
+                noise_sd=of_noise.sd,
+                other_sd=np.sqrt(np.maximum(whole.sd_total**2 - of_noise.sd**2, 0.0)),
+            )
+        )
+    return _Residuals(*(np.concatenate(values) for values in zip(*parts)))

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import rigs
 from scipy.spatial import ConvexHull, Delaunay
+from scipy.spatial.transform import Rotation
 from sklearn.model_selection import GridSearchCV, GroupKFold, PredefinedSplit
 from sklearn.neighbors import KNeighborsRegressor
 
@@ -577,3 +578,15 @@ def test_impossible_k_is_refused():
             ValueError, match=f'{kind} with k = {k} is not possible with 580 inliers'
         ):
             chosen(kind, k=k)
+
+
+def test_turns_of_the_gauge_are_what_a_camera_sees_that_turns():
+    interior = np.array([480.0, 530.0, 2000.0])
+    uv = np.random.default_rng(5).uniform(0, 1024, (200, 2))
+    rays = np.column_stack([(uv - interior[:2]) / interior[2], np.ones(len(uv))])
+    basis = gauge_basis(uv, interior, GaugeKind.TURNS).reshape(2 * len(uv), -1)
+    for axis in np.eye(3):
+        turned = rays @ Rotation.from_rotvec(1e-6 * axis).as_matrix().T
+        moved = interior[:2] + interior[2] * turned[:, :2] / turned[:, 2:] - uv
+        left = moved.ravel() - basis @ np.linalg.lstsq(basis, moved.ravel())[0]
+        assert np.abs(left).max() < 1e-5 * np.abs(moved).max()

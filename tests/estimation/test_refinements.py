@@ -8,15 +8,18 @@ import numpy as np
 import pytest
 
 from fluoro_calib_ros.correction.series import Functions
+from fluoro_calib_ros.estimation.exposure_terms import exposure_functions
 from fluoro_calib_ros.estimation.fluoroscope_terms import SeriesEquations
 from fluoro_calib_ros.estimation.priors import Prior
 from fluoro_calib_ros.estimation.refinements import (
     MAX_MODES,
     MODE_CHANGES,
+    START_MODES,
     MorePlaces,
     NumberOfSines,
     Once,
     Solution,
+    exposure_terms,
 )
 from fluoro_calib_ros.estimation.signal import Signal
 
@@ -82,3 +85,34 @@ def test_a_prior_is_not_searched_where_that_is_done_or_nothing_is_there(refineme
     there = solution()
     part = there.parts[0]
     assert refinement.propose(part, there.equations[0], part.prior) is None
+
+
+@pytest.mark.parametrize('varies', [False, True])
+def test_exposures_get_terms_of_their_own_only_where_they_differ(varies):
+    rng = np.random.default_rng(4)
+    uv = rng.uniform(0, 1024, (600, 2))
+    exposure = np.repeat(np.arange(6), 100)
+    interior = np.array([511.5, 511.5, 4000.0])
+    residuals = rng.normal(0, 0.1, uv.shape)
+    for own in np.arange(600).reshape(6, 100):  # orientations and beads take up a part of them
+        q, _ = np.linalg.qr(exposure_functions(uv, (1024, 1024), interior)[own].reshape(200, -1))
+        residuals[own] -= (0.5 * q @ (q.T @ residuals[own].ravel())).reshape(-1, 2)
+    if varies:  # a stretch along the diagonal that changes from exposure to exposure
+        xy = (uv - 511.5) / 512
+        change = np.column_stack([xy[:, 1] ** 2, xy[:, 0] ** 2])
+        residuals += change * np.linspace(-2, 2, 6)[exposure, None]
+    part = SimpleNamespace(
+        number=0,
+        uv=uv,
+        image_size=(1024, 1024),
+        interior=interior,
+        rows=np.arange(len(uv)),
+        exposure=exposure,
+        angles=np.full(6, np.nan),
+    )
+    adjustment = SimpleNamespace(inliers=np.ones(len(uv), bool), residuals=residuals)
+    found = exposure_terms(SimpleNamespace(parts=[part], adjustment=adjustment, modes=[40]))
+    assert (found is not None) == varies
+    if varies:
+        assert set(found.exposure_terms) == {0} and list(found.modes) == [START_MODES]
+        assert found.exposure_terms[0].size_px > 0.3

@@ -110,35 +110,64 @@ def identify_markers(
     rig = CalibratedRig(orientation, calibrations, angles or {})
     for name in names:
         check_image(images[name], calibrations[name].image_size)
-    count = sum(len(body.target_id) for body in bodies)
-    reason: DataError | None = None
-    best: dict[str, FirstMarkers] = {}
-    filtered: dict[float, list[tuple[FilteredLight, FilteredLight]]] = {}
+    search = _ImageSearch(images, rig, bodies)
     # What else is round in the images may be larger, and more distinct. Of many bodies, perhaps
     # one is there.
-    for strongest, scale in product((count, MIN_MEMBERS), MARKER_SCALES[:3]):
+    count = sum(len(body.target_id) for body in bodies)
+    for scale, strongest in product(MARKER_SCALES[:3], (count, MIN_MEMBERS)):
+        search.look(scale, strongest)
+        if not search.missing:
+            break
+    return search.markers()
+
+
+class _ImageSearch:
+    """Looks for bodies in the images of one exposure, by shadows of one size after another."""
+
+    def __init__(
+        self, images: Mapping[str, np.ndarray], rig: CalibratedRig, bodies: Sequence[Body]
+    ) -> None:
+        self._images = [images[name] for name in rig.orientation.fluoroscopes]
+        self._rig = rig
+        self.missing = list(bodies)
+        self._found: dict[str, list[FirstMarkers]] = {}
+        self._reason: DataError | None = None
+        self._scale = 0.0
+        self._filtered: list[tuple[FilteredLight, FilteredLight]] = []
+
+    def look(self, scale: float, strongest: int) -> None:
+        """Look for the bodies that are missing; so many shadows of a size tell how they look."""
+        if scale != self._scale:
+            self._filtered = [filter_image(image, scale) for image in self._images]
+            self._scale = scale
         try:
-            if scale not in filtered:
-                filtered[scale] = [filter_image(images[name], scale) for name in names]
             shadows = [
                 first_shadows(lights, strongest, SHARE).strongest(MAX_SHADOWS).uv
-                for lights in filtered[scale]
+                for lights in self._filtered
             ]
-            found, missing = find_bodies(shadows, rig, bodies)
         except DataError as error:
-            reason = reason or error
-            continue
-        if _count(found) > _count(best):
-            best = found
-        if not missing:
-            break
-        reason = reason or missing[0]
-    if not best and reason is not None:
-        raise reason
-    for name in names:
-        if name not in best:
-            raise DataError(f'fluoroscope {name} sees none of the bodies that others see')
-    return best
+            self._reason = self._reason or error
+            return
+        found, missing = find_bodies(shadows, self._rig, self.missing)
+        self._reason = self._reason or next(iter(missing.values()), None)
+        self.missing = [body for body in self.missing if body.name in missing]
+        for name, first in found.items():
+            self._found.setdefault(name, []).append(first)
+
+    def markers(self) -> dict[str, FirstMarkers]:
+        """Return the markers of each fluoroscope. Raises DataError where one sees none."""
+        if not self._found and self._reason is not None:
+            raise self._reason
+        for name in self._rig.orientation.fluoroscopes:
+            if name not in self._found:
+                raise DataError(f'fluoroscope {name} sees none of the bodies that others see')
+        return {
+            name: FirstMarkers(
+                np.concatenate([first.target_id for first in parts]),
+                np.concatenate([first.uv for first in parts]),
+            )
+            for name, parts in self._found.items()
+        }
 
 
 def identifiable(bodies: Sequence[Body]) -> tuple[Body, ...]:
@@ -148,26 +177,22 @@ def identifiable(bodies: Sequence[Body]) -> tuple[Body, ...]:
     )
 
 
-def _count(found: Mapping[str, FirstMarkers]) -> int:
-    return sum(len(first.target_id) for first in found.values())
-
-
 def find_bodies(
     shadows: Sequence[np.ndarray], rig: CalibratedRig, bodies: Sequence[Body]
-) -> tuple[dict[str, FirstMarkers], list[DataError]]:
-    """Find bodies among shadows (k, 2) of all views; return their markers, and why not all.
+) -> tuple[dict[str, FirstMarkers], dict[str, DataError]]:
+    """Find bodies among shadows (k, 2) of all views; return their markers, and why others are missing.
 
     Views that see none of the bodies are left out.
     """
     points = shadow_points(shadows, rig)
     fits: list[tuple[Body, _Fit]] = []
-    missing = []
+    missing = {}
     free = np.ones(len(points.xyz), dtype=bool)
     for body in sorted(bodies, key=lambda body: -len(body.target_id)):
         try:
             fit = _fit(body, points, free)
         except DataError as error:
-            missing.append(error)
+            missing[body.name] = error
             continue
         fits.append((body, fit))
         taken = points.shadow[fit.point[fit.point >= 0]]

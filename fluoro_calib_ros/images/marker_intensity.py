@@ -103,6 +103,13 @@ class FilteredLight:
         return field_of_view(self.light, self.scale)
 
     @cached_property
+    def maxima(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rows and columns (k,) of the local maxima."""
+        dilated = cv2.dilate(self.relative, np.ones((_size_of_maximum(self.scale),) * 2, np.uint8))
+        row, column = np.nonzero((self.relative >= dilated) & (self.relative > 0))
+        return row, column
+
+    @cached_property
     def noise(self) -> float:
         """Median response where there is any; a part of the pixels tells it."""
         return _positive_median(self.relative[::SAMPLED, ::SAMPLED])
@@ -204,7 +211,7 @@ def first_shadows(lights: Iterable[FilteredLight], count: int, share: float) -> 
     share: of their response that is found. Raises DataError where there is nothing round.
     """
     look, light = _learned(lights, None, count)
-    return _found(look, light.response, light.around, share)
+    return _found(look, light, share)
 
 
 def search_image(image: np.ndarray, look: MarkerLook, share: float) -> Shadows:
@@ -212,7 +219,8 @@ def search_image(image: np.ndarray, look: MarkerLook, share: float) -> Shadows:
     grey = image.astype(np.float32)
     light = float(np.iinfo(image.dtype).max) - grey if look.inverted else grey
     around = cv2.blur(light, (2 * BACKGROUND_PX + 1,) * 2)
-    return _found(look, _dark_response(light, look.scale), around, share)
+    response = _dark_response(light, look.scale)
+    return _found(look, FilteredLight(look.scale, look.inverted, light, response, around), share)
 
 
 def filter_image(image: np.ndarray, scale: float) -> tuple[FilteredLight, FilteredLight]:
@@ -235,7 +243,7 @@ def _learned(
     """Return what `learn_look` does, from lights of some scales, and the best of them."""
     best: tuple[float, float, FilteredLight] | None = None
     for light in lights:
-        typical = _typical(light.relative, light.scale, near, count)
+        typical = _typical(light, near, count)
         # Small scales have the strongest response to noise, too.
         merit = typical / ((light.noise or 1.0) + NOISE_WEIGHT * typical)
         if best is None or merit * typical > best[0]:
@@ -259,13 +267,16 @@ def _learned(
     return look, light
 
 
-def _found(look: MarkerLook, response: np.ndarray, around: np.ndarray, share: float) -> Shadows:
-    """Find the shadows of a whole image by its response and the light around its pixels."""
-    response = _relative(response, around, look)
-    response[~look.field] = 0
-    response[[0, -1]] = 0
-    response[:, [0, -1]] = 0
-    return _peaks(response, look, share)
+def _found(look: MarkerLook, light: FilteredLight, share: float) -> Shadows:
+    """Find the shadows of a whole filtered image."""
+    row, column = light.maxima
+    height, width = light.light.shape
+    strong = light.relative[row, column] > max(share * look.strength, look.floor)
+    inside = (row > 0) & (row < height - 1) & (column > 0) & (column < width - 1)
+    rows = np.flatnonzero(strong & inside & look.field[row, column])
+    row, column = row[rows], column[rows]
+    clear = light.relative[row, column] >= _floor(look, light.around[row, column])
+    return _shadows_at(light.relative, row[clear], column[clear])
 
 
 def search_windows(
@@ -301,11 +312,16 @@ def _square(half: int) -> np.ndarray:
 
 
 def _relative(response: np.ndarray, around: np.ndarray, look: MarkerLook) -> np.ndarray:
-    """Responses over the light around, 0 where noise explains them: it grows in the dark."""
-    light = np.maximum(around, 1e-3 * look.light)
-    relative = response / light
-    relative[relative < look.floor * np.sqrt(np.maximum(look.light / light, 1.0))] = 0
+    """Responses over the light around, 0 where noise explains them."""
+    relative = response / np.maximum(around, 1e-3 * look.light)
+    relative[relative < _floor(look, around)] = 0
     return np.asarray(relative)
+
+
+def _floor(look: MarkerLook, around: np.ndarray) -> np.ndarray:
+    """Relative response below which noise is, by the light around: it grows in the dark."""
+    light = np.maximum(around, 1e-3 * look.light)
+    return np.asarray(look.floor * np.sqrt(np.maximum(look.light / light, 1.0)))
 
 
 def _responses(grey: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
@@ -340,26 +356,34 @@ def _curvatures(grey: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]
     return mean, spread
 
 
-def _typical(response: np.ndarray, scale: float, near: np.ndarray | None, count: int) -> float:
+def _typical(light: FilteredLight, near: np.ndarray | None, count: int) -> float:
     """Median response near given points, or of the count strongest maxima."""
-    size = 2 * NEAR_PX + 1 if near is not None else 2 * max(1, round(scale)) + 1
-    dilated = cv2.dilate(response, np.ones((size, size), np.uint8))
     if near is not None:
-        height, width = response.shape
+        dilated = cv2.dilate(light.relative, np.ones((2 * NEAR_PX + 1,) * 2, np.uint8))
+        height, width = dilated.shape
         column = np.clip(np.rint(near[:, 0]).astype(int), 0, width - 1)
         row = np.clip(np.rint(near[:, 1]).astype(int), 0, height - 1)
         return float(np.median(dilated[row, column]))
-    values = np.sort(response[(response >= dilated) & (response > 0)])[::-1][: max(count, 3)]
+    values = np.sort(light.relative[light.maxima])[::-1][: max(count, 3)]
     return float(np.median(values)) if len(values) else 0.0
 
 
 def _peaks(response: np.ndarray, look: MarkerLook, share: float) -> Shadows:
     """Local maxima of a response (h, w) that is 0 at its edge, to a part of a pixel."""
-    size = 2 * max(1, round(look.scale)) + 1
-    dilated = cv2.dilate(response, np.ones((size, size), np.uint8))
+    dilated = cv2.dilate(response, np.ones((_size_of_maximum(look.scale),) * 2, np.uint8))
     row, column = np.nonzero(
         (response >= dilated) & (response > max(share * look.strength, look.floor))
     )
+    return _shadows_at(response, row, column)
+
+
+def _size_of_maximum(scale: float) -> int:
+    """Width of the square in which a shadow is the strongest [px]."""
+    return 2 * max(1, round(scale)) + 1
+
+
+def _shadows_at(response: np.ndarray, row: np.ndarray, column: np.ndarray) -> Shadows:
+    """Shadows at local maxima of a response (h, w), to a part of a pixel."""
     at = response[row, column]
     uv = np.column_stack(
         [

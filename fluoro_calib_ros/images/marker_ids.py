@@ -180,7 +180,9 @@ def identifiable(bodies: Sequence[Body]) -> tuple[Body, ...]:
 def find_bodies(
     shadows: Sequence[np.ndarray], rig: CalibratedRig, bodies: Sequence[Body]
 ) -> tuple[dict[str, FirstMarkers], dict[str, DataError]]:
-    """Find bodies among shadows (k, 2) of all views; return their markers, and why others are missing.
+    """Find bodies among shadows (k, 2) of all views.
+
+    Returns their markers by fluoroscope, and by body why others are missing.
 
     Views that see none of the bodies are left out.
     """

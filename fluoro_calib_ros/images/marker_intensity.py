@@ -10,7 +10,7 @@ shadow is the smaller eigenvalue of the Hessian, as in `detection`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
@@ -189,19 +189,23 @@ def check_image(image: np.ndarray, size: tuple[int, int] | None = None) -> None:
         raise DataError(cause, kind=Kind.IMAGE_EMPTY)
 
 
-def learn_look(
-    image: np.ndarray,
-    near: np.ndarray | None,
-    count: int,
-    scales: Sequence[float] = MARKER_SCALES,
-) -> MarkerLook:
+def learn_look(image: np.ndarray, near: np.ndarray) -> MarkerLook:
     """Learn what markers look like, from an image and points (n, 2) near them.
 
-    Without points, the count strongest shadows of each scale decide. scales are those that are
-    tried. Raises DataError where there is nothing round.
+    Raises DataError where there is nothing round.
     """
-    lights = (light for scale in scales for light in filter_image(image, scale))
-    return _learned(lights, near, count)[0]
+    best: _Typical | None = None
+    for scale in MARKER_SCALES:
+        found = max(
+            (_Typical.near(light, near) for light in filter_image(image, scale)),
+            key=lambda one: one.merit,
+        )
+        if best is None or found.merit > best.merit:
+            best = found
+        elif best.clear:
+            break  # beyond the size of the markers, the response falls
+    assert best is not None
+    return best.look('there is nothing round where the markers should be')
 
 
 def first_shadows(lights: Iterable[FilteredLight], count: int, share: float) -> Shadows:
@@ -210,8 +214,9 @@ def first_shadows(lights: Iterable[FilteredLight], count: int, share: float) -> 
     lights: as `filter_image` returns them. count: of the strongest shadows, which tell the look;
     share: of their response that is found. Raises DataError where there is nothing round.
     """
-    look, light = _learned(lights, None, count)
-    return _found(look, light, share)
+    best = max((_Typical.strongest(light, count) for light in lights), key=lambda one: one.merit)
+    look = best.look('there are no markers in the image, nothing round rises above the noise')
+    return _found(look, best.light, share)
 
 
 def search_image(image: np.ndarray, look: MarkerLook, share: float) -> Shadows:
@@ -237,34 +242,53 @@ def filter_image(image: np.ndarray, scale: float) -> tuple[FilteredLight, Filter
     )
 
 
-def _learned(
-    lights: Iterable[FilteredLight], near: np.ndarray | None, count: int
-) -> tuple[MarkerLook, FilteredLight]:
-    """Return what `learn_look` does, from lights of some scales, and the best of them."""
-    best: tuple[float, float, FilteredLight] | None = None
-    for light in lights:
-        typical = _typical(light, near, count)
-        # Small scales have the strongest response to noise, too.
-        merit = typical / ((light.noise or 1.0) + NOISE_WEIGHT * typical)
-        if best is None or merit * typical > best[0]:
-            best = (merit * typical, typical, light)
-    assert best is not None
-    _, strength, light = best
-    floor = max(MIN_SNR * light.noise_in_field, MIN_CONTRAST)
-    if strength < floor:
-        cause = 'there is nothing round where the markers should be'
-        if near is None:
-            cause = 'there are no markers in the image, nothing round rises above the noise'
-        raise DataError(cause, kind=Kind.NO_MARKERS)
-    look = MarkerLook(
-        light.scale,
-        light.inverted,
-        field=light.field,
-        strength=strength,
-        floor=floor,
-        light=max(light.usual, 1.0),
-    )
-    return look, light
+@dataclass(frozen=True)
+class _Typical:
+    """Response to a typical marker in a filtered image."""
+
+    light: FilteredLight
+    strength: float
+
+    @classmethod
+    def near(cls, light: FilteredLight, uv: np.ndarray) -> _Typical:
+        """The median near points (n, 2)."""
+        dilated = cv2.dilate(light.relative, np.ones((2 * NEAR_PX + 1,) * 2, np.uint8))
+        height, width = dilated.shape
+        column = np.clip(np.rint(uv[:, 0]).astype(int), 0, width - 1)
+        row = np.clip(np.rint(uv[:, 1]).astype(int), 0, height - 1)
+        return cls(light, float(np.median(dilated[row, column])))
+
+    @classmethod
+    def strongest(cls, light: FilteredLight, count: int) -> _Typical:
+        """The median of the count strongest maxima."""
+        values = np.sort(light.relative[light.maxima])[::-1][: max(count, 3)]
+        return cls(light, float(np.median(values)) if len(values) else 0.0)
+
+    @property
+    def merit(self) -> float:
+        """How much it stands out: small scales have the strongest response to noise, too."""
+        noise = (self.light.noise or 1.0) + NOISE_WEIGHT * self.strength
+        return self.strength**2 / noise
+
+    @property
+    def clear(self) -> bool:
+        """Whether noise does not explain it."""
+        return self.strength >= max(MIN_SNR * self.light.noise, MIN_CONTRAST)
+
+    def look(self, cause: str) -> MarkerLook:
+        """Return what markers look like. Raises DataError with the cause where there is noise."""
+        light = self.light
+        floor = max(MIN_SNR * light.noise_in_field, MIN_CONTRAST)
+        if self.strength < floor:
+            raise DataError(cause, kind=Kind.NO_MARKERS)
+        return MarkerLook(
+            light.scale,
+            light.inverted,
+            field=light.field,
+            strength=self.strength,
+            floor=floor,
+            light=max(light.usual, 1.0),
+        )
 
 
 def _found(look: MarkerLook, light: FilteredLight, share: float) -> Shadows:
@@ -356,18 +380,6 @@ def _curvatures(grey: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]
     return mean, spread
 
 
-def _typical(light: FilteredLight, near: np.ndarray | None, count: int) -> float:
-    """Median response near given points, or of the count strongest maxima."""
-    if near is not None:
-        dilated = cv2.dilate(light.relative, np.ones((2 * NEAR_PX + 1,) * 2, np.uint8))
-        height, width = dilated.shape
-        column = np.clip(np.rint(near[:, 0]).astype(int), 0, width - 1)
-        row = np.clip(np.rint(near[:, 1]).astype(int), 0, height - 1)
-        return float(np.median(dilated[row, column]))
-    values = np.sort(light.relative[light.maxima])[::-1][: max(count, 3)]
-    return float(np.median(values)) if len(values) else 0.0
-
-
 def _peaks(response: np.ndarray, look: MarkerLook, share: float) -> Shadows:
     """Local maxima of a response (h, w) that is 0 at its edge, to a part of a pixel."""
     dilated = cv2.dilate(response, np.ones((_size_of_maximum(look.scale),) * 2, np.uint8))
@@ -427,7 +439,7 @@ def learn_start(
     if not inside.all():
         bad = int(target_id[~inside][0])
         raise DataError(f'marker {bad} of the first frame lies outside of the image')
-    look = learn_look(image, uv, len(uv))
+    look = learn_look(image, uv)
     found = search_image(image, look, SHARE)
     variance = np.full(len(uv), FIRST_SD_PX**2)
     row, column = assign(uv, variance, found.uv, FIRST_GATE)

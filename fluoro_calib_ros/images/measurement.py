@@ -89,13 +89,20 @@ def estimate_profile(
         if not radius_px / MOST < profile.radius_px < radius_px * MOST:
             break
         profiles.append(profile)
-        if abs(profile.radius_px / before.radius_px - 1) < SETTLED:
+        if _settled(profile, before):
             return profile
     reach_px = max(profile.reach_px for profile in profiles)
     # The first one is no estimate. Of shadows as small as their blur it fits about as well.
     estimates = profiles[1:] or profiles
     fits = [_profile_fit(light, uv[alone], radius, profile, reach_px) for profile in estimates]
     return min(fits, key=ShadowFit.typical).profile
+
+
+def _settled(profile: Profile, before: Profile) -> bool:
+    """Return whether neither radius nor blur of a profile changed by what would be seen."""
+    radius = abs(profile.radius_px / before.radius_px - 1)
+    blur = abs(profile.blur_px / before.blur_px - 1)
+    return radius < SETTLED and blur < RADIUS_SD
 
 
 def _profile_fit(

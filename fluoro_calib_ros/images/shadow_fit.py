@@ -484,8 +484,11 @@ class Profile:
 
         size: relative ones, of which squared distances are multiples of their squares.
         """
-        chord = 2 * np.sqrt(np.maximum(self.radius_px**2 - squared, 0)) / self.radius_px
-        return 1 - np.exp(-self.attenuation * size * chord)
+        return 1 - np.exp(-self.attenuation * size * self.chord(squared))
+
+    def chord(self, squared: np.ndarray) -> np.ndarray:
+        """Way through the bead in radii at squared distances [px^2] from its centre."""
+        return 2 * np.sqrt(np.maximum(self.radius_px**2 - squared, 0)) / self.radius_px
 
     def shadow(self, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Absorbed share of the light at distances [px], and its derivative [1/px]."""
@@ -538,27 +541,75 @@ class Shadows:
         return self._by_dtype[dtype]
 
 
-def _tabulated(profile: Profile) -> np.ndarray:
+class _Blurred:
+    """Shadow of a profile at multiples of TABLE_STEP from its centre."""
+
+    def __init__(self, profile: Profile) -> None:
+        self._parts = max(1, int(min(STEP, profile.radius_px / 4) / TABLE_STEP))
+        step = self._parts * TABLE_STEP
+        # The blur of a square pixel has a variance of 1/12. Only the row through the centre is
+        # needed: all columns are weighted to one row, which is blurred along itself.
+        self.sigma = np.sqrt(profile.blur_px**2 + 1 / 12)
+        half = int(np.ceil(KERNEL_SIGMAS * self.sigma / step)) + 1
+        count = max(int(np.ceil((profile.reach_px + 3) / step)) + 4, half + 1)
+        self._axis = np.arange(count) * step
+        self.squared = self._axis[:, None] ** 2 + self._axis**2
+        kernel = np.exp(-0.5 * (self._axis / self.sigma) ** 2)
+        both = np.append(kernel[0], 2 * kernel[1:])
+        self._across = both / both.sum() ** 2
+        # The blur is exact between the points of the row, too: a part of a step farther on.
+        self._away = (
+            np.arange(-half, half + 1) * step + np.arange(self._parts)[:, None] * TABLE_STEP
+        )
+        self._gauss = np.exp(-0.5 * (self._away / self.sigma) ** 2)
+        self._size = int(np.ceil((profile.reach_px + 2) / TABLE_STEP))
+
+    @property
+    def distance(self) -> NDArray[np.float64]:
+        """Distances (n,) from the centre [px]."""
+        return np.arange(self._size) * TABLE_STEP
+
+    def row(self, quarter: np.ndarray, order: int = 0) -> NDArray[np.float64]:
+        """Blur a quarter of an image across its rows; order of the derivative, 0 or 2."""
+        row = quarter @ (self._across * self._derivative(self._axis, order))
+        return np.concatenate([row[:0:-1], row])
+
+    def table(self, row: np.ndarray, order: int = 0) -> NDArray[np.float64]:
+        """Blur a row along itself (n,); order of the derivative along it, 0 to 2."""
+        kernels = self._gauss * self._derivative(self._away, order)
+        blurred = np.array([np.convolve(row, one, mode='same') for one in kernels])
+        return blurred[:, len(row) // 2 :].T.reshape(-1)[: self._size]
+
+    def _derivative(self, away: np.ndarray, order: int) -> np.ndarray:
+        """Derivative of a Gaussian over the Gaussian itself."""
+        reduced = away / self.sigma
+        if order == 0:
+            return np.ones_like(reduced)
+        return -reduced / self.sigma if order == 1 else (reduced**2 - 1) / self.sigma**2
+
+
+def _tabulated(profile: Profile) -> NDArray[np.float64]:
     """Absorbed shares and their derivatives (2, n) at multiples of TABLE_STEP from the centre."""
-    parts = max(1, int(min(STEP, profile.radius_px / 4) / TABLE_STEP))
-    step = parts * TABLE_STEP
-    # The blur of a square pixel has a variance of 1/12. Only the row through the centre is needed:
-    # all columns are weighted to one row, which is blurred along itself.
-    sigma = np.sqrt(profile.blur_px**2 + 1 / 12)
-    half = int(np.ceil(KERNEL_SIGMAS * sigma / step)) + 1
-    axis = np.arange(max(int(np.ceil((profile.reach_px + 3) / step)) + 4, half + 1)) * step
-    quarter = profile.absorbed(axis[:, None] ** 2 + axis**2)
-    kernel = np.exp(-0.5 * (axis / sigma) ** 2)
-    both = np.append(kernel[0], 2 * kernel[1:])
-    row = quarter @ (both / both.sum() ** 2)
-    row = np.concatenate([row[:0:-1], row])
-    # The blur is exact between the points of the row, too: a part of a step farther on.
-    away = np.arange(-half, half + 1) * step + np.arange(parts)[:, None] * TABLE_STEP
-    gauss = np.exp(-0.5 * (away / sigma) ** 2)
-    kernels = np.stack([gauss, -away / sigma**2 * gauss])
-    blurred = np.array([[np.convolve(row, one, mode='same') for one in two] for two in kernels])
-    table = blurred[:, :, len(axis) - 1 :].swapaxes(1, 2).reshape(2, -1)
-    return np.asarray(table[:, : int(np.ceil((profile.reach_px + 2) / TABLE_STEP))])
+    blurred = _Blurred(profile)
+    row = blurred.row(profile.absorbed(blurred.squared))
+    return np.stack([blurred.table(row), blurred.table(row, 1)])
+
+
+def shadow_derivatives(profile: Profile, distance: np.ndarray) -> NDArray[np.float64]:
+    """Derivatives (n, 3) of absorbed shares at distances (n,) [px].
+
+    With respect to radius [1/px], blur [1/px] and attenuation. A wider blur is the diffusion of a
+    narrower one, dS/dsigma = sigma (S_xx + S_yy), and a larger bead is a scaled one.
+    """
+    blurred = _Blurred(profile)
+    absorbed = profile.absorbed(blurred.squared)
+    row = blurred.row(absorbed)
+    laplacian = blurred.table(row, 2) + blurred.table(blurred.row(absorbed, 2))
+    scaled = blurred.distance * blurred.table(row, 1) + blurred.sigma**2 * laplacian
+    more = profile.chord(blurred.squared) * (1 - absorbed)
+    by_attenuation = blurred.table(blurred.row(more))
+    columns = -scaled / profile.radius_px, profile.blur_px * laplacian, by_attenuation
+    return np.column_stack([np.interp(distance, blurred.distance, one) for one in columns])
 
 
 def fit_profile(
@@ -579,10 +630,15 @@ def fit_profile(
         value, _ = Profile(*unknowns[:3]).shadow(place)
         return root * ((1 - unknowns[3]) * value - mean)
 
+    def slopes(unknowns: np.ndarray) -> np.ndarray:
+        profile = Profile(*unknowns[:3])
+        by_shape = (1 - unknowns[3]) * shadow_derivatives(profile, place)
+        return root[:, None] * np.column_stack([by_shape, -profile.shadow(place)[0]])
+
     first = np.array([start.radius_px, start.blur_px, start.attenuation, start.scatter])
     first = np.clip(first, np.asarray(LOW) * 1.01 + 1e-3, np.asarray(HIGH) * 0.99)
     # The backgrounds belong to the shadows before.
     change = np.append(np.full(3, CHANGE), np.inf)
     bounds = (np.maximum(LOW, first / change), np.minimum(HIGH, first * change))
-    found = least_squares(residual, first, bounds=bounds, x_scale=first, max_nfev=12)
+    found = least_squares(residual, first, jac=slopes, bounds=bounds, x_scale=first, max_nfev=12)
     return Profile(*map(float, found.x))

@@ -24,7 +24,7 @@ from fluoro_calib_ros.images.growth import Seen
 from fluoro_calib_ros.images.light import Light, estimate_noise
 from fluoro_calib_ros.images.matching import PhantomModel, match
 from fluoro_calib_ros.images.measurement import measure_beads
-from fluoro_calib_ros.images.shadow_fit import Profile
+from fluoro_calib_ros.images.shadow_fit import Profile, fit_profile, shadow_derivatives
 from fluoro_calib_ros.images.view import Lens, View, exponents, fit_view, may_be_found
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.simulation.radiographs import HARD, Radiography
@@ -151,6 +151,33 @@ def test_two_overlapping_beads_have_honest_sigmas():
         sigmas.append(beads.sigma)
     assert 0.8 < np.sqrt(np.mean(np.square(normalised))) < 1.25
     assert np.mean(sigmas) > 0.015
+
+
+@pytest.mark.parametrize('shape', [(3.0, 0.9, 1.5), (2.0, 1.5, 0.5), (9.0, 1.2, 3.0)])
+def test_shadow_has_the_derivatives_of_its_differences(shape):
+    """Of differences so wide that the grid of the shadow does not matter."""
+    distance = np.arange(0, shape[0] + 3 * shape[1], 0.25)
+    derivatives = shadow_derivatives(Profile(*shape), distance)
+    for column, step in enumerate(np.diag([0.3, 0.02, 0.02])):
+        above, _ = Profile(*(shape + step)).shadow(distance)
+        below, _ = Profile(*(shape - step)).shadow(distance)
+        expected = (above - below) / (2 * step[column])
+        tolerance = 0.03 * np.abs(expected).max()
+        np.testing.assert_allclose(derivatives[:, column], expected, atol=tolerance)
+
+
+def test_profile_is_fitted_to_its_shadow():
+    true = Profile(3.4, 0.8, 1.3, 0.1)
+    distance = np.random.default_rng(2).uniform(0, 6, 4000)
+    absorbed = 0.9 * true.shadow(distance)[0]
+    start = Profile(3.0, 1.0, 1.5, 0.1)
+    for _ in range(4):
+        start = fit_profile(distance, absorbed, np.ones(4000), start)
+    assert start.radius_px == pytest.approx(3.4, rel=0.002)
+    assert start.blur_px == pytest.approx(0.8, rel=0.02)
+    assert (1 - start.scatter) * start.shadow(np.zeros(1))[0] == pytest.approx(
+        0.9 * true.shadow(np.zeros(1))[0], rel=0.005
+    )
 
 
 def test_profile_is_the_convolution_of_the_sphere():

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -669,6 +669,38 @@ def test_a_body_is_found_among_other_shadows_in_any_pose_and_not_where_it_is_abs
     assert not found and len(missing) == 1
     found, missing = find_bodies([views[0], views[1][:0]], seen, [body])
     assert not found and len(missing) == 1
+
+
+def drawn(places: Sequence[tuple[np.ndarray, float]], size: int) -> np.ndarray:
+    """Image of blurred dark discs: places (k, 2) and their radius [px]."""
+    fine = 4
+    light = np.full((size * fine, size * fine), 180, np.uint8)
+    for uv, radius in places:
+        for u, v in (uv + 0.5) * fine - 0.5:
+            cv2.circle(light, (round(u), round(v)), round(radius * fine), 80, -1)
+    image = cv2.resize(cv2.GaussianBlur(light, (0, 0), 0.8 * fine), (size, size))
+    noise = np.random.default_rng(5).normal(0, 1, image.shape)
+    return np.clip(np.rint(image + noise), 0, 255).astype(np.uint8)
+
+
+def test_bodies_with_markers_of_different_sizes_are_found_together():
+    """No size of shadows shows all: where one body is missing, other sizes are looked for."""
+    rng = np.random.default_rng(2477)  # no two markers are within 9 px in a view
+    shapes = [rng.uniform(-12, 12, (6, 3)) for _ in range(2)]
+    bodies = [
+        Body(name, np.arange(first, first + 6), xyz, np.full(6, 0.03))
+        for name, first, xyz in zip(('small', 'large'), (11, 21), shapes)
+    ]
+    calibrations, orientation = calibration()
+    places = {f.name: [f.ideal(xyz) for xyz in shapes] for f in rig().fluoroscopes}
+    images = {
+        name: drawn([(uv[0], 1.2), (uv[1], 3.2)], calibrations[name].image_size[0])
+        for name, uv in places.items()
+    }
+    found = identify_markers(images, calibrations, orientation, bodies)
+    for name, uv in places.items():
+        assert found[name].target_id.tolist() == [*range(11, 17), *range(21, 27)]
+        assert np.abs(found[name].uv - np.concatenate(uv)).max() < 1.0
 
 
 def without_second_body(images: dict[str, MarkerImage]) -> dict[str, np.ndarray]:

@@ -549,7 +549,7 @@ class _Blurred:
         step = self._parts * TABLE_STEP
         # The blur of a square pixel has a variance of 1/12. Only the row through the centre is
         # needed: all columns are weighted to one row, which is blurred along itself.
-        self.sigma = np.sqrt(profile.blur_px**2 + 1 / 12)
+        self.sigma = float(np.sqrt(profile.blur_px**2 + 1 / 12))
         half = int(np.ceil(KERNEL_SIGMAS * self.sigma / step)) + 1
         count = max(int(np.ceil((profile.reach_px + 3) / step)) + 4, half + 1)
         self._axis = np.arange(count) * step
@@ -578,7 +578,7 @@ class _Blurred:
         """Blur a row along itself (n,); order of the derivative along it, 0 to 2."""
         kernels = self._gauss * self._derivative(self._away, order)
         blurred = np.array([np.convolve(row, one, mode='same') for one in kernels])
-        return blurred[:, len(row) // 2 :].T.reshape(-1)[: self._size]
+        return np.asarray(blurred[:, len(row) // 2 :].T.reshape(-1)[: self._size])
 
     def _derivative(self, away: np.ndarray, order: int) -> np.ndarray:
         """Derivative of a Gaussian over the Gaussian itself."""

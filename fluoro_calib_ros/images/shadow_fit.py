@@ -567,7 +567,7 @@ class _Blurred:
     @property
     def distance(self) -> NDArray[np.float64]:
         """Distances (n,) from the centre [px]."""
-        return np.arange(self._size) * TABLE_STEP
+        return np.asarray(np.arange(self._size) * TABLE_STEP)
 
     def row(self, quarter: np.ndarray, order: int = 0) -> NDArray[np.float64]:
         """Blur a quarter of an image across its rows; order of the derivative, 0 or 2."""

@@ -100,8 +100,8 @@ def identify_markers(
     Raises
     ------
     DataError
-        Where none of the bodies is found, or fits in one way only, and where a fluoroscope sees
-        none of those that are found.
+        Where none of the bodies is found, or fits in one way only, and where no two fluoroscopes
+        see those that are found.
     """
     names = list(orientation.fluoroscopes)
     bodies = identifiable(bodies)
@@ -155,12 +155,13 @@ class _ImageSearch:
             self._found.setdefault(name, []).append(first)
 
     def markers(self) -> dict[str, FirstMarkers]:
-        """Return the markers of each fluoroscope. Raises DataError where one sees none."""
+        """Return the markers of those that see some. Raises DataError where no two of them do."""
         if not self._found and self._reason is not None:
             raise self._reason
-        for name in self._rig.orientation.fluoroscopes:
-            if name not in self._found:
-                raise DataError(f'fluoroscope {name} sees none of the bodies that others see')
+        if len(self._found) < 2:
+            names = self._rig.orientation.fluoroscopes
+            blind = next(name for name in names if name not in self._found)
+            raise DataError(f'fluoroscope {blind} sees none of the bodies that others see')
         return {
             name: FirstMarkers(
                 np.concatenate([first.target_id for first in parts]),

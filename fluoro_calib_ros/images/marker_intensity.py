@@ -426,41 +426,38 @@ class MarkerStart:
 NOWHERE_PX = -2e4  # where markers are whose place is not known yet
 
 
-def learn_start(
-    image: np.ndarray, target_id: np.ndarray, uv: np.ndarray, later: int = 0
-) -> MarkerStart:
-    """Learn from an image with markers near uv (n, 2) [px].
+def learn_start(image: np.ndarray, target_id: np.ndarray, uv: np.ndarray) -> MarkerStart:
+    """Learn from an image with markers near uv (n, 2) [px], NaN where places are not known yet.
 
-    later: number of further markers, whose places are not known yet. Raises DataError where the
-    markers are not there.
+    Raises DataError where the markers are not there.
     """
     height, width = image.shape
-    inside = ((uv > -0.5) & (uv < np.array([width, height]) - 0.5)).all(axis=1)
+    known = np.isfinite(uv).all(axis=1)
+    given = uv[known]
+    inside = ((given > -0.5) & (given < np.array([width, height]) - 0.5)).all(axis=1)
     if not inside.all():
-        bad = int(target_id[~inside][0])
+        bad = int(target_id[known][~inside][0])
         raise DataError(f'marker {bad} of the first frame lies outside of the image')
-    look = learn_look(image, uv)
+    look = learn_look(image, given)
     found = search_image(image, look, SHARE)
-    variance = np.full(len(uv), FIRST_SD_PX**2)
-    row, column = assign(uv, variance, found.uv, FIRST_GATE)
-    if len(row) < max(1, len(uv) // 2):
+    row, column = assign(given, np.full(len(given), FIRST_SD_PX**2), found.uv, FIRST_GATE)
+    if len(row) < max(1, len(given) // 2):
         raise DataError(
-            f'only {len(row)} of {len(uv)} markers of the first frame are in the image'
+            f'only {len(row)} of {len(given)} markers of the first frame are in the image'
         )
-    place = uv.copy()
-    place[row] = found.uv[column]
-    unseen = np.ones(len(uv) + later, dtype=int)
-    unseen[row] = 0
+    seen = np.flatnonzero(known)[row]
+    place = np.where(known[:, None], uv, NOWHERE_PX)
+    place[seen] = found.uv[column]
+    unseen = np.ones(len(uv), dtype=int)
+    unseen[seen] = 0
     top = float(np.iinfo(image.dtype).max)
     light = image.astype(np.float32)
     light = top - light if look.inverted else light
-    seen = place[row]
-    place = np.concatenate([place, np.full((later, 2), NOWHERE_PX)])
     return MarkerStart(
         MarkerStates.start(Motion.start(place, FIRST_SD_PX), unseen),
         look,
         profile=estimate_profile(
-            Light(light, look.field), seen, np.ones(len(seen)), look.radius_px
+            Light(light, look.field), place[seen], np.ones(len(seen)), look.radius_px
         ),
         noise=estimate_noise(light, look.field),
         size=(width, height),

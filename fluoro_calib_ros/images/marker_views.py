@@ -40,9 +40,9 @@ class MarkerViews:
     """Follows markers through the images of one fluoroscope, or of several that are calibrated.
 
     orientation: that they belong to; None for one fluoroscope. first: ids and places in the first
-    images, by fluoroscope. bodies: shapes that are not given are learned from the images. later:
-    ids of markers whose places are given later. Raises DataError for several fluoroscopes without
-    orientation, and for those that it does not have.
+    images, by fluoroscope; None for one that does not see them yet. bodies: shapes that are not
+    given are learned from the images. later: ids of markers whose places are given later. Raises
+    DataError for several fluoroscopes without orientation, and for those that it does not have.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class MarkerViews:
         orientation: RigOrientation | None,
         options: MarkerOptions | None = None,
         *,
-        first: Mapping[str, FirstMarkers],
+        first: Mapping[str, FirstMarkers | None],
         bodies: Sequence[Body] = (),
         later: Sequence[int] = (),
     ) -> None:
@@ -60,7 +60,7 @@ class MarkerViews:
         self.target_id = np.unique(
             np.concatenate(
                 [
-                    *(first[name].target_id for name in self.names),
+                    *(given.target_id for given in first.values() if given is not None),
                     *(body.target_id[body.known] for body in bodies),
                     entering,
                 ]
@@ -69,9 +69,7 @@ class MarkerViews:
         rigid = [body.target_id for body in bodies]
         others = np.intersect1d(self.target_id, np.concatenate([*rigid, entering]))
         self.trackers = {
-            name: MarkerTracker(
-                options, first=first[name], later=np.setdiff1d(others, first[name].target_id)
-            )
+            name: MarkerTracker(options, first=first[name], later=_later(others, first[name]))
             for name in self.names
         }
         self._joined: JoinedViews | None = None
@@ -106,8 +104,13 @@ class MarkerViews:
         return ViewsFrame(found) if joined is None else joined.decided(found, frame)
 
 
+def _later(target_id: np.ndarray, given: FirstMarkers | None) -> np.ndarray:
+    """Ids (k,) of the markers that are not given."""
+    return target_id if given is None else np.setdiff1d(target_id, given.target_id)
+
+
 def _names(
-    first: Mapping[str, FirstMarkers], orientation: RigOrientation | None
+    first: Mapping[str, FirstMarkers | None], orientation: RigOrientation | None
 ) -> tuple[str, ...]:
     """Fluoroscopes that are followed, in the order of the orientation. Raises DataError."""
     if len(first) > 1 and orientation is None:
@@ -228,7 +231,7 @@ class JoinedViews:
 
     def _shadows(self, view: DecidedView, image: np.ndarray | None) -> np.ndarray | None:
         """Places (k, 2) of shadows in a view [px], None where there is no image."""
-        if image is None:
+        if image is None or not view.tracker.begun:
             return None
         try:
             check_image(image, self._rig.calibrations[view.name].image_size)

@@ -135,6 +135,9 @@ class MarkerFrame:
         return '' if self.finding is None else self.finding.cause
 
 
+MIN_SUGGESTED = 4  # markers that are suggested in an image with which following begins
+
+
 @dataclass(frozen=True)
 class _Followed:
     """What follows markers, from the first image on."""
@@ -152,22 +155,23 @@ class _Followed:
 class MarkerTracker:
     """Follows markers through the images of one fluoroscope.
 
-    first: ids and places in the first image; later (k,): ids of markers that are followed once
-    their places are given or suggested.
+    first: ids and places in the first image; None: following begins with an image in which enough
+    suggested markers are seen. later (k,): ids of markers that are followed once their places are
+    given or suggested.
     """
 
     def __init__(
         self,
         options: MarkerOptions | None = None,
         *,
-        first: FirstMarkers,
+        first: FirstMarkers | None,
         later: NDArray[np.int64] | None = None,
     ) -> None:
         self.options = options or MarkerOptions()
         self.first = first
-        self.target_id = first.target_id  # of all markers
-        if later is not None:
-            self.target_id = np.append(first.target_id, np.asarray(later, dtype=np.int64))
+        none = np.zeros(0, dtype=np.int64)
+        known = none if first is None else first.target_id
+        self.target_id = np.append(known, none if later is None else later)  # of all markers
         self._rows = {number: row for row, number in enumerate(self.target_id.tolist())}
         self._followed: _Followed | None = None
         self._frame = 0
@@ -176,6 +180,12 @@ class MarkerTracker:
         self._led: np.ndarray | None = None
         self._suggested: list[tuple[np.ndarray, ...]] = []
         self._given: FirstMarkers | None = None  # of the next image
+        self._tried = 0  # image from which suggested markers are looked for again
+
+    @property
+    def begun(self) -> bool:
+        """Whether markers are followed."""
+        return self._followed is not None
 
     @property
     def profile(self) -> Profile | None:
@@ -200,13 +210,16 @@ class MarkerTracker:
             check_image(image, None if followed is None else followed.size)
         except DataError as error:
             if followed is None:
-                raise
+                return self._not_begun(frame, error, begin)
             self._advance(frame)
             self._given = None
             nothing = MeasuredMarkers.nothing(len(self.target_id))
             return self._result(nothing, (), error.finding, begin)
         if followed is None:
-            self._followed = self._start(image)
+            try:
+                self._followed = self._start(image, frame)
+            except DataError as error:
+                return self._not_begun(frame, error, begin)
             self._frame = frame
         else:
             self._advance(frame)
@@ -222,7 +235,9 @@ class MarkerTracker:
 
     def doubtful(self) -> np.ndarray:
         """Ids (k,) of markers whose id may be wrong."""
-        return self.target_id[self._known().doubts.doubtful]
+        if self._followed is None:
+            return self.target_id[:0]
+        return self.target_id[self._followed.doubts.doubtful]
 
     def confirm(self, target_id: int) -> None:
         """Take back the doubt in a marker."""
@@ -254,7 +269,9 @@ class MarkerTracker:
 
     def unsure(self) -> np.ndarray:
         """Ids (k,) of markers that were not measured last, or are doubtful."""
-        followed = self._known()
+        followed = self._followed
+        if followed is None:
+            return self.target_id
         return self.target_id[(followed.states.unseen > 0) | followed.doubts.doubtful]
 
     def unseen(self) -> np.ndarray:
@@ -298,13 +315,12 @@ class MarkerTracker:
             raise DataError(f'there is no marker {target_id}')
         return row
 
-    def _start(self, image: np.ndarray) -> _Followed:
+    def _start(self, image: np.ndarray, frame: int) -> _Followed:
         """Learn from the first image. Raises DataError where the markers are not there."""
-        given = len(self.first.target_id)
-        later = len(self.target_id) - given
-        start = learn_start(image, self.first.target_id, self.first.uv, later)
+        places = self._first_places(image.shape, frame)
+        start = learn_start(image, self.target_id, places)
         options = self.options
-        for row in range(given, given + later):
+        for row in np.flatnonzero(np.isnan(places[:, 0])).tolist():
             start.states.forget(row, options.lost_after + 1)
         doubts = MarkerDoubts(len(self.target_id))
         return _Followed(
@@ -328,6 +344,45 @@ class MarkerTracker:
                 margin=options.margin,
                 density=start.density,
             ),
+        )
+
+    def _first_places(self, shape: tuple[int, ...], frame: int) -> NDArray[np.float64]:
+        """Return places (n, 2) in the first image [px], NaN for unknown ones.
+
+        Raises DataError where too few are suggested in an image of this shape.
+        """
+        places = np.full((len(self.target_id), 2), np.nan)
+        if self.first is not None:
+            places[: len(self.first.uv)] = self.first.uv
+            return places
+        for rows, uv, _, sd in self._suggested:
+            inside = ((uv > 0) & (uv < np.array(shape[::-1]) - 1)).all(axis=1)
+            near = inside & (sd < FIRST_SD_PX)
+            places[rows[near]] = uv[near]
+        if np.isfinite(places[:, 0]).sum() < MIN_SUGGESTED or frame < self._tried:
+            raise DataError('no marker is seen', kind=Kind.NO_MARKERS)
+        self._tried = frame + self.options.search_every
+        return places
+
+    def _not_begun(self, frame: int, error: DataError, begin: float) -> MarkerFrame:
+        """Return an image without markers, or raise the error where the first ones are given."""
+        if self.first is not None:
+            raise error
+        self._suggested = []
+        count = len(self.target_id)
+        nothing = MeasuredMarkers.nothing(count)
+        return MarkerFrame(
+            frame,
+            self.target_id[:0],
+            uv=nothing.uv[:0],
+            sigma=nothing.sigma[:0],
+            overlapped=nothing.overlapped[:0],
+            doubtful=nothing.measured[:0],
+            missing=self.target_id,
+            predicted=np.full((count, 2), np.nan),
+            lost=np.ones(count, dtype=bool),
+            finding=error.finding,
+            seconds=time.perf_counter() - begin,
         )
 
     def _advance(self, frame: int) -> None:

@@ -256,8 +256,9 @@ DECIDED = {
 class MarkerSettings:
     """What a MarkerFollower is made of."""
 
-    #: ids and places in the first images by fluoroscope; empty: the shapes of the bodies tell them
-    first: Mapping[str, FirstMarkers]
+    #: ids and places in the first images by fluoroscope, None for one that does not see them yet;
+    #: empty: the shapes of the bodies tell them
+    first: Mapping[str, FirstMarkers | None]
     options: MarkerOptions = field(default_factory=MarkerOptions)
     #: of several fluoroscopes
     calibrations: Calibrations = field(default_factory=dict)
@@ -300,7 +301,7 @@ class MarkerFollower:
         if self._settings.first:
             self._follow(self._settings.first)
 
-    def _follow(self, first: Mapping[str, FirstMarkers]) -> None:
+    def _follow(self, first: Mapping[str, FirstMarkers | None]) -> None:
         """Follow markers from their first places on. Raises DataError."""
         settings = self._settings
         self._views = MarkerViews(
@@ -392,17 +393,16 @@ class MarkerFollower:
         """Begin with the bodies that are found by their shapes. Raises DataError."""
         settings = self._settings
         assert settings.orientation is not None
-        self._follow(
-            identify_markers(
-                images, settings.calibrations, settings.orientation, settings.bodies, angles
-            )
+        found = identify_markers(
+            images, settings.calibrations, settings.orientation, settings.bodies, angles
         )
+        self._follow({name: found.get(name) for name in settings.names})
 
     def _check_start(self, exposure: ViewsFrame) -> None:
         """Begin, or wait for another exposure. Raises DataError."""
         for name, view in exposure.views.items():
             given = self._begun_views.trackers[name].first
-            problem = _wrong_start(view, len(given.target_id))
+            problem = None if given is None else _wrong_start(view, len(given.target_id))
             if problem is not None:
                 self._renew()
                 place = Place((name,)) if len(exposure.views) > 1 else Place()

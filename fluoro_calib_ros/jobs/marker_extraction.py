@@ -312,7 +312,7 @@ class _Recording:
 
     def _first_markers(
         self, images: Mapping[str, SourceImage], exposure: int
-    ) -> dict[str, FirstMarkers]:
+    ) -> Mapping[str, FirstMarkers | None]:
         """Return the markers of an exposure, none where they are not known. Raises DataError."""
         if len(images) < len(self._names) or (self._start or exposure) != exposure:
             return {}
@@ -336,7 +336,7 @@ class _Recording:
         ids = [frame.target_id for frame in frames if frame.number > self._start]
         return tuple(np.unique(np.concatenate(ids)).tolist()) if ids else ()
 
-    def _by_shape(self, images: Mapping[str, SourceImage]) -> dict[str, FirstMarkers]:
+    def _by_shape(self, images: Mapping[str, SourceImage]) -> Mapping[str, FirstMarkers | None]:
         """Identify markers by the shapes of their bodies, in one of the first exposures."""
         request = self._request
         assert request.orientation is not None
@@ -346,13 +346,14 @@ class _Recording:
             whole = {n: a for n, a in arrays.items() if not isinstance(a, DataError)}
             if len(whole) < len(arrays):
                 return {}
-            return identify_markers(
+            found = identify_markers(
                 whole,
                 request.calibrations,
                 request.orientation,
                 request.bodies,
                 _angles_of(images),
             )
+            return {name: found.get(name) for name in self._names}
         except DataError as error:
             self._reason = self._reason or str(error)
             if self._tries >= MAX_TRIES:
@@ -362,7 +363,7 @@ class _Recording:
             return {}
 
     def _begin(
-        self, images: Mapping[str, SourceImage], first: Mapping[str, FirstMarkers]
+        self, images: Mapping[str, SourceImage], first: Mapping[str, FirstMarkers | None]
     ) -> MarkerFollower:
         """Return the follower from the first images on. Raises DataError for a damaged one."""
         for name in self._names:

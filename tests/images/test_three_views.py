@@ -150,12 +150,35 @@ def test_points_of_three_rays_leave_few_of_two():
     assert len(two.xyz) > 60 and (two.shadow[:, 2] == -1).all()
 
 
-def test_a_view_that_sees_no_body_is_named():
+def test_views_without_bodies_are_left_out_and_named_where_two_are_needed():
     images = plain(sequence()[0])
     images['c'] = covered(sequence()[0]['c'], np.s_[:])
     calibrations, orientation = calibration()
-    with pytest.raises(DataError, match='fluoroscope c sees none of the bodies'):
+    assert set(identify_markers(images, calibrations, orientation, bodies())) == {'a', 'b'}
+    images['b'] = covered(sequence()[0]['b'], np.s_[:])
+    with pytest.raises(DataError, match=r'markers fit its shape|no markers in the image'):
         identify_markers(images, calibrations, orientation, bodies())
+
+
+def test_a_view_that_sees_nothing_at_first_does_not_keep_the_others_from_starting():
+    """It joins them when the markers enter it, from where their bodies are."""
+    calibrations, orientation = calibration()
+    follower = MarkerSettings({}, OPTIONS, calibrations, orientation, bodies())()
+    joined = []
+    for number, of in enumerate(sequence(), 1):
+        images = plain(of)
+        if number <= 8:
+            images['c'] = covered(of['c'], np.s_[:])
+        found = follower.extract(images, number)
+        assert not found['a'].reason and not found['b'].reason
+        if number <= 8:
+            assert found['c'].finding.kind is Kind.NO_MARKERS and not len(found['c'].target_id)
+            continue
+        true = of['c'].uv[np.searchsorted(ids(), found['c'].target_id)]
+        assert (np.linalg.norm(found['c'].uv - true, axis=1) < FAR_PX).all()
+        joined.append(len(true) / of['c'].seen.sum())
+    assert joined[0] > 0.8
+    assert np.mean(joined) > 0.9
 
 
 def test_bodies_are_found_and_followed_in_three_views():

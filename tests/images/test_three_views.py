@@ -177,8 +177,9 @@ def test_a_view_that_sees_nothing_at_first_does_not_keep_the_others_from_startin
         true = of['c'].uv[np.searchsorted(ids(), found['c'].target_id)]
         assert (np.linalg.norm(found['c'].uv - true, axis=1) < FAR_PX).all()
         joined.append(len(true) / of['c'].seen.sum())
-    assert joined[0] > 0.8
-    assert np.mean(joined) > 0.9
+    later = joined[OPTIONS.search_every :]
+    assert later[0] > 0.8
+    assert np.mean(later) > 0.9
 
 
 def test_bodies_are_found_and_followed_in_three_views():

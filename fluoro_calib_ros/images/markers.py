@@ -39,7 +39,6 @@ from .marker_watch import (
     shift_together,
     velocity_beside,
 )
-from .shadow_fit import Profile
 
 
 @dataclass(frozen=True)
@@ -138,6 +137,31 @@ class MarkerFrame:
 MIN_SUGGESTED = 4  # markers that are suggested in an image with which following begins
 
 
+def _inside(uv: np.ndarray, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Return (n,) whether points (n, 2) are in an image of a shape."""
+    return np.asarray(((uv > 0) & (uv < np.array(shape[::-1]) - 1)).all(axis=1))
+
+
+def _none_seen(
+    frame: int, target_id: NDArray[np.int64], finding: Finding, seconds: float
+) -> MarkerFrame:
+    """Return an image in which no marker was ever seen."""
+    count = len(target_id)
+    return MarkerFrame(
+        frame,
+        target_id[:0],
+        uv=np.zeros((0, 2)),
+        sigma=np.zeros(0),
+        overlapped=np.zeros(0, dtype=bool),
+        doubtful=np.zeros(0, dtype=bool),
+        missing=target_id,
+        predicted=np.full((count, 2), np.nan),
+        lost=np.ones(count, dtype=bool),
+        finding=finding,
+        seconds=seconds,
+    )
+
+
 @dataclass(frozen=True)
 class _Followed:
     """What follows markers, from the first image on."""
@@ -187,11 +211,6 @@ class MarkerTracker:
         """Whether markers are followed."""
         return self._followed is not None
 
-    @property
-    def profile(self) -> Profile | None:
-        """Shadow of a typical marker, None before the first image."""
-        return None if self._followed is None else self._followed.measurement.profile
-
     def update(self, image: np.ndarray | None, frame: int) -> MarkerFrame:
         """Measure the markers of the next image (h, w), of uint8 or uint16; None: there is none.
 
@@ -208,6 +227,8 @@ class MarkerTracker:
             if image is None:
                 raise DataError('there is no image')
             check_image(image, None if followed is None else followed.size)
+            if followed is None:
+                self._followed = self._start(image, frame)
         except DataError as error:
             if followed is None:
                 return self._not_begun(frame, error, begin)
@@ -216,10 +237,6 @@ class MarkerTracker:
             nothing = MeasuredMarkers.nothing(len(self.target_id))
             return self._result(nothing, (), error.finding, begin)
         if followed is None:
-            try:
-                self._followed = self._start(image, frame)
-            except DataError as error:
-                return self._not_begun(frame, error, begin)
             self._frame = frame
         else:
             self._advance(frame)
@@ -356,8 +373,7 @@ class MarkerTracker:
             places[: len(self.first.uv)] = self.first.uv
             return places
         for rows, uv, _, sd in self._suggested:
-            inside = ((uv > 0) & (uv < np.array(shape[::-1]) - 1)).all(axis=1)
-            near = inside & (sd < FIRST_SD_PX)
+            near = _inside(uv, shape) & (sd < FIRST_SD_PX)
             places[rows[near]] = uv[near]
         if np.isfinite(places[:, 0]).sum() < MIN_SUGGESTED or frame < self._tried:
             raise DataError('no marker is seen', kind=Kind.NO_MARKERS)
@@ -369,21 +385,8 @@ class MarkerTracker:
         if self.first is not None:
             raise error
         self._suggested = []
-        count = len(self.target_id)
-        nothing = MeasuredMarkers.nothing(count)
-        return MarkerFrame(
-            frame,
-            self.target_id[:0],
-            uv=nothing.uv[:0],
-            sigma=nothing.sigma[:0],
-            overlapped=nothing.overlapped[:0],
-            doubtful=nothing.measured[:0],
-            missing=self.target_id,
-            predicted=np.full((count, 2), np.nan),
-            lost=np.ones(count, dtype=bool),
-            finding=error.finding,
-            seconds=time.perf_counter() - begin,
-        )
+        seconds = time.perf_counter() - begin
+        return _none_seen(frame, self.target_id, error.finding, seconds)
 
     def _advance(self, frame: int) -> None:
         """Predict all markers for an image."""

@@ -227,6 +227,9 @@ class _BeadFit(ShadowFit):
         self.high = light.high
         self._set_windows(grey, valid & own, bright=np.where(valid, grey, 0.0))
         self.usable = self.valid.sum(axis=1) >= MIN_INSIDE * own.sum(axis=1)
+        # Without a part of its border, a shadow that is not quite that of a sphere moves.
+        from_edge = np.minimum(self.uv, (width - 1, height - 1) - self.uv).min(axis=1)
+        self.usable &= from_edge >= self.profile.radius_px * self.radius
 
     def run(self, steps: int) -> None:
         """Take Gauss-Newton steps; the last one gives standard deviations as well."""

@@ -153,6 +153,22 @@ def test_two_overlapping_beads_have_honest_sigmas():
     assert np.mean(sigmas) > 0.015
 
 
+def test_shadow_whose_border_the_image_cuts_is_not_measured():
+    """What is no sphere, such as a hole of a sheet, would move."""
+    profile = Profile(4.0, 0.9, 1.2, 0.0)
+    field = np.ones((60, 60), bool)
+    true = np.array([[3.6, 30.0], [30.0, 55.2], [30.0, 4.6], [54.4, 30.0]])
+    grid = np.stack(np.meshgrid(np.arange(60.0), np.arange(60.0)), axis=-1)
+    light = np.full((60, 60), 900.0)
+    for centre in true:
+        light *= 1 - profile.shadow(np.linalg.norm(grid - centre, axis=2))[0]
+    image = np.random.default_rng(3).poisson(light).astype(np.float32)
+    noise = replace(estimate_noise(image, field), constant=0.1, gain=1.0)
+    beads = measure_beads(Light(image, field), true, np.ones(4), profile, noise)
+    assert beads.measured.tolist() == [False, False, True, True]
+    assert np.abs(beads.uv - true)[2:].max() < 4 * beads.sigma[2:].max() < 0.2
+
+
 @pytest.mark.parametrize('shape', [(3.0, 0.9, 1.5), (2.0, 1.5, 0.5), (9.0, 1.2, 3.0)])
 def test_shadow_has_the_derivatives_of_its_differences(shape):
     """Of differences so wide that the grid of the shadow does not matter."""

@@ -148,6 +148,7 @@ def _process(
     trials: Mapping[str, Sequence[Step]],
 ) -> bool:
     """Do all steps in the working directory, write the table and print it. Raises DataError."""
+    from ..io.calibration import stored_verdict
     from ..processes import Programs
 
     with Programs() as programs:
@@ -158,7 +159,7 @@ def _process(
             raise DataError(
                 f'no calibration: {failed[0].message} ({study.folder / study.out / LOG})'
             )
-        verdict = calibration_verdict(study.calibration)
+        verdict = stored_verdict(study.calibration).verdict or 'cannot tell'
         if verdict == 'fail':
             raise DataError(
                 f'the verdict of the calibration is fail, the trials are not processed: '
@@ -387,16 +388,6 @@ def digest_of(step: Step) -> str:
                 state = file.stat()
                 digest.update(f'\0{file}\0{state.st_size}\0{state.st_mtime_ns}'.encode())
     return digest.hexdigest()
-
-
-def calibration_verdict(folder: Path) -> str:
-    """Return the verdict of a result folder, 'cannot tell' where it is not about its files."""
-    from ..io.calibration import VALIDATION_NAME, changed_since_verdict, read_result
-
-    document = read_result(folder, VALIDATION_NAME)
-    if not document or changed_since_verdict(folder, document) is not None:
-        return 'cannot tell'
-    return str(document.get('verdict', 'cannot tell'))
 
 
 def trial_row(

@@ -16,7 +16,7 @@ import json
 import os
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -346,6 +346,33 @@ def changed_since_verdict(directory: PathLike, verdict: Mapping[str, Any]) -> Fi
     except DataError as error:
         return error.finding
     return _edited(directory, changed[0], 'the verdict is not about it') if changed else None
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Verdict on calibrations: pass, fail or cannot tell, '' where none was made."""
+
+    verdict: str = ''
+    findings: tuple[str, ...] = ()  #: why it is no pass
+    calibration_id: Mapping[str, str] = field(default_factory=dict)  #: by fluoroscope
+
+
+def stored_verdict(directory: PathLike) -> Verdict:
+    """Return the verdict of a result folder, 'cannot tell' where it is not about its files.
+
+    Raises DataError for a damaged file.
+    """
+    document = read_result(directory, VALIDATION_NAME)
+    if not document:
+        return Verdict()
+    identity = document.get('calibration_id')
+    about = {str(k): str(v) for k, v in identity.items()} if isinstance(identity, Mapping) else {}
+    changed = changed_since_verdict(directory, document)
+    if changed is not None:
+        return Verdict('cannot tell', (str(changed),), about)
+    findings = document.get('findings')
+    told = tuple(map(str, findings)) if isinstance(findings, list) else ()
+    return Verdict(str(document.get('verdict', 'cannot tell')), told, about)
 
 
 def _digest_of_file(path: Path) -> str:

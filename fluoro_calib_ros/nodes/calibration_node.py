@@ -205,11 +205,14 @@ class CalibrationNode(StreamNode):
             angle=self._angles.health(name, incompatible),
         )
         orientation = self._output.orientation
+        verdict = self._output.verdict(name)
         values = {
             **progress.collected.values(),
             'lost at the input': stream.overrun,
             'last fault': stream.refusals.last_fault,
             'calibration': progress.calibration_id,
+            'verdict': verdict.verdict,
+            'findings of the verdict': '\n'.join(verdict.findings),
             'orientation': orientation.orientation_id if orientation else '',
             'source of the orientation': orientation.source if orientation else '',
             **self._angles.values(name),

@@ -17,6 +17,7 @@ from sensor_msgs.msg import Image
 
 from ..correction import fluoroscope_calibration as calibration_result
 from ..images.overlay import coverage_picture
+from ..io.calibration import Verdict
 from ..io.versions import calibrated_orientation
 from ..photogrammetry import rig_orientation
 from .messages.fluoroscope_calibration import message_from_calibration
@@ -52,6 +53,7 @@ class CalibrationOutput:
         self._directory = directory
         self._in_use: dict[str, calibration_result.FluoroscopeCalibration] = {}
         self._since: dict[str, float] = {}
+        self._verdict: dict[str, Verdict] = {}
         # The status first: by its publishers, receivers of calibrations recognise that two nodes
         # serve the same fluoroscope.
         self._status = self._publishers(CalibrationStatus, 'calibration_status', 10)
@@ -79,8 +81,12 @@ class CalibrationOutput:
         self,
         calibrations: Mapping[str, calibration_result.FluoroscopeCalibration],
         orientation: rig_orientation.RigOrientation | None,
+        verdict: Verdict | None = None,
     ) -> None:
-        """Use and publish calibrations, and the orientation that belongs to them, if any."""
+        """Use and publish calibrations, and the orientation that belongs to them, if any.
+
+        verdict: on some of them.
+        """
         # The orientation first, so that it is there when the first points come that are corrected
         # with the new calibrations.
         if orientation is not None:
@@ -88,6 +94,9 @@ class CalibrationOutput:
         for name, calibration in calibrations.items():
             self._in_use[name] = calibration
             self._since[name] = time.monotonic()
+            self._verdict.pop(name, None)
+            if verdict and verdict.calibration_id.get(name) == calibration.calibration_id:
+                self._verdict[name] = verdict
             self.refused.pop(name, None)
             self.load_fault = ''
             self._calibration[name].publish(message_from_calibration(calibration))
@@ -99,6 +108,10 @@ class CalibrationOutput:
         if calibrated is not None:
             self._as_calibrated.publish(message_from_orientation(calibrated))
         self._orientation.publish(message_from_orientation(orientation))
+
+    def verdict(self, name: str) -> Verdict:
+        """Return the verdict on a calibration in use."""
+        return self._verdict.get(name, Verdict())
 
     def age_s(self, name: str) -> float:
         """Return how long a calibration has been in use [s], NaN where there is none."""
@@ -169,6 +182,16 @@ def unknown_angle(state: FluoroscopeState) -> Health | None:
     return state.angle
 
 
+def failed_verdict(state: FluoroscopeState) -> Health | None:
+    """The calibration in use should not be used."""
+    verdict = state.output.verdict(state.stream.name)
+    if verdict.verdict != 'fail':
+        return None
+    return warning(
+        ': '.join(['the calibration in use has failed its verdict', *verdict.findings[:1]])
+    )
+
+
 def working(state: FluoroscopeState) -> Health:
     """Nothing is wrong."""
     progress = state.progress
@@ -192,5 +215,6 @@ CONDITIONS = (
     refused_messages,
     distant_stamps,
     unknown_angle,
+    failed_verdict,
     working,
 )

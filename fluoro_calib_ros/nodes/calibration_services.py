@@ -17,12 +17,13 @@ from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import CallbackGroup
 from rclpy.task import Future
 
+from ..checks.check import Validation
 from ..errors import DataError
 from ..estimation.options import CalibrationRequest
 from ..estimation.rounds import Round
 from ..exposures.frame import Frame
 from ..findings import Severity, sentences
-from ..io.calibration import save_orientation
+from ..io.calibration import Verdict, save_orientation
 from ..io.folder import check_output_folder
 from ..jobs.calibration import CalibrationOutcome, Rig, run_in_worker_process
 from ..jobs.orientation import OrientationOutcome, orient
@@ -368,7 +369,7 @@ class SelfCalibration(Job):
         orientation, fault = self._files.save_outcome(outcome, radiographs)
         if orientation is None:
             self._output.orientation = None
-        self._output.publish(calibrations, orientation)
+        self._output.publish(calibrations, orientation, _verdict_of(outcome.validation))
         fill_result(result, outcome.result, calibrations)
         self._output.save_fault = fault
         if fault:
@@ -384,3 +385,11 @@ class SelfCalibration(Job):
             self._logger.info(f'verdict: {verdict.verdict} ({verdict.seconds:.1f} s)')
             for found in verdict.findings:
                 self._logger.warning(found.sentence)
+
+
+def _verdict_of(validation: Validation | None) -> Verdict | None:
+    """Return the verdict of a validation."""
+    if validation is None:
+        return None
+    findings = tuple(found.sentence for found in validation.findings)
+    return Verdict(validation.verdict, findings, validation.calibration_id)

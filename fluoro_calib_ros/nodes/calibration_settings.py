@@ -25,10 +25,12 @@ from ..exposures.phantom import Phantom
 from ..io.calibration import PHANTOM as PHANTOM_FILE
 from ..io.calibration import (
     SUFFIX,
+    Verdict,
     disagreements,
     load_calibrations,
     load_orientation,
     orientation_path,
+    stored_verdict,
 )
 from ..io.calibration_request import Radiographs, write_radiographs
 from ..io.phantom import read_phantom
@@ -235,7 +237,7 @@ class CalibrationFiles:
             self._logger.error(f'no calibration loaded: {error}')
             return
         if loaded:
-            self._output.publish(loaded, orientation)
+            self._output.publish(loaded, orientation, self._verdict(directory))
             self._logger.info(f'calibration of {", ".join(loaded)} loaded from {directory}')
 
     def save_outcome(
@@ -282,7 +284,7 @@ class CalibrationFiles:
             raise DataError(
                 f'{directory}: there is no calibration of {", ".join(self._rig.names)}'
             )
-        self._output.publish(loaded, orientation)
+        self._output.publish(loaded, orientation, self._verdict(directory))
         return f'{", ".join(loaded)} loaded from {directory}'
 
     def _directory_of(self, request: Any) -> Path:
@@ -320,6 +322,13 @@ class CalibrationFiles:
             f'{path}: the orientation of the rig belongs to other calibrations, it is not used'
         )
         return loaded, None
+
+    def _verdict(self, directory: Path) -> Verdict:
+        """Return the verdict on the calibrations of a folder."""
+        try:
+            return stored_verdict(directory)
+        except DataError:  # which is told as a disagreement
+            return Verdict()
 
     def _check_phantom(self) -> None:
         """Raise DataError where the saved calibrations were made with another phantom."""

@@ -68,7 +68,7 @@ def test_text_holds_every_part_of_the_state():
     text = text_of(session_text(STATE))
     for part in ('59.9 a second', '75 %', '6 more', '3 refused', 'round 4  RMSE 0.210 0.220 px'):
         assert part in text
-    assert 'no calibration of this session yet' in text and 'none yet' in text
+    assert 'none on the calibration in use' in text and 'none yet' in text
 
 
 def test_findings_follow_the_verdict():

@@ -6,11 +6,29 @@
 import json
 from html import escape
 
-from fluoro_calib_msgs.srv import Calibrate
-from ros_graph import SUCCEEDED
+from fluoro_calib_msgs.srv import Calibrate, LoadCalibration
+from ros_graph import SUCCEEDED, value_of
 from test_jobs import rig  # noqa: F401  a fixture
 
+from fluoro_calib_ros.nodes.dashboard.state import light
+from fluoro_calib_ros.nodes.dashboard.watch import SessionClient
 from fluoro_calib_ros.nodes.messages.self_calibration import feedback_text
+
+
+def told(client):
+    """What somebody learns who joins later: the verdict and its findings."""
+    watch = SessionClient(client.get_namespace(), client.context)
+    client._spinner.add_node(watch)
+    client.wait_until(lambda: watch.state().verdict, what='the verdict')
+    state = watch.state()
+    client._spinner.remove_node(watch)
+    watch.destroy_node()
+    assert light(state).word == 'Do not use'
+    status = client.wait_for_diagnostics(
+        'calibration_node', lambda s: value_of(s, 'verdict') == 'fail', 'b'
+    )
+    assert status.message.startswith('the calibration in use has failed its verdict: ')
+    return state.verdict, list(state.findings)
 
 
 def test_job_reports_the_verdict_on_request(rig):  # noqa: F811
@@ -34,7 +52,12 @@ def test_job_reports_the_verdict_on_request(rig):  # noqa: F811
     assert done.result.calibration_id[0] in report
     assert escape(done.result.findings[0]).partition(': ')[2][:60] in report
 
+    assert told(client) == ('fail', document['findings'])
+    assert client.call(LoadCalibration, 'load_calibration').success
+    assert told(client) == ('fail', document['findings'])
+
     answer = client.call(Calibrate, 'calibrate', model='none', fluoroscopes=['b'])
     assert answer.success and answer.verdict == '' and not answer.findings
+    client.wait_for_diagnostics('calibration_node', lambda s: not value_of(s, 'verdict'), 'b')
     for name in ('validation.json', 'report.html'):
         assert not (rig.folder / name).exists(), 'that is of an earlier calibration'

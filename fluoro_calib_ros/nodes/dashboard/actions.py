@@ -128,7 +128,5 @@ class Actions:
         if succeeded and kind.name == HEAL:
             findings = (*result.findings, *result.checks)
             changes['diagnosis'] = Diagnosis(result.verdict, findings, result.orientation_id)
-        elif succeeded:
-            changes |= {'verdict': result.verdict, 'findings': tuple(result.findings)}
         self._set(**changes)
         self._say(f'{kind.name}{"" if succeeded else " failed"}: {result.message}')

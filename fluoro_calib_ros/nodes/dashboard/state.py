@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -51,6 +52,8 @@ class FluoroscopeState:
     rmse_px: tuple[float, float] = (math.nan, math.nan)  #: of that round, in u and v
     calibration_id: str = ''
     age_s: float = math.nan  #: of the calibration
+    verdict: str = ''  #: on the calibration
+    findings: tuple[str, ...] = ()  #: why it is no pass
 
 
 @dataclass(frozen=True)
@@ -86,7 +89,7 @@ class SessionState:
     #: of the drift watch
     drift_level: str = ''
     drift: str = ''
-    verdict: str = ''  #: of the last calibration of this session that was validated
+    verdict: str = ''  #: the worst one on the calibrations in use
     findings: tuple[str, ...] = ()
     results: str = ''  #: folder into which the calibration node writes its results
     job: str = ''  #: what runs at the moment, '' if nothing does
@@ -97,6 +100,17 @@ class SessionState:
         """Whether a healed rig waits to be accepted."""
         healed = self.diagnosis
         return healed.verdict == 'pass' and healed.orientation_id not in ('', self.orientation_id)
+
+
+VERDICTS = ('fail', 'cannot tell', 'pass', '')  # the worst one first
+
+
+def worst_verdict(fluoroscopes: Iterable[FluoroscopeState]) -> tuple[str, tuple[str, ...]]:
+    """Return the worst verdict on the calibrations in use, and all findings."""
+    of_all = tuple(fluoroscopes)
+    known = [one.verdict for one in of_all if one.verdict in VERDICTS]
+    verdict = min(known, key=VERDICTS.index, default='')
+    return verdict, tuple(dict.fromkeys(found for one in of_all for found in one.findings))
 
 
 class Session(Protocol):

@@ -143,7 +143,7 @@ def _results(state: SessionState) -> Table:
         )
         for finding in state.diagnosis.findings:
             table.add_row('', _cell(finding))
-    verdict = _coloured(state.verdict, state.verdict or 'no calibration of this session yet')
+    verdict = _coloured(state.verdict, state.verdict or 'none on the calibration in use')
     table.add_row('verdict', verdict)
     for finding in state.findings:
         table.add_row('', _cell(finding))

@@ -47,6 +47,7 @@ from .state import (
     NodeState,
     RateMeter,
     SessionState,
+    worst_verdict,
 )
 
 NODES = (
@@ -103,8 +104,11 @@ class SessionClient(Node):
         """Return the present state."""
         with self._lock:
             level, drift = self._drift_now()
+            verdict, findings = worst_verdict(self._fluoroscopes.values())
             return replace(
                 self._session,
+                verdict=verdict,
+                findings=findings,
                 drift_level=level,
                 drift=drift,
                 fluoroscopes=tuple(v for _, v in sorted(self._fluoroscopes.items())),
@@ -214,6 +218,8 @@ class SessionClient(Node):
                 frames_hz=self._rate(node, function, values.get('frames received'), stamp_s),
                 next_pose=values.get('next pose', ''),
                 ready=values.get('ready') == 'True',
+                verdict=values.get('verdict', ''),
+                findings=tuple(values.get('findings of the verdict', '').splitlines()),
             )
         elif node == 'correction_node':
             self._update(

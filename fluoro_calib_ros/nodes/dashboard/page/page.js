@@ -114,7 +114,7 @@ function showState(state) {
   document.title = `${state.light.word} - fluoroscopes ${state.namespace}`;
   state.fluoroscopes.forEach((f) => showFluoroscope(f, state.mas, state.doses));
   fillRows(by('results'), [
-    ['Verdict', state.verdict || 'no calibration of this session yet', state.verdict],
+    ['Verdict', state.verdict || 'none on the calibration in use', state.verdict],
     ['Orientation', state.orientation || 'none yet'],
     ['Drift', state.drift || '-', state.drift_level],
     ...(state.diagnosis.verdict ? [['Healing', state.diagnosis.verdict, state.diagnosis.verdict]] : []),

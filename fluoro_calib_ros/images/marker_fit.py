@@ -109,11 +109,10 @@ class _MarkerFit(ShadowFit):
         distance = cdist(self.uv, self.uv)
         np.fill_diagonal(distance, np.inf)
         self.distance = distance.min(axis=1, initial=np.inf)
-        close = distance < together
-        self.crowded = np.flatnonzero(close.any(axis=1))
-        self.neighbours = [np.flatnonzero(row) for row in close]
+        self.close = distance < together
+        self.crowded = np.flatnonzero(self.close.any(axis=1))
         near = np.argsort(distance, axis=1, kind='stable')[:, : self.settings.neighbours]
-        return np.where(np.take_along_axis(close, near, axis=1), near, -1)
+        return np.where(np.take_along_axis(self.close, near, axis=1), near, -1)
 
     def run(self) -> None:
         """Take Gauss-Newton steps; the last one gives standard deviations as well."""
@@ -228,7 +227,8 @@ class _MarkerFit(ShadowFit):
         grid = FineGrid(self.offset, self.profile.blur_px)
         axis = grid.axis
         for one in rows:
-            members = np.concatenate([[one], self.neighbours[one][: self.settings.neighbours]])
+            others = np.flatnonzero(self.close[one])[: self.settings.neighbours]
+            members = np.concatenate([[one], others])
             together = np.zeros((len(axis), len(axis)))
             for weight, way in zip(self.way_weight, self.way):
                 passed = np.ones_like(together)

@@ -49,7 +49,9 @@ def test_products_are_those_with_neighbours_of_other_exposures():
         near = near[exposure[near] != exposure[i]]
         if len(near):
             far = np.linalg.norm(uv[near] - uv[i], axis=1).mean()
-            rows.append((np.mean(r[near] @ r[i]) / 2, np.mean(redundancy[near]) * redundancy[i], far))
+            rows.append(
+                (np.mean(r[near] @ r[i]) / 2, np.mean(redundancy[near]) * redundancy[i], far)
+            )
     value, shown, distance = np.transpose(rows)
     np.testing.assert_allclose(found.value, value)
     np.testing.assert_allclose(found.shown, shown)
@@ -103,7 +105,9 @@ def test_variance_beyond_a_series_is_the_mean_of_a_truncated_gaussian(mean, sd):
 
 def test_variance_beyond_a_series_far_below_zero_is_that_of_the_tail():
     left_out = LeftOut(0.2, np.ones_like)
-    found = [_variance_beyond(products_with(m, 1e-3), flat_series(0.0), left_out) for m in (-0.05, -0.1)]
+    found = [
+        _variance_beyond(products_with(m, 1e-3), flat_series(0.0), left_out) for m in (-0.05, -0.1)
+    ]
     assert found[0] == pytest.approx((1e-3 / 0.6) ** 2 / (0.05 / 0.6 + 7e-5), rel=0.02)
     assert found[0] == pytest.approx(2 * found[1], rel=0.02)
 
@@ -116,7 +120,10 @@ def test_products_that_show_nothing_leave_what_is_expected():
     assert beyond(products_with(0.0, 1e-3), 0.04) == pytest.approx(0.09)
     assert beyond(products_with(0.0, 1e-3), 0.06) < 0.03
     assert beyond(products_with(0.0, 0.0)) == pytest.approx(0.09)
-    assert _variance_beyond(products_with(1.0, 1e-3), flat_series(0.0), LeftOut(0.0, np.ones_like)) == 0
+    assert (
+        _variance_beyond(products_with(1.0, 1e-3), flat_series(0.0), LeftOut(0.0, np.ones_like))
+        == 0
+    )
 
 
 def test_what_is_left_out_in_places_is_scaled_by_what_these_show():
@@ -159,7 +166,11 @@ def test_few_image_points_leave_a_series_what_it_claims():
 def rejected_points(count, place=None, seed=2):
     """Rejected image points (n,) of different targets, all over the image or about a place."""
     rng = np.random.default_rng(seed)
-    uv = rng.uniform(0, 1, (count, 2)) * SIZE if place is None else rng.normal(place, 15.0, (count, 2))
+    uv = (
+        rng.uniform(0, 1, (count, 2)) * SIZE
+        if place is None
+        else rng.normal(place, 15.0, (count, 2))
+    )
     angle = rng.uniform(0, 2 * np.pi, count)
     residuals = 4.0 * np.column_stack([np.cos(angle), np.sin(angle)])
     return FittedPoints(uv, residuals, rng.integers(0, 9, count)), rng
@@ -190,7 +201,9 @@ def test_rejected_points_of_one_place_agree():
     assert len(best.rows) > 16
     # Opposite residuals, or those of few exposures, agree with nothing.
     opposite = common.residuals * np.where(np.arange(24) % 2, 1.0, -1.0)[:, None]
-    assert not exceeding(FittedPoints(points.uv, opposite, points.exposure), np.arange(24), inliers)[1]
+    assert not exceeding(
+        FittedPoints(points.uv, opposite, points.exposure), np.arange(24), inliers
+    )[1]
     two = FittedPoints(points.uv, common.residuals, points.exposure % 2)
     assert not exceeding(two, np.arange(24), inliers)[1]
     three = FittedPoints(points.uv, common.residuals, points.exposure % 3)
@@ -208,7 +221,9 @@ def test_image_points_of_one_target_count_once():
     # Seven points of one target do not outweigh six of others.
     weighted = np.where(np.arange(24)[:, None] < 18, 4.0, -1.0) * np.array([[1.0, 0.0]])
     target = np.where(np.arange(24) < 18, 0, np.arange(24))
-    alone = FittedPoints(np.tile([260.0, 200.0], (24, 1)), weighted, np.maximum(np.arange(24) - 17, 0))
+    alone = FittedPoints(
+        np.tile([260.0, 200.0], (24, 1)), weighted, np.maximum(np.arange(24) - 17, 0)
+    )
     area = max(areas_of_rejected(alone, target, inliers, SIZE), key=lambda one: len(one.rows))
     assert len(area.rows) == 24
     assert area.size_px == pytest.approx(abs(4.0 - 6.0) / 7)

@@ -55,7 +55,7 @@ def noise(count, seed=2):
 
 
 def by_definition(parameters, constraint, weights, used):
-    """Deviations (k,) over their sd about the weighted mean of the used pairs, and their growth."""
+    """Deviations (k,) over their sd about the mean of the used pairs, and their growth."""
     pose = mean_pose(parameters, constraint.pairs[used], weights[used])
     off = discrepancies(constraint, pose, parameters) / SD
     chi2 = np.sum(off[used] ** 2) / (6 * (used.sum() - 1))
@@ -157,7 +157,9 @@ def test_pairs_about_a_step_are_no_single_exposures():
 
 def test_steps_have_two_pairs_on_either_side():
     found = np.hstack(steps_of(6))
-    np.testing.assert_array_equal(found.T, [[0, 0, 1, 1, 1, 1], [0, 0, 0, 1, 1, 1], [0] * 4 + [1] * 2])
+    np.testing.assert_array_equal(
+        found.T, [[0, 0, 1, 1, 1, 1], [0, 0, 0, 1, 1, 1], [0] * 4 + [1] * 2]
+    )
     assert steps_of(3) == []
 
 
@@ -191,7 +193,9 @@ def test_displacements_are_those_of_image_points():
     step = np.array([1.0, -2.0, 5.0, 1e-3, 2e-3, -5e-3])
     moved = [pose.updated(step) for pose in poses]
     found = displacements(network, truth, pairs, moved)
-    np.testing.assert_allclose(displacements(network, truth, pairs, moved, poses), found, rtol=1e-6)
+    np.testing.assert_allclose(
+        displacements(network, truth, pairs, moved, poses), found, rtol=1e-6
+    )
     for k, (a, b) in enumerate(pairs):
         points = truth.points_mm[network.point[network.exposure == b]]
         ways = [

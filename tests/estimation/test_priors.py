@@ -103,9 +103,7 @@ def test_variances_of_the_trend_are_the_most_likely_ones(modes):
                 other = replace(prior, trend=trend)
                 assert evidence(functions, information, right, other) < here
     if not modes:
-        again = most_likely_prior(
-            functions, information, right, np.zeros_like(information), prior
-        )
+        again = most_likely_prior(functions, information, right, np.zeros_like(information), prior)
         np.testing.assert_allclose(again.trend, prior.trend, rtol=1e-2)
 
 
@@ -145,7 +143,7 @@ def test_prior_of_the_trend_is_that_of_its_terms():
 
 
 def test_uncertain_terms_of_a_series_are_those_of_its_polynomials():
-    """The covariance grows by what it is not known that they exist; not that of sines and rings."""
+    """The covariance grows by what is not known of them; not that of sines and rings."""
     functions = Functions(SIZE, 3, 4, 1)
     uv = image_points(300)
     information, right = observed(functions, uv, np.zeros((300, 2)))
@@ -456,7 +454,9 @@ def test_variances_of_ripples_are_the_most_likely_ones():
     width = functions.frequency_of_mode
     uv = image_points()
     there = Ripples(width, (*[0.0] * 14, 900.0, 300.0, 100.0))
-    sd = np.sqrt(there.variance(functions.frequency) + Signal(1.0, 600.0).density(functions.frequency))
+    sd = np.sqrt(
+        there.variance(functions.frequency) + Signal(1.0, 600.0).density(functions.frequency)
+    )
     coefficients = np.random.default_rng(3).normal(size=(len(sd), 2)) * sd[:, None]
     information, right = observed(functions, uv, functions(uv) @ coefficients)
     gauge = np.zeros_like(information)

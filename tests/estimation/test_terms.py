@@ -662,6 +662,34 @@ def test_the_term_with_the_largest_statistic_is_added():
     assert min(costs, key=costs.get) == added
 
 
+def test_change_by_a_term_is_that_of_the_adjustment_with_it(monkeypatch):
+    """The selected terms and all other unknowns follow."""
+    network, truth = rigs.small_network(8, 70, noise_px=0.2)
+    network = replace(bent(network, radial_and_spiral), sigma=np.ones(len(network.uv)))
+    before = adjust(network, truth, noise=NOISE)
+    selected = [0, 8, 12]
+    terms, varying, after, matrix = expert_step(network, before, selected)
+    tried = []
+
+    def improves(self, f, result, rows, change, t):
+        tried.append((change, t))
+        return True
+
+    monkeypatch.setattr(StepwiseTerms, '_improves', improves)
+    monkeypatch.setattr(StepwiseTerms, '_remove_insignificant', lambda *_: False)
+    assert not terms.renew(varying, matrix, after)[0]
+    (added,) = np.setdiff1d(np.flatnonzero(terms.selected[0]), selected)
+    more = solved(network, before, expert_step(network, before, [*selected, added])[0])
+    field = [one.additional_correction(r.parameters) for one, r, _ in ((varying, after, 0), more)]
+    ((change, t),) = tried
+    assert np.abs(change - (field[1] - field[0])).max() < 0.02 * np.abs(change).max()
+    own = precision(*more[:2]).additional[0][added, added]
+    assert abs(t) == pytest.approx(
+        abs(more[1].parameters.additional[0][added]) / np.sqrt(own), rel=0.01
+    )
+    assert 2 * (after.cost - more[1].cost) == pytest.approx(t**2, rel=0.02)
+
+
 def test_trend_of_residuals_is_their_product_with_those_about():
     network, truth = rigs.small_network(4, 40)
     before = adjust(network, truth, noise=NOISE)

@@ -218,7 +218,7 @@ def estimated_terms(sd, random_px, seed=6, series_px=0.0):
 
 
 def test_terms_that_follow_the_angle_are_a_field_of_it():
-    estimated, change, h, effects = estimated_terms(0.01, 0.01)
+    estimated, change, _, effects = estimated_terms(0.01, 0.01)
     fit = fit_angles(estimated, ANGLES)
     np.testing.assert_allclose(fit.effects.mean.reshape(HARMONICS, 14)[:2], effects[:2], atol=0.06)
     assert fit.remaining < 0.02

@@ -21,6 +21,7 @@ from fluoro_calib_ros.estimation.constraints import (
 from fluoro_calib_ros.estimation.estimator import GaugeKind
 from fluoro_calib_ros.estimation.fixed_calibration import (
     SolvedNetwork,
+    fixed_corrections,
     noise_of_calibrations,
     start_within_survey,
     too_few_rays_for_noise,
@@ -498,6 +499,41 @@ def test_noise_of_calibrations_is_that_of_the_median():
     noise = noise_of_calibrations('student_t', used)
     assert (noise.loss, noise.scale, noise.nu, noise.gross) == ('student_t', 0.3, 9.0, 0.01)
     assert noise_of_calibrations('huber', used).gross == 0
+
+
+def test_image_points_are_weighted_by_what_a_calibration_claims_there():
+    """By the profile of its noise where they have no sigma, and by its correction everywhere."""
+    network, truth = rigs.small_network(3, 20, 2)
+    start = measured(network, truth)
+    told = np.full(20, 0.7)
+    frames = tuple(
+        replace(f, sigma=told, angle=0.1) if i == 4 else f for i, f in enumerate(start.frames)
+    )
+    seen = []
+
+    class Calibration:
+        sigma0 = 0.25
+
+        def __init__(self, factor):
+            self.factor = factor
+
+        def correction(self, uv, angle):
+            seen.append(angle)
+            return SimpleNamespace(duv=self.factor * uv, sd=np.full(len(uv), 0.1 * self.factor))
+
+        def noise_factors(self, uv):
+            return 1.0 + uv[:, 0] / 1000
+
+    calibrations = {'a': Calibration(1.0), 'b': Calibration(2.0)}
+    correction, weighted = fixed_corrections(replace(start, frames=frames), calibrations)
+    f = 1.0 + network.fluoroscope[network.exposure]
+    np.testing.assert_allclose(correction, f[:, None] * network.uv)
+    profile = np.where(network.exposure == 4, 1.0, 1.0 + network.uv[:, 0] / 1000)
+    expected = np.hypot(network.sigma * profile, 0.1 * f / 0.25)
+    np.testing.assert_allclose(weighted.sigma, expected)
+    own = network.exposure[network.rows(1)] == 4
+    np.testing.assert_allclose(seen[1][own], 0.1, atol=1e-6)
+    assert np.isnan(seen[1][~own]).all() and np.isnan(seen[0]).all()
 
 
 @pytest.mark.parametrize('rays, few', [(2, True), (3, False)])

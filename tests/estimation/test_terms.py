@@ -514,8 +514,8 @@ def test_what_is_followed_is_the_posterior_with_the_proposed_prior():
     values = there.adjustment.residuals
     used = np.ones(len(near), dtype=bool)
     used[::7] = False
-    prior, found = refinements._followed(part, LOCAL_MODES, values, used, 0.3)
-    functions = part.functions_with(LOCAL_MODES, prior)
+    prior, found = refinements._followed(part, 15, values, used, 0.3)
+    functions = part.functions_with(15, prior)
     design = functions(part.uv[used]) / 0.3
     gauge = part.gauge_of(functions(part.uv))
     normal = block_diag(*[design.T @ design] * 2) + prior_precision(functions, prior) + gauge

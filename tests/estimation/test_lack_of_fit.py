@@ -267,12 +267,12 @@ def test_rejected_points_reach_the_nodes_of_their_cells():
     series = Series(Functions(size, 1), np.zeros((2, 3)), np.full((SD_GRID, SD_GRID), 0.02))
     uv = rng.uniform(0, 1, (6000, 2)) * size
     inliers = FittedPoints(uv, rng.normal(0, NOISE, uv.shape), np.arange(6000) % 12)
-    middle = np.array([1650.0, 1237.5])
-    own = middle + rng.uniform(-5, 5, (12, 2))
+    middle = np.array([1599.5, 1199.5 + 121.0])  # 121 px from a node
+    own = middle + rng.uniform(-1, 1, (12, 2))
     common = FittedPoints(own, np.tile([3.0, -4.0], (12, 1)), np.arange(12))
     found = sd_of_rejected(inliers, common, series)
     near = np.linalg.norm(sd_grid_pixels(size) - middle, axis=1).reshape(found.shape)
     cell = np.hypot(100.0, 75.0)
-    assert (found[near < cell - 8] > 2).all()
-    assert not found[near > cell + 8].any()
+    assert (found[near < cell - 3] > 2).all()
+    assert not found[near > cell + 3].any()
     assert found.max() <= 5.0 / np.sqrt(2)

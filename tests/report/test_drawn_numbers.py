@@ -45,6 +45,7 @@ from fluoro_calib_ros.report.residuals import (
     _plot_histogram,
     _plot_residuals,
     _plot_running_median,
+    normalised_residuals,
     position_figure,
     residuals_of,
 )
@@ -126,6 +127,27 @@ def test_outliers_are_drawn_at_the_border_of_the_panel():
     assert dots.get_ydata().tolist() == [0.5, -0.5] and dots.get_xdata().tolist() == [0, 1]
     assert crosses.get_ydata() == pytest.approx([1.94, -1.94, 1.5])
     assert crosses.get_xdata().tolist() == [2, 3, 4]
+
+
+def test_residuals_are_normalised_by_what_the_unknowns_absorb():
+    """Sigma and the root of the redundancy number; the scale is that after the calibration."""
+    rng = np.random.default_rng(3)
+    sigma, redundancy = rng.uniform(0.2, 2.0, 50), rng.uniform(0.1, 0.9, 50)
+    before, after = rng.normal(size=(2, 50, 2)) * (sigma * np.sqrt(redundancy))[:, None]
+    rows = np.arange(5, 45)
+    inliers = np.arange(50) % 7 > 0
+    run = Fake(
+        measured=Fake(network=Fake(sigma=sigma)),
+        before=Fake(residuals=3 * before, inliers=~inliers),
+        after=Fake(residuals=after, inliers=inliers),
+    )
+    found = normalised_residuals(run, rows, redundancy[rows])
+    unit = (sigma * np.sqrt(redundancy))[:, None]
+    used, out = rows[inliers[rows]], rows[~inliers[rows]]
+    square = np.mean((after / unit)[used] ** 2, axis=1)
+    scale = np.sqrt(np.sum(square * redundancy[used]) / np.sum(redundancy[used]))
+    np.testing.assert_allclose(found[0], 3 * (before / unit)[out] / scale)
+    np.testing.assert_allclose(found[1], (after / unit)[used] / scale)
 
 
 def test_histogram_is_a_density_of_all_values():
@@ -486,6 +508,7 @@ def test_arrows_of_the_page_are_rows_of_each_exposure(monkeypatch):
     assert html._arrows(given(), {'a': some_residuals()}) == {}
 
 
+@pytest.mark.filterwarnings('error')
 def test_largest_correction_and_correlations():
     assert html._largest(some_residuals()) == pytest.approx(4.0)
     matrix = np.array([[4.0, 1, 0], [1, 9, 0], [0, 0, 0]])
@@ -554,6 +577,17 @@ def test_figure_of_points_shows_when_each_was_found_and_its_sd():
     assert seen.get_ylim() == (1.5, -0.5) and seen.get_xlabel() == 'time [s]'
     paths = figure.subfigs[0].axes[0].lines
     assert paths[0].get_data_3d()[0].tolist() == [1, 2, 3]
+
+
+def test_points_are_in_the_path_of_their_target():
+    """Also where a frame has another first target."""
+    every = [frame(n, [True, True, True], n) for n in (1, 2, 3)]
+    late = every[1]
+    late.target_id, late.points = late.target_id[1:], frame(2, [True, True], 2).points
+    late.points.xyz_mm = np.array([[6.0, 6, 6], [7.0, 7, 7]])
+    paths = points_figure(every, {}).subfigs[0].axes[0].lines
+    x = np.array([path.get_data_3d()[0] for path in paths])
+    np.testing.assert_array_equal(x, [[1, np.nan, 3], [1, 6, 3], [1, 7, 3]])
 
 
 def test_frames_without_times_are_shown_by_number():

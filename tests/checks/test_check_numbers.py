@@ -322,6 +322,66 @@ def test_precision_is_that_of_the_correction_over_the_noise(given, ratio, noise)
     assert 'inf' not in str(found)
 
 
+def trends_of(monkeypatch, change=None, rejected=None, model_name='auto', corrects=True):
+    """Checks of whiteness, worst area and drift of an image of 1000 x 500 px."""
+    trend = Fake(size=0.2, place=np.array([300.0, 40.0]), cell_size=0.5, cell_limit=0.3)
+    common = Fake(
+        trend=trend,
+        limit=0.1,
+        rejected=rejected,
+        claimed_sd=0.05,
+        inliers='all',
+        is_significant=False,
+    )
+    change = change or Fake(size=0.3, limit=0.2, cell_size=0.9, cell_limit=0.6)
+    change.place = np.array([900.0, 450.0])
+    monkeypatch.setattr(field_checks, 'change_of_trend', lambda inliers, size: change)
+    model = Fake(corrects=corrects, kind='knn', evaluate=lambda uv: Fake(sd=np.array([0.1])))
+    evidence = Fake(
+        trends={'a': common},
+        calibrations={'a': Fake(model=model, image_size=(1000, 500))},
+        frames={'a': range(12)},
+        request=Fake(options=Fake(model_name=model_name)),
+    )
+    return field_checks.check_trends(evidence, ['a'])
+
+
+def test_trends_are_told_with_their_place_and_limit(monkeypatch):
+    white, area, drift = trends_of(monkeypatch)
+    assert (white.kind, white.value, white.limit) == (Kind.WHITENESS, 0.2, 0.1)
+    assert (area.kind, area.value) == (Kind.WORST_AREA, 0.5)
+    assert area.limit == pytest.approx(np.hypot(0.3, 3 * 0.1))
+    assert (drift.kind, drift.value, drift.limit) == (Kind.DRIFT, 0.3, 0.2)
+    for one, place in ((white, (300, 40)), (area, (300, 40)), (drift, (900, 450))):
+        assert f'u {place[0]}, v {place[1]}' in str(one)
+    only_area = Fake(size=0.1, limit=0.2, cell_size=0.9, cell_limit=0.6)
+    assert trends_of(monkeypatch, only_area)[2].value == 0.9
+    none = Fake(size=0.1, limit=0.2, cell_size=0.5, cell_limit=0.6)
+    assert (trends_of(monkeypatch, none)[2].value, trends_of(monkeypatch, none)[2].limit) == (
+        0.1,
+        0.2,
+    )
+
+
+def test_rejected_points_that_agree_are_the_worst_area(monkeypatch):
+    rejected = Fake(size=0.8, limit=0.7, place=np.array([100.0, 450.0]), points=17)
+    area = trends_of(monkeypatch, rejected=rejected)[1]
+    assert (area.value, area.limit, area.numbers) == (0.8, 0.7, {'rejected_points': 17})
+    assert 'u 100, v 450' in str(area)
+    rejected.size = 0.6
+    assert trends_of(monkeypatch, rejected=rejected)[1].value == 0.5
+
+
+def test_another_model_is_advised_where_one_was_asked_for(monkeypatch):
+    automatic, asked, none = (
+        trends_of(monkeypatch, model_name=name, corrects=corrects)[0].advice
+        for name, corrects in (('auto', True), ('knn', True), ('none', False))
+    )
+    assert '--model' not in automatic
+    assert asked.startswith(automatic) and '--model auto' in asked
+    assert none.startswith('calibrate with a correction model')
+
+
 def test_variation_of_few_points_in_each_exposure_is_not_cured_by_more_exposures():
     def made(beads, exposures):
         evidence = Fake(

@@ -303,6 +303,14 @@ def test_false_matches_of_a_capture_are_those_far_from_the_median(off, image_sd,
     assert found.sigma[1] == pytest.approx((5 if used else 4) ** -0.5)
 
 
+def test_a_target_of_two_frames_that_contradict_each_other_is_left_out():
+    """Either may be false."""
+    frames = still([[0.0, 0.0], [0.0, 0.0]])
+    uv = frames[1].uv.copy()
+    uv[1] += [30.0, 0.0]
+    assert mean([frames[0], replace(frames[1], uv=uv)]).target_id.tolist() == [3, 9]
+
+
 @pytest.mark.parametrize('image_sd, limit', [(0.2, 1.0), (0.5, 2.0)])
 def test_a_phantom_that_moves_is_refused_from_frame_to_frame_and_slowly(image_sd, limit):
     """Four standard deviations, but at least a pixel."""

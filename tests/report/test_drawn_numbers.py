@@ -354,6 +354,15 @@ def test_comparison_is_told_in_pixels_and_mm():
     assert 'mm at the phantom' not in comparison_text(comparison(), None)
 
 
+def test_comparisons_of_fluoroscopes_are_side_by_side():
+    other = comparison()
+    other.fluoroscope = 'b'
+    drawn = [axes for axes in _figure([comparison(), other]).axes if axes.get_title()]
+    assert [axes.get_title()[:2] for axes in drawn] == ['a:', 'b:']
+    one, two = (axes.get_position() for axes in drawn)
+    assert one.y0 == pytest.approx(two.y0) and one.x1 < two.x0
+
+
 def test_arrows_of_a_comparison_are_as_long_as_their_cells():
     drawn = _figure([comparison()]).axes[0]
     assert drawn.get_xlim() == (-0.5, 319.5) and drawn.get_ylim() == (159.5, -0.5)

@@ -56,11 +56,12 @@ def test_a_plate_is_named_where_no_single_bead_stands_out():
     assert check.limit < 0.3 and 'shift_mm' in check.numbers
 
 
-def test_a_plate_that_is_tilted_is_named():
+@pytest.mark.parametrize('along', [0, 1])
+def test_a_plate_that_is_tilted_is_named(along):
     """By 1 mm at its rim, and nothing in its middle."""
     rng = np.random.default_rng(2)
     survey = plates(rng)
-    tilt = np.where(survey[:, 2] > 0, survey[:, 0] / 110.0, 0.0)[:, None] * [0, 0, 1.0]
+    tilt = np.where(survey[:, 2] > 0, survey[:, along] / 110.0, 0.0)[:, None] * [0, 0, 1.0]
     layer = displaced_layer(beads_of(survey, tilt, rng))
     assert layer.axis == 2 and len(layer.target_id) == 100
     assert layer.tilt_rad == pytest.approx(1 / 110, rel=0.1)

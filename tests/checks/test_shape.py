@@ -4,6 +4,7 @@
 
 import functools
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -128,6 +129,14 @@ def test_strain_is_compared_with_what_chance_exceeds_and_what_matters(
     assert '0.50 %' in trusted.cause and '2.0 times' in trusted.cause
     monkeypatch.setattr(shape, 'strain_of_survey', lambda evidence: None)
     assert check_shape(None, ('a',)) == []
+
+
+@pytest.mark.parametrize(('beads', 'datum'), [(9, 'survey'), (10, 'inner')])
+def test_few_beads_and_free_networks_have_no_strain_of_a_survey(beads, datum):
+    network = SimpleNamespace(survey_mm=np.eye(beads, 3), datum=datum)
+    solved = SimpleNamespace(measured=SimpleNamespace(network=network))
+    given = SimpleNamespace(result=SimpleNamespace(solved={'a': solved}))
+    assert strain_of_survey(given) is None
 
 
 def test_strain_of_a_small_set_has_axis_and_size():

@@ -626,6 +626,17 @@ def test_expert_terms_are_without_the_gauge_unless_orientations_are_known(gauge,
     assert [len(c) for c in terms.zeros()] == [count]
 
 
+def test_terms_that_were_not_estimated_have_no_series():
+    network, truth = rigs.small_network(4, 60)
+    before = adjust(network, truth, noise=NOISE)
+    terms = StepwiseTerms(problem_of(network, before))
+    zero, covariance = terms.zeros()[0], np.eye(31)
+    for given, known in ((None, covariance), (zero, None)):
+        after = SimpleNamespace(parameters=SimpleNamespace(additional=(given,)))
+        with pytest.raises(ValueError, match='no terms were estimated for fluoroscope number 0'):
+            terms.fitted_series(0, after, SimpleNamespace(additional=(known,)))
+
+
 def expert_step(network, before, selected):
     """Terms, with some selected, and what a step sees of their solution."""
     terms = StepwiseTerms(problem_of(network, before))

@@ -41,6 +41,7 @@ from fluoro_calib_ros.images.marker_watch import (
     MarkerCompany,
     MarkerDoubts,
     follow_beside,
+    shift_together,
 )
 from fluoro_calib_ros.images.shadow_fit import Profile
 from fluoro_calib_ros.images.view import Lens, View
@@ -474,3 +475,23 @@ def test_states_of_markers_are_exchanged_and_taken_in_together():
     assert states.unseen.tolist()[:4] == [0, 0, 0, 4]
     np.testing.assert_allclose(states.depth[:3], [0.9 * 0 + 0.1 * 4.0, 1.0, 4.0])
     assert states.depth_sd[1] == 1.0 and states.depth_sd[2] < 0.2
+
+
+def test_lost_markers_are_shifted_together_with_the_velocity_that_they_have():
+    """Or with that of the shift, where it is not known; those that are sure stay."""
+    one = motion(6)
+    one.uv[:] = [[100.0, 100], [130, 100], [100, 140], [150, 150], [120, 170], [400, 400]]
+    one.covariance[:4, 0, 0] = 15.0**2  # lost
+    one.covariance[0, 1, 1] = 1e4  # and of unknown velocity
+    one.covariance[4:, 0, 0] = 0.01
+    one.velocity[:] = [2.0, 1.0]
+    before = one.uv.copy()
+    shift = np.array([8.0, -6.0])
+    shift_together(one, Fake(uv=before[:5] + shift), 3.0, 2)
+    np.testing.assert_allclose(one.uv[:4], before[:4] + shift)
+    np.testing.assert_allclose(one.velocity[0], shift / 2)
+    np.testing.assert_allclose(one.velocity[1:], np.tile([2.0, 1.0], (5, 1)))
+    np.testing.assert_allclose(one.uv[4:], before[4:])
+    still = motion(6)
+    shift_together(still, Fake(uv=before + shift), 3.0, 2)
+    np.testing.assert_allclose(still.velocity, motion(6).velocity)

@@ -258,7 +258,15 @@ def test_markers_that_are_not_seen_are_led_by_those_that_are(monkeypatch):
         assert (np.flatnonzero(seen) + 1).tolist() == found.target_id.tolist()
         assert change[seen].any() == (number > 1) and not change[~seen].any()
         np.testing.assert_array_equal(sure[seen], ~found.doubtful)
+        if number == 7:
+            assert found.missing.tolist() == [5]
+            np.testing.assert_allclose(found.predicted, true[4:], atol=1.0)
     assert told[6][0].tolist() == [True] * 4 + [False]
+    late = MarkerTracker(
+        first=FirstMarkers(np.arange(1, 5), meeting(1, False)[1][:4]), later=np.array([9])
+    )
+    found = late.update(meeting(1, False)[0], 1)
+    assert found.missing.tolist() == [9] and np.isnan(found.predicted).all()
 
 
 def test_a_marker_enters_where_a_person_sees_it_first():

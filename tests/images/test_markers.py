@@ -267,6 +267,7 @@ def test_markers_that_are_not_seen_are_led_by_those_that_are(monkeypatch):
     )
     found = late.update(meeting(1, False)[0], 1)
     assert found.missing.tolist() == [9] and np.isnan(found.predicted).all()
+    assert found.lost.all()
 
 
 def test_a_marker_enters_where_a_person_sees_it_first():

@@ -52,6 +52,7 @@ from fluoro_calib_ros.checks.rig import doubtful, motion_between_stamps
 from fluoro_calib_ros.checks.rig_watch import RigDriftWatch
 from fluoro_calib_ros.correction.base import Correction
 from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.estimation.exposure_terms import Variation
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.findings import Finding, Kind, Place, Severity
@@ -221,7 +222,30 @@ def found_in(made, held=None, sigma=None):
     ],
 )
 def test_impossible_results_are_found_at_their_limits(changes, kind):
-    assert kinds(found_in(figures(**changes))) == ([] if kind is None else [kind])
+    found = found_in(figures(**changes))
+    assert kinds(found) == ([] if kind is None else [kind])
+    if kind is Kind.FEW_INLIERS:
+        assert 'only 49 % of the image points fit, at least 50 % are' in found[0].cause
+
+
+def test_targets_on_a_line_are_not_looked_at_for_wrong_coordinates():
+    """Wherever the line is: a calibration says more about it."""
+    along = np.append(np.arange(30.0), 1e5)[:, None]
+    frames = {'a': [Fake(target_id=np.arange(31))]}
+    for direction in ([1.0, 2, 3], [1.0, 0, 0]):
+        line = along * direction + [20.0, -7, 5]
+        assert not inputs.find_wrong_phantom(frames, Fake(target_id=np.arange(31), xyz_mm=line))
+    bent = line + np.where(np.arange(31) % 2, 1.0, 0.0)[:, None] * [0, 3, 0]
+    (found,) = inputs.find_wrong_phantom(frames, Fake(target_id=np.arange(31), xyz_mm=bent))
+    assert found.kind is Kind.REMOTE_TARGETS and found.place.target_id == (30,)
+
+
+def test_names_of_fluoroscopes_may_have_capitals_but_not_differ_in_these():
+    inputs.validate_names(['A', 'b', 'Ab'])
+    inputs.validate_names(['A', 'A'])
+    with pytest.raises(DataError, match='fluoroscopes Ab and aB differ in capital') as told:
+        inputs.validate_names(['b', 'Ab', 'c', 'aB'])
+    assert told.value.finding.place.fluoroscopes == ('Ab', 'aB')
 
 
 def test_sigma_is_plausible_within_its_limits():
@@ -397,6 +421,18 @@ def test_variation_of_few_points_in_each_exposure_is_not_cured_by_more_exposures
     assert made(503, 3) == more
     assert len({made(24, 3), made(24, 16), made(503, 16), more}) == 3
     assert made(24, 16) == made(24, 3) and made(503, 16) != more
+
+
+def test_a_distortion_may_vary_by_a_part_of_the_noise():
+    frames = [Fake(angle=angle) for angle in (0.1, 0.4, 0.2)]
+    evidence = Fake(
+        frames={'a': frames},
+        variations={'a': Variation(1.7, 0.21, 0.4)},
+        trends={'a': Fake(is_significant=False)},
+    )
+    (check,) = field_checks.check_variation(evidence, ['a'])
+    assert check.value == 0.21 and check.limit == pytest.approx(field_checks.HARMLESS * 0.4)
+    assert (check.numbers['chi2_per_dof'], check.numbers['noise_px']) == (1.7, 0.4)
 
 
 def test_achieved_deviation_joins_claim_halves_trend_and_variation():

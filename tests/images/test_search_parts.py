@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.findings import Kind
-from fluoro_calib_ros.images import pose_search
+from fluoro_calib_ros.images import matching, pose_search
 from fluoro_calib_ros.images.growth import (
     Seen,
     _good_cells,
@@ -280,6 +280,16 @@ def test_steps_that_occur_most_often_may_be_those_of_a_symmetry():
     assert len(_common(many, 0.5)) == 2 * SHIFTS
 
 
+def test_steps_to_six_neighbours_are_candidates_of_symmetries(monkeypatch):
+    given = []
+    monkeypatch.setattr(matching, '_common', lambda *args: given.append(args) or [])
+    list(matching._symmetries(BEADS))
+    ((steps, reach),) = given
+    distance, near = cKDTree(BEADS).query(BEADS, k=7)
+    np.testing.assert_allclose(steps, (BEADS[near[:, 1:]] - BEADS[:, None]).reshape(-1, 3))
+    assert reach == pytest.approx(0.3 * np.median(distance[:, 1]))
+
+
 # ---- markers
 
 
@@ -321,6 +331,35 @@ def test_a_shadow_of_no_marker_leaves_open_which_one_is_meant():
     assert doubts.since(0) == 7
     assert not watch.other_shadows(seen, states, 8) and doubts.since(0) == 7
     assert not watch.other_shadows(found_at(at, 5 * [1]), states, 8)
+
+
+@pytest.mark.parametrize(
+    ('apart', 'measured', 'unseen', 'settled', 'taken_back', 'doubtful'),
+    [
+        (3.0, [1, 0], 2, True, True, False),  # a measurement that may be that of the other
+        (3.0, [1, 0], 6, True, True, False),
+        (3.0, [1, 0], 7, True, False, True),  # for too many images
+        (3.0, [1, 0], 7, False, False, True),  # merged
+        (3.0, [1, 0], 2, False, True, False),
+        (6.0, [1, 0], 7, True, False, True),
+        (6.0, [1, 0], 7, False, False, False),  # the velocity of one is not known
+        (3.0, [1, 1], 0, True, False, True),
+        (3.0, [1, 1], 0, False, False, False),
+        (60.0, [1, 0], 7, True, False, False),
+    ],
+)
+def test_markers_that_met(apart, measured, unseen, settled, taken_back, doubtful):
+    at = np.array([[500.0, 300], [500 + apart, 300], [900, 900]])
+    watch, doubts, states = watched(at, 16.0, [0, unseen, 0])
+    if not settled:
+        states.motion.covariance[1, 1, 1] = 1e6
+    seen = found_at(at, [*measured, 1])
+    found, told = watch.shadows_met(seen, states, 4)
+    assert found.measured.tolist() == [not taken_back and bool(m) for m in measured] + [True]
+    assert [one.place.target_id for one in told] == ([(10, 11)] if doubtful else [])
+    assert doubts.doubtful.tolist() == [doubtful, doubtful, False]
+    assert seen.measured.tolist() == [bool(m) for m in measured] + [True]
+    assert not watch.shadows_met(seen, states, 5)[1]
 
 
 def test_a_marker_found_again_in_a_wide_gate_is_doubtful():

@@ -17,7 +17,7 @@ from fluoro_calib_ros.correction.fluoroscope_calibration import NoiseProfile
 from fluoro_calib_ros.exposures.names import Names
 from fluoro_calib_ros.exposures.phantom import Drawing, Phantom
 from fluoro_calib_ros.reconstruction.intersection import OK, REJECTED
-from fluoro_calib_ros.report import html
+from fluoro_calib_ros.report import html, residuals
 from fluoro_calib_ros.report.figures import (
     MARGIN,
     Scale,
@@ -165,6 +165,22 @@ def test_histogram_is_a_density_of_all_values():
     assert label.endswith('37.5 % beyond the panel')
 
 
+def test_histograms_are_compared_with_the_normal_distribution(monkeypatch):
+    values = np.random.default_rng(1).normal(0, [1.0, 2.0], (500, 2))
+    monkeypatch.setattr(
+        residuals, 'normalised_residuals', lambda run, rows, r: (2 * values, values)
+    )
+    monkeypatch.setattr(residuals, 'model_text', str)
+    figure = residuals.histogram_figure(Fake(models={'a': 'knn'}), 'a', np.arange(600), None)
+    assert '500 of the 600' in figure.get_supxlabel() and len(figure.axes) == 2
+    limit = np.clip(2.5 * (2 * values).std(), 4, residuals.MAX_HISTOGRAM_SD)
+    for panel in figure.axes:
+        x, y = panel.lines[-1].get_data()
+        np.testing.assert_allclose(y, np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi))
+        assert panel.get_xlim() == pytest.approx((-limit, limit)) == (x[0], x[-1])
+    plt.close('all')
+
+
 def test_residuals_over_the_image_are_by_column_and_row():
     one = some_residuals()
     figure = position_figure('a', one.uv, (one.before, one.inlier), (one.after, one.inlier), SIZE)
@@ -285,6 +301,9 @@ def test_figure_of_a_distortion_keeps_the_shape_of_the_image():
     at = arrows.XY[:-1]
     wanted = model.predict(at)
     np.testing.assert_allclose(np.column_stack([arrows.U, arrows.V])[:-1], wanted, atol=1e-9)
+    assert [text.get_position() for text in left.texts if text.get_text() == '3 px'] == [
+        pytest.approx((3 * 15 + 0.02 * 640, 200 + 0.13 * 640))
+    ]
     assert 1 / arrows.scale == pytest.approx(15)  # 2 * 640 / 17 / 4 = 18.8, rounded down
 
 
@@ -306,6 +325,16 @@ def test_drawing_of_a_phantom_has_its_places(layers):
         low, high = places[:, :2].min(axis=0) - 4, places[:, :2].max(axis=0) + 4
         assert drawn.get_xlim() == pytest.approx((low[0], high[0]))
         assert drawn.get_ylim() == pytest.approx((high[1], low[1]))
+    plt.close('all')
+
+
+def test_every_place_of_a_drawing_has_room_for_its_id():
+    wide, high = (
+        phantom_figure(Drawing(*n, pitch_mm=(5.0, 5.0, 5.0))) for n in ((40, 5), (5, 40))
+    )
+    assert wide.get_figwidth() == pytest.approx(0.33 * (39 + 1.6) + 1)
+    assert high.get_figheight() == pytest.approx(0.33 * (39 + 1.6) + 1.2)
+    assert wide.get_figheight() == 5 and high.get_figwidth() == 6
     plt.close('all')
 
 

@@ -756,6 +756,39 @@ def test_exposures_are_examined_at_a_rate_and_after_a_restart(last, now, due):
     assert watch.is_due(now) is due
 
 
+def test_the_watch_tells_noise_from_what_is_common_to_exposures():
+    """What the corrections claim is not noise; rays that are far apart are no evidence."""
+    told = []
+    watch = RigDriftWatch.__new__(RigDriftWatch)
+    watch._addition, watch._has_bodies, watch._names = None, False, ('a', 'b')
+    watch._of_charts = watch._state = 'fine'
+    watch._watch = Fake(state='fine', add_residuals=lambda *given: told.append(given))
+    watch._change = Fake(add=lambda *given, noise: told.append(noise))
+    one, two, three = np.full(4, 0.5), np.full(4, 0.8), np.array([0.0, 1, 3, 9000])
+    found = Fake(
+        residual=three,
+        sd_total=np.full(4, 0.6),
+        normal_a=np.ones((4, 2)),
+        normal_b=np.zeros((4, 2)),
+        factor_a=one,
+        factor_b=two,
+    )
+    watch._pairs = [(0, 1, Fake(residuals=lambda *given: found))]
+    sigma = np.array([[0.5] * 4, [0.4] * 4])
+    views = Fake(
+        uv=np.ones((2, 4, 2)), sigma=sigma, correction_sd=np.array([[0.4] * 4, [0.5] * 4])
+    )
+    exposure = Fake(target_id=np.arange(4) + 7, views=views)
+    assert watch.add_exposure(55, exposure) == 'fine' and watch._last_ns == 55
+    noise, (stamp, a, b, given) = told
+    # Of b, nothing is left.
+    np.testing.assert_allclose(noise, 0.5**2 * (0.5**2 - 0.4**2))
+    assert (stamp, a, b) == (55, 'a', 'b') and given.target_id.tolist() == [7, 8, 9]
+    np.testing.assert_allclose(given.sd_noise**2 + given.sd_systematic**2, 0.6**2)
+    np.testing.assert_allclose(given.sd_noise**2, noise[:3])
+    np.testing.assert_array_equal(given.residual, three[:3])
+
+
 # ---- charts of the drift watch
 
 
@@ -797,6 +830,9 @@ def test_observations_swap_their_views_and_leave_out_what_is_not_finite():
     )
     assert bad.usable().target_id.tolist() == [3]
     assert len(EpipolarObservations.concatenate([bad, observations()])) == 8
+    for name in ('sd_noise', 'factor_a', 'factor_b'):
+        none = observations(**{name: np.array([0.1, 0.0, 0.3, -0.1])})
+        assert none.usable().target_id.tolist() == [0, 2]
     with pytest.raises(ValueError, match='factor_a'):
         observations(factor_a=np.ones(3))
 

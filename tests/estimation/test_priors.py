@@ -188,8 +188,8 @@ def test_variance_of_a_place_is_the_most_likely_one():
     there = place((416.0, 608.0), 0.5)
     information, right = observed(functions, uv, drawn(functions, uv, there))
     gauge = np.zeros_like(information)
-    prior = Prior(SMOOTH, np.zeros(0), place((416.0, 608.0), 0.05))
-    for _ in range(25):
+    prior = Prior(SMOOTH, np.zeros(0), place((416.0, 608.0), 0.3))
+    for _ in range(12):
         prior = most_likely_prior(functions, information, right, gauge, prior)
 
     def at(factor):

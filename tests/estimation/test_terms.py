@@ -4,6 +4,7 @@
 """Terms of a distortion in the adjustment: their equations, changes, refinements and series."""
 
 from dataclasses import replace
+from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -474,6 +475,7 @@ def test_a_place_that_residuals_show_is_proposed_with_its_sines():
     assert list(change.modes) == [LOCAL_MODES]
 
 
+@cache
 def rejected_dent(far=False):
     """Terms, and a solution that has rejected the image points of a dent."""
     network, before, terms = many_points(12)

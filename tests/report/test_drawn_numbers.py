@@ -330,10 +330,10 @@ def test_drawing_of_a_phantom_has_its_places(layers):
 
 def test_every_place_of_a_drawing_has_room_for_its_id():
     wide, high = (
-        phantom_figure(Drawing(*n, pitch_mm=(5.0, 5.0, 5.0))) for n in ((40, 5), (5, 40))
+        phantom_figure(Drawing(*n, pitch_mm=(5.0, 5.0, 5.0))) for n in ((20, 2), (2, 20))
     )
-    assert wide.get_figwidth() == pytest.approx(0.33 * (39 + 1.6) + 1)
-    assert high.get_figheight() == pytest.approx(0.33 * (39 + 1.6) + 1.2)
+    assert wide.get_figwidth() == pytest.approx(0.33 * (19 + 1.6) + 1)
+    assert high.get_figheight() == pytest.approx(0.33 * (19 + 1.6) + 1.2)
     assert wide.get_figheight() == 5 and high.get_figwidth() == 6
     plt.close('all')
 

@@ -475,6 +475,39 @@ def test_a_place_that_residuals_show_is_proposed_with_its_sines():
     assert list(change.modes) == [LOCAL_MODES]
 
 
+def test_places_are_looked_for_with_the_weights_of_the_adjustment(monkeypatch):
+    rng = np.random.default_rng(12)
+    uv, residuals = rng.uniform(0, 600, (9, 2)), rng.normal(size=(9, 2))
+    q, sigma = rng.uniform(0, 3, 9), rng.uniform(0.5, 2, 9)
+    inside = np.arange(9) != 4
+    adjustment = SimpleNamespace(
+        noise=NOISE, q=q[::-1], inliers=inside[::-1], residuals=residuals[::-1]
+    )
+    part = SimpleNamespace(
+        number=0,
+        functions=Functions((640, 640), -1, 4),
+        rows=np.arange(9)[::-1],
+        sigma=sigma,
+        uv=uv,
+        prior='given',
+        correction=lambda coefficients: coefficients * uv,
+    )
+    told = []
+
+    def shown(functions, weighted, observed, prior):
+        told.append((functions, weighted, observed, prior))
+        return SimpleNamespace(local=None)
+
+    monkeypatch.setattr(refinements, 'with_shown_places', shown)
+    solution = SimpleNamespace(modes=[4], adjustment=adjustment, parts=[part], coefficients=[0.01])
+    assert places(solution) is None
+    ((functions, weighted, observed, prior),) = told
+    assert functions.modes == LOCAL_MODES and prior == 'given'
+    root = np.sqrt(NOISE.weight(q)) / (NOISE.scale * sigma)
+    np.testing.assert_allclose(observed, ((residuals + 0.01 * uv) * root[:, None])[inside])
+    np.testing.assert_allclose(weighted, (functions(uv) * root[:, None])[inside])
+
+
 @cache
 def rejected_dent(far=False):
     """Terms, and a solution that has rejected the image points of a dent."""

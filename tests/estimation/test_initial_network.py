@@ -509,3 +509,26 @@ def test_a_plane_gets_the_better_of_its_two_poses():
         assert rotation_angle(one.rotation @ seen(flat, *p)[1].T) < np.deg2rad(3)
     assert settle_planes(views, [None] * 3, INTERIOR) == [None] * 3
     assert settle_planes([with_projection], [same], INTERIOR)[0] is same
+
+
+def test_poses_of_planes_are_refined_without_the_preliminary_correction(monkeypatch):
+    told = []
+
+    def better(view, present, interior):
+        told.append((view.uv, present))
+        return present + 1
+
+    monkeypatch.setattr(start_orientation, '_better_pose', better)
+    monkeypatch.setattr(
+        start_orientation, '_preliminary_correction', lambda *given: lambda uv: 0.1 * uv
+    )
+    uv = np.arange(8.0).reshape(4, 2)
+    views = [View(None, None, uv * factor, plane_image=np.eye(3)) for factor in (1.0, 2.0, 3.0)]
+    found = settle_planes(views, [10, None, 20], None)
+    rounds = start_orientation.ROUNDS
+    assert found == [10 + rounds, None, 20 + rounds]
+    assert [present for _, present in told[::2]] == [10 + k for k in range(rounds)]
+    for given, _ in told[::2]:
+        np.testing.assert_allclose(given, 0.9 * uv)
+    bodies = [replace(view, projection=np.eye(3, 4)) for view in views]
+    assert settle_planes(bodies, [1, None, 2], None) == [1, None, 2]

@@ -5,6 +5,7 @@
 
 from types import SimpleNamespace as Fake
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -24,8 +25,16 @@ from fluoro_calib_ros.images.growth import (
     start_view,
     supported,
 )
+from fluoro_calib_ros.images.lattice import FlatGrid, _view
 from fluoro_calib_ros.images.marker_fit import _MarkerFit
-from fluoro_calib_ros.images.marker_intensity import LightWindows, Shadows, check_image
+from fluoro_calib_ros.images.marker_intensity import (
+    LightWindows,
+    Shadows,
+    _curvatures,
+    _dark_response,
+    _responses,
+    check_image,
+)
 from fluoro_calib_ros.images.marker_motion import MeasuredMarkers, Motion
 from fluoro_calib_ros.images.marker_watch import MarkerDoubts, MarkerWatch
 from fluoro_calib_ros.images.matching import SHIFTS, _common
@@ -446,3 +455,38 @@ def test_a_marker_moves_by_the_larger_one_of_its_coordinates():
     np.testing.assert_allclose(fit._take_step(rows, np.zeros((2, 0)), True), [0.5, 0.4])
     np.testing.assert_array_equal(fit.uv, [[1.4, 2.0], [3, 4], [5.1, 5.5]])
     assert fit.depth.tolist() == [0.2, 0, 0.3] and fit.background.tolist() == [20, 0, 30]
+
+
+def test_response_to_a_shadow_is_the_smaller_eigenvalue_of_the_hessian():
+    image = np.random.default_rng(6).uniform(0, 100, (24, 30)).astype(np.float32)
+    smooth = cv2.GaussianBlur(image, (0, 0), 1.5).astype(float)
+    mean, spread = _curvatures(image, 1.5)
+    dark, bright = _responses(image, 1.5)
+    np.testing.assert_array_equal(_dark_response(image, 1.5), dark)
+    for v, u in ((3, 4), (10, 20), (17, 9)):
+        near = smooth[v - 1 : v + 2, u - 1 : u + 2]
+        across = (near[2, 2] - near[2, 0] - near[0, 2] + near[0, 0]) / 4
+        own = near[[1, 0], [0, 1]] + near[[1, 2], [2, 1]] - 2 * near[1, 1]
+        values = 1.5**2 * np.linalg.eigvalsh([[own[0], across], [across, own[1]]])
+        np.testing.assert_allclose(
+            [mean[v, u] - spread[v, u], mean[v, u] + spread[v, u]], values, rtol=1e-3, atol=1e-3
+        )
+        assert dark[v, u] == pytest.approx(max(values[0], 0), abs=1e-3)
+        assert bright[v, u] == pytest.approx(max(-values[1], 0), abs=1e-3)
+    assert (dark > 0).any() and (bright > 0).any()
+
+
+@pytest.mark.parametrize('normal', [1.0, -1.0])
+def test_a_flat_grid_is_seen_from_where_it_is(normal):
+    """Whichever way its normal points."""
+    v, u = np.mgrid[-60:61:15, -75:76:15]
+    tilt = Rotation.from_rotvec([0.5, -0.3, 0.8]).as_matrix()
+    xyz = np.column_stack([u.ravel(), v.ravel(), np.zeros(u.size)]) @ tilt.T + [20.0, 30, -10]
+    turn = Rotation.from_rotvec([-0.2, 0.1, 0.4]).as_matrix()
+    sensor = (xyz - xyz.mean(axis=0)) @ turn.T + [5.0, -8, 1500]
+    uv = 4000 * sensor[:, :2] / sensor[:, 2:] + LENS.centre
+    axes = tilt.T * [[1], [1], [normal]]
+    view = _view(FlatGrid(None, xyz.mean(axis=0), axes), xyz, uv, LENS)
+    np.testing.assert_allclose(view.rotation @ view.rotation.T, np.eye(3), atol=1e-9)
+    np.testing.assert_allclose(view.rotation, turn, atol=0.02)
+    np.testing.assert_allclose(view.project(xyz), uv, atol=0.05)

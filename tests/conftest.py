@@ -47,6 +47,7 @@ ROS = ('tests/ros 1', 'tests/ros 2')
 # worker makes them once.
 SHARING = (
     'tests/estimation/test_calibration.py',
+    'tests/estimation/test_self_calibration.py',
     'tests/estimation/test_orientation.py',
     'tests/estimation/test_grid.py',
     'tests/images/test_undistortion.py',

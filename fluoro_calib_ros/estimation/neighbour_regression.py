@@ -152,7 +152,6 @@ class NeighbourRegression(RegressionStep[NeighbourModel]):
     ) -> None:
         super().__init__(points)
         self.model_type = model_type
-        self.k = k or 0
         self._given_k = k
         self._table: NeighbourTable | None = None
         self._trend = (

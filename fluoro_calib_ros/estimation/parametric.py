@@ -180,7 +180,6 @@ class StepwiseTerms(AdjustedTerms):
         """Add the best term of fluoroscope f, or remove one that is not significant any more."""
         present = prior_of_additional(network, f)
         information = information_of_additional(matrix, f) - present
-        information *= matrix.information_factor
         coefficients = coefficients_of(result)[f]
         selected = self.selected[f]
         rows = network.rows(f)

@@ -52,6 +52,7 @@ from fluoro_calib_ros.checks.rig import doubtful, motion_between_stamps
 from fluoro_calib_ros.checks.rig_watch import RigDriftWatch
 from fluoro_calib_ros.correction.base import Correction
 from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.estimation.exposure_terms import Variation
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.findings import Finding, Kind, Place, Severity
@@ -221,7 +222,30 @@ def found_in(made, held=None, sigma=None):
     ],
 )
 def test_impossible_results_are_found_at_their_limits(changes, kind):
-    assert kinds(found_in(figures(**changes))) == ([] if kind is None else [kind])
+    found = found_in(figures(**changes))
+    assert kinds(found) == ([] if kind is None else [kind])
+    if kind is Kind.FEW_INLIERS:
+        assert 'only 49 % of the image points fit, at least 50 % are' in found[0].cause
+
+
+def test_targets_on_a_line_are_not_looked_at_for_wrong_coordinates():
+    """Wherever the line is: a calibration says more about it."""
+    along = np.append(np.arange(30.0), 1e5)[:, None]
+    frames = {'a': [Fake(target_id=np.arange(31))]}
+    for direction in ([1.0, 2, 3], [1.0, 0, 0]):
+        line = along * direction + [20.0, -7, 5]
+        assert not inputs.find_wrong_phantom(frames, Fake(target_id=np.arange(31), xyz_mm=line))
+    bent = line + np.where(np.arange(31) % 2, 1.0, 0.0)[:, None] * [0, 3, 0]
+    (found,) = inputs.find_wrong_phantom(frames, Fake(target_id=np.arange(31), xyz_mm=bent))
+    assert found.kind is Kind.REMOTE_TARGETS and found.place.target_id == (30,)
+
+
+def test_names_of_fluoroscopes_may_have_capitals_but_not_differ_in_these():
+    inputs.validate_names(['A', 'b', 'Ab'])
+    inputs.validate_names(['A', 'A'])
+    with pytest.raises(DataError, match='fluoroscopes Ab and aB differ in capital') as told:
+        inputs.validate_names(['b', 'Ab', 'c', 'aB'])
+    assert told.value.finding.place.fluoroscopes == ('Ab', 'aB')
 
 
 def test_sigma_is_plausible_within_its_limits():
@@ -322,6 +346,66 @@ def test_precision_is_that_of_the_correction_over_the_noise(given, ratio, noise)
     assert 'inf' not in str(found)
 
 
+def trends_of(monkeypatch, change=None, rejected=None, model_name='auto', corrects=True):
+    """Checks of whiteness, worst area and drift of an image of 1000 x 500 px."""
+    trend = Fake(size=0.2, place=np.array([300.0, 40.0]), cell_size=0.5, cell_limit=0.3)
+    common = Fake(
+        trend=trend,
+        limit=0.1,
+        rejected=rejected,
+        claimed_sd=0.05,
+        inliers='all',
+        is_significant=False,
+    )
+    change = change or Fake(size=0.3, limit=0.2, cell_size=0.9, cell_limit=0.6)
+    change.place = np.array([900.0, 450.0])
+    monkeypatch.setattr(field_checks, 'change_of_trend', lambda inliers, size: change)
+    model = Fake(corrects=corrects, kind='knn', evaluate=lambda uv: Fake(sd=np.array([0.1])))
+    evidence = Fake(
+        trends={'a': common},
+        calibrations={'a': Fake(model=model, image_size=(1000, 500))},
+        frames={'a': range(12)},
+        request=Fake(options=Fake(model_name=model_name)),
+    )
+    return field_checks.check_trends(evidence, ['a'])
+
+
+def test_trends_are_told_with_their_place_and_limit(monkeypatch):
+    white, area, drift = trends_of(monkeypatch)
+    assert (white.kind, white.value, white.limit) == (Kind.WHITENESS, 0.2, 0.1)
+    assert (area.kind, area.value) == (Kind.WORST_AREA, 0.5)
+    assert area.limit == pytest.approx(np.hypot(0.3, 3 * 0.1))
+    assert (drift.kind, drift.value, drift.limit) == (Kind.DRIFT, 0.3, 0.2)
+    for one, place in ((white, (300, 40)), (area, (300, 40)), (drift, (900, 450))):
+        assert f'u {place[0]}, v {place[1]}' in str(one)
+    only_area = Fake(size=0.1, limit=0.2, cell_size=0.9, cell_limit=0.6)
+    assert trends_of(monkeypatch, only_area)[2].value == 0.9
+    none = Fake(size=0.1, limit=0.2, cell_size=0.5, cell_limit=0.6)
+    assert (trends_of(monkeypatch, none)[2].value, trends_of(monkeypatch, none)[2].limit) == (
+        0.1,
+        0.2,
+    )
+
+
+def test_rejected_points_that_agree_are_the_worst_area(monkeypatch):
+    rejected = Fake(size=0.8, limit=0.7, place=np.array([100.0, 450.0]), points=17)
+    area = trends_of(monkeypatch, rejected=rejected)[1]
+    assert (area.value, area.limit, area.numbers) == (0.8, 0.7, {'rejected_points': 17})
+    assert 'u 100, v 450' in str(area)
+    rejected.size = 0.6
+    assert trends_of(monkeypatch, rejected=rejected)[1].value == 0.5
+
+
+def test_another_model_is_advised_where_one_was_asked_for(monkeypatch):
+    automatic, asked, none = (
+        trends_of(monkeypatch, model_name=name, corrects=corrects)[0].advice
+        for name, corrects in (('auto', True), ('knn', True), ('none', False))
+    )
+    assert '--model' not in automatic
+    assert asked.startswith(automatic) and '--model auto' in asked
+    assert none.startswith('calibrate with a correction model')
+
+
 def test_variation_of_few_points_in_each_exposure_is_not_cured_by_more_exposures():
     def made(beads, exposures):
         evidence = Fake(
@@ -337,6 +421,18 @@ def test_variation_of_few_points_in_each_exposure_is_not_cured_by_more_exposures
     assert made(503, 3) == more
     assert len({made(24, 3), made(24, 16), made(503, 16), more}) == 3
     assert made(24, 16) == made(24, 3) and made(503, 16) != more
+
+
+def test_a_distortion_may_vary_by_a_part_of_the_noise():
+    frames = [Fake(angle=angle) for angle in (0.1, 0.4, 0.2)]
+    evidence = Fake(
+        frames={'a': frames},
+        variations={'a': Variation(1.7, 0.21, 0.4)},
+        trends={'a': Fake(is_significant=False)},
+    )
+    (check,) = field_checks.check_variation(evidence, ['a'])
+    assert check.value == 0.21 and check.limit == pytest.approx(field_checks.HARMLESS * 0.4)
+    assert (check.numbers['chi2_per_dof'], check.numbers['noise_px']) == (1.7, 0.4)
 
 
 def test_achieved_deviation_joins_claim_halves_trend_and_variation():
@@ -660,6 +756,39 @@ def test_exposures_are_examined_at_a_rate_and_after_a_restart(last, now, due):
     assert watch.is_due(now) is due
 
 
+def test_the_watch_tells_noise_from_what_is_common_to_exposures():
+    """What the corrections claim is not noise; rays that are far apart are no evidence."""
+    told = []
+    watch = RigDriftWatch.__new__(RigDriftWatch)
+    watch._addition, watch._has_bodies, watch._names = None, False, ('a', 'b')
+    watch._of_charts = watch._state = 'fine'
+    watch._watch = Fake(state='fine', add_residuals=lambda *given: told.append(given))
+    watch._change = Fake(add=lambda *given, noise: told.append(noise))
+    one, two, three = np.full(4, 0.5), np.full(4, 0.8), np.array([0.0, 1, 3, 9000])
+    found = Fake(
+        residual=three,
+        sd_total=np.full(4, 0.6),
+        normal_a=np.ones((4, 2)),
+        normal_b=np.zeros((4, 2)),
+        factor_a=one,
+        factor_b=two,
+    )
+    watch._pairs = [(0, 1, Fake(residuals=lambda *given: found))]
+    sigma = np.array([[0.5] * 4, [0.4] * 4])
+    views = Fake(
+        uv=np.ones((2, 4, 2)), sigma=sigma, correction_sd=np.array([[0.4] * 4, [0.5] * 4])
+    )
+    exposure = Fake(target_id=np.arange(4) + 7, views=views)
+    assert watch.add_exposure(55, exposure) == 'fine' and watch._last_ns == 55
+    noise, (stamp, a, b, given) = told
+    # Of b, nothing is left.
+    np.testing.assert_allclose(noise, 0.5**2 * (0.5**2 - 0.4**2))
+    assert (stamp, a, b) == (55, 'a', 'b') and given.target_id.tolist() == [7, 8, 9]
+    np.testing.assert_allclose(given.sd_noise**2 + given.sd_systematic**2, 0.6**2)
+    np.testing.assert_allclose(given.sd_noise**2, noise[:3])
+    np.testing.assert_array_equal(given.residual, three[:3])
+
+
 # ---- charts of the drift watch
 
 
@@ -701,6 +830,9 @@ def test_observations_swap_their_views_and_leave_out_what_is_not_finite():
     )
     assert bad.usable().target_id.tolist() == [3]
     assert len(EpipolarObservations.concatenate([bad, observations()])) == 8
+    for name in ('sd_noise', 'factor_a', 'factor_b'):
+        none = observations(**{name: np.array([0.1, 0.0, 0.3, -0.1])})
+        assert none.usable().target_id.tolist() == [0, 2]
     with pytest.raises(ValueError, match='factor_a'):
         observations(factor_a=np.ones(3))
 
@@ -869,3 +1001,35 @@ def test_stretch_is_that_of_noise_that_lasts():
 
 def test_levels_begin_at_their_thresholds():
     assert (OK, WARN, ERROR) == (Severity.NOTE, Severity.WARNING, Severity.ERROR)
+
+
+@pytest.mark.parametrize(
+    ('misfit', 'depth', 'distance_mm', 'relabelled', 'kind'),
+    [
+        (0.9 * inputs.FIT, 1, 1000.0, None, None),
+        (0.9 * inputs.FIT, -1, 1000.0, None, Kind.IMAGE_MIRRORED),
+        (0.9 * inputs.FIT, 1, 1e6, None, Kind.WRONG_UNIT),
+        (1.1 * inputs.FIT, -1, 1000.0, None, Kind.IMAGE_MIRRORED),
+        (1.1 * inputs.FIT, 1, 1e6, None, Kind.WRONG_UNIT),
+        (1.1 * inputs.FIT, 1, None, None, None),
+        (1.1 * inputs.MISFIT, -1, 1000.0, None, Kind.OTHER_PHANTOM),
+        (1.1 * inputs.MISFIT, -1, 1000.0, 0.9 * inputs.GOOD_MISFIT, Kind.IDS_SHIFTED),
+        (1.1 * inputs.MISFIT, -1, 1000.0, 1.1 * inputs.GOOD_MISFIT, Kind.OTHER_PHANTOM),
+        (1.1 * inputs.FIT, -1, 1000.0, 1.3 * inputs.BETTER * inputs.FIT, Kind.IMAGE_MIRRORED),
+    ],
+)
+def test_cause_of_an_exposure_is_that_of_its_fit(
+    monkeypatch, misfit, depth, distance_mm, relabelled, kind
+):
+    """Misfits over the side of the image; those of other ids where they are relabelled."""
+    fits = iter(
+        [
+            Fake(misfit_px=1000 * misfit, depth=depth, distance_mm=distance_mm),
+            None if relabelled is None else Fake(misfit_px=1000 * relabelled),
+        ]
+    )
+    monkeypatch.setattr(inputs, 'fit_to_phantom', lambda *_: next(fits, None))
+    phantom = Phantom(np.arange(8), 100.0 * RNG.uniform(-1, 1, (8, 3)), np.full(8, 0.1))
+    frame = Frame('a', 1, np.arange(8), np.zeros((8, 2)), (1000, 800))
+    found = inputs._cause(frame, phantom)
+    assert (found and found.kind) == kind

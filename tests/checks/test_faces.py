@@ -56,15 +56,30 @@ def test_a_plate_is_named_where_no_single_bead_stands_out():
     assert check.limit < 0.3 and 'shift_mm' in check.numbers
 
 
-def test_a_plate_that_is_tilted_is_named():
+@pytest.mark.parametrize('along', [0, 1])
+def test_a_plate_that_is_tilted_is_named(along):
     """By 1 mm at its rim, and nothing in its middle."""
     rng = np.random.default_rng(2)
     survey = plates(rng)
-    tilt = np.where(survey[:, 2] > 0, survey[:, 0] / 110.0, 0.0)[:, None] * [0, 0, 1.0]
+    tilt = np.where(survey[:, 2] > 0, survey[:, along] / 110.0, 0.0)[:, None] * [0, 0, 1.0]
     layer = displaced_layer(beads_of(survey, tilt, rng))
     assert layer.axis == 2 and len(layer.target_id) == 100
     assert layer.tilt_rad == pytest.approx(1 / 110, rel=0.1)
     assert np.linalg.norm(layer.shift_mm) < 0.2
+
+
+def test_a_layer_is_displaced_alike_wherever_the_phantom_has_its_origin():
+    survey = plates(None)
+    tilt = np.where(survey[:, 2] > 0, survey[:, 0] / 110.0, 0.0)[:, None] * [0, 0, 1.0]
+    tilt = tilt + (survey[:, 2:] > 0) * [0.5, 0, 0]
+    here, there = (
+        displaced_layer(beads_of(survey + origin, tilt, np.random.default_rng(2)))
+        for origin in ([0, 0, 0], [300.0, -200, 900])
+    )
+    np.testing.assert_array_equal(there.target_id, here.target_id)
+    np.testing.assert_allclose(there.shift_mm, here.shift_mm, atol=1e-6)
+    assert there.tilt_rad == pytest.approx(here.tilt_rad)
+    assert there.size_mm == pytest.approx(here.size_mm)
 
 
 def test_an_inner_layer_is_named_with_its_bounds():

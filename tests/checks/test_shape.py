@@ -4,6 +4,7 @@
 
 import functools
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -85,6 +86,42 @@ def test_a_phantom_that_is_short_in_one_axis_is_found_with_axis_and_size():
     assert check.passed is False and check.value > check.limit
 
 
+def test_strain_is_that_of_the_normal_equations_and_what_hides_most_is_told(monkeypatch):
+    rng = np.random.default_rng(7)
+    survey = rng.uniform(-50, 50, (20, 3)) + [300, 0, 0]
+    root, pull = rng.normal(size=(5, 5)), 100 * rng.normal(size=5)
+    information = 1e4 * (root @ root.T + np.eye(5))
+    followed, sd = rng.normal(size=(20, 3, 5)), rng.uniform(0.1, 0.3, (20, 3))
+    score = shape._Score(information, pull, followed)
+    monkeypatch.setattr(shape, '_score', lambda evidence, solved, displacement: score)
+    network = SimpleNamespace(survey_mm=survey, datum='survey', survey_sd_mm=np.full(20, 0.1))
+    solved = SimpleNamespace(measured=SimpleNamespace(network=network))
+    covariance = np.einsum('na,ab->nab', sd**2, np.eye(3))
+    result = SimpleNamespace(solved={'a': solved}, targets=SimpleNamespace(covariance=covariance))
+    found = strain_of_survey(SimpleNamespace(result=result, variations={'a': None}))
+    tensors, _ = shape._strains(survey)
+    own, hidden = (
+        np.einsum('tab,ab->t', tensors, tensor) for tensor in (found.tensor, found.hidden)
+    )
+
+    def increase(strain):
+        return np.mean(np.sum((followed @ strain / sd) ** 2, axis=1)) / 3
+
+    np.testing.assert_allclose(own, np.linalg.solve(information, pull))
+    assert found.test == pytest.approx(own @ pull)
+    # Of three coordinates each.
+    assert found.nse == pytest.approx(increase(own))
+    assert hidden @ information @ hidden == pytest.approx(found.critical)
+    assert increase(hidden) == pytest.approx(found.hidden_nse)
+    for other in rng.normal(size=(50, 5)):
+        other *= np.sqrt(found.critical / (other @ information @ other))
+        assert increase(other) <= found.hidden_nse
+    offset = survey - survey.mean(axis=0)
+    moved = offset @ found.tensor
+    # At most: what a similarity takes up is no strain.
+    assert 0 < found.rms_mm <= np.sqrt(np.mean(np.sum(moved**2, axis=1)))
+
+
 def test_a_strain_that_nobody_would_see_is_taken_on_trust():
     numbers = {'hidden_strain': 4e-3, 'hidden_x': 1.0, 'hidden_y': 0.0, 'hidden_z': 0.0}
     for nse, expected in ((0.3, 0), (8.0, 1)):
@@ -128,6 +165,14 @@ def test_strain_is_compared_with_what_chance_exceeds_and_what_matters(
     assert '0.50 %' in trusted.cause and '2.0 times' in trusted.cause
     monkeypatch.setattr(shape, 'strain_of_survey', lambda evidence: None)
     assert check_shape(None, ('a',)) == []
+
+
+@pytest.mark.parametrize(('beads', 'datum'), [(9, 'survey'), (10, 'inner')])
+def test_few_beads_and_free_networks_have_no_strain_of_a_survey(beads, datum):
+    network = SimpleNamespace(survey_mm=np.eye(beads, 3), datum=datum)
+    solved = SimpleNamespace(measured=SimpleNamespace(network=network))
+    given = SimpleNamespace(result=SimpleNamespace(solved={'a': solved}))
+    assert strain_of_survey(given) is None
 
 
 def test_strain_of_a_small_set_has_axis_and_size():

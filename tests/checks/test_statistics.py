@@ -170,6 +170,9 @@ def test_rejected_points_of_an_exposure_agree_where_neighbours_are_alike():
     false = rejected_exposure(given._part(exposure == 0), fitted)
     assert false.number == 4 and false.agreement < false.limit
     assert rejected_exposure(given._part(exposure == 2), fitted) is None
+    given.r[:] = 0
+    with np.errstate(all='raise'):
+        assert rejected_exposure(given, fitted).agreement == 0
 
 
 def corner_of_exposures(alike, rng):

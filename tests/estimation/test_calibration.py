@@ -753,6 +753,32 @@ def test_combined_targets_count_the_datum_once():
     np.testing.assert_allclose(both.xyz_mm.ravel(), truth @ right, rtol=1e-10)
 
 
+def test_points_of_free_networks_are_combined_without_the_survey():
+    """With joint covariances of all parts or of some: information of beads is added up."""
+    rng = np.random.default_rng(7)
+    phantom = replace(
+        PHANTOM, target_id=np.arange(1, 5), xyz_mm=PHANTOM.xyz_mm[:4], sd_mm=np.full(4, 0.1)
+    )
+    root = rng.normal(0, 0.005, (2, 12, 12))
+    joint = root @ root.transpose(0, 2, 1)
+    blocks = joint.reshape(2, 4, 3, 4, 3)[:, np.arange(4), :, np.arange(4), :].swapaxes(0, 1)
+    xyz = phantom.xyz_mm + rng.normal(0, 0.1, (2, 4, 3))
+    parts = [Targets(phantom.target_id, x, c, j) for x, c, j in zip(xyz, blocks, joint)]
+    own = np.linalg.inv(blocks)
+    covariance = np.linalg.inv(own.sum(axis=0))
+    expected = (covariance @ (own @ xyz[..., None]).sum(axis=0))[..., 0]
+    free = combined_targets(parts, phantom, weighted=False)
+    np.testing.assert_allclose(free.covariance, covariance, rtol=1e-8)
+    np.testing.assert_allclose(free.xyz_mm, expected, rtol=1e-9)
+    assert free.joint_covariance is None
+    good = [replace(p, covariance=p.covariance / 100) for p in parts]
+    mixed = [replace(good[0], joint_covariance=None), good[1]]
+    plain = [replace(p, joint_covariance=None) for p in good]
+    one, other = (combined_targets(of, phantom) for of in (mixed, plain))
+    np.testing.assert_array_equal(one.xyz_mm, other.xyz_mm)
+    assert one.joint_covariance is None
+
+
 @pytest.mark.parametrize('is_joint', [False, True])
 def test_points_that_are_worse_than_the_survey_add_nothing_to_it(is_joint):
     """As those of a model that cannot follow the distortion are."""

@@ -447,6 +447,32 @@ def test_ripples_that_differ_between_exposures_are_not_those_of_the_distortion(e
     assert shown_ripples((1024, 1024), uv, residuals, exposure, 10) is None
 
 
+def test_variances_of_shown_ripples_are_those_of_their_sines():
+    """Mean squares of the coefficients, beside a noise that is as large."""
+    functions = Functions((1024, 1024), -1, 30)
+    rng = np.random.default_rng(8)
+    inside = (functions.band >= 20) & (functions.band <= 22)
+    coefficients = rng.normal(0, 20.0, (len(functions), 2)) * inside[:, None]
+    uv = pixels(4000, 4, (1024, 1024))
+    residuals = functions(uv) @ coefficients + rng.normal(0, 1.0, uv.shape)
+    found = shown_ripples((1024, 1024), uv, residuals, np.arange(4000) % 12, 10)
+    assert {20, 21, 22} <= set(found.bands) and len(found.bands) < 11
+    there = [np.mean(coefficients[functions.band == band] ** 2) for band in (20, 21, 22)]
+    assert np.mean(found.variances[20:23]) == pytest.approx(np.mean(there), rel=0.3)
+
+
+def test_ripples_are_common_where_those_of_exposures_agree():
+    """Strong in the sum over all exposures, too: the same points dealt out at random show them."""
+    rng = np.random.default_rng(7)
+    exposure = np.repeat(np.arange(8), 600)
+    uv = pixels(len(exposure), 4, (1024, 1024))
+    shift = rng.uniform(0, 70, (8, 2))[exposure]
+    residuals = plane_wave(uv + shift, 70.0) + rng.normal(0, 0.1, uv.shape)
+    assert shown_ripples((1024, 1024), uv, residuals, exposure, 10) is None
+    dealt = rng.permutation(exposure)
+    assert shown_ripples((1024, 1024), uv, residuals, dealt, 10) is not None
+
+
 def test_ripples_that_short_sines_have_followed_stand_out_of_their_bands():
     """A wave of 150 px and a field that grows weaker with its frequency, both with noise."""
     uv = pixels(2000, 4, (1024, 1024))

@@ -9,13 +9,24 @@ import numpy as np
 import pytest
 import rigs
 
+from fluoro_calib_ros.correction.angle_field import harmonics
+from fluoro_calib_ros.correction.calibration_record import HARMONICS
+from fluoro_calib_ros.correction.series import Functions, sd_grid_pixels
 from fluoro_calib_ros.estimation.collocation import CollocationTerms
-from fluoro_calib_ros.estimation.estimator import AdjustmentProblem, GaugeKind
+from fluoro_calib_ros.estimation.estimator import AdjustmentProblem, GaugeKind, gauge_basis
 from fluoro_calib_ros.estimation.exposure_terms import (
+    VARYING,
+    Effects,
     ExposureTerms,
+    SeriesWithExposures,
+    _Effects,
     estimates_beside_free_points,
     exposure_functions,
+    field_of,
+    fit_angles,
+    is_determined,
     variance_between_exposures,
+    variation,
 )
 from fluoro_calib_ros.photogrammetry.adjustment import adjust
 from fluoro_calib_ros.photogrammetry.collinearity import (
@@ -169,3 +180,242 @@ def test_a_self_calibration_renews_its_terms_of_exposures_until_they_settle(case
     there = np.sqrt(np.sum(np.var(coefficients, axis=0, ddof=1)))
     assert sizes[-1] == pytest.approx(there, rel=0.1)
     assert sizes[-1] == sizes[-2]
+
+
+# ---- what the angle of a C-arm explains
+
+ANGLES = np.deg2rad(np.linspace(-80.0, 85.0, 12))
+
+
+def estimated_terms(sd, random_px, seed=6, series_px=0.0):
+    """Estimates of a series and of terms of exposures that follow the angle, and their changes.
+
+    sd: of the estimates [px]; random_px: of what differs at random.
+    """
+    rng = np.random.default_rng(seed)
+    exposures = len(ANGLES)
+    uv = rng.uniform(0, 1024, (40 * exposures, 2))
+    exposure = np.repeat(np.arange(exposures), 40)
+    functions = exposure_functions(uv, SIZE, np.array([511.5, 511.5, 4000.0]))
+    terms = ExposureTerms(functions, exposure, 1.0)
+    effects = np.zeros((HARMONICS, 14))
+    effects[:2] = rng.normal(0, 0.3, (2, 14))
+    h = harmonics(ANGLES) - harmonics(ANGLES).mean(axis=0)
+    change = h @ effects + rng.normal(0, random_px, (exposures, 14))
+    series = Functions(SIZE, 3)
+    c = 2 * len(series)
+    p = c + terms.count
+    root = rng.normal(0, 1.0, (p, p))
+    covariance = sd**2 * (np.eye(p) + 0.5 * root @ root.T / p)
+    drawn = np.concatenate([np.full(c, series_px), change.ravel()])
+    # A posterior, which the prior of the terms has made smaller.
+    information = np.linalg.inv(covariance)
+    prior = np.diag(np.r_[np.zeros(c), terms.precision])
+    posterior = np.linalg.inv(information + prior)
+    found = posterior @ information @ (drawn + np.linalg.cholesky(covariance) @ rng.normal(size=p))
+    estimated = SeriesWithExposures(series, uv, terms, found, posterior)
+    return estimated, change, h, effects
+
+
+def test_terms_that_follow_the_angle_are_a_field_of_it():
+    estimated, change, _, effects = estimated_terms(0.01, 0.01)
+    fit = fit_angles(estimated, ANGLES)
+    np.testing.assert_allclose(fit.effects.mean.reshape(HARMONICS, 14)[:2], effects[:2], atol=0.06)
+    assert fit.remaining < 0.02
+    at = estimated.uv[:30]
+    functions = estimated.terms.functions.values[:30]
+    for angle, own in zip(ANGLES[::5], change[::5]):
+        np.testing.assert_allclose(fit.field.change(at, angle)[0], functions @ own, atol=0.15)
+    other, *_ = estimated_terms(0.01, 0.5, seed=7)
+    less = fit_angles(other, ANGLES)
+    assert less is None or less.remaining > 0.4
+
+
+def test_effects_of_the_angle_are_a_posterior_of_all_estimates():
+    """Dense: harmonics and random differences with the variances that were found, series free."""
+    estimated, _, h, _ = estimated_terms(0.05, 0.05, series_px=2.0)
+    terms = estimated.terms
+    fit = fit_angles(estimated, ANGLES)
+    effects = _Effects(terms, h)
+    c = 2 * len(estimated.functions)
+    information = np.linalg.inv(estimated.covariance)
+    right = information @ estimated.coefficients
+    own = np.linalg.inv(estimated.covariance[c:, c:])
+    plain = own - np.diag(terms.precision)
+    mean, covariance = effects.estimate(plain, own @ estimated.coefficients[c:])
+    np.testing.assert_allclose(fit.effects.mean, mean[: effects.count], rtol=1e-9)
+    variance = effects._variance
+    # All coefficients together: those of the series, then the effects.
+    design = np.block(
+        [
+            [np.eye(c), np.zeros((c, effects.design.shape[1]))],
+            [np.zeros((terms.count, c)), effects.design],
+        ]
+    )
+    likelihood = information - np.diag(np.r_[np.zeros(c), terms.precision])
+    normal = design.T @ likelihood @ design + np.diag(np.r_[np.zeros(c), 1 / variance])
+    everything = np.linalg.inv(normal)
+    solved = everything @ design.T @ right
+    np.testing.assert_allclose(mean, solved[c:], atol=1e-6)
+    np.testing.assert_allclose(fit.coefficients, solved[:c], atol=1e-6)
+    np.testing.assert_allclose(fit.covariance, everything[:c, :c], atol=1e-8)
+    count = effects.count
+    np.testing.assert_allclose(
+        fit.effects.covariance, everything[c : c + count, c : c + count], atol=1e-8
+    )
+    np.testing.assert_allclose(fit.effects.mixed, everything[:c, c : c + count], atol=1e-8)
+    np.testing.assert_allclose(covariance, everything[c:, c:], atol=1e-8)
+    by_angle = variance[:count].reshape(HARMONICS, 14).sum(axis=1) @ np.mean(h**2, axis=0)
+    at_random = variance[count : count + 14].sum()
+    assert effects.explained(h) == pytest.approx(by_angle / (by_angle + at_random))
+    assert fit.remaining == pytest.approx(1 - effects.explained(h))
+
+
+def test_variances_of_effects_are_the_most_likely_ones():
+    estimated, _, h, _ = estimated_terms(0.05, 0.1)
+    terms = estimated.terms
+    effects = _Effects(terms, h)
+    c = 2 * len(estimated.functions)
+    own = np.linalg.inv(estimated.covariance[c:, c:])
+    information = own - np.diag(terms.precision)
+    right = own @ estimated.coefficients[c:]
+    effects.estimate(information, right)
+    found = effects._factors.copy()
+
+    def evidence(factors):
+        effects._factors = factors
+        variance = effects._variance
+        normal = effects.design.T @ information @ effects.design + np.diag(1 / variance)
+        vector = effects.design.T @ right
+        fit = vector @ np.linalg.solve(normal, vector)
+        return (fit - np.linalg.slogdet(normal)[1] - np.sum(np.log(variance))) / 2
+
+    here = evidence(found)
+    for k in (0, 2):  # the second order vanishes
+        for factor in (0.6, 1.6):
+            other = found.copy()
+            other[k] *= factor
+            assert evidence(other) < here
+    assert found[1] < 0.05 * found[0]
+
+
+def test_a_field_has_the_covariances_of_its_effects():
+    """Against those of drawn fields, over the grid, mean of u and v."""
+    rng = np.random.default_rng(9)
+    estimated, *_ = estimated_terms(0.05, 0.05)
+    series, terms = estimated.functions, estimated.terms
+    q, c = HARMONICS * 14, 2 * len(series)
+    root = rng.normal(0, 0.05, (c + q, c + q))
+    joint = root @ root.T
+    effects = Effects(rng.normal(size=q), joint[c:, c:], joint[:c, c:])
+    field = field_of(estimated, ANGLES, effects)
+    uv = estimated.uv
+    by_harmonic = effects.mean.reshape(HARMONICS, 14)
+    cubic = Functions(SIZE, 3)
+    for j in range(HARMONICS):
+        expected = terms.functions.values @ by_harmonic[j]
+        np.testing.assert_allclose(cubic(uv) @ field.coefficients[j].T, expected, atol=1e-8)
+    pixels = sd_grid_pixels(SIZE)
+    to_cubic = [
+        np.linalg.lstsq(cubic(uv), terms.functions.values[:, a], rcond=None)[0] for a in (0, 1)
+    ]
+    at = 400
+    of_terms = [cubic(pixels[at : at + 1]) @ m for m in to_cubic]
+    of_series = series(pixels[at : at + 1])[0]
+    m = len(of_series)
+
+    def row(axis, j):
+        out = np.zeros(c + q)
+        out[c + 14 * j : c + 14 * (j + 1)] = of_terms[axis][0]
+        return out
+
+    def row_of_series(axis):
+        out = np.zeros(c + q)
+        out[axis * m : (axis + 1) * m] = of_series
+        return out
+
+    variances = field.variances.reshape(len(field.variances), -1)[:, at]
+    with_series = [
+        np.mean([row_of_series(a) @ joint @ row(a, j) for a in (0, 1)]) for j in range(HARMONICS)
+    ]
+    pairs = [
+        np.mean([row(a, j) @ joint @ row(a, k) for a in (0, 1)])
+        for j in range(HARMONICS)
+        for k in range(j, HARMONICS)
+    ]
+    np.testing.assert_allclose(variances, [*with_series, *pairs], atol=1e-9)
+
+
+def test_terms_that_are_not_determined_follow_no_angle():
+    estimated, *_ = estimated_terms(0.05, 0.05)
+    nothing = replace(estimated, covariance=np.zeros_like(estimated.covariance))
+    assert fit_angles(nothing, ANGLES) is None
+
+
+def test_exposures_of_enough_image_points_determine_terms():
+    exposure = np.repeat([4, 5, 9], [30, 29, 31])
+    assert is_determined(exposure, 2) and not is_determined(exposure, 3)
+
+
+def test_small_exposures_do_not_count_in_a_variation():
+    """Square sums over their expectation, written out."""
+    rng = np.random.default_rng(10)
+    exposure = np.repeat([0, 1, 2], [60, 29, 50])
+    uv = rng.uniform(0, 1024, (139, 2))
+    functions = exposure_functions(uv, SIZE, np.array([511.5, 511.5, 4000.0]))
+    residuals = rng.normal(0, 0.3, uv.shape)
+    residuals[:60] += functions[:60] @ rng.normal(0, 0.4, 14)
+    found = variation(residuals, exposure, functions)
+    explained = left = 0.0
+    for e, count in ((0, 60), (2, 50)):
+        a = functions[exposure == e].reshape(2 * count, 14)
+        y = residuals[exposure == e].ravel()
+        rest = y - a @ np.linalg.lstsq(a, y, rcond=None)[0]
+        left += rest @ rest
+        explained += y @ y - rest @ rest
+    noise = left / (2 * 110 - 2 * 14 - 2 * 6)
+    assert found.chi2_per_dof == pytest.approx(explained / (28 * noise))
+    assert found.noise_px == pytest.approx(np.sqrt(noise))
+    size = np.sqrt((explained - VARYING * 28 * noise) / 220)
+    assert found.size_px == pytest.approx(size) and found.is_varying
+    none = variation(residuals[60:89], exposure[60:89], functions[60:89])
+    assert (none.chi2_per_dof, none.size_px, none.is_varying) == (0.0, 0.0, False)
+
+
+def test_changes_of_the_interior_are_what_turns_do_not_absorb():
+    rng = np.random.default_rng(11)
+    uv = rng.uniform(0, 1024, (300, 2))
+    interior = np.array([480.0, 530.0, 2000.0])
+    functions = exposure_functions(uv, SIZE, interior, with_interior=True)
+    flat = functions.reshape(600, 17)
+    np.testing.assert_allclose(flat.T @ flat / 600, np.eye(17), atol=1e-9)
+    turns = gauge_basis(uv, interior, GaugeKind.TURNS).reshape(600, -1)
+    np.testing.assert_allclose(turns.T @ flat[:, 14:], 0, atol=1e-6)
+    whole = gauge_basis(uv, interior).reshape(600, -1)
+    both = np.linalg.lstsq(np.hstack([turns, flat[:, 14:]]), whole, rcond=None)[0]
+    np.testing.assert_allclose(np.hstack([turns, flat[:, 14:]]) @ both, whole, atol=1e-9)
+
+
+@pytest.mark.parametrize('loss', ['gaussian', 'student_t'])
+def test_estimates_beside_free_points_are_those_with_a_loose_survey(loss):
+    """Solved anew with ten times the standard deviations of the survey."""
+    network, true = rigs.small_network(4, 40, survey_sd_mm=0.2, seed=3)
+    functions = exposure_functions(network.uv, SIZE, true.interior[0])
+    terms = ExposureTerms(functions, network.exposure, SIZE_PX)
+    own = AdditionalParameters(
+        np.zeros((len(network.uv), 0)), np.diag(terms.precision), terms.functions
+    )
+    varying = replace(network, additional=(own,))
+    start = replace(true, additional=(np.zeros(terms.count),))
+    noise = Noise(loss, 0.3, 8.0)
+    ((mean, variance),) = estimates_beside_free_points(
+        varying, adjust(varying, start, noise=noise)
+    )
+    loose = replace(varying, survey_sd_mm=10 * varying.survey_sd_mm)
+    there = adjust(loose, start, noise=noise)
+    expected = there.parameters.additional[0]
+    assert np.abs(mean - expected).max() < 0.25 * np.abs(expected).max()
+    factor = 1.0 if loss == 'gaussian' else 10 / 12
+    matrix = factorize(loose, normal_equations(loose, there.parameters, 0.0, noise, factor))
+    sd = np.sqrt(np.diagonal(np.linalg.inv(information_of_additional(matrix, 0))))
+    np.testing.assert_allclose(np.sqrt(variance), sd, rtol=0.05)

@@ -8,7 +8,6 @@ import json
 import pathlib
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace as Fake
 
 import numpy as np
 import pytest
@@ -16,10 +15,7 @@ from rigs import calibrated, exposures, rig, run
 
 from fluoro_calib_ros.correction.registry import no_correction
 from fluoro_calib_ros.errors import DataError
-from fluoro_calib_ros.estimation import rig_orientation
 from fluoro_calib_ros.estimation.rig_orientation import (
-    MAX_PAIRS,
-    _paired,
     orientation_and_scatter,
     orientation_of_capture,
     standing_frames,
@@ -379,26 +375,6 @@ def test_exposures_that_do_not_belong_together_are_refused():
         'relative orientation is not known',
     ):
         orientation_and_scatter(apart, rig().phantom, calibrations())[0]
-
-
-def test_many_exposures_are_thinned_evenly():
-    """Exposures that all fluoroscopes have take precedence."""
-    frame = exposures()['a'][0]
-    frames = {
-        name: [replace(frame, fluoroscope=name, number=n) for n in range(*numbers)]
-        for name, numbers in (('a', (0, 400)), ('b', (0, 400, 2)), ('c', (0, 400)))
-    }
-    used = _paired(frames)
-    numbers = {name: [f.number for f in of_one] for name, of_one in used.items()}
-    assert numbers['a'] == numbers['b'] == numbers['c'] and len(numbers['a']) == MAX_PAIRS
-    assert (
-        numbers['a'][0] == 0
-        and numbers['a'][-1] == 398
-        and max(np.diff(numbers['a'])) <= 800 / MAX_PAIRS
-    )
-    frames['b'] = frames['b'][:3]
-    numbers = {name: [f.number for f in of_one] for name, of_one in _paired(frames).items()}
-    assert len(numbers['a']) == MAX_PAIRS and numbers['a'] == numbers['c']
 
 
 # ---- the file
@@ -783,23 +759,3 @@ def test_one_exposure_can_define_the_rig_frame(folder, tmp_path):
     rotation, shift = phantom_poses(np.random.default_rng([1, 2]), 15)[3]
     true = [rotation.T @ (f.position_mm - shift) for f in rig().fluoroscopes]
     np.testing.assert_allclose(found.position_mm, true, atol=3.0)
-
-
-@pytest.mark.parametrize('turning', [(), ('a',), ('b',)])
-def test_corrections_that_change_with_the_angle_of_either_fluoroscope_count(monkeypatch, turning):
-    told = []
-
-    def mean_of_pairs(fixed, pairs, corrected):
-        told.append(corrected)
-        pose = Fake(rotation=np.eye(3), translation_mm=np.zeros(3))
-        return pose, np.zeros((6, 12)), Fake(growth=np.ones(6))
-
-    monkeypatch.setattr(rig_orientation, '_mean_of_pairs', mean_of_pairs)
-    monkeypatch.setattr(rig_orientation, 'paired_exposures', lambda measured, b: [(0, 1)])
-    fixed = Fake(
-        measured=Fake(fluoroscopes=('a', 'b'), frames=[None, None]),
-        covariance_of_all=lambda: np.eye(12),
-        by_interior=np.zeros((12, 2, 3)),
-    )
-    rig_orientation._relative_to_first(fixed, turning)
-    assert told == [bool(turning)]

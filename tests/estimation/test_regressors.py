@@ -120,6 +120,48 @@ def test_sample_of_weight_zero_is_ignored(regressor):
     np.testing.assert_allclose(weighted.predict(uv), rest.predict(uv), rtol=0, atol=1e-9)
 
 
+def test_neighbours_count_by_their_sample_weights():
+    """Those of the mean, and those of trend and planes, by weighted least squares."""
+    uv, duv, _ = training(200)
+    rng = np.random.default_rng(8)
+    weight = rng.uniform(0.2, 3.0, 200)
+    query = rng.uniform(0, SIZE, (20, 2))
+    mean = KnnRegressor(9).fit(uv, duv, sample_weight=weight).predict(query)
+    plane = LocalLinearRegressor(40, 1).fit(uv, duv, sample_weight=weight).predict(query)
+    basis = np.column_stack([np.ones(200), uv])
+    root = np.sqrt(weight)[:, None]
+    trend = np.linalg.lstsq(root * basis, root * duv, rcond=None)[0]
+    for row, at in enumerate(query):
+        distance = np.linalg.norm(uv - at, axis=1)
+        near = np.argsort(distance)[:9]
+        np.testing.assert_allclose(mean[row], np.average(duv[near], axis=0, weights=weight[near]))
+        near = np.argsort(distance)[:40]
+        kernel = (1 - (distance[near] / distance[near[-1]]) ** 3) ** 3 * weight[near]
+        own = np.sqrt(kernel)[:, None]
+        left = duv[near] - basis[near] @ trend
+        fit = np.linalg.lstsq(own * np.column_stack([np.ones(40), uv[near] - at]), own * left)[0]
+        expected = np.append(1.0, at) @ trend + fit[0]
+        np.testing.assert_allclose(plane[row], expected, atol=1e-4)
+
+
+def test_regressors_of_one_output_and_of_few_samples():
+    uv, duv, _ = training(50)
+    for regressor in (KnnRegressor, LocalLinearRegressor):
+        both = regressor(7).fit(uv, duv).predict(uv)
+        one = regressor(7).fit(uv, duv[:, 0]).predict(uv)
+        np.testing.assert_allclose(one, both[:, 0], atol=1e-9)
+    few = LocalLinearRegressor(90, None).fit(uv, duv)
+    assert few.n_neighbors_ == 50 and np.isfinite(few.predict(uv)).all()
+    with pytest.raises(ValueError):
+        KnnRegressor(51).fit(uv, duv).predict(uv)
+    with pytest.raises(ValueError, match='n_neighbors is at least 1, not 0'):
+        LocalLinearRegressor(0).fit(uv, duv)
+    alike = LocalLinearRegressor(4, None).fit(
+        np.array([[0, 1], [1, 0], [0, -1], [-1.0, 0]]), duv[:4]
+    )
+    np.testing.assert_allclose(alike.predict([[0.0, 0.0]]), duv[:4].mean(axis=0, keepdims=True))
+
+
 @pytest.mark.parametrize('model, regressor', REGRESSORS)
 def test_cross_validation_with_whole_exposures_held_out(model, regressor):
     """cross_val_predict with GroupKFold gives the predictions of our cross-validation."""

@@ -6,6 +6,7 @@
 import functools
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,8 +19,10 @@ from fluoro_calib_ros.checks.survey import (
     displaced,
     unsurveyed,
 )
+from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.calibrate import adjust_with_calibrations, calibrate
 from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
+from fluoro_calib_ros.estimation.result import Targets
 from fluoro_calib_ros.estimation.survey import (
     Distances,
     MeasuredDistance,
@@ -159,6 +162,128 @@ def test_distances_equal_a_dense_adjustment_with_unknown_scale():
     square = left @ left / 0.1**2 + x[:-1] @ np.linalg.solve(joint, x[:-1])
     assert found.chi2 == pytest.approx(square, rel=1e-7)
     assert found.freedom == 3
+
+
+@pytest.mark.parametrize(
+    'ends, length_mm, sd_mm, said',
+    [
+        ((4, 4), 100.0, 0.1, 'both ends are the same bead'),
+        ((4, 5), 0.0, 0.1, 'are numbers above 0'),
+        ((4, 5), np.inf, 0.1, 'are numbers above 0'),
+        ((4, 5), np.nan, 0.1, 'are numbers above 0'),
+        ((4, 5), 100.0, 0.0, 'are numbers above 0'),
+        ((4, 5), 100.0, np.inf, 'are numbers above 0'),
+    ],
+)
+def test_a_distance_that_is_none_is_refused(ends, length_mm, sd_mm, said):
+    with pytest.raises(DataError, match=said) as error:
+        MeasuredDistance(*ends, length_mm, sd_mm)
+    assert error.value.finding.place.target_id == ends
+
+
+def free_network(in_datum=None):
+    """Result of a calibration of nine beads, 20 to 28, with inner constraints, and its survey."""
+    rng = np.random.default_rng(8)
+    n = 9
+    given = Phantom(20 + np.arange(n), rng.uniform(-100, 100, (n, 3)), rng.uniform(0.2, 0.9, n))
+    root = rng.normal(0, 0.1, (3 * n, 3 * n))
+    joint = root @ root.T / n
+    blocks = joint.reshape(n, 3, n, 3).transpose(0, 2, 1, 3)
+    xyz = given.xyz_mm + rng.normal(0, 0.3, (n, 3))
+    targets = Targets(given.target_id, xyz, blocks[np.arange(n), np.arange(n)], joint)
+    network = SimpleNamespace(
+        in_datum=in_datum, point=np.array([0, 0, 1]), exposure=np.array([0, 1, 1]), n_points=n
+    )
+    adjustment = SimpleNamespace(
+        inliers=np.ones(3, bool),
+        parameters=SimpleNamespace(
+            points_mm=xyz, position_mm=np.array([[0.0, -1500.0, 0.0], [1500.0, 0.0, 0.0]])
+        ),
+    )
+    solved = SimpleNamespace(
+        measured=SimpleNamespace(network=network),
+        adjustment=adjustment,
+        covariance_of_points=lambda: lambda p, q: blocks[p, q],
+    )
+    return SimpleNamespace(solved={'a+b': solved}, targets=targets), given, blocks
+
+
+@pytest.mark.parametrize('some', [False, True])
+def test_beads_without_a_distance_have_the_scale_of_their_given_coordinates(some):
+    """As uncertain as these are, about the centre of the datum."""
+    in_datum = np.arange(9) < 6 if some else None
+    result, given, _ = free_network(in_datum)
+    found = surveyed_beads(result, given)
+    own = slice(0, 6) if some else slice(None)
+    arm = found.xyz_mm - found.xyz_mm[own].mean(axis=0)
+    of_given = given.xyz_mm[own] - given.xyz_mm[own].mean(axis=0)
+    square = np.sum(of_given**2, axis=1)
+    sd = np.sqrt(np.sum(given.sd_mm[own] ** 2 * square)) / square.sum()
+    assert (found.scale, found.scale_sd) == (1.0, pytest.approx(sd))
+    expected = result.targets.covariance + sd**2 * arm[:, :, None] * arm[:, None, :]
+    np.testing.assert_allclose(found.covariance, expected)
+    np.testing.assert_array_equal(found.xyz_mm, result.targets.xyz_mm)
+    assert found.rays.tolist() == [2, 1] + [0] * 7 and found.angle_rad[0] > 1.2
+    np.testing.assert_allclose(found.off_mm, np.linalg.norm(found.xyz_mm - given.xyz_mm, axis=1))
+    np.testing.assert_allclose(found.sd_mm**2, np.trace(found.covariance, axis1=1, axis2=2) / 3)
+
+
+def test_beads_with_distances_have_their_scale():
+    result, given, blocks = free_network()
+    xyz = result.targets.xyz_mm
+    ends = [(20, 27), (28, 22), (24, 21)]
+    lengths = [1.002 * np.linalg.norm(xyz[a - 20] - xyz[b - 20]) for a, b in ends]
+    distances = [
+        MeasuredDistance(a, b, length, 0.01 * k)
+        for k, ((a, b), length) in enumerate(zip(ends, lengths), 1)
+    ]
+    found = surveyed_beads(result, given, distances)
+    pairs = np.array(ends) - 20
+    expected = scaled_by_distances(
+        xyz,
+        result.targets.covariance,
+        lambda p, q: blocks[p, q],
+        Distances(pairs, np.array(lengths), np.array([0.01, 0.02, 0.03])),
+        xyz.mean(axis=0),
+    )
+    np.testing.assert_allclose(found.xyz_mm, expected.xyz_mm)
+    np.testing.assert_allclose(found.covariance, expected.covariance)
+    assert (found.scale, found.scale_sd) == (expected.scale, expected.scale_sd)
+    assert found.scale == pytest.approx(1.002, abs=2e-4)
+    for end in (19, 29):
+        with rigs.refused(Kind.FEW_RAYS) as error:
+            surveyed_beads(result, given, [MeasuredDistance(20, end, 50.0, 0.1)])
+        assert error.value.finding.place.target_id == (end,)
+    less = found.without([20, 25])
+    kept = np.array([1, 2, 3, 4, 6, 7, 8])
+    assert less.target_id.tolist() == (20 + kept).tolist()
+    np.testing.assert_array_equal(less.covariance, found.covariance[kept])
+    rows = (3 * kept[:, None] + np.arange(3)).ravel()
+    np.testing.assert_array_equal(
+        less.joint_covariance, found.joint_covariance[np.ix_(rows, rows)]
+    )
+    assert less.scale == found.scale
+
+
+def test_errors_of_distances_are_those_that_all_others_show():
+    """Baarda's test: the error of one; a distance that nothing checks shows none."""
+    result, _, blocks = free_network()
+    xyz = result.targets.xyz_mm
+    pairs = np.array([(0, 7), (8, 2), (4, 1), (3, 6)])
+    length = np.linalg.norm(xyz[pairs[:, 1]] - xyz[pairs[:, 0]], axis=1)
+    wrong = length + [0.0, 0.8, 0.0, 0.0]
+    tiny = 1e-8 * blocks
+    own = tiny[np.arange(9), np.arange(9)]
+    given = Distances(pairs, wrong, np.full(4, 0.02))
+    found = scaled_by_distances(xyz, own, lambda p, q: tiny[p, q], given, xyz.mean(axis=0))
+    assert found.error_mm[1] == pytest.approx(0.8, rel=1e-4)
+    # The residual of an error over its standard deviation.
+    redundancy = 1 - length[1] ** 2 / np.sum(length**2)
+    assert found.normalised[1] == pytest.approx(0.8 * np.sqrt(redundancy) / 0.02, rel=1e-4)
+    assert np.abs(found.normalised).argmax() == 1
+    one = Distances(pairs[:1], wrong[:1] + 1, np.full(1, 0.02))
+    alone = scaled_by_distances(xyz, own, lambda p, q: tiny[p, q], one, xyz.mean(axis=0))
+    assert alone.error_mm.tolist() == alone.normalised.tolist() == [0.0] and alone.freedom == 0
 
 
 @pytest.mark.long

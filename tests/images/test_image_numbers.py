@@ -3,10 +3,13 @@
 
 """Numbers of parts of extraction and following on a few points."""
 
+from copy import deepcopy
+from itertools import permutations
 from types import SimpleNamespace as Fake
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from fluoro_calib_ros.findings import Kind
 from fluoro_calib_ros.images import extraction
@@ -19,12 +22,26 @@ from fluoro_calib_ros.images.growth import (
     supported,
 )
 from fluoro_calib_ros.images.lattice import _basis
-from fluoro_calib_ros.images.marker_motion import MAX_SD_PX, MIN_ACCELERATION_PX, Motion
+from fluoro_calib_ros.images.marker_motion import (
+    FIRST_SPEED_PX,
+    MAX_SD_PX,
+    MIN_ACCELERATION_PX,
+    MODEL_SD_PX,
+    STRANGE_PX,
+    MarkerStates,
+    MeasuredMarkers,
+    Motion,
+    assign,
+    common_shift,
+    costs,
+    doubtful_pairs,
+)
 from fluoro_calib_ros.images.marker_watch import (
     SHARED_PX,
     MarkerCompany,
     MarkerDoubts,
     follow_beside,
+    shift_together,
 )
 from fluoro_calib_ros.images.shadow_fit import Profile
 from fluoro_calib_ros.images.view import Lens, View
@@ -292,3 +309,189 @@ def test_marker_of_unknown_velocity_follows_those_beside_it():
     before = few.uv.copy()
     follow_beside(Fake(motion=few, unseen=np.ones(4)), 2)
     assert np.array_equal(few.uv, before)
+
+
+def two_herds():
+    """Twelve markers of two bodies that move differently, compared for some images."""
+    one = motion(12)
+    one.velocity[:] = np.where(np.arange(12)[:, None] % 2, [8.0, 0.0], [0.0, 3.0])
+    for _ in range(6):
+        one.lead(np.ones(12, bool), one.velocity.copy(), np.ones(12, bool))
+    return one
+
+
+def test_marker_that_is_not_seen_follows_those_that_move_alike():
+    """The change of the velocities of its own body, not of all, nor of those not settled."""
+    one = two_herds()
+    own = np.arange(12) % 2 == 0
+    assert (one.together[0, 1:] == 6).all()
+    np.testing.assert_allclose(one.unlike[0, 1::2], 64 + 9)
+    assert one.unlike[2, 4] == 0 and np.isinf(np.diagonal(one.unlike)).all()
+    before = one.velocity.copy()
+    one.velocity[own] += [1.0, -2.0]
+    one.velocity[~own] += [0.0, 50.0]
+    seen = np.ones(12, bool)
+    seen[[4, 5, 6]] = False
+    one.velocity[[4, 5, 6]] = before[[4, 5, 6]]
+    one.covariance[6, 1, 1] = 1e4
+    led = one.lead(seen, before, np.ones(12, bool))
+    assert np.flatnonzero(led).tolist() == [4, 5]
+    np.testing.assert_allclose(one.velocity[4], before[4] + [1.0, -2.0])
+    np.testing.assert_allclose(one.velocity[5], before[5] + [0.0, 50.0])
+    few = two_herds()
+    seen = np.arange(12) < 3
+    assert not few.lead(seen, few.velocity.copy(), np.ones(12, bool)).any()
+
+
+def test_what_moves_alike_is_learned_from_sure_markers():
+    """A mean of the first differences, which then forgets a tenth with each image."""
+    one = motion(6)
+    sure = np.arange(6) != 5
+    squares = []
+    for n in range(15):
+        one.velocity[0] = [n, 0.0]
+        one.velocity[1:] = 0.0
+        squares.append(float(n * n))
+        one.lead(np.ones(6, bool), one.velocity.copy(), sure)
+    expected = 0.0
+    for n, square in enumerate(squares, 1):
+        share = max(1 / n, 0.1)
+        expected = (1 - share) * expected + share * square
+    assert one.unlike[0, 1] == one.unlike[1, 0] == pytest.approx(expected)
+    assert one.together[0, 5] == 0 and one.unlike[0, 5] == FIRST_SPEED_PX**2
+
+
+def test_marker_that_leaves_its_body_is_strange():
+    one = two_herds()
+    one.velocity[3] += [6.0, 0.0]
+    rows, ratio, others = one.strangeness(np.arange(12) != 7)
+    assert rows.tolist() == [k for k in range(12) if k != 7]
+    np.testing.assert_allclose(others, np.where(rows[:, None] % 2, [8.0, 0.0], [0.0, 3.0]))
+    usual = np.zeros(11)
+    np.testing.assert_allclose(ratio[rows == 3], 36 / STRANGE_PX**2)
+    np.testing.assert_allclose(ratio[rows != 3], usual[rows != 3], atol=1e-12)
+    assert not len(one.strangeness(np.arange(12) < 4)[0])
+    # Those that were compared in few images tell nothing.
+    one.together[:] = 4
+    assert (one.strangeness(np.ones(12, bool))[1] == 0).all()
+
+
+def test_places_are_taken_in_as_by_a_kalman_filter():
+    one = motion(2)
+    one.covariance[:] = [[2.0, 0.3], [0.3, 0.5]]
+    before = np.stack([one.uv, one.velocity], axis=1)
+    uv = one.uv[[1]] + [1.0, -2.0]
+    one.update(np.array([1]), uv, np.array([0.4]), 2)
+    h = np.array([[1.0, 0.0]])
+    p = np.array([[2.0, 0.3], [0.3, 0.5]])
+    noise = 0.4**2 + MODEL_SD_PX**2
+    gain = p @ h.T / (h @ p @ h.T + noise)
+    expected = before[1] + gain @ (uv - before[1, :1])
+    np.testing.assert_allclose(np.stack([one.uv[1], one.velocity[1]]), expected)
+    np.testing.assert_allclose(one.covariance[1], p - gain @ h @ p)
+    np.testing.assert_allclose(one.uv[0], before[0, 0])
+    fresh = motion(2)
+    square = (1 + 4) / 2 / 2**4 - 0.4**2
+    assert one.squared[1] == pytest.approx(0.9 * fresh.squared[1] + 0.1 * max(square, 0))
+
+
+def test_shadows_are_assigned_at_the_largest_likelihood():
+    """Against all permutations; as many markers as possible get one."""
+    rng = np.random.default_rng(4)
+    uv = rng.uniform(0, 20, (5, 2))
+    found = uv[[2, 0, 4, 1]] + rng.normal(0, 2.0, (4, 2))
+    variance = rng.uniform(1, 9, 5)
+    square = np.sum((uv[:, None] - found) ** 2, axis=2)
+    cost = square / variance[:, None] + 2 * np.log(variance)[:, None]
+    np.testing.assert_allclose(costs(uv, variance, found), cost)
+    rows, columns = assign(uv, variance, found, 50.0)
+    best = min(permutations(range(5), 4), key=lambda order: cost[list(order), range(4)].sum())
+    assert dict(zip(columns.tolist(), rows.tolist())) == dict(enumerate(best))
+    rows, columns = assign(uv, variance, found, 1.0)
+    assert (square[rows, columns] < variance[rows]).all()
+    assert not len(assign(uv, variance, np.zeros((0, 2)), 3.0)[0])
+
+
+def test_markers_vote_for_a_shift_in_common():
+    """Most of those beside a marker find a shadow there; the smaller one of two alike."""
+    uv = np.array([[100.0, 100.0], [120, 100], [100, 130], [140, 140], [170, 90]])
+    beside = np.array([1, 2, 3, 4])
+    others = np.array([[104.0, 96.0], [500, 500]])
+
+    def shift(places):
+        return common_shift(uv, 0, beside, cKDTree(np.concatenate([places, others])), 30.0)
+
+    np.testing.assert_allclose(shift(uv + [12.0, 5.0]), [12.0, 5.0])
+    np.testing.assert_allclose(shift((uv + [12.0, 5.0])[[0, 1, 3]]), [12.0, 5.0])
+    assert shift((uv + [12.0, 5.0])[[0, 1]]) is None
+    assert common_shift(uv, 0, beside, cKDTree(others[1:]), 30.0) is None
+    both = np.concatenate([uv + [12.0, 5.0], uv - [5.0, 0.0]])
+    np.testing.assert_allclose(shift(both), [-5.0, 0.0])
+
+
+def test_pairs_of_markers_are_doubtful_where_an_exchange_is_as_likely():
+    uv = np.array([[0.0, 0.0], [3.0, 0.0], [40.0, 0.0], [6.0, 0.0]])
+    variance = np.full(4, 4.0)
+    measured = np.array([True, True, True, False])
+    found = uv + [[1.0, 0], [-1.0, 0], [0, 0], [0, 0]]
+    pairs = doubtful_pairs(uv, variance, measured, found, 1.6)
+    # Exchanged: 2 (2^2 - 1^2) / 4 more.
+    assert pairs.tolist() == [[0, 1]]
+    assert doubtful_pairs(uv, variance, measured, found, 1.4).tolist() == []
+    # The place of the second may be that of the fourth: (4^2 - 1^2) / 4 more.
+    assert doubtful_pairs(uv, variance, measured, found, 3.9).tolist() == [[0, 1], [1, 3]]
+
+
+def test_states_of_markers_are_exchanged_and_taken_in_together():
+    states = MarkerStates.start(two_herds(), np.arange(12))
+    states.depth[:] = np.arange(12.0)
+    before = deepcopy(states)
+    states.exchange(2, 5)
+    order = np.arange(12)
+    order[[2, 5]] = [5, 2]
+    for name in ('uv', 'velocity', 'covariance', 'squared'):
+        np.testing.assert_array_equal(
+            getattr(states.motion, name), getattr(before.motion, name)[order]
+        )
+    for name in ('unlike', 'together'):
+        np.testing.assert_array_equal(
+            getattr(states.motion, name), getattr(before.motion, name)[np.ix_(order, order)]
+        )
+    np.testing.assert_array_equal(states.depth, order)
+    np.testing.assert_array_equal(states.unseen, order)
+    measured = np.arange(12) < 3
+    overlapped = np.arange(12) == 1
+    states.depth_sd[0] = 0.1
+    found = MeasuredMarkers(
+        measured,
+        states.motion.uv + 1,
+        np.full(12, 0.2),
+        np.full(12, 4.0),
+        overlapped,
+        np.zeros((0, 2)),
+    )
+    states.advance(1, None)
+    states.update(found, 1)
+    assert states.unseen.tolist()[:4] == [0, 0, 0, 4]
+    np.testing.assert_allclose(states.depth[:3], [0.9 * 0 + 0.1 * 4.0, 1.0, 4.0])
+    assert states.depth_sd[1] == 1.0 and states.depth_sd[2] < 0.2
+
+
+def test_lost_markers_are_shifted_together_with_the_velocity_that_they_have():
+    """Or with that of the shift, where it is not known; those that are sure stay."""
+    one = motion(6)
+    one.uv[:] = [[100.0, 100], [130, 100], [100, 140], [150, 150], [120, 170], [400, 400]]
+    one.covariance[:4, 0, 0] = 15.0**2  # lost
+    one.covariance[0, 1, 1] = 1e4  # and of unknown velocity
+    one.covariance[4:, 0, 0] = 0.01
+    one.velocity[:] = [2.0, 1.0]
+    before = one.uv.copy()
+    shift = np.array([8.0, -6.0])
+    shift_together(one, Fake(uv=before[:5] + shift), 3.0, 2)
+    np.testing.assert_allclose(one.uv[:4], before[:4] + shift)
+    np.testing.assert_allclose(one.velocity[0], shift / 2)
+    np.testing.assert_allclose(one.velocity[1:], np.tile([2.0, 1.0], (5, 1)))
+    np.testing.assert_allclose(one.uv[4:], before[4:])
+    still = motion(6)
+    shift_together(still, Fake(uv=before + shift), 3.0, 2)
+    np.testing.assert_allclose(still.velocity, motion(6).velocity)

@@ -12,10 +12,12 @@ from fluoro_calib_ros.images.light import Light, estimate_noise
 from fluoro_calib_ros.images.measurement import (
     Expected,
     Imaging,
+    _BeadFit,
     estimate_profile,
     first_imaging,
     measure_beads,
 )
+from fluoro_calib_ros.images.shadow_fit import Profile
 
 FINE = 4  # points across a pixel
 PITCH = 60
@@ -113,6 +115,21 @@ def test_centres_of_beads_of_several_sizes_are_as_good_as_their_sigma(told):
     assert 0.75 < np.sqrt(np.mean(off**2)) < 1.3
     assert (np.abs(beads.depth - 1) < 0.2).all()
     assert beads.misfit.max() < 1.5
+
+
+def test_windows_hold_the_largest_shadow_and_each_its_own():
+    image, _ = image_of(np.full(9, 8.0), 1.2)
+    light = Light(image, np.ones(image.shape, bool))
+    uv = np.array([[60.0, 60.0], [120.0, 60.0], [90.0, 110.0]])
+    size = np.array([0.8, 1.0, 2.5])
+    profile = Profile(8.0, 1.2, 0.1, 0.0)
+    noise = estimate_noise(image, light.field)
+    fit = _BeadFit(light, uv, np.ones(3), profile=profile, noise=noise, size=size)
+    reach = profile.reach_px * size
+    length = np.linalg.norm(fit.offset, axis=1)
+    assert length.max() >= reach.max()
+    used = [length[valid].max() for valid in fit.valid]
+    assert (used >= reach).all() and (used <= reach + 5).all()
 
 
 def test_centres_in_a_compressed_image_are_as_good_as_their_sigma():

@@ -28,6 +28,7 @@ from fluoro_calib_ros.findings import Finding, Kind
 from fluoro_calib_ros.images.codec import encode
 from fluoro_calib_ros.images.marker_decisions import Decision, revise
 from fluoro_calib_ros.images.marker_ids import find_bodies, identify_markers
+from fluoro_calib_ros.images.marker_motion import Motion
 from fluoro_calib_ros.images.marker_points import CalibratedRig
 from fluoro_calib_ros.images.marker_rays import project_observed
 from fluoro_calib_ros.images.marker_views import MarkerViews, ViewsFrame
@@ -235,6 +236,38 @@ def test_markers_that_pass_keep_their_ids():
         last = tracker.update(image, number)
     assert last.target_id.tolist() == [1, 2, 3, 4, 5]
     assert np.abs(last.uv - true).max() < 0.3
+
+
+def test_markers_that_are_not_seen_are_led_by_those_that_are(monkeypatch):
+    """By velocities before and after the image, and not learned from doubtful ones."""
+    told = []
+
+    def lead(motion, seen, before, sure):
+        told.append((seen.copy(), motion.velocity - before, sure.copy()))
+        return np.zeros(len(seen), dtype=bool)
+
+    monkeypatch.setattr(Motion, 'lead', lead)
+    tracker = MarkerTracker(first=FirstMarkers(np.arange(1, 6), meeting(1, False)[1]))
+    for number in range(1, 9):
+        image, true = meeting(number, False)
+        if number == 7:  # the last one is covered
+            u, v = true[4].astype(int)
+            image[v - 12 : v + 12, u - 12 : u + 12] = image[:10].mean()
+        found = tracker.update(image, number)
+        seen, change, sure = told[-1]
+        assert (np.flatnonzero(seen) + 1).tolist() == found.target_id.tolist()
+        assert change[seen].any() == (number > 1) and not change[~seen].any()
+        np.testing.assert_array_equal(sure[seen], ~found.doubtful)
+        if number == 7:
+            assert found.missing.tolist() == [5]
+            np.testing.assert_allclose(found.predicted, true[4:], atol=1.0)
+    assert told[6][0].tolist() == [True] * 4 + [False]
+    late = MarkerTracker(
+        first=FirstMarkers(np.arange(1, 5), meeting(1, False)[1][:4]), later=np.array([9])
+    )
+    found = late.update(meeting(1, False)[0], 1)
+    assert found.missing.tolist() == [9] and np.isnan(found.predicted).all()
+    assert found.lost.all()
 
 
 def test_a_marker_enters_where_a_person_sees_it_first():

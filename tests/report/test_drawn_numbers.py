@@ -17,7 +17,7 @@ from fluoro_calib_ros.correction.fluoroscope_calibration import NoiseProfile
 from fluoro_calib_ros.exposures.names import Names
 from fluoro_calib_ros.exposures.phantom import Drawing, Phantom
 from fluoro_calib_ros.reconstruction.intersection import OK, REJECTED
-from fluoro_calib_ros.report import html
+from fluoro_calib_ros.report import html, residuals
 from fluoro_calib_ros.report.figures import (
     MARGIN,
     Scale,
@@ -45,6 +45,7 @@ from fluoro_calib_ros.report.residuals import (
     _plot_histogram,
     _plot_residuals,
     _plot_running_median,
+    normalised_residuals,
     position_figure,
     residuals_of,
 )
@@ -128,6 +129,27 @@ def test_outliers_are_drawn_at_the_border_of_the_panel():
     assert crosses.get_xdata().tolist() == [2, 3, 4]
 
 
+def test_residuals_are_normalised_by_what_the_unknowns_absorb():
+    """Sigma and the root of the redundancy number; the scale is that after the calibration."""
+    rng = np.random.default_rng(3)
+    sigma, redundancy = rng.uniform(0.2, 2.0, 50), rng.uniform(0.1, 0.9, 50)
+    before, after = rng.normal(size=(2, 50, 2)) * (sigma * np.sqrt(redundancy))[:, None]
+    rows = np.arange(5, 45)
+    inliers = np.arange(50) % 7 > 0
+    run = Fake(
+        measured=Fake(network=Fake(sigma=sigma)),
+        before=Fake(residuals=3 * before, inliers=~inliers),
+        after=Fake(residuals=after, inliers=inliers),
+    )
+    found = normalised_residuals(run, rows, redundancy[rows])
+    unit = (sigma * np.sqrt(redundancy))[:, None]
+    used, out = rows[inliers[rows]], rows[~inliers[rows]]
+    square = np.mean((after / unit)[used] ** 2, axis=1)
+    scale = np.sqrt(np.sum(square * redundancy[used]) / np.sum(redundancy[used]))
+    np.testing.assert_allclose(found[0], 3 * (before / unit)[out] / scale)
+    np.testing.assert_allclose(found[1], (after / unit)[used] / scale)
+
+
 def test_histogram_is_a_density_of_all_values():
     drawn = axes()
     values = np.array([-7.0, -1.1, 0.1, 0.2, 2.9, 3.5, 8, 9])
@@ -141,6 +163,22 @@ def test_histogram_is_a_density_of_all_values():
     label = drawn.patches[0].get_label()
     assert label.startswith(f'after: standard deviation {values.std():.1f}, 50.0 % within')
     assert label.endswith('37.5 % beyond the panel')
+
+
+def test_histograms_are_compared_with_the_normal_distribution(monkeypatch):
+    values = np.random.default_rng(1).normal(0, [1.0, 2.0], (500, 2))
+    monkeypatch.setattr(
+        residuals, 'normalised_residuals', lambda run, rows, r: (2 * values, values)
+    )
+    monkeypatch.setattr(residuals, 'model_text', str)
+    figure = residuals.histogram_figure(Fake(models={'a': 'knn'}), 'a', np.arange(600), None)
+    assert '500 of the 600' in figure.get_supxlabel() and len(figure.axes) == 2
+    limit = np.clip(2.5 * (2 * values).std(), 4, residuals.MAX_HISTOGRAM_SD)
+    for panel in figure.axes:
+        x, y = panel.lines[-1].get_data()
+        np.testing.assert_allclose(y, np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi))
+        assert panel.get_xlim() == pytest.approx((-limit, limit)) == (x[0], x[-1])
+    plt.close('all')
 
 
 def test_residuals_over_the_image_are_by_column_and_row():
@@ -263,6 +301,9 @@ def test_figure_of_a_distortion_keeps_the_shape_of_the_image():
     at = arrows.XY[:-1]
     wanted = model.predict(at)
     np.testing.assert_allclose(np.column_stack([arrows.U, arrows.V])[:-1], wanted, atol=1e-9)
+    assert [text.get_position() for text in left.texts if text.get_text() == '3 px'] == [
+        pytest.approx((3 * 15 + 0.02 * 640, 200 + 0.13 * 640))
+    ]
     assert 1 / arrows.scale == pytest.approx(15)  # 2 * 640 / 17 / 4 = 18.8, rounded down
 
 
@@ -284,6 +325,16 @@ def test_drawing_of_a_phantom_has_its_places(layers):
         low, high = places[:, :2].min(axis=0) - 4, places[:, :2].max(axis=0) + 4
         assert drawn.get_xlim() == pytest.approx((low[0], high[0]))
         assert drawn.get_ylim() == pytest.approx((high[1], low[1]))
+    plt.close('all')
+
+
+def test_every_place_of_a_drawing_has_room_for_its_id():
+    wide, high = (
+        phantom_figure(Drawing(*n, pitch_mm=(5.0, 5.0, 5.0))) for n in ((20, 2), (2, 20))
+    )
+    assert wide.get_figwidth() == pytest.approx(0.33 * (19 + 1.6) + 1)
+    assert high.get_figheight() == pytest.approx(0.33 * (19 + 1.6) + 1.2)
+    assert wide.get_figheight() == 5 and high.get_figwidth() == 6
     plt.close('all')
 
 
@@ -330,6 +381,15 @@ def test_comparison_is_told_in_pixels_and_mm():
         assert part in text
     assert 'xp +1.00 (sd 0.50), yp -2.00 (sd 0.60), c +30.00 (sd 7.00): significant' in text
     assert 'mm at the phantom' not in comparison_text(comparison(), None)
+
+
+def test_comparisons_of_fluoroscopes_are_side_by_side():
+    other = comparison()
+    other.fluoroscope = 'b'
+    drawn = [axes for axes in _figure([comparison(), other]).axes if axes.get_title()]
+    assert [axes.get_title()[:2] for axes in drawn] == ['a:', 'b:']
+    one, two = (axes.get_position() for axes in drawn)
+    assert one.y0 == pytest.approx(two.y0) and one.x1 < two.x0
 
 
 def test_arrows_of_a_comparison_are_as_long_as_their_cells():
@@ -486,6 +546,7 @@ def test_arrows_of_the_page_are_rows_of_each_exposure(monkeypatch):
     assert html._arrows(given(), {'a': some_residuals()}) == {}
 
 
+@pytest.mark.filterwarnings('error')
 def test_largest_correction_and_correlations():
     assert html._largest(some_residuals()) == pytest.approx(4.0)
     matrix = np.array([[4.0, 1, 0], [1, 9, 0], [0, 0, 0]])
@@ -554,6 +615,17 @@ def test_figure_of_points_shows_when_each_was_found_and_its_sd():
     assert seen.get_ylim() == (1.5, -0.5) and seen.get_xlabel() == 'time [s]'
     paths = figure.subfigs[0].axes[0].lines
     assert paths[0].get_data_3d()[0].tolist() == [1, 2, 3]
+
+
+def test_points_are_in_the_path_of_their_target():
+    """Also where a frame has another first target."""
+    every = [frame(n, [True, True, True], n) for n in (1, 2, 3)]
+    late = every[1]
+    late.target_id, late.points = late.target_id[1:], frame(2, [True, True], 2).points
+    late.points.xyz_mm = np.array([[6.0, 6, 6], [7.0, 7, 7]])
+    paths = points_figure(every, {}).subfigs[0].axes[0].lines
+    x = np.array([path.get_data_3d()[0] for path in paths])
+    np.testing.assert_array_equal(x, [[1, np.nan, 3], [1, 6, 3], [1, 7, 3]])
 
 
 def test_frames_without_times_are_shown_by_number():

@@ -116,6 +116,7 @@ def test_poses_are_drawn_over_time_with_two_standard_deviations():
     panels = figure.axes
     assert figure.get_figwidth() > figure.get_figheight()
     assert [panel.get_title()[-4:] for panel in panels] == 3 * ['[mm]'] + 3 * [' [°]']
+    assert [len({panel.get_position().bounds[k] for panel in panels}) for k in (0, 1)] == [3, 2]
     times, x, band = drawn(panels[0])
     np.testing.assert_allclose(times, [0, 2, 4, 6])
     np.testing.assert_array_equal(x, tibia.position_mm[:, 0])
@@ -145,7 +146,9 @@ def test_angles_of_a_joint_are_drawn_in_degrees_and_translations_in_mm():
 
 def test_paths_of_bodies_have_axes_where_they_are():
     femur, tibia = motion()
-    (space,) = paths_figure((femur, tibia)).axes
+    figure = paths_figure((femur, tibia))
+    assert figure.get_figwidth() > figure.get_figheight()
+    (space,) = figure.axes
     path = np.array(space.lines[1].get_data_3d())
     np.testing.assert_array_equal(path, tibia.position_mm.T)
     length = 0.1 * 8 + 5  # by how far the tibia moves

@@ -142,6 +142,13 @@ def test_many_marks_are_pixels_and_few_are_vectors():
     axes.plot(np.arange(MAX_VECTORS + 1), '.')
     text = svg_bytes(figure)
     assert text.count(b'<image') == 1 and b'data:image/png;base64' in text
+    for number, count in ((0, MAX_VECTORS), (1, MAX_VECTORS + 1)):
+        for draw in ('scatter', 'quiver', 'vlines'):
+            figure = new_figure(4, 3, 'marks')
+            x = np.arange(count)
+            more = {'scatter': (x,), 'quiver': (x, x, x), 'vlines': (x - 1, x)}[draw]
+            getattr(figure.subplots(), draw)(x, *more)
+            assert svg_bytes(figure).count(b'<image') == number, draw
 
 
 def test_report_shows_the_residuals_of_the_adjustment(folder):

@@ -153,18 +153,20 @@ def test_errors_of_points_are_of_their_scale_of_each_and_of_all_together():
 
 
 def test_error_of_a_correction_counts_once():
-    """Its smooth part and that of single markers have together the variance that is claimed."""
+    """What stays of each marker and what differs have together the variance that is claimed."""
     scene = Scene(3)
     adjustment = scene.diagnostician().adjustment
     observed = scene.observe()
     prior = adjustment.healthy_prior(observed, 1e-4)
-    root = adjustment.root(prior, observed.correction)
+    root = adjustment.root(prior)
     covariance = root @ root.T
     of_drift = np.diagonal(covariance)[adjustment.drift].reshape(2, 2, -1)
     functions = adjustment.functions_at(observed.pixel)
     smooth = np.mean(np.sum(functions**2 * of_drift[:, 0], axis=-1), axis=(0, 1, 2))
     of_markers = np.diagonal(covariance)[adjustment.bias].reshape(BODIES, MARKERS, 2, 2)
-    np.testing.assert_allclose(smooth + of_markers[0, 0, :, 0], observed.correction[0, 0])
+    stays = np.mean(of_markers[..., 0], axis=(0, 1))
+    assert (0.2 * observed.correction[0, 0] < smooth).all()
+    np.testing.assert_allclose(smooth + stays, observed.correction[0, 0])
 
 
 def test_healthy_rig_has_not_changed():

@@ -200,6 +200,26 @@ def test_knock_would_be_told_by_bodies_that_move_and_not_by_a_single_one_that_st
     assert by_all < 0.2 and by_one > 0.5
 
 
+def test_unseen_knock_is_claimed_by_the_evidence_of_its_size():
+    """Less than if the rig had certainly been knocked hard, more than as it was calibrated."""
+    scene = Scene(3)
+    diagnostician = scene.diagnostician()
+    found = diagnostician.diagnose(scene.observe(), scene.poses())
+    claimed = healed_rig(diagnostician, found, 7, EXPOSURES).orientation
+    adjustment = diagnostician.adjustment
+    hard = np.zeros(adjustment.size)
+    for knock in diagnostician.knocks():
+        hard += diagnostician.sd_of(knock)
+    prior = found.prior.widened(hard)
+    knocked = adjustment.with_fixed(found.observed, prior, found.solution, hard > 0)
+    change = knocked.values[adjustment.rig]
+    covariance = knocked.covariance[adjustment.rig, adjustment.rig] + np.outer(change, change)
+    points = scene.centre.reshape(-1, 3)
+    least, most = scene.rig, replace(scene.rig, covariance=covariance)
+    of_all = [rig_errors(one, points).common_mm for one in (least, claimed, most)]
+    assert of_all[0] < of_all[1] < 0.9 * of_all[2]
+
+
 @pytest.mark.long
 def test_moved_fluoroscope_is_found_and_estimated_with_its_deviations():
     """Over rigs: the change of b is what was done to it, as its covariance claims."""

@@ -429,20 +429,23 @@ def _of_unseen_knocks(
     """Second moments (9F, 9F) of what a rig has changed by that is taken for unchanged.
 
     The mean over sizes of a knock, weighted by their evidence: the moments of one size alone would
-    be those of a rig that has certainly been knocked as hard.
+    be those of a rig that has certainly been knocked as hard. Bodies tell of a knock only: their
+    shapes were learned with the errors of the calibration, which are added as they were.
     """
     adjustment = diagnostician.adjustment
     knock = np.linalg.norm([diagnostician.sd_of(one) for one in diagnostician.knocks()], axis=0)
     moments = []
     evidence = []
+    calibrated = diagnosis.prior.orientation
+    exact = replace(diagnosis.prior, orientation=np.zeros_like(calibrated))
     for size in KNOCK_SIZES[::-1]:
-        prior = diagnosis.prior.widened(size * knock)
+        prior = exact.widened(size * knock)
         start = adjustment.with_fixed(diagnosis.observed, prior, start, knock > 0)
         change = start.values[adjustment.rig]
         moments.append(start.covariance[adjustment.rig, adjustment.rig] + np.outer(change, change))
         evidence.append(start.evidence / diagnosis.noise**2)
     share = np.exp(np.array(evidence) - max(evidence))
-    return np.tensordot(share / share.sum(), np.array(moments), axes=1)
+    return calibrated + np.tensordot(share / share.sum(), np.array(moments), axes=1)
 
 
 def unseen_distortion(diagnostician: Diagnostician, diagnosis: Diagnosis) -> tuple[float, float]:

@@ -132,6 +132,7 @@ SCENARIOS = (
     Scenario('a tenth of the bump', Cause.ORIENTATION, tenth),
     Scenario('a twentieth of the bump', Cause.ORIENTATION, twentieth),
     Scenario('distortion, 4 px', Cause.DISTORTION, drift_px=4.0),
+    replace(KNEE, name='bump, four bodies of four', bodies=4),
 )
 
 

@@ -127,8 +127,8 @@ def known_distortion_error(scene: Scene) -> float:
     return points_error(scene, undistorted(scene.test), result)
 
 
-def correction_error(scene: Scene, result: CalibrationResult) -> float:
-    """RMS difference [px] of a coordinate of the correction from the truth, gauge removed."""
+def correction_errors(scene: Scene, result: CalibrationResult) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (n, 2) of a grid, and the errors (n, 2) [px] of the correction, gauge removed."""
     calibration = result.calibrations[NAME]
     true = next(f for f in scene.rig.fluoroscopes if f.name == NAME).distortion
     axes = [np.arange(0.0, size, GRID_PX) for size in calibration.image_size]
@@ -137,8 +137,7 @@ def correction_error(scene: Scene, result: CalibrationResult) -> float:
     uv = uv[~KnnModel(1, covered, np.zeros_like(covered)).outside(uv)]
     error = calibration.model.predict(uv) - true(uv)
     basis = gauge_basis(uv, calibration.interior)
-    error -= basis @ gauge_coefficients(uv, error, calibration.interior)
-    return float(np.sqrt(np.mean(error**2)))
+    return uv, error - basis @ gauge_coefficients(uv, error, calibration.interior)
 
 
 def measure(scene: Scene, known_mm: float, options: CalibrationOptions) -> Figures:
@@ -149,7 +148,7 @@ def measure(scene: Scene, known_mm: float, options: CalibrationOptions) -> Figur
     return Figures(
         points_mm,
         points_mm / known_mm,
-        correction_error(scene, result),
+        float(np.sqrt(np.mean(correction_errors(scene, result)[1] ** 2))),
         len(result.history[NAME]),
         result.converged,
         seconds,

@@ -70,6 +70,7 @@ MIGRATION_MM = 1.0
 # The same for small changes, relative to these: a drift need not be as large as a knock. The two
 # factors are those of principal point and principal distance, the first one that of all others.
 SIZES = ((1.0, 1.0), (0.125, 0.125))
+KNOCK_SIZES = np.geomspace(2.0**-7, 1.0, 8)  # of a knock that is not seen, relative to a large one
 SIZES_OF_INTERIOR = (*SIZES, (1.0, 0.125), (0.125, 1.0))
 
 
@@ -377,7 +378,7 @@ def healed_rig(
     is that of the directions that are known well; it would pull the others towards no change.
 
     Where nothing of the rig has changed, it stays as it was, with the second moments of the knock
-    that it may have had: bodies do not show all of a knock.
+    that it may have had (see `_of_unseen_knocks`): bodies do not show all of a knock.
     """
     adjustment = diagnostician.adjustment
     changed = np.zeros(adjustment.size)
@@ -393,8 +394,7 @@ def healed_rig(
     covariance = solution.covariance[adjustment.rig, adjustment.rig]
     weakest = _weakest(adjustment, covariance, largest)
     if not changes:
-        knock = values[adjustment.rig]
-        covariance = covariance + np.outer(knock, knock)
+        covariance = _of_unseen_knocks(diagnostician, diagnosis, solution)
         values = np.zeros(adjustment.size)
     views = len(adjustment.functions)
     orientation = replace(
@@ -421,6 +421,31 @@ def healed_rig(
         sd=np.sqrt(np.diagonal(covariance)).reshape(views, -1),
         weakest=weakest,
     )
+
+
+def _of_unseen_knocks(
+    diagnostician: Diagnostician, diagnosis: Diagnosis, start: RigSolution
+) -> NDArray[np.float64]:
+    """Second moments (9F, 9F) of what a rig has changed by that is taken for unchanged.
+
+    The mean over sizes of a knock, weighted by their evidence: the moments of one size alone would
+    be those of a rig that has certainly been knocked as hard. Bodies tell of a knock only: their
+    shapes were learned with the errors of the calibration, which are added as they were.
+    """
+    adjustment = diagnostician.adjustment
+    knock = np.linalg.norm([diagnostician.sd_of(one) for one in diagnostician.knocks()], axis=0)
+    moments = []
+    evidence = []
+    calibrated = diagnosis.prior.orientation
+    exact = replace(diagnosis.prior, orientation=np.zeros_like(calibrated))
+    for size in KNOCK_SIZES[::-1]:
+        prior = exact.widened(size * knock)
+        start = adjustment.with_fixed(diagnosis.observed, prior, start, knock > 0)
+        change = start.values[adjustment.rig]
+        moments.append(start.covariance[adjustment.rig, adjustment.rig] + np.outer(change, change))
+        evidence.append(start.evidence / diagnosis.noise**2)
+    share = np.exp(np.array(evidence) - max(evidence))
+    return calibrated + np.tensordot(share / share.sum(), np.array(moments), axes=1)
 
 
 def unseen_distortion(diagnostician: Diagnostician, diagnosis: Diagnosis) -> tuple[float, float]:

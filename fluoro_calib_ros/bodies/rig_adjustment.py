@@ -17,9 +17,10 @@ Inference, and Learning Algorithms", Cambridge 2003, ch. 28):
 
     log Z = -1/2 (loss + z'z) - 1/2 log det(I + L'HL).
 
-The correction of an image point has an error that stays while a marker stands still. How far it
-reaches is not known. A part of its variance is taken for a smooth field over the image, which all
-markers have in common, the rest for an error of each marker and view that stays all the time.
+The correction of an image point has an error that stays while a marker stands still, and that
+markers near each other have in common (see `correction_errors`). The mean over the exposures is an
+unknown of each marker and view, what differs from exposure to exposure a smooth field over the
+image.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ from ..correction.series import MARGIN, Functions
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
 from ..photogrammetry.rotations import cross_matrix, matrix_from_vector
 from .body import POSE_SIZE, Body
+from .correction_errors import covariance_of_means
 from .image_points import Cameras, ImagePoints
 
 FALSE_SHARE = 0.01  # of image points that are expected to be false matches
@@ -45,9 +47,6 @@ LAST_STEP = 1e-2
 # Of a drift of the distortion: degree of the polynomials, half waves along the longer side.
 DRIFT_DEGREE = 3
 DRIFT_MODES = 4
-# Share of the variance of a correction that is smooth over the image. It may be anything from 0 to
-# 1: this is the mean.
-SMOOTH_SHARE = 0.5
 FITTING = 0.8  # share of the image points of a body that are no false matches, at least
 MAX_NOISE_PX = 10.0  # of image points that are no false matches
 LOOSEST = 1e-6  # weight of a pose [1/mm^2, 1/rad^2] that keeps an unseen one where it is
@@ -118,6 +117,8 @@ class Prior:
     #: (K,) standard deviations of changes in addition to what was known of rig and shapes, and of
     #: the other unknowns
     sd: NDArray[np.float64]
+    #: (F, B M, B M) covariance of the mean errors of the correction, of each coordinate [px^2]
+    correction: NDArray[np.float64]
     #: (B, M) factor of the standard deviations of the image points of a marker
     inflation: NDArray[np.float64]
 
@@ -202,7 +203,13 @@ class RigAdjustment:
         sd = np.zeros(self.size)
         sd[self.scale] = shape_scale
         drift = sd[self.drift].reshape(self._views, -1)
-        correction = np.broadcast_to(observed.correction, observed.seen.shape)
+        sides = [max(functions.image_size) for functions in self.functions]
+        pixel = np.where(observed.seen[..., None], observed.pixel, np.nan)
+        pixel = pixel.reshape(len(pixel), -1, *pixel.shape[3:]) / np.array(sides)[:, None]
+        of_markers = np.sqrt(observed.correction).reshape(-1, self._views).T
+        means = covariance_of_means(pixel) * of_markers[:, :, None] * of_markers[:, None]
+        stays = np.diagonal(means, axis1=1, axis2=2).T.reshape(observed.correction.shape)
+        differs = np.broadcast_to(observed.correction - stays, observed.seen.shape)
         for f in range(self._views):
             seen = observed.seen[..., f]
             one_px = self.sd_of_drift(f)
@@ -210,18 +217,17 @@ class RigAdjustment:
             # A drift of 1 px at the edges has another variance than 1 px^2 at the markers.
             variance = np.sum((values * one_px[: values.shape[1]]) ** 2)
             if variance > 0:
-                smooth = SMOOTH_SHARE * correction[..., f][seen].sum()
+                smooth = max(0.0, differs[..., f][seen].sum())
                 drift[f] = one_px * np.sqrt(smooth / variance)
-        return Prior(self.orientation.covariance, sd, np.ones(self.target_id.shape))
+        return Prior(self.orientation.covariance, sd, means, np.ones(self.target_id.shape))
 
     def sd_of_drift(self, fluoroscope: int) -> NDArray[np.float64]:
         """Return the standard deviations (2n,) of the coefficients of a drift of 1 px."""
         return np.tile(_share_of_functions(self.functions[fluoroscope]), 2)
 
-    def root(self, prior: Prior, correction: np.ndarray) -> NDArray[np.float64]:
+    def root(self, prior: Prior) -> NDArray[np.float64]:
         """Return L (K, k) of a prior; unknowns that are certain have no columns."""
-        sd = prior.sd.copy()
-        sd[self.bias] = np.repeat(np.sqrt((1 - SMOOTH_SHARE) * correction).ravel(), 2)
+        sd = prior.sd
         root = np.diag(sd)
         covariance = prior.orientation + np.diag(sd[self.rig] ** 2)
         root[self.rig, self.rig] = replace(
@@ -232,6 +238,11 @@ class RigAdjustment:
             first = self.shape.start + row * len(widened)
             rows = slice(first, first + len(widened))
             root[rows, rows] = _root_of(covariance + np.diag(widened**2))
+        number = np.arange(self.size)[self.bias].reshape(-1, self._views, 2)
+        for f, covariance in enumerate(prior.correction):
+            own = _root_of(covariance)
+            for axis in range(2):
+                root[np.ix_(number[:, f, axis], number[:, f, axis])] = own
         return root[:, (root != 0).any(axis=0)]
 
     def rig_at(self, values: np.ndarray) -> RigOrientation:
@@ -278,7 +289,7 @@ class RigAdjustment:
         self, observed: ObservedBodies, prior: Prior, solution: RigSolution
     ) -> NDArray[np.float64]:
         """Return the covariance (K, K) of the unknowns with another prior, at a solution."""
-        root = self.root(prior, observed.correction)
+        root = self.root(prior)
         normal, _ = self.normal_at(observed, prior, solution)
         whitened = np.eye(root.shape[1]) + root.T @ normal @ root
         return np.asarray(root @ np.linalg.solve(whitened, root.T))
@@ -342,7 +353,7 @@ class RigAdjustment:
     def _converge(
         self, observed: ObservedBodies, prior: Prior, start: tuple[np.ndarray, Poses]
     ) -> RigSolution:
-        root = self.root(prior, observed.correction)
+        root = self.root(prior)
         unsure = (root != 0).any(axis=1)
         values, poses = start
         z = np.linalg.lstsq(root, values, rcond=None)[0]

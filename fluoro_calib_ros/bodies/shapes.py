@@ -32,6 +32,7 @@ from ..errors import DataError
 from ..findings import Finding, Kind, Place, Severity
 from ..photogrammetry.rotations import cross_matrix
 from .body import POSE_SIZE, Body, by_pose, fitted_pose
+from .correction_errors import covariance_of_means
 
 ROUNDS = 4  # the problem is nearly linear once poses are known
 # Share of the places of a marker that may be false matches, and are left out: of 1 % false image
@@ -60,6 +61,9 @@ class BodyPlaces:
     covariance: NDArray[np.float64]  #: (T, m, 3, 3) of the random errors
     #: (T, m, 3, 3) of the errors that stay while a marker stands still, by the corrections
     fixed: NDArray[np.float64]
+    #: (m, m) covariance of their means over all exposures, relative to `fixed`; None: they are the
+    #: same in all exposures, and those of two markers are independent
+    alike: NDArray[np.float64] | None = None
 
     @property
     def seen(self) -> NDArray[np.bool_]:
@@ -404,9 +408,11 @@ def _stays(
 ) -> np.ndarray:
     """Covariance of the right side of the shape by errors of the corrections.
 
-    They do not average out: they are taken to be the same in all exposures, the most that they can
-    be, as for a body that stands still.
+    They average out only as far as the markers move in the image, and those of markers that are
+    near each other move the body as a whole.
     """
+    known = chosen[1]
+    alike = np.eye(len(known)) if places.alike is None else places.alike[np.ix_(known, known)]
     seen = problem.seen
     exposures, count = seen.shape
     fixed = np.where(seen[..., None, None], places.fixed[np.ix_(*chosen)], 0.0)
@@ -419,8 +425,15 @@ def _stays(
     for k in range(count):
         rows = slice(3 * k, 3 * k + 3)
         pulled[rows, rows] += direct[k]
-        root[rows, rows] = mean[k]
-    return pulled @ root @ pulled.T
+        root[rows, rows] = _root_of(mean[k])
+    root = pulled @ root
+    return root @ np.kron(alike, np.eye(3)) @ root.T
+
+
+def _root_of(covariance: np.ndarray) -> np.ndarray:
+    """Return the symmetric root of a covariance."""
+    variance, axes = np.linalg.eigh(covariance)
+    return np.asarray(axes * np.sqrt(np.maximum(variance, 0.0)) @ axes.T)
 
 
 def _turned(rotation: np.ndarray, w: np.ndarray) -> np.ndarray:
@@ -683,15 +696,19 @@ def places_of(
     """Collect the places of the markers of a body from points in space.
 
     target_ids: (n,) of each exposure; points: of each, 'xyz_mm' (n, 3), 'noise' and 'fixed'
-    (n, 3, 3), with NaN for points that are not to be used.
+    (n, 3, 3), with NaN for points that are not to be used, and 'uv' (n, F, 2), their image points
+    in longer sides of the images.
     """
+    views = points[0]['uv'].shape[1] if len(points) else 0
     shape = (len(target_ids), len(body.target_id))
     xyz = np.full((*shape, 3), np.nan)
     noise = np.full((*shape, 3, 3), np.nan)
     fixed = np.full((*shape, 3, 3), np.nan)
+    uv = np.full((*shape, views, 2), np.nan)
     for row, (ids, values) in enumerate(zip(target_ids, points)):
         _, own, given = np.intersect1d(body.target_id, ids, return_indices=True)
         xyz[row, own] = values['xyz_mm'][given]
         noise[row, own] = values['noise'][given]
         fixed[row, own] = values['fixed'][given]
-    return BodyPlaces(xyz, noise, fixed)
+        uv[row, own] = values['uv'][given]
+    return BodyPlaces(xyz, noise, fixed, alike=covariance_of_means(uv).mean(axis=0))

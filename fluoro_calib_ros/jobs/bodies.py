@@ -303,7 +303,7 @@ def track_bodies(
     exposures = recording.exposures
     shapes = [EstimatedShape(body, np.nan, np.nan, 0, ()) for body in bodies]
     if options.estimate_shapes:
-        shapes = estimated_shapes(bodies, exposures)
+        shapes = estimated_shapes(bodies, recording)
     usable = solvable_bodies([shape.body for shape in shapes])
     lag = options.lag if options.smooth == 'lag' else None
     tracker = BodyTracker(orientation, usable, options.reject, lag)
@@ -350,6 +350,7 @@ class IntersectedRecording:
     """The exposures of a recording, and what is known of it."""
 
     exposures: list[IntersectedExposure]
+    sides: np.ndarray  #: (F,) longer sides of the images [px]
     unpaired: Mapping[str, int]  #: frames without partner, by fluoroscope
     drift: DriftVerdict  #: what the drift watch says
     noise: Finding | None  #: on image points without sigma, where they are not as precise as beads
@@ -387,22 +388,27 @@ def intersected(
         raise DataError(
             'the exposures have no times, or not in their order; give the rate of the recording'
         )
-    return IntersectedRecording(out, unpaired, watch.verdict(), noise)
+    sides = np.array([float(max(sizes[name])) for name in names])
+    return IntersectedRecording(out, sides, unpaired=unpaired, drift=watch.verdict(), noise=noise)
 
 
 def estimated_shapes(
-    bodies: Sequence[Body], exposures: Sequence[IntersectedExposure]
+    bodies: Sequence[Body], recording: IntersectedRecording
 ) -> list[EstimatedShape]:
     """Estimate the shapes of bodies from exposures that are spread over the recording."""
+    exposures = recording.exposures
     rows = np.unique(np.linspace(0, len(exposures) - 1, SHAPE_EXPOSURES).astype(int))
     chosen = [exposures[row].views for row in rows]
     ids = [one.target_id for one in chosen]
-    points = [_split(one) for one in chosen]
+    points = [_split(one, recording.sides) for one in chosen]
     return [estimate_shape(body, places_of(body, ids, points)) for body in bodies]
 
 
-def _split(exposure: IntersectedViews) -> dict[str, np.ndarray]:
-    """Points of an exposure with the covariances of noise, and of the corrections."""
+def _split(exposure: IntersectedViews, sides: np.ndarray) -> dict[str, np.ndarray]:
+    """Points of an exposure with the covariances of noise, and of the corrections.
+
+    sides (F,): longer sides of the images [px].
+    """
     views = exposure.views
     points = exposure.points
     good = np.isin(points.status, (OK, OUTSIDE))
@@ -414,6 +420,7 @@ def _split(exposure: IntersectedViews) -> dict[str, np.ndarray]:
         'xyz_mm': np.where(good[:, None], points.xyz_mm, np.nan),
         'noise': (1 - share) * covariance,
         'fixed': share * covariance,
+        'uv': np.swapaxes(views.uv / sides[:, None, None], 0, 1),
     }
 
 

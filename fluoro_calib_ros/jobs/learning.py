@@ -83,7 +83,7 @@ def learn_shapes(
     drift = found.drift
     if drift.state is not None:
         raise DataError(replace(drift.finding, advice='no shapes are learned in a drift'))
-    shapes = estimated_shapes(bodies, exposures)
+    shapes = estimated_shapes(bodies, found)
     learned = [_known(shape.body) for shape in shapes if _is_good(shape)]
     findings = [finding for shape in shapes for finding in shape.findings]
     if not learned:

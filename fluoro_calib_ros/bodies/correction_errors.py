@@ -1,0 +1,33 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Errors of the correction that markers have in common, and that stay while they move little."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
+
+# Errors of a correction at two pixels are correlated by exp(-distance / REACH), in longer sides
+# of the image, as benchmarks/reach.py measures it.
+REACH = 0.15
+SPREAD = 100  # exposures of a recording, evenly spread, that tell where its markers are seen
+
+
+def covariance_of_means(uv: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Covariances (F, m, m) of the mean errors of m markers over T exposures; that of one is 1.
+
+    uv (T, m, F, 2): image points in longer sides of the images, NaN where there are none. It is
+    the mean correlation of the errors of two markers in any two exposures, 0 for a marker that is
+    not seen.
+    """
+    rows = np.unique(np.linspace(0, len(uv) - 1, SPREAD).astype(int))
+    out = []
+    for path in np.moveaxis(uv[rows], 2, 0):
+        seen = np.isfinite(path).all(axis=2)
+        share = seen / np.maximum(seen.sum(axis=0), 1)
+        flat = np.where(seen[..., None], path, 0.0).reshape(-1, 2)
+        correlation = np.exp(-cdist(flat, flat) / REACH).reshape(*seen.shape, *seen.shape)
+        out.append(np.einsum('tk,tksl,sl->kl', share, correlation, share, optimize=True))
+    return np.array(out)

@@ -91,6 +91,7 @@ class BodyTracker:
         self.filter = MotionFilter(count, lag)
         self._taken: list[_Taken] = []
         self._stamp_ns: int | None = None
+        self._expected: tuple[int, Prediction] | None = None  # of a time, until that is taken
         self._weak = np.zeros(count, dtype=np.int64)  # exposures since one alone gave the pose
         columns = orientation.covariance.shape[0]
         self._fixed = np.full((count, POSE_SIZE, POSE_SIZE), np.nan)
@@ -111,6 +112,7 @@ class BodyTracker:
         if self._stamp_ns is not None and stamp_ns <= self._stamp_ns:
             return None
         expected = self.predict(stamp_ns)
+        self._expected = None
         self._stamp_ns = stamp_ns
         frame = self.solver.solve(exposure, expected)
         self._weak = np.where(frame.alone, 0, expected.weak)
@@ -124,12 +126,16 @@ class BodyTracker:
 
     def predict(self, stamp_ns: int) -> Prediction:
         """Return the poses that are expected at a time after the last exposure."""
+        if self._expected is not None and self._expected[0] == stamp_ns:
+            return self._expected[1]
         dt_s = 0.0 if self._stamp_ns is None else (stamp_ns - self._stamp_ns) / NS_PER_S
         self.filter.predict(dt_s)
         rotation, centre, covariance = self.filter.prediction
         variance = np.diagonal(covariance, axis1=1, axis2=2)[:, 3:].max(axis=1)
         known = self.filter.alive & (variance < LOST_SD_RAD**2)
-        return Prediction(rotation, centre, covariance, known, self._weak + 1)
+        expected = Prediction(rotation, centre, covariance, known, self._weak + 1)
+        self._expected = stamp_ns, expected
+        return expected
 
     def reshape(self, bodies: Sequence[Body]) -> None:
         """Take better shapes of the bodies, in the same frames."""
@@ -137,6 +143,7 @@ class BodyTracker:
         self.solver = PoseSolver(self.solver.orientation, bodies, self._reject)
         moved = self.filter.rotation @ (self.solver.centre - before)[:, :, None]
         self.filter.mean[:, :3] += moved[:, :, 0]
+        self._expected = None
 
     def use(self, orientation: RigOrientation) -> None:
         """Use the same orientation with another covariance from now on."""

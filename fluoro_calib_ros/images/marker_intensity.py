@@ -189,10 +189,10 @@ def check_image(image: np.ndarray, size: tuple[int, int] | None = None) -> None:
         raise DataError(cause, kind=Kind.IMAGE_EMPTY)
 
 
-def learn_look(image: np.ndarray, near: np.ndarray) -> MarkerLook:
+def _learn_look(image: np.ndarray, near: np.ndarray) -> tuple[MarkerLook, FilteredLight]:
     """Learn what markers look like, from an image and points (n, 2) near them.
 
-    Raises DataError where there is nothing round.
+    Returns the image as well, filtered for them. Raises DataError where there is nothing round.
     """
     best: _Typical | None = None
     for scale in MARKER_SCALES:
@@ -205,7 +205,7 @@ def learn_look(image: np.ndarray, near: np.ndarray) -> MarkerLook:
         elif best.clear:
             break  # beyond the size of the markers, the response falls
     assert best is not None
-    return best.look('there is nothing round where the markers should be')
+    return best.look('there is nothing round where the markers should be'), best.light
 
 
 def first_shadows(lights: Iterable[FilteredLight], count: int, share: float) -> Shadows:
@@ -438,8 +438,8 @@ def learn_start(image: np.ndarray, target_id: np.ndarray, uv: np.ndarray) -> Mar
     if not inside.all():
         bad = int(target_id[known][~inside][0])
         raise DataError(f'marker {bad} of the first frame lies outside of the image')
-    look = learn_look(image, given)
-    found = search_image(image, look, SHARE)
+    look, filtered = _learn_look(image, given)
+    found = _found(look, filtered, SHARE)
     row, column = assign(given, np.full(len(given), FIRST_SD_PX**2), found.uv, FIRST_GATE)
     if len(row) < max(1, len(given) // 2):
         raise DataError(
@@ -450,9 +450,7 @@ def learn_start(image: np.ndarray, target_id: np.ndarray, uv: np.ndarray) -> Mar
     place[seen] = found.uv[column]
     unseen = np.ones(len(uv), dtype=int)
     unseen[seen] = 0
-    top = float(np.iinfo(image.dtype).max)
-    light = image.astype(np.float32)
-    light = top - light if look.inverted else light
+    light = filtered.light
     return MarkerStart(
         MarkerStates.start(Motion.start(place, FIRST_SD_PX), unseen),
         look,

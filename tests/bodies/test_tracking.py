@@ -252,3 +252,28 @@ def test_butterworth_propagates_deviations_and_refuses_what_it_cannot_do():
     uneven = dataclasses.replace(alone, stamp_ns=alone.stamp_ns + (alone.number > 50) * 10**8)
     with pytest.raises(DataError, match='not equally far apart'):
         filtered_poses(uneven, 12.0)
+
+
+def test_predictions_do_not_change_what_an_exposure_says():
+    """Asked for twice, for another time, and before better shapes are taken."""
+    trial = Trial(count=12)
+    plain, asked = (BodyTracker(trial.rig, trial.bodies, lag=0) for _ in range(2))
+    shift = np.array([3.0, -2.0, 1.0])
+    moved = [dataclasses.replace(one, xyz_mm=one.xyz_mm + shift) for one in trial.bodies]
+    for number, one in enumerate(trial.exposures):
+        stamp_ns = 1 + round(1e9 * number / RATE)
+        first = asked.predict(stamp_ns)
+        asked.predict(stamp_ns + 10**7)
+        again = asked.predict(stamp_ns)
+        np.testing.assert_array_equal(first.centre_mm, again.centre_mm)
+        if number == 8:
+            before = plain.predict(stamp_ns).centre_mm
+            for tracker in (plain, asked):
+                tracker.reshape(moved)
+            turned = plain.filter.rotation @ shift
+            np.testing.assert_allclose(
+                plain.predict(stamp_ns).centre_mm - before, turned, atol=0.2
+            )
+        found = plain.add(one, number, stamp_ns), asked.add(one, number, stamp_ns)
+        np.testing.assert_array_equal(found[0].centre_mm, found[1].centre_mm)
+        np.testing.assert_array_equal(found[0].covariance, found[1].covariance)

@@ -258,11 +258,11 @@ class Graph:
         self.wait_for_readers(1)
         return nodes
 
-    def wait_for_readers(self, count):
-        """Wait until the correction node has discovered `count` readers of every output."""
-        for name in NAMES:
+    def wait_for_readers(self, count, node='correction_node', names=NAMES):
+        """Wait until a node has discovered `count` readers of its output of every fluoroscope."""
+        for name in names:
             self.client.wait_for_diagnostics(
-                'correction_node', lambda s: int(value_of(s, 'readers') or 0) >= count, name
+                node, lambda s: int(value_of(s, 'readers') or 0) >= count, name, 'the readers'
             )
 
     def play(self, bag, readers, rate=10.0):

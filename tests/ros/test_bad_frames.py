@@ -88,6 +88,7 @@ def rig(module_graph, by_command, exposures):
     corrected = client.listen('a/corrected_observations')
     used = load_calibrations(by_command)['a'].calibration_id
     client.wait_for_diagnostics('correction_node', lambda s: used in [v.value for v in s.values])
+    graph.wait_for_readers(1, names='a')
     changes = [lambda message: None]
     for change, _, _ in BAD.values():
         changes += [change, lambda message: None]

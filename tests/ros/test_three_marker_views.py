@@ -62,6 +62,8 @@ def test_markers_of_three_fluoroscopes_are_followed_together(graph):
         'reconstruction',
         'the orientation',
     )
+    graph.wait_for_readers(2, 'extraction_node', THREE)  # the correction node, and the client
+    graph.wait_for_readers(1, names=THREE)
     for number, of in enumerate(sequence()[:EXPOSURES], 1):
         for name, image in of.items():
             if (name, number) != ('b', LOST):

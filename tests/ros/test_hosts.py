@@ -57,7 +57,7 @@ def test_graph_on_several_hosts(network, tmp_path):
         ids = client.ask('state')['calibrations']
         late.wait(lambda s: s['calibrations'] == ids and s['orientation'], 'latched messages')
 
-        hosts.play(BAGS / 'tracking', readers=3, rate=0.1)
+        hosts.play(BAGS / 'tracking', readers=3, rate=0.1, loop='true')
         client.wait(lambda s: s['came'].get('points', 0) > 10, 'points')
         network.cut_off('a')
         client.wait(

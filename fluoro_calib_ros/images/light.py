@@ -148,16 +148,19 @@ def correlation_of(residual: np.ndarray, valid: np.ndarray) -> np.ndarray:
     At the largest lags the noise is not correlated: what is seen there are slow changes of the
     light, or what a fit has taken from all lags.
     """
-    total = float(np.sum(residual * residual)) / max(float(valid.sum()), 1.0)
-    height, width = residual.shape[1:]
+    # With an edge of zeros, a lag in two directions is one in the order of the pixels.
+    edge_of_zeros = ((0, 0), (0, LAGS), (0, LAGS))
+    value, seen = (np.pad(one, edge_of_zeros).reshape(-1) for one in (residual, valid))
+    total = float(value @ value) / max(float(seen.sum()), 1.0)
     out = np.zeros((2 * LAGS + 1, 2 * LAGS + 1))
     for row in range(LAGS + 1):
-        for column in range(-LAGS, LAGS + 1):
-            a = np.s_[:, : height - row, max(0, -column) : width - max(0, column)]
-            b = np.s_[:, row:, max(0, column) : width + min(0, column)]
-            pairs = max(float(np.sum(valid[a] * valid[b])), 1.0)
-            value = float(np.sum(residual[a] * residual[b])) / pairs / max(total, 1e-300)
-            out[LAGS + row, LAGS + column] = out[LAGS - row, LAGS - column] = value
+        for column in range(-LAGS if row else 0, LAGS + 1):
+            lag = row * (residual.shape[2] + LAGS) + column
+            stop = len(value) - lag
+            pairs = max(float(seen[:stop] @ seen[lag:]), 1.0)
+            products = float(value[:stop] @ value[lag:])
+            mean = products / pairs / max(total, 1e-300)
+            out[LAGS + row, LAGS + column] = out[LAGS - row, LAGS - column] = mean
     edge = float(np.median(np.concatenate([out[0], out[-1], out[:, 0], out[:, -1]])))
     out = np.clip((out - edge) / max(1 - edge, 1 - MAX_SLOW), 0, 1)
     out[out < MIN_CORRELATION] = 0

@@ -14,8 +14,9 @@ many points anywhere.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import product, repeat
 from math import comb
 
 import numpy as np
@@ -28,9 +29,8 @@ from ..errors import DataError
 from ..photogrammetry.rig_orientation import RigOrientation
 from .marker_intensity import (
     MARKER_SCALES,
-    FilteredLight,
+    FilteredImage,
     check_image,
-    filter_image,
     first_shadows,
 )
 from .marker_points import CalibratedRig, ShadowPoints, all_among, shadow_points
@@ -115,7 +115,8 @@ def identify_markers(
     # one is there.
     count = sum(len(body.target_id) for body in bodies)
     for scale, strongest in product(MARKER_SCALES[:3], (count, MIN_MEMBERS)):
-        search.look(scale, strongest)
+        if strongest == count or len(search.missing) == len(bodies):
+            search.look(scale, strongest)
         if not search.missing:
             break
     return search.markers()
@@ -127,24 +128,19 @@ class _ImageSearch:
     def __init__(
         self, images: Mapping[str, np.ndarray], rig: CalibratedRig, bodies: Sequence[Body]
     ) -> None:
-        self._images = [images[name] for name in rig.orientation.fluoroscopes]
+        names = rig.orientation.fluoroscopes
+        self._images = {name: FilteredImage(images[name]) for name in names}
         self._rig = rig
         self.missing = list(bodies)
         self._found: dict[str, list[FirstMarkers]] = {}
         self._reason: DataError | None = None
-        self._scale = 0.0
-        self._filtered: list[tuple[FilteredLight, FilteredLight]] = []
 
     def look(self, scale: float, strongest: int) -> None:
         """Look for the bodies that are missing; so many shadows of a size tell how they look."""
-        if scale != self._scale:
-            self._filtered = [filter_image(image, scale) for image in self._images]
-            self._scale = scale
         try:
-            shadows = [
-                first_shadows(lights, strongest, SHARE).strongest(MAX_SHADOWS).uv
-                for lights in self._filtered
-            ]
+            with ThreadPoolExecutor(len(self._images)) as threads:
+                parts = threads.map(_shadows_of, self._images.values(), repeat((scale, strongest)))
+                shadows = list(parts)
         except DataError as error:
             self._reason = self._reason or error
             return
@@ -166,9 +162,16 @@ class _ImageSearch:
             name: FirstMarkers(
                 np.concatenate([first.target_id for first in parts]),
                 np.concatenate([first.uv for first in parts]),
+                self._images[name],
             )
             for name, parts in self._found.items()
         }
+
+
+def _shadows_of(image: FilteredImage, kind: tuple[float, int]) -> np.ndarray:
+    """Places (k, 2) of shadows, whose scale and strongest ones are of a kind. Raises DataError."""
+    scale, strongest = kind
+    return first_shadows(image.of_scale(scale), strongest, SHARE).strongest(MAX_SHADOWS).uv
 
 
 def identifiable(bodies: Sequence[Body]) -> tuple[Body, ...]:

@@ -134,6 +134,29 @@ def _positive_median(values: np.ndarray) -> float:
     return float(np.median(positive)) if len(positive) else 0.0
 
 
+class FilteredImage:
+    """A whole image (h, w), filtered for shadows of one size after another, of each once."""
+
+    def __init__(self, image: np.ndarray) -> None:
+        self.image = image
+        self._by_scale: dict[float, tuple[FilteredLight, FilteredLight]] = {}
+        grey = image.astype(np.float32)
+        around = cv2.blur(grey, (2 * BACKGROUND_PX + 1,) * 2)
+        top = float(np.iinfo(image.dtype).max)
+        self._lights = (grey, around), (top - grey, top - around)
+
+    def of_scale(self, scale: float) -> tuple[FilteredLight, FilteredLight]:
+        """Return the image filtered for dark shadows, and for bright ones."""
+        if scale not in self._by_scale:
+            dark, bright = self._lights
+            responses = _responses(dark[0], scale)
+            self._by_scale[scale] = (
+                FilteredLight(scale, False, dark[0], responses[0], dark[1]),
+                FilteredLight(scale, True, bright[0], responses[1], bright[1]),
+            )
+        return self._by_scale[scale]
+
+
 class LightWindows:
     """Reads windows of one image, markers dark."""
 
@@ -189,15 +212,15 @@ def check_image(image: np.ndarray, size: tuple[int, int] | None = None) -> None:
         raise DataError(cause, kind=Kind.IMAGE_EMPTY)
 
 
-def _learn_look(image: np.ndarray, near: np.ndarray) -> tuple[MarkerLook, FilteredLight]:
+def _learn_look(image: FilteredImage, near: np.ndarray) -> tuple[MarkerLook, FilteredLight]:
     """Learn what markers look like, from an image and points (n, 2) near them.
 
-    Returns the image as well, filtered for them. Raises DataError where there is nothing round.
+    Returns the light filtered for them, too. Raises DataError where there is nothing round.
     """
     best: _Typical | None = None
     for scale in MARKER_SCALES:
         found = max(
-            (_Typical.near(light, near) for light in filter_image(image, scale)),
+            (_Typical.near(light, near) for light in image.of_scale(scale)),
             key=lambda one: one.merit,
         )
         if best is None or found.merit > best.merit:
@@ -211,7 +234,7 @@ def _learn_look(image: np.ndarray, near: np.ndarray) -> tuple[MarkerLook, Filter
 def first_shadows(lights: Iterable[FilteredLight], count: int, share: float) -> Shadows:
     """Find the shadows in an image that says itself what markers look like.
 
-    lights: as `filter_image` returns them. count: of the strongest shadows, which tell the look;
+    lights: dark and bright ones of one size. count: of the strongest shadows, which tell the look;
     share: of their response that is found. Raises DataError where there is nothing round.
     """
     best = max((_Typical.strongest(light, count) for light in lights), key=lambda one: one.merit)
@@ -226,20 +249,6 @@ def search_image(image: np.ndarray, look: MarkerLook, share: float) -> Shadows:
     around = cv2.blur(light, (2 * BACKGROUND_PX + 1,) * 2)
     response = _dark_response(light, look.scale)
     return _found(look, FilteredLight(look.scale, look.inverted, light, response, around), share)
-
-
-def filter_image(image: np.ndarray, scale: float) -> tuple[FilteredLight, FilteredLight]:
-    """Filter a whole image for shadows of a size, dark ones and bright ones."""
-    grey = image.astype(np.float32)
-    top = float(np.iinfo(image.dtype).max)
-    around = cv2.blur(grey, (2 * BACKGROUND_PX + 1,) * 2)
-    dark, bright = _responses(grey, scale)
-    return (
-        FilteredLight(scale, inverted=False, light=grey, response=dark, around=around),
-        FilteredLight(
-            scale, inverted=True, light=top - grey, response=bright, around=top - around
-        ),
-    )
 
 
 @dataclass(frozen=True)
@@ -426,12 +435,12 @@ class MarkerStart:
 NOWHERE_PX = -2e4  # where markers are whose place is not known yet
 
 
-def learn_start(image: np.ndarray, target_id: np.ndarray, uv: np.ndarray) -> MarkerStart:
+def learn_start(image: FilteredImage, target_id: np.ndarray, uv: np.ndarray) -> MarkerStart:
     """Learn from an image with markers near uv (n, 2) [px], NaN where places are not known yet.
 
     Raises DataError where the markers are not there.
     """
-    height, width = image.shape
+    height, width = image.image.shape
     known = np.isfinite(uv).all(axis=1)
     given = uv[known]
     inside = ((given > -0.5) & (given < np.array([width, height]) - 0.5)).all(axis=1)

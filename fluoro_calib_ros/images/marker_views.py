@@ -11,7 +11,9 @@ a body tells where its markers are to be expected, also those that a view does n
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from itertools import repeat
 
 import numpy as np
 
@@ -97,10 +99,14 @@ class MarkerViews:
         joined = self._joined
         if joined is not None:
             joined.expect(images, frame, angles or {})
-        found = {
-            name: tracker.update(images.get(name), frame)
-            for name, tracker in self.trackers.items()
-        }
+        trackers = self.trackers
+        if all(tracker.begun for tracker in trackers.values()):
+            found = {name: one.update(images.get(name), frame) for name, one in trackers.items()}
+        else:  # which takes the time of ten images
+            with ThreadPoolExecutor(len(trackers)) as threads:
+                given = [images.get(name) for name in trackers]
+                each = threads.map(MarkerTracker.update, trackers.values(), given, repeat(frame))
+                found = dict(zip(trackers, each))
         return ViewsFrame(found) if joined is None else joined.decided(found, frame)
 
 

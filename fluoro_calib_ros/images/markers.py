@@ -12,7 +12,7 @@ so: their ids stay doubtful until a second view, or the user, confirms them.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ from .marker_fit import MarkerMeasurement
 from .marker_intensity import (
     FIRST_SD_PX,
     NOWHERE_PX,
+    FilteredImage,
     LightWindows,
     MarkerLook,
     MarkerSearch,
@@ -85,10 +86,14 @@ class MarkerOptions:
 
 @dataclass(frozen=True)
 class FirstMarkers:
-    """Markers of one image: ids (n,) and places (n, 2) [px], to a pixel or two."""
+    """Markers of one image: ids (n,) and places (n, 2) [px], to a pixel or two.
+
+    filtered: the image, where they were searched in it.
+    """
 
     target_id: np.ndarray
     uv: np.ndarray
+    filtered: FilteredImage | None = None
 
     def __post_init__(self) -> None:
         ids = np.asarray(self.target_id, dtype=np.int64).reshape(-1)
@@ -335,7 +340,7 @@ class MarkerTracker:
     def _start(self, image: np.ndarray, frame: int) -> _Followed:
         """Learn from the first image. Raises DataError where the markers are not there."""
         places = self._first_places(image.shape, frame)
-        start = learn_start(image, self.target_id, places)
+        start = learn_start(self._filtered(image), self.target_id, places)
         options = self.options
         for row in np.flatnonzero(np.isnan(places[:, 0])).tolist():
             start.states.forget(row, options.lost_after + 1)
@@ -362,6 +367,14 @@ class MarkerTracker:
                 density=start.density,
             ),
         )
+
+    def _filtered(self, image: np.ndarray) -> FilteredImage:
+        """Return the first image as it was filtered to find the markers, if it was."""
+        first = self.first
+        if first is None or first.filtered is None or first.filtered.image is not image:
+            return FilteredImage(image)
+        self.first = replace(first, filtered=None)  # which is large
+        return first.filtered
 
     def _first_places(self, shape: tuple[int, ...], frame: int) -> NDArray[np.float64]:
         """Return places (n, 2) in the first image [px], NaN for unknown ones.

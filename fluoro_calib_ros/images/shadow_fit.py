@@ -640,5 +640,7 @@ def fit_profile(
     # The backgrounds belong to the shadows before.
     change = np.append(np.full(3, CHANGE), np.inf)
     bounds = (np.maximum(LOW, first / change), np.minimum(HIGH, first * change))
-    found = least_squares(residual, first, jac=slopes, bounds=bounds, x_scale=first, max_nfev=12)
+    # A few steps: `absorbed` is renewed with each profile, and radius and attenuation of a small
+    # shadow are hardly told apart.
+    found = least_squares(residual, first, jac=slopes, bounds=bounds, x_scale=first, max_nfev=5)
     return Profile(*map(float, found.x))

@@ -287,6 +287,8 @@ class MarkerFollower:
 
     def __init__(self, settings: MarkerSettings) -> None:
         self._settings = settings
+        for calibration in settings.calibrations.values():
+            calibration.prepare()
         self._begun = False
         self._earlier = {name: EarlierImages(REVISED) for name in settings.names}
         self._renew()

@@ -187,7 +187,7 @@ def test_profile_is_fitted_to_its_shadow():
     distance = np.random.default_rng(2).uniform(0, 6, 4000)
     absorbed = 0.9 * true.shadow(distance)[0]
     start = Profile(3.0, 1.0, 1.5, 0.1)
-    for _ in range(4):
+    for _ in range(10):  # of a few steps each
         start = fit_profile(distance, absorbed, np.ones(4000), start)
     assert start.radius_px == pytest.approx(3.4, rel=0.002)
     assert start.blur_px == pytest.approx(0.8, rel=0.02)

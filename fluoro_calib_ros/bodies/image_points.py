@@ -107,7 +107,7 @@ class Cameras:
         arm = xyz @ np.swapaxes(rotation, 1, 2)
         image = ((arm + centre[:, None]) @ self._matrix + self._shift).reshape(*shape, 3)
         depth = np.where(image[..., 2] > 0, image[..., 2], np.nan)
-        uv = image[..., :2] / depth[..., None]
+        uv = np.where(depth[..., None] > 0, image[..., :2] / depth[..., None], 0.0)
         by_place = (self._uv_rows - uv[..., None] * self._depth_rows) / depth[..., None, None]
         good = points.seen & np.isfinite(depth)
         residual = np.where(good[..., None], points.uv - uv, 0.0)
@@ -118,7 +118,8 @@ class Cameras:
         """Derivatives (B, M, F, 2, 9) of image points by T, w, xp, yp, c, see collinearity."""
         interior = self._interior
         c = interior[:, 2]
-        x, y = np.moveaxis((linear.uv - interior[:, :2]) / c[:, None], -1, 0)
+        xy = (linear.uv - interior[:, :2]) / c[:, None]
+        x, y = xy[..., 0], xy[..., 1]
         out = np.zeros((*x.shape, 2, ORIENTATION_SIZE))
         out[..., :3] = -linear.by_place
         out[..., 0, 3] = out[..., 1, 4] = c * x * y
@@ -130,4 +131,4 @@ class Cameras:
         out[..., 0, 6] = out[..., 1, 7] = 1
         out[..., 0, 8] = x
         out[..., 1, 8] = y
-        return np.nan_to_num(out)
+        return out

@@ -187,13 +187,11 @@ class BodyTracker:
         """Return an exposure with its row of a motion."""
         frame = one.frame
         lost = ~one.alive
-        status = np.where(
-            frame.alone,
-            PoseStatus.OK,
-            np.where(frame.markers > 0, PoseStatus.WEAK, PoseStatus.FILLED),
-        )
-        status = np.where(frame.ambiguous, PoseStatus.AMBIGUOUS, status)
-        status = np.where(lost, PoseStatus.FAILED, status).astype(np.uint8)
+        status = np.full(len(lost), PoseStatus.FILLED, dtype=np.uint8)
+        status[frame.markers > 0] = PoseStatus.WEAK
+        status[frame.alone] = PoseStatus.OK
+        status[frame.ambiguous] = PoseStatus.AMBIGUOUS
+        status[lost] = PoseStatus.FAILED
 
         def kept(values: np.ndarray) -> np.ndarray:
             if not lost.any():

@@ -62,11 +62,23 @@ class MarkerGuess:
 
 
 def fit_markers(
-    windows: LightWindows, guess: MarkerGuess, profile: Profile, noise: Noise
+    windows: LightWindows,
+    guess: MarkerGuess,
+    profile: Profile,
+    noise: Noise,
+    inflation: dict[int, float],
 ) -> Beads:
-    """Measure all markers near a guess at once."""
+    """Measure all markers near a guess at once.
+
+    inflation: of variances by correlated noise, by the number of pixels in a window; it is the
+    same for all images, and noted here.
+    """
     fit = _MarkerFit(windows, guess, profile, noise)
+    pixels = len(fit.offset)
+    fit.inflation = inflation.get(pixels)
     fit.run()
+    if fit.inflation is not None:
+        inflation[pixels] = fit.inflation
     return fit.result()
 
 
@@ -268,6 +280,7 @@ class MarkerMeasurement:
     def __init__(self, profile: Profile, noise: Noise, *, gate: float, shutter: float) -> None:
         self.profile = profile
         self._noise = noise
+        self._inflation: dict[int, float] = {}
         self._gate = gate
         self._shutter = shutter
 
@@ -284,7 +297,7 @@ class MarkerMeasurement:
             states.depth_sd[tried],
             self._shutter * states.motion.velocity[tried],
         )
-        beads = fit_markers(windows, guess, self.profile, self._noise)
+        beads = fit_markers(windows, guess, self.profile, self._noise, self._inflation)
         measured = np.zeros(len(start), dtype=bool)
         measured[tried[self._acceptable(beads, tried, states)]] = True
         uv = start.copy()

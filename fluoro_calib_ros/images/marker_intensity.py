@@ -516,7 +516,7 @@ class MarkerSearch:
         middle = np.rint(states.motion.uv).astype(int)
         parts = []
         # Few markers need wide windows; those of the others stay small.
-        small = int(np.ceil(np.percentile(half[near], 75)))
+        small = int(np.sort(half[near])[3 * np.count_nonzero(near) // 4])
         for rows in (near & (half <= small), near & (half > small)):
             if rows.any():
                 size = int(half[rows].max())

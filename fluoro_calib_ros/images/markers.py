@@ -147,6 +147,13 @@ def _inside(uv: np.ndarray, shape: tuple[int, ...]) -> NDArray[np.bool_]:
     return np.asarray(((uv > 0) & (uv < np.array(shape[::-1]) - 1)).all(axis=1))
 
 
+def _filtered(image: np.ndarray, first: FirstMarkers | None) -> FilteredImage:
+    """Return an image, filtered as it was when the first markers were searched in it."""
+    if first is None or first.filtered is None or first.filtered.image is not image:
+        return FilteredImage(image)
+    return first.filtered
+
+
 def _none_seen(
     frame: int, target_id: NDArray[np.int64], finding: Finding, seconds: float
 ) -> MarkerFrame:
@@ -340,7 +347,10 @@ class MarkerTracker:
     def _start(self, image: np.ndarray, frame: int) -> _Followed:
         """Learn from the first image. Raises DataError where the markers are not there."""
         places = self._first_places(image.shape, frame)
-        start = learn_start(self._filtered(image), self.target_id, places)
+        filtered = _filtered(image, self.first)
+        if self.first is not None:
+            self.first = replace(self.first, filtered=None)  # which is large
+        start = learn_start(filtered, self.target_id, places)
         options = self.options
         for row in np.flatnonzero(np.isnan(places[:, 0])).tolist():
             start.states.forget(row, options.lost_after + 1)
@@ -367,14 +377,6 @@ class MarkerTracker:
                 density=start.density,
             ),
         )
-
-    def _filtered(self, image: np.ndarray) -> FilteredImage:
-        """Return the first image as it was filtered to find the markers, if it was."""
-        first = self.first
-        if first is None or first.filtered is None or first.filtered.image is not image:
-            return FilteredImage(image)
-        self.first = replace(first, filtered=None)  # which is large
-        return first.filtered
 
     def _first_places(self, shape: tuple[int, ...], frame: int) -> NDArray[np.float64]:
         """Return places (n, 2) in the first image [px], NaN for unknown ones.

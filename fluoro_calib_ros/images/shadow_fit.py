@@ -234,8 +234,8 @@ class ShadowFit(ABC):
         step = np.where(self.usable[rows][:, None], step, 0)
         longest = self.settings.max_step_px
         return (
-            self.uv[rows] + np.clip(step[:, TERMS : TERMS + 2], -longest, longest),
-            np.clip(self.depth[rows] + step[:, TERMS + 2], *DEPTHS),
+            self.uv[rows] + _within(step[:, TERMS : TERMS + 2], -longest, longest),
+            _within(self.depth[rows] + step[:, TERMS + 2], *DEPTHS),
             self.background[rows] + step[:, :TERMS],
         )
 
@@ -416,6 +416,11 @@ class ShadowFit(ABC):
             overlapped=self.distance < 2 * self.profile.reach_px * OVERLAP,
             measured=measured,
         )
+
+
+def _within(values: np.ndarray, low: float, high: float) -> NDArray[np.float64]:
+    """Values between bounds: np.clip, in a third of its time for a few."""
+    return np.minimum(np.maximum(values, low), high)
 
 
 def _inflation(influence: np.ndarray, correlation: np.ndarray) -> float:

@@ -74,16 +74,15 @@ def quaternion_from_matrix(rotation: ArrayLike) -> np.ndarray:
     d = r[..., 0, 1] + r[..., 1, 0]
     e = r[..., 0, 2] + r[..., 2, 0]
     f = r[..., 1, 2] + r[..., 2, 1]
-    candidates = np.stack(
-        [
-            np.stack([1 + xx + yy + zz, a, b, c], axis=-1),
-            np.stack([a, 1 + xx - yy - zz, d, e], axis=-1),
-            np.stack([b, d, 1 - xx + yy - zz, f], axis=-1),
-            np.stack([c, e, f, 1 - xx - yy + zz], axis=-1),
-        ],
-        axis=-2,
-    )
-    largest = np.argmax(np.stack([candidates[..., i, i] for i in range(4)], axis=-1), axis=-1)
+    candidates = np.empty((*xx.shape, 4, 4))
+    candidates[..., 0, 0] = 1 + xx + yy + zz
+    candidates[..., 1, 1] = 1 + xx - yy - zz
+    candidates[..., 2, 2] = 1 - xx + yy - zz
+    candidates[..., 3, 3] = 1 - xx - yy + zz
+    pairs = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
+    for (i, j), value in zip(pairs, (a, b, c, d, e, f)):
+        candidates[..., i, j] = candidates[..., j, i] = value
+    largest = np.diagonal(candidates, axis1=-2, axis2=-1).argmax(axis=-1)
     q = np.take_along_axis(candidates, largest[..., None, None], axis=-2)[..., 0, :]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     return np.where(q[..., :1] < 0, -q, q)

@@ -28,6 +28,7 @@ from .marker_intensity import (
     LightWindows,
     MarkerLook,
     MarkerSearch,
+    MarkerStart,
     Shadows,
     check_image,
     learn_start,
@@ -186,6 +187,33 @@ class _Followed:
     search: MarkerSearch
     measurement: MarkerMeasurement
     watch: MarkerWatch
+
+    @classmethod
+    def begun(cls, start: MarkerStart, target_id: np.ndarray, options: MarkerOptions) -> _Followed:
+        """Return what follows markers from the first image on."""
+        doubts = MarkerDoubts(len(target_id))
+        return cls(
+            start.states,
+            doubts,
+            start.look,
+            start.size,
+            search=MarkerSearch(
+                start.look,
+                gate=options.gate,
+                lost_after=options.lost_after,
+                search_every=options.search_every,
+            ),
+            measurement=MarkerMeasurement(
+                start.profile, start.noise, gate=options.gate, shutter=options.shutter
+            ),
+            watch=MarkerWatch(
+                target_id,
+                doubts,
+                gate=options.gate,
+                margin=options.margin,
+                density=start.density,
+            ),
+        )
 
 
 class MarkerTracker:
@@ -351,32 +379,9 @@ class MarkerTracker:
         if self.first is not None:
             self.first = replace(self.first, filtered=None)  # which is large
         start = learn_start(filtered, self.target_id, places)
-        options = self.options
         for row in np.flatnonzero(np.isnan(places[:, 0])).tolist():
-            start.states.forget(row, options.lost_after + 1)
-        doubts = MarkerDoubts(len(self.target_id))
-        return _Followed(
-            start.states,
-            doubts,
-            start.look,
-            start.size,
-            search=MarkerSearch(
-                start.look,
-                gate=options.gate,
-                lost_after=options.lost_after,
-                search_every=options.search_every,
-            ),
-            measurement=MarkerMeasurement(
-                start.profile, start.noise, gate=options.gate, shutter=options.shutter
-            ),
-            watch=MarkerWatch(
-                self.target_id,
-                doubts,
-                gate=options.gate,
-                margin=options.margin,
-                density=start.density,
-            ),
-        )
+            start.states.forget(row, self.options.lost_after + 1)
+        return _Followed.begun(start, self.target_id, self.options)
 
     def _first_places(self, shape: tuple[int, ...], frame: int) -> NDArray[np.float64]:
         """Return places (n, 2) in the first image [px], NaN for unknown ones.

@@ -307,6 +307,11 @@ class MarkerBodies:
             if np.count_nonzero(there) >= MIN_MEMBERS:
                 self._bodies.append(body.rows(there))
         self._rows = [np.searchsorted(target_id, body.target_id) for body in self._bodies]
+        # Of all markers of bodies: their body, and their row in it.
+        self._member = (
+            np.repeat(np.arange(len(self._rows)), [len(rows) for rows in self._rows]),
+            np.concatenate([np.arange(len(rows)) for rows in self._rows] or [[]]).astype(int),
+        )
         self._seen: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in self._bodies]
         self._learned = [
             np.where(body.known, LEARNED, 0) for body in self._bodies
@@ -370,14 +375,14 @@ class MarkerBodies:
         """Places of markers at poses of the bodies."""
         assert self._tracker is not None
         out = MarkerPlaces.nowhere(self._count)
-        for number, (body, rows) in enumerate(zip(self._bodies, self._rows)):
-            if not np.isfinite(rotation[number]).all():
-                continue
-            count = len(rows)
-            arm = self._tracker.solver.xyz[number, :count] @ rotation[number].T
-            d = by_pose(arm)
-            out.xyz_mm[rows] = np.where(body.known[:, None], arm + centre[number], np.nan)
-            out.covariance[rows] = d @ covariance[number] @ np.swapaxes(d, 1, 2)
+        arm = self._tracker.solver.xyz @ np.swapaxes(rotation, 1, 2)
+        xyz = (arm + centre[:, None])[self._member]
+        known = np.concatenate([body.known for body in self._bodies]) & np.isfinite(xyz[:, 0])
+        rows = np.concatenate(self._rows)[known]
+        d = by_pose(arm)
+        out.xyz_mm[rows] = xyz[known]
+        spread = d @ covariance[:, None] @ np.swapaxes(d, 2, 3)
+        out.covariance[rows] = spread[self._member][known]
         return out
 
     def learn(self, exposure: MarkerExposure, sure: np.ndarray) -> None:

@@ -57,6 +57,7 @@ from fluoro_calib_ros.simulation.marker_images import (
 from fluoro_calib_ros.simulation.radiographs import RadiographSettings
 from fluoro_calib_ros.simulation.rig import (
     BETWEEN_DEG,
+    BETWEEN_THREE_DEG,
     VirtualRig,
     simulate_exposures,
     virtual_rig,
@@ -64,7 +65,6 @@ from fluoro_calib_ros.simulation.rig import (
 
 FIRST_RIG = 2000  # seeds below are those of development and tests
 FRAMES_OF_A_SEQUENCE = 250
-BETWEEN_THREE_DEG = 60.0  # angle between neighbouring ones of three fluoroscopes
 FALSE_PX = 1.5
 ALONE_PX = 14.0
 BOUND_EVERY = 50

@@ -52,6 +52,8 @@ from ..simulation.marker_images import (
 )
 from ..simulation.radiographs import CLEAN, HARD, RadiographSettings, Radiography
 from ..simulation.rig import (
+    BETWEEN_DEG,
+    BETWEEN_THREE_DEG,
     START_NS,
     Detection,
     Pose,
@@ -356,6 +358,7 @@ def _camera(
 
 
 HOUR_NS = 3600 * 10**9
+NAMES = 'abcdefgh'  # of fluoroscopes
 DATA_SET = FolderKind(
     'a data set of the virtual rig',
     parts=(
@@ -373,6 +376,7 @@ class SimulationOptions:
     seed: int = option(
         1, 'seed of the random numbers, which determines the rig', minimum=0, maximum=2**31
     )
+    fluoroscopes: int = option(2, 'fluoroscopes of the rig', minimum=2, maximum=len(NAMES))
     exposures: int = option(
         15, 'exposures of the phantom for the calibration', minimum=1, maximum=100000
     )
@@ -437,7 +441,9 @@ def _write(
     progress: Callable[[int, int], None] | None,
 ) -> None:
     """Write the parts of a data set."""
-    rig = virtual_rig(options.seed, options.strength)
+    names = NAMES[: options.fluoroscopes]
+    between_deg = min(BETWEEN_DEG, 2 * BETWEEN_THREE_DEG / (len(names) - 1))
+    rig = virtual_rig(options.seed, options.strength, names, between_deg=between_deg)
     write_rig(directory, rig, dataclasses.asdict(options))
     detection = Detection(options.noise, options.false_matches)
     calibration = simulate_exposures(rig, options.exposures, options.seed, detection)

@@ -26,6 +26,7 @@ CUBE_MM = 260.0  # edge of the phantom
 BEADS = 503  # of the phantom
 SURVEY_SD_MM = 0.1  # of a coordinate of a bead
 BETWEEN_DEG = 84.0  # angle between the axes of neighbouring fluoroscopes
+BETWEEN_THREE_DEG = 60.0  # the same, of three
 
 # Rotation (3, 3) and shift (3,) [mm] that take points of the phantom into the rig frame.
 Pose = tuple[np.ndarray, np.ndarray]

@@ -17,6 +17,7 @@ import sys
 import numpy as np
 import pytest
 from rigs import run
+from scipy.spatial.distance import pdist
 
 from fluoro_calib_ros.cli import COMMANDS, main
 from fluoro_calib_ros.correction.base import CorrectionStatus
@@ -150,6 +151,20 @@ def test_sample_bags_were_made_by_the_documented_command(tmp_path):
     assert made.keys() == files_of(ROOT / 'bags').keys() - {'README.md'}
     _, different, failed = filecmp.cmpfiles(tmp_path, ROOT / 'bags', made, shallow=False)
     assert not different and not failed
+
+
+def test_simulate_has_any_number_of_fluoroscopes(tmp_path):
+    assert (
+        run('simulate', '--out', tmp_path, '--fluoroscopes', 3, '--exposures', 3, '--seconds', 0.1)
+        == 0
+    )
+    with open(tmp_path / 'calibration.csv') as file:
+        seen = {row['fluoroscope'] for row in csv.DictReader(file)}
+    assert seen == {'a', 'b', 'c'}
+    rig = json.loads((tmp_path / 'truth' / 'rig.json').read_text())
+    sources = np.array([one['position_mm'] for one in rig['fluoroscopes'].values()])
+    between = np.degrees(np.arccos(1 - pdist(sources, 'cosine')))
+    assert between[[0, 2]] == pytest.approx(60, abs=6)  # of neighbours
 
 
 def test_size_of_one_part_does_not_change_the_others(tmp_path, rig):

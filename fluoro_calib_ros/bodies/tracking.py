@@ -137,6 +137,12 @@ class BodyTracker:
         self._expected = stamp_ns, expected
         return expected
 
+    def lose(self, lost: NDArray[np.bool_]) -> None:
+        """Forget the motion of bodies (B,) that are not where they were expected."""
+        if lost.any():
+            self.filter.lose(lost)
+            self._expected = None
+
     def reshape(self, bodies: Sequence[Body]) -> None:
         """Take better shapes of the bodies, in the same frames."""
         before = self.solver.centre

@@ -37,8 +37,13 @@ class ViewCounts:
         self._agreed_since = np.zeros(count, dtype=int)
         self._wrong = np.zeros(count, dtype=int)
 
-    def agree(self, row: int, agrees: bool, frame: int) -> int:
-        """Count an exposure that agrees with an id or does not, and return how many agree."""
+    def agree(self, row: int, agrees: bool, frame: int, began: int | None) -> int:
+        """Count an exposure that agrees with an id or does not, and return how many agree.
+
+        began: image since which the id is in doubt; exposures before it say nothing.
+        """
+        if began is not None and self._agreed_since[row] < began:
+            self._agreed[row] = 0
         if agrees and self._agreed[row] == 0:
             self._agreed_since[row] = frame
         self._agreed[row] = self._agreed[row] + 1 if agrees else 0
@@ -254,7 +259,7 @@ class BodyDecisions:
         """Confirm or drop an id by the exposures up to the present one, which agrees or not."""
         view = self._view
         began = view.tracker.doubted_since(*view.ids(row))
-        agreed = view.counts.agree(row, agrees, frame)
+        agreed = view.counts.agree(row, agrees, frame, began)
         if began is not None and agreed >= DECIDED:
             return [view.confirm(row, frame)]
         if view.counts.wrong[row] >= WRONG:
@@ -308,7 +313,8 @@ class RayDecisions:
         both = np.isfinite(lack) & ~known
         for row in np.flatnonzero(both & exposure.doubtful[view.view]).tolist():
             (number,) = view.ids(row)
-            if view.tracker.doubted_since(number) is None:
+            began = view.tracker.doubted_since(number)
+            if began is None:
                 continue
             partners = view.tracker.partners(number)
             others = [int(np.searchsorted(view.target_id, other)) for other in partners]
@@ -318,7 +324,7 @@ class RayDecisions:
                     out += self._both_ways(exposure, (row, other), frame)
             if not others and not partners - {number}:
                 agrees = bool(lack[row] < AGREE)
-                if view.counts.agree(row, agrees, frame) >= DECIDED_ALONE:
+                if view.counts.agree(row, agrees, frame, began) >= DECIDED_ALONE:
                     out.append(view.confirm(row, frame))
         rows = np.flatnonzero(both)
         bad = lack[rows] > DISAGREE

@@ -272,6 +272,7 @@ SHADOW_SD_PX = 0.35  # of the place of a shadow before it is measured
 DEPTH_SD = 1.0  # of the depth of a marker that is not known yet
 KNOWN_DEPTH_SD = 0.15
 DEPTH_MEMORY = 0.9
+RECENT = 4  # images in which a place tells the velocity
 
 
 @dataclass(frozen=True)
@@ -304,12 +305,14 @@ class MarkerStates:
     depth: NDArray[np.float64]
     depth_sd: NDArray[np.float64]
     unseen: NDArray[np.int64]  #: (n,), images since a marker was measured
+    placed: NDArray[np.int64]  #: (n,), images since its body was found by its shape
 
     @classmethod
     def start(cls, motion: Motion, unseen: np.ndarray) -> MarkerStates:
         """Return the states of markers whose depth is not known."""
         n = len(unseen)
-        return cls(motion, depth=np.ones(n), depth_sd=np.full(n, DEPTH_SD), unseen=unseen)
+        long_ago = np.full(n, 2 * RECENT)
+        return cls(motion, np.ones(n), np.full(n, DEPTH_SD), unseen=unseen, placed=long_ago)
 
     @property
     def shadow_variance(self) -> np.ndarray:
@@ -320,6 +323,23 @@ class MarkerStates:
         """Predict all markers; led (n,) are those whose velocity follows that of others."""
         self.motion.predict(frames, led)
         self.unseen += 1
+        self.placed += 1
+
+    def place(self, rows: np.ndarray, uv: np.ndarray, sd_px: float, frames: int) -> None:
+        """Put markers at places (k, 2) where their body is, frames after the image before.
+
+        The second of two such images tells their velocities.
+        """
+        motion = self.motion
+        again = (self.placed[rows] < RECENT) & (self.unseen[rows] <= self.placed[rows])
+        since = (self.unseen[rows] + frames - 1)[:, None]  # that they were measured
+        before = motion.uv[rows] - since * motion.velocity[rows]
+        motion.uv[rows] = uv
+        motion.velocity[rows] = np.where(again[:, None], (uv - before) / since, 0.0)
+        motion.covariance[rows] = np.eye(2) * sd_px**2
+        motion.covariance[rows[~again], 1, 1] = FIRST_SPEED_PX**2
+        self.unseen[rows] = 1
+        self.placed[rows] = 0
 
     def update(self, found: MeasuredMarkers, frames: int) -> None:
         """Take in the markers that were measured, frames after the image before."""
@@ -336,7 +356,7 @@ class MarkerStates:
     def exchange(self, one: int, other: int) -> None:
         """Exchange the states of two markers."""
         self.motion.exchange(one, other)
-        for values in (self.depth, self.depth_sd, self.unseen):
+        for values in (self.depth, self.depth_sd, self.unseen, self.placed):
             values[[one, other]] = values[[other, one]]
 
     def forget(self, row: int, unseen: int) -> None:

@@ -286,6 +286,9 @@ def project_observed(
 RIGID_MM = 0.1  # what a marker may move in its body, a standard deviation
 RIGID_SIGMAS = 5.0
 MIN_MEMBERS = 3  # of a body that give its pose
+# Share of the markers of a body that are seen again. Where there are fewer, something has moved
+# the body elsewhere, and what is seen may be anything.
+MIN_SEEN = 0.5
 LEARNED = 40  # exposures from which the shape of a body is learned
 FRAME_NS = 10_000_000  # time of an exposure for the filter, which adapts to any
 
@@ -310,7 +313,7 @@ class MarkerBodies:
         # Of all markers of bodies: their body, and their row in it.
         self._member = (
             np.repeat(np.arange(len(self._rows)), [len(rows) for rows in self._rows]),
-            np.concatenate([np.arange(len(rows)) for rows in self._rows] or [[]]).astype(int),
+            np.array([k for rows in self._rows for k in range(len(rows))], dtype=int),
         )
         self._seen: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in self._bodies]
         self._learned = [
@@ -327,6 +330,24 @@ class MarkerBodies:
             return ()
         alive = self._tracker.filter.alive.tolist()
         return tuple(body for body, is_alive in zip(self._bodies, alive) if not is_alive)
+
+    def miss(self, measured: np.ndarray, before: np.ndarray) -> np.ndarray:
+        """Give up bodies that are not where they were expected; returns their markers (n,).
+
+        measured, before (F, n): markers that are measured now, and in the last images of the same
+        views.
+        """
+        out = np.zeros(self._count, dtype=bool)
+        if self._tracker is None:
+            return out
+        lost = np.zeros(len(self._rows), dtype=bool)
+        for number, rows in enumerate(self._rows):
+            expected = np.count_nonzero(before[:, rows])
+            seen = np.count_nonzero(measured[:, rows] & before[:, rows])
+            lost[number] = expected >= MIN_MEMBERS and seen < MIN_SEEN * expected
+            out[rows] = lost[number]
+        self._tracker.lose(lost)
+        return out
 
     def predicted(self, frame: int) -> MarkerPlaces:
         """Where markers are expected in the next exposure."""

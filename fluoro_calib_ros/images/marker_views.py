@@ -20,10 +20,11 @@ import numpy as np
 from ..bodies.body import Body
 from ..correction.fluoroscope_calibration import Calibrations
 from ..errors import DataError
+from ..findings import Kind
 from ..photogrammetry.rig_orientation import RigOrientation
 from .marker_decisions import BodyDecisions, DecidedView, Decision, RayDecisions, ViewCounts
 from .marker_ids import MAX_SHADOWS, find_bodies, identifiable
-from .marker_intensity import FIRST_SD_PX, check_image
+from .marker_intensity import check_image
 from .marker_points import CalibratedRig
 from .marker_rays import MarkerBodies, MarkerExposure, MarkerPlaces, MarkerRays
 from .markers import FirstMarkers, MarkerFrame, MarkerOptions, MarkerTracker
@@ -157,7 +158,12 @@ class JoinedViews:
         nowhere = MarkerPlaces.nowhere(len(target_id))
         self._told = [_Told(nowhere, nowhere) for _ in self._views]
         self._frame = 0
-        self._searched = 0  # last exposure in which lost bodies were searched
+        # Lost bodies are searched from this exposure on, and then after so many more.
+        self._next_search = 0
+        self._pause = self._views[0].tracker.options.search_every
+        self._again: list[Body] = []  # found in the last exposure: another one tells their speed
+        self._measured = np.zeros((len(self._views), len(target_id)), dtype=bool)
+        self._missed = np.zeros(len(target_id), dtype=bool)  # of bodies that are elsewhere
         # Of the C-arms [rad], in the last exposure and in the one before.
         self._angles: Mapping[str, float | None] = {}
         self._angles_before: Mapping[str, float | None] = {}
@@ -173,12 +179,11 @@ class JoinedViews:
             self._check_sizes(images)
         self._angles_before, self._angles = self._angles, dict(angles)
         if self._frame:
-            self._suggest(frame)
-            self._search(images, frame)
+            self._suggest(frame, self._search(images, frame))
 
     def decided(self, found: Mapping[str, MarkerFrame], frame: int) -> ViewsFrame:
         """Return the markers of the views, after what they say of each other."""
-        exposure = self._rays.intersect(found, self._angles)
+        exposure = self._rays.intersect(self._without_missed(found, frame), self._angles)
         self._bodies.update(exposure, frame)
         decisions = self._decide(exposure, frame)
         decided = [number for decision in decisions for number in decision.target_id]
@@ -201,15 +206,39 @@ class JoinedViews:
                     f'calibration is for {expected[0]} x {expected[1]} px'
                 )
 
-    def _suggest(self, frame: int) -> None:
-        """Offer each view predictions of the markers that it is not sure of."""
+    def _without_missed(
+        self, found: Mapping[str, MarkerFrame], frame: int
+    ) -> dict[str, MarkerFrame]:
+        """Doubt what is measured of bodies that are not where they were expected."""
+        views = [view for view in self._views if _is_of_image(found[view.name])]
+        rows = [view.view for view in views]
+        before = self._measured[rows]
+        for view in views:
+            self._measured[view.view] = np.isin(self._target_id, found[view.name].target_id)
+        missed = self._bodies.miss(self._measured[rows], before)
+        if missed.any():
+            self._next_search = 0
+            self._pause = 1
+        self._missed |= missed
+        out = dict(found)
+        for view in views:
+            view.doubt(np.flatnonzero(self._missed & self._measured[view.view]), frame)
+            doubtful = np.isin(found[view.name].target_id, view.tracker.doubtful())
+            out[view.name] = replace(found[view.name], doubtful=doubtful)
+        return out
+
+    def _suggest(self, frame: int, placed: np.ndarray) -> None:
+        """Offer each view predictions of the markers that it is not sure of.
+
+        placed (n,): those whose bodies have just been found.
+        """
         before = self._bodies.present
         now = self._bodies.predicted(frame)
         for view, told in zip(self._views, self._told):
             here = now.filled(told.expected(frame))
             last = before.filled(told.places)
             rows = np.searchsorted(self._target_id, view.tracker.unsure())
-            rows = rows[(here.known & last.known)[rows]]
+            rows = rows[(here.known & last.known & ~placed)[rows]]
             if not len(rows):
                 continue
             uv = self._rays.project(view.view, here.xyz_mm[rows], self._angles)
@@ -218,22 +247,38 @@ class JoinedViews:
             sd = self._rays.spread(view.view, here.xyz_mm[rows], here.covariance[rows])
             view.tracker.suggest(self._target_id[rows], uv, velocity, sd)
 
-    def _search(self, images: Mapping[str, np.ndarray | None], frame: int) -> None:
-        """Look in the whole images for bodies whose pose is lost, by their shapes."""
-        every = self._views[0].tracker.options.search_every
-        lost = identifiable(self._bodies.lost())
-        if not lost or (self._searched and frame - self._searched < every):
-            return
+    def _search(self, images: Mapping[str, np.ndarray | None], frame: int) -> np.ndarray:
+        """Look in the whole images for bodies whose pose is lost, by their shapes.
+
+        Returns (n,) which markers are those of bodies that are found.
+        """
+        placed = np.zeros(len(self._target_id), dtype=bool)
+        wanted = {body.name: body for body in self._again}
+        due = frame >= self._next_search
+        if due:
+            wanted |= {body.name: body for body in identifiable(self._bodies.lost())}
+        if not wanted:
+            return placed
         shadows = [self._shadows(view, images.get(view.name)) for view in self._views]
         if sum(of_view is not None for of_view in shadows) < 2:
-            return
-        self._searched = frame
+            return placed
+        if due:
+            every = self._views[0].tracker.options.search_every
+            self._next_search = frame + self._pause
+            self._pause = min(2 * self._pause, every)
         rig = replace(self._rig, angles=self._angles)
         seen = [np.zeros((0, 2)) if of_view is None else of_view for of_view in shadows]
-        found, _ = find_bodies(seen, rig, lost)
+        found, missing = find_bodies(seen, rig, list(wanted.values()))
         for view in self._views:
             if view.name in found:
-                _offer(found[view.name], view.tracker)
+                view.tracker.relocate(found[view.name])
+        there = [body for body in wanted.values() if body.name not in missing]
+        for body in there:
+            placed |= np.isin(self._target_id, body.target_id)
+        self._missed &= ~placed
+        before = [body.name for body in self._again]
+        self._again = [body for body in there if body.name not in before]
+        return placed
 
     def _shadows(self, view: DecidedView, image: np.ndarray | None) -> np.ndarray | None:
         """Places (k, 2) of shadows in a view [px], None where there is no image."""
@@ -262,7 +307,7 @@ class JoinedViews:
             sd = self._rays.spread(view, of_view.xyz_mm, of_view.covariance)
             out += by_body.decide(exposure, place, sd, frame)
         for by_rays, of_view in zip(self._by_rays, expected):
-            out += by_rays.decide(exposure, of_view.known, frame)
+            out += by_rays.decide(exposure, of_view.known | self._missed, frame)
         return tuple(out)
 
 
@@ -285,11 +330,6 @@ class _Told:
         return self.places.moved_on(self.before, share)
 
 
-def _offer(found: FirstMarkers, tracker: MarkerTracker) -> None:
-    """Tell a view where markers are that it does not see."""
-    unseen = np.isin(found.target_id, tracker.unseen())
-    for number in found.target_id[unseen].tolist():
-        tracker.forget(number)
-    uv = found.uv[unseen]
-    sd = np.full(len(uv), FIRST_SD_PX)
-    tracker.suggest(found.target_id[unseen], uv, np.zeros_like(uv), sd)
+def _is_of_image(found: MarkerFrame) -> bool:
+    """Whether there was an image in which something could be seen."""
+    return found.finding is None or found.finding.kind is Kind.NO_MARKERS

@@ -243,7 +243,9 @@ class MarkerTracker:
         self._images = 0  # since the first one
         self._led: np.ndarray | None = None
         self._suggested: list[tuple[np.ndarray, ...]] = []
-        self._given: FirstMarkers | None = None  # of the next image
+        # Of the next image: by a person, and by the shapes of bodies.
+        self._given: FirstMarkers | None = None
+        self._relocated: FirstMarkers | None = None
         self._tried = 0  # image from which suggested markers are looked for again
 
     @property
@@ -331,9 +333,9 @@ class MarkerTracker:
             return self.target_id
         return self.target_id[(followed.states.unseen > 0) | followed.doubts.doubtful]
 
-    def unseen(self) -> np.ndarray:
-        """Ids (k,) of markers that were not measured last."""
-        return self.target_id[self._known().states.unseen > 0]
+    def relocate(self, found: FirstMarkers) -> None:
+        """Follow markers from where their bodies are found in the next image; ids are sure."""
+        self._relocated = found
 
     def shadows(self, image: np.ndarray) -> Shadows:
         """Return all shadows in an image that look like markers."""
@@ -418,6 +420,12 @@ class MarkerTracker:
         for suggested in self._suggested:
             states.motion.place(*suggested)
         self._suggested = []
+        found, self._relocated = self._relocated, None
+        if found is not None:
+            rows = np.array([self._row(int(i)) for i in found.target_id])
+            states.place(rows, found.uv, FIRST_SD_PX, self._gap)
+            for row in rows.tolist():
+                self._known().doubts.confirm(row)
 
     def _place_given(self) -> NDArray[np.int64]:
         """Put markers where a person sees them in this image; returns the rows of all of them."""

@@ -376,7 +376,6 @@ class SimulationOptions:
     seed: int = option(
         1, 'seed of the random numbers, which determines the rig', minimum=0, maximum=2**31
     )
-    fluoroscopes: int = option(2, 'fluoroscopes of the rig', minimum=2, maximum=len(NAMES))
     exposures: int = option(
         15, 'exposures of the phantom for the calibration', minimum=1, maximum=100000
     )
@@ -414,6 +413,7 @@ class SimulationOptions:
         minimum=0,
         maximum=100000,
     )
+    fluoroscopes: int = option(2, 'fluoroscopes of the rig', minimum=2, maximum=len(NAMES))
 
     def __post_init__(self) -> None:
         validate_options(self)

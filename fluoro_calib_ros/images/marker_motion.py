@@ -273,6 +273,7 @@ DEPTH_SD = 1.0  # of the depth of a marker that is not known yet
 KNOWN_DEPTH_SD = 0.15
 DEPTH_MEMORY = 0.9
 RECENT = 4  # images in which a place tells the velocity
+THERE_SD = 3.0  # standard deviations from where a marker is expected
 
 
 @dataclass(frozen=True)
@@ -328,9 +329,14 @@ class MarkerStates:
     def place(self, rows: np.ndarray, uv: np.ndarray, sd_px: float, frames: int) -> None:
         """Put markers at places (k, 2) where their body is, frames after the image before.
 
-        The second of two such images tells their velocities.
+        The second of two such images tells their velocities. Markers that are followed and there
+        anyway go on as they are.
         """
         motion = self.motion
+        away = ((uv - motion.uv[rows]) ** 2).sum(axis=1)
+        there = away < THERE_SD**2 * motion.innovation_variance(np.array(sd_px))[rows]
+        elsewhere = ~there | (self.unseen[rows] > 1) | (self.placed[rows] < RECENT)
+        rows, uv = rows[elsewhere], uv[elsewhere]
         again = (self.placed[rows] < RECENT) & (self.unseen[rows] <= self.placed[rows])
         since = (self.unseen[rows] + frames - 1)[:, None]  # that they were measured
         before = motion.uv[rows] - since * motion.velocity[rows]

@@ -331,6 +331,13 @@ class MarkerBodies:
         alive = self._tracker.filter.alive.tolist()
         return tuple(body for body, is_alive in zip(self._bodies, alive) if not is_alive)
 
+    def unplaced(self) -> np.ndarray:
+        """Whether (n,) markers have a known place in a body whose pose is not known."""
+        out = np.zeros(self._count, dtype=bool)
+        for body, rows in zip(self._bodies, self._rows):
+            out[rows] = body.known
+        return np.asarray(out & ~self.present.known)
+
     def miss(self, measured: np.ndarray, before: np.ndarray) -> np.ndarray:
         """Give up bodies that are not where they were expected; returns their markers (n,).
 

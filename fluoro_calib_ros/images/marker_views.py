@@ -185,6 +185,7 @@ class JoinedViews:
         """Return the markers of the views, after what they say of each other."""
         exposure = self._rays.intersect(self._without_missed(found, frame), self._angles)
         self._bodies.update(exposure, frame)
+        self._doubt_unsupported(exposure, frame)
         decisions = self._decide(exposure, frame)
         decided = [number for decision in decisions for number in decision.target_id]
         self._bodies.learn(exposure, exposure.sure & ~np.isin(self._target_id, decided))
@@ -226,6 +227,13 @@ class JoinedViews:
             doubtful = np.isin(found[view.name].target_id, view.tracker.doubtful())
             out[view.name] = replace(found[view.name], doubtful=doubtful)
         return out
+
+    def _doubt_unsupported(self, exposure: MarkerExposure, frame: int) -> None:
+        """Doubt markers of bodies that a view sees anew, and that nothing else supports."""
+        unknown = self._bodies.unplaced()
+        for view in self._views:
+            anew = np.isin(self._target_id, view.tracker.seen_anew())
+            view.doubt(np.flatnonzero(anew & unknown & ~exposure.agree[view.view]), frame)
 
     def _suggest(self, frame: int, placed: np.ndarray) -> None:
         """Offer each view predictions of the markers that it is not sure of.

@@ -72,7 +72,8 @@ def scene():
         ),
         noise_sd=lambda frame: np.full(len(frame.target_id), NOISE_PX),
     )
-    targets = Fake(target_id=ids, xyz_mm=xyz + rng.normal(0, 0.5, xyz.shape))
+    start = np.vstack([[[900.0, 900, 900]], xyz + rng.normal(0, 0.5, xyz.shape)])
+    targets = Fake(target_id=np.append(7, ids), xyz_mm=start)  # one that is not seen
     job = Fake(fluoroscopes=figures, calibrations={'a': calibration, 'b': calibration})
     job.targets = targets
     return job, frames, phantom, rays

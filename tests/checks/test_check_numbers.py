@@ -764,7 +764,7 @@ def test_the_watch_tells_noise_from_what_is_common_to_exposures():
     watch._of_charts = watch._state = 'fine'
     watch._watch = Fake(state='fine', add_residuals=lambda *given: told.append(given))
     watch._change = Fake(add=lambda *given, noise: told.append(noise))
-    one, two, three = np.full(4, 0.5), np.full(4, 0.8), np.array([0.0, 1, 3, 9000])
+    one, two, three = np.full(4, 0.5), np.full(4, 0.8), np.array([0.0, 1, -5.39, 5.41])
     found = Fake(
         residual=three,
         sd_total=np.full(4, 0.6),

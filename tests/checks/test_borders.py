@@ -1,0 +1,239 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""On which side of a limit a value lies that is just at it, and sums spelt out on a few numbers."""
+
+from dataclasses import replace
+from types import SimpleNamespace as Fake
+
+import numpy as np
+import pytest
+
+from fluoro_calib_ros.checks import (
+    field_checks,
+    inputs,
+    mixed_units,
+    pair_watch,
+    residual_tests,
+    rig,
+    rig_change,
+)
+from fluoro_calib_ros.checks.beads import _Candidate, _layers, compare_with_survey
+from fluoro_calib_ros.checks.bead_intersection import Beads
+from fluoro_calib_ros.checks.drift_charts import DriftOptions, EpipolarObservations, ImageAreas
+from fluoro_calib_ros.checks.residual_tests import Residuals, _joins
+from fluoro_calib_ros.exposures.frame import Frame
+from fluoro_calib_ros.exposures.phantom import Phantom
+from fluoro_calib_ros.findings import Kind
+
+RNG = np.random.default_rng(12)
+
+
+def residuals(r, exposure=None, uv=None):
+    r = np.asarray(r, dtype=float)
+    exposure = np.zeros(len(r), dtype=int) if exposure is None else np.asarray(exposure)
+    numbers = np.arange(exposure.max() + 1) + 1
+    uv = np.column_stack([np.arange(len(r)), np.arange(len(r))]) if uv is None else np.array(uv)
+    return Residuals(uv, r, exposure, np.arange(len(r)), numbers, np.full(len(numbers), np.nan))
+
+
+def test_a_residual_at_the_border_of_the_core_belongs_to_it(monkeypatch):
+    monkeypatch.setattr(residual_tests, 'INLIER_Q', 9.0)
+    monkeypatch.setattr(residual_tests, 'LARGEST_SD', 6.0)
+    given = residuals([[3, 0], [3.01, 0], [0, 5.99], [0, 6.0]])
+    sd = np.ones(4)
+    assert given.inliers(sd).target_id.tolist() == [0]
+    assert given.rejected(sd).target_id.tolist() == [1, 2]
+    assert given.capped(sd).tolist() == [9.0] * 4
+
+
+def test_exposures_without_neighbours_in_each_other_have_no_joins():
+    uv = [[0.0, 0], [0, 1], [900, 0], [900, 1]]
+    given = residuals([[1.0, 2], [3, 4], [1, 0], [5, 0]], [0, 1, 2, 2], uv)
+    with np.errstate(all='raise'):
+        joins = _joins(given, 1)
+    assert (joins.earlier.tolist(), joins.later.tolist()) == ([0], [1])
+    assert joins.mean.tolist() == [11.0] and joins.count.tolist() == [2.0]
+
+
+# ---- input
+
+
+def test_residuals_just_as_large_as_is_plausible_are():
+    figures = Fake(rmse_after=np.array([2.5, 2.5]), image_size=(1000, 800))
+    assert inputs._large_residuals(figures, []) is None
+    figures.rmse_after = np.nextafter(figures.rmse_after, 3.0)
+    assert inputs._large_residuals(figures, []).kind is Kind.LARGE_RESIDUALS
+
+
+@pytest.mark.parametrize(
+    ('distance', 'rounded'),
+    [(12_345.0, 10_000.0), (1.7, 2.0), (0.0123, 0.01), (260.0, 300.0), (0.0, 0.0), (None, None)],
+)
+def test_distance_of_the_source_is_told_by_its_first_digit(monkeypatch, distance, rounded):
+    """So that all exposures have one finding."""
+    monkeypatch.setattr(inputs, 'wrong_unit', lambda mm, phantom: (mm, phantom))
+    found = inputs._unit_cause('phantom', inputs.Fit(1.0, 1, distance))
+    assert found == (None if rounded is None else (pytest.approx(rounded), 'phantom'))
+
+
+def test_targets_and_their_multiples_are_told_apart_by_a_projection():
+    xyz = RNG.uniform(-80, 80, (30, 3))
+    projection = np.hstack([np.diag([4000.0, 4000, 1]), [[0.0], [0.0], [900.0]]])
+    projection[:2, 2] = 500.0
+    image = np.column_stack([xyz, np.ones(30)]) @ projection.T
+    uv = image[:, :2] / image[:, 2:]
+    is_multiple = np.arange(30) % 3 == 0
+    given = np.where(is_multiple[:, None], xyz / 10, xyz)
+    near = projection * (1 + 1e-4 * RNG.normal(size=(3, 4)))
+    scaled, median = mixed_units._refined(near, np.stack([given, 10 * given]), uv)
+    assert scaled.tolist() == is_multiple.tolist() and median < 1e-6
+    phantom = Phantom(np.arange(30) + 5, given, np.ones(30))
+    frame = Frame('a', 1, np.arange(30) + 5, uv, (1024, 1024))
+    factor, chosen = mixed_units._factor_by_samples(frame, given, np.arange(30), phantom)
+    assert factor == 10.0 and chosen.tolist() == is_multiple.tolist()
+    right = Phantom(np.arange(30) + 5, xyz, np.ones(30))
+    assert mixed_units._factor_by_samples(frame, xyz, np.arange(30), right) is None
+
+
+@pytest.mark.parametrize(
+    ('degrees', 'what', 'is_asked'),
+    [
+        ((np.nan, 10.0), 'a C-arm at another angle', True),
+        ((10.0, 10.0), 'a C-arm at another angle', False),
+        ((0.0, 6.28), 'in radians', False),
+        ((0.0, 6.29), 'not those of these exposures', False),
+    ],
+)
+def test_what_may_be_wrong_with_angles_depends_on_their_range(degrees, what, is_asked):
+    given = Fake(frames={'a': [Fake(angle=float(np.deg2rad(one))) for one in degrees]})
+    assert what in field_checks._angles(given, 'a')
+    assert bool(field_checks._how_to_give_angles(given, 'a')) is is_asked
+
+
+# ---- beads
+
+
+@pytest.mark.parametrize(
+    ('start', 'stop', 'halves'),
+    [
+        (0, 5, [(0, 5), (5, 10)]),
+        (5, 10, [(5, 10), (0, 5)]),
+        (2, 7, [(2, 7)]),
+        (0, 4, [(0, 4)]),
+        (6, 10, [(6, 10)]),
+    ],
+)
+def test_of_two_faces_with_as_many_beads_either_may_be_displaced(start, stop, halves):
+    found = _Candidate(2, np.arange(10)[::-1], start, stop, 5.0).halves()
+    assert [(one.start, one.stop) for one in found] == halves
+    assert found[0].own.tolist() == list(range(10))[::-1][start:stop]
+
+
+def test_a_border_of_a_layer_is_clear_of_the_deviations_of_both_beads_beside_it():
+    coordinate = np.concatenate([np.zeros(10), np.full(10, 5.0), np.full(10, 10.0)])
+    sd = np.full(30, 0.1)
+    every = [[0, 10], [10, 20], [20, 30]]
+    assert _layers(coordinate, sd).tolist() == every
+    for row, left in ((9, [[20, 30]]), (10, [[20, 30]]), (19, [[0, 10]]), (20, [[0, 10]])):
+        vague = sd.copy()
+        vague[row] = 5 / 3
+        assert _layers(coordinate, vague).tolist() == left
+        vague[row] = 1.6
+        assert _layers(coordinate, vague).tolist() == every
+
+
+def test_ten_beads_are_enough_for_a_comparison_with_their_survey():
+    xyz = RNG.uniform(-50, 50, (10, 3))
+    beads = Beads(
+        np.arange(10), xyz, np.tile(0.01 * np.eye(3), (10, 1, 1)), np.full(10, 4), xyz, np.ones(10)
+    )
+    assert [check.passed for check in compare_with_survey(beads)] == [True, True]
+    found = compare_with_survey(beads.without(np.array([3])))
+    assert [check.passed for check in found] == [None, None]
+    assert [check.numbers for check in found] == [{'beads': 9}] * 2
+    off = replace(beads, xyz_mm=xyz + (np.arange(10) == 4)[:, None] * [0.0, 20, 0])
+    first, second = compare_with_survey(off)
+    assert first.passed is False and first.place.target_id == (4,)
+    assert second.passed is None  # nine are left
+
+
+# ---- the rig and its drift
+
+
+def test_motion_is_that_of_the_first_fluoroscope_between_its_stamps():
+    """The second one sees the phantom move twice as fast."""
+
+    def stamped(number, stamp, speed):
+        uv = np.arange(20.0).reshape(10, 2) + [speed * number, 0]
+        return Frame('a', number, np.arange(10), uv, (1000, 800), stamp_ns=stamp)
+
+    frames = {
+        'a': [stamped(n, 1000 * n, 6.0) for n in (1, 2, 3, 4)],
+        'b': [stamped(n, 1000 * n + 100, 12.0) for n in (1, 2, 3, 4)],
+    }
+    found = rig._trusted(frames, Fake(fluoroscopes=('a', 'b')), 0.5)
+    assert found.numbers == {'moved_px': pytest.approx(0.6)}
+    assert rig._trusted(frames, Fake(fluoroscopes=('b', 'a')), 0.5).numbers == {
+        'moved_px': pytest.approx(1.2)
+    }
+    assert rig._trusted(frames, Fake(fluoroscopes=('a', 'b')), 0.6) is None
+
+
+def test_what_an_alarm_adds_to_image_points_is_the_excess_of_their_variance(monkeypatch):
+    change = rig_change.RigChange.__new__(rig_change.RigChange)
+    rays = rig_change._Rays(
+        residual=np.array([1.0, -1.0, 1.0]),
+        noise=np.array([0.5, 1.0, 9.0]),
+        systematic=np.array([1.0, 2.0, 0.0]),
+        by_rig=np.zeros((3, 2)),
+        is_apart=np.zeros(3, bool),
+    )
+    change._hypotheses = [np.ones(2)]
+    change._blocks = [rays, rays]
+    monkeypatch.setattr(rig_change, '_weights', lambda *given: (3.0, np.ones(len(given[1]))))
+    # Noise and twice what is systematic: 2.5, 5 and 9.
+    assert change.addition(2).image_sd == pytest.approx(np.sqrt(2 * 5.0))
+    assert change.addition(1).image_sd == pytest.approx(np.sqrt(2 * 3.0))
+    monkeypatch.setattr(rig_change, '_weights', lambda *given: (1.0, np.ones(len(given[1]))))
+    assert change.addition(2).image_sd == 0
+
+
+def observations(residual, marker=None):
+    n = len(residual)
+    return EpipolarObservations(
+        np.arange(n) if marker is None else np.asarray(marker),
+        np.full((n, 2), 10.0),
+        uv_b=np.full((n, 2), 90.0),
+        residual=np.asarray(residual, dtype=float),
+        sd_noise=np.full(n, 0.2),
+        sd_systematic=np.full(n, 0.1),
+        normal_a=np.tile([1.0, 0], (n, 1)),
+        normal_b=np.tile([0.0, 1], (n, 1)),
+        factor_a=np.full(n, 0.5),
+        factor_b=np.full(n, 0.8),
+    )
+
+
+@pytest.mark.parametrize(('markers', 'enough'), [(2, False), (3, True)])
+def test_an_area_is_tested_with_so_many_different_markers(markers, enough):
+    watch = pair_watch.PairWatch([(100, 100)] * 2, ImageAreas(2), DriftOptions(cells=2))
+    block = watch.block(observations(np.zeros(6), np.arange(6) % markers))
+    assert block.enough[:, -1].tolist() == [enough] * 4
+
+
+def test_noise_that_lasts_is_seen_in_the_residuals_of_each_marker():
+    """By marker, in the order of frames, and over the noise that is stated."""
+    rng = np.random.default_rng(3)
+    noise = np.zeros((3, 3000))
+    for k in range(1, 3000):
+        noise[:, k] = 0.8 * noise[:, k - 1] + 0.6 * rng.normal(size=3)
+    watch, direct = (
+        pair_watch.PairWatch([(100, 100)] * 2, ImageAreas(2), DriftOptions(cells=2))
+        for _ in range(2)
+    )
+    for part in noise.reshape(3, 60, 50).transpose(1, 2, 0):
+        watch.block(observations(0.2 * part.ravel(), np.tile([7, 9, 30], 50)))
+        clipped = np.clip(part, -5.75, 5.75)  # 3 deviations of noise, 4 x 0.1 and 0.35 px
+        direct._update_correlation(np.tile([0, 1, 2], 50), clipped.ravel())
+    assert watch.stretch() == pytest.approx(direct.stretch()) and watch.stretch() > 1.1

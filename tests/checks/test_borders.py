@@ -8,9 +8,11 @@ from types import SimpleNamespace as Fake
 
 import numpy as np
 import pytest
+import rigs
 
 from fluoro_calib_ros.checks import (
     field_checks,
+    held_out,
     inputs,
     mixed_units,
     pair_watch,
@@ -18,13 +20,20 @@ from fluoro_calib_ros.checks import (
     rig,
     rig_change,
 )
-from fluoro_calib_ros.checks.beads import _Candidate, _layers, compare_with_survey
 from fluoro_calib_ros.checks.bead_intersection import Beads
-from fluoro_calib_ros.checks.drift_charts import DriftOptions, EpipolarObservations, ImageAreas
+from fluoro_calib_ros.checks.beads import _Candidate, _layers, compare_with_survey, rejected_beads
+from fluoro_calib_ros.checks.comparison import compare_calibrations, describe_place
+from fluoro_calib_ros.checks.drift_charts import (
+    CusumCharts,
+    DriftOptions,
+    EpipolarObservations,
+    ImageAreas,
+)
 from fluoro_calib_ros.checks.residual_tests import Residuals, _joins
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.findings import Kind
+from fluoro_calib_ros.photogrammetry.noise import INLIER_Q
 
 RNG = np.random.default_rng(12)
 
@@ -73,7 +82,7 @@ def test_residuals_just_as_large_as_is_plausible_are():
 def test_distance_of_the_source_is_told_by_its_first_digit(monkeypatch, distance, rounded):
     """So that all exposures have one finding."""
     monkeypatch.setattr(inputs, 'wrong_unit', lambda mm, phantom: (mm, phantom))
-    found = inputs._unit_cause('phantom', inputs.Fit(1.0, 1, distance))
+    found = inputs._unit_cause('phantom', inputs.Fit(1.0, False, distance))
     assert found == (None if rounded is None else (pytest.approx(rounded), 'phantom'))
 
 
@@ -237,3 +246,158 @@ def test_noise_that_lasts_is_seen_in_the_residuals_of_each_marker():
         clipped = np.clip(part, -5.75, 5.75)  # 3 deviations of noise, 4 x 0.1 and 0.35 px
         direct._update_correlation(np.tile([0, 1, 2], 50), clipped.ravel())
     assert watch.stretch() == pytest.approx(direct.stretch()) and watch.stretch() > 1.1
+
+
+def test_a_block_without_information_is_passed_over():
+    """The next difference is from the last block that had any."""
+    charts = CusumCharts(1, 1, 0.1, 30.0)
+    one, yes = np.ones((1, 1)), np.ones((1, 1), bool)
+    for score, information in ((0.0, 1.0), (0.0, 0.0), (4.0, 1.0)):
+        charts.update(score * one, information * one, 0 * one, yes, 1)
+    assert charts.variance_factor()[0, 0] == pytest.approx(1.25 * (20 * 4.5 + 8) / 21)
+
+
+# ---- more of input
+
+
+def phantom_of(count=30):
+    return Phantom(np.arange(count) + 5, RNG.uniform(-80, 80, (count, 3)), np.ones(count))
+
+
+def shown(phantom, number=1, mirrored=False):
+    """A frame of all targets, seen from 900 mm."""
+    x, y, z = (phantom.xyz_mm + [0, 0, 900.0]).T
+    uv = 500.0 + 4000.0 * np.column_stack([-x if mirrored else x, y]) / z[:, None]
+    return Frame('a', number, phantom.target_id, uv, (1000, 1000))
+
+
+@pytest.mark.parametrize('mirrored', [False, True])
+def test_an_exposure_fits_its_phantom_from_its_distance(mirrored):
+    phantom = phantom_of()
+    fit = inputs.fit_to_phantom(shown(phantom, mirrored=mirrored), phantom, phantom.target_id)
+    assert fit.misfit_px < 1e-3 and fit.is_behind is mirrored
+    middle = phantom.xyz_mm.mean(axis=0) + [0, 0, 900]
+    assert fit.distance_mm == pytest.approx(np.linalg.norm(middle), rel=0.3 if mirrored else 1e-3)
+
+
+def test_half_of_the_targets_have_to_be_on_the_phantom():
+    phantom = phantom_of()
+    frame = shown(phantom)
+    for known, fits in ((15, True), (14, False)):
+        ids = np.where(np.arange(30) < known, phantom.target_id, 999 + np.arange(30))
+        found = inputs.fit_to_phantom(frame, phantom, ids)
+        assert (found is not None) is fits
+        if found:
+            assert found.misfit_px < 1e-3
+
+
+@pytest.mark.parametrize(('targets', 'is_tested'), [(19, False), (20, True)])
+def test_exposures_of_twenty_targets_are_tested(monkeypatch, targets, is_tested):
+    tested = []
+    monkeypatch.setattr(inputs, '_wrong_exposures', lambda frames, phantom: tested.extend(frames))
+    ids = np.arange(targets)
+    frame = Frame('a', 1, ids, RNG.uniform(0, 900, (targets, 2)), (1000, 1000))
+    inputs.require_phantom({'a': [frame]}, phantom_of())
+    assert bool(tested) is is_tested
+
+
+@pytest.mark.parametrize(('reach', 'is_wrong'), [(600.0, False), (599.9, True)])
+def test_image_points_that_reach_to_the_limit_are_of_the_right_size(reach, is_wrong):
+    uv = np.array([[reach, 100.0], [100.0, 400.0]])
+    found = inputs.wrong_image_size([Frame('a', 1, np.arange(2), uv, (1000, 1000))])
+    assert (found is not None) is is_wrong
+
+
+@pytest.mark.parametrize(
+    ('count', 'rejected', 'doubted'),
+    [
+        (600, 300, False),  # half of them: no more than others may have
+        (600, 301, True),
+        (6, 4, False),  # by chance, as one of so many beads
+        (7, 6, True),
+    ],
+)
+def test_beads_are_doubted_by_most_of_their_points_and_beyond_chance(count, rejected, doubted):
+    target = np.concatenate([np.zeros(count, int), 1 + np.arange(4000) % 100])
+    outlier = np.zeros(len(target), bool)
+    outlier[:rejected] = True
+    outlier[count::11] = True
+    table = Fake(target_id=target, outlier=outlier)
+    assert rejected_beads(table).tolist() == ([0] if doubted else [])
+
+
+def test_layers_begin_also_where_no_gap_is_among_the_largest():
+    lower, upper = np.arange(200.0), 300 + 2 * np.arange(200.0)
+    found = _layers(np.concatenate([lower, upper]), np.full(400, 0.1))
+    inner = np.unique(found[found[:, 1] <= 199])
+    regular = np.linspace(0, 400, 20).astype(int)
+    assert inner.tolist() == regular[regular < 199].tolist()
+    assert regular[-2] in found
+
+
+# ---- comparison, and held out
+
+
+def test_a_place_is_told_in_words_and_numbers():
+    told = describe_place((900.0, 100.0), (1000, 300))
+    assert told == 'the middle right of the image (about u 900, v 100)'
+
+
+@pytest.mark.parametrize('which', [(), ('first',), ('second',)])
+def test_an_interior_that_was_fixed_is_compared_as_it_is(which):
+    """In one gauge only where both are estimated."""
+    one = rigs.pincushion('a', (400, 300))
+    made = {
+        name: replace(
+            one,
+            interior=np.array([200.0, 150.0, 4000.0]) + shift,
+            interior_estimated=name not in which,
+            interior_covariance=np.diag([4.0, 4, 100.0]) * (name not in which),
+        )
+        for name, shift in (('first', np.zeros(3)), ('second', np.array([3.0, -2, 20])))
+    }
+    found = compare_calibrations(made['first'], made['second'])
+    if which:
+        np.testing.assert_allclose(found.interior, [3, -2, 20])
+        np.testing.assert_allclose(found.interior_sd, [2, 2, 10])
+        assert found.interior_test == pytest.approx(9 / 4 + 4 / 4 + 400 / 100)
+    else:
+        np.testing.assert_allclose(found.interior_sd, np.sqrt([8, 8, 200]))
+        assert found.interior == pytest.approx([3, -2, 20], abs=3)
+        np.testing.assert_allclose(found.interior[:2], [3, -2], atol=0.2)
+
+
+def test_sums_of_an_exposure_held_out_are_of_what_its_noise_leaves(monkeypatch):
+    """Image points that are said to be twice as noisy count as a quarter."""
+    rng = np.random.default_rng(5)
+    n = 40
+    exposure = np.repeat([0, 1], n // 2)
+    uv = rng.uniform(0, 900, (n, 2))
+    numbers = np.array([3, 8])
+    outside, inside = (
+        Residuals(uv, rng.normal(0, 0.5, (n, 2)), exposure, np.arange(n), numbers, np.zeros(2))
+        for _ in range(2)
+    )
+    outside.r[4] = 50.0
+    sd = np.where(np.arange(n) % 3, 0.5, 1.0)
+    found = iter([outside, inside])
+    monkeypatch.setattr(held_out, 'residuals_of', lambda *_: next(found))
+    monkeypatch.setattr(held_out, 'noise_of', lambda *_: sd)
+    of_fold = Fake(correction=lambda uv, angle: Fake(sd=np.full(len(uv), 0.3)))
+    evidence = Fake(
+        part=lambda names, chosen: {'a': [i for i in range(8) if chosen(i)]},
+        calibrate=lambda frames: {'a': of_fold},
+        adjust=lambda frames, calibrations: None,
+        calibrations={'a': Fake(image_sd=0.5)},
+    )
+    first, second = held_out._hold_out(evidence, ('a',), 0, 4)['a']
+    assert (first.number, second.number, first.points, second.points) == (3, 8, 20, 20)
+    factor = sd / 0.5
+    for sums, rows in ((first, exposure == 0), (second, exposure == 1)):
+        assert sums.weight == pytest.approx(np.sum(1 / factor[rows] ** 2))
+        assert sums.predicted == pytest.approx(np.sum(2 * (0.3 / factor[rows]) ** 2))
+        for value, given in ((sums.outside, outside), (sums.inside, inside)):
+            squares = np.minimum(np.sum(given.r**2, axis=1), INLIER_Q * sd**2) / factor**2
+            assert value == pytest.approx(squares[rows].sum())
+        white = held_out._white(uv[rows], (outside.r / factor[:, None])[rows], np.full(20, 0.5))
+        assert sums.white == pytest.approx(white)

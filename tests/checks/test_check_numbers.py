@@ -1004,27 +1004,27 @@ def test_levels_begin_at_their_thresholds():
 
 
 @pytest.mark.parametrize(
-    ('misfit', 'depth', 'distance_mm', 'relabelled', 'kind'),
+    ('misfit', 'is_behind', 'distance_mm', 'relabelled', 'kind'),
     [
-        (0.9 * inputs.FIT, 1, 1000.0, None, None),
-        (0.9 * inputs.FIT, -1, 1000.0, None, Kind.IMAGE_MIRRORED),
-        (0.9 * inputs.FIT, 1, 1e6, None, Kind.WRONG_UNIT),
-        (1.1 * inputs.FIT, -1, 1000.0, None, Kind.IMAGE_MIRRORED),
-        (1.1 * inputs.FIT, 1, 1e6, None, Kind.WRONG_UNIT),
-        (1.1 * inputs.FIT, 1, None, None, None),
-        (1.1 * inputs.MISFIT, -1, 1000.0, None, Kind.OTHER_PHANTOM),
-        (1.1 * inputs.MISFIT, -1, 1000.0, 0.9 * inputs.GOOD_MISFIT, Kind.IDS_SHIFTED),
-        (1.1 * inputs.MISFIT, -1, 1000.0, 1.1 * inputs.GOOD_MISFIT, Kind.OTHER_PHANTOM),
-        (1.1 * inputs.FIT, -1, 1000.0, 1.3 * inputs.BETTER * inputs.FIT, Kind.IMAGE_MIRRORED),
+        (0.9 * inputs.FIT, False, 1000.0, None, None),
+        (0.9 * inputs.FIT, True, 1000.0, None, Kind.IMAGE_MIRRORED),
+        (0.9 * inputs.FIT, False, 1e6, None, Kind.WRONG_UNIT),
+        (1.1 * inputs.FIT, True, 1000.0, None, Kind.IMAGE_MIRRORED),
+        (1.1 * inputs.FIT, False, 1e6, None, Kind.WRONG_UNIT),
+        (1.1 * inputs.FIT, False, None, None, None),
+        (1.1 * inputs.MISFIT, True, 1000.0, None, Kind.OTHER_PHANTOM),
+        (1.1 * inputs.MISFIT, True, 1000.0, 0.9 * inputs.GOOD_MISFIT, Kind.IDS_SHIFTED),
+        (1.1 * inputs.MISFIT, True, 1000.0, 1.1 * inputs.GOOD_MISFIT, Kind.OTHER_PHANTOM),
+        (1.1 * inputs.FIT, True, 1000.0, 1.3 * inputs.BETTER * inputs.FIT, Kind.IMAGE_MIRRORED),
     ],
 )
 def test_cause_of_an_exposure_is_that_of_its_fit(
-    monkeypatch, misfit, depth, distance_mm, relabelled, kind
+    monkeypatch, misfit, is_behind, distance_mm, relabelled, kind
 ):
     """Misfits over the side of the image; those of other ids where they are relabelled."""
     fits = iter(
         [
-            Fake(misfit_px=1000 * misfit, depth=depth, distance_mm=distance_mm),
+            Fake(misfit_px=1000 * misfit, is_behind=is_behind, distance_mm=distance_mm),
             None if relabelled is None else Fake(misfit_px=1000 * relabelled),
         ]
     )

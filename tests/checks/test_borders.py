@@ -11,6 +11,9 @@ import pytest
 import rigs
 
 from fluoro_calib_ros.checks import (
+    beads as beads_module,
+)
+from fluoro_calib_ros.checks import (
     field_checks,
     held_out,
     inputs,
@@ -164,7 +167,7 @@ def test_ten_beads_are_enough_for_a_comparison_with_their_survey():
     off = replace(beads, xyz_mm=xyz + (np.arange(10) == 4)[:, None] * [0.0, 20, 0])
     first, second = compare_with_survey(off)
     assert first.passed is False and first.place.target_id == (4,)
-    assert second.passed is None  # nine are left
+    assert second.passed is None and second.kind is Kind.DISTANCES  # nine are left
 
 
 # ---- the rig and its drift
@@ -401,3 +404,101 @@ def test_sums_of_an_exposure_held_out_are_of_what_its_noise_leaves(monkeypatch):
             assert value == pytest.approx(squares[rows].sum())
         white = held_out._white(uv[rows], (outside.r / factor[:, None])[rows], np.full(20, 0.5))
         assert sums.white == pytest.approx(white)
+
+
+def test_targets_of_which_nearly_all_are_in_one_place_are_not_remote_from_it():
+    xyz = np.vstack([np.zeros((30, 3)), [[900.0, 0, 0], [0, 900.0, 0]]])
+    phantom = Phantom(np.arange(32), xyz, np.ones(32))
+    frame = Frame('a', 1, np.arange(32), np.zeros((32, 2)), (1000, 1000))
+    (found,) = inputs.find_wrong_phantom({'a': [frame]}, phantom)
+    assert found.kind is Kind.REPEATED_COORDINATES and len(found.place.target_id) == 30
+
+
+# ---- layers of beads
+
+
+def motion_of(beads, rows):
+    """Motion (6,) of beads by weighted least squares, and the decrease of their square sum."""
+    design, left, weight = [], [], []
+    for row in rows:
+        x, y, z = beads.survey_mm[row] - beads.survey_mm.mean(axis=0)
+        turn = np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]])  # w x P
+        design.append(np.hstack([np.eye(3), turn]))
+        left.append(beads.misclosure[row])
+        weight.append(np.linalg.cholesky(np.linalg.inv(beads.total_covariance[row])).T)
+    a = np.vstack([w @ d for w, d in zip(weight, design)])
+    b = np.concatenate([w @ one for w, one in zip(weight, left)])
+    motion = np.linalg.lstsq(a, b, rcond=None)[0]
+    return motion, b @ b - np.sum((b - a @ motion) ** 2), b @ b
+
+
+def test_gain_of_a_layer_is_that_of_two_motions_over_one():
+    rng = np.random.default_rng(9)
+    survey = rng.uniform(-60, 60, (40, 3)) + [100.0, 0, -50]
+    half = rng.normal(size=(40, 3, 3))
+    covariance = 0.01 * (half @ half.transpose(0, 2, 1) + np.eye(3))
+    off = (survey[:, 1:2] > 10) * [0.5, 0.2, 0.0] + rng.normal(0, 0.1, survey.shape)
+    beads = Beads(
+        np.arange(40), survey + off, covariance, np.full(40, 4), survey, np.full(40, 0.1)
+    )
+    fit = beads_module._Fit(beads)
+    _, of_all, squares = motion_of(beads, range(40))
+    assert fit.excess == pytest.approx(squares - of_all - 3 * 40)
+    for axis in range(3):
+        candidates = fit.candidates(axis)
+        assert len(candidates) > 3
+        for one in candidates[:: max(1, len(candidates) // 4)]:
+            rest = np.setdiff1d(np.arange(40), one.own)
+            motion, gain, _ = motion_of(beads, one.own)
+            other, of_rest, _ = motion_of(beads, rest)
+            assert one.axis == axis and one.gain == pytest.approx(gain + of_rest - of_all)
+            assert survey[one.own, axis].max() - survey[one.own, axis].min() <= 120
+            told = fit.described(one, one.gain / 4)
+            relative = motion - other
+            assert told.tilt_rad == pytest.approx(np.linalg.norm(relative[3:]))
+            middle = survey[one.own].mean(axis=0) - survey.mean(axis=0)
+            shift = relative[:3] + np.cross(relative[3:], middle)
+            np.testing.assert_allclose(told.shift_mm, shift, atol=1e-9)
+            offset = survey[one.own] - survey.mean(axis=0)
+            moved = relative[:3] + np.cross(relative[3:], offset)
+            size = np.sqrt(np.mean(np.sum(moved**2, axis=1)))
+            assert told.size_mm == pytest.approx(size)
+            assert told.limit_mm == pytest.approx(size / 2)  # the gain grows as the square
+            assert set(told.target_id) == set(one.own)
+            inside = np.ones(40, bool)
+            if told.low is not None:
+                inside &= survey[:, axis] > told.low
+            if told.high is not None:
+                inside &= survey[:, axis] < told.high
+            assert np.flatnonzero(inside).tolist() == sorted(one.own.tolist())
+            squares = [
+                [
+                    c @ np.linalg.solve(beads.total_covariance[row], c)
+                    for row in one.own
+                    for c in [
+                        beads.misclosure[row]
+                        - m[:3]
+                        - np.cross(m[3:], survey[row] - survey.mean(axis=0))
+                    ]
+                ]
+                for m in (other, motion)
+            ]
+            expected = np.median(squares[0]) / np.median(squares[1])
+            assert fit.improvement(one) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(('count', 'is_found'), [(15, False), (16, True), (17, True)])
+def test_a_layer_and_the_rest_have_eight_beads_each(count, is_found):
+    rng = np.random.default_rng(2)
+    survey = rng.uniform(-50, 50, (count, 3))
+    survey[:, 2] = np.where(np.arange(count) < count // 2, -60.0, 60.0)
+    off = (np.arange(count) < count // 2)[:, None] * [2.0, 0, 0] + rng.normal(0, 0.02, (count, 3))
+    beads = Beads(
+        np.arange(count),
+        survey + off,
+        np.tile(0.01 * np.eye(3), (count, 1, 1)),
+        np.full(count, 4),
+        survey,
+        np.full(count, 0.01),
+    )
+    assert (beads_module.displaced_layer(beads) is not None) is is_found

@@ -344,6 +344,8 @@ def test_precision_is_that_of_the_correction_over_the_noise(given, ratio, noise)
     assert found.numbers['noise_px'] == pytest.approx(noise)
     assert found.numbers['exposures'] == 8
     assert 'inf' not in str(found)
+    growth = 100 * (np.hypot(1, ratio) - 1)
+    assert (f'corrected points {growth:.0f} % larger' in found.cause) is bool(np.isfinite(ratio))
 
 
 def trends_of(monkeypatch, change=None, rejected=None, model_name='auto', corrects=True):

@@ -229,11 +229,15 @@ def test_displacements_of_a_body_are_clipped_from_its_robust_pose():
     shift = (linear.by_pose @ turn[:, None, :, None])[..., 0]
     seen = points.seen[..., None]
     residual = (linear.by_place @ shift[:, :, None, :, None])[..., 0] * seen
-    exact = _Drift.of(Linear(residual, linear.by_place, linear.uv, linear.by_pose), points, variance)
+    exact = _Drift.of(
+        Linear(residual, linear.by_place, linear.uv, linear.by_pose), points, variance
+    )
     there = points.seen.any(axis=2)
     np.testing.assert_allclose(watch._clipped(exact)[there], 0, atol=1e-9)
     residual[0, 4] += 300.0 * points.seen[0, 4][:, None]
-    false = _Drift.of(Linear(residual, linear.by_place, linear.uv, linear.by_pose), points, variance)
+    false = _Drift.of(
+        Linear(residual, linear.by_place, linear.uv, linear.by_pose), points, variance
+    )
     clipped = watch._clipped(false)
     length = np.sqrt(np.einsum('nmi,nmij,nmj->nm', clipped, false.s_matrix, clipped))
     # 3 deviations of one coordinate are 3.76 of three: chi-square of as rare.
@@ -301,9 +305,7 @@ def test_field_has_the_normal_equations_of_mean_residuals_and_its_prior():
     weights = np.hstack([one for _, one in found])
     residual, variance = RNG.normal(size=count), RNG.uniform(0.1, 0.3, count)
     systematic = RNG.uniform(0.2, 0.4, count)
-    field.add(
-        marker, nodes, weights, residual=residual, variance=variance, systematic=systematic
-    )
+    field.add(marker, nodes, weights, residual=residual, variance=variance, systematic=systematic)
     design = np.zeros((count, 128))
     np.put_along_axis(design, nodes, weights, axis=1)
     rows = np.array([design[marker == m].mean(axis=0) for m in range(3)])
@@ -460,7 +462,7 @@ def test_a_drift_is_confirmed_by_the_other_bodies(scores, source, confirmed):
 
 
 def test_thresholds_are_those_of_all_charts():
-    watch = DriftWatch({name: (100, 100) for name in 'abc'}, DriftOptions(cells=2))
+    watch = DriftWatch(dict.fromkeys('abc', (100, 100)), DriftOptions(cells=2))
     charts = 2 * (3 * 4) * 9  # directions, series of three pairs, areas
     blocks = np.array([10.0, 1000.0]) * 3600 / 0.25
     assert watch.thresholds == pytest.approx(np.log(charts * blocks))

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""On which side of a limit a value lies that is just at it, and sums spelt out on a few numbers."""
+"""On which side of a limit a value lies that is just at it; sums spelt out on a few numbers."""
 
 from dataclasses import replace
 from types import SimpleNamespace as Fake

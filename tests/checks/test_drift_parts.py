@@ -7,7 +7,9 @@ from types import SimpleNamespace as Fake
 
 import numpy as np
 import pytest
+from rigs import true_calibrations, true_orientation
 
+from fluoro_calib_ros.bodies.body import Body
 from fluoro_calib_ros.bodies.healing import FOCUS, KNOCK_MM, KNOCK_RAD, SHIFT_PX
 from fluoro_calib_ros.bodies.image_points import ImagePoints, Linear
 from fluoro_calib_ros.checks import rig_change
@@ -34,6 +36,7 @@ from fluoro_calib_ros.checks.rig_change import Addition, RigChange
 from fluoro_calib_ros.checks.rig_watch import RecordingDriftWatch, RigDriftWatch
 from fluoro_calib_ros.findings import Finding, Kind
 from fluoro_calib_ros.reconstruction.reconstruct import IntersectedViews, MatchedViews
+from fluoro_calib_ros.simulation.rig import virtual_rig
 
 RNG = np.random.default_rng(21)
 SIZES = {'a': (1000, 800), 'b': (1000, 800)}
@@ -469,6 +472,13 @@ def test_thresholds_are_those_of_all_charts():
     assert watch._epipolar.charts._cap == pytest.approx(EVIDENCE_CAP * watch.thresholds[1])
     assert watch._epipolar._records.maxlen == 120
     assert watch._bodies.charts.evidence.shape == (2, 6, 9)
+    body = Body('bone', np.arange(4), RNG.normal(size=(4, 3)), np.ones(4))
+    fluoroscopes = virtual_rig(1, strength=0.0, names=('a', 'b', 'c')).fluoroscopes
+    rig = true_orientation(fluoroscopes, true_calibrations(fluoroscopes))
+    sizes = dict.fromkeys('abc', (100, 100))
+    both = DriftWatch(sizes, DriftOptions(cells=2), [body], rig)
+    # Two series more of each view.
+    assert both.thresholds == pytest.approx(np.log(2 * (3 * 4 + 6) * 9 * blocks))
     assert watch._bodies.charts._step == pytest.approx(2 * watch._epipolar.charts._step)
 
 

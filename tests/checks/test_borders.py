@@ -198,15 +198,22 @@ def test_what_an_alarm_adds_to_image_points_is_the_excess_of_their_variance(monk
         residual=np.array([1.0, -1.0, 1.0]),
         noise=np.array([0.5, 1.0, 9.0]),
         systematic=np.array([1.0, 2.0, 0.0]),
-        by_rig=np.zeros((3, 2)),
+        by_rig=np.tile([1.0, 3.0], (3, 1)),
         is_apart=np.zeros(3, bool),
     )
-    change._hypotheses = [np.ones(2)]
+    change._hypotheses = [np.array([2.0, 0.6]), np.array([0.0, 0.8])]
     change._blocks = [rays, rays]
-    monkeypatch.setattr(rig_change, '_weights', lambda *given: (3.0, np.ones(len(given[1]))))
+    asked = []
+    monkeypatch.setattr(
+        rig_change, '_weights', lambda *given: asked.append(given) or (3.0, np.ones(len(given[1])))
+    )
     # Noise and twice what is systematic: 2.5, 5 and 9.
     assert change.addition(2).image_sd == pytest.approx(np.sqrt(2 * 5.0))
     assert change.addition(1).image_sd == pytest.approx(np.sqrt(2 * 3.0))
+    for design, residual, _ in asked:
+        # The derivatives by unknowns of variance one: four times all causes together.
+        np.testing.assert_allclose(design, np.tile([8.0, 12.0], (len(residual), 1)))
+    assert asked[-1][2].tolist() == [1.5, 3.0, 9.0]
     monkeypatch.setattr(rig_change, '_weights', lambda *given: (1.0, np.ones(len(given[1]))))
     assert change.addition(2).image_sd == 0
 
@@ -502,3 +509,35 @@ def test_a_layer_and_the_rest_have_eight_beads_each(count, is_found):
         np.full(count, 0.01),
     )
     assert (beads_module.displaced_layer(beads) is not None) is is_found
+
+
+def test_a_layer_explains_at_least_half_of_what_is_wrong():
+    """Not where single beads are wrong by much more."""
+    rng = np.random.default_rng(4)
+    survey = rng.uniform(-50, 50, (60, 3))
+    survey[:, 2] = np.where(np.arange(60) < 25, -60.0, 60.0)
+    off = (np.arange(60) < 25)[:, None] * [0, 0, 0.8] + rng.normal(0, 0.05, (60, 3))
+
+    def layer(wrong):
+        found = survey + off
+        found[30:34] += wrong
+        beads = Beads(
+            np.arange(60),
+            found,
+            np.tile(0.01 * np.eye(3), (60, 1, 1)),
+            np.full(60, 4),
+            survey,
+            np.full(60, 0.01),
+        )
+        return beads_module.displaced_layer(beads)
+
+    assert set(layer(0.0).target_id) in (set(range(25)), set(range(25, 60)))
+    assert layer(20.0) is None
+
+
+def test_an_exposure_of_a_plane_has_no_distance_and_no_side():
+    phantom = phantom_of()
+    flat = replace(phantom, xyz_mm=phantom.xyz_mm * [1, 1, 1e-3])
+    fit = inputs.fit_to_phantom(shown(flat), flat, flat.target_id)
+    assert fit.misfit_px < 1.0 and fit.distance_mm is None and not fit.is_behind
+    assert inputs.fit_to_phantom(shown(phantom), phantom, phantom.target_id).distance_mm

@@ -3,13 +3,14 @@
 
 """What parts of a recording are calibrated with, and when a given interior is contradicted."""
 
+import time
 from types import SimpleNamespace as Fake
 
 import numpy as np
 import pytest
 
 from fluoro_calib_ros.checks import calibration_evidence, held_out, verdict
-from fluoro_calib_ros.checks.calibration_evidence import CommonTrend, Evidence
+from fluoro_calib_ros.checks.calibration_evidence import CommonTrend, Evidence, Subject
 from fluoro_calib_ros.checks.check import Check
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.initial_network import StartValues
@@ -241,3 +242,62 @@ def test_what_fails_waits_for_the_given_interior_of_its_fluoroscope(monkeypatch)
         monkeypatch.setattr(verdict, '_given_interior_check', check_of)
         given.request = Fake(**{**vars(request), **changes})
         assert verdict.with_given_interior(given, checks) == checks and not asked
+
+
+# ---- the verdict
+
+
+def test_checks_are_in_the_order_of_fluoroscopes_and_those_of_the_rig_are_last(monkeypatch):
+    """With the frames that were used, by their numbers, and steps that are counted."""
+
+    def check_of(kind, name):
+        return Check(kind, 'x', Place((name,) if name else ()), value=0.5, limit=1.0)
+
+    seen = []
+
+    def of_rig(evidence, names):
+        seen.append(
+            ('rig', names, {n: [f.number for f in of] for n, of in evidence.frames.items()})
+        )
+        return [check_of(Kind.BEADS, '')]
+
+    def of_group(kind):
+        def run(evidence, names):
+            evidence.report_step(kind.value)
+            seen.append((kind, names))
+            return [check_of(kind, name) for name in names]
+
+        return run
+
+    subjects = (
+        Subject(of_rig, of_rig=True),
+        Subject(of_group(Kind.HALVES), steps=1),
+        Subject(of_group(Kind.DRIFT), steps=1),
+    )
+    monkeypatch.setattr(verdict, 'SUBJECTS', subjects)
+    used = {'a': (3, 1), 'b': (2, 4)}
+    result = Fake(
+        fluoroscopes={n: Fake(exposures=[Fake(exposure=e) for e in of]) for n, of in used.items()}
+    )
+    monkeypatch.setattr(verdict, 'adjust_with_calibrations', lambda *given, **options: result)
+    monkeypatch.setattr(verdict, 'ids_of', lambda calibrations: {'a': 'x'})
+    monkeypatch.setattr(verdict, '_achieved_sd', lambda evidence, name, checks: len(checks))
+    monkeypatch.setattr(verdict, 'with_given_interior', lambda evidence, checks: checks)
+    monkeypatch.setattr(verdict, 'check_rig', lambda rig: [check_of(Kind.ORIENTATION, 'a')])
+    request = CalibrationRequest({'a': frames(5)[::-1], 'b': frames(5)}, 'phantom')
+    steps = []
+    began = time.perf_counter()
+    found = verdict.validate(
+        request, {}, progress=lambda *step: steps.append(step), rig=Fake(notes=('note',))
+    )
+    told = [(check.kind, check.place.fluoroscope) for check in found.checks]
+    assert told == [
+        (Kind.HALVES, 'a'), (Kind.DRIFT, 'a'), (Kind.HALVES, 'b'), (Kind.DRIFT, 'b'),
+        (Kind.BEADS, ''), (Kind.ORIENTATION, 'a'),
+    ]  # fmt: skip
+    assert seen[0] == ('rig', ('a', 'b'), {'a': [1, 3], 'b': [2, 4]})
+    assert seen[1:] == [(kind, (name,)) for name in 'ab' for kind in (Kind.HALVES, Kind.DRIFT)]
+    assert [(number, total) for _, number, total in steps] == [(n, 5) for n in range(5)]
+    assert found.notes == ('note',) and found.verdict == 'pass'
+    assert found.achieved_sd_px == {'a': 6, 'b': 6}
+    assert 0 <= found.seconds <= time.perf_counter() - began

@@ -435,3 +435,92 @@ def test_of_two_poses_of_a_grid_one_has_half_the_residuals(monkeypatch):
             grid_match(monkeypatch, [0.5, rival])
         assert told.value.finding.numbers == {'beads': 20, 'beads_of_other': 21}
     assert grid_match(monkeypatch, [0.5, 0.5], regular=True) == 0
+
+
+@pytest.mark.parametrize(
+    ('rivals', 'by_size', 'taken'),
+    [
+        ([], None, 0),
+        ([(9.0, 0.2)], None, 0),  # clearly fewer beads
+        ([(99.5, 1.0)], 1, 1),
+        ([(99.5, 0.24)], 0, 1),  # half the residuals
+        ([(99.5, 1.01)], 1, 0),  # twice as large
+        ([(99.5, 0.6)], None, None),
+    ],
+)
+def test_of_poses_that_fit_alike_sizes_tell(monkeypatch, rivals, by_size, taken):
+    first = Fake(score=100.0, scale_px=0.5, bead=np.arange(40))
+    others = [Fake(score=score, scale_px=scale, bead=np.arange(39)) for score, scale in rivals]
+    asked = []
+    seen, model = Fake(), Fake(regular=False)
+    every = [first, *others]
+    monkeypatch.setattr(matching, '_climbed', lambda *given: (first, others))
+    monkeypatch.setattr(matching, '_same', lambda one, other: False)
+
+    def best_by_size(matches, *given):
+        asked.append((matches, *given))
+        return None if by_size is None else every[by_size]
+
+    monkeypatch.setattr(matching, '_best_by_size', best_by_size)
+    if taken is None:
+        with pytest.raises(DataError, match='ambiguous'):
+            matching.unambiguous(first, seen, model)
+    else:
+        assert matching.unambiguous(first, seen, model) is every[taken]
+    assert asked in ([], [(every, seen, model)])
+    assert matching.unambiguous(first, seen, Fake(regular=True)) is first
+
+
+def bodies_that_learn(monkeypatch, known):
+    """MarkerBodies of one body of four markers, and what its shape was learned from."""
+    learned = []
+    told = []
+    monkeypatch.setattr(
+        'fluoro_calib_ros.images.marker_rays.BodyTracker',
+        lambda rig, bodies: Fake(reshape=told.append),
+    )
+
+    def learned_shape(body, xyz, covariance):
+        learned.append((xyz, covariance))
+        xyz_mm = np.where(np.isnan(body.xyz_mm), 1.0, body.xyz_mm)
+        return replace(body, xyz_mm=xyz_mm, sd_mm=np.full(4, 0.1))
+
+    monkeypatch.setattr('fluoro_calib_ros.images.marker_rays.learned_shape', learned_shape)
+    xyz = np.where(np.array(known)[:, None], RNG.normal(0, 9, (4, 3)), np.nan)
+    body = Body('bone', np.array([2, 4, 6, 8]), xyz, np.where(known, 0.1, np.nan))
+    return MarkerBodies(None, np.array([1, 2, 4, 6, 8]), [body]), learned, told
+
+
+def seen_at(xyz):
+    covariance = np.tile(0.01 * np.eye(3), (5, 1, 1))
+    return Fake(xyz_mm=xyz, intersected=Fake(points=Fake(covariance_noise=covariance)))
+
+
+def test_a_shape_is_learned_from_exposures_of_three_sure_markers(monkeypatch):
+    bodies, learned, told = bodies_that_learn(monkeypatch, [False] * 4)
+    xyz = RNG.normal(0, 30, (5, 3))
+    bodies.learn(seen_at(xyz), np.array([True, True, True, False, False]))
+    assert not learned  # two of the body
+    for number in range(1, 6):
+        bodies.learn(seen_at(xyz + number), np.array([True, True, True, True, False]))
+    # Of the first, the second and the fourth exposure.
+    assert [len(places) for places, _ in learned] == [1, 2, 4] and len(told) == 3
+    places, covariance = learned[-1]
+    np.testing.assert_allclose(places[3, :3], xyz[1:4] + 4)
+    assert np.isnan(places[:, 3]).all() and covariance.shape == (4, 4, 3, 3)
+    assert bodies._learned[0].tolist() == [5, 5, 5, 0]
+
+
+def test_a_known_shape_is_not_learned_and_markers_off_their_place_are_not_used(monkeypatch):
+    bodies, learned, _ = bodies_that_learn(monkeypatch, [True] * 4)
+    xyz = RNG.normal(0, 30, (5, 3))
+    every = np.ones(5, bool)
+    bodies.learn(seen_at(xyz), every)
+    assert not learned
+    bodies, learned, _ = bodies_that_learn(monkeypatch, [True, True, True, False])
+    for off, use in ((0.49, True), (0.51, False)):
+        bodies.present = replace(bodies.present, xyz_mm=xyz + [0, 0, off] * np.eye(5)[1][:, None])
+        del learned[:]
+        bodies._seen[0].clear()
+        bodies.learn(seen_at(xyz), every)
+        assert bool(np.isfinite(learned[0][0][0, 0]).all()) is use  # five times 0.1 mm

@@ -11,10 +11,16 @@ import pytest
 from rigs import true_calibrations, true_orientation
 from scipy.spatial.transform import Rotation
 
+from fluoro_calib_ros.bodies.body import Body
 from fluoro_calib_ros.errors import DataError
-from fluoro_calib_ros.images import corrector, lattice, overlay
+from fluoro_calib_ros.images import corrector, lattice, marker_ids, overlay
 from fluoro_calib_ros.images.marker_decisions import DecidedView, ViewCounts
-from fluoro_calib_ros.images.marker_points import CalibratedRig, _explaining, shadow_points
+from fluoro_calib_ros.images.marker_points import (
+    CalibratedRig,
+    ShadowPoints,
+    _explaining,
+    shadow_points,
+)
 from fluoro_calib_ros.images.marker_rays import MarkerPlaces, MarkerRays
 from fluoro_calib_ros.images.marker_views import JoinedViews, _later, _names, _offer, _Told
 from fluoro_calib_ros.images.markers import FirstMarkers
@@ -369,3 +375,46 @@ def test_views_are_told_where_unsure_markers_are_expected():
     assert uv.tolist() == [[30, 30], [100, 100]] and sd.tolist() == [0.03, 0.1]
     # From 2 and 8 at the other angle, two exposures before.
     assert velocity.tolist() == [[-5, -5], [-30, -30]]
+
+
+@pytest.mark.parametrize(('seen', 'is_told'), [(4, True), (3, True), (2, False)])
+def test_markers_of_a_body_are_where_their_shadows_are_or_would_be(rig, seen, is_told):
+    made, known = rig
+    shape = RNG.normal(0, 15, (5, 3))
+    body = Body('bone', np.array([4, 5, 6, 7, 8]), shape, np.full(5, 0.1))
+    there = Rotation.from_rotvec([0.3, 0.2, -0.5]).apply(shape) + [5.0, -10, 3]
+    point = np.array([1, 0, 3, -1, 2])
+    xyz = np.zeros((4, 3))
+    xyz[point[point >= 0]] = there[point >= 0]
+    shadow = np.full((4, 3), -1)
+    shadow[:seen, 1] = [2, 0, 3, 1][:seen]
+    points = ShadowPoints(xyz, np.ones(4), shadow)
+    ideal = made.fluoroscopes[1].ideal(there)
+    shadows = np.zeros((4, 2))
+    for member, row in enumerate(point):
+        if row >= 0 and shadow[row, 1] >= 0:
+            shadows[shadow[row, 1]] = ideal[member] + 0.3
+    fit = marker_ids._Fit(point, 0.1, 1.0)
+    found = marker_ids._first(1, known, [(body, fit)], points, shadows)
+    if not is_told:
+        assert found is None
+        return
+    assert found.target_id.tolist() == [4, 5, 6, 7, 8]
+    off = [0.3 if row >= 0 and row < seen else 0.0 for row in point]
+    np.testing.assert_allclose(
+        found.uv - ideal, np.repeat(np.array(off)[:, None], 2, 1), atol=1e-3
+    )
+
+
+def test_markers_beyond_the_image_are_not_told(rig):
+    _, known = rig
+    shape = RNG.normal(0, 15, (4, 3))
+    body = Body('bone', np.arange(4), shape, np.full(4, 0.1))
+    width, height = known.calibrations['a'].image_size
+    shadow = np.zeros((4, 3), int) + np.arange(4)[:, None]
+    points = ShadowPoints(shape, np.ones(4), shadow)
+    places = np.array([[5.0, 5], [width - 1.5, 5], [width - 0.5, 5], [5, height - 0.5]])
+    found = marker_ids._first(
+        0, known, [(body, marker_ids._Fit(np.arange(4), 0.1, 1.0))], points, places
+    )
+    assert found.target_id.tolist() == [0, 1]

@@ -88,7 +88,7 @@ def test_places_in_a_reduced_image_are_those_of_the_whole():
     image = image.reshape(160, fine, 200, fine).mean(axis=(1, 3)).astype(np.float32)
     for factor in (1, 2, 4):
         part = cv2.resize(image, (200 // factor, 160 // factor), interpolation=cv2.INTER_AREA)
-        dark, bright = _blobs(part, Noise(1.0, 0.0, WHITE), 6.0 / factor, factor)
+        dark, _ = _blobs(part, Noise(1.0, 0.0, WHITE), 6.0 / factor, factor)
         strongest = dark.uv[np.argmax(dark.response)]
         np.testing.assert_allclose(strongest, centre, atol=0.15)
         # A quarter of the height: the blur is as wide as the blob.

@@ -3,12 +3,16 @@
 
 """Parts of the detection of beads: noise of responses, places in reduced images, large beads."""
 
+from types import SimpleNamespace as Fake
+
 import cv2
 import numpy as np
 import pytest
 from scipy.signal import convolve2d
 
-from fluoro_calib_ros.images import detection
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.findings import Finding, Kind
+from fluoro_calib_ros.images import detection, extraction
 from fluoro_calib_ros.images.detection import (
     _background,
     _Blobs,
@@ -153,3 +157,87 @@ def test_several_maxima_in_a_larger_blob_are_one(monkeypatch):
     assert merged([0.4, 0.9]) == uv.tolist()
     alone = blobs.chosen(np.array([True, False, True, True]))
     assert sight.merged(alone, 0.5, False).tolist() == alone.uv.tolist()
+
+
+# ---- extraction
+
+
+def test_usual_depth_is_linear_in_the_light_without_the_odd_ones():
+    """Contrast = depth times light: a share of the direct light, and what a sheet adds."""
+    light = RNG.uniform(500, 2000, 60)
+    relative = light / np.median(light)
+    depth = (0.8 * relative + 0.15) / relative
+    depth[:6] = [2.0, 0.2, 1.9, 0.1, 2.5, 0.3]
+    measured = np.ones(60, bool)
+    measured[50] = False
+    light[51] = 0.0
+    beads = Fake(uv=np.zeros((60, 2)), light=light, depth=depth, measured=measured)
+    found = extraction._usual_depth(beads)
+    good = np.delete(np.arange(60), [50, 51])
+    np.testing.assert_allclose(found[good], 0.8 + 0.15 / relative[good], rtol=0.02)
+    assert found[[50, 51]].tolist() == [1, 1]
+    few = Fake(**{k: v[:3] for k, v in vars(beads).items()})
+    assert extraction._usual_depth(few).tolist() == [1, 1, 1]
+
+
+def found_with(bead, refused=()):
+    n = len(bead)
+    return extraction.Extraction(
+        np.array(bead), np.arange(2.0 * n).reshape(n, 2), np.arange(n) / 10, np.zeros(n, bool),
+        tuple(refused), None, None, None, None,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(('kind', 'is_kept'), [('vague', True), ('other', False)])
+def test_a_bead_without_neighbours_is_refused_unless_they_are_vague(kind, is_kept):
+    xyz = np.array([[float(i), 0, 0] for i in range(9)] + [[100.0 + i, 0, 0] for i in range(9)])
+    kinds = {'vague': next(iter(extraction.VAGUE)), 'other': Kind.BEAD_AWAY}
+    assert Kind.BEAD_AWAY not in extraction.VAGUE
+    alone = 13
+    refused = [
+        extraction.Refusal(row, np.zeros(2), Finding(kinds[kind], 'x'))
+        for row in range(9, 18)
+        if row != alone
+    ]
+    given = found_with([*range(9), alone], refused)
+    found = extraction._with_support(given, Fake(xyz=xyz), np.arange(18))
+    assert found.bead.tolist() == [*range(9), *([alone] if is_kept else [])]
+    assert len(found.uv) == len(found.sigma) == len(found.overlapped) == len(found.bead)
+    if is_kept:
+        assert found is given
+    else:
+        (last,) = found.refused[len(refused) :]
+        assert last.bead == alone and last.uv.tolist() == [18, 19]
+        assert last.finding is extraction.ALONE
+
+
+def test_looks_are_tried_in_their_order_until_a_pose_is_sure(monkeypatch):
+    """The reason is that of the likeliest look; an ambiguous pose ends the search."""
+
+    def searched(outcomes):
+        tried = []
+        monkeypatch.setattr(
+            extraction, 'likely_detections', lambda image, beads: iter(range(len(outcomes)))
+        )
+        monkeypatch.setattr(extraction, '_seen', lambda detections: detections)
+
+        def match(seen, model, lens):
+            tried.append(seen)
+            if isinstance(outcomes[seen], DataError):
+                raise outcomes[seen]
+            return outcomes[seen]
+
+        monkeypatch.setattr(extraction, 'match', match)
+        monkeypatch.setattr(extraction, '_measured', lambda *given: given[:3])
+        try:
+            return extraction._searched(None, Fake(xyz=np.zeros((4, 3))), None), tried
+        except DataError as error:
+            return error, tried
+
+    none = DataError('none', kind=Kind.NO_POSE)
+    later = DataError('later', kind=Kind.POSE_UNSURE)
+    ambiguous = DataError('ambiguous', kind=Kind.POSE_AMBIGUOUS)
+    assert searched([none, 'pose', 'other']) == ((1, 1, 'pose'), [0, 1])
+    assert searched([none, later, later]) == (none, [0, 1, 2])
+    assert searched([later, ambiguous, 'pose']) == (later, [0, 1])
+    assert searched([ambiguous, 'pose']) == (ambiguous, [0])

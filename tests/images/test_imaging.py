@@ -13,6 +13,7 @@ from fluoro_calib_ros.images.measurement import (
     Expected,
     Imaging,
     _BeadFit,
+    _Sizes,
     estimate_profile,
     first_imaging,
     measure_beads,
@@ -220,3 +221,76 @@ def test_window_of_a_bead_is_not_that_of_the_largest():
     error, sigma = measured_in(image, uv, radii / 6, 6.0)
     assert np.abs(error[::6]).max() < 0.08
     assert sigma[:30:6].max() < 1.3 * np.median(sigma[:30])
+
+
+def sizes_of(count=5, others=()):
+    """Comparison of the sizes of beads in a row, whose lack of fit is a function of them."""
+    uv = np.vstack([100.0 * np.arange(count)[:, None] * [1, 0], *others])
+    n = len(uv)
+    shadows = Expected(np.arange(n), uv, np.ones(n), np.ones(n, bool), np.ones(n, bool))
+    imaging = Imaging(
+        None, Profile(5.0, 1.0, 1.0), np.append(np.ones(count), np.full(n - count, 2))
+    )
+    return _Sizes(None, shadows, imaging)
+
+
+def test_size_is_where_the_fit_is_best_to_a_part_of_a_step(monkeypatch):
+    true = np.array([0.55, 0.71, 1.0, 1.33, 1.85])
+    sizes = sizes_of()
+    monkeypatch.setattr(
+        _Sizes,
+        'lacks',
+        lambda self, rows, sizes: np.array([1 + np.log(one / true[rows]) ** 2 for one in sizes]),
+    )
+    found = sizes.best(np.arange(5))
+    np.testing.assert_allclose(found, true, rtol=1e-6)
+    # Beyond the sizes that are compared, there is no parabola.
+    true[0] = 0.2
+    assert 0.3 < sizes.best(np.arange(5))[0] < 0.5
+
+
+def test_sizes_are_compared_with_the_shadows_around(monkeypatch):
+    """Those that the largest size would reach, with the sizes that they have."""
+    asked = []
+
+    def lack(light, uv, radius, profile, noise, size):
+        asked.append((uv, size))
+        return np.arange(len(uv)) + size
+
+    monkeypatch.setattr('fluoro_calib_ros.images.measurement.lack_of_fit', lack)
+    reach = (1 + 1.25**4) * (5.0 + 3.2)
+    others = np.array([[0.0, 0.99 * reach], [0.0, 1.01 * reach], [100.0, -0.99 * reach]])
+    sizes = sizes_of(2, others)
+    found = sizes.lacks(np.array([0, 1]), [np.array([0.5, 0.6]), np.array([1.5, 1.6])])
+    np.testing.assert_allclose(found, [[0.5, 1.6], [1.5, 2.6]])
+    for uv, size in asked:
+        assert uv.tolist() == [[0, 0], [100, 0], others[0].tolist(), others[2].tolist()]
+        assert size[2:].tolist() == [2, 2]
+
+
+@pytest.mark.parametrize(
+    ('common', 'own', 'share', 'is_equal'),
+    [
+        (1.5, 1.0, 1.0, True),  # less than what something beside a bead does
+        (1.7, 1.0, 0.2, True),
+        (1.7, 1.0, 0.3, False),
+        (1.7, 1.2, 0.3, True),  # their own size fits hardly better
+    ],
+)
+def test_sizes_differ_where_the_common_one_fits_badly(monkeypatch, common, own, share, is_equal):
+    rows = np.arange(10)
+    others = rows < 10 * share
+    sizes = sizes_of(10)
+    monkeypatch.setattr(_Sizes, 'best', lambda self, rows: np.where(others, 1.5, 1.0))
+
+    def lacks(self, rows, sizes):
+        out = []
+        for one in sizes:
+            is_own = np.isclose(one, np.where(others, 1.5, 1.0))
+            same = np.where(others & np.isclose(one, 1.0), common, 1.0)
+            out.append(np.where(is_own & others, own, same))
+        return np.array(out)
+
+    monkeypatch.setattr(_Sizes, 'lacks', lacks)
+    assert sizes.are_equal(rows) is is_equal
+    assert sizes.are_equal(rows[:0])

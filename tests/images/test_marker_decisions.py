@@ -245,6 +245,13 @@ def test_an_id_is_confirmed_by_eight_exposures_whose_rays_meet(lack, confirmed):
     )
 
 
+def test_an_id_that_may_be_exchanged_is_not_confirmed_by_its_own_rays():
+    """Its partner is not seen here, but it may have the other's place."""
+    one = view()
+    one.tracker.doubts.add_pair(5, 11, 12)
+    assert not ray_decided(ray_decisions(one, []), one, [0, 0, 0, np.nan], range(20, 30))
+
+
 @pytest.mark.parametrize(('lack', 'is_doubted'), [(6.0, False), (6.1, True)])
 def test_rays_that_do_not_belong_together_are_doubted(lack, is_doubted):
     one = view()

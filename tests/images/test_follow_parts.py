@@ -524,3 +524,43 @@ def test_a_known_shape_is_not_learned_and_markers_off_their_place_are_not_used(m
         bodies._seen[0].clear()
         bodies.learn(seen_at(xyz), every)
         assert bool(np.isfinite(learned[0][0][0, 0]).all()) is use  # five times 0.1 mm
+
+
+def test_bodies_are_lost_whose_pose_is_not_known(monkeypatch):
+    tracker = Fake(filter=Fake(alive=np.array([True, False])))
+    monkeypatch.setattr(
+        'fluoro_calib_ros.images.marker_rays.BodyTracker', lambda rig, bodies: tracker
+    )
+    one, other = (
+        Body(name, ids, RNG.normal(0, 9, (3, 3)), np.full(3, 0.1))
+        for name, ids in (('one', np.arange(3)), ('other', np.arange(3, 6)))
+    )
+    bodies = MarkerBodies(None, np.arange(6), [one, other])
+    assert [body.name for body in bodies.lost()] == ['other']
+    assert MarkerBodies(None, np.arange(2), [one]).lost() == ()
+
+
+@pytest.mark.parametrize(
+    ('sure', 'agree', 'alive', 'is_used'),
+    [(2, 4, False, True), (2, 3, False, False), (3, 4, False, False), (2, 4, True, False)],
+)
+def test_doubtful_ids_that_fit_a_shape_support_each_other(
+    monkeypatch, sure, agree, alive, is_used
+):
+    """Where a body is lost, and three sure markers do not give its pose."""
+    tracker = Fake(filter=Fake(alive=np.array([alive])))
+    monkeypatch.setattr(
+        'fluoro_calib_ros.images.marker_rays.BodyTracker', lambda rig, bodies: tracker
+    )
+    body = Body('one', np.arange(5), RNG.normal(0, 9, (5, 3)), np.full(5, 0.1))
+    bodies = MarkerBodies(None, np.arange(5), [body])
+    doubtful = np.tile(np.arange(5) >= sure, (2, 1))
+    agrees = np.tile(np.arange(5) < agree, (2, 1))
+    exposure = Fake(
+        corrected=np.zeros((2, 5, 2)),
+        doubtful=doubtful,
+        agree=agrees,
+        sure=(agrees & ~doubtful).all(axis=0),
+    )
+    found = bodies._usable(exposure)
+    assert found.tolist() == (agrees if is_used else agrees & ~doubtful).tolist()

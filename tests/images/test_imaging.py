@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fluoro_calib_ros.images.detection import field_of_view
-from fluoro_calib_ros.images.light import Light, estimate_noise
+from fluoro_calib_ros.images.light import Light, Noise, estimate_noise
 from fluoro_calib_ros.images.measurement import (
     Expected,
     Imaging,
@@ -294,3 +294,46 @@ def test_sizes_differ_where_the_common_one_fits_badly(monkeypatch, common, own, 
     monkeypatch.setattr(_Sizes, 'lacks', lacks)
     assert sizes.are_equal(rows) is is_equal
     assert sizes.are_equal(rows[:0])
+
+
+NOISE = Noise(1.0, 0.0, np.ones((1, 1)))
+
+
+def test_windows_at_the_edge_of_an_image_have_the_pixels_that_are_there():
+    """Beads of which a third is beyond the image or its field, or whose edge is, are not used."""
+    shape = (60, 80)
+    grey = np.random.default_rng(3).uniform(100, 200, shape).astype(np.float32)
+    field = np.ones(shape, bool)
+    field[:, 30:33] = False
+    profile = Profile(4.0, 1.0, 1.0)
+    u = np.array([40.0, 76, 74.9, 75, 4, 3.9, 40, 40, 40, 31, 60])
+    uv = np.column_stack([u, [30, 30, 30, 30, 30, 30, 55, 56, 4, 30, 55.1]])
+    fit = _BeadFit(Light(grey, field), uv, np.ones(11), profile=profile, noise=NOISE)
+    reach = profile.reach_px + 2
+    for row, (u, v) in enumerate(np.rint(uv).astype(int)):
+        for k, (du, dv) in enumerate(fit.offset):
+            there = 0 <= u + du < 80 and 0 <= v + dv < 60 and du * du + dv * dv <= reach**2
+            assert fit.valid[row, k] == bool(there and field[v + dv, u + du])
+            if there:
+                assert fit.grey[row, k] == grey[v + dv, u + du]
+    # The edge of a shadow, 4 px from its centre, lies within the image.
+    expected = np.minimum(uv, np.array([79, 59]) - uv).min(axis=1) >= 4.0
+    assert fit.usable.tolist() == expected.tolist()
+
+
+def test_neighbours_are_those_within_reach_the_nearest_first():
+    uv = np.array([[40.0, 30], [47, 30], [40, 42], [200, 30], [47, 30]])
+    light = Light(np.full((90, 260), 100.0, np.float32), np.ones((90, 260), bool))
+    profile = Profile(4.0, 1.0, 1.0)
+    fit = _BeadFit(light, uv, np.ones(5), profile=profile, noise=NOISE)
+    together = 2 * profile.reach_px + 2
+    away = np.linalg.norm(uv[:, None] - uv[None], axis=2)
+    np.fill_diagonal(away, np.inf)
+    for rows, near in fit.groups:
+        for row, beside in zip(rows, near):
+            expected = np.flatnonzero(away[row] < together)
+            assert set(beside[beside >= 0]) == set(expected)
+            found = away[row][beside[beside >= 0]]
+            assert found.tolist() == sorted(found)
+    assert sorted(np.concatenate([rows for rows, _ in fit.groups])) == [0, 1, 2, 3, 4]
+    assert fit.distance.tolist() == [7, 0, 12, np.inf, 0]

@@ -342,3 +342,22 @@ def test_markers_that_may_be_anywhere_are_not_searched_in_windows():
     found = search.shadows(image, LightWindows(image, look), states, 7).uv
     assert np.linalg.norm(found - PLACES[1], axis=1).min() < 1
     assert np.abs(found - PLACES[1]).max() <= 49
+
+
+@pytest.mark.parametrize('edge', range(4))
+def test_shadows_in_the_middle_of_which_the_image_ends_are_not_found(edge):
+    """The others are. The edge is on the left, below, on the right and above."""
+    left = scene()[:, 40:]  # through the fourth marker
+    cut = np.ascontiguousarray(np.rot90(left, edge))
+    there = (PLACES - [40, 0])[PLACES[:, 0] > 50]
+    for _ in range(edge):
+        there = there @ [[0, -1], [1, 0]]
+    there = there + [[0, 0], [0, 189], [189, 149], [149, 0]][edge]
+    look = look_of(cut)
+    found = search_image(cut, look, 0.35)
+    away = np.linalg.norm(found.uv[:, None] - there[None], axis=2)
+    assert len(found.uv) == len(there) == 10
+    assert away.min(axis=0).max() < 1 and away.min(axis=1).max() < 1
+    whole = detect_beads(cut, 12)
+    off = np.linalg.norm(whole.uv[:, None] - there[None], axis=2)
+    assert off.min(axis=0).max() < 2

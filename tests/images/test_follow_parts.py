@@ -564,3 +564,99 @@ def test_doubtful_ids_that_fit_a_shape_support_each_other(
     )
     found = bodies._usable(exposure)
     assert found.tolist() == (agrees if is_used else agrees & ~doubtful).tolist()
+
+
+@pytest.mark.parametrize('needed', [1, 3, 9])
+def test_sizes_of_shadows_are_tried_until_all_bodies_are_found(monkeypatch, needed):
+    """The strongest shadows, as many as markers, then as few as one body needs."""
+    looks = []
+
+    class Search:
+        def __init__(self, images, rig, bodies):
+            self.missing = list(bodies)
+
+        def look(self, scale, strongest):
+            looks.append((scale, strongest))
+            if len(looks) == needed:
+                self.missing = []
+
+        def markers(self):
+            return 'found'
+
+    monkeypatch.setattr(marker_ids, '_ImageSearch', Search)
+    monkeypatch.setattr(marker_ids, 'check_image', lambda image, size: None)
+    bodies = [
+        Body(name, ids, RNG.normal(0, 9, (4, 3)), np.full(4, 0.1))
+        for name, ids in (('one', np.arange(4)), ('other', np.arange(4, 8)))
+    ]
+    rig = Fake(fluoroscopes=('a', 'b'))
+    calibrations = dict.fromkeys('ab', Fake(image_size=(9, 9)))
+    images = dict.fromkeys('ab')
+    assert marker_ids.identify_markers(images, calibrations, rig, bodies) == 'found'
+    every = [(scale, count) for scale in marker_ids.MARKER_SCALES[:3] for count in (8, 4)]
+    assert looks == every[: min(needed, 6)]
+    with pytest.raises(DataError, match='no body with 4 markers'):
+        marker_ids.identify_markers(images, calibrations, rig, [])
+
+
+def image_search(monkeypatch, outcomes):
+    """Search of bodies 'one' and 'other', and the calls of its parts."""
+    filtered, asked = [], []
+    monkeypatch.setattr(
+        marker_ids, 'filter_image', lambda image, scale: filtered.append((image, scale)) or image
+    )
+
+    def first_shadows(lights, count, share):
+        if outcomes[0] == 'blind':
+            outcomes.pop(0)
+            raise DataError('nothing round')
+        return Fake(strongest=lambda most: Fake(uv=(lights, count)))
+
+    def find_bodies(shadows, rig, missing):
+        asked.append((shadows, [body.name for body in missing]))
+        return outcomes.pop(0)
+
+    monkeypatch.setattr(marker_ids, 'first_shadows', first_shadows)
+    monkeypatch.setattr(marker_ids, 'find_bodies', find_bodies)
+    rig = Fake(orientation=Fake(fluoroscopes=('a', 'b', 'c')))
+    images = {'a': 'A', 'b': 'B', 'c': 'C'}
+    bodies = [Fake(name='one'), Fake(name='other')]
+    return marker_ids._ImageSearch(images, rig, bodies), filtered, asked
+
+
+def told(*numbers):
+    return FirstMarkers(np.array(numbers), np.repeat(np.array(numbers, float)[:, None], 2, axis=1))
+
+
+def test_what_one_size_of_shadows_does_not_show_is_looked_for_with_another(monkeypatch):
+    why, later = DataError('other'), DataError('later')
+    outcomes = [({'a': told(1, 2), 'b': told(1)}, {'other': why}), ({'a': told(7)}, {})]
+    search, filtered, asked = image_search(monkeypatch, outcomes)
+    search.look(2.0, 8)
+    assert [body.name for body in search.missing] == ['other']
+    search.look(2.0, 4)
+    # The images are filtered once for a size.
+    assert filtered == [(image, 2.0) for image in 'ABC'] and search.missing == []
+    assert asked[0] == ([(image, 8) for image in 'ABC'], ['one', 'other'])
+    assert asked[1] == ([(image, 4) for image in 'ABC'], ['other'])
+    found = search.markers()
+    assert {name: one.target_id.tolist() for name, one in found.items()} == {
+        'a': [1, 2, 7],
+        'b': [1],
+    }
+    assert found['a'].uv[:, 0].tolist() == [1, 2, 7]
+    search, filtered, _ = image_search(monkeypatch, [({}, {'one': why, 'other': later})] * 2)
+    search.look(2.0, 8)
+    search.look(3.0, 8)
+    assert len(filtered) == 6
+    with pytest.raises(DataError) as first:
+        search.markers()
+    assert first.value is why
+    search, *_ = image_search(monkeypatch, ['blind', ({'b': told(1)}, {})])
+    search.look(2.0, 8)
+    assert len(search.missing) == 2
+    with pytest.raises(DataError, match='nothing round'):
+        search.markers()
+    search.look(2.0, 4)
+    with pytest.raises(DataError, match='fluoroscope a sees none'):
+        search.markers()

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from fluoro_calib_ros.bodies.body import Body
 from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.findings import Kind
 from fluoro_calib_ros.images import following, marker_ids, matching
 from fluoro_calib_ros.images.lattice import GridPose
 from fluoro_calib_ros.images.light import LAGS, Light, Noise
@@ -660,3 +661,30 @@ def test_what_one_size_of_shadows_does_not_show_is_looked_for_with_another(monke
     search.look(2.0, 4)
     with pytest.raises(DataError, match='fluoroscope a sees none'):
         search.markers()
+
+
+@pytest.mark.parametrize(
+    ('found', 'explained', 'beads', 'cause'),
+    [
+        (0.72, 0.4, 10, None),
+        (0.71, 0.4, 10, 'predicts 30 beads in the image, of which only 71% are found'),
+        (0.6, 0.85, 10, None),
+        (0.6, 0.84, 40, 'of which only 60% are found'),
+        (0.9, 0.9, 9, 'of which only 90% are found'),
+        (0.9, 0.39, 10, 'explains only 39% of the beads in the image'),
+        (0.9, 0.39, 9, 'of which only 90% are found'),
+        (0.3, 0.39, 10, 'explains only 39%'),
+    ],
+)
+def test_a_pose_is_sure_by_what_it_predicts_and_by_what_it_explains(
+    found, explained, beads, cause
+):
+    best = Fake(found=found, explained=explained, bead=np.arange(beads), expected=30)
+    if cause is None:
+        matching._check_evidence(best)
+        return
+    with pytest.raises(DataError, match=cause) as told:
+        matching._check_evidence(best)
+    finding = told.value.finding
+    assert finding.kind is Kind.POSE_UNSURE
+    assert finding.numbers == {'expected': 30, 'found': found, 'explained': explained}

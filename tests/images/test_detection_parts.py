@@ -25,6 +25,7 @@ from fluoro_calib_ros.images.detection import (
     vertex,
 )
 from fluoro_calib_ros.images.light import LAGS, Noise
+from fluoro_calib_ros.images.marker_intensity import check_image
 
 RNG = np.random.default_rng(51)
 WHITE = np.zeros((2 * LAGS + 1, 2 * LAGS + 1))
@@ -241,3 +242,21 @@ def test_looks_are_tried_in_their_order_until_a_pose_is_sure(monkeypatch):
     assert searched([none, later, later]) == (none, [0, 1, 2])
     assert searched([later, ambiguous, 'pose']) == (later, [0, 1])
     assert searched([ambiguous, 'pose']) == (ambiguous, [0])
+
+
+@pytest.mark.parametrize(('size', 'is_refused'), [(31, True), (32, False)])
+def test_an_image_has_32_pixels_at_least(size, is_refused):
+    image = np.zeros((size, 90), np.uint8)
+    image[3, 4] = 9
+    for given in (image, image.T):
+        if is_refused:
+            with pytest.raises(DataError, match=f'only {given.shape[1]} x {given.shape[0]} px'):
+                detection._check(given)
+        else:
+            detection._check(given)
+            check_image(given)
+    for wrong in (np.zeros((40, 40, 3), np.uint8), np.zeros((40, 40), float)):
+        with pytest.raises(DataError):
+            detection._check(wrong)
+    with pytest.raises(DataError, match='every pixel has the grey value 7'):
+        detection._check(np.full((40, 40), 7, np.uint8))

@@ -337,3 +337,21 @@ def test_neighbours_are_those_within_reach_the_nearest_first():
             assert found.tolist() == sorted(found)
     assert sorted(np.concatenate([rows for rows, _ in fit.groups])) == [0, 1, 2, 3, 4]
     assert fit.distance.tolist() == [7, 0, 12, np.inf, 0]
+
+
+def test_windows_of_beads_that_look_larger_are_larger():
+    """By their place in the image, and by their own size."""
+    uv = np.array([[50.0, 50], [150, 50], [250, 50], [350, 50]])
+    light = Light(np.full((100, 400), 100.0, np.float32), np.ones((100, 400), bool))
+    profile = Profile(5.0, 1.0, 1.0)
+    stretch, size = np.array([0.5, 1.0, 1.6, 1.6]), np.array([1.0, 1.0, 1.0, 0.5])
+    fit = _BeadFit(light, uv, stretch, profile=profile, noise=NOISE, size=size)
+    reach = profile.reach_px * size * stretch + 2
+    length = np.linalg.norm(fit.offset, axis=1)
+    for valid, own in zip(fit.valid, reach):
+        assert valid.tolist() == (length <= own).tolist()
+    assert length.max() <= reach.max() and fit.radius.tolist() == (stretch * size).tolist()
+    wide = _BeadFit(light, uv, stretch, profile, NOISE, size=size, reach_px=12.0)
+    length = np.linalg.norm(wide.offset, axis=1)
+    for valid, own in zip(wide.valid, 12.0 * stretch + 2):
+        assert valid.tolist() == (length <= own).tolist()

@@ -13,6 +13,7 @@ from fluoro_calib_ros.checks import calibration_evidence, held_out, verdict
 from fluoro_calib_ros.checks.calibration_evidence import CommonTrend, Evidence, Subject
 from fluoro_calib_ros.checks.check import Check
 from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.estimation.exposure_terms import MIN_POINTS
 from fluoro_calib_ros.estimation.initial_network import StartValues
 from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
 from fluoro_calib_ros.exposures.frame import Frame
@@ -301,3 +302,22 @@ def test_checks_are_in_the_order_of_fluoroscopes_and_those_of_the_rig_are_last(m
     assert found.notes == ('note',) and found.verdict == 'pass'
     assert found.achieved_sd_px == {'a': 6, 'b': 6}
     assert 0 <= found.seconds <= time.perf_counter() - began
+
+
+@pytest.mark.parametrize(('exposures', 'is_told'), [(3, False), (4, True)])
+def test_distortions_vary_by_the_residuals_of_four_exposures_of_enough_points(
+    monkeypatch, exposures, is_told
+):
+    ours = {'a': Fake(image_size=SIZE, interior='interior'), 'b': None}
+    given, _ = evidence(ours)
+    del vars(given)['variations']
+    exposure = np.repeat(np.arange(exposures + 1), [MIN_POINTS] * exposures + [MIN_POINTS - 1])
+    inliers = Fake(uv='uv', r='r', exposure=exposure)
+    vars(given)['trends'] = {'a': Fake(inliers=inliers)}
+    monkeypatch.setattr(calibration_evidence, 'exposure_functions', lambda *given: given)
+    monkeypatch.setattr(calibration_evidence, 'variation', lambda *given: given)
+    found = given._variation('a')
+    if is_told:
+        assert found == ('r', exposure, ('uv', SIZE, 'interior'))
+    else:
+        assert found is None

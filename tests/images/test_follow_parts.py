@@ -5,6 +5,7 @@
 
 import functools
 from dataclasses import replace
+from itertools import permutations
 from math import comb
 from types import SimpleNamespace as Fake
 
@@ -28,7 +29,7 @@ from fluoro_calib_ros.images.marker_rays import MarkerBodies
 from fluoro_calib_ros.images.marker_watch import MarkerDoubts
 from fluoro_calib_ros.images.markers import FirstMarkers, MarkerTracker
 from fluoro_calib_ros.images.measurement import measure_beads
-from fluoro_calib_ros.images.pose_search import _hits
+from fluoro_calib_ros.images.pose_search import _hits, triples_of
 from fluoro_calib_ros.images.shadow_fit import FineGrid, Profile, window_offsets
 from fluoro_calib_ros.images.view import Lens, View
 
@@ -688,3 +689,76 @@ def test_a_pose_is_sure_by_what_it_predicts_and_by_what_it_explains(
     finding = told.value.finding
     assert finding.kind is Kind.POSE_UNSURE
     assert finding.numbers == {'expected': 30, 'found': found, 'explained': explained}
+
+
+def test_poses_are_compared_by_the_sizes_of_the_beads_that_all_of_them_have(monkeypatch):
+    """As logarithms: the size of a shadow, and the response to it; at least ten beads."""
+    xyz = RNG.normal(0, 20, (14, 3))
+    diameter = np.where(np.arange(14) % 3, 2.0, 3.0)
+    seen = Fake(strength=RNG.uniform(0.5, 2, 16), uv=RNG.uniform(0, 900, (16, 2)))
+    seen.strength[5] = 0.0
+    matches = [
+        Fake(
+            bead=np.roll(np.arange(14), shift)[: 14 - drop],
+            detection=(np.arange(14) + 1)[: 14 - drop],
+            view=Fake(depth=lambda xyz, sign=sign: sign * (900 + xyz[:, 2])),
+        )
+        for shift, drop, sign in ((0, 0, 1), (3, 2, -1))
+    ]
+    asked, values = [], [0.0, 0.0]
+
+    def likelihood(size, response, uv):
+        asked.append((size, response, uv))
+        return values[len(asked) % 2 - 1]
+
+    monkeypatch.setattr(matching, '_likelihood_of_sizes', likelihood)
+    model = Fake(xyz=xyz, diameter_mm=diameter)
+    values[:] = [5.0, 5.0 + matching.SIZE_MARGIN]
+    assert matching._best_by_size(matches, seen, model) is matches[1]
+    for one, (size, response, uv) in zip(matches, asked):
+        bead, detection = one.bead[:12], one.detection[:12]
+        np.testing.assert_allclose(size, np.log(diameter[bead] / (900 + xyz[bead, 2])))
+        expected = np.log(np.maximum(seen.strength[detection], 1e-3))
+        np.testing.assert_allclose(response, expected)
+        assert uv.tolist() == seen.uv[detection].tolist()
+    values[:] = [5.0, 4.9 + matching.SIZE_MARGIN]
+    assert matching._best_by_size(matches, seen, model) is None  # none stands out
+    values[:] = [99.0, 5.0]
+    assert matching._best_by_size(matches, seen, model) is matches[0]
+    matches[1].detection = matches[1].detection + 3  # nine in common
+    matches[0].detection, matches[0].bead = matches[0].detection[:12], matches[0].bead[:12]
+    assert matching._best_by_size(matches, seen, model) is None
+    for other in (None, np.full(14, 2.0)):
+        assert matching._best_by_size(matches, seen, Fake(xyz=xyz, diameter_mm=other)) is None
+
+
+def test_a_shadow_that_a_body_has_is_not_that_of_another(monkeypatch):
+    """The larger body chooses first; a point whose shadows are all taken is not free."""
+    shadow = np.array([[0, 0], [1, 1], [2, 2], [0, 1], [3, 0]])
+    points = ShadowPoints(np.zeros((5, 3)), np.ones(5), shadow)
+    asked = []
+
+    def fit(body, points, free):
+        asked.append((body.name, free.tolist()))
+        if body.name == 'middle':
+            raise DataError('none')
+        return marker_ids._Fit(np.array([1, -1, 0]), 0.1, 1.0)
+
+    monkeypatch.setattr(marker_ids, 'shadow_points', lambda shadows, rig: points)
+    monkeypatch.setattr(marker_ids, '_fit', fit)
+    monkeypatch.setattr(
+        marker_ids, '_first', lambda view, *given: (view, given[-1]) if view else None
+    )
+    sizes = {'small': 3, 'large': 5, 'middle': 4}
+    bodies = [Fake(name=name, target_id=range(count)) for name, count in sizes.items()]
+    rig = Fake(orientation=Fake(fluoroscopes=('a', 'b')))
+    found, missing = marker_ids.find_bodies(['A', 'B'], rig, bodies)
+    assert found == {'b': (1, 'B')} and list(missing) == ['middle']
+    every, left = [True] * 5, [False, False, True, False, True]
+    assert asked == [('large', every), ('middle', left), ('small', left)]
+
+
+def test_triples_of_few_beads_are_all_of_them():
+    xyz = 20.0 * np.eye(4, 3)
+    found = triples_of(xyz, 12).bead
+    assert sorted(map(tuple, found.tolist())) == sorted(permutations(range(4), 3))

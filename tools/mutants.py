@@ -57,7 +57,17 @@ SWAPPED: dict[type, type] = {
     ast.Or: ast.And,
 }
 NAMES = {'min': 'max', 'max': 'min', 'argmin': 'argmax', 'argmax': 'argmin', 'sin': 'cos'}
-COMMUTATIVE = ('min', 'max', 'minimum', 'maximum', 'np.clip', 'hypot', 'allclose', 'array_equal')
+COMMUTATIVE = (
+    'min',
+    'max',
+    'minimum',
+    'maximum',
+    'multiply',
+    'np.clip',
+    'hypot',
+    'allclose',
+    'array_equal',
+)
 LEAVING = (ast.Raise, ast.Return, ast.Continue)
 
 

@@ -95,14 +95,13 @@ CONFUSIONS: tuple[tuple[Finding, Relabel], ...] = (
 class Fit:
     """How well an exposure fits the phantom.
 
-    misfit_px is the median residual of the robust direct linear transformation, depth the sign of
-    the depth of the targets: -1 where they lie behind the source; distance_mm is that of the
-    source from their middle. A plane that is mirrored is one seen from behind, and its distance is
-    unknown.
+    misfit_px is the median residual of the robust direct linear transformation, is_behind whether
+    the targets lie behind the source; distance_mm is that of the source from their middle. A plane
+    that is mirrored is one seen from behind, and its distance is unknown.
     """
 
     misfit_px: float
-    depth: int
+    is_behind: bool
     distance_mm: float | None
 
 
@@ -243,7 +242,7 @@ def fit_to_phantom(frame: Frame, phantom: Phantom, target_id: np.ndarray) -> Fit
     if not np.isfinite(residual).all() or not np.isfinite(depth).all():
         return None
     distance = float(np.linalg.norm(source - xyz.mean(axis=0)))
-    return Fit(float(np.median(residual)), -1 if np.median(depth) < 0 else 1, distance)
+    return Fit(float(np.median(residual)), bool(np.median(depth) < 0), distance)
 
 
 def _fit_of_plane(xyz: np.ndarray, uv: np.ndarray) -> Fit | None:
@@ -254,7 +253,7 @@ def _fit_of_plane(xyz: np.ndarray, uv: np.ndarray) -> Fit | None:
             squared = squared_residuals(robust_homography(xy, uv), xy, uv)
     except (DataError, np.linalg.LinAlgError):
         return None
-    return Fit(float(np.sqrt(np.median(squared))), 1, None)
+    return Fit(float(np.sqrt(np.median(squared))), False, None)
 
 
 def find_wrong_input(frames: Frames, phantom: Phantom) -> list[Finding]:
@@ -430,7 +429,7 @@ def _cause(frame: Frame, phantom: Phantom) -> Finding | None:
     if given is None:
         return None
     if given.misfit_px < FIT * side:
-        return _MIRRORED if given.depth < 0 else _unit_cause(phantom, given)
+        return _MIRRORED if given.is_behind else _unit_cause(phantom, given)
     for confusion, relabel in CONFUSIONS:
         other = fit_to_phantom(frame, phantom, relabel(ids, phantom))
         if (
@@ -441,7 +440,7 @@ def _cause(frame: Frame, phantom: Phantom) -> Finding | None:
             return confusion
     if given.misfit_px > MISFIT * side:
         return _OTHER_PHANTOM
-    if given.depth < 0:
+    if given.is_behind:
         return _MIRRORED
     return _unit_cause(phantom, given)
 

@@ -85,8 +85,7 @@ def _picture(image: np.ndarray) -> tuple[np.ndarray, int]:
     """Return an image as a picture of full contrast, small ones enlarged by a factor."""
     grey = full_contrast(image)
     factor = 2 if max(image.shape) <= 512 else 1
-    if factor > 1:
-        grey = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_NEAREST)
+    grey = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_NEAREST)
     return cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), factor
 
 

@@ -344,6 +344,8 @@ def test_precision_is_that_of_the_correction_over_the_noise(given, ratio, noise)
     assert found.numbers['noise_px'] == pytest.approx(noise)
     assert found.numbers['exposures'] == 8
     assert 'inf' not in str(found)
+    growth = 100 * (np.hypot(1, ratio) - 1)
+    assert (f'corrected points {growth:.0f} % larger' in found.cause) is bool(np.isfinite(ratio))
 
 
 def trends_of(monkeypatch, change=None, rejected=None, model_name='auto', corrects=True):
@@ -764,7 +766,7 @@ def test_the_watch_tells_noise_from_what_is_common_to_exposures():
     watch._of_charts = watch._state = 'fine'
     watch._watch = Fake(state='fine', add_residuals=lambda *given: told.append(given))
     watch._change = Fake(add=lambda *given, noise: told.append(noise))
-    one, two, three = np.full(4, 0.5), np.full(4, 0.8), np.array([0.0, 1, 3, 9000])
+    one, two, three = np.full(4, 0.5), np.full(4, 0.8), np.array([0.0, 1, -5.39, 5.41])
     found = Fake(
         residual=three,
         sd_total=np.full(4, 0.6),
@@ -1004,27 +1006,27 @@ def test_levels_begin_at_their_thresholds():
 
 
 @pytest.mark.parametrize(
-    ('misfit', 'depth', 'distance_mm', 'relabelled', 'kind'),
+    ('misfit', 'is_behind', 'distance_mm', 'relabelled', 'kind'),
     [
-        (0.9 * inputs.FIT, 1, 1000.0, None, None),
-        (0.9 * inputs.FIT, -1, 1000.0, None, Kind.IMAGE_MIRRORED),
-        (0.9 * inputs.FIT, 1, 1e6, None, Kind.WRONG_UNIT),
-        (1.1 * inputs.FIT, -1, 1000.0, None, Kind.IMAGE_MIRRORED),
-        (1.1 * inputs.FIT, 1, 1e6, None, Kind.WRONG_UNIT),
-        (1.1 * inputs.FIT, 1, None, None, None),
-        (1.1 * inputs.MISFIT, -1, 1000.0, None, Kind.OTHER_PHANTOM),
-        (1.1 * inputs.MISFIT, -1, 1000.0, 0.9 * inputs.GOOD_MISFIT, Kind.IDS_SHIFTED),
-        (1.1 * inputs.MISFIT, -1, 1000.0, 1.1 * inputs.GOOD_MISFIT, Kind.OTHER_PHANTOM),
-        (1.1 * inputs.FIT, -1, 1000.0, 1.3 * inputs.BETTER * inputs.FIT, Kind.IMAGE_MIRRORED),
+        (0.9 * inputs.FIT, False, 1000.0, None, None),
+        (0.9 * inputs.FIT, True, 1000.0, None, Kind.IMAGE_MIRRORED),
+        (0.9 * inputs.FIT, False, 1e6, None, Kind.WRONG_UNIT),
+        (1.1 * inputs.FIT, True, 1000.0, None, Kind.IMAGE_MIRRORED),
+        (1.1 * inputs.FIT, False, 1e6, None, Kind.WRONG_UNIT),
+        (1.1 * inputs.FIT, False, None, None, None),
+        (1.1 * inputs.MISFIT, True, 1000.0, None, Kind.OTHER_PHANTOM),
+        (1.1 * inputs.MISFIT, True, 1000.0, 0.9 * inputs.GOOD_MISFIT, Kind.IDS_SHIFTED),
+        (1.1 * inputs.MISFIT, True, 1000.0, 1.1 * inputs.GOOD_MISFIT, Kind.OTHER_PHANTOM),
+        (1.1 * inputs.FIT, True, 1000.0, 1.3 * inputs.BETTER * inputs.FIT, Kind.IMAGE_MIRRORED),
     ],
 )
 def test_cause_of_an_exposure_is_that_of_its_fit(
-    monkeypatch, misfit, depth, distance_mm, relabelled, kind
+    monkeypatch, misfit, is_behind, distance_mm, relabelled, kind
 ):
     """Misfits over the side of the image; those of other ids where they are relabelled."""
     fits = iter(
         [
-            Fake(misfit_px=1000 * misfit, depth=depth, distance_mm=distance_mm),
+            Fake(misfit_px=1000 * misfit, is_behind=is_behind, distance_mm=distance_mm),
             None if relabelled is None else Fake(misfit_px=1000 * relabelled),
         ]
     )

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from fluoro_calib_ros.checks import field_checks
+from fluoro_calib_ros.checks import field_checks, held_out
 from fluoro_calib_ros.checks.calibration_evidence import Evidence
 from fluoro_calib_ros.checks.held_out import _hold_out
 from fluoro_calib_ros.errors import DataError
@@ -71,3 +71,25 @@ def test_exposures_that_are_held_out_are_in_no_calibration():
             assert set(trained[name]) | set(tested[name]) == set(range(COUNT))
         held += tested['a']
     assert sorted(held) == list(range(COUNT))  # each once
+
+
+def test_parts_that_are_held_out_are_counted(monkeypatch):
+    """All four are announced, also where there are only three exposures to hold out."""
+    for count, folds in ((3, 3), (4, 4), (11, 4)):
+        evidence, shown, asked = Recorded(count=count), [], []
+        evidence.report_step = shown.append
+        monkeypatch.setattr(
+            held_out, '_hold_out', lambda *given, asked=asked: asked.append(given) or {'a': [1]}
+        )
+        monkeypatch.setattr(held_out, '_checks', lambda evidence, name, sums: [(name, len(sums))])
+        assert held_out.check_held_out(evidence, ('a',)) == [('a', folds)]
+        assert shown == [f'a: held-out exposures, part {n} of 4' for n in (1, 2, 3, 4)]
+        assert [given[1:] for given in asked] == [(('a',), n, folds) for n in range(folds)]
+
+
+def test_exposures_that_cannot_be_held_out_tell_nothing():
+    checks = held_out.check_held_out(Recorded(fails=True), ('a', 'b'))
+    assert [(check.kind, check.place.fluoroscope) for check in checks] == [
+        (kind, name) for name in 'ab' for kind in (Kind.HELD_OUT, Kind.EXPOSURES)
+    ]
+    assert all(check.passed is None and 'too little' in check.cause for check in checks)

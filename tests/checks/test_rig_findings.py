@@ -99,6 +99,13 @@ def test_pairs_contradict_from_a_hundredth_of_their_distance_or_a_degree(
     assert found.place == Place(('a', 'b'), name=NOT_ORIENTED)
 
 
+def test_three_pairs_may_contradict_each_other():
+    shifts = 90.0 * np.array([1, -1, 3])
+    assert contradiction(('a', 'b'), *poses(range(3), shifts)).numbers['shift_mm'] > 80
+    assert contradiction(('a', 'b'), *poses(range(2), shifts[:2])) is None
+    assert interchanged(('a', 'b'), *swapped(*poses(range(3)), (1,))).place.exposures == (1,)
+
+
 def test_fluoroscopes_near_each_other_may_be_off_by_a_centimetre():
     signs = np.array([1, -1, 1, -1, 0, 1, -1])
     for shift_mm, is_found in ((9.9, False), (10.1, True)):

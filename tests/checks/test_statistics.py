@@ -3,6 +3,8 @@
 
 """Sums that the checks and the drift watch rest on, against loops that spell them out."""
 
+from types import SimpleNamespace as Fake
+
 import numpy as np
 import pytest
 from scipy import special
@@ -13,6 +15,7 @@ from fluoro_calib_ros.checks.residual_tests import (
     Residuals,
     _cell_sums,
     _joins,
+    _may_be,
     _scatter,
     change_of_trend,
     common_trend,
@@ -23,6 +26,10 @@ from fluoro_calib_ros.checks.rig import doubtful
 from fluoro_calib_ros.estimation.pair_scatter import PairScatter
 from fluoro_calib_ros.findings import Kind
 from fluoro_calib_ros.photogrammetry.noise import INLIER_Q
+from fluoro_calib_ros.photogrammetry.rotations import (
+    matrix_from_vector,
+    quaternion_from_matrix,
+)
 
 
 def test_joins_are_the_products_of_neighbours_of_two_exposures():
@@ -236,3 +243,44 @@ def test_exposures_of_another_orientation_are_named_with_the_largest_displacemen
     usable, (found,) = doubtful(scatter, 1024, 0.2)
     assert usable and found.kind is Kind.PAIRS_EXCLUDED
     assert found.place.exposures == (3, 4) and found.numbers == {'off_px': 7.0}
+
+
+def test_image_points_that_fail_may_be_targets_that_nothing_else_is():
+    """The nearest first, each only of the point that is nearest to it, by the pose of theirs."""
+    rotation = matrix_from_vector(np.array([0.1, -0.2, 0.3]))
+    position = rotation.T @ np.array([5.0, -3.0, -900.0])
+    interior = np.array([500.0, 400.0, 4000.0])
+    rng = np.random.default_rng(2)
+    ids = np.arange(10) + 20
+    xyz = rng.uniform(-60, 60, (10, 3))
+    xyz[4] = xyz[3] + [1.0, 0, 0]  # 4.4 px beside it
+    x = (xyz - position) @ rotation.T
+    ideal = interior[:2] + interior[2] * x[:, :2] / x[:, 2:]
+    correction = np.tile([3.0, -2.0], (4, 1))
+    # Of four image points the first two fit; the last two are exchanged for others.
+    given = np.array([20, 21, 22, 23])
+    uv = ideal[[0, 1, 3, 6]] + correction + [[0.1, 0], [0.1, 0], [0.5, 0], [0.3, 0]]
+    pose = {'quaternion_wxyz': quaternion_from_matrix(rotation), 'position_mm': position}
+    other = {'quaternion_wxyz': np.array([1.0, 0, 0, 0]), 'position_mm': position}
+    exposures = [Fake(exposure=2, **other), Fake(exposure=5, **pose), Fake(exposure=9, **other)]
+    result = Fake(
+        fluoroscopes={'a': Fake(exposures=exposures, interior=interior)},
+        targets=Fake(target_id=ids, xyz_mm=xyz),
+    )
+    table = Fake(
+        fluoroscope=np.array(['a'] * 4),
+        exposure=np.full(4, 5),
+        target_id=given,
+        uv=uv,
+        correction=correction,
+    )
+    here, rows = np.ones(4, bool), np.array([2, 3])
+    found = _may_be(result, table, here, rows, np.array([20.0, 20.0]))
+    # Target 24 is beside 23, which is given to the other one that fails.
+    assert found == [(23, 24), (26,)]
+    assert _may_be(result, table, here, rows, np.array([2.0, 0.2])) == [(23,), ()]
+    table.target_id = np.array([20, 23, 22, 26])  # 23 fits elsewhere, and 26 is its own id
+    assert _may_be(result, table, here, rows, np.array([20.0, 20.0])) == [(24,), ()]
+    few = Fake(fluoroscopes=result.fluoroscopes, targets=Fake(target_id=ids[:2], xyz_mm=xyz[:2]))
+    table.target_id = given
+    assert _may_be(few, table, here, rows, np.array([20.0, 20.0])) == [(), ()]

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from fluoro_calib_ros.images.detection import field_of_view
-from fluoro_calib_ros.images.light import Light, estimate_noise
+from fluoro_calib_ros.images.light import Light, Noise, estimate_noise
 from fluoro_calib_ros.images.measurement import (
     Expected,
     Imaging,
     _BeadFit,
+    _Sizes,
     estimate_profile,
     first_imaging,
     measure_beads,
@@ -220,3 +221,137 @@ def test_window_of_a_bead_is_not_that_of_the_largest():
     error, sigma = measured_in(image, uv, radii / 6, 6.0)
     assert np.abs(error[::6]).max() < 0.08
     assert sigma[:30:6].max() < 1.3 * np.median(sigma[:30])
+
+
+def sizes_of(count=5, others=()):
+    """Comparison of the sizes of beads in a row, whose lack of fit is a function of them."""
+    uv = np.vstack([100.0 * np.arange(count)[:, None] * [1, 0], *others])
+    n = len(uv)
+    shadows = Expected(np.arange(n), uv, np.ones(n), np.ones(n, bool), np.ones(n, bool))
+    imaging = Imaging(
+        None, Profile(5.0, 1.0, 1.0), np.append(np.ones(count), np.full(n - count, 2))
+    )
+    return _Sizes(None, shadows, imaging)
+
+
+def test_size_is_where_the_fit_is_best_to_a_part_of_a_step(monkeypatch):
+    true = np.array([0.645, 0.71, 1.0, 1.33, 1.85])
+    sizes = sizes_of()
+    monkeypatch.setattr(
+        _Sizes,
+        'lacks',
+        lambda self, rows, sizes: np.array([1 + np.log(one / true[rows]) ** 2 for one in sizes]),
+    )
+    found = sizes.best(np.arange(5))
+    np.testing.assert_allclose(found, true, rtol=1e-6)
+    # Beyond the sizes that are compared, there is no parabola.
+    true[0] = 0.2
+    assert 0.3 < sizes.best(np.arange(5))[0] < 0.5
+
+
+def test_sizes_are_compared_with_the_shadows_around(monkeypatch):
+    """Those that the largest size would reach, with the sizes that they have."""
+    asked = []
+
+    def lack(light, uv, radius, profile, noise, size):
+        asked.append((uv, size))
+        return np.arange(len(uv)) + size
+
+    monkeypatch.setattr('fluoro_calib_ros.images.measurement.lack_of_fit', lack)
+    reach = (1 + 1.25**4) * (5.0 + 3.2)
+    others = np.array([[0.0, 0.99 * reach], [0.0, 1.01 * reach], [100.0, -0.99 * reach]])
+    sizes = sizes_of(2, others)
+    found = sizes.lacks(np.array([0, 1]), [np.array([0.5, 0.6]), np.array([1.5, 1.6])])
+    np.testing.assert_allclose(found, [[0.5, 1.6], [1.5, 2.6]])
+    for uv, size in asked:
+        assert uv.tolist() == [[0, 0], [100, 0], others[0].tolist(), others[2].tolist()]
+        assert size[2:].tolist() == [2, 2]
+
+
+@pytest.mark.parametrize(
+    ('common', 'own', 'share', 'is_equal'),
+    [
+        (1.5, 1.0, 1.0, True),  # less than what something beside a bead does
+        (1.7, 1.0, 0.2, True),
+        (1.7, 1.0, 0.3, False),
+        (1.7, 1.2, 0.3, True),  # their own size fits hardly better
+    ],
+)
+def test_sizes_differ_where_the_common_one_fits_badly(monkeypatch, common, own, share, is_equal):
+    rows = np.arange(10)
+    others = rows < 10 * share
+    sizes = sizes_of(10)
+    monkeypatch.setattr(_Sizes, 'best', lambda self, rows: np.where(others, 1.5, 1.0))
+
+    def lacks(self, rows, sizes):
+        out = []
+        for one in sizes:
+            is_own = np.isclose(one, np.where(others, 1.5, 1.0))
+            same = np.where(others & np.isclose(one, 1.0), common, 1.0)
+            out.append(np.where(is_own & others, own, same))
+        return np.array(out)
+
+    monkeypatch.setattr(_Sizes, 'lacks', lacks)
+    assert sizes.are_equal(rows) is is_equal
+    assert sizes.are_equal(rows[:0])
+
+
+NOISE = Noise(1.0, 0.0, np.ones((1, 1)))
+
+
+def test_windows_at_the_edge_of_an_image_have_the_pixels_that_are_there():
+    """Beads of which a third is beyond the image or its field, or whose edge is, are not used."""
+    shape = (60, 80)
+    grey = np.random.default_rng(3).uniform(100, 200, shape).astype(np.float32)
+    field = np.ones(shape, bool)
+    field[:, 30:33] = False
+    profile = Profile(4.0, 1.0, 1.0)
+    u = np.array([40.0, 76, 74.9, 75, 4, 3.9, 40, 40, 40, 31, 60])
+    uv = np.column_stack([u, [30, 30, 30, 30, 30, 30, 55, 56, 4, 30, 55.1]])
+    fit = _BeadFit(Light(grey, field), uv, np.ones(11), profile=profile, noise=NOISE)
+    reach = profile.reach_px + 2
+    for row, (u, v) in enumerate(np.rint(uv).astype(int)):
+        for k, (du, dv) in enumerate(fit.offset):
+            there = 0 <= u + du < 80 and 0 <= v + dv < 60 and du * du + dv * dv <= reach**2
+            assert fit.valid[row, k] == bool(there and field[v + dv, u + du])
+            if there:
+                assert fit.grey[row, k] == grey[v + dv, u + du]
+    # The edge of a shadow, 4 px from its centre, lies within the image.
+    expected = np.minimum(uv, np.array([79, 59]) - uv).min(axis=1) >= 4.0
+    assert fit.usable.tolist() == expected.tolist()
+
+
+def test_neighbours_are_those_within_reach_the_nearest_first():
+    uv = np.array([[40.0, 30], [47, 30], [40, 42], [200, 30], [47, 30]])
+    light = Light(np.full((90, 260), 100.0, np.float32), np.ones((90, 260), bool))
+    profile = Profile(4.0, 1.0, 1.0)
+    fit = _BeadFit(light, uv, np.ones(5), profile=profile, noise=NOISE)
+    together = 2 * profile.reach_px + 2
+    away = np.linalg.norm(uv[:, None] - uv[None], axis=2)
+    np.fill_diagonal(away, np.inf)
+    for rows, near in fit.groups:
+        for row, beside in zip(rows, near):
+            expected = np.flatnonzero(away[row] < together)
+            assert set(beside[beside >= 0]) == set(expected)
+            found = away[row][beside[beside >= 0]]
+            assert found.tolist() == sorted(found)
+    assert sorted(np.concatenate([rows for rows, _ in fit.groups])) == [0, 1, 2, 3, 4]
+    assert fit.distance.tolist() == [7, 0, 12, np.inf, 0]
+
+
+def test_windows_of_beads_that_look_larger_are_larger():
+    """By their place in the image, and by their own size."""
+    uv = np.array([[50.0, 50], [150, 50], [250, 50], [350, 50]])
+    light = Light(np.full((100, 400), 100.0, np.float32), np.ones((100, 400), bool))
+    profile = Profile(5.0, 1.0, 1.0)
+    stretch, size = np.array([0.5, 1.0, 1.6, 1.6]), np.array([1.0, 1.0, 1.0, 0.5])
+    fit = _BeadFit(light, uv, stretch, profile=profile, noise=NOISE, size=size)
+    reach = profile.reach_px * size * stretch + 2
+    length = np.linalg.norm(fit.offset, axis=1)
+    for valid, own in zip(fit.valid, reach):
+        assert valid.tolist() == (length <= own).tolist()
+    assert length.max() <= reach.max() and fit.radius.tolist() == (stretch * size).tolist()
+    wide = _BeadFit(light, uv, stretch, profile, NOISE, size=size, reach_px=12.0)
+    length = np.linalg.norm(wide.offset, axis=1)
+    for valid, own in zip(wide.valid, 12.0 * stretch + 2):
+        assert valid.tolist() == (length <= own).tolist()

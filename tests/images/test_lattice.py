@@ -160,3 +160,35 @@ def test_scattered_points_have_no_lattice():
     points = np.random.default_rng(4).uniform(0, 100, (200, 2))
     assert number_lattice(points) is None
     assert number_lattice(points[:5]) is None
+
+
+@pytest.mark.parametrize('turn', [(0.0, 0.0, 0.0), (0.4, 1.9, -0.7), (2.2, 0.1, 0.9)])
+def test_a_grid_is_told_whatever_the_frame_of_its_survey_is(turn):
+    """Its axes are those of the beads, not of the frame."""
+    xyz = grid(np.array([[10.0, 0.0], [0.0, 16.0]]), 11, missing=9)
+    true = pixels(xyz, (0.2, -0.3, 0.4))
+    seen = seen_of(true)
+    surveyed = xyz @ matrix_from_vector(turn).T + [300.0, -50, 20]
+    found = match(seen, PhantomModel.of(surveyed), LENS)
+    away = np.linalg.norm(seen.uv[found.detection] - true[found.bead], axis=1)
+    assert np.mean(away < 1) > 0.97
+    assert len(found.bead) > 0.9 * np.isfinite(true[:, 0]).sum()
+
+
+def test_a_lattice_of_unlike_steps_is_numbered_around_its_gaps():
+    """Something beside it, nearer than its long step is, is no place of it."""
+    place = np.array([(i, j) for i in range(9) for j in range(6)])
+    place = place[~((place[:, 0] == 4) & (place[:, 1] < 4))]
+    points = place * [10.0, 45.0]
+    points = np.vstack([points, [[38.0, 10.0], [42.0, 57.0]]])
+    found = number_lattice(points)
+    kept = found.row < len(place)
+    assert kept.sum() == len(place)
+    change = np.linalg.lstsq(
+        place[found.row[kept]] - place[found.row[kept]].mean(axis=0),
+        found.index[kept] - found.index[kept].mean(axis=0),
+        rcond=None,
+    )[0]
+    np.testing.assert_allclose(change, np.rint(change), atol=1e-9)
+    assert abs(np.linalg.det(change)) == pytest.approx(1)
+    assert kept.all()

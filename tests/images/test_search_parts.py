@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.findings import Kind
-from fluoro_calib_ros.images import matching, pose_search
+from fluoro_calib_ros.images import growth, matching, pose_search
 from fluoro_calib_ros.images.growth import (
     Seen,
     _good_cells,
@@ -490,3 +490,28 @@ def test_a_flat_grid_is_seen_from_where_it_is(normal):
     np.testing.assert_allclose(view.rotation @ view.rotation.T, np.eye(3), atol=1e-9)
     np.testing.assert_allclose(view.rotation, turn, atol=0.02)
     np.testing.assert_allclose(view.project(xyz), uv, atol=0.05)
+
+
+@pytest.mark.parametrize('count', [3, 5, 40])
+def test_support_is_the_share_of_the_nearest_beads_in_space(count):
+    rng = np.random.default_rng(count)
+    xyz = rng.uniform(-50, 50, (count, 3))
+    good = rng.random(count) < 0.5
+    near = np.argsort(np.linalg.norm(xyz[:, None] - xyz[None], axis=2), axis=1)[:, 1:]
+    share = good[near[:, : growth.SUPPORT]].mean(axis=1)
+    assert supported(xyz, good).tolist() == (share >= growth.MIN_SUPPORT).tolist()
+    assert 0 < supported(xyz, good).mean() < 1 or count < 40
+
+
+def test_cells_of_an_image_are_bad_by_the_beads_that_are_found_in_them():
+    rng = np.random.default_rng(8)
+    uv = rng.uniform(-20, [1020, 620], (400, 2))
+    found = rng.random(400) < 0.55
+    cell = np.clip(np.floor(uv / [1000, 600] * growth.CELLS), 0, growth.CELLS - 1)
+    expected = []
+    for own in cell:
+        same = (cell == own).all(axis=1)
+        many = same.sum() >= growth.MIN_CELL
+        expected.append(not (many and found[same].sum() < 0.6 * same.sum()))
+    assert _good_cells(uv, found, (600, 1000)).tolist() == expected
+    assert 0.1 < np.mean(expected) < 0.9

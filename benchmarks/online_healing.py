@@ -21,6 +21,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -115,9 +116,7 @@ class Listener(Node):
             self._stream.subscribe(
                 CorrectedObservations,
                 f'{name}/corrected_observations',
-                lambda data, _, name=name: self.corrected[name].append(
-                    deserialize_message(data, CorrectedObservations).frame_number
-                ),
+                partial(self._on_corrected, name),
                 observations_qos(),
                 decode=bytes,
             )
@@ -125,6 +124,10 @@ class Listener(Node):
             ReconstructedPoints, POINTS, self._on_points, observations_qos(), decode=bytes
         )
         self._stream.start()
+
+    def _on_corrected(self, name: str, data: bytes, _: dict[str, int]) -> None:
+        message = deserialize_message(data, CorrectedObservations)
+        self.corrected[name].append(message.frame_number)
 
     def _on_points(self, data: bytes, _: dict[str, int]) -> None:
         message = deserialize_message(data, ReconstructedPoints)
@@ -238,7 +241,7 @@ def _heal(listener: Listener) -> list[tuple[str, int]]:
 def rows_of(events: list[tuple[str, int]], listener: Listener) -> list[list[str]]:
     """Rows of the table: what was lost between the events."""
     out = []
-    first = StreamStart().number
+    first = min(listener.points)  # before, publishers and readers have found each other
     for what, last in events:
         expected = range(first, last + 1)
         if not expected:

@@ -236,8 +236,8 @@ class _Drift:
         affine = np.flatnonzero(self._is_affine)
         rest = np.eye(len(self.functions))
         rest[affine] -= np.linalg.lstsq(values[:, affine], values, rcond=None)[0]
-        rest = np.kron(np.eye(2), rest)
-        return np.asarray(rest @ (covariance + np.outer(mean, mean)) @ rest.T)
+        of_both = np.kron(np.eye(2), rest)
+        return np.asarray(of_both @ (covariance + np.outer(mean, mean)) @ of_both.T)
 
 
 def unseen_distortion(diagnostician: Diagnostician, diagnosis: Diagnosis) -> tuple[float, float]:

@@ -194,11 +194,11 @@ class _Drift:
         told /= diagnosis.noise**2
         return cls(
             adjustment.functions[fluoroscope],
-            (told[:, :-1] + told[:, :-1].T) / 2,
-            told[:, -1],
-            adjustment.healthy_prior(observed, 0.0).sd[own],
-            DRIFT_PX * adjustment.sd_of_drift(fluoroscope),
-            observed.pixel[..., fluoroscope, :][observed.seen[..., fluoroscope]],
+            matrix=(told[:, :-1] + told[:, :-1].T) / 2,
+            right=told[:, -1],
+            smooth=adjustment.healthy_prior(observed, 0.0).sd[own],
+            one_px=DRIFT_PX * adjustment.sd_of_drift(fluoroscope),
+            pixel=observed.pixel[..., fluoroscope, :][observed.seen[..., fluoroscope]],
         )
 
     @property

@@ -175,13 +175,10 @@ def heal_rig(
     stamp_ns = max(frame.stamp_ns for frame in used[-1].values())
     healed = healed_rig(diagnostician, diagnosis, stamp_ns, len(used))
     after = rig_errors(healed.orientation, places)
-    now = rig if fixed else rig.healed(healed)
     # Where nothing has changed, the rig is another one only if it may err by more than it claims.
-    claims_more = after.common_mm > before.common_mm or ids_of(now.calibrations) != ids_of(
-        calibrations
-    )
-    is_other = not fixed and (bool(changed) or claims_more)
-    now = now if is_other else rig
+    claims_more = after.common_mm > before.common_mm
+    now = rig if fixed else rig.healed(healed, is_other=bool(changed) or claims_more)
+    is_other = now is not rig
     step(3, 4)
     known = _correctable(fixed) if fixed else _identified(healed.weakest, bool(changed))
     unseen = _unseen_distortion(*unseen_distortion(diagnostician, diagnosis))
@@ -308,8 +305,11 @@ class _Rig:
         distorted = [names[one.fluoroscope] for one in changes if one.cause is Cause.DISTORTION]
         return [name for name in distorted if self.calibrations[name].model.series is None]
 
-    def healed(self, healed: HealedRig) -> _Rig:
-        """Return the rig with what was healed."""
+    def healed(self, healed: HealedRig, is_other: bool) -> _Rig:
+        """Return the rig with what was healed.
+
+        is_other: False where only a correction may differ; it is this rig where none does.
+        """
         calibrations = dict(self.calibrations)
         names = self.orientation.fluoroscopes
         for f, name in enumerate(names):
@@ -328,6 +328,8 @@ class _Rig:
                     interior_covariance=healed.orientation.covariance[np.ix_(rows, rows)],
                 )
             calibrations[name] = one
+        if not is_other and ids_of(calibrations) == ids_of(self.calibrations):
+            return self
         orientation = replace(
             healed.orientation,
             calibration_ids=tuple(calibrations[name].calibration_id for name in names),

@@ -133,6 +133,7 @@ SCENARIOS = (
     Scenario('a twentieth of the bump', Cause.ORIENTATION, twentieth),
     Scenario('distortion, 4 px', Cause.DISTORTION, drift_px=4.0),
     replace(KNEE, name='bump, four bodies of four', bodies=4),
+    Scenario('distortion, 0.3 px', Cause.DISTORTION, drift_px=0.3),
 )
 
 
@@ -514,8 +515,8 @@ correction of {correction} px. Shapes are learned, as by `fluoro-calib bodies --
 {shape:.4f} mm in a coordinate (RMS, apart from their scale), and claim {claim:.4f} mm. Five bodies
 of six markers unless it says otherwise. Rigs, bodies and motion are made by a generator that
 shares no code with the package. Bump: 0.5 degrees and 5 mm; creep: the same in the course of the
-recording; principal distance: 1 %; distortion: quadratic and cubic terms of up to 1 or 4 px at
-the edges of the image; marker: 0.5 mm; soft body: 0.15 mm.
+recording; principal distance: 1 %; distortion: quadratic and cubic terms of up to 0.3, 1 or 4 px
+at the edges of the image; marker: 0.5 mm; soft body: 0.15 mm.
 
 Right: the cause is named and the verdict is pass; never where the rig goes on changing. Within:
 none is named, the verdict is pass, and what the rig has not found lies within what it claims: six

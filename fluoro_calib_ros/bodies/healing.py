@@ -5,13 +5,12 @@
 
 Bodies whose shapes were learned while the rig was healthy give scale and rigidity. Every cause
 widens the prior of some unknowns by what such a change may be. Causes are added one by one, the
-one with the largest evidence first, as long as the evidence grows (MacKay 2003, ch. 28). What the
-data do not identify keeps the covariance that it had, or that of the change.
+one with the largest evidence first, as long as the evidence grows (MacKay 2003, ch. 28).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from itertools import combinations
@@ -19,17 +18,14 @@ from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import eigh
 
-from ..correction.series import Functions
-from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
+from ..photogrammetry.rig_orientation import ORIENTATION_SIZE
 from .rig_adjustment import (
     ObservedBodies,
     Poses,
     Prior,
     RigAdjustment,
     RigSolution,
-    drift_errors,
 )
 
 MAX_CAUSES = 3
@@ -70,7 +66,6 @@ MIGRATION_MM = 1.0
 # The same for small changes, relative to these: a drift need not be as large as a knock. The two
 # factors are those of principal point and principal distance, the first one that of all others.
 SIZES = ((1.0, 1.0), (0.125, 0.125))
-KNOCK_SIZES = np.geomspace(2.0**-7, 1.0, 8)  # of a knock that is not seen, relative to a large one
 SIZES_OF_INTERIOR = (*SIZES, (1.0, 0.125), (0.125, 1.0))
 
 
@@ -350,129 +345,3 @@ def _probabilities(tried: Sequence[_Tried], causes: int) -> NDArray[np.float64]:
     prior = np.array([0.5, *([0.5 / causes] * (len(tried) - 1))])
     chance = prior * np.exp(log)
     return chance / chance.sum()
-
-
-# The healed rig.
-
-
-@dataclass(frozen=True)
-class HealedRig:
-    """The orientation of a rig as it is now, and the drifts of its images."""
-
-    orientation: RigOrientation  #: with the ids of the calibrations as they were
-    #: by fluoroscope; to be added to its correction
-    drift: Mapping[int, tuple[Functions, NDArray[np.float64], NDArray[np.float64]]]
-    changes: NDArray[np.float64]  #: (F, 9) of T [mm], w [rad], xp, yp, c [px]
-    sd: NDArray[np.float64]  #: (F, 9) their standard deviations
-    #: standard deviation of the direction of the changes that is known worst, over that of a large
-    #: change as it may be: 1 where the data tell nothing of it
-    weakest: float
-
-
-def healed_rig(
-    diagnostician: Diagnostician, diagnosis: Diagnosis, stamp_ns: int, exposures: int
-) -> HealedRig:
-    """Estimate what has changed, with the rest of the rig held as it was calibrated.
-
-    A change of orientation or interior may be as large as any. The size with the largest evidence
-    is that of the directions that are known well; it would pull the others towards no change.
-
-    Where nothing of the rig has changed, it stays as it was, with the second moments of the knock
-    that it may have had (see `_of_unseen_knocks`): bodies do not show all of a knock.
-    """
-    adjustment = diagnostician.adjustment
-    changed = np.zeros(adjustment.size)
-    largest = np.zeros(adjustment.size)
-    changes = [change for change in diagnosis.changes if change.cause in OF_RIG]
-    for change in changes or diagnostician.knocks():
-        changed = np.hypot(changed, diagnostician.sd_of(change))
-        largest = np.hypot(largest, diagnostician.sd_of(replace(change, size=SIZES[0])))
-    largest[adjustment.drift] = 0.0
-    prior = diagnosis.prior.widened(largest)
-    solution = adjustment.with_fixed(diagnosis.observed, prior, diagnosis.solution, changed > 0)
-    values = solution.values
-    covariance = solution.covariance[adjustment.rig, adjustment.rig]
-    weakest = _weakest(adjustment, covariance, largest)
-    if not changes:
-        covariance = _of_unseen_knocks(diagnostician, diagnosis, solution)
-        values = np.zeros(adjustment.size)
-    views = len(adjustment.functions)
-    orientation = replace(
-        adjustment.rig_at(values),
-        covariance=(covariance + covariance.T) / 2,
-        source='healing',
-        stamp_ns=stamp_ns,
-        exposures=exposures,
-    ).rounded()
-    drift = {}
-    for change in changes:
-        if change.cause is Cause.DISTORTION:
-            f = change.fluoroscope
-            number = np.arange(adjustment.size)[adjustment.drift].reshape(views, -1)[f]
-            drift[f] = (
-                adjustment.functions[f],
-                adjustment.drift_at(values)[f],
-                solution.covariance[np.ix_(number, number)],
-            )
-    return HealedRig(
-        orientation,
-        drift,
-        changes=values[adjustment.rig].reshape(views, -1),
-        sd=np.sqrt(np.diagonal(covariance)).reshape(views, -1),
-        weakest=weakest,
-    )
-
-
-def _of_unseen_knocks(
-    diagnostician: Diagnostician, diagnosis: Diagnosis, start: RigSolution
-) -> NDArray[np.float64]:
-    """Second moments (9F, 9F) of what a rig has changed by that is taken for unchanged.
-
-    The mean over sizes of a knock, weighted by their evidence: the moments of one size alone would
-    be those of a rig that has certainly been knocked as hard. Bodies tell of a knock only: their
-    shapes were learned with the errors of the calibration, which are added as they were.
-    """
-    adjustment = diagnostician.adjustment
-    knock = np.linalg.norm([diagnostician.sd_of(one) for one in diagnostician.knocks()], axis=0)
-    moments = []
-    evidence = []
-    calibrated = diagnosis.prior.orientation
-    exact = replace(diagnosis.prior, orientation=np.zeros_like(calibrated))
-    for size in KNOCK_SIZES[::-1]:
-        prior = exact.widened(size * knock)
-        start = adjustment.with_fixed(diagnosis.observed, prior, start, knock > 0)
-        change = start.values[adjustment.rig]
-        moments.append(start.covariance[adjustment.rig, adjustment.rig] + np.outer(change, change))
-        evidence.append(start.evidence / diagnosis.noise**2)
-    share = np.exp(np.array(evidence) - max(evidence))
-    return calibrated + np.tensordot(share / share.sum(), np.array(moments), axes=1)
-
-
-def unseen_distortion(diagnostician: Diagnostician, diagnosis: Diagnosis) -> tuple[float, float]:
-    """Return how far changes of the distortion may move points that the data do not show [mm].
-
-    RMS distances relative to each other where the markers were: by changes that may be as large as
-    any, and by the noise of a single point.
-    """
-    adjustment = diagnostician.adjustment
-    prior = diagnosis.prior
-    for f in range(len(adjustment.functions)):
-        prior = prior.widened(diagnostician.sd_of(Change(Cause.DISTORTION, f)))
-    covariance = adjustment.covariance_at(diagnosis.observed, prior, diagnosis.solution)
-    places = adjustment.places_at(diagnosis.solution)
-    errors, by_noise = drift_errors(adjustment, covariance, places)
-    variance = diagnosis.observed.variance[diagnosis.observed.seen].mean()
-    return float(np.sqrt(3) * errors.place_mm), by_noise * float(np.sqrt(variance))
-
-
-def _weakest(adjustment: RigAdjustment, covariance: np.ndarray, sd: np.ndarray) -> float:
-    """Return the largest standard deviation of a direction over that before the data.
-
-    covariance (9F, 9F) of the rig; sd (K,) by which the changed unknowns may have changed.
-    """
-    rows = np.flatnonzero(sd[adjustment.rig])
-    if not len(rows):
-        return 0.0
-    before = adjustment.orientation.covariance + np.diag(sd[adjustment.rig] ** 2)
-    of_rows = np.ix_(rows, rows)
-    return float(np.sqrt(eigh(covariance[of_rows], before[of_rows], eigvals_only=True)[-1]))

@@ -100,7 +100,8 @@ def _lines(arguments: argparse.Namespace, outcome: HealingOutcome) -> list[str]:
     if healed is None or not is_changed:
         is_evident = is_changed or outcome.changed_meanwhile
         evident = '' if is_evident else 'no change of the rig is evident: '
-        rest = 'nothing is written' if healed is None else 'its sd contain an unseen knock'
+        contain = 'its sd contain an unseen knock and an unseen drift of the distortion'
+        rest = 'nothing is written' if healed is None else contain
         lines.append(f'{evident}it stays as it was calibrated, {rest}')
     if healed is not None:
         for f, name in enumerate(outcome.orientation.fluoroscopes):

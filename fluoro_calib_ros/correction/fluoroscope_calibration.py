@@ -426,6 +426,19 @@ def with_drift(
     return replace(calibration, model=changed)
 
 
+def with_larger_sd(calibration: FluoroscopeCalibration, sd: np.ndarray) -> FluoroscopeCalibration:
+    """Return a calibration whose correction claims a standard deviation of sd (33, 33) at least.
+
+    sd is on the grid of `Series` [px]. A model without a series is returned as it is: it has no
+    field of standard deviations.
+    """
+    series = calibration.model.series
+    if series is None or (sd <= series.sd).all():
+        return calibration
+    model = replace(calibration.model, series=replace(series, sd=np.maximum(series.sd, sd)))
+    return replace(calibration, model=model)
+
+
 def at_common_angle(
     uv: ArrayLike, one: FluoroscopeCalibration, other: FluoroscopeCalibration
 ) -> tuple[Correction, Correction]:

@@ -16,6 +16,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from ..bodies.body import Body, check_bodies, robust_pose, solvable_bodies
+from ..bodies.healed_rig import HealedRig, healed_rig, unseen_distortion
 from ..bodies.healing import (
     OF_RIG,
     SURE_OF_CAUSE,
@@ -23,16 +24,19 @@ from ..bodies.healing import (
     Change,
     Diagnosis,
     Diagnostician,
-    HealedRig,
-    healed_rig,
-    unseen_distortion,
 )
 from ..bodies.rig_adjustment import ObservedBodies, Poses, RigAdjustment, RigErrors, rig_errors
 from ..bodies.shapes import LearnedShapes
 from ..brief import brief_repr
 from ..checks.check import Check, verdict_of
 from ..correction.base import CorrectionStatus
-from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration, with_drift
+from ..correction.fluoroscope_calibration import (
+    Calibrations,
+    FluoroscopeCalibration,
+    ids_of,
+    with_drift,
+    with_larger_sd,
+)
 from ..correction.series import sd_over_image
 from ..errors import DataError
 from ..exposures.frame import Frame, Frames, frames_of_targets
@@ -74,7 +78,8 @@ class HealingOutcome:
     diagnosis : Diagnosis
     healed : HealedRig or None
         None where nothing of the rig has changed and its claims hold. Where they are less than a
-        knock that bodies do not show, it is the rig as it was calibrated, with larger ones.
+        knock or a drift that bodies do not show, it is the rig as it was calibrated, with larger
+        ones.
     calibrations : mapping of str to FluoroscopeCalibration
         Of the healed rig.
     orientation : RigOrientation
@@ -171,8 +176,9 @@ def heal_rig(
     healed = healed_rig(diagnostician, diagnosis, stamp_ns, len(used))
     after = rig_errors(healed.orientation, places)
     # Where nothing has changed, the rig is another one only if it may err by more than it claims.
-    is_other = not fixed and (bool(changed) or after.common_mm > before.common_mm)
-    now = rig.healed(healed) if is_other else rig
+    claims_more = after.common_mm > before.common_mm
+    now = rig if fixed else rig.healed(healed, is_other=bool(changed) or claims_more)
+    is_other = now is not rig
     step(3, 4)
     known = _correctable(fixed) if fixed else _identified(healed.weakest, bool(changed))
     unseen = _unseen_distortion(*unseen_distortion(diagnostician, diagnosis))
@@ -299,8 +305,11 @@ class _Rig:
         distorted = [names[one.fluoroscope] for one in changes if one.cause is Cause.DISTORTION]
         return [name for name in distorted if self.calibrations[name].model.series is None]
 
-    def healed(self, healed: HealedRig) -> _Rig:
-        """Return the rig with what was healed."""
+    def healed(self, healed: HealedRig, is_other: bool) -> _Rig:
+        """Return the rig with what was healed.
+
+        is_other: False where only a correction may differ; it is this rig where none does.
+        """
         calibrations = dict(self.calibrations)
         names = self.orientation.fluoroscopes
         for f, name in enumerate(names):
@@ -309,6 +318,8 @@ class _Rig:
                 functions, coefficients, covariance = healed.drift[f]
                 sd = sd_over_image(functions, covariance)
                 one = with_drift(one, functions, coefficients, sd)
+            else:
+                one = with_larger_sd(one, sd_over_image(*healed.unseen[f]))
             if healed.changes[f, 6:].any():
                 rows = healed.orientation.covariance_rows([f])[6:]
                 one = replace(
@@ -317,6 +328,8 @@ class _Rig:
                     interior_covariance=healed.orientation.covariance[np.ix_(rows, rows)],
                 )
             calibrations[name] = one
+        if not is_other and ids_of(calibrations) == ids_of(self.calibrations):
+            return self
         orientation = replace(
             healed.orientation,
             calibration_ids=tuple(calibrations[name].calibration_id for name in names),

@@ -35,9 +35,10 @@ class CalibrationInput:
     """Subscribes to the calibrations of fluoroscopes and prepares them for use.
 
     The calibration in use stays until the next one is prepared: a frame sees one or the other. Of
-    calibrations that come while one is being prepared, the newest one is next. While two
-    calibration nodes serve the same fluoroscope, their calibrations are held back until release()
-    finds one node only.
+    calibrations that come while one is being prepared, the newest one is next; those of several
+    fluoroscopes are used together, as views with calibrations of two rigs give no points. While
+    two calibration nodes serve the same fluoroscope, their calibrations are held back until
+    release() finds one node only.
 
     Parameters
     ----------
@@ -68,10 +69,13 @@ class CalibrationInput:
         names = tuple(names)
         self._current: dict[str, Any] = dict.fromkeys(names)
         self._next: dict[str, FluoroscopeCalibration] = {}
+        self._ready: dict[str, Any] = {}  # prepared, while those of others are not
         self._threads: dict[str, threading.Thread] = {}
         self._held: dict[str, dict[str, FluoroscopeCalibration]] = {name: {} for name in names}
         self._patience = dict.fromkeys(names, 0)
-        self._lock = threading.Lock()  # of _next, _threads, _closed and the use of the node
+        self._lock = (
+            threading.Lock()
+        )  # of _next, _ready, _threads, _closed and the use of the node
         self._closed = False
         self._subscriptions = [
             node.create_subscription(
@@ -96,6 +100,7 @@ class CalibrationInput:
         with self._lock:
             self._closed = True
             self._next.clear()
+            self._ready.clear()
 
     def begin_with(
         self, name: str, calibration: calibration_result.FluoroscopeCalibration
@@ -178,6 +183,22 @@ class CalibrationInput:
                 self._use(name, message)
 
     def _use(self, name: str, message: FluoroscopeCalibration) -> None:
+        """Prepare a calibration, and use it with those that came together."""
+        prepared = self._prepared(name, message)
+        with self._lock:
+            if self._closed:
+                return
+            if prepared is not None:
+                self._ready[name] = prepared
+            # Not for another one of a fluoroscope that has one: there may be no end of them.
+            if self._next.keys() <= self._ready.keys():
+                ready, self._ready = self._ready, {}
+                self._current = {**self._current, **ready}
+                for one in ready:
+                    self._on_ready(one, ready[one])
+
+    def _prepared(self, name: str, message: FluoroscopeCalibration) -> Any:
+        """Return the prepared calibration, None where it is refused."""
         try:
             calibration = calibration_from_message(message)
             if calibration.fluoroscope != name:
@@ -188,13 +209,9 @@ class CalibrationInput:
             self._node.get_logger().info(
                 f'fluoroscope {name}: calibration {calibration.calibration_id} is being prepared'
             )
-            prepared = self._prepare(calibration)
+            return self._prepare(calibration)
         except Exception as error:  # a message may hold anything, and the stream has to go on
             with self._lock:
                 if not self._closed:
                     self._refuse(name, one_line(error))
-            return
-        with self._lock:
-            if not self._closed:
-                self._current[name] = prepared
-                self._on_ready(name, prepared)
+            return None

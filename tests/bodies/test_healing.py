@@ -12,11 +12,11 @@ from body_views import orientation, project
 from scipy.spatial.transform import Rotation
 
 from fluoro_calib_ros.bodies.body import Body
+from fluoro_calib_ros.bodies.healed_rig import healed_rig
 from fluoro_calib_ros.bodies.healing import (
     SIZES,
     Cause,
     Diagnostician,
-    healed_rig,
 )
 from fluoro_calib_ros.bodies.rig_adjustment import (
     ObservedBodies,

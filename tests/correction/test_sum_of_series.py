@@ -9,7 +9,7 @@ from rigs import calibrated, rig, true_calibrations
 
 from fluoro_calib_ros.correction.base import CorrectionModel
 from fluoro_calib_ros.correction.calibration_record import SD_GRID
-from fluoro_calib_ros.correction.fluoroscope_calibration import with_drift
+from fluoro_calib_ros.correction.fluoroscope_calibration import with_drift, with_larger_sd
 from fluoro_calib_ros.correction.registry import create_model
 from fluoro_calib_ros.correction.series import Functions, Series
 from fluoro_calib_ros.errors import DataError
@@ -47,6 +47,24 @@ def test_calibration_with_a_drift_corrects_by_it_too():
     without = true_calibrations(rig().fluoroscopes)['a']
     with pytest.raises(DataError, match='has no field of standard deviations'):
         with_drift(without, drift.functions, drift.coefficients, drift.sd)
+
+
+def test_calibration_with_a_larger_standard_deviation_corrects_as_before():
+    """It claims the larger of both; a second time, or of a model that has none, it is the same."""
+    calibration = calibrated('a', 6, max_iterations=2).calibrations['a']
+    sd = np.linspace(0, 2 * calibration.model.series.sd.max(), SD_GRID**2).reshape(SD_GRID, -1)
+    changed = with_larger_sd(calibration, sd)
+    uv = np.random.default_rng(5).uniform(300, 700, (40, 2))
+    before, after = (one.correct(uv, exact=True) for one in (calibration, changed))
+    np.testing.assert_array_equal(after.uv, before.uv)
+    np.testing.assert_array_equal(
+        changed.model.series.sd, np.maximum(calibration.model.series.sd, sd)
+    )
+    assert (after.sigma >= before.sigma).all() and (after.sigma > before.sigma).any()
+    assert changed.calibration_id != calibration.calibration_id
+    assert with_larger_sd(changed, sd) is changed
+    without = true_calibrations(rig().fluoroscopes)['a']
+    assert with_larger_sd(without, sd) is without
 
 
 def test_work_grows_with_points_and_functions():

@@ -103,14 +103,20 @@ def test_calibration_with_impossible_numbers_is_refused(calibration, change, sai
 
 
 class Inbox:
-    """A CalibrationInput of one fluoroscope that records its calls; preparing waits for .go."""
+    """A CalibrationInput that records its calls; preparing waits for .go, and may have a fault.
 
-    def __init__(self, fault=None):
+    fault: raised for all calibrations, or those with the stamp in at_ns. put takes a message to
+    the last of the fluoroscopes, putters one for each.
+    """
+
+    def __init__(self, fault=None, names=('a',), at_ns=None):
         self.taken = []
         self.refused = []
         self.go = threading.Event()
         self.began = threading.Semaphore(0)
         self._fault = fault
+        self._at_ns = at_ns
+        self.putters = {}
         self.most = 0
         self._now = 0
         self.ended = threading.Semaphore(0)
@@ -124,7 +130,7 @@ class Inbox:
         self.publishers = []
         self.calibrations = CalibrationInput(
             node,
-            ['a'],
+            names,
             self._prepare,
             self._take,
             self._refuse,
@@ -133,6 +139,7 @@ class Inbox:
     def _subscribe(self, kind, topic, callback, qos, raw):
         assert raw
         self.put = lambda message: callback(serialize_message(message))
+        self.putters[topic[0]] = self.put
 
     def _take(self, name, kept):
         self.taken.append(kept)
@@ -148,7 +155,7 @@ class Inbox:
         self.began.release()
         assert self.go.wait(60)
         self._now -= 1
-        if self._fault is not None:
+        if self._fault is not None and self._at_ns in (None, calibration.stamp_ns):
             raise self._fault
         return calibration.stamp_ns
 
@@ -164,6 +171,37 @@ def test_calibrations_are_prepared_one_at_a_time_and_the_last_one_stays(calibrat
     assert inbox.taken == [0, 49] and inbox.most == 1 and inbox.calibrations.current('a') == 49
     inbox.put(message_from_calibration(replace(calibration, stamp_ns=99)))
     assert inbox.ended.acquire(timeout=60) and inbox.taken[-1] == 99
+
+
+def test_calibrations_of_several_fluoroscopes_that_come_together_are_used_together(calibration):
+    inbox = Inbox(names='ab')
+
+    def put(name, stamp_ns):
+        of_one = replace(calibration, fluoroscope=name, stamp_ns=stamp_ns)
+        inbox.putters[name](message_from_calibration(of_one))
+
+    put('a', 1)
+    assert inbox.began.acquire(timeout=60)  # while it is at work,
+    put('b', 2)
+    inbox.go.set()
+    assert inbox.ended.acquire(timeout=60)
+    assert inbox.calibrations.current('a') == 1 and inbox.calibrations.current('b') == 2
+    assert inbox.ended.acquire(timeout=60) and inbox.taken == [1, 2]
+    put('b', 3)  # alone
+    assert inbox.ended.acquire(timeout=60) and inbox.calibrations.current('b') == 3
+
+
+def test_calibration_is_used_where_the_one_that_came_with_it_is_refused(calibration):
+    inbox = Inbox(ValueError('not this one'), names='ab', at_ns=2)
+    for name, stamp_ns in (('a', 1), ('b', 2)):
+        of_one = replace(calibration, fluoroscope=name, stamp_ns=stamp_ns)
+        inbox.putters[name](message_from_calibration(of_one))
+        if name == 'a':
+            assert inbox.began.acquire(timeout=60)
+    inbox.go.set()
+    assert all(inbox.ended.acquire(timeout=60) for _ in range(2))
+    assert inbox.taken == [1] and inbox.refused == ['not this one']
+    assert inbox.calibrations.current('a') == 1 and inbox.calibrations.current('b') is None
 
 
 def test_calibration_that_comes_while_the_thread_before_it_ends_is_prepared(calibration):

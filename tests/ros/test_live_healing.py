@@ -432,7 +432,12 @@ def test_healthy_rig_stays_where_it_is_and_claims_what_is_not_seen(rig, graph, l
     assert result.success and not result.findings and not result.fluoroscope, result.message
     after = load_orientation(orientation_path(learned))
     assert after.orientation_id == result.orientation_id != before.orientation_id
-    assert after.calibration_ids == before.calibration_ids
+    of_healed, of_parent = (load_calibrations(folder) for folder in (learned, rig.calibrated))
+    assert after.calibration_ids == tuple(of_healed[name].calibration_id for name in NAMES)
+    for name in NAMES:
+        new, old = (one[name].model.series for one in (of_healed, of_parent))
+        np.testing.assert_array_equal(new.coefficients, old.coefficients)
+        assert (new.sd >= old.sd).all() and new.sd[0, 0] > old.sd[0, 0]
     np.testing.assert_array_equal(after.position_mm, before.position_mm)
     np.testing.assert_array_equal(after.rotation, before.rotation)
     of_b = before.covariance_rows([1])[:6]

@@ -736,6 +736,44 @@ def test_bodies_with_markers_of_different_sizes_are_found_together():
         assert np.abs(found[name].uv - np.concatenate(uv)).max() < 1.0
 
 
+def test_bodies_that_an_impact_moves_are_found_again_and_no_wrong_id_is_left():
+    """Two bodies move by 20 px between two images; then a view misses an image."""
+    rng = np.random.default_rng(2477)
+    shapes = [rng.uniform(-12, 12, (6, 3)) for _ in range(2)]
+    bodies = [
+        Body(name, np.arange(first, first + 6), xyz, np.full(6, 0.03))
+        for name, first, xyz in zip(('one', 'other'), (11, 21), shapes)
+    ]
+    ids = np.concatenate([body.target_id for body in bodies])
+    calibrations, orientation = calibration()
+    ways = np.array([[5.0, 3.0, 6.0], [-6.0, 2.0, -5.0]])  # mm, in the first exposure
+
+    def true(number: int) -> dict[str, np.ndarray]:
+        moved = 2 * (1 - 0.5 ** max(number - 4, 0))
+        xyz = np.concatenate([shape + moved * way for shape, way in zip(shapes, ways)])
+        return {f.name: f.ideal(xyz) for f in rig().fluoroscopes}
+
+    views: MarkerViews | None = None
+    found = []
+    for number in range(1, 13):
+        images = {
+            name: drawn([(uv, 1.2)], calibrations[name].image_size[0])
+            for name, uv in true(number).items()
+        }
+        if views is None:
+            first = identify_markers(images, calibrations, orientation, bodies)
+            views = MarkerViews(calibrations, orientation, OPTIONS, first=first, bodies=bodies)
+        found.append(views.update({**images, 'b': None} if number == 7 else images, number))
+    for number, exposure in enumerate(found, 1):
+        for name, of_view in exposure.views.items():
+            uv = true(number)[name][np.searchsorted(ids, of_view.target_id)]
+            right = np.linalg.norm(of_view.uv - uv, axis=1) < 1.5
+            assert right[~of_view.doubtful].all()
+            if number < 5 or number > 7:
+                assert np.count_nonzero(right) == 12
+                assert np.count_nonzero(of_view.doubtful) < 4
+
+
 def without_second_body(images: dict[str, MarkerImage]) -> dict[str, np.ndarray]:
     """Images of an exposure without the markers of the second body."""
     return {name: covered(of, np.s_[4:]) for name, of in images.items()}

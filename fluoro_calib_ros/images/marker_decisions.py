@@ -37,7 +37,7 @@ class ViewCounts:
         self._agreed_since = np.zeros(count, dtype=int)
         self._wrong = np.zeros(count, dtype=int)
 
-    def agree(self, row: int, agrees: bool, frame: int, began: int | None) -> int:
+    def agree(self, row: int, agrees: bool, frame: int, began: int | None = None) -> int:
         """Count an exposure that agrees with an id or does not, and return how many agree.
 
         began: image since which the id is in doubt; exposures before it say nothing.

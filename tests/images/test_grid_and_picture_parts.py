@@ -15,15 +15,15 @@ from fluoro_calib_ros.bodies.body import Body
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.images import corrector, lattice, marker_ids, overlay
 from fluoro_calib_ros.images.marker_decisions import DecidedView, ViewCounts
+from fluoro_calib_ros.images.marker_motion import MarkerStates, Motion
 from fluoro_calib_ros.images.marker_points import (
     CalibratedRig,
     ShadowPoints,
     _explaining,
     shadow_points,
 )
-from fluoro_calib_ros.images.marker_rays import MarkerPlaces, MarkerRays
-from fluoro_calib_ros.images.marker_views import JoinedViews, _later, _names, _offer, _Told
-from fluoro_calib_ros.images.markers import FirstMarkers
+from fluoro_calib_ros.images.marker_rays import MarkerBodies, MarkerPlaces, MarkerRays
+from fluoro_calib_ros.images.marker_views import JoinedViews, _later, _names, _Told
 from fluoro_calib_ros.images.view import Lens
 from fluoro_calib_ros.simulation.rig import virtual_rig
 
@@ -248,31 +248,57 @@ def test_a_correction_goes_on_beyond_the_border_as_steep_as_before():
 
 
 class Tracker:
-    def __init__(self, unsure=(), unseen=(), begun=True):
-        self._unsure, self._unseen, self.begun = np.array(unsure), np.array(unseen), begun
-        self.told, self.forgotten = [], []
-        self.options = Fake(search_every=30)
+    def __init__(self, unsure=()):
+        self._unsure = np.array(unsure)
+        self.told = []
 
     def unsure(self):
         return self._unsure
-
-    def unseen(self):
-        return self._unseen
-
-    def forget(self, number):
-        self.forgotten.append(number)
 
     def suggest(self, ids, uv, velocity, sd):
         self.told.append((ids.tolist(), uv, velocity, sd))
 
 
-def test_markers_that_are_not_seen_are_offered_and_forgotten_before():
-    tracker = Tracker(unseen=[4, 9, 11])
-    _offer(FirstMarkers(np.array([4, 5, 11]), np.arange(6.0).reshape(3, 2)), tracker)
-    assert tracker.forgotten == [4, 11]
-    ((ids, uv, velocity, sd),) = tracker.told
-    assert ids == [4, 11] and uv.tolist() == [[0, 1], [4, 5]]
-    assert not velocity.any() and sd.tolist() == [1.5, 1.5]
+def states_at(uv):
+    states = MarkerStates.start(Motion.start(np.array(uv, dtype=float), 0.3), np.zeros(len(uv)))
+    states.unseen = states.unseen.astype(int)
+    states.motion.covariance[:, 1, 1] = 0.04
+    return states
+
+
+def test_places_of_a_body_tell_the_velocity_by_the_second_image():
+    states = states_at([[100, 100], [200, 100], [300, 100]])
+    states.advance(1, None)
+    states.place(np.array([0, 2]), np.array([[120.0, 110], [300.2, 100]]), 1.5, frames=1)
+    # The third marker is there anyway, and the second one was not asked for.
+    assert states.motion.uv.tolist() == [[120, 110], [200, 100], [300, 100]]
+    assert states.motion.covariance[0].tolist() == [[2.25, 0], [0, 36]]
+    assert not states.motion.velocity.any() and states.placed[0] == 0 and states.unseen[0] == 1
+    states.unseen[:] = 0  # measured
+    states.advance(2, None)
+    states.place(np.array([0]), np.array([[150.0, 116]]), 1.5, frames=2)
+    assert states.motion.velocity[0].tolist() == [15, 3]
+    assert states.motion.covariance[0].tolist() == [[2.25, 0], [0, 2.25]]
+    states.unseen[0] = 9  # long not seen: the place before says nothing
+    states.place(np.array([0]), np.array([[10.0, 20]]), 1.5, frames=1)
+    assert states.motion.uv[0].tolist() == [10, 20] and not states.motion.velocity[0].any()
+
+
+def test_a_body_of_which_less_than_half_is_seen_again_is_elsewhere():
+    bodies = MarkerBodies.__new__(MarkerBodies)
+    lost = []
+    bodies._count, bodies._tracker = 9, Fake(lose=lambda rows: lost.append(rows.tolist()))
+    bodies._rows = [np.array([0, 1, 2]), np.array([4, 5, 6]), np.array([7, 8])]
+    before = np.zeros((2, 9), dtype=bool)
+    before[:, [0, 1, 2, 4, 5, 7]] = True
+    now = np.zeros((2, 9), dtype=bool)
+    now[0, [0, 1, 4, 5, 6]] = True
+    # Two of six; two of four, which is half (one that enters does not count); none of two.
+    assert np.flatnonzero(bodies.miss(now, before)).tolist() == [0, 1, 2]
+    assert lost == [[True, False, False]]
+    assert not bodies.miss(now[:0], before[:0]).any()
+    bodies._tracker = None
+    assert not bodies.miss(now, before).any()
 
 
 def test_views_are_those_of_the_orientation_in_its_order():
@@ -369,12 +395,15 @@ def test_views_are_told_where_unsure_markers_are_expected():
         project=lambda view, xyz, angles: xyz[:, :2] * 10 * angles['a'],
         spread=lambda view, xyz, covariance: xyz[:, 0] / 100,
     )
-    joined._suggest(12)
+    joined._suggest(12, np.zeros(3, dtype=bool))
     ((told_ids, uv, velocity, sd),) = tracker.told
     assert told_ids == [5, 8]
     assert uv.tolist() == [[30, 30], [100, 100]] and sd.tolist() == [0.03, 0.1]
     # From 2 and 8 at the other angle, two exposures before.
     assert velocity.tolist() == [[-5, -5], [-30, -30]]
+    # A body that has just been found tells it better.
+    joined._suggest(12, ids == 8)
+    assert tracker.told[-1][0] == [5]
 
 
 @pytest.mark.parametrize(('seen', 'is_told'), [(4, True), (3, True), (2, False)])

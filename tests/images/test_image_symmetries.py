@@ -15,10 +15,10 @@ from fluoro_calib_ros.images.detection import detect_beads, field_of_view
 from fluoro_calib_ros.images.light import LAGS, Light, Noise, estimate_noise
 from fluoro_calib_ros.images.marker_fit import MarkerGuess, fit_markers
 from fluoro_calib_ros.images.marker_intensity import (
+    FilteredImage,
     LightWindows,
     MarkerLook,
     MarkerSearch,
-    filter_image,
     first_shadows,
     learn_start,
     search_image,
@@ -169,7 +169,7 @@ def test_beads_are_measured_alike_in_a_turned_and_in_a_brighter_image():
 
 
 def look_of(image, inverted=False):
-    light, _ = filter_image(image, 3.0) if not inverted else filter_image(image, 3.0)[::-1]
+    light = FilteredImage(image).of_scale(3.0)[int(inverted)]
     strength = float(np.median(np.sort(light.relative[light.maxima])[-12:]))
     return MarkerLook(
         3.0, inverted, np.ones(image.shape, bool), strength, floor=0.1 * strength, light=15000.0
@@ -198,11 +198,11 @@ def test_markers_are_found_in_a_turned_image_and_in_its_negative():
 
 def test_an_image_says_itself_whether_its_markers_are_bright():
     image = scene()
-    dark = first_shadows(filter_image(image, 3.0), 12, 0.35)
-    bright = first_shadows(filter_image(negative(image), 3.0), 12, 0.35)
+    dark = first_shadows(FilteredImage(image).of_scale(3.0), 12, 0.35)
+    bright = first_shadows(FilteredImage(negative(image)).of_scale(3.0), 12, 0.35)
     np.testing.assert_allclose(in_order(bright.uv), in_order(dark.uv), atol=0.02)
-    sides = filter_image(image, 3.0)
-    turned = filter_image(negative(image), 3.0)
+    sides = FilteredImage(image).of_scale(3.0)
+    turned = FilteredImage(negative(image)).of_scale(3.0)
     assert [one.inverted for one in (*sides, *turned)] == [False, True, False, True]
     np.testing.assert_allclose(sides[0].light, turned[1].light, atol=0.1)
     np.testing.assert_allclose(sides[0].around, turned[1].around, rtol=1e-4)
@@ -261,7 +261,7 @@ def guess_of(uv, motion=(0.0, 0.0)):
 
 def fitted(image, uv, motion=(0.0, 0.0), inverted=False, unit=1.0):
     windows = LightWindows(image, Fake(field=np.ones(image.shape, bool), inverted=inverted))
-    return fit_markers(windows, guess_of(uv, motion), PROFILE, Noise(0.0, 0.2 * unit, WHITE))
+    return fit_markers(windows, guess_of(uv, motion), PROFILE, Noise(0.0, 0.2 * unit, WHITE), {})
 
 
 @pytest.mark.parametrize('motion', [(0.0, 0.0), (1.5, 0.0), (-1.2, 3.0)])
@@ -293,7 +293,7 @@ def test_a_first_image_says_which_markers_are_there():
     image = scene()
     uv = np.vstack([PLACES + 0.8, [[np.nan, np.nan], [30.0, 90.0]]])
     ids = np.arange(14) + 50
-    start = learn_start(image, ids, uv)
+    start = learn_start(FilteredImage(image), ids, uv)
     assert start.states.unseen.tolist() == [0] * 12 + [1, 1]
     assert np.abs(start.states.motion.uv[:12] - PLACES).max() < 1.0
     assert start.states.motion.uv[13].tolist() == [30, 90]
@@ -301,17 +301,17 @@ def test_a_first_image_says_which_markers_are_there():
     assert start.size == (230, 150) and start.density == 2e-6
     assert start.profile.radius_px == pytest.approx(RADIUS_PX, rel=0.2)
     assert not start.look.inverted
-    few = learn_start(image, ids[:6], uv[:6])
+    few = learn_start(FilteredImage(image), ids[:6], uv[:6])
     free = 6 / start.look.field.sum()
     assert few.density == pytest.approx(free, rel=0.01)
     for outside in ([-0.5, 40.0], [229.5, 40.0], [40.0, -0.6], [40.0, 149.5]):
         with pytest.raises(DataError, match='marker 51 of the first frame lies outside'):
-            learn_start(image, ids[:2], np.array([PLACES[0], outside]))
+            learn_start(FilteredImage(image), ids[:2], np.array([PLACES[0], outside]))
     twice = PLACES[[0, 1, 2, 3, 0, 1, 2, 3]] + [0, 0.5]
-    assert learn_start(image, ids[:8], twice).states.unseen.sum() == 4
+    assert learn_start(FilteredImage(image), ids[:8], twice).states.unseen.sum() == 4
     twice[3:] = PLACES[[0, 0, 1, 1, 2]] - [1, 0]
     with pytest.raises(DataError, match='only 3 of 8 markers of the first frame'):
-        learn_start(image, ids[:8], twice)
+        learn_start(FilteredImage(image), ids[:8], twice)
 
 
 @pytest.mark.parametrize(

@@ -119,6 +119,10 @@ def test_counts_begin_with_the_first_exposure_that_agrees():
     counts.clear([1, 2])
     assert counts.wrong.tolist() == [0, 0, 0] and counts.agree(2, True, 7) == 1
     assert counts.confirm(2) == 7
+    # Exposures before a doubt say nothing of it.
+    assert [counts.agree(0, True, frame) for frame in (3, 4)] == [1, 2]
+    assert [counts.agree(0, True, frame, began=8) for frame in (9, 10)] == [1, 2]
+    assert counts.confirm(0) == 9
 
 
 def test_an_id_is_confirmed_by_three_exposures_where_its_body_says():

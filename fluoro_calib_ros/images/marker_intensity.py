@@ -10,9 +10,10 @@ shadow is the smaller eigenvalue of the Hessian, as in `detection`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -94,8 +95,15 @@ class FilteredLight:
     @cached_property
     def relative(self) -> NDArray[np.float32]:
         """Response (h, w) over the light around."""
-        least = 1e-3 * float(self.light.max())
-        return np.asarray(self.response / np.maximum(self.around, least))
+        return self.relative_at(np.s_[:, :])
+
+    def relative_at(self, pixels: Any) -> NDArray[np.float32]:
+        """The same at an index of pixels."""
+        return np.asarray(self.response[pixels] / np.maximum(self.around[pixels], self._least))
+
+    @cached_property
+    def _least(self) -> float:
+        return 1e-3 * float(self.light.max())
 
     @cached_property
     def field(self) -> NDArray[np.bool_]:
@@ -112,12 +120,12 @@ class FilteredLight:
     @cached_property
     def noise(self) -> float:
         """Median response where there is any; a part of the pixels tells it."""
-        return _positive_median(self.relative[::SAMPLED, ::SAMPLED])
+        return _positive_median(self.relative_at(np.s_[::SAMPLED, ::SAMPLED]))
 
     @cached_property
     def noise_in_field(self) -> float:
         """The same in the field of view."""
-        part = self.relative[::SAMPLED, ::SAMPLED]
+        part = self.relative_at(np.s_[::SAMPLED, ::SAMPLED])
         return _positive_median(part[self.field[::SAMPLED, ::SAMPLED]])
 
     @cached_property
@@ -219,10 +227,10 @@ def _learn_look(image: FilteredImage, near: np.ndarray) -> tuple[MarkerLook, Fil
     """
     best: _Typical | None = None
     for scale in MARKER_SCALES:
-        found = max(
-            (_Typical.near(light, near) for light in image.of_scale(scale)),
-            key=lambda one: one.merit,
-        )
+        lights: Sequence[FilteredLight] = image.of_scale(scale)
+        if best is not None and best.clear:  # dark or bright
+            lights = lights[int(best.light.inverted) :][:1]
+        found = max((_Typical.near(one, near) for one in lights), key=lambda one: one.merit)
         if best is None or found.merit > best.merit:
             best = found
         elif best.clear:
@@ -261,11 +269,11 @@ class _Typical:
     @classmethod
     def near(cls, light: FilteredLight, uv: np.ndarray) -> _Typical:
         """The median near points (n, 2)."""
-        dilated = cv2.dilate(light.relative, np.ones((2 * NEAR_PX + 1,) * 2, np.uint8))
-        height, width = dilated.shape
-        column = np.clip(np.rint(uv[:, 0]).astype(int), 0, width - 1)
-        row = np.clip(np.rint(uv[:, 1]).astype(int), 0, height - 1)
-        return cls(light, float(np.median(dilated[row, column])))
+        height, width = light.response.shape
+        around = np.rint(uv).astype(int)[:, None] + _square(NEAR_PX)
+        column = np.clip(around[..., 0], 0, width - 1)
+        row = np.clip(around[..., 1], 0, height - 1)
+        return cls(light, float(np.median(light.relative_at((row, column)).max(axis=1))))
 
     @classmethod
     def strongest(cls, light: FilteredLight, count: int) -> _Typical:

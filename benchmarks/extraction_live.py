@@ -10,7 +10,8 @@ the rate, are measured: for a phantom in ever other poses, for one that moves sl
 followed, for one that is filmed at 30 Hz, and for 30 markers that are filmed so.
 
 `--chain SECONDS` measures the chain from images to poses instead: 30 markers in five bodies, two
-views of 1024 x 1024 px and 8 bits at 30 Hz, whose images another process plays from a bag.
+views of 1024 x 1024 px and 8 bits at 30 Hz, whose images another process plays from a bag; with
+`--times N` so many times, forth and back.
 Nothing but bodies.csv and the calibrations is given. It prints lost exposures, latency, and CPU
 time of each process; with `--parts`, what the milliseconds of an exposure are spent on. `--folder`
 keeps what is rendered. The profile for large messages is used with
@@ -27,6 +28,8 @@ import threading
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -475,31 +478,32 @@ def write_chain(folder: Path, exposures: int) -> None:
 class BagCamera(Node):
     """Publishes the images of a bag at their times, with the time of publication as stamp."""
 
-    def __init__(self, bag: Path) -> None:
+    def __init__(self, bag: Path, times: int) -> None:
         super().__init__('bag_camera')
         outputs = {
             f'/{name}/image_raw': self.create_publisher(Image, f'{name}/image_raw', images_qos())
             for name in NAMES
         }
         wait_for_readers(self, outputs.values(), 1, threading.Event())
+        by_time = groupby(iterate_messages(bag), key=attrgetter('log_time_ns'))
+        exposures = [list(messages) for _, messages in by_time]
         start = time.monotonic()
-        first: int | None = None
-        due = 0
-        stamp_ns = 0
         stamps = []
-        for message in iterate_messages(bag):
-            if first is None:
-                first = message.log_time_ns
-            if message.log_time_ns != due:
-                due = message.log_time_ns
-                time.sleep(max(0.0, start + (due - first) * 1e-9 - time.monotonic()))
-                stamp_ns = time.time_ns()
-                stamps.append(stamp_ns)
-            data = bytearray(message.data)
-            struct.pack_into('<iI', data, STAMP_AT, stamp_ns // 10**9, stamp_ns % 10**9)
-            outputs[message.topic].publish(bytes(data))
+        for number in range(times * len(exposures)):
+            time.sleep(max(0.0, start + number / FILM_HZ - time.monotonic()))
+            stamp_ns = time.time_ns()
+            stamps.append(stamp_ns)
+            for message in exposures[_row(number, len(exposures))]:
+                data = bytearray(message.data)
+                struct.pack_into('<iI', data, STAMP_AT, stamp_ns // 10**9, stamp_ns % 10**9)
+                outputs[message.topic].publish(bytes(data))
         wait_until_acknowledged(outputs.values(), threading.Event())
         np.save(bag.parent / PLAYED, stamps)
+
+
+def _row(number: int, count: int) -> int:
+    """Row of an exposure in a bag of so many that is played forth and back."""
+    return min(number % (2 * count), -1 - number % (2 * count) + 2 * count)
 
 
 class ChainReader(Node):
@@ -558,8 +562,8 @@ def processes_of(nodes: Mapping[str, int]) -> dict[str, list[int]]:
     return out
 
 
-def measure_chain(folder: Path) -> None:
-    """Play the bag to the nodes, and print what was lost, latencies and CPU times."""
+def measure_chain(folder: Path, times: int) -> None:
+    """Play the bag so many times to the nodes; print what was lost, latencies and CPU times."""
     rclpy.init(args=[])
     reader = ChainReader()
     calibrated = {'calibration_directory': folder / 'calibration'}
@@ -571,9 +575,8 @@ def measure_chain(folder: Path) -> None:
             'reconstruction_node': programs.start('reconstruction_node', bodies),
         }
         wait_for_nodes(reader, len(nodes))
-        camera = programs.run(
-            'benchmarks.extraction_live', '--play', str(folder / 'images'), log=folder / 'camera'
-        )
+        play_bag = ('--play', str(folder / 'images'), '--times', str(times))
+        camera = programs.run('benchmarks.extraction_live', *play_bag, log=folder / 'camera')
         counted: dict[str, float] = {}
         used: dict[str, float] = {}
         began = ended = 0
@@ -716,7 +719,7 @@ def compare_chain(folder: Path) -> None:
         with np.load(folder / f'{source}.npz') as found:
             for key in found.files:
                 name, number = key.split('_')
-                true = truth[name][int(number) - 1]
+                true = truth[name][_row(int(number) - 1, len(truth[name]))]
                 rows = found[key]
                 away = rows[:, 1:3] - true[rows[:, 0].astype(int) - FIRST_ID]
                 distance = np.linalg.norm(away, axis=1)
@@ -744,7 +747,7 @@ def compare_chain(folder: Path) -> None:
         )
 
 
-def chain(folder: Path, seconds: float, parts: bool) -> None:
+def chain(folder: Path, seconds: float, parts: bool, times: int) -> None:
     """Render what is not there, and measure the chain, or the parts of an exposure."""
     exposures = round(seconds * FILM_HZ)
     if not (folder / 'truth.npz').exists():
@@ -752,14 +755,14 @@ def chain(folder: Path, seconds: float, parts: bool) -> None:
     if parts:
         measure_parts(folder, exposures, 0.0)
     else:
-        measure_chain(folder)
+        measure_chain(folder, times)
     compare_chain(folder)
 
 
-def play(bag: Path) -> None:
+def play(bag: Path, times: int) -> None:
     """Play a bag, as a camera would."""
     rclpy.init(args=[])
-    BagCamera(bag)
+    BagCamera(bag, times)
     rclpy.shutdown()
 
 
@@ -773,18 +776,19 @@ def main() -> None:
     parser.add_argument('--seconds', type=float, default=20.0, help='length of the film')
     parser.add_argument('--chain', type=float, metavar='SECONDS', help='from images to poses')
     parser.add_argument('--parts', action='store_true', help='with --chain: parts of an exposure')
+    parser.add_argument('--times', type=int, default=1, help='that the bag is played')
     parser.add_argument('--play', type=Path, metavar='BAG', help=argparse.SUPPRESS)
     parser.add_argument('--folder', type=Path, help='of images and logs, which are kept')
     arguments = parser.parse_args()
     if arguments.play:
-        play(arguments.play)
+        play(arguments.play, arguments.times)
         return
     isolate_ros_graph()
     with tempfile.TemporaryDirectory() as temporary:
         folder = arguments.folder or Path(temporary)
         folder.mkdir(exist_ok=True)
         if arguments.chain:
-            chain(folder, arguments.chain, arguments.parts)
+            chain(folder, arguments.chain, arguments.parts, arguments.times)
         else:
             run(arguments.exposures, arguments.steps, arguments.seconds, folder)
 

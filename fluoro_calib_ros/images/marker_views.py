@@ -185,6 +185,7 @@ class JoinedViews:
         """Return the markers of the views, after what they say of each other."""
         exposure = self._rays.intersect(self._without_missed(found, frame), self._angles)
         self._bodies.update(exposure, frame)
+        self._missed &= ~self._bodies.present.known  # their own markers may tell where they are
         self._doubt_unsupported(exposure, frame)
         decisions = self._decide(exposure, frame)
         decided = [number for decision in decisions for number in decision.target_id]

@@ -301,6 +301,26 @@ def test_a_body_of_which_less_than_half_is_seen_again_is_elsewhere():
     assert not bodies.miss(now, before).any()
 
 
+@pytest.mark.parametrize('is_placed', [True, False])
+def test_a_missed_body_that_its_markers_place_is_not_missed_any_more(is_placed):
+    joined = JoinedViews.__new__(JoinedViews)
+    joined._views, joined._told, joined._by_body, joined._by_rays = [], [], [], []
+    joined._target_id, joined._angles = np.array([3, 5]), {}
+    joined._measured = np.zeros((0, 2), dtype=bool)
+    joined._missed = np.array([True, False])
+    joined._rays = Fake(intersect=lambda found, angles: Fake(sure=np.zeros(2, dtype=bool)))
+    nowhere = MarkerPlaces.nowhere(2)
+    joined._bodies = Fake(
+        miss=lambda measured, before: np.zeros(2, dtype=bool),
+        update=lambda exposure, frame: None,
+        present=MarkerPlaces(np.zeros((2, 3)), nowhere.covariance) if is_placed else nowhere,
+        unplaced=lambda: np.zeros(2, dtype=bool),
+        learn=lambda exposure, sure: None,
+    )
+    joined.decided({}, 4)
+    assert joined._missed.tolist() == [not is_placed, False]
+
+
 def test_views_are_those_of_the_orientation_in_its_order():
     rig = Fake(fluoroscopes=('a', 'b', 'c'))
     assert _names({'c': None, 'a': None}, rig) == ('a', 'c')

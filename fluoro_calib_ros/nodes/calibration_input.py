@@ -73,9 +73,8 @@ class CalibrationInput:
         self._threads: dict[str, threading.Thread] = {}
         self._held: dict[str, dict[str, FluoroscopeCalibration]] = {name: {} for name in names}
         self._patience = dict.fromkeys(names, 0)
-        self._lock = (
-            threading.Lock()
-        )  # of _next, _ready, _threads, _closed and the use of the node
+        # Of _next, _ready, _threads, _closed and the use of the node.
+        self._lock = threading.Lock()
         self._closed = False
         self._subscriptions = [
             node.create_subscription(

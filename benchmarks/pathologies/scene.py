@@ -108,8 +108,12 @@ class Scene:
         return out
 
 
-def draw(case, seed):
-    """Draw the scene of a case."""
+def draw(case, seed, recording=0, change=None):
+    """Draw the scene of a case.
+
+    Other recordings have the same rig, phantom and survey; change is a part of the distortion that
+    is new in this one.
+    """
     rng = np.random.default_rng([seed, *case.name.encode()])
     true_mm = case.phantom(rng)
     survey = true_mm + rng.normal(0, case.survey_sd * case.survey_factor, true_mm.shape)
@@ -124,6 +128,10 @@ def draw(case, seed):
         np.arange(1, len(survey) + 1), np.round(survey, 4), np.full(len(survey), case.survey_sd)
     )
     cameras = tuple(_camera(case, rng, f) for f in range(2))
+    if recording:
+        rng = np.random.default_rng([recording, seed, *case.name.encode()])
+    if change is not None:
+        cameras = tuple(_changed(camera, change, rng) for camera in cameras)
     images = []
     poses = []
     angles = _angles(case, rng, case.exposures)
@@ -164,6 +172,14 @@ def _camera(case, rng, f):
     distortion = Distortion.of(case.parts, rng, side)
     turning = Turning(case.arm, 0.0).draw(rng) if case.arm else None
     return Camera(NAMES[f], interior, tilt @ looking, source, distortion, turning)
+
+
+def _changed(camera, change, rng):
+    before = camera.distortion
+    distortion = Distortion(
+        (*before.parts, change), (*before.drawn, change.draw(rng)), before.side
+    )
+    return replace(camera, distortion=distortion)
 
 
 def _pose(case, rng, cameras, true_mm, number):

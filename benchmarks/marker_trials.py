@@ -183,9 +183,13 @@ def _revised(found: MarkerFrame, name: str, decisions: list[Decision]) -> Marker
 
 
 def _wrong(found: MarkerFrame, image: MarkerImage, target_id: np.ndarray) -> np.ndarray:
-    """Whether (n,) markers are not where they should be."""
+    """Whether (n,) markers are not where they should be.
+
+    A shadow that an impact smears is where its marker is in the mean over the exposure.
+    """
     row = np.searchsorted(target_id, found.target_id)
-    return np.linalg.norm(found.uv - image.uv[row], axis=1) > FALSE_PX
+    away = [np.linalg.norm(found.uv - true[row], axis=1) for true in (image.uv, image.mean_uv)]
+    return np.minimum(*away) > FALSE_PX
 
 
 def main() -> None:

@@ -17,6 +17,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -30,7 +31,6 @@ from fluoro_calib_ros.photogrammetry.rotations import matrix_from_quaternion, ma
 from fluoro_calib_ros.simulation.rig import (
     Detection,
     SimulatedExposures,
-    VirtualFluoroscope,
     VirtualRig,
     simulate_exposures,
     virtual_rig,
@@ -41,8 +41,20 @@ QUANTITIES = ('xp', 'yp', 'c', 'T', 'q', 'object points')
 MARGIN_PX = 8.0  # of the grid from the edge of the image
 
 
+class Fluoroscope(Protocol):
+    """What is true of a fluoroscope: its interior orientation (3,) [px] and its distortion."""
+
+    @property
+    def interior(self) -> np.ndarray:
+        """Interior orientation xp, yp, c [px]."""
+
+    @property
+    def distortion(self) -> Callable[[np.ndarray], np.ndarray]:
+        """Correction (n, 2) [px] of pixels (n, 2)."""
+
+
 def truth_in_gauge(
-    fluoroscope: VirtualFluoroscope,
+    fluoroscope: Fluoroscope,
     uv: np.ndarray,
     interior: np.ndarray,
     fitted: np.ndarray | float = 0.0,

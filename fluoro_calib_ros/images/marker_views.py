@@ -230,10 +230,16 @@ class JoinedViews:
         return out
 
     def _doubt_unsupported(self, exposure: MarkerExposure, frame: int) -> None:
-        """Doubt markers of bodies that a view sees anew, and that nothing else supports."""
+        """Doubt markers of bodies that a view sees anew, and that nothing else supports.
+
+        So are those of bodies that were found in one exposure only: their speed is not known.
+        """
         unknown = self._bodies.unplaced()
+        found = [body.target_id for body in self._again]
+        once = np.isin(self._target_id, np.concatenate([[], *found]))
         for view in self._views:
             anew = np.isin(self._target_id, view.tracker.seen_anew())
+            anew |= once & self._measured[view.view]
             view.doubt(np.flatnonzero(anew & unknown & ~exposure.agree[view.view]), frame)
 
     def _suggest(self, frame: int, placed: np.ndarray) -> None:

@@ -76,6 +76,7 @@ class MarkerImage:
     image: np.ndarray  #: (h, w)
     uv: NDArray[np.float64]  #: (n, 2) True centres in the middle of the exposure [px]
     seen: NDArray[np.bool_]  #: (n,) False for markers that are hidden or out of the field
+    mean_uv: NDArray[np.float64]  #: (n, 2) mean of the true centres over the exposure [px]
 
 
 @dataclass(frozen=True)
@@ -182,9 +183,10 @@ class MarkerRadiography(Radiography):
     def take(self, frame: int) -> MarkerImage:
         """Take the radiograph of an image number; the same number gives the same image."""
         rng = np.random.default_rng([self.seed, 23, frame])
-        light, true, hidden = self._light(frame, np.arange(len(self.markers.target_id)))
+        light, uv, hidden = self._light(frame, np.arange(len(self.markers.target_id)))
         image = self._grey(detected(light, self.settings), rng)
-        return MarkerImage(image, true, self.in_field(true, 6.0) & ~hidden)
+        true = self._true(frame)
+        return MarkerImage(image, true, self.in_field(true, 6.0) & ~hidden, uv.mean(axis=0))
 
     def expected_light(
         self, frame: int, rows: np.ndarray, shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -199,19 +201,25 @@ class MarkerRadiography(Radiography):
     def _light(
         self, frame: int, rows: np.ndarray, shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Light (h, w) before the detector, centres (n, 2), and which are hidden (n,)."""
+        """Light (h, w) before the detector, centres (moments, n, 2), which are hidden (n,)."""
         scene = self.markers.scene
         moments = frame + scene.shutter * ((np.arange(MOMENTS) + 0.5) / MOMENTS - 0.5)
         points = np.array([self.markers.points_mm(moment) for moment in moments])
         points += np.asarray(shift_mm)
         still = (np.eye(3), np.zeros(3))
         uv = np.array([self.centres(of_moment, still) for of_moment in points])
-        true = self.centres(self.markers.points_mm(frame) + np.asarray(shift_mm), still)
         light = self._open.copy()
         if scene.bones:
             light *= self._bones(self.markers.poses(frame))
         self._trace(light, points[:, rows], uv[:, rows], self.markers.diameter_mm[rows] / 2)
-        return light, true, self._hide(light, frame, true)
+        return light, uv, self._hide(light, frame, self._true(frame, shift_mm))
+
+    def _true(
+        self, frame: int, shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    ) -> np.ndarray:
+        """True centres (n, 2) in the middle of an exposure, of markers that are moved."""
+        points = self.markers.points_mm(frame) + np.asarray(shift_mm)
+        return self.centres(points, (np.eye(3), np.zeros(3)))
 
     def _trace(
         self, light: np.ndarray, points: np.ndarray, uv: np.ndarray, radius: np.ndarray

@@ -114,6 +114,7 @@ class Kind(str, Enum):
     NO_POSE = 'no_pose'
     POSE_AMBIGUOUS = 'pose_ambiguous'
     POSE_UNSURE = 'pose_unsure'
+    SHADOWS_BENT = 'shadows_bent'
 
     # Predicted beads of the phantom that are not observed.
     BEAD_ALONE = 'bead_alone'

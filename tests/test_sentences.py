@@ -62,6 +62,7 @@ from fluoro_calib_ros.jobs import orientation as orienting
 from fluoro_calib_ros.jobs import reconstruction as reconstructing
 from fluoro_calib_ros.jobs import report as comparing
 from fluoro_calib_ros.jobs.calibration import _without_copies, _without_shared
+from fluoro_calib_ros.jobs.extraction import ImageResult, bent_shadows
 from fluoro_calib_ros.jobs.followers import MarkerFollower, _wrong_start
 from fluoro_calib_ros.jobs.sources import read_content
 from fluoro_calib_ros.photogrammetry.rig_orientation import KnownOrientation
@@ -483,6 +484,9 @@ MAKERS = {
         matching.match, Seen.of(np.zeros((3, 2)), np.ones((9, 9)), 3.0), None, None
     ),
     Kind.GRID_NOT_MARKED: lambda: lattice.NOT_MARKED,
+    Kind.SHADOWS_BENT: lambda: bent_shadows(
+        'a', [ImageResult(sigma=np.full(50, 0.01), bent_px=0.02, frame=Fake())]
+    ),
     Kind.IMAGE_ENCODING: lambda: raised(as_grey, np.zeros((9, 9))),
     Kind.IMAGE_EMPTY: lambda: raised(detection._check, np.zeros((200, 200), np.uint8)),
     Kind.NO_POSE: no_pose,
@@ -798,6 +802,11 @@ SENTENCES = {
     Kind.GRID_NOT_MARKED: (
         'the grid is taken as one without marks: ids count from the hole nearest to the middle of '
         'each image: this serves the distortion of one fluoroscope, not the orientation of two'
+    ),
+    Kind.SHADOWS_BENT: (
+        'fluoroscope a: the distortion within the large shadows shifts their centres by # px '
+        '(RMS); some # px of it may be left in the correction, beyond what that claims: smaller '
+        'beads have less of it, with the square of their size'
     ),
     Kind.IMAGE_ENCODING: 'the image has pixels of float64, not of # or # bits',
     Kind.IMAGE_EMPTY: 'the image is empty: every pixel has the grey value #',

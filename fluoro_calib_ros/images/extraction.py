@@ -68,6 +68,8 @@ class Extraction:
     match: Match
     imaging: Imaging
     followed: bool = False  #: the pose comes from the exposure before, not from a search
+    #: RMS of the corrected shifts of centres by the distortion within their shadows [px]
+    bent_px: float = 0.0
 
     @property
     def nearby(self) -> Nearby:
@@ -210,8 +212,11 @@ def _measured(
     # What was measured are shadows; observations are of the centres of beads.
     radius_px = imaging.profile.border_px * (shadows.radius * size)
     of_bead = radius_px[np.searchsorted(rows, extraction.bead)]
-    shift = view.shadow_shift(model.xyz[extraction.bead], of_bead)
-    return replace(extraction, uv=extraction.uv - shift)
+    xyz = model.xyz[extraction.bead]
+    shift = view.shadow_shift(xyz, of_bead)
+    bent = shift - view.with_degree(1).shadow_shift(xyz, of_bead)
+    bent_px = float(np.sqrt(np.mean(np.sum(bent**2, axis=1)) / 2))
+    return replace(extraction, uv=extraction.uv - shift, bent_px=bent_px)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from ..brief import brief_repr
 from ..errors import DataError
 from ..exposures.frame import Frame
 from ..exposures.phantom import Phantom
-from ..findings import Finding, Kind, Place
+from ..findings import Finding, Kind, Place, Severity
 from ..images.lattice import NOT_MARKED, FlatGrid
 from ..images.overlay import small_jpeg
 from ..images.view import Lens, assumed_lens, may_be_found, shared_lens
@@ -196,7 +196,39 @@ def run_extraction(
     notes: tuple[str | Finding, ...] = request.angles.note(request.fluoroscope, angles)
     if request.regular_grid:
         notes = (NOT_MARKED, *notes)
+    bent = bent_shadows(request.fluoroscope, results)
+    if bent is not None:
+        notes = (*notes, bent)
     return ExtractionOutcome(request.fluoroscope, tuple(results), notes)
+
+
+# What the polynomials of the exposures leave of the shifts of shadows, as a share of them: 0.46,
+# 0.57 and 0.63 with shadows of 17 px (`benchmarks.calibrated_renderings`, large beads).
+BENT_LEFT = 0.55
+# Independent errors of a correction in a coordinate: the median of `benchmarks.pathologies`.
+FREE_ERRORS = 42
+
+
+def bent_shadows(fluoroscope: str, results: Sequence[ImageResult]) -> Finding | None:
+    """Return a warning where the distortion within shadows shifts a correction beyond its noise.
+
+    The exposures share that shift, and no standard deviation contains it.
+    """
+    used = [result for result in results if result.frame is not None]
+    sigma = np.concatenate([result.sigma for result in used])
+    bent_px = float(np.sqrt(np.mean([result.bent_px**2 for result in used])))
+    left_px = BENT_LEFT * bent_px
+    if left_px < float(np.median(sigma)) * np.sqrt(FREE_ERRORS / len(sigma)):
+        return None
+    return Finding(
+        Kind.SHADOWS_BENT,
+        f'the distortion within the large shadows shifts their centres by {bent_px:.3f} px (RMS); '
+        f'some {left_px:.3f} px of it may be left in the correction, beyond what that claims',
+        Place((fluoroscope,)),
+        advice='smaller beads have less of it, with the square of their size',
+        severity=Severity.WARNING,
+        numbers={'bent_px': bent_px, 'left_px': left_px},
+    )
 
 
 def _first_pass(

@@ -59,6 +59,7 @@ class Observations:
     explained: float = 0.0
     view: View | None = None  #: of the phantom
     followed: bool = False  #: whether the image before gave the start
+    bent_px: float = 0.0  #: see Extraction
     doubtful: int = 0  #: targets whose id may be wrong
     #: ids of earlier images of the fluoroscope that turned out to be wrong with this one
     retracted: tuple[Retraction, ...] = ()
@@ -234,6 +235,7 @@ class PhantomFollower:
             explained=extraction.match.explained,
             view=extraction.view,
             followed=extraction.followed,
+            bent_px=extraction.bent_px,
         )
 
 

@@ -307,7 +307,7 @@ def test_a_missed_body_that_its_markers_place_is_not_missed_any_more(is_placed):
     joined._views, joined._told, joined._by_body, joined._by_rays = [], [], [], []
     joined._target_id, joined._angles = np.array([3, 5]), {}
     joined._measured = np.zeros((0, 2), dtype=bool)
-    joined._missed = np.array([True, False])
+    joined._missed, joined._again = np.array([True, False]), []
     joined._rays = Fake(intersect=lambda found, angles: Fake(sure=np.zeros(2, dtype=bool)))
     nowhere = MarkerPlaces.nowhere(2)
     joined._bodies = Fake(
@@ -319,6 +319,24 @@ def test_a_missed_body_that_its_markers_place_is_not_missed_any_more(is_placed):
     )
     joined.decided({}, 4)
     assert joined._missed.tolist() == [not is_placed, False]
+
+
+def test_markers_of_a_body_found_once_are_doubted_where_nothing_supports_them():
+    doubted = []
+    joined = JoinedViews.__new__(JoinedViews)
+    tracker = Fake(seen_anew=lambda: (2,))
+    joined._views = [
+        Fake(view=0, tracker=tracker, doubt=lambda rows, frame: doubted.append(rows.tolist()))
+    ]
+    joined._target_id = np.arange(1, 8)
+    joined._again = [Fake(target_id=np.array([3, 4, 5, 6]))]
+    joined._bodies = Fake(unplaced=lambda: np.array([0, 1, 1, 1, 1, 0, 1], dtype=bool))
+    joined._measured = np.array([[1, 1, 1, 0, 1, 1, 1]], dtype=bool)
+    agree = np.array([[0, 0, 0, 0, 1, 0, 0]], dtype=bool)
+    joined._doubt_unsupported(Fake(agree=agree), 9)
+    # Marker 4 is not measured, 5 is where another view says, 6 where its body does, 7 is of
+    # another body.
+    assert doubted == [[1, 2]]
 
 
 def test_views_are_those_of_the_orientation_in_its_order():

@@ -11,7 +11,7 @@ shadow is the smaller eigenvalue of the Hessian, as in `detection`.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -483,14 +483,15 @@ def learn_start(image: FilteredImage, target_id: np.ndarray, uv: np.ndarray) -> 
 SHARE = 0.35  # of the response to a typical marker, from which a shadow may be a marker
 MIN_HALF = 4  # of a search window [px]
 MAX_HALF = 48
+STRIPS = 6  # of an image that is searched in turn: a whole one takes as long as five exposures
 
 
 class MarkerSearch:
     """Finds shadows where markers may be.
 
     gate: half the width of a search window [standard deviations of the prediction]. lost_after:
-    images without a marker after which it is lost. search_every: images between searches of the
-    whole image, where a marker is lost.
+    images without a marker after which it is lost. search_every: images in which all strips of
+    the image are searched in turn, where a marker is lost.
     """
 
     def __init__(
@@ -499,7 +500,8 @@ class MarkerSearch:
         self._look = look
         self._gate = gate
         self._lost_after = lost_after
-        self._search_every = search_every
+        self._strips = min(STRIPS, search_every)
+        self._every = search_every // self._strips
 
     def everywhere(self, image: np.ndarray) -> Shadows:
         """Find the shadows of a whole image."""
@@ -514,23 +516,35 @@ class MarkerSearch:
     ) -> Shadows:
         """Find shadows in an image; number is that of images since the first one."""
         lost = self.lost(states)
-        if lost.any() and number % self._search_every == 0:
-            return self.everywhere(image)
+        parts = []
+        if lost.any() and number % self._every == 0:
+            parts.append(self._of_strip(image, number // self._every % self._strips))
         reach = np.ceil(self._gate * np.sqrt(states.shadow_variance))
         near = ~lost | (reach <= MAX_HALF)
-        if not near.any():
-            return Shadows(np.zeros((0, 2)), np.zeros(0))
         half = np.clip(reach, MIN_HALF, MAX_HALF).astype(int)
         middle = np.rint(states.motion.uv).astype(int)
-        parts = []
         # Few markers need wide windows; those of the others stay small.
-        small = int(np.sort(half[near])[3 * np.count_nonzero(near) // 4])
+        sizes = np.sort(half[near])
+        small = int(sizes[3 * len(sizes) // 4]) if len(sizes) else 0
         for rows in (near & (half <= small), near & (half > small)):
             if rows.any():
                 size = int(half[rows].max())
                 parts.append(search_windows(windows, middle[rows], size, self._look, SHARE))
         if len(parts) == 1:
             return parts[0]
-        uv = np.concatenate([part.uv for part in parts])
-        strength = np.concatenate([part.strength for part in parts])
-        return Shadows(uv, strength).distinct() if len(uv) else parts[0]
+        uv = np.concatenate([np.zeros((0, 2)), *(part.uv for part in parts)])
+        strength = np.concatenate([np.zeros(0), *(part.strength for part in parts)])
+        return Shadows(uv, strength).distinct() if len(uv) else Shadows(uv, strength)
+
+    def _of_strip(self, image: np.ndarray, strip: int) -> Shadows:
+        """Find the shadows of a strip of rows of an image."""
+        height = len(image)
+        top, bottom = (height * edge // self._strips for edge in (strip, strip + 1))
+        margin = BACKGROUND_PX + int(np.ceil(BORDER * self._look.scale))
+        first = max(top - margin, 0)
+        seen = slice(first, min(bottom + margin, height))
+        look = replace(self._look, field=self._look.field[seen])
+        found = search_image(image[seen], look, SHARE)
+        uv = found.uv + [0, first]
+        inside = (uv[:, 1] >= top - 0.5) & (uv[:, 1] < bottom - 0.5)
+        return Shadows(uv[inside], found.strength[inside])

@@ -62,7 +62,7 @@ class MarkerOptions:
     )
     search_every: int = option(
         30,
-        'images between searches of the whole image, where a marker is lost',
+        'images in which the whole image is searched, in strips, where a marker is lost',
         minimum=1,
         maximum=100000,
         unit='images',

@@ -315,21 +315,41 @@ def test_a_first_image_says_which_markers_are_there():
 
 
 @pytest.mark.parametrize(
-    ('number', 'lost', 'everywhere'), [(30, 11, True), (31, 11, False), (30, 10, False)]
+    ('number', 'lost', 'every', 'there_too'),
+    [(31, 11, 30, False), (30, 10, 30, False), (30, 11, 1, True), (31, 11, 1, True)],
 )
-def test_the_whole_image_is_searched_now_and_then_where_a_marker_is_lost(number, lost, everywhere):
+def test_a_lost_marker_is_searched_in_the_whole_image(number, lost, every, there_too):
     image = scene()
     look = look_of(image)
     unseen = np.zeros(12, int)
     unseen[5] = lost
     states = MarkerStates.start(Motion.start(PLACES + 0.5, 1.0), unseen)
     states.motion.uv[5] = [20.0, 20.0]
-    search = MarkerSearch(look, gate=4.5, lost_after=10, search_every=30)
+    search = MarkerSearch(look, gate=4.5, lost_after=10, search_every=every)
     assert search.lost(states).tolist() == [False] * 5 + [lost > 10] + [False] * 6
     found = search.shadows(image, LightWindows(image, look), states, number)
     there = np.linalg.norm(found.uv[:, None] - PLACES[None], axis=2).min(axis=0) < 1
-    assert there.tolist() == [True] * 5 + [everywhere] + [True] * 6
+    assert there.tolist() == [True] * 5 + [there_too] + [True] * 6
     assert len(found.uv) == there.sum()
+
+
+@pytest.mark.parametrize('every', [30, 4])
+def test_strips_of_an_image_are_searched_in_turn(every):
+    image = scene()
+    look = look_of(image)
+    states = MarkerStates.start(Motion.start(PLACES - 500.0, 30.0), np.full(12, 99))
+    search = MarkerSearch(look, gate=4.5, lost_after=10, search_every=every)
+    whole = search_image(image, look, 0.35)
+    windows = LightWindows(image, look)
+    found = [search.shadows(image, windows, states, number) for number in range(60, 60 + every)]
+    assert np.count_nonzero([len(one.uv) for one in found]) <= min(every, 6)
+    uv = np.concatenate([one.uv for one in found])
+    strength = np.concatenate([one.strength for one in found])
+    away = np.linalg.norm(uv[:, None] - whole.uv[None], axis=2)
+    # Each shadow is found once, as in the whole image.
+    assert len(uv) == len(whole.uv) == 12
+    assert away.min(axis=0).max() < 1e-3
+    assert strength == pytest.approx(whole.strength[away.argmin(axis=1)], rel=1e-4)
 
 
 def test_markers_that_may_be_anywhere_are_not_searched_in_windows():

@@ -42,6 +42,18 @@ class Case:
         Displacement of one side of the phantom in the survey.
     moved : (int, float)
         Number of exposures in which half of the beads move, and how far [mm].
+    short : float
+        Share by which the survey is short in one axis.
+    exchanged_mm : float
+        Distance of two beads that are exchanged in the survey, 0 for none.
+    late : (float, float)
+        Motion of the phantom until b takes its frame [mm], [rad].
+    behind : int
+        Exposures that b is behind, by its frame numbers.
+    repeats : int
+        Frames of each pose, with mostly the same noise.
+    magnified : (int, float)
+        Number of exposures in another magnification, and its factor.
     side, c, principal, distance : int, float, (float, float), float
         Image side [px], principal distance over it, offset of the principal point [px of 1024],
         distance of the source [mm].
@@ -64,7 +76,7 @@ class Case:
     limited : bool
         The information does not allow a ratio of 1.15.
     both : bool
-        Both fluoroscopes are validated.
+        Both fluoroscopes and the orientation of the rig are validated.
     """
 
     name: str
@@ -81,6 +93,12 @@ class Case:
     displaced: tuple = (0, 0.0)
     face_mm: float = 0.0
     moved: tuple = (0, 0.0)
+    short: float = 0.0
+    exchanged_mm: float = 0.0
+    late: tuple = (0.0, 0.0)
+    behind: int = 0
+    repeats: int = 1
+    magnified: tuple = (0, 1.0)
     side: int = 1024
     c: float = 3.6
     principal: tuple = (0.0, 0.0)
@@ -192,6 +210,19 @@ CASES = (
     Case('3 beads 2 mm off', 'survey', displaced=(3, 2.0), faulty=True),
     Case('a face 1 mm off', 'survey', face_mm=1.0, faulty=True),
     Case('moved in an exposure', 'survey', moved=(1, 1.0), faulty=True),
+    # Recordings and surveys that are plausible, and wrong.
+    Case('an axis 0.2 % short', 'confused', short=0.002, faulty=True),
+    Case('two beads exchanged', 'confused', exchanged_mm=5.0, faulty=True),
+    Case('b a frame late', 'confused', late=(1.5, 0.005), faulty=True, both=True),
+    Case('b an exposure behind', 'confused', behind=1, faulty=True, both=True),
+    Case('three frames a pose', 'confused', exposures=45, repeats=3),
+    Case('two exposures magnified', 'confused', magnified=(2, 1.3)),
+    Case(
+        'lead disc of 140 px',
+        'confused',
+        blind=lambda x: ((x - [0.58, 0.45]) ** 2).sum(axis=1) < 0.0187,
+    ),
+    Case('one dent of 4 px, wide', 'confused', parts=(*SMOOTH, Bumps(1, 60, 6.0))),
     # Models other than auto.
     Case('local_linear', 'models', options={'model': 'local_linear'}),
     Case('knn', 'models', options={'model': 'knn'}),

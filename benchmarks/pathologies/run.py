@@ -8,6 +8,7 @@ import json
 import multiprocessing
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 from fluoro_calib_ros.checks.verdict import validate_or_report
@@ -33,7 +34,7 @@ def measured(case, seed, model=None, verdict=True):
     out = {'case': case.name, 'seed': seed, 'model': model or case.options.get('model', 'auto')}
     began = time.process_time()
     try:
-        outcome = run_calibration(request)
+        outcome = run_calibration(request, validate=verdict and case.both)
     except DataError as error:
         return {**out, 'said': str(error), 'seconds': time.process_time() - began}
     out['seconds'] = time.process_time() - began
@@ -43,18 +44,17 @@ def measured(case, seed, model=None, verdict=True):
     out |= claims(scene, result)
     out |= {'converged': result.converged, 'kind': result.fluoroscopes['a'].model_kind}
     if verdict:
-        out |= _verdict(case, scene, request, outcome)
+        out |= _verdict(outcome)
     return out
 
 
-def _verdict(case, scene, request, outcome):
-    """Verdict on fluoroscope a (both where the case says so), and beads accused wrongly."""
-    names = NAMES if case.both else NAMES[:1]
-    request = CalibrationRequest(
-        {name: request.frames[name] for name in names}, scene.phantom, request.options
-    )
+def _verdict(outcome):
+    """Verdict on fluoroscope a, on the whole rig where the case says so."""
+    name = NAMES[0]
+    used = outcome.request.with_exposures(outcome.result.used_exposures)
+    request = replace(used, frames={name: used.frames[name]})
     began = time.process_time()
-    found = validate_or_report(request, {name: outcome.calibrations[name] for name in names})
+    found = outcome.validation or validate_or_report(request, {name: outcome.calibrations[name]})
     return {
         'verdict': found.verdict,
         'failed': [check.name for check in found.checks if check.passed is False],

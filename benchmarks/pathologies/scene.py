@@ -6,6 +6,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
 from fluoro_calib_ros.exposures.frame import Frame
@@ -19,6 +20,7 @@ EDGE = 0.5  # distance [px] of image points from the edge of the image
 MAX_TRIES = 40  # poses that are drawn until one shows the phantom
 ARM = np.deg2rad(90)  # largest angle of the C-arm, either way
 NARROW = np.deg2rad(5)
+FRESH_NOISE = 0.3  # of further frames of a pose, over that of the first
 
 
 @dataclass(frozen=True)
@@ -94,10 +96,11 @@ class Scene:
         """Frames for the calibration, by fluoroscope."""
         out = {name: [] for name in NAMES}
         for image in self.images:
+            behind = self.case.behind if image.camera else 0
             out[NAMES[image.camera]].append(
                 Frame(
                     NAMES[image.camera],
-                    image.number,
+                    (image.number + behind - 1) % self.case.exposures + 1,
                     image.rows + 1,
                     image.observed,
                     (self.case.side, self.case.side),
@@ -124,6 +127,11 @@ def draw(case, seed, recording=0, change=None):
     if case.face_mm:
         face = true_mm[:, 0] > np.quantile(true_mm[:, 0], 0.8)
         survey[face] += case.face_mm * np.array([0.0, 0.6, 0.8])
+    survey[:, 0] *= 1 - case.short
+    if case.exchanged_mm:
+        distance = np.abs(pdist(true_mm) - case.exchanged_mm)
+        displaced = np.stack(np.triu_indices(len(true_mm), 1))[:, distance.argmin()]
+        survey[displaced] = survey[displaced[::-1]]
     phantom = Phantom(
         np.arange(1, len(survey) + 1), np.round(survey, 4), np.full(len(survey), case.survey_sd)
     )
@@ -136,10 +144,18 @@ def draw(case, seed, recording=0, change=None):
     poses = []
     angles = _angles(case, rng, case.exposures)
     for number in range(1, case.exposures + 1):
+        if (number - 1) % case.repeats:
+            poses.append(poses[-1])
+            images += [_again(case, rng, image, number) for image in images[-2:]]
+            continue
         pose = _pose(case, rng, cameras, true_mm, number)
         poses.append(pose)
         here = [camera.at(case, angles[number - 1]) for camera in cameras]
-        images += [_image(case, rng, f, here[f], true_mm, pose, number) for f in range(2)]
+        if number <= case.magnified[0]:
+            factor = np.array([1.0, 1.0, case.magnified[1]])
+            here = [replace(camera, interior=camera.interior * factor) for camera in here]
+        seen = [pose, _moved(case, rng, pose)]
+        images += [_image(case, rng, f, here[f], true_mm, seen[f], number) for f in range(2)]
     tests = [_pose(case, rng, cameras, true_mm, n) for n in range(1, case.tests + 1)]
     test_angles = _angles(case, rng, case.tests)
     return Scene(
@@ -172,6 +188,24 @@ def _camera(case, rng, f):
     distortion = Distortion.of(case.parts, rng, side)
     turning = Turning(case.arm, 0.0).draw(rng) if case.arm else None
     return Camera(NAMES[f], interior, tilt @ looking, source, distortion, turning)
+
+
+def _moved(case, rng, pose):
+    """Pose in which b sees the phantom."""
+    if not any(case.late):
+        return pose
+    turn, shift = pose
+    way = rng.normal(0, 1, (2, 3))
+    way *= np.array(case.late)[:, None] / np.linalg.norm(way, axis=1, keepdims=True)
+    return Rotation.from_rotvec(way[1]).as_matrix() @ turn, shift + way[0]
+
+
+def _again(case, rng, image, number):
+    """Another frame of the pose of an image, with mostly the same noise."""
+    fresh = FRESH_NOISE * rng.normal(0, case.noise.sd, image.observed.shape)
+    return replace(
+        image, number=number, observed=image.observed + fresh, clean=image.clean + fresh
+    )
 
 
 def _changed(camera, change, rng):

@@ -33,7 +33,7 @@ from ..estimation.initial_network import nominal_interior
 from ..estimation.options import CalibrationRequest
 from ..estimation.result import CalibrationResult
 from ..exposures.frame import Frame, Frames
-from ..findings import Kind, Place
+from ..findings import Finding, Kind, Place, Severity
 from .beads import BEADS
 from .calibration_evidence import Evidence
 from .check import Check, Validation, verdict_of
@@ -190,8 +190,32 @@ def validate(
         ids_of(calibrations),
         seconds=time.perf_counter() - began,
         achieved_sd_px={name: _achieved_sd(evidence, name, checks) for name in request.frames},
-        notes=(*rig.notes, *trusted_shape(checks)),
+        notes=(*rig.notes, *trusted_shape(checks), *trusted_angles(calibrations)),
     )
+
+
+# Of the NSE of a correction at an angle: errors that are drawn from its covariance exceed it in so
+# many of a hundred calibrations (docs/how_good.md, a C-arm that turns).
+MANY_NSE = 2.0
+MANY_PERCENT = 7
+
+
+def trusted_angles(calibrations: Calibrations) -> list[Finding]:
+    """Return a finding for each correction that changes with the angle of a C-arm."""
+    return [
+        Finding(
+            Kind.TAKEN_ON_TRUST,
+            'most of the error of the correction at an angle of the C-arm is one number, the '
+            'change of the principal distance over the range of angles: in '
+            f'{MANY_PERCENT} of 100 calibrations, errors are more than '
+            f'{np.sqrt(MANY_NSE):.1f} times the standard deviations',
+            Place((name,)),
+            severity=Severity.NOTE,
+            numbers={'nse': MANY_NSE, 'share': MANY_PERCENT / 100},
+        )
+        for name, calibration in calibrations.items()
+        if calibration.angle_field is not None
+    ]
 
 
 def _achieved_sd(evidence: Evidence, name: str, checks: Sequence[Check]) -> float:

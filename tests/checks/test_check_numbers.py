@@ -449,6 +449,14 @@ def test_achieved_deviation_joins_claim_halves_trend_and_variation():
     assert verdict._achieved_sd(given, 'a', [check(0.5, 1.0)]) == pytest.approx(0.3)
 
 
+def test_corrections_that_change_with_an_angle_are_taken_on_trust():
+    turning, still = Fake(angle_field=object()), Fake(angle_field=None)
+    (found,) = verdict.trusted_angles({'a': still, 'b': turning})
+    assert found.kind is Kind.TAKEN_ON_TRUST and found.severity is Severity.NOTE
+    assert found.place.fluoroscopes == ('b',)
+    assert found.numbers == {'nse': 2.0, 'share': 0.07}
+
+
 def test_limits_of_exposures_follow_their_scatter_and_noise():
     calm = np.full(10, 1.1)
     assert exposure_limits(calm, calm).tolist() == [1.6] * 10

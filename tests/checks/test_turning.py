@@ -28,6 +28,8 @@ def verdict(known):
 def test_calibration_with_known_angles_passes():
     found = verdict(known=True)
     assert found.verdict == 'pass', found.findings
+    of_angles = [one for one in found.notes if one.place.fluoroscopes == ('a',)]
+    assert [one.kind for one in of_angles] == [Kind.TAKEN_ON_TRUST]
 
 
 @pytest.mark.long

@@ -132,6 +132,8 @@ MIN_TARGETS_OF_EXPOSURE = 12
 MIN_TARGETS_OF_KNOWN = 1
 # Flat targets that are tilted less in all exposures do not show the principal distance.
 UNTILTED_RAD = np.deg2rad(5.0)
+# As is advised.
+TILTED_RAD = np.deg2rad(20.0)
 # Smaller differences of rotation and distance make two exposures show one pose of the phantom.
 MIN_POSE_RAD = np.deg2rad(2.0)
 MIN_POSE_MM = 20.0
@@ -413,6 +415,15 @@ def _are_untilted(task: _Task, frames: Sequence[Frame], found: Sequence[Resectio
         if flatness(xyz) >= MIN_FLATNESS or tilt_of(one.rotation, plane_of(xyz)) > UNTILTED_RAD:
             return False
     return any(one is not None for one in found)
+
+
+def is_hardly_tilted(measured: Measured) -> bool:
+    """Whether all targets are flat, and tilted less than is advised where a network begins."""
+    survey = measured.network.survey_mm
+    if flatness(survey) >= MIN_FLATNESS:
+        return False
+    plane = plane_of(survey)
+    return all(tilt_of(rotation, plane) < TILTED_RAD for rotation in measured.start.rotation)
 
 
 def _require_determined(

@@ -32,6 +32,7 @@ from ..correction.registry import (
 )
 from ..correction.series import Series
 from ..errors import DataError
+from ..findings import Place
 from ..photogrammetry.adjustment import (
     Adjustment,
     SolverOptions,
@@ -57,9 +58,11 @@ from .estimator import (
     require_training,
 )
 from .initial_network import (
+    TOO_FLAT,
     EarlierCalibration,
     Measured,
     adjusted_with_precision,
+    is_hardly_tilted,
     start_noise,
     undetermined,
     with_additional,
@@ -434,6 +437,9 @@ def _require_inliers(measured: Measured, adjustment: Adjustment) -> None:
         try:
             require_training(int(adjustment.inliers[measured.network.rows(f)].sum()))
         except ValueError as error:
+            if measured.network.interior_free[f] and is_hardly_tilted(measured):
+                # The principal distance has gone astray, and the residuals with it.
+                raise DataError(replace(TOO_FLAT, place=Place((name,)))) from None
             raise DataError(f'fluoroscope {name}: {error}') from None
 
 

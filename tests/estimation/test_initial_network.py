@@ -27,6 +27,7 @@ from fluoro_calib_ros.estimation.initial_network import (
     nominal_interior,
     undetermined,
 )
+from fluoro_calib_ros.estimation.self_calibration import _require_inliers
 from fluoro_calib_ros.estimation.start_orientation import (
     View,
     _better_pose,
@@ -318,6 +319,32 @@ def test_exposures_that_remain_are_too_few():
     with rigs.refused(Kind.POOR_FIT, needed=3, fitting=2) as error:
         measured_network({'a': wrong}, phantom_of(points))
     assert error.value.finding.place.fluoroscopes == ('a',)
+
+
+@pytest.mark.parametrize(
+    ('tilt_deg', 'height', 'is_free', 'kind'),
+    [
+        (19.0, 0.0, True, Kind.UNTILTED_TARGETS),
+        (21.0, 0.0, True, Kind.DATA),
+        (19.0, 40.0, True, Kind.DATA),
+        (19.0, 0.0, False, Kind.DATA),
+    ],
+)
+def test_flat_targets_that_are_hardly_tilted_are_the_cause_of_few_inliers(
+    tilt_deg, height, is_free, kind
+):
+    survey = np.random.default_rng(1).uniform(-50, 50, (30, 3)) * [1, 1, 0]
+    survey[::2, 2] = height
+    tilts = [np.deg2rad(tilt_deg) * np.array([np.cos(a), np.sin(a), 0]) for a in range(4)]
+    network = SimpleNamespace(
+        survey_mm=survey, rows=lambda f: np.arange(120), interior_free=np.array([is_free])
+    )
+    start = SimpleNamespace(rotation=np.stack([matrix_from_vector(tilt) for tilt in tilts]))
+    measured = SimpleNamespace(network=network, start=start, fluoroscopes=('a',))
+    few = SimpleNamespace(inliers=np.arange(120) < 20)
+    with rigs.refused(kind) as error:
+        _require_inliers(measured, few)
+    assert kind is Kind.DATA or error.value.finding.place.fluoroscopes == ('a',)
 
 
 def test_singular_networks_are_refused_with_what_their_targets_are(monkeypatch):

@@ -229,6 +229,10 @@ class BodyDecisions:
         near = np.maximum(NEAR_PX, NEAR_SIGMAS * np.hypot(exposure.sigma[view.view], sd))
         right = away < near
         wrong = away > FAR * near
+        # A body that another view shows hardly tells a place along the rays of that view.
+        contradicted = (sd > NEAR_PX) & (exposure.standardised[view.view] > DISAGREE)
+        right &= ~contradicted
+        wrong |= contradicted
         self._seen_right[right] = frame
         view.counts.disagree(wrong)
         view.doubt(np.flatnonzero(wrong & ~doubtful), frame)

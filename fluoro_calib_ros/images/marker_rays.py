@@ -338,6 +338,13 @@ class MarkerBodies:
             out[rows] = body.known
         return np.asarray(out & ~self.present.known)
 
+    def among(self, supported: np.ndarray) -> np.ndarray:
+        """Whether (n,) markers are of bodies with so many supported (n,) that give a pose."""
+        out = np.zeros(self._count, dtype=bool)
+        for rows in self._rows:
+            out[rows] = np.count_nonzero(supported[rows]) >= MIN_MEMBERS
+        return out
+
     def miss(self, measured: np.ndarray, before: np.ndarray) -> np.ndarray:
         """Give up bodies that are not where they were expected; returns their markers (n,).
 

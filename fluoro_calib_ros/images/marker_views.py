@@ -230,17 +230,20 @@ class JoinedViews:
         return out
 
     def _doubt_unsupported(self, exposure: MarkerExposure, frame: int) -> None:
-        """Doubt markers of bodies that a view sees anew, and that nothing else supports.
+        """Doubt markers of bodies without a pose that no other view supports.
 
-        So are those of bodies that were found in one exposure only: their speed is not known.
+        Where others of the body are supported, something else is among them; a body that was found
+        in one exposure only has no speed yet.
         """
         unknown = self._bodies.unplaced()
-        found = [body.target_id for body in self._again]
-        once = np.isin(self._target_id, np.concatenate([[], *found]))
+        unknown &= self._bodies.among(exposure.agree.any(axis=0)) | self._among(self._again)
         for view in self._views:
-            anew = np.isin(self._target_id, view.tracker.seen_anew())
-            anew |= once & self._measured[view.view]
-            view.doubt(np.flatnonzero(anew & unknown & ~exposure.agree[view.view]), frame)
+            alone = self._measured[view.view] & ~exposure.agree[view.view]
+            view.doubt(np.flatnonzero(unknown & alone), frame)
+
+    def _among(self, bodies: Sequence[Body]) -> np.ndarray:
+        """Whether (n,) markers are of some of the bodies."""
+        return np.isin(self._target_id, np.concatenate([[], *(b.target_id for b in bodies)]))
 
     def _suggest(self, frame: int, placed: np.ndarray) -> None:
         """Offer each view predictions of the markers that it is not sure of.
@@ -288,8 +291,7 @@ class JoinedViews:
             if view.name in found:
                 view.tracker.relocate(found[view.name])
         there = [body for body in wanted.values() if body.name not in missing]
-        for body in there:
-            placed |= np.isin(self._target_id, body.target_id)
+        placed = self._among(there)
         self._missed &= ~placed
         before = [body.name for body in self._again]
         self._again = [body for body in there if body.name not in before]

@@ -321,22 +321,31 @@ def test_a_missed_body_that_its_markers_place_is_not_missed_any_more(is_placed):
     assert joined._missed.tolist() == [not is_placed, False]
 
 
-def test_markers_of_a_body_found_once_are_doubted_where_nothing_supports_them():
+@pytest.mark.parametrize(('once', 'among'), [((2,), ()), ((), (2,)), ((), ()), ((2,), (2,))])
+def test_markers_of_a_body_without_pose_are_doubted_where_no_other_view_supports_them(once, among):
     doubted = []
     joined = JoinedViews.__new__(JoinedViews)
-    tracker = Fake(seen_anew=lambda: (2,))
-    joined._views = [
-        Fake(view=0, tracker=tracker, doubt=lambda rows, frame: doubted.append(rows.tolist()))
-    ]
+    joined._views = [Fake(view=0, doubt=lambda rows, frame: doubted.append(rows.tolist()))]
     joined._target_id = np.arange(1, 8)
-    joined._again = [Fake(target_id=np.array([3, 4, 5, 6]))]
-    joined._bodies = Fake(unplaced=lambda: np.array([0, 1, 1, 1, 1, 0, 1], dtype=bool))
-    joined._measured = np.array([[1, 1, 1, 0, 1, 1, 1]], dtype=bool)
+    # Of the second body markers 3 and 7, of the others all other ones.
+    second = np.array([0, 0, 1, 0, 0, 0, 1], dtype=bool)
+    joined._again = [Fake(target_id=np.array([3, 7]))] if once else []
     agree = np.array([[0, 0, 0, 0, 1, 0, 0]], dtype=bool)
+    joined._bodies = Fake(
+        unplaced=lambda: np.array([0, 1, 1, 1, 1, 0, 1], dtype=bool),
+        among=lambda supported: second & bool(among) & (supported == agree[0]).all(),
+    )
+    joined._measured = np.array([[1, 1, 1, 0, 1, 1, 1]], dtype=bool)
     joined._doubt_unsupported(Fake(agree=agree), 9)
-    # Marker 4 is not measured, 5 is where another view says, 6 where its body does, 7 is of
-    # another body.
-    assert doubted == [[1, 2]]
+    assert doubted == [[2, 6] if once or among else []]
+
+
+def test_bodies_give_a_pose_by_three_supported_markers():
+    bodies = MarkerBodies.__new__(MarkerBodies)
+    bodies._count = 8
+    bodies._rows = [np.array([0, 1, 2, 5]), np.array([3, 4, 6])]
+    supported = np.array([1, 1, 0, 1, 1, 1, 0, 1], dtype=bool)
+    assert np.flatnonzero(bodies.among(supported)).tolist() == [0, 1, 2, 5]
 
 
 def test_views_are_those_of_the_orientation_in_its_order():

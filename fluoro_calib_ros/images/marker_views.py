@@ -235,8 +235,9 @@ class JoinedViews:
         Where others of the body are supported, something else is among them; a body that was found
         in one exposure only has no speed yet.
         """
+        supported = np.asarray(exposure.agree.any(axis=0))
         unknown = self._bodies.unplaced()
-        unknown &= self._bodies.among(exposure.agree.any(axis=0)) | self._among(self._again)
+        unknown &= self._bodies.among(supported) | self._among(self._again)
         for view in self._views:
             alone = self._measured[view.view] & ~exposure.agree[view.view]
             view.doubt(np.flatnonzero(unknown & alone), frame)

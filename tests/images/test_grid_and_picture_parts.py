@@ -308,13 +308,15 @@ def test_a_missed_body_that_its_markers_place_is_not_missed_any_more(is_placed):
     joined._target_id, joined._angles = np.array([3, 5]), {}
     joined._measured = np.zeros((0, 2), dtype=bool)
     joined._missed, joined._again = np.array([True, False]), []
-    joined._rays = Fake(intersect=lambda found, angles: Fake(sure=np.zeros(2, dtype=bool)))
+    none = np.zeros(2, dtype=bool)
+    joined._rays = Fake(intersect=lambda found, angles: Fake(sure=none, agree=none[None]))
     nowhere = MarkerPlaces.nowhere(2)
     joined._bodies = Fake(
         miss=lambda measured, before: np.zeros(2, dtype=bool),
         update=lambda exposure, frame: None,
         present=MarkerPlaces(np.zeros((2, 3)), nowhere.covariance) if is_placed else nowhere,
-        unplaced=lambda: np.zeros(2, dtype=bool),
+        unplaced=lambda: none.copy(),
+        among=lambda supported: none,
         learn=lambda exposure, sure: None,
     )
     joined.decided({}, 4)

@@ -36,7 +36,8 @@ with a standard deviation of 0.1 mm. Model: {model}.
   that of the sources by about 0.7, that of the correction as chi squared over its degrees of
   freedom, which follow from the claimed covariance (Box 1954).
 - **cover**: share [%] of errors within the claimed 95 % interval, in the same order.
-- **verdict** on fluoroscope a: right where it is `pass` with ratio <= {max_ratio} and NSE of the
+- **verdict** on fluoroscope a, where a case is of both fluoroscopes on the whole rig: right where
+  it is `pass` with ratio <= {max_ratio} and NSE of the
   correction <= {max_nse}, or not `pass` otherwise; where the phantom or its survey is faulty,
   `pass` is wrong. `cannot tell` on a good calibration is open.
 - **s**: CPU seconds of the calibration of both fluoroscopes.

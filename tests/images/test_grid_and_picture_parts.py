@@ -315,7 +315,7 @@ def test_a_missed_body_that_its_markers_place_is_not_missed_any_more(is_placed):
         miss=lambda measured, before: np.zeros(2, dtype=bool),
         update=lambda exposure, frame: None,
         present=MarkerPlaces(np.zeros((2, 3)), nowhere.covariance) if is_placed else nowhere,
-        unplaced=lambda: none.copy(),
+        unplaced=none.copy,
         among=lambda supported: none,
         learn=lambda exposure, sure: None,
     )

@@ -232,15 +232,17 @@ class JoinedViews:
     def _doubt_unsupported(self, exposure: MarkerExposure, frame: int) -> None:
         """Doubt markers of bodies without a pose that no other view supports.
 
-        Where others of the body are supported, something else is among them; a body that was found
-        in one exposure only has no speed yet.
+        Those are in doubt that a view sees anew; all of a body that was found in one exposure
+        only, and has no speed yet; and all where others of the body are supported: something else
+        is among them.
         """
-        supported = np.asarray(exposure.agree.any(axis=0))
         unknown = self._bodies.unplaced()
-        unknown &= self._bodies.among(supported) | self._among(self._again)
+        supported = np.asarray(exposure.agree.any(axis=0))
+        doubted = self._bodies.among(supported) | self._among(self._again)
         for view in self._views:
             alone = self._measured[view.view] & ~exposure.agree[view.view]
-            view.doubt(np.flatnonzero(unknown & alone), frame)
+            anew = np.isin(self._target_id, view.tracker.seen_anew())
+            view.doubt(np.flatnonzero(unknown & alone & (doubted | anew)), frame)
 
     def _among(self, bodies: Sequence[Body]) -> np.ndarray:
         """Whether (n,) markers are of some of the bodies."""

@@ -246,6 +246,7 @@ class MarkerTracker:
         # Of the next image: by a person, and by the shapes of bodies.
         self._given: FirstMarkers | None = None
         self._relocated: FirstMarkers | None = None
+        self._anew = np.zeros(len(self.target_id), dtype=bool)
         self._tried = 0  # image from which suggested markers are looked for again
 
     @property
@@ -332,6 +333,10 @@ class MarkerTracker:
         if followed is None:
             return self.target_id
         return self.target_id[(followed.states.unseen > 0) | followed.doubts.doubtful]
+
+    def seen_anew(self) -> np.ndarray:
+        """Ids (k,) of markers that were measured last, and whose motion was not known before."""
+        return self.target_id[self._anew]
 
     def relocate(self, found: FirstMarkers) -> None:
         """Follow markers from where their bodies are found in the next image; ids are sure."""
@@ -467,9 +472,12 @@ class MarkerTracker:
             follow_beside(states, self._gap)
             shift_together(states.motion, shadows, self.options.gate, self._gap)
         found = followed.measurement.measure(windows, shadows, states)
+        unknown = ~states.motion.settled | (states.unseen > 1)
         found, doubts = watch.shadows_met(found, states, frame)
         doubts += watch.found_again(found, states, frame)
         doubts += watch.other_shadows(found, states, frame)
+        # In the first image, and where bodies have just been found, their shapes tell the ids.
+        self._anew = found.measured & unknown & (states.placed > 0) & (self._images > 0)
         velocity_before = states.motion.velocity.copy()
         states.update(found, self._gap)
         doubts += watch.moving_alone(found, states, frame, self._gap)

@@ -327,7 +327,10 @@ def test_a_missed_body_that_its_markers_place_is_not_missed_any_more(is_placed):
 def test_markers_of_a_body_without_pose_are_doubted_where_no_other_view_supports_them(once, among):
     doubted = []
     joined = JoinedViews.__new__(JoinedViews)
-    joined._views = [Fake(view=0, doubt=lambda rows, frame: doubted.append(rows.tolist()))]
+    tracker = Fake(seen_anew=lambda: (2, 5))
+    joined._views = [
+        Fake(view=0, tracker=tracker, doubt=lambda rows, frame: doubted.append(rows.tolist()))
+    ]
     joined._target_id = np.arange(1, 8)
     # Of the second body markers 3 and 7, of the others all other ones.
     second = np.array([0, 0, 1, 0, 0, 0, 1], dtype=bool)
@@ -339,7 +342,7 @@ def test_markers_of_a_body_without_pose_are_doubted_where_no_other_view_supports
     )
     joined._measured = np.array([[1, 1, 1, 0, 1, 1, 1]], dtype=bool)
     joined._doubt_unsupported(Fake(agree=agree), 9)
-    assert doubted == [[2, 6] if once or among else []]
+    assert doubted == [[1, 2, 6] if once or among else [1]]
 
 
 def test_bodies_give_a_pose_by_three_supported_markers():

@@ -212,7 +212,7 @@ CASES = (
     Case('moved in an exposure', 'survey', moved=(1, 1.0), faulty=True),
     # Recordings and surveys that are plausible, and wrong.
     Case('an axis 0.2 % short', 'confused', short=0.002, faulty=True),
-    Case('two beads exchanged', 'confused', exchanged_mm=5.0, faulty=True, both=True),
+    Case('two beads exchanged', 'confused', exchanged_mm=5.0, faulty=True),
     Case('b a frame late', 'confused', late=(1.5, 0.005), faulty=True, both=True),
     Case('b an exposure behind', 'confused', behind=1, faulty=True, both=True),
     Case('three frames a pose', 'confused', exposures=45, repeats=3),

@@ -20,6 +20,8 @@ ANGLES = 4  # of the C-arm at which a correction is compared with the truth
 MIN_POINTS = 6  # of a test pose
 SAMPLE = 1000  # image points whose joint covariance is used
 COVER = 1.96  # standard deviations of a 95 % interval
+FAR_MM = 0.3  # error of a point that a user would doubt
+FAR_SDS = 4.0
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,7 @@ def intersect(rays, exteriors, points):
 
 
 def out_of_sample(scene, corrected, seed):
-    """RMS error [px] of noise-free test points and RMS error [mm] of stereo points with noise.
+    """RMS error [px] of noise-free test points; errors (n, 3) [mm] of stereo points with noise.
 
     corrected(f, observed, angle) returns rays (n, 2), c and bool (n,) of the points that are used;
     angle is that of the C-arm [rad].
@@ -104,10 +106,7 @@ def out_of_sample(scene, corrected, seed):
             continue
         found = intersect([r[used] for r in rays], exteriors, scene.true_mm[used])
         errors.append(found - scene.true_mm[used])
-    return (
-        float(np.sqrt(np.mean(np.concatenate(squares)))),
-        float(np.sqrt(np.mean(np.concatenate(errors) ** 2))),
-    )
+    return float(np.sqrt(np.mean(np.concatenate(squares)))), np.concatenate(errors)
 
 
 def ratios(scene, result, oracle, seed):
@@ -132,13 +131,23 @@ def ratios(scene, result, oracle, seed):
     sd = scene.case.noise.sd
     return {
         'ratio': float(np.hypot(image, sd) / np.hypot(image_oracle, sd)),
-        'stereo': stereo / stereo_oracle,
+        'stereo': float(np.sqrt(np.mean(stereo**2) / np.mean(stereo_oracle**2))),
+        'stereo_far': _far(stereo),
+        'stereo_far_oracle': _far(stereo_oracle),
         'error_px': image,
     }
 
 
+def _far(errors):
+    """Return the share of errors (n, 3) that are longer than FAR_MM."""
+    return float(np.mean(np.linalg.norm(errors, axis=1) > FAR_MM))
+
+
 def claims(scene, result):
-    """NSE and cover95 of correction, points and sources of fluoroscope a."""
+    """NSE and cover95 of correction, points and sources of fluoroscope a.
+
+    points_far: object points off by more than FAR_MM and FAR_SDS.
+    """
     name = NAMES[0]
     camera = scene.cameras[0]
     run = result.runs[name]
@@ -163,6 +172,11 @@ def claims(scene, result):
     offset = result.targets.xyz_mm - scene.true_mm[result.targets.target_id - 1]
     sd = np.sqrt(np.diagonal(result.targets.covariance, axis1=1, axis2=2))
     out |= _statistics('points', offset[good], sd[good])
+    length = np.linalg.norm(offset, axis=1)
+    far = (length > FAR_MM) & (np.abs(offset) > FAR_SDS * sd).any(axis=1)
+    out['points_far'] = int(np.count_nonzero(far))
+    if result.targets.joint_covariance is not None:
+        out['points_freedom'] = _freedom(result.targets.joint_covariance, np.repeat(good, 3))
     exposures = result.fluoroscopes[name].exposures
     true_sources = np.stack([camera.exterior(scene.poses[e.exposure - 1])[1] for e in exposures])
     offset = np.stack([e.position_mm for e in exposures]) - true_sources
@@ -223,6 +237,13 @@ def independent_errors(run, model):
     blocks = [[scaled @ parts[i, :, j] @ scaled.T for j in (0, 1)] for i in (0, 1)]
     normalised = np.block(blocks)
     return float(np.trace(normalised) ** 2 / np.sum(normalised**2))
+
+
+def _freedom(covariance, rows):
+    """Return the number of independent errors among those of rows (n,) of a covariance (n, n)."""
+    part = covariance[np.ix_(rows, rows)]
+    sd = np.sqrt(np.diagonal(part))
+    return float(len(part) ** 2 / np.sum((part / np.outer(sd, sd)) ** 2))
 
 
 def _statistics(name, error, sd):

@@ -6,10 +6,13 @@
 import numpy as np
 from scipy.stats import chi2
 
+from .measure import FAR_MM, FAR_SDS
+
 MAX_RATIO = 1.15
 MAX_NSE = 1.5
 HONEST = (0.8, 1.25)
 WORST = 5
+MORE_FAR = 0.02  # share of stereo points
 TAIL = 0.01  # of the distribution of an NSE
 
 TEXT = """# Pathologies
@@ -109,7 +112,9 @@ def _summary(results, good, known):
                 f'{np.median(values):.2f}, {inside} of {len(values)} cases within {HONEST[0]} to '
                 f'{HONEST[1]}.{_significance(automatic, f"{name}_nse", by_case)}'
             )
-    lines += _beyond_scatter(automatic)
+    for name in ('correction', 'points'):
+        lines += _beyond_scatter(automatic, name)
+    lines += _far_points(good)
     verdicts = [judge(r, known[r['case']]) for r in good]
     counts = {name: verdicts.count(name) for name in ('right', 'wrong', 'open')}
     if any(counts.values()):
@@ -147,17 +152,39 @@ def _significance(results, key, by_case):
     )
 
 
-def _beyond_scatter(results):
-    """Line on the NSE of corrections that their own claimed covariances do not explain."""
-    known = [r for r in results if r.get('correction_freedom')]
+def _far_points(good):
+    """Line on points of calibrations that pass and are off by more than a user would accept."""
+    passed = [r for r in good if r.get('verdict') == 'pass' and 'points_far' in r]
+    if not passed:
+        return []
+    far = {f'{r["case"]} (seed {r["seed"]}): {r["points_far"]}' for r in passed if r['points_far']}
+    more = {
+        f'{r["case"]} (seed {r["seed"]}): {100 * r["stereo_far"]:.1f} %, oracle '
+        f'{100 * r["stereo_far_oracle"]:.1f} %'
+        for r in passed
+        if r['stereo_far'] > r['stereo_far_oracle'] + MORE_FAR
+    }
+    return [
+        f'- Object points of {len(passed)} calibrations that pass, off by more than {FAR_MM} mm '
+        f'and {FAR_SDS:.0f} standard deviations: {"; ".join(sorted(far)) or "none"}.',
+        f'- Stereo points that are off by more than {FAR_MM} mm: '
+        f'{100 * np.mean([r["stereo_far"] for r in passed]):.2f} % in the mean, '
+        f'{100 * np.mean([r["stereo_far_oracle"] for r in passed]):.2f} % with the oracle; '
+        f'{100 * MORE_FAR:.0f} % more than with the oracle: {"; ".join(sorted(more)) or "none"}.',
+    ]
+
+
+def _beyond_scatter(results, name):
+    """Line on the NSE of corrections or points that their claimed covariances do not explain."""
+    known = [r for r in results if r.get(f'{name}_freedom')]
     if not known:
         return []
-    freedom = np.array([r['correction_freedom'] for r in known])
-    nse = np.array([r['correction_nse'] for r in known])
+    freedom = np.array([r[f'{name}_freedom'] for r in known])
+    nse = np.array([r[f'{name}_nse'] for r in known])
     low, high = (chi2.ppf(p, freedom) / freedom for p in (TAIL, 1 - TAIL))
     above = sorted({r['case'] for r, is_above in zip(known, nse > high) if is_above})
     return [
-        f'- Independent errors of a correction: median {np.median(freedom):.0f}, least '
+        f'- Independent errors of the {name}: median {np.median(freedom):.0f}, least '
         f'{freedom.min():.0f}; the NSE of the median scatters by '
         f'{100 * np.sqrt(2 / np.median(freedom)):.0f} %. Of {len(known)} calibrations, '
         f'{np.sum(nse > high)} have an NSE above the {100 * (1 - TAIL):.0f} % point of their '

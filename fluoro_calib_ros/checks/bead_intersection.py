@@ -84,6 +84,7 @@ class Rays:
     #: (n,) of a coordinate, of observation and correction together [px^2]
     variance: NDArray[np.float64]
     target_id: NDArray[np.int64]  #: (n,)
+    exposure: NDArray[np.int64]  #: (n,) running number over all fluoroscopes
 
 
 def intersect(job: CalibrationResult, frames: Frames, phantom: Phantom) -> Beads:
@@ -93,7 +94,7 @@ def intersect(job: CalibrationResult, frames: Frames, phantom: Phantom) -> Beads
     intersection is robust: least absolute lengths first, then least squares of the image points
     that agree.
     """
-    rays = _rays(job, frames)
+    rays = rays_of(job, frames)
     target_id, bead = np.unique(rays.target_id, return_inverse=True)
     start = job.targets.xyz_mm[np.searchsorted(job.targets.target_id, target_id)]
     return _beads(rays, target_id, bead, start, phantom)
@@ -109,7 +110,7 @@ def least_chi2_without_a_ray(
 
     job, frames, phantom: as in `intersect`. target_id: (n,) beads. Returns (n,).
     """
-    rays = _rays(job, frames)
+    rays = rays_of(job, frames)
     out = np.zeros(len(target_id))
     for number, target in enumerate(target_id):
         own = np.flatnonzero(rays.target_id == target)
@@ -209,9 +210,9 @@ def _degrees_of_freedom(
     return float(np.sum(variance) ** 2 / squares)
 
 
-def _rays(job: CalibrationResult, frames: Frames) -> Rays:
+def rays_of(job: CalibrationResult, frames: Frames) -> Rays:
     """Return the image points of all exposures of an adjustment."""
-    parts = []
+    parts: list[tuple[np.ndarray, ...]] = []
     for name, figures in job.fluoroscopes.items():
         calibration = job.calibrations[name]
         by_number = {frame.number: frame.sorted() for frame in frames[name]}
@@ -227,6 +228,7 @@ def _rays(job: CalibrationResult, frames: Frames) -> Rays:
                     frame.uv - correction.duv,
                     calibration.noise_sd(frame) ** 2 + correction.sd**2,
                     frame.target_id,
+                    np.full(n, len(parts)),
                 )
             )
     return Rays(*(np.concatenate(column) for column in zip(*parts)))

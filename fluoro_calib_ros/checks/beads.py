@@ -25,9 +25,16 @@ from scipy.special import bdtrc, chdtri
 from ..bodies.body import by_pose
 from ..estimation.rounds import ResidualTable
 from ..findings import Kind, Place, first_few
-from .bead_intersection import Beads, distances, intersect, least_chi2_without_a_ray
+from .bead_intersection import (
+    Beads,
+    distances,
+    intersect,
+    least_chi2_without_a_ray,
+    rays_of,
+)
 from .calibration_evidence import Evidence, Subject
 from .check import Check
+from .exchanged_beads import exchanged_beads
 
 MIN_LAYER = 8  # of a layer, and of the rest
 BORDERS = 40  # between layers that are tried along each axis
@@ -274,8 +281,13 @@ def check_beads(evidence: Evidence, names: Sequence[str]) -> list[Check]:
         )
 
     checks = compare_with_survey(found, has_trend, least_chi2)
-    doubted = rejected_beads(evidence.result.residuals)
-    if len(doubted) and not any(check.passed is False for check in checks):
+    result = evidence.result
+    exchanged = exchanged_beads(rays_of(result, evidence.frames), result.targets)
+    doubted = rejected_beads(result.residuals)
+    is_wrong = any(check.passed is False for check in checks)
+    if len(exchanged) and (not is_wrong or set(checks[0].place.target_id) <= set(exchanged.flat)):
+        checks[0] = _exchanged(exchanged).after_trend(has_trend)
+    elif len(doubted) and not is_wrong:
         checks[0] = _rejected(doubted).after_trend(has_trend)
     return checks
 
@@ -306,6 +318,21 @@ def _rejected(target_id: NDArray[np.int64]) -> Check:
         'survey again, and calibrate again',
         numbers={'beads': len(target_id)},
         value=len(target_id),
+        limit=0,
+        unit='beads',
+    )
+
+
+def _exchanged(pairs: NDArray[np.int64]) -> Check:
+    """Return check 'beads' that fails because beads are exchanged: target ids (n, 2)."""
+    return Check(
+        Kind.BEADS,
+        f'bead {first_few(f"{first} is exchanged with {second}" for first, second in pairs)} in '
+        "the survey: their image points lie at each other's place",
+        Place(target_id=tuple(pairs.ravel().tolist())),
+        'exchange them in the file of the phantom, and calibrate again',
+        numbers={'beads': pairs.size},
+        value=pairs.size,
         limit=0,
         unit='beads',
     )

@@ -15,8 +15,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from rigs import calibrated, kinds, refused, run, true_calibrations, true_orientation, turning
+from scipy.spatial.distance import pdist, squareform
 
 from fluoro_calib_ros.checks import verdict as verdict_module
+from fluoro_calib_ros.checks.beads import check_beads
+from fluoro_calib_ros.checks.calibration_evidence import Evidence
 from fluoro_calib_ros.checks.field_checks import PRECISION
 from fluoro_calib_ros.checks.rig import RigFindings, check_rig, doubtful, rig_findings
 from fluoro_calib_ros.errors import DataError
@@ -177,6 +180,29 @@ def test_frames_of_other_exposures_fail_and_frames_without_partner_cannot_tell()
     assert found.orientation is None and check.passed is None
     assert check.kind is Kind.ORIENTATION and np.isnan([check.value, check.limit]).all()
     assert check.place.fluoroscopes == ('a', 'b') and check.advice
+
+
+def test_two_beads_exchanged_in_the_survey_are_named():
+    """By the exposures of one fluoroscope, and the message says which."""
+    phantom = rig().phantom
+    distance = squareform(pdist(phantom.xyz_mm))
+    seen_ids = np.concatenate([frame.target_id for frame in frames()['a']])
+    often = np.array([np.sum(seen_ids == one) >= 2 for one in phantom.target_id])
+    distance[~often] = distance[:, ~often] = np.inf
+    np.fill_diagonal(distance, np.inf)
+    pair = np.array(np.unravel_index(distance.argmin(), distance.shape))
+    xyz = phantom.xyz_mm.copy()
+    xyz[pair] = xyz[pair[::-1]]
+    wrong = replace(phantom, xyz_mm=xyz)
+    of_a = {'a': sorted(frames()['a'], key=lambda frame: frame.number)}
+    held = {'a': calibrations()['a']}
+    result = adjust(of_a, wrong, held)
+    evidence = Evidence(CalibrationRequest(of_a, wrong), held, result, lambda step: None)
+    check = check_beads(evidence, ['a'])[0]
+    first, second = sorted(phantom.target_id[pair].tolist())
+    assert check.passed is False and check.place.target_id == (first, second)
+    assert f'bead {first} is exchanged with {second}' in check.cause
+    assert check.value == check.numbers['beads'] == 2
 
 
 @pytest.mark.parametrize('late, trusted', [(0.0, 0), (0.2, 1)])

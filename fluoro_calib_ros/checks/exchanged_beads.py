@@ -1,0 +1,104 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Beads that are exchanged in the survey: their image points lie at each other's place.
+
+Beads that few exposures show cannot be intersected from their images, and that all of their few
+image points are rejected may be chance. That the image points of either bead lie where the other
+one is projected is not chance if several exposures show it: a false match lies anywhere, and ids
+that are exchanged in one exposure are right in the others. Both chances are combined (Fisher,
+"Statistical Methods for Research Workers", 4th edition, 1932, 21.1).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.special import bdtrc
+
+from ..estimation.result import Targets
+from ..photogrammetry.collinearity import project_with_jacobian
+from ..photogrammetry.noise import INLIER_Q
+from .bead_intersection import Rays
+
+FALSE_ALARM = 2e-3  # chance that any two beads of a good phantom are taken for exchanged
+MOST = 0.5  # part of the image points of two beads that lie at each other's place
+NOWHERE = -1  # an image point that agrees with no bead
+FAR = 1e9  # [px]: place of a bead behind the source
+ROUNDING = 1e-9
+
+
+def exchanged_beads(rays: Rays, targets: Targets) -> NDArray[np.int64]:
+    """Return the target ids (n, 2) of pairs of beads that are exchanged."""
+    place = _places(rays, targets)
+    rejected = place != rays.target_id
+    moved = rejected & (place != NOWHERE)
+    ids = np.sort(np.stack([rays.target_id, place], axis=1), axis=1)
+    near = np.full(len(ids), len(targets.target_id))
+    near[moved] = _nearness(ids[moved], targets)
+    found = []
+    for pair in np.unique(ids[moved], axis=0):
+        own = np.isin(rays.target_id, pair)
+        at_other = moved & np.all(ids == pair, axis=1)
+        both = len(np.unique(place[at_other])) == 2
+        if not both or at_other.sum() <= MOST * own.sum():
+            continue
+        # Of all other beads, by the rule of succession: how often image points are rejected, and
+        # how often these lie at the place of a bead as near as this one.
+        others = rejected & ~own
+        share = _rate(others.sum(), (~own).sum())
+        share_near = _rate(np.sum(others & (near <= near[at_other].max())), others.sum())
+        # Image points are false each for itself, or ids are exchanged, which displaces two.
+        chances = []
+        for unit in (np.arange(len(own)), rays.exposure):
+            count = [len(np.unique(unit[rows])) for rows in (own, own & rejected, at_other)]
+            chance = bdtrc(count[1] - 1, count[0], share) * bdtrc(
+                count[2] - 1, count[1], share_near
+            )
+            chances.append(chance * (1 - np.log(chance)))
+        if max(chances) * len(targets.target_id) < FALSE_ALARM:
+            found.append(pair)
+    return np.array(found, dtype=np.int64).reshape(-1, 2)
+
+
+def _rate(events: int, count: int) -> float:
+    """Return the rate of events by the rule of succession (Laplace)."""
+    return (float(events) + 1) / (float(count) + 2)
+
+
+def _nearness(ids: NDArray[np.int64], targets: Targets) -> NDArray[np.int64]:
+    """Return how many beads are as near to one bead of pairs (n, 2) as the other: (n,)."""
+    first, second = targets.xyz_mm[np.searchsorted(targets.target_id, ids)].transpose(1, 0, 2)
+    distance = np.linalg.norm(first - second, axis=1) * (1 + ROUNDING)
+    tree = cKDTree(targets.xyz_mm)
+    return np.minimum(
+        *(tree.query_ball_point(one, distance, return_length=True) for one in (first, second))
+    )
+
+
+def _places(rays: Rays, targets: Targets) -> NDArray[np.int64]:
+    """Return the target ids (n,) of the beads at whose place image points lie.
+
+    That of an image point itself where it agrees with its bead; NOWHERE where with none.
+    """
+    out = rays.target_id.copy()
+    for exposure in np.unique(rays.exposure):
+        rows = np.flatnonzero(rays.exposure == exposure)
+        shape = (len(targets.target_id), 3)
+        ideal, _, d_point, _ = project_with_jacobian(
+            np.broadcast_to(rays.rotation[rows[0]], (*shape, 3)),
+            np.broadcast_to(rays.position_mm[rows[0]], shape),
+            targets.xyz_mm,
+            rays.interior[rows[0]],
+        )
+        of_bead = np.einsum('nij,njk,nlk->nil', d_point, targets.covariance, d_point)
+        nearest = cKDTree(np.nan_to_num(ideal, nan=FAR)).query(rays.uv[rows])[1]
+        own = np.searchsorted(targets.target_id, rays.target_id[rows])
+        both = np.stack([own, nearest])
+        r = rays.uv[rows] - ideal[both]
+        covariance = rays.variance[rows, None, None] * np.eye(2) + of_bead[both]
+        q = np.einsum('...i,...ij,...j', r, np.linalg.inv(covariance), r)
+        other = np.where(q[1] <= INLIER_Q, targets.target_id[nearest], NOWHERE)
+        out[rows] = np.where(q[0] <= INLIER_Q, rays.target_id[rows], other)
+    return out

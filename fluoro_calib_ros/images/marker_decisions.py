@@ -343,6 +343,11 @@ class RayDecisions:
         view = self._view
         other = self._rays.exchanged(exposure, view.view, rows)
         lack = exposure.standardised[view.view, list(rows)]
+        if not (lack < AGREE).all() and not (other < AGREE).all():
+            # One of them is something else, which tells nothing of the other exposures.
+            if rows in self._evidence:
+                self._kept[rows] = frame + 1
+            return []
         keep = np.minimum(lack**2, MAX_COST).sum()
         change = np.minimum(np.nan_to_num(other, nan=np.inf) ** 2, MAX_COST).sum()
         if change < keep or rows not in self._evidence:

@@ -297,6 +297,20 @@ def test_an_id_is_kept_since_the_exchange_was_last_as_likely():
     ] * 2  # 21 - 3 + 32: just 50
 
 
+def test_an_exposure_in_which_one_of_two_is_something_else_tells_nothing_of_their_exchange():
+    """Ids are confirmed since a later one."""
+    one = view()
+    one.tracker.doubts.add_pair(3, 11, 12)
+    told = iter([(9.0, 0.0), (30.0, 5.0), (9.0, 0.0)])
+    decisions = RayDecisions(one, Fake(exchanged=lambda *_: np.array(next(told))))
+    assert not ray_decided(decisions, one, [4.0, 0, 0, 3.0], [20])
+    assert not ray_decided(decisions, one, [4.0, 0, 0, 3.0], [21])
+    assert ray_decided(decisions, one, [0.0, 0, 0, 0.0], [22]) == [
+        ('confirmed', 22, 22, (3,)),
+        ('confirmed', 22, 22, (11,)),
+    ]
+
+
 # ---- places of markers
 
 

@@ -221,9 +221,10 @@ class CollocationTerms(AdjustedTerms):
             f = part.number
             part.prior = change.priors.get(f, part.prior)
             converted = part.use_modes(modes, present)
+            if f in change.coefficients:
+                converted[part.of_series] = change.coefficients[f]
             part.own = change.exposure_terms.get(f, part.own)
-            started = np.pad(converted, (0, part.count - len(converted)))
-            out.append(change.coefficients.get(f, started))
+            out.append(np.pad(converted, (0, part.count - len(converted))))
         return tuple(out)
 
     def series(self, f: int, coefficients: np.ndarray, covariance: np.ndarray) -> Series:

@@ -73,7 +73,7 @@ class Change:
     priors: Mapping[int, Prior] = field(default_factory=dict)
     #: of fluoroscopes whose distortion varies
     exposure_terms: Mapping[int, ExposureTerms] = field(default_factory=dict)
-    #: (p,) with which to continue, where they are not those of the solution
+    #: (p,) of the series with which to continue, where they are not those of the solution
     coefficients: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
 
 

@@ -334,11 +334,30 @@ def test_a_change_of_the_terms_continues_with_the_same_correction():
     assert not settled
     assert [part.functions.modes for part in terms.parts] == [4, 7]
     assert terms.parts[0].prior.signal is signal and terms.parts[1].own is own
-    assert coefficients[0] is given
+    assert coefficients[0].tolist() == given.tolist()
     np.testing.assert_allclose(terms.parts[1].correction(coefficients[1]), fields[1], atol=1e-9)
     assert len(coefficients[1]) == terms.parts[1].count
     assert not coefficients[1][terms.parts[1].of_series.stop :].any()
     assert terms.exposure_terms == [None, own]
+
+
+def test_terms_of_exposures_stay_where_the_series_is_given_anew():
+    """Rejected image points that agree may be found after exposures that differ."""
+    network, before, terms = case(modes=5)
+    part = terms.parts[0]
+    functions = exposure_functions(part.uv, SIZE, part.interior)
+    part.own = ExposureTerms(functions, part.exposure, 0.3)
+    terms._start = terms.zeros()
+    varying, after, matrix = solved(network, before, terms)
+    present = coefficients_of(after)[0]
+    given = np.arange(1.0, 1.0 + 2 * len(part.functions_with(4, part.prior)))
+    terms._refinements = [Proposed(Change([4], coefficients={0: given}))]
+    _, (coefficients,) = terms.renew(varying, matrix, after)
+    end = part.of_series.stop
+    assert coefficients[:end].tolist() == given.tolist()
+    assert np.abs(coefficients[end:]).max() > 0.01
+    assert coefficients[end:].tolist() == present[-part.own.count :].tolist()
+    assert len(coefficients) == part.count == terms.with_additional(network).additional[0].count
 
 
 def test_priors_stay_after_two_renewals_that_change_nothing():

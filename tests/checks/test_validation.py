@@ -335,13 +335,13 @@ def test_points_that_are_said_to_be_imprecise_are_no_misfit_of_their_exposure(
     """As beads in front of each other in images: a quarter of one exposure has an sd of 2 px."""
     monkeypatch.setattr(verdict_module, 'SUBJECTS', (HELD_OUT,))
     rng = np.random.default_rng(8)
-    frames = [replace(f, sigma=np.full(len(f.uv), 0.25)) for f in exposures()['a']]
+    frames = [replace(f, sigma=np.full(len(f.uv), 0.25)) for f in exposures()['a'][:8]]
     fifth = frames[4]
     some = np.arange(len(fifth.uv)) % 4 == 0
     noise = rng.normal(0, 2.0, fifth.uv.shape) * some[:, None]
     sigma = np.where(some, claimed, fifth.sigma)
     frames[4] = replace(fifth, uv=fifth.uv + noise, sigma=sigma)
-    request = CalibrationRequest({'a': frames}, rig().phantom, CalibrationOptions(**LOCAL))
+    request = CalibrationRequest({'a': frames}, rig().phantom, CalibrationOptions(model='collocation'))
     calibrations = calibrate(request.frames, request.phantom, request.options).calibrations
     found = validate(request, calibrations)
     (check,) = [check for check in found.checks if check.kind is Kind.EXPOSURES]

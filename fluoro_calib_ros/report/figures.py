@@ -21,7 +21,7 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
-from matplotlib.collections import Collection
+from matplotlib.collections import Collection, QuadMesh
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
@@ -86,6 +86,8 @@ def _marks(artist: Artist) -> int:
     """Return how many marks an artist draws."""
     if isinstance(artist, Line2D):
         return len(np.atleast_1d(artist.get_xdata()))
+    if isinstance(artist, QuadMesh):  # its paths would be made for this
+        return int(np.size(artist.get_array()))
     if isinstance(artist, Collection):
         return max(len(artist.get_offsets()), len(artist.get_paths()))
     return 1

@@ -224,10 +224,10 @@ def dented():
     """Self-calibrations of a fluoroscope that has all dents and of the same without them."""
     frames = [
         replace(f, uv=f.uv + shallow(f.uv) + round_dent(f.uv) + deep(f.uv))
-        for f in rigs.exposures()['a']
+        for f in rigs.exposures()['a'][:10]
     ]
     run = calibrate({'a': frames}, rigs.rig().phantom).runs['a']
-    return run, rigs.calibrated('a').runs['a']
+    return run, rigs.calibrated('a', 10).runs['a']
 
 
 @pytest.mark.long

@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from scipy.special import bdtrc
+from scipy.special import bdtrc, xlogy
 
 from ..estimation.result import Targets
 from ..photogrammetry.collinearity import project_with_jacobian
@@ -25,7 +25,7 @@ from .bead_intersection import Rays
 FALSE_ALARM = 2e-3  # chance that any two beads of a good phantom are taken for exchanged
 MOST = 0.5  # part of the image points of two beads that lie at each other's place
 NOWHERE = -1  # an image point that agrees with no bead
-FAR = 1e9  # [px]: place of a bead behind the source
+FAR = 1e9  # [px]: in the place of NaN, as of a bead behind the source
 ROUNDING = 1e-9
 
 
@@ -38,7 +38,8 @@ def exchanged_beads(rays: Rays, targets: Targets) -> NDArray[np.int64]:
     near = np.full(len(ids), len(targets.target_id))
     near[moved] = _nearness(ids[moved], targets)
     found = []
-    for pair in np.unique(ids[moved], axis=0):
+    pairs, times = np.unique(ids[moved], axis=0, return_counts=True)
+    for pair in pairs[times > 1]:
         own = np.isin(rays.target_id, pair)
         at_other = moved & np.all(ids == pair, axis=1)
         both = len(np.unique(place[at_other])) == 2
@@ -56,14 +57,14 @@ def exchanged_beads(rays: Rays, targets: Targets) -> NDArray[np.int64]:
             chance = bdtrc(count[1] - 1, count[0], share) * bdtrc(
                 count[2] - 1, count[1], share_near
             )
-            chances.append(chance * (1 - np.log(chance)))
+            chances.append(chance - xlogy(chance, chance))
         if max(chances) * len(targets.target_id) < FALSE_ALARM:
             found.append(pair)
     return np.array(found, dtype=np.int64).reshape(-1, 2)
 
 
 def _rate(events: int, count: int) -> float:
-    """Return the rate of events by the rule of succession (Laplace)."""
+    """Return the rate of events, by the rule of succession of Laplace."""
     return (float(events) + 1) / (float(count) + 2)
 
 
@@ -93,7 +94,8 @@ def _places(rays: Rays, targets: Targets) -> NDArray[np.int64]:
             rays.interior[rows[0]],
         )
         of_bead = np.einsum('nij,njk,nlk->nil', d_point, targets.covariance, d_point)
-        nearest = cKDTree(np.nan_to_num(ideal, nan=FAR)).query(rays.uv[rows])[1]
+        tree = cKDTree(np.nan_to_num(ideal, nan=FAR))
+        nearest = tree.query(np.nan_to_num(rays.uv[rows], nan=-FAR))[1]
         own = np.searchsorted(targets.target_id, rays.target_id[rows])
         both = np.stack([own, nearest])
         r = rays.uv[rows] - ideal[both]

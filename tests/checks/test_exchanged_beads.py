@@ -68,6 +68,19 @@ def test_two_exchanged_beads_are_named(scene):
     assert exchanged_beads(exchanged(rays, *pair), targets).tolist() == [sorted(pair)]
 
 
+def test_two_exchanged_beads_of_many_exposures_are_named(scene):
+    """Where chances are too small for a number; one image point has no correction."""
+    rays, targets = scene
+    pair = nearest_pair(targets)
+    columns = [getattr(rays, name) for name in Rays.__dataclass_fields__]
+    many = Rays(*(np.concatenate([column] * 150) for column in columns))
+    many = replace(many, exposure=np.repeat(np.arange(150), len(rays.uv)) + 1000 * many.exposure)
+    uv = many.uv.copy()
+    uv[3] = np.nan
+    found = exchanged_beads(exchanged(replace(many, uv=uv), *pair), targets)
+    assert found.tolist() == [sorted(pair)]
+
+
 def test_beads_that_one_exposure_each_shows_are_named(scene):
     """Whatever a false match does to one more of their image points."""
     rays, targets = scene

@@ -341,7 +341,9 @@ def test_points_that_are_said_to_be_imprecise_are_no_misfit_of_their_exposure(
     noise = rng.normal(0, 2.0, fifth.uv.shape) * some[:, None]
     sigma = np.where(some, claimed, fifth.sigma)
     frames[4] = replace(fifth, uv=fifth.uv + noise, sigma=sigma)
-    request = CalibrationRequest({'a': frames}, rig().phantom, CalibrationOptions(model='collocation'))
+    request = CalibrationRequest(
+        {'a': frames}, rig().phantom, CalibrationOptions(model='collocation')
+    )
     calibrations = calibrate(request.frames, request.phantom, request.options).calibrations
     found = validate(request, calibrations)
     (check,) = [check for check in found.checks if check.kind is Kind.EXPOSURES]

@@ -34,7 +34,7 @@ def knee(tmp_path_factory):
     simulate = ('simulate', '--out', folder, '--bodies', '--exposures', '8', '--seconds', '0.5')
     assert run(*simulate) == 0
     calibrate = ('calibrate', folder / 'calibration', '--phantom', folder / 'phantom.csv')
-    options = ('--fast', '--max-iterations', 2, '--out', folder / 'result')
+    options = ('--model', 'collocation', '--fast', '--out', folder / 'result')
     assert run(*calibrate, *options) == 0
     return folder
 

@@ -144,7 +144,12 @@ def calibrate_request(
     return CalibrationResult(
         figures,
         calibrations,
-        targets=combined_targets(targets, request.phantom, options.datum == 'survey'),
+        targets=combined_targets(
+            targets,
+            request.phantom,
+            weighted=options.datum == 'survey',
+            open_datum=not request.known_orientations,
+        ),
         history={label: run.history for label, run in runs.items()},
         runs=runs,
         findings=tuple(found for run in runs.values() for found in run.measured.excluded),

@@ -17,6 +17,7 @@ from ..brief import brief_repr
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..exposures.phantom import Phantom
 from ..findings import Finding
+from ..photogrammetry.network import similarity_directions
 from ..photogrammetry.rotations import matrix_from_quaternion
 from .constraints import RelativeOrientation
 from .fixed_calibration import SolvedNetwork
@@ -142,13 +143,17 @@ class CalibrationResult:
         )
 
 
-def combined_targets(parts: Sequence[Targets], phantom: Phantom, weighted: bool = True) -> Targets:
+def combined_targets(
+    parts: Sequence[Targets], phantom: Phantom, weighted: bool = True, open_datum: bool = False
+) -> Targets:
     """Return one set of object points from separate adjustments of the same phantom.
 
     Every adjustment holds the survey. In the sum of their information it counts once, so the
     information of the survey is subtracted for every further adjustment; weighted False: none of
-    them holds the survey. Where the errors of a model make the points of an adjustment worse than
-    the survey, they add nothing to it.
+    them holds the survey. open_datum: shift, turn and scale of all points follow from the survey
+    alone, in every adjustment; their errors are those of the survey, and all points have them in
+    common. Where the errors of a model make the points of an adjustment worse than the survey,
+    they add nothing to it.
     """
     if len(parts) == 1:
         return parts[0]
@@ -164,12 +169,18 @@ def combined_targets(parts: Sequence[Targets], phantom: Phantom, weighted: bool 
         together = _combined_jointly(parts, joint, further, phantom)
         if together is not None:
             return together
+    common = np.zeros_like(survey)
+    if weighted and open_datum:
+        common = _common_covariance(phantom.xyz_mm[row], phantom.sd_mm[row])
+        if not all(_contains(p, common[np.searchsorted(target_id, p.target_id)]) for p in parts):
+            common = np.zeros_like(survey)
+        survey = np.asarray(np.linalg.inv(np.linalg.inv(survey) - common), dtype=np.float64)
     surveyed = weighted * survey
     information = surveyed.copy()
     right = (surveyed @ phantom.xyz_mm[row, :, None])[..., 0]
     for part in parts:
         at = np.searchsorted(target_id, part.target_id)
-        own = np.linalg.inv(part.covariance)
+        own = np.linalg.inv(part.covariance - common[at])
         value, vector = np.linalg.eigh(own - surveyed[at])
         is_better = value > 0
         better = (vector * (value * is_better)[:, None, :]) @ vector.transpose(0, 2, 1)
@@ -179,7 +190,20 @@ def combined_targets(parts: Sequence[Targets], phantom: Phantom, weighted: bool 
         inside = (vector * is_better[:, None, :]) @ vector.transpose(0, 2, 1)
         right[at] += (inside @ added)[..., 0]
     covariance = np.linalg.inv(information)
-    return Targets(target_id, (covariance @ right[..., None])[..., 0], covariance)
+    return Targets(target_id, (covariance @ right[..., None])[..., 0], covariance + common)
+
+
+def _common_covariance(xyz_mm: np.ndarray, sd_mm: np.ndarray) -> NDArray[np.float64]:
+    """Return the covariances (n, 3, 3) of surveyed points (n, 3) that their datum has [mm^2]."""
+    directions = similarity_directions(xyz_mm, xyz_mm.mean(axis=0))
+    scaled = (directions / sd_mm[:, None, None]).reshape(-1, directions.shape[2])
+    of_datum = np.linalg.pinv(scaled.T @ scaled, hermitian=True)
+    return np.asarray(directions @ of_datum @ directions.transpose(0, 2, 1))
+
+
+def _contains(part: Targets, common: np.ndarray) -> bool:
+    """Whether the covariances of points are larger than common ones (n, 3, 3)."""
+    return bool((np.linalg.eigvalsh(part.covariance - common) > 0).all())
 
 
 def _combined_jointly(

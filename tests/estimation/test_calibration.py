@@ -20,7 +20,9 @@ from fluoro_calib_ros.estimation.initial_network import measured_network, nomina
 from fluoro_calib_ros.estimation.options import CalibrationOptions
 from fluoro_calib_ros.estimation.result import Targets, combined_targets
 from fluoro_calib_ros.estimation.self_calibration import self_calibrate
+from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.findings import Kind, Place
+from fluoro_calib_ros.photogrammetry.network import similarity_directions
 from fluoro_calib_ros.photogrammetry.rotations import (
     matrix_from_quaternion,
     matrix_from_vector,
@@ -751,6 +753,45 @@ def test_combined_targets_count_the_datum_once():
     np.testing.assert_allclose(mean @ truth @ mean.T, 0.01 / n * np.eye(3), atol=1e-12)
     right = survey @ phantom.xyz_mm.ravel() + between @ (seen[0] + seen[1]).ravel()
     np.testing.assert_allclose(both.xyz_mm.ravel(), truth @ right, rtol=1e-10)
+
+
+@pytest.mark.parametrize('is_open', [True, False])
+def test_points_without_joint_covariances_count_an_open_datum_once(is_open):
+    """Images show all but shift, turn and scale; where they show a turn, nothing is in common."""
+    rng = np.random.default_rng(8)
+    n = 60
+    sd = rng.uniform(0.05, 0.2, n)
+    phantom = Phantom(np.arange(1, n + 1), rng.uniform(-70, 70, (n, 3)), sd)
+    centre = phantom.xyz_mm.mean(axis=0)
+    datum = similarity_directions(phantom.xyz_mm, centre).reshape(3 * n, 7)
+    datum = datum if is_open else datum[:, :3]
+    between = 1e4 * (np.eye(3 * n) - datum @ np.linalg.pinv(datum))
+    survey = np.diag(np.repeat(1 / sd**2, 3))
+    seen = [phantom.xyz_mm + rng.normal(0, 0.01, (n, 3)) for _ in range(2)]
+
+    def points(count):
+        joint = np.linalg.inv(survey + count * between)
+        right = survey @ phantom.xyz_mm.ravel() + between @ sum(seen[:count]).ravel()
+        blocks = joint.reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n), :]
+        return Targets(phantom.target_id, (joint @ right).reshape(n, 3), blocks)
+
+    first = points(1)
+    parts = [first, replace(first, xyz_mm=first.xyz_mm + seen[1] - seen[0])]
+    both = combined_targets(parts, phantom, open_datum=True)
+    truth = points(2)
+    ratio = np.trace(both.covariance, axis1=1, axis2=2) / np.trace(
+        truth.covariance, axis1=1, axis2=2
+    )
+    if is_open:
+        assert ratio == pytest.approx(1, abs=0.05)
+        truth_sd = np.sqrt(np.diagonal(truth.covariance, axis1=1, axis2=2))
+        assert np.abs((both.xyz_mm - truth.xyz_mm) / truth_sd).max() < 0.3
+    else:
+        plain = combined_targets(parts, phantom)
+        assert both.covariance.tolist() == plain.covariance.tolist()
+    # As if each adjustment had a datum of its own.
+    apart = np.trace(combined_targets(parts, phantom).covariance, axis1=1, axis2=2)
+    assert np.median(apart / np.trace(truth.covariance, axis1=1, axis2=2)) < 0.7
 
 
 def test_points_of_free_networks_are_combined_without_the_survey():

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import threading
 from collections import deque
@@ -163,25 +164,35 @@ def _is_of_this_machine(address: str) -> bool:
         return False
 
 
+def _connected(cluster: Cluster) -> Any | str:
+    """Return a client of a scheduler, or why there is none."""
+    try:
+        from distributed import Client
+    except ImportError:
+        raise DataError(
+            '--scheduler needs the package distributed: pip install distributed'
+        ) from None
+    security = cluster.security()
+    try:
+        return Client(
+            cluster.scheduler, timeout=CONNECT_S, set_as_default=False, security=security
+        )
+    except (OSError, ValueError) as error:
+        return str(error).splitlines()[0] if str(error) else type(error).__name__
+
+
 class DaskWorkers:
     """Workers of a Dask cluster. A task whose worker dies runs again on another one."""
 
     def __init__(self, cluster: Cluster) -> None:
         address = cluster.scheduler
-        try:
-            from distributed import Client
-        except ImportError:
-            raise DataError(
-                '--scheduler needs the package distributed: pip install distributed'
-            ) from None
-        security = cluster.security()
-        try:
-            self._client: Any = Client(
-                address, timeout=CONNECT_S, set_as_default=False, security=security
-            )
-        except (OSError, ValueError) as error:
-            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise DataError(f'there is no Dask scheduler at {address}: {reason}') from None
+        client = _connected(cluster)
+        if isinstance(client, str):
+            # A client that could not connect is closed when it is collected. That must not happen
+            # while another one starts: both would wait for one lock.
+            gc.collect()
+            raise DataError(f'there is no Dask scheduler at {address}: {client}')
+        self._client = client
         try:
             self._client.wait_for_workers(1, timeout=CONNECT_S)
         except TimeoutError:

@@ -121,6 +121,18 @@ def test_a_scheduler_that_is_not_there_is_told(monkeypatch):
         open_workers(scheduler=Cluster('nonsense', trusted_network=True))
 
 
+def test_a_client_that_could_not_connect_is_closed_at_once(monkeypatch):
+    """Closed by the collector, later, it may hang with the start of another one."""
+    from distributed import Client
+
+    monkeypatch.setattr(scheduling, 'CONNECT_S', 0.5)
+    closed = []
+    monkeypatch.setattr(Client, '__del__', lambda client: closed.append(client.status))
+    with pytest.raises(DataError, match='no Dask scheduler'):
+        open_workers(scheduler='tcp://127.0.0.1:9')
+    assert len(closed) == 1
+
+
 def certificate(folder: Path, name: str, authority: str) -> Path:
     """Make a certificate NAME.pem with its key NAME.key, signed by AUTHORITY.pem."""
     pem = folder / f'{name}.pem'

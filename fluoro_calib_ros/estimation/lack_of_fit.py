@@ -66,6 +66,11 @@ FALSE_ALARM = 2e-3  # chance that false matches agree in any of the areas
 # the limit of that.
 CLUSTERED_FALSE_ALARM = 0.05
 CLUSTERED = 1e-3
+# At a border, few image points may be all there are: so many targets in so many exposures are
+# enough where they are clustered. Draws of the directions that so few have by chance.
+FEW_TARGETS = 3
+FEW_EXPOSURES = 2
+DRAWS = 10_000
 # Exposures whose scatter is the standard error of a mean product, and that may agree.
 MIN_EXPOSURES = 3
 
@@ -308,34 +313,81 @@ def areas_of_rejected(
     gives those of one place the same. The image points of one target count once: its survey may be
     wrong.
     """
-    cell = np.asarray(image_size) / CELLS
-    found = []
-    if len(target) < MIN_TARGETS:
+    if len(target) < FEW_TARGETS:
         return []
+    cell = np.asarray(image_size) / CELLS
+    corners = list(np.ndindex(2 * CELLS - 1, 2 * CELLS - 1))
     rate = len(target) / (len(target) + len(inliers))
-    for corner in np.ndindex(2 * CELLS - 1, 2 * CELLS - 1):
-        at = (rejected.uv + 0.5) / cell - np.array(corner) / 2
-        rows = np.flatnonzero(((at >= 0) & (at < 1)).all(axis=1))
+    several: list[_Area] = []
+    few: list[_Area] = []
+    for corner in corners:
+        rows = _inside(rejected.uv, np.array(corner) / 2, cell)
+        number = len(np.unique(target[rows]))
+        if number < FEW_TARGETS:
+            continue
+        total = len(rows) + len(_inside(inliers, np.array(corner) / 2, cell))
+        by_chance = len(corners) * bdtrc(number - 1, total, rate)
+        area = _Area.of(rejected, target, rows, clustered=bool(by_chance < CLUSTERED))
+        if number >= MIN_TARGETS:
+            several.append(area)
+        elif area.clustered:
+            few.append(area)
+    # Bonferroni. Areas with few targets are a question of their own, asked of clusters only.
+    return [area.tested(len(several)) for area in several] + [
+        area.tested_by_draws(len(few)) for area in few
+    ]
+
+
+def _inside(uv: np.ndarray, corner: np.ndarray, cell: np.ndarray) -> np.ndarray:
+    """Rows of the image points (n, 2) in a cell, its corner (2,) in units of its size (2,) [px]."""
+    at = (uv + 0.5) / cell - corner
+    return np.flatnonzero(((at >= 0) & (at < 1)).all(axis=1))
+
+
+@dataclass(frozen=True)
+class _Area:
+    """Rejected image points of an area.
+
+    rows (n,): the image points; of_target (k, 2): mean residual of each target [px]; exposures:
+    number of exposures that agree with the mean of all; clustered: so many by no chance.
+    """
+
+    rows: np.ndarray
+    of_target: np.ndarray
+    exposures: int
+    clustered: bool
+
+    @staticmethod
+    def of(
+        rejected: FittedPoints, target: np.ndarray, rows: np.ndarray, clustered: bool
+    ) -> _Area:
+        """Area of rows of rejected image points, of targets (n,)."""
         _, place = np.unique(target[rows], return_inverse=True)
         number = np.bincount(place)
-        if len(number) < MIN_TARGETS:
-            continue
         r = rejected.residuals[rows]
         of_target = np.stack([np.bincount(place, r[:, i]) / number for i in (0, 1)], axis=1)
-        mean = of_target.mean(axis=0)
-        along = np.bincount(rejected.exposure[rows], r @ mean)
-        agree = np.count_nonzero(along > 0) >= MIN_EXPOSURES
-        chance = np.sqrt(np.sum(of_target**2)) / len(of_target)
-        others = (inliers + 0.5) / cell - np.array(corner) / 2
-        total = len(rows) + int(((others >= 0) & (others < 1)).all(axis=1).sum())
-        by_chance = (2 * CELLS - 1) ** 2 * bdtrc(len(number) - 1, total, rate)
-        alarm = CLUSTERED_FALSE_ALARM if by_chance < CLUSTERED else FALSE_ALARM
-        size = float(np.linalg.norm(mean)) if agree else 0.0
-        found.append((size, float(chance), alarm, rows))
-    return [
-        RejectedArea(size, chance * float(np.sqrt(np.log(len(found) / alarm))), rows)  # Bonferroni
-        for size, chance, alarm, rows in found
-    ]
+        along = np.bincount(rejected.exposure[rows], r @ of_target.mean(axis=0))
+        return _Area(rows, of_target, int(np.count_nonzero(along > 0)), clustered)
+
+    def tested(self, areas: int) -> RejectedArea:
+        """Test of the mean residual: many residuals of any direction have a Gaussian mean."""
+        chance = float(np.sqrt(np.sum(self.of_target**2))) / len(self.of_target)
+        alarm = CLUSTERED_FALSE_ALARM if self.clustered else FALSE_ALARM
+        limit = chance * float(np.sqrt(np.log(areas / alarm)))
+        return RejectedArea(self._size(MIN_EXPOSURES), limit, self.rows)
+
+    def tested_by_draws(self, areas: int) -> RejectedArea:
+        """Test of the mean of few residuals: by draws of their directions."""
+        length = np.linalg.norm(self.of_target, axis=1)
+        angle = np.random.default_rng(0).uniform(0, 2 * np.pi, (DRAWS, len(length)))
+        drawn = np.abs(np.mean(length * np.exp(1j * angle), axis=1))
+        limit = float(np.quantile(drawn, 1 - CLUSTERED_FALSE_ALARM / areas))
+        return RejectedArea(self._size(FEW_EXPOSURES), limit, self.rows)
+
+    def _size(self, exposures: int) -> float:
+        """Length of the mean residual [px], 0 where fewer exposures agree."""
+        agree = self.exposures >= exposures
+        return float(np.linalg.norm(self.of_target.mean(axis=0))) if agree else 0.0
 
 
 def _variance_in_places(

@@ -146,7 +146,7 @@ def _far(errors):
 def claims(scene, result):
     """NSE and cover95 of correction, points and sources of fluoroscope a.
 
-    points_far: object points off by more than FAR_MM and FAR_SDS.
+    points_far: object points off by more than FAR_MM and FAR_SDS, of points_number.
     """
     name = NAMES[0]
     camera = scene.cameras[0]
@@ -175,6 +175,7 @@ def claims(scene, result):
     length = np.linalg.norm(offset, axis=1)
     far = (length > FAR_MM) & (np.abs(offset) > FAR_SDS * sd).any(axis=1)
     out['points_far'] = int(np.count_nonzero(far))
+    out['points_number'] = len(far)
     if result.targets.joint_covariance is not None:
         out['points_freedom'] = _freedom(result.targets.joint_covariance, np.repeat(good, 3))
     exposures = result.fluoroscopes[name].exposures

@@ -166,7 +166,8 @@ def _far_points(good):
     }
     return [
         f'- Object points of {len(passed)} calibrations that pass, off by more than {FAR_MM} mm '
-        f'and {FAR_SDS:.0f} standard deviations: {"; ".join(sorted(far)) or "none"}.',
+        f'and {FAR_SDS:.0f} standard deviations, of {sum(r["points_number"] for r in passed)}: '
+        f'{"; ".join(sorted(far)) or "none"}.',
         f'- Stereo points that are off by more than {FAR_MM} mm: '
         f'{100 * np.mean([r["stereo_far"] for r in passed]):.2f} % in the mean, '
         f'{100 * np.mean([r["stereo_far_oracle"] for r in passed]):.2f} % with the oracle; '

@@ -339,7 +339,7 @@ def areas_of_rejected(
 
 
 def _inside(uv: np.ndarray, corner: np.ndarray, cell: np.ndarray) -> np.ndarray:
-    """Rows of the image points (n, 2) in a cell, its corner (2,) in units of its size (2,) [px]."""
+    """Rows of the image points (n, 2) in a cell of a size (2,) [px]; corner (2,): in such cells."""
     at = (uv + 0.5) / cell - corner
     return np.flatnonzero(((at >= 0) & (at < 1)).all(axis=1))
 
@@ -358,9 +358,7 @@ class _Area:
     clustered: bool
 
     @staticmethod
-    def of(
-        rejected: FittedPoints, target: np.ndarray, rows: np.ndarray, clustered: bool
-    ) -> _Area:
+    def of(rejected: FittedPoints, target: np.ndarray, rows: np.ndarray, clustered: bool) -> _Area:
         """Area of rows of rejected image points, of targets (n,)."""
         _, place = np.unique(target[rows], return_inverse=True)
         number = np.bincount(place)

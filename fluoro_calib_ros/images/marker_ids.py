@@ -20,7 +20,7 @@ from itertools import product, repeat
 from math import comb
 
 import numpy as np
-from scipy.spatial.distance import pdist
+from scipy.spatial.distance import pdist, squareform
 from scipy.special import chdtri, erfc
 
 from ..bodies.body import POSE_SIZE, Body, fitted_pose
@@ -267,11 +267,17 @@ class _Search:
         self.body = body
         self.points = points
         xyz = points.xyz
-        self.wanted = np.linalg.norm(body.xyz_mm[:, None] - body.xyz_mm[None], axis=2)
-        self.given = np.linalg.norm(xyz[:, None] - xyz[None], axis=2)
-        # Variances of the distances, of the points and of the shape.
-        self.given_variance = points.variance[:, None] + points.variance
-        self.wanted_variance = body.sd_mm[:, None] ** 2 + body.sd_mm**2
+        wanted = squareform(pdist(body.xyz_mm))
+        given = squareform(pdist(xyz))
+        variance = points.variance[:, None] + points.variance
+        # Whether two points may be two members: (member, member, point, point).
+        self.may_be = [
+            [
+                (given - distance) ** 2 < REJECT**2 * (variance + one**2 + other**2)
+                for distance, other in zip(of_member, body.sd_mm)
+            ]
+            for of_member, one in zip(wanted, body.sd_mm)
+        ]
         self.free = free
         self.fits: list[_Fit] = []  # with as many members as the best one
         self.steps = 0
@@ -290,7 +296,8 @@ class _Search:
         if self.steps > MAX_STEPS:
             raise DataError(f'body {self.body.name}: too many round shadows to search')
         size = len(self.point)
-        chosen = np.flatnonzero(self.point >= 0)
+        point = self.point.tolist()
+        chosen = [other for other in range(member) if point[other] >= 0]
         least = self.fits[0].count if self.fits else MIN_MEMBERS
         if len(chosen) + size - member < least:
             return
@@ -301,15 +308,12 @@ class _Search:
             return
         fits = free.copy()
         for other in chosen:
-            away = self.given[self.point[other]] - self.wanted[other, member]
-            variance = self.given_variance[self.point[other]]
-            variance = variance + self.wanted_variance[other, member]
-            fits &= away**2 < REJECT**2 * variance
-        for point in np.flatnonzero(fits).tolist():
-            self.point[member] = point
-            free[point] = False
+            fits &= self.may_be[member][other][point[other]]
+        for number in fits.nonzero()[0].tolist():
+            self.point[member] = number
+            free[number] = False
             self._extend(member + 1, free)
-            free[point] = True
+            free[number] = True
         self.point[member] = -1
         self._extend(member + 1, free)
 

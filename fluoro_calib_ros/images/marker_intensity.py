@@ -10,7 +10,7 @@ shadow is the smaller eigenvalue of the Hessian, as in `detection`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
@@ -35,6 +35,7 @@ MIN_CONTRAST = 0.02  # of a response, as a fraction of the light around it
 MIN_SNR = 4.5  # of a response, over the noise of the response
 WINDOW_BACKGROUND_PX = 6  # the same along the rows of a window
 BACKGROUND_PX = 15  # half the width of the box whose mean is the light around a pixel
+PIXELS_AT_ONCE = 2**16  # that are filtered: four arrays of them fit a cache of 1 MiB
 SAMPLED = 4  # rows and columns from one pixel to the next, where all are of one kind
 SAME_PX = 1.0  # between maxima that are one shadow
 BORDER = 3  # scales of the blur at the edge of a window that are not searched
@@ -99,7 +100,8 @@ class FilteredLight:
 
     def relative_at(self, pixels: Any) -> NDArray[np.float32]:
         """The same at an index of pixels."""
-        return np.asarray(self.response[pixels] / np.maximum(self.around[pixels], self._least))
+        light = np.maximum(self.around[pixels], self._least)
+        return np.asarray(np.divide(self.response[pixels], light, out=light))
 
     @cached_property
     def _least(self) -> float:
@@ -114,7 +116,9 @@ class FilteredLight:
     def maxima(self) -> tuple[np.ndarray, np.ndarray]:
         """Rows and columns (k,) of the local maxima."""
         dilated = cv2.dilate(self.relative, np.ones((_size_of_maximum(self.scale),) * 2, np.uint8))
-        row, column = np.nonzero((self.relative >= dilated) & (self.relative > 0))
+        largest = self.relative >= dilated
+        largest &= self.relative > 0
+        row, column = np.divmod(np.flatnonzero(largest), largest.shape[1])
         return row, column
 
     @cached_property
@@ -367,34 +371,51 @@ def _floor(look: MarkerLook, around: np.ndarray) -> np.ndarray:
 
 def _responses(grey: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
     """Responses (h, w) to dark and to bright blobs: the smaller eigenvalue, or 0."""
-    mean, spread = _curvatures(grey, scale)
-    return np.maximum(mean - spread, 0), np.maximum(-mean - spread, 0)
+    dark, bright = np.empty((2, *grey.shape), dtype=np.float32)
+    for rows, mean, spread in _curvatures(grey, scale):
+        np.maximum(mean - spread, 0, out=dark[rows])
+        mean += spread
+        np.maximum(np.negative(mean, out=mean), 0, out=bright[rows])
+    return dark, bright
 
 
 def _dark_response(grey: np.ndarray, scale: float) -> np.ndarray:
     """Response (h, w) to dark blobs alone."""
-    mean, spread = _curvatures(grey, scale)
-    mean -= spread
-    return np.maximum(mean, 0, out=mean)
+    out = np.empty(grey.shape, dtype=np.float32)
+    for rows, mean, spread in _curvatures(grey, scale):
+        mean -= spread
+        np.maximum(mean, 0, out=out[rows])
+    return out
 
 
-def _curvatures(grey: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """Mean (h, w) of both eigenvalues of the scaled Hessian, and half their difference."""
+def _curvatures(grey: np.ndarray, scale: float) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
+    """Yield rows of an image, the mean of both eigenvalues of the scaled Hessian there, and half
+    their difference.
+
+    Of a few rows, what is computed on the way stays in the cache of a core.
+    """
     smooth = cv2.GaussianBlur(grey, (0, 0), scale)
     twice = np.array([1.0, -2.0, 1.0], dtype=np.float32)
     one = np.array([0.0, 1.0, 0.0], dtype=np.float32)
     once = np.array([-0.5, 0.0, 0.5], dtype=np.float32)
-    xx = cv2.sepFilter2D(smooth, cv2.CV_32F, twice, one)
-    yy = cv2.sepFilter2D(smooth, cv2.CV_32F, one, twice)
-    xy = cv2.sepFilter2D(smooth, cv2.CV_32F, once, once)
-    mean = (0.5 * scale**2) * (xx + yy)
-    difference = 0.5 * (xx - yy)
-    difference *= difference
-    xy *= xy
-    difference += xy
-    spread = cv2.sqrt(difference)
-    spread *= scale**2
-    return mean, spread
+    step = max(PIXELS_AT_ONCE // grey.shape[1], 1)
+    for first in range(0, len(grey), step):
+        last = min(first + step, len(grey))
+        above = max(first - 1, 0)
+        part = smooth[above : last + 1]
+        own = slice(first - above, last - above)
+        xx = cv2.sepFilter2D(part, cv2.CV_32F, twice, one)[own]
+        yy = cv2.sepFilter2D(part, cv2.CV_32F, one, twice)[own]
+        xy = cv2.sepFilter2D(part, cv2.CV_32F, once, once)[own]
+        mean = (0.5 * scale**2) * (xx + yy)
+        xx -= yy
+        xx *= 0.5
+        xx *= xx
+        xy *= xy
+        xx += xy
+        spread = np.sqrt(xx, out=xx)
+        spread *= scale**2
+        yield slice(first, last), mean, spread
 
 
 def _peaks(response: np.ndarray, look: MarkerLook, share: float) -> Shadows:

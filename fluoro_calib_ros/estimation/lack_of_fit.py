@@ -339,7 +339,7 @@ def areas_of_rejected(
 
 
 def _inside(uv: np.ndarray, corner: np.ndarray, cell: np.ndarray) -> np.ndarray:
-    """Rows of the image points (n, 2) in a cell of a size (2,) [px]; corner (2,): in such cells."""
+    """Rows of image points (n, 2) in a cell of a size (2,) [px]; corner (2,): in such cells."""
     at = (uv + 0.5) / cell - corner
     return np.flatnonzero(((at >= 0) & (at < 1)).all(axis=1))
 

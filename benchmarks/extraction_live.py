@@ -450,7 +450,7 @@ PARTS: dict[str, tuple[tuple[type, str], ...]] = {
 }
 
 
-def write_chain(folder: Path, exposures: int) -> None:
+def write_chain(folder: Path, exposures: int, rate_hz: float = FILM_HZ) -> None:
     """Write calibration, bodies.csv and a bag of images of moving bodies, and the truth."""
     rig = virtual_rig(CHAIN_SEED)
     outcome = calibrate(simulate_exposures(rig, 15, CHAIN_SEED).frames, rig.phantom, joint=True)
@@ -466,7 +466,7 @@ def write_chain(folder: Path, exposures: int) -> None:
     truth: dict[str, list[np.ndarray]] = {name: [] for name in NAMES}
     with BagWriter(folder / 'images', overwrite=True) as bag:
         for number, views in enumerate(sequence):
-            stamp_ns = FIRST_NS + round(number * 1e9 / FILM_HZ)
+            stamp_ns = FIRST_NS + round(number * 1e9 / rate_hz)
             for name, view in views.items():
                 header = Header(stamp=stamp_from_nanoseconds(stamp_ns), frame_id=f'{name}_optical')
                 data = serialize_message(message_from_image(header, view.image))

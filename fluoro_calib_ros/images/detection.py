@@ -44,6 +44,7 @@ MAX_LIKELY = 3  # sizes and polarities that are tried
 MANY = 4 * MOST_TYPICAL  # beads, of which the middle quarter of an image shows enough
 SEEN_SHARE = 0.5  # of the beads of a phantom that every image is expected to show
 BACKGROUND = 8.0  # blur of the light around a bead, over its scale
+PIXELS_AT_ONCE = 2**16  # that are filtered: four arrays of them fit a cache of 1 MiB
 COARSE_BLUR = 4.0  # at which a coarser image has the same blur within 1 %
 FIELD_BLUR_PX = 4.0
 FIELD_LEVEL = 0.18  # of the light in the field below which there is no field
@@ -343,7 +344,7 @@ def _blobs(grey: np.ndarray, noise: Noise, scale: float, factor: int = 1) -> Ite
     """Yield the dark, then the bright blobs of an image (h, w) that is reduced by a factor."""
     background = _background(grey, scale)
     sd = np.sqrt(noise.variance(background)) * (_noise_of_response(noise, scale * factor))
-    dark, bright = _responses(grey, scale)
+    dark, bright = responses(grey, scale)
     top = float(grey.max())
     floor = 1e-3 * top
     yield _found(dark, sd, np.maximum(background, floor), scale, factor)
@@ -381,22 +382,53 @@ def _noise_of_response(noise: Noise, scale: float) -> float:
     return float(np.sqrt(max(variance, along[lags] * across[lags])))
 
 
-def _responses(grey: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
+def responses(grey: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
     """Responses (h, w) to dark and to bright blobs: the smaller eigenvalue, or 0."""
-    smooth = cv2.GaussianBlur(grey, (0, 0), scale)
-    xx, yy, xy = (
-        cv2.sepFilter2D(smooth, cv2.CV_32F, np.array(a), np.array(b))
-        for a, b in (
-            ([1.0, -2.0, 1.0], [0.0, 1.0, 0.0]),
-            ([0.0, 1.0, 0.0], [1.0, -2.0, 1.0]),
-            ([-0.5, 0.0, 0.5], [-0.5, 0.0, 0.5]),
-        )
-    )
-    mean = (0.5 * scale**2) * (xx + yy)
-    spread = scale**2 * cv2.sqrt(0.25 * (xx - yy) ** 2 + xy**2)
-    dark = np.maximum(mean - spread, 0)
-    bright = np.maximum(-mean - spread, 0)
+    dark, bright = np.empty((2, *grey.shape), dtype=np.float32)
+    for rows, mean, spread in _curvatures(grey, scale):
+        np.maximum(mean - spread, 0, out=dark[rows])
+        mean += spread
+        np.maximum(np.negative(mean, out=mean), 0, out=bright[rows])
     return dark, bright
+
+
+def dark_response(grey: np.ndarray, scale: float) -> np.ndarray:
+    """Response (h, w) to dark blobs alone."""
+    out = np.empty(grey.shape, dtype=np.float32)
+    for rows, mean, spread in _curvatures(grey, scale):
+        mean -= spread
+        np.maximum(mean, 0, out=out[rows])
+    return out
+
+
+def _curvatures(grey: np.ndarray, scale: float) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
+    """Yield rows of an image, the mean of both eigenvalues of the scaled Hessian there, and half
+    their difference.
+
+    Of a few rows, what is computed on the way stays in the cache of a core.
+    """
+    smooth = cv2.GaussianBlur(grey, (0, 0), scale)
+    twice = np.array([1.0, -2.0, 1.0], dtype=np.float32)
+    one = np.array([0.0, 1.0, 0.0], dtype=np.float32)
+    once = np.array([-0.5, 0.0, 0.5], dtype=np.float32)
+    step = max(PIXELS_AT_ONCE // grey.shape[1], 1)
+    for first in range(0, len(grey), step):
+        last = min(first + step, len(grey))
+        above = max(first - 1, 0)
+        part = smooth[above : last + 1]
+        own = slice(first - above, last - above)
+        xx = cv2.sepFilter2D(part, cv2.CV_32F, twice, one)[own]
+        yy = cv2.sepFilter2D(part, cv2.CV_32F, one, twice)[own]
+        xy = cv2.sepFilter2D(part, cv2.CV_32F, once, once)[own]
+        mean = (0.5 * scale**2) * (xx + yy)
+        xx -= yy
+        xx *= 0.5
+        xx *= xx
+        xy *= xy
+        xx += xy
+        spread = np.sqrt(xx, out=xx)
+        spread *= scale**2
+        yield slice(first, last), mean, spread
 
 
 def _found(
@@ -405,18 +437,23 @@ def _found(
     """Local maxima of a response (h, w) that rise above its noise, away from the border."""
     size = 2 * max(1, round(scale)) + 1
     dilated = cv2.dilate(response, np.ones((size, size), np.uint8))
-    mask = (response >= dilated) & (response > MIN_SNR * sd)
+    mask = response >= dilated
+    mask &= response > MIN_SNR * sd
     mask[[0, -1]] = False
     mask[:, [0, -1]] = False
-    v, u = np.nonzero(mask)
-    relative = response / background
+    v, u = np.divmod(np.flatnonzero(mask), mask.shape[1])
+
+    def relative(row: np.ndarray, column: np.ndarray) -> np.ndarray:
+        return np.asarray(response[row, column] / background[row, column])
+
+    at = relative(v, u)
     uv = np.column_stack(
         [
-            u + vertex(relative[v, u - 1], relative[v, u], relative[v, u + 1]),
-            v + vertex(relative[v - 1, u], relative[v, u], relative[v + 1, u]),
+            u + vertex(relative(v, u - 1), at, relative(v, u + 1)),
+            v + vertex(relative(v - 1, u), at, relative(v + 1, u)),
         ]
     )
-    return _Blobs(factor * (uv + 0.5) - 0.5, response[v, u], relative[v, u])
+    return _Blobs(factor * (uv + 0.5) - 0.5, response[v, u], at)
 
 
 def _beads(blobs: _Blobs, field: NDArray[np.bool_], count: int) -> _Blobs:
@@ -435,7 +472,7 @@ def _strengths(
     There they increase with the size of a bead; at its own scale they hardly do.
     """
     column, row = np.rint(uv).astype(int).T
-    response, _ = _responses(light, WIDER[-1] * scale)
+    response = dark_response(light, WIDER[-1] * scale)
     relative = response[row, column] / around[row, column]
     return np.asarray(relative / max(float(np.median(relative)), 1e-9), dtype=float)
 

@@ -10,7 +10,7 @@ shadow is the smaller eigenvalue of the Hessian, as in `detection`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
@@ -22,7 +22,15 @@ from scipy.spatial import cKDTree
 
 from ..errors import DataError
 from ..findings import Kind
-from .detection import BLOB_RADIUS, MIN_SIZE, SCALES, field_of_view, vertex
+from .detection import (
+    BLOB_RADIUS,
+    MIN_SIZE,
+    SCALES,
+    dark_response,
+    field_of_view,
+    responses,
+    vertex,
+)
 from .light import Light, Noise, estimate_noise
 from .marker_motion import MarkerStates, Motion, assign
 from .measurement import estimate_profile
@@ -35,7 +43,6 @@ MIN_CONTRAST = 0.02  # of a response, as a fraction of the light around it
 MIN_SNR = 4.5  # of a response, over the noise of the response
 WINDOW_BACKGROUND_PX = 6  # the same along the rows of a window
 BACKGROUND_PX = 15  # half the width of the box whose mean is the light around a pixel
-PIXELS_AT_ONCE = 2**16  # that are filtered: four arrays of them fit a cache of 1 MiB
 SAMPLED = 4  # rows and columns from one pixel to the next, where all are of one kind
 SAME_PX = 1.0  # between maxima that are one shadow
 BORDER = 3  # scales of the blur at the edge of a window that are not searched
@@ -161,10 +168,10 @@ class FilteredImage:
         """Return the image filtered for dark shadows, and for bright ones."""
         if scale not in self._by_scale:
             dark, bright = self._lights
-            responses = _responses(dark[0], scale)
+            of_both = responses(dark[0], scale)
             self._by_scale[scale] = (
-                FilteredLight(scale, False, dark[0], responses[0], dark[1]),
-                FilteredLight(scale, True, bright[0], responses[1], bright[1]),
+                FilteredLight(scale, False, dark[0], of_both[0], dark[1]),
+                FilteredLight(scale, True, bright[0], of_both[1], bright[1]),
             )
         return self._by_scale[scale]
 
@@ -259,7 +266,7 @@ def search_image(image: np.ndarray, look: MarkerLook, share: float) -> Shadows:
     grey = image.astype(np.float32)
     light = float(np.iinfo(image.dtype).max) - grey if look.inverted else grey
     around = cv2.blur(light, (2 * BACKGROUND_PX + 1,) * 2)
-    response = _dark_response(light, look.scale)
+    response = dark_response(light, look.scale)
     return _found(look, FilteredLight(look.scale, look.inverted, light, response, around), share)
 
 
@@ -332,7 +339,7 @@ def search_windows(
     size = 2 * (half + border) + 1
     grey, valid = windows.read(middle, _square(half + border))
     around = cv2.blur(grey.reshape(-1, size), (2 * WINDOW_BACKGROUND_PX + 1, 1))
-    response = _relative(_dark_response(grey.reshape(-1, size), look.scale), around, look)
+    response = _relative(dark_response(grey.reshape(-1, size), look.scale), around, look)
     response = response.reshape(len(middle), size, size)
     response *= valid.reshape(response.shape)
     # The seams between windows lie in their borders.
@@ -367,55 +374,6 @@ def _floor(look: MarkerLook, around: np.ndarray) -> np.ndarray:
     """Relative response below which noise is, by the light around: it grows in the dark."""
     light = np.maximum(around, 1e-3 * look.light)
     return np.asarray(look.floor * np.sqrt(np.maximum(look.light / light, 1.0)))
-
-
-def _responses(grey: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """Responses (h, w) to dark and to bright blobs: the smaller eigenvalue, or 0."""
-    dark, bright = np.empty((2, *grey.shape), dtype=np.float32)
-    for rows, mean, spread in _curvatures(grey, scale):
-        np.maximum(mean - spread, 0, out=dark[rows])
-        mean += spread
-        np.maximum(np.negative(mean, out=mean), 0, out=bright[rows])
-    return dark, bright
-
-
-def _dark_response(grey: np.ndarray, scale: float) -> np.ndarray:
-    """Response (h, w) to dark blobs alone."""
-    out = np.empty(grey.shape, dtype=np.float32)
-    for rows, mean, spread in _curvatures(grey, scale):
-        mean -= spread
-        np.maximum(mean, 0, out=out[rows])
-    return out
-
-
-def _curvatures(grey: np.ndarray, scale: float) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
-    """Yield rows of an image, the mean of both eigenvalues of the scaled Hessian there, and half
-    their difference.
-
-    Of a few rows, what is computed on the way stays in the cache of a core.
-    """
-    smooth = cv2.GaussianBlur(grey, (0, 0), scale)
-    twice = np.array([1.0, -2.0, 1.0], dtype=np.float32)
-    one = np.array([0.0, 1.0, 0.0], dtype=np.float32)
-    once = np.array([-0.5, 0.0, 0.5], dtype=np.float32)
-    step = max(PIXELS_AT_ONCE // grey.shape[1], 1)
-    for first in range(0, len(grey), step):
-        last = min(first + step, len(grey))
-        above = max(first - 1, 0)
-        part = smooth[above : last + 1]
-        own = slice(first - above, last - above)
-        xx = cv2.sepFilter2D(part, cv2.CV_32F, twice, one)[own]
-        yy = cv2.sepFilter2D(part, cv2.CV_32F, one, twice)[own]
-        xy = cv2.sepFilter2D(part, cv2.CV_32F, once, once)[own]
-        mean = (0.5 * scale**2) * (xx + yy)
-        xx -= yy
-        xx *= 0.5
-        xx *= xx
-        xy *= xy
-        xx += xy
-        spread = np.sqrt(xx, out=xx)
-        spread *= scale**2
-        yield slice(first, last), mean, spread
 
 
 def _peaks(response: np.ndarray, look: MarkerLook, share: float) -> Shadows:

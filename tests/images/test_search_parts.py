@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.findings import Kind
 from fluoro_calib_ros.images import growth, matching, pose_search
+from fluoro_calib_ros.images.detection import PIXELS_AT_ONCE, dark_response, responses
 from fluoro_calib_ros.images.growth import (
     Seen,
     _good_cells,
@@ -28,11 +29,8 @@ from fluoro_calib_ros.images.growth import (
 from fluoro_calib_ros.images.lattice import FlatGrid, _view
 from fluoro_calib_ros.images.marker_fit import _MarkerFit
 from fluoro_calib_ros.images.marker_intensity import (
-    PIXELS_AT_ONCE,
     LightWindows,
     Shadows,
-    _dark_response,
-    _responses,
     check_image,
 )
 from fluoro_calib_ros.images.marker_motion import MeasuredMarkers, Motion
@@ -463,8 +461,8 @@ def test_response_to_a_shadow_is_the_smaller_eigenvalue_of_the_hessian():
     image = np.random.default_rng(6).uniform(0, 100, (24, width)).astype(np.float32)
     assert PIXELS_AT_ONCE // width == 16
     smooth = cv2.GaussianBlur(image, (0, 0), 1.5).astype(float)
-    dark, bright = _responses(image, 1.5)
-    np.testing.assert_array_equal(_dark_response(image, 1.5), dark)
+    dark, bright = responses(image, 1.5)
+    np.testing.assert_array_equal(dark_response(image, 1.5), dark)
     for v, u in ((3, 4), (10, 20), (15, 9), (16, 70), (17, 9)):
         near = smooth[v - 1 : v + 2, u - 1 : u + 2]
         across = (near[2, 2] - near[2, 0] - near[0, 2] + near[0, 0]) / 4

@@ -260,6 +260,42 @@ def test_a_cluster_of_rejected_points_needs_less_to_agree():
     assert clustered / plain == pytest.approx(expected, rel=1e-6)
 
 
+def few_at_a_corner(angles, exposure):
+    """Rejected points with residuals of these directions, and the inliers beside and elsewhere."""
+    rng = np.random.default_rng(6)
+    uv = rng.uniform(0, 12, (len(angles), 2))
+    residuals = 1.3 * np.column_stack([np.cos(angles), np.sin(angles)])
+    beside = rng.uniform(0, 30, (6, 2))
+    inliers = np.concatenate([beside, rng.uniform(0.2, 1, (2000, 2)) * SIZE])
+    return exceeding(
+        FittedPoints(uv, residuals, np.array(exposure)), np.arange(len(angles)), inliers
+    )
+
+
+def test_three_rejected_points_that_agree_are_enough_where_hardly_any_others_are():
+    """At a border, where few exposures show anything, a dent rejects few image points."""
+    found, wrong = few_at_a_corner([0.7, 0.75, 0.72], [0, 0, 1])
+    assert len(found) == len(wrong) == 1 and len(wrong[0].rows) == 3
+    assert wrong[0].size_px == pytest.approx(1.3, rel=1e-3)
+    # Those of one exposure, and two, show nothing.
+    assert not few_at_a_corner([0.7, 0.75, 0.72], [0, 0, 0])[1]
+    assert not few_at_a_corner([0.7, 0.75], [0, 1])[0]
+    # Directions of chance exceed the limit in one of 20.
+    rng = np.random.default_rng(7)
+    alarms = sum(
+        bool(few_at_a_corner(rng.uniform(0, 2 * np.pi, 3), [0, 1, 2])[1]) for _ in range(200)
+    )
+    assert 2 <= alarms <= 19
+
+
+def test_few_rejected_points_among_many_inliers_are_not_looked_at():
+    rng = np.random.default_rng(8)
+    uv = rng.uniform(0, 12, (3, 2))
+    points = FittedPoints(uv, np.ones((3, 2)), np.arange(3))
+    crowd = rng.uniform(0, 60, (2000, 2))
+    assert not areas_of_rejected(points, np.arange(3), crowd, SIZE)
+
+
 def test_rejected_points_reach_the_nodes_of_their_cells():
     """Where inliers are dense, too: a node is at most a cell away."""
     rng = np.random.default_rng(5)

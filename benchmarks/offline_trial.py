@@ -4,9 +4,10 @@
 """Images of a trial to joint angles by the commands: `python -m benchmarks.offline_trial`.
 
 Ten seconds of two views of 1024 x 1024 px and 8 bits at 250 Hz, 30 markers in five bodies, in a
-bag. `fluoro-calib extract` follows the markers, their ids from the shapes of the bodies, and
-`fluoro-calib bodies` gives poses, joint angles and C3D. Prints the time of each command, and how
-far the poses are from the truth. `--folder` keeps what is rendered.
+bag. `fluoro-calib extract` follows the markers, their ids from the shapes of the bodies,
+`fluoro-calib bodies` gives poses and joint angles, and `fluoro-calib convert` the poses as C3D.
+Prints the time of each command, and how far the poses are from the truth. `--folder` keeps what
+is rendered.
 """
 
 from __future__ import annotations
@@ -108,8 +109,11 @@ def main() -> None:
                 *('--rate', f'{RATE_HZ}', '--out', f'{folder}/motion'),
             ]
         )
+        poses = folder / 'motion' / 'poses.csv'
+        c3d = ['--to', 'c3d', '--rate', f'{RATE_HZ}', '--out', f'{folder}/poses.c3d']
+        seconds += run(['convert', f'{poses}', *c3d])
         print(f'together {seconds:.1f} s; the target is {TARGET_S:.0f} s for {SECONDS:.0f} s')
-        compare(folder / 'motion' / 'poses.csv', exposures)
+        compare(poses, exposures)
 
 
 if __name__ == '__main__':

@@ -531,7 +531,9 @@ class _Sizes:
         """
         shadows = self.shadows
         imaging = self.imaging
-        reach = (1 + SIZES[-1]) * imaging.profile.reach_px
+        # The windows of the beads, and the largest shadow that may be around.
+        largest = max(1.0, float(np.max(sizes))), np.nanmax(imaging.size, initial=1.0)
+        reach = sum(largest) * imaging.profile.reach_px
         near = cKDTree(shadows.uv).query_ball_point(shadows.uv[rows], reach)
         around = np.setdiff1d(np.concatenate(near).astype(int), rows)
         every = np.concatenate([rows, around])

@@ -37,7 +37,7 @@ MIN_INSIDE = 0.6  # of a window that lies in the field
 FINE = 3  # points across a pixel of the grid on which shadows that touch are blurred
 OVERLAP = 0.85  # times both reaches; shadows that are nearer overlap
 DISTURBED = 1.6  # lack of fit from which pixels with large residuals count less
-AT_ONCE = 500  # windows whose waves are in memory, some 80 MB
+AT_ONCE = 2**18  # derivatives that are computed together, 1 MB: they fit a cache
 CORRELATED = 60  # windows that tell the correlation of the noise
 INFLUENCES = 20  # beads of whose pixels the influence is computed
 UNDISTURBED = 4.0  # times the median lack of fit, of a window without anything else
@@ -185,6 +185,14 @@ class ShadowFit(ABC):
             if len(rows):
                 self.groups.append((rows, near[rows, :high]))
 
+    def _parts(self, rows: np.ndarray, near: np.ndarray) -> list[Group]:
+        """Parts of a group that are computed one after the other."""
+        size = len(rows) * len(self.offset) * (OWN + 3 * near.shape[1])
+        if size < AT_ONCE:
+            return [(rows, near)]
+        parts = np.array_split(np.arange(len(rows)), size // AT_ONCE + 1)
+        return [(rows[some], near[some]) for some in parts]
+
     # ---- what a fit must say
 
     @abstractmethod
@@ -230,7 +238,14 @@ class ShadowFit(ABC):
         self, rows: np.ndarray, near: np.ndarray, final: bool
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return centres, depths and backgrounds of some beads after a step."""
-        step = self._solve(rows, near, self._equations(rows, near, final), final)
+        parts = self._parts(rows, near)
+        usual = self.typical() if len(parts) > 1 else None
+        step = np.concatenate(
+            [
+                self._solve(some, beside, self._equations(some, beside, final, usual), final)
+                for some, beside in parts
+            ]
+        )
         step = np.where(self.usable[rows][:, None], step, 0)
         longest = self.settings.max_step_px
         return (
@@ -239,8 +254,13 @@ class ShadowFit(ABC):
             self.background[rows] + step[:, :TERMS],
         )
 
-    def _equations(self, rows: np.ndarray, near: np.ndarray, final: bool) -> NormalEquations:
-        """Return the normal equations of some beads, and note their lack of fit."""
+    def _equations(
+        self, rows: np.ndarray, near: np.ndarray, final: bool, usual: float | None
+    ) -> NormalEquations:
+        """Return the normal equations of some beads, and note their lack of fit.
+
+        usual: lack of fit of a typical bead; None: the present one.
+        """
         light, jacobian = self._model(rows, near)
         grey = self.grey[rows]
         residual = grey - light
@@ -250,7 +270,7 @@ class ShadowFit(ABC):
         total = squared.sum(axis=1)
         disturbed = self._disturbed(rows, near, final) & (self.strength[rows] == 0)
         if disturbed.any():
-            half = ROBUST**2 * self.typical()
+            half = ROBUST**2 * (self.typical() if usual is None else usual)
             weight = weight / (1 + disturbed[:, None] * squared / half)
         weighted = jacobian * weight.astype(DTYPE)[:, None]
         prior = self._prior(rows, near)
@@ -297,7 +317,7 @@ class ShadowFit(ABC):
         self.correlation = self._correlation((residual - common) * valid, valid)
         spectra = []
         for (rows, near), (residual, root) in zip(self.groups, parts):
-            for some in np.array_split(np.arange(len(rows)), len(rows) // AT_ONCE + 1):
+            for some in np.array_split(np.arange(len(rows)), len(self._parts(rows, near))):
                 _, jacobian = self._model(rows[some], near[some])
                 # In double precision: waves that a small window hardly sees are nearly alike.
                 rest = (residual[some] - common) / np.maximum(root[some], 1e-12)
@@ -313,7 +333,7 @@ class ShadowFit(ABC):
 
     def _standardised(self, rows: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Residuals (g, m) over the noise, and roots (g, m) of weights; 0 for invalid pixels."""
-        light, _ = self._model(rows, near)
+        light = np.concatenate([self._model(*part)[0] for part in self._parts(rows, near)])
         grey = self.grey[rows]
         root = self._valid(rows, grey, light) / np.sqrt(self.noise.variance(light), dtype=DTYPE)
         return (grey - light) * root, root

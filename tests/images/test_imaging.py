@@ -250,7 +250,7 @@ def test_size_is_where_the_fit_is_best_to_a_part_of_a_step(monkeypatch):
 
 
 def test_sizes_are_compared_with_the_shadows_around(monkeypatch):
-    """Those that the largest size would reach, with the sizes that they have."""
+    """Those whose shadows the windows may show, with the sizes that they have."""
     asked = []
 
     def lack(light, uv, radius, profile, noise, size):
@@ -258,7 +258,7 @@ def test_sizes_are_compared_with_the_shadows_around(monkeypatch):
         return np.arange(len(uv)) + size
 
     monkeypatch.setattr('fluoro_calib_ros.images.measurement.lack_of_fit', lack)
-    reach = (1 + 1.25**4) * (5.0 + 3.2)
+    reach = (1.6 + 2.0) * (5.0 + 3.2)  # of the largest size that is compared, and that is known
     others = np.array([[0.0, 0.99 * reach], [0.0, 1.01 * reach], [100.0, -0.99 * reach]])
     sizes = sizes_of(2, others)
     found = sizes.lacks(np.array([0, 1]), [np.array([0.5, 0.6]), np.array([1.5, 1.6])])

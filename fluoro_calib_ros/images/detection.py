@@ -173,7 +173,8 @@ class _Sight:
         a blob is a maximum over places and scales (Lindeberg 1998).
         """
         uv = blobs.uv
-        if len(uv) < 2 or not cKDTree(uv).query_pairs(2 * LARGER[-1] * BLOB_RADIUS * scale):
+        tree = cKDTree(uv) if len(uv) else None
+        if tree is None or not tree.query_pairs(2 * LARGER[-1] * BLOB_RADIUS * scale):
             return uv
         merged = np.zeros(len(uv), dtype=bool)
         large: list[np.ndarray] = []
@@ -187,11 +188,11 @@ class _Sight:
             )
             wide = larger * scale
             found = next(islice(_blobs(part, self.noise, wide / factor, factor), inverted, None))
-            for place, relative in zip(found.uv, found.relative):
-                inside = np.linalg.norm(uv - place, axis=1) < BLOB_RADIUS * wide
-                inside &= ~merged
-                if inside.sum() > 1 and relative > blobs.relative[inside].max():
-                    merged |= inside
+            near = tree.query_ball_point(found.uv, BLOB_RADIUS * wide)
+            for place, relative, rows in zip(found.uv, found.relative, near):
+                inside = [row for row in rows if not merged[row]]
+                if len(inside) > 1 and relative > blobs.relative[inside].max():
+                    merged[inside] = True
                     large.append(place)
         return np.concatenate([uv[~merged], np.reshape(large, (-1, 2))])
 

@@ -60,19 +60,24 @@ class MarkerWatch:
         self._density = density
 
     def shadows_met(
-        self, found: MeasuredMarkers, states: MarkerStates, frame: int
+        self,
+        found: MeasuredMarkers,
+        states: MarkerStates,
+        frame: int,
+        is_first: bool = False,
     ) -> tuple[MeasuredMarkers, tuple[Finding, ...]]:
         """Note which markers may have been exchanged in an image.
 
         A measurement that may be that of a marker beside it, which is not seen, is taken back.
+        is_first: places are not predicted, but given, to a pixel or two.
         """
         motion = states.motion
         measured = found.measured.copy()
         out = []
         variance = motion.innovation_variance(found.sigma)
         pairs = doubtful_pairs(motion.uv, variance, measured, found.uv, self._margin)
-        # Ids of the first image are given; before a velocity is known, nothing can be said.
-        settled = motion.settled
+        # After the first image, nothing can be said before a velocity is known.
+        settled = motion.settled | is_first
         apart = np.linalg.norm(motion.uv[pairs[:, 0]] - motion.uv[pairs[:, 1]], axis=1)
         for (one, two), distance in zip(pairs.tolist(), apart.tolist()):
             both_settled = settled[one] and settled[two]

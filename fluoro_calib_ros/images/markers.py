@@ -473,7 +473,7 @@ class MarkerTracker:
             shift_together(states.motion, shadows, self.options.gate, self._gap)
         found = followed.measurement.measure(windows, shadows, states)
         unknown = ~states.motion.settled | (states.unseen > 1)
-        found, doubts = watch.shadows_met(found, states, frame)
+        found, doubts = watch.shadows_met(found, states, frame, is_first=self._images == 0)
         doubts += watch.found_again(found, states, frame)
         doubts += watch.other_shadows(found, states, frame)
         # In the first image, and where bodies have just been found, their shapes tell the ids.

@@ -29,6 +29,7 @@ from fluoro_calib_ros.images.growth import (
 from fluoro_calib_ros.images.lattice import FlatGrid, _view
 from fluoro_calib_ros.images.marker_fit import _MarkerFit
 from fluoro_calib_ros.images.marker_intensity import (
+    FIRST_SD_PX,
     LightWindows,
     Shadows,
     check_image,
@@ -368,6 +369,21 @@ def test_markers_that_met(apart, measured, unseen, settled, taken_back, doubtful
     assert doubts.doubtful.tolist() == [doubtful, doubtful, False]
     assert seen.measured.tolist() == [bool(m) for m in measured] + [True]
     assert not watch.shadows_met(seen, states, 5)[1]
+
+
+@pytest.mark.parametrize(('apart', 'doubtful'), [(1.8, True), (3.0, True), (6.0, False)])
+def test_places_of_the_first_image_tell_no_markers_apart_that_are_nearer_to_each_other(
+    apart, doubtful
+):
+    """They are given to a pixel or two, whoever gives them."""
+    at = np.array([[500.0, 300], [500 + apart, 300], [900, 900]])
+    watch, doubts, states = watched(at, FIRST_SD_PX**2, [0, 0, 0])
+    states.motion.covariance[:, 1, 1] = 1e6  # no velocity is known
+    seen = found_at(at, [1, 1, 1])
+    assert not watch.shadows_met(seen, states, 4)[1]
+    found, told = watch.shadows_met(seen, states, 4, is_first=True)
+    assert found.measured.all()
+    assert doubts.doubtful.tolist() == [doubtful, doubtful, False] and len(told) == doubtful
 
 
 def test_a_marker_found_again_in_a_wide_gate_is_doubtful():

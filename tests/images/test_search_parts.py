@@ -371,7 +371,7 @@ def test_markers_that_met(apart, measured, unseen, settled, taken_back, doubtful
     assert not watch.shadows_met(seen, states, 5)[1]
 
 
-@pytest.mark.parametrize(('apart', 'doubtful'), [(1.8, True), (3.0, True), (6.0, False)])
+@pytest.mark.parametrize(('apart', 'doubtful'), [(1.0, True), (2.4, True), (6.0, False)])
 def test_places_of_the_first_image_tell_no_markers_apart_that_are_nearer_to_each_other(
     apart, doubtful
 ):

@@ -122,6 +122,15 @@ class FineGrid:
         return smooth[self._row, self._column]
 
 
+def _parts(rows: np.ndarray, near: np.ndarray, pixels: int) -> list[Group]:
+    """Parts of a group, with windows of so many pixels, that are computed one after the other."""
+    size = len(rows) * pixels * (OWN + 3 * near.shape[1])
+    if size < AT_ONCE:
+        return [(rows, near)]
+    parts = np.array_split(np.arange(len(rows)), size // AT_ONCE + 1)
+    return [(rows[some], near[some]) for some in parts]
+
+
 class ShadowFit(ABC):
     """Gauss-Newton fit of windows, each with the neighbours of its bead.
 
@@ -185,14 +194,6 @@ class ShadowFit(ABC):
             if len(rows):
                 self.groups.append((rows, near[rows, :high]))
 
-    def _parts(self, rows: np.ndarray, near: np.ndarray) -> list[Group]:
-        """Parts of a group that are computed one after the other."""
-        size = len(rows) * len(self.offset) * (OWN + 3 * near.shape[1])
-        if size < AT_ONCE:
-            return [(rows, near)]
-        parts = np.array_split(np.arange(len(rows)), size // AT_ONCE + 1)
-        return [(rows[some], near[some]) for some in parts]
-
     # ---- what a fit must say
 
     @abstractmethod
@@ -238,13 +239,10 @@ class ShadowFit(ABC):
         self, rows: np.ndarray, near: np.ndarray, final: bool
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return centres, depths and backgrounds of some beads after a step."""
-        parts = self._parts(rows, near)
+        parts = _parts(rows, near, len(self.offset))
         usual = self.typical() if len(parts) > 1 else None
         step = np.concatenate(
-            [
-                self._solve(some, beside, self._equations(some, beside, final, usual), final)
-                for some, beside in parts
-            ]
+            [self._solve(*part, self._equations(part, final, usual), final) for part in parts]
         )
         step = np.where(self.usable[rows][:, None], step, 0)
         longest = self.settings.max_step_px
@@ -254,13 +252,9 @@ class ShadowFit(ABC):
             self.background[rows] + step[:, :TERMS],
         )
 
-    def _equations(
-        self, rows: np.ndarray, near: np.ndarray, final: bool, usual: float | None
-    ) -> NormalEquations:
-        """Return the normal equations of some beads, and note their lack of fit.
-
-        usual: lack of fit of a typical bead; None: the present one.
-        """
+    def _equations(self, group: Group, final: bool, usual: float | None) -> NormalEquations:
+        """Normal equations of some beads, and their lack of fit; usual: that of a typical bead."""
+        rows, near = group
         light, jacobian = self._model(rows, near)
         grey = self.grey[rows]
         residual = grey - light
@@ -317,8 +311,8 @@ class ShadowFit(ABC):
         self.correlation = self._correlation((residual - common) * valid, valid)
         spectra = []
         for (rows, near), (residual, root) in zip(self.groups, parts):
-            for some in np.array_split(np.arange(len(rows)), len(self._parts(rows, near))):
-                _, jacobian = self._model(rows[some], near[some])
+            for some, beside in _parts(np.arange(len(rows)), near, len(self.offset)):
+                _, jacobian = self._model(rows[some], beside)
                 # In double precision: waves that a small window hardly sees are nearly alike.
                 rest = (residual[some] - common) / np.maximum(root[some], 1e-12)
                 spectra.append(
@@ -333,7 +327,8 @@ class ShadowFit(ABC):
 
     def _standardised(self, rows: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Residuals (g, m) over the noise, and roots (g, m) of weights; 0 for invalid pixels."""
-        light = np.concatenate([self._model(*part)[0] for part in self._parts(rows, near)])
+        parts = _parts(rows, near, len(self.offset))
+        light = np.concatenate([self._model(*part)[0] for part in parts])
         grey = self.grey[rows]
         root = self._valid(rows, grey, light) / np.sqrt(self.noise.variance(light), dtype=DTYPE)
         return (grey - light) * root, root

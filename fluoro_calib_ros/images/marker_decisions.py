@@ -205,6 +205,7 @@ WRONG = 3  # exposures that disagree before an id is wrong
 NEAR_PX = 1.0  # from where its body says, that a marker is; or so many
 NEAR_SIGMAS = 3.5
 FAR = 1.5  # times that, from which it is something else
+DOUBT_SIGMAS = 4.5  # from which it may be: chance exceeds them in one of 25,000 places
 MAX_DISTANCE_PX = 50.0  # beyond it, distances are alike
 
 
@@ -226,7 +227,8 @@ class BodyDecisions:
         seen = exposure.observed[view.view]
         doubtful = exposure.doubtful[view.view]
         away = np.linalg.norm(seen - place, axis=1)
-        near = np.maximum(NEAR_PX, NEAR_SIGMAS * np.hypot(exposure.sigma[view.view], sd))
+        scatter = np.hypot(exposure.sigma[view.view], sd)
+        near = np.maximum(NEAR_PX, NEAR_SIGMAS * scatter)
         right = away < near
         wrong = away > FAR * near
         # A body that another view shows hardly tells a place along the rays of that view.
@@ -235,7 +237,8 @@ class BodyDecisions:
         wrong |= contradicted
         self._seen_right[right] = frame
         view.counts.disagree(wrong)
-        view.doubt(np.flatnonzero(wrong & ~doubtful), frame)
+        strange = wrong | (away > np.maximum(NEAR_PX, DOUBT_SIGMAS * scatter))
+        view.doubt(np.flatnonzero(strange & ~doubtful), frame)
         suspects = np.flatnonzero(np.isfinite(away) & (doubtful | (view.counts.wrong > 0)))
         crossed = _crossed(seen, place, near, suspects)
         out = [self._exchange(rows, frame) for rows in crossed]

@@ -146,6 +146,27 @@ def test_an_id_is_dropped_after_three_exposures_elsewhere(began):
 
 
 @pytest.mark.parametrize(
+    ('off', 'sd', 'sigma', 'is_doubted'),
+    [
+        (0.99, 0.0, 0.0, False),
+        (1.01, 0.0, 0.0, True),
+        (2.24, 0.3, 0.4, False),  # 4.5 deviations of both
+        (2.26, 0.3, 0.4, True),
+        (np.nan, 0.0, 0.0, False),
+    ],
+)
+def test_a_place_that_chance_does_not_explain_is_doubted_at_once(off, sd, sigma, is_doubted):
+    """And in its place for three images, it is confirmed."""
+    one = view()
+    decisions = BodyDecisions(one)
+    seen = PLACES + (np.arange(4) == 0)[:, None] * [0.0, off]
+    assert decided(decisions, one, seen, [11], sd=sd, sigma=sigma) == []
+    assert one.tracker.doubts.since(3) == (11 if is_doubted else None)
+    found = decided(decisions, one, PLACES, range(12, 16), sd=sd, sigma=sigma)
+    assert found == ([('confirmed', 14, 12, (3,))] if is_doubted else [])
+
+
+@pytest.mark.parametrize(
     ('off', 'sd', 'sigma', 'kinds'),
     [
         (0.99, 0.0, 0.0, ['confirmed']),

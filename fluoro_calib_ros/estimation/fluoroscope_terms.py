@@ -30,6 +30,7 @@ from .lack_of_fit import FittedPoints, LeftOut, LeftOutInPlaces
 from .local_signal import correlation_beyond
 from .priors import (
     Prior,
+    covariance_by_signal,
     covariance_of_series,
     gauge_precision,
     has_rings,
@@ -37,7 +38,7 @@ from .priors import (
     prior_precision,
     starting_prior,
 )
-from .signal import ripples_of
+from .ripples import ripples_of
 
 if TYPE_CHECKING:
     from ..photogrammetry.adjustment import Adjustment
@@ -135,6 +136,7 @@ class FluoroscopeTerms:
         self.functions = functions
         self.values = functions(self.uv)  #: (n, m) functions at the image points
         self.gauge = self.gauge_of(self.values)  #: (2m, 2m) precision matrix of the gauge
+        self._last_equations: SeriesEquations | None = None  # with these functions
 
     def gauge_of(self, values: np.ndarray) -> NDArray[np.float64]:
         """Precision matrix (2m, 2m) of the gauge for values (n, m) of functions."""
@@ -223,7 +225,8 @@ class FluoroscopeTerms:
             information, right = without_exposure_terms(
                 information, right, self.own.precision, self.of_series.stop
             )
-        return SeriesEquations(information, right)
+        self._last_equations = SeriesEquations(information, right)
+        return self._last_equations
 
     def series(self, coefficients: np.ndarray, covariance: np.ndarray) -> Series:
         """Return the series, without the terms of the exposures.
@@ -251,6 +254,11 @@ class FluoroscopeTerms:
         covariance = covariance_of_series(
             self.functions, self.prior, coefficients, covariance[of_series, of_series]
         )
+        last = self._last_equations
+        if last is not None:
+            covariance = covariance + covariance_by_signal(
+                self.functions, last.information, last.right, self.gauge, self.prior
+            )
         return self.series(coefficients, covariance)
 
     def fit_angles(self, adjustment: Adjustment, precise: Precision) -> AngleFit | None:

@@ -23,7 +23,7 @@ from ..correction.terms import ABSENT_VARIANCE, trend_transformation
 from .estimator import GaugeKind, gauge_rows
 from .local_signal import LocalSignal, SineEstimates, bumps, largest_gain, with_likely_places
 from .parametric import covariance_with_uncertain_terms
-from .signal import Signal, SignalEquations, most_likely_signal, starting_signal
+from .signal import Signal, SignalEquations, most_likely_signal, plausible_signals, starting_signal
 
 # Standard deviation to which the gauge is fixed; a much smaller one would damp the steps of the
 # adjustment.
@@ -104,6 +104,13 @@ def signal_precision(functions: Functions, prior: Prior) -> NDArray[np.float64]:
     return cho_solve(cho_factor(covariance, lower=True), np.eye(len(variance)))
 
 
+def _terms_that_can_exist(functions: Functions) -> list[int]:
+    """Numbers of the terms of the polynomials, and of the rings that can exist."""
+    _, count = trend_transformation(functions.degree, functions.rings)
+    rings = count - 4 * functions.rings
+    return [*range(rings), *(rings + k for k in RING_TERMS if rings + k < count)]
+
+
 def _trend_columns(functions: Functions) -> np.ndarray:
     """Places of the coefficients of polynomials and rings, those of u first."""
     m = len(functions)
@@ -125,15 +132,49 @@ def covariance_of_series(
 ) -> NDArray[np.float64]:
     """Return the covariance (2m, 2m) of a series with that of which trend terms exist.
 
-    Whether a ring exists is the result of a test, and taken as known.
-
     coefficients, covariance: (2m, 2m) posterior with this prior. Returns (2m, 2m).
     """
-    to_terms, count = trend_transformation(functions.degree, functions.rings)
-    rows = np.arange(count - 4 * functions.rings)
+    to_terms, _ = trend_transformation(functions.degree, functions.rings)
+    rows = _terms_that_can_exist(functions)
     whole = np.zeros((len(rows), 2 * len(functions)))
     whole[:, _trend_columns(functions)] = to_terms[rows]
     return covariance_with_uncertain_terms(whole, prior.trend[rows], coefficients, covariance)
+
+
+def covariance_by_signal(
+    functions: Functions,
+    information: NDArray[np.float64],
+    right: NDArray[np.float64],
+    gauge: NDArray[np.float64],
+    prior: Prior,
+) -> NDArray[np.float64]:
+    """Return what a series' covariance (2m, 2m) grows by as its signal is only estimated.
+
+    It is the mean over plausible signals of the covariance with each and of the square of the
+    change of the coefficients, less the covariance with the most likely signal. The arguments are
+    those of `most_likely_prior`.
+    """
+    base = information + gauge
+    out = np.zeros_like(base)
+    if not functions.modes:
+        return out
+    equations = _signal_equations(functions, base, right, prior)
+    signals = plausible_signals(prior.signal, equations, max(functions.image_size))
+    mean, covariance = _posterior(functions, base, right, prior)
+    for signal in signals:
+        other_mean, other = _posterior(functions, base, right, replace(prior, signal=signal))
+        change = other_mean - mean
+        out += (other - covariance + np.outer(change, change)) / len(signals)
+    return out
+
+
+def _posterior(
+    functions: Functions, information: np.ndarray, right: np.ndarray, prior: Prior
+) -> tuple[np.ndarray, np.ndarray]:
+    """Coefficients (2m,) and their covariance (2m, 2m); information: with the gauge."""
+    factor = cho_factor(information + prior_precision(functions, prior), lower=True)
+    covariance = cho_solve(factor, np.eye(len(right)))
+    return covariance @ right, covariance
 
 
 def gauge_precision(
@@ -174,19 +215,25 @@ def _most_likely_signal(
     functions: Functions, information: np.ndarray, right: np.ndarray, prior: Prior
 ) -> Prior:
     """Return the prior with a renewed signal."""
+    equations = _signal_equations(functions, information, right, prior)
+    found = most_likely_signal(prior.signal, equations, max(functions.image_size))
+    local = prior.local
+    if local is not None:
+        local = _renewed(local, equations, found.variance(functions.frequency))
+    return replace(prior, signal=found, local=local)
+
+
+def _signal_equations(
+    functions: Functions, information: np.ndarray, right: np.ndarray, prior: Prior
+) -> SignalEquations:
+    """Normal equations with every prior but the signal's; information: with the gauge."""
     at = _trend_columns(functions)
     base = information.copy(order='F')
     base[np.ix_(at, at)] += _trend_precision(functions, prior)
     columns = np.setdiff1d(np.arange(len(right)), at)
-    side = max(functions.image_size)
-    local = prior.local
-    if local is not None:
-        base, right = _with_bumps(functions, base, right, local)
-    equations = SignalEquations(functions.frequency, base, right, columns)
-    found = most_likely_signal(prior.signal, equations, side)
-    if local is not None:
-        local = _renewed(local, equations, found.variance(functions.frequency))
-    return replace(prior, signal=found, local=local)
+    if prior.local is not None:
+        base, right = _with_bumps(functions, base, right, prior.local)
+    return SignalEquations(functions.frequency, base, right, columns)
 
 
 def _with_bumps(
@@ -272,9 +319,8 @@ def with_more_places(
     """
     m = len(functions)
     t = functions.trend
-    precision = information + gauge + prior_precision(functions, prior)
-    covariance = cho_solve(cho_factor(precision, lower=True), np.eye(2 * m))
-    mean = (covariance @ right).reshape(2, m).T[t:]
+    coefficients, covariance = _posterior(functions, information + gauge, right, prior)
+    mean = coefficients.reshape(2, m).T[t:]
     sines = [slice(axis * m + t, (axis + 1) * m) for axis in (0, 1)]
     covariances = np.stack([covariance[own, own] for own in sines])
     estimates = SineEstimates.of(signal_precision(functions, prior), mean, covariances)
@@ -295,7 +341,7 @@ def _most_likely_trend(
     variance = prior.trend.copy()
     rings = count - 4 * functions.rings
     for _ in range(SWEEPS):
-        for j in (*range(rings), *(rings + k for k in RING_TERMS if rings + k < count)):
+        for j in _terms_that_can_exist(functions):
             precision = np.concatenate([1 / variance, np.zeros(len(to_terms) - count)])
             precision[j] = 0
             # The term is estimated without its prior; its square exceeds its own variance by that

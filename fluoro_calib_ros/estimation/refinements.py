@@ -23,7 +23,7 @@ from .exposure_terms import ExposureTerms, can_be_fitted, exposure_functions, va
 from .fluoroscope_terms import FluoroscopeTerms, SeriesEquations
 from .lack_of_fit import LARGEST_SD, FittedPoints, areas_of_rejected
 from .priors import Prior, most_likely_prior, prior_precision, with_more_places, with_shown_places
-from .signal import Ripples, shown_ripples
+from .ripples import Ripples, shown_ripples
 
 START_MODES = 16  # half waves along the image, until the signal is known
 MIN_MODES = 10  # least number

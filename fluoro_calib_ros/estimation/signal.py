@@ -20,157 +20,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack, solve_triangular
-from scipy.special import j0, stdtrit
+from scipy.special import j0
 
-from ..correction.series import MARGIN, Functions
 from ..correction.terms import ABSENT_VARIANCE
-from .lack_of_fit import MIN_EXPOSURES
-
-# Ripples: a part of the signal within a few bands of spatial frequency.
-#
-# A weave, a moire pattern or the seams of fibre plates repeat with a wavelength. A covariance
-# function of Matern's family has to hold all longer waves, too, to hold such ripples; a series
-# for it has as many sines. The periodogram of the residuals (Scargle, "Studies in astronomical
-# time series analysis II", ApJ 263, 1982) shows which few bands of frequencies there are.
-
-# Sines along the image that are looked at: ripples shorter than 53 px on 1024 px.
-SEARCHED_BANDS = 50
-# Standard deviations by which the mean power of a band with ripples exceeds that of noise.
-SIGNIFICANT = 5.0
-INDEPENDENT = 1 / MARGIN**2  # part of the sines, over their rectangle, that the image can tell
-# Chance that ripples which differ between exposures agree in a band.
-FALSE_ALARM = 1e-5
-BESIDE = 1  # bands next to one with ripples that are used, too: the image ends, and waves do not
-BESIDE_PEAK = 0.2  # part of the power of the strongest band, up to which others belong to it
-LEAST_EXCESS = 0.1  # power that a band starts with, over that of noise
-
-
-@dataclass(frozen=True)
-class Ripples:
-    """Prior variances of the sines of bands of frequencies.
-
-    width: of a band [1/px]; variances: [px^2] of the bands 0, 1, ..., zero where there are none.
-    """
-
-    width: float
-    variances: tuple[float, ...]
-
-    @property
-    def bands(self) -> tuple[int, ...]:
-        """Bands in which there are ripples."""
-        return tuple(band for band, variance in enumerate(self.variances) if variance > 0)
-
-    def band(self, frequency: np.ndarray) -> NDArray[np.float64]:
-        """Band (s,) of frequency (s,) [1/px]."""
-        return np.rint(frequency / self.width).astype(int)
-
-    def variance(self, frequency: np.ndarray) -> NDArray[np.float64]:
-        """Variances (s,) of sines of frequency (s,) [1/px]."""
-        band = self.band(frequency)
-        inside = band < len(self.variances)
-        return np.where(inside, np.asarray(self.variances)[np.where(inside, band, 0)], 0.0)
-
-    def with_variances(self, variances: np.ndarray) -> Ripples:
-        """Return ripples in the same bands with these variances (n,), of all bands."""
-        own = np.where(np.asarray(self.variances) > 0, variances, 0.0)
-        return replace(self, variances=tuple(float(value) for value in own))
-
-    def alone(self) -> Ripples | None:
-        """Return the ripples in the bands about the strongest; None: longer waves are as strong.
-
-        A field without ripples grows weaker from band to band.
-        """
-        variances = np.asarray(self.variances)
-        largest = float(variances.max())
-        if variances[self.bands[0]] > BESIDE_PEAK * largest:
-            return None
-        used = np.convolve(variances > BESIDE_PEAK * largest, np.ones(2 * BESIDE + 1), 'same') > 0
-        return replace(self, variances=tuple(float(v) for v in np.where(used, variances, 0.0)))
-
-
-def ripples_of(functions: Functions, coefficients: np.ndarray) -> Ripples | None:
-    """Ripples of a series that has them, as its coefficients (2, m) show them, or None."""
-    if not functions.absent:
-        return None
-    count = functions.modes + 1
-    squares = np.mean(coefficients[:, functions.trend :] ** 2, axis=0)
-    number = np.maximum(np.bincount(functions.band, minlength=count), 1)
-    variances = np.bincount(functions.band, squares, count) / number
-    variances[: functions.complete + 1] = 0.0
-    return Ripples(functions.frequency_of_mode, tuple(float(value) for value in variances))
-
-
-def shown_ripples(
-    image_size: tuple[int, int],
-    uv: NDArray[np.float64],
-    residuals: NDArray[np.float64],
-    exposure: NDArray[np.int64],
-    complete: int,
-) -> Ripples | None:
-    """Return the ripples that residuals show beyond the sines of a series, or None.
-
-    Parameters
-    ----------
-    image_size : (int, int)
-        Width and height of the image [px].
-    uv, residuals : (n, 2) ndarray
-        Image points and their residuals [px].
-    exposure : (n,) ndarray
-        Exposures of the image points.
-    complete : int
-        Bands up to which the series has all sines.
-    """
-    functions = Functions(image_size, -1, SEARCHED_BANDS)
-    products, squares = functions.sums_of_sines(uv, residuals)
-    noise = float(np.mean(residuals**2))
-    power = np.mean(products**2, axis=1) / (squares * noise)
-    number = np.maximum(np.bincount(functions.band), 1)
-    excess = np.bincount(functions.band, power) / number - 1
-    bands = np.arange(len(number))
-    # The power of a sine has a standard deviation of one: it is a mean of two squares.
-    shown = (excess > SIGNIFICANT / np.sqrt(INDEPENDENT * number)) & (bands > complete)
-    if shown.any():
-        shown[shown] = _are_common(functions, uv, residuals, exposure, bands[shown])
-    if not shown.any():
-        return None
-    used = np.convolve(shown, np.ones(2 * BESIDE + 1), 'same') > 0
-    used &= (bands > complete) & (bands <= SEARCHED_BANDS)
-    variances = np.maximum(excess, LEAST_EXCESS) * noise / float(np.mean(squares))
-    return Ripples(
-        functions.frequency_of_mode, tuple(float(v) for v in np.where(used, variances, 0.0))
-    )
-
-
-def _are_common(
-    functions: Functions,
-    uv: np.ndarray,
-    residuals: np.ndarray,
-    exposure: np.ndarray,
-    bands: np.ndarray,
-) -> np.ndarray:
-    """Whether the ripples of residuals (n, 2) in bands (b,) are common to the exposures (n,).
-
-    The products of pairs of exposures are compared with zero by Student's t: those of different
-    pairs are uncorrelated where the ripples of an exposure have their own signs.
-    """
-    sums = np.stack(
-        [
-            functions.sums_of_sines(uv[exposure == e], residuals[exposure == e])[0]
-            for e in np.unique(exposure)
-        ]
-    )
-    first, second = np.triu_indices(len(sums), 1)
-    if len(sums) < MIN_EXPOSURES:
-        return np.zeros(len(bands), dtype=bool)
-    limit = -stdtrit(len(first) - 1, FALSE_ALARM)
-    out = []
-    for band in bands:
-        own = sums[:, functions.band == band].reshape(len(sums), -1)
-        product = (own @ own.T)[first, second]
-        error = np.std(product, ddof=1) / np.sqrt(len(product))
-        out.append(np.mean(product) > limit * error)
-    return np.array(out)
-
+from .ripples import Ripples
 
 # Smoothness nu of the long field: its range, and the median and the standard deviation of its
 # logarithm before it is estimated. It tells how much of the signal the sines leave out.
@@ -199,6 +52,18 @@ MAX_STEP = 0.8  # of the logarithm of a standard deviation or length
 STEPS = 4  # of the likelihood in one renewal
 RIPPLE_STEPS = 2  # of the variances of ripples in one renewal
 MIN_DETERMINED = 1e-3  # least number of coefficients that a sum counts as determined
+# Quadrature over the parameters of the long field, which are these: distance of the two nodes on
+# an axis from the most likely value [standard deviations]. Their weights are then those of the
+# three axes, and what is most likely has none.
+LONG_FIELD = [0, 1, 4]
+NODE = np.sqrt(3)
+NODE_TRIALS = 5
+NODE_TOLERANCE = 0.2  # of the logarithm of that distance
+MIN_RISE = 1e-3  # of the cost that counts as one
+AT_LIMIT = 0.1  # part of a step that leads out of the range of a parameter: it keeps its value
+# Largest step from the most likely logarithms. The likelihood is level where the signal is lost in
+# the noise; claims are the same for 1.5 to 4.
+FARTHEST = 2.5
 # Frequencies of a quadrature, from the lowest to so many times it.
 QUADRATURE = 120
 SHORTEST = 30.0
@@ -370,6 +235,63 @@ def _more_likely(signal: Signal, coefficients: SignalEquations, side: float) -> 
         if gain < MIN_GAIN:
             break
     return _signal(at, signal.ripples)
+
+
+def plausible_signals(signal: Signal, coefficients: SignalEquations, side: float) -> list[Signal]:
+    """Return signals of which any may be the true one, all with the same weight.
+
+    Their mean stands for that over the posterior of the parameters of the long field (3-point
+    Gauss-Hermite quadrature along the principal axes of its curvature). The posterior is skewed:
+    in each direction it is scaled by its own decrease (Rue, Martino and Chopin, "Approximate
+    Bayesian inference for latent Gaussian models", JRSS B 71, 2009, 6.5).
+
+    signal: the most likely one; side: longer side of the image [px]. Empty where there is no
+    posterior.
+    """
+    here = _likelihood_of(signal, coefficients)
+    if here is None:
+        return []
+    values, vectors = np.linalg.eigh(here.curvature[np.ix_(LONG_FIELD, LONG_FIELD)])
+    out = []
+    for value, vector in zip(values, vectors.T):
+        step = np.zeros(len(here.slopes))
+        step[LONG_FIELD] = vector * min(NODE / np.sqrt(max(value, RIDGE**2)), FARTHEST)
+        for direction in (step, -step):
+            out.append(_node(signal, direction, coefficients, here.cost, side))
+    return out
+
+
+def _node(
+    signal: Signal, step: np.ndarray, coefficients: SignalEquations, cost: float, side: float
+) -> Signal:
+    """Return the signal along a step (5,) that is as likely as a node of a normal distribution.
+
+    cost: of the most likely signal.
+    """
+    at = _parameters(signal)
+    low, high = _ranges(side)
+    beyond = at + AT_LIMIT * step
+    step = np.where((beyond > high) | (beyond < low), 0.0, step)
+    if not step.any():
+        return signal
+    room = np.where(step > 0, high - at, low - at)[step != 0] / step[step != 0]
+    farthest = np.min([*room, FARTHEST / np.max(np.abs(step))])
+    scale = min(1.0, farthest)
+    node = signal
+    for _ in range(NODE_TRIALS):
+        node = _signal(at + scale * step, signal.ripples)
+        there = _likelihood_of(node, coefficients)
+        rise = np.inf if there is None else max(there.cost - cost, MIN_RISE)
+        ratio = NODE / np.sqrt(2 * rise)
+        if abs(np.log(ratio)) < NODE_TOLERANCE or (ratio > 1 and scale == farthest):
+            break
+        scale = min(scale * ratio, farthest)
+    return node
+
+
+def _likelihood_of(signal: Signal, coefficients: SignalEquations) -> _Likelihood | None:
+    """Return the likelihood of a signal, or None."""
+    return _likelihood(_parameters(signal), coefficients, ripples=signal.ripples)
 
 
 def _signal(at: np.ndarray, ripples: Ripples | None) -> Signal:

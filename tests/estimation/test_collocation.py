@@ -54,17 +54,16 @@ from fluoro_calib_ros.estimation.priors import (
     starting_prior,
 )
 from fluoro_calib_ros.estimation.refinements import START_MODES
+from fluoro_calib_ros.estimation.ripples import Ripples, shown_ripples
 from fluoro_calib_ros.estimation.self_calibration import (
     adjust_with_terms,
     calibrate_by_adjustment,
     estimator_of,
 )
 from fluoro_calib_ros.estimation.signal import (
-    Ripples,
     Signal,
     SignalEquations,
     _likelihood,
-    shown_ripples,
     spectral_density,
 )
 from fluoro_calib_ros.photogrammetry.adjustment import (

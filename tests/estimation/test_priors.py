@@ -42,7 +42,8 @@ from fluoro_calib_ros.estimation.priors import (
     with_more_places,
     with_shown_places,
 )
-from fluoro_calib_ros.estimation.signal import Ripples, Signal, ripples_of
+from fluoro_calib_ros.estimation.ripples import Ripples, ripples_of
+from fluoro_calib_ros.estimation.signal import Signal
 
 SIZE = (1024, 1024)
 NOISE = 0.25

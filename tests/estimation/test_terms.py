@@ -39,8 +39,9 @@ from fluoro_calib_ros.estimation.refinements import (
     places,
     ripples,
 )
+from fluoro_calib_ros.estimation.ripples import Ripples
 from fluoro_calib_ros.estimation.self_calibration import adjust_with_terms
-from fluoro_calib_ros.estimation.signal import Ripples, Signal
+from fluoro_calib_ros.estimation.signal import Signal
 from fluoro_calib_ros.photogrammetry.adjustment import adjust
 from fluoro_calib_ros.photogrammetry.elimination import factorize
 from fluoro_calib_ros.photogrammetry.noise import Noise

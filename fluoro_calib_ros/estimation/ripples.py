@@ -1,0 +1,159 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Ripples: a part of the signal of a distortion within a few bands of spatial frequency.
+
+A weave, a moire pattern or the seams of fibre plates repeat with a wavelength. A covariance
+function of Matern's family has to hold all longer waves, too, to hold such ripples; a series for
+it has as many sines. The periodogram of the residuals (Scargle, "Studies in astronomical time
+series analysis II", ApJ 263, 1982) shows which few bands of frequencies there are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import stdtrit
+
+from ..correction.series import MARGIN, Functions
+from .lack_of_fit import MIN_EXPOSURES
+
+# Sines along the image that are looked at: ripples shorter than 53 px on 1024 px.
+SEARCHED_BANDS = 50
+# Standard deviations by which the mean power of a band with ripples exceeds that of noise.
+SIGNIFICANT = 5.0
+INDEPENDENT = 1 / MARGIN**2  # part of the sines, over their rectangle, that the image can tell
+# Chance that ripples which differ between exposures agree in a band.
+FALSE_ALARM = 1e-5
+BESIDE = 1  # bands next to one with ripples that are used, too: the image ends, and waves do not
+BESIDE_PEAK = 0.2  # part of the power of the strongest band, up to which others belong to it
+LEAST_EXCESS = 0.1  # power that a band starts with, over that of noise
+
+
+@dataclass(frozen=True)
+class Ripples:
+    """Prior variances of the sines of bands of frequencies.
+
+    width: of a band [1/px]; variances: [px^2] of the bands 0, 1, ..., zero where there are none.
+    """
+
+    width: float
+    variances: tuple[float, ...]
+
+    @property
+    def bands(self) -> tuple[int, ...]:
+        """Bands in which there are ripples."""
+        return tuple(band for band, variance in enumerate(self.variances) if variance > 0)
+
+    def band(self, frequency: np.ndarray) -> NDArray[np.float64]:
+        """Band (s,) of frequency (s,) [1/px]."""
+        return np.rint(frequency / self.width).astype(int)
+
+    def variance(self, frequency: np.ndarray) -> NDArray[np.float64]:
+        """Variances (s,) of sines of frequency (s,) [1/px]."""
+        band = self.band(frequency)
+        inside = band < len(self.variances)
+        return np.where(inside, np.asarray(self.variances)[np.where(inside, band, 0)], 0.0)
+
+    def with_variances(self, variances: np.ndarray) -> Ripples:
+        """Return ripples in the same bands with these variances (n,), of all bands."""
+        own = np.where(np.asarray(self.variances) > 0, variances, 0.0)
+        return replace(self, variances=tuple(float(value) for value in own))
+
+    def alone(self) -> Ripples | None:
+        """Return the ripples in the bands about the strongest; None: longer waves are as strong.
+
+        A field without ripples grows weaker from band to band.
+        """
+        variances = np.asarray(self.variances)
+        largest = float(variances.max())
+        if variances[self.bands[0]] > BESIDE_PEAK * largest:
+            return None
+        used = np.convolve(variances > BESIDE_PEAK * largest, np.ones(2 * BESIDE + 1), 'same') > 0
+        return replace(self, variances=tuple(float(v) for v in np.where(used, variances, 0.0)))
+
+
+def ripples_of(functions: Functions, coefficients: np.ndarray) -> Ripples | None:
+    """Ripples of a series that has them, as its coefficients (2, m) show them, or None."""
+    if not functions.absent:
+        return None
+    count = functions.modes + 1
+    squares = np.mean(coefficients[:, functions.trend :] ** 2, axis=0)
+    number = np.maximum(np.bincount(functions.band, minlength=count), 1)
+    variances = np.bincount(functions.band, squares, count) / number
+    variances[: functions.complete + 1] = 0.0
+    return Ripples(functions.frequency_of_mode, tuple(float(value) for value in variances))
+
+
+def shown_ripples(
+    image_size: tuple[int, int],
+    uv: NDArray[np.float64],
+    residuals: NDArray[np.float64],
+    exposure: NDArray[np.int64],
+    complete: int,
+) -> Ripples | None:
+    """Return the ripples that residuals show beyond the sines of a series, or None.
+
+    Parameters
+    ----------
+    image_size : (int, int)
+        Width and height of the image [px].
+    uv, residuals : (n, 2) ndarray
+        Image points and their residuals [px].
+    exposure : (n,) ndarray
+        Exposures of the image points.
+    complete : int
+        Bands up to which the series has all sines.
+    """
+    functions = Functions(image_size, -1, SEARCHED_BANDS)
+    products, squares = functions.sums_of_sines(uv, residuals)
+    noise = float(np.mean(residuals**2))
+    power = np.mean(products**2, axis=1) / (squares * noise)
+    number = np.maximum(np.bincount(functions.band), 1)
+    excess = np.bincount(functions.band, power) / number - 1
+    bands = np.arange(len(number))
+    # The power of a sine has a standard deviation of one: it is a mean of two squares.
+    shown = (excess > SIGNIFICANT / np.sqrt(INDEPENDENT * number)) & (bands > complete)
+    if shown.any():
+        shown[shown] = _are_common(functions, uv, residuals, exposure, bands[shown])
+    if not shown.any():
+        return None
+    used = np.convolve(shown, np.ones(2 * BESIDE + 1), 'same') > 0
+    used &= (bands > complete) & (bands <= SEARCHED_BANDS)
+    variances = np.maximum(excess, LEAST_EXCESS) * noise / float(np.mean(squares))
+    return Ripples(
+        functions.frequency_of_mode, tuple(float(v) for v in np.where(used, variances, 0.0))
+    )
+
+
+def _are_common(
+    functions: Functions,
+    uv: np.ndarray,
+    residuals: np.ndarray,
+    exposure: np.ndarray,
+    bands: np.ndarray,
+) -> np.ndarray:
+    """Whether the ripples of residuals (n, 2) in bands (b,) are common to the exposures (n,).
+
+    The products of pairs of exposures are compared with zero by Student's t: those of different
+    pairs are uncorrelated where the ripples of an exposure have their own signs.
+    """
+    sums = np.stack(
+        [
+            functions.sums_of_sines(uv[exposure == e], residuals[exposure == e])[0]
+            for e in np.unique(exposure)
+        ]
+    )
+    first, second = np.triu_indices(len(sums), 1)
+    if len(sums) < MIN_EXPOSURES:
+        return np.zeros(len(bands), dtype=bool)
+    limit = -stdtrit(len(first) - 1, FALSE_ALARM)
+    out = []
+    for band in bands:
+        own = sums[:, functions.band == band].reshape(len(sums), -1)
+        product = (own @ own.T)[first, second]
+        error = np.std(product, ddof=1) / np.sqrt(len(product))
+        out.append(np.mean(product) > limit * error)
+    return np.array(out)

@@ -411,13 +411,19 @@ def _likelihood(
 
 
 def _with_priors(likelihood: _Likelihood, at: np.ndarray, extent: float) -> _Likelihood:
-    """Return the posterior of logarithms (5,) of the parameters; extent: of the sines [px]."""
-    _, _, fine_sd, fine_reach, smoothness = at
+    """Return the posterior of logarithms (5,) of the parameters; extent: of the sines [px].
+
+    The density of the standard deviation of the long field grows with it (Chung et al., "A
+    nondegenerate penalized likelihood estimator for variance parameters in multilevel models",
+    Psychometrika 78, 2013): the likelihood of few image points is often largest at zero, and the
+    claim would be that nothing is left.
+    """
+    sd, _, fine_sd, fine_reach, smoothness = at
     large = np.exp(fine_sd) / FINE_PX
     short = extent / np.exp(fine_reach) / FINE_PER_EXTENT
     rough = (smoothness - np.log(SMOOTHNESS)) / SMOOTHNESS_SD
     return _Likelihood(
-        likelihood.cost + float(large + short + rough**2 / 2),
-        likelihood.slopes + [0, 0, large, -short, rough / SMOOTHNESS_SD],
+        likelihood.cost + float(large + short + rough**2 / 2 - sd),
+        likelihood.slopes + [-1, 0, large, -short, rough / SMOOTHNESS_SD],
         likelihood.curvature + np.diag([0, 0, large, short, SMOOTHNESS_SD**-2]),
     )

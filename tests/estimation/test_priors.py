@@ -33,6 +33,7 @@ from fluoro_calib_ros.estimation.priors import (
     RIDGE,
     Prior,
     _most_likely_trend,
+    covariance_by_signal,
     covariance_of_series,
     has_rings,
     most_likely_prior,
@@ -43,7 +44,7 @@ from fluoro_calib_ros.estimation.priors import (
     with_shown_places,
 )
 from fluoro_calib_ros.estimation.ripples import Ripples, ripples_of
-from fluoro_calib_ros.estimation.signal import Signal
+from fluoro_calib_ros.estimation.signal import SMOOTHNESS, Signal, starting_signal
 
 SIZE = (1024, 1024)
 NOISE = 0.25
@@ -143,8 +144,8 @@ def test_prior_of_the_trend_is_that_of_its_terms():
     np.testing.assert_allclose(precision[np.ix_(rest, rest)], np.diag(of_signal))
 
 
-def test_uncertain_terms_of_a_series_are_those_of_its_polynomials():
-    """The covariance grows by what is not known of them; not that of sines and rings."""
+def test_uncertain_terms_of_a_series_are_those_that_can_exist():
+    """The covariance grows by what is not known of polynomials and of two terms of a ring."""
     functions = Functions(SIZE, 3, 4, 1)
     uv = image_points(300)
     information, right = observed(functions, uv, np.zeros((300, 2)))
@@ -160,8 +161,73 @@ def test_uncertain_terms_of_a_series_are_those_of_its_polynomials():
     to_terms[:, at] = trend_transformation(3, 1)[0]
     more = np.diagonal(to_terms @ found @ to_terms.T)
     before = np.diagonal(to_terms @ covariance @ to_terms.T)
-    assert (np.delete(more[:14], 2) > 0.3 * np.delete(before[:14], 2)).all()
-    assert (more[14:18] < 1e-3 * more[:14].max()).all()
+    assert (np.delete(more[:16], 2) > 0.3 * np.delete(before[:16], 2)).all()
+    assert (more[16:18] < 1e-6 * more[:16].max()).all()
+
+
+# ---- uncertain signal
+
+
+def drawn_field(functions, rng):
+    """Coefficients (2, s) of a field whose covariance function is drawn, too."""
+    signal = Signal(
+        float(rng.lognormal(np.log(0.3), 0.7)),
+        float(rng.lognormal(np.log(300), 0.4)),
+        smoothness=float(rng.lognormal(np.log(SMOOTHNESS), 0.4)),
+    )
+    return rng.normal(0, 1, (2, len(functions))) * np.sqrt(signal.variance(functions.frequency))
+
+
+def estimated_prior(functions, information, right):
+    """The most likely prior of a signal without trend."""
+    prior = Prior(starting_signal(0.3, max(SIZE)), np.zeros(0))
+    for _ in range(30):
+        before = prior
+        prior = most_likely_prior(
+            functions, information, right, np.zeros_like(information), prior=before
+        )
+        if prior.change(before, functions) < 1e-3:
+            break
+    return prior
+
+
+def normalized_squares(functions, error, covariances):
+    """Mean squares of the errors of a field over their claimed variances, by covariance matrix."""
+    values = functions(image_points(200, seed=9))
+    at = np.kron(np.eye(2), values)
+    return [np.mean((at @ error) ** 2 / np.sum(at @ c * at, axis=1)) for c in covariances]
+
+
+@pytest.mark.parametrize(('count', 'too_small'), [(40, (1.3, 1.7)), (400, (0.95, 1.15))])
+def test_claims_hold_where_the_signal_is_only_estimated(count, too_small):
+    """Errors of drawn fields: with few image points, the most likely signal claims too little."""
+    functions = Functions(SIZE, -1, 6)
+    rng = np.random.default_rng(1)
+    uv = image_points(count)
+    found = []
+    for seed in range(60):
+        field = drawn_field(functions, rng)
+        information, right = observed(functions, uv, functions(uv) @ field.T, seed)
+        prior = estimated_prior(functions, information, right)
+        known = np.linalg.inv(information + prior_precision(functions, prior))
+        more = covariance_by_signal(
+            functions, information, right, np.zeros_like(information), prior=prior
+        )
+        error = known @ right - field.ravel()
+        found.append(normalized_squares(functions, error, (known, known + more)))
+    of_known, of_estimated = np.mean(found, axis=0)
+    assert too_small[0] < of_known < too_small[1]
+    assert of_estimated < of_known
+    assert abs(np.log(of_estimated)) < max(0.5 * np.log(of_known), 0.05)
+
+
+def test_a_series_without_sines_has_no_signal_to_be_estimated():
+    """Nothing is added to its covariance."""
+    functions = Functions(SIZE, 3, 0)
+    information, right = observed(functions, image_points(300), np.zeros((300, 2)))
+    prior = Prior(SMOOTH, np.ones(14))
+    gauge = np.zeros_like(information)
+    assert not covariance_by_signal(functions, information, right, gauge, prior).any()
 
 
 # ---- places

@@ -96,28 +96,48 @@ def test_each_refused_bead_has_a_reason():
     assert not set(found.bead.tolist()) & {refusal.bead for refusal in found.refused}
 
 
-def test_beads_that_overlap_are_as_sure_as_their_radius_is_known():
-    """One of a radius of 12 px that is taken as 12.12 px; alone, it moves no centre."""
-    true = np.array([[40.2, 40.4], [55.9, 40.9], [100.3, 40.1]])
+OVERLAPPING = np.array([[40.2, 40.4], [55.9, 40.9], [100.3, 40.1]])
+
+
+def overlapping_beads(radius_px, most=np.inf):
+    """Beads with a radius of 12 px, two of which overlap, measured with another radius.
+
+    most: light beyond which grey values are clipped.
+    """
     axis = np.arange(0, 560) / 4
     u, v = np.meshgrid(axis, axis[:320])
     light = 800.0 * np.ones(u.shape)
-    for centre in true:
+    for centre in OVERLAPPING:
         squared = (u - centre[0]) ** 2 + (v - centre[1]) ** 2
         light *= np.exp(-1.9 * 2 * np.sqrt(np.maximum(12.0**2 - squared, 0)) / 12.0)
     light = cv2.GaussianBlur(light, (0, 0), 4 * np.sqrt(1.0**2 + 1 / 12))[::4, ::4]
-    image = np.random.default_rng(3).poisson(light).astype(np.float32)
+    image = np.minimum(np.random.default_rng(3).poisson(light), most).astype(np.float32)
     field = np.ones(image.shape, bool)
     noise = replace(
         estimate_noise(image, field), constant=0.1, gain=1.0, correlation=np.ones((1, 1))
     )
-    profile = Profile(12.12, 1.0, 1.9, 0.0)
-    beads = measure_beads(Light(image, field), true + 0.2, np.ones(3), profile, noise)
-    off = np.linalg.norm(beads.uv - true, axis=1)
+    profile = Profile(radius_px, 1.0, 1.9, 0.0)
+    shown = Light(image, field, high=most)
+    return measure_beads(shown, OVERLAPPING + 0.2, np.ones(3), profile, noise)
+
+
+def test_beads_that_overlap_are_as_sure_as_their_radius_is_known():
+    """One of a radius of 12 px that is taken as 12.12 px; alone, it moves no centre."""
+    beads = overlapping_beads(12.12)
+    off = np.linalg.norm(beads.uv - OVERLAPPING, axis=1)
     assert list(beads.overlapped) == [True, True, False]
     assert off[:2].min() > 0.03 and off[2] < 0.03
     assert (off < 3 * beads.sigma).all()
     assert beads.sigma[2] < 0.25 * beads.sigma[:2].min()
+
+
+def test_beads_that_overlap_in_clipped_light_are_less_sure():
+    """Only the inside of their shadows tells the radius; a bead alone is about as sure."""
+    beads = overlapping_beads(12.12)
+    clipped = overlapping_beads(12.12, most=500.0)
+    assert list(clipped.overlapped) == [True, True, False]
+    assert clipped.sigma[:2].min() > 4 * beads.sigma[:2].max()
+    assert clipped.sigma[2] < 2 * beads.sigma[2]
 
 
 def test_two_overlapping_beads_have_honest_sigmas():

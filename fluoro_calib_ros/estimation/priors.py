@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag, cho_factor, cho_solve
+from scipy.linalg import block_diag, cho_factor, cho_solve, lapack
 
 from ..correction.series import Functions
 from ..correction.terms import ABSENT_VARIANCE, trend_transformation
@@ -172,8 +172,10 @@ def _posterior(
     functions: Functions, information: np.ndarray, right: np.ndarray, prior: Prior
 ) -> tuple[np.ndarray, np.ndarray]:
     """Coefficients (2m,) and their covariance (2m, 2m); information: with the gauge."""
-    factor = cho_factor(information + prior_precision(functions, prior), lower=True)
-    covariance = cho_solve(factor, np.eye(len(right)))
+    precision = information + prior_precision(functions, prior)
+    factor, _ = cho_factor(precision, lower=True)
+    half, _ = lapack.dpotri(factor, lower=1)
+    covariance = np.tril(half) + np.tril(half, -1).T
     return covariance @ right, covariance
 
 

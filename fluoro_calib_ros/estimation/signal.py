@@ -190,6 +190,11 @@ class SignalEquations:
     right: NDArray[np.float64]
     columns: NDArray[np.int64]  #: (2 s,) places of the coefficients of the sines, those of u first
 
+    @property
+    def extent(self) -> float:
+        """Size of the rectangle of the sines [px]."""
+        return float(np.pi / self.frequency.min())
+
 
 @dataclass(frozen=True)
 class _Likelihood:
@@ -248,7 +253,7 @@ def plausible_signals(signal: Signal, coefficients: SignalEquations, side: float
     signal: the most likely one; side: longer side of the image [px]. Empty where there is no
     posterior.
     """
-    here = _likelihood_of(signal, coefficients)
+    here = _likelihood(_parameters(signal), coefficients, ripples=signal.ripples)
     if here is None:
         return []
     values, vectors = np.linalg.eigh(here.curvature[np.ix_(LONG_FIELD, LONG_FIELD)])
@@ -280,8 +285,7 @@ def _node(
     node = signal
     for _ in range(NODE_TRIALS):
         node = _signal(at + scale * step, signal.ripples)
-        there = _likelihood_of(node, coefficients)
-        rise = np.inf if there is None else max(there.cost - cost, MIN_RISE)
+        rise = max(_cost(node, coefficients) - cost, MIN_RISE)
         ratio = NODE / np.sqrt(2 * rise)
         if abs(np.log(ratio)) < NODE_TOLERANCE or (ratio > 1 and scale == farthest):
             break
@@ -289,9 +293,13 @@ def _node(
     return node
 
 
-def _likelihood_of(signal: Signal, coefficients: SignalEquations) -> _Likelihood | None:
-    """Return the likelihood of a signal, or None."""
-    return _likelihood(_parameters(signal), coefficients, ripples=signal.ripples)
+def _cost(signal: Signal, coefficients: SignalEquations) -> float:
+    """Return the cost of the likelihood of a signal, infinite where there is none."""
+    variance = np.tile(signal.variance(coefficients.frequency), 2)
+    found = _factorised(variance, coefficients)
+    if found is None:
+        return np.inf
+    return found.cost + _cost_of_priors(_parameters(signal), coefficients.extent)
 
 
 def _signal(at: np.ndarray, ripples: Ripples | None) -> Signal:
@@ -359,13 +367,20 @@ class _Posterior:
     variance: np.ndarray
 
 
-def _posterior(
-    variance: np.ndarray, coefficients: SignalEquations, limit: float = np.inf
-) -> _Posterior | None:
-    """Return the posterior for prior variances (2 s,).
+@dataclass(frozen=True)
+class _Factorised:
+    """Normal equations with a prior.
 
-    None where there is none, or where its cost is found to be above a limit.
+    cost: as in `_Posterior`; factor (p, p): lower triangular; z (p,): solution with it alone.
     """
+
+    cost: float
+    factor: np.ndarray
+    z: np.ndarray
+
+
+def _factorised(variance: np.ndarray, coefficients: SignalEquations) -> _Factorised | None:
+    """Return the equations for prior variances (2 s,), or None where they have no solution."""
     columns = coefficients.columns
     matrix = coefficients.information.copy(order='F')
     matrix[columns, columns] += 1 / variance
@@ -374,14 +389,27 @@ def _posterior(
         return None
     z = solve_triangular(factor, coefficients.right, lower=True, check_finite=False)
     cost = np.sum(np.log(np.diagonal(factor))) + np.sum(np.log(variance)) / 2 - z @ z / 2
-    if not np.isfinite(cost) or cost > limit:  # the priors only add to it
+    return _Factorised(float(cost), factor, z) if np.isfinite(cost) else None
+
+
+def _posterior(
+    variance: np.ndarray, coefficients: SignalEquations, limit: float = np.inf
+) -> _Posterior | None:
+    """Return the posterior for prior variances (2 s,).
+
+    None where there is none, or where its cost is found to be above a limit.
+    """
+    found = _factorised(variance, coefficients)
+    if found is None or found.cost > limit:
         return None
-    mean = solve_triangular(factor, z, trans='T', lower=True, check_finite=False)[columns]
-    inverse, failed = lapack.dtrtri(factor, lower=1, overwrite_c=1)
+    columns = coefficients.columns
+    mean = solve_triangular(found.factor, found.z, trans='T', lower=True, check_finite=False)
+    inverse, failed = lapack.dtrtri(found.factor, lower=1, overwrite_c=1)
     if failed:
         return None
     # Columns are contiguous, and what is above the diagonal is zero.
-    return _Posterior(float(cost), mean, np.sum(np.square(inverse, out=inverse), axis=0)[columns])
+    squares = np.sum(np.square(inverse, out=inverse), axis=0)
+    return _Posterior(found.cost, mean[columns], squares[columns])
 
 
 def _likelihood(
@@ -397,7 +425,7 @@ def _likelihood(
     signal = _signal(at, ripples)
     frequency = coefficients.frequency
     variance = np.tile(signal.variance(frequency), 2)
-    found = _posterior(variance, coefficients, limit)
+    found = _posterior(variance, coefficients, limit - _cost_of_priors(at, coefficients.extent))
     if found is None:
         return None
     slopes = np.tile(_slopes(signal, frequency), (2, 1))
@@ -407,23 +435,34 @@ def _likelihood(
         slopes.T @ (1 - (found.mean**2 + found.variance) / variance) / 2,
         (slopes * (determined**2)[:, None]).T @ slopes / 2,
     )
-    return _with_priors(likelihood, at, np.pi / frequency.min())
+    return _with_priors(likelihood, at, coefficients.extent)
 
 
 def _with_priors(likelihood: _Likelihood, at: np.ndarray, extent: float) -> _Likelihood:
-    """Return the posterior of logarithms (5,) of the parameters; extent: of the sines [px].
+    """Return the posterior of logarithms (5,) of the parameters; extent: of the sines [px]."""
+    large, short, rough = _parts_of_priors(at, extent)
+    return _Likelihood(
+        likelihood.cost + _cost_of_priors(at, extent),
+        likelihood.slopes + [-1, 0, large, -short, rough / SMOOTHNESS_SD],
+        likelihood.curvature + np.diag([0, 0, large, short, SMOOTHNESS_SD**-2]),
+    )
+
+
+def _cost_of_priors(at: np.ndarray, extent: float) -> float:
+    """Negative logarithm of the prior density of logarithms (5,) of the parameters.
 
     The density of the standard deviation of the long field grows with it (Chung et al., "A
     nondegenerate penalized likelihood estimator for variance parameters in multilevel models",
     Psychometrika 78, 2013): the likelihood of few image points is often largest at zero, and the
     claim would be that nothing is left.
     """
-    sd, _, fine_sd, fine_reach, smoothness = at
+    large, short, rough = _parts_of_priors(at, extent)
+    return large + short + rough**2 / 2 - float(at[0])
+
+
+def _parts_of_priors(at: np.ndarray, extent: float) -> tuple[float, float, float]:
+    """Size and shortness of the short field, and smoothness of the long one, in their scales."""
+    _, _, fine_sd, fine_reach, smoothness = (float(value) for value in at)
     large = np.exp(fine_sd) / FINE_PX
     short = extent / np.exp(fine_reach) / FINE_PER_EXTENT
-    rough = (smoothness - np.log(SMOOTHNESS)) / SMOOTHNESS_SD
-    return _Likelihood(
-        likelihood.cost + float(large + short + rough**2 / 2 - sd),
-        likelihood.slopes + [-1, 0, large, -short, rough / SMOOTHNESS_SD],
-        likelihood.curvature + np.diag([0, 0, large, short, SMOOTHNESS_SD**-2]),
-    )
+    return large, short, (smoothness - np.log(SMOOTHNESS)) / SMOOTHNESS_SD

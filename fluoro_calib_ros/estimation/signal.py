@@ -62,7 +62,7 @@ NODE_TOLERANCE = 0.2  # of the logarithm of that distance
 MIN_RISE = 1e-3  # of the cost that counts as one
 AT_LIMIT = 0.1  # part of a step that leads out of the range of a parameter: it keeps its value
 # Largest step from the most likely logarithms. The likelihood is level where the signal is lost in
-# the noise; claims are the same for 1.5 to 4.
+# the noise. From 1.5 to 4, NSE of 0.9 to 2 change by 3 %; without distortion, 0.5 falls to 0.2.
 FARTHEST = 2.5
 # Frequencies of a quadrature, from the lowest to so many times it.
 QUADRATURE = 120

@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import bdtrc, chdtri
+from scipy.special import bdtrc, chdtri, pdtrc
 
 from ..bodies.body import by_pose
 from ..estimation.rounds import ResidualTable
@@ -296,7 +296,8 @@ def rejected_beads(residuals: ResidualTable | None) -> NDArray[np.int64]:
     """Return the target ids of beads of which most image points are rejected, and not by chance.
 
     Too few rays of such a bead may agree to intersect it, but false matches are as frequent among
-    its image points as among those of the others.
+    its image points as among those of the others. That chance rejects all of the few image points
+    of one bead is likely; that it does so with several beads is not.
     """
     if residuals is None or not len(residuals.target_id):
         return np.zeros(0, dtype=np.int64)
@@ -305,7 +306,24 @@ def rejected_beads(residuals: ResidualTable | None) -> NDArray[np.int64]:
     rejected = np.bincount(bead, residuals.outlier)
     chance = bdtrc(rejected - 1, seen, np.mean(residuals.outlier))
     doubted = (rejected > MOST * seen) & (chance * len(target_id) < FALSE_ALARM)
+    several = seen > 1
+    expected = np.exp(np.bincount(bead, np.log(_rate_of_exposure(residuals))))[several].sum()
+    without = several & (rejected == seen)
+    if pdtrc(np.count_nonzero(without) - 1, expected) < FALSE_ALARM:
+        doubted |= without
     return target_id[doubted]
+
+
+def _rate_of_exposure(residuals: ResidualTable) -> NDArray[np.float64]:
+    """Return how often image points are rejected in the exposure of each (N,).
+
+    By the rule of succession of Laplace.
+    """
+    _, name = np.unique(residuals.fluoroscope, return_inverse=True)
+    exposures = np.stack([name, residuals.exposure])
+    exposure = np.unique(exposures, axis=1, return_inverse=True)[1].ravel()
+    rate = (np.bincount(exposure, residuals.outlier) + 1) / (np.bincount(exposure) + 2)
+    return np.asarray(rate[exposure])
 
 
 def _rejected(target_id: NDArray[np.int64]) -> Check:

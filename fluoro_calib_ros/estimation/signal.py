@@ -59,6 +59,7 @@ LONG_FIELD = [0, 1, 4]
 NODE = np.sqrt(3)
 NODE_TRIALS = 5
 NODE_TOLERANCE = 0.2  # of the logarithm of that distance
+MIN_RATIO = 0.1  # of that distance to the one before
 MIN_RISE = 1e-3  # of the cost that counts as one
 AT_LIMIT = 0.1  # part of a step that leads out of the range of a parameter: it keeps its value
 # Largest step from the most likely logarithms. The likelihood is level where the signal is lost in
@@ -286,7 +287,7 @@ def _node(
     for _ in range(NODE_TRIALS):
         node = _signal(at + scale * step, signal.ripples)
         rise = max(_cost(node, coefficients) - cost, MIN_RISE)
-        ratio = NODE / np.sqrt(2 * rise)
+        ratio = max(NODE / np.sqrt(2 * rise), MIN_RATIO)  # without a likelihood, it is zero
         if abs(np.log(ratio)) < NODE_TOLERANCE or (ratio > 1 and scale == farthest):
             break
         scale = min(scale * ratio, farthest)

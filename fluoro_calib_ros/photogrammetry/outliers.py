@@ -26,7 +26,7 @@ from .adjustment import DEFAULT_OPTIONS, Adjustment, SolverOptions, adjust, resi
 from .collinearity import project_with_jacobian
 from .elimination import CovarianceBlocks, factorize
 from .network import Network
-from .noise import DEFAULT_NOISE, Noise
+from .noise import DEFAULT_NOISE, FEW_GROSS, Noise
 from .normal_equations import normal_equations
 from .precision import MIN_WEIGHT, Precision, covariance_blocks, variance_of_projection
 from .unknowns import Parameters
@@ -252,6 +252,9 @@ SETTLED = 2e-3
 LOOSE = 0.1
 # No target is measured better than this. Where redundancy is scarce, the scale could vanish.
 MIN_NOISE_PX = 0.01
+# Part of the image points of an exposure that are no gross errors, from which its start values
+# are good: with half of its matches false it is about 0.5, with wrong start values nearly zero.
+MIN_CORE = 0.25
 
 
 def adjust_and_estimate_noise(
@@ -272,10 +275,7 @@ def adjust_and_estimate_noise(
     correction = np.zeros_like(network.uv) if correction is None else correction
     _, q = residuals_and_q(network, start, correction, noise)
     if np.isfinite(q).all():
-        # Far from the solution, whole exposures may look like gross errors: these are told apart
-        # only after the first adjustment.
-        plain = replace(noise, gross=0.0).estimate_from(q * noise.scale**2)
-        noise = replace(plain, gross=noise.gross)
+        noise = _first_noise(network, q * noise.scale**2, noise)
     loose = replace(options, tolerance=LOOSE)
     parameters = start
     settled = False
@@ -303,6 +303,21 @@ def adjust_and_estimate_noise(
         options=options,
     )
     return replace(result, converged=result.converged and settled)
+
+
+def _first_noise(network: Network, squared: NDArray[np.float64], noise: Noise) -> Noise:
+    """Return the noise model at the start values; squared (N,): residuals over sigma, squared.
+
+    Far from the solution, whole exposures may look like gross errors: these are told apart only
+    where every exposure has image points that are none.
+    """
+    mixed = noise.estimate_from(squared)
+    core = mixed.core_probability(squared / mixed.scale**2)
+    share = np.bincount(network.exposure, core) / np.bincount(network.exposure)
+    if mixed.gross > FEW_GROSS and np.min(share) > MIN_CORE:
+        return mixed
+    plain = replace(noise, gross=0.0).estimate_from(squared)
+    return replace(plain, gross=noise.gross)
 
 
 def estimate_noise(

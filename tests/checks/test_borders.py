@@ -332,7 +332,9 @@ def test_beads_are_doubted_by_most_of_their_points_and_beyond_chance(count, reje
     outlier = np.zeros(len(target), bool)
     outlier[:rejected] = True
     outlier[count::11] = True
-    table = Fake(target_id=target, outlier=outlier)
+    exposure = np.zeros(len(target), int)
+    name = np.full(len(target), 'a')
+    table = Fake(target_id=target, outlier=outlier, exposure=exposure, fluoroscope=name)
     assert rejected_beads(table).tolist() == ([0] if doubted else [])
 
 

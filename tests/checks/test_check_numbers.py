@@ -647,7 +647,9 @@ def test_beads_of_which_most_points_are_rejected_are_named():
     outlier[12:24] = True  # all of bead 1
     outlier[24:30] = True  # half of bead 2
     outlier[36] = True
-    table = Fake(target_id=target, outlier=outlier)
+    exposure = np.arange(120) % 12
+    name = np.full(120, 'a')
+    table = Fake(target_id=target, outlier=outlier, exposure=exposure, fluoroscope=name)
     assert rejected_beads(table).tolist() == [1]
     outlier[30:33] = True
     assert rejected_beads(table).tolist() == [1, 2]

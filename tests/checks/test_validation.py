@@ -538,18 +538,47 @@ def test_a_bead_that_one_ray_puts_out_of_place_is_not_accused():
     assert all(check.passed for check in checks)
 
 
+def table_of(target_id, outlier, exposure=None):
+    """Residual table of one fluoroscope, as far as rejected beads need it."""
+    count = len(target_id)
+    exposure = np.zeros(count, dtype=int) if exposure is None else exposure
+    name = np.full(count, 'a')
+    return SimpleNamespace(
+        target_id=target_id, outlier=outlier, exposure=exposure, fluoroscope=name
+    )
+
+
 def test_a_bead_of_which_nearly_all_points_are_rejected_is_doubted():
     """Unless false matches are so frequent that chance does it."""
     target_id = np.repeat(np.arange(100), 4)
     outlier = np.zeros(400, dtype=bool)
     outlier[:5] = [True, True, True, False, True]  # three of bead 0, one of bead 1
-    table = SimpleNamespace(target_id=target_id, outlier=outlier)
-    assert rejected_beads(table).tolist() == [0]
+    assert rejected_beads(table_of(target_id, outlier)).tolist() == [0]
     rng = np.random.default_rng(1)
     for share in (0.01, 0.2, 0.4):
         for _ in range(20):
-            table = SimpleNamespace(target_id=target_id, outlier=rng.random(400) < share)
+            table = table_of(target_id, rng.random(400) < share)
             assert not len(rejected_beads(table))
+
+
+def test_beads_that_two_exposures_show_are_doubted_together():
+    """All image points of one such bead are rejected by chance, those of three are not."""
+    target_id = np.repeat(np.arange(400), np.where(np.arange(400) < 40, 2, 6))
+    exposure = np.arange(len(target_id)) % 17
+    chance = np.random.default_rng(2).random(len(target_id)) < 0.01
+    for wrong, doubted in (([3], []), ([3, 9, 31], [3, 9, 31])):
+        outlier = chance | np.isin(target_id, wrong)
+        assert rejected_beads(table_of(target_id, outlier, exposure)).tolist() == doubted
+
+
+@pytest.mark.parametrize('bad', [0.1, 0.5, 0.8])
+def test_an_exposure_with_many_false_matches_puts_no_bead_in_doubt(bad):
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        target_id = np.concatenate([rng.permutation(300)[:100] for _ in range(12)])
+        exposure = np.repeat(np.arange(12), 100)
+        outlier = rng.random(1200) < np.where(exposure < 3, bad, 0.01)
+        assert not len(rejected_beads(table_of(target_id, outlier, exposure)))
 
 
 def test_errors_of_intersected_beads_agree_with_their_covariance():

@@ -119,16 +119,11 @@ HUBER_DELTA = 1.345  # 95 % efficiency at the Gaussian (Huber 1981)
 # Below 3, the likelihood rewards an exact fit of some image points at the expense of the others.
 # Above 200, a t distribution cannot be distinguished from a Gaussian.
 NU_RANGE = (3.0, 200.0)
-# Area over which gross errors are spread, in squares of scale * sigma. A factor of ten moves the
-# border between core and gross errors by 0.4 sigma.
+# Area over which gross errors are spread, in squares of scale * sigma, where the image is not
+# smaller. A factor of ten moves the border between core and gross errors by 0.4 sigma.
 GROSS_AREA = 1e6
 # Share of gross errors.
 GROSS_RANGE = (1e-5, 0.4)
-# Degrees of freedom up to which, and share up to which, gross errors may be hidden in the tails;
-# the degrees of freedom with which they are looked for.
-HEAVY_NU = 4.0
-FEW_GROSS = 0.02
-MANY_GROSS_NU = 30.0
 # Smallest redundancy of an image point: with less, its residual says nothing about the noise.
 MIN_REDUNDANCY = 0.05
 # 0.9999 quantile of chi-square with two degrees of freedom: about four sigma of each coordinate.
@@ -159,6 +154,8 @@ class Noise:
     nu: float = 5.0  #: degrees of freedom of the Student-t; infinite for the others
     #: share of gross errors besides the Student-t. 0: there are none, and none are estimated
     gross: float = 0.0
+    #: area over which gross errors can be spread, in the unit of scale, squared
+    widest: float = np.inf
 
     def __post_init__(self) -> None:
         if self.loss not in LOSSES:
@@ -177,11 +174,16 @@ class Noise:
             return np.minimum(1.0, HUBER_DELTA / np.sqrt(np.maximum(q, 1e-300)))
         return np.ones_like(q)
 
+    @property
+    def _gross_area(self) -> float:
+        """Area over which gross errors are spread, in squares of scale * sigma."""
+        return float(min(GROSS_AREA, self.widest / self.scale**2))
+
     def core_probability(self, q: np.ndarray) -> np.ndarray:
         """Probability (n,) that an image point is not a gross error."""
         if not self.gross:
             return np.ones_like(q)
-        background = self.gross / (1 - self.gross) * 2 * np.pi / GROSS_AREA
+        background = self.gross / (1 - self.gross) * 2 * np.pi / self._gross_area
         exponent = np.minimum((self.nu + 2) / 2 * np.log1p(q / self.nu), 700.0)
         return 1 / (1 + background * np.exp(exponent))
 
@@ -194,7 +196,7 @@ class Noise:
             constant = 2 * np.pi
             if self.gross:
                 value = -np.logaddexp(
-                    np.log1p(-self.gross) - value, np.log(self.gross * constant / GROSS_AREA)
+                    np.log1p(-self.gross) - value, np.log(self.gross * constant / self._gross_area)
                 )
         elif self.loss == 'huber':
             inside = q <= HUBER_DELTA**2
@@ -267,7 +269,7 @@ class Noise:
         values: np.ndarray = np.maximum(np.asarray(squared, dtype=float), 1e-300)
         missing = np.broadcast_to(np.asarray(unresolved, dtype=float), values.shape)
         if self.loss == 'student_t':
-            return self._estimate_student_t(values, missing)._or_with_gross(values, missing)
+            return self._estimate_student_t(values, missing)
         redundancy = np.maximum(1 - missing / 2, MIN_REDUNDANCY)
         if self.loss == 'gaussian':
             variance = np.sum(values) / (2 * np.sum(redundancy))
@@ -275,21 +277,6 @@ class Noise:
             median = _weighted_median(values / redundancy, redundancy)
             variance = median / (2 * np.log(2))  # median of chi-square, two degrees of freedom
         return replace(self, scale=float(np.sqrt(variance)))
-
-    def _or_with_gross(self, squared: np.ndarray, unresolved: np.ndarray) -> Noise:
-        """Return the more likely of this noise and one with a large share of gross errors.
-
-        Many gross errors that are not large look like heavy tails at first, from which the share
-        of gross errors does not grow.
-        """
-        if not self.gross or self.nu > HEAVY_NU or self.gross > FEW_GROSS:
-            return self
-        scale = float(np.sqrt(np.quantile(squared, 0.25) / (2 * np.log(4 / 3))))
-        start = replace(self, scale=scale, nu=MANY_GROSS_NU, gross=GROSS_RANGE[1])
-        other = start._estimate_student_t(squared, unresolved)
-        sigma = np.ones(len(squared))
-        costs = [n.cost(squared / n.scale**2, sigma) for n in (self, other)]
-        return other if costs[1] < costs[0] else self
 
     def _estimate_student_t(self, squared: np.ndarray, unresolved: np.ndarray) -> Noise:
         """Student-t with scale, nu and share of gross errors."""
@@ -314,6 +301,7 @@ class Noise:
         nu = self.nu
         for _ in range(MAX_SCALE_STEPS):
             q = squared / variance + unresolved
+            noise = replace(noise, scale=float(np.sqrt(variance)))
             core = noise.core_probability(q)
             if noise.gross:
                 noise = replace(noise, gross=float(np.clip(1 - np.mean(core), *GROSS_RANGE)))

@@ -26,7 +26,7 @@ from .adjustment import DEFAULT_OPTIONS, Adjustment, SolverOptions, adjust, resi
 from .collinearity import project_with_jacobian
 from .elimination import CovarianceBlocks, factorize
 from .network import Network
-from .noise import DEFAULT_NOISE, FEW_GROSS, Noise
+from .noise import DEFAULT_NOISE, Noise
 from .normal_equations import normal_equations
 from .precision import MIN_WEIGHT, Precision, covariance_blocks, variance_of_projection
 from .unknowns import Parameters
@@ -311,10 +311,12 @@ def _first_noise(network: Network, squared: NDArray[np.float64], noise: Noise) -
     Far from the solution, whole exposures may look like gross errors: these are told apart only
     where every exposure has image points that are none.
     """
+    area = np.prod(np.ptp(network.uv, axis=0)) / np.median(network.sigma) ** 2
+    noise = replace(noise, widest=max(float(area), 1.0))
     mixed = noise.estimate_from(squared)
     core = mixed.core_probability(squared / mixed.scale**2)
     share = np.bincount(network.exposure, core) / np.bincount(network.exposure)
-    if mixed.gross > FEW_GROSS and np.min(share) > MIN_CORE:
+    if np.min(share) > MIN_CORE:
         return mixed
     plain = replace(noise, gross=0.0).estimate_from(squared)
     return replace(plain, gross=noise.gross)

@@ -21,6 +21,7 @@ from fluoro_calib_ros.photogrammetry.outliers import (
     target_statistics,
 )
 from fluoro_calib_ros.photogrammetry.precision import precision
+from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 
 SHAPE = dict(exposures=10, targets=60, noise_px=0.25)
 
@@ -111,3 +112,32 @@ def test_limits_of_the_f_distribution_are_those_of_scipy():
                 stats.f.isf(probability, 2, freedom), rel=1e-7
             )
     assert _f_limit(1e-3, np.inf) == pytest.approx(stats.chi2.isf(1e-3, 2) / 2)
+
+
+def with_false_matches(network, share, seed):
+    """The network with a share of its image points anywhere in an image of 1024 px."""
+    rng = np.random.default_rng(seed)
+    false = rng.random(network.n_image_points) < share
+    uv = np.where(false[:, None], rng.uniform(0, 1023, network.uv.shape), network.uv)
+    return replace(network, uv=uv), false
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_nearly_half_of_the_matches_false_are_not_taken_for_noise(seed):
+    network, truth = rigs.small_network(exposures=12, targets=100, noise_px=0.25, seed=seed)
+    network, false = with_false_matches(network, 0.48, seed)
+    start = rigs.disturbed(truth, seed, degrees=0.1, mm=2.0)
+    result = adjust_and_estimate_noise(network, start, noise=Noise(gross=0.01))
+    assert 0.2 < result.noise.scale < 0.3
+    assert np.mean(result.inliers == ~false) > 0.99
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_exposures_with_wrong_start_values_are_no_false_matches(seed):
+    network, truth = rigs.small_network(exposures=8, targets=60, noise_px=0.25, seed=seed)
+    network, false = with_false_matches(network, 0.1, seed)
+    rotation = truth.rotation.copy()
+    rotation[2:5] = matrix_from_vector(np.deg2rad([6.0, -6.0, 6.0])) @ rotation[2:5]
+    start = replace(truth, rotation=rotation)
+    result = adjust_and_estimate_noise(network, start, noise=Noise(gross=0.01))
+    assert np.mean(result.inliers == ~false) > 0.99

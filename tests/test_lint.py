@@ -58,6 +58,7 @@ def test_imports_keep_their_contracts():
     assert status == 0, output[-3000:]
 
 
+@pytest.mark.long
 def test_every_file_names_its_licence():
     status, output = run('-m', 'reuse', 'lint')
     assert status == 0, output[-3000:]

@@ -159,6 +159,12 @@ CASES = (
     Case('20 % false', 'matches', false=FalseMatches(0.20)),
     Case('40 % near false', 'matches', false=FalseMatches(0.40)),
     Case('45 % anywhere', 'matches', false=FalseMatches(0.45, 'anywhere')),
+    Case(
+        'barrel 80 px, 45 % anywhere',
+        'matches',
+        parts=BARREL,
+        false=FalseMatches(0.45, 'anywhere'),
+    ),
     Case('20 % swapped', 'matches', false=FalseMatches(0.20, 'swapped')),
     Case('40 % swapped', 'matches', false=FalseMatches(0.40, 'swapped')),
     Case('cube 20 % false', 'matches', false=FalseMatches(0.20), **CUBE),

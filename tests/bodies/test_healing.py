@@ -176,6 +176,7 @@ def test_healthy_rig_has_not_changed():
     assert found.noise < 1.1
 
 
+@pytest.mark.long
 def test_knock_would_be_told_by_bodies_that_move_and_not_by_a_single_one_that_stands():
     scene = Scene(3)
     diagnostician = scene.diagnostician()

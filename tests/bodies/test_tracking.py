@@ -202,6 +202,7 @@ def test_an_exposure_that_is_not_later_is_not_taken():
     assert tracker.add(trial.exposures[2], 2, 4_000_000) is not None
 
 
+@pytest.mark.long
 def test_stamps_of_arrival_lose_no_body():
     """Exposures that are stamped when they arrive, some within a tenth of a millisecond."""
     trial = Trial(seed=4, count=600)

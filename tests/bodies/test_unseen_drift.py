@@ -81,6 +81,7 @@ def test_affine_part_of_an_unseen_drift_is_left_to_the_rig():
         assert np.abs(affine @ fit).max() < 1e-6 * size
 
 
+@pytest.mark.long
 def test_drift_that_passes_as_nothing_is_claimed_where_no_marker_has_passed():
     """Over rigs: as large as it is far from the markers, and little where they were."""
     rng = np.random.default_rng(1)
@@ -101,6 +102,7 @@ def test_drift_that_passes_as_nothing_is_claimed_where_no_marker_has_passed():
     assert 0.2 < np.mean(ratio) < 2
 
 
+@pytest.mark.long
 def test_healed_drift_goes_on_where_no_marker_has_passed_and_claims_what_is_left():
     """Its polynomials have the size that markers show, whatever the size of the diagnosis."""
     rng = np.random.default_rng(2)

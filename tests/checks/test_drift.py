@@ -549,6 +549,7 @@ def perfect(learned_s=12):
 @pytest.mark.parametrize(
     'name, quarter, direction', [('a', 'upper left', 0), ('b', 'lower right', 180)]
 )
+@pytest.mark.long
 def test_clusters_see_a_drift_along_the_epipolar_lines(name, quarter, direction):
     scene, watch, first = perfect()
     drift = Drift(name, quarter, 0.5, direction)

@@ -168,6 +168,7 @@ def test_what_is_added_grows_with_what_the_rays_show(geometry):
     assert np.linalg.eigvalsh(newest.covariance).min() > -1e-12
 
 
+@pytest.mark.long
 def test_points_of_a_knocked_rig_are_found_with_honest_deviations():
     """Most rays no longer meet; without the alarm there would hardly be a point."""
     alarm = BUMPED + round(1.5 * RATE_HZ)
@@ -191,6 +192,7 @@ def test_points_of_a_knocked_rig_are_found_with_honest_deviations():
     assert np.mean(np.concatenate([frame.points.status for frame in plain]) == 0) < 0.5
 
 
+@pytest.mark.long
 def test_small_drift_widens_points_while_rays_show_it():
     mean = []
     without = []
@@ -206,6 +208,7 @@ def test_small_drift_widens_points_while_rays_show_it():
     assert np.nanmean(without) > 10
 
 
+@pytest.mark.long
 def test_small_drift_widens_poses():
     calibrations, orientation, frames, truth = scene(0.3)
     rows = np.searchsorted(truth.marker_id, BODY)

@@ -623,6 +623,7 @@ def test_frames_of_another_image_size_are_refused(rig, result, tmp_path, capsys)
     assert 'the image is 2048 x 2048 px, but the calibration is for 1024 x 1024 px' in sentence
 
 
+@pytest.mark.long
 def test_failing_command_leaves_earlier_results(rig, result, tmp_path, capsys):
     """Byte for byte: a calibration that fails at its second fluoroscope, an adjustment, a
     correction.

@@ -64,6 +64,7 @@ def test_paths_are_taken_and_shown_in_a_line(place):
     assert dir(fc) == sorted(fc.__all__)
 
 
+@pytest.mark.long
 def test_progress_of_a_calibration_is_told_and_may_stop_it(place):
     recording = fc.read_source(place / 'bags' / 'calibration')
     phantom = ROOT / 'bags' / 'phantom.csv'

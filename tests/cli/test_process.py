@@ -117,6 +117,7 @@ def changed_by(study, *more):
     return {str(p.relative_to(results)) for p in changed} - {'trials.csv'}, status
 
 
+@pytest.mark.long
 def test_trials_are_processed_once_and_again_where_something_changed(study, forked):
     everything = {
         f'trials/{name}/points.{kind}' for name in ('walk', 'run') for kind in ('csv', 'trc')

@@ -259,6 +259,7 @@ def test_adjustment_and_model_are_of_the_same_round():
     assert last.quadratic == pytest.approx(expected, rel=1e-3)
 
 
+@pytest.mark.long
 def test_convergence_follows_the_tolerance():
     """F and G change by less than the tolerance in the last round, and by more before."""
     history = rigs.calibrated(count=6, model='local_linear').history['a']

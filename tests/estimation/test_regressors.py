@@ -238,6 +238,7 @@ def calibrated_with(model, **options):
     return calibrate(frames, rigs.rig().phantom, CalibrationOptions(model, **options))
 
 
+@pytest.mark.long
 def test_calibration_with_a_user_regressor(tmp_path):
     """It converges, is orthogonal to the gauge, and is saved as a lookup grid."""
     result = calibrated_with(cubic())

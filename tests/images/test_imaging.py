@@ -101,6 +101,7 @@ def test_sizes_that_are_not_told_are_seen(radius_px):
 
 
 @pytest.mark.parametrize('told', [True, False])
+@pytest.mark.long
 def test_centres_of_beads_of_several_sizes_are_as_good_as_their_sigma(told):
     radii = np.tile([5.5, 8.0, 10.5], 8)
     imaging, light, uv = completed(radii, radii / 8 if told else None, 8.0)

@@ -166,6 +166,7 @@ def errors(name: str, frames: tuple[MarkerFrame, ...]) -> tuple[np.ndarray, ...]
     )
 
 
+@pytest.mark.long
 def test_ids_are_right_or_doubtful_through_crossings_and_occlusions():
     ids, images = sequence()
     hidden = {name: sum(int((~of[name].seen).sum()) for of in images) for name in 'ab'}
@@ -637,6 +638,7 @@ def decided(frames: Iterable[ViewsFrame]) -> list[tuple[str, str, tuple[int, ...
     return [(d.kind, d.fluoroscope, d.target_id) for of in frames for d in of.decisions]
 
 
+@pytest.mark.long
 def test_doubts_are_decided_at_the_angles_of_the_arms_as_without_distortion():
     """The mean over the angles, whose standard deviation is larger, decides nothing else."""
     assert np.abs(displaced('b', 1, given('b').uv) - given('b').uv).max() > 5

@@ -121,6 +121,7 @@ def test_killed_calibrations_leave_a_whole_folder(tmp_path, outcomes):
     assert sorted(os.listdir(tmp_path)) == ['result', 'result.previous']
 
 
+@pytest.mark.long
 def test_killed_simulation_leaves_a_whole_data_set(tmp_path):
     path = tmp_path / 'rig'
     options = [SimulationOptions(seed, 2, 0, 0.02) for seed in (1, 2)]

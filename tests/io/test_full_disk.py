@@ -59,6 +59,7 @@ def commands(rig: Path, folder: Path):
 
 
 @pytest.mark.parametrize('free_kb', FREE_KB)
+@pytest.mark.long
 def test_command_on_a_full_disk_keeps_what_was_there(rig, earlier, disk, free_kb, capsys):
     """Old results as they were, nothing unfinished, one sentence."""
     shutil.copytree(earlier, disk.path, dirs_exist_ok=True)

@@ -238,6 +238,7 @@ def content_of(folder):
     }
 
 
+@pytest.mark.long
 def test_archive_with_folders_on_two_processes(one, tmp_path, capfd):
     """The folders in the folder, too; the same bytes with one process and with two."""
     source = archive_of(tmp_path / 'in')

@@ -150,6 +150,7 @@ def cluster_with(folder: Path, address: str, authority: str, name: str) -> Clust
     return Cluster(address, *files)
 
 
+@pytest.mark.long
 def test_who_has_no_certificate_of_the_cluster_gets_and_gives_nothing(tmp_path, monkeypatch):
     from distributed import LocalCluster, Worker
     from distributed.security import Security

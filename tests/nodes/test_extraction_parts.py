@@ -139,6 +139,7 @@ class Fragile:
         return {'a': Observations(expected=self.count)}
 
 
+@pytest.mark.long
 def test_a_failure_loses_one_image_an_interrupt_none_and_closing_ends_the_one_in_work():
     process = follower_process(Fragile)
 

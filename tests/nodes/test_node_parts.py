@@ -352,6 +352,7 @@ def test_unknown_home_folder_is_refused():
 # ---- the demonstration
 
 
+@pytest.mark.long
 def test_demo_runs_as_a_module():
     """Also where the console script is not installed."""
     command = [sys.executable, '-m', 'fluoro_calib_ros.demo.demo', '--help']

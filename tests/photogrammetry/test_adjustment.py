@@ -280,6 +280,7 @@ def normalised_errors(count, loss, **network):
     return {name: np.concatenate(values) for name, values in out.items()}, scales
 
 
+@pytest.mark.long
 def test_standard_deviations_of_gaussian_noise_against_monte_carlo():
     """60 simulated adjustments: errors agree with their covariances."""
     errors, scales = normalised_errors(60, 'gaussian', exposures=6, targets=40)

@@ -313,6 +313,7 @@ def test_weight_is_twice_the_slope_of_the_cost(loss):
         ('gaussian', np.inf),
     ],
 )
+@pytest.mark.long
 def test_information_factor_against_monte_carlo(loss, nu):
     """Variance of 1500 location estimates of 100 points is 1 / (factor * sum of weights)."""
     rng = np.random.default_rng(5)

@@ -189,6 +189,7 @@ def test_a_target_in_one_view_of_two_has_the_status_single_view():
 # ---- the drift watch of a recording
 
 
+@pytest.mark.long
 def test_a_drift_of_a_recording_is_found_and_reported():
     frames = shifted(tracking(30.0, 30.0, 'ab').frames, 'b', 16.0)
     watch = watched(frames, 'ab')

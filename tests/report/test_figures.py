@@ -144,6 +144,7 @@ def test_angles_of_a_joint_are_drawn_in_degrees_and_translations_in_mm():
     assert np.nanmax(panels[2].lines[0].get_ydata()) == pytest.approx(np.degrees(1.1))
 
 
+@pytest.mark.long
 def test_paths_of_bodies_have_axes_where_they_are():
     femur, tibia = motion()
     figure = paths_figure((femur, tibia))

@@ -238,8 +238,12 @@ def _interior_difference(
     calibrations: Sequence[FluoroscopeCalibration],
     fields: Sequence[Correction],
 ) -> NDArray[np.float64]:
-    """Return second - first interior orientation (3,) in the gauge at pixels uv (n, 2)."""
-    centre = calibrations[0].interior[:2]
+    """Return second - first interior orientation (3,) in the gauge at pixels uv (n, 2).
+
+    The gauge is that about the middle of the image: a strong distortion moves principal points far
+    away, and there are several solutions about these.
+    """
+    centre = (np.array(calibrations[0].image_size) - 1) / 2
     first, second = (
         interior_about(centre, uv, field.duv, calibration.interior)
         for calibration, field in zip(calibrations, fields)

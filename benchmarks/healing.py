@@ -38,7 +38,7 @@ from .bodies import Rig, table
 NOISE_PX = 0.25
 CORRECTION_PX = 0.03
 FALSE_SHARE = 0.01
-EXPOSURES = 100  # of 5 s, half of them for the verdict
+EXPOSURES = 600  # of 5 s at 120 Hz, half of them for the verdict
 LEARNED_S = 30.0  # of the recording that shapes are learned from, at the same rate
 STEP_MM = 25.0  # of the grid of points in the common field
 # Errors of the calibration: T [mm], w [rad], xp, yp, c [px]; a is the rig frame.

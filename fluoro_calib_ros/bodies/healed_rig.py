@@ -5,21 +5,15 @@
 
 What the data do not identify keeps the covariance that it had, or that of the change.
 
-The size of an unseen change has a half-Cauchy prior: flat where it is small, so that it does not
-matter which size is the smallest that is tried, and with a heavy tail (Gelman, "Prior
-distributions for variance parameters in hierarchical models", Bayesian Analysis 1, 2006).
-
 How large a drift of the distortion is far from the bodies follows from what they show of it. Three
-parts have a size each: polynomials up to degree 1, those beyond, which grow towards the edges, and
-the waves. The mean square of a size, given the data, is the prior variance of its part everywhere.
+parts have a size each (see `sizes`): polynomials up to degree 1, those beyond, which grow towards
+the edges, and the waves.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
-from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,11 +21,8 @@ from scipy.linalg import eigh
 
 from ..correction.series import Functions
 from ..photogrammetry.rig_orientation import RigOrientation
-from .healing import DRIFT_PX, OF_RIG, SIZES, Cause, Change, Diagnosis, Diagnostician
-from .rig_adjustment import Prior, RigAdjustment, RigSolution, drift_errors
-
-KNOCK_SIZES = np.geomspace(2.0**-7, 1.0, 8)  # of a knock that is not seen, relative to a large one
-DRIFT_SIZES = np.geomspace(2.0**-7, 8.0, 11)  # of each part of a drift, in units of DRIFT_PX
+from .healing import OF_RIG, Cause, Change, Diagnosis, Diagnostician
+from .rig_adjustment import RigAdjustment, drift_errors
 
 
 @dataclass(frozen=True)
@@ -61,29 +52,29 @@ def healed_rig(
 
     Where nothing of the rig has changed, it stays as it was, with the second moments of the knock
     that it may have had (see `_of_unseen_knocks`): bodies do not show all of a knock. Nor do they
-    show all of a drift of the distortion (see `_Drift.unseen`).
+    show all of a drift of the distortion (see `_unseen_drift`).
     """
     adjustment = diagnostician.adjustment
-    changed = np.zeros(adjustment.size)
     largest = np.zeros(adjustment.size)
     changes = [change for change in diagnosis.changes if change.cause in OF_RIG]
     for change in changes or diagnostician.knocks():
-        changed = np.hypot(changed, diagnostician.sd_of(change))
-        largest = np.hypot(largest, diagnostician.sd_of(replace(change, size=SIZES[0])))
-    largest[adjustment.drift] = 0.0
+        largest = np.hypot(largest, diagnostician.sd_of(change))
+    free = largest > 0
     drifted = [change.fluoroscope for change in changes if change.cause is Cause.DISTORTION]
-    prior = _with_sizes_of_drifts(adjustment, diagnosis, drifted).widened(largest)
-    solution = adjustment.with_fixed(diagnosis.observed, prior, diagnosis.solution, changed > 0)
+    sd = diagnosis.prior.sd.copy()
+    sd[adjustment.rig] = np.maximum(sd, largest)[adjustment.rig]
+    prior = replace(diagnosis.prior, sd=sd)
+    solution = adjustment.with_fixed(diagnosis.observed, prior, diagnosis.solution, free)
     values = solution.values
     covariance = solution.covariance[adjustment.rig, adjustment.rig]
     weakest = _weakest(adjustment, covariance, largest)
     if not changes:
-        covariance = _of_unseen_knocks(diagnostician, diagnosis, solution)
+        covariance = _of_unseen_knocks(diagnostician, diagnosis)
         values = np.zeros(adjustment.size)
     views = len(adjustment.functions)
     held = values[adjustment.rig]
     unseen = {
-        f: (adjustment.functions[f], _Drift.of(adjustment, diagnosis, f, held).unseen())
+        f: (adjustment.functions[f], _unseen_drift(diagnostician, diagnosis, f, held))
         for f in range(views)
         if f not in drifted
     }
@@ -112,36 +103,23 @@ def healed_rig(
     )
 
 
-def _of_unseen_knocks(
-    diagnostician: Diagnostician, diagnosis: Diagnosis, start: RigSolution
-) -> NDArray[np.float64]:
+def _of_unseen_knocks(diagnostician: Diagnostician, diagnosis: Diagnosis) -> NDArray[np.float64]:
     """Second moments (9F, 9F) of what a rig has changed by that is taken for unchanged.
 
-    The mean over sizes of a knock, weighted by prior and evidence: the moments of one size alone
+    The mean over sizes of a knock, of its shift and turn together: the moments of one size alone
     would be those of a rig that has certainly been knocked as hard. Bodies tell of a knock only:
     their shapes were learned with the errors of the calibration, which are added as they were.
     """
     adjustment = diagnostician.adjustment
-    knock = np.linalg.norm([diagnostician.sd_of(one) for one in diagnostician.knocks()], axis=0)
-    moments = []
-    evidence = []
     calibrated = diagnosis.prior.orientation
+    sd = np.linalg.norm([diagnostician.sd_of(one) for one in diagnostician.knocks()], axis=0)
+    rows = np.flatnonzero(sd)
     exact = replace(diagnosis.prior, orientation=np.zeros_like(calibrated))
-    for size in KNOCK_SIZES[::-1]:
-        prior = exact.widened(size * knock)
-        start = adjustment.with_fixed(diagnosis.observed, prior, start, knock > 0)
-        change = start.values[adjustment.rig]
-        moments.append(start.covariance[adjustment.rig, adjustment.rig] + np.outer(change, change))
-        evidence.append(start.evidence / diagnosis.noise**2)
-    share = _shares(np.array(evidence), KNOCK_SIZES[::-1, None])
-    return calibrated + np.tensordot(share, np.array(moments), axes=1)
-
-
-def _shares(evidence: np.ndarray, size: np.ndarray) -> NDArray[np.float64]:
-    """Return the probabilities (k,) of sizes (k, p), evenly spaced in their logarithms."""
-    log = evidence + np.log(size / (1 + size**2)).sum(axis=1)
-    share = np.exp(log - log.max())
-    return np.asarray(share / share.sum())
+    told = adjustment.told(diagnosis.observed, exact, diagnosis.solution)
+    out = calibrated.copy()
+    moments = told.only(rows).with_noise(diagnosis.noise).moments(sd[None, rows])
+    out[np.ix_(rows, rows)] += moments
+    return out
 
 
 def _coefficients(adjustment: RigAdjustment, fluoroscope: int) -> NDArray[np.int64]:
@@ -150,94 +128,42 @@ def _coefficients(adjustment: RigAdjustment, fluoroscope: int) -> NDArray[np.int
     return np.arange(adjustment.size)[adjustment.drift].reshape(views, -1)[fluoroscope]
 
 
-def _with_sizes_of_drifts(
-    adjustment: RigAdjustment, diagnosis: Diagnosis, drifted: Sequence[int]
-) -> Prior:
-    """Return the prior of a diagnosis, where drifts have the sizes that the data show."""
+def _unseen_drift(
+    diagnostician: Diagnostician, diagnosis: Diagnosis, fluoroscope: int, held: np.ndarray
+) -> NDArray[np.float64]:
+    """Second moments (2n, 2n) of the drift of an image that is not corrected.
+
+    held (9F,): the changes of the rig, which are certain. Without the affine map that is nearest
+    to the drift where the markers were: orientation and interior take that up, and their
+    covariance contains it.
+    """
+    adjustment = diagnostician.adjustment
+    observed = diagnosis.observed
+    own = _coefficients(adjustment, fluoroscope)
     sd = diagnosis.prior.sd.copy()
-    held = diagnosis.solution.values[adjustment.rig]
-    for f in drifted:
-        sd[_coefficients(adjustment, f)] = _Drift.of(adjustment, diagnosis, f, held).sd
-    return replace(diagnosis.prior, sd=sd)
+    sd[adjustment.rig] = 0.0
+    sd[own] = 0.0
+    certain = np.zeros_like(diagnosis.prior.orientation)
+    known = np.zeros(adjustment.size)
+    known[adjustment.rig] = held
+    exact = replace(diagnosis.prior, orientation=certain, sd=sd)
+    told = adjustment.told(observed, exact, diagnosis.solution, known)
+    parts = diagnostician.parts_of(Change(Cause.DISTORTION, fluoroscope))[:, own]
+    smooth = adjustment.healthy_prior(observed, 0.0).sd[own]  # by the error of the correction
+    moments = told.only(own).with_noise(diagnosis.noise).moments(parts, smooth)
+    functions = adjustment.functions[fluoroscope]
+    pixel = observed.pixel[..., fluoroscope, :][observed.seen[..., fluoroscope]]
+    of_both = np.kron(np.eye(2), _without_affine(functions, pixel))
+    return np.asarray(of_both @ moments @ of_both.T)
 
 
-@dataclass(frozen=True)
-class _Drift:
-    """What the bodies tell of the drift of an image, with the rig held."""
-
-    functions: Functions
-    matrix: np.ndarray  # (2n, 2n) normal equations of the coefficients, without other unknowns
-    right: np.ndarray  # (2n,)
-    smooth: np.ndarray  # (2n,) standard deviations by the error of the correction
-    one_px: np.ndarray  # (2n,) the same by a drift of 1 px
-    pixel: np.ndarray  # (m, 2) where the markers were seen
-
-    @classmethod
-    def of(
-        cls, adjustment: RigAdjustment, diagnosis: Diagnosis, fluoroscope: int, held: np.ndarray
-    ) -> _Drift:
-        """Eliminate the other unknowns; held (9F,): changes of the rig."""
-        observed, solution = diagnosis.observed, diagnosis.solution
-        own = _coefficients(adjustment, fluoroscope)
-        normal, right = adjustment.normal_at(observed, diagnosis.prior, solution)
-        values = solution.values.copy()
-        values[adjustment.rig] -= held
-        right = right + normal @ values  # for all unknowns at 0, and the rig as it is held
-        sd = diagnosis.prior.sd.copy()
-        sd[adjustment.rig] = 0.0
-        sd[own] = 0.0
-        exact = np.zeros_like(diagnosis.prior.orientation)
-        root = adjustment.root(replace(diagnosis.prior, orientation=exact, sd=sd))
-        whitened = np.eye(root.shape[1]) + root.T @ normal @ root
-        both = np.column_stack([normal[:, own], right])
-        told = both[own] - normal[own] @ root @ np.linalg.solve(whitened, root.T @ both)
-        told /= diagnosis.noise**2
-        return cls(
-            adjustment.functions[fluoroscope],
-            matrix=(told[:, :-1] + told[:, :-1].T) / 2,
-            right=told[:, -1],
-            smooth=adjustment.healthy_prior(observed, 0.0).sd[own],
-            one_px=DRIFT_PX * adjustment.sd_of_drift(fluoroscope),
-            pixel=observed.pixel[..., fluoroscope, :][observed.seen[..., fluoroscope]],
-        )
-
-    @property
-    def _is_affine(self) -> np.ndarray:
-        """Which functions (n,) are polynomials up to degree 1."""
-        out = np.zeros(len(self.functions), dtype=bool)
-        out[: len(self.functions.powers)] = [i + j <= 1 for i, j in self.functions.powers]
-        return out
-
-    @cached_property
-    def sd(self) -> NDArray[np.float64]:
-        """Standard deviations (2n,) of the coefficients, by the sizes that the data show."""
-        waves = np.arange(len(self.functions)) >= self.functions.trend
-        part = np.tile(np.where(waves, 2, np.where(self._is_affine, 0, 1)), 2)
-        size = np.array(list(product(DRIFT_SIZES, repeat=3)))
-        root = np.hypot(self.smooth, size[:, part] * self.one_px)
-        whitened = np.eye(len(part)) + root[:, :, None] * self.matrix * root[:, None]
-        gradient = root * self.right
-        solved = np.linalg.solve(whitened, gradient[..., None])[..., 0]
-        evidence = 0.5 * (np.sum(gradient * solved, axis=1) - np.linalg.slogdet(whitened)[1])
-        mean_square = _shares(evidence, size) @ size**2
-        return np.hypot(self.smooth, np.sqrt(mean_square)[part] * self.one_px)
-
-    def unseen(self) -> NDArray[np.float64]:
-        """Second moments (2n, 2n) of the drift that is not corrected.
-
-        Without the affine map that is nearest to it where the markers were: orientation and
-        interior take that up, and their covariance contains it.
-        """
-        sd = self.sd
-        whitened = np.eye(len(sd)) + sd[:, None] * self.matrix * sd
-        covariance = sd[:, None] * np.linalg.solve(whitened, np.diag(sd))
-        mean = covariance @ self.right
-        values = self.functions(self.pixel)
-        affine = np.flatnonzero(self._is_affine)
-        rest = np.eye(len(self.functions))
-        rest[affine] -= np.linalg.lstsq(values[:, affine], values, rcond=None)[0]
-        of_both = np.kron(np.eye(2), rest)
-        return np.asarray(of_both @ (covariance + np.outer(mean, mean)) @ of_both.T)
+def _without_affine(functions: Functions, pixel: np.ndarray) -> NDArray[np.float64]:
+    """Matrix (n, n) that takes the nearest affine map at pixels (m, 2) from coefficients (n,)."""
+    values = functions(pixel)
+    affine = np.flatnonzero([i + j <= 1 for i, j in functions.powers])
+    rest = np.eye(len(functions))
+    rest[affine] -= np.linalg.lstsq(values[:, affine], values, rcond=None)[0]
+    return rest
 
 
 def unseen_distortion(diagnostician: Diagnostician, diagnosis: Diagnosis) -> tuple[float, float]:

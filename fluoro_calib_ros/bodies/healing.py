@@ -11,7 +11,7 @@ one with the largest evidence first, as long as the evidence grows (MacKay 2003,
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from enum import Enum
 from itertools import combinations
 from math import comb
@@ -19,7 +19,7 @@ from math import comb
 import numpy as np
 from numpy.typing import NDArray
 
-from ..photogrammetry.rig_orientation import ORIENTATION_SIZE
+from .pose_modes import with_best_modes
 from .rig_adjustment import (
     ObservedBodies,
     Poses,
@@ -27,13 +27,14 @@ from .rig_adjustment import (
     RigAdjustment,
     RigSolution,
 )
+from .sizes import Sizes, Told, parts_of_drift, parts_of_interior, parts_of_knock
 
 MAX_CAUSES = 3
 # Probability that nothing more has changed, from 1 - SURE on no further cause is looked for.
 SURE = 0.95
-# Probability below which a cause is not believed: another one explains the data, too. Sizes of
-# changes are known to a factor of eight, and two causes differ by up to three unknowns.
-SURE_OF_CAUSE = 1 - 8.0**-3
+# Probability below which a cause is not believed: another one explains the data, too. The evidence
+# of two causes depends on the units of four sizes, each of which is known to a factor of eight.
+SURE_OF_CAUSE = 1 - 8.0**-4
 # Share of inliers of a pose below which it does not fit: most of its image points are false.
 FITS = 0.5
 # Markers that are tried in full, of those that their derivatives make most likely.
@@ -54,19 +55,9 @@ class Cause(str, Enum):
 
 # Of the rig; the others are of bodies, and leave its calibration as it is.
 OF_RIG = (Cause.ORIENTATION, Cause.INTERIOR, Cause.DISTORTION)
-# How large changes are: standard deviations of a knock [mm, rad], of principal point and principal
-# distance [px, relative], of a distortion [px], and of a marker [mm]. The evidence depends on
-# their logarithms.
-KNOCK_MM = 10.0
-KNOCK_RAD = 0.02
-SHIFT_PX = 10.0
-FOCUS = 0.01
+# Units of the sizes of a change of a distortion [px], and of a marker [mm].
 DRIFT_PX = 1.0
 MIGRATION_MM = 1.0
-# The same for small changes, relative to these: a drift need not be as large as a knock. The two
-# factors are those of principal point and principal distance, the first one that of all others.
-SIZES = ((1.0, 1.0), (0.125, 0.125))
-SIZES_OF_INTERIOR = (*SIZES, (1.0, 0.125), (0.125, 1.0))
 
 
 @dataclass(frozen=True)
@@ -77,7 +68,6 @@ class Change:
     fluoroscope: int = -1
     body: int = -1
     markers: tuple[int, ...] = ()
-    size: tuple[float, float] = field(default=SIZES[0], compare=False)  # of the change
 
 
 @dataclass(frozen=True)
@@ -110,6 +100,13 @@ class _Tried:
     observed: ObservedBodies
     prior: Prior
     solution: RigSolution
+    # Evidence of the last change with any size, less that of the prior; of the others, theirs.
+    by_size: float
+
+    @property
+    def evidence(self) -> float:
+        """Logarithm, of changes of any size."""
+        return self.solution.evidence + self.by_size
 
 
 class Diagnostician:
@@ -131,13 +128,18 @@ class Diagnostician:
         pairs = sum(comb(len(body.sd_mm), 2) for body in bodies)
         self._causes = len(self._of_rig()) + 2 * len(self._markers) + len(bodies) + pairs
 
-    def diagnose(self, observed: ObservedBodies, poses: Poses) -> Diagnosis:
-        """Say what has changed, from first poses of the bodies."""
+    def diagnose(
+        self, observed: ObservedBodies, poses: Poses, until: Sequence[Cause] = ()
+    ) -> Diagnosis:
+        """Say what has changed, from first poses of the bodies.
+
+        until: causes after one of which no further one is looked for.
+        """
         adjustment = self.adjustment
         zero = np.zeros(adjustment.size)
         healthy = adjustment.healthy_prior(observed, self._shape_scale)
-        solution = adjustment.solve(observed, healthy, (zero, poses))
-        best = _Tried((), observed, healthy, solution)
+        solution = self._solve(observed, healthy, (zero, poses))
+        best = _Tried((), observed, healthy, solution, 0.0)
         probability: list[float] = []
         rivals: list[Change | None] = []
         rest = 1.0
@@ -152,6 +154,8 @@ class Diagnostician:
             best = tried[winner]
             probability.append(float(chances[1:][winner]))
             rest = 0.0
+            if best.changes[-1].cause in until:
+                break
         return Diagnosis(
             best.changes,
             tuple(probability),
@@ -169,7 +173,11 @@ class Diagnostician:
         """Solve for the causes that may be added, of those that the derivatives make likely."""
         changes = [*self._changes_of_unknowns(best), *self._scattering(best)]
         changes += self._exchanges(best)
-        return [self._with(best, change, first) for change in changes]
+        start = np.zeros(self.adjustment.size), first
+        if best.changes:  # else a rig that is wrong may have led values and poses astray
+            found = best.solution
+            start = found.values, found.poses.or_else(first, found.inliers_of_pose > FITS)
+        return [self._with(best, change, start) for change in changes]
 
     def knocks(self) -> list[Change]:
         """Return the changes of the orientation that can be seen."""
@@ -186,36 +194,17 @@ class Diagnostician:
         If one is expected to have some, they are all changes of the rig, which may be far from
         where the derivatives hold, and the likeliest ones of markers. So they are where the
         solution takes most image points of a pose for false matches: these have no weight in the
-        derivatives. Of unknowns with the
-        additional variances V, gradient g and information S without the others, the evidence is
-        expected to be 1/2 g'(S + V^-1)^-1 g - 1/2 log det(I + SV).
+        derivatives.
         """
-        adjustment = self.adjustment
-        normal, right = adjustment.normal_at(best.observed, best.prior, best.solution)
-        covariance = best.solution.covariance
+        told = self.adjustment.told(best.observed, best.prior, best.solution)
         lost = (best.solution.inliers_of_pose < FITS).any()  # by a change, hardly by chance
         places = self._of_rig()
         places += [Change(Cause.MIGRATED, body=b, markers=(m,)) for b, m in self._markers]
-        gains: list[tuple[float, Change]] = []
-        for place in places:
-            if place in best.changes or _is_told(place, best.changes):
-                continue
-            of_sizes = []
-            sizes = SIZES_OF_INTERIOR if place.cause is Cause.INTERIOR else SIZES
-            for size in SIZES[:1] if lost else sizes:
-                change = replace(place, size=size)
-                sd = self.sd_of(change)
-                rows = np.flatnonzero(sd)
-                cross = normal[rows]
-                scaled = sd[rows, None] * (
-                    normal[np.ix_(rows, rows)] - cross @ covariance @ cross.T
-                )
-                whitened = np.eye(len(rows)) + scaled * sd[rows]
-                gradient = sd[rows] * right[rows]
-                gain = 0.5 * gradient @ np.linalg.solve(whitened, gradient)
-                gain -= 0.5 * np.linalg.slogdet(whitened)[1]
-                of_sizes.append((float(gain), change))
-            gains.append(max(of_sizes, key=lambda one: one[0]))
+        gains = [
+            (self._sizes(told, place).evidence, place)
+            for place in places
+            if place not in best.changes and not _is_told(place, best.changes)
+        ]
         gains.sort(key=lambda one: -one[0])
         if not gains or (gains[0][0] <= 0 and not lost):
             return []
@@ -260,39 +249,75 @@ class Diagnostician:
         ]
         return [change for change in pairs if change not in best.changes]
 
-    def _with(self, best: _Tried, change: Change, first: Poses) -> _Tried:
-        """Solve for a cause in addition to others."""
+    def _with(
+        self, best: _Tried, change: Change, start: tuple[NDArray[np.float64], Poses]
+    ) -> _Tried:
+        """Solve for a cause in addition to others, from values of the unknowns and poses."""
         observed = best.observed
         if change.cause is Cause.EXCHANGED:
             observed = observed.exchanged(change.body, *change.markers)
-        prior = best.prior.widened(self.sd_of(change))
+        prior = best.prior
         if change.cause in (Cause.LOOSE, Cause.SOFT):
             prior = replace(prior, inflation=self._inflation(best, change))
-        start = np.zeros(self.adjustment.size), first
-        if best.changes:  # else a rig that is wrong may have led values and poses astray
-            found = best.solution
-            start = found.values, found.poses.or_else(first, found.inliers_of_pose > FITS)
-        solution = self.adjustment.solve(observed, prior, start)
-        return _Tried((*best.changes, change), observed, prior, solution)
+        # With a usual size first; the solution tells which size it has.
+        solution = self._solve(observed, prior.widened(self.sd_of(change)), start)
+        tried = _Tried((*best.changes, change), observed, prior, solution, best.by_size)
+        rows = self.rows_of(change)
+        if not len(rows):
+            return tried
+        sd = np.zeros(self.adjustment.size)
+        sd[rows] = self._sizes(self.adjustment.told(observed, prior, solution), change).rms
+        widened = prior.widened(sd)
+        start = solution.values, solution.poses
+        solution = self.adjustment.refine(observed, widened, start)
+        told = self.adjustment.told(observed, prior, solution)
+        by_size = self._sizes(told, change).evidence - float(told.only(rows).evidence(sd[rows]))
+        return replace(tried, prior=widened, solution=solution, by_size=best.by_size + by_size)
+
+    def _solve(
+        self, observed: ObservedBodies, prior: Prior, start: tuple[NDArray[np.float64], Poses]
+    ) -> RigSolution:
+        found = self.adjustment.solve(observed, prior, start)
+        return with_best_modes(self.adjustment, observed, prior, found)
+
+    def rows_of(self, change: Change) -> NDArray[np.int64]:
+        """Return the unknowns (k,) that a change changes."""
+        return np.flatnonzero(self.sd_of(change))
+
+    def _sizes(self, told: Told, change: Change) -> Sizes:
+        rows = self.rows_of(change)
+        return told.only(rows).sizes(self.parts_of(change)[:, rows])
 
     def sd_of(self, change: Change) -> NDArray[np.float64]:
-        """Standard deviations (K,) of the unknowns by a change."""
+        """Standard deviations (K,) of the unknowns by a change of the usual size."""
+        return np.asarray(np.linalg.norm(self.parts_of(change), axis=0))
+
+    def parts_of(self, change: Change) -> NDArray[np.float64]:
+        """Standard deviations (p, K) of the unknowns by the parts of a change, of usual sizes."""
         adjustment = self.adjustment
-        sd = np.zeros(adjustment.size)
-        first = ORIENTATION_SIZE * change.fluoroscope
-        of_rig = sd[adjustment.rig][first : first + ORIENTATION_SIZE]
+        number = np.arange(adjustment.size)
+        of_rig = number[adjustment.rig]
+        parts: list[tuple[NDArray[np.int64], NDArray[np.float64] | float]] = []
         if change.cause is Cause.ORIENTATION:
-            of_rig[:6] = [KNOCK_MM] * 3 + [KNOCK_RAD] * 3
+            knock = parts_of_knock(adjustment.orientation, change.fluoroscope)
+            parts = [(of_rig, part) for part in knock]
         elif change.cause is Cause.INTERIOR:
-            c = adjustment.orientation.interior[change.fluoroscope, 2]
-            of_rig[6:] = [SHIFT_PX, SHIFT_PX, FOCUS * c * change.size[1] / change.size[0]]
+            shift = parts_of_interior(adjustment.orientation, change.fluoroscope)
+            parts = [(of_rig, part) for part in shift]
         elif change.cause is Cause.DISTORTION:
-            drift = sd[adjustment.drift].reshape(len(adjustment.functions), -1)
-            drift[change.fluoroscope] = DRIFT_PX * adjustment.sd_of_drift(change.fluoroscope)
+            drift = number[adjustment.drift].reshape(len(adjustment.functions), -1)
+            one_px = DRIFT_PX * adjustment.sd_of_drift(change.fluoroscope)
+            parts = [
+                (drift[change.fluoroscope], np.where(part, one_px, 0.0))
+                for part in parts_of_drift(adjustment.functions[change.fluoroscope])
+            ]
         elif change.cause is Cause.MIGRATED:
-            shape = sd[adjustment.shape].reshape(adjustment.xyz.shape)
-            shape[change.body, change.markers[0]] = MIGRATION_MM
-        return sd * change.size[0]
+            shape = number[adjustment.shape].reshape(adjustment.xyz.shape)
+            parts = [(shape[change.body, change.markers[0]], MIGRATION_MM)]
+        out = np.zeros((len(parts), adjustment.size))
+        for row, (columns, sd) in zip(out, parts):
+            row[columns] = sd
+        return out
 
     def _inflation(self, best: _Tried, change: Change) -> NDArray[np.float64]:
         """Return how much more the image points of a loose marker or a soft body scatter."""
@@ -330,7 +355,7 @@ def _probabilities(tried: Sequence[_Tried], causes: int) -> NDArray[np.float64]:
     Where image points scatter more than claimed, the evidence counts less. A loose marker or a
     soft body has one more unknown, its scatter, known to 1/sqrt(2 n) of n squares.
     """
-    found = np.array([one.solution.evidence for one in tried])
+    found = np.array([one.evidence for one in tried])
     noise = _noise(tried[int(np.argmax(found))].solution)
     log = found / noise**2
     for row, one in enumerate(tried[1:], 1):

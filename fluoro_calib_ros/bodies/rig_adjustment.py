@@ -37,6 +37,7 @@ from ..photogrammetry.rotations import cross_matrix, matrix_from_vector
 from .body import POSE_SIZE, Body
 from .correction_errors import covariance_of_means
 from .image_points import Cameras, ImagePoints
+from .sizes import Told
 
 FALSE_SHARE = 0.01  # of image points that are expected to be false matches
 MAX_STEPS = 20
@@ -97,6 +98,10 @@ class Poses:
     rotation: NDArray[np.float64]
     centre_mm: NDArray[np.float64]
     known: NDArray[np.bool_]
+
+    def exposures(self, chosen: NDArray[np.int64]) -> Poses:
+        """Return some exposures."""
+        return Poses(self.rotation[chosen], self.centre_mm[chosen], self.known[chosen])
 
     def or_else(self, other: Poses, fits: NDArray[np.bool_]) -> Poses:
         """Return other poses where these (T, B) do not fit."""
@@ -280,10 +285,28 @@ class RigAdjustment:
         self, observed: ObservedBodies, prior: Prior, solution: RigSolution
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the reduced normal equations H (K, K), h (K,) of all unknowns at a solution."""
-        linear = _Linear.of(self, observed, solution.values, solution.poses)
-        weight = _Mixture.of(self, linear, observed, prior).weight(1.0)
-        normal = self._normal(linear, weight, np.ones(self.size, dtype=bool))
+        linear = LinearPoints.of(self, observed, solution.values, solution.poses)
+        weight = Mixture.of(self, linear, observed, prior).weight(1.0)
+        normal = self.normal_of(linear, weight, np.ones(self.size, dtype=bool))
         return normal.matrix, normal.right
+
+    def told(
+        self,
+        observed: ObservedBodies,
+        prior: Prior,
+        solution: RigSolution,
+        known: NDArray[np.float64] | float = 0.0,
+    ) -> Told:
+        """Return what the data tell of changes of the unknowns (K,) in addition to a prior.
+
+        At a solution, which may be that of another prior. known (K,): changes that are certain.
+        """
+        normal, right = self.normal_at(observed, prior, solution)
+        both = np.column_stack([normal, right + normal @ (solution.values - known)])
+        root = self.root(prior)
+        whitened = np.eye(root.shape[1]) + root.T @ normal @ root
+        both -= normal @ root @ np.linalg.solve(whitened, root.T @ both)
+        return Told((both[:, :-1] + both[:, :-1].T) / 2, both[:, -1])
 
     def covariance_at(
         self, observed: ObservedBodies, prior: Prior, solution: RigSolution
@@ -323,7 +346,7 @@ class RigAdjustment:
             ),
         )
         values = np.where(fixed, 0.0, solution.values)
-        found = self.solve(observed, only, (values, solution.poses))
+        found = self.refine(observed, only, (values, solution.poses))
         normal, _ = self.normal_at(observed, only, found)
         of_fixed = np.zeros((self.size, self.size))
         of_fixed[self.rig, self.rig] = prior.orientation
@@ -341,39 +364,52 @@ class RigAdjustment:
         It is repeated from its result while that helps: a pose that false matches have led astray
         finds back once the rig is right.
         """
-        found = self._converge(observed, prior, start)
+        found = self._converge(observed, prior, start, np.inf)
         for _ in range(MAX_REPEATS):
-            again = self._converge(observed, prior, (found.values, found.poses))
+            again = self._converge(observed, prior, (found.values, found.poses), np.inf)
             gain = again.evidence - found.evidence
             found = again if gain > 0 else found
             if gain < LAST_GAIN:
                 break
         return found
 
-    def _converge(
+    def refine(
         self, observed: ObservedBodies, prior: Prior, start: tuple[np.ndarray, Poses]
     ) -> RigSolution:
+        """Solve for a hypothesis from values (K,) and poses that tell which points are false."""
+        return self._converge(observed, prior, start, 1.0)
+
+    def _converge(
+        self,
+        observed: ObservedBodies,
+        prior: Prior,
+        start: tuple[np.ndarray, Poses],
+        widest: float,
+    ) -> RigSolution:
+        """Iterate; standard deviations are larger by up to a factor, halved with each step."""
         root = self.root(prior)
         unsure = (root != 0).any(axis=1)
         values, poses = start
         z = np.linalg.lstsq(root, values, rcond=None)[0]
-        widening = np.full((1, 1, 1, 1), np.inf)
+        widening = np.full((1, 1, 1, 1), widest)
         for _ in range(MAX_STEPS):
             values = root @ z
-            linear = _Linear.of(self, observed, values, poses)
-            terms = _Mixture.of(self, linear, observed, prior)
+            linear = LinearPoints.of(self, observed, values, poses)
+            terms = Mixture.of(self, linear, observed, prior)
             widening = np.clip(terms.scale, 1.0, np.maximum(widening / 2, 1.0))
             weight = terms.weight(widening)
-            normal = self._normal(linear, weight, unsure)
+            normal = self.normal_of(linear, weight, unsure)
             whitened = np.eye(root.shape[1]) + root.T @ normal.matrix @ root
             right = root.T @ normal.right - z
             step = np.linalg.solve(whitened, right)
+            if self._is_impossible(root @ (z + step)):
+                break
             z = z + step
-            poses = _moved(poses, normal, root @ step)
+            poses = moved_poses(poses, normal, root @ step)
             if (widening == 1.0).all() and right @ step < LAST_STEP:
                 break
         covariance = root @ np.linalg.solve(whitened, root.T)
-        evidence = -0.5 * (terms.loss + z @ z + np.linalg.slogdet(whitened)[1])
+        evidence = -0.5 * (terms.losses.sum() + z @ z + np.linalg.slogdet(whitened)[1])
         return RigSolution(
             root @ z,
             covariance,
@@ -382,7 +418,12 @@ class RigAdjustment:
             **terms.shares(),
         )
 
-    def _normal(self, linear: _Linear, weight: np.ndarray, unsure: np.ndarray) -> _Normal:
+    def _is_impossible(self, values: np.ndarray) -> bool:
+        """Whether a principal distance is less than half of what it was: a wrong hypothesis."""
+        c = self.orientation.interior[:, 2]
+        return bool((c + values[self.rig].reshape(self._views, -1)[:, 8] < c / 2).any())
+
+    def normal_of(self, linear: LinearPoints, weight: np.ndarray, unsure: np.ndarray) -> _Normal:
         """Sum up the image points with weights (T, B, M, F); poses are eliminated.
 
         unsure (K,): unknowns that may change.
@@ -392,8 +433,8 @@ class RigAdjustment:
         back = []
         for row in range(len(self.bodies)):
             root = np.sqrt(weight[:, row])[..., None]
-            columns, design = self._design(linear, row, unsure)
-            flat = (len(root), -1)
+            columns, design = _design(self, linear, row, unsure)
+            flat = (len(root), root[0].size * 2)
             design = (design * root[..., None]).reshape(*flat, len(columns))
             by_pose = (linear.by_pose(row) * root[..., None]).reshape(*flat, POSE_SIZE)
             residual = (linear.residual[:, row] * root).reshape(*flat, 1)
@@ -414,45 +455,46 @@ class RigAdjustment:
             back.append((columns, solved))
         return _Normal(matrix, right, back)
 
-    def _design(
-        self, linear: _Linear, row: int, unsure: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Unknowns (L,) that a body tells of, and the derivatives (T, M, F, 2, L) by them."""
-        shape = linear.residual[:, row].shape  # (T, M, F, 2)
-        _, markers, views, _ = shape
-        turned = linear.by_place[:, row] @ linear.poses.rotation[:, row, None, None]
-        by_rig = np.zeros((*shape, views, ORIENTATION_SIZE))
-        by_bias = np.zeros((*shape, markers, views, 2))
-        by_shape = np.zeros((*shape, markers, 3))
-        for f in range(views):
-            by_rig[:, :, f, :, f] = linear.by_orientation[:, row, :, f]
-            for m in range(markers):
-                by_bias[:, m, f, :, m, f] = np.eye(2)
+
+def _design(
+    adjustment: RigAdjustment, linear: LinearPoints, row: int, unsure: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Unknowns (L,) that a body tells of, and the derivatives (T, M, F, 2, L) by them."""
+    shape = linear.residual[:, row].shape  # (T, M, F, 2)
+    _, markers, views, _ = shape
+    turned = linear.by_place[:, row] @ linear.poses.rotation[:, row, None, None]
+    by_rig = np.zeros((*shape, views, ORIENTATION_SIZE))
+    by_bias = np.zeros((*shape, markers, views, 2))
+    by_shape = np.zeros((*shape, markers, 3))
+    for f in range(views):
+        by_rig[:, :, f, :, f] = linear.by_orientation[:, row, :, f]
         for m in range(markers):
-            by_shape[:, m, :, :, m] = turned[:, m]
-        by_scale = turned @ linear.shape[row, :, None, :, None]
-        number = np.arange(self.size)
-        parts = [
-            (number[self.rig], by_rig),
-            (number[self.shape].reshape(*self.xyz.shape)[row], by_shape),
-            (number[self.scale], by_scale),
-            (number[self.bias].reshape(*self.target_id.shape, -1)[row], by_bias),
-        ]
-        if unsure[self.drift].any():
-            by_drift = np.zeros((*shape, views, 2, len(self.functions[0])))
-            for f in range(views):
-                for axis in range(2):
-                    by_drift[:, :, f, axis, f, axis] = linear.functions[:, row, :, f]
-            parts.append((number[self.drift], by_drift))
-        columns = np.concatenate([numbers.ravel() for numbers, _ in parts])
-        design = np.concatenate([part.reshape(*shape, -1) for _, part in parts], axis=-1)
-        keep = unsure[columns]
-        good = linear.good[:, row, ..., None, None]
-        return columns[keep], np.where(good, design[..., keep], 0.0)
+            by_bias[:, m, f, :, m, f] = np.eye(2)
+    for m in range(markers):
+        by_shape[:, m, :, :, m] = turned[:, m]
+    by_scale = turned @ linear.shape[row, :, None, :, None]
+    number = np.arange(adjustment.size)
+    parts = [
+        (number[adjustment.rig], by_rig),
+        (number[adjustment.shape].reshape(*adjustment.xyz.shape)[row], by_shape),
+        (number[adjustment.scale], by_scale),
+        (number[adjustment.bias].reshape(*adjustment.target_id.shape, -1)[row], by_bias),
+    ]
+    if unsure[adjustment.drift].any():
+        by_drift = np.zeros((*shape, views, 2, len(adjustment.functions[0])))
+        for f in range(views):
+            for axis in range(2):
+                by_drift[:, :, f, axis, f, axis] = linear.functions[:, row, :, f]
+        parts.append((number[adjustment.drift], by_drift))
+    columns = np.concatenate([numbers.ravel() for numbers, _ in parts])
+    design = np.concatenate([part.reshape(*shape, -1) for _, part in parts], axis=-1)
+    keep = unsure[columns]
+    good = linear.good[:, row, ..., None, None]
+    return columns[keep], np.where(good, design[..., keep], 0.0)
 
 
 @dataclass(frozen=True)
-class _Linear:
+class LinearPoints:
     """Image points (T, B, M, F) at values of the unknowns: residuals and derivatives."""
 
     residual: np.ndarray  # (..., 2)
@@ -467,7 +509,7 @@ class _Linear:
     @classmethod
     def of(
         cls, adjustment: RigAdjustment, observed: ObservedBodies, values: np.ndarray, poses: Poses
-    ) -> _Linear:
+    ) -> LinearPoints:
         """Linearise at values of the unknowns and at poses."""
         grid = observed.seen.shape  # (T, B, M, F)
         cameras = Cameras(adjustment.rig_at(values), adjustment.target_id)
@@ -518,7 +560,7 @@ def _drift(functions: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class _Mixture:
+class Mixture:
     """Squares of standardised residuals (T, B, M, F), and the density of false matches there."""
 
     squares: np.ndarray
@@ -529,8 +571,13 @@ class _Mixture:
 
     @classmethod
     def of(
-        cls, adjustment: RigAdjustment, linear: _Linear, observed: ObservedBodies, prior: Prior
-    ) -> _Mixture:
+        cls,
+        adjustment: RigAdjustment,
+        linear: LinearPoints,
+        observed: ObservedBodies,
+        prior: Prior,
+    ) -> Mixture:
+        """Standardise the residuals of image points."""
         inflation = prior.inflation[..., None] ** 2
         variance = observed.variance * inflation
         squares = np.sum(linear.residual**2, axis=-1) / variance
@@ -562,10 +609,10 @@ class _Mixture:
         return self.inlier(widening) / (self.variance * widening**2)
 
     @property
-    def loss(self) -> float:
-        """Minus twice the logarithm of the likelihood."""
+    def losses(self) -> np.ndarray:
+        """Minus twice the logarithms of the likelihoods."""
         density = np.exp(-0.5 * self.squares) / self.inflation + self.false
-        return float(-2 * np.log(density[self.good]).sum())
+        return np.where(self.good, -2 * np.log(density), 0.0)
 
     def shares(self) -> dict[str, np.ndarray]:
         """Squares and their expectation by marker, and shares of inliers."""
@@ -638,7 +685,7 @@ def _by_vector(w: np.ndarray) -> np.ndarray:
     return np.eye(3) + cross @ (np.eye(3) / 2 + cross @ (np.eye(3) / 6 + cross / 24))
 
 
-def _moved(poses: Poses, normal: _Normal, step: np.ndarray) -> Poses:
+def moved_poses(poses: Poses, normal: _Normal, step: np.ndarray) -> Poses:
     """Move the poses by what they gain from a step (K,) of the other unknowns."""
     rotation = poses.rotation.copy()
     centre = poses.centre_mm.copy()

@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bodies.healing import FOCUS, KNOCK_MM, KNOCK_RAD, SHIFT_PX
+from ..bodies.sizes import parts_of_interior, parts_of_knock
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
 from ..reconstruction.epipolar import EpipolarGeometry, EpipolarResiduals
 
@@ -200,10 +200,9 @@ def _hypotheses(orientation: RigOrientation) -> list[NDArray[np.float64]]:
     views = len(orientation.fluoroscopes)
     out = []
     for f in range(views):
-        sd = np.zeros((2, views, ORIENTATION_SIZE))
-        sd[0, f, :6] = [KNOCK_MM] * 3 + [KNOCK_RAD] * 3
-        sd[1, f, 6:] = [SHIFT_PX, SHIFT_PX, FOCUS * orientation.interior[f, 2]]
-        out += [row.ravel() for row in sd[int(views == 2 and f == 0) :]]
+        if views > 2 or f > 0:
+            out.append(np.linalg.norm(parts_of_knock(orientation, f), axis=0))
+        out.append(np.linalg.norm(parts_of_interior(orientation, f), axis=0))
     return out
 
 

@@ -54,7 +54,7 @@ from ..reconstruction.observed_noise import with_observed_noise
 from ..reconstruction.reconstruct import orientation_of_recorded, pair_recording
 
 BLOCKS = 10  # of a recording, used in turn for the diagnosis and for its verdict
-MAX_EXPOSURES = 200  # of a recording that are used for each, evenly spread
+MAX_EXPOSURES = 100  # of a recording that are used for each, evenly spread
 MIN_EXPOSURES = 10
 # Standard deviation of a direction of a change, relative to that of a change as it may be, above
 # which the data do not identify it: they have told less than half of it.
@@ -339,7 +339,10 @@ class _Rig:
     def diagnose(
         self, exposures: Sequence[_Exposure], known: Diagnosis, shape_scale: float
     ) -> Diagnosis | None:
-        """Say what has changed beside what is known of the bodies; None for too few exposures."""
+        """Say what has changed beside what is known of the bodies, up to a change of the rig.
+
+        Returns None for too few exposures.
+        """
         if len(exposures) < MIN_EXPOSURES:
             return None
         observed, poses = self.observe(exposures)
@@ -352,7 +355,7 @@ class _Rig:
         told = poses.known[:, _solvable(target_id, left_out)]
         if told.any(axis=1).sum() < MIN_EXPOSURES:
             return None
-        return Diagnostician(self.adjustment(), shape_scale).diagnose(observed, poses)
+        return Diagnostician(self.adjustment(), shape_scale).diagnose(observed, poses, OF_RIG)
 
 
 def _left_out(changes: Sequence[Change], target_id: np.ndarray) -> np.ndarray:

@@ -13,20 +13,19 @@ from scipy.spatial.transform import Rotation
 
 from fluoro_calib_ros.bodies.body import Body
 from fluoro_calib_ros.bodies.healed_rig import healed_rig
-from fluoro_calib_ros.bodies.healing import (
-    SIZES,
-    Cause,
-    Diagnostician,
-)
+from fluoro_calib_ros.bodies.healing import Cause, Change, Diagnostician, _Tried
+from fluoro_calib_ros.bodies.pose_modes import _choices, with_best_modes
 from fluoro_calib_ros.bodies.rig_adjustment import (
+    LinearPoints,
+    Mixture,
     ObservedBodies,
     Poses,
     RigAdjustment,
+    _design,
     _errors,
-    _Linear,
-    _Mixture,
     rig_errors,
 )
+from fluoro_calib_ros.bodies.sizes import SIZES
 
 NOISE_PX = 0.2
 SHAPE_SD_MM = 0.01
@@ -99,12 +98,12 @@ def test_derivatives_are_those_of_differences():
     values[adjustment.drift] = 0.0  # the gradient of a drift is neglected beside 1
 
     def residual(at, of=poses):
-        return _Linear.of(adjustment, observed, at, of).residual
+        return LinearPoints.of(adjustment, observed, at, of).residual
 
-    linear = _Linear.of(adjustment, observed, values, poses)
+    linear = LinearPoints.of(adjustment, observed, values, poses)
     everything = np.ones(adjustment.size, dtype=bool)
     for row in range(BODIES):
-        columns, design = adjustment._design(linear, row, everything)
+        columns, design = _design(adjustment, linear, row, everything)
         for column in rng.choice(len(columns), 40, replace=False):
             step = np.zeros(adjustment.size)
             step[columns[column]] = 1e-5
@@ -125,7 +124,7 @@ def test_inliers_are_told_from_false_matches_that_lie_anywhere():
     variance = np.array([0.04, 0.09, 0.16])[None, None, :, None]
     scale = np.array([[[1.0, 2.0, 1.0]]])
     area = 1e6
-    found = _Mixture.of(
+    found = Mixture.of(
         Fake(_area=area),
         Fake(residual=residual, good=np.ones((1, 1, 3, 1), dtype=bool)),
         Fake(variance=variance),
@@ -137,7 +136,7 @@ def test_inliers_are_told_from_false_matches_that_lie_anywhere():
     np.testing.assert_allclose(found.inlier(), density / (density + 0.01 / area))
     # The likelihood, less that of a residual of 0 without the scale.
     likelihood = (density + 0.01 / area) * 2 * np.pi * variance / 0.99
-    assert found.loss == pytest.approx(-2 * np.log(likelihood).sum())
+    np.testing.assert_allclose(found.losses, -2 * np.log(likelihood))
 
 
 def test_errors_of_points_are_of_their_scale_of_each_and_of_all_together():
@@ -263,10 +262,9 @@ def test_estimate_does_not_depend_on_the_size_that_was_likeliest():
     assert [one.cause for one in found.changes] == [Cause.ORIENTATION]
     healthy = diagnostician.adjustment.healthy_prior(observed, 1e-4)
     estimated = []
-    for size in SIZES:
-        change = replace(found.changes[0], size=size)
-        prior = healthy.widened(diagnostician.sd_of(change))
-        diagnosis = replace(found, changes=(change,), prior=prior)
+    for size in (1.0, 0.125):
+        prior = healthy.widened(size * diagnostician.sd_of(found.changes[0]))
+        diagnosis = replace(found, prior=prior)
         estimated.append(healed_rig(diagnostician, diagnosis, 7, EXPOSURES))
     large, small = estimated
     np.testing.assert_allclose(small.sd[1, :6], large.sd[1, :6], rtol=0.02)
@@ -274,6 +272,37 @@ def test_estimate_does_not_depend_on_the_size_that_was_likeliest():
     assert (difference < 0.02 * large.sd[1, :6]).all()
     error = (large.changes[1] - moved[9:] - scene.errors[9:])[:6]
     assert (np.abs(error) < 4 * large.sd[1, :6]).all()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize('cause', [Cause.ORIENTATION, Cause.INTERIOR])
+def test_evidence_of_a_cause_is_the_mean_over_its_sizes(cause):
+    """Of solutions with every second size of each part, as equations hold near one of them."""
+    scene = Scene(9)
+    moved = np.zeros(18)
+    moved[9:15] = [0.4, -0.3, 0.2, 0.0006, -0.0004, 0.0005]
+    diagnostician = scene.diagnostician()
+    adjustment = diagnostician.adjustment
+    observed = scene.observe(moved)
+    healthy = adjustment.healthy_prior(observed, 1e-4)
+    start = np.zeros(adjustment.size), scene.poses()
+    solution = adjustment.solve(observed, healthy, start)
+    change = Change(cause, 1)
+    best = _Tried((), observed, healthy, solution, 0.0)
+    found = diagnostician._with(best, change, start)
+    shift, turn = diagnostician.parts_of(change)
+    start = found.solution.values, found.solution.poses
+    total = 0.0
+    weights = SIZES[::2] / (1 + SIZES[::2] ** 2)
+    for a, of_a in zip(SIZES[::2], weights):
+        for b, of_b in zip(SIZES[::2], weights):
+            prior = healthy.widened(np.hypot(a * shift, b * turn))
+            one = adjustment.refine(observed, prior, start)
+            total += of_a * of_b * np.exp(one.evidence - found.solution.evidence)
+    expected = found.solution.evidence + np.log(total / weights.sum() ** 2)
+    assert found.evidence == pytest.approx(expected, abs=0.5)
+    # The size that is solved with is another one than the mean.
+    assert abs(found.by_size) > 0.5
 
 
 @pytest.mark.long
@@ -303,6 +332,55 @@ def test_markers_and_bodies_that_have_changed_are_named():
     exchanged = scene.observe().exchanged(1, 0, 4)
     found = scene.diagnostician().diagnose(exchanged, scene.poses())
     assert [(o.cause, o.body, o.markers) for o in found.changes] == [(Cause.EXCHANGED, 1, (0, 4))]
+
+
+def test_hypothesis_that_turns_the_rig_into_another_one_ends_before():
+    """Images of b at a third of their size, as of a principal distance that cannot be."""
+    scene = Scene(51)
+    diagnostician = scene.diagnostician()
+    adjustment = diagnostician.adjustment
+    observed = scene.observe()
+    uv = observed.uv.copy()
+    uv[..., 1, :] = 511.5 + (uv[..., 1, :] - 511.5) / 3
+    observed = replace(observed, uv=uv, pixel=uv)
+    sd = 1e3 * diagnostician.sd_of(Change(Cause.INTERIOR, 1))
+    prior = adjustment.healthy_prior(observed, 1e-4).widened(sd)
+    found = adjustment.solve(observed, prior, (np.zeros(adjustment.size), scene.poses()))
+    assert np.isfinite(found.evidence)
+    distance = adjustment.rig_at(found.values).interior[1, 2]
+    assert distance > scene.rig.interior[1, 2] / 2
+
+
+def test_pose_with_two_false_matches_does_not_take_others_for_false():
+    """From a start that fits none, and of a body whose two other markers are seen by one view."""
+    scene = Scene(50)
+    adjustment = scene.diagnostician().adjustment
+    observed = scene.observe()
+    uv = observed.uv.copy()
+    uv[5, 1, [0, 3], 1] = [[200.0, 700.0], [800.0, 300.0]]
+    seen = observed.seen.copy()
+    seen[5, 1, 4] = False  # a body of four
+    observed = replace(observed, uv=uv, pixel=uv, seen=seen)
+    prior = adjustment.healthy_prior(observed, 1e-4)
+    right = adjustment.solve(observed, prior, (np.zeros(adjustment.size), scene.poses()))
+    rotation = right.poses.rotation.copy()
+    rotation[5, 1] = rotation[5, 1] @ Rotation.from_rotvec([0, 2.2, 0]).as_matrix()
+    start = right.values, replace(right.poses, rotation=rotation)
+    astray = adjustment.refine(observed, prior, start)
+    assert astray.inliers_of_pose[5, 1] < 0.7
+    found = with_best_modes(adjustment, observed, prior, astray)
+    assert found.inliers_of_pose[5, 1] == pytest.approx(0.75, abs=0.02)
+    assert found.evidence > astray.evidence + 10
+    turn = found.poses.rotation[5, 1] @ scene.rotation[5, 1].T
+    assert Rotation.from_matrix(turn).magnitude() < 0.02
+
+
+def test_false_matches_are_tried_alone_and_in_pairs_of_bodies_with_few_image_points():
+    few = _choices((4, 2))
+    assert few.shape == (1 + 8 + 28, 4, 2) and not few[0].any()
+    assert len(np.unique(few.reshape(len(few), -1), axis=0)) == len(few)
+    assert few.reshape(len(few), -1).sum(axis=1).max() == 2
+    assert len(_choices((20, 2))) == 1 + 40
 
 
 @pytest.mark.long

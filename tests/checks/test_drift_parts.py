@@ -10,8 +10,8 @@ import pytest
 from rigs import true_calibrations, true_orientation
 
 from fluoro_calib_ros.bodies.body import Body
-from fluoro_calib_ros.bodies.healing import FOCUS, KNOCK_MM, KNOCK_RAD, SHIFT_PX
 from fluoro_calib_ros.bodies.image_points import ImagePoints, Linear
+from fluoro_calib_ros.bodies.sizes import FOCUS, KNOCK_MM, KNOCK_RAD, SHIFT_PX
 from fluoro_calib_ros.checks import rig_change
 from fluoro_calib_ros.checks.body_watch import BodyWatch, _by_area, _Drift
 from fluoro_calib_ros.checks.drift_charts import (

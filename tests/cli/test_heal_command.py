@@ -73,7 +73,7 @@ def assert_same_but_for_larger_sd(parent, healed):
             del values['calibration_id']
         np.testing.assert_equal(new, old)
         assert (larger >= sd).all()
-        assert larger[0, 0] > 1.1 * sd[0, 0], 'no marker has passed in a corner'
+        assert (larger / sd).max() > 2, 'somewhere no marker has passed'
 
 
 def test_bumped_rig_is_healed_and_its_points_are_right_again(rig, tmp_path, capsys):

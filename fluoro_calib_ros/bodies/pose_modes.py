@@ -1,0 +1,129 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Poses of exposures with several false matches, of which an iteration may take the wrong ones.
+
+The likelihood of a pose has a mode for each choice of the false matches. The iteration ends in the
+one that is next to its start. A pose that ends in another mode with one hypothesis than with
+the others decides between them: an image point that is lost costs some ten in logarithms.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations
+from math import comb
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .rig_adjustment import (
+    LinearPoints,
+    Mixture,
+    ObservedBodies,
+    Poses,
+    Prior,
+    RigAdjustment,
+    RigSolution,
+    moved_poses,
+)
+
+MAX_TRIED = 200  # choices of false matches; of many image points, two do not lead a pose astray
+# Share of the poses that have several false matches by chance; above it, the rig is another one.
+BY_CHANCE = 0.1
+STEPS = 4  # of a pose by the trusted image points, and as many by all
+
+
+def with_best_modes(
+    adjustment: RigAdjustment, observed: ObservedBodies, prior: Prior, found: RigSolution
+) -> RigSolution:
+    """Return a solution, of whose poses those with several false matches are the likeliest.
+
+    From the pose of the nearest exposure without, each image point and each pair of them (of
+    bodies with few) is left out once, and the pose with the largest likelihood is taken.
+    """
+    lost = observed.seen.sum(axis=(2, 3)) * (1 - found.inliers_of_pose) > 1.5
+    exposures = np.flatnonzero(lost.any(axis=1))
+    if not len(exposures) or lost.mean() > BY_CHANCE:
+        return found
+    without = _choices(observed.seen.shape[2:])
+    rows = np.tile(exposures, len(without))
+    tried = observed.exposures(rows)
+    trusted = tried.seen & np.repeat(~without, len(exposures), axis=0)[:, None]
+    start = _from_neighbours(found.poses, lost).exposures(rows)
+    poses = _posed(adjustment, tried, prior, (found.values, start), trusted)
+    loss = _loss(adjustment, tried, prior, (found.values, poses))
+    best = np.argmin(loss.reshape(len(without), len(exposures), -1), axis=0)
+    best = best * len(exposures) + np.arange(len(exposures))[:, None]
+    before = _loss(adjustment, observed, prior, (found.values, found.poses))[exposures]
+    better = lost[exposures] & (np.take_along_axis(loss, best, axis=0) < before)
+    rotation, centre = found.poses.rotation.copy(), found.poses.centre_mm.copy()
+    row, body = np.nonzero(better)
+    at = exposures[row], body
+    rotation[at] = poses.rotation[best[row, body], body]
+    centre[at] = poses.centre_mm[best[row, body], body]
+    again = Poses(rotation, centre, found.poses.known)
+    refined = adjustment.refine(observed, prior, (found.values, again))
+    return max(found, refined, key=lambda one: one.evidence)
+
+
+def _choices(shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Return which (n, M, F) of the image points of a body are left out, none first."""
+    points = range(int(np.prod(shape)))
+    choices: list[tuple[int, ...]] = [()]
+    for count in (1, 2):
+        if len(choices) + comb(len(points), count) <= MAX_TRIED:
+            choices += combinations(points, count)
+    out = np.zeros((len(choices), len(points)), dtype=bool)
+    for row, choice in zip(out, choices):
+        row[list(choice)] = True
+    return out.reshape(-1, *shape)
+
+
+def _from_neighbours(poses: Poses, lost: NDArray[np.bool_]) -> Poses:
+    """Return the poses of the nearest exposures that are not lost where others (T, B) are."""
+    rotation, centre = poses.rotation.copy(), poses.centre_mm.copy()
+    for t, b in np.argwhere(lost):
+        good = np.flatnonzero(poses.known[:, b] & ~lost[:, b])
+        if len(good):
+            nearest = good[np.argmin(np.abs(good - t))]
+            rotation[t, b], centre[t, b] = rotation[nearest, b], centre[nearest, b]
+    return Poses(rotation, centre, poses.known)
+
+
+def _posed(
+    adjustment: RigAdjustment,
+    observed: ObservedBodies,
+    prior: Prior,
+    start: tuple[NDArray[np.float64], Poses],
+    trusted: NDArray[np.bool_],
+) -> Poses:
+    """Return poses by their trusted image points (T, B, M, F) alone, and then by all.
+
+    start: values (K,) of the unknowns, which are certain, and first poses.
+    """
+    values, poses = start
+    certain = np.zeros(adjustment.size, dtype=bool)
+    for step in range(2 * STEPS):
+        linear = LinearPoints.of(adjustment, observed, values, poses)
+        terms = Mixture.of(adjustment, linear, observed, prior)
+        weight = terms.weight(1.0)
+        if step < STEPS:
+            weight = np.where(trusted & linear.good, 1 / terms.variance, 0.0)
+        normal = adjustment.normal_of(linear, weight, certain)
+        poses = moved_poses(poses, normal, np.zeros(adjustment.size))
+    return poses
+
+
+def _loss(
+    adjustment: RigAdjustment,
+    observed: ObservedBodies,
+    prior: Prior,
+    found: tuple[NDArray[np.float64], Poses],
+) -> NDArray[np.float64]:
+    """Return minus twice the logarithms (T, B) of the likelihood of poses.
+
+    Image points of markers behind a source are false.
+    """
+    terms = Mixture.of(adjustment, LinearPoints.of(adjustment, observed, *found), observed, prior)
+    losses = np.where(terms.good, terms.losses, -2 * np.log(terms.false))
+    return np.asarray(np.where(observed.seen, losses, 0.0).sum(axis=(2, 3)))

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from fluoro_calib_ros.bodies.body import Body
 from fluoro_calib_ros.bodies.healed_rig import healed_rig
-from fluoro_calib_ros.bodies.healing import Cause, Change, Diagnostician, _Tried
+from fluoro_calib_ros.bodies.healing import OF_RIG, Cause, Change, Diagnostician, _Tried
 from fluoro_calib_ros.bodies.pose_modes import _choices, with_best_modes
 from fluoro_calib_ros.bodies.rig_adjustment import (
     LinearPoints,
@@ -334,6 +334,20 @@ def test_markers_and_bodies_that_have_changed_are_named():
     assert [(o.cause, o.body, o.markers) for o in found.changes] == [(Cause.EXCHANGED, 1, (0, 4))]
 
 
+@pytest.mark.long
+def test_no_further_cause_is_looked_for_after_one_that_is_enough():
+    scene = Scene(30)
+    scene.shapes[1, 2] += [0.3, -0.3, 0.3]
+    moved = np.zeros(18)
+    moved[9:15] = [4.0, -3.0, 2.0, 0.006, -0.004, 0.005]
+    diagnostician = scene.diagnostician()
+    observed, poses = scene.observe(moved), scene.poses()
+    found = diagnostician.diagnose(observed, poses)
+    assert [one.cause for one in found.changes] == [Cause.ORIENTATION, Cause.MIGRATED]
+    first = diagnostician.diagnose(observed, poses, until=OF_RIG)
+    assert first.changes == found.changes[:1] and not first.complete
+
+
 def test_hypothesis_that_turns_the_rig_into_another_one_ends_before():
     """Images of b at a third of their size, as of a principal distance that cannot be."""
     scene = Scene(51)
@@ -364,7 +378,7 @@ def test_pose_with_two_false_matches_does_not_take_others_for_false():
     prior = adjustment.healthy_prior(observed, 1e-4)
     right = adjustment.solve(observed, prior, (np.zeros(adjustment.size), scene.poses()))
     rotation = right.poses.rotation.copy()
-    rotation[5, 1] = rotation[5, 1] @ Rotation.from_rotvec([0, 2.2, 0]).as_matrix()
+    rotation[5, 1] = Rotation.from_rotvec([3.1, 0, 0]).as_matrix() @ rotation[5, 1]
     start = right.values, replace(right.poses, rotation=rotation)
     astray = adjustment.refine(observed, prior, start)
     assert astray.inliers_of_pose[5, 1] < 0.7

@@ -117,7 +117,7 @@ def _of_unseen_knocks(diagnostician: Diagnostician, diagnosis: Diagnosis) -> NDA
     exact = replace(diagnosis.prior, orientation=np.zeros_like(calibrated))
     told = adjustment.told(diagnosis.observed, exact, diagnosis.solution)
     out = calibrated.copy()
-    moments = told.only(rows).with_noise(diagnosis.noise).moments(sd[None, rows])
+    moments = told.only(rows).with_noise(diagnosis.noise).mean_moments(sd[None, rows])
     out[np.ix_(rows, rows)] += moments
     return out
 
@@ -150,7 +150,7 @@ def _unseen_drift(
     told = adjustment.told(observed, exact, diagnosis.solution, known)
     parts = diagnostician.parts_of(Change(Cause.DISTORTION, fluoroscope))[:, own]
     smooth = adjustment.healthy_prior(observed, 0.0).sd[own]  # by the error of the correction
-    moments = told.only(own).with_noise(diagnosis.noise).moments(parts, smooth)
+    moments = told.only(own).with_noise(diagnosis.noise).mean_moments(parts, smooth)
     functions = adjustment.functions[fluoroscope]
     pixel = observed.pixel[..., fluoroscope, :][observed.seen[..., fluoroscope]]
     of_both = np.kron(np.eye(2), _without_affine(functions, pixel))

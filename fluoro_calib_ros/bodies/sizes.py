@@ -59,17 +59,20 @@ class Told:
         log_z = np.sum(gradient * solved, axis=-1) - np.linalg.slogdet(whitened)[1]
         return np.asarray(0.5 * log_z)
 
-    def moments(
-        self, parts: NDArray[np.float64], least: NDArray[np.float64] | float = 0.0
-    ) -> NDArray[np.float64]:
-        """Return second moments (k, k) of the unknowns, the mean over the sizes of a change."""
-        sizes = self.sizes(parts, least)
-        whitened, gradient = self._whitened(sizes.sd)
+    def moments(self, sd: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return second moments (..., k, k) of the unknowns, with standard deviations (..., k)."""
+        whitened, gradient = self._whitened(sd)
         covariance = np.linalg.inv(whitened)
         mean = covariance @ gradient[..., None]
-        moments = covariance + mean @ np.swapaxes(mean, 1, 2)
-        moments *= sizes.sd[:, :, None] * sizes.sd[:, None]
-        return np.asarray(np.tensordot(sizes.share, moments, axes=1))
+        moments = covariance + mean @ np.swapaxes(mean, -1, -2)
+        return np.asarray(sd[..., :, None] * moments * sd[..., None, :])
+
+    def mean_moments(
+        self, parts: NDArray[np.float64], least: NDArray[np.float64] | float = 0.0
+    ) -> NDArray[np.float64]:
+        """Return the mean (k, k) of second moments over the sizes of a change, see `sizes`."""
+        sizes = self.sizes(parts, least)
+        return np.asarray(np.tensordot(sizes.share, self.moments(sizes.sd), axes=1))
 
     def _whitened(self, sd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Normal equations of unknowns in units of their standard deviations (..., k)."""

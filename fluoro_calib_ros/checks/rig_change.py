@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bodies.sizes import parts_of_interior, parts_of_knock
+from ..bodies.sizes import Told, parts_of_interior, parts_of_knock
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
 from ..reconstruction.epipolar import EpipolarGeometry, EpipolarResiduals
 
@@ -162,15 +162,17 @@ class RigChange:
         factor, weight = _weights(design, rays.residual, variance)
         normal = rays.by_rig.T @ (rays.by_rig * weight[:, None])
         right = -rays.by_rig.T @ (weight * rays.residual)
-        moments = []
+        told = Told(normal, right)
+        moments = np.zeros((len(self._hypotheses), len(SIZES), *normal.shape))
         evidence = []
-        for sd in self._hypotheses:
-            for size in SIZES:
-                moment, log_z = _moment(normal, right, size * sd)
-                moments.append(moment)
-                evidence.append(log_z)
-        share = np.exp(np.array(evidence) - max(evidence))
-        covariance = np.tensordot(share / share.sum(), np.array(moments), axes=1)
+        for of_sizes, sd in zip(moments, self._hypotheses):
+            rows = np.flatnonzero(sd)
+            of_change = told.only(rows)
+            tried = SIZES[:, None] * sd[rows]
+            of_sizes[:, rows[:, None], rows] = of_change.moments(tried)
+            evidence.append(of_change.evidence(tried))
+        share = np.exp(np.array(evidence) - np.max(evidence))
+        covariance = np.tensordot(share / share.sum(), moments, axes=2)
         return Addition(
             (covariance + covariance.T) / 2,
             float(np.sqrt(max(factor - 1, 0.0) * np.median(variance))),
@@ -226,17 +228,3 @@ def _weights(
         factor = max(1.0, float(np.median(squares)) / NORMAL_MEDIAN * len(rest) / free)
         weight = (NU + 1) / (NU + squares / factor) / (variance * factor)
     return factor, weight
-
-
-def _moment(normal: np.ndarray, right: np.ndarray, sd: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return second moment (K, K) and log evidence of a change of standard deviations (K,)."""
-    rows = np.flatnonzero(sd)
-    scale = sd[rows]
-    whitened = np.eye(len(rows)) + normal[np.ix_(rows, rows)] * np.outer(scale, scale)
-    covariance = np.linalg.inv(whitened)
-    gradient = scale * right[rows]
-    mean = covariance @ gradient
-    moment = np.zeros((len(sd), len(sd)))
-    moment[np.ix_(rows, rows)] = np.outer(scale, scale) * (np.outer(mean, mean) + covariance)
-    log_z = 0.5 * (gradient @ mean - np.linalg.slogdet(whitened)[1])
-    return moment, float(log_z)

@@ -55,7 +55,7 @@ def test_sizes_and_moments_are_those_of_the_change():
     assert rms[:20] == pytest.approx(0.25, rel=0.5)
     weight = SIZES / (1 + SIZES**2)
     assert rms[20:] == pytest.approx(np.sqrt(weight @ SIZES**2 / weight.sum()))
-    moments = told.moments(parts)
+    moments = told.mean_moments(parts)
     np.testing.assert_allclose(moments[:20, :20], np.outer(change, change)[:20, :20], atol=0.01)
     np.testing.assert_allclose(np.diagonal(moments)[20:], rms[20:] ** 2)
 

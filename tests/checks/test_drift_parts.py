@@ -11,7 +11,7 @@ from rigs import true_calibrations, true_orientation
 
 from fluoro_calib_ros.bodies.body import Body
 from fluoro_calib_ros.bodies.image_points import ImagePoints, Linear
-from fluoro_calib_ros.bodies.sizes import FOCUS, KNOCK_MM, KNOCK_RAD, SHIFT_PX
+from fluoro_calib_ros.bodies.sizes import FOCUS, KNOCK_MM, KNOCK_RAD, SHIFT_PX, Told
 from fluoro_calib_ros.checks import rig_change
 from fluoro_calib_ros.checks.body_watch import BodyWatch, _by_area, _Drift
 from fluoro_calib_ros.checks.drift_charts import (
@@ -59,8 +59,9 @@ def test_moment_and_evidence_are_those_of_a_normal_prior():
     p = np.linalg.inv(n + np.linalg.inv(d))
     expected = np.zeros((5, 5))
     expected[np.ix_(rows, rows)] = np.outer(p @ g, p @ g) + p
-    found, log_z = rig_change._moment(normal, right, sd)
-    np.testing.assert_allclose(found, expected)
+    told = Told(normal, right)
+    log_z = told.evidence(sd)
+    np.testing.assert_allclose(told.moments(sd), expected, atol=1e-12)
     determinant = np.linalg.det(np.eye(3) + n @ d)
     assert log_z == pytest.approx(0.5 * (g @ p @ g - np.log(determinant)))
 

@@ -72,6 +72,7 @@ def test_stream_continues_while_a_job_runs(rig, exposures):
     received = client.wait_for_status(lambda s: s.exposures == 15).frames_received
     corrected = rig.messages('corrected_observations')
     before = {n: len(m) for n, m in corrected.items()}
+    published = rig.state()[1]['a']
     frames = [standing(exposures[n][0], 10**6, 1000, rate) for n in NAMES]
     answer = client.goal(model='local_linear', fluoroscopes=['a']).get_result_async()
 
@@ -106,6 +107,9 @@ def test_stream_continues_while_a_job_runs(rig, exposures):
     )
     client.wait_until(
         lambda: all(len(corrected[n]) == before[n] + during for n in NAMES), what='all corrected'
+    )
+    client.wait_until(
+        lambda: rig.state()[1]['a'] == published + 1, what='the new calibration of a'
     )
     for name in NAMES:
         assert client.status(name).exposures == 15 and client.status(name).frames_unpaired == 0

@@ -21,13 +21,13 @@ from scipy.special import chdtri
 from threadpoolctl import threadpool_limits
 
 from fluoro_calib_ros.bodies.body import declared_bodies
-from fluoro_calib_ros.bodies.healing import Cause
-from fluoro_calib_ros.bodies.rig_adjustment import RigErrors, rig_errors
 from fluoro_calib_ros.bodies.shapes import LearnedShapes
 from fluoro_calib_ros.correction.fluoroscope_calibration import FluoroscopeCalibration
 from fluoro_calib_ros.correction.registry import CollocationModel
 from fluoro_calib_ros.correction.series import Functions, Series
 from fluoro_calib_ros.exposures.frame import Frame
+from fluoro_calib_ros.healing.diagnosis import Cause
+from fluoro_calib_ros.healing.rig_adjustment import RigErrors, rig_errors
 from fluoro_calib_ros.jobs.healing import HealingOutcome, heal_rig
 from fluoro_calib_ros.jobs.learning import learn_shapes
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation

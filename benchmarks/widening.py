@@ -21,12 +21,12 @@ from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
 
 from fluoro_calib_ros.bodies.body import BodyPoses
-from fluoro_calib_ros.bodies.healing import Cause
 from fluoro_calib_ros.bodies.tracking import BodyTracker, TrackedExposure, poses_of
 from fluoro_calib_ros.checks.drift_charts import OK
 from fluoro_calib_ros.checks.rig_watch import RigDriftWatch
 from fluoro_calib_ros.correction.fluoroscope_calibration import Calibrations
 from fluoro_calib_ros.exposures.frame import Frame
+from fluoro_calib_ros.healing.diagnosis import Cause
 from fluoro_calib_ros.jobs.healing import heal_rig
 from fluoro_calib_ros.photogrammetry.noise import ObservedScatter
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation

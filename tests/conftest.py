@@ -60,7 +60,7 @@ SHARING = (
 )
 # Other files that take more than 20 s of CPU time. Short files fill the gaps at the end.
 LENGTHY = (
-    'tests/bodies/test_healing.py',
+    'tests/healing/test_healing.py',
     'tests/estimation/test_survey.py',
     'tests/report/test_experiment.py',
     'tests/test_lint.py',

@@ -26,7 +26,6 @@ from rigs import (
 )
 
 from fluoro_calib_ros.bodies.body import Body
-from fluoro_calib_ros.bodies.healing import Cause, Change
 from fluoro_calib_ros.bodies.shapes import BodyPlaces, _stability, _unseen, estimate_shape
 from fluoro_calib_ros.checks import held_out as held_fit
 from fluoro_calib_ros.checks import inputs, mixed_units, verdict
@@ -50,6 +49,7 @@ from fluoro_calib_ros.exposures.collector import without_repeats
 from fluoro_calib_ros.exposures.frame import without_strays
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.findings import Finding, Kind, Place
+from fluoro_calib_ros.healing.diagnosis import Cause, Change
 from fluoro_calib_ros.images import detection, extraction, lattice, matching
 from fluoro_calib_ros.images.codec import as_grey
 from fluoro_calib_ros.images.growth import Seen

@@ -4,7 +4,7 @@
 """What the rays of an alarm tell of a change of the rig, as an addition to its covariance.
 
 The unknowns of the rig have changed by d. Epipolar residuals are r = -J d + noise. A cause, such
-as a knock, and its size s are a normal prior of d with the covariance s^2 D (see bodies.healing).
+as a knock, and its size s are a normal prior of d with the covariance s^2 D (see healing.sizes).
 With the normal equations N = J'WJ and g = -J'Wr, a cause of a size has the posterior mean m and
 covariance P and the evidence Z,
 
@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bodies.sizes import Told, parts_of_interior, parts_of_knock
+from ..healing.sizes import Told, parts_of_interior, parts_of_knock
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
 from ..reconstruction.epipolar import EpipolarGeometry, EpipolarResiduals
 

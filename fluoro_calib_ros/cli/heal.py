@@ -89,7 +89,7 @@ def run(arguments: argparse.Namespace) -> bool:
 
 def _lines(arguments: argparse.Namespace, outcome: HealingOutcome) -> list[str]:
     """Return what has changed by how much, and what that is good for."""
-    from ..bodies.healing import OF_RIG
+    from ..healing.diagnosis import OF_RIG
     from ..jobs.healing import CHANGED_MEANWHILE
 
     lines = []

@@ -16,16 +16,6 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from ..bodies.body import Body, check_bodies, robust_pose, solvable_bodies
-from ..bodies.healed_rig import HealedRig, healed_rig, unseen_distortion
-from ..bodies.healing import (
-    OF_RIG,
-    SURE_OF_CAUSE,
-    Cause,
-    Change,
-    Diagnosis,
-    Diagnostician,
-)
-from ..bodies.rig_adjustment import ObservedBodies, Poses, RigAdjustment, RigErrors, rig_errors
 from ..bodies.shapes import LearnedShapes
 from ..brief import brief_repr
 from ..checks.check import Check, verdict_of
@@ -42,6 +32,16 @@ from ..errors import DataError
 from ..exposures.frame import Frame, Frames, frames_of_targets
 from ..exposures.pairing import RecordedPairing
 from ..findings import Finding, Kind, Place, Severity
+from ..healing.diagnosis import (
+    OF_RIG,
+    SURE_OF_CAUSE,
+    Cause,
+    Change,
+    Diagnosis,
+    Diagnostician,
+)
+from ..healing.healed_rig import HealedRig, healed_rig, unseen_distortion
+from ..healing.rig_adjustment import ObservedBodies, Poses, RigAdjustment, RigErrors, rig_errors
 from ..io.access import PathLike
 from ..io.calibration import ORIENTATION_NAME as ORIENTATION
 from ..io.calibration import SUFFIX, save_calibration, save_orientation

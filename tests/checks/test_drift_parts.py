@@ -11,7 +11,6 @@ from rigs import true_calibrations, true_orientation
 
 from fluoro_calib_ros.bodies.body import Body
 from fluoro_calib_ros.bodies.image_points import ImagePoints, Linear
-from fluoro_calib_ros.bodies.sizes import FOCUS, KNOCK_MM, KNOCK_RAD, SHIFT_PX, Told
 from fluoro_calib_ros.checks import rig_change
 from fluoro_calib_ros.checks.body_watch import BodyWatch, _by_area, _Drift
 from fluoro_calib_ros.checks.drift_charts import (
@@ -35,6 +34,7 @@ from fluoro_calib_ros.checks.pair_watch import PairWatch, SystematicErrorField
 from fluoro_calib_ros.checks.rig_change import Addition, RigChange
 from fluoro_calib_ros.checks.rig_watch import RecordingDriftWatch, RigDriftWatch
 from fluoro_calib_ros.findings import Finding, Kind
+from fluoro_calib_ros.healing.sizes import FOCUS, KNOCK_MM, KNOCK_RAD, SHIFT_PX, Told
 from fluoro_calib_ros.reconstruction.reconstruct import IntersectedViews, MatchedViews
 from fluoro_calib_ros.simulation.rig import virtual_rig
 

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from rigs import run
 
-from fluoro_calib_ros.bodies.healing import Cause
 from fluoro_calib_ros.checks.check import Check
 from fluoro_calib_ros.cli import bag, calibrate, convert, extract, heal, output, phantom, process
 from fluoro_calib_ros.cli import reconstruct as reconstruct_command
@@ -28,6 +27,7 @@ from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.rounds import Round
 from fluoro_calib_ros.exposures.names import Names
 from fluoro_calib_ros.findings import Finding, Kind, Severity
+from fluoro_calib_ros.healing.diagnosis import Cause
 from fluoro_calib_ros.io.bags.salvage import BagReport, Damage, TopicReport
 from fluoro_calib_ros.io.phantom import read_phantom
 from fluoro_calib_ros.jobs.reconstruction import ReconstructionOptions

@@ -31,12 +31,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ..bodies.body import POSE_SIZE, Body
+from ..bodies.correction_errors import covariance_of_means
+from ..bodies.image_points import Cameras, ImagePoints
 from ..correction.series import MARGIN, Functions
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
 from ..photogrammetry.rotations import cross_matrix, matrix_from_vector
-from .body import POSE_SIZE, Body
-from .correction_errors import covariance_of_means
-from .image_points import Cameras, ImagePoints
 from .sizes import Told
 
 FALSE_SHARE = 0.01  # of image points that are expected to be false matches

@@ -12,10 +12,10 @@ from body_views import orientation, project
 from scipy.spatial.transform import Rotation
 
 from fluoro_calib_ros.bodies.body import Body
-from fluoro_calib_ros.bodies.healed_rig import healed_rig
-from fluoro_calib_ros.bodies.healing import OF_RIG, Cause, Change, Diagnostician, _Tried
-from fluoro_calib_ros.bodies.pose_modes import _choices, with_best_modes
-from fluoro_calib_ros.bodies.rig_adjustment import (
+from fluoro_calib_ros.healing.diagnosis import OF_RIG, Cause, Change, Diagnostician, _Tried
+from fluoro_calib_ros.healing.healed_rig import healed_rig
+from fluoro_calib_ros.healing.pose_modes import _choices, with_best_modes
+from fluoro_calib_ros.healing.rig_adjustment import (
     LinearPoints,
     Mixture,
     ObservedBodies,
@@ -25,7 +25,7 @@ from fluoro_calib_ros.bodies.rig_adjustment import (
     _errors,
     rig_errors,
 )
-from fluoro_calib_ros.bodies.sizes import SIZES
+from fluoro_calib_ros.healing.sizes import SIZES
 
 NOISE_PX = 0.2
 SHAPE_SD_MM = 0.01

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from test_healing import SIZE, Scene
 
-from fluoro_calib_ros.bodies.healed_rig import _unseen_drift, healed_rig
-from fluoro_calib_ros.bodies.healing import Cause, Change, Diagnosis, _Tried
 from fluoro_calib_ros.correction.series import sd_grid_pixels, sd_over_image
+from fluoro_calib_ros.healing.diagnosis import Cause, Change, Diagnosis, _Tried
+from fluoro_calib_ros.healing.healed_rig import _unseen_drift, healed_rig
 
 B = 1  # the fluoroscope whose distortion drifts
 GRID = sd_grid_pixels(SIZE)

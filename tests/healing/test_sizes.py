@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from fluoro_calib_ros.bodies.sizes import SIZES, Told
+from fluoro_calib_ros.healing.sizes import SIZES, Told
 
 
 def told_of(change, design, noise, rng):

@@ -21,7 +21,7 @@ from scipy.linalg import eigh
 
 from ..correction.series import Functions
 from ..photogrammetry.rig_orientation import RigOrientation
-from .healing import OF_RIG, Cause, Change, Diagnosis, Diagnostician
+from .diagnosis import OF_RIG, Cause, Change, Diagnosis, Diagnostician
 from .rig_adjustment import RigAdjustment, drift_errors
 
 

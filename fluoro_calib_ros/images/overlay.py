@@ -23,6 +23,7 @@ OVERLAPPED = (230, 200, 40)
 REFUSED = (60, 60, 255)
 UNEXPLAINED = (0, 190, 255)
 TEXT = (235, 235, 235)
+OUTLINE = (0, 0, 0)
 TEXT_HEIGHT = 18
 QUALITY = 80  # of a small JPEG
 
@@ -193,9 +194,18 @@ def draw_bodies(image: np.ndarray, title: str, bodies: Sequence[BodyView]) -> np
         centre, *ends = (_place(uv, factor) for uv in body.axes)
         for end, axis in zip(ends, AXIS_COLOURS):
             cv2.line(picture, centre, end, axis, 2, cv2.LINE_AA)
-        cv2.putText(
-            picture, body.name, centre, cv2.FONT_HERSHEY_SIMPLEX, 0.45, TEXT, 1, cv2.LINE_AA
-        )
+        place = (centre[0] + RADIUS_PX, centre[1] - RADIUS_PX)
+        for colour, width in ((OUTLINE, 3), (TEXT, 1)):  # legible on any background
+            cv2.putText(
+                picture,
+                body.name,
+                place,
+                cv2.FONT_HERSHEY_SIMPLEX,
+                0.45,
+                colour,
+                width,
+                cv2.LINE_AA,
+            )
     whole = _labelled(picture, lines)
     return whole[: len(whole) // 2 * 2, : whole.shape[1] // 2 * 2]
 

@@ -185,6 +185,23 @@ def test_bodies_are_drawn_with_their_axes():
     assert not overlay.draw_bodies(image, '', [far])[:600].any()
 
 
+@pytest.mark.parametrize('background', [0, 255])
+def test_the_name_of_a_body_is_legible_on_any_background(background):
+    image = np.full((600, 700), background, np.uint8)
+    image[0, 0] = 255 - background
+    axes = np.array([[300.0, 300], [350, 300], [300, 350], [260, 260]])
+    unnamed, named = (
+        overlay.draw_bodies(image, '', [overlay.BodyView(name, 'OK', np.zeros((0, 2)), axes)])[
+            :600
+        ]
+        for name in ('', 'femur')
+    )
+    changed = (named != unnamed).any(axis=2)
+    text = named[changed]
+    assert text.min() < 40 and text.max() > 215
+    assert not changed[297:304, 300:350].any(), 'the name is apart from the axis'
+
+
 @pytest.mark.parametrize('size', [(480, 240), (300, 600)])
 def test_covered_cells_are_green_where_they_are(size):
     covered = np.array([[True, False], [False, False], [False, True]])

@@ -177,7 +177,27 @@ class Diagnostician:
         if best.changes:  # else a rig that is wrong may have led values and poses astray
             found = best.solution
             start = found.values, found.poses.or_else(first, found.inliers_of_pose > FITS)
-        return [self._with(best, change, start) for change in changes]
+        leader = best
+        out: list[_Tried] = []
+        for change in changes:
+            if self._is_hopeless(change, best, leader):
+                continue
+            out.append(self._with(best, change, start))
+            leader = max(leader, out[-1], key=lambda one: one.evidence)
+        return out
+
+    def _is_hopeless(self, change: Change, best: _Tried, leader: _Tried) -> bool:
+        """Whether a change of a body has no chance beside a leader, if all of its points fitted.
+
+        What other bodies show stays as unlikely as it was. All hopeless causes together leave the
+        leader as sure as it is.
+        """
+        if change.cause in OF_RIG:
+            return False
+        lost = best.solution.losses[change.body]
+        most = best.evidence + 0.5 * float(lost[list(change.markers) or slice(None)].sum())
+        behind = (leader.evidence - most) / _noise(leader.solution) ** 2
+        return bool(behind > np.log(self._causes / (1 - SURE_OF_CAUSE)))
 
     def knocks(self) -> list[Change]:
         """Return the changes of the orientation that can be seen."""

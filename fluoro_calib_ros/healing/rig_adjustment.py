@@ -140,6 +140,8 @@ class RigSolution:
     covariance: NDArray[np.float64]  #: (K, K)
     poses: Poses
     evidence: float  #: logarithm, up to a constant that all hypotheses share
+    #: (B, M) minus twice the logarithm of the likelihood of the image points of each marker
+    losses: NDArray[np.float64]
     #: (B, M) weighted squares of the residuals of the inliers of each marker, and their
     #: expectation
     squares: NDArray[np.float64]
@@ -615,7 +617,7 @@ class Mixture:
         return np.where(self.good, -2 * np.log(density), 0.0)
 
     def shares(self) -> dict[str, np.ndarray]:
-        """Squares and their expectation by marker, and shares of inliers."""
+        """Losses, squares and their expectation by marker, and shares of inliers."""
         inlier = self.inlier()
         # A pose takes up six of the residuals of its body, in proportion to their number.
         count = 2 * inlier.sum(axis=(2, 3))
@@ -625,6 +627,7 @@ class Mixture:
             of_marker = inlier.sum(axis=(0, 3)) / self.good.sum(axis=(0, 3))
             of_pose = inlier.sum(axis=(2, 3)) / self.good.sum(axis=(2, 3))
         return {
+            'losses': self.losses.sum(axis=(0, 3)),
             'squares': (weighted * self.squares * self.inflation).sum(axis=(0, 3)),
             'freedom': (2 * weighted * share[..., None, None]).sum(axis=(0, 3)),
             'inliers': of_marker,

@@ -27,6 +27,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +52,7 @@ DRIFT_MODES = 4
 FITTING = 0.8  # share of the image points of a body that are no false matches, at least
 MAX_NOISE_PX = 10.0  # of image points that are no false matches
 LOOSEST = 1e-6  # weight of a pose [1/mm^2, 1/rad^2] that keeps an unseen one where it is
+ROUNDING = POSE_SIZE * np.finfo(float).eps  # of the normal matrix of a pose, over its trace
 _EYE_6 = np.eye(POSE_SIZE)
 
 
@@ -158,7 +160,20 @@ class _Normal:
 
     matrix: np.ndarray
     right: np.ndarray
-    back: list[tuple[np.ndarray, np.ndarray]]  # columns (L,), N^-1 (D'J, D'r) (T, 6, L + 1)
+    back: list[_Back]
+
+
+class _Back(NamedTuple):
+    """What gives back the poses of a body: N = C C' of its poses, and their mixed matrix."""
+
+    columns: np.ndarray  # (L,) unknowns
+    inverse: np.ndarray  # (T, 6, 6) C^-1
+    half: np.ndarray  # (T, 6, L + 1) C^-1 (D'J, D'r)
+
+    def poses(self, step: np.ndarray) -> np.ndarray:
+        """Return by how much the poses (T, 6) change with a step (K,) of the other unknowns."""
+        half = self.half[..., -1] - self.half[..., :-1] @ step[self.columns]
+        return np.asarray((np.swapaxes(self.inverse, 1, 2) @ half[..., None])[..., 0])
 
 
 class RigAdjustment:
@@ -434,65 +449,105 @@ class RigAdjustment:
         right = np.zeros(self.size)
         back = []
         for row in range(len(self.bodies)):
-            root = np.sqrt(weight[:, row])[..., None]
-            columns, design = _design(self, linear, row, unsure)
-            flat = (len(root), root[0].size * 2)
-            design = (design * root[..., None]).reshape(*flat, len(columns))
-            by_pose = (linear.by_pose(row) * root[..., None]).reshape(*flat, POSE_SIZE)
-            residual = (linear.residual[:, row] * root).reshape(*flat, 1)
-            both = np.concatenate([design, residual], axis=2)
-            transposed = np.swapaxes(by_pose, 1, 2)
-            cross = transposed @ both
-            normal = transposed @ by_pose
-            empty = ~linear.poses.known[:, row]
-            normal[empty] = _EYE_6
-            normal += LOOSEST * _EYE_6
-            solved = np.linalg.solve(normal, cross)
-            rows = both.reshape(-1, both.shape[2])
-            told = rows.T @ rows - cross.reshape(-1, both.shape[2]).T @ solved.reshape(
-                -1, both.shape[2]
-            )
+            columns, told, cross, normal = _summed(self, linear, row, weight[:, row], unsure)
+            normal[~linear.poses.known[:, row]] = _EYE_6
+            least = LOOSEST + ROUNDING * np.trace(normal, axis1=1, axis2=2)
+            normal += least[:, None, None] * _EYE_6
+            inverse = np.linalg.inv(np.linalg.cholesky(normal))
+            half = inverse @ cross
+            flat = half.reshape(-1, half.shape[2])
+            told -= flat.T @ flat
             matrix[np.ix_(columns, columns)] += told[:-1, :-1]
             right[columns] += told[:-1, -1]
-            back.append((columns, solved))
+            back.append(_Back(columns, inverse, half))
         return _Normal(matrix, right, back)
 
+    def of_body(self, row: int) -> _Unknowns:
+        """Return the numbers of the unknowns that a body tells of."""
+        number = np.arange(self.size)
+        return _Unknowns(
+            number[self.rig].reshape(self._views, ORIENTATION_SIZE),
+            number[self.drift].reshape(self._views, 2, -1),
+            number[self.shape].reshape(len(self.bodies), -1)[row],
+            number[self.scale],
+            number[self.bias].reshape(*self.target_id.shape, self._views, 2)[row],
+        )
 
-def _design(
-    adjustment: RigAdjustment, linear: LinearPoints, row: int, unsure: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Unknowns (L,) that a body tells of, and the derivatives (T, M, F, 2, L) by them."""
-    shape = linear.residual[:, row].shape  # (T, M, F, 2)
-    _, markers, views, _ = shape
-    turned = linear.by_place[:, row] @ linear.poses.rotation[:, row, None, None]
-    by_rig = np.zeros((*shape, views, ORIENTATION_SIZE))
-    by_bias = np.zeros((*shape, markers, views, 2))
-    by_shape = np.zeros((*shape, markers, 3))
-    for f in range(views):
-        by_rig[:, :, f, :, f] = linear.by_orientation[:, row, :, f]
-        for m in range(markers):
-            by_bias[:, m, f, :, m, f] = np.eye(2)
-    for m in range(markers):
-        by_shape[:, m, :, :, m] = turned[:, m]
-    by_scale = turned @ linear.shape[row, :, None, :, None]
-    number = np.arange(adjustment.size)
-    parts = [
-        (number[adjustment.rig], by_rig),
-        (number[adjustment.shape].reshape(*adjustment.xyz.shape)[row], by_shape),
-        (number[adjustment.scale], by_scale),
-        (number[adjustment.bias].reshape(*adjustment.target_id.shape, -1)[row], by_bias),
-    ]
-    if unsure[adjustment.drift].any():
-        by_drift = np.zeros((*shape, views, 2, len(adjustment.functions[0])))
-        for f in range(views):
-            for axis in range(2):
-                by_drift[:, :, f, axis, f, axis] = linear.functions[:, row, :, f]
-        parts.append((number[adjustment.drift], by_drift))
-    columns = np.concatenate([numbers.ravel() for numbers, _ in parts])
-    design = np.concatenate([part.reshape(*shape, -1) for _, part in parts], axis=-1)
-    keep = unsure[columns]
-    good = linear.good[:, row, ..., None, None]
-    return columns[keep], np.where(good, design[..., keep], 0.0)
+
+class _Unknowns(NamedTuple):
+    """Numbers of the unknowns of the rig and of a body."""
+
+    rig: np.ndarray  # (F, 9)
+    drift: np.ndarray  # (F, 2, n)
+    shape: np.ndarray  # (3 M,)
+    scale: np.ndarray  # (1,)
+    bias: np.ndarray  # (M, F, 2)
+
+    def of_coordinate(self, view: int, axis: int) -> np.ndarray:
+        """Return those on which a coordinate of a view depends, in the order of `_design`."""
+        own = self.rig[view], self.drift[view, axis], self.shape, self.scale
+        return np.concatenate([*own, self.bias[:, view, axis]])
+
+
+def _summed(
+    adjustment: RigAdjustment,
+    linear: LinearPoints,
+    row: int,
+    weight: np.ndarray,
+    unsure: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Sum up the image points of a body with weights (T, M, F).
+
+    Returns the unknowns (L,) that it tells of, their normal matrix with the right side in the last
+    row and column, the same mixed with poses (T, 6, L + 1), and that of poses (T, 6, 6). A
+    coordinate of a view depends on few of the unknowns, so each is summed up on its own.
+    """
+    unknowns = adjustment.of_body(row)
+    columns = np.concatenate([part.ravel() for part in unknowns])
+    columns = columns[unsure[columns]]
+    place = np.zeros(adjustment.size, dtype=int)
+    place[columns] = np.arange(len(columns))
+    told = np.zeros((len(columns) + 1,) * 2)
+    cross = np.zeros((len(columns) + 1, len(weight), POSE_SIZE))
+    normal = np.zeros((len(weight), POSE_SIZE, POSE_SIZE))
+    of_pose = linear.by_pose(row)
+    for f, axis in np.ndindex(*unknowns.drift.shape[:2]):
+        root = np.sqrt(weight[..., f])[..., None]
+        number = unknowns.of_coordinate(f, axis)
+        kept = unsure[number]
+        design = _design(linear, row, f, axis)[..., np.append(kept, True)] * root
+        by_pose = np.swapaxes(of_pose[:, :, f, axis] * root, 1, 2)
+        rows = np.append(place[number[kept]], len(columns))
+        flat = design.reshape(-1, len(rows))
+        told[np.ix_(rows, rows)] += flat.T @ flat
+        cross[rows] += (by_pose @ design).transpose(2, 0, 1)
+        normal += by_pose @ np.swapaxes(by_pose, 1, 2)
+    return columns, told, cross.transpose(1, 2, 0), normal
+
+
+def _design(linear: LinearPoints, row: int, view: int, axis: int) -> np.ndarray:
+    """Derivatives (T, M, 9 + n + 3 M + 1 + M) of a coordinate of a body in a view, and residuals.
+
+    By the orientation of the view, the drift along the axis, shape, scale and the mean errors of
+    the correction.
+    """
+    by_place = linear.by_place[:, row, :, view, axis]  # (T, M, 3)
+    turned = by_place @ linear.poses.rotation[:, row]
+    exposures, count, _ = turned.shape
+    marker = np.arange(count)
+    by_shape = np.zeros((exposures, count, count, 3))
+    by_shape[:, marker, marker] = turned
+    return np.concatenate(
+        [
+            linear.by_orientation[:, row, :, view, axis],
+            linear.functions[:, row, :, view],
+            by_shape.reshape(exposures, count, -1),
+            np.sum(turned * linear.shape[row], axis=2, keepdims=True),
+            np.broadcast_to(np.eye(count), (exposures, count, count)),
+            linear.residual[:, row, :, view, axis, None],
+        ],
+        axis=2,
+    )
 
 
 @dataclass(frozen=True)
@@ -692,9 +747,8 @@ def moved_poses(poses: Poses, normal: _Normal, step: np.ndarray) -> Poses:
     """Move the poses by what they gain from a step (K,) of the other unknowns."""
     rotation = poses.rotation.copy()
     centre = poses.centre_mm.copy()
-    for row, (columns, solved) in enumerate(normal.back):
-        of_pose = solved[:, :, -1] - solved[:, :, :-1] @ step[columns]
-        of_pose = np.where(poses.known[:, row, None], of_pose, 0.0)
+    for row, back in enumerate(normal.back):
+        of_pose = np.where(poses.known[:, row, None], back.poses(step), 0.0)
         centre[:, row] += of_pose[:, :3]
         rotation[:, row] = matrix_from_vector(of_pose[:, 3:]) @ rotation[:, row]
     return replace(poses, rotation=rotation, centre_mm=centre)

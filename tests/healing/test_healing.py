@@ -101,12 +101,15 @@ def test_derivatives_are_those_of_differences():
         return LinearPoints.of(adjustment, observed, at, of).residual
 
     linear = LinearPoints.of(adjustment, observed, values, poses)
-    everything = np.ones(adjustment.size, dtype=bool)
     for row in range(BODIES):
-        columns, design = _design(adjustment, linear, row, everything)
-        for column in rng.choice(len(columns), 40, replace=False):
+        unknowns = adjustment.of_body(row)
+        design = np.zeros((*linear.residual[:, row].shape, adjustment.size))
+        for f, axis in np.ndindex(2, 2):
+            columns = unknowns.of_coordinate(f, axis)
+            design[:, :, f, axis, columns] = _design(linear, row, f, axis)[..., :-1]
+        for column in rng.choice(np.concatenate([each.ravel() for each in unknowns]), 40, False):
             step = np.zeros(adjustment.size)
-            step[columns[column]] = 1e-5
+            step[column] = 1e-5
             found = (residual(values - step) - residual(values + step))[:, row] / 2e-5
             np.testing.assert_allclose(design[..., column], found, atol=2e-3, rtol=2e-3)
         for axis in range(3):

@@ -337,6 +337,23 @@ def test_markers_and_bodies_that_have_changed_are_named():
     assert [(o.cause, o.body, o.markers) for o in found.changes] == [(Cause.EXCHANGED, 1, (0, 4))]
 
 
+def test_changes_of_a_body_that_cannot_explain_what_others_show_are_not_solved_for(monkeypatch):
+    tried = []
+    solve = Diagnostician._with
+
+    def noted(self, best, change, start):
+        tried.append(change.cause)
+        return solve(self, best, change, start)
+
+    monkeypatch.setattr(Diagnostician, '_with', noted)
+    scene = Scene(0)
+    moved = np.zeros(18)
+    moved[9:15] = [2.0, 2.0, 2.0, 0.004, 0.004, 0.004]
+    found = scene.diagnostician().diagnose(scene.observe(moved), scene.poses())
+    assert [one.cause for one in found.changes] == [Cause.ORIENTATION]
+    assert set(tried) == set(OF_RIG)
+
+
 @pytest.mark.long
 def test_no_further_cause_is_looked_for_after_one_that_is_enough():
     scene = Scene(30)

@@ -59,7 +59,7 @@ from .online import BODIES, NAMES, ROOT, _command, logged, rig_of_the_simulator
 RATE_HZ = 120
 HEALTHY_S = 25.0
 LEARNED_S = 15.0  # of these
-BUMPED_S = 240.0  # at most: the diagnosis takes a minute where other programs compute
+BUMPED_S = 240.0  # at most: the diagnosis takes longer where other programs compute
 ACCEPTED_S = 10.0  # that are counted with the healed rig
 COLLECTED_S = 5.0
 MOVED_MM = (3.0, -2.0, 3.5)  # 5 mm and 0.5 degrees

@@ -141,6 +141,7 @@ def _unseen_drift(
     observed = diagnosis.observed
     own = _coefficients(adjustment, fluoroscope)
     sd = diagnosis.prior.sd.copy()
+    smooth = sd[own]  # by the error of the correction
     sd[adjustment.rig] = 0.0
     sd[own] = 0.0
     certain = np.zeros_like(diagnosis.prior.orientation)
@@ -149,7 +150,6 @@ def _unseen_drift(
     exact = replace(diagnosis.prior, orientation=certain, sd=sd)
     told = adjustment.told(observed, exact, diagnosis.solution, known)
     parts = diagnostician.parts_of(Change(Cause.DISTORTION, fluoroscope))[:, own]
-    smooth = adjustment.healthy_prior(observed, 0.0).sd[own]  # by the error of the correction
     moments = told.only(own).with_noise(diagnosis.noise).mean_moments(parts, smooth)
     functions = adjustment.functions[fluoroscope]
     pixel = observed.pixel[..., fluoroscope, :][observed.seen[..., fluoroscope]]

@@ -27,7 +27,7 @@ from fluoro_calib_ros.correction.registry import CollocationModel
 from fluoro_calib_ros.correction.series import Functions, Series
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.healing.diagnosis import Cause
-from fluoro_calib_ros.healing.rig_adjustment import RigErrors, rig_errors
+from fluoro_calib_ros.healing.rig_errors import RigErrors, rig_errors
 from fluoro_calib_ros.jobs.healing import HealingOutcome, heal_rig
 from fluoro_calib_ros.jobs.learning import learn_shapes
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation

@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 from fluoro_calib_ros.bodies.body import solvable_bodies
 from fluoro_calib_ros.healing.diagnosis import Diagnosis, Diagnostician
 from fluoro_calib_ros.healing.healed_rig import HealedRig, healed_rig
-from fluoro_calib_ros.healing.rig_adjustment import rig_errors
+from fluoro_calib_ros.healing.rig_errors import rig_errors
 from fluoro_calib_ros.jobs.healing import HealingOptions, _chosen, _exposures_of, _Rig
 from tools.sections import write_section
 

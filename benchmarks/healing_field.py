@@ -20,7 +20,7 @@ from threadpoolctl import threadpool_limits
 
 from fluoro_calib_ros.bodies.correction_errors import REACH
 from fluoro_calib_ros.correction.fluoroscope_calibration import FluoroscopeCalibration
-from fluoro_calib_ros.healing.rig_adjustment import rig_errors
+from fluoro_calib_ros.healing.rig_errors import rig_errors
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 from fluoro_calib_ros.reconstruction.intersection import Intersector
 from tools.sections import write_section

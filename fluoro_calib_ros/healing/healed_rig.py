@@ -22,7 +22,8 @@ from scipy.linalg import eigh
 from ..correction.series import Functions
 from ..photogrammetry.rig_orientation import RigOrientation
 from .diagnosis import OF_RIG, Cause, Change, Diagnosis, Diagnostician
-from .rig_adjustment import RigAdjustment, drift_errors
+from .rig_adjustment import RigAdjustment
+from .rig_errors import drift_errors
 
 
 @dataclass(frozen=True)

@@ -259,10 +259,10 @@ class RigAdjustment:
         for row, (covariance, widened) in enumerate(zip(self._of_shapes, of_shapes)):
             first = self.shape.start + row * len(widened)
             rows = slice(first, first + len(widened))
-            root[rows, rows] = _root_of(covariance + np.diag(widened**2))
+            root[rows, rows] = root_of(covariance + np.diag(widened**2))
         number = np.arange(self.size)[self.bias].reshape(-1, self._views, 2)
         for f, covariance in enumerate(prior.correction):
-            own = _root_of(covariance)
+            own = root_of(covariance)
             for axis in range(2):
                 root[np.ix_(number[:, f, axis], number[:, f, axis])] = own
         return root[:, (root != 0).any(axis=0)]
@@ -713,7 +713,7 @@ def _shape_covariance(body: Body, count: int) -> np.ndarray:
     return out
 
 
-def _root_of(covariance: np.ndarray) -> np.ndarray:
+def root_of(covariance: np.ndarray) -> np.ndarray:
     """Root L of a covariance L L' that may be singular: of a motion of a whole body nothing."""
     variance, axes = np.linalg.eigh(covariance)
     rounding = len(variance) * np.finfo(float).eps * variance[-1]
@@ -752,96 +752,3 @@ def moved_poses(poses: Poses, normal: _Normal, step: np.ndarray) -> Poses:
         centre[:, row] += of_pose[:, :3]
         rotation[:, row] = matrix_from_vector(of_pose[:, 3:]) @ rotation[:, row]
     return replace(poses, rotation=rotation, centre_mm=centre)
-
-
-@dataclass(frozen=True)
-class RigErrors:
-    """Errors of points by those of a rig: relative to each other, and of all together."""
-
-    scale: float  #: standard deviation of the scale
-    place_mm: float  #: of a coordinate, where all points move together freely
-    #: RMS distance by which points move together, as a rigid body
-    common_mm: float
-
-
-def rig_errors(orientation: RigOrientation, points_mm: NDArray[np.float64]) -> RigErrors:
-    """Return the errors of points (n, 3) by the errors of an orientation.
-
-    The points move by -(A'A)^-1 A'B do (see `intersection`). Their scale is what they have in
-    common with a similarity about their centre, the rest what a rigid motion leaves.
-    """
-    image = _Intersected.of(orientation, points_mm)
-    return _errors(points_mm, image.moved(image.by_rig) @ orientation.covariance_root())
-
-
-def drift_errors(
-    adjustment: RigAdjustment, covariance: NDArray[np.float64], points_mm: NDArray[np.float64]
-) -> tuple[RigErrors, float]:
-    """Return the errors of points (n, 3) by those of rig and drifts, with a covariance (K, K).
-
-    Also returns the RMS distance [mm] by which noise of 1 px moves a point.
-    """
-    image = _Intersected.of(adjustment.orientation, points_mm)
-    functions = adjustment.functions_at(image.uv)
-    _, views, count = functions.shape
-    by_drift = np.zeros((len(points_mm), views, 2, views, 2, count))
-    for f in range(views):
-        for axis in range(2):
-            by_drift[:, f, axis, f, axis] = functions[:, f]
-    derivatives = [image.by_rig, by_drift.reshape(*image.by_rig.shape[:3], -1)]
-    rows = np.r_[adjustment.rig, adjustment.drift]
-    root = _root_of(covariance[np.ix_(rows, rows)])
-    noise = np.sqrt(np.mean(np.sum(image.by_uv**2, axis=(1, 2))))
-    moved = image.moved(np.concatenate(derivatives, axis=-1)) @ root
-    return _errors(points_mm, moved), float(noise)
-
-
-@dataclass(frozen=True)
-class _Intersected:
-    """Image points uv (n, F, 2) of points (n, 3), and how the points follow from them.
-
-    by_rig (n, F, 2, 9F): derivatives of the image points by the orientation. by_uv (n, 3, 2F):
-    of the points by the image points.
-    """
-
-    uv: np.ndarray
-    by_rig: np.ndarray
-    by_uv: np.ndarray
-
-    @classmethod
-    def of(cls, orientation: RigOrientation, points_mm: np.ndarray) -> _Intersected:
-        cameras = Cameras(orientation, np.zeros((1, len(points_mm)), dtype=int))
-        views = len(orientation.fluoroscopes)
-        shape = (1, len(points_mm), views)
-        empty = ImagePoints(
-            np.zeros((*shape, 2)), np.ones(shape), np.zeros(shape), np.ones(shape, dtype=bool)
-        )
-        linear = cameras.linear(points_mm[None], (np.eye(3)[None], np.zeros((1, 3))), empty)
-        by_place = linear.by_place[0].reshape(len(points_mm), -1, 3)
-        by_rig = np.zeros((len(points_mm), views, 2, views, ORIENTATION_SIZE))
-        by_orientation = cameras.by_orientation(linear)[0]
-        for f in range(views):
-            by_rig[:, f, :, f] = by_orientation[:, f]
-        transposed = np.swapaxes(by_place, 1, 2)
-        by_uv = np.linalg.solve(transposed @ by_place, transposed)
-        return cls(linear.uv[0], by_rig.reshape(*by_rig.shape[:3], -1), by_uv)
-
-    def moved(self, derivatives: np.ndarray) -> np.ndarray:
-        """Return by how much points move (3n, k), from derivatives (n, F, 2, k) of their views."""
-        flat = derivatives.reshape(len(self.uv), -1, derivatives.shape[-1])
-        return np.asarray(-(self.by_uv @ flat).reshape(-1, flat.shape[2]))
-
-
-def _errors(points_mm: np.ndarray, moved: np.ndarray) -> RigErrors:
-    """Errors of points (n, 3) that move by moved (3n, k), times unknowns of variance one."""
-    arm = points_mm - points_mm.mean(axis=0)
-    rigid = np.concatenate([np.broadcast_to(np.eye(3), (len(arm), 3, 3)), -cross_matrix(arm)], 2)
-    rigid = rigid.reshape(-1, POSE_SIZE)
-    similar = np.column_stack([rigid, arm.ravel()])
-    scale = np.linalg.pinv(similar)[-1] @ moved
-    common = rigid @ (np.linalg.pinv(rigid) @ moved)
-    by_coordinate = (np.sqrt(np.mean(np.sum(x**2, axis=1))) for x in (moved - common, common))
-    place_mm, common_mm = map(float, by_coordinate)
-    return RigErrors(
-        float(np.sqrt(scale @ scale)), place_mm, common_mm=float(np.sqrt(3)) * common_mm
-    )

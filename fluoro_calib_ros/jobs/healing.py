@@ -41,7 +41,8 @@ from ..healing.diagnosis import (
     Diagnostician,
 )
 from ..healing.healed_rig import HealedRig, healed_rig, unseen_distortion
-from ..healing.rig_adjustment import ObservedBodies, Poses, RigAdjustment, RigErrors, rig_errors
+from ..healing.rig_adjustment import ObservedBodies, Poses, RigAdjustment
+from ..healing.rig_errors import RigErrors, rig_errors
 from ..io.access import PathLike
 from ..io.calibration import ORIENTATION_NAME as ORIENTATION
 from ..io.calibration import SUFFIX, save_calibration, save_orientation

@@ -22,9 +22,8 @@ from fluoro_calib_ros.healing.rig_adjustment import (
     Poses,
     RigAdjustment,
     _design,
-    _errors,
-    rig_errors,
 )
+from fluoro_calib_ros.healing.rig_errors import _errors, rig_errors
 from fluoro_calib_ros.healing.sizes import SIZES
 
 NOISE_PX = 0.2

@@ -14,7 +14,7 @@ from fluoro_calib_ros.bodies.body import Body
 from fluoro_calib_ros.checks.check import verdict_of
 from fluoro_calib_ros.cli.heal import _lines
 from fluoro_calib_ros.healing.diagnosis import Cause, Change
-from fluoro_calib_ros.healing.rig_adjustment import RigErrors
+from fluoro_calib_ros.healing.rig_errors import RigErrors
 from fluoro_calib_ros.jobs import healing
 
 TARGET_ID = np.array([[0, 1, 2, 3], [10, 11, 12, -1]])

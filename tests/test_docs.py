@@ -46,6 +46,15 @@ def test_pages_that_sources_name_exist():
     assert named and not [name for name in named if not (ROOT / name).exists()]
 
 
+def test_picture_of_the_rooms_shows_those_that_there_are():
+    """From the top down, as the import contract orders them; entry_points only names others."""
+    layers = re.search(r'^layers = \[(.*?)^\]', (ROOT / 'pyproject.toml').read_text(), re.M | re.S)
+    rooms = re.findall(r'\w+', layers[1])
+    picture = (ROOT / 'docs/images/architecture.svg').read_text()
+    drawn = re.findall(r'font-weight="bold">(\w+)<', picture)
+    assert drawn == [room for room in rooms if room != 'entry_points']
+
+
 def test_section_is_replaced_between_its_marks(tmp_path):
     page = tmp_path / 'page.md'
     page.write_text('# Page\n\n<!-- begin: a -->\n\nold\n\n<!-- end: a -->\n\nrest\n')

@@ -12,9 +12,9 @@ strongest ones. Both hold for three beads as for thousands.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -56,34 +56,52 @@ MIN_CONTRAST = 0.05  # of a bead, as a fraction of the light around it
 
 
 @dataclass(frozen=True)
+class Look:
+    """How an image shows beads."""
+
+    radius_px: float  #: of a typical bead
+    inverted: bool  #: beads are bright
+    noise: Noise | None = None  #: of the image, None where it is to be estimated
+    alike: bool = False  #: no bead is much larger than a typical one
+
+
+@dataclass(frozen=True)
 class Detections:
     """Blobs of an image, and what they were found with."""
 
     light: Light  #: grey values, turned round where beads are bright, so that beads are dark
     noise: Noise  #: of the light
     uv: NDArray[np.float64]  #: (n, 2), centres [px], to some 0.1 px
-    #: (n,), response at a wider scale, 1 for a typical bead; it increases with the size
-    strength: NDArray[np.float64]
+    scale: float  #: of the blur with which they were found [px]
     radius_px: float  #: radius of a typical bead with its blur [px]
     inverted: bool  #: beads are bright in the image
 
+    @cached_property
+    def strength(self) -> NDArray[np.float64]:
+        """Responses (n,) at a scale beyond that of most beads, 1 for a typical one.
+
+        There they increase with the size of a bead; at its own scale they hardly do.
+        """
+        column, row = np.rint(self.uv).astype(int).T
+        (response,) = responses(self.light.grey, WIDER[-1] * self.scale, (False,))
+        relative = response[row, column] / _light_around(self.light.grey, self.scale)[row, column]
+        return np.asarray(relative / max(float(np.median(relative)), 1e-9), dtype=float)
+
 
 def detect_beads(
-    image: np.ndarray,
-    beads: int = 2 * MOST_TYPICAL,
-    radius_px: float | None = None,
-    inverted: bool | None = None,
+    image: np.ndarray, beads: int = 2 * MOST_TYPICAL, look: Look | None = None
 ) -> Detections:
     """Find the beads of an image (h, w) of uint8 or uint16.
 
-    beads is the number of beads of the phantom, radius_px the radius of a typical one, and
-    inverted whether they are bright; where these are not known, the likeliest are taken. Raises
-    DataError, in one sentence, for an image without beads.
+    beads is the number of beads of the phantom. Where it is not known how the image shows them,
+    the likeliest size and polarity are taken. Raises DataError, in one sentence, for an image
+    without beads.
     """
-    if radius_px is None or inverted is None:
+    if look is None:
         return next(likely_detections(image, beads))
-    sight = _Sight.of(image, beads)
-    found = sight.detections(max(radius_px / BLOB_RADIUS, 1.0), inverted)
+    sight = _Sight.of(image, beads, look.noise)
+    scale = max(look.radius_px / BLOB_RADIUS, 1.0)
+    found = sight.detections(scale, look.inverted, look.alike)
     if found is None:
         raise _nothing(image, sight)
     return found
@@ -120,11 +138,12 @@ class _Sight:
     typical: int
 
     @classmethod
-    def of(cls, image: np.ndarray, beads: int) -> _Sight:
+    def of(cls, image: np.ndarray, beads: int, noise: Noise | None = None) -> _Sight:
         """Return what is needed to find so many beads in an image. Raises DataError."""
         _check(image)
         grey = image.astype(np.float32)
-        noise = estimate_noise(grey, (image > image.min()) & (image < image.max()))
+        if noise is None:
+            noise = estimate_noise(grey, (image > image.min()) & (image < image.max()))
         typical = int(np.clip(SEEN_SHARE * beads, LEAST_TYPICAL, MOST_TYPICAL))
         return cls(grey, noise, typical)
 
@@ -164,7 +183,7 @@ class _Sight:
 
     def blobs(self, scale: float, inverted: bool) -> _Blobs:
         """Return the dark or bright blobs of the image."""
-        return next(islice(_blobs(self.grey, self.noise, scale), inverted, None))
+        return _blobs(self.grey, self.noise, scale, polarities=(inverted,))[0]
 
     def merged(self, blobs: _Blobs, scale: float, inverted: bool) -> NDArray[np.float64]:
         """Return places (n, 2) of beads, several in one large bead as one.
@@ -187,7 +206,7 @@ class _Sight:
                 interpolation=cv2.INTER_AREA,
             )
             wide = larger * scale
-            found = next(islice(_blobs(part, self.noise, wide / factor, factor), inverted, None))
+            found = _blobs(part, self.noise, wide / factor, factor, (inverted,))[0]
             near = tree.query_ball_point(found.uv, BLOB_RADIUS * wide)
             for place, relative, rows in zip(found.uv, found.relative, near):
                 inside = [row for row in rows if not merged[row]]
@@ -206,8 +225,11 @@ class _Sight:
             best = max(best, float((blobs.response / light).max(initial=0.0)))
         return best
 
-    def detections(self, scale: float, inverted: bool) -> Detections | None:
-        """Return what is found with a scale and a polarity, None for nothing."""
+    def detections(self, scale: float, inverted: bool, alike: bool = False) -> Detections | None:
+        """Return what is found with a scale and a polarity, None for nothing.
+
+        alike: no bead is much larger than a typical one.
+        """
         grey = self.grey
         light = float(grey.max()) - grey if inverted else grey
         low, high = clipped_at(light)
@@ -216,16 +238,15 @@ class _Sight:
             # Holes of a sheet are bright, and there is no light beyond the field either.
             field &= field_of_view(grey, scale)
         for wider in WIDER:
-            blobs = self.blobs(wider * scale, inverted)
-            uv = self.merged(_beads(blobs, field, self.typical), wider * scale, inverted)
+            blobs = _beads(self.blobs(wider * scale, inverted), field, self.typical)
+            uv = blobs.uv if alike else self.merged(blobs, wider * scale, inverted)
             if len(uv):
-                around = np.maximum(_background(light, scale), 1e-3 * light.max())
-                uv, radius = set_apart(light / around, uv)
+                uv, radius = set_apart(light / _light_around(light, scale), uv)
                 return Detections(
                     Light(light, field, low, high),
                     estimate_noise(light, field) if inverted else self.noise,
                     uv=uv,
-                    strength=_strengths(light, around, uv, scale),
+                    scale=scale,
                     radius_px=radius or scale * BLOB_RADIUS,
                     inverted=inverted,
                 )
@@ -341,15 +362,34 @@ def _check(image: np.ndarray) -> None:
         )
 
 
-def _blobs(grey: np.ndarray, noise: Noise, scale: float, factor: int = 1) -> Iterator[_Blobs]:
-    """Yield the dark, then the bright blobs of an image (h, w) that is reduced by a factor."""
+def _blobs(
+    grey: np.ndarray,
+    noise: Noise,
+    scale: float,
+    factor: int = 1,
+    polarities: Sequence[bool] = (False, True),
+) -> list[_Blobs]:
+    """Return the dark and the bright blobs of an image (h, w) that is reduced by a factor.
+
+    polarities: whether those wanted are bright.
+    """
     background = _background(grey, scale)
-    sd = np.sqrt(noise.variance(background)) * (_noise_of_response(noise, scale * factor))
-    dark, bright = responses(grey, scale)
+    per_sd = MIN_SNR * _noise_of_response(noise, scale * factor)
     top = float(grey.max())
     floor = 1e-3 * top
-    yield _found(dark, sd, np.maximum(background, floor), scale, factor)
-    yield _found(bright, sd, np.maximum(top - background, floor), scale, factor)
+    out = []
+    for inverted, response in zip(polarities, responses(grey, scale, polarities)):
+        v, u = _maxima(response, scale, per_sd * np.sqrt(noise.variance(background.min())))
+        strong = response[v, u] > per_sd * np.sqrt(noise.variance(background[v, u]))
+        v, u = v[strong], u[strong]
+        light = top - background if inverted else background
+        before, at, after, above, below = (
+            response[row, column] / np.maximum(light[row, column], floor)
+            for row, column in ((v, u - 1), (v, u), (v, u + 1), (v - 1, u), (v + 1, u))
+        )
+        uv = np.column_stack([u + vertex(before, at, after), v + vertex(above, at, below)])
+        out.append(_Blobs(factor * (uv + 0.5) - 0.5, response[v, u], at))
+    return out
 
 
 def _background(grey: np.ndarray, scale: float) -> np.ndarray:
@@ -361,6 +401,11 @@ def _background(grey: np.ndarray, scale: float) -> np.ndarray:
     coarse = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
     smooth = cv2.GaussianBlur(coarse, (0, 0), blur / factor)
     return cv2.resize(smooth, (width, height), interpolation=cv2.INTER_LINEAR)
+
+
+def _light_around(light: np.ndarray, scale: float) -> np.ndarray:
+    """Light (h, w) around beads of a scale, positive."""
+    return np.maximum(_background(light, scale), 1e-3 * light.max())
 
 
 def _noise_of_response(noise: Noise, scale: float) -> float:
@@ -383,22 +428,18 @@ def _noise_of_response(noise: Noise, scale: float) -> float:
     return float(np.sqrt(max(variance, along[lags] * across[lags])))
 
 
-def responses(grey: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """Responses (h, w) to dark and to bright blobs: the smaller eigenvalue, or 0."""
-    dark, bright = np.empty((2, *grey.shape), dtype=np.float32)
-    for rows, mean, spread in _curvatures(grey, scale):
-        np.maximum(mean - spread, 0, out=dark[rows])
-        mean += spread
-        np.maximum(np.negative(mean, out=mean), 0, out=bright[rows])
-    return dark, bright
+def responses(
+    grey: np.ndarray, scale: float, polarities: Sequence[bool] = (False, True)
+) -> list[np.ndarray]:
+    """Responses (h, w) to dark and to bright blobs: the smaller eigenvalue, or 0.
 
-
-def dark_response(grey: np.ndarray, scale: float) -> np.ndarray:
-    """Response (h, w) to dark blobs alone."""
-    out = np.empty(grey.shape, dtype=np.float32)
+    polarities: whether the blobs are bright.
+    """
+    out = [np.empty(grey.shape, dtype=np.float32) for _ in polarities]
     for rows, mean, spread in _curvatures(grey, scale):
-        mean -= spread
-        np.maximum(mean, 0, out=out[rows])
+        for inverted, response in zip(polarities, out):
+            smaller = -mean - spread if inverted else mean - spread
+            np.maximum(smaller, 0, out=response[rows])
     return out
 
 
@@ -432,29 +473,17 @@ def _curvatures(grey: np.ndarray, scale: float) -> Iterator[tuple[slice, np.ndar
         yield slice(first, last), mean, spread
 
 
-def _found(
-    response: np.ndarray, sd: np.ndarray, background: np.ndarray, scale: float, factor: int
-) -> _Blobs:
-    """Local maxima of a response (h, w) that rise above its noise, away from the border."""
+def _maxima(
+    response: np.ndarray, scale: float, least: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows and columns (n,) of local maxima of a response (h, w), away from the border."""
     size = 2 * max(1, round(scale)) + 1
-    dilated = cv2.dilate(response, np.ones((size, size), np.uint8))
-    mask = response >= dilated
-    mask &= response > MIN_SNR * sd
+    mask = response >= cv2.dilate(response, np.ones((size, size), np.uint8))
+    mask &= response > least
     mask[[0, -1]] = False
     mask[:, [0, -1]] = False
     v, u = np.divmod(np.flatnonzero(mask), mask.shape[1])
-
-    def relative(row: np.ndarray, column: np.ndarray) -> np.ndarray:
-        return np.asarray(response[row, column] / background[row, column])
-
-    at = relative(v, u)
-    uv = np.column_stack(
-        [
-            u + vertex(relative(v, u - 1), at, relative(v, u + 1)),
-            v + vertex(relative(v - 1, u), at, relative(v + 1, u)),
-        ]
-    )
-    return _Blobs(factor * (uv + 0.5) - 0.5, response[v, u], at)
+    return v, u
 
 
 def _beads(blobs: _Blobs, field: NDArray[np.bool_], count: int) -> _Blobs:
@@ -463,19 +492,6 @@ def _beads(blobs: _Blobs, field: NDArray[np.bool_], count: int) -> _Blobs:
     values = np.where(inside, blobs.relative, 0)
     typical = _typical(values[inside], min(count, max(int(inside.sum()), 1)))
     return blobs.chosen(inside & (values > MIN_SHARE * typical) & (typical >= MIN_CONTRAST))
-
-
-def _strengths(
-    light: np.ndarray, around: np.ndarray, uv: NDArray[np.float64], scale: float
-) -> NDArray[np.float64]:
-    """Responses (n,) to beads at a scale beyond that of most, 1 for a typical one.
-
-    There they increase with the size of a bead; at its own scale they hardly do.
-    """
-    column, row = np.rint(uv).astype(int).T
-    response = dark_response(light, WIDER[-1] * scale)
-    relative = response[row, column] / around[row, column]
-    return np.asarray(relative / max(float(np.median(relative)), 1e-9), dtype=float)
 
 
 def vertex(before: np.ndarray, at: np.ndarray, after: np.ndarray) -> np.ndarray:

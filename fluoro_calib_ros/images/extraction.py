@@ -15,7 +15,7 @@ from threadpoolctl import ThreadpoolController
 
 from ..errors import DataError
 from ..findings import Finding, Kind
-from .detection import Detections, detect_beads, likely_detections
+from .detection import Detections, Look, detect_beads, likely_detections
 from .following import Far, follow
 from .growth import Match, Seen, nearby_residuals, supported
 from .matching import PhantomModel, match
@@ -95,6 +95,13 @@ class Nearby:
     inverted: bool  #: beads are bright
     far: Far | None = None  #: for images that were left out since
 
+    @property
+    def look(self) -> Look:
+        """How beads are expected to look."""
+        # The noise of the image where beads are bright is not that of the image turned round.
+        noise = None if self.inverted else self.imaging.noise
+        return Look(self.radius_px, self.inverted, noise, alike=self.imaging.sizes_are_alike)
+
 
 def extract_beads(
     image: np.ndarray, model: PhantomModel, lens: Lens, near: Nearby | None = None
@@ -120,7 +127,7 @@ def _searched(image: np.ndarray, model: PhantomModel, lens: Lens) -> Extraction:
     """Return the extraction by a search for the pose. Raises DataError."""
     first: DataError | None = None
     for detections in likely_detections(image, len(model.xyz)):
-        seen = _seen(detections)
+        seen = _seen(detections, model)
         try:
             found = match(seen, model, lens)
             return _measured(detections, seen, found, model)
@@ -135,10 +142,10 @@ def _searched(image: np.ndarray, model: PhantomModel, lens: Lens) -> Extraction:
 def _followed(image: np.ndarray, model: PhantomModel, near: Nearby) -> Extraction | None:
     """Return the extraction from an exposure nearby, None where it does not lead to the pose."""
     try:
-        detections = detect_beads(image, len(model.xyz), near.radius_px, near.inverted)
+        detections = detect_beads(image, len(model.xyz), near.look)
         if image.shape != near.view.lens.image_size[::-1]:
             return None
-        seen = _seen(detections)
+        seen = _seen(detections, model)
         found = follow(seen, model, near.view, near.scale_px, near.far)
         if found is None:
             return None
@@ -150,9 +157,12 @@ def _followed(image: np.ndarray, model: PhantomModel, near: Nearby) -> Extractio
     return replace(followed, followed=True)
 
 
-def _seen(detections: Detections) -> Seen:
+def _seen(detections: Detections, model: PhantomModel) -> Seen:
     return Seen.of(
-        detections.uv, detections.light.field, detections.radius_px, detections.strength
+        detections.uv,
+        detections.light.field,
+        detections.radius_px,
+        strength=detections.strength if model.sizes_differ else None,
     )
 
 

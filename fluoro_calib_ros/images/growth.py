@@ -162,6 +162,7 @@ def settle(view: View, xyz: np.ndarray, seen: Seen) -> Match | None:
     bead = detection = np.zeros(0, dtype=int)
     residual = np.zeros_like(xyz[:, :2])
     for step in range(LAST_STEPS):
+        before = bead, detection
         predicted = view.project(xyz) + residual
         row = np.flatnonzero(seen.in_field(predicted))
         if len(row) < 4:
@@ -172,6 +173,8 @@ def settle(view: View, xyz: np.ndarray, seen: Seen) -> Match | None:
         bead = row[bead]
         if len(bead) < MIN_SHARE * len(row) and step:
             return None
+        if all(map(np.array_equal, before, (bead, detection))):
+            break
         view, scale = fit_view(view, xyz[bead], seen.uv[detection], 2)
         residual = nearby_residuals(view, xyz, bead, seen.uv[detection]).value
         tolerance = max(0.6 * tolerance, min(LAST_TOLERANCE_PX, seen.tolerance_px))

@@ -169,8 +169,11 @@ def correlation_of(residual: np.ndarray, valid: np.ndarray) -> np.ndarray:
 
 
 HIGHEST = 9  # half waves across a window
-TELLING = 6  # of those that tell the strength: 0.97 of the variance is in them
+# Principal components of the background beyond a polynomial that tell the strength: 0.9 of its
+# variance is in them.
+TELLING = 26
 EXPONENT = 3.0
+POLYNOMIAL = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # powers of x and y
 # Ratios of the variance of the background to that of the noise that are compared. Steps of a
 # factor of 2 change a standard deviation by less than a quarter of what the ratio itself leaves
 # open.
@@ -201,13 +204,16 @@ class Cosines:
         power = np.sum(number**2, axis=1) ** (-EXPONENT / 2)
         # Of one unit of strength a pixel has one unit of variance.
         self.variance = power / (power @ np.mean(self.waves**2, axis=1))
-        telling = np.sum(number**2, axis=1) <= TELLING**2
-        self.telling = self.waves[telling] * np.sqrt(self.variance[telling, None]).astype(dtype)
+        polynomial, _ = np.linalg.qr(np.stack([x**i * y**j for i, j in POLYNOMIAL], axis=1))
+        beyond = np.sqrt(self.variance)[:, None] * self.waves
+        beyond -= (beyond @ polynomial) @ polynomial.T
+        _, vectors = np.linalg.eigh(beyond @ beyond.T)
+        self.telling = (vectors[:, -TELLING:].T @ beyond).astype(dtype)
 
     def spectra(
         self, relative: np.ndarray, jacobian: np.ndarray, weight: np.ndarray, residual: np.ndarray
     ) -> Spectra:
-        """Project the residuals of windows on the cosines that tell the strength.
+        """Project the residuals of windows on what tells the strength.
 
         relative: (g, m) light behind the beads, as a fraction of that without them. jacobian: (g,
         u, m) derivatives of the light by the unknowns that are estimated with it. weight,

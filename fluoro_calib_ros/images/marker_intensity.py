@@ -26,7 +26,6 @@ from .detection import (
     BLOB_RADIUS,
     MIN_SIZE,
     SCALES,
-    dark_response,
     field_of_view,
     responses,
     vertex,
@@ -266,7 +265,7 @@ def search_image(image: np.ndarray, look: MarkerLook, share: float) -> Shadows:
     grey = image.astype(np.float32)
     light = float(np.iinfo(image.dtype).max) - grey if look.inverted else grey
     around = cv2.blur(light, (2 * BACKGROUND_PX + 1,) * 2)
-    response = dark_response(light, look.scale)
+    (response,) = responses(light, look.scale, (False,))
     return _found(look, FilteredLight(look.scale, look.inverted, light, response, around), share)
 
 
@@ -339,7 +338,8 @@ def search_windows(
     size = 2 * (half + border) + 1
     grey, valid = windows.read(middle, _square(half + border))
     around = cv2.blur(grey.reshape(-1, size), (2 * WINDOW_BACKGROUND_PX + 1, 1))
-    response = _relative(dark_response(grey.reshape(-1, size), look.scale), around, look)
+    (response,) = responses(grey.reshape(-1, size), look.scale, (False,))
+    response = _relative(response, around, look)
     response = response.reshape(len(middle), size, size)
     response *= valid.reshape(response.shape)
     # The seams between windows lie in their borders.

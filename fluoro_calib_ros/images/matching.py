@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 from ..errors import DataError
 from ..findings import Kind
 from ..photogrammetry.rotations import rotation_angle
-from .growth import Match, Seen, grow, settle, start_view
+from .growth import LAST_TOLERANCE_PX, Match, Seen, grow, settle, start_view
 from .lattice import FlatGrid, GridPose, grid_poses
 from .pose_search import Triples, enough_seeds, local_poses, nearby_map, triples_of
 from .view import Lens, View, fit_view
@@ -126,6 +126,12 @@ class PhantomModel:
             grid=grid,
             regular=regular,
         )
+
+    @property
+    def sizes_differ(self) -> bool:
+        """Whether sizes tell beads apart."""
+        diameter = self.diameter_mm
+        return diameter is not None and np.ptp(diameter) >= MIN_SIZES * diameter.min()
 
     @cached_property
     def _triples(self) -> dict[int, Triples]:
@@ -292,7 +298,7 @@ def _best_by_size(matches: list[Match], seen: Seen, model: PhantomModel) -> Matc
     Matches are compared by the likelihood of the responses to the beads that all of them have.
     """
     diameter = model.diameter_mm
-    if seen.strength is None or diameter is None or np.ptp(diameter) < MIN_SIZES * diameter.min():
+    if seen.strength is None or diameter is None or not model.sizes_differ:
         return None
     common = set.intersection(*(set(one.detection.tolist()) for one in matches))
     if len(common) < MIN_BEADS:
@@ -363,7 +369,8 @@ def _alternatives(
             RIVAL_STEPS,
             0.3,
         )
-        rival = settle(view, model.xyz, seen) if scale <= seen.tolerance_px else None
+        # In the end, beads are matched within this.
+        rival = settle(view, model.xyz, seen) if scale <= LAST_TOLERANCE_PX else None
         if rival is not None:
             yield rival
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from .detection import vertex
+from .detection import LARGER, vertex
 from .light import Light, Noise
 from .shadow_fit import (
     DEPTH_SD,
@@ -57,6 +57,9 @@ MOST = 2.0  # factor between the radius of a bead and that of its detection
 START_BLUR_PX = 0.9
 START_ATTENUATION = 1.5
 START_SCATTER = 0.1
+# Largest step of a coordinate of a bead that has settled: the next one is some ten times shorter,
+# and the centres of the sharpest beads are known to 0.01 px.
+SETTLED_PX = 0.003
 MAX_SHIFT_PX = 4.0  # of a centre, beyond which the fit has lost its bead
 RADIUS_SD = 0.01  # of the radius of a shadow: what profile and distortion leave open
 # The same where the light about it is clipped, of which less than a part is below that. Only the
@@ -238,28 +241,39 @@ class _BeadFit(ShadowFit):
         self.usable &= from_edge >= self.profile.radius_px * self.radius
 
     def run(self, steps: int) -> None:
-        """Take Gauss-Newton steps; the last one gives standard deviations as well."""
+        """Take Gauss-Newton steps; the last one gives standard deviations as well.
+
+        Beads that have settled take part in the first two steps, in the last one, and where what
+        is known of their windows changes.
+        """
+        active = np.ones(len(self.uv), dtype=bool)
         for step in range(steps):
+            final = step == steps - 1
+            active |= final
             if step in self.settings.crossing_steps:
-                self._cross()
-            moved = [self._step(rows, near, final=step == steps - 1) for rows, near in self.groups]
-            if step == steps // 2:
-                self.disturbed = self.misfit > DISTURBED * self.typical()
-                if steps >= STEPS:
-                    self._add_texture()
-            for (rows, _), (uv, depth, background) in zip(self.groups, moved):
+                active |= self._cross()
+            groups = [(rows[active[rows]], near[active[rows]]) for rows, near in self.groups]
+            moved = [self._step(rows, near, final) for rows, near in groups]
+            for (rows, _), (uv, depth, background) in zip(groups, moved):
                 lost = np.linalg.norm(uv - self.start[rows], axis=1) > MAX_SHIFT_PX
                 self.usable[rows[lost]] = False
+                active[rows] = (np.abs(uv - self.uv[rows]) > SETTLED_PX).any(axis=1) | (step == 0)
                 kept = rows[~lost]
                 self.uv[kept] = uv[~lost]
                 self.depth[kept] = depth[~lost]
                 self.background[kept] = background[~lost]
+            if step == steps // 2:
+                self.disturbed = self.misfit > DISTURBED * self.typical()
+                if steps >= STEPS:
+                    self._add_texture()
+                active |= self.disturbed | (self.strength > 0)
 
-    def _cross(self) -> None:
+    def _cross(self) -> NDArray[np.bool_]:
         """Note what shadows that touch have together, beyond the product of both.
 
-        It is computed of the two nearest neighbours.
+        It is computed of the two nearest neighbours. Returns the beads (n,) of which it is.
         """
+        crossed = np.zeros(len(self.uv), dtype=bool)
         if self.crossing is None:
             self.crossing = np.zeros((len(self.uv), len(self.offset)), dtype=np.float32)
         reach = 2 * (self.profile.radius_px + self.profile.blur_px)
@@ -273,6 +287,8 @@ class _BeadFit(ShadowFit):
                 chosen = rows[touching]
                 members = np.concatenate([chosen[:, None], near[touching, :2]], axis=1)
                 self.crossing[chosen] = self._crossing(chosen, members)
+                crossed[chosen] = True
+        return crossed
 
     def _crossing(self, rows: np.ndarray, members: np.ndarray) -> np.ndarray:
         """Differences (g, m) for windows of beads (g,) and shadows of members (g, k) or -1."""
@@ -449,6 +465,11 @@ class Imaging:
     profile: Profile  #: of a typical bead
     #: (n,), of all beads of the phantom, 1 for a typical one, NaN where it is not known
     size: NDArray[np.float64]
+
+    @property
+    def sizes_are_alike(self) -> bool:
+        """Whether no bead is much larger than a typical one."""
+        return bool((self.size < LARGER[0]).all())
 
     def completed(self, light: Light, shadows: Expected) -> Imaging:
         """Return it with the sizes of beads that were not known and stand alone here."""

@@ -38,7 +38,7 @@ FINE = 3  # points across a pixel of the grid on which shadows that touch are bl
 OVERLAP = 0.85  # times both reaches; shadows that are nearer overlap
 DISTURBED = 1.6  # lack of fit from which pixels with large residuals count less
 AT_ONCE = 2**18  # derivatives that are computed together, 1 MB: they fit a cache
-CORRELATED = 60  # windows that tell the correlation of the noise
+CORRELATED = 180  # windows that tell the correlation of the noise
 INFLUENCES = 20  # beads of whose pixels the influence is computed
 UNDISTURBED = 4.0  # times the median lack of fit, of a window without anything else
 ROBUST = 2.5  # residual of half weight [standard deviations of the noise]
@@ -296,42 +296,42 @@ class ShadowFit(ABC):
 
     def _add_texture(self) -> None:
         """Give beads a background beyond the polynomial where pixels say so."""
-        usual = self.typical()
-        parts = [self._standardised(rows, near) for rows, near in self.groups]
-        plain = [
-            np.flatnonzero(self.misfit[rows] <= usual)[:CORRELATED] for rows, _ in self.groups
-        ]
-        residual, root = (
-            np.concatenate([part[each][chosen] for part, chosen in zip(parts, plain)])
-            for each in (0, 1)
-        )
-        valid = root > 0
+        rows, residual, root, jacobians = self._standardised()
+        plain = np.flatnonzero(self.misfit[rows] <= self.typical())
+        plain = plain[:: len(plain) // CORRELATED + 1]
+        valid = root[plain] > 0
         # Where the shadow is not quite that of a sphere, all windows show it: that is no noise.
-        common = residual.sum(axis=0) / np.maximum(valid.sum(axis=0), 1)
-        self.correlation = self._correlation((residual - common) * valid, valid)
+        common = residual[plain].sum(axis=0) / np.maximum(valid.sum(axis=0), 1)
+        self.correlation = self._correlation((residual[plain] - common) * valid, valid)
+        rest = (residual - common) / np.maximum(root, DTYPE(1e-12))
+        weight = root**2
         spectra = []
-        for (rows, near), (residual, root) in zip(self.groups, parts):
-            for some, beside in _parts(np.arange(len(rows)), near, len(self.offset)):
-                _, jacobian = self._model(rows[some], beside)
-                # In double precision: waves that a small window hardly sees are nearly alike.
-                rest = (residual[some] - common) / np.maximum(root[some], 1e-12)
-                spectra.append(
-                    self.cosines.spectra(
-                        jacobian[:, 0], jacobian=jacobian, weight=root[some] ** 2, residual=rest
-                    )
+        first = 0
+        for jacobian in jacobians:
+            part = slice(first, first + len(jacobian))
+            first += len(jacobian)
+            spectra.append(
+                self.cosines.spectra(
+                    jacobian[:, 0], jacobian=jacobian, weight=weight[part], residual=rest[part]
                 )
+            )
         # The waves are longer than the noise is correlated.
         excess = float(self.correlation.sum())
-        rows = np.concatenate([rows for rows, _ in self.groups])
         self.strength[rows] = Spectra.joined(spectra).strengths(excess)
 
-    def _standardised(self, rows: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Residuals (g, m) over the noise, and roots (g, m) of weights; 0 for invalid pixels."""
-        parts = _parts(rows, near, len(self.offset))
-        light = np.concatenate([self._model(*part)[0] for part in parts])
+    def _standardised(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[np.ndarray]]:
+        """Residuals of all windows over the noise.
+
+        Returns the beads (n,), residuals (n, m), roots (n, m) of weights, 0 for invalid pixels, and
+        the derivatives of some windows after the other.
+        """
+        groups = [part for group in self.groups for part in _parts(*group, len(self.offset))]
+        lights, jacobians = zip(*(self._model(*part) for part in groups))
+        light = np.concatenate(lights)
+        rows = np.concatenate([rows for rows, _ in groups])
         grey = self.grey[rows]
         root = self._valid(rows, grey, light) / np.sqrt(self.noise.variance(light), dtype=DTYPE)
-        return (grey - light) * root, root
+        return rows, (grey - light) * root, root, list(jacobians)
 
     def _correlation(self, residual: np.ndarray, valid: np.ndarray) -> NDArray[np.float64]:
         """Correlation of the noise from standardised residuals (g, m) of windows.

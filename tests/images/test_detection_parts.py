@@ -141,10 +141,10 @@ def test_several_maxima_in_a_larger_blob_are_one(monkeypatch):
         none = _Blobs(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
         asked = []
 
-        def found(part, noise, scale, factor):
+        def found(part, noise, scale, factor, polarities):
+            assert polarities == (False,)
             asked.append((part.shape, scale, factor))
-            dark = wide if len(asked) == 1 else none
-            return iter([dark, none])
+            return [wide if len(asked) == 1 else none]
 
         monkeypatch.setattr(detection, '_blobs', found)
         out = sight.merged(blobs, 3.0, False)
@@ -220,7 +220,7 @@ def test_looks_are_tried_in_their_order_until_a_pose_is_sure(monkeypatch):
         monkeypatch.setattr(
             extraction, 'likely_detections', lambda image, beads: iter(range(len(outcomes)))
         )
-        monkeypatch.setattr(extraction, '_seen', lambda detections: detections)
+        monkeypatch.setattr(extraction, '_seen', lambda detections, model: detections)
 
         def match(seen, model, lens):
             tried.append(seen)

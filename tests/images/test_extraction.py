@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from benchmarks.bead_images import bead_image
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.findings import Kind
-from fluoro_calib_ros.images.detection import detect_beads
+from fluoro_calib_ros.images.detection import Look, detect_beads
 from fluoro_calib_ros.images.extraction import Extraction, extract_beads
 from fluoro_calib_ros.images.following import Far, follow, moved_on
 from fluoro_calib_ros.images.growth import Seen
@@ -458,7 +458,7 @@ def test_an_image_with_faint_beads_says_how_faint():
     beads = bead_image(rng.uniform(20, 380, (30, 2)), (400, 400), noise=0).astype(float)
     image = plain * (1 - 0.04 * (1 - beads / beads.max())) + rng.normal(0, 20, plain.shape)
     with pytest.raises(DataError) as raised:
-        detect_beads(image.astype(np.uint16), 30, 4.0, False)
+        detect_beads(image.astype(np.uint16), 30, Look(4.0, False))
     finding = raised.value.finding
     assert finding.kind is Kind.FEW_BEADS
     assert 0.005 < finding.numbers['contrast'] < 0.05

@@ -28,6 +28,7 @@ from fluoro_calib_ros.images.marker_points import ShadowPoints
 from fluoro_calib_ros.images.marker_rays import MarkerBodies
 from fluoro_calib_ros.images.marker_watch import MarkerDoubts
 from fluoro_calib_ros.images.markers import FirstMarkers, MarkerTracker
+from fluoro_calib_ros.images.matching import PhantomModel
 from fluoro_calib_ros.images.measurement import measure_beads
 from fluoro_calib_ros.images.pose_search import _hits, triples_of
 from fluoro_calib_ros.images.shadow_fit import FineGrid, Profile, window_offsets
@@ -713,7 +714,7 @@ def test_poses_are_compared_by_the_sizes_of_the_beads_that_all_of_them_have(monk
         return values[len(asked) % 2 - 1]
 
     monkeypatch.setattr(matching, '_likelihood_of_sizes', likelihood)
-    model = Fake(xyz=xyz, diameter_mm=diameter)
+    model = PhantomModel.of(xyz, diameter)
     values[:] = [5.0, 5.0 + matching.SIZE_MARGIN]
     assert matching._best_by_size(matches, seen, model) is matches[1]
     for one, (size, response, uv) in zip(matches, asked):
@@ -730,7 +731,7 @@ def test_poses_are_compared_by_the_sizes_of_the_beads_that_all_of_them_have(monk
     matches[0].detection, matches[0].bead = matches[0].detection[:12], matches[0].bead[:12]
     assert matching._best_by_size(matches, seen, model) is None
     for other in (None, np.full(14, 2.0)):
-        assert matching._best_by_size(matches, seen, Fake(xyz=xyz, diameter_mm=other)) is None
+        assert matching._best_by_size(matches, seen, PhantomModel.of(xyz, other)) is None
 
 
 def test_a_shadow_that_a_body_has_is_not_that_of_another(monkeypatch):

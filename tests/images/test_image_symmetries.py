@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from fluoro_calib_ros.errors import DataError
-from fluoro_calib_ros.images.detection import detect_beads, field_of_view
+from fluoro_calib_ros.images.detection import Look, detect_beads, field_of_view
 from fluoro_calib_ros.images.light import LAGS, Light, Noise, estimate_noise
 from fluoro_calib_ros.images.marker_fit import MarkerGuess, fit_markers
 from fluoro_calib_ros.images.marker_intensity import (
@@ -64,20 +64,20 @@ def in_order(uv):
 # ---- beads
 
 
-@pytest.mark.parametrize('look', [{}, {'radius_px': 5.5, 'inverted': False}])
+@pytest.mark.parametrize('look', [None, Look(5.5, False)])
 def test_beads_are_found_in_the_transposed_and_the_mirrored_image(look):
     image = scene()
-    found = detect_beads(image, 12, **look)
+    found = detect_beads(image, 12, look)
     away = np.linalg.norm(in_order(found.uv)[:, None] - PLACES[None], axis=2)
     assert len(found.uv) == 12 and away.min(axis=0).max() < 0.8 and not found.inverted
     assert 0.6 * RADIUS_PX < found.radius_px < RADIUS_PX + BLUR_PX
-    turned = detect_beads(np.ascontiguousarray(image.T), 12, **look)
+    turned = detect_beads(np.ascontiguousarray(image.T), 12, look)
     off = np.abs(in_order(swapped(turned.uv)) - in_order(found.uv))
     assert np.median(off) == 0 and off.max() <= 1  # of discs that overlap, to a pixel
     assert sorted(turned.strength) == pytest.approx(sorted(found.strength), rel=1e-3)
     assert turned.radius_px == pytest.approx(found.radius_px, rel=1e-6)
     np.testing.assert_allclose(turned.noise.correlation, found.noise.correlation.T, atol=1e-6)
-    mirrored = detect_beads(np.ascontiguousarray(image[:, ::-1]), 12, **look)
+    mirrored = detect_beads(np.ascontiguousarray(image[:, ::-1]), 12, look)
     there = [SHAPE[1] - 1, 0] + mirrored.uv * [-1, 1]
     off = np.abs(in_order(there) - in_order(found.uv))
     assert np.median(off) == 0 and off.max() <= 1
@@ -92,7 +92,7 @@ def test_bright_beads_are_found_as_dark_ones_are():
     assert len(turned.uv) == len(found.uv)
     away = np.linalg.norm(in_order(turned.uv) - in_order(found.uv), axis=1)
     assert np.median(away) < 0.01 and away.max() < 1.5  # two of them overlap
-    again = detect_beads(bright, 12, found.radius_px, True)
+    again = detect_beads(bright, 12, Look(found.radius_px, True))
     assert again.inverted and len(again.uv) == 12
     np.testing.assert_array_equal(again.light.grey, bright.max() - bright.astype(float))
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.findings import Kind
 from fluoro_calib_ros.images import growth, matching, pose_search
-from fluoro_calib_ros.images.detection import PIXELS_AT_ONCE, dark_response, responses
+from fluoro_calib_ros.images.detection import PIXELS_AT_ONCE, responses
 from fluoro_calib_ros.images.growth import (
     Seen,
     _good_cells,
@@ -478,7 +478,7 @@ def test_response_to_a_shadow_is_the_smaller_eigenvalue_of_the_hessian():
     assert PIXELS_AT_ONCE // width == 16
     smooth = cv2.GaussianBlur(image, (0, 0), 1.5).astype(float)
     dark, bright = responses(image, 1.5)
-    np.testing.assert_array_equal(dark_response(image, 1.5), dark)
+    np.testing.assert_array_equal(responses(image, 1.5, (True,)), [bright])
     for v, u in ((3, 4), (10, 20), (15, 9), (16, 70), (17, 9)):
         near = smooth[v - 1 : v + 2, u - 1 : u + 2]
         across = (near[2, 2] - near[2, 0] - near[0, 2] + near[0, 0]) / 4

@@ -17,12 +17,12 @@ PIXELS = len(OFFSET)
 
 
 def windows(count: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Light behind beads (g, m), derivatives (g, 4, m) and weights (g, m)."""
+    """Light behind beads (g, m), derivatives (g, 7, m) and weights (g, m)."""
     rng = np.random.default_rng(seed)
     x, y = OFFSET.T / 8
     relative = np.broadcast_to(1 - 0.5 * np.exp(-4 * (x * x + y * y)), (count, PIXELS))
-    plane = np.stack([np.ones(PIXELS), x, y]) * relative[0]
-    jacobian = np.stack([np.vstack([plane, rng.normal(size=PIXELS)]) for _ in range(count)])
+    background = np.stack([np.ones(PIXELS), x, y, x * x, x * y, y * y]) * relative[0]
+    jacobian = np.stack([np.vstack([background, rng.normal(size=PIXELS)]) for _ in range(count)])
     return relative, jacobian, rng.uniform(0.5, 2.0, (count, PIXELS))
 
 

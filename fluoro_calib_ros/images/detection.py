@@ -24,7 +24,7 @@ from scipy.spatial import cKDTree
 from ..errors import DataError
 from ..findings import Kind
 from .discs import set_apart
-from .light import Light, Noise, clipped_at, estimate_noise
+from .light import Light, Noise, clipped_at, estimate_noise, vertex
 
 MIN_SIZE = 32  # of an image [px]
 SCALES = (1.1, 1.5, 2.1, 3.0, 4.2, 6.0, 8.5, 12.0, 17.0)  # standard deviations of the blur [px]
@@ -492,10 +492,3 @@ def _beads(blobs: _Blobs, field: NDArray[np.bool_], count: int) -> _Blobs:
     values = np.where(inside, blobs.relative, 0)
     typical = _typical(values[inside], min(count, max(int(inside.sum()), 1)))
     return blobs.chosen(inside & (values > MIN_SHARE * typical) & (typical >= MIN_CONTRAST))
-
-
-def vertex(before: np.ndarray, at: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Places (n,) of the vertices of parabolas through three samples, relative to the middle."""
-    curvature = before - 2 * at + after
-    shift = 0.5 * (before - after) / np.where(curvature < 0, curvature, -1.0)
-    return np.clip(np.where(curvature < 0, shift, 0), -0.5, 0.5)

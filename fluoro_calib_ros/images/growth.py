@@ -188,7 +188,7 @@ def pairs(predicted: np.ndarray, seen: Seen, tolerance: float) -> tuple[np.ndarr
     row = np.flatnonzero(np.isfinite(distance))
     order = row[np.argsort(distance[row], kind='stable')]
     _, first = np.unique(detection[order], return_index=True)
-    kept = order[np.sort(first)]
+    kept = np.sort(order[first])
     return kept, detection[kept]
 
 

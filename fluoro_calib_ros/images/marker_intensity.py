@@ -28,9 +28,8 @@ from .detection import (
     SCALES,
     field_of_view,
     responses,
-    vertex,
 )
-from .light import Light, Noise, estimate_noise
+from .light import Light, Noise, estimate_noise, vertex
 from .marker_motion import MarkerStates, Motion, assign
 from .measurement import estimate_profile
 from .shadow_fit import Profile

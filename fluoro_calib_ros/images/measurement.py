@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from .detection import LARGER, vertex
-from .light import Light, Noise
+from .detection import LARGER
+from .light import Light, Noise, vertex
 from .shadow_fit import (
     DEPTH_SD,
     DISTURBED,
@@ -45,7 +45,7 @@ SETTINGS = FitSettings(
     crossed=1.0,
 )
 STEPS = SETTINGS.steps
-FIRST_STEPS = 4  # that only have to tell beads from other things
+FIRST_STEPS = 3  # that only have to tell beads from other things
 PROFILE_STEPS = 3
 PROFILE_BEADS = 100
 # Rounds without a better fit, after which the best profile is chosen in windows of one size: a
@@ -243,8 +243,8 @@ class _BeadFit(ShadowFit):
     def run(self, steps: int) -> None:
         """Take Gauss-Newton steps; the last one gives standard deviations as well.
 
-        Beads that have settled take part in the first two steps, in the last one, and where what
-        is known of their windows changes.
+        Beads that have settled take part in the last one, and where what is known of their windows
+        changes.
         """
         active = np.ones(len(self.uv), dtype=bool)
         for step in range(steps):
@@ -257,7 +257,7 @@ class _BeadFit(ShadowFit):
             for (rows, _), (uv, depth, background) in zip(groups, moved):
                 lost = np.linalg.norm(uv - self.start[rows], axis=1) > MAX_SHIFT_PX
                 self.usable[rows[lost]] = False
-                active[rows] = (np.abs(uv - self.uv[rows]) > SETTLED_PX).any(axis=1) | (step == 0)
+                active[rows] = (np.abs(uv - self.uv[rows]) > SETTLED_PX).any(axis=1)
                 kept = rows[~lost]
                 self.uv[kept] = uv[~lost]
                 self.depth[kept] = depth[~lost]

@@ -322,8 +322,8 @@ class ShadowFit(ABC):
     def _standardised(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[np.ndarray]]:
         """Residuals of all windows over the noise.
 
-        Returns the beads (n,), residuals (n, m), roots (n, m) of weights, 0 for invalid pixels, and
-        the derivatives of some windows after the other.
+        Returns the beads (n,), residuals (n, m), roots (n, m) of weights, 0 for invalid pixels,
+        and the derivatives of some windows after the other.
         """
         groups = [part for group in self.groups for part in _parts(*group, len(self.offset))]
         lights, jacobians = zip(*(self._model(*part) for part in groups))

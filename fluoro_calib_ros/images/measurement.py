@@ -394,18 +394,11 @@ class _BeadFit(ShadowFit):
         Where the shadow is not quite that of a sphere, residuals are alike in all windows. They
         move no centre against the others, and are no noise.
         """
-        usual = measured & (self.strength == 0)
-        usual &= self.misfit <= np.median(self.misfit[usual]) if usual.any() else usual
-        n = int(usual.sum())
-        if n < 2:
-            return self.misfit
-        common = self.residual[usual].sum(axis=0)
-        common /= np.maximum(self.counted[usual].sum(axis=0), 1)
+        usual = measured & (self.strength == 0) & (self.misfit <= DISTURBED * self.typical())
+        rows = np.arange(len(self.uv))
+        rest = self._less_common(rows, self.residual, self.counted, usual)
         whole = (self.residual**2 * self.counted).sum(axis=1)
-        rest = ((self.residual - common) ** 2 * self.counted).sum(axis=1)
-        # The mean of n windows has a share of their noise, and is subtracted from each.
-        rest *= np.where(usual, n / (n - 1), n / (n + 1))
-        share = np.minimum(rest / np.maximum(whole, 1e-12), 1.0)
+        share = np.minimum((rest**2).sum(axis=1) / np.maximum(whole, 1e-12), 1.0)
         return np.where(self.strength > 0, 1.0, share) * self.misfit
 
     def _moved_by_radius(self) -> NDArray[np.float64]:

@@ -299,11 +299,11 @@ class ShadowFit(ABC):
         rows, residual, root, jacobians = self._standardised()
         plain = np.flatnonzero(self.misfit[rows] <= self.typical())
         plain = plain[:: len(plain) // CORRELATED + 1]
-        valid = root[plain] > 0
-        # Where the shadow is not quite that of a sphere, all windows show it: that is no noise.
-        common = residual[plain].sum(axis=0) / np.maximum(valid.sum(axis=0), 1)
-        self.correlation = self._correlation((residual[plain] - common) * valid, valid)
-        rest = (residual - common) / np.maximum(root, DTYPE(1e-12))
+        valid = root > 0
+        usual = self.misfit[rows] <= DISTURBED * self.typical()
+        residual = self._less_common(rows, residual, valid, usual)
+        self.correlation = self._correlation(residual[plain], valid[plain])
+        rest = residual / np.maximum(root, DTYPE(1e-12))
         weight = root**2
         spectra = []
         first = 0
@@ -318,6 +318,36 @@ class ShadowFit(ABC):
         # The waves are longer than the noise is correlated.
         excess = float(self.correlation.sum())
         self.strength[rows] = Spectra.joined(spectra).strengths(excess)
+
+    def _less_common(
+        self,
+        rows: np.ndarray,
+        residual: np.ndarray,
+        valid: NDArray[np.bool_],
+        usual: NDArray[np.bool_],
+    ) -> np.ndarray:
+        """Return residuals (n, m) over the noise, without what usual windows have in common.
+
+        Where the shadow is not quite that of a sphere, all windows show it, and more or less so
+        by their place: a polynomial of degree 2 for each pixel, a priori as large as the noise.
+        What is left is enlarged by what the polynomial takes of the noise of usual windows, and
+        reduced by what it adds to that of others.
+        """
+        place = self.uv[rows] - self.uv[rows].mean(axis=0)
+        x, y = place.T / max(float(np.abs(place).max(initial=0.0)), 1.0)
+        terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
+        known = terms[usual].astype(DTYPE)
+        products = (known[:, :, None] * known[:, None]).reshape(-1, TERMS * TERMS)
+        of_pixel = (valid[usual].T.astype(DTYPE) @ products).reshape(-1, TERMS, TERMS)
+        right = residual[usual].T @ known
+        coefficients = np.linalg.solve(of_pixel + np.eye(TERMS, dtype=DTYPE), right[..., None])
+        common = terms.astype(DTYPE) @ coefficients[..., 0].T
+        normal = known.T @ known
+        influence = np.linalg.solve(normal + np.eye(TERMS), terms.T)
+        own = np.sum(terms * influence.T, axis=1)
+        added = np.sum(influence * (normal @ influence), axis=0)
+        noise = np.sqrt(1 + added - np.where(usual, 2 * own, 0.0)).astype(DTYPE)
+        return (residual - common) * valid / noise[:, None]
 
     def _standardised(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[np.ndarray]]:
         """Residuals of all windows over the noise.
@@ -390,8 +420,9 @@ class ShadowFit(ABC):
         if self.inflation is None:
             # The influence of pixels on a centre: noise of neighbouring pixels adds up.
             plain = equations.plain[:INFLUENCES]
-            influence = np.linalg.solve(plain, equations.weighted[:INFLUENCES])[:, TERMS]
-            self.inflation = _inflation(self._images(influence), self.correlation)
+            influence = np.linalg.solve(plain, equations.weighted[:INFLUENCES])
+            both = influence[:, TERMS : TERMS + 2].reshape(-1, influence.shape[2])
+            self.inflation = _inflation(self._images(both), self.correlation)
         return inverse
 
     def _images(self, windows: np.ndarray) -> np.ndarray:

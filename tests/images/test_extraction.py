@@ -89,6 +89,20 @@ def test_bright_beads_are_the_same_beads():
     assert abs(len(bright.uv) - len(dark.uv)) < 0.02 * len(dark.uv)
 
 
+def test_beads_of_one_size_are_found_without_a_search_for_larger_ones():
+    """What an image before tells: the noise, and that no bead is much larger than others."""
+    image, true, _ = radiograph()
+    found = detect_beads(image)
+    look = Look(found.radius_px, False, found.noise, alike=True)
+    again = detect_beads(image, look=look)
+    assert again.noise is found.noise
+    # Two that touch are no large one.
+    of_true = [np.count_nonzero(cKDTree(one.uv).query(true)[0] < 1) for one in (found, again)]
+    assert of_true[1] >= of_true[0] > 0.7 * len(true)
+    away, _ = cKDTree(true).query(again.uv)
+    assert np.mean(away < 2) > 0.9  # there is clutter
+
+
 def test_each_refused_bead_has_a_reason():
     found = extraction()
     assert found.refused

@@ -3,14 +3,15 @@
 
 """Extraction of beads from radiographs: found, precise, honest, never wrong.
 
-    python -m benchmarks.extraction --images 100        both sets of images, printed as tables of
+    python -m benchmarks.extraction --images 100        all sets of images, printed as tables of
                                                         docs/how_good.md
     python -m benchmarks.extraction --points 500        poses from points alone
     python -m benchmarks.extraction --calibration 12    calibration from images and true centres
     python -m benchmarks.extraction --picture PATH      an image with its overlay
 
 The settings of the renderer (bead, blur, glare, field, polarity, distortion) are drawn anew for
-every image. The Cramer-Rao bound is that of the rendered light: its derivative by the place of a
+every image. Of the set `followed`, clean, each image follows one in which the phantom was turned by
+a degree. The Cramer-Rao bound is that of the rendered light: its derivative by the place of a
 bead, against the variance of photons, for beads that stand alone.
 """
 
@@ -54,6 +55,8 @@ FALSE_PX = 1.0
 UNSEEN = 8  # exposures that test a calibration
 PLAIN = 0.3  # of the noise, to which a plain background is a polynomial
 SIZE = (1024, 1024)
+SETS = ('clean', 'hard', 'followed')
+TURN = Rotation.from_euler('z', 1, degrees=True).as_matrix()  # since the image that is followed
 KINDS = ('turntable', 'any', 'tube', 'other')  # of poses; other: of another phantom
 
 
@@ -109,8 +112,9 @@ def _roughness(background: np.ndarray) -> float:
     return rms(values - fitted)
 
 
-def measure_set(count: int, hard: bool, report: Callable[[str], None]) -> dict[str, Any]:
+def measure_set(count: int, name: str, report: Callable[[str], None]) -> dict[str, Any]:
     """Extract a set of images and compare them with the truth."""
+    hard = name == 'hard'
     records: dict[str, list[Any]] = {
         key: []
         for key in ('seconds', 'error', 'sigma', 'overlapped', 'free', 'bound', 'found', 'refused')
@@ -130,9 +134,13 @@ def measure_set(count: int, hard: bool, report: Callable[[str], None]) -> dict[s
         alone = cKDTree(centres).query(centres, k=2)[0][:, 1] > 2 * shadow
         free = alone & radiography.in_field(centres, shadow + 4)
         free &= points_on_image(centres, SIZE)
+        near = None
+        if name == 'followed':
+            before = radiography.image(rig.true_mm, (TURN @ pose[0], *pose[1:]), number + 50)
+            near = extract_beads(before, model, Lens(SIZE, 4000.0)).nearby
         start = time.process_time()
         try:
-            found = extract_beads(image, model, Lens(SIZE, 4000.0))
+            found = extract_beads(image, model, Lens(SIZE, 4000.0), near)
         except DataError as refusal:
             records['refused'].append(f'image {number}: {refusal}')
             records['seconds'].append(time.process_time() - start)
@@ -152,7 +160,7 @@ def measure_set(count: int, hard: bool, report: Callable[[str], None]) -> dict[s
         records['bound'].append(limit)
         false_of.append(float(np.mean(np.abs(error).max(axis=1) > FALSE_PX)))
         report(
-            f'{"hard" if hard else "clean"} {number}: {len(error)} beads, free '
+            f'{name} {number}: {len(error)} beads{" followed" * found.followed}, free '
             f'{records["found"][-1][0]}/{records["found"][-1][1]}, rms '
             f'{np.sqrt(np.mean(error[free[found.bead]] ** 2)):.4f} px, '
             f'{records["seconds"][-1]:.2f} s'
@@ -416,7 +424,7 @@ def write_picture(path: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--images', type=int, default=0, help='images of each set')
-    parser.add_argument('--sets', nargs='+', default=('clean', 'hard'), choices=('clean', 'hard'))
+    parser.add_argument('--sets', nargs='+', default=SETS, choices=SETS)
     parser.add_argument('--points', type=int, default=0, help='poses of each kind')
     parser.add_argument('--kinds', nargs='+', default=KINDS, choices=KINDS)
     parser.add_argument('--phantoms', type=int, default=0, help='poses of each other phantom')
@@ -438,7 +446,7 @@ def main() -> None:
         tables.update(measure_phantoms(arguments.phantoms, report))
     if arguments.images:
         for name in arguments.sets:
-            tables[name] = measure_set(arguments.images, name == 'hard', report)
+            tables[name] = measure_set(arguments.images, name, report)
             report(f'{name}: {tables[name]}')
     if arguments.calibration:
         measure_calibration(arguments.calibration, report)

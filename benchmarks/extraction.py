@@ -10,9 +10,9 @@
     python -m benchmarks.extraction --picture PATH      an image with its overlay
 
 The settings of the renderer (bead, blur, glare, field, polarity, distortion) are drawn anew for
-every image. Of the set `followed`, clean, each image follows one in which the phantom was turned by
-a degree. The Cramer-Rao bound is that of the rendered light: its derivative by the place of a
-bead, against the variance of photons, for beads that stand alone.
+every image. The images of the set `followed` are clean, and each follows one in which the phantom
+was turned by a degree. The Cramer-Rao bound is that of the rendered light: its derivative by the
+place of a bead, against the variance of photons, for beads that stand alone.
 """
 
 from __future__ import annotations

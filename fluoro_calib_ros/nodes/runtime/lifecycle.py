@@ -38,7 +38,7 @@ from .diagnostics import (
 )
 from .parameters import ParameterNode
 from .streams import FaultHandlers, StreamReader
-from .topics import best_effort_message, qos_overrides
+from .topics import best_effort_message, publisher_conflict, qos_overrides
 
 T = TypeVar('T')
 
@@ -387,6 +387,11 @@ overrun_input = counted(
 unpaired_frames = counted(
     'unpaired', '{count} frames without partner of the other fluoroscopes in the last minute'
 )
+
+
+def several_nodes(state: StreamState) -> Health | None:
+    """Several calibration nodes serve the fluoroscope."""
+    return fault(publisher_conflict(state.node, f'{state.stream.name}/calibration_status'))
 
 
 def missing_publisher(state: StreamState) -> Health | None:

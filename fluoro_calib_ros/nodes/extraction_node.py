@@ -33,7 +33,7 @@ from ..io.calibration import load_orientation, orientation_path
 from ..jobs.extraction import RADIOGRAPH_PX
 from ..jobs.followers import (
     REVISED,
-    MakeFollower,
+    FollowerSettings,
     MarkerSettings,
     Observations,
     PhantomSettings,
@@ -151,7 +151,7 @@ class ExtractionSettings:
 PARAMETERS = (*groups_of(ExtractionSettings).values(), READ_LIMITS)
 
 
-def read_followers(settings: ExtractionSettings, logger: Logger) -> Sequence[MakeFollower]:
+def read_followers(settings: ExtractionSettings, logger: Logger) -> Sequence[FollowerSettings]:
     """Return what makes the followers: one for each view, or one for all. Raises StartError."""
     mode = settings.node.mode
     path = settings.node.phantom if mode == 'phantom' else settings.node.markers
@@ -174,7 +174,7 @@ def read_followers(settings: ExtractionSettings, logger: Logger) -> Sequence[Mak
 
 def _of_phantom(
     path: Path, parameters: ExtractionParameters, logger: Logger
-) -> Sequence[MakeFollower]:
+) -> Sequence[FollowerSettings]:
     """Return what makes the follower of each fluoroscope. Raises DataError."""
     survey = read_survey(path)
     for note in survey.notes:

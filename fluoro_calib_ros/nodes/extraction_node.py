@@ -54,7 +54,7 @@ from .image_stream import (
 from .messages.image import message_from_image, use_single_thread
 from .messages.observations import NS_PER_S, message_from_frame, uint32_field
 from .runtime.diagnostics import Logger, RefusalLog, StartError, Status, health_of
-from .runtime.lifecycle import StreamNode, remember, stream_faults
+from .runtime.lifecycle import StreamNode, stream_faults
 from .runtime.main import run
 from .runtime.parameters import (
     READ_LIMITS,
@@ -65,6 +65,7 @@ from .runtime.parameters import (
     group,
     groups_of,
 )
+from .runtime.streams import remember
 from .runtime.topics import images_qos, observations_qos
 
 MODES = ('phantom', 'markers')

@@ -20,7 +20,8 @@ from .messages.bodies import BodiesContent
 from .messages.observations import nanoseconds_from_stamp, stamp_from_nanoseconds, uint32_field
 from .messages.points import PointsContent
 from .runtime.diagnostics import RefusalLog
-from .runtime.lifecycle import StreamNode, remember
+from .runtime.lifecycle import StreamNode
+from .runtime.streams import remember
 from .runtime.topics import observations_qos
 
 TOPIC = 'retractions'

@@ -27,7 +27,7 @@ from ...photogrammetry import rig_orientation
 from ..messages.image import ImageConverter
 from ..messages.rig_orientation import orientation_from_message
 from ..runtime.diagnostics import Refused
-from ..runtime.lifecycle import remember
+from ..runtime.streams import remember
 from ..runtime.topics import adapted_qos
 
 IDLE_S = 10.0  # after which a topic that nobody looks at is no longer subscribed

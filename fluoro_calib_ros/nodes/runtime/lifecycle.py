@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import time
 import traceback
-from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -276,13 +275,6 @@ class StreamNode(ManagedNode):
 
 
 # What a node counts of the stream of one fluoroscope, and the conditions of its diagnostics.
-
-
-def remember(table: OrderedDict[Any, Any], key: object, value: object, most: int) -> None:
-    """Keep a value by its key; of more than that many, the oldest is forgotten."""
-    table[key] = value
-    if len(table) > most:
-        table.popitem(last=False)
 
 
 class Stream:

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import threading
 import traceback
+from collections import OrderedDict
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
@@ -49,6 +50,13 @@ MAX_BATCH = 8
 MAX_FIRST = 100  # messages of a topic that comes first that are handled at once
 # What decoding a damaged message raises, in our decoders and in those of the middleware.
 DECODING_ERRORS = (ValueError, RCLError, RuntimeError, MemoryError)
+
+
+def remember(table: OrderedDict[Any, Any], key: object, value: object, most: int) -> None:
+    """Keep a value by its key; of more than that many, the oldest is forgotten."""
+    table[key] = value
+    if len(table) > most:
+        table.popitem(last=False)
 
 
 class TooLarge(ValueError):

@@ -25,7 +25,7 @@ from ..errors import DataError
 from ..exposures.angles import AngleOptions
 from ..exposures.frame import Frame
 from ..exposures.pairing import PairingOptions
-from ..exposures.stamps import ExposureNumbers
+from ..exposures.stamps import ExposureNumbers, nanoseconds_from_stamp
 from ..images.markers import FirstMarkers, MarkerOptions
 from ..images.overlay import small_jpeg
 from ..io.bodies import read_bodies
@@ -52,7 +52,7 @@ from .image_stream import (
     Task,
 )
 from .messages.image import message_from_image, use_single_thread
-from .messages.observations import NS_PER_S, message_from_frame, uint32_field
+from .messages.observations import message_from_frame, uint32_field
 from .runtime.diagnostics import Logger, RefusalLog, StartError, Status, health_of
 from .runtime.lifecycle import StreamNode, stream_faults
 from .runtime.main import run
@@ -303,8 +303,7 @@ class ExtractionNode(StreamNode):
     ) -> None:
         """Number an image and let it wait for the thread of its fluoroscope."""
         self.streams[name].received += 1
-        stamp = message.header.stamp
-        stamp_ns = NS_PER_S * stamp.sec + stamp.nanosec
+        stamp_ns = nanoseconds_from_stamp(message.header.stamp)
         number = self._numbers.number(name, stamp_ns)
         angle = self._angles.of_frame(name, stamp_ns, needed=self._needs_angle(name))
         self._workers.put(name, Task(number, message, info['received_timestamp'], angle))
@@ -333,7 +332,7 @@ class ExtractionNode(StreamNode):
                 found.uv,
                 (image.shape[1], image.shape[0]),
                 sigma=found.sigma,
-                stamp_ns=NS_PER_S * header.stamp.sec + header.stamp.nanosec,
+                stamp_ns=nanoseconds_from_stamp(header.stamp),
                 frame_id=header.frame_id,
             )
             self._observations[stream.name].publish(message_from_frame(frame))

@@ -15,6 +15,7 @@ import numpy as np
 from ...errors import DataError, ErrorsAt
 from ...exposures.angles import AngleOptions, JointAngles
 from ...exposures.frame import Frame, Frames, validate_frame, without_strays
+from ...exposures.stamps import nanoseconds_from_stamp
 from ...limits import MAX_OBSERVATIONS
 from ..access import PathLike, check_safe_name
 from .mcap_file import (
@@ -137,7 +138,7 @@ def _without_retracted(source: PathLike, frames: Frames) -> tuple[dict[str, list
     for message in iterate_messages(source, topics) if topics else ():
         with ErrorsAt(f'{source}, topic {message.topic}'):
             one = from_cdr(message.data, RETRACTION)
-        stamp_ns = one.header.stamp.sec * 10**9 + one.header.stamp.nanosec
+        stamp_ns = nanoseconds_from_stamp(one.header.stamp)
         ids = wrong.setdefault((topics[message.topic], stamp_ns), set())
         ids.update(one.target_id.tolist())
     count = 0
@@ -309,8 +310,7 @@ def images_of_topic(source: PathLike, topic: str) -> Iterator[BagImage]:
         where = f'{source}, topic {topic}, message {number}'
         try:
             content = from_cdr(message.data, kind)
-            stamp = content.header.stamp
-            stamp_ns = stamp.sec * 10**9 + stamp.nanosec
+            stamp_ns = nanoseconds_from_stamp(content.header.stamp)
             image = decode(content.data) if kind == COMPRESSED_IMAGE else _pixels(content)
         except DataError as error:
             yield BagImage(where, error.at(where), stamp_ns)
@@ -398,8 +398,7 @@ def _read_states(source: PathLike, angles: JointAngles) -> None:
             state = from_cdr(message.data, JOINT_STATE)
         for joint in state.name:
             found.setdefault(joint, set()).add(message.topic)
-        stamp = state.header.stamp
-        angles.add(stamp.sec * 10**9 + stamp.nanosec, state.name, state.position)
+        angles.add(nanoseconds_from_stamp(state.header.stamp), state.name, state.position)
     for joint in sorted(wanted):
         if joint not in found:
             raise DataError(

@@ -55,6 +55,7 @@ from fluoro_calib_ros.bodies.body import Body
 from fluoro_calib_ros.demo.assessment import NodeProcesses, isolate_ros_graph
 from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
 from fluoro_calib_ros.exposures.frame import Frame
+from fluoro_calib_ros.exposures.stamps import nanoseconds_from_stamp
 from fluoro_calib_ros.images.codec import encode
 from fluoro_calib_ros.images.marker_fit import MarkerMeasurement
 from fluoro_calib_ros.images.marker_intensity import MarkerSearch
@@ -76,7 +77,6 @@ from fluoro_calib_ros.jobs.simulation import SETTINGS, RenderedScene, Renderers
 from fluoro_calib_ros.jobs.sources import read_calibrations
 from fluoro_calib_ros.nodes.messages.image import ImageConverter, message_from_image
 from fluoro_calib_ros.nodes.messages.observations import (
-    nanoseconds_from_stamp,
     stamp_from_nanoseconds,
 )
 from fluoro_calib_ros.nodes.runtime.topics import (

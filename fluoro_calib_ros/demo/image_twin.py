@@ -16,6 +16,7 @@ import numpy as np
 
 from ..bodies.joints import JointMotion
 from ..correction.fluoroscope_calibration import Calibrations
+from ..exposures.stamps import nanoseconds_from_stamp
 from ..io.access import make_folder, write_bytes
 from ..io.bags.metadata import message_class
 from ..io.bags.reader import IMAGE
@@ -224,13 +225,12 @@ class LiveKnee:
     def assess(self, messages: Sequence[Any], picture: Path) -> str:
         """Draw the live angles of JointAngles, and return how good they are in one line."""
         number = np.array([message.frame_number for message in messages])
-        stamps = [message.header.stamp for message in messages]
         metres = np.repeat([1.0, 1e3], 3)
         covariance = np.array([message.covariance for message in messages]).reshape(-1, 6, 6)
         motion = JointMotion(
             self._knee.joint,
             number,
-            np.array([10**9 * stamp.sec + stamp.nanosec for stamp in stamps]),
+            np.array([nanoseconds_from_stamp(message.header.stamp) for message in messages]),
             angles=np.array([message.angle for message in messages]),
             translations=1e3 * np.array([message.translation for message in messages]),
             covariance=covariance * metres * metres[:, None],

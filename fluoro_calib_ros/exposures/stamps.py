@@ -13,14 +13,20 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Mapping
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
+NS_PER_S = 1_000_000_000
 RECENT = 200  # exposures that are compared
 MIN_EXPOSURES = 5
 # Part of the frame interval from which the frame with another number is nearer in time.
 MAX_PART = 0.5
+
+
+def nanoseconds_from_stamp(stamp: Any) -> int:
+    """Return the time [ns] of what has the fields sec and nanosec, as a Time message."""
+    return int(stamp.sec * NS_PER_S + stamp.nanosec)
 
 
 class StampedFrame(Protocol):

@@ -12,7 +12,7 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, BinaryIO
 
 from ..errors import DataError
 from ..limits import read_limits
@@ -68,31 +68,39 @@ def check_regular_file(path: PathLike) -> None:
         raise DataError('this is a pipe, device or socket, not a file', at=path)
 
 
-def read_bytes(path: PathLike) -> bytes:
-    """Return the content of a file.
+@contextmanager
+def opened(path: PathLike) -> Iterator[BinaryIO]:
+    """Open a file to read it.
 
-    Raises DataError for a file that does not exist, cannot be read or is empty, and for a folder.
+    Raises DataError for a file that does not exist or cannot be read, and for a folder.
     """
     check_regular_file(path)
     try:
         with open(path, 'rb') as file:
-            size = os.fstat(file.fileno()).st_size
-            limits = read_limits()
-            if size > limits.max_file_bytes:
-                raise DataError(
-                    f'the file has {size / 1e6:.0f} MB, more than {limits.max_file_mb} MB '
-                    'are not read',
-                    at=path,
-                )
-            content = file.read()
+            yield file
+    except DataError:
+        raise
     except FileNotFoundError:
         raise DataError('there is no such file', at=path) from None
     except IsADirectoryError:
         raise DataError('this is a folder, not a file', at=path) from None
-    except OSError as error:
-        raise DataError(f'cannot be read ({os_error_reason(error)})', at=path) from None
-    except ValueError as error:  # a NUL byte in the name
-        raise DataError(f'cannot be read ({error})', at=path) from None
+    except (OSError, ValueError) as error:  # ValueError: a NUL byte in the name
+        reason = os_error_reason(error) if isinstance(error, OSError) else error
+        raise DataError(f'cannot be read ({reason})', at=path) from None
+
+
+def read_bytes(path: PathLike) -> bytes:
+    """Return the content of a file. Raises DataError as `opened`, and for an empty file."""
+    with opened(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        limits = read_limits()
+        if size > limits.max_file_bytes:
+            raise DataError(
+                f'the file has {size / 1e6:.0f} MB, more than {limits.max_file_mb} MB '
+                'are not read',
+                at=path,
+            )
+        content = file.read()
     if not content:
         raise DataError('the file is empty', at=path)
     return content

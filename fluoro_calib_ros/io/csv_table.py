@@ -102,18 +102,18 @@ def read_blocks(path: PathLike, required: Sequence[str]) -> Iterator[Block]:
     """
     text = read_text(path)
     check_rows(text, MAX_ROWS_CSV, path)
-    lines: Iterable[str] = io.StringIO(text, newline='')
-    if '#' in text:  # a comment becomes a blank line, so that the numbers of the rows remain
-        lines = ('\n' if line.lstrip().startswith('#') else line for line in lines)
-    rows_of_file = _RowReader(path, lines, _separator(text))
-    header = rows_of_file.read_header(required)
+    rows = _numbered_rows(path, text)
+    line, first = next(rows, (0, []))
+    if not first:
+        raise DataError(f'{path}: the file has no header, {",".join(required)} is expected')
+    header = [name.strip() for name in first]
+    _check_header(f'{path}, row {line}', header, required)
     is_empty = True
-    while not rows_of_file.ended:
-        rows, numbers = rows_of_file.read(BLOCK)
-        if rows:
-            is_empty = False
-            _check_widths(path, header, rows, numbers)
-            yield Block(path, header, rows, numbers)
+    while block := list(islice(rows, BLOCK)):
+        is_empty = False
+        lines, cells = zip(*block)
+        _check_widths(path, header, cells, lines)
+        yield Block(path, header, list(cells), np.array(lines))
     if is_empty:
         raise DataError(f'{path}: the file has a header, but no rows')
 
@@ -205,59 +205,22 @@ def format_float(value: float) -> str:
     return '' if np.isnan(value) else repr(float(value))
 
 
-class _RowReader:
-    """Reads the rows of a CSV file that are not blank, with their numbers in the file."""
-
-    def __init__(self, path: PathLike, lines: Iterable[str], separator: str = ',') -> None:
-        self.ended = False
-        self._path = path
-        self._has_decimal_commas = separator == ';'
-        self._reader = csv.reader(lines, delimiter=separator, strict=True)
-
-    def read_header(self, required: Sequence[str]) -> list[str]:
-        """Return the column names in the first row that is not blank. Raises DataError."""
-        while not self.ended:
-            before = self._reader.line_num
-            row = self._next()
-            if not _is_blank(row):
-                header = [name.strip() for name in row]
-                _check_header(f'{self._path}, row {before + 1}', header, required)
-                return header
-        raise DataError(f'{self._path}: the file has no header, {",".join(required)} is expected')
-
-    def _next(self) -> list[str]:
-        """Return the next row, an empty one at the end. Raises DataError."""
-        try:
-            return next(self._reader)
-        except StopIteration:
-            self.ended = True
-            return []
-        except csv.Error as error:
-            self._fail(error)
-
-    def _fail(self, error: csv.Error) -> NoReturn:
-        raise DataError(
-            f'{self._path}, row {self._reader.line_num}: this is not CSV ({error})'
-        ) from None
-
-    def read(self, count: int) -> tuple[list[list[str]], np.ndarray]:
-        """Return those of the next `count` rows that are not blank, and their numbers."""
-        before = self._reader.line_num
-        try:
-            rows = list(islice(self._reader, count))
-        except csv.Error as error:
-            self._fail(error)
-        self.ended = len(rows) < count
-        lines = before + 1 + np.arange(len(rows))
-        if self._reader.line_num - before > len(rows):  # some cells contain line ends
-            line_ends = [sum(cell.count('\n') for cell in row) for row in rows[:-1]]
-            lines[1:] += np.cumsum(line_ends, dtype=int)
-        filled = np.array([not _is_blank(row) for row in rows], dtype=bool)
-        if not filled.all():
-            rows = [row for row, keep in zip(rows, filled) if keep]
-        if self._has_decimal_commas:
-            rows = [[decimal_point(cell.strip()) for cell in row] for row in rows]
-        return rows, lines[filled]
+def _numbered_rows(path: PathLike, text: str) -> Iterator[tuple[int, list[str]]]:
+    """Yield the rows of a table that are not blank, with their numbers in it. Raises DataError."""
+    separator = _separator(text)
+    lines: Iterable[str] = io.StringIO(text, newline='')
+    if '#' in text:  # a comment becomes a blank line, so that the numbers of the rows remain
+        lines = ('\n' if line.lstrip().startswith('#') else line for line in lines)
+    reader = csv.reader(lines, delimiter=separator, strict=True)
+    has_commas = separator == ';'
+    before = 0
+    try:
+        for row in reader:
+            if len(row) > 1 or (row and row[0].strip()):
+                yield before + 1, [decimal_point(c.strip()) for c in row] if has_commas else row
+            before = reader.line_num
+    except csv.Error as error:
+        raise DataError(f'{path}, row {reader.line_num}: this is not CSV ({error})') from None
 
 
 def _separator(text: str) -> str:
@@ -265,10 +228,6 @@ def _separator(text: str) -> str:
     lines = (line for line in io.StringIO(text) if not line.lstrip().startswith('#'))
     header = next((line for line in lines if line.strip()), '')
     return ';' if ';' in header and ',' not in header else ','
-
-
-def _is_blank(row: Sequence[str]) -> bool:
-    return len(row) <= 1 and not (row and row[0].strip())
 
 
 def _check_header(where: str, header: Sequence[str], required: Sequence[str]) -> None:
@@ -286,7 +245,7 @@ def _check_header(where: str, header: Sequence[str], required: Sequence[str]) ->
 
 
 def _check_widths(
-    path: PathLike, header: Sequence[str], rows: Sequence[Sequence[str]], lines: np.ndarray
+    path: PathLike, header: Sequence[str], rows: Sequence[Sequence[str]], lines: Sequence[int]
 ) -> None:
     """Raise DataError for the first row with too few or too many cells."""
     if set(map(len, rows)) != {len(header)}:

@@ -12,11 +12,10 @@ import struct
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
 
 import cv2
 import numpy as np
-from tifffile import TiffFile, TiffFileError, TiffWriter
+from tifffile import TiffFile, TiffFileError
 
 from ..errors import DataError, ErrorsAt
 from ..exposures.frame import MAX_ANGLE
@@ -123,40 +122,13 @@ def listed(suffixes: Iterable[str]) -> str:
     return ', '.join(suffix[1:] for suffix in suffixes)
 
 
-# Stacks of grey images in TIFF files: written page by page, and checked before they are read.
+# Stacks of grey images in TIFF files are checked before they are read.
 #
-# tifffile writes the pages and lists them; a stack needs no more memory than one page. If a file
-# is cut off, tifffile only logs it and goes on with the remaining pages: `count_pages` refuses
-# such a file.
-
-CLASSIC_BYTES = 4 * 10**9  # size from which a file needs 64-bit offsets, with some reserve
-PAGE_OVERHEAD = 1024  # bytes
+# tifffile lists the pages. If a file is cut off, it only logs it and goes on with the remaining
+# pages: `count_pages` refuses such a file.
 
 # tifffile logs what count_pages says in its one sentence.
 logging.getLogger('tifffile').addHandler(logging.NullHandler())
-
-
-class StackWriter:
-    """Writes uncompressed pages into a seekable binary file; to be used in a with statement.
-
-    The largest number of pages and the size of one decide the size of the offsets.
-    """
-
-    def __init__(self, file: IO[bytes], pages: int, page_bytes: int) -> None:
-        size = pages * (page_bytes + PAGE_OVERHEAD)
-        self._writer = TiffWriter(file, bigtiff=size > CLASSIC_BYTES, byteorder='<')
-
-    def write(self, image: np.ndarray) -> None:
-        """Add a page (h, w) of uint8 or uint16."""
-        self._writer.write(
-            image, photometric='minisblack', metadata=None, software=False, contiguous=False
-        )
-
-    def __enter__(self) -> StackWriter:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._writer.close()
 
 
 def count_pages(path: PathLike) -> int:

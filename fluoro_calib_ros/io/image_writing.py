@@ -12,11 +12,13 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import cast
 
 import cv2
 import numpy as np
+from tifffile import TiffWriter
 
 from ..errors import DataError, ErrorsAt
 from ..images.codec import encode
@@ -32,7 +34,6 @@ from .image_reading import (
     SUPPORTS_16_BIT_VIDEOS,
     VIDEO_CODECS,
     ImageSource,
-    StackWriter,
     check_name,
     image_suffix_of,
     listed,
@@ -76,14 +77,21 @@ def write_images(out: Path, source: ImageSource, progress: Progress) -> int:
     return 1
 
 
+CLASSIC_BYTES = 4 * 10**9  # size from which a file needs 64-bit offsets, with some reserve
+PAGE_OVERHEAD = 1024  # bytes
+
+
 def _write_stack(out: Path, source: ImageSource, progress: Progress) -> int:
-    """Write an uncompressed TIFF file; returns the number of pages."""
+    """Write an uncompressed TIFF file, page by page; returns the number of pages."""
     _, image = next(source.images)
+    large = max(source.count, 1) * (image.nbytes + PAGE_OVERHEAD) > CLASSIC_BYTES
     with (
         atomic_file(out) as file,
-        StackWriter(file, max(source.count, 1), image.nbytes) as writer,
+        TiffWriter(file, bigtiff=large, byteorder='<') as writer,
     ):
-        return _write_each(source, image, writer.write, progress)
+        page = {'photometric': 'minisblack', 'metadata': None, 'contiguous': False}
+        write = partial(writer.write, software=False, **page)
+        return _write_each(source, image, write, progress)
 
 
 def _write_each(

@@ -17,7 +17,7 @@ from ..exposures.names import Names, without_trivial
 from ..exposures.phantom import Phantom, first_repeated
 from ..limits import read_limits
 from .access import PathLike
-from .csv_table import NamedColumn, read_blocks, write_table
+from .csv_table import Block, NamedColumn, read_all, read_blocks, write_table
 
 COLUMNS = ('target_id', 'x', 'y', 'z', 'sd')
 DIAMETER = 'diameter'  # of the beads, optional
@@ -40,38 +40,29 @@ def read_named_phantom(path: PathLike, known: Names) -> tuple[Phantom, Names]:
 
 
 def _read(path: PathLike, column: NamedColumn) -> Phantom:
-    id_parts = []
-    number_parts = []
-    line_parts = []
-    diameter_parts = []
+    rows = read_all(path, COLUMNS)
+    numbers = _numbers(rows)
+    ids = column.numbers(column.read(rows))
     most = read_limits().max_targets
-    count = 0
-    for block in read_blocks(path, COLUMNS):
-        numbers = np.column_stack([block.floats(name) for name in COLUMNS[1:]])
-        id_parts.append(column.read(block))
-        count += len(numbers)
-        if count > most:
-            raise DataError(f'{path}: phantoms of more than {most} targets are not read')
-        block.require('sd', numbers[:, 3] > 0, 'not above 0')
-        number_parts.append(numbers)
-        line_parts.append(block.lines)
-        if DIAMETER in block:
-            diameter = block.floats(DIAMETER)
-            block.require(DIAMETER, diameter > 0, 'not above 0')
-            diameter_parts.append(diameter)
-    ids = column.numbers(np.concatenate(id_parts))
-    numbers = np.concatenate(number_parts)
+    if len(ids) > most:
+        raise DataError(f'{path}: phantoms of more than {most} targets are not read')
+    diameters = None
+    if DIAMETER in rows:
+        diameters = rows.floats(DIAMETER)
+        rows.require(DIAMETER, diameters > 0, 'not above 0')
     repeated = first_repeated(ids)
     if repeated is not None:
-        lines = np.concatenate(line_parts)
         first, second = repeated
-        raise DataError(
-            f'{path}, row {lines[second]}: target {ids[second]} is already given in row '
-            f'{lines[first]}'
-        )
+        rows.fail(second, f'target {ids[second]} is already given in row {rows.lines[first]}')
     with ErrorsAt(path):
-        diameters = np.concatenate(diameter_parts) if diameter_parts else None
         return Phantom(ids, numbers[:, :3], numbers[:, 3], diameters)
+
+
+def _numbers(rows: Block) -> np.ndarray:
+    """Return x, y, z and sd (n, 4) of the rows of a file. Raises DataError."""
+    numbers = np.column_stack([rows.floats(name) for name in COLUMNS[1:]])
+    rows.require('sd', numbers[:, 3] > 0, 'not above 0')
+    return numbers
 
 
 def has_exposures(path: PathLike) -> bool:
@@ -87,21 +78,18 @@ def read_moving_points(path: PathLike) -> MovingPoints:
 
     Raises DataError that names row and cause.
     """
-    parts = []
-    lines = []
-    for block in read_blocks(path, (EXPOSURE, *COLUMNS)):
-        numbers = np.column_stack([block.floats(name) for name in COLUMNS[1:]])
-        block.require('sd', numbers[:, 3] > 0, 'not above 0')
-        parts.append((block.ids(EXPOSURE), block.ids('target_id'), numbers))
-        lines.append(block.lines)
-    exposure, target_id, numbers = (np.concatenate(column) for column in zip(*parts))
+    rows = read_all(path, (EXPOSURE, *COLUMNS))
+    numbers = _numbers(rows)
+    exposure = rows.ids(EXPOSURE)
+    target_id = rows.ids('target_id')
     points = MovingPoints(exposure, target_id, numbers[:, :3], numbers[:, 3])
     repeated = first_repeated(points.ids(exposure, target_id))
     if repeated is not None:
-        first, second = (np.concatenate(lines)[row] for row in repeated)
-        raise DataError(
-            f'{path}, row {second}: target {target_id[repeated[1]]} of exposure '
-            f'{exposure[repeated[1]]} is already given in row {first}'
+        first, second = repeated
+        rows.fail(
+            second,
+            f'target {target_id[second]} of exposure {exposure[second]} is already given in row '
+            f'{rows.lines[first]}',
         )
     return points
 

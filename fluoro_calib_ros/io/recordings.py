@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from ..errors import DataError, ErrorsAt
 from ..images.codec import check_size
-from .access import check_regular_file, os_error_reason, os_errors
+from .access import check_regular_file, opened, os_errors
 
 # Transfer syntaxes (PS3.5, annex A) that are read: implicit and explicit little endian, explicit
 # big endian, RLE. A deflated file could be of any size when it is decompressed.
@@ -228,17 +228,8 @@ def read_cine_header(path: Path) -> CineHeader:
     Raises DataError for a file that cannot be read, is no cine file, is cut off, is damaged, or
     holds colours or compressed images.
     """
-    check_regular_file(path)
-    try:
-        with open(path, 'rb') as file:
-            return _cine_header(file, os.fstat(file.fileno()).st_size)
-    except DataError as error:
-        raise error.at(path) from None
-    except FileNotFoundError:
-        raise DataError('there is no such file', at=path) from None
-    except (OSError, ValueError) as error:
-        reason = os_error_reason(error) if isinstance(error, OSError) else error
-        raise DataError(f'cannot be read ({reason})', at=path) from None
+    with opened(path) as file, ErrorsAt(path):
+        return _cine_header(file, os.fstat(file.fileno()).st_size)
 
 
 def read_cine_images(path: Path, header: CineHeader) -> Iterator[tuple[str, np.ndarray]]:

@@ -14,7 +14,6 @@ from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,51 +72,6 @@ class Observations:
         return '' if self.finding is None else self.finding.cause
 
 
-class Follower(Protocol):
-    """Extracts the targets of one fluoroscope, or of several together, by exposures."""
-
-    def extract(
-        self,
-        images: Mapping[str, np.ndarray],
-        number: int,
-        overlays: Collection[str] = (),
-        angles: Mapping[str, float | None] | None = None,
-    ) -> dict[str, Observations]:
-        """Return what is found in the images of an exposure; never raises DataError.
-
-        Parameters
-        ----------
-        images : mapping of str to (h, w) ndarray of uint8 or uint16
-            By fluoroscope.
-        number : int
-            Of the exposure: it grows, and tells how many are left out.
-        overlays : collection of str
-            Fluoroscopes whose pictures are wanted.
-        angles : mapping of str to float or None
-            Of the C-arms [rad], None where they are unknown.
-        """
-
-
-class MakeFollower(Protocol):
-    """Settings of a follower, which can be pickled."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Fluoroscopes that are followed."""
-
-    def __call__(self) -> Follower:
-        """Return a new follower. Raises DataError for settings that do not fit together."""
-
-
-def follower_process(make: MakeFollower) -> WorkerProcess:
-    """Return a process with a follower; it is called as `extract`."""
-    return WorkerProcess(partial(_extract_of, make), 'the process of the extraction', OF_STREAM)
-
-
-def _extract_of(make: MakeFollower) -> Callable[..., dict[str, Observations]]:
-    return make().extract
-
-
 @dataclass(frozen=True)
 class PhantomSettings:
     """What a PhantomFollower is made of."""
@@ -161,7 +115,19 @@ class PhantomFollower:
         overlays: Collection[str] = (),
         angles: Mapping[str, float | None] | None = None,
     ) -> dict[str, Observations]:
-        """Return what is found in the image of an exposure; see Follower."""
+        """Return what is found in the images of an exposure; never raises DataError.
+
+        Parameters
+        ----------
+        images : mapping of str to (h, w) ndarray of uint8 or uint16
+            By fluoroscope.
+        number : int
+            Of the exposure: it grows, and tells how many are left out.
+        overlays : collection of str
+            Fluoroscopes whose pictures are wanted.
+        angles : mapping of str to float or None
+            Of the C-arms [rad], None where they are unknown.
+        """
         name = self._settings.fluoroscope
         return {name: self._observations(images[name], number, name in overlays)}
 
@@ -276,7 +242,7 @@ class MarkerSettings:
         return self.orientation.fluoroscopes
 
     def __call__(self) -> MarkerFollower:
-        """Return a new MarkerFollower. Raises DataError as MarkerViews."""
+        """Return a new MarkerFollower. Raises DataError for what does not fit together."""
         return MarkerFollower(self)
 
 
@@ -329,7 +295,7 @@ class MarkerFollower:
     ) -> ViewsFrame:
         """Return the markers in the images of an exposure; None: an image that cannot be read.
 
-        Parameters are those of Follower. Raises DataError.
+        Parameters are those of extract(). Raises DataError.
         """
         return self._begun_views.update(images, number, angles)
 
@@ -345,7 +311,7 @@ class MarkerFollower:
         overlays: Collection[str] = (),
         angles: Mapping[str, float | None] | None = None,
     ) -> dict[str, Observations]:
-        """Return the markers that are seen in the images of an exposure; see Follower."""
+        """Return the markers that are seen in the images of an exposure; see PhantomFollower."""
         start = time.perf_counter()
         results = self._results(images, number, overlays, angles)
         seconds = (time.perf_counter() - start) / max(len(results), 1)
@@ -468,3 +434,15 @@ def _doubt_text(doubt: Finding) -> str:
     markers = ' and '.join(map(str, doubt.place.target_id))
     what = 'may have been exchanged' if len(doubt.place.target_id) > 1 else 'may be something else'
     return f'markers {markers} {what}: {doubt.cause}'
+
+
+FollowerSettings = PhantomSettings | MarkerSettings  # they can be pickled, and make a follower
+
+
+def follower_process(make: FollowerSettings) -> WorkerProcess:
+    """Return a process with a follower; it is called as `extract`."""
+    return WorkerProcess(partial(_extract_of, make), 'the process of the extraction', OF_STREAM)
+
+
+def _extract_of(make: FollowerSettings) -> Callable[..., dict[str, Observations]]:
+    return make().extract

@@ -26,6 +26,7 @@ from rclpy.lifecycle.node import LifecycleState
 from sensor_msgs.msg import CompressedImage
 
 from ..exposures.frame import Frame
+from ..exposures.stamps import nanoseconds_from_stamp
 from .angle_input import AngleInput
 from .calibration_output import CONDITIONS, CalibrationOutput, FluoroscopeState
 from .calibration_services import OrientationService, SelfCalibration
@@ -38,7 +39,7 @@ from .calibration_settings import (
 from .exposure_input import RADIOGRAPH, CollectServices, ExposureInput, NodeParts
 from .frame_validation import with_limit
 from .healing_services import Healing
-from .messages.observations import NS_PER_S, ObservedFrame, decode_target_observations
+from .messages.observations import ObservedFrame, decode_target_observations
 from .messages.status import FluoroscopeProgress
 from .runtime.diagnostics import RefusalLog, Status, health_of
 from .runtime.lifecycle import StreamNode, stream_faults
@@ -161,7 +162,7 @@ class CalibrationNode(StreamNode):
     # -- observations, in the thread of the streams
 
     def _on_frame(self, name: str, frame: ObservedFrame, _: Mapping[str, int]) -> None:
-        stamp_ns = NS_PER_S * frame.sec + frame.nanosec
+        stamp_ns = nanoseconds_from_stamp(frame)
         needed = bool(self._settings.angles.angle_joint)
 
         def angle() -> float | None:

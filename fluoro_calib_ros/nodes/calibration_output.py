@@ -34,9 +34,10 @@ from .runtime.lifecycle import (
     missing_publisher,
     overrun_input,
     refused_messages,
+    several_nodes,
     unpaired_frames,
 )
-from .runtime.topics import latched_qos, publisher_conflict
+from .runtime.topics import latched_qos
 
 
 class CalibrationOutput:
@@ -142,11 +143,6 @@ class FluoroscopeState(StreamState):
     output: CalibrationOutput
     disagreement: str  #: about frames with the same number that are far apart in time, else ''
     angle: Health | None  #: where the angle of the C-arm is unknown
-
-
-def several_nodes(state: FluoroscopeState) -> Health | None:
-    """Another calibration node serves the same fluoroscope."""
-    return fault(publisher_conflict(state.node, f'{state.stream.name}/calibration_status'))
 
 
 def nothing_loaded(state: FluoroscopeState) -> Health | None:

@@ -20,7 +20,6 @@ from .runtime.diagnostics import (
     Health,
     RefusalLog,
     Status,
-    fault,
     health_of,
     healthy,
     one_line,
@@ -36,6 +35,7 @@ from .runtime.lifecycle import (
     missing_publisher,
     overrun_input,
     refused_messages,
+    several_nodes,
     stalled_stream,
     stream_faults,
 )
@@ -70,11 +70,6 @@ class CorrectingState(StreamState):
     beyond: str  #: what becomes of the items at an angle far from all calibrated ones
     calibrations: CalibrationInput
     angles: AngleInput
-
-
-def several_nodes(state: CorrectingState) -> Health | None:
-    """Several calibration nodes serve the fluoroscope."""
-    return fault(state.calibrations.conflict(state.stream.name))
 
 
 def uncalibrated(state: CorrectingState) -> Health | None:

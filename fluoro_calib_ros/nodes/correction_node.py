@@ -17,12 +17,12 @@ from sensor_msgs.msg import CameraInfo
 from ..correction.base import CorrectionStatus
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..exposures.angles import AngleOptions
+from ..exposures.stamps import nanoseconds_from_stamp
 from ..limits import StreamLimits
 from .correcting_node import CorrectedStream, CorrectingNode
 from .frame_validation import OBSERVED_REFUSALS, FrameValidator, with_limit
 from .messages.fluoroscope_calibration import message_of_corrected_stream
 from .messages.observations import (
-    NS_PER_S,
     ObservedFrame,
     decode_target_observations,
     encode_corrected_observations,
@@ -156,7 +156,7 @@ class CorrectionNode(CorrectingNode):
         except Refused as error:
             stream.refusals.refuse(error)
             return
-        stamp_ns = NS_PER_S * frame.sec + frame.nanosec
+        stamp_ns = nanoseconds_from_stamp(frame)
         angle = self.angle_of(name, stamp_ns, calibration.angle_field)
         corrected = calibration.correct_arrays(*arrays, angle=angle)
         self._corrected[name].publish(

@@ -22,6 +22,7 @@ from ..exposures.collector import ExposureCollector, RadiographCollector, readin
 from ..exposures.frame import Frame, Frames, validate_frame
 from ..exposures.pairing import CompletePairer
 from ..exposures.phantom import Phantom
+from ..exposures.stamps import nanoseconds_from_stamp
 from ..images.codec import JPEG_START
 from ..io.calibration_request import MAX_BYTES
 from .calibration_output import CalibrationOutput
@@ -31,7 +32,7 @@ from .calibration_settings import (
     CalibrationSettings,
     RigSetup,
 )
-from .messages.observations import NS_PER_S, ObservedFrame, frame_from_observed
+from .messages.observations import ObservedFrame, frame_from_observed
 from .messages.status import Collected
 from .runtime.diagnostics import Logger, RateLimitedLogger, RefusalLog
 from .runtime.lifecycle import Stream, StreamNode
@@ -209,9 +210,8 @@ class ExposureInput:
             error = DataError(f'{name}/{RADIOGRAPH}: this is no small JPEG')
             self.streams[name].refusals.refuse(error)
             return
-        stamp = message.header.stamp
         with self._lock:
-            self._radiographs.add(name, NS_PER_S * stamp.sec + stamp.nanosec, jpeg)
+            self._radiographs.add(name, nanoseconds_from_stamp(message.header.stamp), jpeg)
 
     def _validated(
         self,

@@ -25,7 +25,7 @@ from ..errors import DataError
 from ..exposures.angles import AngleOptions
 from ..exposures.frame import Frame
 from ..exposures.pairing import PairingOptions
-from ..exposures.stamps import ExposureNumbers
+from ..exposures.stamps import ExposureNumbers, nanoseconds_from_stamp
 from ..images.markers import FirstMarkers, MarkerOptions
 from ..images.overlay import small_jpeg
 from ..io.bodies import read_bodies
@@ -33,7 +33,7 @@ from ..io.calibration import load_orientation, orientation_path
 from ..jobs.extraction import RADIOGRAPH_PX
 from ..jobs.followers import (
     REVISED,
-    MakeFollower,
+    FollowerSettings,
     MarkerSettings,
     Observations,
     PhantomSettings,
@@ -52,9 +52,9 @@ from .image_stream import (
     Task,
 )
 from .messages.image import message_from_image, use_single_thread
-from .messages.observations import NS_PER_S, message_from_frame, uint32_field
+from .messages.observations import message_from_frame, uint32_field
 from .runtime.diagnostics import Logger, RefusalLog, StartError, Status, health_of
-from .runtime.lifecycle import StreamNode, remember, stream_faults
+from .runtime.lifecycle import StreamNode, stream_faults
 from .runtime.main import run
 from .runtime.parameters import (
     READ_LIMITS,
@@ -65,6 +65,7 @@ from .runtime.parameters import (
     group,
     groups_of,
 )
+from .runtime.streams import remember
 from .runtime.topics import images_qos, observations_qos
 
 MODES = ('phantom', 'markers')
@@ -151,7 +152,7 @@ class ExtractionSettings:
 PARAMETERS = (*groups_of(ExtractionSettings).values(), READ_LIMITS)
 
 
-def read_followers(settings: ExtractionSettings, logger: Logger) -> Sequence[MakeFollower]:
+def read_followers(settings: ExtractionSettings, logger: Logger) -> Sequence[FollowerSettings]:
     """Return what makes the followers: one for each view, or one for all. Raises StartError."""
     mode = settings.node.mode
     path = settings.node.phantom if mode == 'phantom' else settings.node.markers
@@ -174,7 +175,7 @@ def read_followers(settings: ExtractionSettings, logger: Logger) -> Sequence[Mak
 
 def _of_phantom(
     path: Path, parameters: ExtractionParameters, logger: Logger
-) -> Sequence[MakeFollower]:
+) -> Sequence[FollowerSettings]:
     """Return what makes the follower of each fluoroscope. Raises DataError."""
     survey = read_survey(path)
     for note in survey.notes:
@@ -302,8 +303,7 @@ class ExtractionNode(StreamNode):
     ) -> None:
         """Number an image and let it wait for the thread of its fluoroscope."""
         self.streams[name].received += 1
-        stamp = message.header.stamp
-        stamp_ns = NS_PER_S * stamp.sec + stamp.nanosec
+        stamp_ns = nanoseconds_from_stamp(message.header.stamp)
         number = self._numbers.number(name, stamp_ns)
         angle = self._angles.of_frame(name, stamp_ns, needed=self._needs_angle(name))
         self._workers.put(name, Task(number, message, info['received_timestamp'], angle))
@@ -332,7 +332,7 @@ class ExtractionNode(StreamNode):
                 found.uv,
                 (image.shape[1], image.shape[0]),
                 sigma=found.sigma,
-                stamp_ns=NS_PER_S * header.stamp.sec + header.stamp.nanosec,
+                stamp_ns=nanoseconds_from_stamp(header.stamp),
                 frame_id=header.frame_id,
             )
             self._observations[stream.name].publish(message_from_frame(frame))

@@ -19,6 +19,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..exposures.angles import AngleOptions
+from ..exposures.stamps import nanoseconds_from_stamp
 from ..images.angle_maps import AngleMaps
 from ..images.corrector import INTERPOLATIONS
 from ..options import option
@@ -32,7 +33,6 @@ from .messages.image import (
     compressed_message,
     use_single_thread,
 )
-from .messages.observations import NS_PER_S
 from .runtime.diagnostics import RefusalLog, Refused
 from .runtime.main import run
 from .runtime.parameters import (
@@ -190,10 +190,8 @@ class ImageNode(CorrectingNode):
             stream.refusals.refuse(error)
             return
         out, pixels = stream.converter.prepare_output(message.header, encoding, image.shape)
-        stamp = message.header.stamp
-        angle = self.angle_of(
-            name, NS_PER_S * stamp.sec + stamp.nanosec, prepared.calibration.angle_field
-        )
+        stamp_ns = nanoseconds_from_stamp(message.header.stamp)
+        angle = self.angle_of(name, stamp_ns, prepared.calibration.angle_field)
         prepared.maps.at(angle).correct(image, pixels)
         self._images[name].publish(out)  # copies the image
         prepared.info.header = message.header

@@ -16,7 +16,7 @@ import numpy as np
 from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Header
 
-from ..jobs.followers import MakeFollower, Observations, follower_process
+from ..jobs.followers import FollowerSettings, Observations, follower_process
 from ..processes import LentArrays, WorkerProcess
 from .angle_input import AngleInput
 from .messages.image import IMAGE_REFUSALS, ImageConverter
@@ -310,7 +310,7 @@ class ExtractionWorkers:
         self._threads: list[threading.Thread] = []
         self._processes: list[WorkerProcess] = []
 
-    def start(self, followers: Sequence[MakeFollower]) -> None:
+    def start(self, followers: Sequence[FollowerSettings]) -> None:
         """Start the processes, and the threads."""
         for make in followers:
             process = follower_process(make)

@@ -21,6 +21,7 @@ from tf2_msgs.msg import TFMessage
 from ..checks.drift_charts import DriftOptions
 from ..errors import DataError
 from ..exposures.pairing import PairingOptions, exposure_pairer
+from ..exposures.stamps import nanoseconds_from_stamp
 from ..limits import StreamLimits
 from ..options import option
 from ..reconstruction.epipolar import RecentMisses
@@ -29,7 +30,7 @@ from ..reconstruction.reconstruct import CorrectedView, intersect_exposure, watc
 from .drift_monitor import DriftMonitor, DriftParameters
 from .frame_validation import CORRECTED_REFUSALS, validate_corrected, with_limit
 from .messages.fluoroscope_calibration import image_size_of
-from .messages.observations import NS_PER_S, CorrectedFrame, decode_corrected_observations
+from .messages.observations import CorrectedFrame, decode_corrected_observations
 from .messages.points import PointsContent
 from .messages.rig_orientation import message_from_orientation, transforms_of_orientation
 from .reconstruction_output import (
@@ -282,7 +283,7 @@ class ReconstructionNode(StreamNode):
         except Refused as error:
             self._refusals.refuse(error)
             return
-        stamp_ns = NS_PER_S * frame.sec + frame.nanosec
+        stamp_ns = nanoseconds_from_stamp(frame)
         for exposure in self._pairer.add(_View(name, frame.frame_number, stamp_ns, frame)):
             self._exposures += 1
             rig = self._rigs.rig_of({n: v.frame.calibration_id for n, v in exposure.items()})

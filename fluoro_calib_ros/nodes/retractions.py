@@ -16,11 +16,13 @@ from fluoro_calib_msgs.msg import Retraction
 
 from ..bodies.body import BodyPoses, PoseStatus
 from ..bodies.tracking import unknown_motion
+from ..exposures.stamps import nanoseconds_from_stamp
 from .messages.bodies import BodiesContent
-from .messages.observations import nanoseconds_from_stamp, stamp_from_nanoseconds, uint32_field
+from .messages.observations import stamp_from_nanoseconds, uint32_field
 from .messages.points import PointsContent
 from .runtime.diagnostics import RefusalLog
-from .runtime.lifecycle import StreamNode, remember
+from .runtime.lifecycle import StreamNode
+from .runtime.streams import remember
 from .runtime.topics import observations_qos
 
 TOPIC = 'retractions'

@@ -9,6 +9,8 @@ import os
 import struct
 import sys
 from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import cv2
 import numpy as np
@@ -28,6 +30,7 @@ from fluoro_calib_ros.io.image_writing import (
     correct_images,
     folder_like,
     list_images,
+    write_images,
     write_video,
 )
 
@@ -175,7 +178,7 @@ def test_stack(one, corrector, tmp_path, monkeypatch, dtype):
 def test_tiff_with_large_offsets(tmp_path, monkeypatch, large, order):
     """Files beyond 4 GB and of either byte order: read by OpenCV, and their pages counted."""
     if large:
-        monkeypatch.setattr(tiff, 'CLASSIC_BYTES', 0)
+        monkeypatch.setattr('fluoro_calib_ros.io.image_writing.CLASSIC_BYTES', 0)
     pages = stack_of(3, np.uint16)
     content = tiff_of(pages)
     (tmp_path / 'x.tif').write_bytes(content)
@@ -394,11 +397,11 @@ def said(capfd, *arguments):
 
 def tiff_of(pages):
     """Bytes of a stack as it is written here."""
-    file = io.BytesIO()
-    with tiff.StackWriter(file, len(pages), pages[0].nbytes) as writer:
-        for page in pages:
-            writer.write(page)
-    return file.getvalue()
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / 'stack.tif'
+        source = ImageSource('stack', len(pages), iter([('', page) for page in pages]))
+        write_images(path, source, lambda done, total: None)
+        return path.read_bytes()
 
 
 def in_a_circle(content):

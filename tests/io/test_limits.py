@@ -74,7 +74,8 @@ def test_size_of_files(limited, tmp_path):
     path.write_bytes(bytes(1_100_000))
     access.read_bytes(path)
     limited(max_file_mb=1)
-    assert 'the file has 1 MB, more than 1 MB are not read' in refused(access.read_bytes, path)
+    said = f'{path}: the file has 1 MB, more than 1 MB are not read'
+    assert refused(access.read_bytes, path) == said
 
 
 def test_size_of_images(limited, monkeypatch):

@@ -11,10 +11,10 @@ from sensor_msgs.msg import Image
 
 from benchmarks.extraction_live import FIRST_ID, write_chain
 from fluoro_calib_ros.exposures.frame import Frame
+from fluoro_calib_ros.exposures.stamps import nanoseconds_from_stamp
 from fluoro_calib_ros.io.bags.reader import iterate_messages, read_frames
 from fluoro_calib_ros.io.bags.writer import BagWriter
 from fluoro_calib_ros.io.observations import write_observations_csv
-from fluoro_calib_ros.nodes.messages.observations import nanoseconds_from_stamp
 from fluoro_calib_ros.nodes.runtime.topics import images_qos
 
 EXPOSURES = 6

@@ -13,7 +13,7 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, NamedTuple
+from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 
 import zstandard
 from mcap.exceptions import EndOfFile
@@ -27,7 +27,7 @@ from ...errors import DataError
 from ...limits import MAX_CHUNK, MAX_TOPICS
 from ..access import PathLike, check_regular_file, os_errors
 from ..documents import read_yaml
-from .metadata import to_yaml
+from .metadata import Definition, parse_profiles, to_yaml
 
 if TYPE_CHECKING:
     from rosbags.rosbag2 import Reader
@@ -54,7 +54,26 @@ class ChannelInfo:
 
     channel: Channel
     schema: Schema | None
-    count: int
+    count: int = 0
+
+    @property
+    def msg_type(self) -> str:
+        """Type of the messages, '' where it is not known."""
+        return self.schema.name if self.schema else ''
+
+    @property
+    def definition(self) -> Definition:
+        """Definition of the type as it was recorded."""
+        type_hash = self.channel.metadata.get('topic_type_hash', '')
+        if self.schema is None:
+            return Definition('', '', type_hash)
+        text = self.schema.data.decode(errors='replace')
+        return Definition(text, self.schema.encoding, type_hash)
+
+    @property
+    def offered_qos(self) -> list[dict[str, Any]]:
+        """QoS profiles {policy: value} of the publishers, none where they are not known."""
+        return parse_profiles(self.channel.metadata.get('offered_qos_profiles', ''))
 
 
 @dataclass
@@ -123,7 +142,7 @@ def _open_checked(path: str) -> Iterator[BinaryIO]:
     except (EndOfFile, struct.error):
         raise DataError(f'{path}: the bag is damaged, a record ends too early') from None
     except Exception as error:  # damaged bytes make the reader raise almost anything
-        raise DataError(f'{path}: the bag is damaged ({_one_line(error)})') from None
+        raise DataError(f'{path}: the bag is damaged ({_cause(error, MAX_CAUSE)})') from None
 
 
 def _check_ends(path: str, file: BinaryIO) -> None:
@@ -223,12 +242,15 @@ def _records(file: BinaryIO) -> Iterator[McapRecord]:
     return StreamReader(file, validate_crcs=True).records
 
 
-def _one_line(error: Exception) -> str:
-    text = ' '.join(str(error).split())
-    return text[:MAX_CAUSE] or type(error).__name__
+def _cause(error: Exception, most: int) -> str:
+    """Return the text of an error in one line of so many characters, or its type."""
+    return ' '.join(str(error).split())[:most] or type(error).__name__
 
 
 # Storage files of a bag: an .mcap file, or those in the folder of a rosbag2 bag.
+
+METADATA = 'metadata.yaml'
+NO_METADATA = 'this is not the metadata of a bag, or it is damaged'
 
 
 def storage_files(source: PathLike) -> list[str]:
@@ -241,9 +263,8 @@ def storage_files(source: PathLike) -> list[str]:
         raise DataError(f'{source}: there is no such bag')
     if not os.path.isdir(source):
         return [os.fspath(source)]
-    metadata = os.path.join(source, 'metadata.yaml')
-    if os.path.lexists(metadata):
-        return _listed_files(source, metadata)
+    if os.path.lexists(os.path.join(source, METADATA)):
+        return _listed_files(source)
     return _files_in(source)
 
 
@@ -275,14 +296,25 @@ def _natural_order(name: str) -> list[tuple[int, str]]:
     ]
 
 
-def _listed_files(source: PathLike, path: str) -> list[str]:
+def bag_information(folder: PathLike) -> dict[str, Any]:
+    """Return what metadata.yaml says of a bag. Raises DataError."""
+    path = os.path.join(folder, METADATA)
+    document = read_yaml(path)
+    found = document.get('rosbag2_bagfile_information') if isinstance(document, dict) else None
+    if not isinstance(found, dict):
+        raise DataError(f'{path}: {NO_METADATA}')
+    return found
+
+
+def _listed_files(source: PathLike) -> list[str]:
     """Return the files that metadata.yaml lists. Raises DataError."""
+    path = os.path.join(source, METADATA)
+    information = bag_information(source)
     try:
-        information = read_yaml(path)['rosbag2_bagfile_information']
         storage = str(information['storage_identifier'])
         names = list(information['relative_file_paths'])
-    except (KeyError, TypeError, AttributeError):
-        raise DataError(f'{path}: this is not the metadata of a bag, or it is damaged') from None
+    except (KeyError, TypeError):
+        raise DataError(f'{path}: {NO_METADATA}') from None
     if storage != 'mcap':
         raise DataError(
             f'{path}: the bag is stored as {storage}, only mcap and sqlite3 are supported; '
@@ -310,15 +342,11 @@ SQLITE = b'SQLite format 3\0'
 def is_foreign(source: PathLike) -> bool:
     """Return whether a bag is not stored in plain .mcap files."""
     if os.path.isdir(source):
-        path = os.path.join(source, 'metadata.yaml')
-        if not os.path.isfile(path):
-            return False
-        try:
-            information = read_yaml(path)['rosbag2_bagfile_information']
+        with suppress(DataError, KeyError):  # the reader of MCAP bags says what is wrong
+            information = bag_information(source)
             mode = str(information.get('compression_mode') or 'none').lower()
             return str(information['storage_identifier']) == 'sqlite3' or mode != 'none'
-        except (DataError, KeyError, TypeError, AttributeError):
-            return False  # the reader of MCAP bags says what is wrong
+        return False
     if not os.path.isfile(source):
         return False
     try:
@@ -378,5 +406,5 @@ def _opened(source: PathLike) -> Iterator[Reader]:
     except DataError:
         raise
     except Exception as error:  # a damaged bag makes the library raise almost anything
-        cause = ' '.join(str(error).split())[:MAX_FOREIGN_CAUSE] or type(error).__name__
+        cause = _cause(error, MAX_FOREIGN_CAUSE)
         raise DataError(f'{source}: the bag cannot be read ({cause})') from None

@@ -21,6 +21,7 @@ from rosbags.typesys.store import Typestore
 from ...correction.calibration_record import FIELDS, VERSION
 from ...errors import DataError, ErrorsAt
 from ...exposures.frame import Frame, stack_image_points
+from ...exposures.stamps import nanoseconds_from_stamp
 from ..documents import parse_yaml
 
 PACKAGE = 'fluoro_calib_msgs'
@@ -255,7 +256,6 @@ def frame_from_message(message: Any, fluoroscope: str) -> Frame:
         target_id, uv, sigma = stack_image_points(
             message.target_id, message.u, message.v, message.sigma
         )
-    stamp = message.header.stamp
     return Frame(
         fluoroscope=fluoroscope,
         number=int(message.frame_number),
@@ -263,7 +263,7 @@ def frame_from_message(message: Any, fluoroscope: str) -> Frame:
         uv=uv,
         image_size=(int(message.image_width), int(message.image_height)),
         sigma=sigma,
-        stamp_ns=stamp.sec * 10**9 + stamp.nanosec,
+        stamp_ns=nanoseconds_from_stamp(message.header.stamp),
         frame_id=message.header.frame_id,
     )
 

@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from mcap.records import Schema
 
 from ...errors import DataError, ErrorsAt
 from ...exposures.angles import AngleOptions, JointAngles
 from ...exposures.frame import Frame, Frames, validate_frame, without_strays
+from ...exposures.stamps import nanoseconds_from_stamp
 from ...limits import MAX_OBSERVATIONS
 from ..access import PathLike, check_safe_name
 from .mcap_file import (
@@ -31,11 +31,11 @@ from .mcap_file import (
 from .metadata import (
     RETRACTION,
     TARGET_OBSERVATIONS,
+    Definition,
     fields_of,
     fluoroscope_of_topic,
     frame_from_message,
     from_cdr,
-    parse_profiles,
     type_hash,
     typestore,
 )
@@ -138,7 +138,7 @@ def _without_retracted(source: PathLike, frames: Frames) -> tuple[dict[str, list
     for message in iterate_messages(source, topics) if topics else ():
         with ErrorsAt(f'{source}, topic {message.topic}'):
             one = from_cdr(message.data, RETRACTION)
-        stamp_ns = one.header.stamp.sec * 10**9 + one.header.stamp.nanosec
+        stamp_ns = nanoseconds_from_stamp(one.header.stamp)
         ids = wrong.setdefault((topics[message.topic], stamp_ns), set())
         ids.update(one.target_id.tolist())
     count = 0
@@ -196,15 +196,13 @@ def topics_of(source: PathLike) -> dict[str, TopicInfo]:
     for path, channels in _channels(source):
         for info in channels:
             topic = info.channel.topic
-            name = info.schema.name if info.schema else ''
+            name = info.msg_type
             known = out.get(topic, TopicInfo(name, 0, []))
             if known.type != name:
                 raise DataError(
                     f'{path}: topic {topic} is of type {known.type} and of type {name}'
                 )
-            profiles = known.offered_qos or parse_profiles(
-                info.channel.metadata.get('offered_qos_profiles', '')
-            )
+            profiles = known.offered_qos or info.offered_qos
             out[topic] = TopicInfo(name, known.count + info.count, profiles)
     return dict(sorted(out.items()))
 
@@ -252,24 +250,20 @@ def _check_definition(info: ChannelInfo) -> None:
     encoding = info.channel.message_encoding
     if encoding != 'cdr':
         raise DataError(f'the messages are encoded as {encoding!r}, only cdr is supported')
-    assert info.schema is not None  # the type of the topic is the name of the schema
-    if not _is_same_definition(info.schema, info.channel.metadata.get('topic_type_hash', '')):
+    if not _is_same_definition(info.definition):
         raise DataError(f'the bag defines {TARGET_OBSERVATIONS} differently from this program')
 
 
-def _is_same_definition(schema: Schema, recorded_hash: str) -> bool:
+def _is_same_definition(recorded: Definition) -> bool:
     """Return whether a definition in a bag has the fields that this program knows.
 
     Without a text the recorded hash decides; without either the definition is accepted.
     """
-    if not schema.data.strip():
-        return recorded_hash in ('', type_hash(TARGET_OBSERVATIONS))
-    text = schema.data.decode(errors='replace')
+    if not recorded.text.strip():
+        return recorded.type_hash in ('', type_hash(TARGET_OBSERVATIONS))
     known = typestore().fielddefs
-    return all(
-        name in known and known[name][1] == fields
-        for name, fields in fields_of(TARGET_OBSERVATIONS, text, schema.encoding).items()
-    )
+    found = fields_of(TARGET_OBSERVATIONS, recorded.text, recorded.encoding)
+    return all(name in known and known[name][1] == fields for name, fields in found.items())
 
 
 # Images of a bag: sensor_msgs/Image and CompressedImage, without ROS.
@@ -316,8 +310,7 @@ def images_of_topic(source: PathLike, topic: str) -> Iterator[BagImage]:
         where = f'{source}, topic {topic}, message {number}'
         try:
             content = from_cdr(message.data, kind)
-            stamp = content.header.stamp
-            stamp_ns = stamp.sec * 10**9 + stamp.nanosec
+            stamp_ns = nanoseconds_from_stamp(content.header.stamp)
             image = decode(content.data) if kind == COMPRESSED_IMAGE else _pixels(content)
         except DataError as error:
             yield BagImage(where, error.at(where), stamp_ns)
@@ -405,8 +398,7 @@ def _read_states(source: PathLike, angles: JointAngles) -> None:
             state = from_cdr(message.data, JOINT_STATE)
         for joint in state.name:
             found.setdefault(joint, set()).add(message.topic)
-        stamp = state.header.stamp
-        angles.add(stamp.sec * 10**9 + stamp.nanosec, state.name, state.position)
+        angles.add(nanoseconds_from_stamp(state.header.stamp), state.name, state.position)
     for joint in sorted(wanted):
         if joint not in found:
             raise DataError(

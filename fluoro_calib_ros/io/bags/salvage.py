@@ -31,15 +31,12 @@ from mcap.records import Channel, MessageIndex, Schema, Statistics
 
 from ...errors import DataError
 from ...limits import MAX_CHUNK
-from ..access import PathLike, check_regular_file, os_error_reason
-from ..documents import read_yaml
-from .mcap_file import FOOTER, MAGIC, RECORD, candidate_files
+from ..access import PathLike, opened
+from .mcap_file import FOOTER, MAGIC, RECORD, ChannelInfo, bag_information, candidate_files
 from .metadata import (
     PACKAGE,
     TARGET_OBSERVATIONS,
-    Definition,
     fluoroscope_of_topic,
-    parse_profiles,
     profile,
     typestore,
 )
@@ -60,19 +57,6 @@ class SalvagedMessage(NamedTuple):
     publish_time_ns: int
     sequence: int
     data: bytes
-
-
-@dataclass(frozen=True)
-class SalvagedTopic:
-    """A topic of a file as it was recorded: definition of its type, and QoS profiles as YAML."""
-
-    name: str
-    msg_type: str
-    encoding: str  # of the messages
-    schema_encoding: str
-    text: str
-    qos: str
-    type_hash: str
 
 
 @dataclass(frozen=True)
@@ -98,7 +82,7 @@ class FileSalvage:
 
     def __init__(self, path: str) -> None:
         self.path = path
-        self.topics: dict[str, SalvagedTopic] = {}
+        self.topics: dict[str, ChannelInfo] = {}
         self.damages: list[Damage] = []
         self.counts: Counter[str] = Counter()
         self.expected: Counter[str] = Counter()  # number of messages, where the end is intact
@@ -113,18 +97,14 @@ class FileSalvage:
 
         Raises DataError for a file that cannot be read at all.
         """
-        check_regular_file(self.path)
-        try:
-            with open(self.path, 'rb') as file:
-                if os.fstat(file.fileno()).st_size == 0:
-                    self._note('the file is empty')
-                    self._close_damage(None)
-                    return
-                with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-                    self._read_summary(data)
-                    yield from self._records(data)
-        except OSError as error:
-            raise DataError(f'{self.path}: cannot be read ({os_error_reason(error)})') from None
+        with opened(self.path) as file:
+            if os.fstat(file.fileno()).st_size == 0:
+                self._note('the file is empty')
+                self._close_damage(None)
+                return
+            with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+                self._read_summary(data)
+                yield from self._records(data)
         if not self._has_end and self._open_damage is None:
             self._note('the end of the file is missing')
         self._close_damage(None)
@@ -213,15 +193,7 @@ class FileSalvage:
             return None
         if channel.topic not in self.topics:
             schema = self._schemas.get(channel.schema_id)
-            self.topics[channel.topic] = SalvagedTopic(
-                channel.topic,
-                schema.name if schema else '',
-                encoding=channel.message_encoding,
-                schema_encoding=schema.encoding if schema else '',
-                text=schema.data.decode(errors='replace') if schema else '',
-                qos=channel.metadata.get('offered_qos_profiles', ''),
-                type_hash=channel.metadata.get('topic_type_hash', ''),
-            )
+            self.topics[channel.topic] = ChannelInfo(channel, schema)
         return channel.topic
 
     def _read_summary(self, data: mmap.mmap) -> None:
@@ -437,15 +409,14 @@ def recover_bag(source: PathLike, out: PathLike) -> Recovery:
     return Recovery(dict(sorted(counts.items())), salvage.expected, salvage.damages, skipped)
 
 
-def _added(bag: BagWriter, topic: SalvagedTopic) -> str:
+def _added(bag: BagWriter, topic: ChannelInfo) -> str:
     """Add a topic to a bag; returns why that is not possible, or ''."""
-    if topic.encoding != 'cdr':
-        return f'the messages are encoded as {topic.encoding!r}'
-    definition = Definition(topic.text, topic.schema_encoding, topic.type_hash)
+    encoding = topic.channel.message_encoding
+    if encoding != 'cdr':
+        return f'the messages are encoded as {encoding!r}'
+    profiles = topic.offered_qos or [profile()]
     try:
-        bag.add_topic(
-            topic.name, topic.msg_type, parse_profiles(topic.qos) or [profile()], definition
-        )
+        bag.add_topic(topic.channel.topic, topic.msg_type, profiles, topic.definition)
     except DataError as error:
         return str(error)
     return ''
@@ -453,14 +424,10 @@ def _added(bag: BagWriter, topic: SalvagedTopic) -> str:
 
 def _expected_of_metadata(source: PathLike) -> dict[str, int]:
     """Return the numbers of messages by topic in metadata.yaml, if there is one."""
-    path = os.path.join(source, 'metadata.yaml')
-    if not os.path.isdir(source) or not os.path.exists(path):
-        return {}
     try:
-        information = read_yaml(path)['rosbag2_bagfile_information']
         return {
             str(entry['topic_metadata']['name']): int(entry['message_count'])
-            for entry in information['topics_with_message_count']
+            for entry in bag_information(source)['topics_with_message_count']
         }
     except (DataError, KeyError, TypeError, ValueError):
         return {}

@@ -16,13 +16,7 @@ from pathlib import Path
 from ...errors import DataError
 from ...exposures.frame import Frame
 from ...exposures.names import Names
-from ..access import (
-    PathLike,
-    check_regular_file,
-    encoding_of,
-    kind_not_read,
-    os_error_reason,
-)
+from ..access import PathLike, encoding_of, kind_not_read, opened
 from . import bundle, native, xmalab_points, xmalab_project
 from .bodies import AUTOSCOPER, OPENSIM, POSES, RIGIDBODY
 from .content import PARTS, Content, FileSettings, Format, Sample, Written, has_content
@@ -75,16 +69,8 @@ def kinds(condition: Callable[[Format], object]) -> tuple[str, ...]:
 def sample_of(path: PathLike) -> Sample:
     """Return how a file begins. Raises DataError for a file that cannot be read."""
     path = Path(path)
-    check_regular_file(path)
-    try:
-        with path.open('rb') as file:
-            head = file.read(HEAD)
-    except FileNotFoundError:
-        raise DataError(f'{path}: there is no such file') from None
-    except OSError as error:
-        raise DataError(f'{path}: cannot be read ({os_error_reason(error)})') from None
-    except ValueError as error:  # a NUL byte in the name
-        raise DataError(f'{path}: cannot be read ({error})') from None
+    with opened(path) as file:
+        head = file.read(HEAD)
     if not head:
         raise DataError(f'{path}: the file is empty')
     encoding = encoding_of(head)

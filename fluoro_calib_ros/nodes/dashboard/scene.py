@@ -21,13 +21,14 @@ from rclpy.node import Node
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import CompressedImage, Image
 
+from ...exposures.stamps import nanoseconds_from_stamp
 from ...images.codec import encode
 from ...images.overlay import small_jpeg
 from ...photogrammetry import rig_orientation
 from ..messages.image import ImageConverter
 from ..messages.rig_orientation import orientation_from_message
 from ..runtime.diagnostics import Refused
-from ..runtime.lifecycle import remember
+from ..runtime.streams import remember
 from ..runtime.topics import adapted_qos
 
 IDLE_S = 10.0  # after which a topic that nobody looks at is no longer subscribed
@@ -90,7 +91,7 @@ class Scene:
         has_images = self._take_image(name, film)
         depth = WAITING if has_images else 1
         for message in self._taken(f'{name}/target_observations', TargetObservations, depth):
-            remember(film.points, _stamp_ns(message), message, WAITING)
+            remember(film.points, nanoseconds_from_stamp(message.header.stamp), message, WAITING)
             film.found_at = time.monotonic()
         if has_images and film.images:
             stamp = _shown(film)
@@ -124,7 +125,7 @@ class Scene:
                 height, width = image.shape
                 remember(
                     film.images,
-                    _stamp_ns(message),
+                    nanoseconds_from_stamp(message.header.stamp),
                     (small_jpeg(image, LARGEST_PX), width, height),
                     KEPT,
                 )
@@ -216,11 +217,6 @@ def _shown(film: _Film) -> int:
         return newest
     last = next(reversed(film.points))
     return max((stamp for stamp in film.images if stamp <= last), default=newest)
-
-
-def _stamp_ns(message: Any) -> int:
-    stamp = message.header.stamp
-    return int(stamp.sec * 10**9 + stamp.nanosec)
 
 
 def _rows(message: TargetObservations | None) -> list[list[float]]:

@@ -20,13 +20,13 @@ from sensor_msgs.msg import CameraInfo
 from ...correction import fluoroscope_calibration as calibration_result
 from ...correction.calibration_record import FIELDS, Field
 from ...errors import DataError
+from ...exposures.stamps import nanoseconds_from_stamp
 from ...io.arrays import to_values
 from ...io.bags.metadata import FLUOROSCOPE_CALIBRATION, present_cdr
 from ...io.calibration import validated_arrays
 from ..runtime.streams import DECODING_ERRORS
 from .observations import (
     float64_field,
-    nanoseconds_from_stamp,
     stamp_from_nanoseconds,
     uint32_field,
 )

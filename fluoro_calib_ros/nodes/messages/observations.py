@@ -31,6 +31,7 @@ from sensor_msgs.msg import JointState
 
 from ...errors import DataError
 from ...exposures.frame import Frame, stack_image_points
+from ...exposures.stamps import NS_PER_S, nanoseconds_from_stamp
 
 LITTLE_ENDIAN = b'\0\1'
 ENCAPSULATION = LITTLE_ENDIAN + b'\0\0'
@@ -134,13 +135,6 @@ def columns_bytes(
 
 # Fields that many messages have: stamps, and arrays of primitive numbers.
 
-NS_PER_S = 1_000_000_000
-
-
-def nanoseconds_from_stamp(stamp: Time) -> int:
-    """Return a Time message in nanoseconds."""
-    return stamp.sec * NS_PER_S + stamp.nanosec
-
 
 def stamp_from_nanoseconds(nanoseconds: int) -> Time:
     """Return a Time message of a time in nanoseconds."""
@@ -231,7 +225,7 @@ def frame_from_observed(
         uv,
         observed.image_size,
         sigma=sigma,
-        stamp_ns=NS_PER_S * observed.sec + observed.nanosec,
+        stamp_ns=nanoseconds_from_stamp(observed),
         frame_id=observed.frame_id,
         angle=angle,
     )

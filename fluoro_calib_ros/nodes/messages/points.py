@@ -14,12 +14,12 @@ from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
+from ...exposures.stamps import NS_PER_S
 from ...photogrammetry.rig_orientation import RigOrientation
 from ...photogrammetry.rotations import quaternion_from_matrix
 from ...reconstruction.intersection import IntersectedPoints
 from .observations import (
     ENCAPSULATION,
-    NS_PER_S,
     TIME,
     UINT32,
     columns_bytes,

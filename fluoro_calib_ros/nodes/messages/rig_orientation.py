@@ -11,6 +11,7 @@ from geometry_msgs.msg import TransformStamped
 from tf2_msgs.msg import TFMessage
 
 from ...errors import DataError
+from ...exposures.stamps import nanoseconds_from_stamp
 from ...limits import read_limits
 from ...photogrammetry import rig_orientation as rig
 from ...photogrammetry.rotations import (
@@ -18,7 +19,7 @@ from ...photogrammetry.rotations import (
     quaternion_from_matrix,
     vector_from_matrix,
 )
-from .observations import float64_field, nanoseconds_from_stamp, stamp_from_nanoseconds
+from .observations import float64_field, stamp_from_nanoseconds
 
 # Of an orientation that goes through a message and back.
 ROUNDING_MM = 1e-6

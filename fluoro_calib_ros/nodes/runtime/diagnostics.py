@@ -23,16 +23,16 @@ from rclpy.node import Node
 
 from ...errors import DataError, printable, shortened
 
-# Errors that a user can cause, as opposed to bugs.
-
-MAX_LINE = 1000  # of an error message in one line
+MAX_LINE = 4000  # characters
+MAX_TRACE = 20_000  # characters
 
 
 class StartError(RuntimeError):
     """Reason why a node cannot start, in one sentence."""
 
 
-# Raised for invalid names, parameters and QoS overrides; rclpy's RCLError is a RuntimeError.
+# Errors that a user can cause, as opposed to bugs: raised for invalid names,
+# parameters and QoS overrides; rclpy's RCLError is a RuntimeError.
 USER_ERRORS = (ParameterException, NameValidationException, RuntimeError, DataError)
 
 
@@ -40,9 +40,6 @@ def one_line(error: BaseException) -> str:
     """Return the message of an exception in one line, or its type where it has none."""
     return printable(' '.join(str(error).split())[:MAX_LINE]) or type(error).__name__
 
-
-MAX_LINE = 4000  # characters
-MAX_TRACE = 20_000  # characters
 
 # rclpy keeps state for each place that logs: that is the caller of this module.
 rcutils_logger._internal_callers.append(os.path.realpath(__file__))

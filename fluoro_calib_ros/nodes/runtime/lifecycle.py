@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import time
 import traceback
-from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -38,7 +37,7 @@ from .diagnostics import (
 )
 from .parameters import ParameterNode
 from .streams import FaultHandlers, StreamReader
-from .topics import best_effort_message, qos_overrides
+from .topics import best_effort_message, publisher_conflict, qos_overrides
 
 T = TypeVar('T')
 
@@ -278,13 +277,6 @@ class StreamNode(ManagedNode):
 # What a node counts of the stream of one fluoroscope, and the conditions of its diagnostics.
 
 
-def remember(table: OrderedDict[Any, Any], key: object, value: object, most: int) -> None:
-    """Keep a value by its key; of more than that many, the oldest is forgotten."""
-    table[key] = value
-    if len(table) > most:
-        table.popitem(last=False)
-
-
 class Stream:
     """Counts of the messages of one fluoroscope; nodes add what only they count."""
 
@@ -387,6 +379,11 @@ overrun_input = counted(
 unpaired_frames = counted(
     'unpaired', '{count} frames without partner of the other fluoroscopes in the last minute'
 )
+
+
+def several_nodes(state: StreamState) -> Health | None:
+    """Several calibration nodes serve the fluoroscope."""
+    return fault(publisher_conflict(state.node, f'{state.stream.name}/calibration_status'))
 
 
 def missing_publisher(state: StreamState) -> Health | None:

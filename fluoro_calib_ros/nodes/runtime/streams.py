@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import threading
 import traceback
+from collections import OrderedDict
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
@@ -35,6 +36,7 @@ from rclpy.qos import (
     ReliabilityPolicy,
     qos_check_compatible,
 )
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 
@@ -48,6 +50,13 @@ MAX_BATCH = 8
 MAX_FIRST = 100  # messages of a topic that comes first that are handled at once
 # What decoding a damaged message raises, in our decoders and in those of the middleware.
 DECODING_ERRORS = (ValueError, RCLError, RuntimeError, MemoryError)
+
+
+def remember(table: OrderedDict[Any, Any], key: object, value: object, most: int) -> None:
+    """Keep a value by its key; of more than that many, the oldest is forgotten."""
+    table[key] = value
+    if len(table) > most:
+        table.popitem(last=False)
 
 
 class TooLarge(ValueError):
@@ -150,18 +159,28 @@ class StreamReader:
             Larger messages are dropped before they are decoded; by default those that are larger
             than an image may be.
         """
-        subscription = self._node.create_subscription(
+        subscription = self._subscription(kind, topic, qos, qos_overrides())
+        self._max_bytes[topic] = max_bytes or read_limits().max_image_bytes
+        decode = decode or (lambda data: deserialize_message(data, kind))
+        self._routes.append(_Route.of(topic, subscription, decode, callback))
+
+    def _subscription(
+        self,
+        kind: type,
+        topic: str,
+        qos: QoSProfile,
+        overrides: QoSOverridingOptions | None = None,
+    ) -> Subscription:
+        """Return a subscription that no executor serves."""
+        return self._node.create_subscription(
             kind,
             topic,
             lambda _: None,
             qos,
             callback_group=self._group,
-            qos_overriding_options=qos_overrides(),
+            qos_overriding_options=overrides,
             event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
         )
-        self._max_bytes[topic] = max_bytes or read_limits().max_image_bytes
-        decode = decode or (lambda data: deserialize_message(data, kind))
-        self._routes.append(_Route.of(topic, subscription, decode, callback))
 
     def take_first(self, topic: str, faults: FaultHandlers) -> None:
         """Handle what is pending of a subscribed topic before each message of the others.
@@ -200,14 +219,7 @@ class StreamReader:
             qos = copy(old.qos_profile)
             qos.reliability = ReliabilityPolicy.BEST_EFFORT
             self._node.destroy_subscription(old)
-            new = self._node.create_subscription(
-                old.msg_type,
-                topic,
-                lambda _: None,
-                qos,
-                callback_group=self._group,
-                event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
-            )
+            new = self._subscription(old.msg_type, topic, qos)
             self._routes[number] = _Route.of(topic, new, decode, callback)
         self.start()
         return [self._routes[number].topic for number in lowered]

@@ -168,6 +168,37 @@ def correlation_of(residual: np.ndarray, valid: np.ndarray) -> np.ndarray:
     return out
 
 
+def less_common(
+    place: NDArray[np.float64],
+    residual: np.ndarray,
+    valid: NDArray[np.bool_],
+    usual: NDArray[np.bool_],
+) -> np.ndarray:
+    """Return residuals (n, m) of windows, over the noise, without what usual ones have in common.
+
+    Where the shadow is not quite that of a sphere, all windows show it, and more or less so by
+    their place (n, 2): a polynomial of degree 2 for each pixel, a priori as large as the noise.
+    What is left is enlarged by what the polynomial takes of the noise of usual windows, and
+    reduced by what it adds to that of others. Residuals that are not valid are 0.
+    """
+    away = place - place.mean(axis=0)
+    x, y = away.T / max(float(np.abs(away).max(initial=0.0)), 1.0)
+    terms = np.stack([x**i * y**j for i, j in POLYNOMIAL], axis=1)
+    prior = np.eye(len(POLYNOMIAL), dtype=residual.dtype)
+    known = terms[usual].astype(residual.dtype)
+    products = (known[:, :, None] * known[:, None]).reshape(len(known), -1)
+    of_pixel = (valid[usual].T.astype(residual.dtype) @ products).reshape(-1, *prior.shape)
+    right = residual[usual].T @ known
+    coefficients = np.linalg.solve(of_pixel + prior, right[..., None])
+    common = terms.astype(residual.dtype) @ coefficients[..., 0].T
+    normal = known.T @ known
+    influence = np.linalg.solve(normal + prior, terms.T)
+    own = np.sum(terms * influence.T, axis=1)
+    added = np.sum(influence * (normal @ influence), axis=0)
+    noise = np.sqrt(1 + added - np.where(usual, 2 * own, 0.0)).astype(residual.dtype)
+    return (residual - common) * valid / noise[:, None]
+
+
 HIGHEST = 9  # half waves across a window
 # Principal components of the background beyond a polynomial that tell the strength: 0.9 of its
 # variance is in them.

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from .detection import LARGER
-from .light import Light, Noise, vertex
+from .light import Light, Noise, less_common, vertex
 from .shadow_fit import (
     DEPTH_SD,
     DISTURBED,
@@ -395,8 +395,7 @@ class _BeadFit(ShadowFit):
         move no centre against the others, and are no noise.
         """
         usual = measured & (self.strength == 0) & (self.misfit <= DISTURBED * self.typical())
-        rows = np.arange(len(self.uv))
-        rest = self._less_common(rows, self.residual, self.counted, usual)
+        rest = less_common(self.uv, self.residual, self.counted, usual)
         whole = (self.residual**2 * self.counted).sum(axis=1)
         share = np.minimum((rest**2).sum(axis=1) / np.maximum(whole, 1e-12), 1.0)
         return np.where(self.strength > 0, 1.0, share) * self.misfit

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from .light import MIN_PIXELS, Cosines, Noise, Spectra, correlation_of
+from .light import MIN_PIXELS, Cosines, Noise, Spectra, correlation_of, less_common
 
 MAX_SIGMA_PX = 0.3  # of a centre: a larger one is that of no shadow, or of one hardly seen
 MARGIN_PX = 2.0  # of background around the shadow
@@ -301,53 +301,17 @@ class ShadowFit(ABC):
         plain = plain[:: len(plain) // CORRELATED + 1]
         valid = root > 0
         usual = self.misfit[rows] <= DISTURBED * self.typical()
-        residual = self._less_common(rows, residual, valid, usual)
+        residual = less_common(self.uv[rows], residual, valid, usual)
         self.correlation = self._correlation(residual[plain], valid[plain])
         rest = residual / np.maximum(root, DTYPE(1e-12))
-        weight = root**2
-        spectra = []
-        first = 0
-        for jacobian in jacobians:
-            part = slice(first, first + len(jacobian))
-            first += len(jacobian)
-            spectra.append(
-                self.cosines.spectra(
-                    jacobian[:, 0], jacobian=jacobian, weight=weight[part], residual=rest[part]
-                )
-            )
+        ends = np.cumsum([len(jacobian) for jacobian in jacobians])[:-1]
+        spectra = [
+            self.cosines.spectra(one[:, 0], jacobian=one, weight=weight, residual=left)
+            for one, weight, left in zip(jacobians, np.split(root**2, ends), np.split(rest, ends))
+        ]
         # The waves are longer than the noise is correlated.
         excess = float(self.correlation.sum())
         self.strength[rows] = Spectra.joined(spectra).strengths(excess)
-
-    def _less_common(
-        self,
-        rows: np.ndarray,
-        residual: np.ndarray,
-        valid: NDArray[np.bool_],
-        usual: NDArray[np.bool_],
-    ) -> np.ndarray:
-        """Return residuals (n, m) over the noise, without what usual windows have in common.
-
-        Where the shadow is not quite that of a sphere, all windows show it, and more or less so
-        by their place: a polynomial of degree 2 for each pixel, a priori as large as the noise.
-        What is left is enlarged by what the polynomial takes of the noise of usual windows, and
-        reduced by what it adds to that of others.
-        """
-        place = self.uv[rows] - self.uv[rows].mean(axis=0)
-        x, y = place.T / max(float(np.abs(place).max(initial=0.0)), 1.0)
-        terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
-        known = terms[usual].astype(DTYPE)
-        products = (known[:, :, None] * known[:, None]).reshape(-1, TERMS * TERMS)
-        of_pixel = (valid[usual].T.astype(DTYPE) @ products).reshape(-1, TERMS, TERMS)
-        right = residual[usual].T @ known
-        coefficients = np.linalg.solve(of_pixel + np.eye(TERMS, dtype=DTYPE), right[..., None])
-        common = terms.astype(DTYPE) @ coefficients[..., 0].T
-        normal = known.T @ known
-        influence = np.linalg.solve(normal + np.eye(TERMS), terms.T)
-        own = np.sum(terms * influence.T, axis=1)
-        added = np.sum(influence * (normal @ influence), axis=0)
-        noise = np.sqrt(1 + added - np.where(usual, 2 * own, 0.0)).astype(DTYPE)
-        return (residual - common) * valid / noise[:, None]
 
     def _standardised(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[np.ndarray]]:
         """Residuals of all windows over the noise.

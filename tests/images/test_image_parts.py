@@ -23,6 +23,7 @@ from fluoro_calib_ros.images.light import (
     clipped_at,
     correlation_of,
     estimate_noise,
+    less_common,
 )
 from fluoro_calib_ros.images.matching import (
     EVIDENT,
@@ -310,10 +311,9 @@ def fit_of(count=3, near=None):
 def test_what_windows_have_in_common_is_no_noise_where_it_changes_over_the_image(count):
     """What is left has the noise of what was given, in usual windows and in others."""
     rng = np.random.default_rng(9)
-    fit = fit_of(count)
-    fit.uv = rng.uniform(0, 1000, (count, 2))
-    x, y = (fit.uv.T - 500) / 500
-    pixels = len(fit.offset)
+    place = rng.uniform(0, 1000, (count, 2))
+    x, y = (place.T - 500) / 500
+    pixels = 200
     common = rng.normal(size=(4, pixels))
     usual = np.arange(count) % 4 > 0
     valid = rng.random((count, pixels)) < 0.9
@@ -322,7 +322,7 @@ def test_what_windows_have_in_common_is_no_noise_where_it_changes_over_the_image
         noise = rng.normal(size=(count, pixels))
         pattern = np.stack([np.ones_like(x), x, y, x * y], axis=1) @ common
         given = ((noise + pattern) * valid).astype(np.float32)
-        left.append(fit._less_common(np.arange(count), given, valid, usual))
+        left.append(less_common(place, given, valid, usual))
     assert not np.stack(left)[:, ~valid].any()
     variance = np.mean(np.square(left), axis=(0, 2)) / valid.mean(axis=1)
     many = count > 100
@@ -330,7 +330,7 @@ def test_what_windows_have_in_common_is_no_noise_where_it_changes_over_the_image
     assert np.mean(variance[usual]) == pytest.approx(1, abs=0.05 if many else 0.5)
     assert np.mean(variance[~usual]) == pytest.approx(1, abs=0.05 if many else 1.0)
     noise_alone = [
-        fit._less_common(np.arange(count), rng.normal(size=(count, pixels)), valid | True, usual)
+        less_common(place, rng.normal(size=(count, pixels)), valid | True, usual)
         for _ in range(20)
     ]
     variance = np.mean(np.square(noise_alone), axis=(0, 2))

@@ -186,7 +186,7 @@ def less_common(
     terms = np.stack([x**i * y**j for i, j in POLYNOMIAL], axis=1)
     prior = np.eye(len(POLYNOMIAL), dtype=residual.dtype)
     known = terms[usual].astype(residual.dtype)
-    products = (known[:, :, None] * known[:, None]).reshape(len(known), -1)
+    products = (known[:, :, None] * known[:, None]).reshape(-1, prior.size)
     of_pixel = (valid[usual].T.astype(residual.dtype) @ products).reshape(-1, *prior.shape)
     right = residual[usual].T @ known
     coefficients = np.linalg.solve(of_pixel + prior, right[..., None])

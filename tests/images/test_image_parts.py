@@ -335,6 +335,7 @@ def test_what_windows_have_in_common_is_no_noise_where_it_changes_over_the_image
     ]
     variance = np.mean(np.square(noise_alone), axis=(0, 2))
     np.testing.assert_allclose(variance, 1, atol=0.1)
+    np.testing.assert_array_equal(less_common(place, given, valid, usual & False), given)
 
 
 @pytest.mark.parametrize('neighbours', [0, 2])

@@ -283,7 +283,7 @@ def poses_alone(bodies: Sequence[Body], exposures: Sequence[TrackedExposure]) ->
     )
 
 
-def _by_body(exposures: Sequence[object], name: str) -> NDArray[np.float64]:
+def _by_body(exposures: Sequence[object], name: str) -> np.ndarray:
     """Stack values (B, T, ...) of T exposures."""
     return np.stack([getattr(one, name) for one in exposures], axis=1)
 

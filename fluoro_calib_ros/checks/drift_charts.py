@@ -185,7 +185,7 @@ class EpipolarObservations:
     Raises ValueError for arrays whose shapes do not agree.
     """
 
-    target_id: NDArray[np.int64]  #: (n,)
+    target_id: NDArray[np.integer]  #: (n,)
     #: (n, 2) where the markers are in the images [px]
     uv_a: NDArray[np.float64]
     uv_b: NDArray[np.float64]

@@ -243,7 +243,7 @@ class SystematicErrorField:
     def add(
         self,
         marker: np.ndarray,
-        nodes: NDArray[np.float64],
+        nodes: NDArray[np.int64],
         weights: NDArray[np.float64],
         residual: NDArray[np.float64],
         variance: NDArray[np.float64],

@@ -161,7 +161,7 @@ class Joins:
     """Products of neighbouring residuals of two exposures, by pair of exposures."""
 
     mean: NDArray[np.float64]  #: (p,) mean product [px^2]
-    count: NDArray[np.int64]  #: (p,) number of joins
+    count: NDArray[np.float64]  #: (p,) number of joins
     #: (p,) rows of the exposures
     earlier: NDArray[np.int64]
     later: NDArray[np.int64]

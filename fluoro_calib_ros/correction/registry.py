@@ -41,7 +41,7 @@ class NoCorrection(CorrectionModel):
         """Zeros (n, 2)."""
         return np.zeros_like(np.asarray(uv, dtype=float).reshape(-1, 2))
 
-    def outside(self, uv: ArrayLike) -> NDArray[np.float64]:
+    def outside(self, uv: ArrayLike) -> NDArray[np.bool_]:
         """False (n,): there is no calibrated area to leave."""
         return np.zeros(len(np.asarray(uv)), dtype=bool)
 

@@ -76,7 +76,7 @@ class Functions:
         return np.pi / (MARGIN * max(self.image_size))
 
     @cached_property
-    def band(self) -> NDArray[np.float64]:
+    def band(self) -> NDArray[np.int64]:
         """Band (s,) of each sine."""
         return np.rint(self.frequency / self.frequency_of_mode).astype(int)
 

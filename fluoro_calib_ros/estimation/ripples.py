@@ -47,7 +47,7 @@ class Ripples:
         """Bands in which there are ripples."""
         return tuple(band for band, variance in enumerate(self.variances) if variance > 0)
 
-    def band(self, frequency: np.ndarray) -> NDArray[np.float64]:
+    def band(self, frequency: np.ndarray) -> NDArray[np.int64]:
         """Band (s,) of frequency (s,) [1/px]."""
         return np.rint(frequency / self.width).astype(int)
 

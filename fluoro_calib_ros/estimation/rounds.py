@@ -72,7 +72,7 @@ class SelfCalibration:
     stated: Precision | None = None
     #: (i,) variances [px^2], at the inliers of a fluoroscope, by which its distortion differs
     #: between exposures, without what orientations absorb
-    between_exposures: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
+    between_exposures: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     #: of the fluoroscopes whose distortion changes with the angle of the C-arm
     angle_fields: Mapping[str, AngleField] = field(default_factory=dict)
 

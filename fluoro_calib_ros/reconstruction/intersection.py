@@ -82,13 +82,13 @@ class IntersectedPoints:
     #: for positions of points relative to each other
     covariance_noise: NDArray[np.float64]
     residual: NDArray[np.float64]  #: (n,) RMS of the image residuals [px]
-    rays: NDArray[np.float64]  #: (n,) number of rays used
+    rays: NDArray[np.int64]  #: (n,) number of rays used
     #: (n,) root of the weighted square sum of the residuals over its expectation; for two rays
     #: the epipolar distance over its standard deviation (sd_total)
     standardised: NDArray[np.float64]
     status: np.ndarray  #: (n,) PointStatus as uint8
     #: (n,) number of the fluoroscope whose ray was dropped as false, else -1
-    dropped_view: NDArray[np.float64]
+    dropped_view: NDArray[np.int64]
 
     @property
     def sd_mm(self) -> NDArray[np.float64]:

@@ -73,7 +73,7 @@ def match_views(views: Sequence[CorrectedView | None]) -> MatchedViews:
         )
     if all(_equal(first, view.target_id) for view in present[1:]):
         target_id = first
-        rows: list[np.ndarray | slice] = [slice(None)] * len(present)
+        rows: list[NDArray[np.int64] | slice] = [slice(None)] * len(present)
     else:
         target_id = np.unique(np.concatenate([view.target_id for view in present]))
         rows = [np.searchsorted(target_id, view.target_id) for view in present]
@@ -91,7 +91,7 @@ def match_views(views: Sequence[CorrectedView | None]) -> MatchedViews:
     return MatchedViews(target_id, uv, sigma, correction_sd, outside)
 
 
-def _equal(one: np.ndarray, other: np.ndarray) -> bool:
+def _equal(one: NDArray[np.integer], other: NDArray[np.integer]) -> bool:
     """Whether two views have the same ids in the same order."""
     return len(one) == len(other) and bool((one == other).all())
 

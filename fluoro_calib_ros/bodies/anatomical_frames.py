@@ -77,7 +77,7 @@ def frame_of_axes(axes: Mapping[str, ArrayLike], origin_mm: ArrayLike) -> Anatom
     """
     if not set(axes) <= set(AXES) or len(axes) < 2:
         raise DataError('a frame has two or three of the axes x, y and z')
-    unit: dict[str, np.ndarray] = {}
+    unit: dict[str, NDArray[np.float64]] = {}
     for name, axis in axes.items():
         vector = np.array(axis, dtype=float)
         length = np.linalg.norm(vector)
@@ -223,11 +223,15 @@ def frame_of_landmarks(
     )
 
 
-def _mean(names: tuple[str, ...], points: Mapping[str, np.ndarray]) -> np.ndarray:
+def _mean(
+    names: tuple[str, ...], points: Mapping[str, NDArray[np.float64]]
+) -> NDArray[np.float64]:
     return np.mean([points[name] for name in names], axis=0)
 
 
-def _vector(direction: Direction, points: Mapping[str, np.ndarray], side: str) -> np.ndarray:
+def _vector(
+    direction: Direction, points: Mapping[str, NDArray[np.float64]], side: str
+) -> NDArray[np.float64]:
     """Return a direction (3,) of length one. Raises DataError."""
     vector = _mean(direction.end, points) - _mean(direction.start, points)
     length = np.linalg.norm(vector)

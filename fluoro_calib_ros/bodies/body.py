@@ -266,7 +266,9 @@ MAX_TRIPLES = 84  # of points that are tried: all of nine points
 
 
 def fitted_pose(
-    source: np.ndarray, target: np.ndarray, weight: np.ndarray | None = None
+    source: NDArray[np.float64],
+    target: NDArray[np.float64],
+    weight: NDArray[np.float64] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Rotations (..., 3, 3) and shifts (..., 3) that take points (..., k, 3) to others.
 
@@ -285,7 +287,7 @@ def fitted_pose(
 
 
 def robust_pose(
-    source: np.ndarray, target: np.ndarray
+    source: NDArray[np.float64], target: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Rotation (3, 3) and shift (3,) that take most of at least three points (k, 3) to others.
 
@@ -305,7 +307,7 @@ def robust_pose(
     return fitted_pose(source[near], target[near])
 
 
-def by_pose(arm: np.ndarray) -> NDArray[np.float64]:
+def by_pose(arm: NDArray[np.float64]) -> NDArray[np.float64]:
     """Derivatives (..., 3, 6) of places by position and rotation; arm (..., 3): R x."""
     out = np.zeros((*arm.shape, 6))
     out[..., :3] = np.eye(3)

@@ -42,7 +42,7 @@ def filtered_poses(poses: BodyPoses, cutoff_hz: float) -> BodyPoses:
     b, a = scipy.signal.butter(ORDER, cutoff_hz, fs=rate)
     time = np.arange(len(known))
 
-    def smooth(values: np.ndarray) -> np.ndarray:
+    def smooth(values: NDArray[np.float64]) -> NDArray[np.float64]:
         flat = values.reshape(len(values), -1)
         whole = np.stack([np.interp(time, time[known], v[known]) for v in flat.T], axis=1)
         return scipy.signal.filtfilt(b, a, whole, axis=0).reshape(values.shape)
@@ -73,7 +73,7 @@ def _rate(poses: BodyPoses) -> float:
     return 1 / typical
 
 
-def _continuous(quaternion: np.ndarray) -> NDArray[np.float64]:
+def _continuous(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
     """Quaternions (T, 4) without changes of sign."""
     same = np.sum(quaternion[1:] * quaternion[:-1], axis=1) >= 0
     sign = np.cumprod(np.concatenate([[1.0], np.where(same, 1.0, -1.0)]))
@@ -81,7 +81,9 @@ def _continuous(quaternion: np.ndarray) -> NDArray[np.float64]:
 
 
 def _propagated(
-    covariance: np.ndarray, known: np.ndarray, filter_: tuple[np.ndarray, np.ndarray]
+    covariance: NDArray[np.float64],
+    known: NDArray[np.bool_],
+    filter_: tuple[NDArray[np.float64], NDArray[np.float64]],
 ) -> NDArray[np.float64]:
     """Covariances (T, 6, 6) after the filter: sums by the square of its impulse response."""
     size = len(covariance)
@@ -97,7 +99,7 @@ def _propagated(
     return filtered.reshape(covariance.shape)
 
 
-def _nearest(values: np.ndarray, known: np.ndarray) -> NDArray[np.float64]:
+def _nearest(values: NDArray[np.float64], known: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Values (T, ...) with those of the nearest known exposure where there are none."""
     rows = np.flatnonzero(known)
     after = np.searchsorted(rows, np.arange(len(known))).clip(0, len(rows) - 1)

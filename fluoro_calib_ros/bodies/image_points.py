@@ -20,20 +20,20 @@ from .body import by_pose
 class ImagePoints:
     """Image points (B, M, F): uv, variances of noise and of correction, and whether seen."""
 
-    uv: np.ndarray
-    noise: np.ndarray
-    correction: np.ndarray
-    seen: np.ndarray
+    uv: NDArray[np.float64]
+    noise: NDArray[np.float64]
+    correction: NDArray[np.float64]
+    seen: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
 class Linear:
     """Image points at a pose: residuals (B, M, F, 2), and derivatives by place (B, M, F, 2, 3)."""
 
-    residual: np.ndarray
-    by_place: np.ndarray
-    uv: np.ndarray  # predicted
-    by_pose: np.ndarray  # (B, M, 3, 6), derivatives D of places by the pose
+    residual: NDArray[np.float64]
+    by_place: NDArray[np.float64]
+    uv: NDArray[np.float64]  # predicted
+    by_pose: NDArray[np.float64]  # (B, M, 3, 6), derivatives D of places by the pose
 
 
 class Cameras:
@@ -42,7 +42,7 @@ class Cameras:
     target_id: (B, M) markers of B bodies, -1 where a body has fewer.
     """
 
-    def __init__(self, orientation: RigOrientation, target_id: np.ndarray) -> None:
+    def __init__(self, orientation: RigOrientation, target_id: NDArray[np.int64]) -> None:
         self.target_id = target_id
         self._views = len(orientation.fluoroscopes)
         self._interior = orientation.interior
@@ -56,7 +56,7 @@ class Cameras:
         self._depth_rows = rows[:, 2:]
         # (F, 9, k): of the covariance of the orientation, by independent unknowns of variance one.
         self.root = orientation.covariance_root().reshape(self._views, ORIENTATION_SIZE, -1)
-        self._ids: np.ndarray | None = None
+        self._ids: NDArray[np.integer] | None = None
         self._rows = np.zeros(0, dtype=int)
 
     def sorted(self, exposure: IntersectedViews) -> ImagePoints:
@@ -95,7 +95,10 @@ class Cameras:
         return xyz[self._rows].reshape(*self.target_id.shape, 3)
 
     def linear(
-        self, xyz: np.ndarray, pose: tuple[np.ndarray, np.ndarray], points: ImagePoints
+        self,
+        xyz: NDArray[np.float64],
+        pose: tuple[NDArray[np.float64], NDArray[np.float64]],
+        points: ImagePoints,
     ) -> Linear:
         """Residuals and derivatives of all image points at poses.
 
@@ -114,7 +117,7 @@ class Cameras:
         by_place = np.where(good[..., None, None], by_place, 0.0)
         return Linear(residual, by_place, uv, by_pose(arm))
 
-    def by_orientation(self, linear: Linear) -> np.ndarray:
+    def by_orientation(self, linear: Linear) -> NDArray[np.float64]:
         """Derivatives (B, M, F, 2, 9) of image points by T, w, xp, yp, c, see collinearity."""
         interior = self._interior
         c = interior[:, 2]

@@ -252,7 +252,7 @@ class _Relative:
     translation: NDArray[np.float64]
     covariance: NDArray[np.float64]
 
-    def of(self, rows: np.ndarray) -> _Relative:
+    def of(self, rows: NDArray[np.int64]) -> _Relative:
         return _Relative(self.rotation[rows], self.translation[rows], self.covariance[rows])
 
 
@@ -296,7 +296,7 @@ def _relative(
     return _Relative(rotation, translation, covariance)
 
 
-def _angles(of: Convention, rotation: np.ndarray) -> np.ndarray:
+def _angles(of: Convention, rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the angles (..., 3) [rad] of R = R_i R_j R_k, matrices (..., 3, 3).
 
     The third angle is that of R_i^T R, so that the three give R also in gimbal lock.
@@ -317,7 +317,7 @@ def _angles(of: Convention, rotation: np.ndarray) -> np.ndarray:
     return np.stack([first, second, np.arctan2(sine_of_third, row[..., j])], axis=-1)
 
 
-def _axes(of: Convention, angles: np.ndarray) -> np.ndarray:
+def _axes(of: Convention, angles: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the axes of rotation (..., 3, 3), in the columns, in the proximal frame.
 
     They are the unit vectors i, R_i j and R_i R_j k.
@@ -339,14 +339,18 @@ def _axes(of: Convention, angles: np.ndarray) -> np.ndarray:
     return axes
 
 
-def _translations(of: Convention, axes: np.ndarray, translation: np.ndarray) -> np.ndarray:
+def _translations(
+    of: Convention, axes: NDArray[np.float64], translation: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Return the translations (..., 3) of the convention [mm]."""
     if not of.along_axes:
         return translation
     return (np.swapaxes(axes, -1, -2) @ translation[..., None])[..., 0]
 
 
-def _jacobian(of: Convention, axes: np.ndarray, translation: np.ndarray) -> np.ndarray:
+def _jacobian(
+    of: Convention, axes: NDArray[np.float64], translation: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Derivatives (T, 6, 6) of angles and translations by rotation error and translation."""
     e1, e2, e3 = (axes[..., n] for n in range(3))
     by_1, by_2, between = np.cross(np.stack([e1, e1, e2]), np.stack([e2, e3, e3]))
@@ -369,7 +373,9 @@ def _jacobian(of: Convention, axes: np.ndarray, translation: np.ndarray) -> np.n
     return jacobian
 
 
-def _near_lock(of: Convention, angles: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+def _near_lock(
+    of: Convention, angles: NDArray[np.float64], covariance: NDArray[np.float64]
+) -> NDArray[np.bool_]:
     """Return whether exposures with covariances (T, 6, 6) are LOCK_SDS from gimbal lock or less.
 
     The third axis has the polar coordinates (distance from the lock, first angle) about the first.
@@ -380,15 +386,15 @@ def _near_lock(of: Convention, angles: np.ndarray, covariance: np.ndarray) -> np
     return distance < LOCK_SDS * sd  # False for NaN
 
 
-def _is_nonlinear(covariance: np.ndarray) -> np.ndarray:
+def _is_nonlinear(covariance: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return whether angles are too uncertain for linear propagation."""
     variance = np.diagonal(covariance[:, :3, :3], axis1=1, axis2=2)
     return np.asarray(variance.max(axis=1) > LINEAR_SD_RAD**2)  # False for NaN
 
 
 def _second_moments(
-    of: Convention, relative: _Relative, angles: np.ndarray, nodes: int
-) -> np.ndarray:
+    of: Convention, relative: _Relative, angles: NDArray[np.float64], nodes: int
+) -> NDArray[np.float64]:
     """Return second moments (T, 6, 6) of the errors of angles and translations.
 
     By a Gauss-Hermite rule over the rotation error; what the translation has besides is linear.
@@ -421,7 +427,9 @@ def _second_moments(
     return moments
 
 
-def angle_errors(of: Convention, angles: np.ndarray, true: np.ndarray) -> np.ndarray:
+def angle_errors(
+    of: Convention, angles: NDArray[np.float64], true: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Return the differences (..., 3) [rad] of two sets of angles, without full turns.
 
     Close to gimbal lock the sum or difference of the first and the third angle is known well where
@@ -440,8 +448,8 @@ def angle_errors(of: Convention, angles: np.ndarray, true: np.ndarray) -> np.nda
 
 
 def _unwrapped(
-    angles: np.ndarray, locked: np.ndarray, before: NDArray[np.float64] | None
-) -> np.ndarray:
+    angles: NDArray[np.float64], locked: NDArray[np.bool_], before: NDArray[np.float64] | None
+) -> NDArray[np.float64]:
     """Return angles (T, 3) without jumps by full turns.
 
     Near gimbal lock an angle may turn by noise; each is compared with the last one that is not.
@@ -464,13 +472,16 @@ def _unwrapped(
     return out
 
 
-def _turns(angle: np.ndarray) -> np.ndarray:
+def _turns(angle: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the nearest numbers of full turns."""
     return np.round(angle / (2 * np.pi))
 
 
 def _status(
-    proximal: np.ndarray, distal: np.ndarray, locked: np.ndarray, angles: np.ndarray
+    proximal: NDArray[np.uint8],
+    distal: NDArray[np.uint8],
+    locked: NDArray[np.bool_],
+    angles: NDArray[np.float64],
 ) -> NDArray[np.uint8]:
     """Return the JointStatus (T,): of the worse body, and of gimbal lock."""
     status = np.full(len(angles), JointStatus.OK, dtype=np.uint8)

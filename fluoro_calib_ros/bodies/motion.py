@@ -112,14 +112,14 @@ class _Step:
     """
 
     dt_s: float
-    into: np.ndarray
-    reference: np.ndarray
-    mean: np.ndarray
-    covariance: np.ndarray
-    z: np.ndarray
-    m: np.ndarray
-    log_q: np.ndarray
-    started: np.ndarray
+    into: NDArray[np.float64]
+    reference: NDArray[np.float64]
+    mean: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    z: NDArray[np.float64]
+    m: NDArray[np.float64]
+    log_q: NDArray[np.float64]
+    started: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -167,7 +167,7 @@ def twist_between(
     return np.concatenate([shift[:, :, 0], turn], axis=1)
 
 
-def _vector(rotation: np.ndarray) -> np.ndarray:
+def _vector(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     """Rotation vectors (B, 3) of rotations (B, 3, 3), most of them small."""
     skew = (rotation - np.swapaxes(rotation, 1, 2)) / 2
     vector = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=1)
@@ -293,7 +293,7 @@ class MotionFilter:
         """Forget bodies (B,) whose prediction is worth nothing any more."""
         self.alive = self.alive & ~lost
 
-    def _start(self, step: _Step, seen: PoseInformation, start: np.ndarray) -> None:
+    def _start(self, step: _Step, seen: PoseInformation, start: NDArray[np.bool_]) -> None:
         """Let bodies begin at the pose of an exposure."""
         step.started = start
         step.into = np.where(start[:, None, None], 0, step.into)
@@ -311,7 +311,7 @@ class MotionFilter:
         self._log_variance[start] = START_LOG_SD**2
         self._slope[start] = 0
 
-    def _adapt(self, step: _Step, seen: tuple[np.ndarray, np.ndarray]) -> None:
+    def _adapt(self, step: _Step, seen: tuple[NDArray[np.float64], NDArray[np.float64]]) -> None:
         """Improve the log densities by the likelihood of an exposure.
 
         With S the covariance of the prediction error and D its derivative by h, the derivative of
@@ -359,7 +359,11 @@ class MotionFilter:
         )
 
 
-def _weigh(step: _Step, covariance: np.ndarray, seen: tuple[np.ndarray, np.ndarray]) -> None:
+def _weigh(
+    step: _Step,
+    covariance: NDArray[np.float64],
+    seen: tuple[NDArray[np.float64], NDArray[np.float64]],
+) -> None:
     """Weigh an exposure (B, 6, 6), (B, 6) against the covariance (B, 6, 6) of its prediction."""
     normal, right = seen
     inner = np.linalg.inv(_EYE_6 + normal @ covariance)
@@ -372,8 +376,8 @@ def _weigh(step: _Step, covariance: np.ndarray, seen: tuple[np.ndarray, np.ndarr
 class _Scores:
     """Derivatives (T, B, 2) of the log likelihood by h, and twice their information."""
 
-    gradient: np.ndarray
-    information: np.ndarray
+    gradient: NDArray[np.float64]
+    information: NDArray[np.float64]
 
 
 def _smooth(steps: Sequence[_Step]) -> tuple[Motion, _Scores]:
@@ -429,7 +433,9 @@ def _smooth(steps: Sequence[_Step]) -> tuple[Motion, _Scores]:
     return motion, scores
 
 
-def _moved(step: _Step, change: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _moved(
+    step: _Step, change: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Rotations and states (B, 18), whose deviation is 0, after a change of a prediction."""
     mean = step.mean + change
     rotation, mean[:, :3] = pose_after(step.reference, step.mean[:, :3], change[:, POSE])
@@ -437,7 +443,9 @@ def _moved(step: _Step, change: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return rotation, mean
 
 
-def _turned_covariance(covariance: np.ndarray, turned: np.ndarray) -> np.ndarray:
+def _turned_covariance(
+    covariance: NDArray[np.float64], turned: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Covariance (B, 18, 18) with its deviations of poses turned by matrices (B, 6, 6)."""
     out = covariance.copy()
     out[:, POSE] = turned @ out[:, POSE]
@@ -445,7 +453,9 @@ def _turned_covariance(covariance: np.ndarray, turned: np.ndarray) -> np.ndarray
     return out
 
 
-def _smoothed_covariance(covariance: np.ndarray, n: np.ndarray) -> np.ndarray:
+def _smoothed_covariance(
+    covariance: NDArray[np.float64], n: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """P - P N P (B, 18, 18).
 
     Where a body appears, variances fall by twelve digits, which the difference loses. There it is
@@ -496,8 +506,11 @@ def smooth_trial(first: MotionFilter, seen: Sequence[PoseInformation]) -> Motion
 
 
 def _improved(
-    log_q: np.ndarray, scores: _Scores, dt_s: np.ndarray, walk: np.ndarray
-) -> tuple[np.ndarray, float, np.ndarray]:
+    log_q: NDArray[np.float64],
+    scores: _Scores,
+    dt_s: NDArray[np.float64],
+    walk: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], float, NDArray[np.float64]]:
     """Return log densities (T, B, 2) after a step of scoring, its size, and walks (B, 2)."""
     out = log_q.copy()
     new_walk = walk.copy()
@@ -526,7 +539,7 @@ def _improved(
     return out, largest, new_walk
 
 
-def _variance_of_steps(banded: np.ndarray) -> NDArray[np.float64]:
+def _variance_of_steps(banded: NDArray[np.float64]) -> NDArray[np.float64]:
     """Variances (T - 1,) of the differences of neighbours, from a tridiagonal normal matrix.
 
     The elements of its inverse near the diagonal follow from a forward and a backward elimination
@@ -548,7 +561,7 @@ def _variance_of_steps(banded: np.ndarray) -> NDArray[np.float64]:
     return variance[:-1] + variance[1:] - 2 * covariance
 
 
-def _transition(dt_s: float, turn: np.ndarray) -> np.ndarray:
+def _transition(dt_s: float, turn: NDArray[np.float64]) -> NDArray[np.float64]:
     """Transitions (B, 18, 18) over dt_s of bodies that turn by vectors (B, 3)."""
     out = np.broadcast_to(_EYE_STATE, (len(turn), STATE, STATE)).copy()
     jacobian = left_jacobian(turn)
@@ -561,7 +574,7 @@ def _transition(dt_s: float, turn: np.ndarray) -> np.ndarray:
     return out
 
 
-def _noise(dt_s: float, log_q: np.ndarray) -> np.ndarray:
+def _noise(dt_s: float, log_q: NDArray[np.float64]) -> NDArray[np.float64]:
     """Covariances (B, 2, 18, 18) of the noise of positions and of rotations over dt_s."""
     shares = noise_factors(dt_s)[_FACTOR_ROWS, _FACTOR_ROWS.T] * _KIND_SHARES
     return np.exp(log_q)[:, :, None, None] * shares

@@ -105,22 +105,22 @@ class FramePoses:
 class _Marker:
     """What markers tell: S, s, r'Wr (B, M), M, and M S, M s."""
 
-    weight: np.ndarray  # (B, M, F), W
-    s_matrix: np.ndarray
-    s_vector: np.ndarray
-    squares: np.ndarray
-    m: np.ndarray
-    ms_matrix: np.ndarray
-    ms_vector: np.ndarray
+    weight: NDArray[np.float64]  # (B, M, F), W
+    s_matrix: NDArray[np.float64]
+    s_vector: NDArray[np.float64]
+    squares: NDArray[np.float64]
+    m: NDArray[np.float64]
+    ms_matrix: NDArray[np.float64]
+    ms_vector: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class _Solution:
     """Poses of B bodies, whether (B,) the exposure alone gives them, parts of normal matrices."""
 
-    rotation: np.ndarray
-    centre: np.ndarray
-    alone: np.ndarray
+    rotation: NDArray[np.float64]
+    centre: NDArray[np.float64]
+    alone: NDArray[np.bool_]
     parts: _Eigen
     linear: Linear
     marker: _Marker
@@ -201,7 +201,7 @@ class PoseSolver:
 
     def _ambiguous(
         self, solution: _Solution, points: ImagePoints, used: np.ndarray, prediction: Prediction
-    ) -> np.ndarray:
+    ) -> NDArray[np.bool_]:
         """Whether (B,) a body that one view sees alone fits in a second pose, too.
 
         Under a weak perspective, markers near a plane look the same when the plane is tilted the
@@ -235,8 +235,8 @@ class PoseSolver:
         self,
         exposure: IntersectedViews,
         points: ImagePoints,
-        rows: np.ndarray,
-        pose: tuple[np.ndarray, np.ndarray, np.ndarray],
+        rows: NDArray[np.int64],
+        pose: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]],
     ) -> bool:
         """Start bodies at points in space; returns whether there are enough of any.
 
@@ -256,9 +256,9 @@ class PoseSolver:
 
     def _converge(
         self,
-        pose: tuple[np.ndarray, np.ndarray],
+        pose: tuple[NDArray[np.float64], NDArray[np.float64]],
         points: ImagePoints,
-        used: np.ndarray,
+        used: NDArray[np.bool_],
         prediction: Prediction | None,
     ) -> _Solution:
         """Iterate from rotations and centres.
@@ -304,7 +304,7 @@ class PoseSolver:
             marker=marker,
         )
 
-    def _marker(self, linear: Linear, weight: np.ndarray) -> _Marker:
+    def _marker(self, linear: Linear, weight: NDArray[np.float64]) -> _Marker:
         """Sum up the image points of each marker with weights (B, M, F)."""
         s_matrix, s_vector = marker_sums(linear, weight)
         m = np.linalg.inv(_EYE_3 + self._variance_3 * s_matrix)
@@ -321,10 +321,10 @@ class PoseSolver:
     def _false_markers(
         self,
         solution: _Solution,
-        observed: tuple[ImagePoints, np.ndarray],
+        observed: tuple[ImagePoints, NDArray[np.bool_]],
         prediction: Prediction,
-        test: np.ndarray,
-    ) -> tuple[np.ndarray, np.ndarray]:
+        test: NDArray[np.float64],
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Rows of bodies that contain a false marker, and its row in each; fill in the tests.
 
         observed: image points, and whether (B, M) a marker is used.
@@ -383,10 +383,10 @@ class PoseSolver:
     def _result(
         self,
         solution: _Solution,
-        observed: tuple[ImagePoints, np.ndarray],
+        observed: tuple[ImagePoints, NDArray[np.bool_]],
         prediction: Prediction,
-        test: np.ndarray,
-        ambiguous: np.ndarray,
+        test: NDArray[np.float64],
+        ambiguous: NDArray[np.bool_],
     ) -> FramePoses:
         """Return the poses with their covariances."""
         points, used = observed
@@ -442,9 +442,9 @@ def _growth_by_rig(
     cameras: Cameras,
     solution: _Solution,
     points: ImagePoints,
-    normal: np.ndarray,
-    rows: np.ndarray,
-) -> np.ndarray:
+    normal: NDArray[np.float64],
+    rows: NDArray[np.int64],
+) -> NDArray[np.float64]:
     """Factor (S, M) of the expected squares of markers by errors of the rig's orientation.
 
     What the pose takes up of these errors is no part of it. rows (S,): bodies.
@@ -463,19 +463,23 @@ def _growth_by_rig(
     return 1 + squares.sum(axis=2) / np.maximum(2 * points.seen[rows].sum(axis=2), 1)
 
 
-def _of_unit_diagonal(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _of_unit_diagonal(
+    normal: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Normal matrices (..., 6, 6) in units in which their diagonal is 1, and these (..., 6)."""
     scale = np.sqrt(np.maximum(np.diagonal(normal, axis1=-2, axis2=-1), 1e-12))
     return normal / (scale[..., :, None] * scale[..., None, :]), scale
 
 
-def _own_squares(marker: _Marker, variance: np.ndarray) -> np.ndarray:
+def _own_squares(marker: _Marker, variance: NDArray[np.float64]) -> NDArray[np.float64]:
     """Weighted sum of squares (B, M) of each marker, its shape having a variance (B, M)."""
     shape = variance * np.sum(marker.s_vector * marker.ms_vector, axis=-1)
     return np.maximum(marker.squares - shape, 0.0)
 
 
-def _variance_of_last(noise: np.ndarray, fixed: np.ndarray, number: np.ndarray) -> np.ndarray:
+def _variance_of_last(
+    noise: NDArray[np.float64], fixed: NDArray[np.float64], number: NDArray[np.int64]
+) -> NDArray[np.float64]:
     """Variance of the last of `number` observations that have an error in common.
 
     With a variance r of their noise and c of this error, n of them tell n / (r + n c), and the
@@ -485,7 +489,7 @@ def _variance_of_last(noise: np.ndarray, fixed: np.ndarray, number: np.ndarray) 
 
 
 def _curvature(
-    by_place: np.ndarray, by_pose: np.ndarray, covariance: np.ndarray
+    by_place: NDArray[np.float64], by_pose: NDArray[np.float64], covariance: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Mean squares (B, M, F) of what derivatives neglect of image points, per coordinate.
 
@@ -509,11 +513,11 @@ def _curvature(
 
 
 def _covariances(
-    inverse: np.ndarray,
+    inverse: NDArray[np.float64],
     solution: _Solution,
-    observed: tuple[ImagePoints, np.ndarray],
+    observed: tuple[ImagePoints, NDArray[np.float64]],
     cameras: Cameras,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Covariances (B, 6, 6) of poses by noise and by what stays, and the root by the rig.
 
     inverse (B, 6, 6): of the normal matrix; observed: image points, and variances (B, M) of the
@@ -538,7 +542,9 @@ def _covariances(
     return noise, fixed, rig_root
 
 
-def _sum(marker: _Marker, by_pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _sum(
+    marker: _Marker, by_pose: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Normal matrices (B, 6, 6) and right sides (B, 6) of poses."""
     transposed = np.swapaxes(by_pose, 2, 3)
     normal = (transposed @ marker.ms_matrix @ by_pose).sum(axis=1)
@@ -546,30 +552,34 @@ def _sum(marker: _Marker, by_pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return (normal + np.swapaxes(normal, 1, 2)) / 2, right
 
 
-def _weight(points: ImagePoints, used: np.ndarray, variance: np.ndarray) -> np.ndarray:
+def _weight(
+    points: ImagePoints, used: NDArray[np.bool_], variance: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Weights (B, M, F) of image points by their variances; 0 for those that are not used."""
     return np.where(used[..., None] & points.seen, 1 / variance, 0.0)
 
 
-def marker_sums(linear: Linear, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def marker_sums(
+    linear: Linear, weight: NDArray[np.float64]
+) -> tuple[np.ndarray, NDArray[np.float64]]:
     """S (B, M, 3, 3) and s (B, M, 3) of markers."""
     weighted = _weighted(linear, weight)
     s_matrix = weighted @ linear.by_place.reshape(*weight.shape[:2], -1, 3)
     return s_matrix, _vectors(weighted, linear.residual)
 
 
-def _weighted(linear: Linear, weight: np.ndarray) -> np.ndarray:
+def _weighted(linear: Linear, weight: NDArray[np.float64]) -> NDArray[np.float64]:
     """A'W (B, M, 3, 2 F) of markers."""
     weighted = linear.by_place * weight[..., None, None]
     return np.swapaxes(weighted.reshape(*weight.shape[:2], -1, 3), 2, 3)
 
 
-def _vectors(weighted: np.ndarray, residual: np.ndarray) -> np.ndarray:
+def _vectors(weighted: NDArray[np.float64], residual: NDArray[np.float64]) -> NDArray[np.float64]:
     """Vectors s (B, M, 3) of markers."""
     return (weighted @ residual.reshape(*weighted.shape[:2], -1, 1))[..., 0]
 
 
-def _squares(linear: Linear, weight: np.ndarray) -> np.ndarray:
+def _squares(linear: Linear, weight: NDArray[np.float64]) -> NDArray[np.float64]:
     """Sums r'Wr (B, M) of markers."""
     return ((linear.residual**2).sum(axis=-1) * weight).sum(axis=-1)
 
@@ -577,17 +587,17 @@ def _squares(linear: Linear, weight: np.ndarray) -> np.ndarray:
 class _Eigen(NamedTuple):
     """Eigenvalues (B, 6) and vectors of normal matrices of unit diagonal, and scale (B, 6)."""
 
-    values: np.ndarray
-    vectors: np.ndarray
-    scale: np.ndarray
+    values: NDArray[np.float64]
+    vectors: NDArray[np.float64]
+    scale: NDArray[np.float64]
 
 
-def _eigen(normal: np.ndarray) -> _Eigen:
+def _eigen(normal: NDArray[np.float64]) -> _Eigen:
     scale = np.sqrt(np.maximum(np.diagonal(normal, axis1=1, axis2=2), 1e-30))
     return _Eigen(*np.linalg.eigh(normal / (scale[:, :, None] * scale[:, None, :])), scale)
 
 
-def _inverse(parts: _Eigen, wanted: np.ndarray) -> np.ndarray:
+def _inverse(parts: _Eigen, wanted: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Inverses (B, 6, 6) of those normal matrices that are wanted (B,), else NaN."""
     values, vectors, scale = parts
     regular = (wanted & (values[:, 0] > SINGULAR))[:, None]
@@ -596,7 +606,7 @@ def _inverse(parts: _Eigen, wanted: np.ndarray) -> np.ndarray:
     return divided @ np.swapaxes(scaled, 1, 2)
 
 
-def _is_determined(parts: _Eigen) -> np.ndarray:
+def _is_determined(parts: _Eigen) -> NDArray[np.bool_]:
     """Whether (B,) normal matrices determine a pose so that derivatives hold about it."""
     values = np.maximum(parts.values, SINGULAR)
     variance = (
@@ -605,7 +615,7 @@ def _is_determined(parts: _Eigen) -> np.ndarray:
     return (parts.values[:, 0] > SINGULAR) & (np.max(variance, axis=1) < ALONE_SD_RAD**2)
 
 
-def _solved(parts: _Eigen, right: np.ndarray) -> np.ndarray:
+def _solved(parts: _Eigen, right: NDArray[np.float64]) -> NDArray[np.float64]:
     """Steps (B, 6); 0 in directions that are not determined."""
     values, vectors, scale = parts
     inverse = np.where(values > 1e-10, 1 / np.maximum(values, 1e-10), 0.0)
@@ -613,15 +623,15 @@ def _solved(parts: _Eigen, right: np.ndarray) -> np.ndarray:
     return (vectors @ (inverse[:, :, None] * reduced))[:, :, 0] / scale
 
 
-def _mirror(direction: np.ndarray) -> np.ndarray:
+def _mirror(direction: NDArray[np.float64]) -> NDArray[np.float64]:
     """Reflection (3, 3) along a direction (3,)."""
     unit = direction / np.linalg.norm(direction)
     return np.eye(3) - 2 * np.outer(unit, unit)
 
 
 def _pull_of(
-    prediction: Prediction, pose: tuple[np.ndarray, np.ndarray]
-) -> tuple[np.ndarray, np.ndarray]:
+    prediction: Prediction, pose: tuple[NDArray[np.float64], NDArray[np.float64]]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Normal matrices (B, 6, 6) of predictions at poses, and twists (B, 6) to the predictions."""
     normal = np.linalg.inv(prediction.covariance + 1e-12 * _EYE_6)
     normal = np.where(prediction.known[:, None, None], normal, 0.0)

@@ -209,15 +209,15 @@ class _Adjustment:
     the residuals of places, 0 for those that are not used.
     """
 
-    xyz: np.ndarray
-    covariance: np.ndarray
-    test: np.ndarray
-    squares: np.ndarray
+    xyz: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    test: NDArray[np.float64]
+    squares: NDArray[np.float64]
     mean_error_mm: float
     exposures: int
 
 
-def _start(body: Body, places: BodyPlaces) -> tuple[np.ndarray, np.ndarray] | None:
+def _start(body: Body, places: BodyPlaces) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
     """First coordinates (m, 3), NaN for markers never seen, and the exposures that give poses.
 
     The shape is that of the images, so that wrong coordinates of CT do not lead astray; CT says
@@ -250,11 +250,11 @@ def _start(body: Body, places: BodyPlaces) -> tuple[np.ndarray, np.ndarray] | No
 class _Problem:
     """Places (T, k, 3), their information (T, k, 3, 3), and CT (k, 3) with its weights (k,)."""
 
-    place: np.ndarray
-    information: np.ndarray
-    seen: np.ndarray
-    ct: np.ndarray
-    ct_weight: np.ndarray
+    place: NDArray[np.float64]
+    information: NDArray[np.float64]
+    seen: NDArray[np.bool_]
+    ct: NDArray[np.float64]
+    ct_weight: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -265,13 +265,15 @@ class _Reduced:
     """
 
     matrix: np.ndarray
-    right: np.ndarray
-    solved: np.ndarray
-    by_pose: np.ndarray
-    normal: np.ndarray
+    right: NDArray[np.float64]
+    solved: NDArray[np.float64]
+    by_pose: NDArray[np.float64]
+    normal: NDArray[np.float64]
 
 
-def _adjust(body: Body, places: BodyPlaces, start: tuple[np.ndarray, np.ndarray]) -> _Adjustment:
+def _adjust(
+    body: Body, places: BodyPlaces, start: tuple[NDArray[np.float64], NDArray[np.int64]]
+) -> _Adjustment:
     """Adjust coordinates and poses together, from first coordinates and exposures."""
     xyz, rows = start
     known = np.flatnonzero(np.isfinite(xyz).all(axis=1))
@@ -308,7 +310,10 @@ def _adjust(body: Body, places: BodyPlaces, start: tuple[np.ndarray, np.ndarray]
 
 
 def _problem(
-    body: Body, places: BodyPlaces, xyz: np.ndarray, chosen: tuple[np.ndarray, np.ndarray]
+    body: Body,
+    places: BodyPlaces,
+    xyz: NDArray[np.float64],
+    chosen: tuple[NDArray[np.int64], NDArray[np.int64]],
 ) -> _Problem:
     """Return what is observed of the chosen exposures and markers."""
     known = chosen[1]
@@ -329,7 +334,10 @@ def _problem(
 
 
 def _residual(
-    problem: _Problem, shape: np.ndarray, rotation: np.ndarray, shift: np.ndarray
+    problem: _Problem,
+    shape: NDArray[np.float64],
+    rotation: NDArray[np.float64],
+    shift: NDArray[np.float64],
 ) -> np.ndarray:
     """Residuals (T, k, 3) of the places, 0 where a marker is not seen."""
     expected = shape @ np.swapaxes(rotation, 1, 2) + shift[:, None]
@@ -337,7 +345,10 @@ def _residual(
 
 
 def _reduced(
-    problem: _Problem, shape: np.ndarray, rotation: np.ndarray, shift: np.ndarray
+    problem: _Problem,
+    shape: NDArray[np.float64],
+    rotation: NDArray[np.float64],
+    shift: NDArray[np.float64],
 ) -> _Reduced:
     """Eliminate the poses from the normal equations."""
     exposures, count = problem.seen.shape
@@ -375,8 +386,8 @@ def _reduced(
 
 
 def _squares_over_expectation(
-    problem: _Problem, reduced: _Reduced, squares: np.ndarray
-) -> np.ndarray:
+    problem: _Problem, reduced: _Reduced, squares: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Sums (k,) of weighted squares (T, k) over their redundancy, NaN without any."""
     of_place = reduced.by_pose @ np.linalg.inv(reduced.normal)[:, None]
     of_place = of_place @ np.swapaxes(reduced.by_pose, 2, 3)
@@ -385,7 +396,7 @@ def _squares_over_expectation(
     return np.where(freedom > 1, squares.sum(axis=0) / np.maximum(freedom, 1), np.nan)
 
 
-def _false_places(adjustment: _Adjustment) -> np.ndarray:
+def _false_places(adjustment: _Adjustment) -> NDArray[np.bool_]:
     """Return the places (T, m) that are false matches: far larger squares than of the marker.
 
     A marker that moves has large ones in many exposures; it keeps its places.
@@ -401,11 +412,11 @@ def _false_places(adjustment: _Adjustment) -> np.ndarray:
 
 def _stays(
     places: BodyPlaces,
-    chosen: tuple[np.ndarray, np.ndarray],
+    chosen: tuple[NDArray[np.int64], NDArray[np.int64]],
     problem: _Problem,
     reduced: _Reduced,
-    rotation: np.ndarray,
-) -> np.ndarray:
+    rotation: NDArray[np.float64],
+) -> NDArray[np.float64]:
     """Covariance of the right side of the shape by errors of the corrections.
 
     They average out only as far as the markers move in the image, and those of markers that are
@@ -430,19 +441,21 @@ def _stays(
     return root @ np.kron(alike, np.eye(3)) @ root.T
 
 
-def _root_of(covariance: np.ndarray) -> np.ndarray:
+def _root_of(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the symmetric root of a covariance."""
     variance, axes = np.linalg.eigh(covariance)
     return np.asarray(axes * np.sqrt(np.maximum(variance, 0.0)) @ axes.T)
 
 
-def _turned(rotation: np.ndarray, w: np.ndarray) -> np.ndarray:
+def _turned(rotation: NDArray[np.float64], w: NDArray[np.float64]) -> NDArray[np.float64]:
     """Rotations (T, 3, 3) varied on the left, made orthogonal again."""
     u, _, vt = np.linalg.svd((np.eye(3) + cross_matrix(w)) @ rotation)
     return u @ vt
 
 
-def _datum(xyz: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _datum(
+    xyz: NDArray[np.float64], covariance: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Covariance (6, 6) of the frame about the centre, and that of coordinates in their datum."""
     motion = _motion(xyz)
     read = np.linalg.pinv(motion)
@@ -450,7 +463,7 @@ def _datum(xyz: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndar
     return read @ covariance @ read.T, relative @ covariance @ relative.T
 
 
-def _motion(xyz: np.ndarray) -> np.ndarray:
+def _motion(xyz: NDArray[np.float64]) -> NDArray[np.float64]:
     """Derivatives (3k, 6) of coordinates (k, 3) by a motion of all of them about their centre."""
     return by_pose(xyz - xyz.mean(axis=0)).reshape(-1, POSE_SIZE)
 
@@ -581,7 +594,7 @@ def _limit_of_ratio(places: BodyPlaces) -> float:
     return float(chdtri(independent, REJECT_TAIL) / independent)
 
 
-def _migrated(body: Body, adjustment: _Adjustment, known: np.ndarray) -> list[Finding]:
+def _migrated(body: Body, adjustment: _Adjustment, known: NDArray[np.bool_]) -> list[Finding]:
     """Compare the shape of the images with that of CT, marker by marker."""
     rows = np.flatnonzero(known)
     limit = float(chdtri(3, REJECT_TAIL))
@@ -633,7 +646,11 @@ def _migrated(body: Body, adjustment: _Adjustment, known: np.ndarray) -> list[Fi
 
 
 def _against_others(
-    given: np.ndarray, found: np.ndarray, sd: np.ndarray, marker: int, kept: Sequence[int]
+    given: NDArray[np.float64],
+    found: NDArray[np.float64],
+    sd: NDArray[np.float64],
+    marker: int,
+    kept: Sequence[int],
 ) -> float:
     """Squared deviation of a marker from CT over its variance, by the fit of the others."""
     others = [k for k in kept if k != marker]
@@ -647,14 +664,18 @@ def _against_others(
     return float(away @ np.linalg.solve(covariance, away))
 
 
-def _misfit(given: np.ndarray, found: np.ndarray, sd: np.ndarray) -> float:
+def _misfit(
+    given: NDArray[np.float64], found: NDArray[np.float64], sd: NDArray[np.float64]
+) -> float:
     """Weighted sum of squares of the fit of coordinates (k, 3) to those of CT, over its limit."""
     rotation, shift = fitted_pose(found, given, 1 / sd**2)
     away = (found @ rotation.T + shift - given) / sd[:, None]
     return float(np.sum(away**2) / chdtri(3 * len(given) - POSE_SIZE, REJECT_TAIL))
 
 
-def _exchanged(given: np.ndarray, found: np.ndarray, sd: np.ndarray) -> tuple[int, int] | None:
+def _exchanged(
+    given: NDArray[np.float64], found: NDArray[np.float64], sd: NDArray[np.float64]
+) -> tuple[int, int] | None:
     """Two markers that contradict CT, and agree with it when they are exchanged."""
     if _misfit(given, found, sd) <= 1:
         return None
@@ -691,7 +712,9 @@ def _stability(body: Body, condition: float, mean_error_mm: float) -> list[Findi
 
 
 def places_of(
-    body: Body, target_ids: Sequence[np.ndarray], points: Sequence[Mapping[str, np.ndarray]]
+    body: Body,
+    target_ids: Sequence[NDArray[np.int64]],
+    points: Sequence[Mapping[str, NDArray[np.float64]]],
 ) -> BodyPlaces:
     """Collect the places of the markers of a body from points in space.
 

@@ -59,9 +59,9 @@ class _Taken:
     number: int
     stamp_ns: int
     frame: FramePoses
-    alive: np.ndarray
-    fixed: np.ndarray
-    rig_root: np.ndarray
+    alive: NDArray[np.bool_]
+    fixed: NDArray[np.float64]
+    rig_root: NDArray[np.float64]
 
 
 class BodyTracker:
@@ -199,7 +199,7 @@ class BodyTracker:
         status[frame.ambiguous] = PoseStatus.AMBIGUOUS
         status[lost] = PoseStatus.FAILED
 
-        def kept(values: np.ndarray) -> np.ndarray:
+        def kept(values: NDArray[np.float64]) -> NDArray[np.float64]:
             if not lost.any():
                 return values
             shape = (-1,) + (1,) * (values.ndim - 1)
@@ -283,7 +283,7 @@ def poses_alone(bodies: Sequence[Body], exposures: Sequence[TrackedExposure]) ->
     )
 
 
-def _by_body(exposures: Sequence[object], name: str) -> NDArray[np.float64]:
+def _by_body(exposures: Sequence[object], name: str) -> np.ndarray:
     """Stack values (B, T, ...) of T exposures."""
     return np.stack([getattr(one, name) for one in exposures], axis=1)
 
@@ -291,11 +291,11 @@ def _by_body(exposures: Sequence[object], name: str) -> NDArray[np.float64]:
 def _poses(
     bodies: Sequence[Body],
     exposures: Sequence[TrackedExposure],
-    pose: tuple[np.ndarray, np.ndarray],
+    pose: tuple[NDArray[np.float64], NDArray[np.float64]],
     *,
-    noise: np.ndarray,
-    fixed: np.ndarray,
-    status: np.ndarray,
+    noise: NDArray[np.float64],
+    fixed: NDArray[np.float64],
+    status: NDArray[np.uint8],
 ) -> list[BodyPoses]:
     """Move poses from the centres of the markers to the origins of B bodies: t = c - R x_c.
 

@@ -36,18 +36,18 @@ class Beads:
     survey_mm: NDArray[np.float64]  #: (n, 3)
     survey_sd_mm: NDArray[np.float64]  #: (n,)
 
-    def without(self, target_id: np.ndarray) -> Beads:
+    def without(self, target_id: NDArray[np.int64]) -> Beads:
         """Return the beads except those with a target id."""
         keep = ~np.isin(self.target_id, target_id)
         return Beads(*(getattr(self, name)[keep] for name in self.__dataclass_fields__))
 
     @property
-    def misclosure(self) -> np.ndarray:
+    def misclosure(self) -> NDArray[np.float64]:
         """Images - survey (n, 3) [mm]."""
         return self.xyz_mm - self.survey_mm
 
     @property
-    def total_covariance(self) -> np.ndarray:
+    def total_covariance(self) -> NDArray[np.float64]:
         """Covariance (n, 3, 3) of the misclosures, of images and survey together [mm^2]."""
         return self.covariance + self.survey_sd_mm[:, None, None] ** 2 * np.eye(3)
 
@@ -127,7 +127,11 @@ def least_chi2_without_a_ray(
 
 
 def _beads(
-    rays: Rays, target_id: np.ndarray, bead: np.ndarray, start: np.ndarray, phantom: Phantom
+    rays: Rays,
+    target_id: NDArray[np.int64],
+    bead: NDArray[np.int64],
+    start: NDArray[np.float64],
+    phantom: Phantom,
 ) -> Beads:
     """Intersect beads from rays.
 
@@ -191,7 +195,7 @@ def distances(beads: Beads) -> DistanceComparison:
 
 
 def _degrees_of_freedom(
-    direction: np.ndarray, covariance: np.ndarray, variance: np.ndarray
+    direction: NDArray[np.float64], covariance: NDArray[np.float64], variance: NDArray[np.float64]
 ) -> float:
     """Return those of the sum of squared errors of all distances between n beads.
 

@@ -93,13 +93,13 @@ class _Candidate:
     """A layer to try: the beads order[start:stop] along an axis; gain of its own motion."""
 
     axis: int
-    order: np.ndarray
+    order: NDArray[np.int64]
     start: int
     stop: int
     gain: float
 
     @property
-    def own(self) -> np.ndarray:
+    def own(self) -> NDArray[np.int64]:
         """Rows of its beads."""
         return self.order[self.start : self.stop]
 
@@ -204,17 +204,21 @@ class _Fit:
             limit_mm=size * float(np.sqrt(critical / candidate.gain)),
         )
 
-    def _motion_and_rest(self, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _motion_and_rest(
+        self, own: NDArray[np.int64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Motions (6,) of beads and of the rest."""
         layer = _Equations(self._normals[own].sum(axis=0), self._rights[own].sum(axis=0))
         return layer.motion, self._all.without(layer).motion
 
-    def _squares(self, left: np.ndarray, rows: np.ndarray | slice) -> np.ndarray:
+    def _squares(
+        self, left: NDArray[np.float64], rows: NDArray[np.int64] | slice
+    ) -> NDArray[np.float64]:
         """Weighted squares (k,) of misclosures left (k, 3) of beads."""
         return np.einsum('na,nab,nb->n', left, self._information[rows], left)
 
 
-def _layers(coordinate: np.ndarray, sd: np.ndarray) -> np.ndarray:
+def _layers(coordinate: NDArray[np.float64], sd: NDArray[np.float64]) -> NDArray[np.int64]:
     """Starts and stops (k, 2) of the layers to try, from coordinates (n,) in order with their sd.
 
     Borders are where the gaps are largest. Of a face and the rest, the smaller one is tried.
@@ -231,7 +235,9 @@ def _layers(coordinate: np.ndarray, sd: np.ndarray) -> np.ndarray:
     return pairs[(size >= MIN_LAYER) & (size <= count // 2)]
 
 
-def _sums(values: np.ndarray, start: np.ndarray, stop: np.ndarray) -> np.ndarray:
+def _sums(
+    values: NDArray[np.float64], start: NDArray[np.int64], stop: NDArray[np.int64]
+) -> NDArray[np.float64]:
     """Sums (k, ...) of values (n, ...) from start (k,) to before stop (k,)."""
     sums = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)])
     return sums[stop] - sums[start]
@@ -241,15 +247,15 @@ def _sums(values: np.ndarray, start: np.ndarray, stop: np.ndarray) -> np.ndarray
 class _Equations:
     """Normal equations of motions: normal (..., 6, 6) and right (..., 6)."""
 
-    normal: np.ndarray
-    right: np.ndarray
+    normal: NDArray[np.float64]
+    right: NDArray[np.float64]
 
     def without(self, part: _Equations) -> _Equations:
         """Return those of the beads that are not in a part."""
         return _Equations(self.normal - part.normal, self.right - part.right)
 
     @property
-    def motion(self) -> np.ndarray:
+    def motion(self) -> NDArray[np.float64]:
         """Motions (..., 6); beads on a line do not determine all of them."""
         inverse = np.linalg.pinv(self.normal, hermitian=True, rcond=1e-9)
         return (inverse @ self.right[..., None])[..., 0]
@@ -275,7 +281,7 @@ def check_beads(evidence: Evidence, names: Sequence[str]) -> list[Check]:
     found = intersect(evidence.result, evidence.frames, evidence.phantom)
     has_trend = any(common.is_significant for common in evidence.trends.values())
 
-    def least_chi2(target_id: np.ndarray) -> np.ndarray:
+    def least_chi2(target_id: NDArray[np.int64]) -> NDArray[np.float64]:
         return least_chi2_without_a_ray(
             evidence.result, evidence.frames, evidence.phantom, target_id
         )
@@ -359,7 +365,7 @@ def _exchanged(pairs: NDArray[np.int64]) -> Check:
 def compare_with_survey(
     beads: Beads,
     has_trend: bool = False,
-    least_chi2: Callable[[np.ndarray], np.ndarray] | None = None,
+    least_chi2: Callable[[NDArray[np.int64]], NDArray[np.float64]] | None = None,
 ) -> list[Check]:
     """Return the checks 'beads' and 'distances'.
 
@@ -427,7 +433,7 @@ def _not_made(kind: Kind, count: int) -> Check:
     )
 
 
-def _wrong_beads(target_id: np.ndarray, size: np.ndarray) -> str:
+def _wrong_beads(target_id: NDArray[np.int64], size: NDArray[np.float64]) -> str:
     """Return the names of the beads with a wrong survey, and their errors [mm]."""
     wrong = first_few(f'{target} is wrong by {mm:.1f} mm' for target, mm in zip(target_id, size))
     return f'the survey of bead {wrong}'

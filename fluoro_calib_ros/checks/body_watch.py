@@ -72,7 +72,7 @@ class _Seen:
     """One exposure: image points of the bodies, and places (B, M, 3) of their markers."""
 
     points: ImagePoints
-    places: np.ndarray
+    places: NDArray[np.float64]
 
 
 class BodyWatch:
@@ -169,7 +169,7 @@ class BodyWatch:
         if self._known.all():
             self._learning = []
 
-    def _learned(self, row: int, fresh: np.ndarray) -> Body:
+    def _learned(self, row: int, fresh: NDArray[np.bool_]) -> Body:
         """Return a body with the places of fresh (M,) markers; the known ones stay."""
         body = self.bodies[row]
         count = len(body.target_id)
@@ -227,7 +227,7 @@ class BodyWatch:
             int(there.sum()),
         )
 
-    def _inside(self, points: ImagePoints) -> np.ndarray:
+    def _inside(self, points: ImagePoints) -> NDArray[np.float64]:
         """Whether (n, F, M, A) image points are seen in an area."""
         member = self._areas.member.T
         parts = []
@@ -237,7 +237,7 @@ class BodyWatch:
             parts.append(member[cell] * points.seen[:, :, view, None])
         return np.stack(parts, axis=1)
 
-    def _clipped(self, drift: _Drift) -> np.ndarray:
+    def _clipped(self, drift: _Drift) -> NDArray[np.float64]:
         """Displacements (n, M, 3) [mm] from the robust pose, clipped.
 
         Clipped at what noise, systematic errors and the smallest drift to be found explain; the
@@ -277,17 +277,17 @@ class _Drift:
     by noise; by_pose D; pulled (n, M, 6, 3), D'S; inverse (n, 6, 6) of N.
     """
 
-    s_matrix: np.ndarray
-    displacement: np.ndarray
-    weighted: np.ndarray
-    square: np.ndarray
-    systematic: np.ndarray
-    by_pose: np.ndarray
-    pulled: np.ndarray
-    inverse: np.ndarray
+    s_matrix: NDArray[np.float64]
+    displacement: NDArray[np.float64]
+    weighted: NDArray[np.float64]
+    square: NDArray[np.float64]
+    systematic: NDArray[np.float64]
+    by_pose: NDArray[np.float64]
+    pulled: NDArray[np.float64]
+    inverse: NDArray[np.float64]
 
     @classmethod
-    def of(cls, linear: Linear, points: ImagePoints, variance: np.ndarray) -> _Drift:
+    def of(cls, linear: Linear, points: ImagePoints, variance: NDArray[np.float64]) -> _Drift:
         """Of image points at a pose, and shapes of variances (n, M) [mm^2]."""
         weight = np.where(points.seen, 1 / points.noise, 0.0)
         s_matrix, s_vector = marker_sums(linear, weight)
@@ -310,15 +310,15 @@ class _Drift:
         )
 
 
-def _inverse(normal: np.ndarray) -> np.ndarray:
+def _inverse(normal: NDArray[np.float64]) -> NDArray[np.float64]:
     """Inverses (n, 6, 6) of normal matrices, of which two markers leave a rotation open."""
     diagonal = REGULAR * normal.max(axis=(1, 2), keepdims=True) * np.eye(POSE_SIZE)
     return np.linalg.inv(normal + diagonal)
 
 
 def _by_area(
-    drift: _Drift, displacement: np.ndarray, inside: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    drift: _Drift, displacement: NDArray[np.float64], inside: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Score, information and systematic error of the score (n, 2F, A) of shifts of areas."""
     n, views, markers, areas = inside.shape
     told = np.concatenate(

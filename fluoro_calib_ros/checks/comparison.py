@@ -63,7 +63,7 @@ class FieldDifference:
         return self.uv[np.argmax(np.linalg.norm(self.duv, axis=1) / self.sd)]
 
 
-def image_grid(image_size: tuple[int, int]) -> np.ndarray:
+def image_grid(image_size: tuple[int, int]) -> NDArray[np.float64]:
     """Return pixels (GRID^2, 2), evenly spaced over an image (width, height)."""
     u, v = ((np.arange(GRID) + 0.5) / GRID * size - 0.5 for size in image_size)
     return np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
@@ -102,12 +102,14 @@ def difference(
     return _difference(grid[both], (one.interior, other.interior), parts)
 
 
-def _part(correction: Correction, rows: np.ndarray) -> Correction:
+def _part(correction: Correction, rows: NDArray[np.bool_]) -> Correction:
     return Correction(correction.duv[rows], correction.sd[rows], correction.outside[rows])
 
 
 def _difference(
-    uv: np.ndarray, interiors: Sequence[np.ndarray], corrections: Sequence[Correction]
+    uv: NDArray[np.float64],
+    interiors: Sequence[NDArray[np.float64]],
+    corrections: Sequence[Correction],
 ) -> FieldDifference:
     """Return the first less the second prediction at pixels uv (n, 2)."""
     rays = [
@@ -167,7 +169,7 @@ class Comparison:
         return np.hypot(*self.duv.T)
 
     @property
-    def significant(self) -> np.ndarray:
+    def significant(self) -> NDArray[np.bool_]:
         """Whether (n,) a difference exceeds its 99 % quantile."""
         return self.size**2 > chdtri(2, 1 - LEVEL) * self.sd**2
 
@@ -234,7 +236,7 @@ def compare_calibrations(
 
 
 def _interior_difference(
-    uv: np.ndarray,
+    uv: NDArray[np.float64],
     calibrations: Sequence[FluoroscopeCalibration],
     fields: Sequence[Correction],
 ) -> NDArray[np.float64]:
@@ -251,7 +253,9 @@ def _interior_difference(
     return second - first
 
 
-def cell_centres(image_size: Sequence[int], cells: int) -> tuple[list[np.ndarray], np.ndarray]:
+def cell_centres(
+    image_size: Sequence[int], cells: int
+) -> tuple[list[np.ndarray], NDArray[np.float64]]:
     """Return columns and rows of the centres of cells over an image, and the centres (n, 2).
 
     cells: along the longer side.
@@ -262,7 +266,7 @@ def cell_centres(image_size: Sequence[int], cells: int) -> tuple[list[np.ndarray
     return axes, np.column_stack([u.ravel(), v.ravel()])
 
 
-def _test(difference: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:
+def _test(difference: NDArray[np.float64], covariance: NDArray[np.float64]) -> tuple[float, float]:
     """Return the weighted square sum of a difference (3,) and its limit; NaN without variance."""
     free = np.diag(covariance) > 0
     if not free.any():

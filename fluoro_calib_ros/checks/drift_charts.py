@@ -185,7 +185,7 @@ class EpipolarObservations:
     Raises ValueError for arrays whose shapes do not agree.
     """
 
-    target_id: NDArray[np.int64]  #: (n,)
+    target_id: NDArray[np.integer]  #: (n,)
     #: (n, 2) where the markers are in the images [px]
     uv_a: NDArray[np.float64]
     uv_b: NDArray[np.float64]
@@ -214,17 +214,17 @@ class EpipolarObservations:
         return len(self.target_id)
 
     @property
-    def uv(self) -> tuple[np.ndarray, np.ndarray]:
+    def uv(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Pixels of both images."""
         return self.uv_a, self.uv_b
 
     @property
-    def normal(self) -> tuple[np.ndarray, np.ndarray]:
+    def normal(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Normals of the epipolar lines in both images."""
         return self.normal_a, self.normal_b
 
     @property
-    def factor(self) -> tuple[np.ndarray, np.ndarray]:
+    def factor(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Factors of both images."""
         return self.factor_a, self.factor_b
 
@@ -290,7 +290,9 @@ class ImageAreas:
     def __len__(self) -> int:
         return len(self.member)
 
-    def cell(self, uv: np.ndarray, size: Sequence[float] | np.ndarray) -> np.ndarray:
+    def cell(
+        self, uv: NDArray[np.float64], size: Sequence[float] | np.ndarray
+    ) -> NDArray[np.int64]:
         """Cells (n,) of pixels uv (n, 2) of an image of size (width, height) [px].
 
         Pixels off the image belong to the nearest cell.
@@ -371,7 +373,7 @@ class CusumCharts:
         score: NDArray[np.float64],
         information: NDArray[np.float64],
         band: NDArray[np.float64],
-        testing: np.ndarray,
+        testing: NDArray[np.bool_],
         stamp_ns: int,
     ) -> None:
         """Add one block.
@@ -402,8 +404,8 @@ class CusumCharts:
         self.evidence = np.clip(self.evidence + gain, 0, self._cap)
 
     def _update_variance(
-        self, score: np.ndarray, information: np.ndarray, seen: np.ndarray
-    ) -> np.ndarray:
+        self, score: NDArray[np.float64], information: NDArray[np.float64], seen: NDArray[np.bool_]
+    ) -> NDArray[np.float64]:
         """Add the differences from the last block; return the factor (K, A) as it was before."""
         factor = self.variance_factor()
         with np.errstate(divide='ignore', invalid='ignore'):

@@ -41,7 +41,7 @@ class BlockRecord:
     begin_ns: int
     score: np.ndarray
     information: np.ndarray
-    systematic: np.ndarray
+    systematic: NDArray[np.float64]
     detail: Any
 
 
@@ -148,11 +148,13 @@ class Evidence(ABC):
         return names, best.series, best.area
 
     @abstractmethod
-    def _preferred(self, likelihood: np.ndarray) -> np.ndarray:
+    def _preferred(self, likelihood: NDArray[np.float64]) -> NDArray[np.float64]:
         """The likelihood (2, K, A), -1 for series to which others are preferred."""
 
     @abstractmethod
-    def _likeliest(self, likelihood: np.ndarray, series: int) -> tuple[tuple[str, ...], int, int]:
+    def _likeliest(
+        self, likelihood: NDArray[np.float64], series: int
+    ) -> tuple[tuple[str, ...], int, int]:
         """Names of the likeliest fluoroscopes, and series and area of the first of them.
 
         likelihood (K, A); series: that of the largest likelihood.
@@ -161,7 +163,7 @@ class Evidence(ABC):
     @abstractmethod
     def _direction(
         self, run: list[BlockRecord], series: int, area: int
-    ) -> tuple[np.ndarray, str, bool]:
+    ) -> tuple[NDArray[np.float64], str, bool]:
         """Direction (2,) of a drift, its source, and whether it is confirmed."""
 
     @abstractmethod
@@ -176,14 +178,16 @@ class EpipolarEvidence(Evidence):
         super().__init__(charts, fluoroscopes, window)
         self._pairs = list(combinations(self._names, 2))
 
-    def _preferred(self, likelihood: np.ndarray) -> np.ndarray:
+    def _preferred(self, likelihood: NDArray[np.float64]) -> NDArray[np.float64]:
         # Those against the start know the errors of the calibration, so they are sharper.
         start = np.arange(likelihood.shape[1]) % SERIES_OF_PAIR >= 2
         if likelihood[:, start].max() >= 0:
             likelihood[:, ~start] = -1
         return likelihood
 
-    def _likeliest(self, likelihood: np.ndarray, series: int) -> tuple[tuple[str, ...], int, int]:
+    def _likeliest(
+        self, likelihood: NDArray[np.float64], series: int
+    ) -> tuple[tuple[str, ...], int, int]:
         reference = series % SERIES_OF_PAIR // 2
         candidates = {}
         for name in self._names:
@@ -200,7 +204,7 @@ class EpipolarEvidence(Evidence):
 
     def _direction(
         self, run: list[BlockRecord], series: int, area: int
-    ) -> tuple[np.ndarray, str, bool]:
+    ) -> tuple[NDArray[np.float64], str, bool]:
         pair = series // SERIES_OF_PAIR
         normal = sum(record.detail[pair, series % 2, area] for record in run)
         return normal / max(np.linalg.norm(normal), MIN_INFORMATION), EPIPOLAR, True
@@ -225,10 +229,12 @@ class BodyEvidence(Evidence):
         super().__init__(charts, fluoroscopes, window)
         self._bodies = tuple(bodies)
 
-    def _preferred(self, likelihood: np.ndarray) -> np.ndarray:
+    def _preferred(self, likelihood: NDArray[np.float64]) -> NDArray[np.float64]:
         return likelihood
 
-    def _likeliest(self, likelihood: np.ndarray, series: int) -> tuple[tuple[str, ...], int, int]:
+    def _likeliest(
+        self, likelihood: NDArray[np.float64], series: int
+    ) -> tuple[tuple[str, ...], int, int]:
         candidates = {}
         for view, name in enumerate(self._names):
             first = COMPONENTS * view
@@ -240,7 +246,7 @@ class BodyEvidence(Evidence):
 
     def _direction(
         self, run: list[BlockRecord], series: int, area: int
-    ) -> tuple[np.ndarray, str, bool]:
+    ) -> tuple[NDArray[np.float64], str, bool]:
         score = sum(record.detail.score[:, series, area] for record in run)
         information = sum(record.detail.information[:, series, area] for record in run)
         sign = np.sign(score.sum())

@@ -29,6 +29,7 @@ from collections.abc import Mapping, Sequence
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..bodies.body import Body
 from ..findings import Finding, Kind, Place, Severity
@@ -242,7 +243,9 @@ class DriftWatch:
             watch.learn()
         return bool(testing.any())
 
-    def _dead_band(self, factor: float | np.ndarray, systematic: np.ndarray) -> np.ndarray:
+    def _dead_band(
+        self, factor: float | NDArray[np.float64], systematic: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
         """Dead bands [px] of a number of systematic standard deviations [px]."""
         return np.hypot(self.options.tolerance_px, factor * np.nan_to_num(systematic))
 

@@ -109,7 +109,7 @@ def corrected_already(
     )
 
 
-def _rmse(values: np.ndarray) -> float:
+def _rmse(values: NDArray[np.float64]) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
@@ -234,7 +234,7 @@ def _hold_out(
     return out
 
 
-def _white(uv: np.ndarray, r: np.ndarray, sd: np.ndarray) -> float:
+def _white(uv: NDArray[np.float64], r: NDArray[np.float64], sd: NDArray[np.float64]) -> float:
     """Sum of half the squared differences (n, 2) [px] between neighbours, capped as residuals are.
 
     Differences of independent residuals have twice their variance (von Neumann, "Distribution of
@@ -305,7 +305,7 @@ def _rejected_exposure(name: str, found: RejectedExposure) -> Check:
     )
 
 
-def exposure_limits(ratio: np.ndarray, white: np.ndarray) -> NDArray[np.float64]:
+def exposure_limits(ratio: NDArray[np.float64], white: NDArray[np.float64]) -> NDArray[np.float64]:
     """Limits (m,) of the residuals of exposures over their expectation.
 
     ratio (m,): of all exposures; half of them or fewer are at fault. white (m,): the same of the

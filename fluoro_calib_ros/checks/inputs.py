@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..correction.series import sd_grid_pixels
@@ -52,7 +53,7 @@ SAME_PX = 1e-6  # image points of two exposures that agree so closely are copies
 MIN_COMMON = 8  # targets in two exposures that are compared
 COPIED = 0.9  # share of common image points that are the same in a copied exposure
 
-Relabel = Callable[[np.ndarray, Phantom], np.ndarray]
+Relabel = Callable[[NDArray[np.int64], Phantom], NDArray[np.int64]]
 
 _PHANTOM = Place(name='phantom')
 _MIRRORED = Finding(
@@ -217,7 +218,7 @@ def _validate_sigma(frame: Frame) -> None:
         )
 
 
-def fit_to_phantom(frame: Frame, phantom: Phantom, target_id: np.ndarray) -> Fit | None:
+def fit_to_phantom(frame: Frame, phantom: Phantom, target_id: NDArray[np.int64]) -> Fit | None:
     """Fit an exposure, with target_id (n,) for its ids, to the phantom.
 
     Returns None where too few targets are on the phantom, or where they lie on a line.
@@ -245,7 +246,7 @@ def fit_to_phantom(frame: Frame, phantom: Phantom, target_id: np.ndarray) -> Fit
     return Fit(float(np.median(residual)), bool(np.median(depth) < 0), distance)
 
 
-def _fit_of_plane(xyz: np.ndarray, uv: np.ndarray) -> Fit | None:
+def _fit_of_plane(xyz: NDArray[np.float64], uv: NDArray[np.float64]) -> Fit | None:
     """Fit image points (n, 2) to targets (n, 3) in one plane."""
     try:
         with np.errstate(all='ignore'):
@@ -350,7 +351,7 @@ def _median_residual(frames: Sequence[Frame], phantom: Phantom, known: KnownOrie
     return float(np.median(np.concatenate(distances))) if distances else 0.0
 
 
-def _residuals(frame: Frame, phantom: Phantom, known: KnownOrientation) -> np.ndarray:
+def _residuals(frame: Frame, phantom: Phantom, known: KnownOrientation) -> NDArray[np.float64]:
     """Distances (n,) [px] of image points from their targets, infinite behind the source."""
     xyz = phantom.xyz_mm[phantom.index(frame.target_id)]
     n = len(xyz)
@@ -493,7 +494,7 @@ def shared_exposures(one: Sequence[Frame], other: Sequence[Frame]) -> list[tuple
     return found
 
 
-def _are_copied(uv: np.ndarray, others: np.ndarray) -> np.ndarray:
+def _are_copied(uv: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Which (k,) of others (k, n, 2) have the image points uv (n, 2) [px]; NaN where unseen."""
     u, v = np.moveaxis(np.abs(others - uv), 2, 0)
     distance = np.maximum(u, v)  # max() along so short an axis takes ten times as long
@@ -615,12 +616,12 @@ def _wrong_given_distance(calibration: FluoroscopeCalibration) -> Finding | None
     )
 
 
-def _off_centre(interior: np.ndarray, image_size: tuple[int, int]) -> float:
+def _off_centre(interior: NDArray[np.float64], image_size: tuple[int, int]) -> float:
     """Distance [px] of a principal point from the middle of the image."""
     return float(np.linalg.norm(interior[:2] - (np.array(image_size) - 1) / 2))
 
 
-def _interior_about_middle(calibration: FluoroscopeCalibration) -> np.ndarray:
+def _interior_about_middle(calibration: FluoroscopeCalibration) -> NDArray[np.float64]:
     """Interior orientation (3,) [px] with a correction in the gauge about the middle of the image.
 
     A strong affine distortion can move the principal point far away, and its correction with it.

@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import DataError
 from ..exposures.frame import Frame, Frames
@@ -84,14 +85,14 @@ def _on_phantom(frame: Frame, phantom: Phantom) -> Frame:
     )
 
 
-def _seen(frames: Sequence[Frame], phantom: Phantom) -> np.ndarray:
+def _seen(frames: Sequence[Frame], phantom: Phantom) -> NDArray[np.bool_]:
     """Return which (n,) targets of a phantom are seen."""
     return np.isin(phantom.target_id, np.concatenate([frame.target_id for frame in frames]))
 
 
 def _factor_of(
     frame: Frame, phantom: Phantom, is_suspicious: bool
-) -> tuple[float, np.ndarray] | None:
+) -> tuple[float, NDArray[np.bool_]] | None:
     """Return the factor by which some targets fit, and which (n,) of the phantom, or None."""
     rows = phantom.index(frame.target_id)
     xyz = phantom.xyz_mm[rows]
@@ -114,8 +115,8 @@ def _factor_of(
 
 
 def _factor_by_samples(
-    frame: Frame, xyz: np.ndarray, rows: np.ndarray, phantom: Phantom
-) -> tuple[float, np.ndarray] | None:
+    frame: Frame, xyz: NDArray[np.float64], rows: NDArray[np.int64], phantom: Phantom
+) -> tuple[float, NDArray[np.bool_]] | None:
     """Return the same as `_factor_of`, found without a majority of the targets (n, 3)."""
     rng = np.random.default_rng(0)
     limit = max(frame.image_size)
@@ -141,8 +142,8 @@ def _factor_by_samples(
 
 
 def _refined(
-    projection: np.ndarray, versions: np.ndarray, uv: np.ndarray
-) -> tuple[np.ndarray, float]:
+    projection: NDArray[np.float64], versions: NDArray[np.float64], uv: NDArray[np.float64]
+) -> tuple[NDArray[np.bool_], float]:
     """Return which (n,) targets of versions (2, n, 3) are multiples, and the median residual."""
     every = np.arange(len(uv))
     scaled = np.zeros(len(uv), dtype=int)
@@ -156,15 +157,15 @@ def _refined(
     return scaled == 1, float(np.sqrt(np.median(squared)))
 
 
-def _chosen(phantom: Phantom, rows: np.ndarray) -> np.ndarray:
+def _chosen(phantom: Phantom, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
     out = np.zeros(len(phantom.target_id), dtype=bool)
     out[rows] = True
     return out
 
 
 def _whole_group(
-    frames: Sequence[Frame], phantom: Phantom, factor: float, group: np.ndarray
-) -> tuple[np.ndarray, float]:
+    frames: Sequence[Frame], phantom: Phantom, factor: float, group: NDArray[np.bool_]
+) -> tuple[NDArray[np.bool_], float]:
     """Return which (n,) targets fit by the factor in most exposures, and the source's distance.
 
     group (n,) is a part of them; the distance [mm] is that with these targets multiplied.
@@ -201,7 +202,7 @@ def _whole_group(
     return group, float(np.median(distances)) if distances else np.nan
 
 
-def _finding(ids: np.ndarray, factor: float) -> Finding:
+def _finding(ids: NDArray[np.int64], factor: float) -> Finding:
     """Return the finding on targets that fit when they are multiplied by a factor."""
     unit = UNITS.get(factor)
     meant = f' ({unit} in place of mm)' if unit else ''

@@ -31,7 +31,7 @@ class PairBlock:
     score: NDArray[np.float64]
     information: NDArray[np.float64]
     systematic: NDArray[np.float64]  #: (4, A) systematic standard deviations [px]
-    enough: np.ndarray  #: (4, A) whether there are enough markers in the area
+    enough: NDArray[np.bool_]  #: (4, A) whether there are enough markers in the area
     #: (2, A, 2) sums of the normals of the epipolar lines in both images
     normals: NDArray[np.float64]
 
@@ -84,7 +84,9 @@ class PairWatch:
         white = v1 - s * (1 - r)
         return max(1.0, (white + s * long) / (white + s * (own - shared)))
 
-    def _update_correlation(self, marker: np.ndarray, standardised: np.ndarray) -> None:
+    def _update_correlation(
+        self, marker: NDArray[np.int64], standardised: NDArray[np.float64]
+    ) -> None:
         """Add the differences of standardised residuals (n,) of markers (n,), in frame order."""
         order = np.argsort(marker, kind='stable')
         marker = marker[order]
@@ -151,9 +153,9 @@ class PairWatch:
         out: PairBlock,
         side: int,
         observations: EpipolarObservations,
-        residuals: np.ndarray,
-        cell: np.ndarray,
-        marker: np.ndarray,
+        residuals: NDArray[np.float64],
+        cell: NDArray[np.int64],
+        marker: NDArray[np.int64],
     ) -> None:
         """Fill in the series of one image.
 
@@ -182,7 +184,9 @@ class PairWatch:
         markers = ((areas.member @ present) > 0).sum(axis=1)
         out.enough[both] = markers >= self._options.min_markers
 
-    def _area_sums(self, cell: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    def _area_sums(
+        self, cell: NDArray[np.int64], columns: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
         """Sums (k, A) of columns (k, n) over the areas, for rows in cells (n,)."""
         size = self._areas.n**2
         k = len(columns)
@@ -191,8 +195,8 @@ class PairWatch:
         return sums @ self._areas.member.T
 
     def _unknown_variance(
-        self, cell: np.ndarray, nodes: np.ndarray, weights: np.ndarray
-    ) -> np.ndarray:
+        self, cell: NDArray[np.int64], nodes: NDArray[np.int64], weights: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
         """Variance (A,) of the weighted sums of residuals by the uncertainty of the field."""
         covariance = np.asarray(self.field.covariance)
         size = len(covariance)
@@ -228,10 +232,12 @@ class SystematicErrorField:
         self._square_sum = 0.0
         self._count = 0
         #: (m,) [px] and (m, m) [px^2] of the nodes; None until `estimate` is called
-        self.mean: np.ndarray | None = None
-        self.covariance: np.ndarray | None = None
+        self.mean: NDArray[np.float64] | None = None
+        self.covariance: NDArray[np.float64] | None = None
 
-    def interpolation(self, uv: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]:
+    def interpolation(
+        self, uv: NDArray[np.float64], side: int
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Nodes (n, 4) and their bilinear weights (n, 4) at pixels uv (n, 2) of image 0 or 1."""
         x = np.clip((uv + 0.5) * ((NODES - 1) / self._sizes[side]), 0, NODES - 1)
         low = np.minimum(x.astype(int), NODES - 2)
@@ -242,8 +248,8 @@ class SystematicErrorField:
 
     def add(
         self,
-        marker: np.ndarray,
-        nodes: NDArray[np.float64],
+        marker: NDArray[np.int64],
+        nodes: NDArray[np.int64],
         weights: NDArray[np.float64],
         residual: NDArray[np.float64],
         variance: NDArray[np.float64],

@@ -83,7 +83,7 @@ class Residuals:
         """Angle (n,) of the C-arm [rad] of each residual."""
         return self.angles[self.exposure]
 
-    def capped(self, sd: np.ndarray) -> NDArray[np.float64]:
+    def capped(self, sd: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return squared lengths (n,) [px^2], capped at the border of the core of the noise.
 
         sd (n,): standard deviations of the noise [px].
@@ -95,12 +95,12 @@ class Residuals:
         """Return the residuals in the core of noise of standard deviations sd (n,) [px]."""
         return self._part(np.sum(self.r**2, axis=1) <= INLIER_Q * sd**2)
 
-    def rejected(self, sd: np.ndarray) -> Residuals:
+    def rejected(self, sd: NDArray[np.float64]) -> Residuals:
         """Return the residuals beyond that core which a distortion may have left."""
         q = np.sum(self.r**2, axis=1) / sd**2
         return self._part((q > INLIER_Q) & (q < LARGEST_SD**2))
 
-    def _part(self, keep: np.ndarray) -> Residuals:
+    def _part(self, keep: NDArray[np.bool_]) -> Residuals:
         return Residuals(
             self.uv[keep],
             self.r[keep],
@@ -161,7 +161,7 @@ class Joins:
     """Products of neighbouring residuals of two exposures, by pair of exposures."""
 
     mean: NDArray[np.float64]  #: (p,) mean product [px^2]
-    count: NDArray[np.int64]  #: (p,) number of joins
+    count: NDArray[np.float64]  #: (p,) number of joins
     #: (p,) rows of the exposures
     earlier: NDArray[np.int64]
     later: NDArray[np.int64]
@@ -331,7 +331,9 @@ def _trend(squared: float, limit: float, cell: CellTrend) -> ResidualTrend:
     return ResidualTrend(float(size), float(size_limit), *cell)
 
 
-def _mean_and_limit(joins: Joins, same: np.ndarray, false_alarm: float) -> tuple[float, float]:
+def _mean_and_limit(
+    joins: Joins, same: NDArray[np.bool_], false_alarm: float
+) -> tuple[float, float]:
     """Return the mean product of the pairs (p,) that are the same, and its limit [px^2].
 
     Where there are others, half the excess over their mean is returned.
@@ -352,7 +354,7 @@ def _mean_and_limit(joins: Joins, same: np.ndarray, false_alarm: float) -> tuple
 
 def _cell_sums(
     residuals: Residuals, image_size: tuple[int, int], overlap: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return the residuals by cell and exposure.
 
     overlap: a cell consists of so many parts along each side, and there is one for each place of
@@ -378,7 +380,7 @@ def _cell_sums(
 
 
 def _worst_cell(
-    residuals: Residuals, image_size: tuple[int, int], part: np.ndarray, plan: _TestPlan
+    residuals: Residuals, image_size: tuple[int, int], part: NDArray[np.bool_], plan: _TestPlan
 ) -> CellTrend:
     """Return the mean residual of the cell where it is most significant.
 
@@ -406,11 +408,11 @@ def _worst_cell(
 
 
 def _scatter(
-    sums: np.ndarray,
+    sums: NDArray[np.float64],
     counts: np.ndarray,
     groups: Sequence[np.ndarray],
-    means: Sequence[np.ndarray],
-) -> tuple[np.ndarray, np.ndarray]:
+    means: Sequence[NDArray[np.float64]],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the squared deviations (c,) of the exposures from the mean of their group, by cell.
 
     The second array is their number of degrees of freedom.

@@ -21,6 +21,7 @@ from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..correction.fluoroscope_calibration import Calibrations
 from ..errors import DataError
@@ -92,7 +93,7 @@ def _pairs(
 
 def _relative(
     pairs: Sequence[tuple[ExposureResult, ExposureResult]],
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return rotations (k, 3, 3) from sensor to sensor, and shifts (k, 3) [mm] in the first."""
     r_a = matrix_from_quaternion([a.quaternion_wxyz for a, _ in pairs])
     r_b = matrix_from_quaternion([b.quaternion_wxyz for _, b in pairs])
@@ -101,8 +102,11 @@ def _relative(
 
 
 def _distances(
-    turn: np.ndarray, shift: np.ndarray, other_turn: np.ndarray, other_shift: np.ndarray
-) -> np.ndarray:
+    turn: NDArray[np.float64],
+    shift: NDArray[np.float64],
+    other_turn: NDArray[np.float64],
+    other_shift: NDArray[np.float64],
+) -> NDArray[np.float64]:
     """Return how far (k, l) relative orientations are apart: angle [rad] and relative shift."""
     angle = rotation_angle(turn[:, None] @ other_turn[None].transpose(0, 1, 3, 2))
     length = np.linalg.norm(other_shift, axis=-1)[None]
@@ -196,7 +200,7 @@ def doubtful(scatter: PairScatter, side_px: int, noise_px: float) -> tuple[bool,
     return True, out
 
 
-def _size(off_px: np.ndarray) -> str:
+def _size(off_px: NDArray[np.float64]) -> str:
     """Return the displacements of image points as text."""
     low, high = float(np.min(off_px)), float(np.max(off_px))
     if not np.isfinite(high):
@@ -241,7 +245,9 @@ def _cause(scatter: PairScatter) -> tuple[Kind, tuple[int, ...], str]:
     return Kind.RIG_MOVED, (before, after), cause
 
 
-def _squares(values: np.ndarray, columns: np.ndarray) -> tuple[float, np.ndarray]:
+def _squares(
+    values: NDArray[np.float64], columns: NDArray[np.float64]
+) -> tuple[float, np.ndarray]:
     """Fit functions (k, p) to values (k, 6); return the squares left, and coefficients (p, 6)."""
     coefficients = np.linalg.lstsq(columns, values, rcond=None)[0]
     return float(np.sum((values - columns @ coefficients) ** 2)), coefficients

@@ -56,11 +56,11 @@ class Addition:
 class _Rays:
     """Residuals (n,) of pairs of rays, and their derivatives (n, 9F) by the rig."""
 
-    residual: np.ndarray
-    noise: np.ndarray  # variance
-    systematic: np.ndarray  # variance of the part that stays
-    by_rig: np.ndarray
-    is_apart: np.ndarray  # so that they do not meet
+    residual: NDArray[np.float64]
+    noise: NDArray[np.float64]  # variance
+    systematic: NDArray[np.float64]  # variance of the part that stays
+    by_rig: NDArray[np.float64]
+    is_apart: NDArray[np.bool_]  # so that they do not meet
 
 
 class RigChange:
@@ -83,10 +83,10 @@ class RigChange:
     def add(
         self,
         number: int,
-        target_id: np.ndarray,
-        uv: tuple[np.ndarray, np.ndarray],
+        target_id: NDArray[np.integer],
+        uv: tuple[NDArray[np.float64], NDArray[np.float64]],
         found: EpipolarResiduals,
-        noise: np.ndarray,
+        noise: NDArray[np.float64],
     ) -> None:
         """Add the image points uv (n, 2) of a pair in an exposure.
 
@@ -180,7 +180,7 @@ class RigChange:
         )
 
 
-def _cap(residual: np.ndarray) -> float:
+def _cap(residual: NDArray[np.float64]) -> float:
     """Square of a residual beyond which it counts as false in a mean."""
     return float(9 * np.median(residual**2) / NORMAL_MEDIAN)
 
@@ -209,8 +209,8 @@ def _hypotheses(orientation: RigOrientation) -> list[NDArray[np.float64]]:
 
 
 def _weights(
-    design: np.ndarray, residual: np.ndarray, variance: np.ndarray
-) -> tuple[float, np.ndarray]:
+    design: NDArray[np.float64], residual: NDArray[np.float64], variance: NDArray[np.float64]
+) -> tuple[float, NDArray[np.float64]]:
     """Return the factor of the variance, at least 1, and the weights (n,) of residuals (n,).
 
     design (n, K): derivatives by unknowns of variance one. Weights are those of a t distribution

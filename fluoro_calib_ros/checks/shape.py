@@ -105,12 +105,12 @@ class _Score:
     adjusted beads by unit strains [mm].
     """
 
-    information: np.ndarray
-    pull: np.ndarray
-    followed: np.ndarray
+    information: NDArray[np.float64]
+    pull: NDArray[np.float64]
+    followed: NDArray[np.float64]
 
 
-def _score(evidence: Evidence, solved: SolvedNetwork, displacement: np.ndarray) -> _Score:
+def _score(evidence: Evidence, solved: SolvedNetwork, displacement: NDArray[np.float64]) -> _Score:
     """Normal equations of strains with displacements (n, 3, 5), linearised at an adjustment."""
     network = solved.measured.network
     adjustment = solved.adjustment
@@ -156,7 +156,7 @@ def _change(evidence: Evidence, network: Network, f: int, name: str) -> Addition
     return AdditionalParameters(functions, np.eye(functions.shape[2]) / claimed**2)
 
 
-def _strains(survey_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _strains(survey_mm: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Tensors (5, 3, 3) of unit strains, and displacements (n, 3, 5) [mm] of beads by them."""
     tensors = np.zeros((STRAINS, 3, 3))
     tensors[0] = np.diag([1.0, -1.0, 0.0]) / np.sqrt(2)
@@ -168,8 +168,8 @@ def _strains(survey_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _without_similarity(
-    displacement: np.ndarray, survey_mm: np.ndarray, sd_mm: np.ndarray
-) -> np.ndarray:
+    displacement: NDArray[np.float64], survey_mm: NDArray[np.float64], sd_mm: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Displacements (n, 3, 5) less their shift, rotation and scale, which the poses take up."""
     offset = survey_mm - survey_mm.mean(axis=0)
     similarity = np.zeros((len(offset), 3, 7))
@@ -183,7 +183,7 @@ def _without_similarity(
     return displacement - similarity @ np.linalg.lstsq(left, right, rcond=None)[0]
 
 
-def _strains_that_show(displacement: np.ndarray) -> np.ndarray:
+def _strains_that_show(displacement: NDArray[np.float64]) -> NDArray[np.float64]:
     """Strains (5, k) that displace beads (n, 3, 5), as columns of unit length."""
     of_beads = displacement.reshape(-1, STRAINS)
     values, vectors = np.linalg.eigh(of_beads.T @ of_beads)
@@ -245,7 +245,7 @@ def trusted_shape(checks: Sequence[Check]) -> list[Finding]:
     return out
 
 
-def _principal(tensor: np.ndarray) -> tuple[np.ndarray, float]:
+def _principal(tensor: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
     """Direction (3,) of the largest strain, its largest coordinate positive, and that strain."""
     values, vectors = np.linalg.eigh(tensor)
     largest = int(np.argmax(np.abs(values)))
@@ -253,7 +253,7 @@ def _principal(tensor: np.ndarray) -> tuple[np.ndarray, float]:
     return direction * np.sign(direction[np.argmax(np.abs(direction))]), float(values[largest])
 
 
-def _text(direction: np.ndarray) -> str:
+def _text(direction: NDArray[np.float64]) -> str:
     x, y, z = direction + 0.0
     return f'({x:.2f}, {y:.2f}, {z:.2f})'
 

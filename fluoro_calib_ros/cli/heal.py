@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .arguments import (
     add_exit_zero,
@@ -123,7 +124,7 @@ def _lines(arguments: argparse.Namespace, outcome: HealingOutcome) -> list[str]:
     return lines
 
 
-def _change(value: np.ndarray, sd: np.ndarray) -> str:
+def _change(value: NDArray[np.float64], sd: NDArray[np.float64]) -> str:
     """Return changes of an orientation with their standard deviations."""
     parts = []
     if value[:6].any():

@@ -29,7 +29,7 @@ PAIRS = [(j, k) for j in range(HARMONICS) for k in range(j, HARMONICS)]
 MAX_DISTANCE = np.deg2rad(15)  # of an angle from the next one that was calibrated
 
 
-def harmonics(angle: ArrayLike) -> np.ndarray:
+def harmonics(angle: ArrayLike) -> NDArray[np.float64]:
     """Cosines and sines (..., 4) of angles (...) [rad], by order."""
     multiple = np.asarray(angle, dtype=float)[..., None] * np.arange(1, ORDERS + 1)
     both = np.stack([np.cos(multiple), np.sin(multiple)], axis=-1)
@@ -82,11 +82,11 @@ class AngleField:
         return Functions(self.image_size, CUBIC)
 
     @cached_property
-    def _mean(self) -> np.ndarray:
+    def _mean(self) -> NDArray[np.float64]:
         return harmonics(self.angles).mean(axis=0)
 
     @cached_property
-    def _spread(self) -> np.ndarray:
+    def _spread(self) -> NDArray[np.float64]:
         """Mean products (4, 4) of the harmonics over the exposures, less their mean."""
         h = harmonics(self.angles) - self._mean
         return h.T @ h / len(h)
@@ -116,7 +116,9 @@ class AngleField:
         turn = np.exp(1j * self.angles)[:, None] / np.exp(1j * other.angles)
         return float(self.angles[np.argmin(np.abs(np.angle(turn)).min(axis=1))])
 
-    def change(self, uv: ArrayLike, angle: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    def change(
+        self, uv: ArrayLike, angle: ArrayLike
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return what an angle adds to a correction and to its variance.
 
         uv: (n, 2) observed pixels. angle: one or (n,) [rad]; NaN: it is unknown, the correction is
@@ -137,7 +139,7 @@ class AngleField:
         duv[rows], variance[rows] = self._change_at(uv[rows], np.nan)
         return duv, variance
 
-    def duv(self, uv: np.ndarray, angle: float) -> NDArray[np.float64]:
+    def duv(self, uv: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
         """Return what a known angle [rad] adds to a correction (n, 2) at pixels uv (n, 2) [px]."""
         return self._values(uv, self._known(angle).coefficients)[:, 0]
 
@@ -154,7 +156,9 @@ class AngleField:
             np.sqrt(np.maximum(series.sd**2 + variance.reshape(series.sd.shape), 0)),
         )
 
-    def _change_at(self, uv: np.ndarray, angle: float) -> tuple[np.ndarray, np.ndarray]:
+    def _change_at(
+        self, uv: NDArray[np.float64], angle: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         found = self._unknown if np.isnan(angle) else self._known(angle)
         values = self._values(uv, found.coefficients)
         variance = self._at(uv, found.variance)
@@ -180,7 +184,12 @@ class AngleField:
         weights = np.zeros(HARMONICS)
         return self._change(weights, self._spread, np.vstack([weights, roots]))
 
-    def _change(self, weights: np.ndarray, products: np.ndarray, fields: np.ndarray) -> _Change:
+    def _change(
+        self,
+        weights: NDArray[np.float64],
+        products: NDArray[np.float64],
+        fields: NDArray[np.float64],
+    ) -> _Change:
         """Return a change from weights of the harmonics, their products, and those of fields."""
         j, k = np.transpose(PAIRS)
         factors = np.concatenate([2 * weights, products[j, k] * np.where(j == k, 1, 2)])
@@ -191,7 +200,9 @@ class AngleField:
         variance = np.tensordot(factors, self.variances, axes=1)
         return _Change(square, variance, len(fields) > 1)
 
-    def _values(self, uv: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
+    def _values(
+        self, uv: NDArray[np.float64], coefficients: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
         """Values (n, k, 2) of k fields, from the coefficients of a `_Change`."""
         side = max(self.image_size) / 2
         powers = np.empty((CUBIC + 1, len(uv), 2))
@@ -203,13 +214,15 @@ class AngleField:
         by_y = by_y.reshape(len(uv), *coefficients.shape[1:])
         return np.einsum('nkay,yn->nka', by_y, powers[:, :, 1])
 
-    def _at(self, uv: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    def _at(self, uv: NDArray[np.float64], grid: NDArray[np.float64]) -> NDArray[np.float64]:
         """Values (n,) of a grid (33, 33) over the image at pixels uv (n, 2), interpolated."""
         place = (uv + 0.5) / np.asarray(self.image_size) * (SD_GRID - 1)
         return map_coordinates(grid, place[:, ::-1].T, order=1, mode='nearest')
 
 
-def packed_angles(field: AngleField | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def packed_angles(
+    field: AngleField | None,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return angles (e,), coefficients (4, 2, 10) and variances (14, 33, 33), as they are saved.
 
     No field gives empty arrays.
@@ -221,9 +234,9 @@ def packed_angles(field: AngleField | None) -> tuple[np.ndarray, np.ndarray, np.
 
 def unpacked_angles(
     image_size: tuple[int, int],
-    angles: np.ndarray,
-    coefficients: np.ndarray,
-    variances: np.ndarray,
+    angles: NDArray[np.float64],
+    coefficients: NDArray[np.float64],
+    variances: NDArray[np.float64],
 ) -> AngleField | None:
     """Return the AngleField, or None, from which `packed_angles` made the arguments.
 

@@ -88,7 +88,7 @@ class CorrectionModel(ABC):
     noise_px: float = 0.0  #: standard deviation of one training correction
     bias_px: float = 0.0  #: systematic error of a prediction, as a standard deviation
     series: Series | None = None  #: terms that were estimated in the adjustment
-    _hull: np.ndarray = field(init=False, repr=False, compare=False)
+    _hull: NDArray[np.float64] = field(init=False, repr=False, compare=False)
     _holes: Holes | None = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -123,7 +123,7 @@ class CorrectionModel(ABC):
     def _prepare(self) -> None:  # noqa: B027
         """Derive from the content what predictions need; called once, by the constructor."""
 
-    def _calibrated_points(self, uv: np.ndarray) -> np.ndarray:
+    def _calibrated_points(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points whose convex hull bounds the calibrated area."""
         return uv
 
@@ -131,11 +131,11 @@ class CorrectionModel(ABC):
     def predict(self, uv: ArrayLike) -> NDArray[np.float64]:
         """Corrections (n, 2) [px] at pixels uv (n, 2)."""
 
-    def standard_deviation(self, uv: np.ndarray) -> NDArray[np.float64]:
+    def standard_deviation(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
         """Standard deviations (n,) [px] of the predictions at pixels uv (n, 2)."""
         return self._sd(np.zeros(len(uv)), uv)
 
-    def _sd(self, norm2: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    def _sd(self, norm2: NDArray[np.float64], uv: NDArray[np.float64]) -> NDArray[np.float64]:
         """Standard deviations (n,) [px] from the squared norms (n,) of the prediction weights."""
         variance = self.noise_px**2 * norm2 + self.bias_px**2
         return np.sqrt(variance if self.series is None else variance + self.series.sd_at(uv) ** 2)
@@ -145,7 +145,7 @@ class CorrectionModel(ABC):
         uv = np.asarray(uv, dtype=float).reshape(-1, 2)
         return Correction(self.predict(uv), self.standard_deviation(uv), self.outside(uv))
 
-    def evaluate_in_bulk(self, uv: np.ndarray) -> NDArray[np.float64]:
+    def evaluate_in_bulk(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return du, dv and standard deviation (3, n) [px] at many pixels uv (n, 2).
 
         The lookup grid is built with it. A subclass overrides it where there is a faster way than
@@ -158,7 +158,7 @@ class CorrectionModel(ABC):
             out[2, part] = self.standard_deviation(uv[part])
         return out
 
-    def bulk_work(self, uv: np.ndarray, limit: float) -> float:
+    def bulk_work(self, uv: NDArray[np.float64], limit: float) -> float:
         """Return the work of `evaluate_in_bulk` at pixels uv (n, 2), in some 50 ns.
 
         By default the values of functions that are added up. A result above the limit may be too
@@ -166,7 +166,7 @@ class CorrectionModel(ABC):
         """
         return float(len(uv)) * (1 if self.series is None else len(self.series.functions))
 
-    def outside(self, uv: ArrayLike) -> np.ndarray:
+    def outside(self, uv: ArrayLike) -> NDArray[np.bool_]:
         """True (n,) where a pixel uv (n, 2) is beyond the calibrated area.
 
         It is beyond the convex hull of the training points, or in a hole between them: what a
@@ -203,13 +203,13 @@ class Holes:
     centres: cKDTree
     radius: float
 
-    def contain(self, uv: np.ndarray) -> NDArray[np.bool_]:
+    def contain(self, uv: NDArray[np.float64]) -> NDArray[np.bool_]:
         """True (n,) where a pixel uv (n, 2) is in one of the discs."""
         distance, _ = self.centres.query(uv, distance_upper_bound=self.radius)
         return np.isfinite(distance)
 
 
-def _holes_of(uv: np.ndarray, hull: np.ndarray) -> Holes | None:
+def _holes_of(uv: NDArray[np.float64], hull: NDArray[np.float64]) -> Holes | None:
     """Holes between training points uv (N, 2) within their hull; None: there are none.
 
     Their union is what an alpha shape excludes (Edelsbrunner, Kirkpatrick and Seidel, "On the
@@ -232,12 +232,12 @@ def _holes_of(uv: np.ndarray, hull: np.ndarray) -> Holes | None:
     return Holes(cKDTree(tried[empty]), radius) if empty.any() else None
 
 
-def _beyond(hull: np.ndarray, uv: np.ndarray) -> NDArray[np.bool_]:
+def _beyond(hull: NDArray[np.float64], uv: NDArray[np.float64]) -> NDArray[np.bool_]:
     """True (n,) where a pixel uv (n, 2) is beyond half-planes (h, 3)."""
     return (uv @ hull[:, :2].T + hull[:, 2] > 0).any(axis=1)
 
 
-def _half_planes(uv: np.ndarray) -> np.ndarray:
+def _half_planes(uv: NDArray[np.float64]) -> NDArray[np.float64]:
     """Half-planes (h, 3) whose intersection is the convex hull of uv (N, 2).
 
     A pixel (u, v) is inside where a u + b v + c <= 0 for every row (a, b, c).

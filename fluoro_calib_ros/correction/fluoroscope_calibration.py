@@ -47,7 +47,7 @@ class NoiseProfile:
     reach: float
 
     def factors(
-        self, u: np.ndarray, v: np.ndarray, image_size: tuple[int, int]
+        self, u: NDArray[np.float64], v: NDArray[np.float64], image_size: tuple[int, int]
     ) -> NDArray[np.float64]:
         """Return the factors (n,) at pixels u, v (n,)."""
         square = np.minimum(square_distance(u, v, image_size), self.reach**2)
@@ -80,7 +80,9 @@ def unpacked_profile(values: np.ndarray) -> NoiseProfile | None:
     return NoiseProfile(middle, rim, reach)
 
 
-def square_distance(u: np.ndarray, v: np.ndarray, image_size: tuple[int, int]) -> np.ndarray:
+def square_distance(
+    u: NDArray[np.float64], v: NDArray[np.float64], image_size: tuple[int, int]
+) -> NDArray[np.float64]:
     """Squares (n,) of distances from the middle of an image, in halves of its longer side."""
     width, height = image_size
     half = max(width, height) / 2
@@ -107,9 +109,9 @@ class CorrectedPoints:
 
     __repr__ = brief_repr
 
-    uv: np.ndarray
-    sigma: np.ndarray
-    status: np.ndarray
+    uv: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+    status: NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -134,18 +136,18 @@ class FluoroscopeCalibration:
 
     fluoroscope: str
     image_size: tuple[int, int]
-    interior: np.ndarray
-    interior_covariance: np.ndarray
+    interior: NDArray[np.float64]
+    interior_covariance: NDArray[np.float64]
     interior_estimated: bool
     model: CorrectionModel
-    train_exposure: np.ndarray
+    train_exposure: NDArray[np.int64]
     image_sd: float
     sigma0: float
     nu: float
     exposures: int
     observations: int
     inliers: int
-    rmse_before: np.ndarray
+    rmse_before: NDArray[np.float64]
     rmse_after: np.ndarray
     cost_adjustment: float
     cost_regression: float
@@ -231,17 +233,17 @@ class FluoroscopeCalibration:
             **{field.name: values[field.name] for field in FIELDS if field.name not in packed},
         )
 
-    def noise_factors(self, uv: np.ndarray) -> np.ndarray:
+    def noise_factors(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the factors (n,) of image_sd at pixels uv (n, 2)."""
         if self.noise_profile is None:
             return np.ones(len(uv))
         return self.noise_profile.factors(uv[:, 0], uv[:, 1], self.image_size)
 
-    def image_sd_at(self, uv: np.ndarray) -> np.ndarray:
+    def image_sd_at(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the standard deviations (n,) [px] of image coordinates at pixels uv (n, 2)."""
         return self.image_sd * self.noise_factors(uv)
 
-    def noise_sd(self, frame: Frame) -> np.ndarray:
+    def noise_sd(self, frame: Frame) -> NDArray[np.float64]:
         """Return the standard deviations (n,) [px] of the image coordinates of a frame."""
         if frame.sigma is None:
             return self.image_sd_at(frame.uv)
@@ -332,11 +334,17 @@ class FluoroscopeCalibration:
 
     def correct_arrays(
         self,
-        u: np.ndarray,
-        v: np.ndarray,
-        sigma: np.ndarray | None = None,
+        u: NDArray[np.float64],
+        v: NDArray[np.float64],
+        sigma: NDArray[np.float64] | None = None,
         angle: ArrayLike | None = None,
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    ) -> tuple[
+        NDArray[np.float64],
+        NDArray[np.float64],
+        NDArray[np.float64],
+        NDArray[np.float64],
+        NDArray[np.uint8],
+    ]:
         """Correct arrays u, v and sigma (n,) of floats, with the least overhead.
 
         angle: of the C-arm [rad], a number or (n,); None or NaN where it is unknown. Returns
@@ -362,9 +370,9 @@ class FluoroscopeCalibration:
     @staticmethod
     def _add_angle(
         field: AngleField,
-        uv: tuple[np.ndarray, np.ndarray],
-        correction: tuple[np.ndarray, np.ndarray, np.ndarray],
-        status: np.ndarray,
+        uv: tuple[NDArray[np.float64], NDArray[np.float64]],
+        correction: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
+        status: NDArray[np.uint8],
         angle: ArrayLike | None,
     ) -> None:
         """Add to a correction and its status, in place, what an angle changes."""
@@ -382,7 +390,7 @@ class FluoroscopeCalibration:
             status[on] = np.where(beyond, CorrectionStatus.OUTSIDE, status[on])
 
     def _correct_exactly(
-        self, uv: np.ndarray, sigma: np.ndarray | float, angle: ArrayLike | None
+        self, uv: NDArray[np.float64], sigma: NDArray[np.float64] | float, angle: ArrayLike | None
     ) -> CorrectedPoints:
         """Correct by the model itself."""
         good = points_on_image(uv, self.image_size)
@@ -403,7 +411,10 @@ class FluoroscopeCalibration:
 
 
 def with_drift(
-    calibration: FluoroscopeCalibration, drift: Functions, coefficients: np.ndarray, sd: np.ndarray
+    calibration: FluoroscopeCalibration,
+    drift: Functions,
+    coefficients: NDArray[np.float64],
+    sd: NDArray[np.float64],
 ) -> FluoroscopeCalibration:
     """Return a calibration with a change of its correction.
 
@@ -426,7 +437,9 @@ def with_drift(
     return replace(calibration, model=changed)
 
 
-def with_larger_sd(calibration: FluoroscopeCalibration, sd: np.ndarray) -> FluoroscopeCalibration:
+def with_larger_sd(
+    calibration: FluoroscopeCalibration, sd: NDArray[np.float64]
+) -> FluoroscopeCalibration:
     """Return a calibration whose correction claims a standard deviation of sd (33, 33) at least.
 
     sd is on the grid of `Series` [px]. A model without a series is returned as it is: it has no

@@ -96,7 +96,7 @@ class LookupWorkspace:
         self.result = np.empty((3, n))  #: (3, n) du, dv and standard deviation [px]
         self.status = np.empty(n, dtype=np.uint8)  #: (n,) status of their cells
 
-    def locate(self, u: np.ndarray, v: np.ndarray) -> None:
+    def locate(self, u: NDArray[np.float64], v: NDArray[np.float64]) -> None:
         """Find the cells of points u, v (m,) with m <= n: sets `uv`, `place` and `row`."""
         place = self.place
         row = self.row
@@ -111,7 +111,7 @@ class LookupWorkspace:
         np.multiply(row, self._columns_of_table, row)
         np.add(row, self._column, row)
 
-    def interpolate(self, table: np.ndarray, status: np.ndarray) -> None:
+    def interpolate(self, table: NDArray[np.float64], status: NDArray[np.uint8]) -> None:
         """Evaluate the cells of the located points: sets `result` and `status`.
 
         table (cells, COEFFICIENTS) and status (cells,) have a row for each cell.
@@ -195,7 +195,9 @@ class CorrectionGrid:
         self._status[self._divided_cells] += DIVIDED
         self.divided = len(divided.row)
 
-    def _errors_of_divided(self, model: CorrectionModel, divided: DividedCells) -> np.ndarray:
+    def _errors_of_divided(
+        self, model: CorrectionModel, divided: DividedCells
+    ) -> NDArray[np.float64]:
         """Errors (2, d) [px] of correction and standard deviation left in divided cells."""
         place = np.random.default_rng(0).random((2, CHECKS_OF_DIVIDED, self.divided))
         u, v = (
@@ -217,7 +219,7 @@ class CorrectionGrid:
         v: NDArray[np.float64],
         values: NDArray[np.float64] | None = None,
         status: NDArray[np.uint8] | None = None,
-    ) -> tuple[np.ndarray, np.ndarray]:
+    ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
         """Return correction, standard deviation and status at pixels.
 
         u, v: (n,) columns and rows [px]. values, status: (3, n) arrays for the results, both or
@@ -238,11 +240,11 @@ class CorrectionGrid:
 
     def _look_up(
         self,
-        u: np.ndarray,
-        v: np.ndarray,
-        values: np.ndarray | None,
-        status: np.ndarray | None,
-    ) -> tuple[np.ndarray, np.ndarray]:
+        u: NDArray[np.float64],
+        v: NDArray[np.float64],
+        values: NDArray[np.float64] | None,
+        status: NDArray[np.uint8] | None,
+    ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
         """Look up at most CHUNK points; see `look_up`."""
         n = len(u)
         number = (n + 31) // 32 if n <= MAX_STEPPED else 16 + (n - 1 >> 9).bit_length()

@@ -31,7 +31,7 @@ MAX_MEASURED = 25_000  # centres of cells, which bounds the time
 PLACES = ((0.5, 0.5), (0.5, 0.0), (0.0, 0.5), (0.5, 1.0), (1.0, 0.5))  # in a cell, where it is
 
 
-def errors_of_finer_grid(values: np.ndarray) -> NDArray[np.float64]:
+def errors_of_finer_grid(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Errors (2, h, w) [px] of correction and standard deviation in cells.
 
     values (3, 2h + 1, 2w + 1): du, dv and standard deviation at the corners of the cells, the
@@ -53,7 +53,7 @@ def errors_where_curved(
     nodes: tuple[NDArray[np.float64], NDArray[np.float64]],
     values: NDArray[np.float64],
     affordable: int,
-) -> np.ndarray:
+) -> NDArray[np.float64]:
     """Errors of cells, measured where second differences suggest that they may be too large.
 
     nodes: (w,) columns and rows [px] of the corners of the cells. values: (3, h, w) du, dv and
@@ -83,7 +83,7 @@ def errors_where_curved(
     return errors
 
 
-def _second_differences(values: np.ndarray) -> np.ndarray:
+def _second_differences(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Largest second difference (h - 1, w - 1) [px] of the correction at the corners of a cell."""
     at_node = np.zeros(values.shape[1:])
     at_node[:, 1:-1] = np.abs(np.diff(values[:2], 2, axis=2)).max(axis=0)
@@ -103,7 +103,9 @@ MAX_CELL_PX = 64  # larger ones would not resemble the model
 MAX_WORK = 1.2e8
 COEFFICIENTS = 12  # of a cell: 1, u, v, u v, each for du, dv and the standard deviation
 
-Nodes = tuple[np.ndarray, np.ndarray]  # columns (w,) and rows (h,) [px] of the corners of cells
+Nodes = tuple[
+    NDArray[np.float64], NDArray[np.float64]
+]  # columns (w,) and rows (h,) [px] of the corners of cells
 
 
 @dataclass(frozen=True)
@@ -129,7 +131,7 @@ class DividedCells:
     column: NDArray[np.int64]
     parts: NDArray[np.int64]  #: (d,) number of parts along a side
     first: NDArray[np.int64]  #: (d,) row of the first part in the table
-    table: np.ndarray  #: (p, 12) coefficients of all parts
+    table: NDArray[np.float64]  #: (p, 12) coefficients of all parts
 
 
 def build_cells(model: CorrectionModel, image_size: tuple[int, int]) -> Cells:
@@ -182,14 +184,18 @@ def divide_cells(model: CorrectionModel, cells: Cells) -> DividedCells | None:
     return DividedCells(j, i, parts, first, table)
 
 
-def _affordable_cells(error: np.ndarray, parts: np.ndarray, work: float) -> np.ndarray:
+def _affordable_cells(
+    error: NDArray[np.float64], parts: NDArray[np.int64], work: float
+) -> NDArray[np.int64]:
     """Places, ascending, of the cells with the largest errors whose parts do not take too long."""
     worst_first = np.argsort(-error, kind='stable')
     values = np.cumsum((parts[worst_first] + 1) ** 2)
     return np.sort(worst_first[: np.searchsorted(values * work, MAX_WORK / 2, side='right')])
 
 
-def write_coefficients(nodes: Nodes, values: np.ndarray, out: np.ndarray) -> None:
+def write_coefficients(
+    nodes: Nodes, values: NDArray[np.float64], out: NDArray[np.float64]
+) -> None:
     """Write the coefficients of bilinear interpolation in cells to out (h - 1, w - 1, 12).
 
     nodes: columns (w,) and rows (h,) [px] of the corners; values (3, h, w) there. The coefficients
@@ -215,7 +221,7 @@ def write_coefficients(nodes: Nodes, values: np.ndarray, out: np.ndarray) -> Non
         out[:, :, 9 + k] = d
 
 
-def aligned_array(shape: tuple[int, ...]) -> np.ndarray:
+def aligned_array(shape: tuple[int, ...]) -> NDArray[np.float64]:
     """Uninitialised floats that begin with a cache line, so that a row is in few of them."""
     size = int(np.prod(shape))
     memory = np.empty(size + 8)
@@ -225,7 +231,7 @@ def aligned_array(shape: tuple[int, ...]) -> np.ndarray:
 
 def _nodes_and_values(
     model: CorrectionModel, image_size: tuple[int, int], sizes: list[float], work: float
-) -> tuple[Nodes, np.ndarray, np.ndarray]:
+) -> tuple[Nodes, NDArray[np.float64], NDArray[np.float64]]:
     """Nodes of the cell size that is chosen, values (3, h, w) there, and errors of the cells."""
     nodes = _nodes(image_size, sizes[0], 1)
     values = None
@@ -287,23 +293,23 @@ def _nodes(image_size: tuple[int, int], size: float, parts: int) -> Nodes:
     return _axis_nodes(width, size, parts), _axis_nodes(height, size, parts)
 
 
-def _axis_nodes(length: int, size: float, parts: int) -> np.ndarray:
+def _axis_nodes(length: int, size: float, parts: int) -> NDArray[np.float64]:
     return np.linspace(-0.5, length - 0.5, parts * max(1, int(np.ceil(length / size))) + 1)
 
 
-def _pixels(nodes: Nodes) -> np.ndarray:
+def _pixels(nodes: Nodes) -> NDArray[np.float64]:
     """Pixels (h * w, 2) of nodes, row by row."""
     columns, rows = nodes
     return np.stack([np.tile(columns, len(rows)), np.repeat(rows, len(columns))], axis=1)
 
 
-def _exact_values(model: CorrectionModel, nodes: Nodes) -> np.ndarray:
+def _exact_values(model: CorrectionModel, nodes: Nodes) -> NDArray[np.float64]:
     """du, dv and standard deviation (3, h, w) [px] of the model at nodes."""
     columns, rows = nodes
     return model.evaluate_in_bulk(_pixels(nodes)).reshape(3, len(rows), len(columns))
 
 
-def _outside(model: CorrectionModel, nodes: Nodes) -> np.ndarray:
+def _outside(model: CorrectionModel, nodes: Nodes) -> NDArray[np.bool_]:
     """True (h - 1, w - 1) for cells with a corner beyond the calibrated area.
 
     All other cells are inside, but for less than a cell at the border of a hole.

@@ -34,8 +34,8 @@ WORK_OF_NEIGHBOUR = 10
 
 
 def blocks_with_candidates(
-    tree: cKDTree, uv: np.ndarray, k: int, most: int
-) -> Iterator[tuple[np.ndarray, list[int] | None]]:
+    tree: cKDTree, uv: NDArray[np.float64], k: int, most: int
+) -> Iterator[tuple[NDArray[np.int64], list[int] | None]]:
     """Blocks of pixels uv (n, 2), and the training points among which their k nearest are.
 
     tree holds the training points. Yields the rows of the pixels and of the training points; None
@@ -52,7 +52,7 @@ def blocks_with_candidates(
             yield block, next(found) if is_few else None
 
 
-def work_of_blocks(tree: cKDTree, uv: np.ndarray, k: int, limit: float) -> int:
+def work_of_blocks(tree: cKDTree, uv: NDArray[np.float64], k: int, limit: float) -> int:
     """Sum of the numbers of candidates over pixels uv (n, 2), and the work on blocks as such.
 
     Counting ends above a limit.
@@ -68,8 +68,8 @@ def work_of_blocks(tree: cKDTree, uv: np.ndarray, k: int, limit: float) -> int:
 
 
 def _circles(
-    tree: cKDTree, uv: np.ndarray, k: int, per_query: int
-) -> Iterator[tuple[list[np.ndarray], np.ndarray, np.ndarray]]:
+    tree: cKDTree, uv: NDArray[np.float64], k: int, per_query: int
+) -> Iterator[tuple[list[NDArray[np.int64]], NDArray[np.float64], NDArray[np.float64]]]:
     """Yield per_query blocks at a time, with centres and radii of the circles of candidates."""
     reach = np.median(tree.query(uv[:: len(uv) // REACH_SAMPLES + 1], k=[k])[0])
     blocks = _blocks(uv, reach)
@@ -83,7 +83,7 @@ def _circles(
         yield some, centre, (kth + diagonal) * (1 + 1e-9) + 1e-9
 
 
-def _blocks(uv: np.ndarray, reach: float) -> list[np.ndarray]:
+def _blocks(uv: NDArray[np.float64], reach: float) -> list[NDArray[np.int64]]:
     """Rows of pixels uv (n, 2) that are close together, about BLOCK of them each.
 
     reach: distance of the k-th nearest training point [px]. Larger blocks would have many more
@@ -119,7 +119,7 @@ class Neighbourhoods:
     neighbours (n, K, 2) and queries (n, 2) [px].
     """
 
-    def __init__(self, neighbours: np.ndarray, queries: np.ndarray) -> None:
+    def __init__(self, neighbours: NDArray[np.float64], queries: NDArray[np.float64]) -> None:
         self.dx = neighbours[:, :, 0] - queries[:, :1]
         self.dy = neighbours[:, :, 1] - queries[:, 1:]
         square = self.dx * self.dx + self.dy * self.dy
@@ -129,7 +129,7 @@ class Neighbourhoods:
         return len(self.dx)
 
 
-def tricube_plane_weights(near: Neighbourhoods, k: int) -> np.ndarray:
+def tricube_plane_weights(near: Neighbourhoods, k: int) -> NDArray[np.float64]:
     """Weights (n, k) of a plane fitted to the k nearest values with tricube weights.
 
     The plane is evaluated at the query point (Cleveland, "Robust locally weighted regression",
@@ -190,7 +190,9 @@ class NeighbourTable:
     default all.
     """
 
-    def __init__(self, uv: np.ndarray, count: int, rows: np.ndarray | None = None) -> None:
+    def __init__(
+        self, uv: NDArray[np.float64], count: int, rows: NDArray[np.int64] | None = None
+    ) -> None:
         self._uv = uv
         numbers = np.arange(1, min(len(uv), int(1.3 * count) + 30) + 1)
         if rows is None:
@@ -199,7 +201,9 @@ class NeighbourTable:
         self._near = np.empty((len(uv), len(numbers)), dtype=np.intp)
         _, self._near[rows] = cKDTree(uv).query(uv[rows], k=numbers)
 
-    def nearest(self, rows: np.ndarray, allowed: NDArray[np.bool_], count: int) -> np.ndarray:
+    def nearest(
+        self, rows: NDArray[np.int64], allowed: NDArray[np.bool_], count: int
+    ) -> NDArray[np.int64]:
         """Return the count nearest allowed points (n, count) of the points rows (n,), in order.
 
         allowed : (N,) ndarray of bool
@@ -220,7 +224,7 @@ class NeighbourTable:
             out[~full] = points[found]
         return out
 
-    def restricted(self, selected: np.ndarray) -> NeighbourTable:
+    def restricted(self, selected: NDArray[np.bool_]) -> NeighbourTable:
         """Return the table of the selected points (N, bool) alone, renumbered."""
         other = NeighbourTable.__new__(NeighbourTable)
         other._uv = self._uv[selected]
@@ -239,7 +243,7 @@ class Trend:
     degree: the highest, None: there are no polynomials; uv (N, 2): training pixels.
     """
 
-    def __init__(self, degree: int | None, uv: np.ndarray) -> None:
+    def __init__(self, degree: int | None, uv: NDArray[np.float64]) -> None:
         self._powers = (
             []
             if degree is None
@@ -293,8 +297,8 @@ class NeighbourModel(CorrectionModel):
 
     tree: cKDTree
     trend: Trend
-    trend_coefficients: np.ndarray
-    remainder: np.ndarray
+    trend_coefficients: NDArray[np.float64]
+    remainder: NDArray[np.float64]
 
     def _prepare(self) -> None:
         uv = self.train_uv
@@ -313,11 +317,13 @@ class NeighbourModel(CorrectionModel):
 
     @classmethod
     @abstractmethod
-    def weights(cls, near: Neighbourhoods, k: int) -> np.ndarray:
+    def weights(cls, near: Neighbourhoods, k: int) -> NDArray[np.float64]:
         """Weights (n, k) of the k nearest training values in the predictions."""
 
     @classmethod
-    def weights_of_candidates(cls, candidates: np.ndarray, uv: np.ndarray, k: int) -> np.ndarray:
+    def weights_of_candidates(
+        cls, candidates: NDArray[np.float64], uv: NDArray[np.float64], k: int
+    ) -> NDArray[np.float64]:
         """Weights (n, c) of candidates (c, 2) at pixels uv (n, 2); zero but for the k nearest.
 
         The lookup grid is built with it. A subclass overrides it where it need not sort.
@@ -330,7 +336,7 @@ class NeighbourModel(CorrectionModel):
         return out
 
     @classmethod
-    def candidate_k(cls, count: int) -> np.ndarray:
+    def candidate_k(cls, count: int) -> NDArray[np.int64]:
         """Values of k that are tried for count training points, in steps of a quarter."""
         largest = max(cls.min_k, min(int(count * 0.4), 400))
         steps = np.round(10 * 1.25 ** np.arange(17)).astype(int)
@@ -347,11 +353,11 @@ class NeighbourModel(CorrectionModel):
         uv = np.asarray(uv, dtype=float).reshape(-1, 2)
         return Correction(duv, self._sd(norm2, uv), self.outside(uv))
 
-    def standard_deviation(self, uv: np.ndarray) -> NDArray[np.float64]:
+    def standard_deviation(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
         """Standard deviations (n,) [px] of the predictions at pixels uv (n, 2)."""
         return self.evaluate(uv).sd
 
-    def evaluate_in_bulk(self, uv: np.ndarray) -> NDArray[np.float64]:
+    def evaluate_in_bulk(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return du, dv and standard deviation (3, n) [px] at many pixels uv (n, 2)."""
         out = np.zeros((3, len(uv)))
         norm2 = np.zeros(len(uv))
@@ -374,23 +380,25 @@ class NeighbourModel(CorrectionModel):
             out[2, part] = self._sd(norm2[part], uv[part])
         return out
 
-    def bulk_work(self, uv: np.ndarray, limit: float) -> float:
+    def bulk_work(self, uv: NDArray[np.float64], limit: float) -> float:
         """Return the work of `evaluate_in_bulk`: candidates of neighbours, and functions."""
         return super().bulk_work(uv, limit) + work_of_blocks(self.tree, uv, self.k, limit)
 
-    def _global_part(self, uv: np.ndarray) -> np.ndarray:
+    def _global_part(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
         """Trend or series (n, 2) [px] at pixels uv (n, 2)."""
         if self.series is None:
             return self.trend.basis(uv) @ self.trend_coefficients
         return self.series.predict_in_chunks(uv)
 
-    def _predict_with_norm(self, uv: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    def _predict_with_norm(self, uv: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Corrections (n, 2) [px] and the squared norms (n,) of their weights."""
         uv = np.asarray(uv, dtype=float).reshape(-1, 2)
         duv, norm2 = self._local_part(uv)
         return duv + self._global_part(uv), norm2
 
-    def _local_part(self, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _local_part(
+        self, uv: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """What the neighbours add to the global part (n, 2) [px], and the norms as above."""
         duv = np.zeros_like(uv)
         norm2 = np.zeros(len(uv))
@@ -414,8 +422,8 @@ class NeighbourModel(CorrectionModel):
 
 
 def _distances(
-    candidates: np.ndarray, uv: np.ndarray, k: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    candidates: NDArray[np.float64], uv: NDArray[np.float64], k: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Differences (n, c) in u and v of candidates, squared distances, and those of the k-th."""
     dx = candidates[:, 0] - uv[:, :1]
     dy = candidates[:, 1] - uv[:, 1:]
@@ -439,7 +447,9 @@ class LocalLinearModel(NeighbourModel):
         return tricube_plane_weights(near, k)
 
     @classmethod
-    def weights_of_candidates(cls, candidates: np.ndarray, uv: np.ndarray, k: int) -> np.ndarray:
+    def weights_of_candidates(
+        cls, candidates: NDArray[np.float64], uv: NDArray[np.float64], k: int
+    ) -> NDArray[np.float64]:
         """Weights (n, c); a candidate as far as the k-th nearest or farther has the weight 0."""
         dx, dy, distance2, kth = _distances(candidates, uv, k)
         ratio = distance2 / np.maximum(kth, 1e-12)[:, None]
@@ -482,14 +492,16 @@ class KnnModel(NeighbourModel):
         return np.full((len(near), k), 1.0 / k)
 
     @classmethod
-    def weights_of_candidates(cls, candidates: np.ndarray, uv: np.ndarray, k: int) -> np.ndarray:
+    def weights_of_candidates(
+        cls, candidates: NDArray[np.float64], uv: NDArray[np.float64], k: int
+    ) -> NDArray[np.float64]:
         """Weights (n, c); candidates at the distance of the k-th nearest share its weight."""
         *_, distance2, kth = _distances(candidates, uv, k)
         nearest = (distance2 <= kth[:, None]).astype(float)
         return nearest / nearest.sum(axis=1, keepdims=True)
 
     @classmethod
-    def candidate_k(cls, count: int) -> np.ndarray:
+    def candidate_k(cls, count: int) -> NDArray[np.int64]:
         """Return all k from 3 to 100, or to 40 % of count training points."""
         largest = max(cls.min_k, min(int(count * 0.4), 100))
         return np.arange(min(3, largest), largest + 1)

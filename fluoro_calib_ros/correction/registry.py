@@ -41,7 +41,7 @@ class NoCorrection(CorrectionModel):
         """Zeros (n, 2)."""
         return np.zeros_like(np.asarray(uv, dtype=float).reshape(-1, 2))
 
-    def outside(self, uv: ArrayLike) -> NDArray[np.float64]:
+    def outside(self, uv: ArrayLike) -> NDArray[np.bool_]:
         """False (n,): there is no calibrated area to leave."""
         return np.zeros(len(np.asarray(uv)), dtype=bool)
 
@@ -107,11 +107,11 @@ class LookupModel(CorrectionModel):
             _dv=self.train_duv[:nodes, 1].reshape(rows, columns),
         )
 
-    def _calibrated_points(self, uv: np.ndarray) -> np.ndarray:
+    def _calibrated_points(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
         columns, rows = _grid_shape(uv)
         return uv[columns * rows :]
 
-    def predict(self, uv: ArrayLike) -> np.ndarray:
+    def predict(self, uv: ArrayLike) -> NDArray[np.float64]:
         """Corrections (n, 2) [px] at pixels uv (n, 2); off the image those at its edge."""
         uv = np.asarray(uv, dtype=float).reshape(-1, 2)
         place = ((uv - self._low) * self._per_px)[:, ::-1].T
@@ -120,13 +120,13 @@ class LookupModel(CorrectionModel):
         ]
         return np.stack(values, axis=1)
 
-    _low: np.ndarray
-    _per_px: np.ndarray
-    _du: np.ndarray
-    _dv: np.ndarray
+    _low: NDArray[np.float64]
+    _per_px: NDArray[np.float64]
+    _du: NDArray[np.float64]
+    _dv: NDArray[np.float64]
 
 
-def grid_nodes(image_size: tuple[int, int]) -> np.ndarray:
+def grid_nodes(image_size: tuple[int, int]) -> NDArray[np.float64]:
     """Nodes (n, 2) [px] of the lookup grid of an image (width, height), row by row."""
     size = max(CELL_PX, max(image_size) / MAX_CELLS)
     u, v = (
@@ -136,7 +136,7 @@ def grid_nodes(image_size: tuple[int, int]) -> np.ndarray:
     return np.stack([np.tile(u, len(v)), np.repeat(v, len(u))], axis=1)
 
 
-def hull_corners(uv: np.ndarray) -> NDArray[np.float64]:
+def hull_corners(uv: NDArray[np.float64]) -> NDArray[np.float64]:
     """Corners (h, 2) of the convex hull of uv (N, 2); all points where they enclose no area."""
     try:
         return uv[ConvexHull(uv).vertices]
@@ -144,7 +144,7 @@ def hull_corners(uv: np.ndarray) -> NDArray[np.float64]:
         return uv
 
 
-def _grid_shape(uv: np.ndarray) -> tuple[int, int]:
+def _grid_shape(uv: NDArray[np.float64]) -> tuple[int, int]:
     """Numbers of columns and rows of the grid with which uv (N, 2) begins.
 
     Raises ValueError where it does not begin with a grid.
@@ -203,8 +203,8 @@ def neighbour_models() -> tuple[str, ...]:
 def create_model(
     kind: str,
     k: int,
-    train_uv: np.ndarray,
-    train_duv: np.ndarray,
+    train_uv: NDArray[np.float64],
+    train_duv: NDArray[np.float64],
     noise_px: float = 0.0,
     bias_px: float = 0.0,
     series: Series | None = None,

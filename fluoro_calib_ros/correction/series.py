@@ -53,7 +53,7 @@ class Functions:
         return [(i, j) for i in range(self.degree + 1) for j in range(self.degree + 1 - i)]
 
     @cached_property
-    def _sines(self) -> np.ndarray:
+    def _sines(self) -> NDArray[np.int64]:
         """Numbers (s, 2) of the half waves along u and v."""
         extent = MARGIN * np.asarray(self.image_size) / max(self.image_size)
         i, j = np.meshgrid(
@@ -76,7 +76,7 @@ class Functions:
         return np.pi / (MARGIN * max(self.image_size))
 
     @cached_property
-    def band(self) -> NDArray[np.float64]:
+    def band(self) -> NDArray[np.int64]:
         """Band (s,) of each sine."""
         return np.rint(self.frequency / self.frequency_of_mode).astype(int)
 
@@ -99,7 +99,7 @@ class Functions:
         return len(self.powers) + 2 * self.rings
 
     @property
-    def _ring_polynomials(self) -> np.ndarray:
+    def _ring_polynomials(self) -> NDArray[np.float64]:
         """Coefficients (rings, k) of r^0, r^2, r^4, ... in R(r) / r, coordinates as elsewhere."""
         corner = np.hypot(*self.image_size) / max(self.image_size)
         out = np.zeros((self.rings, RING_DEGREE // 2 + self.rings))
@@ -108,7 +108,9 @@ class Functions:
             values[: len(found)] = found / corner ** (2 * np.arange(len(found)) + 1)
         return out
 
-    def as_polynomials(self, coefficients: np.ndarray) -> tuple[Functions, np.ndarray]:
+    def as_polynomials(
+        self, coefficients: NDArray[np.float64]
+    ) -> tuple[Functions, NDArray[np.float64]]:
         """Functions without rings, and their coefficients (2, m) for the same series.
 
         The rings are written as polynomials of their degree.
@@ -128,7 +130,9 @@ class Functions:
                     matrix[:, number[2 * i, 2 * (order - i) + 1]] += part * own[:, 1]
         return out, matrix
 
-    def converted(self, other: Functions, coefficients: np.ndarray) -> NDArray[np.float64]:
+    def converted(
+        self, other: Functions, coefficients: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
         """Coefficients (2m,) for these functions from those for others.
 
         A function that the others lack gets the coefficient 0.
@@ -138,8 +142,8 @@ class Functions:
         return np.where(mine >= 0, coefficients.reshape(2, -1)[:, mine], 0.0).ravel()
 
     def as_rings(
-        self, coefficients: np.ndarray, degree: int, rings: int
-    ) -> tuple[Functions, np.ndarray]:
+        self, coefficients: NDArray[np.float64], degree: int, rings: int
+    ) -> tuple[Functions, NDArray[np.float64]]:
         """Functions with rings, and their coefficients (2, m) for the same series.
 
         It is the inverse of `as_polynomials`, and the nearest series where these functions cannot
@@ -164,13 +168,13 @@ class Functions:
         rings = [('ring', k, axis) for k in range(self.rings) for axis in 'xy']
         return [*self.powers, *rings, *(('sine', int(i), int(j)) for i, j in self._sines)]
 
-    def _coordinates(self, uv: ArrayLike) -> np.ndarray:
+    def _coordinates(self, uv: ArrayLike) -> NDArray[np.float64]:
         return (
             (np.asarray(uv, dtype=float) - (np.asarray(self.image_size) - 1) / 2)
             / (max(self.image_size) / 2)
         ).T
 
-    def __call__(self, uv: ArrayLike) -> np.ndarray:
+    def __call__(self, uv: ArrayLike) -> NDArray[np.float64]:
         """Values (n, m) at pixels uv (n, 2): the polynomials, the rings, then the sines."""
         x, y = self._coordinates(uv)
         out = np.empty((len(x), len(self)))
@@ -188,7 +192,9 @@ class Functions:
             np.multiply(of_x[:, i], of_y[:, j], out=out[:, self.trend :])
         return out
 
-    def sums_of_sines(self, uv: ArrayLike, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def sums_of_sines(
+        self, uv: ArrayLike, values: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Sums (s, k) of values (n, k) at pixels uv (n, 2) times the sines; (s,) of their squares.
 
         A sine is a product of one along u and one along v: it takes no value at every pixel.
@@ -198,12 +204,14 @@ class Functions:
         sums = [(of_x.T @ (column[:, None] * of_y))[i, j] for column in values.T]
         return np.stack(sums, axis=1), (np.square(of_x).T @ np.square(of_y))[i, j]
 
-    def _waves_of_both(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _waves_of_both(
+        self, x: NDArray[np.float64], y: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Sines (n, modes) along u and along v."""
         extent = MARGIN * np.asarray(self.image_size) / 2
         return self._waves(x, extent[0]), self._waves(y, extent[1])
 
-    def _waves(self, coordinate: np.ndarray, extent: float) -> np.ndarray:
+    def _waves(self, coordinate: NDArray[np.float64], extent: float) -> NDArray[np.float64]:
         """Sines (n, modes) along one axis; extent: half the side of their rectangle [px]."""
         place = coordinate[:, None] * max(self.image_size) / 2 + extent
         return np.sin(np.arange(1, self.modes + 1) * (np.pi / 2 / extent * place)) / np.sqrt(
@@ -220,8 +228,8 @@ class Series:
     """
 
     functions: Functions
-    coefficients: np.ndarray
-    sd: np.ndarray
+    coefficients: NDArray[np.float64]
+    sd: NDArray[np.float64]
 
     def plus(self, other: Series) -> Series:
         """Return the sum with another series, whose errors are independent."""
@@ -253,7 +261,7 @@ class Series:
         return out
 
     @cached_property
-    def _by_axes(self) -> tuple[np.ndarray, np.ndarray]:
+    def _by_axes(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Coefficients (2, i, j) of powers, and of sines, along u times those along v."""
         functions, coefficients = self.functions.as_polynomials(self.coefficients)
         powers = np.zeros((2, functions.degree + 1, functions.degree + 1))
@@ -264,7 +272,7 @@ class Series:
         sines[:, i, j] = coefficients[:, functions.trend :]
         return powers, sines
 
-    def predict_in_chunks(self, uv: np.ndarray) -> NDArray[np.float64]:
+    def predict_in_chunks(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
         """Corrections (n, 2) [px] at many pixels uv (n, 2), with bounded memory."""
         starts = range(0, max(1, len(uv)), PREDICTION_CHUNK)
         return np.concatenate([self.predict(uv[i : i + PREDICTION_CHUNK]) for i in starts])
@@ -280,8 +288,8 @@ class Series:
 
 
 def without_absent_bands(
-    functions: Functions, coefficients: np.ndarray
-) -> tuple[Functions, np.ndarray]:
+    functions: Functions, coefficients: NDArray[np.float64]
+) -> tuple[Functions, NDArray[np.float64]]:
     """Leave out the bands of sines whose coefficients are all zero.
 
     Returns the functions that remain, and their coefficients (2, m).
@@ -295,7 +303,7 @@ def without_absent_bands(
     return out, out.converted(functions, coefficients.ravel()).reshape(2, -1)
 
 
-def packed(series: Series | None) -> tuple[int, int, np.ndarray, np.ndarray]:
+def packed(series: Series | None) -> tuple[int, int, NDArray[np.float64], NDArray[np.float64]]:
     """Return degree, modes, coefficients (2, m) and sd (33, 33), as they are sent and saved.
 
     No series gives -1, 0 and empty arrays.
@@ -346,13 +354,13 @@ def series_from_values(image_size: tuple[int, int], content: Mapping[str, Any]) 
     )
 
 
-def sd_grid_pixels(image_size: tuple[int, int]) -> np.ndarray:
+def sd_grid_pixels(image_size: tuple[int, int]) -> NDArray[np.float64]:
     """Pixels (33 * 33, 2) of the standard deviations of a series, row by row, edge to edge."""
     u, v = (np.linspace(-0.5, size - 0.5, SD_GRID) for size in image_size)
     return np.stack([a.ravel() for a in np.meshgrid(u, v)], axis=1)
 
 
-def sd_over_image(functions: Functions, covariance: np.ndarray) -> NDArray[np.float64]:
+def sd_over_image(functions: Functions, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
     """Standard deviations (33, 33) [px] of a series.
 
     covariance (2m, 2m) of its coefficients, those of u first.

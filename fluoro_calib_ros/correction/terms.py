@@ -110,7 +110,7 @@ EXPERT: dict[str, list[Part]] = {
 }
 
 
-def expert_terms(with_gauge: bool = False) -> tuple[list[str], np.ndarray]:
+def expert_terms(with_gauge: bool = False) -> tuple[list[str], NDArray[np.float64]]:
     """Names of the 31 terms, and their coefficients (31, 2, m) as polynomials of degree 7.
 
     with_gauge: whether the six terms of the gauge follow, for orientations that are known.
@@ -149,7 +149,7 @@ def ring_coefficients(degree: int) -> NDArray[np.float64]:
 
 
 @cache
-def trend_transformation(degree: int, rings: int = 0) -> tuple[np.ndarray, int]:
+def trend_transformation(degree: int, rings: int = 0) -> tuple[NDArray[np.float64], int]:
     """Matrix (2t, 2t) from coefficients of the trend's functions to those of terms; their number.
 
     The functions are those of `series.Functions` for u, then for v. The terms that are not gauge

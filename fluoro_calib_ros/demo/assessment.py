@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..correction.fluoroscope_calibration import Calibrations
 from ..photogrammetry.collinearity import project
@@ -97,7 +98,7 @@ class SpaceFigures:
     latency_ms: float
 
 
-def latencies_ms(sent: Frames, corrected: Frames) -> np.ndarray:
+def latencies_ms(sent: Frames, corrected: Frames) -> NDArray[np.float64]:
     """Return the latency of every corrected frame [ms].
 
     It runs from the publication of the frame by the player to that of its correction.
@@ -195,7 +196,7 @@ def space_figures(
     )
 
 
-def projective_lack_of_fit(uv: np.ndarray, ideal: np.ndarray) -> float:
+def projective_lack_of_fit(uv: NDArray[np.float64], ideal: NDArray[np.float64]) -> float:
     """Return the RMSE of a coordinate after the best projective map of uv (n, 2) to ideal [px]."""
     x, y = (uv - IMAGE_CENTRE).T / IMAGE_SCALE
     u, v = (ideal - IMAGE_CENTRE).T / IMAGE_SCALE
@@ -214,13 +215,13 @@ def projective_lack_of_fit(uv: np.ndarray, ideal: np.ndarray) -> float:
     return float(np.sqrt(np.mean(residual**2)))
 
 
-def _true_markers(bags: Path) -> dict[tuple[int, int], np.ndarray]:
+def _true_markers(bags: Path) -> dict[tuple[int, int], NDArray[np.float64]]:
     """Return the true positions [mm] by (frame, target)."""
     rows = np.loadtxt(bags / 'truth' / 'markers.csv', delimiter=',', skiprows=1)
     return {(int(row[0]), int(row[1])): row[2:] for row in rows}
 
 
-def _ideal_projection(true: Mapping[str, Any], points: np.ndarray) -> np.ndarray:
+def _ideal_projection(true: Mapping[str, Any], points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the undistorted image points (n, 2) of points (n, 3) in a true fluoroscope."""
     n = len(points)
     return project(
@@ -231,7 +232,9 @@ def _ideal_projection(true: Mapping[str, Any], points: np.ndarray) -> np.ndarray
     )
 
 
-def _error_after_rigid_fit(measured: np.ndarray, true: np.ndarray) -> np.ndarray:
+def _error_after_rigid_fit(
+    measured: NDArray[np.float64], true: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Return measured - true (n, 3) after the best rotation and shift of true (Kabsch)."""
     a = measured - measured.mean(axis=0)
     b = true - true.mean(axis=0)

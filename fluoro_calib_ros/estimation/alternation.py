@@ -52,12 +52,15 @@ class Anderson:
 
     def restart(self) -> None:
         """Forget the earlier iterates: the map has changed."""
-        self._x: list[np.ndarray] = []
-        self._f: list[np.ndarray] = []
+        self._x: list[NDArray[np.float64]] = []
+        self._f: list[NDArray[np.float64]] = []
 
     def next(
-        self, x: np.ndarray, f: np.ndarray, counted: np.ndarray | slice = slice(None)
-    ) -> np.ndarray:
+        self,
+        x: NDArray[np.float64],
+        f: NDArray[np.float64],
+        counted: NDArray[np.bool_] | slice = slice(None),
+    ) -> NDArray[np.float64]:
         """Return the next iterate from the present one x and its image f.
 
         counted: entries whose residual is minimised.
@@ -101,7 +104,7 @@ class Regressions:
         return {name: step.k for name, step in self.steps.items()}
 
     def choose(
-        self, values: np.ndarray, q: np.ndarray, information: np.ndarray
+        self, values: NDArray[np.float64], q: NDArray[np.float64], information: NDArray[np.float64]
     ) -> tuple[float, bool]:
         """Update inliers and k of all fluoroscopes; return G and whether any of them changed.
 
@@ -115,21 +118,23 @@ class Regressions:
         score = sum(step.score for step in self.steps.values())
         return score, any(step.changed for step in self.steps.values())
 
-    def inliers(self) -> np.ndarray:
+    def inliers(self) -> NDArray[np.bool_]:
         """True (N,) for the image points to which the models are fitted."""
         out = np.zeros(sum(len(rows) for rows in self._rows.values()), dtype=bool)
         for name, rows in self._rows.items():
             out[rows] = self.steps[name].inliers
         return out
 
-    def without_gauge(self, values: np.ndarray, interior: np.ndarray) -> NDArray[np.float64]:
+    def without_gauge(
+        self, values: NDArray[np.float64], interior: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
         """Values (N, 2) with a fitted correction that is orthogonal to the gauge."""
         out = values.copy()
         for f, (name, rows) in enumerate(self._rows.items()):
             out[rows] = self.steps[name].without_gauge(values[rows], interior[f])
         return out
 
-    def smooth(self, values: np.ndarray) -> NDArray[np.float64]:
+    def smooth(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Fitted corrections (N, 2) of values (N, 2)."""
         out = np.zeros_like(values)
         for name, rows in self._rows.items():
@@ -138,7 +143,7 @@ class Regressions:
 
     def models(
         self,
-        values: np.ndarray,
+        values: NDArray[np.float64],
         terms: AdjustedTerms | None,
         after: Adjustment,
         precise: Precision,
@@ -278,7 +283,7 @@ def calibrate_by_regression(
 
 
 def _information(
-    network: Network, adjustment: Adjustment, correction: np.ndarray
+    network: Network, adjustment: Adjustment, correction: NDArray[np.float64]
 ) -> tuple[np.ndarray, Noise]:
     """C_r^-1 (N, 2, 2) [1/px^2] of the residuals, and the noise model that they show.
 

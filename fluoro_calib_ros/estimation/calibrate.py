@@ -12,6 +12,7 @@ from datetime import datetime, timezone
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from ..correction.base import CorrectionModel
@@ -379,7 +380,7 @@ def _targets(measured: Measured, adjustment: Adjustment, precise: Precision) -> 
     )
 
 
-def _rows_of(measured: Measured, f: int) -> np.ndarray:
+def _rows_of(measured: Measured, f: int) -> NDArray[np.int64]:
     """Image points of fluoroscope number f."""
     return np.flatnonzero(measured.network.fluoroscope[measured.network.exposure] == f)
 

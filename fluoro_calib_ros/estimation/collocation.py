@@ -30,6 +30,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..correction.angle_field import AngleField
 from ..correction.series import Functions, Series
@@ -138,7 +139,7 @@ class CollocationTerms(AdjustedTerms):
         return [part.functions for part in self.parts]
 
     @property
-    def values(self) -> list[np.ndarray]:
+    def values(self) -> list[NDArray[np.float64]]:
         """See `AdjustedTerms`."""
         return [part.values for part in self.parts]
 
@@ -152,11 +153,11 @@ class CollocationTerms(AdjustedTerms):
         """Terms of exposures by fluoroscope."""
         return [part.own for part in self.parts]
 
-    def start(self) -> tuple[np.ndarray, ...]:
+    def start(self) -> tuple[NDArray[np.float64], ...]:
         """Coefficients to start with, by fluoroscope."""
         return self._start
 
-    def zeros(self) -> tuple[np.ndarray, ...]:
+    def zeros(self) -> tuple[NDArray[np.float64], ...]:
         """Coefficients of no correction, by fluoroscope."""
         return tuple(np.zeros(part.count) for part in self.parts)
 
@@ -166,7 +167,7 @@ class CollocationTerms(AdjustedTerms):
 
     def renew(
         self, network: Network, matrix: FactorizedNormalMatrix, adjustment: Adjustment
-    ) -> tuple[bool, tuple[np.ndarray, ...]]:
+    ) -> tuple[bool, tuple[NDArray[np.float64], ...]]:
         """Renew priors, gauges and functions at a solution.
 
         Returns whether the priors have settled, and the coefficients with which to continue.
@@ -213,8 +214,8 @@ class CollocationTerms(AdjustedTerms):
                     self._steady_renewals = 0
 
     def _changed(
-        self, change: Change, coefficients: Sequence[np.ndarray]
-    ) -> tuple[np.ndarray, ...]:
+        self, change: Change, coefficients: Sequence[NDArray[np.float64]]
+    ) -> tuple[NDArray[np.float64], ...]:
         """Change the terms; return the coefficients with which to continue."""
         out = []
         for part, modes, present in zip(self.parts, change.modes, coefficients):
@@ -227,7 +228,9 @@ class CollocationTerms(AdjustedTerms):
             out.append(np.pad(converted, (0, part.count - len(converted))))
         return tuple(out)
 
-    def series(self, f: int, coefficients: np.ndarray, covariance: np.ndarray) -> Series:
+    def series(
+        self, f: int, coefficients: NDArray[np.float64], covariance: NDArray[np.float64]
+    ) -> Series:
         """Return the series of fluoroscope f, without the terms of its exposures.
 
         coefficients (p,), those of u first, and their covariance (p, p).
@@ -249,7 +252,7 @@ class CollocationTerms(AdjustedTerms):
 
     def variance_between_exposures(
         self, f: int, network: Network, adjustment: Adjustment, precise: Precision
-    ) -> np.ndarray:
+    ) -> NDArray[np.float64]:
         """See `AdjustedTerms`."""
         found = self.parts[f].variance_between_exposures(network, adjustment, precise)
         if found is None:

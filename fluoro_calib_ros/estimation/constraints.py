@@ -64,7 +64,7 @@ class RelativeOrientation:
         return np.sqrt(np.diagonal(self.covariance)[3:])
 
 
-def paired_exposures(measured: Measured, b: int) -> np.ndarray:
+def paired_exposures(measured: Measured, b: int) -> NDArray[np.int64]:
     """Rows (k, 2) of the exposures of fluoroscopes 0 and b that have the same number."""
     row = {
         (int(f), frame.number): j
@@ -76,7 +76,7 @@ def paired_exposures(measured: Measured, b: int) -> np.ndarray:
     return np.array(pairs, dtype=int).reshape(-1, 2)
 
 
-def interiors_to_estimate(measured: Measured, options: CalibrationOptions) -> np.ndarray:
+def interiors_to_estimate(measured: Measured, options: CalibrationOptions) -> NDArray[np.bool_]:
     """Whether (F,) the interior orientation of each fluoroscope is estimated.
 
     It is fixed where it is known and has no standard deviation, and where flat targets parallel to
@@ -113,7 +113,7 @@ def _is_untilted(measured: Measured, f: int) -> bool:
     return bool(measured.untilted) and measured.untilted[f]
 
 
-def _interior_sd(measured: Measured, options: CalibrationOptions) -> np.ndarray | None:
+def _interior_sd(measured: Measured, options: CalibrationOptions) -> NDArray[np.float64] | None:
     """Standard deviations (F, 3) [px] of the start values of the interior orientations.
 
     None where nothing is known of any.
@@ -252,7 +252,9 @@ def relative_orientations(
     return tuple(out)
 
 
-def _mean_of_pairs(run: SelfCalibration, pairs: np.ndarray) -> tuple[RelativePose, np.ndarray]:
+def _mean_of_pairs(
+    run: SelfCalibration, pairs: NDArray[np.int64]
+) -> tuple[RelativePose, NDArray[np.float64]]:
     """Weighted mean of the relative orientations of pairs (k, 2), and its covariance (6, 6).
 
     The exposures are correlated through interior orientation and object points, so their mixed
@@ -274,7 +276,7 @@ def _mean_of_pairs(run: SelfCalibration, pairs: np.ndarray) -> tuple[RelativePos
     )
     count = len(pairs)
     one, other = (a.ravel() for a in np.indices((count, count)))
-    mixed: np.ndarray = np.zeros(())
+    mixed: NDArray[np.float64] = np.zeros(())
     for p, d_p in zip(pairs.T, (d_a, d_b)):
         for q, d_q in zip(pairs.T, (d_a, d_b)):
             between = blocks.between(p[one], q[other])

@@ -70,7 +70,7 @@ TURN_STEP = 1e-3  # rad, as large as a pixel of the principal point for the sear
 
 
 def gauge_basis(
-    uv: ArrayLike, interior: np.ndarray, kind: GaugeKind = GaugeKind.FULL
+    uv: ArrayLike, interior: NDArray[np.float64], kind: GaugeKind = GaugeKind.FULL
 ) -> NDArray[np.float64]:
     """Basis (n, 2, g) of the gauge at pixels uv (n, 2), scaled to about one; interior (3,) [px].
 
@@ -114,8 +114,11 @@ def gauge_coefficients(
 
 
 def gauge_rows(
-    values: np.ndarray, uv: np.ndarray, interior: np.ndarray, kind: GaugeKind = GaugeKind.FULL
-) -> np.ndarray:
+    values: NDArray[np.float64],
+    uv: NDArray[np.float64],
+    interior: NDArray[np.float64],
+    kind: GaugeKind = GaugeKind.FULL,
+) -> NDArray[np.float64]:
     """Rows (g, 2m) whose products with the coefficients of a series vanish without a gauge part.
 
     values (n, m): functions of the series at pixels uv (n, 2); interior (3,) [px]. The
@@ -132,7 +135,7 @@ def gauge_rows(
     return np.concatenate(rows, axis=1) / len(uv)
 
 
-def _cubic_terms(uv: ArrayLike, interior: np.ndarray) -> np.ndarray:
+def _cubic_terms(uv: ArrayLike, interior: NDArray[np.float64]) -> NDArray[np.float64]:
     """Terms (n, 2, 14) that complete the gauge to all cubic polynomials about (xp, yp)."""
     x, y = (np.asarray(uv) - interior[:2]).T / UNIT_PX
     powers = np.stack([x**i * y**j for i, j in polynomial_powers(CUBIC)], axis=1)
@@ -177,7 +180,7 @@ def interior_about(
     rays = np.column_stack([(uv - correction - interior[:2]) / interior[2], np.ones(len(uv))])
     reference = np.array([*centre, interior[2]])
 
-    def misclosure(x: np.ndarray) -> np.ndarray:
+    def misclosure(x: NDArray[np.float64]) -> NDArray[np.float64]:
         turned = rays @ matrix_from_vector(x[3:]).T
         if not (turned[:, 2] > 0).all():
             raise ValueError('no orientation about this principal point')
@@ -239,29 +242,31 @@ class AdjustedTerms(ABC):
 
     @property
     @abstractmethod
-    def values(self) -> list[np.ndarray]:
+    def values(self) -> list[NDArray[np.float64]]:
         """Functions at the image points of each fluoroscope, (N, m) or (N, 2, p)."""
 
     @abstractmethod
     def with_additional(self, network: Network) -> Network:
         """Return the network with the terms as additional parameters."""
 
-    def start(self) -> tuple[np.ndarray, ...]:
+    def start(self) -> tuple[NDArray[np.float64], ...]:
         """Coefficients to start with, by fluoroscope."""
         return self.zeros()
 
     @abstractmethod
-    def zeros(self) -> tuple[np.ndarray, ...]:
+    def zeros(self) -> tuple[NDArray[np.float64], ...]:
         """Coefficients of no correction, by fluoroscope."""
 
     @abstractmethod
-    def series(self, f: int, coefficients: np.ndarray, covariance: np.ndarray) -> Series:
+    def series(
+        self, f: int, coefficients: NDArray[np.float64], covariance: NDArray[np.float64]
+    ) -> Series:
         """Return the series of fluoroscope f from its coefficients (p,) and their covariance."""
 
     @abstractmethod
     def renew(
         self, network: Network, matrix: FactorizedNormalMatrix, adjustment: Adjustment
-    ) -> tuple[bool, tuple[np.ndarray, ...]]:
+    ) -> tuple[bool, tuple[NDArray[np.float64], ...]]:
         """Renew what the terms assume, from the solved normal matrix of an adjustment.
 
         Returns whether nothing changed, and the coefficients with which to continue.
@@ -281,7 +286,7 @@ class AdjustedTerms(ABC):
 
     def variance_between_exposures(
         self, f: int, network: Network, adjustment: Adjustment, precise: Precision
-    ) -> np.ndarray:
+    ) -> NDArray[np.float64]:
         """Variances [px^2] by which the distortion of fluoroscope f differs between exposures.
 
         They are those of its inliers (i,), without what orientations absorb. network: that with
@@ -308,7 +313,8 @@ class RegressionStep(ABC, Generic[Model_co]):
         self.k = 0  #: number of neighbours chosen; 0 for a model without
         self.score = 0.0  #: G, weighted square sum of the errors of cross-validation
         self.changed = False  #: whether inliers or k differ from the last round
-        self.inliers: np.ndarray | None = None  #: (N,) image points to which the model is fitted
+        #: (N,) image points to which the model is fitted
+        self.inliers: NDArray[np.bool_] | None = None
 
     @abstractmethod
     def choose(
@@ -322,21 +328,23 @@ class RegressionStep(ABC, Generic[Model_co]):
         """
 
     @abstractmethod
-    def without_gauge(self, values: np.ndarray, interior: np.ndarray) -> NDArray[np.float64]:
+    def without_gauge(
+        self, values: NDArray[np.float64], interior: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
         """Change values (N, 2) so that their fitted correction is orthogonal to the gauge."""
 
     @abstractmethod
-    def smooth(self, values: np.ndarray) -> NDArray[np.float64]:
+    def smooth(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Fit values (N, 2) [px] at the inliers; return the corrections (N, 2) at all points."""
 
     @abstractmethod
-    def model(self, values: np.ndarray, series: Series | None = None) -> Model_co:
+    def model(self, values: NDArray[np.float64], series: Series | None = None) -> Model_co:
         """Return the correction model of values (N, 2) with its noise and bias.
 
         series: terms that were estimated in the adjustment and are not in the values.
         """
 
-    def _updated_inliers(self, q: np.ndarray) -> np.ndarray:
+    def _updated_inliers(self, q: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Inliers (N,) by normalised squared residuals q (N,); sets `changed`.
 
         The limit depends on the last state: a point that moves about it would otherwise start the
@@ -377,7 +385,7 @@ def require_training(count: int) -> None:
         )
 
 
-def coefficients_of(adjustment: Adjustment) -> tuple[np.ndarray, ...]:
+def coefficients_of(adjustment: Adjustment) -> tuple[NDArray[np.float64], ...]:
     """Coefficients of the additional parameters by fluoroscope, which all have some."""
     return tuple(c for c in adjustment.parameters.additional if c is not None)
 
@@ -389,7 +397,7 @@ def prior_of_additional(network: Network, f: int) -> NDArray[np.float64]:
     return additional.prior
 
 
-def exposure_folds(exposure: np.ndarray, folds: int = FOLDS) -> np.ndarray:
+def exposure_folds(exposure: NDArray[np.int64], folds: int = FOLDS) -> NDArray[np.int64]:
     """Fold (N,) of each image point: the exposures (N,) are dealt out in turn.
 
     Of a single exposure the image points are dealt out.

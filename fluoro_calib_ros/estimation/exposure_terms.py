@@ -74,9 +74,9 @@ class Variation:
 
 
 def exposure_functions(
-    uv: np.ndarray,
+    uv: NDArray[np.float64],
     image_size: tuple[int, int],
-    interior: np.ndarray,
+    interior: NDArray[np.float64],
     with_interior: bool = False,
 ) -> NDArray[np.float64]:
     """Values (N, 2, 14) of the terms at pixels uv (N, 2), orthogonal and with an RMS of one.
@@ -100,12 +100,14 @@ def exposure_functions(
     return q.reshape(len(uv), 2, -1) * np.sqrt(2 * len(uv))
 
 
-def is_determined(exposure: np.ndarray, fewest: int) -> bool:
+def is_determined(exposure: NDArray[np.int64], fewest: int) -> bool:
     """Whether at least `fewest` exposures have enough of the image points of exposure (n,)."""
     return int(np.sum(np.unique(exposure, return_counts=True)[1] >= MIN_POINTS)) >= fewest
 
 
-def variation(residuals: np.ndarray, exposure: np.ndarray, functions: np.ndarray) -> Variation:
+def variation(
+    residuals: NDArray[np.float64], exposure: NDArray[np.int64], functions: NDArray[np.float64]
+) -> Variation:
     """Return the change of the distortion that residuals show.
 
     residuals (n, 2) [px] of inliers, their exposures (n,), and the values (n, 2, 14) of
@@ -143,7 +145,9 @@ class ExposureTerms:
     coordinate of the change to start with [px].
     """
 
-    def __init__(self, functions: np.ndarray, exposure: np.ndarray, size_px: float) -> None:
+    def __init__(
+        self, functions: NDArray[np.float64], exposure: NDArray[np.int64], size_px: float
+    ) -> None:
         numbers, place = np.unique(exposure, return_inverse=True)
         self.exposures = len(numbers)
         #: at the image points; the groups are the exposures
@@ -159,7 +163,7 @@ class ExposureTerms:
         return self.functions.count
 
     @property
-    def values(self) -> np.ndarray:
+    def values(self) -> NDArray[np.float64]:
         """Functions (N, 2, t e) at the image points; zero but for those of the own exposure."""
         own = self.functions
         out = np.zeros((len(own.group), 2, self.exposures, own.values.shape[2]))
@@ -176,7 +180,7 @@ class ExposureTerms:
         """RMS of a coordinate of the change [px]."""
         return float(np.sqrt(np.sum(self.variance)))
 
-    def renew(self, mean: np.ndarray, posterior: np.ndarray) -> None:
+    def renew(self, mean: NDArray[np.float64], posterior: NDArray[np.float64]) -> None:
         """Renew the variances from coefficients (t e,) and their posterior variances (t e,)."""
         mean = mean.reshape(self.exposures, -1)
         posterior = posterior.reshape(self.exposures, -1)
@@ -191,8 +195,11 @@ class ExposureTerms:
 
 
 def without_exposure_terms(
-    information: np.ndarray, right: np.ndarray, precision: np.ndarray, count: int
-) -> tuple[np.ndarray, np.ndarray]:
+    information: NDArray[np.float64],
+    right: NDArray[np.float64],
+    precision: NDArray[np.float64],
+    count: int,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Information (c, c) and right side (c,) of the first coefficients, the others eliminated.
 
     precision (p - c,): prior of the coefficients that are eliminated.
@@ -222,7 +229,7 @@ NEARLY_FREE = 10.0  # factor of the standard deviations of the survey
 
 def estimates_beside_free_points(
     network: Network, adjustment: Adjustment
-) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+) -> tuple[tuple[NDArray[np.float64], NDArray[np.float64]], ...]:
     """Coefficients (p,) and their variances (p,) by fluoroscope, with points that are nearly free.
 
     network has additional parameters for each fluoroscope; it is linearised at the adjustment.
@@ -244,7 +251,7 @@ def variance_between_exposures(
     terms: ExposureTerms,
     coefficients: NDArray[np.float64],
     covariance: NDArray[np.float64],
-) -> np.ndarray:
+) -> NDArray[np.float64]:
     """Variances [px^2] of image coordinates by terms of exposures, less what orientations absorb.
 
     Parameters
@@ -282,10 +289,10 @@ def variance_between_exposures(
 
 def _information(
     network: Network, adjustment: Adjustment, f: int, terms: ExposureTerms
-) -> np.ndarray:
+) -> NDArray[np.float64]:
     """Information (p, p) of the terms where only orientations and object points are unknown."""
     additional: list[AdditionalParameters | None] = [None] * network.n_fluoroscopes
-    start: list[np.ndarray | None] = [None] * network.n_fluoroscopes
+    start: list[NDArray[np.float64] | None] = [None] * network.n_fluoroscopes
     none = np.zeros((len(network.rows(f)), 0))
     additional[f] = AdditionalParameters(none, np.diag(terms.precision), terms.functions)
     start[f] = np.zeros(terms.count)
@@ -303,7 +310,7 @@ def _information(
 
 def _variances_left(
     network: Network, adjustment: Adjustment, f: int, terms: ExposureTerms
-) -> np.ndarray:
+) -> NDArray[np.float64]:
     """Expected squares (i,) [px^2] of the terms, without what orientations absorb, of inliers."""
     rows = network.rows(f)
     inliers = adjustment.inliers[rows]
@@ -365,14 +372,14 @@ class SeriesWithExposures:
     covariance: NDArray[np.float64]  #: (p, p)
 
 
-def can_be_fitted(angles: np.ndarray) -> bool:
+def can_be_fitted(angles: NDArray[np.float64]) -> bool:
     """Whether angles (e,) [rad] of exposures are known, enough, and not all alike."""
     if len(angles) < HARMONICS or not np.isfinite(angles).all():
         return False
     return bool(np.sqrt(np.mean(np.var(harmonics(angles)[:, :2], axis=0))) > MIN_SPREAD)
 
 
-def fit_angles(estimated: SeriesWithExposures, angles: np.ndarray) -> AngleFit | None:
+def fit_angles(estimated: SeriesWithExposures, angles: NDArray[np.float64]) -> AngleFit | None:
     """Return series and terms as a function of the angles (e,) [rad] of the exposures.
 
     None where they do not explain the terms, or the terms are not determined.
@@ -382,7 +389,7 @@ def fit_angles(estimated: SeriesWithExposures, angles: np.ndarray) -> AngleFit |
     return None
 
 
-def _fit(estimated: SeriesWithExposures, angles: np.ndarray) -> AngleFit | None:
+def _fit(estimated: SeriesWithExposures, angles: NDArray[np.float64]) -> AngleFit | None:
     """See `fit_angles`; raises LinAlgError."""
     h = harmonics(angles) - harmonics(angles).mean(axis=0)
     c = 2 * len(estimated.functions)
@@ -419,7 +426,7 @@ class _Effects:
     of the harmonics, and one for what is random, are estimated from all terms.
     """
 
-    def __init__(self, own: ExposureTerms, h: np.ndarray) -> None:
+    def __init__(self, own: ExposureTerms, h: NDArray[np.float64]) -> None:
         terms = len(own.variance)
         self.design = np.hstack([np.kron(h, np.eye(terms)), np.eye(len(h) * terms)])
         self.count = HARMONICS * terms
@@ -431,12 +438,12 @@ class _Effects:
         self._factors = np.full(ORDERS + 1, 1 / (ORDERS + 1))
 
     @property
-    def _variance(self) -> np.ndarray:
+    def _variance(self) -> NDArray[np.float64]:
         return np.maximum(self._factors[self._factor_of] * self._unit, ABSENT_VARIANCE)
 
     def estimate(
-        self, information: np.ndarray, right: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+        self, information: NDArray[np.float64], right: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Mean and covariance of all effects, with the most likely variances.
 
         information, right: normal equations of the terms of the exposures, without their prior.
@@ -457,7 +464,7 @@ class _Effects:
         covariance = root.T @ root
         return covariance @ vector, covariance
 
-    def explained(self, h: np.ndarray) -> float:
+    def explained(self, h: NDArray[np.float64]) -> float:
         """Share of the variance between exposures that harmonics h (e, 4) explain."""
         variance = self._variance
         of_harmonics = variance[: self.count].reshape(HARMONICS, -1).sum(axis=1)
@@ -466,7 +473,7 @@ class _Effects:
         return by_angle / (by_angle + at_random)
 
 
-def _inverse_root(matrix: np.ndarray) -> np.ndarray:
+def _inverse_root(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     """Lower triangular matrix R with the inverse R^T R of a positive definite matrix."""
     factor = np.asfortranarray(np.linalg.cholesky(matrix))
     root, failed = lapack.dtrtri(factor, lower=1, overwrite_c=1)
@@ -475,7 +482,9 @@ def _inverse_root(matrix: np.ndarray) -> np.ndarray:
     return root
 
 
-def field_of(estimated: SeriesWithExposures, angles: np.ndarray, effects: Effects) -> AngleField:
+def field_of(
+    estimated: SeriesWithExposures, angles: NDArray[np.float64], effects: Effects
+) -> AngleField:
     """Field of the effects of angles (e,) [rad] on estimated terms."""
     size = estimated.functions.image_size
     cubic = Functions(size, CUBIC)

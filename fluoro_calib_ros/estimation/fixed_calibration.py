@@ -126,7 +126,7 @@ class SolvedNetwork:
             )
         return covariance_blocks(factorize(network, equations))
 
-    def _as_stated(self, covariance: np.ndarray) -> np.ndarray:
+    def _as_stated(self, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
         """Scale a covariance matrix to the standard deviations that the unknowns claim."""
         if self.stated is None:
             return covariance
@@ -180,7 +180,7 @@ def network_of_calibrations(
 def _sensor(calibration: FluoroscopeCalibration) -> KnownSensor:
     """Return interior orientation and correction of a calibration."""
 
-    def correction(frame: Frame) -> np.ndarray:
+    def correction(frame: Frame) -> NDArray[np.float64]:
         if calibration.angle_field is None:
             return calibration.model.predict(frame.uv)
         return calibration.correction(frame.uv, frame.angle).duv
@@ -188,14 +188,14 @@ def _sensor(calibration: FluoroscopeCalibration) -> KnownSensor:
     return KnownSensor(calibration.interior, correction)
 
 
-def _angles(measured: Measured, rows: np.ndarray) -> np.ndarray:
+def _angles(measured: Measured, rows: NDArray[np.int64]) -> NDArray[np.float64]:
     """Angle [rad] of the C-arm for image points (r,), NaN where it is unknown."""
     return angles_of(measured.frames)[measured.network.exposure[rows]]
 
 
 def fixed_corrections(
     measured: Measured, calibrations: Calibrations
-) -> tuple[np.ndarray, Network]:
+) -> tuple[NDArray[np.float64], Network]:
     """Corrections (N, 2) [px] by calibrations, and the network with their uncertainty in sigma.
 
     Where a correction is uncertain, at the border and beyond the calibrated area, an image point

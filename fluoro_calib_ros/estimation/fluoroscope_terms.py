@@ -100,7 +100,7 @@ class FluoroscopeTerms:
     @classmethod
     def continued(
         cls, problem: AdjustmentProblem, number: int, series: Series, prior: Prior | None
-    ) -> tuple[FluoroscopeTerms, np.ndarray]:
+    ) -> tuple[FluoroscopeTerms, NDArray[np.float64]]:
         """Return terms with the functions of an earlier series, and its coefficients (2m,).
 
         prior: None, it is to be estimated from the series.
@@ -113,7 +113,7 @@ class FluoroscopeTerms:
         out.prior = prior or out._prior_of(matrix, problem.before.noise.scale)
         return out, matrix.ravel()
 
-    def _prior_of(self, matrix: np.ndarray, scale: float) -> Prior:
+    def _prior_of(self, matrix: NDArray[np.float64], scale: float) -> Prior:
         """Prior that is most likely for coefficients (2, m); scale: of the noise.
 
         Orientations are taken to be known, which is near enough to start with.
@@ -127,7 +127,7 @@ class FluoroscopeTerms:
         right = information @ matrix.ravel()
         return most_likely_prior(self.functions, information, right, self.gauge, prior=start)
 
-    def weighted(self, values: np.ndarray, scale: float) -> np.ndarray:
+    def weighted(self, values: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
         """Values (n, k) at image points over the sd of their noise, of a scale."""
         return values / (scale * self.sigma)[:, None]
 
@@ -138,11 +138,11 @@ class FluoroscopeTerms:
         self.gauge = self.gauge_of(self.values)  #: (2m, 2m) precision matrix of the gauge
         self._last_equations: SeriesEquations | None = None  # with these functions
 
-    def gauge_of(self, values: np.ndarray) -> NDArray[np.float64]:
+    def gauge_of(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Precision matrix (2m, 2m) of the gauge for values (n, m) of functions."""
         return gauge_precision(values, self.uv, self.interior, self.gauge_kind)
 
-    def use_interior(self, estimated: np.ndarray) -> None:
+    def use_interior(self, estimated: NDArray[np.float64]) -> None:
         """Let the gauge follow an estimated interior orientation (3,).
 
         The estimate depends on the gauge. Where the image points hardly tell the principal point,
@@ -180,7 +180,7 @@ class FluoroscopeTerms:
         prior = block_diag(prior, np.diag(self.own.precision))
         return AdditionalParameters(self.values, prior, self.own.functions)
 
-    def correction(self, coefficients: np.ndarray) -> np.ndarray:
+    def correction(self, coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
         """Corrections (n, 2) [px] of the image points by the series."""
         return self.values @ coefficients[self.of_series].reshape(2, -1).T
 
@@ -199,7 +199,7 @@ class FluoroscopeTerms:
         absent = tuple(b for b in range(modes + 1, highest) if b not in bands)
         return Functions(self.image_size, CUBIC, highest, self.functions.rings, absent)
 
-    def use_modes(self, modes: int, coefficients: np.ndarray) -> np.ndarray:
+    def use_modes(self, modes: int, coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
         """Use all sines up to a number of modes, and those of the ripples of the prior.
 
         Returns the coefficients for them.
@@ -211,7 +211,7 @@ class FluoroscopeTerms:
         return np.concatenate([series, coefficients[end:]])
 
     def equations(
-        self, network: Network, matrix: FactorizedNormalMatrix, solved: np.ndarray
+        self, network: Network, matrix: FactorizedNormalMatrix, solved: NDArray[np.float64]
     ) -> SeriesEquations:
         """Normal equations of the series at a solution.
 
@@ -228,7 +228,7 @@ class FluoroscopeTerms:
         self._last_equations = SeriesEquations(information, right)
         return self._last_equations
 
-    def series(self, coefficients: np.ndarray, covariance: np.ndarray) -> Series:
+    def series(self, coefficients: NDArray[np.float64], covariance: NDArray[np.float64]) -> Series:
         """Return the series, without the terms of the exposures.
 
         coefficients (p,), those of u first, and their covariance (p, p).
@@ -291,7 +291,7 @@ class FluoroscopeTerms:
 
     def variance_between_exposures(
         self, network: Network, adjustment: Adjustment, precise: Precision
-    ) -> np.ndarray | None:
+    ) -> NDArray[np.float64] | None:
         """See `AdjustedTerms`; None: there are no terms of exposures."""
         covariance = precise.additional[self.number]
         if self.own is None or covariance is None:

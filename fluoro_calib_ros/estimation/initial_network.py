@@ -121,7 +121,7 @@ def undetermined(network: Network) -> DataError:
     return DataError(SINGULAR, kind=Kind.UNDETERMINED)
 
 
-def with_additional(adjustment: Adjustment, values: tuple[np.ndarray, ...]) -> Adjustment:
+def with_additional(adjustment: Adjustment, values: tuple[NDArray[np.float64], ...]) -> Adjustment:
     """Return an adjustment whose parameters have additional parameters of these values."""
     return replace(adjustment, parameters=replace(adjustment.parameters, additional=values))
 
@@ -161,7 +161,7 @@ class Measured:
     known: Known = field(default_factory=dict)
 
     @property
-    def angles(self) -> list[np.ndarray]:
+    def angles(self) -> list[NDArray[np.float64]]:
         """Angles (e,) of the C-arm [rad] in the exposures of each fluoroscope; NaN: unknown."""
         network = self.network
         exposures = [
@@ -177,8 +177,8 @@ class KnownSensor:
     correction: of the n image points of a frame, (n, 2) [px].
     """
 
-    interior: np.ndarray
-    correction: Callable[[Frame], np.ndarray]
+    interior: NDArray[np.float64]
+    correction: Callable[[Frame], NDArray[np.float64]]
 
 
 @dataclass(frozen=True)
@@ -194,7 +194,7 @@ class EarlierCalibration:
     #: found, with which the next one starts
     priors: dict[str, Prior] = field(default_factory=dict)
 
-    def points(self, target_id: np.ndarray) -> NDArray[np.float64]:
+    def points(self, target_id: NDArray[np.int64]) -> NDArray[np.float64]:
         """Object points (k, 3) [mm] of targets (k,)."""
         return self.points_mm[np.searchsorted(self.target_id, target_id)]
 
@@ -246,12 +246,14 @@ class _Resected:
 
     frames: list[Frame]
     resections: list[Resection]
-    interior: np.ndarray
+    interior: NDArray[np.float64]
     excluded: list[Finding]
     untilted: bool = False
 
 
-def nominal_interior(image_size: tuple[int, int], principal_distance: float) -> np.ndarray:
+def nominal_interior(
+    image_size: tuple[int, int], principal_distance: float
+) -> NDArray[np.float64]:
     """Interior orientation (3,) [px] with the principal point at the centre of the image."""
     return np.array([(image_size[0] - 1) / 2, (image_size[1] - 1) / 2, principal_distance])
 
@@ -359,13 +361,13 @@ def _resected(task: _Task, name: str, frames: Sequence[Frame]) -> _Resected:
     )
 
 
-def _no_correction(frame: Frame) -> np.ndarray:
+def _no_correction(frame: Frame) -> NDArray[np.float64]:
     return np.zeros_like(frame.uv)
 
 
 def _place_all(
     task: _Task, name: str, frames: Sequence[Frame]
-) -> tuple[list[Resection | None], np.ndarray, list[Finding]]:
+) -> tuple[list[Resection | None], NDArray[np.float64], list[Finding]]:
     """Known orientations of the frames of one fluoroscope; returns as _resect_all."""
     known = task.known[name]
     sensor = None if task.sensors is None else task.sensors[name]
@@ -384,7 +386,7 @@ def _place_all(
 
 def _start_all(
     task: _Task, name: str, frames: Sequence[Frame]
-) -> tuple[list[Resection | None], np.ndarray, list[Finding]]:
+) -> tuple[list[Resection | None], NDArray[np.float64], list[Finding]]:
     """Start values that are given for the frames of one fluoroscope; returns as _resect_all."""
     assert task.starts is not None
     sensor = None if task.sensors is None else task.sensors[name]
@@ -479,7 +481,7 @@ def _too_few(name: str, count: int, needed: int, excluded: Sequence[Finding]) ->
 
 def _resect_all(
     task: _Task, name: str, frames: Sequence[Frame]
-) -> tuple[list[Resection | None], np.ndarray, list[Finding]]:
+) -> tuple[list[Resection | None], NDArray[np.float64], list[Finding]]:
     """Resections of the frames of one fluoroscope.
 
     Returns them, None where one fails; the interior orientation (3,); and a finding for every
@@ -511,7 +513,7 @@ def _resect_all(
     return found, interior, excluded
 
 
-def _start_interior(task: _Task, name: str, views: Sequence[View]) -> np.ndarray:
+def _start_interior(task: _Task, name: str, views: Sequence[View]) -> NDArray[np.float64]:
     """Start values (3,) [px] of the interior orientation. Raises DataError."""
     size = views[0].frame.image_size
     middle = nominal_interior(size, 1.0)[:2]
@@ -568,8 +570,8 @@ def _require_different_poses(name: str, resections: Sequence[Resection | None]) 
 
 
 def _index(
-    frames: Sequence[Frame], fluoroscope: np.ndarray, task: _Task, n_fluoroscopes: int
-) -> tuple[Network, np.ndarray]:
+    frames: Sequence[Frame], fluoroscope: NDArray[np.int64], task: _Task, n_fluoroscopes: int
+) -> tuple[Network, NDArray[np.int64]]:
     """The network of frames, and the target ids (n,) of its object points."""
     counts = [len(frame.target_id) for frame in frames]
     rows = task.phantom.index(np.concatenate([frame.target_id for frame in frames]))

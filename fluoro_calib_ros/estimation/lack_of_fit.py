@@ -83,10 +83,10 @@ class FittedPoints:
     redundancy number of a coordinate, 1 where they do not matter.
     """
 
-    uv: np.ndarray
-    residuals: np.ndarray
-    exposure: np.ndarray
-    redundancy: np.ndarray | float = 1.0
+    uv: NDArray[np.float64]
+    residuals: NDArray[np.float64]
+    exposure: NDArray[np.int64]
+    redundancy: NDArray[np.float64] | float = 1.0
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class RejectedArea:
 
     size_px: float
     limit_px: float
-    rows: np.ndarray
+    rows: NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ class LeftOut:
     """
 
     sd_px: float
-    correlation: Callable[[np.ndarray], np.ndarray]
+    correlation: Callable[[NDArray[np.float64]], NDArray[np.float64]]
     places: LeftOutInPlaces | None = None
 
 
@@ -122,8 +122,8 @@ class LeftOutInPlaces:
     variance: callable, variances [px^2] at pixels (n, 2); correlation: as in `LeftOut`.
     """
 
-    variance: Callable[[np.ndarray], np.ndarray]
-    correlation: Callable[[np.ndarray], np.ndarray]
+    variance: Callable[[NDArray[np.float64]], NDArray[np.float64]]
+    correlation: Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
 @dataclass(frozen=True)
@@ -136,11 +136,11 @@ class _Products:
     that at the distance of the neighbours, 1 where there is none.
     """
 
-    uv: np.ndarray
-    value: np.ndarray
-    shown: np.ndarray
-    exposure: np.ndarray
-    distance: np.ndarray
+    uv: NDArray[np.float64]
+    value: NDArray[np.float64]
+    shown: NDArray[np.float64]
+    exposure: NDArray[np.int64]
+    distance: NDArray[np.float64]
     growth: float
 
     def mean_of_all(self) -> tuple[float, float]:
@@ -170,7 +170,7 @@ def _products(points: FittedPoints) -> _Products:
     number = other.sum(axis=1)
     usable = number > 0
 
-    def mean(of_pairs: np.ndarray) -> np.ndarray:
+    def mean(of_pairs: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.where(other, of_pairs, 0.0).sum(axis=1)[usable] / number[usable]
 
     product = np.einsum('na,nka->nk', r, r[near]) / 2
@@ -184,7 +184,9 @@ def _products(points: FittedPoints) -> _Products:
     )
 
 
-def _growth(product: np.ndarray, distance: np.ndarray, other: np.ndarray) -> float:
+def _growth(
+    product: NDArray[np.float64], distance: NDArray[np.float64], other: NDArray[np.bool_]
+) -> float:
     """Mean product at no distance over the mean of products (n, k) at distances (n, k) [px].
 
     The covariance of a smooth error falls with the square of the distance: it is extrapolated
@@ -274,7 +276,7 @@ def sd_of_rejected(
 
 def _pairs_of_rejected(
     inliers: FittedPoints, rejected: FittedPoints, reach: float, limit: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_], NDArray[np.bool_]]:
     """Pairs (k,), (k,) of neighbouring rejected points; which (k,) agree, and which are opposite.
 
     reach [px]: of neighbours of different exposures; limit [px]: difference of residuals that
@@ -303,7 +305,10 @@ def _pairs_of_rejected(
 
 
 def areas_of_rejected(
-    rejected: FittedPoints, target: np.ndarray, inliers: np.ndarray, image_size: tuple[int, int]
+    rejected: FittedPoints,
+    target: NDArray[np.int64],
+    inliers: NDArray[np.float64],
+    image_size: tuple[int, int],
 ) -> list[RejectedArea]:
     """Return the areas with enough rejected image points, of targets (n,), to see what they share.
 
@@ -338,7 +343,9 @@ def areas_of_rejected(
     ]
 
 
-def _inside(uv: np.ndarray, corner: np.ndarray, cell: np.ndarray) -> np.ndarray:
+def _inside(
+    uv: NDArray[np.float64], corner: NDArray[np.float64], cell: NDArray[np.float64]
+) -> NDArray[np.int64]:
     """Rows of image points (n, 2) in a cell of a size (2,) [px]; corner (2,): in such cells."""
     at = (uv + 0.5) / cell - corner
     return np.flatnonzero(((at >= 0) & (at < 1)).all(axis=1))
@@ -352,13 +359,15 @@ class _Area:
     number of exposures that agree with the mean of all; clustered: so many by no chance.
     """
 
-    rows: np.ndarray
-    of_target: np.ndarray
+    rows: NDArray[np.int64]
+    of_target: NDArray[np.float64]
     exposures: int
     clustered: bool
 
     @staticmethod
-    def of(rejected: FittedPoints, target: np.ndarray, rows: np.ndarray, clustered: bool) -> _Area:
+    def of(
+        rejected: FittedPoints, target: NDArray[np.int64], rows: NDArray[np.int64], clustered: bool
+    ) -> _Area:
         """Area of rows of rejected image points, of targets (n,)."""
         _, place = np.unique(target[rows], return_inverse=True)
         number = np.bincount(place)
@@ -389,8 +398,8 @@ class _Area:
 
 
 def _variance_in_places(
-    products: _Products, series: Series, places: LeftOutInPlaces, pixels: np.ndarray
-) -> np.ndarray:
+    products: _Products, series: Series, places: LeftOutInPlaces, pixels: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Variances (n,) [px^2] at pixels (n, 2) of what a series leaves out in places.
 
     The share of what is expected there is that which the products of these places show.
@@ -475,7 +484,9 @@ def fitted_profile(
     return NoiseProfile(middle, middle * float(np.exp(growth / 2)), reach)
 
 
-def _gamma_regression(x: np.ndarray, y: np.ndarray) -> tuple[float, np.ndarray]:
+def _gamma_regression(
+    x: NDArray[np.float64], y: NDArray[np.float64]
+) -> tuple[float, NDArray[np.float64]]:
     """Slope of the logarithm of the expectation of y (n,) over x (n,), and the expectations (n,).
 
     Fisher scoring: with a logarithmic link, all weights are one (McCullagh and Nelder, 8.4).

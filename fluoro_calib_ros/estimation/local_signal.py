@@ -63,7 +63,9 @@ class LocalSignal:
         """Variances (n,) of the heights of the bumps [px^2]."""
         return self.variances[self.window]
 
-    def variance_beyond(self, functions: Functions, uv: np.ndarray) -> NDArray[np.float64]:
+    def variance_beyond(
+        self, functions: Functions, uv: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
         """Variances (n,) [px^2] at pixels uv (n, 2) of what the sines of a series leave out."""
         width = WIDTH * max(functions.image_size)
         squares = np.sum((uv[:, None] - self.nodes[None]) ** 2, axis=2)
@@ -76,7 +78,9 @@ class LocalSignal:
             return np.inf
         return float(np.mean(np.abs(np.log(self.variances / other.variances))))
 
-    def renewed(self, mean: np.ndarray, variance: np.ndarray) -> LocalSignal | None:
+    def renewed(
+        self, mean: NDArray[np.float64], variance: NDArray[np.float64]
+    ) -> LocalSignal | None:
         """Return the windows with more likely variances, without those that have vanished.
 
         mean, variance (2, n): of the heights [px], [px^2]. None: no window is left.
@@ -108,13 +112,18 @@ class SineEstimates:
     evidence: NDArray[np.float64]
 
     @classmethod
-    def of(cls, precision: np.ndarray, mean: np.ndarray, covariances: np.ndarray) -> SineEstimates:
+    def of(
+        cls,
+        precision: NDArray[np.float64],
+        mean: NDArray[np.float64],
+        covariances: NDArray[np.float64],
+    ) -> SineEstimates:
         """Return them from the inverse of K (s, s), estimates (s, 2) and covariances (k, s, s)."""
         evidence = [precision - precision @ one @ precision for one in covariances]
         return cls(precision @ mean, np.stack(evidence))
 
 
-def bumps(functions: Functions, nodes: np.ndarray) -> NDArray[np.float64]:
+def bumps(functions: Functions, nodes: NDArray[np.float64]) -> NDArray[np.float64]:
     """Coefficients (s, n) of the sines for bumps of height one about nodes (n, 2) [px].
 
     A sine is an eigenfunction of the convolution with a Gaussian.
@@ -124,7 +133,7 @@ def bumps(functions: Functions, nodes: np.ndarray) -> NDArray[np.float64]:
     return functions(nodes)[:, functions.trend :].T * damped[:, None]
 
 
-def correlation_beyond(functions: Functions, distance: np.ndarray) -> NDArray[np.float64]:
+def correlation_beyond(functions: Functions, distance: NDArray[np.float64]) -> NDArray[np.float64]:
     """Correlation (n,), at distances (n,) [px], of what the sines leave out of the bumps."""
     f = functions.highest * np.geomspace(1, SHORTEST, QUADRATURE)
     # f df on a geometric grid
@@ -178,7 +187,7 @@ class _Place:
     rows (b,); gain: of the logarithm of the likelihood; variance: the most likely one [px^2].
     """
 
-    rows: np.ndarray
+    rows: NDArray[np.int64]
     gain: float
     variance: float
 
@@ -192,9 +201,9 @@ class _ShownBumps:
     """
 
     image_size: tuple[int, int]
-    nodes: np.ndarray
-    pulls: np.ndarray
-    products: np.ndarray
+    nodes: NDArray[np.float64]
+    pulls: NDArray[np.float64]
+    products: NDArray[np.float64]
 
     @classmethod
     def of(cls, functions: Functions, estimates: SineEstimates) -> _ShownBumps:
@@ -208,7 +217,7 @@ class _ShownBumps:
         """Return all windows."""
         return [self._place(rows) for rows in _windows(self.image_size, self.nodes)]
 
-    def most_likely_band(self, taken: np.ndarray) -> _Place | None:
+    def most_likely_band(self, taken: NDArray[np.bool_]) -> _Place | None:
         """Return the band that gains most, without the bumps that are taken (n,).
 
         Those whose bumps, each alone, are the least likely to be zero are looked at.
@@ -226,20 +235,20 @@ class _ShownBumps:
         ]
         return max(likely, key=lambda band: band.gain, default=None)
 
-    def _place(self, rows: np.ndarray) -> _Place:
+    def _place(self, rows: NDArray[np.int64]) -> _Place:
         """Return the place of some bumps (b,)."""
         products = [product[np.ix_(rows, rows)] for product in self.products]
         return _Place(rows, *_largest_gain(self.pulls[rows], products))
 
 
-def _all_nodes(image_size: tuple[int, int]) -> np.ndarray:
+def _all_nodes(image_size: tuple[int, int]) -> NDArray[np.float64]:
     """Middles (n, 2) [px] of the bumps that an image may have."""
     spacing = max(image_size) / NODES
     u, v = ((np.arange(max(1, round(size / spacing))) + 0.5) * spacing for size in image_size)
     return np.stack(np.meshgrid(u, v, indexing='ij'), axis=-1).reshape(-1, 2)
 
 
-def _windows(image_size: tuple[int, int], nodes: np.ndarray) -> list[np.ndarray]:
+def _windows(image_size: tuple[int, int], nodes: NDArray[np.float64]) -> list[NDArray[np.int64]]:
     """Rows of the nodes (n, 2) [px] of each window."""
     size = max(image_size) / WINDOWS
     count = [max(1, int(np.ceil(2 * side / size)) - 1) for side in image_size]
@@ -249,7 +258,7 @@ def _windows(image_size: tuple[int, int], nodes: np.ndarray) -> list[np.ndarray]
 
 
 @lru_cache(maxsize=4)
-def _bands(image_size: tuple[int, int]) -> np.ndarray:
+def _bands(image_size: tuple[int, int]) -> NDArray[np.float64]:
     """Ones (b, n) for the bumps within a distance of each of many lines across the image."""
     nodes = _all_nodes(image_size)
     half = BAND * max(image_size) / NODES
@@ -261,7 +270,9 @@ def _bands(image_size: tuple[int, int]) -> np.ndarray:
     return np.concatenate(out).astype(float)
 
 
-def _largest_gain(pulls: np.ndarray, products: list[np.ndarray]) -> tuple[float, float]:
+def _largest_gain(
+    pulls: NDArray[np.float64], products: list[NDArray[np.float64]]
+) -> tuple[float, float]:
     """Largest gain of the logarithm of the likelihood by one more place, and its variance.
 
     pulls (b, 2) and products (b, b), for u and v or one for both: q and s of Tipping and Faul 2003
@@ -278,13 +289,13 @@ def _largest_gain(pulls: np.ndarray, products: list[np.ndarray]) -> tuple[float,
     return float(gain[best]), float(VARIANCES[best])
 
 
-def _is_beside(nodes: np.ndarray, others: np.ndarray, reach: float) -> bool:
+def _is_beside(nodes: NDArray[np.float64], others: NDArray[np.float64], reach: float) -> bool:
     """Whether some of the nodes (b, 2) are within reach [px] of others (n, 2)."""
     distance = np.abs(nodes[:, None] - others[None]).max(axis=2)
     return bool(np.min(distance, initial=np.inf) < reach)
 
 
-def _joined(local: LocalSignal | None, nodes: np.ndarray, variance: float) -> LocalSignal:
+def _joined(local: LocalSignal | None, nodes: NDArray[np.float64], variance: float) -> LocalSignal:
     """Return the places with one more, of nodes (b, 2)."""
     if local is None:
         return LocalSignal(nodes, np.zeros(len(nodes), dtype=int), np.array([variance]))

@@ -98,13 +98,16 @@ def _precision_by(reference: SelfCalibration, run: SelfCalibration) -> Precision
     )
 
 
-def _squares(differences: np.ndarray) -> np.ndarray:
+def _squares(differences: NDArray[np.float64]) -> NDArray[np.float64]:
     """Products (n, s, s) of the components of differences (n, s)."""
     return differences[:, :, None] * differences[:, None, :]
 
 
 def _with_variance(
-    model: CorrectionModel, pixels: np.ndarray, square: np.ndarray, inside: np.ndarray
+    model: CorrectionModel,
+    pixels: NDArray[np.float64],
+    square: NDArray[np.float64],
+    inside: NDArray[np.bool_],
 ) -> CorrectionModel:
     """Return a model with variances (n,) [px^2] at the pixels (n, 2) of the grid of a series.
 
@@ -215,11 +218,11 @@ def _prior_of(terms: CollocationTerms, f: int) -> _SeriesPrior:
 
 def _held_out(
     prior: _SeriesPrior,
-    functions: np.ndarray,
-    values: np.ndarray,
-    weight: np.ndarray,
-    fold: np.ndarray,
-) -> np.ndarray:
+    functions: NDArray[np.float64],
+    values: NDArray[np.float64],
+    weight: NDArray[np.float64],
+    fold: NDArray[np.int64],
+) -> NDArray[np.float64]:
     """Predictions (N, 2) of values (N, 2) by functions fitted without the own fold.
 
     functions: (N, m) trend, then sines. values: (N, 2). weight, fold: (N,). Returns (N, 2).
@@ -238,7 +241,9 @@ def _held_out(
     return out
 
 
-def _solved(prior: _SeriesPrior, gram: np.ndarray, right: np.ndarray) -> np.ndarray:
+def _solved(
+    prior: _SeriesPrior, gram: NDArray[np.float64], right: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Coefficients (m, 2) of u and v from their normal equations (m, m) and (m, 2).
 
     The sines, whose matrix u and v have in common, are eliminated first; what remains are trend
@@ -278,8 +283,11 @@ def _solved(prior: _SeriesPrior, gram: np.ndarray, right: np.ndarray) -> np.ndar
 
 
 def _held_out_of_terms(
-    terms: np.ndarray, values: np.ndarray, weight: np.ndarray, fold: np.ndarray
-) -> np.ndarray:
+    terms: NDArray[np.float64],
+    values: NDArray[np.float64],
+    weight: NDArray[np.float64],
+    fold: NDArray[np.int64],
+) -> NDArray[np.float64]:
     """Predictions (N, 2) of values (N, 2) by terms (N, 2, t) fitted without the own fold.
 
     weight, fold (N,).

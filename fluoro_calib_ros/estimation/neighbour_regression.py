@@ -61,11 +61,11 @@ class CrossValidation:
     def __init__(
         self,
         model_type: type[NeighbourModel],
-        uv: np.ndarray,
-        fold: np.ndarray,
+        uv: NDArray[np.float64],
+        fold: NDArray[np.int64],
         candidates: ArrayLike,
         near: NeighbourTable | None = None,
-        tested: np.ndarray | None = None,
+        tested: NDArray[np.int64] | None = None,
     ) -> None:
         self._tested = np.arange(len(uv)) if tested is None else tested
         numbers = np.unique(fold)
@@ -92,11 +92,13 @@ class CrossValidation:
         cached = few and not model_type.equal_weights
         self._weights = list(self._all_weights()) if cached else None
 
-    def _all_weights(self) -> Iterable[np.ndarray]:
+    def _all_weights(self) -> Iterable[NDArray[np.float64]]:
         """Weights (T, k) for every candidate k."""
         return (self.model_type.weights(self._near, k) for k in self.candidates)
 
-    def _neighbour_values(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _neighbour_values(
+        self, values: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Values less trend at the neighbours (2, T, K), and trend (T, 2), of the other folds."""
         near = np.empty((2,) + self._index.shape)
         trend = np.zeros((len(self._tested), 2))
@@ -107,7 +109,7 @@ class CrossValidation:
             trend[held_out] = self._basis[self._tested[held_out]] @ coefficients
         return near, trend
 
-    def predictions(self, values: np.ndarray) -> NDArray[np.float64]:
+    def predictions(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Held-out predictions (K, T, 2) of values (N, 2), for every candidate."""
         near, trend = self._neighbour_values(values)
         if self.model_type.equal_weights:
@@ -118,19 +120,23 @@ class CrossValidation:
             [trend + np.einsum('nk,cnk->nc', w, near[:, :, : w.shape[1]]) for w in weights]
         )
 
-    def predictions_for(self, k: int, values: np.ndarray) -> np.ndarray:
+    def predictions_for(self, k: int, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Held-out predictions (T, 2) of values (N, 2) with k neighbours."""
         near, trend = self._neighbour_values(values)
         weights = self.model_type.weights(self._near, k)
         return trend + np.einsum('nk,cnk->nc', weights, near[:, :, :k])
 
-    def scores(self, values: np.ndarray, information: np.ndarray) -> NDArray[np.float64]:
+    def scores(
+        self, values: NDArray[np.float64], information: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
         """G (K,) for every candidate: errors weighted by information (N, 2, 2) = C_r^-1."""
         error = values[self._tested] - self.predictions(values)
         return weighted_square_sum(error, information[self._tested])
 
 
-def weighted_square_sum(error: np.ndarray, information: np.ndarray) -> NDArray[np.float64]:
+def weighted_square_sum(
+    error: NDArray[np.float64], information: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Sums (K,) of e^T W e over errors e (K, N, 2) with weights W (N, 2, 2)."""
     return np.sum((error[:, :, None, :] @ information)[:, :, 0] * error, axis=(1, 2))
 
@@ -160,7 +166,9 @@ class NeighbourRegression(RegressionStep[NeighbourModel]):
             else np.einsum('nm,ab->nabm', points.trend, np.eye(2)).reshape(len(points.uv), 2, -1)
         )
 
-    def choose(self, values: np.ndarray, q: np.ndarray, information: np.ndarray) -> None:
+    def choose(
+        self, values: NDArray[np.float64], q: NDArray[np.float64], information: NDArray[np.float64]
+    ) -> None:
         """Update the inliers, and choose k by its score; see `RegressionStep.choose`."""
         before = self.k
         inliers = self._updated_inliers(q)
@@ -182,7 +190,7 @@ class NeighbourRegression(RegressionStep[NeighbourModel]):
         if self.changed:
             self._prepare_smoothing(inliers)
 
-    def _prepare_smoothing(self, inliers: np.ndarray) -> None:
+    def _prepare_smoothing(self, inliers: NDArray[np.bool_]) -> None:
         """Look up the k nearest inliers of all image points, and their weights."""
         uv = self.points.uv
         assert self._table is not None
@@ -191,7 +199,7 @@ class NeighbourRegression(RegressionStep[NeighbourModel]):
         self._basis = Trend(self.model_type.trend_degree, uv[inliers]).basis(uv)
         self._trend_fit = least_squares_map(self._basis[inliers])
 
-    def _set_inliers(self, inliers: np.ndarray) -> None:
+    def _set_inliers(self, inliers: NDArray[np.bool_]) -> None:
         """Prepare the cross-validation with the inliers. Raises ValueError for too few."""
         count = int(inliers.sum())
         require_training(count)
@@ -224,7 +232,7 @@ class NeighbourRegression(RegressionStep[NeighbourModel]):
         at_end = best == len(tried) - 1 and len(tried) > 1 and tried[-1] < possible[-1]
         return bool(at_start or at_end)
 
-    def smooth(self, values: np.ndarray) -> NDArray[np.float64]:
+    def smooth(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Fit values (N, 2) [px] at the inliers; return the corrections (N, 2) at all points."""
         trend = self._basis @ (self._trend_fit @ values[self.inliers])
         remainder = values - trend
@@ -234,7 +242,9 @@ class NeighbourRegression(RegressionStep[NeighbourModel]):
         ]
         return trend + np.stack(smoothed, axis=1)
 
-    def without_gauge(self, values: np.ndarray, interior: np.ndarray) -> NDArray[np.float64]:
+    def without_gauge(
+        self, values: NDArray[np.float64], interior: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
         """Change values (N, 2) so that their fitted correction is orthogonal to the gauge."""
         if self._trend is None:
             basis = gauge_basis(self.points.uv, interior, self.points.gauge)
@@ -247,7 +257,12 @@ class NeighbourRegression(RegressionStep[NeighbourModel]):
             values = values - basis @ self._part_in(basis, fitted, interior)
         return values
 
-    def _part_in(self, basis: np.ndarray, fitted: np.ndarray, interior: np.ndarray) -> np.ndarray:
+    def _part_in(
+        self,
+        basis: NDArray[np.float64],
+        fitted: NDArray[np.float64],
+        interior: NDArray[np.float64],
+    ) -> np.ndarray:
         """Coefficients of the part of corrections fitted at the inliers that is in the gauge."""
         if self._trend is None:
             uv = self.points.uv[self.inliers]
@@ -255,7 +270,7 @@ class NeighbourRegression(RegressionStep[NeighbourModel]):
         flat = basis[self.inliers].reshape(-1, basis.shape[2])
         return np.linalg.lstsq(flat, fitted.reshape(-1), rcond=None)[0]
 
-    def model(self, values: np.ndarray, series: Series | None = None) -> NeighbourModel:
+    def model(self, values: NDArray[np.float64], series: Series | None = None) -> NeighbourModel:
         """Return the correction model of values (N, 2) with its noise and bias.
 
         For a linear smoother S without bias E|y - S y|^2 = s^2 (1 - 2 tr(S)/N + tr(S S')/N)

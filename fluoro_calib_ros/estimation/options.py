@@ -111,13 +111,15 @@ class UserRegression(RegressionStep[LookupModel]):
         super().__init__(points)
         self._regressor = _repeatable_multi_output(regressor)
         self._nodes = grid_nodes(points.image_size)
-        self._interior: np.ndarray | None = None
+        self._interior: NDArray[np.float64] | None = None
         self._held_out_error2 = 0.0
         # The fits of a round: of the values and of the next ones. `model` wants the first again,
         # with the gauge of its own round.
-        self._last_fits: deque[tuple[np.ndarray, LookupModel]] = deque(maxlen=2)
+        self._last_fits: deque[tuple[NDArray[np.float64], LookupModel]] = deque(maxlen=2)
 
-    def choose(self, values: np.ndarray, q: np.ndarray, information: np.ndarray) -> None:
+    def choose(
+        self, values: NDArray[np.float64], q: NDArray[np.float64], information: NDArray[np.float64]
+    ) -> None:
         """Update the inliers; G is that of held-out exposures."""
         from sklearn.model_selection import GroupKFold, cross_val_predict
 
@@ -136,18 +138,20 @@ class UserRegression(RegressionStep[LookupModel]):
         self.score = float(weighted_square_sum(error[None], information[inliers])[0])
         self._held_out_error2 = float(np.mean(error**2))
 
-    def without_gauge(self, values: np.ndarray, interior: np.ndarray) -> np.ndarray:
+    def without_gauge(
+        self, values: NDArray[np.float64], interior: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
         """Return the values: `smooth` takes the gauge of this interior orientation out."""
         self._interior = interior
         return values
 
-    def smooth(self, values: np.ndarray) -> NDArray[np.float64]:
+    def smooth(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Fit values (N, 2) [px] at the inliers; return the corrections (N, 2) at all points."""
         fitted = self._fit(values)
         self._last_fits.append((values.copy(), fitted))
         return fitted.predict(self.points.uv)
 
-    def model(self, values: np.ndarray, series: Series | None = None) -> LookupModel:
+    def model(self, values: NDArray[np.float64], series: Series | None = None) -> LookupModel:
         """Return the lookup grid of the regressor fitted to values (N, 2).
 
         For a least-squares fit and for a mean of neighbours, the error variance of a training
@@ -164,7 +168,7 @@ class UserRegression(RegressionStep[LookupModel]):
             0, fitted.train_uv, fitted.train_duv, float(np.sqrt(noise2)), float(prediction2**0.5)
         )
 
-    def _fit(self, values: np.ndarray) -> LookupModel:
+    def _fit(self, values: NDArray[np.float64]) -> LookupModel:
         """Fit values (N, 2) at the inliers; return the correction without gauge, on the grid."""
         from sklearn.base import clone
 
@@ -180,11 +184,11 @@ class UserRegression(RegressionStep[LookupModel]):
         coefficients = gauge_coefficients(uv, fitted, self._interior, self.points.gauge)
         return LookupModel(0, pixels, duv - self._gauge(pixels) @ coefficients)
 
-    def _gauge(self, uv: np.ndarray) -> np.ndarray:
+    def _gauge(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
         assert self._interior is not None, 'without_gauge comes before smooth'
         return gauge_basis(uv, self._interior, self.points.gauge)
 
-    def _features(self, uv: np.ndarray) -> np.ndarray:
+    def _features(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
         """Image coordinates (n, 2) from -1 to 1 along the longer side."""
         size = np.asarray(self.points.image_size)
         return (uv - (size - 1) / 2) / (size.max() / 2)

@@ -81,7 +81,7 @@ class Agreement:
     trend: NDArray[np.float64]  #: (k, 6) what the angle explains: translation [mm], rotation [rad]
 
 
-def functions_of_angles(angles: Sequence[np.ndarray]) -> NDArray[np.float64]:
+def functions_of_angles(angles: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
     """Functions (k, p) of angles (k,) [rad] of the fluoroscopes of k pairs, the first of them 1.
 
     As many orders of the harmonics as there are pairs for; none where angles are not known.
@@ -101,7 +101,7 @@ def agreeing(
     parameters: Parameters,
     constraint: RelativeConstraint,
     weights: np.ndarray,
-    columns: np.ndarray,
+    columns: NDArray[np.float64],
 ) -> Agreement:
     """Return which pairs agree.
 
@@ -121,8 +121,8 @@ def agreeing(
 
 
 def _plain(
-    parameters: Parameters, constraint: RelativeConstraint, weights: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+    parameters: Parameters, constraint: RelativeConstraint, weights: NDArray[np.float64]
+) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     """Return which (k,) pairs agree, and the deviations (k,) of all over their sd."""
     pairs = constraint.pairs
     every = np.ones(len(pairs), dtype=bool)
@@ -138,13 +138,13 @@ def _plain(
     return used, _deviations(parameters, constraint, pose, weights)
 
 
-def _near(deviation: np.ndarray) -> np.ndarray:
+def _near(deviation: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Which (k,) pairs agree; all where too many do not."""
     near = deviation <= MAX_PAIR_SD * max(1.0, float(np.median(deviation)))
     return near if np.sum(~near) <= MAX_LEFT_OUT * len(near) else np.ones(len(near), dtype=bool)
 
 
-def _growth(off_sd: np.ndarray, used: np.ndarray, columns: int) -> float:
+def _growth(off_sd: NDArray[np.float64], used: NDArray[np.bool_], columns: int) -> float:
     """Factor by which used pairs scatter more than stated about so many functions."""
     freedom = max(6 * (int(used.sum()) - columns), 1)
     return float(np.sqrt(max(1.0, 6 * np.sum(off_sd[used] ** 2) / freedom)))
@@ -153,8 +153,8 @@ def _growth(off_sd: np.ndarray, used: np.ndarray, columns: int) -> float:
 def _with_trend(
     parameters: Parameters,
     constraint: RelativeConstraint,
-    weights: np.ndarray,
-    columns: np.ndarray,
+    weights: NDArray[np.float64],
+    columns: NDArray[np.float64],
 ) -> Agreement:
     """Return which pairs agree on a relative orientation that changes with the angle."""
     pairs = constraint.pairs
@@ -180,7 +180,9 @@ def _with_trend(
     )
 
 
-def _moved_once(off: np.ndarray, weights: np.ndarray, columns: np.ndarray) -> bool:
+def _moved_once(
+    off: NDArray[np.float64], weights: NDArray[np.float64], columns: NDArray[np.float64]
+) -> bool:
     """Whether one step explains nearly all that a trend leaves of discrepancies (k, 6)."""
     left = [
         np.sum(_about_trend(off, weights, weights, np.hstack([columns, step]))[0] ** 2)
@@ -190,7 +192,7 @@ def _moved_once(off: np.ndarray, weights: np.ndarray, columns: np.ndarray) -> bo
     return bool(left) and min(left) <= MOVED_SHARE * total
 
 
-def steps_of(count: int) -> list[np.ndarray]:
+def steps_of(count: int) -> list[NDArray[np.float64]]:
     """Functions (count, 1) that are 0 before one of count pairs in order, and 1 from it on.
 
     At least two pairs are on either side.
@@ -199,8 +201,11 @@ def steps_of(count: int) -> list[np.ndarray]:
 
 
 def _about_trend(
-    off: np.ndarray, shared: np.ndarray, weights: np.ndarray, columns: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+    off: NDArray[np.float64],
+    shared: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    columns: NDArray[np.float64],
+) -> tuple[np.ndarray, NDArray[np.float64]]:
     """Deviations (k,) over their sd about a trend of discrepancies (k, 6), and the trend (k, 6).
 
     The trend is estimated with the weights shared (k, 6, 6).
@@ -218,8 +223,8 @@ def _deviations(
     parameters: Parameters,
     constraint: RelativeConstraint,
     pose: RelativePose,
-    weights: np.ndarray,
-) -> np.ndarray:
+    weights: NDArray[np.float64],
+) -> NDArray[np.float64]:
     """Deviations (k,) of pairs from a relative orientation over their standard deviations."""
     off = discrepancies(constraint, pose, parameters)
     return np.sqrt(np.einsum('ki,kij,kj->k', off, weights, off) / 6)
@@ -228,10 +233,10 @@ def _deviations(
 def displacements(
     network: Network,
     parameters: Parameters,
-    pairs: np.ndarray,
+    pairs: NDArray[np.int64],
     poses: Sequence[RelativePose],
     others: Sequence[RelativePose] | None = None,
-) -> np.ndarray:
+) -> NDArray[np.float64]:
     """RMS (k,) [px] of a coordinate by which image points of pairs (k, 2) of exposures are off.
 
     They are displaced by one relative orientation of each pair against another, by default that
@@ -260,7 +265,9 @@ def displacements(
     return np.where(np.isnan(out), np.inf, out)  # NaN: points behind the source
 
 
-def _exterior(parameters: Parameters, a: int, pose: RelativePose) -> tuple[np.ndarray, np.ndarray]:
+def _exterior(
+    parameters: Parameters, a: int, pose: RelativePose
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Rotation (3, 3) and source (3,) [mm] that a relative orientation to exposure a gives."""
     rotation = parameters.rotation[a]
     return pose.rotation @ rotation, parameters.position_mm[a] + rotation.T @ pose.translation_mm

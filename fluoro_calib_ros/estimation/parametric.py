@@ -116,9 +116,9 @@ class StepwiseTerms(AdjustedTerms):
         # What no orientation can take up is left to the terms.
         self.names, terms = expert_terms(GaugeKind.NONE in problem.gauges)
         self.functions: list[Functions] = []
-        self._values: list[np.ndarray] = []
-        self._maps: list[np.ndarray] = []
-        self._near: list[np.ndarray] = []
+        self._values: list[NDArray[np.float64]] = []
+        self._maps: list[NDArray[np.float64]] = []
+        self._near: list[NDArray[np.int64]] = []
         for f, size in enumerate(problem.image_sizes):
             uv = self.network.uv[self.network.rows(f)]
             functions = Functions(size, HIGHEST)
@@ -138,7 +138,7 @@ class StepwiseTerms(AdjustedTerms):
         self._rejected = [np.zeros(len(terms), dtype=bool) for _ in self.functions]
 
     @property
-    def values(self) -> list[np.ndarray]:
+    def values(self) -> list[NDArray[np.float64]]:
         """See `AdjustedTerms`."""
         return self._values
 
@@ -150,11 +150,13 @@ class StepwiseTerms(AdjustedTerms):
         )
         return replace(network, additional=additional)
 
-    def zeros(self) -> tuple[np.ndarray, ...]:
+    def zeros(self) -> tuple[NDArray[np.float64], ...]:
         """Coefficients of no correction, by fluoroscope."""
         return tuple(np.zeros(len(self.names)) for _ in self.functions)
 
-    def series(self, f: int, coefficients: np.ndarray, covariance: np.ndarray) -> Series:
+    def series(
+        self, f: int, coefficients: NDArray[np.float64], covariance: NDArray[np.float64]
+    ) -> Series:
         """Return the series of fluoroscope f from its coefficients (31,) and their covariance."""
         functions = self.functions[f]
         to_polynomials = self._maps[f]
@@ -166,7 +168,7 @@ class StepwiseTerms(AdjustedTerms):
 
     def renew(
         self, network: Network, matrix: FactorizedNormalMatrix, adjustment: Adjustment
-    ) -> tuple[bool, tuple[np.ndarray, ...]]:
+    ) -> tuple[bool, tuple[NDArray[np.float64], ...]]:
         """Add or remove a term of every fluoroscope.
 
         Returns whether no term was, and the coefficients with which to continue.
@@ -209,7 +211,11 @@ class StepwiseTerms(AdjustedTerms):
         return False
 
     def _remove_insignificant(
-        self, f: int, information: np.ndarray, coefficients: np.ndarray, limit: float
+        self,
+        f: int,
+        information: NDArray[np.float64],
+        coefficients: NDArray[np.float64],
+        limit: float,
     ) -> bool:
         """Reject the least significant selected term for good if it is below the limit of t."""
         selected = np.flatnonzero(self.selected[f])
@@ -225,7 +231,12 @@ class StepwiseTerms(AdjustedTerms):
         return True
 
     def _improves(
-        self, f: int, result: Adjustment, rows: np.ndarray, change: np.ndarray, t: float
+        self,
+        f: int,
+        result: Adjustment,
+        rows: NDArray[np.int64],
+        change: NDArray[np.float64],
+        t: float,
     ) -> bool:
         """Whether a significant change (n, 2) of the correction reduces the RMSE or the trend."""
         core = result.inliers[rows]
@@ -236,13 +247,15 @@ class StepwiseTerms(AdjustedTerms):
             return True
         return self._trend(f, residuals - change, core) < self._trend(f, residuals, core)
 
-    def _trend(self, f: int, residuals: np.ndarray, core: np.ndarray) -> float:
+    def _trend(self, f: int, residuals: NDArray[np.float64], core: NDArray[np.bool_]) -> float:
         """Mean product of the residuals with the mean residual of their neighbours [px^2]."""
         inside = np.where(core[:, None], residuals, 0.0)
         return float(np.mean(np.sum(inside * inside[self._near[f]].mean(axis=1), axis=1)))
 
 
-def _without_gauge(terms: np.ndarray, values: np.ndarray, gauge: np.ndarray) -> np.ndarray:
+def _without_gauge(
+    terms: NDArray[np.float64], values: NDArray[np.float64], gauge: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Terms (t, 2, m) less their part in the gauge.
 
     terms: (t, 2, m) coefficients of the polynomials in u and v. values: (n, m) polynomials at the

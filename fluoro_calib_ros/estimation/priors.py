@@ -53,7 +53,7 @@ class Prior:
     """
 
     signal: Signal
-    trend: np.ndarray
+    trend: NDArray[np.float64]
     local: LocalSignal | None = None
 
     def change(self, other: Prior, functions: Functions) -> float:
@@ -111,14 +111,14 @@ def _terms_that_can_exist(functions: Functions) -> list[int]:
     return [*range(rings), *(rings + k for k in RING_TERMS if rings + k < count)]
 
 
-def _trend_columns(functions: Functions) -> np.ndarray:
+def _trend_columns(functions: Functions) -> NDArray[np.int64]:
     """Places of the coefficients of polynomials and rings, those of u first."""
     m = len(functions)
     t = functions.trend
     return np.concatenate([np.arange(t), m + np.arange(t)])
 
 
-def _trend_precision(functions: Functions, prior: Prior) -> np.ndarray:
+def _trend_precision(functions: Functions, prior: Prior) -> NDArray[np.float64]:
     """Precision matrix of the coefficients of the trend; zero for what the gauge holds."""
     to_terms, count = trend_transformation(functions.degree, functions.rings)
     return to_terms[:count].T @ (to_terms[:count] / prior.trend[:, None])
@@ -169,8 +169,11 @@ def covariance_by_signal(
 
 
 def _posterior(
-    functions: Functions, information: np.ndarray, right: np.ndarray, prior: Prior
-) -> tuple[np.ndarray, np.ndarray]:
+    functions: Functions,
+    information: NDArray[np.float64],
+    right: NDArray[np.float64],
+    prior: Prior,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Coefficients (2m,) and their covariance (2m, 2m); information: with the gauge."""
     precision = information + prior_precision(functions, prior)
     factor, _ = cho_factor(precision, lower=True)
@@ -184,7 +187,7 @@ def gauge_precision(
     uv: NDArray[np.float64],
     interior: NDArray[np.float64],
     kind: GaugeKind = GaugeKind.FULL,
-) -> np.ndarray:
+) -> NDArray[np.float64]:
     """Precision matrix that keeps a series orthogonal to the gauge at image points.
 
     values: (n, m) functions of the series at the image points. uv: (n, 2) image points [px].
@@ -214,7 +217,10 @@ def most_likely_prior(
 
 
 def _most_likely_signal(
-    functions: Functions, information: np.ndarray, right: np.ndarray, prior: Prior
+    functions: Functions,
+    information: NDArray[np.float64],
+    right: NDArray[np.float64],
+    prior: Prior,
 ) -> Prior:
     """Return the prior with a renewed signal."""
     equations = _signal_equations(functions, information, right, prior)
@@ -226,7 +232,10 @@ def _most_likely_signal(
 
 
 def _signal_equations(
-    functions: Functions, information: np.ndarray, right: np.ndarray, prior: Prior
+    functions: Functions,
+    information: NDArray[np.float64],
+    right: NDArray[np.float64],
+    prior: Prior,
 ) -> SignalEquations:
     """Normal equations with every prior but the signal's; information: with the gauge."""
     at = _trend_columns(functions)
@@ -239,8 +248,11 @@ def _signal_equations(
 
 
 def _with_bumps(
-    functions: Functions, matrix: np.ndarray, right: np.ndarray, local: LocalSignal
-) -> tuple[np.ndarray, np.ndarray]:
+    functions: Functions,
+    matrix: NDArray[np.float64],
+    right: NDArray[np.float64],
+    local: LocalSignal,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Normal equations with the heights of the bumps as further unknowns, those of u first.
 
     matrix (2m, 2m), right (2m,): of the coefficients. The coefficients of the sines are then what
@@ -258,7 +270,7 @@ def _with_bumps(
 
 
 def _renewed(
-    local: LocalSignal, equations: SignalEquations, variance: np.ndarray
+    local: LocalSignal, equations: SignalEquations, variance: NDArray[np.float64]
 ) -> LocalSignal | None:
     """Return the places with more likely variances; variance (s,): of the sines."""
     matrix = equations.information.copy(order='F')
@@ -310,9 +322,9 @@ def with_shown_places(
 
 def with_more_places(
     functions: Functions,
-    information: np.ndarray,
-    right: np.ndarray,
-    gauge: np.ndarray,
+    information: NDArray[np.float64],
+    right: NDArray[np.float64],
+    gauge: NDArray[np.float64],
     prior: Prior,
 ) -> Prior:
     """Return the prior with more places where the signal varies more, if there are any.
@@ -330,7 +342,10 @@ def with_more_places(
 
 
 def _most_likely_trend(
-    functions: Functions, information: np.ndarray, right: np.ndarray, prior: Prior
+    functions: Functions,
+    information: NDArray[np.float64],
+    right: NDArray[np.float64],
+    prior: Prior,
 ) -> Prior:
     """Return the prior with renewed variances of the trend terms, one after the other."""
     to_terms, count = trend_transformation(functions.degree, functions.rings)
@@ -360,8 +375,11 @@ def _most_likely_trend(
 
 
 def _trend_alone(
-    functions: Functions, information: np.ndarray, right: np.ndarray, prior: Prior
-) -> tuple[np.ndarray, np.ndarray]:
+    functions: Functions,
+    information: NDArray[np.float64],
+    right: NDArray[np.float64],
+    prior: Prior,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Information and right side of the coefficients of the trend, the signal eliminated."""
     at = _trend_columns(functions)
     rest = np.setdiff1d(np.arange(len(right)), at)

@@ -54,7 +54,7 @@ class Solution:
     is_steady: bool  #: whether the renewal changed no prior visibly
 
     @property
-    def coefficients(self) -> tuple[np.ndarray, ...]:
+    def coefficients(self) -> tuple[NDArray[np.float64], ...]:
         """Coefficients by fluoroscope."""
         return coefficients_of(self.adjustment)
 
@@ -127,7 +127,7 @@ class NumberOfSines:
         self._changes += 1
         return Change(modes)
 
-    def _wanted(self, part: FluoroscopeTerms, information: np.ndarray) -> int:
+    def _wanted(self, part: FluoroscopeTerms, information: NDArray[np.float64]) -> int:
         """Number of modes with which image points can tell the signal.
 
         information (2m, 2m) of its coefficients without prior.
@@ -187,7 +187,7 @@ def ripples(solution: Solution) -> Change | None:
 
 
 def _followed_ripples(
-    part: FluoroscopeTerms, points: FittedPoints, coefficients: np.ndarray
+    part: FluoroscopeTerms, points: FittedPoints, coefficients: NDArray[np.float64]
 ) -> Ripples | None:
     """Ripples that the sines beyond those of a smooth field have followed, or None."""
     functions = part.functions
@@ -199,7 +199,7 @@ def _followed_ripples(
 
 
 def _shown_ripples(
-    part: FluoroscopeTerms, points: FittedPoints, values: np.ndarray, complete: int
+    part: FluoroscopeTerms, points: FittedPoints, values: NDArray[np.float64], complete: int
 ) -> Ripples | None:
     """Ripples that values (n, 2) [px] at image points show beyond the complete bands."""
     return shown_ripples(
@@ -269,7 +269,7 @@ class AgreeingOutliers:
         return Change(modes, priors, coefficients=coefficients) if priors else None
 
 
-def _agreeing(part: FluoroscopeTerms, adjustment: Adjustment) -> np.ndarray:
+def _agreeing(part: FluoroscopeTerms, adjustment: Adjustment) -> NDArray[np.int64]:
     """Rows, of those of a fluoroscope, of rejected image points that agree."""
     residuals = adjustment.residuals[part.rows]
     inliers = adjustment.inliers[part.rows]
@@ -283,8 +283,12 @@ def _agreeing(part: FluoroscopeTerms, adjustment: Adjustment) -> np.ndarray:
 
 
 def _followed(
-    part: FluoroscopeTerms, modes: int, values: np.ndarray, used: np.ndarray, scale: float
-) -> tuple[Prior, np.ndarray]:
+    part: FluoroscopeTerms,
+    modes: int,
+    values: NDArray[np.float64],
+    used: NDArray[np.bool_],
+    scale: float,
+) -> tuple[Prior, NDArray[np.float64]]:
     """Prior and coefficients that follow the values (n, 2) [px] of the points used (n,).
 
     The robust adjustment goes on from there: at a solution that rejects image points they have no

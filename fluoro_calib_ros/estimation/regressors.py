@@ -157,7 +157,7 @@ class LocalLinearRegressor(RegressorMixin, BaseEstimator):
         predicted += np.einsum('nk,nko->no', weights, self._remainder[index])
         return predicted[:, 0] if self._single_output else predicted
 
-    def _basis(self, X: np.ndarray) -> np.ndarray:
+    def _basis(self, X: NDArray[np.float64]) -> NDArray[np.float64]:
         """Values (n, p) of the polynomials of the trend."""
         if self.trend_degree is None:
             return np.zeros((len(X), 0))
@@ -166,7 +166,9 @@ class LocalLinearRegressor(RegressorMixin, BaseEstimator):
         )
 
 
-def _plane_weights(offset: np.ndarray, kernel: np.ndarray) -> np.ndarray:
+def _plane_weights(
+    offset: NDArray[np.float64], kernel: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Weights (n, k) that evaluate at 0 the plane fitted at offset (n, k, d) with kernel (n, k).
 
     The offsets are in units of the bandwidth, to which the ridge of the slopes is relative.

@@ -193,7 +193,9 @@ def combined_targets(
     return Targets(target_id, (covariance @ right[..., None])[..., 0], covariance + common)
 
 
-def _common_covariance(xyz_mm: np.ndarray, sd_mm: np.ndarray) -> NDArray[np.float64]:
+def _common_covariance(
+    xyz_mm: NDArray[np.float64], sd_mm: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Return the covariances (n, 3, 3) of surveyed points (n, 3) that their datum has [mm^2]."""
     directions = similarity_directions(xyz_mm, xyz_mm.mean(axis=0))
     scaled = (directions / sd_mm[:, None, None]).reshape(-1, directions.shape[2])
@@ -201,15 +203,15 @@ def _common_covariance(xyz_mm: np.ndarray, sd_mm: np.ndarray) -> NDArray[np.floa
     return np.asarray(directions @ of_datum @ directions.transpose(0, 2, 1))
 
 
-def _contains(part: Targets, common: np.ndarray) -> bool:
+def _contains(part: Targets, common: NDArray[np.float64]) -> bool:
     """Whether the covariances of points are larger than common ones (n, 3, 3)."""
     return bool((np.linalg.eigvalsh(part.covariance - common) > 0).all())
 
 
 def _combined_jointly(
     parts: Sequence[Targets],
-    joint: Sequence[np.ndarray],
-    further: np.ndarray,
+    joint: Sequence[NDArray[np.float64]],
+    further: NDArray[np.float64],
     phantom: Phantom,
 ) -> Targets | None:
     """Return one set of object points from their joint covariances.

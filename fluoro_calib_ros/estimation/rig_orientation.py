@@ -109,7 +109,7 @@ def orientation_of_known(
     ).rounded()
 
 
-def _mean_rotation(figures: FluoroscopeResult) -> np.ndarray:
+def _mean_rotation(figures: FluoroscopeResult) -> NDArray[np.float64]:
     """Mean rotation (3, 3) of exposures: the nearest to the sum of their matrices."""
     total = matrix_from_quaternion([e.quaternion_wxyz for e in figures.exposures]).sum(axis=0)
     u, _, vt = np.linalg.svd(total)
@@ -140,7 +140,7 @@ class _FixedAdjustment:
     blocks: CovarianceBlocks  #: of the adjustment with the interiors among the unknowns
     interiors: NDArray[np.float64]  #: (3F, 3F) covariance of the interiors
 
-    def covariance(self, e: np.ndarray, f: np.ndarray) -> NDArray[np.float64]:
+    def covariance(self, e: NDArray[np.int64], f: NDArray[np.int64]) -> NDArray[np.float64]:
         """Covariances (k, 6, 6) of exposures e (k,) with others f (k,), the interiors known."""
         derivative = self.by_interior
         of_interiors = derivative[e] @ self.blocks.gg @ derivative[f].transpose(0, 2, 1)
@@ -298,7 +298,7 @@ def _relative_to_first(
     return _Exteriors(rotation, position, known, by_interior), tuple(scatter)
 
 
-def _seen_by_first(fixed: _FixedAdjustment) -> np.ndarray:
+def _seen_by_first(fixed: _FixedAdjustment) -> NDArray[np.float64]:
     """Object points (n, 3) [mm] that the first fluoroscope sees, in its sensor frame."""
     network = fixed.measured.network
     parameters = fixed.after.parameters
@@ -446,7 +446,7 @@ def _adjusted(
 
 
 def _with_free_interiors(
-    network: Network, after: Adjustment, correction: np.ndarray
+    network: Network, after: Adjustment, correction: NDArray[np.float64]
 ) -> CovarianceBlocks:
     """Covariances of an adjustment with the interiors as further unknowns."""
     count = network.n_fluoroscopes
@@ -461,7 +461,9 @@ def _with_free_interiors(
     return covariance_blocks(factorize(free, equations))
 
 
-def _covariance_of_interiors(calibrations: Iterable[FluoroscopeCalibration]) -> np.ndarray:
+def _covariance_of_interiors(
+    calibrations: Iterable[FluoroscopeCalibration],
+) -> NDArray[np.float64]:
     """Covariance (3F, 3F) of the interior orientations of calibrations."""
     used = list(calibrations)
     out = np.zeros((3 * len(used), 3 * len(used)))
@@ -472,8 +474,8 @@ def _covariance_of_interiors(calibrations: Iterable[FluoroscopeCalibration]) -> 
 
 
 def _mean_of_pairs(
-    fixed: _FixedAdjustment, pairs: np.ndarray, corrected: bool
-) -> tuple[RelativePose, np.ndarray, PairScatter]:
+    fixed: _FixedAdjustment, pairs: NDArray[np.int64], corrected: bool
+) -> tuple[RelativePose, NDArray[np.float64], PairScatter]:
     """Weighted mean of the relative orientations of pairs (k, 2) of exposures.
 
     corrected: whether a correction changes with the angle of a C-arm. Returns the mean, its
@@ -519,8 +521,11 @@ def _mean_of_pairs(
 
 
 def _covariance_of_pairs(
-    fixed: _FixedAdjustment, pairs: np.ndarray, d_a: np.ndarray, d_b: np.ndarray
-) -> np.ndarray:
+    fixed: _FixedAdjustment,
+    pairs: NDArray[np.int64],
+    d_a: NDArray[np.float64],
+    d_b: NDArray[np.float64],
+) -> NDArray[np.float64]:
     """Covariances (k, 6, 6) of the relative orientations of pairs (k, 2) of exposures.
 
     d_a, d_b (k, 6, 6) are their derivatives by the exposures.

@@ -47,17 +47,17 @@ class Ripples:
         """Bands in which there are ripples."""
         return tuple(band for band, variance in enumerate(self.variances) if variance > 0)
 
-    def band(self, frequency: np.ndarray) -> NDArray[np.float64]:
+    def band(self, frequency: NDArray[np.float64]) -> NDArray[np.int64]:
         """Band (s,) of frequency (s,) [1/px]."""
         return np.rint(frequency / self.width).astype(int)
 
-    def variance(self, frequency: np.ndarray) -> NDArray[np.float64]:
+    def variance(self, frequency: NDArray[np.float64]) -> NDArray[np.float64]:
         """Variances (s,) of sines of frequency (s,) [1/px]."""
         band = self.band(frequency)
         inside = band < len(self.variances)
         return np.where(inside, np.asarray(self.variances)[np.where(inside, band, 0)], 0.0)
 
-    def with_variances(self, variances: np.ndarray) -> Ripples:
+    def with_variances(self, variances: NDArray[np.float64]) -> Ripples:
         """Return ripples in the same bands with these variances (n,), of all bands."""
         own = np.where(np.asarray(self.variances) > 0, variances, 0.0)
         return replace(self, variances=tuple(float(value) for value in own))
@@ -75,7 +75,7 @@ class Ripples:
         return replace(self, variances=tuple(float(v) for v in np.where(used, variances, 0.0)))
 
 
-def ripples_of(functions: Functions, coefficients: np.ndarray) -> Ripples | None:
+def ripples_of(functions: Functions, coefficients: NDArray[np.float64]) -> Ripples | None:
     """Ripples of a series that has them, as its coefficients (2, m) show them, or None."""
     if not functions.absent:
         return None
@@ -130,11 +130,11 @@ def shown_ripples(
 
 def _are_common(
     functions: Functions,
-    uv: np.ndarray,
-    residuals: np.ndarray,
-    exposure: np.ndarray,
-    bands: np.ndarray,
-) -> np.ndarray:
+    uv: NDArray[np.float64],
+    residuals: NDArray[np.float64],
+    exposure: NDArray[np.int64],
+    bands: NDArray[np.int64],
+) -> NDArray[np.bool_]:
     """Whether the ripples of residuals (n, 2) in bands (b,) are common to the exposures (n,).
 
     The products of pairs of exposures are compared with zero by Student's t: those of different

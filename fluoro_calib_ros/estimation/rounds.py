@@ -72,7 +72,7 @@ class SelfCalibration:
     stated: Precision | None = None
     #: (i,) variances [px^2], at the inliers of a fluoroscope, by which its distortion differs
     #: between exposures, without what orientations absorb
-    between_exposures: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
+    between_exposures: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     #: of the fluoroscopes whose distortion changes with the angle of the C-arm
     angle_fields: Mapping[str, AngleField] = field(default_factory=dict)
 
@@ -133,7 +133,7 @@ def _has_settled(rounds: Sequence[Round], tolerance: float) -> bool:
     return d_f <= tolerance and d_g <= tolerance and now.change <= SETTLED_PX
 
 
-def rmse_of_inliers(adjustment: Adjustment, rows: np.ndarray) -> np.ndarray:
+def rmse_of_inliers(adjustment: Adjustment, rows: NDArray[np.int64]) -> NDArray[np.float64]:
     """RMSE (2,) [px] in u and v of the raw inlier residuals of the image points rows."""
     r = adjustment.residuals[rows][adjustment.inliers[rows]]
     return np.sqrt(np.mean(r * r, axis=0)) if len(r) else np.full(2, np.nan)
@@ -176,7 +176,7 @@ class AdjustmentStatistics:
 class ResidualTable:
     """Residuals of all image points of adjustments."""
 
-    fluoroscope: np.ndarray  #: (N,)
+    fluoroscope: NDArray[np.str_]  #: (N,)
     #: (N,)
     exposure: NDArray[np.int64]
     target_id: NDArray[np.int64]
@@ -250,7 +250,7 @@ def _square_of_others(measured: Measured, adjustment: Adjustment) -> float:
 
 
 def residuals_of_adjustment(
-    measured: Measured, adjustment: Adjustment, precise: Precision, correction: np.ndarray
+    measured: Measured, adjustment: Adjustment, precise: Precision, correction: NDArray[np.float64]
 ) -> ResidualTable:
     """Return the residuals of an adjustment; correction (N, 2) [px], all parts of it."""
     network = measured.network

@@ -80,21 +80,25 @@ class NoRegression(RegressionStep[NoCorrection]):
 
     iterates = False
 
-    def choose(self, values: np.ndarray, q: np.ndarray, information: np.ndarray) -> None:
+    def choose(
+        self, values: NDArray[np.float64], q: NDArray[np.float64], information: NDArray[np.float64]
+    ) -> None:
         """Update the inliers and sum up their weighted residuals."""
         self.inliers = self._updated_inliers(q)
         inside = values[self.inliers]
         self.score = float(np.einsum('na,nab,nb', inside, information[self.inliers], inside))
 
-    def without_gauge(self, values: np.ndarray, interior: np.ndarray) -> np.ndarray:
+    def without_gauge(
+        self, values: NDArray[np.float64], interior: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
         """Return the values."""
         return values
 
-    def smooth(self, values: np.ndarray) -> NDArray[np.float64]:
+    def smooth(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return zeros (N, 2)."""
         return np.zeros_like(values)
 
-    def model(self, values: np.ndarray, series: Series | None = None) -> NoCorrection:
+    def model(self, values: NDArray[np.float64], series: Series | None = None) -> NoCorrection:
         """Return the model that corrects nothing."""
         return no_correction()
 
@@ -410,7 +414,7 @@ def _models(
     values = after.residuals + network.additional_correction(after.parameters)
     models = {}
 
-    def points(rows: np.ndarray) -> FittedPoints:
+    def points(rows: NDArray[np.int64]) -> FittedPoints:
         return FittedPoints(
             network.uv[rows],
             after.residuals[rows],

@@ -98,11 +98,11 @@ class Signal:
         """Variances (s,) of the coefficients by the fields alone."""
         return np.sum([spectral_density(frequency, *field) for field in self.fields], axis=0)
 
-    def variance(self, frequency: np.ndarray) -> NDArray[np.float64]:
+    def variance(self, frequency: NDArray[np.float64]) -> NDArray[np.float64]:
         """Prior variances (s,) of the coefficients of sines of frequency (s,) [1/px]."""
         return np.maximum(self.density(frequency) + self.of_ripples(frequency), ABSENT_VARIANCE)
 
-    def of_ripples(self, frequency: np.ndarray) -> NDArray[np.float64]:
+    def of_ripples(self, frequency: NDArray[np.float64]) -> NDArray[np.float64]:
         """Parts (s,) of these variances that are those of the ripples."""
         if self.ripples is None:
             return np.zeros_like(frequency)
@@ -120,7 +120,9 @@ class Signal:
             variance += sd**2 * (a / (a + frequency**2)) ** nu
         return float(np.sqrt(variance))
 
-    def correlation_beyond(self, frequency: float, distance: np.ndarray) -> NDArray[np.float64]:
+    def correlation_beyond(
+        self, frequency: float, distance: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
         """Correlation (n,) of that part at distances (n,) [px]: its Hankel transform.
 
         Ripples shorter than the distance of image points hardly show in products of neighbours.
@@ -137,14 +139,14 @@ class Signal:
         """Return a signal whose short field starts anew, very small; side: of the image [px]."""
         return replace(self, fine_sd=MIN_SD_PX, fine_reach=START_FINE_REACH * side)
 
-    def change(self, other: Signal, frequency: np.ndarray) -> float:
+    def change(self, other: Signal, frequency: NDArray[np.float64]) -> float:
         """Mean change of the logarithms of the variances at frequency (s,) from another signal."""
         ratio = self.variance(frequency) / other.variance(frequency)
         return float(np.mean(np.abs(np.log(ratio))))
 
 
 def spectral_density(
-    frequency: np.ndarray, sd: float, reach: float, nu: float = SMOOTHNESS
+    frequency: NDArray[np.float64], sd: float, reach: float, nu: float = SMOOTHNESS
 ) -> NDArray[np.float64]:
     """Variances (s,) of the coefficients of sines: Matern's covariance in two dimensions.
 
@@ -160,13 +162,13 @@ def starting_signal(sd: float, side: float) -> Signal:
     return Signal(sd, START_REACH * side, START_FINE_SHARE * sd, START_FINE_REACH * side)
 
 
-def _parameters(signal: Signal) -> np.ndarray:
+def _parameters(signal: Signal) -> NDArray[np.float64]:
     """Logarithms (5,) of the parameters of a signal."""
     fine = [signal.fine_sd, signal.fine_reach]
     return np.log([signal.sd, signal.reach, *fine, signal.smoothness])
 
 
-def _slopes(signal: Signal, frequency: np.ndarray) -> np.ndarray:
+def _slopes(signal: Signal, frequency: NDArray[np.float64]) -> NDArray[np.float64]:
     """Derivatives (s, 5) of the logarithms of the variances by those of the parameters."""
     out = []
     for sd, reach, nu in signal.fields:
@@ -206,8 +208,8 @@ class _Likelihood:
     """
 
     cost: float
-    slopes: np.ndarray
-    curvature: np.ndarray
+    slopes: NDArray[np.float64]
+    curvature: NDArray[np.float64]
 
 
 def most_likely_signal(signal: Signal, coefficients: SignalEquations, side: float) -> Signal:
@@ -268,7 +270,11 @@ def plausible_signals(signal: Signal, coefficients: SignalEquations, side: float
 
 
 def _node(
-    signal: Signal, step: np.ndarray, coefficients: SignalEquations, cost: float, side: float
+    signal: Signal,
+    step: NDArray[np.float64],
+    coefficients: SignalEquations,
+    cost: float,
+    side: float,
 ) -> Signal:
     """Return the signal along a step (5,) that is as likely as a node of a normal distribution.
 
@@ -303,7 +309,7 @@ def _cost(signal: Signal, coefficients: SignalEquations) -> float:
     return found.cost + _cost_of_priors(_parameters(signal), coefficients.extent)
 
 
-def _signal(at: np.ndarray, ripples: Ripples | None) -> Signal:
+def _signal(at: NDArray[np.float64], ripples: Ripples | None) -> Signal:
     """Signal with these logarithms (5,) of its parameters."""
     sd, reach, fine_sd, fine_reach, smoothness = (float(value) for value in np.exp(at))
     return Signal(
@@ -339,7 +345,7 @@ def _with_likely_ripples(
     return signal
 
 
-def _ranges(side: float) -> tuple[np.ndarray, np.ndarray]:
+def _ranges(side: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Least and largest logarithms (5,) of the parameters; side: of the image [px]."""
     return (
         np.log(
@@ -364,8 +370,8 @@ class _Posterior:
     """
 
     cost: float
-    mean: np.ndarray
-    variance: np.ndarray
+    mean: NDArray[np.float64]
+    variance: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -376,11 +382,13 @@ class _Factorised:
     """
 
     cost: float
-    factor: np.ndarray
-    z: np.ndarray
+    factor: NDArray[np.float64]
+    z: NDArray[np.float64]
 
 
-def _factorised(variance: np.ndarray, coefficients: SignalEquations) -> _Factorised | None:
+def _factorised(
+    variance: NDArray[np.float64], coefficients: SignalEquations
+) -> _Factorised | None:
     """Return the equations for prior variances (2 s,), or None where they have no solution."""
     columns = coefficients.columns
     matrix = coefficients.information.copy(order='F')
@@ -394,7 +402,7 @@ def _factorised(variance: np.ndarray, coefficients: SignalEquations) -> _Factori
 
 
 def _posterior(
-    variance: np.ndarray, coefficients: SignalEquations, limit: float = np.inf
+    variance: NDArray[np.float64], coefficients: SignalEquations, limit: float = np.inf
 ) -> _Posterior | None:
     """Return the posterior for prior variances (2 s,).
 
@@ -414,7 +422,7 @@ def _posterior(
 
 
 def _likelihood(
-    at: np.ndarray,
+    at: NDArray[np.float64],
     coefficients: SignalEquations,
     limit: float = np.inf,
     ripples: Ripples | None = None,
@@ -439,7 +447,7 @@ def _likelihood(
     return _with_priors(likelihood, at, coefficients.extent)
 
 
-def _with_priors(likelihood: _Likelihood, at: np.ndarray, extent: float) -> _Likelihood:
+def _with_priors(likelihood: _Likelihood, at: NDArray[np.float64], extent: float) -> _Likelihood:
     """Return the posterior of logarithms (5,) of the parameters; extent: of the sines [px]."""
     large, short, rough = _parts_of_priors(at, extent)
     return _Likelihood(
@@ -449,7 +457,7 @@ def _with_priors(likelihood: _Likelihood, at: np.ndarray, extent: float) -> _Lik
     )
 
 
-def _cost_of_priors(at: np.ndarray, extent: float) -> float:
+def _cost_of_priors(at: NDArray[np.float64], extent: float) -> float:
     """Negative logarithm of the prior density of logarithms (5,) of the parameters.
 
     The density of the standard deviation of the long field grows with it (Chung et al., "A
@@ -461,7 +469,7 @@ def _cost_of_priors(at: np.ndarray, extent: float) -> float:
     return large + short + rough**2 / 2 - float(at[0])
 
 
-def _parts_of_priors(at: np.ndarray, extent: float) -> tuple[float, float, float]:
+def _parts_of_priors(at: NDArray[np.float64], extent: float) -> tuple[float, float, float]:
     """Size and shortness of the short field, and smoothness of the long one, in their scales."""
     _, _, fine_sd, fine_reach, smoothness = (float(value) for value in at)
     large = np.exp(fine_sd) / FINE_PX

@@ -72,7 +72,7 @@ class View:
     uv: NDArray[np.float64]
     projection: NDArray[np.float64] | None = None  #: (3, 4) where the targets are not in a plane
     plane: Plane | None = None  #: where the targets are nearly in a plane
-    plane_image: np.ndarray | None = None  #: (3, 3) homography of the plane
+    plane_image: NDArray[np.float64] | None = None  #: (3, 3) homography of the plane
     error: Finding | None = None  #: why neither is known
 
     @property
@@ -86,7 +86,7 @@ class View:
         return len(self.xyz) < FEW_TARGETS or self.plane is not None
 
 
-def view_of(frame: Frame, xyz: np.ndarray, uv: np.ndarray) -> View:
+def view_of(frame: Frame, xyz: NDArray[np.float64], uv: NDArray[np.float64]) -> View:
     """Return the view of an exposure."""
     flat = flatness(xyz)
     view = View(frame, xyz, uv)
@@ -103,7 +103,7 @@ def view_of(frame: Frame, xyz: np.ndarray, uv: np.ndarray) -> View:
 
 
 def principal_distance_of_views(
-    views: Sequence[View], principal_point: np.ndarray, image_size: tuple[int, int]
+    views: Sequence[View], principal_point: NDArray[np.float64], image_size: tuple[int, int]
 ) -> float:
     """Return the principal distance [px] that views show, those in space before those of planes.
 
@@ -122,7 +122,7 @@ def principal_distance_of_views(
     return found
 
 
-def orient_view(view: View, interior: np.ndarray) -> Resection:
+def orient_view(view: View, interior: NDArray[np.float64]) -> Resection:
     """Return the exterior orientation of a view with the smallest residuals. Raises DataError."""
     if view.projection is not None and not view.needs_samples:
         return resect(view.xyz, view.uv, interior, view.projection, tolerance=START_TOLERANCE)
@@ -140,7 +140,7 @@ def orient_view(view: View, interior: np.ndarray) -> Resection:
     return min(found, key=lambda one: one.scale)
 
 
-def _starts(view: View, interior: np.ndarray) -> list[Callable[[], Resection]]:
+def _starts(view: View, interior: NDArray[np.float64]) -> list[Callable[[], Resection]]:
     """Return the resections that compete."""
     xyz = view.xyz
     uv = view.uv
@@ -175,7 +175,7 @@ def settle_planes(
     return out
 
 
-def _better_pose(view: View, present: Resection, interior: np.ndarray) -> Resection:
+def _better_pose(view: View, present: Resection, interior: NDArray[np.float64]) -> Resection:
     """Return the pose of a view refined; of a plane the better of its two."""
     starts = [(present.rotation, present.position_mm)]
     if view.is_flat and view.plane is not None:
@@ -190,8 +190,8 @@ def _better_pose(view: View, present: Resection, interior: np.ndarray) -> Resect
 
 
 def _preliminary_correction(
-    views: Sequence[View], found: Sequence[Resection | None], interior: np.ndarray
-) -> Callable[[np.ndarray], np.ndarray]:
+    views: Sequence[View], found: Sequence[Resection | None], interior: NDArray[np.float64]
+) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
     """Return a polynomial correction fitted robustly to the residuals of all views."""
     functions = Functions(views[0].frame.image_size, DEGREE)
     pixels = []

@@ -16,7 +16,7 @@ from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import binary_dilation
 
 from ..errors import DataError
@@ -362,7 +362,7 @@ class Coverage:
         self._occupied[row, column] = True
 
     @property
-    def covered(self) -> np.ndarray:
+    def covered(self) -> NDArray[np.bool_]:
         """Whether cells (rows, columns) are covered."""
         return binary_dilation(self._occupied, np.ones((3, 3), dtype=bool))
 
@@ -386,7 +386,7 @@ class Coverage:
         """Covered fraction of the field of view, 0 to 1."""
         return float(np.mean(self.covered[self._field()]))
 
-    def _field(self) -> np.ndarray:
+    def _field(self) -> NDArray[np.bool_]:
         """Return whether cells (rows, columns) belong to the field of view."""
         return _ellipse() if self.is_round else np.ones((CELLS, CELLS), dtype=bool)
 
@@ -399,13 +399,13 @@ class Coverage:
         return tuple(int(i) for i in order if fractions[i] < SUFFICIENT_OF_AREA)
 
 
-def _sums_of_areas(cells: np.ndarray) -> np.ndarray:
+def _sums_of_areas(cells: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Return the number of cells (rows, columns) of bool in each of the 3 x 3 areas."""
     thirds = np.linspace(0, CELLS, 4).astype(int)[:-1]
     return np.add.reduceat(np.add.reduceat(cells.astype(float), thirds, 0), thirds, 1)
 
 
-def _ellipse() -> np.ndarray:
+def _ellipse() -> NDArray[np.bool_]:
     """Return whether cells (rows, columns) touch the ellipse that is inscribed into the image."""
     nearest = np.abs(np.arange(CELLS) + 0.5 - CELLS / 2) - 0.5  # edge towards the centre
     return np.hypot(nearest[:, None], nearest[None]) <= CELLS / 2
@@ -491,7 +491,9 @@ class _Table:
         for own, frame in zip(self._uv, frames):
             own[np.searchsorted(ids, frame.target_id)] = frame.uv
 
-    def compare(self, number: int, others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def compare(
+        self, number: int, others: NDArray[np.int64]
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Return whether exposures (k,) have the pose of one, and whether they have another."""
         same = np.zeros(len(others), dtype=bool)
         has = np.array([other in self._row for other in others.tolist()], dtype=bool)

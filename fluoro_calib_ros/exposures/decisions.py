@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import DataError
 from .frame import Frame, Frames
@@ -99,7 +100,7 @@ def _decided(frame: Frame, decisions: Sequence[PointDecision]) -> tuple[Frame | 
     return changed, int((~keep).sum()), renamed
 
 
-def _rows(frame: Frame, decision: PointDecision) -> np.ndarray:
+def _rows(frame: Frame, decision: PointDecision) -> NDArray[np.bool_]:
     """Return which image points (n,) of a frame a decision is on."""
     if decision.target_id is None:
         return np.ones(len(frame.target_id), dtype=bool)

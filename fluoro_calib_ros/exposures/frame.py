@@ -241,12 +241,14 @@ def stack_image_points(
     return ids.astype(np.int64), uv, deviations.astype(float) if len(deviations) else None
 
 
-def _finite_error(ids: np.ndarray, uv: np.ndarray) -> str:
+def _finite_error(ids: NDArray[np.int64], uv: NDArray[np.float64]) -> str:
     finite = np.isfinite(uv).all(axis=1)
     return '' if finite.all() else f'the image point of target {ids[~finite][0]} is not a number'
 
 
-def _image_error(ids: np.ndarray, uv: np.ndarray, image_size: tuple[int, int]) -> str:
+def _image_error(
+    ids: NDArray[np.int64], uv: NDArray[np.float64], image_size: tuple[int, int]
+) -> str:
     inside = points_on_image(uv, image_size)
     if inside.all():
         return ''
@@ -254,7 +256,7 @@ def _image_error(ids: np.ndarray, uv: np.ndarray, image_size: tuple[int, int]) -
     return f'target {ids[~inside][0]} is off the image of {width} x {height} px'
 
 
-def _phantom_error(ids: np.ndarray, phantom: Phantom) -> str:
+def _phantom_error(ids: NDArray[np.int64], phantom: Phantom) -> str:
     known = phantom.index(ids) >= 0
     return '' if known.all() else f'target {ids[~known][0]} is not on the phantom'
 
@@ -410,7 +412,7 @@ def frames_without_strays(
     return out, findings
 
 
-def _together(uv: np.ndarray) -> np.ndarray:
+def _together(uv: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Which (n,) of image points (n, 2) are at the place of so many others that none is there."""
     if len(uv) < MIN_TOGETHER:
         return np.zeros(len(uv), dtype=bool)

@@ -80,7 +80,7 @@ class Phantom:
         return np.where(self.target_id[row] == target_id, row, -1)
 
 
-def _validate(ids: np.ndarray, xyz: np.ndarray, sd: np.ndarray) -> None:
+def _validate(ids: NDArray[np.int64], xyz: NDArray[np.float64], sd: NDArray[np.float64]) -> None:
     """Raise DataError for a survey that cannot be used."""
     if xyz.shape != (len(ids), 3) or sd.shape != (len(ids),):
         raise DataError(

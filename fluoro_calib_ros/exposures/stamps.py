@@ -16,6 +16,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 NS_PER_S = 1_000_000_000
 RECENT = 200  # exposures that are compared
@@ -93,7 +94,7 @@ class StampAgreement:
         )
 
 
-def _frame_interval(number: np.ndarray, stamp_ns: np.ndarray) -> float:
+def _frame_interval(number: NDArray[np.int64], stamp_ns: NDArray[np.int64]) -> float:
     """Return the time [ns] between frames of consecutive numbers; 0 where it is not known."""
     numbers = np.diff(number)
     times = np.diff(stamp_ns)

@@ -130,7 +130,7 @@ def _coefficients(adjustment: RigAdjustment, fluoroscope: int) -> NDArray[np.int
 
 
 def _unseen_drift(
-    diagnostician: Diagnostician, diagnosis: Diagnosis, fluoroscope: int, held: np.ndarray
+    diagnostician: Diagnostician, diagnosis: Diagnosis, fluoroscope: int, held: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Second moments (2n, 2n) of the drift of an image that is not corrected.
 
@@ -158,7 +158,7 @@ def _unseen_drift(
     return np.asarray(of_both @ moments @ of_both.T)
 
 
-def _without_affine(functions: Functions, pixel: np.ndarray) -> NDArray[np.float64]:
+def _without_affine(functions: Functions, pixel: NDArray[np.float64]) -> NDArray[np.float64]:
     """Matrix (n, n) that takes the nearest affine map at pixels (m, 2) from coefficients (n,)."""
     values = functions(pixel)
     affine = np.flatnonzero([i + j <= 1 for i, j in functions.powers])
@@ -184,7 +184,9 @@ def unseen_distortion(diagnostician: Diagnostician, diagnosis: Diagnosis) -> tup
     return float(np.sqrt(3) * errors.place_mm), by_noise * float(np.sqrt(variance))
 
 
-def _weakest(adjustment: RigAdjustment, covariance: np.ndarray, sd: np.ndarray) -> float:
+def _weakest(
+    adjustment: RigAdjustment, covariance: NDArray[np.float64], sd: NDArray[np.float64]
+) -> float:
     """Return the largest standard deviation of a direction over that before the data.
 
     covariance (9F, 9F) of the rig; sd (K,) by which the changed unknowns may have changed.

@@ -158,19 +158,19 @@ class RigSolution:
 class _Normal:
     """Reduced normal equations H (K, K), h (K,), and what gives the poses back by body."""
 
-    matrix: np.ndarray
-    right: np.ndarray
+    matrix: NDArray[np.float64]
+    right: NDArray[np.float64]
     back: list[_Back]
 
 
 class _Back(NamedTuple):
     """What gives back the poses of a body: N = C C' of its poses, and their mixed matrix."""
 
-    columns: np.ndarray  # (L,) unknowns
-    inverse: np.ndarray  # (T, 6, 6) C^-1
-    half: np.ndarray  # (T, 6, L + 1) C^-1 (D'J, D'r)
+    columns: NDArray[np.int64]  # (L,) unknowns
+    inverse: NDArray[np.float64]  # (T, 6, 6) C^-1
+    half: NDArray[np.float64]  # (T, 6, L + 1) C^-1 (D'J, D'r)
 
-    def poses(self, step: np.ndarray) -> np.ndarray:
+    def poses(self, step: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return by how much the poses (T, 6) change with a step (K,) of the other unknowns."""
         half = self.half[..., -1] - self.half[..., :-1] @ step[self.columns]
         return np.asarray((np.swapaxes(self.inverse, 1, 2) @ half[..., None])[..., 0])
@@ -267,7 +267,7 @@ class RigAdjustment:
                 root[np.ix_(number[:, f, axis], number[:, f, axis])] = own
         return root[:, (root != 0).any(axis=0)]
 
-    def rig_at(self, values: np.ndarray) -> RigOrientation:
+    def rig_at(self, values: NDArray[np.float64]) -> RigOrientation:
         """Return the orientation, with the changes of the unknowns."""
         change = values[self.rig].reshape(self._views, ORIENTATION_SIZE)
         return replace(
@@ -277,7 +277,7 @@ class RigAdjustment:
             interior=self.orientation.interior + change[:, 6:],
         )
 
-    def functions_at(self, pixel: np.ndarray) -> NDArray[np.float64]:
+    def functions_at(self, pixel: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the functions (..., F, n) of a drift at pixels (..., F, 2)."""
         shape = pixel.shape[:-2]
         return np.stack(
@@ -288,11 +288,11 @@ class RigAdjustment:
             axis=-2,
         )
 
-    def drift_at(self, values: np.ndarray) -> NDArray[np.float64]:
+    def drift_at(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the coefficients (F, 2, n) of the drifts of the distortion [px]."""
         return values[self.drift].reshape(self._views, 2, -1)
 
-    def shapes_at(self, values: np.ndarray) -> NDArray[np.float64]:
+    def shapes_at(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the coordinates (B, M, 3) of the markers about their centres."""
         return (self.xyz + values[self.shape].reshape(self.xyz.shape)) * (
             1 + values[self.scale][0]
@@ -374,7 +374,7 @@ class RigAdjustment:
         return replace(found, covariance=covariance)
 
     def solve(
-        self, observed: ObservedBodies, prior: Prior, start: tuple[np.ndarray, Poses]
+        self, observed: ObservedBodies, prior: Prior, start: tuple[NDArray[np.float64], Poses]
     ) -> RigSolution:
         """Solve for a hypothesis, from values (K,) of the unknowns and poses.
 
@@ -391,7 +391,7 @@ class RigAdjustment:
         return found
 
     def refine(
-        self, observed: ObservedBodies, prior: Prior, start: tuple[np.ndarray, Poses]
+        self, observed: ObservedBodies, prior: Prior, start: tuple[NDArray[np.float64], Poses]
     ) -> RigSolution:
         """Solve for a hypothesis from values (K,) and poses that tell which points are false."""
         return self._converge(observed, prior, start, 1.0)
@@ -400,7 +400,7 @@ class RigAdjustment:
         self,
         observed: ObservedBodies,
         prior: Prior,
-        start: tuple[np.ndarray, Poses],
+        start: tuple[NDArray[np.float64], Poses],
         widest: float,
     ) -> RigSolution:
         """Iterate; standard deviations are larger by up to a factor, halved with each step."""
@@ -435,12 +435,14 @@ class RigAdjustment:
             **terms.shares(),
         )
 
-    def _is_impossible(self, values: np.ndarray) -> bool:
+    def _is_impossible(self, values: NDArray[np.float64]) -> bool:
         """Whether a principal distance is less than half of what it was: a wrong hypothesis."""
         c = self.orientation.interior[:, 2]
         return bool((c + values[self.rig].reshape(self._views, -1)[:, 8] < c / 2).any())
 
-    def normal_of(self, linear: LinearPoints, weight: np.ndarray, unsure: np.ndarray) -> _Normal:
+    def normal_of(
+        self, linear: LinearPoints, weight: NDArray[np.float64], unsure: NDArray[np.bool_]
+    ) -> _Normal:
         """Sum up the image points with weights (T, B, M, F); poses are eliminated.
 
         unsure (K,): unknowns that may change.
@@ -477,13 +479,13 @@ class RigAdjustment:
 class _Unknowns(NamedTuple):
     """Numbers of the unknowns of the rig and of a body."""
 
-    rig: np.ndarray  # (F, 9)
-    drift: np.ndarray  # (F, 2, n)
-    shape: np.ndarray  # (3 M,)
-    scale: np.ndarray  # (1,)
-    bias: np.ndarray  # (M, F, 2)
+    rig: NDArray[np.int64]  # (F, 9)
+    drift: NDArray[np.int64]  # (F, 2, n)
+    shape: NDArray[np.int64]  # (3 M,)
+    scale: NDArray[np.int64]  # (1,)
+    bias: NDArray[np.int64]  # (M, F, 2)
 
-    def of_coordinate(self, view: int, axis: int) -> np.ndarray:
+    def of_coordinate(self, view: int, axis: int) -> NDArray[np.int64]:
         """Return those on which a coordinate of a view depends, in the order of `_design`."""
         own = self.rig[view], self.drift[view, axis], self.shape, self.scale
         return np.concatenate([*own, self.bias[:, view, axis]])
@@ -493,9 +495,9 @@ def _summed(
     adjustment: RigAdjustment,
     linear: LinearPoints,
     row: int,
-    weight: np.ndarray,
-    unsure: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    weight: NDArray[np.float64],
+    unsure: NDArray[np.bool_],
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Sum up the image points of a body with weights (T, M, F).
 
     Returns the unknowns (L,) that it tells of, their normal matrix with the right side in the last
@@ -525,7 +527,7 @@ def _summed(
     return columns, told, cross.transpose(1, 2, 0), normal
 
 
-def _design(linear: LinearPoints, row: int, view: int, axis: int) -> np.ndarray:
+def _design(linear: LinearPoints, row: int, view: int, axis: int) -> NDArray[np.float64]:
     """Derivatives (T, M, 9 + n + 3 M + 1 + M) of a coordinate of a body in a view, and residuals.
 
     By the orientation of the view, the drift along the axis, shape, scale and the mean errors of
@@ -554,18 +556,22 @@ def _design(linear: LinearPoints, row: int, view: int, axis: int) -> np.ndarray:
 class LinearPoints:
     """Image points (T, B, M, F) at values of the unknowns: residuals and derivatives."""
 
-    residual: np.ndarray  # (..., 2)
-    by_place: np.ndarray  # (..., 2, 3)
-    by_orientation: np.ndarray  # (..., 2, 9)
-    functions: np.ndarray  # (..., n), of a drift
-    place_by_pose: np.ndarray  # (T, B, M, 3, 6)
-    good: np.ndarray
-    shape: np.ndarray  # (B, M, 3)
+    residual: NDArray[np.float64]  # (..., 2)
+    by_place: NDArray[np.float64]  # (..., 2, 3)
+    by_orientation: NDArray[np.float64]  # (..., 2, 9)
+    functions: NDArray[np.float64]  # (..., n), of a drift
+    place_by_pose: NDArray[np.float64]  # (T, B, M, 3, 6)
+    good: NDArray[np.bool_]
+    shape: NDArray[np.float64]  # (B, M, 3)
     poses: Poses
 
     @classmethod
     def of(
-        cls, adjustment: RigAdjustment, observed: ObservedBodies, values: np.ndarray, poses: Poses
+        cls,
+        adjustment: RigAdjustment,
+        observed: ObservedBodies,
+        values: NDArray[np.float64],
+        poses: Poses,
     ) -> LinearPoints:
         """Linearise at values of the unknowns and at poses."""
         grid = observed.seen.shape  # (T, B, M, F)
@@ -606,12 +612,14 @@ class LinearPoints:
             poses=poses,
         )
 
-    def by_pose(self, row: int) -> np.ndarray:
+    def by_pose(self, row: int) -> NDArray[np.float64]:
         """Derivatives (T, M, F, 2, 6) of the image points of a body by its pose."""
         return self.by_place[:, row] @ self.place_by_pose[:, row, :, None]
 
 
-def _drift(functions: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
+def _drift(
+    functions: NDArray[np.float64], coefficients: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Drift (T, B, M, F, 2) of functions (T, B, M, F, n) with coefficients (F, 2, n)."""
     return np.asarray((coefficients @ functions[..., None])[..., 0])
 
@@ -620,11 +628,11 @@ def _drift(functions: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
 class Mixture:
     """Squares of standardised residuals (T, B, M, F), and the density of false matches there."""
 
-    squares: np.ndarray
-    variance: np.ndarray
-    inflation: np.ndarray
-    false: np.ndarray  # density over that of a residual of 0
-    good: np.ndarray
+    squares: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    inflation: NDArray[np.float64]
+    false: NDArray[np.float64]  # density over that of a residual of 0
+    good: NDArray[np.bool_]
 
     @classmethod
     def of(
@@ -644,7 +652,7 @@ class Mixture:
         )
 
     @property
-    def scale(self) -> np.ndarray:
+    def scale(self) -> NDArray[np.float64]:
         """Scales (T, B, 1, 1) of the standardised residuals of bodies, by a quantile of them.
 
         A median would be small where one of two views fits, and the other one not at all.
@@ -656,22 +664,22 @@ class Mixture:
         scale[seen] = _quantile(squares[seen], FITTING) / (-2 * np.log(1 - FITTING))
         return np.sqrt(scale)[..., None, None]
 
-    def inlier(self, widening: np.ndarray | float = 1.0) -> np.ndarray:
+    def inlier(self, widening: NDArray[np.float64] | float = 1.0) -> NDArray[np.float64]:
         """Probability to be an inlier, where standard deviations are larger by a factor."""
         density = np.exp(-0.5 * self.squares / widening**2) / self.inflation
         return np.where(self.good, density / (density + self.false), 0.0)
 
-    def weight(self, widening: np.ndarray | float) -> np.ndarray:
+    def weight(self, widening: NDArray[np.float64] | float) -> NDArray[np.float64]:
         """Weights of the image points, where standard deviations are larger by a factor."""
         return self.inlier(widening) / (self.variance * widening**2)
 
     @property
-    def losses(self) -> np.ndarray:
+    def losses(self) -> NDArray[np.float64]:
         """Minus twice the logarithms of the likelihoods."""
         density = np.exp(-0.5 * self.squares) / self.inflation + self.false
         return np.where(self.good, -2 * np.log(density), 0.0)
 
-    def shares(self) -> dict[str, np.ndarray]:
+    def shares(self) -> dict[str, NDArray[np.float64]]:
         """Losses, squares and their expectation by marker, and shares of inliers."""
         inlier = self.inlier()
         # A pose takes up six of the residuals of its body, in proportion to their number.
@@ -690,7 +698,7 @@ class Mixture:
         }
 
 
-def _quantile(values: np.ndarray, share: float) -> np.ndarray:
+def _quantile(values: NDArray[np.float64], share: float) -> NDArray[np.float64]:
     """Quantile (n,) of each row (n, k) without its NaN, by a sort: np.nanquantile loops over rows.
 
     Linear between two values, as there (Hyndman and Fan, "Sample Quantiles in Statistical
@@ -704,7 +712,7 @@ def _quantile(values: np.ndarray, share: float) -> np.ndarray:
     return lower + (at - below) * (ordered[row, np.ceil(at).astype(int)] - lower)
 
 
-def _shape_covariance(body: Body, count: int) -> np.ndarray:
+def _shape_covariance(body: Body, count: int) -> NDArray[np.float64]:
     """Covariance (3 count, 3 count) of the shape of a body, 0 where it has no markers."""
     out = np.zeros((3 * count, 3 * count))
     own = slice(3 * len(body.sd_mm))
@@ -713,14 +721,14 @@ def _shape_covariance(body: Body, count: int) -> np.ndarray:
     return out
 
 
-def root_of(covariance: np.ndarray) -> np.ndarray:
+def root_of(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
     """Root L of a covariance L L' that may be singular: of a motion of a whole body nothing."""
     variance, axes = np.linalg.eigh(covariance)
     rounding = len(variance) * np.finfo(float).eps * variance[-1]
     return np.asarray(axes * np.sqrt(np.where(variance > rounding, variance, 0.0)))
 
 
-def _share_of_functions(functions: Functions) -> np.ndarray:
+def _share_of_functions(functions: Functions) -> NDArray[np.float64]:
     """Standard deviations (n,) of coefficients that give a field of variance one.
 
     The mean square of a product of two sines over their rectangle is 1 / (4 extent_u extent_v).
@@ -733,7 +741,7 @@ def _share_of_functions(functions: Functions) -> np.ndarray:
     return out
 
 
-def _by_vector(w: np.ndarray) -> np.ndarray:
+def _by_vector(w: NDArray[np.float64]) -> NDArray[np.float64]:
     """Derivatives (F, 3, 3) of a further small rotation by the vectors (F, 3) of rotations.
 
     exp([w + dw]x) = exp([J dw]x) exp([w]x) with J = sum [w]x^n / (n + 1)! (Chirikjian, "Stochastic
@@ -743,7 +751,7 @@ def _by_vector(w: np.ndarray) -> np.ndarray:
     return np.eye(3) + cross @ (np.eye(3) / 2 + cross @ (np.eye(3) / 6 + cross / 24))
 
 
-def moved_poses(poses: Poses, normal: _Normal, step: np.ndarray) -> Poses:
+def moved_poses(poses: Poses, normal: _Normal, step: NDArray[np.float64]) -> Poses:
     """Move the poses by what they gain from a step (K,) of the other unknowns."""
     rotation = poses.rotation.copy()
     centre = poses.centre_mm.copy()

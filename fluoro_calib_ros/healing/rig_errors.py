@@ -67,12 +67,12 @@ class _Intersected:
     of the points by the image points.
     """
 
-    uv: np.ndarray
-    by_rig: np.ndarray
-    by_uv: np.ndarray
+    uv: NDArray[np.float64]
+    by_rig: NDArray[np.float64]
+    by_uv: NDArray[np.float64]
 
     @classmethod
-    def of(cls, orientation: RigOrientation, points_mm: np.ndarray) -> _Intersected:
+    def of(cls, orientation: RigOrientation, points_mm: NDArray[np.float64]) -> _Intersected:
         cameras = Cameras(orientation, np.zeros((1, len(points_mm)), dtype=int))
         views = len(orientation.fluoroscopes)
         shape = (1, len(points_mm), views)
@@ -89,13 +89,13 @@ class _Intersected:
         by_uv = np.linalg.solve(transposed @ by_place, transposed)
         return cls(linear.uv[0], by_rig.reshape(*by_rig.shape[:3], -1), by_uv)
 
-    def moved(self, derivatives: np.ndarray) -> np.ndarray:
+    def moved(self, derivatives: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return by how much points move (3n, k), from derivatives (n, F, 2, k) of their views."""
         flat = derivatives.reshape(len(self.uv), -1, derivatives.shape[-1])
         return np.asarray(-(self.by_uv @ flat).reshape(-1, flat.shape[2]))
 
 
-def _errors(points_mm: np.ndarray, moved: np.ndarray) -> RigErrors:
+def _errors(points_mm: NDArray[np.float64], moved: NDArray[np.float64]) -> RigErrors:
     """Errors of points (n, 3) that move by moved (3n, k), times unknowns of variance one."""
     arm = points_mm - points_mm.mean(axis=0)
     rigid = np.concatenate([np.broadcast_to(np.eye(3), (len(arm), 3, 3)), -cross_matrix(arm)], 2)

@@ -74,7 +74,9 @@ class Told:
         sizes = self.sizes(parts, least)
         return np.asarray(np.tensordot(sizes.share, self.moments(sizes.sd), axes=1))
 
-    def _whitened(self, sd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _whitened(
+        self, sd: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Normal equations of unknowns in units of their standard deviations (..., k)."""
         matrix = np.eye(len(self.right)) + sd[..., :, None] * self.matrix * sd[..., None, :]
         return matrix, sd * self.right

@@ -19,6 +19,7 @@ from functools import cached_property
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from ..correction.angle_field import AngleField
 from ..correction.base import CorrectionStatus
@@ -138,7 +139,9 @@ class _Base:
         left, right = columns[columns < width // 2], columns[columns >= width // 2]
         return slice(left.max(initial=-1) + 1, right.min(initial=width))
 
-    def of_stripe(self, start: int, shift: np.ndarray, is_small: bool) -> np.ndarray:
+    def of_stripe(
+        self, start: int, shift: NDArray[np.float32], is_small: bool
+    ) -> NDArray[np.float32]:
         """Sources (2, r, w) of a stripe, shifted by values of nodes; NaN off the image.
 
         is_small: no shift is larger than the margin.
@@ -153,7 +156,7 @@ class _Base:
             own[:, ~((own >= -0.5) & (own < self._high)).all(axis=0)] = np.nan
         return source
 
-    def _between(self, of_nodes: np.ndarray, start: int) -> np.ndarray:
+    def _between(self, of_nodes: NDArray[np.float32], start: int) -> NDArray[np.float32]:
         """Values (r, w) at the pixels of a stripe from those of nodes.
 
         The first node is half a step before the image: resizing begins between two nodes.
@@ -164,14 +167,14 @@ class _Base:
         fine = cv2.resize(own, (own.shape[1] * NODE_PX, own.shape[0] * NODE_PX))
         return fine[NODE_PX : NODE_PX + count, NODE_PX : NODE_PX + width]
 
-    def status(self, source: np.ndarray) -> np.ndarray:
+    def status(self, source: NDArray[np.float32]) -> NDArray[np.uint8]:
         """Status (h, w) of the observed pixels at sources (2, h, w)."""
         found = [
             self._grid.look_up(*source[:, row].astype(float))[1] for row in range(source.shape[1])
         ]
         return np.stack(found)
 
-    def may_fold(self, shift: np.ndarray) -> bool:
+    def may_fold(self, shift: NDArray[np.float32]) -> bool:
         """Whether pixels may be seen mirrored by sources that are shifted (2, rows, columns)."""
         if self._bad is not None:
             return True
@@ -179,7 +182,9 @@ class _Base:
         turn = max(np.abs(np.diff(shift, axis=axis)).max() for axis in (1, 2)) / NODE_PX
         return bool(self._least_area <= 4 * self._longest_step * turn + 2 * turn**2)
 
-    def folded(self, source: np.ndarray, change: np.ndarray) -> np.ndarray:
+    def folded(
+        self, source: NDArray[np.float32], change: NDArray[np.float32]
+    ) -> NDArray[np.bool_]:
         """Whether (h, w) sources are folded, or those of a pixel that has none by the mean."""
         folded = is_folded(source)
         if self._bad is None:
@@ -192,7 +197,9 @@ class _Base:
             folded[start : start + STRIPE] |= bad
         return folded
 
-    def at_nodes(self, field: AngleField, angle: float) -> tuple[np.ndarray, np.ndarray]:
+    def at_nodes(
+        self, field: AngleField, angle: float
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Change of the correction, and by what it moves the sources (2, rows, columns) [px]."""
         shift = self._shift_of_nodes
         change = np.zeros_like(self._nodes)
@@ -204,7 +211,7 @@ class _Base:
             shift = self._shift_at(self._nodes + change)
         return change, np.stack(cv2.split(change + shift - self._shift_of_nodes))
 
-    def _shift_at(self, places: np.ndarray) -> np.ndarray:
+    def _shift_at(self, places: NDArray[np.float32]) -> NDArray[np.float32]:
         """Source less pixel (rows, columns, 2) of the mean, at places around the image [px]."""
         return cv2.remap(
             self._shift, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
@@ -219,12 +226,12 @@ class _AtAngle:
         self._covered = bool(field.covers(angle))
         change, self._shift = base.at_nodes(field, angle)
         self._is_small = bool(np.abs(self._shift).max() < base.margin)
-        self._folded: np.ndarray | None = None
+        self._folded: NDArray[np.bool_] | None = None
         if base.may_fold(self._shift):
             self._folded = base.folded(self.source, change)
             del self.source  # it is without them
 
-    def of_stripe(self, start: int) -> np.ndarray:
+    def of_stripe(self, start: int) -> NDArray[np.float32]:
         """See `corrector.Sources`."""
         source = self._base.of_stripe(start, self._shift, self._is_small)
         if self._folded is not None:
@@ -232,13 +239,13 @@ class _AtAngle:
         return source
 
     @cached_property
-    def source(self) -> np.ndarray:
+    def source(self) -> NDArray[np.float32]:
         """See `corrector.Sources`."""
         starts = range(0, self._base.height, STRIPE)
         return np.concatenate([self.of_stripe(start) for start in starts], axis=1)
 
     @cached_property
-    def status(self) -> np.ndarray:
+    def status(self) -> NDArray[np.uint8]:
         """See `corrector.Sources`."""
         status = self._base.status(self.source)
         if not self._covered:
@@ -256,6 +263,6 @@ def _rate(field: AngleField) -> tuple[float, float]:
     return _longest(rates), _longest(changes)
 
 
-def _longest(vectors: np.ndarray) -> float:
+def _longest(vectors: NDArray[np.float64]) -> float:
     """Length of the longest of vectors (..., 2)."""
     return float(np.hypot(vectors[..., 0], vectors[..., 1]).max())

@@ -12,6 +12,7 @@ import zlib
 import cv2
 import numpy as np
 import tifffile
+from numpy.typing import NDArray
 
 from ..errors import DataError
 from ..findings import Kind
@@ -38,7 +39,7 @@ def silence_opencv() -> None:
 silence_opencv()
 
 
-def decode(content: bytes | bytearray | memoryview | np.ndarray) -> np.ndarray:
+def decode(content: bytes | bytearray | memoryview | NDArray[np.uint8]) -> np.ndarray:
     """Grey image (h, w) of uint8 or uint16 from the bytes of an image file.
 
     The formats are PNG, JPEG, TIFF (the first page), BMP and PGM. An image whose colours are all

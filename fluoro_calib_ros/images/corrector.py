@@ -19,6 +19,7 @@ from typing import Protocol
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from ..correction.base import CorrectionStatus
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
@@ -43,16 +44,16 @@ class Sources(Protocol):
     """Where the pixels of a corrected image were seen, see `ImageCorrector`."""
 
     @property
-    def source(self) -> np.ndarray:
+    def source(self) -> NDArray[np.float32]:
         """Sources (2, h, w)."""
         ...
 
     @property
-    def status(self) -> np.ndarray:
+    def status(self) -> NDArray[np.uint8]:
         """Status (h, w)."""
         ...
 
-    def of_stripe(self, start: int) -> np.ndarray:
+    def of_stripe(self, start: int) -> NDArray[np.float32]:
         """Return the source (2, r, w) of STRIPE rows, or those that are left, from a row on."""
         ...
 
@@ -61,10 +62,10 @@ class Sources(Protocol):
 class _KnownSources:
     """See `Sources`."""
 
-    source: np.ndarray
-    status: np.ndarray
+    source: NDArray[np.float32]
+    status: NDArray[np.uint8]
 
-    def of_stripe(self, start: int) -> np.ndarray:
+    def of_stripe(self, start: int) -> NDArray[np.float32]:
         return self.source[:, start : start + STRIPE]
 
 
@@ -128,7 +129,7 @@ class ImageCorrector:
             cv2.convertMaps(u, v, cv2.CV_16SC2, self._map_1[rows], self._map_2[rows])
 
     @property
-    def source(self) -> np.ndarray:
+    def source(self) -> NDArray[np.float32]:
         """Pixels (2, h, w) of the observed image that the corrected one shows, columns first [px].
 
         NaN where there is none: off the image, or where the correction folds it.
@@ -136,17 +137,17 @@ class ImageCorrector:
         return self._sources.source
 
     @property
-    def status(self) -> np.ndarray:
+    def status(self) -> NDArray[np.uint8]:
         """Status (h, w) uint8: OK, OUTSIDE of the calibrated area, or INVALID without a source."""
         return self._sources.status
 
     @cached_property
-    def mask(self) -> np.ndarray:
+    def mask(self) -> NDArray[np.bool_]:
         """Whether there is a source (h, w)."""
         return ~np.isnan(self.source[0])
 
     @cached_property
-    def _empty(self) -> np.ndarray:
+    def _empty(self) -> NDArray[np.int64]:
         return np.flatnonzero(~self.mask)
 
     def correct(self, image: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
@@ -225,8 +226,8 @@ def _sources(grid: CorrectionGrid, image_size: tuple[int, ...]) -> Sources:
 
 
 def _invert_correction(
-    grid: CorrectionGrid, undistorted: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+    grid: CorrectionGrid, undistorted: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """Observed pixels (2, n) of undistorted ones (2, n) [px], and their status (n,)."""
     observed = iterated(grid, undistorted)
     (du, dv, _), status = grid.look_up(*observed)  # off the image it is INVALID
@@ -237,9 +238,9 @@ def _invert_correction(
 
 def iterated(
     grid: CorrectionGrid,
-    undistorted: np.ndarray,
-    look_up: Callable[[CorrectionGrid, np.ndarray], np.ndarray] | None = None,
-) -> np.ndarray:
+    undistorted: NDArray[np.float64],
+    look_up: Callable[[CorrectionGrid, NDArray[np.float64]], NDArray[np.float64]] | None = None,
+) -> NDArray[np.float64]:
     """Observed pixels (2, n) of undistorted ones (2, n) [px], also where they do not converge.
 
     The iteration is observed = undistorted + (du, dv)(observed). Each step leaves the fraction of
@@ -261,12 +262,12 @@ def iterated(
     return observed
 
 
-def as_at_rim(grid: CorrectionGrid, at: np.ndarray) -> np.ndarray:
+def as_at_rim(grid: CorrectionGrid, at: NDArray[np.float64]) -> NDArray[np.float64]:
     """Corrections (2, n) at pixels (2, n); off the image that of the nearest pixel."""
     return grid.look_up(*np.clip(at, -0.5, _end(grid)))[0][:2]
 
 
-def continued(grid: CorrectionGrid, at: np.ndarray) -> np.ndarray:
+def continued(grid: CorrectionGrid, at: NDArray[np.float64]) -> NDArray[np.float64]:
     """Corrections (2, n) at pixels (2, n), beyond the border as steep as before it."""
     out = as_at_rim(grid, at)
     off = np.flatnonzero(((at < -0.5) | (at > _end(grid))).any(axis=0))
@@ -275,24 +276,24 @@ def continued(grid: CorrectionGrid, at: np.ndarray) -> np.ndarray:
     return out
 
 
-def _end(grid: CorrectionGrid) -> np.ndarray:
+def _end(grid: CorrectionGrid) -> NDArray[np.float64]:
     """Largest columns and rows (2, 1) on the image."""
     return np.array(grid.image_size)[:, None] - 0.5 - 1e-6
 
 
-def is_folded(source: np.ndarray) -> np.ndarray:
+def is_folded(source: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Whether (h, w) the neighbours of a pixel are seen mirrored by the sources (2, h, w)."""
     right, down = steps(source)
     folded = right[0] * down[1] - right[1] * down[0] <= 0
     return np.pad(folded, ((0, 1), (0, 1))) | np.pad(folded, ((1, 0), (1, 0)))
 
 
-def steps(source: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def steps(source: NDArray[np.floating]) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
     """From the source of a pixel to those on its right and below it (2, h - 1, w - 1) [px]."""
     return np.diff(source, axis=2)[:, :-1], np.diff(source, axis=1)[:, :, :-1]
 
 
-def _cubic_coordinates(wanted: np.ndarray) -> np.ndarray:
+def _cubic_coordinates(wanted: NDArray[np.float32]) -> NDArray[np.float32]:
     """Coordinates at which OpenCV's cubic convolution shows what is at other ones (h, w) [px].
 
     With its sharpness, the first moment of the kernel is not the fraction of a pixel that it is

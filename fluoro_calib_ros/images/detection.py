@@ -133,7 +133,7 @@ def likely_detections(image: np.ndarray, beads: int) -> Iterator[Detections]:
 class _Sight:
     """An image (h, w) with its noise, and the number of beads that choose their size."""
 
-    grey: np.ndarray
+    grey: NDArray[np.float32]
     noise: Noise
     typical: int
 
@@ -147,7 +147,7 @@ class _Sight:
         typical = int(np.clip(SEEN_SHARE * beads, LEAST_TYPICAL, MOST_TYPICAL))
         return cls(grey, noise, typical)
 
-    def middle(self) -> np.ndarray:
+    def middle(self) -> NDArray[np.float32]:
         """Return the middle quarter of the image, which is a quarter of the work."""
         height, width = self.grey.shape
         return self.grey[height // 4 : height - height // 4, width // 4 : width - width // 4]
@@ -158,13 +158,13 @@ class _Sight:
         looks = sorted(looks or self.likely(self.grey), reverse=True)
         return [(scale, inverted) for _, scale, inverted in looks]
 
-    def likely(self, grey: np.ndarray) -> list[tuple[float, float, bool]]:
+    def likely(self, grey: NDArray[np.float32]) -> list[tuple[float, float, bool]]:
         """Return strength, scale and polarity of the strongest blobs of the image or a part.
 
         For either polarity, those scales at which they are stronger than at the next ones.
         """
         strengths = np.zeros((2, len(SCALES) + 2))
-        fields: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        fields: dict[int, tuple[NDArray[np.bool_], NDArray[np.bool_]]] = {}
         for column, (scale, part, factor) in enumerate(_resolutions(grey), 1):
             if factor not in fields:
                 turned = float(part.max()) - part
@@ -196,7 +196,7 @@ class _Sight:
         if tree is None or not tree.query_pairs(2 * LARGER[-1] * BLOB_RADIUS * scale):
             return uv
         merged = np.zeros(len(uv), dtype=bool)
-        large: list[np.ndarray] = []
+        large: list[NDArray[np.float64]] = []
         for larger in LARGER:
             factor = max(1, int(larger * scale / FINE_SCALE))
             height, width = (size // factor for size in self.grey.shape)
@@ -253,7 +253,7 @@ class _Sight:
         return None
 
 
-def field_of_view(light: np.ndarray, scale: float) -> np.ndarray:
+def field_of_view(light: NDArray[np.float32], scale: float) -> NDArray[np.bool_]:
     """Return the mask (h, w) of the field of view: where there is light, holes filled."""
     smooth = cv2.GaussianBlur(light, (0, 0), max(FIELD_BLUR_PX, 2 * scale))
     apart = int(FIELD_BLUR_PX)  # pixels that the blur leaves different
@@ -268,7 +268,7 @@ def field_of_view(light: np.ndarray, scale: float) -> np.ndarray:
     return eroded.astype(bool)
 
 
-def _lit(mask: np.ndarray) -> np.ndarray:
+def _lit(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return the field (h, w) of a mask of what is bright: convex, for beads leave bays in it.
 
     A plate seen from its edge may cut off a part of the field. Letters beside the field are lit as
@@ -292,22 +292,22 @@ class _Blobs:
     """Blobs that the noise does not explain."""
 
     uv: NDArray[np.float64]  #: (n, 2) [px]
-    response: NDArray[np.float64]  #: (n,)
-    relative: NDArray[np.float64]  #: (n,), the same as fractions of the light around
+    response: NDArray[np.floating]  #: (n,)
+    relative: NDArray[np.floating]  #: (n,), the same as fractions of the light around
 
     def chosen(self, mask: NDArray[np.bool_]) -> _Blobs:
         """Return those of a mask (n,)."""
         return _Blobs(self.uv[mask], self.response[mask], self.relative[mask])
 
 
-def _typical(values: np.ndarray, count: int) -> float:
+def _typical(values: NDArray[np.floating], count: int) -> float:
     """Median of so many of the largest values, 0 where there are fewer."""
     if len(values) < count:
         return 0.0
     return float(np.median(np.sort(values)[::-1][:count]))
 
 
-def _resolutions(grey: np.ndarray) -> Iterator[tuple[float, np.ndarray, int]]:
+def _resolutions(grey: NDArray[np.float32]) -> Iterator[tuple[float, NDArray[np.float32], int]]:
     """Yield scales, the image (h, w) in which they are tried, and how much smaller it is."""
     factor = 1
     for scale in SCALES:
@@ -320,7 +320,9 @@ def _resolutions(grey: np.ndarray) -> Iterator[tuple[float, np.ndarray, int]]:
         yield scale, grey, factor
 
 
-def _inside(uv: np.ndarray, field: NDArray[np.bool_], factor: int = 1) -> NDArray[np.bool_]:
+def _inside(
+    uv: NDArray[np.float64], field: NDArray[np.bool_], factor: int = 1
+) -> NDArray[np.bool_]:
     """Return (n,) whether pixels (n, 2) are in a field that is reduced by a factor."""
     column, row = np.rint((uv + 0.5) / factor - 0.5).astype(int).T
     return field[row, column]
@@ -363,7 +365,7 @@ def _check(image: np.ndarray) -> None:
 
 
 def _blobs(
-    grey: np.ndarray,
+    grey: NDArray[np.float32],
     noise: Noise,
     scale: float,
     factor: int = 1,
@@ -392,7 +394,7 @@ def _blobs(
     return out
 
 
-def _background(grey: np.ndarray, scale: float) -> np.ndarray:
+def _background(grey: NDArray[np.float32], scale: float) -> NDArray[np.float32]:
     """Blur of an image (h, w) over many beads of a scale, from a coarser image."""
     blur = BACKGROUND * scale
     factor = max(1, int(blur / COARSE_BLUR))
@@ -429,8 +431,8 @@ def _noise_of_response(noise: Noise, scale: float) -> float:
 
 
 def responses(
-    grey: np.ndarray, scale: float, polarities: Sequence[bool] = (False, True)
-) -> list[np.ndarray]:
+    grey: NDArray[np.float32], scale: float, polarities: Sequence[bool] = (False, True)
+) -> list[NDArray[np.float32]]:
     """Responses (h, w) to dark and to bright blobs: the smaller eigenvalue, or 0.
 
     polarities: whether the blobs are bright.
@@ -443,7 +445,9 @@ def responses(
     return out
 
 
-def _curvatures(grey: np.ndarray, scale: float) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
+def _curvatures(
+    grey: NDArray[np.float32], scale: float
+) -> Iterator[tuple[slice, NDArray[np.float32], NDArray[np.float32]]]:
     """Yield rows of an image, the mean of both eigenvalues of the scaled Hessian there, and half
     their difference.
 

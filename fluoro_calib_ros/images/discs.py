@@ -27,7 +27,7 @@ SAME = 0.1  # radii from a disc, within which a blob has the better place
 
 
 def set_apart(
-    relative: np.ndarray, uv: NDArray[np.float64]
+    relative: NDArray[np.floating], uv: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], float | None]:
     """Return places (n, 2) and radius of beads, from blobs (m, 2) that may be several beads each.
 
@@ -57,7 +57,7 @@ def set_apart(
     return np.concatenate([uv[exact | (away > radius)], discs[~found]]), radius
 
 
-def _discs(distance: np.ndarray, radius: float) -> NDArray[np.float64]:
+def _discs(distance: NDArray[np.float32], radius: float) -> NDArray[np.float64]:
     """Middles (n, 2) of discs of about a radius, by the distances (h, w) to the border."""
     size = 2 * int(APART * radius) + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
@@ -69,7 +69,10 @@ def _discs(distance: np.ndarray, radius: float) -> NDArray[np.float64]:
 
 
 def _in_bars(
-    discs: NDArray[np.float64], distance: np.ndarray, part: np.ndarray, radius: float
+    discs: NDArray[np.float64],
+    distance: NDArray[np.float32],
+    part: NDArray[np.int32],
+    radius: float,
 ) -> NDArray[np.bool_]:
     """Return (n,) whether discs (n, 2) lie in bars, such as screws, that are as wide as a bead.
 

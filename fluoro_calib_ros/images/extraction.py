@@ -49,7 +49,7 @@ class Refusal:
     """A predicted bead without observation: its row, the prediction (2,) [px], and why."""
 
     bead: int
-    uv: np.ndarray
+    uv: NDArray[np.float64]
     finding: Finding
 
 
@@ -288,7 +288,9 @@ def _checked(
     )
 
 
-def _with_support(extraction: Extraction, model: PhantomModel, rows: np.ndarray) -> Extraction:
+def _with_support(
+    extraction: Extraction, model: PhantomModel, rows: NDArray[np.int64]
+) -> Extraction:
     """Exclude beads of which most neighbours among the predicted ones (n,) are not found.
 
     One that is found, but too vague to be observed, supports them as well.
@@ -315,12 +317,12 @@ def _with_support(extraction: Extraction, model: PhantomModel, rows: np.ndarray)
 
 
 def _expected(
-    predicted: np.ndarray,
-    rows: np.ndarray,
-    bead: np.ndarray,
-    uv: np.ndarray,
+    predicted: NDArray[np.float64],
+    rows: NDArray[np.int64],
+    bead: NDArray[np.int64],
+    uv: NDArray[np.float64],
     seen: Seen,
-    depth: np.ndarray,
+    depth: NDArray[np.float64],
 ) -> Expected:
     """Shadows of predicted beads: where one alone was found, else where it is predicted."""
     start = predicted.copy()
@@ -341,7 +343,7 @@ def _relative_sizes(model: PhantomModel) -> NDArray[np.float64]:
     return np.asarray(model.diameter_mm / np.median(model.diameter_mm))
 
 
-def _usual_depth(beads: Beads) -> np.ndarray:
+def _usual_depth(beads: Beads) -> NDArray[np.float64]:
     """Depths (n,) of shadows that are usual where beads lie.
 
     Beads take the same share of the direct light, and nothing of scattered light; a hole of a
@@ -365,7 +367,7 @@ def _usual_depth(beads: Beads) -> np.ndarray:
     return usual
 
 
-def _reasons(beads: Beads, predicted: np.ndarray) -> list[Finding | None]:
+def _reasons(beads: Beads, predicted: NDArray[np.float64]) -> list[Finding | None]:
     """Why beads are not observed, None for those that are."""
     away = np.linalg.norm(beads.uv - predicted, axis=1)
     usual_depth = _usual_depth(beads)

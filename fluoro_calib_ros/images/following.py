@@ -106,7 +106,7 @@ def _elsewhere(
         yield from _farther(seen, model, near)
 
 
-def _over_the_image(seen: Seen, xyz: np.ndarray, near: View) -> Match | None:
+def _over_the_image(seen: Seen, xyz: NDArray[np.float64], near: View) -> Match | None:
     """Return the match of a pose nearby that is shifted, None where there is none."""
     predicted = near.project(xyz)
     row = np.flatnonzero(seen.in_field(predicted))
@@ -147,7 +147,7 @@ def _farther(seen: Seen, model: PhantomModel, near: View) -> Iterator[Match | No
             yield grow(view, pose.bead, model.xyz, seen)
 
 
-def _turned(pose: LocalPose, near: View, xyz: np.ndarray) -> View | None:
+def _turned(pose: LocalPose, near: View, xyz: NDArray[np.float64]) -> View | None:
     """Return a view nearby in the pose of a bead, None where it is turned too far."""
     c = near.principal_distance_px
     start = start_view(pose, replace(near.lens, principal_distance_px=c), xyz)
@@ -159,13 +159,13 @@ def _turned(pose: LocalPose, near: View, xyz: np.ndarray) -> View | None:
     return _shifted(view, pose.uv - view.project(bead)[0], float(view.depth(bead)[0]))
 
 
-def _shifted(view: View, shift: np.ndarray, depth_mm: float) -> View:
+def _shifted(view: View, shift: NDArray[np.float64], depth_mm: float) -> View:
     """Return a view that sees points at a depth shifted by (2,) [px]."""
     sensor = np.append(shift, 0) * depth_mm / view.principal_distance_px
     return replace(view, position=view.position - view.rotation.T @ sensor)
 
 
-def _shift(predicted: np.ndarray, seen: Seen) -> np.ndarray | None:
+def _shift(predicted: NDArray[np.float64], seen: Seen) -> NDArray[np.float64] | None:
     """Shift (2,) [px] that takes most predictions (n, 2) to something that was found."""
     reach = REACH * max(seen.field.shape)
     pairs = cKDTree(predicted).query_ball_tree(seen.tree, reach)

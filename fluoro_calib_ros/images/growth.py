@@ -47,10 +47,10 @@ class Seen:
     @classmethod
     def of(
         cls,
-        uv: np.ndarray,
+        uv: NDArray[np.float64],
         field: np.ndarray,
         radius_px: float,
-        strength: np.ndarray | None = None,
+        strength: NDArray[np.float64] | None = None,
     ) -> Seen:
         """Return what was found, with a tolerance from the distances between beads."""
         tree = cKDTree(uv)
@@ -60,7 +60,7 @@ class Seen:
             uv, tree, field=field, radius_px=radius_px, tolerance_px=tolerance, strength=strength
         )
 
-    def in_field(self, uv: np.ndarray) -> np.ndarray:
+    def in_field(self, uv: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return (n,) whether pixels (n, 2) lie in the field; NaN does not."""
         height, width = self.field.shape
         places = np.rint(np.where(np.isfinite(uv), uv, -1)).astype(int)
@@ -90,7 +90,7 @@ class Match:
         return len(self.bead) - self.expected * (1 - self.found)
 
 
-def start_view(pose: LocalPose, lens: Lens, xyz: np.ndarray) -> View:
+def start_view(pose: LocalPose, lens: Lens, xyz: NDArray[np.float64]) -> View:
     """Return the perspective view of a scaled-orthographic pose around a bead."""
     c = lens.principal_distance_px
     ray = np.append((pose.uv - lens.centre) / c, 1.0)
@@ -118,7 +118,7 @@ def start_view(pose: LocalPose, lens: Lens, xyz: np.ndarray) -> View:
     )
 
 
-def _turn_to(ray: np.ndarray) -> np.ndarray:
+def _turn_to(ray: NDArray[np.float64]) -> NDArray[np.float64]:
     """Smallest rotation (3, 3) that takes the z axis to a direction (3,)."""
     z = ray / np.linalg.norm(ray)
     axis = np.array([-z[1], z[0], 0.0])
@@ -126,7 +126,7 @@ def _turn_to(ray: np.ndarray) -> np.ndarray:
     return np.eye(3) + k + k @ k / (1 + z[2])
 
 
-def grow(view: View, start: int, xyz: np.ndarray, seen: Seen) -> Match | None:
+def grow(view: View, start: int, xyz: NDArray[np.float64], seen: Seen) -> Match | None:
     """Grow a view from one bead over the phantom; None where it does not fit.
 
     The radius around the bead grows, in space: what lies behind it in the image is predicted last,
@@ -154,7 +154,7 @@ def grow(view: View, start: int, xyz: np.ndarray, seen: Seen) -> Match | None:
     return settle(view, xyz, seen)
 
 
-def settle(view: View, xyz: np.ndarray, seen: Seen) -> Match | None:
+def settle(view: View, xyz: NDArray[np.float64], seen: Seen) -> Match | None:
     """Match all beads by a view that is near the right one, and refine it."""
     view = view.with_degree(max(view.degree, LAST_DEGREE))
     tolerance = seen.tolerance_px
@@ -182,7 +182,9 @@ def settle(view: View, xyz: np.ndarray, seen: Seen) -> Match | None:
     return _judged(view, xyz, seen, predicted, scale)
 
 
-def pairs(predicted: np.ndarray, seen: Seen, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+def pairs(
+    predicted: NDArray[np.float64], seen: Seen, tolerance: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Rows of predictions (n, 2) and of what was found that are nearest to each other."""
     distance, detection = seen.tree.query(predicted, distance_upper_bound=tolerance)
     row = np.flatnonzero(np.isfinite(distance))
@@ -193,7 +195,7 @@ def pairs(predicted: np.ndarray, seen: Seen, tolerance: float) -> tuple[np.ndarr
 
 
 def nearby_residuals(
-    view: View, xyz: np.ndarray, bead: np.ndarray, uv: np.ndarray
+    view: View, xyz: NDArray[np.float64], bead: NDArray[np.int64], uv: NDArray[np.float64]
 ) -> Interpolation:
     """Residuals of all beads of a view, as their matched neighbours in the image have them.
 
@@ -204,7 +206,7 @@ def nearby_residuals(
 
 
 def _judged(
-    view: View, xyz: np.ndarray, seen: Seen, predicted: np.ndarray, scale: float
+    view: View, xyz: NDArray[np.float64], seen: Seen, predicted: NDArray[np.float64], scale: float
 ) -> Match | None:
     """Return the match of settled predictions (n, 2), without regions that ran away."""
     row = np.flatnonzero(seen.in_field(predicted))
@@ -242,7 +244,7 @@ def _judged(
     )
 
 
-def supported(xyz: np.ndarray, good: np.ndarray) -> np.ndarray:
+def supported(xyz: NDArray[np.float64], good: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return (n,) whether most neighbours in space of beads (n, 3) are good (n,).
 
     Where a face is seen from its edge, a prediction that is off by one bead still finds something
@@ -256,7 +258,9 @@ def supported(xyz: np.ndarray, good: np.ndarray) -> np.ndarray:
     return np.asarray(share >= MIN_SUPPORT)
 
 
-def _good_cells(uv: np.ndarray, found: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+def _good_cells(
+    uv: NDArray[np.float64], found: NDArray[np.bool_], shape: tuple[int, ...]
+) -> NDArray[np.bool_]:
     """Return (n,) whether most predicted beads (n, 2) of the same region are found."""
     height, width = shape
     cell = (np.clip(uv / (width, height), 0, 0.999) * CELLS).astype(int)
@@ -290,7 +294,10 @@ class Interpolation:
 
 
 def interpolated(
-    place: np.ndarray, bead: np.ndarray, residual: np.ndarray, length_px: float
+    place: NDArray[np.float64],
+    bead: NDArray[np.int64],
+    residual: NDArray[np.float64],
+    length_px: float,
 ) -> Interpolation:
     """Interpolate residuals (m, 2) of the matched rows bead (m,) of pixels place (n, 2).
 
@@ -311,7 +318,9 @@ def interpolated(
     return Interpolation(value, np.sqrt(_scale(squared) * variance))
 
 
-def _noise_share(kriging: _Kriging, residual: np.ndarray, sample: np.ndarray) -> float:
+def _noise_share(
+    kriging: _Kriging, residual: NDArray[np.float64], sample: NDArray[np.int64]
+) -> float:
     """Share of the noise with which a sample of matched beads is predicted best."""
 
     def lack(share: float) -> float:
@@ -321,7 +330,7 @@ def _noise_share(kriging: _Kriging, residual: np.ndarray, sample: np.ndarray) ->
     return min(NOISE_SHARES, key=lack)
 
 
-def _scale(squared: np.ndarray) -> float:
+def _scale(squared: NDArray[np.float64]) -> float:
     """Variance factor of squared lengths (m,) of residuals with two normal coordinates."""
     return max(float(np.median(squared)) / (2 * np.log(2)), np.finfo(float).tiny)
 
@@ -335,7 +344,7 @@ class _Kriging:
     known: NDArray[np.float64]  #: (n, k), covariance of a place with its neighbours, 0 for its own
 
     @classmethod
-    def of(cls, place: np.ndarray, bead: np.ndarray) -> _Kriging:
+    def of(cls, place: NDArray[np.float64], bead: NDArray[np.int64]) -> _Kriging:
         """Return that of places (n, 2), in units of the length of the covariance."""
         count = min(NEIGHBOURS + 1, len(bead))
         _, near = cKDTree(place[bead]).query(place, k=list(range(1, count + 1)))
@@ -347,11 +356,13 @@ class _Kriging:
         covariance *= other[:, :, None] & other[:, None] | np.eye(count, dtype=bool)
         return cls(near, covariance, known)
 
-    def chosen(self, rows: np.ndarray) -> _Kriging:
+    def chosen(self, rows: NDArray[np.int64]) -> _Kriging:
         """Return that of some of the places."""
         return _Kriging(self.near[rows], self.covariance[rows], self.known[rows])
 
-    def at(self, residual: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def at(
+        self, residual: NDArray[np.float64], noise: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Values (n, 2), and their variances (n,) in units of that of the smooth part.
 
         noise: (m,) variances of the residuals (m, 2). Variances contain the noise of one more.
@@ -364,7 +375,7 @@ class _Kriging:
         return value, 1 + noise.min() - np.sum(weight * self.known, axis=1)
 
 
-def _matern(shift: np.ndarray) -> np.ndarray:
+def _matern(shift: NDArray[np.float64]) -> NDArray[np.float64]:
     """Matern's covariance of order 3/2 at shifts (..., 2) in units of its length."""
     distance = np.sqrt(3) * np.hypot(shift[..., 0], shift[..., 1])
     return (1 + distance) * np.exp(-distance)

@@ -65,7 +65,7 @@ class FlatGrid:
     axes: NDArray[np.float64]  #: (3, 3), rows: two directions in the plane, and its normal
 
     @classmethod
-    def of(cls, xyz: np.ndarray) -> FlatGrid | None:
+    def of(cls, xyz: NDArray[np.float64]) -> FlatGrid | None:
         """Return the grid of beads (n, 3) [mm]; None where they are not flat, or on no lattice."""
         centre = xyz.mean(axis=0)
         _, extent, axes = np.linalg.svd(xyz - centre, full_matrices=False)
@@ -75,7 +75,7 @@ class FlatGrid:
         return None if lattice is None else cls(lattice, centre, axes)
 
 
-def number_lattice(points: np.ndarray) -> Lattice | None:
+def number_lattice(points: NDArray[np.float64]) -> Lattice | None:
     """Number points (n, 2) of a plane along the steps of their lattice; None for no lattice.
 
     The lattice may be bent: a step is compared with those beside it.
@@ -94,7 +94,7 @@ def number_lattice(points: np.ndarray) -> Lattice | None:
     return None
 
 
-def _basis(points: np.ndarray, tree: cKDTree, start: int) -> np.ndarray | None:
+def _basis(points: NDArray[np.float64], tree: cKDTree, start: int) -> NDArray[np.float64] | None:
     """Two steps (2, 2) of the lattice at a point: the shortest one, and the next across it."""
     _, near = tree.query(points[start], k=min(13, len(points)))
     steps = points[near[1:]] - points[start]
@@ -108,7 +108,7 @@ def _basis(points: np.ndarray, tree: cKDTree, start: int) -> np.ndarray | None:
 
 
 def _numbered(
-    points: np.ndarray, tree: cKDTree, start: int, basis: np.ndarray
+    points: NDArray[np.float64], tree: cKDTree, start: int, basis: NDArray[np.float64]
 ) -> dict[int, tuple[int, int]]:
     """Return the places of points that are reached step by step from one of them."""
     number = {start: (0, 0)}
@@ -148,7 +148,9 @@ class GridPose:
     numbered: int  #: beads found in rows and columns
 
 
-def grid_poses(grid: FlatGrid, xyz: np.ndarray, seen: Seen, lens: Lens) -> Iterator[GridPose]:
+def grid_poses(
+    grid: FlatGrid, xyz: NDArray[np.float64], seen: Seen, lens: Lens
+) -> Iterator[GridPose]:
     """Yield poses of a flat grid, those that least speaks against first.
 
     Among equal ones the least tilted comes first, then the one most upright, then the one whose
@@ -191,13 +193,13 @@ def grid_poses(grid: FlatGrid, xyz: np.ndarray, seen: Seen, lens: Lens) -> Itera
                 return
 
 
-def _steps(index: np.ndarray, points: np.ndarray) -> np.ndarray:
+def _steps(index: NDArray[np.int64], points: NDArray[np.float64]) -> np.ndarray:
     """Mean steps (2, k) of a lattice with places (n, 2) of points (n, k)."""
     centred = index - index.mean(axis=0)
     return np.linalg.lstsq(centred, points - points.mean(axis=0), rcond=None)[0]
 
 
-def _missing(index: np.ndarray) -> np.ndarray:
+def _missing(index: NDArray[np.int64]) -> NDArray[np.int64]:
     """Places (k, 2) of a lattice where nothing is found, though it is all around them."""
     corner = index.min(axis=0) - 2 * GAP
     there = np.pad(_raster(index - corner), ((0, 2 * GAP), (0, 2 * GAP))) > 0
@@ -206,7 +208,7 @@ def _missing(index: np.ndarray) -> np.ndarray:
     return np.argwhere(around & ~there) + corner
 
 
-def _changes() -> Iterator[np.ndarray]:
+def _changes() -> Iterator[NDArray[np.int64]]:
     """Yield the changes (2, 2) of the basis of a lattice by at most one step."""
     for entries in product((-1, 0, 1), repeat=4):
         change = np.array(entries).reshape(2, 2)
@@ -215,8 +217,11 @@ def _changes() -> Iterator[np.ndarray]:
 
 
 def _shifts(
-    found: np.ndarray, missing: np.ndarray, grid: np.ndarray, wanted: np.ndarray
-) -> list[tuple[np.ndarray, int]]:
+    found: NDArray[np.int64],
+    missing: NDArray[np.int64],
+    grid: NDArray[np.int64],
+    wanted: np.ndarray,
+) -> list[tuple[NDArray[np.int64], int]]:
     """Shifts (2,) of places found (n, 2) onto a grid (m, 2), with what speaks against each.
 
     Those nearest to a wanted shift (2,) come first where as much speaks against several.
@@ -241,14 +246,16 @@ def _shifts(
     ]
 
 
-def _raster(places: np.ndarray) -> np.ndarray:
+def _raster(places: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return an image with 1 at places (n, 2), which are not negative."""
     image = np.zeros(places.max(axis=0) + 1)
     image[tuple(places.T)] = 1
     return image
 
 
-def _view(grid: FlatGrid, xyz: np.ndarray, uv: np.ndarray, lens: Lens) -> View | None:
+def _view(
+    grid: FlatGrid, xyz: NDArray[np.float64], uv: NDArray[np.float64], lens: Lens
+) -> View | None:
     """Return the view of matched beads of a grid; None where no pose fits them.
 
     Collins and Bartoli, "Infinitesimal plane-based pose estimation", IJCV 109, 2014.

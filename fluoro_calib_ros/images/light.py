@@ -41,14 +41,14 @@ MAX_SLOW = 0.9  # share of slow changes, beyond which the noise is not seen
 class Light:
     """Grey values of an image that has dark beads."""
 
-    grey: np.ndarray  #: (h, w)
+    grey: NDArray[np.float32]  #: (h, w)
     field: NDArray[np.bool_]  #: (h, w), the field of view
     #: values at which grey values are clipped: there is no less, or more, light than they say
     low: float = -np.inf
     high: float = np.inf
 
 
-def clipped_at(grey: np.ndarray) -> tuple[float, float]:
+def clipped_at(grey: NDArray[np.floating]) -> tuple[float, float]:
     """Return the values at which an image (h, w) is clipped, infinite where it is not.
 
     Noise alone makes the outermost value rarer than the next one.
@@ -60,7 +60,7 @@ def clipped_at(grey: np.ndarray) -> tuple[float, float]:
     return low, high
 
 
-def _is_clipped(grey: np.ndarray, outermost: float, beside: float) -> bool:
+def _is_clipped(grey: NDArray[np.floating], outermost: float, beside: float) -> bool:
     """Return whether an outermost value is more frequent than the one beside it."""
     count = int(np.count_nonzero(grey == outermost))
     return count > max(int(np.count_nonzero(grey == beside)), MIN_CLIPPED)
@@ -75,12 +75,12 @@ class Noise:
     #: (2 LAGS + 1, 2 LAGS + 1), of the noise of pixels at lags (row, column), 1 in the middle
     correlation: NDArray[np.float64]
 
-    def variance(self, light: np.ndarray) -> np.ndarray:
+    def variance(self, light: NDArray[np.floating]) -> NDArray[np.floating]:
         """Variance of grey values of an expected light."""
         return np.maximum(self.constant + self.gain * np.maximum(light, 0), MIN_VARIANCE)
 
 
-def estimate_noise(light: np.ndarray, usable: NDArray[np.bool_]) -> Noise:
+def estimate_noise(light: NDArray[np.float32], usable: NDArray[np.bool_]) -> Noise:
     """Estimate the noise of an image (h, w) from what a plane does not explain.
 
     The second differences of Immerkaer, "Fast noise variance estimation", CVIU 64, 1996, of
@@ -110,7 +110,7 @@ def estimate_noise(light: np.ndarray, usable: NDArray[np.bool_]) -> Noise:
     return Noise(max(constant, MIN_VARIANCE), gain, correlation)
 
 
-def _seen_by(kernel: np.ndarray, correlation: np.ndarray) -> float:
+def _seen_by(kernel: NDArray[np.float64], correlation: NDArray[np.float64]) -> float:
     """Variance that a kernel in both directions leaves of correlated noise, over that of white."""
     lags = len(correlation) // 2
     padded = np.pad(kernel, lags)
@@ -119,7 +119,7 @@ def _seen_by(kernel: np.ndarray, correlation: np.ndarray) -> float:
     return max(float(np.sum(correlation * np.outer(own, own))), MIN_SEEN)
 
 
-def _correlation(light: np.ndarray, field: NDArray[np.bool_]) -> np.ndarray:
+def _correlation(light: NDArray[np.float32], field: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Correlation of the noise, from the background less its blur, clipped at beads."""
     height, width = light.shape
     middle = np.s_[height // 4 : height - height // 4, width // 4 : width - width // 4]
@@ -142,7 +142,9 @@ def _correlation(light: np.ndarray, field: NDArray[np.bool_]) -> np.ndarray:
     return correlation_of(rest[None], valid[None])
 
 
-def correlation_of(residual: np.ndarray, valid: np.ndarray) -> np.ndarray:
+def correlation_of(
+    residual: NDArray[np.floating], valid: NDArray[np.floating]
+) -> NDArray[np.float64]:
     """Correlation (2 LAGS + 1, 2 LAGS + 1) of residuals (k, h, w), 0 where they are not valid.
 
     At the largest lags the noise is not correlated: what is seen there are slow changes of the
@@ -226,7 +228,7 @@ class Cosines:
     offset (m, 2): pixels, from the middle of the window [px].
     """
 
-    def __init__(self, offset: np.ndarray, dtype: type[np.floating]) -> None:
+    def __init__(self, offset: NDArray[np.int64], dtype: type[np.floating]) -> None:
         half = float(np.abs(offset).max()) + 0.5
         x, y = (offset.T + half) * (np.pi / (2 * half))
         number = np.array(
@@ -249,7 +251,11 @@ class Cosines:
         self.telling = (vectors[:, -TELLING:].T @ beyond).astype(dtype)
 
     def spectra(
-        self, relative: np.ndarray, jacobian: np.ndarray, weight: np.ndarray, residual: np.ndarray
+        self,
+        relative: NDArray[np.floating],
+        jacobian: NDArray[np.floating],
+        weight: NDArray[np.floating],
+        residual: NDArray[np.float64],
     ) -> Spectra:
         """Project the residuals of windows on what tells the strength.
 
@@ -282,11 +288,11 @@ class Cosines:
     def eliminated(
         self,
         strength: NDArray[np.float64],
-        relative: np.ndarray,
-        jacobian: np.ndarray,
-        weight: np.ndarray,
-        residual: np.ndarray,
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        relative: NDArray[np.float32],
+        jacobian: NDArray[np.float32],
+        weight: NDArray[np.floating],
+        residual: NDArray[np.float32],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Return what the backgrounds take from normal equations, right sides and squared sums.
 
         strength (g,) is positive; the other arguments are those of `spectra`.
@@ -310,7 +316,7 @@ class Spectra:
     #: side and the squared sum of the residuals
     products: NDArray[np.float64]
     freedom: NDArray[np.int64]  #: (g,), of the residuals
-    noise: NDArray[np.float64]  #: (g,), variance of a usual pixel
+    noise: NDArray[np.floating]  #: (g,), variance of a usual pixel
 
     @classmethod
     def joined(cls, parts: Sequence[Spectra]) -> Spectra:

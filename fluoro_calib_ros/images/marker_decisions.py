@@ -54,12 +54,14 @@ class ViewCounts:
         self._agreed[row] = 0
         return int(self._agreed_since[row])
 
-    def disagree(self, wrong: np.ndarray, rows: np.ndarray | slice = np.s_[:]) -> None:
+    def disagree(
+        self, wrong: NDArray[np.bool_], rows: NDArray[np.int64] | slice = np.s_[:]
+    ) -> None:
         """Count an exposure in which some of the rows are wrong, and the others are not."""
         self._wrong[rows] = np.where(wrong, self._wrong[rows] + 1, 0)
 
     @property
-    def wrong(self) -> np.ndarray:
+    def wrong(self) -> NDArray[np.int64]:
         """Exposures (n,) that disagree."""
         return self._wrong
 
@@ -87,7 +89,7 @@ class DecidedView:
         """Return the ids of rows."""
         return tuple(int(self.target_id[row]) for row in rows)
 
-    def doubt(self, rows: np.ndarray, frame: int) -> None:
+    def doubt(self, rows: NDArray[np.int64], frame: int) -> None:
         """Note that the ids of rows may be wrong."""
         for number in self.ids(*rows):
             self.tracker.doubt(number, frame)
@@ -217,7 +219,11 @@ class BodyDecisions:
         self._seen_right = np.zeros(len(view.target_id), dtype=int)  # last image in the place
 
     def decide(
-        self, exposure: MarkerExposure, place: np.ndarray, sd: np.ndarray, frame: int
+        self,
+        exposure: MarkerExposure,
+        place: NDArray[np.float64],
+        sd: NDArray[np.float64],
+        frame: int,
     ) -> list[Decision]:
         """Confirm, exchange or drop ids by places (n, 2) of markers [px], NaN for unknown.
 
@@ -275,7 +281,10 @@ class BodyDecisions:
 
 
 def _crossed(
-    seen: np.ndarray, place: np.ndarray, near: np.ndarray, suspects: np.ndarray
+    seen: NDArray[np.float64],
+    place: NDArray[np.float64],
+    near: NDArray[np.float64],
+    suspects: NDArray[np.int64],
 ) -> list[tuple[int, int]]:
     """Pairs of suspects that are where bodies say that the other is.
 
@@ -312,7 +321,9 @@ class RayDecisions:
         self._evidence: dict[tuple[int, int], float] = {}
         self._kept: dict[tuple[int, int], int] = {}
 
-    def decide(self, exposure: MarkerExposure, known: np.ndarray, frame: int) -> list[Decision]:
+    def decide(
+        self, exposure: MarkerExposure, known: NDArray[np.bool_], frame: int
+    ) -> list[Decision]:
         """Confirm or exchange ids; known (n,) are those that bodies decide on."""
         view = self._view
         out: list[Decision] = []

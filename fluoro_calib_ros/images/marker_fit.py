@@ -83,7 +83,7 @@ def fit_markers(
 
 
 @lru_cache(maxsize=8)
-def _gauss_points(count: int) -> tuple[np.ndarray, np.ndarray]:
+def _gauss_points(count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Nodes and weights (count,) of the quadrature from -1 to 1."""
     node, weight = np.polynomial.legendre.leggauss(count)
     return node, weight
@@ -116,7 +116,7 @@ class _MarkerFit(ShadowFit):
         self._set_windows(grey, valid, bright=grey)
         self._set_groups(self._near(2 * reach + MARGIN_PX))
 
-    def _near(self, together: float) -> np.ndarray:
+    def _near(self, together: float) -> NDArray[np.int64]:
         """Neighbours (n, k) of the markers, -1 for none; notes the distances of the nearest."""
         distance = cdist(self.uv, self.uv)
         np.fill_diagonal(distance, np.inf)
@@ -143,7 +143,9 @@ class _MarkerFit(ShadowFit):
             if again.any():
                 self._take_step(rows[again], near[again], True)
 
-    def _take_step(self, rows: np.ndarray, near: np.ndarray, final: bool) -> np.ndarray:
+    def _take_step(
+        self, rows: NDArray[np.int64], near: NDArray[np.int64], final: bool
+    ) -> NDArray[np.float64]:
         """Take a step of some markers; return how far (g,) their centres move [px]."""
         uv, depth, background = self._step(rows, near, final)
         moved = np.abs(uv - self.uv[rows]).max(axis=1)
@@ -153,8 +155,8 @@ class _MarkerFit(ShadowFit):
         return np.asarray(moved)
 
     def _shadow(
-        self, rows: np.ndarray, middle: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        self, rows: NDArray[np.int64], middle: NDArray[np.int64]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
         """Shadows (g, k, m) in windows around pixels middle (g, 2), and derivatives by the centre.
 
         rows (g, k) are the markers.
@@ -182,7 +184,9 @@ class _MarkerFit(ShadowFit):
             (-weight @ y.reshape(points, -1)).reshape(shape),
         )
 
-    def _model(self, rows: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _model(
+        self, rows: NDArray[np.int64], near: NDArray[np.int64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
         """Light (g, m) and its derivatives (g, OWN + 3 k, m)."""
         everyone = np.concatenate([rows[:, None], near], axis=1)
         shadow, by_u, by_v = self._shadow(everyone, self.middle[rows])
@@ -211,17 +215,25 @@ class _MarkerFit(ShadowFit):
         jacobian[:, TERMS + 2 :: 3] = by_shadow * shadow * there[..., None]
         return plane * relative, jacobian
 
-    def _disturbed(self, rows: np.ndarray, near: np.ndarray, final: bool) -> np.ndarray:
+    def _disturbed(
+        self, rows: NDArray[np.int64], near: NDArray[np.int64], final: bool
+    ) -> NDArray[np.bool_]:
         if final or near.shape[1]:
             return self.misfit[rows] > DISTURBED * self.typical()
         return np.zeros(len(rows), dtype=bool)
 
-    def _depth_sd(self, rows: np.ndarray, near: np.ndarray) -> float | np.ndarray:
+    def _depth_sd(
+        self, rows: NDArray[np.int64], near: NDArray[np.int64]
+    ) -> float | NDArray[np.float64]:
         # The depth of a marker alone tells whether it is one, so it is hardly constrained.
         return self.guess.depth_sd[rows] if near.shape[1] else DEPTH_SD
 
     def _solve(
-        self, rows: np.ndarray, near: np.ndarray, equations: NormalEquations, final: bool
+        self,
+        rows: NDArray[np.int64],
+        near: NDArray[np.int64],
+        equations: NormalEquations,
+        final: bool,
     ) -> np.ndarray:
         if not final:
             return np.linalg.solve(equations.matrix, equations.right[..., None])[..., 0]
@@ -314,7 +326,7 @@ class MarkerMeasurement:
 
     def _assign(
         self, found: Shadows, states: MarkerStates
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.float64]]:
         """Places (n, 2) of shadows or predictions, which have one (n,), and free ones (k, 2)."""
         motion = states.motion
         variance = states.shadow_variance
@@ -327,7 +339,9 @@ class MarkerMeasurement:
         assigned[row] = True
         return start, assigned, np.delete(found.uv, column, axis=0)
 
-    def _share_shadows(self, start: np.ndarray, assigned: np.ndarray, motion: Motion) -> None:
+    def _share_shadows(
+        self, start: NDArray[np.float64], assigned: NDArray[np.bool_], motion: Motion
+    ) -> None:
         """Let markers without a shadow share that of a marker beside them.
 
         Both start from their predictions, moved together so that their middle is the shadow's.
@@ -347,7 +361,9 @@ class MarkerMeasurement:
                 start[other] = motion.uv[other] + shift
                 assigned[row] = True
 
-    def _acceptable(self, beads: Beads, rows: np.ndarray, states: MarkerStates) -> np.ndarray:
+    def _acceptable(
+        self, beads: Beads, rows: NDArray[np.int64], states: MarkerStates
+    ) -> NDArray[np.bool_]:
         """Return (k,) whether fitted shadows are those of the markers in rows (k,)."""
         relative = beads.depth / states.depth[rows]
         away = beads.uv - states.motion.uv[rows]

@@ -20,6 +20,7 @@ from itertools import product, repeat
 from math import comb
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.distance import pdist, squareform
 from scipy.special import chdtri, erfc
 
@@ -57,7 +58,7 @@ MAX_AT_ONCE = 64
 class _Fit:
     """Points (k,) of the members of a body, -1 for none, and how well they fit."""
 
-    point: np.ndarray
+    point: NDArray[np.int64]
     rms_mm: float
     chi2: float
 
@@ -65,7 +66,7 @@ class _Fit:
     def count(self) -> int:
         return int(np.count_nonzero(self.point >= 0))
 
-    def only(self, members: np.ndarray) -> _Fit:
+    def only(self, members: NDArray[np.bool_]) -> _Fit:
         """Return the fit without the points of other members than these (k,)."""
         return replace(self, point=np.where(members, self.point, -1))
 
@@ -212,7 +213,7 @@ def find_bodies(
     return found, missing
 
 
-def _fit(body: Body, points: ShadowPoints, free: np.ndarray) -> _Fit:
+def _fit(body: Body, points: ShadowPoints, free: NDArray[np.bool_]) -> _Fit:
     """Find the members of a body among points. Raises DataError."""
     search = _Search(body, points, free)
     search.run()
@@ -240,7 +241,7 @@ def _fit(body: Body, points: ShadowPoints, free: np.ndarray) -> _Fit:
     return best
 
 
-def _by_chance(body: Body, fit: _Fit, xyz: np.ndarray) -> float:
+def _by_chance(body: Body, fit: _Fit, xyz: NDArray[np.float64]) -> float:
     """Expected number of fits as good among as many points anywhere in the space of xyz (n, 3).
 
     The second member is on a sphere about the first, the third on a circle, and each further one
@@ -263,7 +264,7 @@ def _by_chance(body: Body, fit: _Fit, xyz: np.ndarray) -> float:
 class _Search:
     """Search of a body with backtracking: members are points with the right distances."""
 
-    def __init__(self, body: Body, points: ShadowPoints, free: np.ndarray) -> None:
+    def __init__(self, body: Body, points: ShadowPoints, free: NDArray[np.bool_]) -> None:
         self.body = body
         self.points = points
         xyz = points.xyz
@@ -281,7 +282,7 @@ class _Search:
         self.free = free
         self.fits: list[_Fit] = []  # with as many members as the best one
         self.steps = 0
-        self.choices: list[np.ndarray] = []  # complete ones that are not judged yet
+        self.choices: list[NDArray[np.int64]] = []  # complete ones that are not judged yet
         self.judged = 0
         self.point = np.full(len(body.target_id), -1)
 
@@ -290,7 +291,7 @@ class _Search:
         self._extend(0, self.free.copy())
         self._judge()
 
-    def _extend(self, member: int, free: np.ndarray) -> None:
+    def _extend(self, member: int, free: NDArray[np.bool_]) -> None:
         """Choose a point for a member, and for those after it."""
         self.steps += 1
         if self.steps > MAX_STEPS:
@@ -319,7 +320,7 @@ class _Search:
 
     def _judge(self) -> None:
         """Compare complete choices with the best ones, those of most members first."""
-        by_count: dict[int, list[np.ndarray]] = {}
+        by_count: dict[int, list[NDArray[np.int64]]] = {}
         for choice in self.choices:
             by_count.setdefault(int(np.count_nonzero(choice >= 0)), []).append(choice)
         self.judged += len(self.choices)
@@ -355,7 +356,7 @@ def _first(
     rig: CalibratedRig,
     fits: Sequence[tuple[Body, _Fit]],
     points: ShadowPoints,
-    shadows: np.ndarray,
+    shadows: NDArray[np.float64],
 ) -> FirstMarkers | None:
     """Return the markers of a view with these shadows, None where it sees none of the bodies."""
     name = rig.orientation.fluoroscopes[view]

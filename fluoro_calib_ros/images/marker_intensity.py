@@ -53,8 +53,8 @@ class Shadows:
     A strength is the response over the light around the shadow.
     """
 
-    uv: np.ndarray
-    strength: np.ndarray
+    uv: NDArray[np.float64]
+    strength: NDArray[np.floating]
 
     def strongest(self, count: int) -> Shadows:
         """Return so many of the shadows at most."""
@@ -94,9 +94,9 @@ class FilteredLight:
 
     scale: float
     inverted: bool  # whether they are bright in the image
-    light: np.ndarray
-    response: np.ndarray
-    around: np.ndarray  # mean of the light around
+    light: NDArray[np.float32]
+    response: NDArray[np.float32]
+    around: NDArray[np.float32]  # mean of the light around
 
     @cached_property
     def relative(self) -> NDArray[np.float32]:
@@ -118,7 +118,7 @@ class FilteredLight:
         return field_of_view(self.light, self.scale)
 
     @cached_property
-    def maxima(self) -> tuple[np.ndarray, np.ndarray]:
+    def maxima(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Rows and columns (k,) of the local maxima."""
         dilated = cv2.dilate(self.relative, np.ones((_size_of_maximum(self.scale),) * 2, np.uint8))
         largest = self.relative >= dilated
@@ -145,7 +145,7 @@ class FilteredLight:
         return float(np.median(part[field])) if field.any() else float(self.light.mean())
 
 
-def _positive_median(values: np.ndarray) -> float:
+def _positive_median(values: NDArray[np.float32]) -> float:
     """Median of the positive values, 0 without any."""
     positive = values[values > 0]
     return float(np.median(positive)) if len(positive) else 0.0
@@ -184,7 +184,9 @@ class LightWindows:
         self.shape = image.shape
         self._top = float(np.iinfo(image.dtype).max) if look.inverted else None
 
-    def read(self, middle: np.ndarray, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def read(
+        self, middle: NDArray[np.int64], offset: NDArray[np.int64]
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Return grey values (n, m) of float32 at middle (n, 2) + offset (m, 2), and validity."""
         height, width = self.shape
         column = middle[:, :1] + offset[:, 0]
@@ -229,7 +231,9 @@ def check_image(image: np.ndarray, size: tuple[int, int] | None = None) -> None:
         raise DataError(cause, kind=Kind.IMAGE_EMPTY)
 
 
-def _learn_look(image: FilteredImage, near: np.ndarray) -> tuple[MarkerLook, FilteredLight]:
+def _learn_look(
+    image: FilteredImage, near: NDArray[np.float64]
+) -> tuple[MarkerLook, FilteredLight]:
     """Learn what markers look like, from an image and points (n, 2) near them.
 
     Returns the light filtered for them, too. Raises DataError where there is nothing round.
@@ -276,7 +280,7 @@ class _Typical:
     strength: float
 
     @classmethod
-    def near(cls, light: FilteredLight, uv: np.ndarray) -> _Typical:
+    def near(cls, light: FilteredLight, uv: NDArray[np.float64]) -> _Typical:
         """The median near points (n, 2)."""
         height, width = light.response.shape
         around = np.rint(uv).astype(int)[:, None] + _square(NEAR_PX)
@@ -330,7 +334,7 @@ def _found(look: MarkerLook, light: FilteredLight, share: float) -> Shadows:
 
 
 def search_windows(
-    windows: LightWindows, middle: np.ndarray, half: int, look: MarkerLook, share: float
+    windows: LightWindows, middle: NDArray[np.int64], half: int, look: MarkerLook, share: float
 ) -> Shadows:
     """Search windows of 2 half + 1 px around pixels middle (n, 2), each shadow found once."""
     border = int(np.ceil(BORDER * look.scale))
@@ -356,26 +360,28 @@ def search_windows(
 
 
 @lru_cache(maxsize=64)
-def _square(half: int) -> np.ndarray:
+def _square(half: int) -> NDArray[np.int64]:
     """Pixels (m, 2) of a square window, from its middle, row by row."""
     axis = np.arange(-half, half + 1)
     return np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
 
 
-def _relative(response: np.ndarray, around: np.ndarray, look: MarkerLook) -> np.ndarray:
+def _relative(
+    response: NDArray[np.floating], around: NDArray[np.floating], look: MarkerLook
+) -> NDArray[np.floating]:
     """Responses over the light around, 0 where noise explains them."""
     relative = response / np.maximum(around, 1e-3 * look.light)
     relative[relative < _floor(look, around)] = 0
     return np.asarray(relative)
 
 
-def _floor(look: MarkerLook, around: np.ndarray) -> np.ndarray:
+def _floor(look: MarkerLook, around: NDArray[np.floating]) -> NDArray[np.floating]:
     """Relative response below which noise is, by the light around: it grows in the dark."""
     light = np.maximum(around, 1e-3 * look.light)
     return np.asarray(look.floor * np.sqrt(np.maximum(look.light / light, 1.0)))
 
 
-def _peaks(response: np.ndarray, look: MarkerLook, share: float) -> Shadows:
+def _peaks(response: NDArray[np.float32], look: MarkerLook, share: float) -> Shadows:
     """Local maxima of a response (h, w) that is 0 at its edge, to a part of a pixel."""
     dilated = cv2.dilate(response, np.ones((_size_of_maximum(look.scale),) * 2, np.uint8))
     row, column = np.nonzero(
@@ -389,7 +395,9 @@ def _size_of_maximum(scale: float) -> int:
     return 2 * max(1, round(scale)) + 1
 
 
-def _shadows_at(response: np.ndarray, row: np.ndarray, column: np.ndarray) -> Shadows:
+def _shadows_at(
+    response: NDArray[np.float32], row: NDArray[np.int64], column: NDArray[np.int64]
+) -> Shadows:
     """Shadows at local maxima of a response (h, w), to a part of a pixel."""
     at = response[row, column]
     uv = np.column_stack(
@@ -421,7 +429,7 @@ class MarkerStart:
 NOWHERE_PX = -2e4  # where markers are whose place is not known yet
 
 
-def learn_start(image: FilteredImage, target_id: np.ndarray, uv: np.ndarray) -> MarkerStart:
+def learn_start(image: FilteredImage, target_id: NDArray[np.int64], uv: np.ndarray) -> MarkerStart:
     """Learn from an image with markers near uv (n, 2) [px], NaN where places are not known yet.
 
     Raises DataError where the markers are not there.
@@ -485,7 +493,7 @@ class MarkerSearch:
         """Find the shadows of a whole image."""
         return search_image(image, self._look, SHARE)
 
-    def lost(self, states: MarkerStates) -> np.ndarray:
+    def lost(self, states: MarkerStates) -> NDArray[np.bool_]:
         """Return (n,) whether markers are searched in the whole image."""
         return np.asarray(states.unseen > self._lost_after)
 

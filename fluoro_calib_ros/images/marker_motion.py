@@ -67,11 +67,11 @@ class Motion:
         )
 
     @property
-    def variance(self) -> np.ndarray:
+    def variance(self) -> NDArray[np.float64]:
         """Variances (n,) of a coordinate [px^2]."""
         return self.covariance[:, 0, 0]
 
-    def predict(self, frames: int, led: np.ndarray | None = None) -> None:
+    def predict(self, frames: int, led: NDArray[np.bool_] | None = None) -> None:
         """Move all markers on by a number of frames.
 
         led (n,) are those whose velocity follows that of others.
@@ -92,11 +92,17 @@ class Motion:
             factor = np.where(too_wide, MAX_SD_PX**2 / p[:, 0, 0], 1.0)
             p *= factor[:, None, None]
 
-    def innovation_variance(self, sigma: np.ndarray) -> np.ndarray:
+    def innovation_variance(self, sigma: NDArray[np.float64]) -> NDArray[np.float64]:
         """Variances (n,) of a measured less a predicted coordinate."""
         return self.variance + sigma**2 + MODEL_SD_PX**2
 
-    def update(self, rows: np.ndarray, uv: np.ndarray, sigma: np.ndarray, frames: int) -> None:
+    def update(
+        self,
+        rows: NDArray[np.int64],
+        uv: NDArray[np.float64],
+        sigma: NDArray[np.float64],
+        frames: int,
+    ) -> None:
         """Take in measured centres (m, 2) of some markers."""
         innovation = uv - self.uv[rows]
         p = self.covariance[rows]
@@ -112,7 +118,9 @@ class Motion:
         update = FORGET * self.squared[rows] + (1 - FORGET) * seen
         self.squared[rows] = np.where(settled, update, self.squared[rows])
 
-    def lead(self, seen: np.ndarray, before: np.ndarray, sure: np.ndarray) -> np.ndarray:
+    def lead(
+        self, seen: NDArray[np.bool_], before: NDArray[np.float64], sure: NDArray[np.bool_]
+    ) -> NDArray[np.bool_]:
         """Let unseen markers follow those that move alike; returns (n,) which do.
 
         seen (n,) were measured now, and had velocities before (n, 2). Which markers move alike is
@@ -139,7 +147,9 @@ class Motion:
             led[row] = True
         return led
 
-    def strangeness(self, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def strangeness(
+        self, seen: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
         """Compare velocities with those of the markers that moved alike so far.
 
         Returns, for markers in rows (k,), the ratio (k,) of the squared difference to what it used
@@ -157,7 +167,11 @@ class Motion:
         return rows, squared / (usual + STRANGE_PX**2), others
 
     def place(
-        self, rows: np.ndarray, uv: np.ndarray, velocity: np.ndarray, sd_px: np.ndarray
+        self,
+        rows: NDArray[np.int64],
+        uv: NDArray[np.float64],
+        velocity: NDArray[np.float64],
+        sd_px: NDArray[np.float64],
     ) -> None:
         """Put some markers where a better prediction says, if it is better."""
         better = sd_px**2 < self.variance[rows]
@@ -171,11 +185,13 @@ class Motion:
         self.covariance[row] = np.diag([MAX_SD_PX**2, FIRST_SPEED_PX**2])
 
     @property
-    def settled(self) -> np.ndarray:
+    def settled(self) -> NDArray[np.bool_]:
         """Return (n,) whether the velocity of a marker is known."""
         return np.asarray(self.covariance[:, 1, 1] < FIRST_SPEED_PX**2 / 4)
 
-    def redirect(self, row: int, uv: np.ndarray, velocity: np.ndarray, sd_px: float) -> None:
+    def redirect(
+        self, row: int, uv: NDArray[np.float64], velocity: NDArray[np.float64], sd_px: float
+    ) -> None:
         """Put a marker at a place (2,), with a velocity (2,) [px a frame]."""
         self.uv[row] = uv
         self.velocity[row] = velocity
@@ -191,7 +207,9 @@ class Motion:
         self.together[:, [one, other]] = self.together[:, [other, one]]
 
 
-def costs(uv: np.ndarray, variance: np.ndarray, found: np.ndarray) -> np.ndarray:
+def costs(
+    uv: NDArray[np.float64], variance: NDArray[np.float64], found: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Costs (n, m), -2 log likelihood, of places (m, 2) for markers predicted at uv (n, 2)."""
     away = uv[:, None] - found[None]
     squared = (away * away).sum(axis=2)
@@ -199,8 +217,11 @@ def costs(uv: np.ndarray, variance: np.ndarray, found: np.ndarray) -> np.ndarray
 
 
 def assign(
-    uv: np.ndarray, variance: np.ndarray, found: np.ndarray, gate_sigmas: float
-) -> tuple[np.ndarray, np.ndarray]:
+    uv: NDArray[np.float64],
+    variance: NDArray[np.float64],
+    found: NDArray[np.float64],
+    gate_sigmas: float,
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Assign places (m, 2) to markers predicted at uv (n, 2); rows of both.
 
     As many markers as possible get a place within their gate, at the smallest sum of costs.
@@ -216,8 +237,8 @@ def assign(
 
 
 def common_shift(
-    uv: np.ndarray, row: int, beside: np.ndarray, found: cKDTree, reach_px: float
-) -> np.ndarray | None:
+    uv: NDArray[np.float64], row: int, beside: NDArray[np.int64], found: cKDTree, reach_px: float
+) -> NDArray[np.float64] | None:
     """Shift (2,) of a marker that takes most of the markers beside it to shadows, or None.
 
     uv (n, 2) are predictions, beside (k,) rows of markers that move with it.
@@ -239,9 +260,9 @@ def doubtful_pairs(
     uv: NDArray[np.float64],
     variance: NDArray[np.float64],
     measured: NDArray[np.bool_],
-    found: np.ndarray,
+    found: NDArray[np.float64],
     margin: float,
-) -> np.ndarray:
+) -> NDArray[np.int64]:
     """Pairs (k, 2) of markers whose places could as well be exchanged.
 
     Parameters
@@ -316,17 +337,19 @@ class MarkerStates:
         return cls(motion, np.ones(n), np.full(n, DEPTH_SD), unseen=unseen, placed=long_ago)
 
     @property
-    def shadow_variance(self) -> np.ndarray:
+    def shadow_variance(self) -> NDArray[np.float64]:
         """Variances (n,) of a coordinate of a shadow less that of the prediction [px^2]."""
         return self.motion.variance + SHADOW_SD_PX**2
 
-    def advance(self, frames: int, led: np.ndarray | None) -> None:
+    def advance(self, frames: int, led: NDArray[np.bool_] | None) -> None:
         """Predict all markers; led (n,) are those whose velocity follows that of others."""
         self.motion.predict(frames, led)
         self.unseen += 1
         self.placed += 1
 
-    def place(self, rows: np.ndarray, uv: np.ndarray, sd_px: float, frames: int) -> None:
+    def place(
+        self, rows: NDArray[np.int64], uv: NDArray[np.float64], sd_px: float, frames: int
+    ) -> None:
         """Put markers at places (k, 2) where their body is, frames after the image before.
 
         The second of two such images tells their velocities. Markers that are followed and there

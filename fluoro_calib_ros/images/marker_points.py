@@ -45,13 +45,13 @@ class ShadowPoints:
     shadow: NDArray[np.int64]  #: (n, F) row of the shadow in each view, -1 where there is none
 
 
-def all_among(shadow: np.ndarray, others: np.ndarray) -> np.ndarray:
+def all_among(shadow: NDArray[np.int64], others: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Whether all shadows (n, F) of points are also shadows (k, F) of other points."""
     among = [np.isin(mine, theirs) for mine, theirs in zip(shadow.T, others.T)]
     return np.asarray((np.column_stack(among) | (shadow < 0)).all(axis=1))
 
 
-def shadow_points(shadows: Sequence[np.ndarray], rig: CalibratedRig) -> ShadowPoints:
+def shadow_points(shadows: Sequence[NDArray[np.float64]], rig: CalibratedRig) -> ShadowPoints:
     """Points where rays of shadows (k, 2) of all views [px] meet."""
     names = rig.orientation.fluoroscopes
     rays = _Rays(
@@ -83,7 +83,7 @@ def shadow_points(shadows: Sequence[np.ndarray], rig: CalibratedRig) -> ShadowPo
     return ShadowPoints(xyz, rays.variance(shadow), shadow)
 
 
-def _explaining(shadow: np.ndarray) -> np.ndarray:
+def _explaining(shadow: NDArray[np.int64]) -> NDArray[np.int64]:
     """Rows (k,) of points that are needed to explain shadows (n, F), each once."""
     _, once = np.unique(shadow, axis=0, return_index=True)
     rows = np.sort(once)
@@ -103,7 +103,7 @@ class _Rays:
         self._orientation = orientation
         self._fit = RayFit(orientation)
 
-    def pairs(self) -> np.ndarray:
+    def pairs(self) -> NDArray[np.int64]:
         """Rows (n, F) of the shadows of every two views whose rays meet, -1 for other views."""
         names = self._orientation.fluoroscopes
         out = [np.zeros((0, len(names)), dtype=np.int64)]
@@ -121,7 +121,7 @@ class _Rays:
             out.append(shadow)
         return np.concatenate(out)
 
-    def intersect(self, shadow: np.ndarray) -> tuple[IntersectedPoints, np.ndarray]:
+    def intersect(self, shadow: NDArray[np.int64]) -> tuple[IntersectedPoints, NDArray[np.bool_]]:
         """Points of shadows (n, F), and whether (n,) all their rays meet."""
         uv = self._uv(shadow)
         sigma = np.full(uv.shape[:2], np.nan)
@@ -134,7 +134,7 @@ class _Rays:
         )
         return points, agree
 
-    def variance(self, shadow: np.ndarray) -> np.ndarray:
+    def variance(self, shadow: NDArray[np.int64]) -> NDArray[np.float64]:
         """Variances (n,) of points of shadows (n, F), in the direction of the largest one [mm^2].
 
         Errors of orientation and correction are the same for all members of a body, nearly.
@@ -143,7 +143,7 @@ class _Rays:
         points, _ = self._fit.intersect(uv, np.full(uv.shape[:2], SHADOW_SD_PX))
         return np.asarray(np.linalg.eigvalsh(points.covariance_noise)[:, -1])
 
-    def _uv(self, shadow: np.ndarray) -> np.ndarray:
+    def _uv(self, shadow: NDArray[np.int64]) -> NDArray[np.float64]:
         """Corrected image points (F, n, 2) [px], NaN where there is no shadow."""
         uv = np.full((shadow.shape[1], len(shadow), 2), np.nan)
         for view, (of_view, row) in enumerate(zip(self._corrected, shadow.T)):

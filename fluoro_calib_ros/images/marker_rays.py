@@ -117,7 +117,7 @@ class MarkerRays:
         calibrations: Calibrations,
         orientation: RigOrientation,
         names: Sequence[str],
-        target_id: np.ndarray,
+        target_id: NDArray[np.int64],
     ) -> None:
         self._calibrations = calibrations
         self._names = names
@@ -149,7 +149,9 @@ class MarkerRays:
         matched = MatchedViews(self._target_id, corrected, sigma, correction_sd, outside)
         return MarkerExposure(observed, doubtful, IntersectedViews(matched, points), standardised)
 
-    def exchanged(self, exposure: MarkerExposure, view: int, rows: Sequence[int]) -> np.ndarray:
+    def exchanged(
+        self, exposure: MarkerExposure, view: int, rows: Sequence[int]
+    ) -> NDArray[np.float64]:
         """Standardised lack of fit (2,) of two markers of a view if it exchanged them."""
         pair = list(rows)
         uv = exposure.corrected[:, pair].copy()
@@ -159,7 +161,9 @@ class MarkerRays:
         _, standardised = self._fit.intersect(uv, sigma)
         return standardised[view]
 
-    def by_others(self, exposure: MarkerExposure, view: int, wanted: np.ndarray) -> MarkerPlaces:
+    def by_others(
+        self, exposure: MarkerExposure, view: int, wanted: NDArray[np.bool_]
+    ) -> MarkerPlaces:
         """Places where two views and more, without this one, agree that markers are.
 
         wanted (n,): of these markers.
@@ -180,8 +184,8 @@ class MarkerRays:
         return out
 
     def project(
-        self, view: int, xyz_mm: np.ndarray, angles: Mapping[str, float | None]
-    ) -> np.ndarray:
+        self, view: int, xyz_mm: NDArray[np.float64], angles: Mapping[str, float | None]
+    ) -> NDArray[np.float64]:
         """Observed pixels (k, 2) of points (k, 3) in the rig frame [mm] at angles [rad].
 
         They are NaN where a point is.
@@ -199,7 +203,9 @@ class MarkerRays:
             )
         return uv
 
-    def spread(self, view: int, xyz_mm: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    def spread(
+        self, view: int, xyz_mm: NDArray[np.float64], covariance: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
         """Standard deviations (k,) of a coordinate in a view [px] of points (k, 3).
 
         covariance (k, 3, 3) is that of the points [mm^2].
@@ -228,7 +234,7 @@ class RayFit:
         self._scale = limits[2] / limits
 
     def intersect(
-        self, uv: np.ndarray, sigma: np.ndarray
+        self, uv: np.ndarray, sigma: NDArray[np.float64]
     ) -> tuple[IntersectedPoints, NDArray[np.float64]]:
         """Intersect image points uv (F, n, 2) of standard deviations sigma (F, n) [px].
 
@@ -261,9 +267,9 @@ def project_observed(
     orientation: RigOrientation,
     view: int,
     calibration: FluoroscopeCalibration,
-    xyz: np.ndarray,
+    xyz: NDArray[np.float64],
     angle: float | None = None,
-) -> np.ndarray:
+) -> NDArray[np.float64]:
     """Observed pixels (k, 2) of points (k, 3) in the rig frame [mm].
 
     view is the row of the fluoroscope in the orientation; angle that of its C-arm [rad], None
@@ -301,7 +307,7 @@ class MarkerBodies:
     """
 
     def __init__(
-        self, orientation: RigOrientation, target_id: np.ndarray, bodies: Sequence[Body]
+        self, orientation: RigOrientation, target_id: NDArray[np.int64], bodies: Sequence[Body]
     ) -> None:
         self._count = len(target_id)
         self._bodies = []
@@ -315,7 +321,9 @@ class MarkerBodies:
             np.repeat(np.arange(len(self._rows)), [len(rows) for rows in self._rows]),
             np.array([k for rows in self._rows for k in range(len(rows))], dtype=int),
         )
-        self._seen: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in self._bodies]
+        self._seen: list[list[tuple[NDArray[np.float64], NDArray[np.float64]]]] = [
+            [] for _ in self._bodies
+        ]
         self._learned = [
             np.where(body.known, LEARNED, 0) for body in self._bodies
         ]  # exposures, by marker
@@ -331,21 +339,21 @@ class MarkerBodies:
         alive = self._tracker.filter.alive.tolist()
         return tuple(body for body, is_alive in zip(self._bodies, alive) if not is_alive)
 
-    def unplaced(self) -> np.ndarray:
+    def unplaced(self) -> NDArray[np.bool_]:
         """Whether (n,) markers have a known place in a body whose pose is not known."""
         out = np.zeros(self._count, dtype=bool)
         for body, rows in zip(self._bodies, self._rows):
             out[rows] = body.known
         return np.asarray(out & ~self.present.known)
 
-    def among(self, supported: np.ndarray) -> np.ndarray:
+    def among(self, supported: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Whether (n,) markers are of bodies with so many supported (n,) that give a pose."""
         out = np.zeros(self._count, dtype=bool)
         for rows in self._rows:
             out[rows] = np.count_nonzero(supported[rows]) >= MIN_MEMBERS
         return out
 
-    def miss(self, measured: np.ndarray, before: np.ndarray) -> np.ndarray:
+    def miss(self, measured: NDArray[np.bool_], before: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Give up bodies that are not where they were expected; returns their markers (n,).
 
         measured, before (F, n): markers that are measured now, and in the last images of the same
@@ -387,7 +395,7 @@ class MarkerBodies:
             covariance = found.covariance[:, POSE, POSE]
             self.present = self._placed(found.rotation, found.centre_mm, covariance)
 
-    def _usable(self, exposure: MarkerExposure) -> np.ndarray:
+    def _usable(self, exposure: MarkerExposure) -> NDArray[np.bool_]:
         """Image points (F, n) whose ids are believed."""
         assert self._tracker is not None
         seen = np.isfinite(exposure.corrected).all(axis=2)
@@ -405,7 +413,10 @@ class MarkerBodies:
         return out
 
     def _placed(
-        self, rotation: np.ndarray, centre: np.ndarray, covariance: np.ndarray
+        self,
+        rotation: NDArray[np.float64],
+        centre: NDArray[np.float64],
+        covariance: NDArray[np.float64],
     ) -> MarkerPlaces:
         """Places of markers at poses of the bodies."""
         assert self._tracker is not None
@@ -420,7 +431,7 @@ class MarkerBodies:
         out.covariance[rows] = spread[self._member][known]
         return out
 
-    def learn(self, exposure: MarkerExposure, sure: np.ndarray) -> None:
+    def learn(self, exposure: MarkerExposure, sure: NDArray[np.bool_]) -> None:
         """Improve the shapes by an exposure, of which sure (n,) markers are trusted."""
         if self._tracker is None:
             return

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from itertools import repeat
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..bodies.body import Body
 from ..correction.fluoroscope_calibration import Calibrations
@@ -111,7 +112,7 @@ class MarkerViews:
         return ViewsFrame(found) if joined is None else joined.decided(found, frame)
 
 
-def _later(target_id: np.ndarray, given: FirstMarkers | None) -> np.ndarray:
+def _later(target_id: NDArray[np.int64], given: FirstMarkers | None) -> NDArray[np.int64]:
     """Ids (k,) of the markers that are not given."""
     return target_id if given is None else np.setdiff1d(target_id, given.target_id)
 
@@ -142,7 +143,7 @@ class JoinedViews:
         self,
         trackers: Mapping[str, MarkerTracker],
         rig: CalibratedRig,
-        target_id: np.ndarray,
+        target_id: NDArray[np.int64],
         bodies: Sequence[Body],
     ) -> None:
         self._views = [
@@ -244,11 +245,11 @@ class JoinedViews:
             anew = np.isin(self._target_id, view.tracker.seen_anew())
             view.doubt(np.flatnonzero(unknown & alone & (doubted | anew)), frame)
 
-    def _among(self, bodies: Sequence[Body]) -> np.ndarray:
+    def _among(self, bodies: Sequence[Body]) -> NDArray[np.bool_]:
         """Whether (n,) markers are of some of the bodies."""
         return np.isin(self._target_id, np.concatenate([[], *(b.target_id for b in bodies)]))
 
-    def _suggest(self, frame: int, placed: np.ndarray) -> None:
+    def _suggest(self, frame: int, placed: NDArray[np.bool_]) -> None:
         """Offer each view predictions of the markers that it is not sure of.
 
         placed (n,): those whose bodies have just been found.
@@ -268,7 +269,7 @@ class JoinedViews:
             sd = self._rays.spread(view.view, here.xyz_mm[rows], here.covariance[rows])
             view.tracker.suggest(self._target_id[rows], uv, velocity, sd)
 
-    def _search(self, images: Mapping[str, np.ndarray | None], frame: int) -> np.ndarray:
+    def _search(self, images: Mapping[str, np.ndarray | None], frame: int) -> NDArray[np.bool_]:
         """Look in the whole images for bodies whose pose is lost, by their shapes.
 
         Returns (n,) which markers are those of bodies that are found.
@@ -300,7 +301,7 @@ class JoinedViews:
         self._again = [body for body in there if body.name not in before]
         return placed
 
-    def _shadows(self, view: DecidedView, image: np.ndarray | None) -> np.ndarray | None:
+    def _shadows(self, view: DecidedView, image: np.ndarray | None) -> NDArray[np.float64] | None:
         """Places (k, 2) of shadows in a view [px], None where there is no image."""
         if image is None or not view.tracker.begun:
             return None

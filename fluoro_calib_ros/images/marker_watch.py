@@ -9,6 +9,7 @@ from collections.abc import Set as AbstractSet
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ..findings import Finding, Kind, Place, Severity
@@ -45,7 +46,7 @@ class MarkerWatch:
 
     def __init__(
         self,
-        target_id: np.ndarray,
+        target_id: NDArray[np.int64],
         doubts: MarkerDoubts,
         *,
         gate: float,
@@ -168,7 +169,7 @@ class MarkerDoubts:
         self._partners: list[set[int]] = [set() for _ in range(count)]
 
     @property
-    def doubtful(self) -> np.ndarray:
+    def doubtful(self) -> NDArray[np.bool_]:
         """Return (n,) whether an id may be wrong."""
         return np.array([bool(partners) for partners in self._partners], dtype=bool)
 
@@ -243,7 +244,7 @@ def follow_beside(states: MarkerStates, frames: int) -> None:
             motion.redirect(row, uv, velocity, max(spread, SHIFTED_SD_PX))
 
 
-def velocity_beside(states: MarkerStates, row: int) -> tuple[np.ndarray, float] | None:
+def velocity_beside(states: MarkerStates, row: int) -> tuple[NDArray[np.float64], float] | None:
     """Velocity (2,) of the markers beside one, and how much theirs differ; None without some."""
     motion = states.motion
     known = np.flatnonzero(motion.settled & (states.unseen <= 1))
@@ -290,7 +291,7 @@ class MarkerCompany:
         self._own = np.zeros((count, 2))  # its own way
 
     def compare(
-        self, motion: Motion, measured: np.ndarray, doubtful: np.ndarray, frames: int
+        self, motion: Motion, measured: np.ndarray, doubtful: NDArray[np.bool_], frames: int
     ) -> tuple[list[int], list[int]]:
         """Return rows that move alone from now on, and doubtful ones that do not.
 

@@ -92,8 +92,8 @@ class FirstMarkers:
     filtered: the image, where they were searched in it.
     """
 
-    target_id: np.ndarray
-    uv: np.ndarray
+    target_id: NDArray[np.int64]
+    uv: NDArray[np.float64]
     filtered: FilteredImage | None = None
 
     def __post_init__(self) -> None:
@@ -143,7 +143,7 @@ class MarkerFrame:
 MIN_SUGGESTED = 4  # markers that are suggested in an image with which following begins
 
 
-def _inside(uv: np.ndarray, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+def _inside(uv: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.bool_]:
     """Return (n,) whether points (n, 2) are in an image of a shape."""
     return np.asarray(((uv > 0) & (uv < np.array(shape[::-1]) - 1)).all(axis=1))
 
@@ -189,7 +189,9 @@ class _Followed:
     watch: MarkerWatch
 
     @classmethod
-    def begun(cls, start: MarkerStart, target_id: np.ndarray, options: MarkerOptions) -> _Followed:
+    def begun(
+        cls, start: MarkerStart, target_id: NDArray[np.int64], options: MarkerOptions
+    ) -> _Followed:
         """Return what follows markers from the first image on."""
         doubts = MarkerDoubts(len(target_id))
         return cls(
@@ -241,7 +243,7 @@ class MarkerTracker:
         self._frame = 0
         self._gap = 1  # frames between the last two images
         self._images = 0  # since the first one
-        self._led: np.ndarray | None = None
+        self._led: NDArray[np.bool_] | None = None
         self._suggested: list[tuple[np.ndarray, ...]] = []
         # Of the next image: by a person, and by the shapes of bodies.
         self._given: FirstMarkers | None = None
@@ -293,7 +295,7 @@ class MarkerTracker:
         """Return the image since which an id may be wrong, None for one that is sure."""
         return self._known().doubts.since(self._row(target_id))
 
-    def doubtful(self) -> np.ndarray:
+    def doubtful(self) -> NDArray[np.int64]:
         """Ids (k,) of markers whose id may be wrong."""
         if self._followed is None:
             return self.target_id[:0]
@@ -327,14 +329,14 @@ class MarkerTracker:
         """Note that an id may be wrong."""
         self._known().doubts.add(self._row(target_id), frame)
 
-    def unsure(self) -> np.ndarray:
+    def unsure(self) -> NDArray[np.int64]:
         """Ids (k,) of markers that were not measured last, or are doubtful."""
         followed = self._followed
         if followed is None:
             return self.target_id
         return self.target_id[(followed.states.unseen > 0) | followed.doubts.doubtful]
 
-    def seen_anew(self) -> np.ndarray:
+    def seen_anew(self) -> NDArray[np.int64]:
         """Ids (k,) of markers that were measured last, and whose motion was not known before."""
         return self.target_id[self._anew]
 
@@ -450,7 +452,7 @@ class MarkerTracker:
         return rows
 
     def _believe(
-        self, given: np.ndarray, found: MeasuredMarkers, doubts: tuple[Finding, ...]
+        self, given: NDArray[np.int64], found: MeasuredMarkers, doubts: tuple[Finding, ...]
     ) -> tuple[Finding, ...]:
         """Take back the doubts in markers that a person has given; returns those that remain."""
         sure = given[found.measured[given]]

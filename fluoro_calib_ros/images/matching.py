@@ -110,7 +110,10 @@ class PhantomModel:
 
     @classmethod
     def of(
-        cls, xyz: np.ndarray, diameter_mm: np.ndarray | None = None, regular: bool = False
+        cls,
+        xyz: NDArray[np.float64],
+        diameter_mm: NDArray[np.float64] | None = None,
+        regular: bool = False,
     ) -> PhantomModel:
         """Return the model of beads (n, 3) [mm] with diameters (n,) [mm], if they are known.
 
@@ -318,7 +321,9 @@ def _best_by_size(matches: list[Match], seen: Seen, model: PhantomModel) -> Matc
     return matches[order[-1]]
 
 
-def _likelihood_of_sizes(size: np.ndarray, response: np.ndarray, uv: np.ndarray) -> float:
+def _likelihood_of_sizes(
+    size: NDArray[np.float64], response: NDArray[np.float64], uv: NDArray[np.float64]
+) -> float:
     """Log-likelihood of responses (n,) to shadows of sizes (n,), as logarithms, at uv (n, 2).
 
     A response is linear in the size, and changes slowly across the image. Its scatter is that of
@@ -417,7 +422,7 @@ def _enough(seen: Seen, model: PhantomModel) -> int:
     return enough_seeds(model.xyz, len(seen.uv), radius_mm, LEVELS[0][:2])
 
 
-def seeds_of(seen: Seen) -> np.ndarray:
+def seeds_of(seen: Seen) -> NDArray[np.int64]:
     """Rows of beads to begin with: some of the middle, then those that stand apart, at random.
 
     Distortion is least in the middle. Where faces are seen from the edge, beads of several faces
@@ -453,7 +458,7 @@ def _scale_by_extent(seen: Seen, model: PhantomModel) -> float:
     return float(spread / (np.sqrt(2 / 3) * extent))
 
 
-def _symmetries(xyz: np.ndarray) -> Iterator[Symmetry]:
+def _symmetries(xyz: NDArray[np.float64]) -> Iterator[Symmetry]:
     """Yield motions of a phantom (n, 3) onto itself: turns, and shifts by a neighbour.
 
     The turns are the 24 of a cube, about the axes of the phantom's frame and its principal axes.
@@ -477,7 +482,7 @@ def _symmetries(xyz: np.ndarray) -> Iterator[Symmetry]:
             yield Symmetry(rotation, shift, row)
 
 
-def _turns_of_cube() -> Iterator[np.ndarray]:
+def _turns_of_cube() -> Iterator[NDArray[np.float64]]:
     """Yield the 24 rotations (3, 3) of a cube."""
     for order in permutations(range(3)):
         for signs in product((-1.0, 1.0), repeat=3):
@@ -487,7 +492,7 @@ def _turns_of_cube() -> Iterator[np.ndarray]:
                 yield turn
 
 
-def _common(steps: np.ndarray, reach: float) -> list[np.ndarray]:
+def _common(steps: NDArray[np.float64], reach: float) -> list[NDArray[np.float64]]:
     """Return the steps (3,) to a neighbour that occur most often among steps (n, 3)."""
     cell = np.rint(steps / max(2 * reach, 1e-9)).astype(int)
     _, inverse, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)

@@ -116,8 +116,8 @@ def _settled(profile: Profile, before: Profile) -> bool:
 
 def _profile_fit(
     light: Light,
-    uv: np.ndarray,
-    radius: np.ndarray,
+    uv: NDArray[np.float64],
+    radius: NDArray[np.float64],
     profile: Profile,
     reach_px: float = 0.0,
 ) -> _BeadFit:
@@ -131,12 +131,12 @@ def _profile_fit(
 
 def measure_beads(
     light: Light,
-    uv: np.ndarray,
-    relative_radius: np.ndarray,
+    uv: NDArray[np.float64],
+    relative_radius: NDArray[np.float64],
     profile: Profile,
     noise: Noise,
     steps: int = STEPS,
-    size: np.ndarray | None = None,
+    size: NDArray[np.float64] | None = None,
 ) -> Beads:
     """Measure all beads near pixels uv (n, 2) at once, in so many Gauss-Newton steps.
 
@@ -151,11 +151,11 @@ def measure_beads(
 
 def lack_of_fit(
     light: Light,
-    uv: np.ndarray,
-    relative_radius: np.ndarray,
+    uv: NDArray[np.float64],
+    relative_radius: NDArray[np.float64],
     profile: Profile,
     noise: Noise,
-    size: np.ndarray,
+    size: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """Mean squared residuals (n,) over the noise of beads of some sizes (n,).
 
@@ -180,11 +180,11 @@ class _BeadFit(ShadowFit):
     def __init__(
         self,
         light: Light,
-        uv: np.ndarray,
-        relative_radius: np.ndarray,
+        uv: NDArray[np.float64],
+        relative_radius: NDArray[np.float64],
         profile: Profile,
         noise: Noise,
-        size: np.ndarray | None = None,
+        size: NDArray[np.float64] | None = None,
         reach_px: float = 0.0,
     ) -> None:
         self.stretch = np.asarray(relative_radius, dtype=float)
@@ -208,7 +208,7 @@ class _BeadFit(ShadowFit):
         self._set_groups(self._near(window + reach))
         self._read(light, own_reach + MARGIN_PX)
 
-    def _near(self, together: float) -> np.ndarray:
+    def _near(self, together: float) -> NDArray[np.int64]:
         """Neighbours (n, k) of the beads, -1 for none; notes the distances of the nearest."""
         n = len(self.uv)
         count = min(self.settings.neighbours + 1, n)
@@ -222,7 +222,7 @@ class _BeadFit(ShadowFit):
         self.distance = np.where(other, distance, np.inf).min(axis=1)
         return near[:, : count - 1]
 
-    def _read(self, light: Light, window_px: np.ndarray) -> None:
+    def _read(self, light: Light, window_px: NDArray[np.float64]) -> None:
         """Read the windows (n, m) around the beads, each with a radius (n,) of its own."""
         height, width = light.grey.shape
         places = self.middle[:, None] + self.offset
@@ -290,7 +290,9 @@ class _BeadFit(ShadowFit):
                 crossed[chosen] = True
         return crossed
 
-    def _crossing(self, rows: np.ndarray, members: np.ndarray) -> np.ndarray:
+    def _crossing(
+        self, rows: NDArray[np.int64], members: NDArray[np.int64]
+    ) -> NDArray[np.float64]:
         """Differences (g, m) for windows of beads (g,) and shadows of members (g, k) or -1."""
         grid = FineGrid(self.offset, self.profile.blur_px)
         axis = grid.axis
@@ -316,7 +318,9 @@ class _BeadFit(ShadowFit):
             out[number] = grid.blurred(image)
         return out - blurred
 
-    def _model(self, rows: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _model(
+        self, rows: NDArray[np.int64], near: NDArray[np.int64]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Light (g, m) and its derivatives (g, OWN + 3 k, m), of single precision."""
         everyone = np.concatenate([rows[:, None], near], axis=1)
         there = everyone >= 0
@@ -344,20 +348,26 @@ class _BeadFit(ShadowFit):
         np.multiply(by_shadow, shadow, out=jacobian[:, TERMS + 2 :: 3])
         return plane * relative, jacobian
 
-    def _disturbed(self, rows: np.ndarray, near: np.ndarray, final: bool) -> np.ndarray:
+    def _disturbed(
+        self, rows: NDArray[np.int64], near: NDArray[np.int64], final: bool
+    ) -> NDArray[np.bool_]:
         return self.disturbed[rows]
 
-    def _depth_sd(self, rows: np.ndarray, near: np.ndarray) -> float:
+    def _depth_sd(self, rows: NDArray[np.int64], near: NDArray[np.int64]) -> float:
         return DEPTH_SD
 
-    def _prior(self, rows: np.ndarray, near: np.ndarray) -> np.ndarray:
+    def _prior(self, rows: NDArray[np.int64], near: NDArray[np.int64]) -> NDArray[np.float64]:
         prior = super()._prior(rows, near)
         if self.plane_only:
             prior[:, 3:TERMS] = HELD
         return prior
 
     def _solve(
-        self, rows: np.ndarray, near: np.ndarray, equations: NormalEquations, final: bool
+        self,
+        rows: NDArray[np.int64],
+        near: NDArray[np.int64],
+        equations: NormalEquations,
+        final: bool,
     ) -> np.ndarray:
         if final:
             self._note_precision(rows, equations)
@@ -366,7 +376,7 @@ class _BeadFit(ShadowFit):
             self.counted[rows] = equations.valid
         return np.linalg.solve(equations.matrix, equations.right[..., None])[..., 0]
 
-    def absorbed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def absorbed(self) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float32]]:
         """Distances [px] of pixels from beads, absorbed shares there, and weights (n,)."""
         plane = self._plane(np.arange(len(self.uv)))
         away = self.middle[:, None] + self.offset - self.uv[:, None]
@@ -388,7 +398,7 @@ class _BeadFit(ShadowFit):
             sigma=np.hypot(beads.sigma, self._moved_by_radius()),
         )
 
-    def _noise(self, measured: np.ndarray) -> NDArray[np.float64]:
+    def _noise(self, measured: NDArray[np.bool_]) -> NDArray[np.float64]:
         """Lack of fit (n,) beyond what the windows of usual beads show alike.
 
         Where the shadow is not quite that of a sphere, residuals are alike in all windows. They
@@ -502,7 +512,9 @@ def first_imaging(
     return imaging
 
 
-def _typical(light: Light, shadows: Expected, size: np.ndarray, radius_px: float) -> Profile:
+def _typical(
+    light: Light, shadows: Expected, size: NDArray[np.float64], radius_px: float
+) -> Profile:
     """Return the profile of beads of about the typical size: a third, and all equals."""
     seen = np.flatnonzero(shadows.seen & shadows.alone)
     if len(seen) < FEW:
@@ -522,7 +534,7 @@ class _Sizes:
         self.shadows = shadows
         self.imaging = imaging
 
-    def are_equal(self, rows: np.ndarray) -> bool:
+    def are_equal(self, rows: NDArray[np.int64]) -> bool:
         """Return whether nearly all of some beads that nothing is beside have the same size.
 
         Another size counts where the common one fits as badly as if something were beside a bead.
@@ -540,7 +552,7 @@ class _Sizes:
         differs &= common > DISTURBED * own
         return bool(np.mean(differs[own < DISTURBED * np.median(own)]) <= OTHERS)
 
-    def best(self, rows: np.ndarray) -> NDArray[np.float64]:
+    def best(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
         """Sizes (m,) of best fit of some beads."""
         same = np.ones(len(rows))
         lack = self.lacks(rows, [one * same for one in SIZES])
@@ -554,7 +566,9 @@ class _Sizes:
         # Only where both neighbours fit worse, a parabola says more.
         return np.asarray(size * np.where(least == 1, FINER_STEPS[-1] ** vertex(*-lack), 1.0))
 
-    def lacks(self, rows: np.ndarray, sizes: Sequence[np.ndarray]) -> np.ndarray:
+    def lacks(
+        self, rows: NDArray[np.int64], sizes: Sequence[NDArray[np.float64]]
+    ) -> NDArray[np.float64]:
         """Lack of fit (k, m) of some beads (m,) with some sizes (m,) each.
 
         The shadows around them are fitted as well.

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import DataError
 from .codec import encode
@@ -28,7 +29,9 @@ TEXT_HEIGHT = 18
 QUALITY = 80  # of a small JPEG
 
 
-def draw_overlay(image: np.ndarray, extraction: Extraction | None, reason: str = '') -> np.ndarray:
+def draw_overlay(
+    image: np.ndarray, extraction: Extraction | None, reason: str = ''
+) -> NDArray[np.uint8]:
     """Draw a picture (h, w, 3) of uint8, blue, green, red, of an image (h, w).
 
     Green circles are observations, light blue ones overlapped observations, red crosses predicted
@@ -68,7 +71,7 @@ def draw_overlay(image: np.ndarray, extraction: Extraction | None, reason: str =
     return _labelled(picture, lines)
 
 
-def full_contrast(image: np.ndarray) -> np.ndarray:
+def full_contrast(image: np.ndarray) -> NDArray[np.uint8]:
     """Return an image (h, w) as uint8 of full contrast."""
     low, high = np.percentile(image[::4, ::4], [0.5, 99.8])
     return np.clip((image - low) * (255 / max(high - low, 1)), 0, 255).astype(np.uint8)
@@ -82,7 +85,7 @@ def small_jpeg(image: np.ndarray, largest_px: int) -> bytes:
     return encode(full_contrast(image), '.jpg', QUALITY)
 
 
-def _picture(image: np.ndarray) -> tuple[np.ndarray, int]:
+def _picture(image: np.ndarray) -> tuple[NDArray[np.uint8], int]:
     """Return an image as a picture of full contrast, small ones enlarged by a factor."""
     grey = full_contrast(image)
     factor = 2 if max(image.shape) <= 512 else 1
@@ -96,13 +99,17 @@ def _place(uv: np.ndarray, factor: int) -> tuple[int, int]:
     return int(u), int(v)
 
 
-def _square(picture: np.ndarray, uv: np.ndarray, factor: int, radius: float) -> None:
+def _square(
+    picture: NDArray[np.uint8], uv: NDArray[np.float64], factor: int, radius: float
+) -> None:
     u, v = _place(uv, factor)
     r = round(factor * radius)
     cv2.rectangle(picture, (u - r, v - r), (u + r, v + r), UNEXPLAINED, 1)
 
 
-def _labelled(picture: np.ndarray, lines: list[tuple[str, tuple[int, int, int]]]) -> np.ndarray:
+def _labelled(
+    picture: NDArray[np.uint8], lines: list[tuple[str, tuple[int, int, int]]]
+) -> NDArray[np.uint8]:
     """Return a picture with lines of text below it."""
     width = picture.shape[1]
     band = np.zeros((TEXT_HEIGHT * len(lines) + 8, width, 3), np.uint8)
@@ -119,7 +126,7 @@ RADIUS_PX = 7
 
 def draw_markers(
     image: np.ndarray, found: MarkerFrame, target_names: Mapping[int, str] | None = None
-) -> np.ndarray:
+) -> NDArray[np.uint8]:
     """Draw a picture (h, w, 3) of uint8, blue, green, red, of an image (h, w).
 
     Green circles are markers, light blue ones overlapped markers, yellow ones markers whose id
@@ -171,11 +178,11 @@ class BodyView:
 
     name: str
     status: str
-    markers: np.ndarray
-    axes: np.ndarray
+    markers: NDArray[np.float64]
+    axes: NDArray[np.float64]
 
 
-def draw_bodies(image: np.ndarray, title: str, bodies: Sequence[BodyView]) -> np.ndarray:
+def draw_bodies(image: np.ndarray, title: str, bodies: Sequence[BodyView]) -> NDArray[np.uint8]:
     """Draw a picture (h, w, 3) of uint8, blue, green, red, of an image (h, w), of even size.
 
     Circles are markers where the pose of their body puts them, green where markers were seen;
@@ -220,11 +227,11 @@ FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 def coverage_picture(
-    covered: np.ndarray,
+    covered: NDArray[np.bool_],
     image_size: tuple[int, int],
     lines: tuple[str, ...],
     areas: Sequence[int] = (),
-) -> np.ndarray:
+) -> NDArray[np.uint8]:
     """Draw covered cells green and missing ones grey, with lines of text below.
 
     covered: (rows, columns) of bool; image_size: (width, height) [px] of the image, whose shape

@@ -45,12 +45,12 @@ class Triples:
     products: NDArray[np.float64]
     #: (VOTERS, 3, t), neighbours of the first bead, the nearest first, in the axes of both sides
     #: and their cross product
-    voter: NDArray[np.float64]
+    voter: NDArray[np.float32]
     sides: NDArray[np.float64]  #: (t, 2, 3), from the first bead [mm]
     #: (t,), all voters lie in one plane, so that both solutions have the same votes
     planar: NDArray[np.bool_]
 
-    def of_beads(self, chosen: np.ndarray) -> Triples:
+    def of_beads(self, chosen: NDArray[np.bool_]) -> Triples:
         """Return the triples whose first bead is one of those that are chosen (n,)."""
         row = np.flatnonzero(chosen[self.bead[:, 0]])
         return Triples(
@@ -74,7 +74,7 @@ class LocalPose:
     vote: float  #: share of the voters that are found
 
 
-def triples_of(xyz: np.ndarray, neighbours: int) -> Triples:
+def triples_of(xyz: NDArray[np.float64], neighbours: int) -> Triples:
     """Return the triples of beads (n, 3) [mm] with so many neighbours each."""
     n = len(xyz)
     count = min(max(neighbours, VOTERS) + 1, n)
@@ -110,7 +110,9 @@ def triples_of(xyz: np.ndarray, neighbours: int) -> Triples:
     return Triples(bead, products, voter, np.stack([a, b], axis=1), planar)
 
 
-def nearby_map(uv: np.ndarray, image_size: tuple[int, int], reach_px: float) -> np.ndarray:
+def nearby_map(
+    uv: NDArray[np.float64], image_size: tuple[int, int], reach_px: float
+) -> NDArray[np.uint8]:
     """Mask (h, w) of uint8: 1 within a distance of a pixel (n, 2), else 0."""
     width, height = image_size
     empty = np.full((height, width), 255, dtype=np.uint8)
@@ -163,10 +165,10 @@ def local_poses(
 
 
 def _best(
-    parts: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]],
+    parts: Sequence[tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float64]]],
     triples: Triples,
-    centre: np.ndarray,
-    found: np.ndarray,
+    centre: NDArray[np.float32],
+    found: NDArray[np.uint8],
 ) -> list[LocalPose]:
     """Return the poses with the most votes of the solutions of several triples of an image."""
     triple, axes, scale = (np.concatenate(values) for values in zip(*parts))
@@ -202,8 +204,8 @@ def _best(
 
 
 def _solutions(
-    p: np.ndarray, q: np.ndarray, triples: Triples, scales: tuple[float, float]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    p: NDArray[np.float64], q: NDArray[np.float64], triples: Triples, scales: tuple[float, float]
+) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float64]]:
     """Rows of triples, image (m, 3, 2) of their axes, scales (m,), for sides p and q (2,) [px]."""
     pp = p @ p
     qq = q @ q
@@ -238,12 +240,12 @@ def _solutions(
 
 
 def _elected(
-    centre: np.ndarray,
-    axes: np.ndarray,
-    triple: np.ndarray,
-    voter: np.ndarray,
-    field: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
+    centre: NDArray[np.float32],
+    axes: NDArray[np.float32],
+    triple: NDArray[np.int64],
+    voter: NDArray[np.float32],
+    field: NDArray[np.uint8],
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Rows (k,) of the solutions that the nearest voters elect, and their votes."""
     some, nearest = FIRST_VOTERS
     hits, inside = _hits(centre, axes, triple, voter[:some], field)
@@ -255,12 +257,12 @@ def _elected(
 
 
 def _hits(
-    centre: np.ndarray,
-    axes: np.ndarray,
-    triple: np.ndarray,
-    voters: np.ndarray,
-    field: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
+    centre: NDArray[np.float32],
+    axes: NDArray[np.float32],
+    triple: NDArray[np.int64],
+    voters: NDArray[np.float32],
+    field: NDArray[np.uint8],
+) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
     """Numbers (m,) of voters (k, 3, t) that are found, and that are in the field of view.
 
     axes (m, 3, 2) are the images of the axes of triples (m,), field the map with its frame.
@@ -283,7 +285,7 @@ def _hits(
     return hits, inside
 
 
-def _votes(hits: np.ndarray, inside: np.ndarray, voters: int) -> np.ndarray:
+def _votes(hits: NDArray[np.int8], inside: NDArray[np.int8], voters: int) -> NDArray[np.float64]:
     """Shares (m,) of the voters that are found.
 
     A pose that puts its voters off the image must not win by the rest of them.
@@ -291,7 +293,9 @@ def _votes(hits: np.ndarray, inside: np.ndarray, voters: int) -> np.ndarray:
     return hits / np.maximum(inside, 0.6 * voters)
 
 
-def _rotation(sides: np.ndarray, axes: np.ndarray, scale: float) -> np.ndarray:
+def _rotation(
+    sides: NDArray[np.float64], axes: NDArray[np.floating], scale: float
+) -> NDArray[np.float64]:
     """Rotation (3, 3) that takes sides (2, 3) [mm] to their image (3, 2) [px]."""
     a, b = sides
     normal = np.cross(a, b)
@@ -347,7 +351,7 @@ def enough_seeds(
 
 
 def _chances(
-    xyz: np.ndarray, share: float, merged: float, neighbours: tuple[int, int]
+    xyz: NDArray[np.float64], share: float, merged: float, neighbours: tuple[int, int]
 ) -> NDArray[np.float64]:
     """Chances (v,) that something found is a bead with two neighbours that are its own.
 

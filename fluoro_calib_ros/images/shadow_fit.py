@@ -44,7 +44,7 @@ UNDISTURBED = 4.0  # times the median lack of fit, of a window without anything 
 ROBUST = 2.5  # residual of half weight [standard deviations of the noise]
 
 # Rows of beads (g,) and of their neighbours (g, k), -1 for none.
-Group = tuple[np.ndarray, np.ndarray]
+Group = tuple[NDArray[np.int64], NDArray[np.int64]]
 
 
 @dataclass(frozen=True)
@@ -87,13 +87,14 @@ class NormalEquations:
     matrix: NDArray[np.float64]  #: (g, u, u)
     plain: NDArray[np.float64]  #: (g, u, u), with a background that is no more than the polynomial
     right: NDArray[np.float64]  #: (g, u)
-    weighted: np.ndarray  #: (g, u, m), derivatives of the pixels times their weights
-    residual: np.ndarray  #: (g, m), of the pixels, over their standard deviations; 0 for invalid
-    valid: np.ndarray  #: (g, m)
+    weighted: NDArray[np.float32]  #: (g, u, m), derivatives of the pixels times their weights
+    #: (g, m), of the pixels, over their standard deviations; 0 for invalid
+    residual: NDArray[np.floating]
+    valid: NDArray[np.bool_]  #: (g, m)
 
 
 @lru_cache(maxsize=32)
-def window_offsets(radius_px: float) -> np.ndarray:
+def window_offsets(radius_px: float) -> NDArray[np.int64]:
     """Pixels (m, 2) of a round window, from its middle."""
     half = int(np.ceil(radius_px))
     axis = np.arange(-half, half + 1)
@@ -110,19 +111,19 @@ class FineGrid:
     (a,) are the coordinates of its points, from the middle of a window [px].
     """
 
-    def __init__(self, offset: np.ndarray, blur_px: float) -> None:
+    def __init__(self, offset: NDArray[np.int64], blur_px: float) -> None:
         half = int(np.abs(offset).max()) + int(np.ceil(3 * blur_px))
         self.axis = np.arange(-half * FINE, half * FINE + 1) / FINE
         self._sigma = float(FINE * np.sqrt(blur_px**2 + 1 / 12))
         self._column, self._row = (offset.T + half) * FINE
 
-    def blurred(self, light: np.ndarray) -> np.ndarray:
+    def blurred(self, light: NDArray[np.floating]) -> NDArray[np.floating]:
         """Light (a, a), blurred, in the pixels (m,) of a window."""
         smooth = cv2.GaussianBlur(light, (0, 0), self._sigma, borderType=cv2.BORDER_REPLICATE)
         return smooth[self._row, self._column]
 
 
-def _parts(rows: np.ndarray, near: np.ndarray, pixels: int) -> list[Group]:
+def _parts(rows: NDArray[np.int64], near: NDArray[np.int64], pixels: int) -> list[Group]:
     """Parts of a group, with windows of so many pixels, that are computed one after the other."""
     size = len(rows) * pixels * (OWN + 3 * near.shape[1])
     if size < AT_ONCE:
@@ -201,11 +202,11 @@ class ShadowFit(ABC):
         """Light (g, m) and its derivatives (g, OWN + 3 k, m): background, then u, v, depth."""
 
     @abstractmethod
-    def _disturbed(self, rows: np.ndarray, near: np.ndarray, final: bool) -> np.ndarray:
+    def _disturbed(self, rows: np.ndarray, near: np.ndarray, final: bool) -> NDArray[np.bool_]:
         """Windows (g,) in which pixels with large residuals count less."""
 
     @abstractmethod
-    def _depth_sd(self, rows: np.ndarray, near: np.ndarray) -> float | np.ndarray:
+    def _depth_sd(self, rows: np.ndarray, near: np.ndarray) -> float | NDArray[np.float64]:
         """Standard deviation of what is expected of the depths."""
 
     @abstractmethod
@@ -216,17 +217,17 @@ class ShadowFit(ABC):
 
     # ---- parts of the model
 
-    def _plane(self, rows: np.ndarray) -> np.ndarray:
+    def _plane(self, rows: NDArray[np.int64]) -> NDArray[np.float32]:
         """Light (g, m) in windows without beads."""
         background = self.background[rows].astype(DTYPE)
         plane = background @ self.basis.T
         return np.maximum(plane, 1e-3 * np.abs(background[:, :1]) + 1e-6)
 
-    def _crossing_in(self, rows: np.ndarray) -> np.ndarray:
+    def _crossing_in(self, rows: NDArray[np.int64]) -> np.ndarray:
         """What shadows that touch have together in windows, beyond the product of both."""
         return DTYPE(0) if self.crossing is None else self.crossing[rows]
 
-    def _jacobian(self, relative: np.ndarray, beads: int) -> np.ndarray:
+    def _jacobian(self, relative: NDArray[np.floating], beads: int) -> NDArray[np.float32]:
         """Derivatives (g, TERMS + 3 beads, m); only those by the background are set."""
         shape = (len(relative), TERMS + 3 * beads, len(self.offset))
         jacobian = np.empty(shape, dtype=DTYPE)
@@ -236,8 +237,8 @@ class ShadowFit(ABC):
     # ---- Gauss-Newton steps
 
     def _step(
-        self, rows: np.ndarray, near: np.ndarray, final: bool
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        self, rows: NDArray[np.int64], near: NDArray[np.int64], final: bool
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Return centres, depths and backgrounds of some beads after a step."""
         parts = _parts(rows, near, len(self.offset))
         usual = self.typical() if len(parts) > 1 else None
@@ -354,7 +355,7 @@ class ShadowFit(ABC):
             valid &= (grey > self.low) | (light >= grey)
         return valid
 
-    def _prior(self, rows: np.ndarray, near: np.ndarray) -> np.ndarray:
+    def _prior(self, rows: NDArray[np.int64], near: NDArray[np.int64]) -> NDArray[np.float64]:
         """Weights (g, OWN + 3 k) of what is expected of the unknowns."""
         prior = np.zeros((len(rows), OWN + 3 * near.shape[1]))
         prior[:, TERMS + 2] = self._depth_sd(rows, near) ** -2.0
@@ -372,7 +373,7 @@ class ShadowFit(ABC):
         half = len(values) // 2
         return float(values[half] if len(values) % 2 else values[half - 1 : half + 1].mean())
 
-    def _note_precision(self, rows: np.ndarray, equations: NormalEquations) -> np.ndarray:
+    def _note_precision(self, rows: NDArray[np.int64], equations: NormalEquations) -> np.ndarray:
         """Note standard deviations of centres; return the covariances (g, u, u)."""
         inverse = np.linalg.inv(equations.matrix)
         self.sigma[rows] = self.noise_sigma[rows] = _sd_of_centre(inverse)
@@ -389,7 +390,7 @@ class ShadowFit(ABC):
             self.inflation = _inflation(self._images(both), self.correlation)
         return inverse
 
-    def _images(self, windows: np.ndarray) -> np.ndarray:
+    def _images(self, windows: np.ndarray) -> NDArray[np.float64]:
         """Square images (g, w, w) of round windows (g, m)."""
         half = int(np.abs(self.offset).max())
         images = np.zeros((len(windows), 2 * half + 1, 2 * half + 1))
@@ -397,7 +398,7 @@ class ShadowFit(ABC):
         return images
 
     def _beads(
-        self, measured: np.ndarray, typical: float, noise: np.ndarray | None = None
+        self, measured: NDArray[np.bool_], typical: float, noise: NDArray[np.float64] | None = None
     ) -> Beads:
         """Return what was measured, given the usual lack of fit.
 
@@ -428,12 +429,12 @@ class ShadowFit(ABC):
         )
 
 
-def _within(values: np.ndarray, low: float, high: float) -> NDArray[np.float64]:
+def _within(values: NDArray[np.float64], low: float, high: float) -> NDArray[np.float64]:
     """Values between bounds: np.clip, in a third of its time for a few."""
     return np.minimum(np.maximum(values, low), high)
 
 
-def _inflation(influence: np.ndarray, correlation: np.ndarray) -> float:
+def _inflation(influence: NDArray[np.float64], correlation: NDArray[np.float64]) -> float:
     """Return the factor on variances for correlated noise; influence (g, w, w) of pixels."""
     # One tall image: what is filtered reaches into the rows of zeros between them.
     tall = np.pad(influence, ((0, 0), (0, len(correlation) // 2), (0, 0)))
@@ -443,7 +444,7 @@ def _inflation(influence: np.ndarray, correlation: np.ndarray) -> float:
     return max(float(np.sum(tall * spread)) / max(independent, 1e-300), 1.0)
 
 
-def _sd_of_centre(covariance: np.ndarray) -> np.ndarray:
+def _sd_of_centre(covariance: np.ndarray) -> NDArray[np.float64]:
     """Standard deviations (g,) of a coordinate of centres, from covariances (g, u, u)."""
     variance = 0.5 * (covariance[:, TERMS, TERMS] + covariance[:, TERMS + 1, TERMS + 1])
     return np.sqrt(np.maximum(variance, 0))
@@ -494,18 +495,22 @@ class Profile:
         attenuation = self.attenuation * size
         return Profile(self.radius_px * size, self.blur_px, attenuation, self.scatter)
 
-    def absorbed(self, squared: np.ndarray, size: np.ndarray | float = 1.0) -> np.ndarray:
+    def absorbed(
+        self, squared: NDArray[np.float64], size: NDArray[np.float64] | float = 1.0
+    ) -> NDArray[np.float64]:
         """Absorbed share of the light without blur at squared distances [px^2].
 
         size: relative ones, of which squared distances are multiples of their squares.
         """
         return 1 - np.exp(-self.attenuation * size * self.chord(squared))
 
-    def chord(self, squared: np.ndarray) -> np.ndarray:
+    def chord(self, squared: NDArray[np.float64]) -> NDArray[np.float64]:
         """Way through the bead in radii at squared distances [px^2] from its centre."""
         return 2 * np.sqrt(np.maximum(self.radius_px**2 - squared, 0)) / self.radius_px
 
-    def shadow(self, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def shadow(
+        self, distance: NDArray[np.floating]
+    ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
         """Absorbed share of the light at distances [px], and its derivative [1/px]."""
         return self._tables.shadow(distance)
 
@@ -526,8 +531,8 @@ class Shadows:
         self._by_dtype: dict[np.dtype, tuple[np.ndarray, ...]] = {}
 
     def shadow(
-        self, distance: np.ndarray, profile: np.ndarray | int = 0
-    ) -> tuple[np.ndarray, np.ndarray]:
+        self, distance: NDArray[np.floating], profile: NDArray[np.int64] | int = 0
+    ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
         """Absorbed share of the light at distances [px] (..., m), and its derivative [1/px].
 
         profile: (...,), which of the profiles.
@@ -548,7 +553,7 @@ class Shadows:
         derivative += slope.take(index)
         return absorbed, derivative
 
-    def _tables(self, dtype: np.dtype) -> tuple[np.ndarray, ...]:
+    def _tables(self, dtype: np.dtype) -> tuple[NDArray[np.floating], ...]:
         """Absorbed shares (n,), derivatives (n,), and the steps (n - 1,) to the next of each."""
         if dtype not in self._by_dtype:
             value, slope = self._table.astype(dtype)
@@ -584,18 +589,18 @@ class _Blurred:
         """Distances (n,) from the centre [px]."""
         return np.asarray(np.arange(self._size) * TABLE_STEP)
 
-    def row(self, quarter: np.ndarray, order: int = 0) -> NDArray[np.float64]:
+    def row(self, quarter: NDArray[np.float64], order: int = 0) -> NDArray[np.float64]:
         """Blur a quarter of an image across its rows; order of the derivative, 0 or 2."""
         row = quarter @ (self._across * self._derivative(self._axis, order))
         return np.concatenate([row[:0:-1], row])
 
-    def table(self, row: np.ndarray, order: int = 0) -> NDArray[np.float64]:
+    def table(self, row: NDArray[np.float64], order: int = 0) -> NDArray[np.float64]:
         """Blur a row along itself (n,); order of the derivative along it, 0 to 2."""
         kernels = self._gauss * self._derivative(self._away, order)
         blurred = np.array([np.convolve(row, one, mode='same') for one in kernels])
         return np.asarray(blurred[:, len(row) // 2 :].T.reshape(-1)[: self._size])
 
-    def _derivative(self, away: np.ndarray, order: int) -> np.ndarray:
+    def _derivative(self, away: np.ndarray, order: int) -> NDArray[np.float64]:
         """Derivative of a Gaussian over the Gaussian itself."""
         reduced = away / self.sigma
         if order == 0:
@@ -610,7 +615,7 @@ def _tabulated(profile: Profile) -> NDArray[np.float64]:
     return np.stack([blurred.table(row), blurred.table(row, 1)])
 
 
-def shadow_derivatives(profile: Profile, distance: np.ndarray) -> NDArray[np.float64]:
+def shadow_derivatives(profile: Profile, distance: NDArray[np.float64]) -> NDArray[np.float64]:
     """Derivatives (n, 3) of absorbed shares at distances (n,) [px].
 
     With respect to radius [1/px], blur [1/px] and attenuation. A wider blur is the diffusion of a
@@ -628,7 +633,10 @@ def shadow_derivatives(profile: Profile, distance: np.ndarray) -> NDArray[np.flo
 
 
 def fit_profile(
-    distance: np.ndarray, absorbed: np.ndarray, weight: np.ndarray, start: Profile
+    distance: NDArray[np.float64],
+    absorbed: NDArray[np.floating],
+    weight: NDArray[np.floating],
+    start: Profile,
 ) -> Profile:
     """Fit a profile to absorbed shares (n,) of the light at distances (n,) [px] from beads."""
     edges = np.arange(0, start.reach_px + 1, 0.25)
@@ -641,11 +649,11 @@ def fit_profile(
     place = moments[used] / total[used]
     root = np.sqrt(total[used])
 
-    def residual(unknowns: np.ndarray) -> np.ndarray:
+    def residual(unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
         value, _ = Profile(*unknowns[:3]).shadow(place)
         return root * ((1 - unknowns[3]) * value - mean)
 
-    def slopes(unknowns: np.ndarray) -> np.ndarray:
+    def slopes(unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
         profile = Profile(*unknowns[:3])
         by_shape = (1 - unknowns[3]) * shadow_derivatives(profile, place)
         return root[:, None] * np.column_stack([by_shape, -profile.shadow(place)[0]])

@@ -42,7 +42,7 @@ class Lens:
     certainty: float = 1.0  #: factor on the standard deviations of the coefficients
 
     @property
-    def centre(self) -> np.ndarray:
+    def centre(self) -> NDArray[np.float64]:
         """Middle of the image (2,) [px], where the principal point is assumed."""
         return (np.asarray(self.image_size, dtype=float) - 1) / 2
 
@@ -51,14 +51,14 @@ class Lens:
         """Half the larger side of the image."""
         return max(self.image_size) / 2
 
-    def expected(self, degree: int) -> np.ndarray:
+    def expected(self, degree: int) -> NDArray[np.float64]:
         """Expected coefficients (2, k) of a polynomial of some degree."""
         out = np.zeros((2, len(exponents(degree))))
         count = min(out.shape[1], self.coefficients.shape[1])
         out[:, :count] = self.coefficients[:, :count]
         return out
 
-    def deviations(self, degree: int) -> np.ndarray:
+    def deviations(self, degree: int) -> NDArray[np.float64]:
         """Standard deviations (k,) of the coefficients [px]."""
         order = exponents(degree).sum(axis=1)
         return self.certainty * self.half_px * np.asarray(PRIOR_SD)[order - 1]
@@ -76,7 +76,7 @@ class View:
     degree: int
 
     @property
-    def interior(self) -> np.ndarray:
+    def interior(self) -> NDArray[np.float64]:
         """Interior orientation (3,): xp, yp, c [px]."""
         return np.append(self.lens.centre, self.principal_distance_px)
 
@@ -87,14 +87,14 @@ class View:
         coefficients[:, :count] = self.coefficients[:, :count]
         return replace(self, coefficients=coefficients, degree=degree)
 
-    def project(self, xyz: np.ndarray) -> np.ndarray:
+    def project(self, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
         """Predicted pixels (n, 2) of points (n, 3) [mm]; NaN for one behind the source."""
         x = (xyz - self.position) @ self.rotation.T
         z = np.where(x[:, 2] > 1e-9, x[:, 2], np.nan)
         ideal = self.lens.centre + self.principal_distance_px * x[:, :2] / z[:, None]
         return ideal + self._distortion(ideal)[0]
 
-    def shadow_shift(self, xyz: np.ndarray, radius_px: np.ndarray) -> NDArray[np.float64]:
+    def shadow_shift(self, xyz: NDArray[np.float64], radius_px: np.ndarray) -> NDArray[np.float64]:
         """Places (n, 2) of the shadows of spheres less those of their projected centres [px].
 
         xyz (n, 3) [mm]; radius_px (n,). The rays that touch a sphere form a cone, whose section is
@@ -122,11 +122,13 @@ class View:
         along = np.einsum('nkc,kc->nk', away, normal)
         return np.asarray(2 / CONTOUR * along @ normal)
 
-    def depth(self, xyz: np.ndarray) -> np.ndarray:
+    def depth(self, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
         """Distances (n,) of points (n, 3) from the source along the axis [mm]."""
         return (xyz - self.position) @ self.rotation[2]
 
-    def _distortion(self, ideal: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _distortion(
+        self, ideal: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Distortion (n, 2) [px] of undistorted pixels (n, 2), derivatives (n, 2, 2), basis."""
         # Far outside of the image the polynomial stays what it is at one and a half of its size.
         x = np.clip((ideal - self.lens.centre) / self.lens.half_px, -1.5, 1.5)
@@ -135,12 +137,14 @@ class View:
         return basis @ self.coefficients.T, slope / self.lens.half_px, basis
 
 
-def exponents(degree: int) -> np.ndarray:
+def exponents(degree: int) -> NDArray[np.int64]:
     """Exponents (k, 2) of the monomials of degree 1 to `degree`, in the order of degree."""
     return np.array([(n - j, j) for n in range(1, degree + 1) for j in range(n + 1)])
 
 
-def _monomials(x: np.ndarray, degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _monomials(
+    x: NDArray[np.float64], degree: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Values (n, k) of the monomials at points (n, 2), and their derivatives."""
     powers = np.ones((degree + 1, *x.shape))
     for n in range(1, degree + 1):
@@ -214,7 +218,9 @@ def fit_view(
     return view, scale
 
 
-def _linearised(view: View, xyz: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _linearised(
+    view: View, xyz: NDArray[np.float64], uv: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Residuals (n, 2) and derivatives (n, 2, 7 + 2 k) of the predictions.
 
     The first unknowns are those of `project_with_jacobian`: position, rotation vector.
@@ -237,7 +243,7 @@ def _linearised(view: View, xyz: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray
     return uv - ideal - shift, jacobian
 
 
-def _moved(view: View, step: np.ndarray) -> View:
+def _moved(view: View, step: NDArray[np.float64]) -> View:
     """Return a view after a step of all unknowns."""
     turn = step[3:6]
     angle = float(np.linalg.norm(turn))

@@ -285,7 +285,7 @@ def _table(table: Mapping[str, Any], key: str) -> Mapping[str, Any]:
     return table[key]
 
 
-def _array(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+def _array(name: str, value: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
     """Return finite numbers of this shape. Raises DataError that names the key."""
 
     def is_array(part: Any, size: Sequence[int]) -> bool:
@@ -306,7 +306,9 @@ def _array(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
     return array
 
 
-def joint_definition(joint: Joint, landmarks: Mapping[str, Mapping[str, np.ndarray]]) -> str:
+def joint_definition(
+    joint: Joint, landmarks: Mapping[str, Mapping[str, NDArray[np.float64]]]
+) -> str:
     """Return the text of a joints.toml with one joint, from landmarks (3,) by body [mm]."""
     keys = {name: getattr(joint, name) for name in (*REQUIRED, 'side') if getattr(joint, name)}
     lines = ['[[joint]]', *(f'{key} = "{value}"' for key, value in keys.items())]

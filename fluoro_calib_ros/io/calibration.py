@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..correction.calibration_record import FIELDS, VERSION, Field
 from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
@@ -158,7 +159,7 @@ def _check_content(where: object, arrays: Mapping[str, Any]) -> None:
         )
 
 
-def _largest_heap(uv: np.ndarray) -> int:
+def _largest_heap(uv: NDArray[np.float64]) -> int:
     """Return the largest number of points (n, 2) in one cell: no search tree can divide them."""
     if not len(uv):
         return 0

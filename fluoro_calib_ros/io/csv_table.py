@@ -51,18 +51,18 @@ class Block:
         cells = list(map(str.strip, map(itemgetter(self.header.index(name)), self.rows)))
         return list(map(_from_text, cells)) if "'" in ''.join(cells) else cells
 
-    def floats(self, name: str) -> np.ndarray:
+    def floats(self, name: str) -> NDArray[np.float64]:
         """Return a column (n,) of finite numbers. Raises DataError."""
         values = np.array(self._convert(name, self.strings(name), float, 'a number'))
         self.require(name, np.isfinite(values), 'not a finite number')
         return values
 
-    def floats_or_nan(self, name: str) -> np.ndarray:
+    def floats_or_nan(self, name: str) -> NDArray[np.float64]:
         """Return a column (n,) of numbers, NaN for an empty cell. Raises DataError."""
         cells = [cell or 'nan' for cell in self.strings(name)]
         return np.array(self._convert(name, cells, float, 'a number'))
 
-    def ids(self, name: str) -> np.ndarray:
+    def ids(self, name: str) -> NDArray[np.int64]:
         """Return a column (n,) of whole numbers from 0 to MAX_ID. Raises DataError."""
         values = self._convert(name, self.strings(name), int, 'a whole number')
         if len(values) and not 0 <= min(values) <= max(values) <= MAX_ID:
@@ -70,7 +70,7 @@ class Block:
             self.require(name, in_range, f'not between 0 and {MAX_ID}')
         return np.array(values, dtype=np.int64)
 
-    def require(self, name: str, valid: np.ndarray, cause: str) -> None:
+    def require(self, name: str, valid: NDArray[np.bool_], cause: str) -> None:
         """Raise DataError for the first row of a column that is not valid (n,)."""
         if not np.all(valid):
             index = int(np.argmin(valid))
@@ -281,7 +281,7 @@ class NamedColumn:
         self._codes: dict[str, int] | None = None
         self._is_first = True
 
-    def read(self, block: Block) -> np.ndarray:
+    def read(self, block: Block) -> NDArray[np.int64]:
         """Return ids (n,), or codes of names in the order of occurrence. Raises DataError."""
         if self._is_first:
             self._is_first = False
@@ -303,7 +303,7 @@ class NamedColumn:
         ids = number_names(self._codes, self._known)
         return {name: ids[name] for name in self._codes}
 
-    def numbers(self, values: np.ndarray) -> np.ndarray:
+    def numbers(self, values: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the ids of what `read` returned, after all blocks were read."""
         ids = self.ids()
         return np.array(list(ids.values()), dtype=np.int64)[values] if ids else values

@@ -361,7 +361,7 @@ FLAGS = ('overlapped', 'doubtful')
 
 def write_extracted(
     path: PathLike,
-    frames: Sequence[tuple[Frame, Sequence[np.ndarray]]],
+    frames: Sequence[tuple[Frame, Sequence[NDArray[np.bool_]]]],
     target_names: Mapping[int, str],
     flags: tuple[str, ...] = FLAGS,
 ) -> None:
@@ -385,7 +385,7 @@ def _angle_cell(frame: Frame) -> float:
 def _rows(
     path: PathLike,
     frame: Frame,
-    flags: Sequence[np.ndarray],
+    flags: Sequence[NDArray[np.bool_]],
     target_names: Mapping[int, str],
 ) -> Iterator[list[object]]:
     """Yield the rows of a frame, with flags (n,) as the last columns."""
@@ -414,7 +414,7 @@ class PointsFile:
     uv: NDArray[np.float64]  #: (n, 2) [px], NaN where a cell is empty or nan
     #: (n,) [px], NaN where a cell is empty; None without such a column
     sigma: NDArray[np.float64] | None
-    fluoroscope: np.ndarray | None  #: (n,), None without such a column
+    fluoroscope: NDArray[np.str_] | None  #: (n,), None without such a column
     #: (n,), of the C-arm [rad], NaN where a cell is empty; None without such a column
     angle: NDArray[np.float64] | None = None
 
@@ -491,17 +491,17 @@ def read_points(path: PathLike, known: Mapping[str, str] | None = None) -> Point
     return points
 
 
-def _fluoroscopes(block: Block, known: Mapping[str, str]) -> np.ndarray:
+def _fluoroscopes(block: Block, known: Mapping[str, str]) -> NDArray[np.str_]:
     return np.array([known.get(name, name) for name in block.strings('fluoroscope')])
 
 
-def _sigma(block: Block) -> np.ndarray:
+def _sigma(block: Block) -> NDArray[np.float64]:
     sigma = block.floats_or_nan('sigma')
     block.require('sigma', np.isnan(sigma) | is_positive(sigma), 'not a finite number above 0')
     return sigma
 
 
-def _image_angle(block: Block) -> np.ndarray:
+def _image_angle(block: Block) -> NDArray[np.float64]:
     angle = np.radians(block.floats_or_nan(ANGLE))
     block.require(ANGLE, np.isnan(angle) | (np.abs(angle) <= MAX_ANGLE), 'not an angle')
     return angle

@@ -336,7 +336,7 @@ def _image(file: BinaryIO, offset: int, header: CineHeader) -> np.ndarray:
     return np.ascontiguousarray(image, np.uint16 if header.bits == 16 else np.uint8)
 
 
-def _unpacked_10(rows: np.ndarray, width: int) -> np.ndarray:
+def _unpacked_10(rows: NDArray[np.uint8], width: int) -> np.ndarray:
     """Return pixels (h, w) of rows in which four pixels take five bytes, highest bits first."""
     bits = np.unpackbits(rows, axis=1)[:, : 10 * width].reshape(len(rows), width, 10)
     padded = np.zeros((len(rows), width, 16), np.uint8)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..bodies.body import AXIS_MM, STATUS_NAMES, Body, BodyPoses, check_bodies, solvable_bodies
 from ..bodies.butterworth import filtered_poses
@@ -350,7 +351,7 @@ class IntersectedRecording:
     """The exposures of a recording, and what is known of it."""
 
     exposures: list[IntersectedExposure]
-    sides: np.ndarray  #: (F,) longer sides of the images [px]
+    sides: NDArray[np.float64]  #: (F,) longer sides of the images [px]
     unpaired: Mapping[str, int]  #: frames without partner, by fluoroscope
     drift: DriftVerdict  #: what the drift watch says
     noise: Finding | None  #: on image points without sigma, where they are not as precise as beads
@@ -404,7 +405,9 @@ def estimated_shapes(
     return [estimate_shape(body, places_of(body, ids, points)) for body in bodies]
 
 
-def _split(exposure: IntersectedViews, sides: np.ndarray) -> dict[str, np.ndarray]:
+def _split(
+    exposure: IntersectedViews, sides: NDArray[np.float64]
+) -> dict[str, NDArray[np.float64]]:
     """Points of an exposure with the covariances of noise, and of the corrections.
 
     sides (F,): longer sides of the images [px].

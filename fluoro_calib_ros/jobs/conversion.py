@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..correction.angle_field import note_on_angles
 from ..correction.base import CorrectionStatus
@@ -348,7 +349,7 @@ def stations_of(path: Path) -> Iterable[Station]:
         raise DataError(f'{path}: this is not the result of a calibration') from None
 
 
-Poses = Mapping[str, tuple[np.ndarray, np.ndarray]]
+Poses = Mapping[str, tuple[NDArray[np.float64], NDArray[np.float64]]]
 
 
 def _poses(
@@ -381,7 +382,7 @@ def _camera(calibration: FluoroscopeCalibration, poses: Poses) -> Camera:
     return camera_at(name, matrix, calibration.image_size, *poses[name])
 
 
-def _lookup(calibration: FluoroscopeCalibration) -> np.ndarray:
+def _lookup(calibration: FluoroscopeCalibration) -> NDArray[np.float32]:
     """Return the observed pixel (2, h, w) of every corrected one, NaN outside the support."""
     corrector = ImageCorrector(calibration)
     return np.where(corrector.status == CorrectionStatus.OK, corrector.source, np.float32(np.nan))

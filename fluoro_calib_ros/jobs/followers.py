@@ -63,7 +63,7 @@ class Observations:
     #: ids of earlier images of the fluoroscope that turned out to be wrong with this one
     retracted: tuple[Retraction, ...] = ()
     #: (h, w, 3), overlay of uint8, blue, green, red, if it was asked for
-    picture: np.ndarray | None = None
+    picture: NDArray[np.uint8] | None = None
     seconds: float = 0.0
 
     @property

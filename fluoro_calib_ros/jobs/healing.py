@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..bodies.body import Body, check_bodies, robust_pose, solvable_bodies
 from ..bodies.shapes import LearnedShapes
@@ -282,7 +283,7 @@ class _Rig:
         observed = ObservedBodies(uv, pixel, noise, fixed.sum(axis=0) / count, seen)
         return observed, self._first_poses(uv, sigma)
 
-    def _first_poses(self, uv: np.ndarray, sigma: np.ndarray) -> Poses:
+    def _first_poses(self, uv: NDArray[np.float64], sigma: NDArray[np.float64]) -> Poses:
         """Return poses that take the bodies to their markers in space, which may be false."""
         shape = uv.shape[:3]
         views = uv.shape[3]
@@ -359,7 +360,7 @@ class _Rig:
         return Diagnostician(self.adjustment(), shape_scale).diagnose(observed, poses, OF_RIG)
 
 
-def _left_out(changes: Sequence[Change], target_id: np.ndarray) -> np.ndarray:
+def _left_out(changes: Sequence[Change], target_id: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Return the markers (B, M) that have changed, or whose bodies have.
 
     Where no body would remain, they are kept: a rig that changes during the recording makes all
@@ -372,14 +373,14 @@ def _left_out(changes: Sequence[Change], target_id: np.ndarray) -> np.ndarray:
     return out & _solvable(target_id, out).any()
 
 
-def _solvable(target_id: np.ndarray, left_out: np.ndarray) -> np.ndarray:
+def _solvable(target_id: NDArray[np.int64], left_out: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return which bodies (B,) have three markers that are not left out (B, M)."""
     return np.asarray(((target_id >= 0) & ~left_out).sum(axis=1) >= 3)
 
 
 def _corrected(
-    target_id: np.ndarray, frame: Frame, calibration: FluoroscopeCalibration
-) -> tuple[np.ndarray, np.ndarray]:
+    target_id: NDArray[np.int64], frame: Frame, calibration: FluoroscopeCalibration
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Rows (n,) of the markers of a frame in target_id, and their values (n, 6).
 
     Image points beyond the calibrated area are left out.

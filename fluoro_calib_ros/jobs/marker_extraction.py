@@ -18,6 +18,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from ..bodies.body import Body
@@ -107,7 +108,7 @@ class MarkerOutcome:
     before: Mapping[str, int]
     notes: tuple[str, ...] = ()  #: what a user has to know about the angles
 
-    def frames(self) -> list[tuple[Frame, np.ndarray, np.ndarray]]:
+    def frames(self) -> list[tuple[Frame, NDArray[np.bool_], NDArray[np.bool_]]]:
         """Observations, with flags (n,) of overlapped markers and of doubtful ids."""
         out = []
         for name, results in self.results.items():

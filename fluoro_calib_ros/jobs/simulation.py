@@ -88,7 +88,10 @@ def write_bag(path: PathLike, frames: Frames) -> None:
 
 
 def _rows(
-    begin: Sequence[object], ids: Iterable[object], values: Iterable[np.ndarray], digits: int
+    begin: Sequence[object],
+    ids: Iterable[object],
+    values: Iterable[NDArray[np.float64]],
+    digits: int,
 ) -> Iterator[list[object]]:
     """Yield rows that begin alike, with an id and numbers of so many digits."""
     for identity, numbers in zip(ids, values):

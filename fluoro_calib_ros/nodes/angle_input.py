@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
 
 from ..exposures.angles import AngleOptions
@@ -137,7 +138,7 @@ class AngleInput:
         self._logger.warning(reason)
 
 
-def beyond_text(angle: float, calibrated: np.ndarray) -> str:
+def beyond_text(angle: float, calibrated: NDArray[np.float64]) -> str:
     """Return a sentence about an angle [rad] that is far from all calibrated ones."""
     nearest = calibrated[np.abs(np.angle(np.exp(1j * (calibrated - angle)))).argmin()]
     return (

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from builtin_interfaces.msg import Time
 from fluoro_calib_msgs.msg import CorrectedObservations, TargetObservations
+from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo
 
 from ..correction.base import CorrectionStatus
@@ -169,7 +170,7 @@ class CorrectionNode(CorrectingNode):
 
     @staticmethod
     def _note_invalid_points(
-        stream: ObservationStream, frame: ObservedFrame, status: np.ndarray
+        stream: ObservationStream, frame: ObservedFrame, status: NDArray[np.uint8]
     ) -> None:
         """Count and log points of a published frame that are not on the image."""
         where = f'fluoroscope {stream.name}, frame {frame.frame_number}'

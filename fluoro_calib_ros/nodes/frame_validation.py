@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..exposures.frame import image_size_error, length_error, repeated_target_error, sigma_error
@@ -60,7 +61,7 @@ class FrameValidator:
 
     def validated_arrays(
         self, frame: ObservedFrame, calibration: FluoroscopeCalibration
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64] | None]:
         """Return u, v (n,) and sigma (n,) or None of a frame that a calibration can correct.
 
         Raises Refused for a frame that cannot be corrected as a whole.
@@ -97,7 +98,7 @@ class FrameValidator:
         )
 
 
-def _target_ids(frame: ObservedFrame) -> np.ndarray:
+def _target_ids(frame: ObservedFrame) -> NDArray[np.uint32]:
     return np.frombuffer(frame.target_id, np.uint32)
 
 

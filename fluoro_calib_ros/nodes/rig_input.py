@@ -102,7 +102,7 @@ class RigInput:
         """The last one that has arrived."""
         return next(reversed(self._rigs.values()), None)
 
-    def camera_of(self, name: str) -> tuple[str, np.ndarray | None]:
+    def camera_of(self, name: str) -> tuple[str, NDArray[np.float64] | None]:
         """Return optical frame and interior orientation (3,) of the newest one, or '' and None."""
         rig = self.newest
         if rig is None:

@@ -16,6 +16,7 @@ from functools import partial
 import numpy as np
 import rclpy
 from fluoro_calib_msgs.msg import TargetObservations
+from numpy.typing import NDArray
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
@@ -268,7 +269,7 @@ class SimulatorNode(ParameterNode):
                 frame_id=f'{fluoroscope.name}_optical',
             )
 
-    def _pose(self, number: int) -> tuple[np.ndarray, np.ndarray]:
+    def _pose(self, number: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the present pose: standing, or on the way to the next one."""
         stand_s = self._settings.stand_time
         move_s = self._settings.move_time

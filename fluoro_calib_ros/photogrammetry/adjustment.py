@@ -79,7 +79,7 @@ class Adjustment:
     exposure: NDArray[np.int64]  #: (N,) exposures of the image points
 
     @cached_property
-    def inliers(self) -> np.ndarray:
+    def inliers(self) -> NDArray[np.bool_]:
         """True (N,) for the image points in the core of the noise distribution.
 
         An exposure whose image points scatter more than those of others has a wider limit.
@@ -90,8 +90,8 @@ class Adjustment:
 
 
 def residuals_and_q(
-    network: Network, parameters: Parameters, correction: np.ndarray | float, noise: Noise
-) -> tuple[np.ndarray, np.ndarray]:
+    network: Network, parameters: Parameters, correction: NDArray[np.float64] | float, noise: Noise
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Residuals (N, 2) [px] and normalised squared residuals (N,).
 
     Both are NaN where a point is behind the source.
@@ -101,7 +101,9 @@ def residuals_and_q(
     return r, np.sum(r * r, axis=1) / (noise.scale * network.sigma) ** 2
 
 
-def total_cost(network: Network, parameters: Parameters, q: np.ndarray, noise: Noise) -> float:
+def total_cost(
+    network: Network, parameters: Parameters, q: NDArray[np.float64], noise: Noise
+) -> float:
     """F: negative log-likelihood of image points, surveyed coordinates, constraints and priors.
 
     Infinite where a point is behind the source. Constants of Gaussian terms are left out.
@@ -134,8 +136,8 @@ class _Iterate:
     """Parameters of one iteration with their residuals, normalised squares and cost."""
 
     parameters: Parameters
-    residuals: np.ndarray
-    q: np.ndarray
+    residuals: NDArray[np.float64]
+    q: NDArray[np.float64]
     cost: float
 
 
@@ -152,8 +154,8 @@ class _Solver:
 class _Step:
     """A step as `BorderedFactor.solve` gives it, and the decrease of F that it predicts."""
 
-    x_blocks: np.ndarray
-    x_rest: np.ndarray
+    x_blocks: NDArray[np.float64]
+    x_rest: NDArray[np.float64]
     predicted: float
 
 
@@ -162,7 +164,7 @@ class _Problem:
     """What an adjustment minimises: the cost of a network for a correction and a noise model."""
 
     network: Network
-    correction: np.ndarray
+    correction: NDArray[np.float64]
     noise: Noise
     elimination: Elimination
 
@@ -376,7 +378,7 @@ def adjust(
 def adjust_with_matrix(
     network: Network,
     start: Parameters,
-    correction: np.ndarray | None = None,
+    correction: NDArray[np.float64] | None = None,
     noise: Noise = DEFAULT_NOISE,
     options: SolverOptions = DEFAULT_OPTIONS,
 ) -> tuple[Adjustment, FactorizedNormalMatrix | None]:

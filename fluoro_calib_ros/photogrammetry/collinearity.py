@@ -23,7 +23,7 @@ from .rotations import cross_matrix, mirror_lower
 
 
 def to_sensor(
-    rotation: np.ndarray, position: np.ndarray, points: np.ndarray
+    rotation: NDArray[np.float64], position: NDArray[np.float64], points: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Points in the sensor frame (n, 3) [mm].
 
@@ -37,7 +37,7 @@ def project(
     position: NDArray[np.float64],
     points: NDArray[np.float64],
     interior: NDArray[np.float64],
-) -> np.ndarray:
+) -> NDArray[np.float64]:
     """Image points (n, 2) [px] of object points; NaN for a point that is not before the source.
 
     Parameters
@@ -58,8 +58,11 @@ def project(
 
 
 def project_with_jacobian(
-    rotation: np.ndarray, position: np.ndarray, points: np.ndarray, interior: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    rotation: NDArray[np.float64],
+    position: NDArray[np.float64],
+    points: NDArray[np.float64],
+    interior: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Image points and their derivatives; parameters as in `project`.
 
     Returns
@@ -112,15 +115,15 @@ class GroupedFunctions:
     before.
     """
 
-    values: np.ndarray
-    group: np.ndarray
+    values: NDArray[np.float64]
+    group: NDArray[np.int64]
 
     @property
     def count(self) -> int:
         """Number of coefficients."""
         return (int(self.group[-1]) + 1) * self.values.shape[2]
 
-    def split(self, of_coefficients: np.ndarray) -> np.ndarray:
+    def split(self, of_coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
         """Values (..., count) of the coefficients as (..., groups, t)."""
         return of_coefficients.reshape(*of_coefficients.shape[:-1], -1, self.values.shape[2])
 
@@ -129,9 +132,9 @@ class GroupedFunctions:
 class _Ordered:
     """Functions (N, k) of the image points in the order of an index, and where it changes."""
 
-    index: np.ndarray
-    order: np.ndarray | slice
-    functions: np.ndarray
+    index: NDArray[np.int64]
+    order: NDArray[np.int64] | slice
+    functions: NDArray[np.float64]
     groups: list[tuple[int, int, int]]
 
 
@@ -159,18 +162,18 @@ class AdditionalParameters:
         return self._common + (0 if self.own is None else self.own.count)
 
     @cached_property
-    def _contiguous(self) -> np.ndarray:
+    def _contiguous(self) -> NDArray[np.float64]:
         """Functions (2, N, p) of u and v: strided products take four times as long."""
         return np.ascontiguousarray(self.functions.transpose(1, 0, 2))
 
-    def _by_axis(self) -> list[tuple[np.ndarray, slice]]:
+    def _by_axis(self) -> list[tuple[NDArray[np.float64], slice]]:
         """Functions (N, p or k) of u and of v, and the columns of their coefficients."""
         if self.functions.ndim == 3:
             return [(self._contiguous[axis], ALL) for axis in (0, 1)]
         k = self.functions.shape[1]
         return [(self.functions, slice(axis * k, (axis + 1) * k)) for axis in (0, 1)]
 
-    def correction(self, coefficients: np.ndarray) -> NDArray[np.float64]:
+    def correction(self, coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
         """Corrections (N, 2) [px] for coefficients (P,)."""
         common = coefficients[: self._common]
         out = np.stack([f @ common[columns] for f, columns in self._by_axis()], axis=1)
@@ -179,7 +182,7 @@ class AdditionalParameters:
             out += (self.own.values @ of_point[:, :, None])[:, :, 0]
         return out
 
-    def normal_matrix(self, weight: np.ndarray) -> np.ndarray:
+    def normal_matrix(self, weight: NDArray[np.float64]) -> NDArray[np.float64]:
         """Normal matrix (P, P) of the coefficients for weights (N,) of the image points."""
         out = np.zeros((self.count, self.count))
         if self.functions.ndim == 2:
@@ -199,7 +202,9 @@ class AdditionalParameters:
             lower = blas.dsyrk(1.0, weighted.T, beta=1.0, c=lower, lower=1, overwrite_c=1)
         return mirror_lower(lower)
 
-    def _add_own(self, own: GroupedFunctions, weight: np.ndarray, out: np.ndarray) -> None:
+    def _add_own(
+        self, own: GroupedFunctions, weight: NDArray[np.float64], out: NDArray[np.float64]
+    ) -> None:
         """Fill in the rows and columns of functions of groups in a normal matrix."""
         weighted = weight[:, None, None] * own.values
         groups = int(own.group[-1]) + 1
@@ -208,7 +213,7 @@ class AdditionalParameters:
         out[self._common :] = rows
         out[: self._common, self._common :] = rows[:, : self._common].T
 
-    def right_side(self, values: np.ndarray) -> np.ndarray:
+    def right_side(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Sum (P,) over the image points of the functions times values (N, 2)."""
         out = np.zeros(self.count)
         for axis, (f, columns) in enumerate(self._by_axis()):
@@ -218,7 +223,7 @@ class AdditionalParameters:
             np.add.at(self.own.split(out[self._common :]), self.own.group, of_point)
         return out
 
-    def _ordered(self, index: np.ndarray) -> _Ordered:
+    def _ordered(self, index: NDArray[np.int64]) -> _Ordered:
         """Functions (N, k) in the order of an index (N,); the last unordered one is kept."""
         kept: _Ordered | None = self.__dict__.get('_kept')
         if kept is not None and np.array_equal(kept.index, index):
@@ -231,7 +236,9 @@ class AdditionalParameters:
         self.__dict__['_kept'] = made
         return made
 
-    def grouped_products(self, index: np.ndarray, count: int, a: np.ndarray) -> np.ndarray:
+    def grouped_products(
+        self, index: NDArray[np.int64], count: int, a: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
         """Sums (count, q, P) of a^T times functions over image points with the same index.
 
         index (N,) from 0 to count - 1; a (N, 2, q) weighted derivatives by other unknowns.
@@ -266,7 +273,9 @@ class AdditionalParameters:
             out[:, :, self._common :] = sums.transpose(0, 2, 1, 3).reshape(count, q, -1)
         return out
 
-    def correction_covariance(self, covariance: np.ndarray, part: slice = ALL) -> np.ndarray:
+    def correction_covariance(
+        self, covariance: NDArray[np.float64], part: slice = ALL
+    ) -> NDArray[np.float64]:
         """Covariances (n, 2, 2) [px^2] of the corrections at image points `part`.
 
         covariance (P, P) of the coefficients.
@@ -283,7 +292,7 @@ class AdditionalParameters:
         return out
 
     def correction_variance(
-        self, covariance: np.ndarray, part: slice = ALL
+        self, covariance: NDArray[np.float64], part: slice = ALL
     ) -> NDArray[np.float64]:
         """Traces (n,) [px^2] of `correction_covariance`, for half to a third of its work."""
         common = covariance[: self._common, : self._common]
@@ -301,8 +310,8 @@ class AdditionalParameters:
         return out
 
     def _own_covariance(
-        self, own: GroupedFunctions, covariance: np.ndarray, part: slice
-    ) -> np.ndarray:
+        self, own: GroupedFunctions, covariance: NDArray[np.float64], part: slice
+    ) -> NDArray[np.float64]:
         """What functions of groups add (n, 2, 2) to the covariances of the corrections."""
         values = own.values[part]
         group = own.group[part]
@@ -318,8 +327,8 @@ class AdditionalParameters:
         )
 
     def cross_covariance(
-        self, covariance: np.ndarray, index: np.ndarray, part: slice = ALL
-    ) -> np.ndarray:
+        self, covariance: NDArray[np.float64], index: NDArray[np.int64], part: slice = ALL
+    ) -> NDArray[np.float64]:
         """Covariances (n, q, 2) of other unknowns with the corrections at image points `part`.
 
         covariance (k, q, P) of k sets of other unknowns with the coefficients; index (n,) of the
@@ -333,8 +342,8 @@ class AdditionalParameters:
         return out
 
     def _common_cross_covariance(
-        self, covariance: np.ndarray, index: np.ndarray, part: slice
-    ) -> np.ndarray:
+        self, covariance: NDArray[np.float64], index: NDArray[np.int64], part: slice
+    ) -> NDArray[np.float64]:
         """Covariances (n, q, 2) as cross_covariance, of the common functions alone."""
         sets, q, _ = covariance.shape
         n = len(index)
@@ -360,7 +369,7 @@ class AdditionalParameters:
         return out
 
 
-def _groups(index: np.ndarray) -> list[tuple[int, int, int]]:
+def _groups(index: NDArray[np.int64]) -> list[tuple[int, int, int]]:
     """First row, row after the last, and value of every value of an ascending index (n,)."""
     starts = np.flatnonzero(np.diff(index, prepend=-1)).tolist()
     return list(zip(starts, [*starts[1:], len(index)], index[starts].tolist()))

@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import eigh
 
 from ..findings import Finding, Kind, Place, first_few
@@ -105,7 +106,9 @@ def high_correlations(
     )
 
 
-def _correlations(covariance: np.ndarray, row_sd: np.ndarray, column_sd: np.ndarray) -> np.ndarray:
+def _correlations(
+    covariance: NDArray[np.float64], row_sd: NDArray[np.float64], column_sd: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Correlations of covariances (r, c); zero where an unknown is fixed."""
     with np.errstate(divide='ignore', invalid='ignore'):
         out = covariance / np.outer(row_sd, column_sd)
@@ -113,8 +116,8 @@ def _correlations(covariance: np.ndarray, row_sd: np.ndarray, column_sd: np.ndar
 
 
 def _turned_to_sensor(
-    parameters: Parameters, exterior: np.ndarray, mixed: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+    parameters: Parameters, exterior: NDArray[np.float64], mixed: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Covariances (m, 6, 6) and (m, 6, G) of exposures with the source in the sensor frame."""
     turn = np.tile(np.eye(EXTERIOR_SIZE), (len(exterior), 1, 1))
     turn[:, :3, :3] = parameters.rotation
@@ -169,7 +172,7 @@ def undetermined_interiors(
 
 def _distance_correlations(
     network: Network, parameters: Parameters, precision: Precision
-) -> np.ndarray:
+) -> NDArray[np.float64]:
     """Smallest correlation (F,) of c with the distance of the source along its axis.
 
     The smallest is taken over the exposures of each fluoroscope.
@@ -192,7 +195,7 @@ def _flatness_remark(network: Network) -> str:
     return '; the beads lie nearly in one plane' if flat else ''
 
 
-def reduced_normal_matrix(network: Network, parameters: Parameters) -> np.ndarray:
+def reduced_normal_matrix(network: Network, parameters: Parameters) -> NDArray[np.float64]:
     """Normal matrix of the exposures and free global unknowns, object points eliminated.
 
     Shape (6m + G, 6m + G), with the sources in the sensor frame and all weights equal. It may be

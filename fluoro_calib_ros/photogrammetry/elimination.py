@@ -43,7 +43,9 @@ class BorderedSystem:
         rest.ravel()[:: len(rest) + 1] *= 1 + mu
         return replace(self, blocks=blocks, rest=rest)
 
-    def predicted_decrease(self, x_blocks: np.ndarray, x_rest: np.ndarray, mu: float) -> float:
+    def predicted_decrease(
+        self, x_blocks: NDArray[np.float64], x_rest: NDArray[np.float64], mu: float
+    ) -> float:
         """Decrease of the cost that a step damped by mu makes in the linearised problem.
 
         Not finite where the step is too large for it.
@@ -90,8 +92,8 @@ class BorderedFactor:
     schur: NDArray[np.float64]
 
     def solve(
-        self, block_right: np.ndarray, rest_right: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+        self, block_right: NDArray[np.float64], rest_right: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Solutions x_b (k, s, d) and x_r (q, d) for right sides (k, s, d) and (q, d)."""
         columns = block_right.shape[2]
         half = (self.inverse @ block_right).reshape(-1, columns)
@@ -137,11 +139,11 @@ class CovarianceBlocks:
     eg: NDArray[np.float64]  #: (m, 6, G)
     pg: NDArray[np.float64]  #: (n, 3, G)
     #: pe(e, p): blocks (k, 3, 6) of object points p (k,) with exposures e (k,)
-    pe: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    pe: Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.float64]]
     #: between(e, f): blocks (k, 6, 6) of exposures e (k,) with exposures f (k,)
-    between: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    between: Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.float64]]
     #: points_between(p, q): blocks (k, 3, 3) of object points p (k,) with object points q (k,)
-    points_between: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    points_between: Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.float64]]
 
 
 class Elimination(ABC):
@@ -164,27 +166,34 @@ class Elimination(ABC):
         """
 
     @abstractmethod
-    def right_sides(self, right: UnknownVector) -> tuple[np.ndarray, np.ndarray]:
+    def right_sides(self, right: UnknownVector) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Right sides (k, s) and (q,) of the eliminated and the remaining unknowns."""
 
     @abstractmethod
-    def to_unknowns(self, x_blocks: np.ndarray, x_rest: np.ndarray) -> UnknownVector:
+    def to_unknowns(
+        self, x_blocks: NDArray[np.float64], x_rest: NDArray[np.float64]
+    ) -> UnknownVector:
         """Values (k, s, ...) of the eliminated and (q, ...) of the remaining unknowns, by kind."""
 
     @abstractmethod
-    def right_side_of_points(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def right_side_of_points(
+        self, values: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Right sides (k, s, d) and (q, d) with values (n, 3, d) of the points, else zeros."""
 
     @abstractmethod
     def covariance_blocks(self, covariance: BorderedCovariance) -> CovarianceBlocks:
         """Covariances by kind of unknown."""
 
-    def _globals_of(self, x_rest: np.ndarray) -> np.ndarray:
+    def _globals_of(self, x_rest: NDArray[np.float64]) -> NDArray[np.float64]:
         return self.network.layout.expand_globals(x_rest[self.layout.globals])
 
     def _rest_matrix(
-        self, own: np.ndarray, own_globals: np.ndarray, equations: NormalEquations
-    ) -> np.ndarray:
+        self,
+        own: NDArray[np.float64],
+        own_globals: NDArray[np.float64],
+        equations: NormalEquations,
+    ) -> NDArray[np.float64]:
         """Matrix (q, q) of the remaining blocks (c, s, s), their mixed ones (c, s, G), and gg."""
         rows = self.layout.block_rows
         blocks = self.layout.blocks
@@ -197,7 +206,7 @@ class Elimination(ABC):
         out[border, border] = equations.gg[np.ix_(free, free)]
         return out
 
-    def _fix_gauge(self, rest: np.ndarray, directions: np.ndarray) -> None:
+    def _fix_gauge(self, rest: NDArray[np.float64], directions: NDArray[np.float64]) -> None:
         """Fix the open directions (c, s, 7) of the remaining blocks in their matrix."""
         blocks = self.layout.blocks
         directions = directions.reshape(blocks.stop, -1)
@@ -206,7 +215,7 @@ class Elimination(ABC):
 
     def _split_rest(
         self, covariance: BorderedCovariance
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Covariances of the rest: its blocks (c, s, s), gg (G, G) and mixed ones (c, s, G)."""
         rest = covariance.rest
         rows = self.layout.block_rows
@@ -218,7 +227,9 @@ class Elimination(ABC):
         mixed[:, :, free] = rest[self.layout.blocks, self.layout.globals].reshape(*rows.shape, -1)
         return rest[rows[:, :, None], rows[:, None, :]], gg, mixed
 
-    def _split_border(self, border: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _split_border(
+        self, border: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Covariances (k, t, q) of other unknowns with the rest, split.
 
         Returns those with its blocks (k, t, c, s) and with all global unknowns (k, t, G).
@@ -257,17 +268,21 @@ class EliminatePoints(Elimination):
         right = self.right_sides(UnknownVector(equations.e, equations.p, equations.g))
         return BorderedSystem(equations.pp, border, rest, *right)
 
-    def right_sides(self, right: UnknownVector) -> tuple[np.ndarray, np.ndarray]:
+    def right_sides(self, right: UnknownVector) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Right sides of object points (n, 3), and of exposures and free global unknowns (q,)."""
         free = self.network.layout.free
         return right.points, np.concatenate([right.exteriors.ravel(), right.globals[free]])
 
-    def to_unknowns(self, x_blocks: np.ndarray, x_rest: np.ndarray) -> UnknownVector:
+    def to_unknowns(
+        self, x_blocks: NDArray[np.float64], x_rest: NDArray[np.float64]
+    ) -> UnknownVector:
         """Values of object points (n, 3, ...) and of the remaining unknowns (q, ...), by kind."""
         exteriors = x_rest[self.layout.blocks].reshape(-1, EXTERIOR_SIZE, *x_rest.shape[1:])
         return UnknownVector(exteriors, x_blocks, self._globals_of(x_rest))
 
-    def right_side_of_points(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def right_side_of_points(
+        self, values: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """The values themselves, and zeros for the remaining unknowns."""
         return values, np.zeros((self.layout.size, values.shape[2]))
 
@@ -277,7 +292,7 @@ class EliminatePoints(Elimination):
         ee, gg, eg = self._split_rest(covariance)
         pairs, pg = self._split_border(covariance.border)
 
-        def points_between(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+        def points_between(p: NDArray[np.int64], q: NDArray[np.int64]) -> NDArray[np.float64]:
             same = (p == q)[:, None, None]
             fixed = np.where(same, covariance.conditional[p], 0.0)
             return fixed - covariance.border[p] @ covariance.gain[q].transpose(0, 2, 1)
@@ -326,7 +341,7 @@ class EliminateExposures(Elimination):
             self._cell_blocks(equations), self._cell_border(equations), rest, *right
         )
 
-    def right_sides(self, right: UnknownVector) -> tuple[np.ndarray, np.ndarray]:
+    def right_sides(self, right: UnknownVector) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Right sides of cells (k, s), and of object points and free global unknowns (q,)."""
         of_cells = np.zeros((self.n_cells, self.n_places, EXTERIOR_SIZE))
         of_cells[self.cell, self.place] = right.exteriors
@@ -334,7 +349,7 @@ class EliminateExposures(Elimination):
         rest = np.concatenate([right.points.ravel(), right.globals[free]])
         return of_cells.reshape(self.n_cells, -1), rest
 
-    def _cell_blocks(self, equations: NormalEquations) -> np.ndarray:
+    def _cell_blocks(self, equations: NormalEquations) -> NDArray[np.float64]:
         """Blocks (k, s, s) of the cells; an empty place has ones in its diagonal."""
         cell = self.cell
         place = self.place
@@ -349,7 +364,7 @@ class EliminateExposures(Elimination):
         width = EXTERIOR_SIZE * self.n_places
         return blocks.reshape(self.n_cells, width, width)
 
-    def _cell_border(self, equations: NormalEquations) -> np.ndarray:
+    def _cell_border(self, equations: NormalEquations) -> NDArray[np.float64]:
         """Mixed blocks (k, s, q) of the cells with object points and global unknowns."""
         network = self.network
         shape = (self.n_cells, self.n_places, EXTERIOR_SIZE)
@@ -362,12 +377,16 @@ class EliminateExposures(Elimination):
         border[self.cell, self.place, :, self.layout.globals] = equations.eg[:, :, free]
         return border.reshape(self.n_cells, EXTERIOR_SIZE * self.n_places, -1)
 
-    def to_unknowns(self, x_blocks: np.ndarray, x_rest: np.ndarray) -> UnknownVector:
+    def to_unknowns(
+        self, x_blocks: NDArray[np.float64], x_rest: NDArray[np.float64]
+    ) -> UnknownVector:
         """Values of the cells (k, s, ...) and of the remaining unknowns (q, ...), by kind."""
         points = x_rest[self.layout.blocks].reshape(-1, POINT_SIZE, *x_rest.shape[1:])
         return UnknownVector(self._of_exposures(x_blocks), points, self._globals_of(x_rest))
 
-    def right_side_of_points(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def right_side_of_points(
+        self, values: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Zeros for the cells, and the values in the rows of the object points."""
         columns = values.shape[2]
         rest = np.zeros((self.layout.size, columns))
@@ -387,7 +406,7 @@ class EliminateExposures(Elimination):
         conditional = covariance.conditional.reshape(*shape, *shape[1:])
         gain = covariance.gain.reshape(*shape, self.layout.size)
 
-        def between(e: np.ndarray, f: np.ndarray) -> np.ndarray:
+        def between(e: NDArray[np.int64], f: NDArray[np.int64]) -> NDArray[np.float64]:
             same_cell = (cell[e] == cell[f])[:, None, None]
             fixed = np.where(same_cell, conditional[cell[e], place[e], :, place[f], :], 0.0)
             return fixed - border[e] @ gain[cell[f], place[f]].transpose(0, 2, 1)
@@ -403,7 +422,7 @@ class EliminateExposures(Elimination):
             points_between=lambda p, q: covariance.rest[rows[p][:, :, None], rows[q][:, None, :]],
         )
 
-    def _of_exposures(self, values: np.ndarray) -> np.ndarray:
+    def _of_exposures(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Values (m, 6, ...) of the exposures from those (k, s, ...) of their cells."""
         shape = (self.n_cells, self.n_places, EXTERIOR_SIZE, *values.shape[2:])
         return values.reshape(shape)[self.cell, self.place]

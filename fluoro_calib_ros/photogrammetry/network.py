@@ -126,11 +126,11 @@ class Network:
         return 1 / np.asarray(self.interior_sd, dtype=float) ** 2
 
     @cached_property
-    def _rows(self) -> tuple[np.ndarray, ...]:
+    def _rows(self) -> tuple[NDArray[np.int64], ...]:
         fluoroscope = self.fluoroscope[self.exposure]
         return tuple(np.flatnonzero(fluoroscope == f) for f in range(self.n_fluoroscopes))
 
-    def rows(self, f: int) -> np.ndarray:
+    def rows(self, f: int) -> NDArray[np.int64]:
         """Rows of the image points of fluoroscope f."""
         return self._rows[f]
 
@@ -145,7 +145,7 @@ class Network:
 
     def per_image_point(
         self, parameters: Parameters
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Rotation, position, object point and interior orientation of every image point."""
         return (
             parameters.rotation[self.exposure],
@@ -196,7 +196,9 @@ class Gauge:
     constraint: NDArray[np.float64]
 
 
-def similarity_directions(points: np.ndarray, centre: np.ndarray) -> NDArray[np.float64]:
+def similarity_directions(
+    points: NDArray[np.float64], centre: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Changes (n, 3, 7) of points (n, 3) [mm] by shift, turn and scale about a centre (3,)."""
     offset = points - centre
     shift = np.broadcast_to(np.eye(3), (len(points), 3, 3))
@@ -240,7 +242,9 @@ def in_determined_datum(
     return network, transform_to_datum(network, parameters)
 
 
-def stabilising_factor(directions: np.ndarray, diagonal: np.ndarray) -> NDArray[np.float64]:
+def stabilising_factor(
+    directions: NDArray[np.float64], diagonal: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Matrix D (q, 7) such that adding D D^T to a normal matrix fixes its open directions.
 
     directions (q, 7) are open; diagonal (q,) is that of the normal matrix. D D^T is a projector in
@@ -267,7 +271,7 @@ def transform_to_datum(network: Network, parameters: Parameters) -> Parameters:
     turn = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
     scale = np.sum(wanted**2) / np.sum(wanted * (found @ turn.T))
 
-    def transform(points: np.ndarray) -> np.ndarray:
+    def transform(points: NDArray[np.float64]) -> NDArray[np.float64]:
         return survey_centre + scale * (points - centre) @ turn.T
 
     return replace(
@@ -298,10 +302,10 @@ class STransformation:
 
     def transform(
         self,
-        covariance: np.ndarray,
-        left: tuple[np.ndarray, np.ndarray],
-        right: tuple[np.ndarray, np.ndarray],
-    ) -> np.ndarray:
+        covariance: NDArray[np.float64],
+        left: tuple[NDArray[np.float64], NDArray[np.float64]],
+        right: tuple[NDArray[np.float64], NDArray[np.float64]],
+    ) -> NDArray[np.float64]:
         """Covariances (..., i, j) in the new datum; left and right are the sides of the block."""
         h_left, v_left = left
         h_right, v_right = right

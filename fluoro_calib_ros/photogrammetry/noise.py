@@ -79,7 +79,9 @@ def widening(size: NDArray[np.float64], limit: float, common: float = 0.0) -> fl
     return float(np.clip(scale / np.sqrt(chance), 1.0, MAX_WIDENING))
 
 
-def widening_by_group(size: np.ndarray, limit: float, group: np.ndarray) -> NDArray[np.float64]:
+def widening_by_group(
+    size: NDArray[np.float64], limit: float, group: NDArray[np.int64]
+) -> NDArray[np.float64]:
     """Factors (n,) of errors (n,), each that of its group (n,), such as an exposure."""
     out = np.ones(len(size))
     order = np.argsort(group, kind='stable')
@@ -94,11 +96,11 @@ class ObservedScatter:
 
     def __init__(self) -> None:
         self.factor = 1.0
-        self._latest: deque[tuple[np.ndarray, np.ndarray]] = deque()
+        self._latest: deque[tuple[NDArray[np.float64], NDArray[np.float64]]] = deque()
         self._count = 0
         self._new = 0
 
-    def add(self, size: np.ndarray, common: np.ndarray, limit: float) -> None:
+    def add(self, size: NDArray[np.float64], common: NDArray[np.float64], limit: float) -> None:
         """Take in errors and their common parts (n,) as `widening` takes them."""
         self._latest.append((size, common))
         self._count += len(size)
@@ -179,7 +181,7 @@ class Noise:
         """Area over which gross errors are spread, in squares of scale * sigma."""
         return float(min(GROSS_AREA, self.widest / self.scale**2))
 
-    def core_probability(self, q: np.ndarray) -> np.ndarray:
+    def core_probability(self, q: np.ndarray) -> NDArray[np.float64]:
         """Probability (n,) that an image point is not a gross error."""
         if not self.gross:
             return np.ones_like(q)
@@ -187,7 +189,7 @@ class Noise:
         exponent = np.minimum((self.nu + 2) / 2 * np.log1p(q / self.nu), 700.0)
         return 1 / (1 + background * np.exp(exponent))
 
-    def cost(self, q: np.ndarray, sigma: np.ndarray) -> float:
+    def cost(self, q: NDArray[np.float64], sigma: NDArray[np.float64]) -> float:
         """Negative log-likelihood of image points with normalised squares q (n,), sigma (n,)."""
         if self.loss == 'student_t':
             # Logarithm of the bivariate t density; its constant is Gamma(nu/2 + 1)/(Gamma(nu/2) nu
@@ -209,7 +211,7 @@ class Noise:
             np.sum(value) + len(q) * np.log(constant) + 2 * np.sum(np.log(self.scale * sigma))
         )
 
-    def information_factor(self, q: np.ndarray) -> float:
+    def information_factor(self, q: NDArray[np.float64]) -> float:
         """Fisher information over the expected weighted normal matrix.
 
         The weighted normal matrix of a robust fit is optimistic. For the t with D = 2 the factor
@@ -224,7 +226,7 @@ class Noise:
         slope = np.where(q <= HUBER_DELTA**2, 1.0, w / 2)  # w + q dw/dq
         return float(np.mean(slope) ** 2 / (np.mean(w * w * q) / 2 * np.mean(w)))
 
-    def inliers(self, q: np.ndarray) -> np.ndarray:
+    def inliers(self, q: NDArray[np.float64]) -> NDArray[np.bool_]:
         """True (n,) where an image point belongs to the core of the distribution."""
         return q <= INLIER_Q
 
@@ -252,7 +254,7 @@ class Noise:
         tail = nu * (MAX_REJECTED ** (-2 / nu) - 1)
         return float(max(INLIER_Q, tail))
 
-    def accepts(self, q: np.ndarray) -> np.ndarray:
+    def accepts(self, q: NDArray[np.float64]) -> NDArray[np.bool_]:
         """True (n,) where an image point is no gross error, for this noise with its own tails."""
         return (q <= self.limit) & (self.core_probability(q) >= 0.5)
 
@@ -266,7 +268,7 @@ class Noise:
         C A^T) / (scale * sigma)^2 of each image point; for a point of weight one it is two minus
         twice its redundancy number.
         """
-        values: np.ndarray = np.maximum(np.asarray(squared, dtype=float), 1e-300)
+        values: NDArray[np.float64] = np.maximum(np.asarray(squared, dtype=float), 1e-300)
         missing = np.broadcast_to(np.asarray(unresolved, dtype=float), values.shape)
         if self.loss == 'student_t':
             return self._estimate_student_t(values, missing)
@@ -278,7 +280,9 @@ class Noise:
             variance = median / (2 * np.log(2))  # median of chi-square, two degrees of freedom
         return replace(self, scale=float(np.sqrt(variance)))
 
-    def _estimate_student_t(self, squared: np.ndarray, unresolved: np.ndarray) -> Noise:
+    def _estimate_student_t(
+        self, squared: NDArray[np.float64], unresolved: NDArray[np.float64]
+    ) -> Noise:
         """Student-t with scale, nu and share of gross errors."""
         noise = self
         variance = self.scale**2
@@ -294,8 +298,8 @@ class Noise:
         return noise
 
     def _estimate_variance(
-        self, variance: float, squared: np.ndarray, unresolved: np.ndarray
-    ) -> tuple[Noise, float, np.ndarray]:
+        self, variance: float, squared: NDArray[np.float64], unresolved: NDArray[np.float64]
+    ) -> tuple[Noise, float, NDArray[np.float64]]:
         """Share of gross errors, variance and core probabilities (n,) for the present nu."""
         noise = self
         nu = self.nu
@@ -316,14 +320,14 @@ class Noise:
 DEFAULT_NOISE = Noise()
 
 
-def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
+def _weighted_median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
     """Median of values (n,) with weights (n,)."""
     order = np.argsort(values)
     sums = np.cumsum(weights[order])
     return float(values[order][np.searchsorted(sums, sums[-1] / 2)])
 
 
-def _estimate_nu(q: np.ndarray, share: np.ndarray) -> float:
+def _estimate_nu(q: NDArray[np.float64], share: NDArray[np.float64]) -> float:
     """Degrees of freedom of bivariate t variables with squared norms q (n,) and weights (n,)."""
 
     def cost(log_nu: float) -> float:

@@ -56,7 +56,9 @@ class NormalEquations:
     gauge: Gauge | None = None  #: directions that a free network leaves open
 
 
-def _by_component(values: np.ndarray, index: np.ndarray | None = None) -> np.ndarray:
+def _by_component(
+    values: NDArray[np.float64], index: NDArray[np.int64] | None = None
+) -> NDArray[np.float64]:
     """Components of values (n, ...) as rows (c, n), or (c, N) taken at index (N,)."""
     rows = values.reshape(len(values), -1).T
     return np.ascontiguousarray(rows) if index is None else np.take(rows, index, axis=1)
@@ -70,11 +72,11 @@ class _SensorPoints:
     front of the source; interior (3, k) and rotation (9, k) belong to the image points.
     """
 
-    x: np.ndarray
-    y: np.ndarray
-    inverse_depth: np.ndarray
-    interior: np.ndarray
-    rotation: np.ndarray
+    x: NDArray[np.float64]
+    y: NDArray[np.float64]
+    inverse_depth: NDArray[np.float64]
+    interior: NDArray[np.float64]
+    rotation: NDArray[np.float64]
 
 
 def _to_sensor(network: Network, parameters: Parameters, rows: slice) -> _SensorPoints:
@@ -96,7 +98,7 @@ def _to_sensor(network: Network, parameters: Parameters, rows: slice) -> _Sensor
     return _SensorPoints(x * inverse_depth, y * inverse_depth, inverse_depth, interior, rotation)
 
 
-def project_network(network: Network, parameters: Parameters) -> np.ndarray:
+def project_network(network: Network, parameters: Parameters) -> NDArray[np.float64]:
     """Image points (N, 2) [px] of a network; NaN where a point is behind the source."""
     out = np.empty_like(network.uv)
     for start in range(0, len(out), CHUNK):
@@ -121,7 +123,9 @@ class _Linearised:
     pu: NDArray[np.float64]
     pv: NDArray[np.float64]
 
-    def by_image_point(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def by_image_point(
+        self,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Arrays (k, 2, ...) with one image point a row.
 
         Derivatives by exterior orientation, object point and interior orientation, and residuals.
@@ -137,7 +141,7 @@ class _Linearisation:
 
     network: Network
     parameters: Parameters
-    correction: np.ndarray
+    correction: NDArray[np.float64]
     noise: Noise
     image_factor: float
 
@@ -187,7 +191,9 @@ POINT_PRODUCTS = slice(0, 9)
 INTERIOR_PRODUCTS = slice(9, 18)
 
 
-def _add_by_point(lin: _Linearised, point: np.ndarray, sums: np.ndarray, pe: np.ndarray) -> None:
+def _add_by_point(
+    lin: _Linearised, point: NDArray[np.int64], sums: NDArray[np.float64], pe: NDArray[np.float64]
+) -> None:
     """Add products of k image points to the sums by object point, and fill in pe (k, 18).
 
     point (k,) are their object points. The sums (18, n) are the products with P and the residual -
@@ -213,7 +219,7 @@ def _add_by_point(lin: _Linearised, point: np.ndarray, sums: np.ndarray, pe: np.
     pe[:] = mixed.T
 
 
-def _chunks(network: Network) -> Iterator[tuple[int, int, np.ndarray]]:
+def _chunks(network: Network) -> Iterator[tuple[int, int, NDArray[np.int64]]]:
     """Ranges of exposures of one fluoroscope with about CHUNK image points.
 
     Yields the first exposure, the one after the last, and the rows (k + 1,) at which the image
@@ -239,9 +245,9 @@ class _ImageSums:
     pe (N, 3, 6); linearised: the chunks, where additional parameters need them.
     """
 
-    by_exposure: np.ndarray
-    by_point: np.ndarray
-    pe: np.ndarray
+    by_exposure: NDArray[np.float64]
+    by_point: NDArray[np.float64]
+    pe: NDArray[np.float64]
     linearised: list[_Linearised]
 
 
@@ -323,7 +329,7 @@ def normal_equations(
 
 
 def right_sides(
-    network: Network, parameters: Parameters, correction: np.ndarray | float, noise: Noise
+    network: Network, parameters: Parameters, correction: NDArray[np.float64] | float, noise: Noise
 ) -> UnknownVector:
     """Right sides of `normal_equations` alone, for a network without relative orientations.
 
@@ -363,26 +369,26 @@ def right_sides(
     return UnknownVector(exteriors, points.T + _survey_pull(network, parameters), of_globals)
 
 
-def _survey_weight(network: Network) -> np.ndarray:
+def _survey_weight(network: Network) -> NDArray[np.float64]:
     """Weights (n, 1) of the surveyed coordinates; zeros in a free network."""
     if network.datum != 'survey':
         return np.zeros((network.n_points, 1))
     return 1 / network.survey_sd_mm[:, None] ** 2
 
 
-def _survey_pull(network: Network, parameters: Parameters) -> np.ndarray:
+def _survey_pull(network: Network, parameters: Parameters) -> NDArray[np.float64]:
     """What the survey adds (n, 3) to the right side."""
     return _survey_weight(network) * (network.survey_mm - parameters.points_mm)
 
 
-def _exterior_pull(network: Network, parameters: Parameters) -> np.ndarray:
+def _exterior_pull(network: Network, parameters: Parameters) -> NDArray[np.float64]:
     """What known exterior orientations add (m, 6) to the right side."""
     assert network.exterior is not None
     off = network.exterior.discrepancies(parameters.rotation, parameters.position_mm)
     return -network.exterior.weights * off
 
 
-def _interior_pull(network: Network, parameters: Parameters) -> np.ndarray:
+def _interior_pull(network: Network, parameters: Parameters) -> NDArray[np.float64]:
     """What the prior of the interior orientations adds (3 F,) to the right side."""
     assert network.interior_mean is not None
     return (network.interior_weight * (network.interior_mean - parameters.interior)).ravel()
@@ -390,7 +396,7 @@ def _interior_pull(network: Network, parameters: Parameters) -> np.ndarray:
 
 def _point_blocks(
     network: Network, parameters: Parameters, sums: _ImageSums
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Blocks pp (n, 3, 3) and right side p (n, 3), with the survey."""
     products = sums.by_point[:, POINT_PRODUCTS].sum(axis=0)
     symmetric = products[[0, 1, 2, 1, 3, 4, 2, 4, 5]].T.reshape(-1, 3, 3)
@@ -403,10 +409,10 @@ class _GlobalBlocks:
     """Blocks with the global unknowns, as in NormalEquations, while they are filled in."""
 
     network: Network
-    gg: np.ndarray
-    eg: np.ndarray
-    pg: np.ndarray
-    g: np.ndarray
+    gg: NDArray[np.float64]
+    eg: NDArray[np.float64]
+    pg: NDArray[np.float64]
+    g: NDArray[np.float64]
 
     @classmethod
     def zeros(cls, network: Network) -> _GlobalBlocks:
@@ -438,8 +444,8 @@ class _GlobalBlocks:
 
 
 def _add_relative(
-    parameters: Parameters, ee: np.ndarray, e: np.ndarray, blocks: _GlobalBlocks
-) -> tuple[np.ndarray, np.ndarray]:
+    parameters: Parameters, ee: NDArray[np.float64], e: NDArray[np.float64], blocks: _GlobalBlocks
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Add the relative orientation constraints to ee, e and the global blocks.
 
     Returns the coupled pairs (k, 2) of exposures and their mixed blocks (k, 6, 6).

@@ -97,7 +97,7 @@ def image_statistics(
     adjustment: Adjustment,
     precision: Precision,
     significance: float = SIGNIFICANCE,
-) -> tuple[np.ndarray, float]:
+) -> tuple[NDArray[np.float64], float]:
     """Statistics (N,) of the image points and their critical value.
 
     A statistic is NaN where the redundancy is too small.
@@ -172,9 +172,9 @@ class _Rays:
     residual (N, 2) [px] at the surveyed coordinates.
     """
 
-    derivative: np.ndarray
-    information: np.ndarray
-    residual: np.ndarray
+    derivative: NDArray[np.float64]
+    information: NDArray[np.float64]
+    residual: NDArray[np.float64]
 
 
 def _rays_of(network: Network, adjustment: Adjustment, precision: Precision) -> _Rays:
@@ -202,7 +202,7 @@ def _rays_of(network: Network, adjustment: Adjustment, precision: Precision) -> 
 
 def _intersect(
     network: Network, rays: _Rays, noise: Noise
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, NDArray[np.float64], NDArray[np.float64]]:
     """Intersect the targets from their rays.
 
     Returns offsets (n, 3) [mm], their covariances (n, 3, 3) and squares (N,) of the rays'

@@ -48,18 +48,18 @@ class Plane:
     #: (3, 3) right-handed axes as rows: two in the plane, and its normal
     axes: NDArray[np.float64]
 
-    def coordinates(self, xyz: np.ndarray) -> NDArray[np.float64]:
+    def coordinates(self, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
         """Coordinates (n, 2) [mm] in the plane of targets (n, 3)."""
         return (xyz - self.centre_mm) @ self.axes[:2].T
 
 
-def flatness(xyz: np.ndarray) -> float:
+def flatness(xyz: NDArray[np.float64]) -> float:
     """Smallest over largest extent of targets (n, 3): 0 for a plane, about 1 for a cube."""
     extent = np.linalg.svd(xyz - xyz.mean(axis=0), compute_uv=False)
     return float(extent[-1] / extent[0]) if extent[0] > 0 else 0.0
 
 
-def plane_of(xyz: np.ndarray) -> Plane:
+def plane_of(xyz: NDArray[np.float64]) -> Plane:
     """Return the plane that fits targets (n, 3) best. Raises DataError for targets on a line."""
     centre = xyz.mean(axis=0)
     _, extent, axes = np.linalg.svd(xyz - centre, full_matrices=False)
@@ -70,7 +70,7 @@ def plane_of(xyz: np.ndarray) -> Plane:
 
 
 def homography(
-    xy: np.ndarray, uv: np.ndarray, weights: np.ndarray | None = None
+    xy: NDArray[np.float64], uv: NDArray[np.float64], weights: NDArray[np.float64] | None = None
 ) -> NDArray[np.float64]:
     """Homographies (..., 3, 3) with uv ~ H (xy, 1) by the direct linear transformation.
 
@@ -85,7 +85,7 @@ def homography(
     return from_u @ normalised @ np.linalg.inv(from_x)
 
 
-def _normalised(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _normalised(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Points (..., n, 2) about zero at a mean distance of about one; the matrix back from them."""
     mean = points.mean(axis=-2, keepdims=True)
     square = np.mean(np.sum((points - mean) ** 2, axis=-1), axis=-1)[..., None, None]
@@ -97,7 +97,7 @@ def _normalised(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return (points - mean) / size, back
 
 
-def robust_homography(xy: np.ndarray, uv: np.ndarray) -> NDArray[np.float64]:
+def robust_homography(xy: NDArray[np.float64], uv: NDArray[np.float64]) -> NDArray[np.float64]:
     """Homography (3, 3) of targets of which up to half may be falsely matched.
 
     The sample with the least median of squared residuals (Rousseeuw 1984) is refined on all points
@@ -122,7 +122,7 @@ def robust_homography(xy: np.ndarray, uv: np.ndarray) -> NDArray[np.float64]:
 
 
 def principal_distance_of_planes(
-    homographies: Sequence[np.ndarray], principal_point: np.ndarray
+    homographies: Sequence[NDArray[np.float64]], principal_point: NDArray[np.float64]
 ) -> float | None:
     """Principal distance [px] from homographies (3, 3) of planes in mm, None: no plane is tilted.
 
@@ -150,8 +150,8 @@ def principal_distance_of_planes(
 
 
 def poses_of_homography(
-    found: np.ndarray, plane: Plane, interior: np.ndarray
-) -> list[tuple[np.ndarray, np.ndarray]]:
+    found: NDArray[np.float64], plane: Plane, interior: NDArray[np.float64]
+) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Rotation (3, 3) and position (3,) [mm] of a homography, and those mirrored.
 
     interior (3,) [px]. The second pose is that of the plane mirrored at the line of sight to the
@@ -168,26 +168,28 @@ def poses_of_homography(
 
 
 def mirrored_pose(
-    rotation: np.ndarray, position: np.ndarray, plane: Plane
-) -> tuple[np.ndarray, np.ndarray]:
+    rotation: NDArray[np.float64], position: NDArray[np.float64], plane: Plane
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Rotation (3, 3) and position (3,) of the pose mirrored at the line of sight."""
     middle = rotation @ (plane.centre_mm - position)
     return _pose(_mirrored(rotation @ plane.axes[:2].T, middle), middle, plane)
 
 
-def _mirrored(axes: np.ndarray, middle: np.ndarray) -> np.ndarray:
+def _mirrored(axes: NDArray[np.float64], middle: NDArray[np.float64]) -> NDArray[np.float64]:
     """Axes (3, 2) of a plane in the sensor frame, mirrored at the line of sight to its middle."""
     sight = middle / np.linalg.norm(middle)
     return axes - 2 * np.outer(sight, sight @ axes)
 
 
-def _pose(axes: np.ndarray, middle: np.ndarray, plane: Plane) -> tuple[np.ndarray, np.ndarray]:
+def _pose(
+    axes: NDArray[np.float64], middle: NDArray[np.float64], plane: Plane
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Pose with these axes (3, 2) and middle (3,) of the plane in the sensor frame."""
     turned = np.column_stack([axes, np.cross(axes[:, 0], axes[:, 1])])
     rotation = turned @ plane.axes
     return rotation, plane.centre_mm - rotation.T @ middle
 
 
-def tilt_of(rotation: np.ndarray, plane: Plane) -> float:
+def tilt_of(rotation: NDArray[np.float64], plane: Plane) -> float:
     """Angle [rad] between the normal of a plane and the axis of the sensor."""
     return float(np.arccos(min(abs(rotation[2] @ plane.axes[2]), 1.0)))

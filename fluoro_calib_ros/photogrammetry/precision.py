@@ -73,10 +73,10 @@ def _in_datum(
     """Covariances in the datum of a free network, from those with other directions fixed."""
     s = STransformation(gauge, covariance_times_points(matrix, gauge.constraint))
 
-    def exteriors(index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def exteriors(index: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         return s.exteriors[0][index], s.exteriors[1][index]
 
-    def points(index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def points(index: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         return s.points[0][index], s.points[1][index]
 
     free = matrix.network.layout.free
@@ -92,7 +92,9 @@ def _in_datum(
     )
 
 
-def covariance_times_points(matrix: FactorizedNormalMatrix, values: np.ndarray) -> UnknownVector:
+def covariance_times_points(
+    matrix: FactorizedNormalMatrix, values: NDArray[np.float64]
+) -> UnknownVector:
     """Products of the inverse normal matrix with columns of values (n, 3, d) of the points.
 
     Of a free network they are those with other directions fixed than those of its datum.
@@ -125,7 +127,7 @@ def information_of_additional(matrix: FactorizedNormalMatrix, f: int) -> NDArray
 
 def solved_additional(
     matrix: FactorizedNormalMatrix, network: Network, adjustment: Adjustment
-) -> tuple[np.ndarray, ...]:
+) -> tuple[NDArray[np.float64], ...]:
     """Coefficients (p,) of the additional parameters at the solution, by fluoroscope.
 
     An adjustment ends where F hardly decreases any more. A coefficient whose prior variance is
@@ -154,7 +156,7 @@ def solved_additional(
 
 def covariance_of_projection(
     network: Network, parameters: Parameters, blocks: CovarianceBlocks
-) -> np.ndarray:
+) -> NDArray[np.float64]:
     """A C_x A^T (N, 2, 2) [px^2] of the image points; additional parameters are unknowns too."""
     out = np.empty((network.n_image_points, 2, 2))
     for f, local, a in _design(network, parameters):
@@ -188,7 +190,9 @@ def variance_of_projection(
     return out
 
 
-def _design(network: Network, parameters: Parameters) -> Iterator[tuple[int, slice, np.ndarray]]:
+def _design(
+    network: Network, parameters: Parameters
+) -> Iterator[tuple[int, slice, NDArray[np.float64]]]:
     """Derivatives (k, 2, 12) of image points by exterior, object point and interior orientation.
 
     Yields fluoroscope f, a range among its image points, and their derivatives.
@@ -204,8 +208,8 @@ def _design(network: Network, parameters: Parameters) -> Iterator[tuple[int, sli
 
 
 def _covariance_of_orientation(
-    network: Network, blocks: CovarianceBlocks, f: int, rows: np.ndarray
-) -> np.ndarray:
+    network: Network, blocks: CovarianceBlocks, f: int, rows: NDArray[np.int64]
+) -> NDArray[np.float64]:
     """Covariances (k, 12, 12) of exterior orientation, object point and interior orientation.
 
     rows (k,) of image points of fluoroscope f.
@@ -231,7 +235,7 @@ def _mixed_covariance(
     blocks: CovarianceBlocks,
     f: int,
     local: slice,
-) -> np.ndarray:
+) -> NDArray[np.float64]:
     """Covariances (k, 12, 2) of the orientation with the corrections by additional parameters.
 
     local: rows among the image points of fluoroscope f, whose parameters are `additional`.
@@ -321,7 +325,7 @@ class JointCovariance:
     points_globals: NDArray[np.float64]
 
     @property
-    def matrix(self) -> np.ndarray:
+    def matrix(self) -> NDArray[np.float64]:
         """All of them: exposures, object points, global unknowns."""
         return np.block(
             [
@@ -338,8 +342,10 @@ def joint_covariance(blocks: CovarianceBlocks) -> JointCovariance:
     n = len(blocks.pp)
 
     def assembled(
-        of_pairs: Callable[[np.ndarray, np.ndarray], np.ndarray], rows: int, columns: int
-    ) -> np.ndarray:
+        of_pairs: Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.float64]],
+        rows: int,
+        columns: int,
+    ) -> NDArray[np.float64]:
         i, j = (a.ravel() for a in np.indices((rows, columns)))
         found = of_pairs(i, j)
         height, width = found.shape[1:]
@@ -359,7 +365,7 @@ def joint_covariance(blocks: CovarianceBlocks) -> JointCovariance:
 
 def _relative_redundancy(
     network: Network, parameters: Parameters, blocks: CovarianceBlocks
-) -> tuple[np.ndarray, ...]:
+) -> tuple[NDArray[np.float64], ...]:
     """Redundancy numbers (k, 6) of the pairs of every relative orientation constraint."""
     out = []
     for constraint, pose, columns in zip(
@@ -381,7 +387,7 @@ def _relative_redundancy(
     return tuple(out)
 
 
-def _weighted_variance(network: Network, adjustment: Adjustment) -> np.ndarray:
+def _weighted_variance(network: Network, adjustment: Adjustment) -> NDArray[np.float64]:
     """Variances (N,) [px^2] of the image points in the weighted least-squares problem."""
     weight = np.maximum(adjustment.noise.weight(adjustment.q), MIN_WEIGHT)
     return (adjustment.noise.scale * network.sigma) ** 2 / weight
@@ -391,7 +397,7 @@ def residual_covariance(
     network: Network,
     adjustment: Adjustment,
     blocks: CovarianceBlocks,
-    projected: np.ndarray | None = None,
+    projected: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float64]:
     """Covariances C_r (N, 2, 2) [px^2] of the residuals.
 
@@ -402,7 +408,9 @@ def residual_covariance(
     return _weighted_variance(network, adjustment)[:, None, None] * np.eye(2) - projected
 
 
-def geometric_redundancy(network: Network, parameters: Parameters, noise: Noise) -> np.ndarray:
+def geometric_redundancy(
+    network: Network, parameters: Parameters, noise: Noise
+) -> NDArray[np.float64]:
     """Redundancy numbers (N,) of the image points under equal weights, mean of u and v.
 
     They depend on the geometry only. Those of the weighted problem follow the residuals, so they
@@ -474,7 +482,10 @@ def precision_with_fixed_interiors(
 
 
 def equations_with_fixed_interiors(
-    network: Network, adjustment: Adjustment, correction: np.ndarray, covariances: np.ndarray
+    network: Network,
+    adjustment: Adjustment,
+    correction: np.ndarray,
+    covariances: NDArray[np.float64],
 ) -> tuple[Network, NormalEquations]:
     """Network and normal equations whose inverse holds the uncertainty of fixed interiors.
 

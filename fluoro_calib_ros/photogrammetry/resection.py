@@ -56,12 +56,12 @@ class Resection:
     inliers: NDArray[np.bool_]  #: (n,)
 
 
-def least_vectors(forms: np.ndarray) -> np.ndarray:
+def least_vectors(forms: NDArray[np.float64]) -> NDArray[np.float64]:
     """Unit vectors (..., k) with the least values of quadratic forms (..., k, k)."""
     return np.linalg.eigh(forms)[1][..., 0]
 
 
-def least_vectors_with_last_one(forms: np.ndarray) -> np.ndarray:
+def least_vectors_with_last_one(forms: NDArray[np.float64]) -> NDArray[np.float64]:
     """Vectors (..., k) with the least values whose last component is one, in a tenth of the time.
 
     That of a projection matrix is the depth of the centre of the points, which is not zero
@@ -73,7 +73,9 @@ def least_vectors_with_last_one(forms: np.ndarray) -> np.ndarray:
     return np.concatenate([found[..., 0], np.ones_like(found[..., :1, 0])], axis=-1)
 
 
-def dlt_rows(x: np.ndarray, u: np.ndarray, weights: np.ndarray | None) -> np.ndarray:
+def dlt_rows(
+    x: NDArray[np.float64], u: NDArray[np.float64], weights: NDArray[np.float64] | None
+) -> NDArray[np.float64]:
     """Rows (..., 2n, 3 (k + 1)) of u ~ P (x, 1) in P, row by row: x (..., n, k), u (..., n, 2)."""
     x1 = np.concatenate([x, np.ones_like(x[..., :1])], axis=-1)
     zero = np.zeros_like(x1)
@@ -90,10 +92,10 @@ def dlt_rows(x: np.ndarray, u: np.ndarray, weights: np.ndarray | None) -> np.nda
 
 
 def direct_linear_transformation(
-    xyz: np.ndarray,
-    uv: np.ndarray,
-    weights: np.ndarray | None = None,
-    least: Callable[[np.ndarray], np.ndarray] = least_vectors,
+    xyz: NDArray[np.float64],
+    uv: NDArray[np.float64],
+    weights: NDArray[np.float64] | None = None,
+    least: Callable[[NDArray[np.float64]], NDArray[np.float64]] = least_vectors,
 ) -> NDArray[np.float64]:
     """Projection matrices (..., 3, 4) with uv ~ P (xyz, 1).
 
@@ -105,8 +107,10 @@ def direct_linear_transformation(
 
 
 def _dlt_of_weights(
-    xyz: np.ndarray, uv: np.ndarray, least: Callable[[np.ndarray], np.ndarray] = least_vectors
-) -> Callable[[np.ndarray | None], NDArray[np.float64]]:
+    xyz: NDArray[np.float64],
+    uv: NDArray[np.float64],
+    least: Callable[[NDArray[np.float64]], NDArray[np.float64]] = least_vectors,
+) -> Callable[[NDArray[np.float64] | None], NDArray[np.float64]]:
     """Return `direct_linear_transformation` of these points as a function of their weights."""
     mean_x = xyz.mean(axis=-2, keepdims=True)
     mean_u = uv.mean(axis=-2, keepdims=True)
@@ -124,7 +128,7 @@ def _dlt_of_weights(
     from_u[..., :2, 2] = mean_u[..., 0, :]
     from_u[..., 2, 2] = 1
 
-    def projections(weights: np.ndarray | None) -> NDArray[np.float64]:
+    def projections(weights: NDArray[np.float64] | None) -> NDArray[np.float64]:
         weighted = rows
         if weights is not None:
             weighted = rows * np.concatenate([weights, weights], axis=-1)[..., None]
@@ -134,7 +138,9 @@ def _dlt_of_weights(
     return projections
 
 
-def decompose(projection: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def decompose(
+    projection: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], np.ndarray]:
     """Calibration matrix (3, 3), rotation (3, 3) and source (3,) of a projection matrix (3, 4).
 
     The calibration matrix has a positive diagonal and a one in the corner (Hartley and Zisserman
@@ -151,7 +157,9 @@ def decompose(projection: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
     return k / k[2, 2], rotation, -np.linalg.solve(m, projection[:, 3])
 
 
-def squared_residuals(projection: np.ndarray, xyz: np.ndarray, uv: np.ndarray) -> np.ndarray:
+def squared_residuals(
+    projection: NDArray[np.float64], xyz: NDArray[np.float64], uv: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Squared residuals (..., n) of projection matrices (..., 3, 4) or homographies (..., 3, 3).
 
     They are infinite for points in the plane of the source.
@@ -164,13 +172,13 @@ def squared_residuals(projection: np.ndarray, xyz: np.ndarray, uv: np.ndarray) -
     return np.where(np.isfinite(r), r, np.inf)
 
 
-def robust_variance(squared: np.ndarray) -> float:
+def robust_variance(squared: NDArray[np.float64]) -> float:
     """Variance [px^2] of each coordinate by the median of squared residuals (n,)."""
     # The median of chi-square with two degrees of freedom is 2 ln 2.
     return max(np.median(squared) / (2 * np.log(2)), MIN_VARIANCE)
 
 
-def robust_dlt(xyz: np.ndarray, uv: np.ndarray) -> NDArray[np.float64]:
+def robust_dlt(xyz: NDArray[np.float64], uv: NDArray[np.float64]) -> NDArray[np.float64]:
     """Projection matrix (3, 4) of targets of which up to half may be falsely matched.
 
     xyz (n, 3) [mm] and uv (n, 2) [px] of n >= 8 targets. Raises DataError where the targets are
@@ -210,8 +218,8 @@ def robust_dlt(xyz: np.ndarray, uv: np.ndarray) -> NDArray[np.float64]:
 
 
 def robust_p3p(
-    xyz: np.ndarray, uv: np.ndarray, interior: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+    xyz: NDArray[np.float64], uv: NDArray[np.float64], interior: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Rotation (3, 3) and position (3,) [mm] of few targets of which up to half may be false.
 
     The solution of three targets (Ke and Roumeliotis, "An efficient algebraic solution to the
@@ -221,9 +229,11 @@ def robust_p3p(
     """
     rng = np.random.default_rng(0)
     rays = (uv - interior[:2]) / interior[2]
-    best: tuple[float, np.ndarray, np.ndarray] | None = None
+    best: tuple[float, NDArray[np.float64], NDArray[np.float64]] | None = None
 
-    def keep_better(turns: Sequence[np.ndarray], shifts: Sequence[np.ndarray]) -> None:
+    def keep_better(
+        turns: Sequence[NDArray[np.float64]], shifts: Sequence[NDArray[np.float64]]
+    ) -> None:
         nonlocal best
         for turn, shift in zip(turns, shifts):
             rotation = matrix_from_vector(np.ravel(turn))
@@ -255,7 +265,7 @@ def robust_p3p(
     return rotation, -rotation.T @ shift
 
 
-def principal_distance_of(projection: np.ndarray) -> float:
+def principal_distance_of(projection: NDArray[np.float64]) -> float:
     """Principal distance [px] of a projection matrix (3, 4): mean of its two scale factors."""
     k, _, _ = decompose(projection)
     return float(np.sqrt(abs(k[0, 0] * k[1, 1])))
@@ -300,11 +310,11 @@ def resect(
 
 
 def refine_resection(
-    xyz: np.ndarray,
-    uv: np.ndarray,
-    interior: np.ndarray,
-    rotation: np.ndarray,
-    position: np.ndarray,
+    xyz: NDArray[np.float64],
+    uv: NDArray[np.float64],
+    interior: NDArray[np.float64],
+    rotation: NDArray[np.float64],
+    position: NDArray[np.float64],
     max_steps: int = 100,
 ) -> Resection:
     """Exterior orientation of one exposure from start values (3, 3) and (3,) [mm].
@@ -315,11 +325,11 @@ def refine_resection(
 
 
 def resection_at(
-    rotation: np.ndarray,
-    position: np.ndarray,
-    xyz: np.ndarray,
-    uv: np.ndarray,
-    interior: np.ndarray,
+    rotation: NDArray[np.float64],
+    position: NDArray[np.float64],
+    xyz: NDArray[np.float64],
+    uv: NDArray[np.float64],
+    interior: NDArray[np.float64],
 ) -> Resection:
     """Return a known exterior orientation with the scale and inliers of its residuals.
 
@@ -334,8 +344,8 @@ def resection_at(
 
 def _refined(
     problem: _Problem,
-    rotation: np.ndarray,
-    position: np.ndarray,
+    rotation: NDArray[np.float64],
+    position: NDArray[np.float64],
     max_steps: int,
     tolerance: float = TOLERANCE,
 ) -> Resection:
@@ -356,9 +366,9 @@ def _refined(
 class _System:
     """Normal equations of the exterior orientation, with the noise model of their weights."""
 
-    normal: np.ndarray
-    right: np.ndarray
-    squared: np.ndarray
+    normal: NDArray[np.float64]
+    right: NDArray[np.float64]
+    squared: NDArray[np.float64]
     noise: Noise
 
 
@@ -366,11 +376,11 @@ class _System:
 class _Problem:
     """Targets (n, 3) [mm] and image points (n, 2) [px] of one exposure, and xp, yp, c [px]."""
 
-    xyz: np.ndarray
-    uv: np.ndarray
-    interior: np.ndarray
+    xyz: NDArray[np.float64]
+    uv: NDArray[np.float64]
+    interior: NDArray[np.float64]
 
-    def linearise(self, rotation: np.ndarray, position: np.ndarray) -> _System:
+    def linearise(self, rotation: NDArray[np.float64], position: NDArray[np.float64]) -> _System:
         """Robustly weighted normal equations. Raises DataError for a target behind the source."""
         n = len(self.xyz)
         predicted, jacobian, _, _ = project_with_jacobian(
@@ -391,7 +401,9 @@ class _Problem:
         weighted = (np.repeat(w, 2)[:, None] * jacobian).T
         return _System(weighted @ jacobian, weighted @ r.ravel(), squared, noise)
 
-    def squared_residuals(self, rotation: np.ndarray, position: np.ndarray) -> NDArray[np.float64]:
+    def squared_residuals(
+        self, rotation: NDArray[np.float64], position: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
         """Squared residuals (n,) [px^2]; NaN behind the source."""
         n = len(self.xyz)
         predicted = project(
@@ -404,8 +416,12 @@ class _Problem:
 
 
 def _damped_step(
-    problem: _Problem, system: _System, rotation: np.ndarray, position: np.ndarray, mu: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    problem: _Problem,
+    system: _System,
+    rotation: NDArray[np.float64],
+    position: NDArray[np.float64],
+    mu: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], np.ndarray, float]:
     """Orientation after a step that does not increase the cost, the step (6,), and the damping.
 
     The orientation is returned unchanged, with a step of zeros, where no such step is found.
@@ -425,7 +441,9 @@ def _damped_step(
     return rotation, position, np.zeros(6), mu
 
 
-def _start_orientation(projection: np.ndarray, problem: _Problem) -> tuple[np.ndarray, np.ndarray]:
+def _start_orientation(
+    projection: NDArray[np.float64], problem: _Problem
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Rotation (3, 3) and position (3,) from a projection matrix and the interior orientation.
 
     The projection matrix has a principal distance of its own. The ratio of distance and principal

@@ -136,7 +136,7 @@ class RigOrientation:
         if not str(self.frame_id):
             raise DataError('rig orientation: the rig frame has no name')
 
-    def _array(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
+    def _array(self, name: str, shape: tuple[int, ...]) -> NDArray[np.float64]:
         """A read-only copy of an array. Raises DataError for a wrong shape or infinite values."""
         value = np.array(getattr(self, name), dtype=float)
         if value.shape != shape:
@@ -178,7 +178,7 @@ class RigOrientation:
         """Standard deviations (F, 3) of the rotations about the axes of the sensors [rad]."""
         return self._sd(slice(3, 6))
 
-    def _sd(self, columns: slice) -> np.ndarray:
+    def _sd(self, columns: slice) -> NDArray[np.float64]:
         return np.sqrt(np.diagonal(self.covariance).reshape(-1, ORIENTATION_SIZE)[:, columns])
 
     def index(self, fluoroscope: str) -> int:
@@ -190,7 +190,7 @@ class RigOrientation:
             )
         return self.fluoroscopes.index(fluoroscope)
 
-    def covariance_rows(self, indices: Sequence[int]) -> np.ndarray:
+    def covariance_rows(self, indices: Sequence[int]) -> NDArray[np.int64]:
         """Rows (9k,) of k fluoroscopes in the covariance, from their indices."""
         first = ORIENTATION_SIZE * np.asarray(indices, dtype=int)
         return (first[:, None] + np.arange(ORIENTATION_SIZE)).ravel()
@@ -301,7 +301,9 @@ def datum_transformation(orientation: RigOrientation, points_mm: ArrayLike) -> N
     return np.eye(size) + frame_motion @ common_motion
 
 
-def _check_orientation(names: Sequence[str], interior: np.ndarray, rotation: np.ndarray) -> None:
+def _check_orientation(
+    names: Sequence[str], interior: NDArray[np.float64], rotation: np.ndarray
+) -> None:
     """Raise DataError for a negative principal distance or an invalid rotation matrix."""
     large = (np.abs(rotation) > 1 + ORTHOGONALITY_TOLERANCE).any(axis=(1, 2))
     rotation = np.where(large[:, None, None], 0.0, rotation)  # no overflow; refused below
@@ -319,18 +321,18 @@ def _check_orientation(names: Sequence[str], interior: np.ndarray, rotation: np.
             )
 
 
-def _to_steps(values: np.ndarray, step: float) -> np.ndarray:
+def _to_steps(values: NDArray[np.float64], step: float) -> NDArray[np.float64]:
     """Round to multiples of a step, which is a power of two."""
     return np.round(values / step) * step + 0.0  # + 0.0: no negative zero
 
 
-def _to_digits(values: np.ndarray) -> np.ndarray:
+def _to_digits(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Round to DIGITS binary digits."""
     mantissa, exponent = np.frexp(values)
     return np.ldexp(_to_steps(mantissa, 2.0**-DIGITS), exponent)
 
 
-def _rounded_rotation(rotation: np.ndarray) -> np.ndarray:
+def _rounded_rotation(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     """Round the quaternions of rotation matrices (F, 3, 3) to QUATERNION_STEP.
 
     The first component that is large follows from the other three, so that the norm is one.
@@ -345,7 +347,7 @@ def _rounded_rotation(rotation: np.ndarray) -> np.ndarray:
     return matrix_from_quaternion(q)
 
 
-def _check_covariance(covariance: np.ndarray) -> None:
+def _check_covariance(covariance: NDArray[np.float64]) -> None:
     """Raise DataError unless a matrix is symmetric and positive semi-definite."""
     sd = np.sqrt(np.maximum(np.diagonal(covariance), 0))
     scale = np.where(sd > 0, sd, 1.0)
@@ -380,7 +382,9 @@ class ExteriorPrior:
         """Weights (m, 6) of the components."""
         return 1 / self.sd**2
 
-    def discrepancies(self, rotation: np.ndarray, position_mm: np.ndarray) -> NDArray[np.float64]:
+    def discrepancies(
+        self, rotation: NDArray[np.float64], position_mm: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
         """Discrepancies (m, 6) of orientations from the observed ones.
 
         Those of a rotation R are log(R R0^T), whose derivative by a rotation on the left is the
@@ -497,7 +501,7 @@ class KnownOrientation:
         return cls(np.array([k[0, 2], k[1, 2], c]), r, -r.T @ t, interior_sd, exterior_sd)
 
 
-def _as_rotation(matrix: np.ndarray) -> np.ndarray:
+def _as_rotation(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the rotation nearest to a matrix of few digits. Raises DataError for any other."""
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
         raise DataError('known orientation: R is not 3 x 3 finite numbers')

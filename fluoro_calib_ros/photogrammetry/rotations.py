@@ -24,7 +24,7 @@ from scipy.linalg import blas
 BLOCK = 128  # rows and columns that are handled at once: they stay in the cache
 
 
-def mirror_lower(matrix: np.ndarray) -> NDArray[np.float64]:
+def mirror_lower(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     """Copy the lower triangle of a matrix (n, n) to its upper one, in place; return the matrix."""
     n = len(matrix)
     for start in range(0, n, BLOCK):
@@ -35,7 +35,7 @@ def mirror_lower(matrix: np.ndarray) -> NDArray[np.float64]:
     return matrix
 
 
-def square_of_lower(factor: np.ndarray) -> NDArray[np.float64]:
+def square_of_lower(factor: NDArray[np.float64]) -> NDArray[np.float64]:
     """L L^T (n, n) of a lower triangular matrix L; the upper triangle of factor is not used."""
     n = len(factor)
     out = np.zeros((n, n), order='F')
@@ -47,7 +47,7 @@ def square_of_lower(factor: np.ndarray) -> NDArray[np.float64]:
     return mirror_lower(out)
 
 
-def matrix_from_quaternion(q: ArrayLike) -> np.ndarray:
+def matrix_from_quaternion(q: ArrayLike) -> NDArray[np.float64]:
     """Rotation matrices (..., 3, 3) of quaternions (..., 4) in w, x, y, z of any norm."""
     q = np.asarray(q, dtype=float)
     w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
@@ -59,7 +59,7 @@ def matrix_from_quaternion(q: ArrayLike) -> np.ndarray:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def quaternion_from_matrix(rotation: ArrayLike) -> np.ndarray:
+def quaternion_from_matrix(rotation: ArrayLike) -> NDArray[np.float64]:
     """Unit quaternions (..., 4) in w, x, y, z, with w >= 0, of rotation matrices (..., 3, 3).
 
     The formula with the largest divisor of four equivalent ones is used (Shepperd's method).
@@ -88,7 +88,7 @@ def quaternion_from_matrix(rotation: ArrayLike) -> np.ndarray:
     return np.where(q[..., :1] < 0, -q, q)
 
 
-def cross_matrix(v: ArrayLike) -> np.ndarray:
+def cross_matrix(v: ArrayLike) -> NDArray[np.float64]:
     """Matrices (..., 3, 3) with cross_matrix(v) w = v x w, of vectors (..., 3)."""
     v = np.asarray(v, dtype=float)
     out = np.zeros((*v.shape, 3))
@@ -101,7 +101,7 @@ def cross_matrix(v: ArrayLike) -> np.ndarray:
     return out
 
 
-def matrix_from_vector(w: ArrayLike) -> np.ndarray:
+def matrix_from_vector(w: ArrayLike) -> NDArray[np.float64]:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad] (Rodrigues' formula)."""
     w = np.asarray(w, dtype=float)
     angle = np.linalg.norm(w, axis=-1)[..., None, None]
@@ -112,7 +112,7 @@ def matrix_from_vector(w: ArrayLike) -> np.ndarray:
     return np.eye(3) + first * k + second * (k @ k)
 
 
-def vector_from_matrix(rotation: ArrayLike) -> np.ndarray:
+def vector_from_matrix(rotation: ArrayLike) -> NDArray[np.float64]:
     """Rotation vectors (..., 3) [rad] of rotation matrices (..., 3, 3) with angles below pi."""
     q = quaternion_from_matrix(rotation)
     sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
@@ -132,7 +132,7 @@ def rotation_angle(rotation: ArrayLike) -> np.ndarray:
     return np.arctan2(sine, cosine)
 
 
-def left_jacobian(w: ArrayLike) -> np.ndarray:
+def left_jacobian(w: ArrayLike) -> NDArray[np.float64]:
     """Matrices J (..., 3, 3) of vectors (..., 3): exp(w + d) = exp(J d) exp(w) to first order.
 
     Source: Sola, Deray and Atchuthan, "A micro Lie theory for state estimation in robotics", 2018,

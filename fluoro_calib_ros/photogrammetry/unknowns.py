@@ -63,8 +63,8 @@ class RelativePose:
     in the sensor frame of a.
     """
 
-    rotation: np.ndarray
-    translation_mm: np.ndarray
+    rotation: NDArray[np.float64]
+    translation_mm: NDArray[np.float64]
 
     def updated(self, step: np.ndarray) -> RelativePose:
         """The pose after a step (6,): translation [mm], rotation [rad] on the left."""
@@ -104,7 +104,7 @@ class ReducedLayout:
         return self.blocks.stop + self.n_globals
 
     @property
-    def block_rows(self) -> np.ndarray:
+    def block_rows(self) -> NDArray[np.int64]:
         """Rows (n_blocks, block_size) of each block."""
         return np.arange(self.blocks.stop).reshape(self.n_blocks, self.block_size)
 
@@ -209,7 +209,7 @@ class UnknownLayout:
         """Order of the unknowns after the elimination of the exposures."""
         return ReducedLayout(self.n_points, POINT_SIZE, self.n_free_globals)
 
-    def expand_globals(self, free_values: np.ndarray) -> np.ndarray:
+    def expand_globals(self, free_values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Values (G, ...) of all global unknowns from the free ones; zeros where fixed."""
         out = np.zeros((self.n_globals, *free_values.shape[1:]))
         out[self.free] = free_values
@@ -250,7 +250,7 @@ MEAN_ITERATIONS = 10
 MEAN_TOLERANCE = 1e-12
 
 
-def inverse_left_jacobian(w: np.ndarray) -> np.ndarray:
+def inverse_left_jacobian(w: NDArray[np.float64]) -> NDArray[np.float64]:
     """Derivatives (..., 3, 3) of log(exp(v) exp(w)) with respect to v at v = 0.
 
     w (..., 3) are rotation vectors [rad] (Barfoot 7.1.3).
@@ -264,7 +264,9 @@ def inverse_left_jacobian(w: np.ndarray) -> np.ndarray:
     return np.eye(3) - k / 2 + factor * (k @ k)
 
 
-def relative_poses(parameters: Parameters, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def relative_poses(
+    parameters: Parameters, pairs: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Rotations (k, 3, 3) and translations (k, 3) [mm] of b relative to a in pairs of exposures.
 
     pairs (k, 2) are rows of exposures.
@@ -288,7 +290,7 @@ def discrepancies(
 
 def _translation_scale(
     constraint: RelativeConstraint, pose: RelativePose
-) -> tuple[float, np.ndarray]:
+) -> tuple[float, NDArray[np.float64]]:
     """Factor of the translations, and its derivative (3,) by the translation of the pose."""
     if constraint.length_mm is None:
         return 1.0, np.zeros(3)
@@ -299,7 +301,7 @@ def _translation_scale(
 
 def discrepancies_with_jacobian(
     constraint: RelativeConstraint, pose: RelativePose, parameters: Parameters
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Discrepancies (k, 6) and their derivatives.
 
     Returns the discrepancies and their derivatives (k, 6, 6) by the exposure of a, by the exposure
@@ -324,7 +326,7 @@ def discrepancies_with_jacobian(
 
 
 def mean_pose(
-    parameters: Parameters, pairs: np.ndarray, weights: np.ndarray | None = None
+    parameters: Parameters, pairs: NDArray[np.int64], weights: np.ndarray | None = None
 ) -> RelativePose:
     """Mean relative orientation of pairs (k, 2) of exposures.
 
@@ -356,7 +358,7 @@ def exposures_from_pose(
     constraint: RelativeConstraint,
     pose: RelativePose,
     offset: NDArray[np.float64] | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Exterior orientations of b's exposures from those of a and a relative orientation.
 
     Parameters

@@ -144,7 +144,7 @@ class EpipolarGeometry:
         return np.asarray(terms @ self._derivative / norm[:, None])
 
 
-def _directions(uv: ArrayLike, interior: np.ndarray) -> np.ndarray:
+def _directions(uv: ArrayLike, interior: NDArray[np.float64]) -> NDArray[np.float64]:
     """Directions (n, 3) in the sensor frame, z = 1, of image points (n, 2) [px]."""
     uv = np.asarray(uv, dtype=float).reshape(-1, 2)
     out = np.ones((len(uv), 3))
@@ -153,8 +153,11 @@ def _directions(uv: ArrayLike, interior: np.ndarray) -> np.ndarray:
 
 
 def _essential_jacobian(
-    relative_rotation: np.ndarray, shift: np.ndarray, r_b: np.ndarray, c: np.ndarray
-) -> np.ndarray:
+    relative_rotation: NDArray[np.float64],
+    shift: NDArray[np.float64],
+    r_b: NDArray[np.float64],
+    c: NDArray[np.float64],
+) -> NDArray[np.float64]:
     """Derivatives (9, 18) of the elements of E, row by row, by T, w, xp, yp, c of a and of b.
 
     Those by the interior orientation hold for E as it acts on the present directions. A changed
@@ -237,7 +240,7 @@ def share_rejected(found: Sequence[ReconstructedFrame]) -> tuple[float, int]:
     return bad / max(total, 1), total
 
 
-def _counts(status: np.ndarray) -> tuple[int, int, int]:
+def _counts(status: NDArray[np.integer]) -> tuple[int, int, int]:
     """Number of rejected points, of points of two views, and of points of a single one."""
     counts = np.bincount(status, minlength=len(STATUS_NAMES))
     bad = int(counts[REJECTED] + counts[FAILED])

@@ -82,13 +82,13 @@ class IntersectedPoints:
     #: for positions of points relative to each other
     covariance_noise: NDArray[np.float64]
     residual: NDArray[np.float64]  #: (n,) RMS of the image residuals [px]
-    rays: NDArray[np.float64]  #: (n,) number of rays used
+    rays: NDArray[np.int64]  #: (n,) number of rays used
     #: (n,) root of the weighted square sum of the residuals over its expectation; for two rays
     #: the epipolar distance over its standard deviation (sd_total)
     standardised: NDArray[np.float64]
-    status: np.ndarray  #: (n,) PointStatus as uint8
+    status: NDArray[np.uint8]  #: (n,) PointStatus as uint8
     #: (n,) number of the fluoroscope whose ray was dropped as false, else -1
-    dropped_view: NDArray[np.float64]
+    dropped_view: NDArray[np.int64]
 
     @property
     def sd_mm(self) -> NDArray[np.float64]:
@@ -104,13 +104,13 @@ class _Solution:
     lack of fit that is by the orientation of the rig.
     """
 
-    xyz: np.ndarray
-    covariance: np.ndarray
-    noise: np.ndarray
-    residual: np.ndarray
-    standardised: np.ndarray
-    failed: np.ndarray
-    by_rig: np.ndarray
+    xyz: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    noise: NDArray[np.float64]
+    residual: NDArray[np.float64]
+    standardised: NDArray[np.float64]
+    failed: NDArray[np.bool_]
+    by_rig: NDArray[np.float64]
 
 
 class Intersector:
@@ -201,7 +201,7 @@ class Intersector:
         return found
 
     def _intersect(
-        self, uv: np.ndarray, weight: np.ndarray, scatter: ObservedScatter | None
+        self, uv: NDArray[np.float64], weight: NDArray[np.float64], scatter: ObservedScatter | None
     ) -> IntersectedPoints:
         """Intersect image points uv (n, F, 2) of weights (n, F) [1/px^2], NaN where unseen."""
         seen = np.isfinite(uv.sum(axis=2) + weight)
@@ -220,7 +220,9 @@ class Intersector:
         )
         return found if enough.all() else _expanded(found, enough, rays)
 
-    def _solve(self, uv: np.ndarray, weight: np.ndarray, rays: np.ndarray) -> _Solution:
+    def _solve(
+        self, uv: NDArray[np.float64], weight: NDArray[np.float64], rays: NDArray[np.int64]
+    ) -> _Solution:
         """Solve for the points of image points uv (n, F, 2).
 
         Weights (n, F) [1/px^2] are 0 where a point is unseen; rays (n,) is their number.
@@ -264,7 +266,7 @@ class Intersector:
             by_rig=1 - freedom / expected,
         )
 
-    def _start(self, uv: np.ndarray, flat: np.ndarray) -> np.ndarray:
+    def _start(self, uv: NDArray[np.float64], flat: NDArray[np.float64]) -> NDArray[np.float64]:
         """Linear solution (n, 3) for image points uv (n, F, 2).
 
         flat (n, 2F, 1): weights of the coordinates. It solves (P_1 - u P_3) (X, 1) = 0, and the
@@ -277,7 +279,9 @@ class Intersector:
         weighted = (a * flat).transpose(0, 2, 1)
         return (_inverse(weighted @ a)[0] @ (weighted @ b))[:, :, 0]
 
-    def _image_jacobian(self, predicted: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    def _image_jacobian(
+        self, predicted: NDArray[np.float64], depth: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
         """Derivatives (n, 2F, 9F) of the image points by the orientation.
 
         Its unknowns are expressed by independent ones of variance one. predicted (n, F, 2) [px],
@@ -301,9 +305,9 @@ class Intersector:
 
     def _classified(
         self,
-        uv: np.ndarray,
-        weight: np.ndarray,
-        rays: np.ndarray,
+        uv: NDArray[np.float64],
+        weight: NDArray[np.float64],
+        rays: NDArray[np.int64],
         solution: _Solution,
         scatter: ObservedScatter | None,
     ) -> IntersectedPoints:
@@ -343,13 +347,13 @@ class Intersector:
 
     def _drop_one_ray(
         self,
-        uv: np.ndarray,
-        weight: np.ndarray,
-        rays: np.ndarray,
-        rows: np.ndarray,
+        uv: NDArray[np.float64],
+        weight: NDArray[np.float64],
+        rays: NDArray[np.int64],
+        rows: NDArray[np.int64],
         solution: _Solution,
-        limit: np.ndarray,
-    ) -> tuple[_Solution, np.ndarray]:
+        limit: NDArray[np.float64],
+    ) -> tuple[_Solution, NDArray[np.int64]]:
         """Replace points of a solution by those without their false ray.
 
         Each ray of the image points uv (m, F, 2) of the points in rows (m,) is dropped in turn. If
@@ -375,7 +379,7 @@ class Intersector:
         return _Solution(**values), dropped
 
 
-def _without_points(solution: _Solution, wrong: np.ndarray) -> _Solution:
+def _without_points(solution: _Solution, wrong: NDArray[np.bool_]) -> _Solution:
     """Set coordinates and covariances of the points that are wrong (n,) to NaN."""
     xyz = solution.xyz.copy()
     covariance = solution.covariance.copy()
@@ -385,7 +389,9 @@ def _without_points(solution: _Solution, wrong: np.ndarray) -> _Solution:
     return replace(solution, xyz=xyz, covariance=covariance, noise=noise)
 
 
-def _expanded(found: IntersectedPoints, enough: np.ndarray, rays: np.ndarray) -> IntersectedPoints:
+def _expanded(
+    found: IntersectedPoints, enough: NDArray[np.bool_], rays: NDArray[np.int64]
+) -> IntersectedPoints:
     """Points of all n targets, given those that enough (n,) fluoroscopes see."""
     n = len(enough)
     out = IntersectedPoints(
@@ -403,7 +409,7 @@ def _expanded(found: IntersectedPoints, enough: np.ndarray, rays: np.ndarray) ->
     return out
 
 
-def _inverse(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _inverse(normal: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Inverse of symmetric matrices (n, 3, 3) by cofactors.
 
     Also returns their determinants (n,) over the cube of the mean of their diagonals. A singular
@@ -417,7 +423,7 @@ def _inverse(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return (cofactors / determinant[:, None]).reshape(-1, 3, 3), determinant / mean**3
 
 
-def largest_lack_of_fit(reject: float, count: int) -> np.ndarray:
+def largest_lack_of_fit(reject: float, count: int) -> NDArray[np.float64]:
     """Largest standardised lack of fit (count + 1,) of points of 0, 1, ... rays that agree.
 
     Q = r^T W r is chi-square with 2 rays - 3 degrees of freedom, and the lack of fit is the root
@@ -430,13 +436,13 @@ def largest_lack_of_fit(reject: float, count: int) -> np.ndarray:
     return np.sqrt(quantile / freedom)
 
 
-def _medians(count: int) -> np.ndarray:
+def _medians(count: int) -> NDArray[np.float64]:
     """Median standardised lack of fit (count + 1,) of points of 0, 1, ... rays that agree."""
     freedom = np.maximum(2.0 * np.arange(count + 1) - 3, 1)
     return np.sqrt(chdtri(freedom, 0.5) / freedom)
 
 
-def _depth_of_axes(orientation: RigOrientation) -> np.ndarray:
+def _depth_of_axes(orientation: RigOrientation) -> NDArray[np.float64]:
     """Depths (F,) [mm] of the point that is nearest to the axes of all fluoroscopes."""
     axis = orientation.rotation[:, 2]
     across = np.eye(3) - axis[:, :, None] * axis[:, None, :]
@@ -446,7 +452,7 @@ def _depth_of_axes(orientation: RigOrientation) -> np.ndarray:
     return np.where(depth > 0, depth, 1.0)
 
 
-def _derivative_functions(orientation: RigOrientation) -> np.ndarray:
+def _derivative_functions(orientation: RigOrientation) -> NDArray[np.float64]:
     """Coefficients (F, 9, 2, 9) of nine functions in the derivatives of u, v by T, w, xp, yp, c.
 
     The functions are 1, x, y, x^2, y^2, xy, 1/Z, x/Z and y/Z with x = X/Z and y = Y/Z, and the
@@ -473,7 +479,9 @@ def _derivative_functions(orientation: RigOrientation) -> np.ndarray:
     return out
 
 
-def _by_independent_unknowns(functions: np.ndarray, root: np.ndarray) -> np.ndarray:
+def _by_independent_unknowns(
+    functions: NDArray[np.float64], root: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Coefficients (F, 9, 18F) of the derivatives by independent unknowns of variance one.
 
     functions (F, 9, 2, 9): coefficients by the unknowns of the orientation; root (9F, 9F): root

@@ -32,12 +32,12 @@ from .intersection import IntersectedPoints, Intersector
 class CorrectedView:
     """Corrected image points of one view of an exposure."""
 
-    target_id: NDArray[np.int64]  #: (n,) each once
+    target_id: NDArray[np.integer]  #: (n,) each once
     uv: NDArray[np.float64]  #: (n, 2) corrected pixels
     #: (n,) standard deviations of the coordinates, and of the correction alone [px]
     sigma: NDArray[np.float64]
     correction_sd: NDArray[np.float64]
-    outside: NDArray[np.float64]  #: (n,) True beyond the calibrated area
+    outside: NDArray[np.bool_]  #: (n,) True beyond the calibrated area
 
 
 @dataclass(frozen=True)
@@ -48,12 +48,12 @@ class MatchedViews:
     """
 
     #: (n,) ascending; or, where all views have the same ids in the same order, in that order
-    target_id: NDArray[np.int64]
+    target_id: NDArray[np.integer]
     uv: NDArray[np.float64]  #: (F, n, 2) corrected pixels
     #: (F, n) standard deviations of the coordinates, and of the correction alone [px]
     sigma: NDArray[np.float64]
     correction_sd: NDArray[np.float64]
-    outside: NDArray[np.float64]  #: (F, n) True beyond the calibrated area
+    outside: NDArray[np.bool_]  #: (F, n) True beyond the calibrated area
 
 
 def match_views(views: Sequence[CorrectedView | None]) -> MatchedViews:
@@ -73,7 +73,7 @@ def match_views(views: Sequence[CorrectedView | None]) -> MatchedViews:
         )
     if all(_equal(first, view.target_id) for view in present[1:]):
         target_id = first
-        rows: list[np.ndarray | slice] = [slice(None)] * len(present)
+        rows: list[NDArray[np.int64] | slice] = [slice(None)] * len(present)
     else:
         target_id = np.unique(np.concatenate([view.target_id for view in present]))
         rows = [np.searchsorted(target_id, view.target_id) for view in present]
@@ -91,7 +91,7 @@ def match_views(views: Sequence[CorrectedView | None]) -> MatchedViews:
     return MatchedViews(target_id, uv, sigma, correction_sd, outside)
 
 
-def _equal(one: np.ndarray, other: np.ndarray) -> bool:
+def _equal(one: NDArray[np.integer], other: NDArray[np.integer]) -> bool:
     """Whether two views have the same ids in the same order."""
     return len(one) == len(other) and bool((one == other).all())
 

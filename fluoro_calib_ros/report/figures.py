@@ -25,6 +25,7 @@ from matplotlib.collections import Collection, QuadMesh
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
+from numpy.typing import NDArray
 
 from ..checks.comparison import Comparison, cell_centres
 from ..correction.base import Correction, CorrectionModel
@@ -249,7 +250,7 @@ def distortion_figure(
 
 def _field_on_grid(
     model: CorrectionModel, image_size: Sequence[int], cells: int
-) -> tuple[list[np.ndarray], Correction]:
+) -> tuple[list[NDArray[np.float64]], Correction]:
     """Columns and rows of a regular grid over the image [px], and the Correction at its points."""
     axes, centres = cell_centres(image_size, cells)
     return axes, model.evaluate(centres)

@@ -17,6 +17,7 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matplotlib import style
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from ..correction.fluoroscope_calibration import Calibrations
 from ..exposures.frame import Frames
@@ -296,7 +297,7 @@ def _largest(residuals: Residuals) -> float:
     return float(np.nanmax(np.hypot(*correction.T))) if len(correction) else float('nan')
 
 
-def _correlation(covariance: np.ndarray) -> list[list[float]]:
+def _correlation(covariance: NDArray[np.float64]) -> list[list[float]]:
     sd = np.sqrt(np.diag(covariance))
     scale = np.outer(np.where(sd > 0, sd, np.nan), np.where(sd > 0, sd, np.nan))
     return (covariance / scale).tolist()

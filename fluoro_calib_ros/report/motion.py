@@ -12,6 +12,7 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from ..bodies.body import BodyPoses, PoseStatus
 from ..bodies.joints import JointMotion
@@ -56,7 +57,7 @@ def _series(
     title: str,
     names: list[str],
     source: JointMotion | BodyPoses,
-    series: tuple[np.ndarray, np.ndarray],
+    series: tuple[NDArray[np.float64], NDArray[np.float64]],
 ) -> Figure:
     """Six time series (T, 6) with their standard deviations."""
     values, sd = series
@@ -89,7 +90,9 @@ def _series(
     return figure
 
 
-def _draw(axes: Axes, time_s: np.ndarray, values: np.ndarray, sd: np.ndarray) -> None:
+def _draw(
+    axes: Axes, time_s: NDArray[np.float64], values: NDArray[np.float64], sd: NDArray[np.float64]
+) -> None:
     axes.fill_between(
         time_s, values - BAND * sd, values + BAND * sd, color=RED, alpha=0.3, linewidth=0
     )
@@ -157,7 +160,7 @@ def points_figure(frames: Sequence[ReconstructedFrame], names: Mapping[int, str]
     return figure
 
 
-def _draw_paths(axes: Axes, xyz: np.ndarray) -> None:
+def _draw_paths(axes: Axes, xyz: NDArray[np.float64]) -> None:
     """Draw the paths of points (T, n, 3), with a dot at the end of each."""
     for path in np.swapaxes(xyz, 0, 1):
         (line,) = axes.plot(*path.T, linewidth=1)
@@ -169,7 +172,9 @@ def _draw_paths(axes: Axes, xyz: np.ndarray) -> None:
         axes.set_aspect('equal')
 
 
-def _draw_gaps(axes: Axes, when: np.ndarray, found: np.ndarray, labels: Sequence[str]) -> None:
+def _draw_gaps(
+    axes: Axes, when: np.ndarray, found: NDArray[np.bool_], labels: Sequence[str]
+) -> None:
     """Draw when targets (T, n) were found, a row each, with the share of the frames."""
     for row, of_target in enumerate(found.T):
         edges = np.flatnonzero(np.diff(np.concatenate([[0], of_target.astype(int), [0]])))

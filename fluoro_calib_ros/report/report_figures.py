@@ -13,6 +13,7 @@ from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
+from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from ..estimation.result import CalibrationResult
@@ -39,7 +40,9 @@ from .residuals import Residuals, histogram_figure, position_figure
 from .tables import model_text
 
 
-def relative_costs(run: SelfCalibration) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def relative_costs(
+    run: SelfCalibration,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """F (n+1,), G (n,) and recorded G (n,) of the n rounds, in percent of their first values.
 
     F[i] is the weighted square sum of the residuals of adjustment i, 0 being the one without
@@ -146,14 +149,14 @@ def residual_map(residuals: Residuals, name: str, image_size: tuple[int, int]) -
     return figure
 
 
-def covered_cells(uv: np.ndarray, image_size: tuple[int, int]) -> np.ndarray:
+def covered_cells(uv: NDArray[np.float64], image_size: tuple[int, int]) -> NDArray[np.bool_]:
     """Return (CELLS, CELLS) whether a part of the image is near an image point."""
     coverage = Coverage(image_size)
     coverage.add(uv)
     return coverage.covered
 
 
-def missing_sides(uv: np.ndarray, image_size: tuple[int, int]) -> list[str]:
+def missing_sides(uv: NDArray[np.float64], image_size: tuple[int, int]) -> list[str]:
     """Return the parts of the image, in words, of which less than half is covered."""
     covered = covered_cells(uv, image_size)
     third = CELLS // 3
@@ -202,7 +205,7 @@ def distribution(residuals: Residuals, name: str) -> Figure:
     return figure
 
 
-def bead_shifts(shift_mm: np.ndarray, sd_mm: np.ndarray) -> Figure:
+def bead_shifts(shift_mm: NDArray[np.float64], sd_mm: NDArray[np.float64]) -> Figure:
     """Shifts of the beads against their survey (n, 3), and relative to its standard deviation."""
     figure = new_figure(7.5, 3.6, 'Beads: adjusted minus survey')
     left, right = figure.subplots(1, 2)

@@ -20,7 +20,7 @@ from ..photogrammetry.collinearity import project
 from .figures import AFTER, BEFORE, BLACK, GREY, new_figure
 from .tables import model_text
 
-Pose = tuple[np.ndarray, np.ndarray]
+Pose = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Residuals:
         return position_figure(title, self.uv, before, (self.after, self.inlier), image_size)
 
 
-def _rms(values: np.ndarray) -> float:
+def _rms(values: NDArray[np.float64]) -> float:
     return float(np.sqrt(np.mean(values**2))) if len(values) else float('nan')
 
 
@@ -123,7 +123,7 @@ COORDINATES = ('u', 'v')
 
 def normalised_residuals(
     run: SelfCalibration, rows: NDArray[np.int64], redundancy: NDArray[np.float64]
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Inlier residuals in units of their standard deviation, before (n, 2) and after (m, 2).
 
     rows (k,) are image points, redundancy (k,) their redundancy numbers. The standard deviation of
@@ -144,7 +144,7 @@ def normalised_residuals(
 
 
 def histogram_figure(
-    run: SelfCalibration, name: str, rows: np.ndarray, redundancy: np.ndarray
+    run: SelfCalibration, name: str, rows: NDArray[np.int64], redundancy: np.ndarray
 ) -> Figure:
     """Histograms of the normalised residuals of one fluoroscope, with the standard normal.
 
@@ -184,7 +184,7 @@ def histogram_figure(
     return figure
 
 
-def _plot_histogram(axes: Axes, values: np.ndarray, limit: float, when: str) -> None:
+def _plot_histogram(axes: Axes, values: NDArray[np.float64], limit: float, when: str) -> None:
     """Histogram of values (n,) from -limit to limit; when: 'before' or 'after'."""
     colour, alpha = (BEFORE, 0.45) if when == 'before' else (AFTER, 0.5)
     edges = np.linspace(-limit, limit, 2 * round(limit / BIN_SD) + 1)
@@ -205,7 +205,7 @@ def _plot_histogram(axes: Axes, values: np.ndarray, limit: float, when: str) -> 
     )
 
 
-def _percent_within(values: np.ndarray, limit: float) -> float:
+def _percent_within(values: NDArray[np.float64], limit: float) -> float:
     return 100 * np.mean(np.abs(values) <= limit)
 
 
@@ -269,9 +269,9 @@ def _residual_limit(residuals: Residual, axis: int) -> float:
 
 def _plot_residuals(
     axes: Axes,
-    position: np.ndarray,
-    residual: np.ndarray,
-    inliers: np.ndarray,
+    position: NDArray[np.float64],
+    residual: NDArray[np.float64],
+    inliers: NDArray[np.bool_],
     limit: float,
     colour: str,
 ) -> None:
@@ -285,7 +285,7 @@ def _plot_residuals(
 
 
 def _plot_running_median(
-    axes: Axes, position: np.ndarray, residual: np.ndarray, size: int
+    axes: Axes, position: NDArray[np.float64], residual: NDArray[np.float64], size: int
 ) -> None:
     """Running median of residuals (n,) over positions (n,) in an image of this size."""
     edges = np.linspace(-0.5, size - 0.5, STRIPES + 1)

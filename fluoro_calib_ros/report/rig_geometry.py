@@ -101,7 +101,7 @@ def beams(orientation: RigOrientation) -> list[tuple[str, float, float]]:
     return out
 
 
-def phantom_in_sensor(entry: Mapping[str, Any]) -> np.ndarray:
+def phantom_in_sensor(entry: Mapping[str, Any]) -> NDArray[np.float64]:
     """Return the origin of the phantom in the sensor frame of an exposure of result.json [mm]."""
     rotation = matrix_from_quaternion(np.array(entry['quaternion_wxyz'], dtype=float))
     return -rotation @ np.array(entry['position_mm'], dtype=float)

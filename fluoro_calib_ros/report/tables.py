@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..checks.check import Validation
 from ..correction.angle_field import AngleField
@@ -206,7 +207,7 @@ def orientation_text(orientation: RigOrientation) -> str:
     return '\n'.join(lines)
 
 
-def _numbers(values: np.ndarray) -> str:
+def _numbers(values: NDArray[np.float64]) -> str:
     return ', '.join(f'{value:.2f}' for value in values)
 
 

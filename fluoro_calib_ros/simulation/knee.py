@@ -182,7 +182,9 @@ def landing(knee: VirtualKnee, times_s: NDArray[np.float64]) -> KneeMotion:
     return _motion(knee, times_s, (rotation, centre), angles, translations, of_tibia=True)
 
 
-def _coupled(flexion: np.ndarray, phase: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _coupled(
+    flexion: NDArray[np.float64], phase: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return angles and translations (T, 3): what goes with flexion (T,) [rad].
 
     A few degrees and millimetres, as pins in the bones showed (Lafortune et al., J. Biomech. 25,
@@ -201,10 +203,10 @@ def _coupled(flexion: np.ndarray, phase: np.ndarray) -> tuple[np.ndarray, np.nda
 
 def _motion(
     knee: VirtualKnee,
-    times_s: np.ndarray,
-    driven: tuple[np.ndarray, np.ndarray],
-    angles: np.ndarray,
-    translations: np.ndarray,
+    times_s: NDArray[np.float64],
+    driven: tuple[NDArray[np.float64], NDArray[np.float64]],
+    angles: NDArray[np.float64],
+    translations: NDArray[np.float64],
     of_tibia: bool = False,
 ) -> KneeMotion:
     """Return the motion of both bones; driven: pose of the femur, or the tibia, in the rig."""
@@ -241,8 +243,8 @@ def _motion(
 
 
 def _of_body(
-    rotation: np.ndarray, origin: np.ndarray, frame: AnatomicalFrame
-) -> tuple[np.ndarray, np.ndarray]:
+    rotation: NDArray[np.float64], origin: NDArray[np.float64], frame: AnatomicalFrame
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the pose of a body whose anatomical frame has this pose."""
     of_body = rotation @ frame.rotation.T
     return of_body, origin - of_body @ frame.origin_mm

@@ -88,7 +88,7 @@ class _Disc:
     first: float
     last: float
     radius_px: float
-    drift: np.ndarray  # [px] from its middle to its end
+    drift: NDArray[np.float64]  # [px] from its middle to its end
 
 
 class MovingMarkers:
@@ -119,7 +119,7 @@ class MovingMarkers:
         angle = rng.uniform(-1.0, 1.0, (scene.clusters, 3))
         self._turn = np.array([matrix_from_vector(vector) for vector in angle])
 
-    def poses(self, frame: float) -> list[tuple[np.ndarray, np.ndarray]]:
+    def poses(self, frame: float) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
         """Rotations (3, 3) and shifts (3,) [mm] of all clusters at an image number."""
         angle = 2 * self._frequency * frame / 2 + self._phase
         values = (self._amplitude * np.sin(angle)).sum(axis=2)
@@ -128,7 +128,7 @@ class MovingMarkers:
             for value, turn in zip(values, self._turn)
         ]
 
-    def points_mm(self, frame: float) -> np.ndarray:
+    def points_mm(self, frame: float) -> NDArray[np.float64]:
         """Markers (n, 3) in the rig frame at an image number."""
         out = np.empty_like(self.local_mm)
         for number, (rotation, shift) in enumerate(self.poses(frame)):
@@ -137,11 +137,11 @@ class MovingMarkers:
         return out
 
 
-def _spread(rng: np.random.Generator, scene: MarkerScene) -> np.ndarray:
+def _spread(rng: np.random.Generator, scene: MarkerScene) -> NDArray[np.float64]:
     """Markers (n, 3) of all clusters [mm], no two of a cluster close to each other."""
     out = []
     for _ in range(scene.clusters):
-        chosen: list[np.ndarray] = []
+        chosen: list[NDArray[np.float64]] = []
         while len(chosen) < scene.markers:
             point = rng.uniform(-1, 1, 3) * scene.spread_mm * np.array([0.5, 0.5, 1.0])
             if all(np.linalg.norm(point - other) > 0.25 * scene.spread_mm for other in chosen):
@@ -189,8 +189,11 @@ class MarkerRadiography(Radiography):
         return MarkerImage(image, true, self.in_field(true, 6.0) & ~hidden, uv.mean(axis=0))
 
     def expected_light(
-        self, frame: int, rows: np.ndarray, shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    ) -> np.ndarray:
+        self,
+        frame: int,
+        rows: NDArray[np.int64],
+        shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> NDArray[np.float32]:
         """Return the light (h, w) that is expected, 1 in the open beam, of markers in rows (k,).
 
         They are moved by shift_mm in the rig frame.
@@ -199,8 +202,11 @@ class MarkerRadiography(Radiography):
         return detected(light, self.settings)
 
     def _light(
-        self, frame: int, rows: np.ndarray, shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        self,
+        frame: int,
+        rows: NDArray[np.int64],
+        shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_]]:
         """Light (h, w) before the detector, centres (moments, n, 2), which are hidden (n,)."""
         scene = self.markers.scene
         moments = frame + scene.shutter * ((np.arange(MOMENTS) + 0.5) / MOMENTS - 0.5)
@@ -216,13 +222,17 @@ class MarkerRadiography(Radiography):
 
     def _true(
         self, frame: int, shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    ) -> np.ndarray:
+    ) -> NDArray[np.float64]:
         """True centres (n, 2) in the middle of an exposure, of markers that are moved."""
         points = self.markers.points_mm(frame) + np.asarray(shift_mm)
         return self.centres(points, (np.eye(3), np.zeros(3)))
 
     def _trace(
-        self, light: np.ndarray, points: np.ndarray, uv: np.ndarray, radius: np.ndarray
+        self,
+        light: NDArray[np.float32],
+        points: NDArray[np.float64],
+        uv: NDArray[np.float64],
+        radius: NDArray[np.float64],
     ) -> None:
         """Multiply the light (h, w) by the transmission of markers (moments, k, 3) at uv."""
         fluoroscope = self.fluoroscope
@@ -256,7 +266,9 @@ class MarkerRadiography(Radiography):
             coarse = cv2.resize(total, (u1 - u0, v1 - v0), interpolation=cv2.INTER_AREA)
             light[v0:v1, u0:u1] *= coarse / (MOMENTS * SPOT_POINTS)
 
-    def _bones(self, poses: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    def _bones(
+        self, poses: list[tuple[NDArray[np.float64], NDArray[np.float64]]]
+    ) -> NDArray[np.float32]:
         """Transmission (h, w) of the bones around the clusters."""
         fluoroscope = self.fluoroscope
         size = self.markers.scene.spread_mm
@@ -278,7 +290,9 @@ class MarkerRadiography(Radiography):
         )
         return cv2.remap(passed, *place, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
 
-    def _hide(self, light: np.ndarray, frame: int, true: np.ndarray) -> np.ndarray:
+    def _hide(
+        self, light: NDArray[np.float32], frame: int, true: NDArray[np.float64]
+    ) -> NDArray[np.bool_]:
         """Draw the discs of metal of an image; returns (n,) which markers they hide."""
         hidden = np.zeros(len(true), dtype=bool)
         for disc in self._discs:
@@ -294,7 +308,7 @@ class MarkerRadiography(Radiography):
             hidden |= np.linalg.norm(true - centre, axis=1) < disc.radius_px + 2.5
         return hidden
 
-    def _grey(self, light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    def _grey(self, light: NDArray[np.float32], rng: np.random.Generator) -> np.ndarray:
         """Grey values (h, w) of light from 0 to 1; so many photons have Gaussian noise."""
         settings = self.settings
         expected = np.maximum(light, 0).astype(np.float32) * np.float32(settings.photons)
@@ -311,7 +325,7 @@ class MarkerRadiography(Radiography):
 
 
 def _regions(
-    low: np.ndarray, high: np.ndarray
+    low: NDArray[np.int64], high: NDArray[np.int64]
 ) -> Iterator[tuple[list[int], tuple[int, int], tuple[int, int]]]:
     """Yield rows and corners of boxes low (n, 2) to high (n, 2), those that touch as one."""
     boxes = [
@@ -338,7 +352,9 @@ def _regions(
         yield rows, (int(a[0]), int(a[1])), (int(b[0]), int(b[1]))
 
 
-def _ellipsoid_path(source: np.ndarray, direction: np.ndarray) -> np.ndarray:
+def _ellipsoid_path(
+    source: NDArray[np.float64], direction: NDArray[np.float32]
+) -> NDArray[np.float32]:
     """Lengths (n,) of rays in an ellipsoid, scaled to the unit sphere; directions (3, n)."""
     x, y, z = direction
     a = x * x + y * y + z * z

@@ -74,14 +74,14 @@ class Radiography:
         rays = self._rays.astype(np.float32)
         self._directions = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
-    def centres(self, points_mm: np.ndarray, pose: Pose) -> np.ndarray:
+    def centres(self, points_mm: NDArray[np.float64], pose: Pose) -> NDArray[np.float64]:
         """Observed pixels (n, 2) of points of the phantom (n, 3) [mm]."""
         rotation, shift = pose
         return self.fluoroscope.distortion.distort(
             self.fluoroscope.ideal(points_mm @ rotation.T + shift)
         )
 
-    def in_field(self, uv: np.ndarray, margin_px: float = 0.0) -> np.ndarray:
+    def in_field(self, uv: NDArray[np.float64], margin_px: float = 0.0) -> NDArray[np.bool_]:
         """Return (n,) whether pixels (n, 2) lie in the field, a margin from its edge."""
         return _depth_in_field(uv, self.fluoroscope.image_size, self.settings) > margin_px
 
@@ -118,10 +118,10 @@ class Radiography:
 
     def light(
         self,
-        points_mm: np.ndarray,
+        points_mm: NDArray[np.float64],
         pose: Pose,
         seed: int = 0,
-        diameter_mm: np.ndarray | None = None,
+        diameter_mm: NDArray[np.float64] | None = None,
         plates: bool = True,
     ) -> np.ndarray:
         """Return the light (h, w) that reaches the detector, 1 in the open beam, without noise.
@@ -145,14 +145,19 @@ class Radiography:
         light *= self._open_beam
         return detected(light, settings)
 
-    def _detector_mm(self, uv: np.ndarray) -> np.ndarray:
+    def _detector_mm(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points of the detector (n, 3) in the sensor frame [mm] of observed pixels (n, 2)."""
         xp, yp, c = self.fluoroscope.interior
         ideal = uv - self.fluoroscope.distortion(uv)
         scaled = (ideal - (xp, yp)) * (self.settings.detector_mm / c)
         return np.column_stack([scaled, np.full(len(uv), self.settings.detector_mm)])
 
-    def _beads(self, sensor_mm: np.ndarray, uv: np.ndarray, radius_mm: np.ndarray) -> np.ndarray:
+    def _beads(
+        self,
+        sensor_mm: NDArray[np.float64],
+        uv: NDArray[np.float64],
+        radius_mm: NDArray[np.float64],
+    ) -> np.ndarray:
         """Transmission (h, w) of beads: sensor frame (n, 3) [mm], pixels (n, 2), radii (n,)."""
         width, height = self.fluoroscope.image_size
         fine = OVERSAMPLING
@@ -177,7 +182,7 @@ class Radiography:
             total += cv2.resize(inner, (width, height), interpolation=cv2.INTER_AREA)
         return total / len(spots)
 
-    def _patches_mm(self, low: np.ndarray, count: int) -> np.ndarray:
+    def _patches_mm(self, low: NDArray[np.int64], count: int) -> NDArray[np.float64]:
         """Points (n, k, 3) of the detector [mm] where rays meet patches of `count` pixels.
 
         low (n, 2) are their first pixels. The points are interpolated linearly between pixels:
@@ -194,7 +199,9 @@ class Radiography:
         both = np.tensordot(weight, rows, axes=(1, 2))  # (fine across, fine down, n, 3)
         return both.transpose(2, 1, 0, 3).reshape(len(low), (count * fine) ** 2, 3)
 
-    def _plates(self, rotation: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    def _plates(
+        self, rotation: NDArray[np.float64], origin: NDArray[np.float64]
+    ) -> NDArray[np.float32]:
         """Transmission (h, w) of the four plates of the cube.
 
         rotation (3, 3) and origin (3,) [mm] take points of the phantom to the sensor frame.
@@ -215,7 +222,7 @@ class Radiography:
         return np.exp(-self.settings.plate_attenuation * path).astype(np.float32)
 
 
-def focal_spot(diameter_mm: float) -> np.ndarray:
+def focal_spot(diameter_mm: float) -> NDArray[np.float64]:
     """Points (k, 3) of a uniform disc: its middle, and a ring that gives its second moment."""
     if not diameter_mm:
         return np.zeros((1, 3))
@@ -225,7 +232,9 @@ def focal_spot(diameter_mm: float) -> np.ndarray:
     return np.concatenate([np.zeros((1, 3)), around])
 
 
-def chords(centre: np.ndarray, ray: np.ndarray, radius: np.ndarray) -> np.ndarray:
+def chords(
+    centre: NDArray[np.float64], ray: NDArray[np.float64], radius: np.ndarray
+) -> NDArray[np.float64]:
     """Lengths of rays from the origin inside spheres; all arguments broadcast, the last axis 3."""
     x, y, z = np.moveaxis(ray, -1, 0)
     a, b, c = np.moveaxis(centre, -1, 0)
@@ -234,8 +243,11 @@ def chords(centre: np.ndarray, ray: np.ndarray, radius: np.ndarray) -> np.ndarra
 
 
 def _path_in_box(
-    source: np.ndarray, rays: np.ndarray, low: np.ndarray, high: np.ndarray
-) -> np.ndarray:
+    source: np.ndarray,
+    rays: NDArray[np.float32],
+    low: NDArray[np.float32],
+    high: NDArray[np.float32],
+) -> NDArray[np.float32]:
     """Lengths (h, w) of rays (h, w, 3) of unit length inside a box, by the slab method."""
     direction = np.where(np.abs(rays) < 1e-12, rays.dtype.type(1e-12), rays)
     first = (low - source) / direction
@@ -249,7 +261,7 @@ def _path_in_box(
 
 def _depth_in_field(
     uv: np.ndarray, image_size: tuple[int, int], settings: RadiographSettings
-) -> np.ndarray:
+) -> NDArray[np.float64]:
     """Distances [px] of pixels (..., 2) from the edge of the field, negative outside."""
     size = np.asarray(image_size)
     from_centre = uv - (size - 1) / 2
@@ -259,8 +271,8 @@ def _depth_in_field(
 
 
 def illumination(
-    uv: np.ndarray, image_size: tuple[int, int], settings: RadiographSettings
-) -> np.ndarray:
+    uv: NDArray[np.int64], image_size: tuple[int, int], settings: RadiographSettings
+) -> NDArray[np.float32]:
     """Open beam (h, w) from 0 to 1 at pixels (h, w, 2): darker to the border and to the anode."""
     x = (uv - (np.asarray(image_size) - 1) / 2) / (max(image_size) / 2)
     light = 1 - 0.16 * np.sum(x * x, axis=-1) + 0.06 * x[..., 0] - 0.05 * x[..., 1] ** 3
@@ -269,7 +281,7 @@ def illumination(
     return (light * (LEAKAGE + (1 - LEAKAGE) * inside)).astype(np.float32)
 
 
-def clutter(rng: np.random.Generator, shape: tuple[int, ...], count: int) -> np.ndarray:
+def clutter(rng: np.random.Generator, shape: tuple[int, ...], count: int) -> NDArray[np.float32]:
     """Transmission (h, w) of cables, bone-like shadows, screws and specks."""
     height, width = shape
     size = np.array([width, height])
@@ -310,7 +322,7 @@ def clutter(rng: np.random.Generator, shape: tuple[int, ...], count: int) -> np.
     return out
 
 
-def detected(light: np.ndarray, settings: RadiographSettings) -> np.ndarray:
+def detected(light: NDArray[np.float32], settings: RadiographSettings) -> NDArray[np.float32]:
     """Light (h, w) after blur and glare of the detector."""
     sharp = cv2.GaussianBlur(light, (0, 0), settings.blur_px) if settings.blur_px else light
     if not settings.glare:
@@ -322,7 +334,7 @@ def detected(light: np.ndarray, settings: RadiographSettings) -> np.ndarray:
 
 
 def _digitised(
-    light: np.ndarray, settings: RadiographSettings, rng: np.random.Generator
+    light: NDArray[np.float32], settings: RadiographSettings, rng: np.random.Generator
 ) -> np.ndarray:
     """Grey values (h, w) of light from 0 to 1, with quantum noise."""
     expected = np.maximum(light, 0) * settings.photons

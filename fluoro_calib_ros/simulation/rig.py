@@ -29,7 +29,7 @@ BETWEEN_DEG = 84.0  # angle between the axes of neighbouring fluoroscopes
 BETWEEN_THREE_DEG = 60.0  # the same, of three
 
 # Rotation (3, 3) and shift (3,) [mm] that take points of the phantom into the rig frame.
-Pose = tuple[np.ndarray, np.ndarray]
+Pose = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class VirtualFluoroscope:
         rotation, shift = pose
         return self.rotation @ rotation, rotation.T @ (self.position_mm - shift)
 
-    def ideal(self, points_mm: np.ndarray) -> np.ndarray:
+    def ideal(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         """Undistorted image points (n, 2) [px] of points (n, 3) in the rig frame."""
         n = len(points_mm)
         return project(
@@ -68,11 +68,11 @@ class VirtualRig:
     """A rig: fluoroscopes, the true coordinates of the phantom [mm] and its survey."""
 
     fluoroscopes: tuple[VirtualFluoroscope, ...]
-    true_mm: np.ndarray
+    true_mm: NDArray[np.float64]
     phantom: Phantom
 
 
-def bead_coordinates(rng: np.random.Generator) -> np.ndarray:
+def bead_coordinates(rng: np.random.Generator) -> NDArray[np.float64]:
     """Coordinates (503, 3) [mm] of beads on the side faces of the cube, in a disturbed grid."""
     across, up = np.meshgrid(
         (np.arange(11) - 5) * 23.0, (np.arange(12) - 5.5) * 21.0, indexing='ij'
@@ -88,7 +88,7 @@ def bead_coordinates(rng: np.random.Generator) -> np.ndarray:
     return np.round(np.concatenate(beads), 6)
 
 
-def looking_at_origin(position_mm: ArrayLike) -> np.ndarray:
+def looking_at_origin(position_mm: ArrayLike) -> NDArray[np.float64]:
     """Rotation (3, 3) rig -> sensor frame of a source at position_mm (3,) that faces the origin.
 
     The y axis of the sensor points down.
@@ -162,7 +162,7 @@ class DistortionField:
     #: (k, 5), Gaussian bumps: centre u, v, width, and height along u and v [px]
     ripples: NDArray[np.float64]
 
-    def __call__(self, uv: ArrayLike) -> np.ndarray:
+    def __call__(self, uv: ArrayLike) -> NDArray[np.float64]:
         """Corrections (n, 2) [px] of observed pixels uv (n, 2)."""
         uv = np.asarray(uv, dtype=float)
         x = (uv - self.centre) / EDGE_PX
@@ -178,7 +178,7 @@ class DistortionField:
             out[:, 1] += bump * height_v
         return out
 
-    def distort(self, uv: ArrayLike) -> np.ndarray:
+    def distort(self, uv: ArrayLike) -> NDArray[np.float64]:
         """Observed pixels (n, 2) of undistorted ones uv (n, 2), by fixed-point iteration.
 
         Far beyond the image it may diverge; these are NaN or infinite.
@@ -234,8 +234,8 @@ class StreamStart:
         fluoroscope: VirtualFluoroscope,
         index: int,
         time_s: float,
-        target_id: np.ndarray,
-        observed: np.ndarray,
+        target_id: NDArray[np.int64],
+        observed: NDArray[np.float64],
     ) -> Frame:
         """Frame number `index`, counted from 0, at a time after the first one [s].
 
@@ -305,7 +305,7 @@ def simulate_exposures(
     rng = np.random.default_rng([seed, 2])
     poses = phantom_poses(rng, count)
     frames: dict[str, list[Frame]] = {f.name: [] for f in rig.fluoroscopes}
-    undistorted: dict[str, list[np.ndarray]] = {f.name: [] for f in rig.fluoroscopes}
+    undistorted: dict[str, list[NDArray[np.float64]]] = {f.name: [] for f in rig.fluoroscopes}
     for index, (rotation, shift) in enumerate(poses):
         points = rig.true_mm @ rotation.T + shift
         for fluoroscope in rig.fluoroscopes:
@@ -324,7 +324,7 @@ def detect_beads(
     points_mm: NDArray[np.float64],
     target_id: NDArray[np.int64],
     detection: Detection | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Simulate the detection of beads in one image.
 
     points_mm: (k, 3), beads in the rig frame. target_id: (k,). Returns target_id: (n,), ids of the
@@ -413,8 +413,8 @@ def simulate_tracking(
 
 def image_frames(
     rig: VirtualRig,
-    points_mm: np.ndarray,
-    target_id: np.ndarray,
+    points_mm: NDArray[np.float64],
+    target_id: NDArray[np.int64],
     times_s: Sequence[float],
     noise_px: float,
     rng: np.random.Generator,
@@ -441,7 +441,7 @@ def image_frames(
     return frames, ideal
 
 
-def _markers_at(time_s: float, shapes: list[np.ndarray]) -> np.ndarray:
+def _markers_at(time_s: float, shapes: list[NDArray[np.float64]]) -> NDArray[np.float64]:
     """Positions (k, 3) [mm] of all markers at a time [s]; shapes: clusters (6, 3) [mm]."""
     t = time_s
     bend = np.deg2rad(25) * np.sin(2 * np.pi * 0.5 * t)

@@ -24,6 +24,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...bodies.joints import JointMotion
 from ...errors import DataError
@@ -102,7 +103,7 @@ def _bodies(row: Row, first: int) -> list[str]:
     return names
 
 
-def _check(row: Row, matrices: np.ndarray, names: list[str]) -> None:
+def _check(row: Row, matrices: NDArray[np.float64], names: list[str]) -> None:
     """Raise DataError for a matrix (4, 4) that is not a pose."""
     for name, matrix in zip(names, matrices):
         if np.isnan(matrix).any():
@@ -279,7 +280,7 @@ def _write(
     path: PathLike,
     header: Iterable[str],
     labels: Sequence[str],
-    times_s: np.ndarray,
+    times_s: NDArray[np.float64],
     cells: Iterable[Sequence[str]],
 ) -> None:
     """Write a table. Raises DataError for a label that would be two, or no column."""

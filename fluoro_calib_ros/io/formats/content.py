@@ -38,17 +38,17 @@ PARTS = {
 }
 
 
-def from_units(values: np.ndarray, mm: float) -> np.ndarray:
+def from_units(values: NDArray[np.float64], mm: float) -> NDArray[np.float64]:
     """Return lengths in mm of lengths in units of mm, with the same decimal digits."""
     return _shifted(values, mm, 1)
 
 
-def in_units(values_mm: np.ndarray, mm: float) -> np.ndarray:
+def in_units(values_mm: NDArray[np.float64], mm: float) -> NDArray[np.float64]:
     """Return lengths in units of mm of lengths in mm, with the same decimal digits."""
     return _shifted(values_mm, mm, -1)
 
 
-def _shifted(values: np.ndarray, mm: float, sign: int) -> np.ndarray:
+def _shifted(values: NDArray[np.float64], mm: float, sign: int) -> NDArray[np.float64]:
     """Move the decimal point: 11.39205 cm are 113.9205 mm, not 113.92050000000002."""
     values = np.asarray(values, dtype=float)
     digits = sign * round(math.log10(mm))
@@ -73,7 +73,7 @@ class Camera:
     distortion: tuple[float, ...] = ()
 
     @property
-    def pose(self) -> tuple[np.ndarray, np.ndarray]:
+    def pose(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Rotation (3, 3) and translation (3,) [mm] of X_sensor = R X + t. Raises DataError."""
         if self.rotation is None or self.translation_mm is None:
             raise DataError(
@@ -100,9 +100,9 @@ class Camera:
 
 def camera_at(
     name: str,
-    matrix: np.ndarray,
+    matrix: NDArray[np.float64],
     image_size: tuple[int, int] | None,
-    rotation: np.ndarray,
+    rotation: NDArray[np.float64],
     position_mm: np.ndarray,
 ) -> Camera:
     """Return the Camera whose source is at position_mm (3,)."""
@@ -115,8 +115,8 @@ class Station:
 
     fluoroscope: str
     exposure: int
-    rotation: np.ndarray
-    position_mm: np.ndarray
+    rotation: NDArray[np.float64]
+    position_mm: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,10 @@ class Points:
 
 
 def points_without_precision(
-    frame: np.ndarray, target_id: np.ndarray, xyz_mm: np.ndarray, rate_hz: float | None = None
+    frame: NDArray[np.int64],
+    target_id: NDArray[np.int64],
+    xyz_mm: NDArray[np.float64],
+    rate_hz: float | None = None,
 ) -> Points:
     """Return Points of which only the coordinates are known."""
     unknown = np.full(xyz_mm.shape[:2], np.nan)
@@ -350,7 +353,7 @@ def name_of_file(path: Path, ending: str) -> str:
     return path.name[: -len(ending)] if path.name.endswith(ending) else path.stem
 
 
-def check_rotation(where: object, rotation: np.ndarray) -> None:
+def check_rotation(where: object, rotation: NDArray[np.float64]) -> None:
     """Raise DataError for a matrix (3, 3) that is not a rotation."""
     error = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if not error <= ROTATION_TOLERANCE:
@@ -359,7 +362,7 @@ def check_rotation(where: object, rotation: np.ndarray) -> None:
         raise DataError(f'{where}: the matrix is not a rotation, it mirrors')
 
 
-def check_matrix(where: object, matrix: np.ndarray) -> None:
+def check_matrix(where: object, matrix: NDArray[np.float64]) -> None:
     """Raise DataError for a matrix (3, 3) that is not a camera matrix."""
     if not (matrix[0, 0] > 0 and matrix[1, 1] > 0):
         raise DataError(f'{where}: the focal lengths in the camera matrix are not above 0')

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 
 from ...errors import DataError, ErrorsAt
 from ...exposures.names import Names, without_trivial
@@ -103,7 +104,7 @@ def _read_points(path: Path, settings: FileSettings) -> Content:
         rows.fail(index, f'target {target[index]} of frame {frame[index]} is given twice')
     shape = (len(frames), len(targets))
 
-    def table(values: np.ndarray) -> np.ndarray:
+    def table(values: NDArray[np.float64]) -> NDArray[np.float64]:
         out = np.full(shape, np.nan)
         out[row, column] = values
         return out

@@ -18,6 +18,7 @@ from typing import Any
 import cv2
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 
 from ...errors import DataError
 from ...photogrammetry.rotations import matrix_from_vector, vector_from_matrix
@@ -103,7 +104,7 @@ def _opencv_camera(path: Path, storage: cv2.FileStorage, settings: FileSettings)
 
 def _node_matrix(
     path: Path, storage: cv2.FileStorage, names: tuple[str, ...]
-) -> np.ndarray | None:
+) -> NDArray[np.float64] | None:
     """Return the first of some matrices that is there. Raises DataError."""
     for name in names:
         node = storage.getNode(name)
@@ -200,7 +201,7 @@ def _anipose_camera(where: str, table: Mapping[str, Any], mm: float) -> Camera:
 
 def _numbers_of(
     where: object, table: Mapping[str, Any], key: str, shape: tuple[int, ...] | None
-) -> np.ndarray:
+) -> NDArray[np.float64]:
     """Return an entry of a document as an array of finite numbers. Raises DataError."""
     try:
         value = np.array(table[key], dtype=float)
@@ -298,7 +299,7 @@ def _read_camera_info(path: Path, settings: FileSettings) -> Content:
 
 def _entry_matrix(
     path: Path, document: Mapping[str, Any], key: str, shape: tuple[int, ...] | None
-) -> np.ndarray:
+) -> NDArray[np.float64]:
     """Return an entry {rows, cols, data} as an array. Raises DataError."""
     entry = document.get(key)
     if not isinstance(entry, Mapping):
@@ -337,7 +338,7 @@ def _camera_info_text(camera: Camera) -> str:
     return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=1000)
 
 
-def _entry(matrix: np.ndarray) -> dict[str, Any]:
+def _entry(matrix: NDArray[np.float64]) -> dict[str, Any]:
     rows, columns = matrix.shape
     return {'rows': rows, 'cols': columns, 'data': matrix.ravel().tolist()}
 

@@ -15,6 +15,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 VALUES = 'values_block_0'  # of columns of one kind, as in a table of coordinates
 _VALUES = ('UNICODE', 'STRING', 'INT', 'LONG')
@@ -49,7 +50,7 @@ def table_arrays(group: Any) -> dict[str, Any]:
     return {'columns': columns, 'index': index, 'values': values}
 
 
-def _appendable(group: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _appendable(group: Any) -> tuple[NDArray[np.str_], NDArray[np.str_], NDArray[np.float64]]:
     table = group['table']
     if set(table.dtype.names) != {'index', VALUES}:
         raise ValueError('its columns are not of one kind')
@@ -60,7 +61,7 @@ def _appendable(group: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.array(columns, dtype=str), np.array(texts(rows['index'])), rows[VALUES].astype(float)
 
 
-def _fixed(group: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _fixed(group: Any) -> tuple[NDArray[np.str_], NDArray[np.str_], NDArray[np.float64]]:
     if int(group.attrs['nblocks']) != 1:
         raise ValueError('its columns are not of one kind')
     columns = np.array(_levels(group, 'block0_items')).T

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...errors import DataError, ErrorsAt
 from ...exposures.names import MAX_ID, Names, number_names, without_trivial
@@ -173,7 +174,7 @@ def _numbers(row: Row, layout: _Layout, names: Sequence[str]) -> list[float]:
     return out
 
 
-def _positive(rows: Sequence[Row], layout: _Layout, name: str) -> np.ndarray:
+def _positive(rows: Sequence[Row], layout: _Layout, name: str) -> NDArray[np.float64]:
     values = np.array([_numbers(row, layout, (name,))[0] for row in rows])
     if not (values > 0).all():
         rows[int(np.argmin(values > 0))].fail(f'{name} is not above 0')
@@ -260,7 +261,7 @@ def content_of(path: Path, text: str, settings: FileSettings) -> Content:
 
 def _sd_unsaid(
     path: Path, count: int, settings: FileSettings
-) -> tuple[np.ndarray, tuple[str, ...]]:
+) -> tuple[NDArray[np.float64], tuple[str, ...]]:
     """Return standard deviations (n,) [mm] that a file does not say, and a note if nobody does."""
     if settings.phantom_sd_mm is not None:
         return np.full(count, settings.phantom_sd_mm), ()
@@ -268,7 +269,7 @@ def _sd_unsaid(
     return np.full(count, DEFAULT_SD_MM), (note + 'with --phantom-sd',)
 
 
-def _factors(row: Row) -> np.ndarray:
+def _factors(row: Row) -> NDArray[np.float64]:
     """Return the factors (3,) of the coordinates."""
     cells = row.cells
     if len(cells) < 3 or not all(cell.lower().startswith('s') for cell in cells[:3]):

@@ -20,6 +20,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...errors import DataError
 from ...exposures.frame import Frame
@@ -63,7 +64,7 @@ def read_deeplabcut(path: Path, settings: FileSettings) -> Content:
     size = settings.image_size_of(path)
     fluoroscope = _fluoroscope_of_table(path, settings)
     frames: dict[int, Frame] = {}
-    likelihood: list[np.ndarray] = []
+    likelihood: list[NDArray[np.float64]] = []
     unsure = 0
     for row in body:
         values = np.array(row.numbers_or_nan(first)).reshape(len(targets), -1)

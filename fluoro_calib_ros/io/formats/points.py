@@ -28,6 +28,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...errors import DataError
 from ..access import atomic_file, read_bytes, read_text, write_bytes
@@ -371,7 +372,7 @@ def _read_trc(path: Path, settings: FileSettings) -> Content:
     )
 
 
-def _coordinates(row: Row, count: int) -> np.ndarray:
+def _coordinates(row: Row, count: int) -> NDArray[np.float64]:
     """Return coordinates (count, 3), NaN where a marker is missing."""
     cells = row.cells[2:]
     while len(cells) > 3 * count and not cells[-1]:

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...errors import DataError
 from ...processes import run_module, watch_parent
@@ -77,7 +78,7 @@ def c3d_arrays(path: str) -> dict[str, Any]:
 DEC = 85  # processor type of a C3D file
 
 
-def _residuals(path: str, xyz: np.ndarray, scale: float) -> np.ndarray:
+def _residuals(path: str, xyz: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
     """Return the residuals (m, n) of the points of a C3D file, -1 where there is none.
 
     They are the low byte of the fourth word of a point. ezc3d 1.7.2 gives the high byte, which

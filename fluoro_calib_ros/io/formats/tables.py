@@ -193,7 +193,7 @@ def joined(values: Sequence[float] | np.ndarray, separator: str = ',') -> str:
 
 
 def write_frames(
-    path: PathLike, columns: Iterable[str], frame: np.ndarray, values: np.ndarray
+    path: PathLike, columns: Iterable[str], frame: NDArray[np.int64], values: NDArray[np.float64]
 ) -> None:
     """Write a table with the column Frame and the numbers (m, ...) of each frame (m,)."""
     with atomic_file(path, 'w') as file:
@@ -255,7 +255,9 @@ class Frames:
         """Times (m,) after the first frame [s]."""
         return np.arange(self.count) / self.rate_hz
 
-    def expanded(self, frame: np.ndarray, values: np.ndarray) -> NDArray[np.float64]:
+    def expanded(
+        self, frame: NDArray[np.int64], values: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
         """Return values (m, ...) of all frames, NaN for those that are not in frame (k,)."""
         out = np.full((self.count, *values.shape[1:]), np.nan)
         out[frame - self.first] = values
@@ -306,7 +308,7 @@ def bodies_of(bodies: Bodies, frames: Frames) -> Bodies:
     )
 
 
-def rate_of(frame: np.ndarray, stamp_ns: np.ndarray) -> float | None:
+def rate_of(frame: NDArray[np.int64], stamp_ns: np.ndarray) -> float | None:
     """Return the frames per second between the first and the last time stamp, None without."""
     first = int(np.argmin(frame))
     last = int(np.argmax(frame))

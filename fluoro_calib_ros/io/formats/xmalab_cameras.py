@@ -24,6 +24,7 @@ import os
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import rq
 from scipy.spatial.transform import Rotation
 
@@ -248,14 +249,16 @@ def _read_dlt(path: Path, settings: FileSettings) -> Content:
     return Content(cameras=tuple(cameras), notes=(note,) if downwards else ())
 
 
-def _file_pixels(size: tuple[int, int], downwards: bool = False) -> np.ndarray:
+def _file_pixels(size: tuple[int, int], downwards: bool = False) -> NDArray[np.float64]:
     """Return the matrix (3, 3) from our homogeneous pixels to those of the file."""
     if downwards:
         return np.array([[1.0, 0, 1], [0, 1, 1], [0, 0, 1]])
     return np.array([[1.0, 0, 1], [0, -1, size[1]], [0, 0, 1]])
 
 
-def _dlt_camera(name: str, projection: np.ndarray, size: tuple[int, int], mm: float) -> Camera:
+def _dlt_camera(
+    name: str, projection: NDArray[np.float64], size: tuple[int, int], mm: float
+) -> Camera:
     """Return the camera of a matrix (3, 4) from homogeneous coordinates to our pixels.
 
     Source: Hartley and Zisserman, Multiple View Geometry, 2nd edition, section 6.2.4. Raises

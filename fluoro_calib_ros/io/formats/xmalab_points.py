@@ -19,6 +19,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...errors import DataError
 from ...exposures.frame import Frame, points_on_image
@@ -121,7 +122,9 @@ def _check_offsets(row: Row, first: int, offsets: int) -> None:
         row.fail('the cameras are offset against each other in time: write them without offset')
 
 
-def _pixels(values: Sequence[float], settings: FileSettings, size: tuple[int, int]) -> np.ndarray:
+def _pixels(
+    values: Sequence[float], settings: FileSettings, size: tuple[int, int]
+) -> NDArray[np.float64]:
     """Return pixels (n, 2) in our convention, NaN where either coordinate is missing."""
     uv = np.array(values).reshape(-1, 2)
     if settings.one_based:
@@ -133,7 +136,7 @@ def _pixels(values: Sequence[float], settings: FileSettings, size: tuple[int, in
 
 
 def _check_point(
-    row: Row, uv: np.ndarray, size: tuple[int, int], header: Sequence[tuple[str, int]]
+    row: Row, uv: NDArray[np.float64], size: tuple[int, int], header: Sequence[tuple[str, int]]
 ) -> None:
     """Raise DataError for a point off the image."""
     wrong = ~points_on_image(uv, size) & ~np.isnan(uv).any(axis=1)
@@ -186,7 +189,7 @@ def write(path: Path, content: Content, settings: FileSettings) -> Written:
     return Written((str(path),), tuple(notes))
 
 
-def _file_pixels(frame: Frame, settings: FileSettings) -> np.ndarray:
+def _file_pixels(frame: Frame, settings: FileSettings) -> NDArray[np.float64]:
     """Return pixels (n, 2) in the convention of the file."""
     uv = np.array(frame.uv, dtype=float)
     if settings.y_up:

@@ -22,6 +22,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...errors import DataError, ErrorsAt
 from ...exposures.frame import Frame
@@ -211,7 +212,7 @@ class _Observations(_Part):
         points = (self._bead_ids(count)[used], uv[used])
         return frame_of(f'{self._path}, {file}', name, number, *points, size)
 
-    def _bead_ids(self, count: int) -> np.ndarray:
+    def _bead_ids(self, count: int) -> NDArray[np.int64]:
         """Return the ids of the beads in the order of the frame specification."""
         if self._survey.names.targets:
             return np.array(list(self._survey.names.targets.values()), dtype=np.int64)
@@ -326,7 +327,7 @@ class _Calibration(_Part):
             by_exposure.setdefault(station.exposure, set()).add(station.fluoroscope)
         return min((e for e, of in by_exposure.items() if of >= set(names)), default=None)
 
-    def grids(self) -> Iterator[tuple[str, np.ndarray]]:
+    def grids(self) -> Iterator[tuple[str, NDArray[np.float64]]]:
         """Yield the points of the undistortion grids that XMALab used, observed and reference."""
         for camera, name in self._project.named():
             grid = camera.find('UndistortionGrid')
@@ -411,7 +412,7 @@ class ProjectArchive:
         """Return a file of the archive as text."""
         return self.member(name, MAX_MEMBER).decode('utf-8', 'replace')
 
-    def numbers(self, name: str) -> np.ndarray:
+    def numbers(self, name: str) -> NDArray[np.float64]:
         """Return a table of numbers; an error for rows of different lengths, too."""
         rows: list[Row] = table_of(f'{self.path}, {name}', self.member_text(name))
         values = [row.numbers_or_nan() for row in rows]

@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 from builtin_interfaces.msg import Time
+from numpy.typing import NDArray
 from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Header
 
@@ -137,7 +138,7 @@ class ImageConverter:
         )
 
 
-def colour_message(image: np.ndarray, stamp: Time, frame_id: str) -> Image:
+def colour_message(image: NDArray[np.uint8], stamp: Time, frame_id: str) -> Image:
     """Return the Image of a colour picture (h, w, 3) of uint8, RGB."""
     message = Image(
         height=image.shape[0],

@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from builtin_interfaces.msg import Time
 from fluoro_calib_msgs.msg import CorrectedObservations, TargetObservations
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import JointState
 
@@ -68,7 +68,7 @@ def read_string(data: bytes, start: int, length: int) -> tuple[str, int]:
     return data[start:end].partition(b'\0')[0].decode(errors='replace'), end + -end % 4
 
 
-def read_float64_sequence(data: bytes, start: int) -> tuple[np.ndarray, int]:
+def read_float64_sequence(data: bytes, start: int) -> tuple[NDArray[np.float64], int]:
     """Read a sequence of float64 and return the offset behind it. Raises ValueError."""
     (count,) = UINT32.unpack_from(data, start)
     start += 4
@@ -96,8 +96,8 @@ def string_sequence_bytes(texts: Sequence[str]) -> bytes:
 def columns_bytes(
     start: bytes,
     target_id: bytes,
-    columns: Sequence[np.ndarray],
-    octets: Sequence[np.ndarray],
+    columns: Sequence[NDArray[np.float64]],
+    octets: Sequence[NDArray[np.uint8]],
     end: bytes = b'',
 ) -> bytes:
     """Return a message that consists of columns of equal length.
@@ -127,8 +127,8 @@ def columns_bytes(
         parts += before, column
         before = count + b'\0\0\0\0'
     padding = b'\0' * (-number % 4)
-    for column in octets:
-        parts += count, column, padding
+    for octet in octets:
+        parts += count, octet, padding
     parts[-1] = end and padding + end
     return b''.join(parts)
 
@@ -170,9 +170,9 @@ class ObservedFrame(NamedTuple):
     image_size: tuple[int, int]  #: width and height [px]
     target_id: bytes  #: the ids as uint32
     #: image points and their standard deviations [px], of any lengths
-    u: np.ndarray
-    v: np.ndarray
-    sigma: np.ndarray
+    u: NDArray[np.float64]
+    v: NDArray[np.float64]
+    sigma: NDArray[np.float64]
     #: the message up to the frame number: so a CorrectedObservations message begins, too
     start: bytes
 
@@ -263,12 +263,12 @@ class CorrectedFrame(NamedTuple):
     frame_id: str
     frame_number: int
     calibration_id: str
-    target_id: np.ndarray  #: uint32
+    target_id: NDArray[np.uint32]  #: uint32
     #: corrected points and standard deviations [px], of any lengths
-    u: np.ndarray
-    v: np.ndarray
-    sigma: np.ndarray
-    correction_sd: np.ndarray
+    u: NDArray[np.float64]
+    v: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+    correction_sd: NDArray[np.float64]
     status: np.ndarray  #: uint8, of any length
 
 

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from fluoro_calib_msgs.msg import ReconstructedPoints
 from geometry_msgs.msg import Point
+from numpy.typing import NDArray
 from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
@@ -50,7 +51,7 @@ class PointsContent(NamedTuple):
     frame_number: int
     orientation_id: str
     orientation: RigOrientation  #: orientation with which the points were intersected
-    target_id: np.ndarray  #: (n,)
+    target_id: NDArray[np.integer]  #: (n,)
     points: IntersectedPoints  #: n points
 
 
@@ -79,7 +80,7 @@ def encode_reconstructed_points(content: PointsContent) -> bytes:
     )
 
 
-def covariance_of(message: ReconstructedPoints) -> np.ndarray:
+def covariance_of(message: ReconstructedPoints) -> NDArray[np.float64]:
     """Return the covariance matrices (n, 3, 3) of a message [m^2]."""
     columns = [np.asarray(getattr(message, name)) for name in _SYMMETRIC]
     return np.stack(columns, axis=1).reshape(-1, 3, 3)
@@ -90,9 +91,9 @@ class GoodPoints(NamedTuple):
 
     frame_number: int
     total: int  #: number of all points of the message, the ones that failed among them
-    target_id: np.ndarray  #: (n,)
-    xyz_mm: np.ndarray  #: (n, 3)
-    covariance: np.ndarray  #: (n, 3, 3) [mm^2]
+    target_id: NDArray[np.uint32]  #: (n,)
+    xyz_mm: NDArray[np.float64]  #: (n, 3)
+    covariance: NDArray[np.float64]  #: (n, 3, 3) [mm^2]
 
 
 def good_points_of(message: ReconstructedPoints) -> GoodPoints:
@@ -116,7 +117,7 @@ LIFETIME_NS = 500_000_000  # after which RViz removes a marker that is no longer
 
 
 def ellipsoid_markers(
-    message: ReconstructedPoints, good: np.ndarray, sigmas: float
+    message: ReconstructedPoints, good: NDArray[np.int64], sigmas: float
 ) -> MarkerArray:
     """Return the ellipsoids of the good points (indices) of a message.
 
@@ -153,7 +154,7 @@ except ImportError:
 MOCAP_MARKERS = None if mocap is None else mocap.Markers
 
 
-def mocap_markers(message: ReconstructedPoints, good: np.ndarray) -> mocap.Markers:
+def mocap_markers(message: ReconstructedPoints, good: NDArray[np.int64]) -> mocap.Markers:
     """Return the good points (indices) of a message; the index of each is its target id."""
     out = mocap.Markers(header=message.header, frame_number=message.frame_number)
     for k in good.tolist():
@@ -173,7 +174,7 @@ POINT_TYPE = np.dtype([('x', '<f4'), ('y', '<f4'), ('z', '<f4'), ('id', '<u4'), 
 _FIELD_TYPES = {'f': PointField.FLOAT32, 'u': PointField.UINT32}
 
 
-def point_cloud(message: ReconstructedPoints, good: np.ndarray) -> PointCloud2:
+def point_cloud(message: ReconstructedPoints, good: NDArray[np.int64]) -> PointCloud2:
     """Return a cloud of the good points (indices) of a message: x, y, z, id, sigma [m]."""
     points = np.empty(len(good), dtype=POINT_TYPE)
     for name in 'xyz':

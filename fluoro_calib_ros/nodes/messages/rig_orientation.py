@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from fluoro_calib_msgs.msg import RigOrientation
 from geometry_msgs.msg import TransformStamped
+from numpy.typing import NDArray
 from tf2_msgs.msg import TFMessage
 
 from ...errors import DataError
@@ -93,13 +94,15 @@ def rig_change(before: rig.RigOrientation, after: rig.RigOrientation) -> dict[st
     }
 
 
-def _pose_of(stamped: TransformStamped) -> tuple[np.ndarray, np.ndarray]:
+def _pose_of(stamped: TransformStamped) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     place, turn = stamped.transform.translation, stamped.transform.rotation
     rotation = matrix_from_quaternion(np.array([[turn.w, turn.x, turn.y, turn.z]]))[0]
     return np.array([place.x, place.y, place.z]), rotation
 
 
-def _set_pose(stamped: TransformStamped, place: np.ndarray, rotation: np.ndarray) -> None:
+def _set_pose(
+    stamped: TransformStamped, place: NDArray[np.float64], rotation: NDArray[np.float64]
+) -> None:
     turn = quaternion_from_matrix(rotation)
     for name, value in zip('xyz', place):
         setattr(stamped.transform.translation, name, float(value))
@@ -233,6 +236,6 @@ def _moved_by(before: rig.RigOrientation, after: rig.RigOrientation, name: str) 
     return f'{shift:.2f} mm and {np.degrees(turn):.3f} degrees'
 
 
-def _metre_scale(count: int) -> np.ndarray:
+def _metre_scale(count: int) -> NDArray[np.float64]:
     """Return the factors (9 count,) that turn the unknowns of an orientation from mm into m."""
     return np.tile(np.repeat([1e-3, 1.0], [3, 6]), count)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from builtin_interfaces.msg import Time
 from fluoro_calib_msgs.msg import CalibrationStatus, DriftStatus
+from numpy.typing import NDArray
 
 from ...checks.drift_charts import DriftState
 from ...correction.fluoroscope_calibration import FluoroscopeCalibration
@@ -63,7 +64,7 @@ class Collected:
     observations: int
     coverage: float  #: covered part of the image, 0 to 1
     #: whether cells (rows, columns) of the image are covered; None before the first exposure
-    covered: np.ndarray | None
+    covered: NDArray[np.bool_] | None
     image_size: tuple[int, int] | None
     readiness: Readiness
 

@@ -173,10 +173,13 @@ def settle(view: View, xyz: NDArray[np.float64], seen: Seen) -> Match | None:
         bead = row[bead]
         if len(bead) < MIN_SHARE * len(row) and step:
             return None
-        if all(map(np.array_equal, before, (bead, detection))):
-            break
-        view, scale = fit_view(view, xyz[bead], seen.uv[detection], 2)
+        # What is matched as before takes the steps that are left at once.
+        is_last = all(map(np.array_equal, before, (bead, detection)))
+        steps = 2 * (LAST_STEPS - step) if is_last else 2
+        view, scale = fit_view(view, xyz[bead], seen.uv[detection], steps)
         residual = nearby_residuals(view, xyz, bead, seen.uv[detection]).value
+        if is_last:
+            break
         tolerance = max(0.6 * tolerance, min(LAST_TOLERANCE_PX, seen.tolerance_px))
     predicted = view.project(xyz) + residual
     return _judged(view, xyz, seen, predicted, scale)

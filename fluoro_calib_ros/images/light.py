@@ -172,6 +172,7 @@ def correlation_of(
 
 def less_common(
     place: NDArray[np.float64],
+    size: NDArray[np.float64],
     residual: np.ndarray,
     valid: NDArray[np.bool_],
     usual: NDArray[np.bool_],
@@ -179,14 +180,15 @@ def less_common(
     """Return residuals (n, m) of windows, over the noise, without what usual ones have in common.
 
     Where the shadow is not quite that of a sphere, all windows show it, and more or less so by
-    their place (n, 2): a polynomial of degree 2 for each pixel, a priori as large as the noise.
-    What is left is enlarged by what the polynomial takes of the noise of usual windows, and
-    reduced by what it adds to that of others. Residuals that are not valid are 0.
+    the place (n, 2) and the size (n,) of the shadow: for each pixel polynomials of degree 2, a
+    priori as large as the noise. What is left is enlarged by what these take of the noise of usual
+    windows, and reduced by what they add to that of others. Residuals that are not valid are 0.
     """
-    away = place - place.mean(axis=0)
-    x, y = away.T / max(float(np.abs(away).max(initial=0.0)), 1.0)
-    terms = np.stack([x**i * y**j for i, j in POLYNOMIAL], axis=1)
-    prior = np.eye(len(POLYNOMIAL), dtype=residual.dtype)
+    differing = np.column_stack([place, np.log(size)])
+    away = differing - differing.mean(axis=0)
+    x, y, z = (away / np.maximum(np.abs(away).max(axis=0, initial=0.0), 1e-6)).T
+    terms = np.stack([*(x**i * y**j for i, j in POLYNOMIAL), z, z * z], axis=1)
+    prior = np.eye(terms.shape[1], dtype=residual.dtype)
     known = terms[usual].astype(residual.dtype)
     products = (known[:, :, None] * known[:, None]).reshape(-1, prior.size)
     of_pixel = (valid[usual].T.astype(residual.dtype) @ products).reshape(-1, *prior.shape)

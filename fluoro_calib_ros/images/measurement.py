@@ -189,7 +189,6 @@ class _BeadFit(ShadowFit):
     ) -> None:
         self.stretch = np.asarray(relative_radius, dtype=float)
         self.size = np.ones(len(uv)) if size is None else size
-        self.radius = self.stretch * self.size
         # Sizes that differ by less than a radius is known share a table.
         step = np.log1p(RADIUS_SD)
         kinds, self.kind = np.unique(np.rint(np.log(self.size) / step), return_inverse=True)
@@ -200,6 +199,7 @@ class _BeadFit(ShadowFit):
         super().__init__(
             SETTINGS, profile, noise=noise, uv=uv, depth=np.ones(len(uv)), window_px=window
         )
+        self.radius = self.stretch * self.size
         self.measured = np.zeros(len(uv), dtype=bool)
         self.disturbed = np.zeros(len(uv), dtype=bool)
         self.plane_only = False
@@ -405,7 +405,7 @@ class _BeadFit(ShadowFit):
         move no centre against the others, and are no noise.
         """
         usual = measured & (self.strength == 0) & (self.misfit <= DISTURBED * self.typical())
-        rest = less_common(self.uv, self.residual, self.counted, usual)
+        rest = less_common(self.uv, self.radius, self.residual, self.counted, usual)
         whole = (self.residual**2 * self.counted).sum(axis=1)
         share = np.minimum((rest**2).sum(axis=1) / np.maximum(whole, 1e-12), 1.0)
         return np.where(self.strength > 0, 1.0, share) * self.misfit

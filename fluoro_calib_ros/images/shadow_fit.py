@@ -155,6 +155,7 @@ class ShadowFit(ABC):
         self.uv = self.start.copy()
         self.expected_depth = np.array(depth, dtype=float)
         self.depth = self.expected_depth.copy()
+        self.radius = np.ones(len(self.uv))  # of the shadows, 1 for a typical one
         self.middle = np.rint(self.uv).astype(int)
         self.offset = window_offsets(window_px)
         x, y = (self.offset.T / window_px).astype(DTYPE)
@@ -302,7 +303,7 @@ class ShadowFit(ABC):
         plain = plain[:: len(plain) // CORRELATED + 1]
         valid = root > 0
         usual = self.misfit[rows] <= DISTURBED * self.typical()
-        residual = less_common(self.uv[rows], residual, valid, usual)
+        residual = less_common(self.uv[rows], self.radius[rows], residual, valid, usual)
         self.correlation = self._correlation(residual[plain], valid[plain])
         rest = residual / np.maximum(root, DTYPE(1e-12))
         ends = np.cumsum([len(jacobian) for jacobian in jacobians])[:-1]

@@ -313,16 +313,17 @@ def test_what_windows_have_in_common_is_no_noise_where_it_changes_over_the_image
     rng = np.random.default_rng(9)
     place = rng.uniform(0, 1000, (count, 2))
     x, y = (place.T - 500) / 500
+    size = rng.choice([0.7, 1.0, 1.4], count)
     pixels = 200
-    common = rng.normal(size=(4, pixels))
+    common = rng.normal(size=(5, pixels))
     usual = np.arange(count) % 4 > 0
     valid = rng.random((count, pixels)) < 0.9
     left = []
     for _ in range(20):
         noise = rng.normal(size=(count, pixels))
-        pattern = np.stack([np.ones_like(x), x, y, x * y], axis=1) @ common
+        pattern = np.stack([np.ones_like(x), x, y, x * y, np.log(size)], axis=1) @ common
         given = ((noise + pattern) * valid).astype(np.float32)
-        left.append(less_common(place, given, valid, usual))
+        left.append(less_common(place, size, given, valid, usual))
     assert not np.stack(left)[:, ~valid].any()
     variance = np.mean(np.square(left), axis=(0, 2)) / valid.mean(axis=1)
     many = count > 100
@@ -330,12 +331,12 @@ def test_what_windows_have_in_common_is_no_noise_where_it_changes_over_the_image
     assert np.mean(variance[usual]) == pytest.approx(1, abs=0.05 if many else 0.5)
     assert np.mean(variance[~usual]) == pytest.approx(1, abs=0.05 if many else 1.0)
     noise_alone = [
-        less_common(place, rng.normal(size=(count, pixels)), valid | True, usual)
+        less_common(place, size, rng.normal(size=(count, pixels)), valid | True, usual)
         for _ in range(20)
     ]
     variance = np.mean(np.square(noise_alone), axis=(0, 2))
     np.testing.assert_allclose(variance, 1, atol=0.1)
-    np.testing.assert_array_equal(less_common(place, given, valid, usual & False), given)
+    np.testing.assert_array_equal(less_common(place, size, given, valid, usual & False), given)
 
 
 @pytest.mark.parametrize('neighbours', [0, 2])

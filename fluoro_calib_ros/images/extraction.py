@@ -23,8 +23,8 @@ from .measurement import FIRST_STEPS, STEPS, Expected, Imaging, first_imaging, m
 from .shadow_fit import MAX_SIGMA_PX, Beads
 from .view import Lens, View, fit_view
 
-# Of a bead of which one in 300 is half a pixel off (Rayleigh's distribution).
-SURE_SIGMA_PX = 0.5 / np.sqrt(2 * np.log(300))
+# Of a bead of which one in a thousand is half a pixel off (Rayleigh's distribution).
+SURE_SIGMA_PX = 0.5 / np.sqrt(2 * np.log(1000))
 MAX_SIGMAS = 2.9  # times that of a usual bead of the image: an eighth of its weight
 MAX_MISFIT = 5.0
 DEPTH = (0.55, 1.7)  # of the shadow of a bead, 1 for what is usual in such light

@@ -126,9 +126,7 @@ def _score(evidence: Evidence, solved: SolvedNetwork, displacement: np.ndarray) 
     matrix = factorize(network, equations)
     weighted = displacement / network.survey_sd_mm[:, None, None] ** 2
     followed = covariance_times_points(matrix, weighted).points
-    rights = matrix.elimination.right_sides(UnknownVector(equations.e, equations.p, equations.g))
-    solution = matrix.factor.solve(rights[0][..., None], rights[1][:, None])
-    step = matrix.elimination.to_unknowns(*solution).points[..., 0]
+    step = matrix.solve(UnknownVector(equations.e, equations.p, equations.g)).points[..., 0]
     left = network.survey_mm - parameters.points_mm - step
     return _Score(
         np.einsum('nai,naj->ij', weighted, displacement - followed),

@@ -25,13 +25,14 @@ from .rotations import (
     quaternion_from_matrix,
     vector_from_matrix,
 )
+from .unknowns import EXTERIOR_SIZE, INTERIOR_SIZE
 
-ORIENTATION_SIZE = 9  # unknowns of a fluoroscope: T [mm], w [rad], xp, yp, c [px]
+# Unknowns of a fluoroscope: T [mm], w [rad], xp, yp, c [px].
+ORIENTATION_SIZE = EXTERIOR_SIZE + INTERIOR_SIZE
 SOURCES = ('capture', 'joint calibration', 'healing')
-# Largest deviation of a rotation matrix from orthogonality that rounding explains.
-ORTHOGONALITY_TOLERANCE = 1e-6
-# Largest asymmetry of the correlation matrix, and its most negative eigenvalue.
-CORRELATION_TOLERANCE = 1e-6
+# What rounding explains: of the deviation of a rotation matrix from orthogonality, the asymmetry
+# of a correlation matrix, and of its most negative eigenvalue.
+ROUNDING = 1e-6
 MAX_VALUE = 1e15  # of a position [mm], an interior orientation [px] or a covariance
 # What `rounded` keeps: far coarser than a rounding error, far finer than a standard deviation.
 DIGITS = 40  # binary, of positions and covariances
@@ -303,7 +304,7 @@ def datum_transformation(orientation: RigOrientation, points_mm: ArrayLike) -> N
 
 def _check_orientation(names: Sequence[str], interior: np.ndarray, rotation: np.ndarray) -> None:
     """Raise DataError for a negative principal distance or an invalid rotation matrix."""
-    large = (np.abs(rotation) > 1 + ORTHOGONALITY_TOLERANCE).any(axis=(1, 2))
+    large = (np.abs(rotation) > 1 + ROUNDING).any(axis=(1, 2))
     rotation = np.where(large[:, None, None], 0.0, rotation)  # no overflow; refused below
     product = rotation @ rotation.transpose(0, 2, 1)
     errors = np.max(np.abs(product - np.eye(3)), axis=(1, 2))
@@ -313,7 +314,7 @@ def _check_orientation(names: Sequence[str], interior: np.ndarray, rotation: np.
             raise DataError(
                 f'rig orientation: the principal distance of fluoroscope {name} is {c:g} px'
             )
-        if error > ORTHOGONALITY_TOLERANCE or sign < 0:
+        if error > ROUNDING or sign < 0:
             raise DataError(
                 f'rig orientation: the rotation of fluoroscope {name} is not a rotation matrix'
             )
@@ -350,9 +351,9 @@ def _check_covariance(covariance: np.ndarray) -> None:
     sd = np.sqrt(np.maximum(np.diagonal(covariance), 0))
     scale = np.where(sd > 0, sd, 1.0)
     correlation = covariance / np.outer(scale, scale)
-    if np.max(np.abs(correlation - correlation.T)) > CORRELATION_TOLERANCE:
+    if np.max(np.abs(correlation - correlation.T)) > ROUNDING:
         raise DataError('rig orientation: its covariance is not symmetric')
-    if np.linalg.eigvalsh(correlation)[0] < -CORRELATION_TOLERANCE:
+    if np.linalg.eigvalsh(correlation)[0] < -ROUNDING:
         raise DataError('rig orientation: its covariance has a negative eigenvalue')
 
 

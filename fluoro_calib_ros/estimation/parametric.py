@@ -22,7 +22,7 @@ from scipy.special import stdtrit
 from ..correction.series import Functions, Series, sd_over_image
 from ..correction.terms import HIGHEST, expert_terms
 from ..photogrammetry.collinearity import AdditionalParameters
-from ..photogrammetry.outliers import LOOSE
+from ..photogrammetry.outliers import LOOSE, SIGNIFICANCE
 from ..photogrammetry.precision import information_of_additional
 from .estimator import (
     AdjustedTerms,
@@ -99,7 +99,6 @@ def covariance_with_uncertain_terms(
     return covariance + along @ along.T
 
 
-SIGNIFICANCE = 0.01  # of all terms together that are tested for one fluoroscope
 ZERO_PRECISION = 1e12  # prior that holds a term at zero
 MIN_DROP = 1e-3  # relative decrease of the RMSE that counts as one
 NEIGHBOURS = 8  # of an image point, whose mean residual shows the trend
@@ -187,6 +186,7 @@ class StepwiseTerms(AdjustedTerms):
         if network.exterior is not None:
             # Most unknowns are known beforehand.
             dof += network.n_observations - 2 * network.n_image_points
+        # Of all terms together that are tested for one fluoroscope.
         limit = stdtrit(max(dof, 1), 1 - SIGNIFICANCE / (2 * len(self.names)))  # quantile of t
         if self._remove_insignificant(f, information, coefficients, limit):
             return True

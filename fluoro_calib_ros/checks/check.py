@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from ..brief import brief_repr
 from ..findings import Finding, Kind, Place, Severity, sentence_of
 
+FALSE_ALARM = 2e-3  # chance that a check of a good calibration, phantom or image fails
 GOOD_EXPOSURES = 15  # with fewer, more exposures are the first advice
 MIN_MORE_EXPOSURES = 5  # that are worth recording
 WITHOUT_TREND = 'check this again when the residuals no longer have a trend'

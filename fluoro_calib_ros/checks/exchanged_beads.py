@@ -21,9 +21,8 @@ from ..estimation.result import Targets
 from ..photogrammetry.collinearity import project_with_jacobian
 from ..photogrammetry.noise import INLIER_Q
 from .bead_intersection import Rays
+from .check import FALSE_ALARM
 
-FALSE_ALARM = 2e-3  # chance that any two beads of a good phantom are taken for exchanged
-MOST = 0.5  # part of the image points of two beads that lie at each other's place
 NOWHERE = -1  # an image point that agrees with no bead
 FAR = 1e9  # [px]: in the place of NaN, as of a bead behind the source
 ROUNDING = 1e-9
@@ -43,7 +42,7 @@ def exchanged_beads(rays: Rays, targets: Targets) -> NDArray[np.int64]:
         own = np.isin(rays.target_id, pair)
         at_other = moved & np.all(ids == pair, axis=1)
         both = len(np.unique(place[at_other])) == 2
-        if not both or at_other.sum() <= MOST * own.sum():
+        if not both or 2 * at_other.sum() <= own.sum():
             continue
         # Of all other beads, by the rule of succession: how often image points are rejected, and
         # how often these lie at the place of a bead as near as this one.

@@ -18,6 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..errors import DataError
+from ..estimation.initial_network import MIN_TARGETS_OF_EXPOSURE
 from ..exposures.frame import Frame, Frames
 from ..exposures.phantom import Phantom
 from ..findings import Finding, Kind, Place, first_few
@@ -33,9 +34,10 @@ from ..photogrammetry.resection import (
 DISTANCES_MM = (200.0, 10_000.0)  # of the source from a phantom in mm
 UNITS = {10.0: 'cm', 25.4: 'inches', 1000.0: 'm'}  # that mm are mistaken for
 MAX_TESTED = 3  # exposures of a fluoroscope, those with the most targets
-MIN_TARGETS = 12  # of an exposure that is tested
-OFF = 0.03  # residual over the longer side of the image of a target that is not at its place
-AT = 0.01  # the same of one that is
+# Residual over the longer side of the image of a target that is not at its place, and of one that
+# is; the same of the median of an exposure whose ids are wrong, and of one whose ids are right.
+OFF = 0.03
+AT = 0.01
 FIT = 0.004  # median of these residuals where all targets have their unit
 UNCLEAR = 0.6  # share of targets at their places below which there may be no majority
 MIN_GROUP = 3  # targets in either unit
@@ -50,7 +52,7 @@ def mixed_units(frames: Frames, phantom: Phantom, is_suspicious: bool = False) -
     not fit the phantom, so that there may be no majority.
     """
     every = [_on_phantom(frame, phantom) for of_one in frames.values() for frame in of_one]
-    every = [frame for frame in every if len(frame.target_id) >= MIN_TARGETS]
+    every = [frame for frame in every if len(frame.target_id) >= MIN_TARGETS_OF_EXPOSURE]
     tested = [
         frame
         for name in frames

@@ -25,6 +25,7 @@ from scipy.spatial import cKDTree
 
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..estimation.lack_of_fit import (
+    CELLS,
     LARGEST_SD,
     MIN_EXPOSURES,
     FittedPoints,
@@ -38,11 +39,9 @@ from ..findings import Finding, Kind, Severity
 from ..photogrammetry.collinearity import project
 from ..photogrammetry.noise import INLIER_Q
 from ..photogrammetry.rotations import matrix_from_quaternion
-from .check import Check
+from .check import FALSE_ALARM, Check
 
-CELLS = 8  # across the image
 MIN_IN_CELL = 10  # image points
-FALSE_ALARM = 2e-3  # chance of a false alarm of each test for a common trend
 
 
 class _TestPlan(NamedTuple):

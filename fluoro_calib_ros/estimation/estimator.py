@@ -69,6 +69,19 @@ UNIT_PX = 512.0  # of the image coordinates in the basis; any fixed length would
 TURN_STEP = 1e-3  # rad, as large as a pixel of the principal point for the search of both
 
 
+def orientation_fields(xy: ArrayLike) -> NDArray[np.float64]:
+    """Return the displacements (n, 2, 6) of points xy (n, 2) that orientations absorb.
+
+    In any unit of xy: a shift of the image in both directions, its scale, its rotation, and its
+    tilt about both axes (the linearised projective map of a rotated sensor).
+    """
+    x, y = np.asarray(xy, dtype=float).T
+    one = np.ones_like(x)
+    zero = np.zeros_like(x)
+    columns = [(one, zero), (zero, one), (x, y), (-y, x), (x * x, x * y), (x * y, y * y)]
+    return np.stack([np.stack(column, axis=1) for column in columns], axis=2)
+
+
 def gauge_basis(
     uv: ArrayLike, interior: np.ndarray, kind: GaugeKind = GaugeKind.FULL
 ) -> NDArray[np.float64]:
@@ -76,20 +89,18 @@ def gauge_basis(
 
     g is 3 for the turns, 0 for none, else 6.
     """
-    x, y = (np.asarray(uv) - interior[:2]).T / UNIT_PX
-    one = np.ones_like(x)
-    zero = np.zeros_like(x)
+    xy = (np.asarray(uv) - interior[:2]) / UNIT_PX
     if kind is GaugeKind.NONE:
-        return np.zeros((len(x), 2, 0))
-    if kind is GaugeKind.TURNS:
-        square = (UNIT_PX / interior[2]) ** 2
-        columns = [
-            (-y, x),
-            (one + square * x * x, square * x * y),
-            (square * x * y, one + square * y * y),
-        ]
-    else:
-        columns = [(one, zero), (zero, one), (x, y), (-y, x), (x * x, x * y), (x * y, y * y)]
+        return np.zeros((len(xy), 2, 0))
+    if kind is not GaugeKind.TURNS:
+        return orientation_fields(xy)
+    x, y = xy.T
+    square = (UNIT_PX / interior[2]) ** 2
+    columns = [
+        (-y, x),
+        (1 + square * x * x, square * x * y),
+        (square * x * y, 1 + square * y * y),
+    ]
     return np.stack([np.stack(column, axis=1) for column in columns], axis=2)
 
 

@@ -41,7 +41,7 @@ from .rounds import SelfCalibration
 # (Rasmussen and Williams, "Gaussian Processes for Machine Learning", 2006, 2.4). The same holds
 # for object points and orientations, which take up what the correction leaves.
 
-MIN_PIXELS = 20  # of the grid that are within both calibrated areas
+MIN_PIXELS = 20  # of a grid that are within both of two calibrated areas
 
 
 def with_errors_by(

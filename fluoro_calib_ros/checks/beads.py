@@ -22,9 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import bdtrc, chdtri, pdtrc
 
-from ..bodies.body import POSE_SIZE, by_pose
+from ..bodies.body import by_pose
 from ..estimation.rounds import ResidualTable
 from ..findings import Kind, Place, first_few
+from ..photogrammetry.unknowns import POSE_SIZE
 from .bead_intersection import (
     Beads,
     distances,

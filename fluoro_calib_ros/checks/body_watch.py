@@ -29,11 +29,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri, erfc
 
-from ..bodies.body import POSE_SIZE, Body, check_bodies, fitted_pose
+from ..bodies.body import Body, check_bodies, fitted_pose
 from ..bodies.image_points import Cameras, ImagePoints, Linear
 from ..bodies.pose import marker_sums
-from ..bodies.shapes import learned_shape
+from ..bodies.shapes import REGULAR, learned_shape
 from ..photogrammetry.rig_orientation import RigOrientation
+from ..photogrammetry.unknowns import POSE_SIZE
 from ..reconstruction.reconstruct import IntersectedViews
 from .drift_charts import DriftOptions, ImageAreas
 
@@ -45,7 +46,6 @@ COMMON_SYSTEMATIC = 0.5
 MIN_PAIRS = 2  # of markers in an exposure, one in an area and one outside, to test the area
 LEARNED = 200  # exposures from which a shape is learned: its noise is a fourteenth of theirs
 REWEIGHTINGS = 3
-REGULAR = 1e-10  # of the largest element of a normal matrix, added to its diagonal
 MAX_LEARNING = 5000  # exposures that are kept until all markers are known
 
 

@@ -27,14 +27,14 @@ from ..estimation.options import CalibrationRequest
 from ..estimation.result import CalibrationResult, FluoroscopeResult
 from ..exposures.collector import MIN_COMMON_TARGETS
 from ..exposures.frame import Frame, Frames, validate_frame
-from ..exposures.phantom import Phantom
+from ..exposures.phantom import MISTAKEN_UNITS, Phantom
 from ..findings import Finding, Kind, Place, first_few
 from ..photogrammetry.collinearity import project
 from ..photogrammetry.diagnosis import MAX_RELATIVE_SD
 from ..photogrammetry.plane_resection import flatness, plane_of, robust_homography
 from ..photogrammetry.resection import MIN_FLATNESS, decompose, robust_dlt, squared_residuals
 from ..photogrammetry.rig_orientation import KnownOrientation
-from .mixed_units import AT, DISTANCES_MM, FIT, MAX_TESTED, OFF, UNITS, mixed_units
+from .mixed_units import AT, DISTANCES_MM, FIT, MAX_TESTED, OFF, mixed_units
 
 MIN_TESTED = 20  # targets of a single exposure that is tested
 BETTER = 0.35  # median residual of other ids over that of the given ones from which they are right
@@ -409,7 +409,7 @@ def wrong_unit(distance_mm: float, phantom: Phantom) -> Finding | None:
             'camera',
             numbers=numbers,
         )
-    units = [unit for mm, unit in UNITS.items() if low <= distance_mm * mm <= high]
+    units = [unit for mm, unit in MISTAKEN_UNITS.items() if low <= distance_mm * mm <= high]
     perhaps = f', but perhaps in {" or ".join(units)}' if units else ''
     return Finding(
         Kind.WRONG_UNIT,

@@ -20,7 +20,7 @@ import numpy as np
 from ..errors import DataError
 from ..estimation.initial_network import MIN_TARGETS_OF_EXPOSURE
 from ..exposures.frame import Frame, Frames
-from ..exposures.phantom import Phantom
+from ..exposures.phantom import MISTAKEN_UNITS, Phantom
 from ..findings import Finding, Kind, Place, first_few
 from ..photogrammetry.resection import (
     SAMPLE_SIZE,
@@ -32,7 +32,6 @@ from ..photogrammetry.resection import (
 )
 
 DISTANCES_MM = (200.0, 10_000.0)  # of the source from a phantom in mm
-UNITS = {10.0: 'cm', 25.4: 'inches', 1000.0: 'm'}  # that mm are mistaken for
 MAX_TESTED = 3  # exposures of a fluoroscope, those with the most targets
 # Residual over the longer side of the image of a target that is not at its place, and of one that
 # is; the same of the median of an exposure whose ids are wrong, and of one whose ids are right.
@@ -105,7 +104,7 @@ def _factor_of(
         return None
     residual = np.sqrt(squared_residuals(projection, xyz, frame.uv))
     off = residual > OFF * limit
-    for factor in (*UNITS, *(1 / factor for factor in UNITS)):
+    for factor in (*MISTAKEN_UNITS, *(1 / factor for factor in MISTAKEN_UNITS)):
         scaled = np.sqrt(squared_residuals(projection, factor * xyz, frame.uv))
         there = off & (scaled < AT * limit)
         if there.sum() >= MIN_GROUP and (residual < AT * limit).sum() > there.sum():
@@ -123,7 +122,7 @@ def _factor_by_samples(
     limit = max(frame.image_size)
     samples = np.argsort(rng.random((SAMPLES, len(xyz))), axis=1)[:, :SAMPLE_SIZE]
     which = rng.integers(0, 2, samples.shape)
-    for factor in UNITS:
+    for factor in MISTAKEN_UNITS:
         versions = np.stack([xyz, factor * xyz])
         try:
             with np.errstate(all='ignore'):
@@ -205,7 +204,7 @@ def _whole_group(
 
 def _finding(ids: np.ndarray, factor: float) -> Finding:
     """Return the finding on targets that fit when they are multiplied by a factor."""
-    unit = UNITS.get(factor)
+    unit = MISTAKEN_UNITS.get(factor)
     meant = f' ({unit} in place of mm)' if unit else ''
     return Finding(
         Kind.MIXED_UNITS,

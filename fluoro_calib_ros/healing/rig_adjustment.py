@@ -32,12 +32,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bodies.body import POSE_SIZE, Body
+from ..bodies.body import Body
 from ..bodies.correction_errors import covariance_of_means
 from ..bodies.image_points import Cameras, ImagePoints
 from ..correction.series import MARGIN, Functions
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
 from ..photogrammetry.rotations import cross_matrix, matrix_from_vector
+from ..photogrammetry.unknowns import POSE_SIZE
 from .sizes import Told
 
 FALSE_SHARE = 0.01  # of image points that are expected to be false matches
@@ -53,7 +54,6 @@ FITTING = 0.8  # share of the image points of a body that are no false matches, 
 MAX_NOISE_PX = 10.0  # of image points that are no false matches
 LOOSEST = 1e-6  # weight of a pose [1/mm^2, 1/rad^2] that keeps an unseen one where it is
 ROUNDING = POSE_SIZE * np.finfo(float).eps  # of the normal matrix of a pose, over its trace
-_EYE_6 = np.eye(POSE_SIZE)
 
 
 _BY_EXPOSURE = ('uv', 'pixel', 'variance', 'seen')
@@ -448,11 +448,12 @@ class RigAdjustment:
         matrix = np.zeros((self.size, self.size))
         right = np.zeros(self.size)
         back = []
+        unit = np.eye(POSE_SIZE)
         for row in range(len(self.bodies)):
             columns, told, cross, normal = _summed(self, linear, row, weight[:, row], unsure)
-            normal[~linear.poses.known[:, row]] = _EYE_6
+            normal[~linear.poses.known[:, row]] = unit
             least = LOOSEST + ROUNDING * np.trace(normal, axis1=1, axis2=2)
-            normal += least[:, None, None] * _EYE_6
+            normal += least[:, None, None] * unit
             inverse = np.linalg.inv(np.linalg.cholesky(normal))
             half = inverse @ cross
             flat = half.reshape(-1, half.shape[2])

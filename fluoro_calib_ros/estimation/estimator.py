@@ -266,10 +266,6 @@ class AdjustedTerms(ABC):
         """Coefficients of no correction, by fluoroscope."""
 
     @abstractmethod
-    def series(self, f: int, coefficients: np.ndarray, covariance: np.ndarray) -> Series:
-        """Return the series of fluoroscope f from its coefficients (p,) and their covariance."""
-
-    @abstractmethod
     def renew(
         self, network: Network, matrix: FactorizedNormalMatrix, adjustment: Adjustment
     ) -> tuple[bool, tuple[np.ndarray, ...]]:
@@ -300,13 +296,9 @@ class AdjustedTerms(ABC):
         """
         return np.zeros(int(adjustment.inliers[network.rows(f)].sum()))
 
+    @abstractmethod
     def fitted_series(self, f: int, adjustment: Adjustment, precise: Precision) -> Series:
         """Return the series of fluoroscope f that an adjustment has estimated."""
-        coefficients = adjustment.parameters.additional[f]
-        covariance = precise.additional[f]
-        if coefficients is None or covariance is None:
-            raise ValueError(f'no terms were estimated for fluoroscope number {f}')
-        return self.series(f, coefficients, covariance)
 
 
 class RegressionStep(ABC, Generic[Model_co]):
@@ -391,6 +383,20 @@ def require_training(count: int) -> None:
 def coefficients_of(adjustment: Adjustment) -> tuple[np.ndarray, ...]:
     """Coefficients of the additional parameters by fluoroscope, which all have some."""
     return tuple(c for c in adjustment.parameters.additional if c is not None)
+
+
+def estimated_terms(
+    f: int, adjustment: Adjustment, precise: Precision
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Coefficients (p,) of the additional parameters of fluoroscope f, and covariance (p, p).
+
+    Raises ValueError where there are none.
+    """
+    coefficients = adjustment.parameters.additional[f]
+    covariance = precise.additional[f]
+    if coefficients is None or covariance is None:
+        raise ValueError(f'no terms were estimated for fluoroscope number {f}')
+    return coefficients, covariance
 
 
 def prior_of_additional(network: Network, f: int) -> NDArray[np.float64]:

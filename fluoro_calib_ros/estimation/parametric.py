@@ -29,6 +29,7 @@ from .estimator import (
     AdjustmentProblem,
     GaugeKind,
     coefficients_of,
+    estimated_terms,
     gauge_basis,
     prior_of_additional,
 )
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from ..photogrammetry.adjustment import Adjustment
     from ..photogrammetry.elimination import FactorizedNormalMatrix
     from ..photogrammetry.network import Network
+    from ..photogrammetry.precision import Precision
 
 # Uncertainty of which terms of a trend exist, and with which variance.
 #
@@ -153,8 +155,9 @@ class StepwiseTerms(AdjustedTerms):
         """Coefficients of no correction, by fluoroscope."""
         return tuple(np.zeros(len(self.names)) for _ in self.functions)
 
-    def series(self, f: int, coefficients: np.ndarray, covariance: np.ndarray) -> Series:
-        """Return the series of fluoroscope f from its coefficients (31,) and their covariance."""
+    def fitted_series(self, f: int, adjustment: Adjustment, precise: Precision) -> Series:
+        """See `AdjustedTerms`."""
+        coefficients, covariance = estimated_terms(f, adjustment, precise)
         functions = self.functions[f]
         to_polynomials = self._maps[f]
         return Series(

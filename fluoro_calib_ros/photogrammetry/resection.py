@@ -266,7 +266,6 @@ def resect(
     uv: NDArray[np.float64],
     interior: NDArray[np.float64],
     projection: NDArray[np.float64] | None = None,
-    max_steps: int = 100,
     tolerance: float = TOLERANCE,
 ) -> Resection:
     """Exterior orientation of one exposure for a given interior orientation.
@@ -283,10 +282,8 @@ def resect(
         xp, yp, c [px].
     projection : (3, 4) ndarray, optional
         Result of robust_dlt; computed by default.
-    max_steps : int
-        Largest number of steps of the refinement.
     tolerance : float
-        Squared step at which it ends, in standard deviations.
+        Squared step at which the refinement ends, in standard deviations.
 
     Raises
     ------
@@ -296,7 +293,7 @@ def resect(
     projection = robust_dlt(xyz, uv) if projection is None else projection
     problem = _Problem(xyz, uv, interior)
     start = _start_orientation(projection, problem)
-    return _refined(problem, *start, max_steps, tolerance)
+    return _refined(problem, *start, tolerance)
 
 
 def refine_resection(
@@ -305,13 +302,12 @@ def refine_resection(
     interior: np.ndarray,
     rotation: np.ndarray,
     position: np.ndarray,
-    max_steps: int = 100,
 ) -> Resection:
     """Exterior orientation of one exposure from start values (3, 3) and (3,) [mm].
 
     The other arguments and the errors are those of `resect`.
     """
-    return _refined(_Problem(xyz, uv, interior), rotation, position, max_steps)
+    return _refined(_Problem(xyz, uv, interior), rotation, position)
 
 
 def resection_at(
@@ -336,12 +332,11 @@ def _refined(
     problem: _Problem,
     rotation: np.ndarray,
     position: np.ndarray,
-    max_steps: int,
     tolerance: float = TOLERANCE,
 ) -> Resection:
     """Refine an exterior orientation. Raises DataError for a target behind the source."""
     mu = START_DAMPING
-    for _ in range(max_steps):
+    for _ in range(100):  # of which it takes a few
         system = problem.linearise(rotation, position)
         rotation, position, step, mu = _damped_step(problem, system, rotation, position, mu)
         if step @ system.normal @ step <= tolerance * system.noise.scale**2:

@@ -35,7 +35,7 @@ from .bead_intersection import (
 )
 from .calibration_evidence import Evidence, Subject
 from .check import FALSE_ALARM, Check
-from .exchanged_beads import exchanged_beads
+from .exchanged_beads import exchanged_beads, rate_of
 
 MIN_LAYER = 8  # of a layer, and of the rest
 BORDERS = 40  # between layers that are tried along each axis
@@ -313,15 +313,11 @@ def rejected_beads(residuals: ResidualTable | None) -> NDArray[np.int64]:
 
 
 def _rate_of_exposure(residuals: ResidualTable) -> NDArray[np.float64]:
-    """Return how often image points are rejected in the exposure of each (N,).
-
-    By the rule of succession of Laplace.
-    """
+    """Return how often image points are rejected in the exposure of each (N,)."""
     _, name = np.unique(residuals.fluoroscope, return_inverse=True)
     exposures = np.stack([name, residuals.exposure])
     exposure = np.unique(exposures, axis=1, return_inverse=True)[1].ravel()
-    rate = (np.bincount(exposure, residuals.outlier) + 1) / (np.bincount(exposure) + 2)
-    return np.asarray(rate[exposure])
+    return rate_of(np.bincount(exposure, residuals.outlier), np.bincount(exposure))[exposure]
 
 
 def _rejected(target_id: NDArray[np.int64]) -> Check:

@@ -34,6 +34,7 @@ from ..photogrammetry.diagnosis import MAX_RELATIVE_SD
 from ..photogrammetry.plane_resection import flatness, plane_of, robust_homography
 from ..photogrammetry.resection import MIN_FLATNESS, decompose, robust_dlt, squared_residuals
 from ..photogrammetry.rig_orientation import KnownOrientation
+from .check import rms
 from .mixed_units import AT, DISTANCES_MM, FIT, MAX_TESTED, OFF, mixed_units
 
 MIN_TESTED = 20  # targets of a single exposure that is tested
@@ -351,13 +352,7 @@ def _median_residual(frames: Sequence[Frame], phantom: Phantom, known: KnownOrie
 def _residuals(frame: Frame, phantom: Phantom, known: KnownOrientation) -> np.ndarray:
     """Distances (n,) [px] of image points from their targets, infinite behind the source."""
     xyz = phantom.xyz_mm[phantom.index(frame.target_id)]
-    n = len(xyz)
-    predicted = project(
-        np.broadcast_to(known.rotation, (n, 3, 3)),
-        np.broadcast_to(known.position_mm, (n, 3)),
-        xyz,
-        known.interior,
-    )
+    predicted = project(known.rotation, known.position_mm, xyz, known.interior)
     distance = np.linalg.norm(frame.uv - predicted, axis=1)
     return np.where(np.isfinite(distance), distance, np.inf)
 
@@ -531,7 +526,7 @@ def implausible(request: CalibrationRequest, result: CalibrationResult) -> list[
 
 def _large_residuals(figures: FluoroscopeResult, frames: Sequence[Frame]) -> Finding | None:
     """Residuals that are larger than distortion and noise leave."""
-    rmse = float(np.sqrt(np.mean(np.square(figures.rmse_after))))
+    rmse = rms(figures.rmse_after)
     given = [np.median(frame.sigma) for frame in frames if frame.sigma is not None]
     limit = MAX_MISFIT * max(figures.image_size)
     if given:

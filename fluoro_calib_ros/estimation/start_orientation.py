@@ -199,13 +199,7 @@ def _preliminary_correction(
     for view, one in zip(views, found):
         if one is None:
             continue
-        n = len(view.xyz)
-        predicted = project(
-            np.broadcast_to(one.rotation, (n, 3, 3)),
-            np.broadcast_to(one.position_mm, (n, 3)),
-            view.xyz,
-            interior,
-        )
+        predicted = project(one.rotation, one.position_mm, view.xyz, interior)
         in_front = np.isfinite(predicted).all(axis=1)
         pixels.append(view.uv[in_front])
         residuals.append((view.uv - predicted)[in_front])

@@ -36,6 +36,7 @@ from ..bodies.body import Body
 from ..bodies.correction_errors import covariance_of_means
 from ..bodies.image_points import Cameras, ImagePoints
 from ..correction.series import MARGIN, Functions
+from ..correction.terms import CUBIC
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
 from ..photogrammetry.rotations import cross_matrix, matrix_from_vector
 from ..photogrammetry.unknowns import POSE_SIZE
@@ -47,8 +48,7 @@ MAX_REPEATS = 3
 LAST_GAIN = 0.1  # of the logarithm of the evidence, which decides by differences of about 3
 # Square of a step in standard deviations after which the iteration ends.
 LAST_STEP = 1e-2
-# Of a drift of the distortion: degree of the polynomials, half waves along the longer side.
-DRIFT_DEGREE = 3
+# Half waves along the longer side, of a drift of the distortion beside a cubic trend.
 DRIFT_MODES = 4
 FITTING = 0.8  # share of the image points of a body that are no false matches, at least
 MAX_NOISE_PX = 10.0  # of image points that are no false matches
@@ -191,7 +191,7 @@ class RigAdjustment:
     ) -> None:
         self.orientation = orientation
         self.bodies = tuple(bodies)
-        self.functions = [Functions(size, DRIFT_DEGREE, DRIFT_MODES) for size in image_size]
+        self.functions = [Functions(size, CUBIC, DRIFT_MODES) for size in image_size]
         self._area = np.array([float(w * h) for w, h in image_size])
         count = max(len(body.target_id) for body in bodies)
         self.target_id = np.full((len(bodies), count), -1)

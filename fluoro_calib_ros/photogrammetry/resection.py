@@ -367,12 +367,8 @@ class _Problem:
 
     def linearise(self, rotation: np.ndarray, position: np.ndarray) -> _System:
         """Robustly weighted normal equations. Raises DataError for a target behind the source."""
-        n = len(self.xyz)
         predicted, jacobian, _, _ = project_with_jacobian(
-            np.broadcast_to(rotation, (n, 3, 3)),
-            np.broadcast_to(position, (n, 3)),
-            self.xyz,
-            self.interior,
+            rotation, position, self.xyz, self.interior
         )
         r = self.uv - predicted
         if not np.isfinite(r).all():
@@ -388,13 +384,7 @@ class _Problem:
 
     def squared_residuals(self, rotation: np.ndarray, position: np.ndarray) -> NDArray[np.float64]:
         """Squared residuals (n,) [px^2]; NaN behind the source."""
-        n = len(self.xyz)
-        predicted = project(
-            np.broadcast_to(rotation, (n, 3, 3)),
-            np.broadcast_to(position, (n, 3)),
-            self.xyz,
-            self.interior,
-        )
+        predicted = project(rotation, position, self.xyz, self.interior)
         return np.sum((self.uv - predicted) ** 2, axis=1)
 
 

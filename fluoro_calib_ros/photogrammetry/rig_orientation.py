@@ -280,10 +280,7 @@ def datum_transformation(orientation: RigOrientation, points_mm: ArrayLike) -> N
         rows = slice(2 * f, 2 * f + 2)
         columns = orientation.covariance_rows([f])
         _, by_exterior, by_points[:, rows], by_interior = project_with_jacobian(
-            np.broadcast_to(r, (len(points), 3, 3)),
-            np.broadcast_to(t, points.shape),
-            points,
-            interior,
+            r, t, points, interior
         )
         by_orientation[:, rows, columns[0] : columns[-1] + 1] = np.concatenate(
             [by_exterior, by_interior], axis=2

@@ -31,7 +31,7 @@ from ..brief import brief_repr
 from ..errors import DataError
 from ..exposures.phantom import MISTAKEN_UNITS
 from ..findings import Finding, Kind, Place, Severity
-from ..photogrammetry.rotations import cross_matrix
+from ..photogrammetry.rotations import cross_matrix, nearest_rotation
 from ..photogrammetry.unknowns import POSE_SIZE
 from .body import Body, by_pose, fitted_pose
 from .correction_errors import covariance_of_means
@@ -439,8 +439,7 @@ def _root_of(covariance: np.ndarray) -> np.ndarray:
 
 def _turned(rotation: np.ndarray, w: np.ndarray) -> np.ndarray:
     """Rotations (T, 3, 3) varied on the left, made orthogonal again."""
-    u, _, vt = np.linalg.svd((np.eye(3) + cross_matrix(w)) @ rotation)
-    return u @ vt
+    return nearest_rotation((np.eye(3) + cross_matrix(w)) @ rotation)
 
 
 def _datum(xyz: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -40,7 +40,7 @@ from ..photogrammetry.network import Network
 from ..photogrammetry.normal_equations import normal_equations
 from ..photogrammetry.precision import covariance_blocks
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation, with_datum_of_points
-from ..photogrammetry.rotations import matrix_from_quaternion
+from ..photogrammetry.rotations import matrix_from_quaternion, nearest_rotation
 from ..photogrammetry.unknowns import (
     RIGID_SD_MM,
     RIGID_SD_RAD,
@@ -110,8 +110,7 @@ def orientation_of_known(
 def _mean_rotation(figures: FluoroscopeResult) -> np.ndarray:
     """Mean rotation (3, 3) of exposures: the nearest to the sum of their matrices."""
     total = matrix_from_quaternion([e.quaternion_wxyz for e in figures.exposures]).sum(axis=0)
-    u, _, vt = np.linalg.svd(total)
-    return u @ vt
+    return nearest_rotation(total)
 
 
 # Exposures that are used: with more of them the interior orientations remain the uncertainty.

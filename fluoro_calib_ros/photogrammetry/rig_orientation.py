@@ -20,8 +20,10 @@ from ..brief import brief_repr
 from ..errors import DataError
 from .collinearity import project_with_jacobian
 from .rotations import (
+    ROTATION_TOLERANCE,
     cross_matrix,
     matrix_from_quaternion,
+    nearest_rotation,
     quaternion_from_matrix,
     vector_from_matrix,
 )
@@ -389,7 +391,6 @@ class ExteriorPrior:
 
 
 MAX_SKEW = 0.05  # of a calibration matrix, and of its ratio of scales, which a correction takes up
-MAX_ROTATION_ERROR = 1e-3  # of R^T R from the unit matrix; a file has few digits
 
 
 @dataclass(frozen=True)
@@ -499,9 +500,8 @@ def _as_rotation(matrix: np.ndarray) -> np.ndarray:
     """Return the rotation nearest to a matrix of few digits. Raises DataError for any other."""
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
         raise DataError('known orientation: R is not 3 x 3 finite numbers')
-    if np.abs(matrix.T @ matrix - np.eye(3)).max() > MAX_ROTATION_ERROR:
+    if np.abs(matrix.T @ matrix - np.eye(3)).max() > ROTATION_TOLERANCE:
         raise DataError('known orientation: R is not a rotation, its columns are not orthonormal')
     if np.linalg.det(matrix) < 0:
         raise DataError('known orientation: R is a reflection, its determinant is -1')
-    u, _, vt = np.linalg.svd(matrix)
-    return u @ vt
+    return nearest_rotation(matrix)

@@ -20,12 +20,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import DataError
-from ..photogrammetry.rotations import matrix_from_quaternion
+from ..photogrammetry.rotations import (
+    ROTATION_TOLERANCE,
+    matrix_from_quaternion,
+    nearest_rotation,
+)
 
 AXES = 'xyz'
 SIDES = ('left', 'right')
-# Three decimals of a direction leave half a thousandth.
-AXES_TOLERANCE = 1e-3
 # A landmark picked to 1 mm leaves the direction of a line of 50 mm open by this angle [rad].
 MIN_SINE = 0.02
 MIN_LENGTH_MM = 1.0
@@ -38,7 +40,7 @@ class AnatomicalFrame:
     Raises DataError for axes that are not finite, not perpendicular or left-handed.
     """
 
-    #: (3, 3) columns are the x, y and z axis; unit lengths and right angles to AXES_TOLERANCE
+    #: (3, 3) columns are the x, y and z axis; unit lengths and right angles to ROTATION_TOLERANCE
     rotation: NDArray[np.float64]
     origin_mm: NDArray[np.float64]  #: (3,)
 
@@ -49,12 +51,11 @@ class AnatomicalFrame:
             raise DataError('a frame has three axes and an origin of three coordinates')
         if not (np.isfinite(rotation).all() and np.isfinite(origin).all()):
             raise DataError('the frame has coordinates that are not finite')
-        if np.abs(rotation.T @ rotation - np.eye(3)).max() > AXES_TOLERANCE:
+        if np.abs(rotation.T @ rotation - np.eye(3)).max() > ROTATION_TOLERANCE:
             raise DataError('the axes of the frame are not perpendicular unit vectors')
         if np.linalg.det(rotation) < 0:
             raise DataError('the axes of the frame are left-handed')
-        u, _, vt = np.linalg.svd(rotation)  # the nearest rotation (Schoenemann 1966)
-        for name, array in (('rotation', u @ vt), ('origin_mm', origin)):
+        for name, array in (('rotation', nearest_rotation(rotation)), ('origin_mm', origin)):
             array.setflags(write=False)
             object.__setattr__(self, name, array)
 
@@ -65,7 +66,7 @@ BODY_FRAME = AnatomicalFrame(np.eye(3), np.zeros(3))
 def frame_of_quaternion(wxyz: ArrayLike, origin_mm: ArrayLike) -> AnatomicalFrame:
     """Return the frame of a quaternion (4,), anatomical axes -> body. Raises DataError."""
     q = np.array(wxyz, dtype=float)
-    if q.shape != (4,) or not abs(np.linalg.norm(q) - 1) <= AXES_TOLERANCE:
+    if q.shape != (4,) or not abs(np.linalg.norm(q) - 1) <= ROTATION_TOLERANCE:
         raise DataError('the quaternion of the frame does not have four numbers and length one')
     return AnatomicalFrame(matrix_from_quaternion(q), np.array(origin_mm, dtype=float))
 

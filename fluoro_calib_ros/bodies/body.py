@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from ..brief import brief_repr
 from ..errors import DataError
 from ..photogrammetry.rotations import cross_matrix
+from ..photogrammetry.unknowns import POSE_SIZE
 
 AXIS_MM = 20.0  # length of a drawn axis, about the size of a cluster of markers in a bone
-POSE_SIZE = 6  # position [mm], then rotation about the axes of the rig frame [rad]
 
 
 @dataclass(frozen=True)

@@ -66,8 +66,8 @@ LOST_DIGITS = 1e-9  # of a variance, where the difference keeps too few of sixte
 ADAPTATIONS = 4  # rounds of h in an exposure, live
 LOG_RANGE = (-20.0, 50.0)
 
-_EYE_3 = np.eye(3)
-_EYE_6 = np.eye(6)
+EYE_3 = np.eye(3)
+EYE_6 = np.eye(6)
 _EYE_STATE = np.eye(STATE)
 _POSE_ROWS = np.eye(6, STATE)
 # Of each element of the state its row in noise_factors, and of each kind the elements it moves.
@@ -210,7 +210,7 @@ class MotionFilter:
         self.mean = np.zeros((count, STATE))  # the rotation is a deviation, 0 after each step
         # Of deviations at the last prediction; _turned makes them those at the estimate.
         self.covariance = np.zeros((count, STATE, STATE))
-        self._turned = np.broadcast_to(_EYE_6, (count, 6, 6))
+        self._turned = np.broadcast_to(EYE_6, (count, 6, 6))
         self.log_q = np.broadcast_to(START_LOG, (count, 2)).copy()
         self._log_variance = np.full((count, 2), START_LOG_SD**2)
         # Derivatives of the covariance by the two log densities.
@@ -366,7 +366,7 @@ def _weigh(
 ) -> None:
     """Weigh an exposure (B, 6, 6), (B, 6) against the covariance (B, 6, 6) of its prediction."""
     normal, right = seen
-    inner = np.linalg.inv(_EYE_6 + normal @ covariance)
+    inner = np.linalg.inv(EYE_6 + normal @ covariance)
     step.z = (inner @ right[:, :, None])[:, :, 0]
     m = inner @ normal
     step.m = (m + np.swapaxes(m, 1, 2)) / 2
@@ -565,12 +565,12 @@ def _transition(dt_s: float, turn: NDArray[np.float64]) -> NDArray[np.float64]:
     """Transitions (B, 18, 18) over dt_s of bodies that turn by vectors (B, 3)."""
     out = np.broadcast_to(_EYE_STATE, (len(turn), STATE, STATE)).copy()
     jacobian = left_jacobian(turn)
-    out[:, 0:3, 6:9] = dt_s * _EYE_3
-    out[:, 0:3, 12:15] = dt_s**2 / 2 * _EYE_3
+    out[:, 0:3, 6:9] = dt_s * EYE_3
+    out[:, 0:3, 12:15] = dt_s**2 / 2 * EYE_3
     out[:, 3:6, 3:6] = Rotation.from_rotvec(turn).as_matrix()
     out[:, 3:6, 9:12] = dt_s * jacobian
     out[:, 3:6, 15:18] = dt_s**2 / 2 * jacobian
-    out[:, 6:12, 12:18] = dt_s * _EYE_6
+    out[:, 6:12, 12:18] = dt_s * EYE_6
     return out
 
 

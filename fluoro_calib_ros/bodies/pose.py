@@ -35,10 +35,11 @@ from scipy.special import chdtri, erfc
 
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import cross_matrix, vector_from_matrix
+from ..photogrammetry.unknowns import POSE_SIZE
 from ..reconstruction.reconstruct import IntersectedViews
-from .body import POSE_SIZE, Body, robust_pose
+from .body import Body, robust_pose
 from .image_points import Cameras, ImagePoints, Linear
-from .motion import PoseInformation, turn_of_twists, twist_between
+from .motion import EYE_3, EYE_6, PoseInformation, turn_of_twists, twist_between
 
 MAX_STEPS = 8
 # Square of the next step in standard deviations below which the iteration ends. A step of
@@ -55,8 +56,6 @@ SINGULAR = 1e-11
 # One below which others do not predict a marker, and with which a matrix is held that may be
 # singular: far above rounding, which a constant beside large elements is not.
 WEAK = 1e-9
-_EYE_3 = np.eye(3)
-_EYE_6 = np.eye(POSE_SIZE)
 
 
 @dataclass(frozen=True)
@@ -307,7 +306,7 @@ class PoseSolver:
     def _marker(self, linear: Linear, weight: NDArray[np.float64]) -> _Marker:
         """Sum up the image points of each marker with weights (B, M, F)."""
         s_matrix, s_vector = marker_sums(linear, weight)
-        m = np.linalg.inv(_EYE_3 + self._variance_3 * s_matrix)
+        m = np.linalg.inv(EYE_3 + self._variance_3 * s_matrix)
         return _Marker(
             weight,
             s_matrix,
@@ -357,7 +356,7 @@ class PoseSolver:
         # A marker that the others do not predict is tested by its own rays only.
         unit, scale = _of_unit_diagonal(others)
         predicted = np.linalg.eigvalsh(unit)[..., 0] > WEAK
-        inverse = np.linalg.inv(np.where(predicted[..., None, None], unit, _EYE_6))
+        inverse = np.linalg.inv(np.where(predicted[..., None, None], unit, EYE_6))
         reduced = gradient / scale
         gain = np.sum(reduced * (inverse @ reduced[..., None])[..., 0], axis=-1)
         excess = (own[suspect] + np.where(predicted, gain, 0.0)) / limit
@@ -374,7 +373,7 @@ class PoseSolver:
         pulled = (held @ away[suspect, :, None])[:, None, :, 0] - gradient
         unit, scale = _of_unit_diagonal(others + held[:, None])
         pulled = pulled / scale
-        rest = np.linalg.inv(unit + WEAK * _EYE_6)
+        rest = np.linalg.inv(unit + WEAK * EYE_6)
         left = own[suspect] + np.sum(pulled * (rest @ pulled[..., None])[..., 0], axis=-1)
         worst = np.argmax(np.where(excess > 1, left, -np.inf), axis=1)
         wrong = np.flatnonzero((excess > 1).any(axis=1))
@@ -457,7 +456,7 @@ def _growth_by_rig(
     d = linear.by_pose[rows]
     right = (np.swapaxes(d, 2, 3) @ solution.marker.m[rows] @ pulled).sum(axis=1)
     unit, scale = _of_unit_diagonal(normal[rows])
-    moved = np.linalg.solve(unit + WEAK * _EYE_6, right / scale[..., None]) / scale[..., None]
+    moved = np.linalg.solve(unit + WEAK * EYE_6, right / scale[..., None]) / scale[..., None]
     taken = by_place @ (d @ moved[:, None])[:, :, None]
     squares = np.sum((by_rig - taken) ** 2, axis=(3, 4)) * weight
     return 1 + squares.sum(axis=2) / np.maximum(2 * points.seen[rows].sum(axis=2), 1)
@@ -633,7 +632,7 @@ def _pull_of(
     prediction: Prediction, pose: tuple[NDArray[np.float64], NDArray[np.float64]]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Normal matrices (B, 6, 6) of predictions at poses, and twists (B, 6) to the predictions."""
-    normal = np.linalg.inv(prediction.covariance + 1e-12 * _EYE_6)
+    normal = np.linalg.inv(prediction.covariance + 1e-12 * EYE_6)
     normal = np.where(prediction.known[:, None, None], normal, 0.0)
     turned = turn_of_twists(prediction.rotation, pose[0])
     away = twist_between((prediction.rotation, prediction.centre_mm), pose)

@@ -29,9 +29,11 @@ from scipy.special import chdtri
 
 from ..brief import brief_repr
 from ..errors import DataError
+from ..exposures.phantom import MISTAKEN_UNITS
 from ..findings import Finding, Kind, Place, Severity
-from ..photogrammetry.rotations import cross_matrix
-from .body import POSE_SIZE, Body, by_pose, fitted_pose
+from ..photogrammetry.rotations import cross_matrix, nearest_rotation
+from ..photogrammetry.unknowns import POSE_SIZE
+from .body import Body, by_pose, fitted_pose
 from .correction_errors import covariance_of_means
 
 ROUNDS = 4  # the problem is nearly linear once poses are known
@@ -50,7 +52,6 @@ REJECT_TAIL = 6.3e-5  # probability of four standard deviations, as everywhere
 SCALE_TOLERANCE = 0.05
 REGULAR = 1e-10  # of the largest element of a normal matrix, added to its diagonal
 _MOVED = (Kind.MARKER_MIGRATED, Kind.MARKERS_EXCHANGED)
-UNITS = {10.0: 'cm', 1000.0: 'm', 25.4: 'inches'}
 
 
 @dataclass(frozen=True)
@@ -449,8 +450,7 @@ def _root_of(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _turned(rotation: NDArray[np.float64], w: NDArray[np.float64]) -> NDArray[np.float64]:
     """Rotations (T, 3, 3) varied on the left, made orthogonal again."""
-    u, _, vt = np.linalg.svd((np.eye(3) + cross_matrix(w)) @ rotation)
-    return u @ vt
+    return nearest_rotation((np.eye(3) + cross_matrix(w)) @ rotation)
 
 
 def _datum(
@@ -515,7 +515,7 @@ def _wrong_frame(body: Body, places: BodyPlaces) -> list[Finding]:
     measured = places.xyz_mm[row][seen[row]]
     spread = [np.sqrt(np.sum((x - x.mean(axis=0)) ** 2)) for x in (given, measured)]
     factor = float(spread[1] / spread[0])
-    for scale, unit in UNITS.items():
+    for scale, unit in MISTAKEN_UNITS.items():
         if abs(factor / scale - 1) < SCALE_TOLERANCE:
             cause = (
                 f'its coordinates are in {unit}, not in mm: distances in space are larger '

@@ -19,10 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DataError
+from ..exposures.stamps import NS_PER_S
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import cross_matrix
+from ..photogrammetry.unknowns import POSE_SIZE
 from ..reconstruction.reconstruct import IntersectedViews
-from .body import POSE_SIZE, Body, BodyPoses, PoseStatus
+from .body import Body, BodyPoses, PoseStatus
 from .joints import Joint, JointMotion, JointStatus, joint_motion, with_neutral
 from .motion import POSE, Motion, MotionFilter, smooth_trial
 from .pose import FramePoses, PoseSolver, Prediction
@@ -30,7 +32,6 @@ from .pose import FramePoses, PoseSolver, Prediction
 # A rotation that is predicted less surely says nothing for the markers that are looked for: at
 # 20 mm from the centre this is as far as the next marker.
 LOST_SD_RAD = 0.3
-NS_PER_S = 1e9
 
 
 @dataclass(frozen=True)

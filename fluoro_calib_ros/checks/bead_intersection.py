@@ -14,11 +14,10 @@ from ..estimation.result import CalibrationResult
 from ..exposures.frame import Frames
 from ..exposures.phantom import Phantom
 from ..photogrammetry.collinearity import project_with_jacobian
-from ..photogrammetry.network import similarity_directions
+from ..photogrammetry.network import MIN_RAYS, similarity_directions
 from ..photogrammetry.noise import INLIER_Q
 from ..photogrammetry.rotations import matrix_from_quaternion
 
-MIN_VIEWS = 3  # that agree: with fewer, a false match could pass for a displaced bead
 STEPS_L1 = 12  # of least absolute lengths
 STEPS_L2 = 6  # of least squares
 MAX_SD_MM = 2.0  # of a bead that counts
@@ -159,7 +158,7 @@ def _beads(
     covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
     views = np.bincount(bead, agree, len(points)).astype(int)
     seen = np.bincount(bead, minlength=len(points))
-    valid = (views >= MIN_VIEWS) & (2 * views > seen)
+    valid = (views >= MIN_RAYS) & (2 * views > seen)
     valid &= np.sqrt(np.trace(covariance, axis1=1, axis2=2)) < MAX_SD_MM
     row = phantom.index(target_id[valid])
     return Beads(

@@ -25,6 +25,7 @@ from scipy.special import bdtrc, chdtri, pdtrc
 from ..bodies.body import by_pose
 from ..estimation.rounds import ResidualTable
 from ..findings import Kind, Place, first_few
+from ..photogrammetry.unknowns import POSE_SIZE
 from .bead_intersection import (
     Beads,
     distances,
@@ -33,13 +34,12 @@ from .bead_intersection import (
     rays_of,
 )
 from .calibration_evidence import Evidence, Subject
-from .check import Check
-from .exchanged_beads import exchanged_beads
+from .check import FALSE_ALARM, Check
+from .exchanged_beads import exchanged_beads, rate_of
 
 MIN_LAYER = 8  # of a layer, and of the rest
 BORDERS = 40  # between layers that are tried along each axis
 FALSE_ALARM_LAYER = 1e-3
-MOTION = 6  # unknowns
 # Gap beside a border [sd of the survey's difference of two beads]. In a smaller one the survey's
 # own errors decide which bead lies on which side, and a layer seems displaced by its selection.
 BORDER_SDS = 3.0
@@ -121,7 +121,7 @@ def displaced_layer(beads: Beads) -> DisplacedLayer | None:
     if not tried:
         return None
     best = max(tried, key=lambda candidate: candidate.gain)
-    critical = float(chdtri(MOTION, FALSE_ALARM_LAYER / len(tried)))
+    critical = float(chdtri(POSE_SIZE, FALSE_ALARM_LAYER / len(tried)))
     if (
         best.gain < critical
         or fit.excess <= 0
@@ -266,14 +266,12 @@ class _Equations:
         return np.einsum('...i,...i->...', self.right, self.motion)
 
 
-MIN_BEADS = 10  # for distances
-FALSE_ALARM = 2e-3  # chance that any bead of a good phantom is reported
+MIN_BEADS = 10  # that are compared with their survey, or of two halves with each other
 # For the part of the errors of orientations and calibration that all beads have in common.
 SD_FACTOR = 1.1
 # Times the expectation, from simulated rigs with some 500 beads: docs/verdict.md. With few beads
 # the limit is that of a FALSE_ALARM.
 DISTANCES_LIMIT = 1.12
-MOST = 0.5  # part of the image points of a bead that are rejected, above which it is doubted
 
 
 def check_beads(evidence: Evidence, names: Sequence[str]) -> list[Check]:
@@ -311,7 +309,7 @@ def rejected_beads(residuals: ResidualTable | None) -> NDArray[np.int64]:
     seen = np.bincount(bead)
     rejected = np.bincount(bead, residuals.outlier)
     chance = bdtrc(rejected - 1, seen, np.mean(residuals.outlier))
-    doubted = (rejected > MOST * seen) & (chance * len(target_id) < FALSE_ALARM)
+    doubted = (2 * rejected > seen) & (chance * len(target_id) < FALSE_ALARM)
     several = seen > 1
     expected = np.exp(np.bincount(bead, np.log(_rate_of_exposure(residuals))))[several].sum()
     without = several & (rejected == seen)
@@ -321,15 +319,11 @@ def rejected_beads(residuals: ResidualTable | None) -> NDArray[np.int64]:
 
 
 def _rate_of_exposure(residuals: ResidualTable) -> NDArray[np.float64]:
-    """Return how often image points are rejected in the exposure of each (N,).
-
-    By the rule of succession of Laplace.
-    """
+    """Return how often image points are rejected in the exposure of each (N,)."""
     _, name = np.unique(residuals.fluoroscope, return_inverse=True)
     exposures = np.stack([name, residuals.exposure])
     exposure = np.unique(exposures, axis=1, return_inverse=True)[1].ravel()
-    rate = (np.bincount(exposure, residuals.outlier) + 1) / (np.bincount(exposure) + 2)
-    return np.asarray(rate[exposure])
+    return rate_of(np.bincount(exposure, residuals.outlier), np.bincount(exposure))[exposure]
 
 
 def _rejected(target_id: NDArray[np.int64]) -> Check:

@@ -29,11 +29,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri, erfc
 
-from ..bodies.body import POSE_SIZE, Body, check_bodies, fitted_pose
+from ..bodies.body import Body, check_bodies, fitted_pose
 from ..bodies.image_points import Cameras, ImagePoints, Linear
 from ..bodies.pose import marker_sums
-from ..bodies.shapes import learned_shape
+from ..bodies.shapes import REGULAR, learned_shape
 from ..photogrammetry.rig_orientation import RigOrientation
+from ..photogrammetry.unknowns import POSE_SIZE
 from ..reconstruction.reconstruct import IntersectedViews
 from .drift_charts import DriftOptions, ImageAreas
 
@@ -45,9 +46,7 @@ COMMON_SYSTEMATIC = 0.5
 MIN_PAIRS = 2  # of markers in an exposure, one in an area and one outside, to test the area
 LEARNED = 200  # exposures from which a shape is learned: its noise is a fourteenth of theirs
 REWEIGHTINGS = 3
-REGULAR = 1e-10  # of the largest element of a normal matrix, added to its diagonal
 MAX_LEARNING = 5000  # exposures that are kept until all markers are known
-_EYE = np.eye(3)
 
 
 @dataclass(frozen=True)
@@ -185,7 +184,8 @@ class BodyWatch:
         still = (np.eye(3)[None], np.zeros((1, 3)))
         information, _ = marker_sums(self._cameras.linear(places, still, points), weight)
         known = np.asarray(np.isfinite(xyz).all(axis=2))
-        covariance = np.linalg.inv(np.where(known[..., None, None], information[:, :count], _EYE))
+        of_known = np.where(known[..., None, None], information[:, :count], np.eye(3))
+        covariance = np.linalg.inv(of_known)
         found = learned_shape(body, xyz, covariance)
         new = found.known & ~body.known
         return replace(
@@ -292,7 +292,7 @@ class _Drift:
         weight = np.where(points.seen, 1 / points.noise, 0.0)
         s_matrix, s_vector = marker_sums(linear, weight)
         regular = np.asarray(points.seen.any(axis=2))[..., None, None]
-        inverse = np.linalg.inv(np.where(regular, s_matrix, _EYE))
+        inverse = np.linalg.inv(np.where(regular, s_matrix, np.eye(3)))
         weighted = linear.by_place * weight[..., None, None]
         square = np.sum((weighted @ inverse[:, :, None]) * weighted, axis=-1)
         systematic = np.sum(points.correction[..., None] * square, axis=(2, 3))

@@ -19,13 +19,13 @@ from ..estimation.calibrate import adjust_with_calibrations, calibrate_part
 from ..estimation.exposure_terms import Variation, exposure_functions, is_determined, variation
 from ..estimation.fixed_calibration import noise_of_calibrations
 from ..estimation.initial_network import EarlierCalibration, StartValues
+from ..estimation.lack_of_fit import CELLS
 from ..estimation.options import AUTO, CalibrationRequest
 from ..estimation.result import CalibrationResult
 from ..exposures.frame import Frame, Frames
 from ..exposures.phantom import Phantom
 from .check import Check
 from .residual_tests import (
-    CELLS,
     RejectedExposure,
     RejectedTrend,
     Residuals,

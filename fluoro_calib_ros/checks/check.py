@@ -9,10 +9,14 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+from numpy.typing import ArrayLike
+
 from ..brief import brief_repr
+from ..exposures.collector import RECOMMENDED_EXPOSURES
 from ..findings import Finding, Kind, Place, Severity, sentence_of
 
-GOOD_EXPOSURES = 15  # with fewer, more exposures are the first advice
+FALSE_ALARM = 2e-3  # chance that a check of a good calibration, phantom or image fails
 MIN_MORE_EXPOSURES = 5  # that are worth recording
 WITHOUT_TREND = 'check this again when the residuals no longer have a trend'
 
@@ -99,6 +103,11 @@ class Validation:
         )
 
 
+def rms(values: ArrayLike) -> float:
+    """Return the root of the mean square of values."""
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
 def verdict_of(checks: Iterable[Check]) -> str:
     """Return 'fail' if a check failed, else 'cannot tell' if one could not be made, else 'pass'.
 
@@ -123,5 +132,5 @@ def too_little_data(kind: Kind, fluoroscope: str, reason: str, count: int) -> Ch
 
 def more_exposures(count: int) -> str:
     """Return the advice how many exposures to record in addition to `count`."""
-    more = max(GOOD_EXPOSURES - count, MIN_MORE_EXPOSURES)
+    more = max(RECOMMENDED_EXPOSURES - count, MIN_MORE_EXPOSURES)
     return f'take {more} more exposures (there are {count})'

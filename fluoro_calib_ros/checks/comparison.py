@@ -25,7 +25,8 @@ from scipy.special import chdtri
 from ..correction.base import Correction
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration, at_common_angle
 from ..errors import DataError
-from ..estimation.estimator import interior_about
+from ..estimation.estimator import interior_about, orientation_fields
+from ..estimation.model_choice import MIN_PIXELS
 from ..exposures.frame import cells_of
 
 # Comparison of two independent calibrations of one fluoroscope, and names of image areas.
@@ -35,7 +36,6 @@ from ..exposures.frame import cells_of
 # what the orientation absorbs and for their noise.
 
 GRID = 24  # points across the image at which predictions are compared
-MIN_POINTS = 20  # of the grid inside both calibrated areas
 MIN_SD_PX = 1e-3  # of a prediction: a model without uncertainty would cause a division by 0
 
 
@@ -69,21 +69,6 @@ def image_grid(image_size: tuple[int, int]) -> NDArray[np.float64]:
     return np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
 
 
-def orientation_fields(xy: ArrayLike) -> NDArray[np.float64]:
-    """Return the displacements (2n, 6) of points xy (n, 2) that orientations absorb.
-
-    Coordinates are in units of the principal distance. The columns are a shift of the image in
-    both directions, its scale, its rotation, and its tilt about both axes (the linearised
-    projective map of a rotated sensor).
-    """
-    x, y = np.asarray(xy, dtype=float).T
-    one = np.ones_like(x)
-    zero = np.zeros_like(x)
-    u = np.stack([one, zero, x, -y, x * x, x * y], axis=1)
-    v = np.stack([zero, one, y, x, x * y, y * y], axis=1)
-    return np.stack([u, v], axis=1).reshape(-1, 6)
-
-
 def difference(
     one: FluoroscopeCalibration, other: FluoroscopeCalibration
 ) -> FieldDifference | None:
@@ -96,7 +81,7 @@ def difference(
     grid = image_grid(one.image_size)
     corrections = at_common_angle(grid, one, other)
     both = ~(corrections[0].outside | corrections[1].outside)
-    if both.sum() < MIN_POINTS:
+    if both.sum() < MIN_PIXELS:
         return None
     parts = [_part(correction, both) for correction in corrections]
     return _difference(grid[both], (one.interior, other.interior), parts)
@@ -120,7 +105,7 @@ def _difference(
     variance = sum(correction.sd**2 for correction in corrections)
     sd = np.maximum(np.sqrt(variance), MIN_SD_PX)
     offset = c_mean * (rays[0] - rays[1])
-    basis = orientation_fields((rays[0] + rays[1]) / 2)
+    basis = orientation_fields((rays[0] + rays[1]) / 2).reshape(-1, 6)
     weight = 1 / np.repeat(sd, 2)
     fit, *_ = np.linalg.lstsq(basis * weight[:, None], offset.ravel() * weight, rcond=None)
     return FieldDifference(uv, offset - (basis @ fit).reshape(-1, 2), sd)
@@ -142,7 +127,6 @@ def describe_place(uv: ArrayLike, image_size: tuple[int, int]) -> str:
 
 CELLS = 64  # along the longer side of the image
 LEVEL = 0.99  # of confidence
-MIN_COMMON = 20  # cells that both calibrations cover
 # Of the area: this much differs at the level by chance, doubled for the cells' correlation.
 CHANCE = 2 * (1 - LEVEL)
 
@@ -210,7 +194,7 @@ def compare_calibrations(
     _, uv = cell_centres(first.image_size, CELLS)
     fields = at_common_angle(uv, first, second)
     common = ~(fields[0].outside | fields[1].outside)
-    if common.sum() < MIN_COMMON:
+    if common.sum() < MIN_PIXELS:
         raise DataError(
             f'fluoroscope {name}: the calibrated areas have hardly any image in common'
         )

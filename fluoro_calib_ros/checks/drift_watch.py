@@ -32,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..bodies.body import Body
+from ..exposures.pairing import RESTART_NS
 from ..findings import Finding, Kind, Place, Severity
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.reconstruct import IntersectedViews
@@ -345,9 +346,8 @@ def _alarm(level: Severity, estimate: DriftEstimate, place: str, since_s: float)
     )
 
 
-RESTART_S = 1.0  # a stamp that much before the newest one starts a new stream; it is no late frame
-# Exposures in a row before the newest one that start a new stream: of a bag shorter than RESTART_S
-# that is played in a loop. Late frames are fewer.
+# Exposures in a row before the newest one that start a new stream: of a bag shorter than that time
+# which is played in a loop. Late frames are fewer.
 MAX_LATE = 100
 
 
@@ -377,7 +377,7 @@ class BlockClock:
             self._late += 1
         elif now > self.newest_ns:
             self._late = 0
-        if now < self.newest_ns - RESTART_S * 1e9 or self._late > MAX_LATE:
+        if now < self.newest_ns - RESTART_NS or self._late > MAX_LATE:
             self._late = 0
             self._offset_ns += self.newest_ns - now
             now = self.newest_ns

@@ -13,7 +13,7 @@ that are exchanged in one exposure are right in the others. Both chances are com
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 from scipy.special import bdtrc, xlogy
 
@@ -21,9 +21,8 @@ from ..estimation.result import Targets
 from ..photogrammetry.collinearity import project_with_jacobian
 from ..photogrammetry.noise import INLIER_Q
 from .bead_intersection import Rays
+from .check import FALSE_ALARM
 
-FALSE_ALARM = 2e-3  # chance that any two beads of a good phantom are taken for exchanged
-MOST = 0.5  # part of the image points of two beads that lie at each other's place
 NOWHERE = -1  # an image point that agrees with no bead
 FAR = 1e9  # [px]: in the place of NaN, as of a bead behind the source
 ROUNDING = 1e-9
@@ -43,13 +42,13 @@ def exchanged_beads(rays: Rays, targets: Targets) -> NDArray[np.int64]:
         own = np.isin(rays.target_id, pair)
         at_other = moved & np.all(ids == pair, axis=1)
         both = len(np.unique(place[at_other])) == 2
-        if not both or at_other.sum() <= MOST * own.sum():
+        if not both or 2 * at_other.sum() <= own.sum():
             continue
         # Of all other beads, by the rule of succession: how often image points are rejected, and
         # how often these lie at the place of a bead as near as this one.
         others = rejected & ~own
-        share = _rate(others.sum(), (~own).sum())
-        share_near = _rate(np.sum(others & (near <= near[at_other].max())), others.sum())
+        share = rate_of(others.sum(), (~own).sum())
+        share_near = rate_of(np.sum(others & (near <= near[at_other].max())), others.sum())
         # Image points are false each for itself, or ids are exchanged, which displaces two.
         chances = []
         for unit in (np.arange(len(own)), rays.exposure):
@@ -63,9 +62,9 @@ def exchanged_beads(rays: Rays, targets: Targets) -> NDArray[np.int64]:
     return np.array(found, dtype=np.int64).reshape(-1, 2)
 
 
-def _rate(events: int, count: int) -> float:
-    """Return the rate of events, by the rule of succession of Laplace."""
-    return (float(events) + 1) / (float(count) + 2)
+def rate_of(events: ArrayLike, count: ArrayLike) -> NDArray[np.float64]:
+    """Return rates (...) of events of counts, by the rule of succession of Laplace."""
+    return (np.asarray(events) + 1.0) / (np.asarray(count) + 2.0)
 
 
 def _nearness(ids: NDArray[np.int64], targets: Targets) -> NDArray[np.int64]:
@@ -86,12 +85,9 @@ def _places(rays: Rays, targets: Targets) -> NDArray[np.int64]:
     out = rays.target_id.copy()
     for exposure in np.unique(rays.exposure):
         rows = np.flatnonzero(rays.exposure == exposure)
-        shape = (len(targets.target_id), 3)
+        first = rows[0]
         ideal, _, d_point, _ = project_with_jacobian(
-            np.broadcast_to(rays.rotation[rows[0]], (*shape, 3)),
-            np.broadcast_to(rays.position_mm[rows[0]], shape),
-            targets.xyz_mm,
-            rays.interior[rows[0]],
+            rays.rotation[first], rays.position_mm[first], targets.xyz_mm, rays.interior[first]
         )
         of_bead = np.einsum('nij,njk,nlk->nil', d_point, targets.covariance, d_point)
         tree = cKDTree(np.nan_to_num(ideal, nan=FAR))

@@ -82,8 +82,6 @@ PRECISION = Subject(check_precision)
 # exposure has it as an error beside its noise, which is larger than residuals: the errors of its
 # points are then up to 8 % larger.
 HARMLESS = 0.45
-# Range [rad] of angles in degrees that is not larger than a full turn in radians.
-LARGEST_RADIANS = np.deg2rad(2 * np.pi)
 
 
 def check_variation(evidence: Evidence, names: Sequence[str]) -> list[Check]:
@@ -133,7 +131,7 @@ def _angles(evidence: Evidence, name: str) -> str:
     angles = angles_of(evidence.frames[name])
     if not np.isfinite(angles).all() or np.ptp(angles) == 0:
         return 'a C-arm at another angle'
-    if np.ptp(angles) < LARGEST_RADIANS:
+    if np.ptp(angles) < np.deg2rad(2 * np.pi):  # as degrees, less than a full turn in radians
         return 'angles of the C-arm that are in radians, not in degrees'
     return 'angles of the C-arm that are not those of these exposures'
 

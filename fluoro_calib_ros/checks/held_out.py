@@ -18,11 +18,12 @@ from ..correction.registry import no_correction
 from ..errors import DataError
 from ..estimation.result import CalibrationResult
 from ..estimation.rounds import ResidualTable
+from ..exposures.collector import RECOMMENDED_EXPOSURES
 from ..exposures.frame import Frame, Frames
 from ..findings import Finding, Kind, Place
 from ..photogrammetry.noise import INLIER_Q
 from .calibration_evidence import Evidence, Subject
-from .check import GOOD_EXPOSURES, Check, more_exposures, too_little_data
+from .check import Check, more_exposures, rms, too_little_data
 from .residual_tests import RejectedExposure, noise_of, residuals_of
 
 # Doubts whether exposures fit calibrations that are fixed.
@@ -78,7 +79,7 @@ def _lack_of_fit(
         place = np.searchsorted(ordered.target_id, table.target_id[rows])
         noise = calibration.noise_sd(ordered)[place]
         ratios.append(table.residual[rows] / noise[:, None])
-    return _rmse(np.concatenate(ratios))
+    return rms(np.concatenate(ratios))
 
 
 def corrected_already(
@@ -96,7 +97,7 @@ def corrected_already(
     if not names:
         return None
     one, other = (
-        max(_rmse(found.fluoroscopes[name].rmse_after) for name in names)
+        max(rms(found.fluoroscopes[name].rmse_after) for name in names)
         for found in (result, without)
     )
     return Finding(
@@ -109,18 +110,14 @@ def corrected_already(
     )
 
 
-def _rmse(values: NDArray[np.float64]) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
-
-
 def poor_fits(
     result: CalibrationResult, calibrations: Calibrations, frames: Frames
 ) -> list[Finding]:
     """Return a finding for every fluoroscope whose exposures its calibration does not fit."""
     out = []
     for name, ratio in misfits(result, calibrations, frames).items():
-        after = _rmse(result.fluoroscopes[name].rmse_after)
-        before = _rmse(result.fluoroscopes[name].rmse_before)
+        after = rms(result.fluoroscopes[name].rmse_after)
+        before = rms(result.fluoroscopes[name].rmse_before)
         kind = Kind.POOR_CALIBRATION_FIT
         why = 'the image has changed, or the calibration is that of another fluoroscope'
         if before < CORRECTED * after:
@@ -142,9 +139,8 @@ def poor_fits(
 KINDS = (Kind.HELD_OUT, Kind.EXPOSURES)
 FOLDS = 4
 # Limits from simulated rigs: docs/verdict.md, benchmarks/verdict.py.
-MARGIN = (
-    0.13  # over the expectation, with GOOD_EXPOSURES; it grows as the root of their number falls
-)
+# Over the expectation, with RECOMMENDED_EXPOSURES; it grows as the root of their number falls.
+MARGIN = 0.13
 EXPOSURE_LIMIT = 1.6  # times the expectation
 # Robust standard deviations of the logarithms over all exposures that one of many exposures may
 # stand out by; n exposures add SCATTER_OF_FEW / n. Where the noise differs from exposure to
@@ -254,7 +250,7 @@ def _checks(evidence: Evidence, name: str, sums: Sequence[ExposureSums]) -> list
     noise = np.maximum(inside - 2 * weight * common.trend.size**2, MIN_NOISE * inside)
     value = float(np.sqrt(outside.sum() / (2 * n.sum())))
     expected = float(np.sqrt((noise + predicted).sum() / (2 * n.sum())))
-    limit = 1 + MARGIN * np.sqrt(GOOD_EXPOSURES / count)
+    limit = 1 + MARGIN * np.sqrt(RECOMMENDED_EXPOSURES / count)
     held_out = Check(
         Kind.HELD_OUT,
         f'residuals of exposures held out are {value:.3f} px, {expected:.3f} px are expected',

@@ -26,20 +26,20 @@ from ..errors import DataError
 from ..estimation.estimator import interior_about
 from ..estimation.options import CalibrationRequest
 from ..estimation.result import CalibrationResult, FluoroscopeResult
+from ..exposures.collector import MIN_COMMON_TARGETS
 from ..exposures.frame import Frame, Frames, validate_frame
-from ..exposures.phantom import Phantom
+from ..exposures.phantom import MISTAKEN_UNITS, Phantom
 from ..findings import Finding, Kind, Place, first_few
 from ..photogrammetry.collinearity import project
+from ..photogrammetry.diagnosis import MAX_RELATIVE_SD
 from ..photogrammetry.plane_resection import flatness, plane_of, robust_homography
 from ..photogrammetry.resection import MIN_FLATNESS, decompose, robust_dlt, squared_residuals
 from ..photogrammetry.rig_orientation import KnownOrientation
-from .mixed_units import DISTANCES_MM, FIT, UNITS, mixed_units
+from .check import rms
+from .mixed_units import AT, DISTANCES_MM, FIT, MAX_TESTED, OFF, mixed_units
 
-MAX_TESTED = 3  # exposures of a fluoroscope, those with the most targets
 MIN_TESTED = 20  # targets of a single exposure that is tested
-MISFIT = 0.03  # median residual over the longer side of the image from which nothing fits
 BETTER = 0.35  # median residual of other ids over that of the given ones from which they are right
-GOOD_MISFIT = 0.01  # median residual over the longer side of the image of ids that are right
 MAX_COORDINATE_MM = 1e6  # a kilometre
 EXTENT_SHARE = 0.9  # of the targets, within the extent of the phantom
 MAX_EXTENT = 6.0  # distance of a target from the middle over that extent
@@ -50,7 +50,6 @@ MIN_SHARE = 0.5  # of the targets that other ids must have on the phantom
 # Median residual of a known orientation over the longer side of the image from which it is wrong.
 WRONG_ORIENTATION = 0.1
 SAME_PX = 1e-6  # image points of two exposures that agree so closely are copies
-MIN_COMMON = 8  # targets in two exposures that are compared
 COPIED = 0.9  # share of common image points that are the same in a copied exposure
 
 Relabel = Callable[[NDArray[np.int64], Phantom], NDArray[np.int64]]
@@ -354,13 +353,7 @@ def _median_residual(frames: Sequence[Frame], phantom: Phantom, known: KnownOrie
 def _residuals(frame: Frame, phantom: Phantom, known: KnownOrientation) -> NDArray[np.float64]:
     """Distances (n,) [px] of image points from their targets, infinite behind the source."""
     xyz = phantom.xyz_mm[phantom.index(frame.target_id)]
-    n = len(xyz)
-    predicted = project(
-        np.broadcast_to(known.rotation, (n, 3, 3)),
-        np.broadcast_to(known.position_mm, (n, 3)),
-        xyz,
-        known.interior,
-    )
+    predicted = project(known.rotation, known.position_mm, xyz, known.interior)
     distance = np.linalg.norm(frame.uv - predicted, axis=1)
     return np.where(np.isfinite(distance), distance, np.inf)
 
@@ -412,7 +405,7 @@ def wrong_unit(distance_mm: float, phantom: Phantom) -> Finding | None:
             'camera',
             numbers=numbers,
         )
-    units = [unit for mm, unit in UNITS.items() if low <= distance_mm * mm <= high]
+    units = [unit for mm, unit in MISTAKEN_UNITS.items() if low <= distance_mm * mm <= high]
     perhaps = f', but perhaps in {" or ".join(units)}' if units else ''
     return Finding(
         Kind.WRONG_UNIT,
@@ -436,10 +429,10 @@ def _cause(frame: Frame, phantom: Phantom) -> Finding | None:
         if (
             other is not None
             and other.misfit_px < BETTER * given.misfit_px
-            and other.misfit_px < GOOD_MISFIT * side
+            and other.misfit_px < AT * side
         ):
             return confusion
-    if given.misfit_px > MISFIT * side:
+    if given.misfit_px > OFF * side:
         return _OTHER_PHANTOM
     if given.is_behind:
         return _MIRRORED
@@ -500,7 +493,7 @@ def _are_copied(uv: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray
     distance = np.maximum(u, v)  # max() along so short an axis takes ten times as long
     common = np.sum(np.isfinite(distance), axis=1)
     same = np.sum(distance <= SAME_PX, axis=1)
-    return (common >= MIN_COMMON) & (same >= COPIED * common)
+    return (common >= MIN_COMMON_TARGETS) & (same >= COPIED * common)
 
 
 # Absolute tests of a calibration: what no calibration of a fluoroscope can look like.
@@ -512,7 +505,6 @@ def _are_copied(uv: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray
 MAX_MISFIT = 0.0025  # RMSE after the correction over the longer side of the image
 MAX_MISFIT_SD = 4.0  # the same over the a-priori standard deviation of the image points
 MIN_INLIERS = 0.5  # share of the image points
-MAX_SD_DISTANCE = 0.05  # standard deviation of the principal distance over it
 MAX_DISTANCE_CHANGE = 0.2  # of one that is fixed, by the scale of the correction
 MAX_SD_POINT = 0.15  # of the principal point over the longer side of the image
 MAX_OFF_CENTRE = 1.0  # distance of the principal point from the middle over the longer side
@@ -535,7 +527,7 @@ def implausible(request: CalibrationRequest, result: CalibrationResult) -> list[
 
 def _large_residuals(figures: FluoroscopeResult, frames: Sequence[Frame]) -> Finding | None:
     """Residuals that are larger than distortion and noise leave."""
-    rmse = float(np.sqrt(np.mean(np.square(figures.rmse_after))))
+    rmse = rms(figures.rmse_after)
     given = [np.median(frame.sigma) for frame in frames if frame.sigma is not None]
     limit = MAX_MISFIT * max(figures.image_size)
     if given:
@@ -579,7 +571,7 @@ def _wrong_interior(
     side = max(figures.image_size)
     if not np.any(sd) and (found := _wrong_given_distance(calibration)):
         return found
-    if sd[2] > MAX_SD_DISTANCE * c or max(sd[:2]) > MAX_SD_POINT * side:
+    if sd[2] > MAX_RELATIVE_SD * c or max(sd[:2]) > MAX_SD_POINT * side:
         return Finding(
             Kind.INTERIOR_UNDETERMINED,
             f'the interior orientation is not determined: principal distance {c:.0f} px with a '

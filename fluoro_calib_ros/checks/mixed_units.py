@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DataError
+from ..estimation.initial_network import MIN_TARGETS_OF_EXPOSURE
 from ..exposures.frame import Frame, Frames
-from ..exposures.phantom import Phantom
+from ..exposures.phantom import MISTAKEN_UNITS, Phantom
 from ..findings import Finding, Kind, Place, first_few
 from ..photogrammetry.resection import (
     SAMPLE_SIZE,
@@ -32,11 +33,11 @@ from ..photogrammetry.resection import (
 )
 
 DISTANCES_MM = (200.0, 10_000.0)  # of the source from a phantom in mm
-UNITS = {10.0: 'cm', 25.4: 'inches', 1000.0: 'm'}  # that mm are mistaken for
 MAX_TESTED = 3  # exposures of a fluoroscope, those with the most targets
-MIN_TARGETS = 12  # of an exposure that is tested
-OFF = 0.03  # residual over the longer side of the image of a target that is not at its place
-AT = 0.01  # the same of one that is
+# Residual over the longer side of the image of a target that is not at its place, and of one that
+# is; the same of the median of an exposure whose ids are wrong, and of one whose ids are right.
+OFF = 0.03
+AT = 0.01
 FIT = 0.004  # median of these residuals where all targets have their unit
 UNCLEAR = 0.6  # share of targets at their places below which there may be no majority
 MIN_GROUP = 3  # targets in either unit
@@ -51,7 +52,7 @@ def mixed_units(frames: Frames, phantom: Phantom, is_suspicious: bool = False) -
     not fit the phantom, so that there may be no majority.
     """
     every = [_on_phantom(frame, phantom) for of_one in frames.values() for frame in of_one]
-    every = [frame for frame in every if len(frame.target_id) >= MIN_TARGETS]
+    every = [frame for frame in every if len(frame.target_id) >= MIN_TARGETS_OF_EXPOSURE]
     tested = [
         frame
         for name in frames
@@ -104,7 +105,7 @@ def _factor_of(
         return None
     residual = np.sqrt(squared_residuals(projection, xyz, frame.uv))
     off = residual > OFF * limit
-    for factor in (*UNITS, *(1 / factor for factor in UNITS)):
+    for factor in (*MISTAKEN_UNITS, *(1 / factor for factor in MISTAKEN_UNITS)):
         scaled = np.sqrt(squared_residuals(projection, factor * xyz, frame.uv))
         there = off & (scaled < AT * limit)
         if there.sum() >= MIN_GROUP and (residual < AT * limit).sum() > there.sum():
@@ -122,7 +123,7 @@ def _factor_by_samples(
     limit = max(frame.image_size)
     samples = np.argsort(rng.random((SAMPLES, len(xyz))), axis=1)[:, :SAMPLE_SIZE]
     which = rng.integers(0, 2, samples.shape)
-    for factor in UNITS:
+    for factor in MISTAKEN_UNITS:
         versions = np.stack([xyz, factor * xyz])
         try:
             with np.errstate(all='ignore'):
@@ -204,7 +205,7 @@ def _whole_group(
 
 def _finding(ids: NDArray[np.int64], factor: float) -> Finding:
     """Return the finding on targets that fit when they are multiplied by a factor."""
-    unit = UNITS.get(factor)
+    unit = MISTAKEN_UNITS.get(factor)
     meant = f' ({unit} in place of mm)' if unit else ''
     return Finding(
         Kind.MIXED_UNITS,

@@ -25,6 +25,7 @@ from scipy.spatial import cKDTree
 
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..estimation.lack_of_fit import (
+    CELLS,
     LARGEST_SD,
     MIN_EXPOSURES,
     FittedPoints,
@@ -38,11 +39,9 @@ from ..findings import Finding, Kind, Severity
 from ..photogrammetry.collinearity import project
 from ..photogrammetry.noise import INLIER_Q
 from ..photogrammetry.rotations import matrix_from_quaternion
-from .check import Check
+from .check import FALSE_ALARM, Check
 
-CELLS = 8  # across the image
 MIN_IN_CELL = 10  # image points
-FALSE_ALARM = 2e-3  # chance of a false alarm of each test for a common trend
 
 
 class _TestPlan(NamedTuple):
@@ -183,12 +182,7 @@ def residuals_of(job: CalibrationResult, name: str, frames: Sequence[Frame]) -> 
         frame = by_number[exposure.exposure]
         points = targets.xyz_mm[np.searchsorted(targets.target_id, frame.target_id)]
         rotation = matrix_from_quaternion(exposure.quaternion_wxyz)
-        ideal = project(
-            np.broadcast_to(rotation, (len(points), 3, 3)),
-            np.broadcast_to(exposure.position_mm, points.shape),
-            points,
-            figures.interior,
-        )
+        ideal = project(rotation, exposure.position_mm, points, figures.interior)
         uv.append(frame.uv)
         correction = calibration.correction(frame.uv, frame.angle).duv
         residuals.append(frame.uv - correction - ideal)
@@ -518,13 +512,8 @@ def _may_be(
     if not others.any():
         return [()] * len(rows)
     points = result.targets.xyz_mm[others]
-    count = len(points)
-    uv: Any = project(
-        np.broadcast_to(matrix_from_quaternion(pose.quaternion_wxyz), (count, 3, 3)),
-        np.broadcast_to(pose.position_mm, (count, 3)),
-        points,
-        figures.interior,
-    )
+    rotation = matrix_from_quaternion(pose.quaternion_wxyz)
+    uv: Any = project(rotation, pose.position_mm, points, figures.interior)
     seen = table.uv[rows] - table.correction[rows]
     distance = np.linalg.norm(seen[:, None] - uv, axis=2)
     nearest = distance.argmin(axis=0) == np.arange(len(rows))[:, None]

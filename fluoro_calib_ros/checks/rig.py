@@ -29,6 +29,7 @@ from ..estimation.options import CalibrationRequest
 from ..estimation.pair_scatter import MOVED_SHARE, PairScatter, steps_of
 from ..estimation.result import CalibrationResult, ExposureResult, FluoroscopeResult
 from ..estimation.rig_orientation import orientation_and_scatter, orientation_of_known
+from ..exposures.collector import displacement
 from ..exposures.frame import Frame, Frames
 from ..findings import Finding, Kind, Place, Severity
 from ..photogrammetry.rig_orientation import RigOrientation
@@ -253,7 +254,6 @@ def _squares(
     return float(np.sum((values - columns @ coefficients) ** 2)), coefficients
 
 
-MIN_COMMON = 8  # targets of two frames whose displacement is known
 CAPTURE = 'orient the rig from a capture'
 
 
@@ -409,10 +409,9 @@ def motion_between_stamps(one: Sequence[Frame], other: Sequence[Frame]) -> float
     moved = []
     for before, after in pairwise(stamped):
         partner = there.get(after.number)
-        _, i, j = np.intersect1d(before.target_id, after.target_id, return_indices=True)
+        by = displacement(before, after)
         interval = after.stamp_ns - before.stamp_ns
-        if partner is None or len(i) < MIN_COMMON or not interval:
+        if partner is None or not np.isfinite(by) or not interval:
             continue
-        displacement = np.median(np.linalg.norm(after.uv[j] - before.uv[i], axis=1))
-        moved.append(displacement * abs(partner.stamp_ns - after.stamp_ns) / interval)
+        moved.append(by * abs(partner.stamp_ns - after.stamp_ns) / interval)
     return float(np.median(moved)) if moved else None

@@ -40,7 +40,6 @@ NORMAL_MEDIAN = 0.455  # of chi-squared with one degree of freedom
 # Blocks in a row, with so many markers and most of their rays apart, that show a knock.
 KNOCKED_BLOCKS = 2
 MIN_MARKERS = 3
-MOST = 0.5
 
 
 @dataclass(frozen=True)
@@ -117,7 +116,7 @@ class RigChange:
         if len(rays.residual) < MIN_MARKERS:
             return
         self._blocks.append(rays)
-        is_apart = bool(rays.is_apart.mean() > MOST)
+        is_apart = bool(rays.is_apart.mean() > 0.5)
         self.blocks_apart = self.blocks_apart + 1 if is_apart else 0
         self._has_met |= not is_apart
 

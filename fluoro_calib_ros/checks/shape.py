@@ -30,16 +30,15 @@ from ..estimation.fixed_calibration import SolvedNetwork
 from ..findings import Finding, Kind, Place, Severity
 from ..photogrammetry.collinearity import AdditionalParameters
 from ..photogrammetry.elimination import factorize
-from ..photogrammetry.network import Network
+from ..photogrammetry.network import Network, similarity_directions
 from ..photogrammetry.normal_equations import normal_equations
 from ..photogrammetry.precision import covariance_times_points
 from ..photogrammetry.unknowns import UnknownVector
-from .beads import FALSE_ALARM, SD_FACTOR
+from .beads import MIN_BEADS, SD_FACTOR
 from .calibration_evidence import Evidence, Subject
-from .check import Check
+from .check import FALSE_ALARM, Check
 
 STRAINS = 5  # symmetric, without the common scale
-MIN_BEADS = 10
 # Increase of the NSE of the points by a strain that is no fault: up to 1.25 it is honest.
 HARMLESS_NSE = 0.25
 # Increase of the NSE by a strain that would not be found from which it is taken on trust.
@@ -126,9 +125,7 @@ def _score(evidence: Evidence, solved: SolvedNetwork, displacement: NDArray[np.f
     matrix = factorize(network, equations)
     weighted = displacement / network.survey_sd_mm[:, None, None] ** 2
     followed = covariance_times_points(matrix, weighted).points
-    rights = matrix.elimination.right_sides(UnknownVector(equations.e, equations.p, equations.g))
-    solution = matrix.factor.solve(rights[0][..., None], rights[1][:, None])
-    step = matrix.elimination.to_unknowns(*solution).points[..., 0]
+    step = matrix.solve(UnknownVector(equations.e, equations.p, equations.g)).points[..., 0]
     left = network.survey_mm - parameters.points_mm - step
     return _Score(
         np.einsum('nai,naj->ij', weighted, displacement - followed),
@@ -171,14 +168,10 @@ def _without_similarity(
     displacement: NDArray[np.float64], survey_mm: NDArray[np.float64], sd_mm: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Displacements (n, 3, 5) less their shift, rotation and scale, which the poses take up."""
-    offset = survey_mm - survey_mm.mean(axis=0)
-    similarity = np.zeros((len(offset), 3, 7))
-    similarity[:, :, :3] = np.eye(3)
-    similarity[:, :, 3:6] = np.cross(np.eye(3)[None], offset[:, None]).transpose(0, 2, 1)
-    similarity[:, :, 6] = offset
+    similarity = similarity_directions(survey_mm, survey_mm.mean(axis=0))
     weight = 1 / sd_mm[:, None, None]
-    rows = 3 * len(offset)
-    left = (weight * similarity).reshape(rows, 7)
+    rows = 3 * len(survey_mm)
+    left = (weight * similarity).reshape(rows, -1)
     right = (weight * displacement).reshape(rows, STRAINS)
     return displacement - similarity @ np.linalg.lstsq(left, right, rcond=None)[0]
 

@@ -14,21 +14,19 @@ from scipy.special import chdtri
 
 from ..estimation.survey import SurveyedBeads
 from ..findings import Finding, Kind, Place, Severity, first_few
-from ..photogrammetry.network import similarity_directions
+from ..photogrammetry.network import DATUM_DEFECT, MIN_RAYS, similarity_directions
+from .beads import MIN_BEADS
 from .check import Check
 
-MIN_RAYS = 3  # that agree: two determine a bead, but nothing would check them
 # Errors along two rays are cot(angle / 2) times those across: 6 times at 20 degrees. A single sd
 # for all axes would then be wrong by more than half for the worst of them.
 MIN_ANGLE_RAD = np.deg2rad(20.0)
 FALSE_ALARM = 1e-3
-MIN_BEADS = 10  # of both halves
 # Mean square of the normalised differences of two halves: docs/how_good.md. It is 1.41 at most in
 # simulated surveys whose sds are right, and was 1.64 in one with an NSE of 1.6 (8 exposures, seed
 # 7 of benchmarks.survey).
 HALVES_LIMIT = 1.5
 OFF_SD = 1.5  # times what the sd of rough coordinates says, as an RMS of many beads
-DATUM = 7  # shift, rotation and scale
 UNKNOWN = 1e6  # variance of a datum that is not known, over that of the beads
 
 
@@ -108,14 +106,14 @@ def check_survey_halves(one: SurveyedBeads, other: SurveyedBeads) -> Check:
     one, other = (beads.without(np.setdiff1d(beads.target_id, common)) for beads in (one, other))
     difference = (one.xyz_mm - other.xyz_mm).reshape(-1, 1)
     covariance = one.covariance + other.covariance
-    flat = similarity_directions(one.given_mm, one.given_mm.mean(axis=0)).reshape(-1, DATUM)
+    flat = similarity_directions(one.given_mm, one.given_mm.mean(axis=0)).reshape(-1, DATUM_DEFECT)
     flat = flat / np.linalg.norm(flat, axis=0)
     weighted = _weighted_by(one, other, flat)
     left = difference - flat @ np.linalg.solve(
         flat.T @ weighted(flat), flat.T @ weighted(difference)
     )
     square = float(np.sum(left * weighted(left)))
-    freedom = 3 * len(common) - DATUM
+    freedom = 3 * len(common) - DATUM_DEFECT
     rms = float(np.sqrt(np.mean(left**2)))
     expected = float(np.sqrt(np.trace(covariance, axis1=1, axis2=2).mean() / 3))
     return Check(

@@ -36,7 +36,7 @@ from ..exposures.frame import Frame, Frames
 from ..findings import Finding, Kind, Place, Severity
 from .beads import BEADS
 from .calibration_evidence import Evidence
-from .check import Check, Validation, verdict_of
+from .check import Check, Validation, rms, verdict_of
 from .field_checks import HALVES, PRECISION, TRENDS, VARIATION
 from .held_out import HELD_OUT
 from .rig import RigFindings, check_rig, rig_findings
@@ -93,7 +93,8 @@ def _given_interior_check(
     evidence: Evidence, name: str, free: FluoroscopeCalibration, distance: float
 ) -> Check | None:
     present = evidence.calibrations[name]
-    gain = _rmse(present) / _rmse(free)
+    rmse, rmse_free = rms(present.rmse_after), rms(free.rmse_after)
+    gain = rmse / rmse_free
     given = nominal_interior(present.image_size, distance)
     given_sd = np.asarray(evidence.request.options.interior_sd)
     sd = np.sqrt(np.diag(free.interior_covariance))
@@ -107,8 +108,8 @@ def _given_interior_check(
     return Check(
         Kind.GIVEN_INTERIOR,
         f'the given interior orientation, {stated} px, contradicts the '
-        f'exposures, which show {shown} px: the residuals are {_rmse(present):.2f} px with what '
-        f'was given and {_rmse(free):.2f} px without',
+        f'exposures, which show {shown} px: the residuals are {rmse:.2f} px with what '
+        f'was given and {rmse_free:.2f} px without',
         Place((name,)),
         'give the right value, a larger --interior-sd, or none',
         numbers={
@@ -119,11 +120,6 @@ def _given_interior_check(
         limit=MAX_SD,
         unit='sd',
     )
-
-
-def _rmse(calibration: FluoroscopeCalibration) -> float:
-    """RMSE of the inlier residuals of a coordinate after the correction [px]."""
-    return float(np.sqrt(np.mean(np.square(calibration.rmse_after))))
 
 
 Progress = Callable[[str, int, int], None]

@@ -54,14 +54,12 @@ class NoiseProfile:
         square *= math.log(self.rim / self.middle) / self.reach**2
         return self.middle * np.exp(square)
 
-    def packed(self) -> NDArray[np.float64]:
-        """Return middle, border and reach (3,), for files and messages."""
-        return np.array([self.middle, self.rim, self.reach])
-
 
 def packed_profile(profile: NoiseProfile | None) -> NDArray[np.float64]:
-    """Return a profile as an array (3,) for files and messages, (0,) for None."""
-    return np.zeros(0) if profile is None else profile.packed()
+    """Return middle, border and reach (3,) of a profile for files and messages, (0,) for None."""
+    if profile is None:
+        return np.zeros(0)
+    return np.array([profile.middle, profile.rim, profile.reach])
 
 
 def unpacked_profile(values: np.ndarray) -> NoiseProfile | None:

@@ -131,9 +131,8 @@ class LookupWorkspace:
 DIVIDED = 4  # added to the status of a cell that is divided
 CHUNK = 8192  # points that are looked up at once, so that their workspace fits the cache
 # Numbers of points for which workspaces are made: steps of 32 for frames, then powers of two.
-WORKSPACE_STEP = 32
 MAX_STEPPED = 512  # points up to which workspaces grow in steps
-WORKSPACE_SIZES = (*range(0, MAX_STEPPED + 1, WORKSPACE_STEP), 1024, 2048, 4096, CHUNK)
+WORKSPACE_SIZES = (*range(0, MAX_STEPPED + 1, 32), 1024, 2048, 4096, CHUNK)
 CHECKS_OF_DIVIDED = 20  # random points in each divided cell at which its error is measured
 
 

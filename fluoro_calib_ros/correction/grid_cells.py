@@ -92,7 +92,7 @@ def _second_differences(values: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.maximum(of_cell[:, :-1], of_cell[:, 1:])
 
 
-CELL_PX = (8, 4, 2)  # sizes of cells that are tried
+CELL_PX = (8, 4, 2)  # sizes of cells that are tried; those of a saved lookup grid are the largest
 MAX_SHARE_DIVIDED = 0.01  # of cells, so that not all of them have to be smaller
 MAX_DIVIDED = 2500  # cells, the worst ones
 MAX_PARTS = 16  # of a divided cell along a side

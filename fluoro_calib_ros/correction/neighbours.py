@@ -26,7 +26,7 @@ BLOCK = 200  # pixels of a block
 MIN_BLOCK = 9  # where training points are dense
 MAX_BLOCK_PX = 64.0  # its largest side, for pixels that are far apart
 BLOCKS_PER_QUERY = 32
-MAX_FOUND = 2_000_000  # candidates of a query, to bound the memory
+MAX_AT_ONCE = 2_000_000  # candidates of a query, and weights, to bound the memory
 REACH_SAMPLES = 32
 # In candidates of a pixel: what a block costs, and each neighbour in the search from its centre.
 WORK_OF_BLOCK = 5000
@@ -41,7 +41,7 @@ def blocks_with_candidates(
     tree holds the training points. Yields the rows of the pixels and of the training points; None
     in place of more than most points, as where many coincide.
     """
-    per_query = int(np.clip(MAX_FOUND // min(tree.n, most), 1, BLOCKS_PER_QUERY))
+    per_query = int(np.clip(MAX_AT_ONCE // min(tree.n, most), 1, BLOCKS_PER_QUERY))
     for some, centre, radius in _circles(tree, uv, k, per_query):
         if tree.n <= most:
             yield from zip(some, tree.query_ball_point(centre, radius))
@@ -277,7 +277,6 @@ def least_squares_map(basis: np.ndarray) -> NDArray[np.float64]:
 
 # Models that predict a weighted sum of the k nearest training corrections.
 
-WEIGHTS_CHUNK = 2_000_000  # weights computed at once, to bound the memory
 MAX_CANDIDATES = 50  # for each neighbour; more are never found among distinct points
 
 
@@ -367,7 +366,7 @@ class NeighbourModel(CorrectionModel):
                 predicted, norm2[block] = self._local_part(uv[block])
                 out[:2, block] = predicted.T
                 continue
-            rows = max(1, WEIGHTS_CHUNK // len(near))
+            rows = max(1, MAX_AT_ONCE // len(near))
             for start in range(0, len(block), rows):
                 some = block[start : start + rows]
                 weights = self.weights_of_candidates(self.train_uv[near], uv[some], self.k)
@@ -402,7 +401,7 @@ class NeighbourModel(CorrectionModel):
         """What the neighbours add to the global part (n, 2) [px], and the norms as above."""
         duv = np.zeros_like(uv)
         norm2 = np.zeros(len(uv))
-        size = max(1, WEIGHTS_CHUNK // self.k)
+        size = max(1, MAX_AT_ONCE // self.k)
         for start in range(0, len(uv), size):
             part = slice(start, start + size)
             _, index = self.tree.query(uv[part], k=np.arange(1, self.k + 1))

@@ -23,6 +23,7 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial import ConvexHull, QhullError
 
 from .base import CorrectionModel
+from .grid_cells import CELL_PX
 from .neighbours import HybridModel, KnnModel, LocalLinearModel
 from .series import Series, series_from_values
 
@@ -79,7 +80,6 @@ class CollocationModel(SeriesModel):
     description = 'cubic trend and random field in the adjustment'
 
 
-CELL_PX = 8  # largest side of a cell, as the largest cells of the run-time grid
 MAX_CELLS = 128  # along a side of the image, to bound the size of files and messages
 MIN_NODES = 2  # along a side
 
@@ -128,7 +128,7 @@ class LookupModel(CorrectionModel):
 
 def grid_nodes(image_size: tuple[int, int]) -> NDArray[np.float64]:
     """Nodes (n, 2) [px] of the lookup grid of an image (width, height), row by row."""
-    size = max(CELL_PX, max(image_size) / MAX_CELLS)
+    size = max(*CELL_PX, max(image_size) / MAX_CELLS)
     u, v = (
         np.linspace(-0.5, length - 0.5, max(MIN_NODES, int(np.ceil(length / size)) + 1))
         for length in image_size

@@ -12,7 +12,6 @@ from datetime import datetime, timezone
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from ..correction.base import CorrectionModel
@@ -380,11 +379,6 @@ def _targets(measured: Measured, adjustment: Adjustment, precise: Precision) -> 
     )
 
 
-def _rows_of(measured: Measured, f: int) -> NDArray[np.int64]:
-    """Image points of fluoroscope number f."""
-    return np.flatnonzero(measured.network.fluoroscope[measured.network.exposure] == f)
-
-
 def _figures(
     measured: Measured,
     before: Adjustment | None,
@@ -394,7 +388,7 @@ def _figures(
     model: CorrectionModel,
 ) -> FluoroscopeResult:
     """Figures of fluoroscope number f of an adjustment; before: the one without correction."""
-    rows = _rows_of(measured, f)
+    rows = measured.network.rows(f)
     exposures = []
     for j in np.flatnonzero(measured.network.fluoroscope == f):
         sd = np.sqrt(np.diagonal(precise.exterior[j]))
@@ -442,7 +436,7 @@ def _image_noise(run: SelfCalibration, f: int, name: str) -> _ImageNoise:
         redundancy = run.precision.redundancy.mean(axis=1)
     else:
         redundancy = geometric_redundancy(run.measured.network, run.after.parameters, noise_model)
-    rows = _rows_of(run.measured, f)
+    rows = run.measured.network.rows(f)
     rows = rows[run.after.inliers[rows]]
     square = np.sum(run.after.residuals[rows] ** 2, axis=1) / 2
     between = run.between_exposures.get(name, np.zeros(len(rows)))
@@ -461,7 +455,7 @@ def _calibration(
     noise: _ImageNoise,
 ) -> FluoroscopeCalibration:
     """Calibration of fluoroscope number f of a self-calibration."""
-    rows = _rows_of(run.measured, f)
+    rows = run.measured.network.rows(f)
     last = run.history[-1]
     frames = [frame for frame in run.measured.frames if frame.fluoroscope == name]
     numbers = np.array([frame.number for frame in run.measured.frames])

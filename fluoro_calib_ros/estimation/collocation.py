@@ -228,15 +228,6 @@ class CollocationTerms(AdjustedTerms):
             out.append(np.pad(converted, (0, part.count - len(converted))))
         return tuple(out)
 
-    def series(
-        self, f: int, coefficients: NDArray[np.float64], covariance: NDArray[np.float64]
-    ) -> Series:
-        """Return the series of fluoroscope f, without the terms of its exposures.
-
-        coefficients (p,), those of u first, and their covariance (p, p).
-        """
-        return self.parts[f].series(coefficients, covariance)
-
     def fit_angles(self, f: int, adjustment: Adjustment, precise: Precision) -> AngleField | None:
         """See `AdjustedTerms`."""
         fit = self.parts[f].fit_angles(adjustment, precise)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ..errors import DataError
 from ..findings import Finding, Kind, Place, Severity, first_few
 from ..photogrammetry.elimination import factorize
+from ..photogrammetry.network import MIN_RAYS
 from ..photogrammetry.normal_equations import normal_equations
 from ..photogrammetry.precision import covariance_blocks
 from ..photogrammetry.unknowns import (
@@ -33,9 +34,6 @@ from .initial_network import Measured
 from .options import CalibrationOptions
 from .rounds import SelfCalibration
 
-# Image points of a target without surveyed coordinates. Two would determine it, but a false match
-# among them could not be detected, and would move it anywhere.
-MIN_RAYS = 3
 MIN_PAIRS = 2  # of exposures for a constraint of the relative orientation
 
 

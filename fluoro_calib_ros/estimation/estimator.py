@@ -69,6 +69,19 @@ UNIT_PX = 512.0  # of the image coordinates in the basis; any fixed length would
 TURN_STEP = 1e-3  # rad, as large as a pixel of the principal point for the search of both
 
 
+def orientation_fields(xy: ArrayLike) -> NDArray[np.float64]:
+    """Return the displacements (n, 2, 6) of points xy (n, 2) that orientations absorb.
+
+    In any unit of xy: a shift of the image in both directions, its scale, its rotation, and its
+    tilt about both axes (the linearised projective map of a rotated sensor).
+    """
+    x, y = np.asarray(xy, dtype=float).T
+    one = np.ones_like(x)
+    zero = np.zeros_like(x)
+    columns = [(one, zero), (zero, one), (x, y), (-y, x), (x * x, x * y), (x * y, y * y)]
+    return np.stack([np.stack(column, axis=1) for column in columns], axis=2)
+
+
 def gauge_basis(
     uv: ArrayLike, interior: NDArray[np.float64], kind: GaugeKind = GaugeKind.FULL
 ) -> NDArray[np.float64]:
@@ -76,20 +89,18 @@ def gauge_basis(
 
     g is 3 for the turns, 0 for none, else 6.
     """
-    x, y = (np.asarray(uv) - interior[:2]).T / UNIT_PX
-    one = np.ones_like(x)
-    zero = np.zeros_like(x)
+    xy = (np.asarray(uv) - interior[:2]) / UNIT_PX
     if kind is GaugeKind.NONE:
-        return np.zeros((len(x), 2, 0))
-    if kind is GaugeKind.TURNS:
-        square = (UNIT_PX / interior[2]) ** 2
-        columns = [
-            (-y, x),
-            (one + square * x * x, square * x * y),
-            (square * x * y, one + square * y * y),
-        ]
-    else:
-        columns = [(one, zero), (zero, one), (x, y), (-y, x), (x * x, x * y), (x * y, y * y)]
+        return np.zeros((len(xy), 2, 0))
+    if kind is not GaugeKind.TURNS:
+        return orientation_fields(xy)
+    x, y = xy.T
+    square = (UNIT_PX / interior[2]) ** 2
+    columns = [
+        (-y, x),
+        (1 + square * x * x, square * x * y),
+        (square * x * y, 1 + square * y * y),
+    ]
     return np.stack([np.stack(column, axis=1) for column in columns], axis=2)
 
 
@@ -258,12 +269,6 @@ class AdjustedTerms(ABC):
         """Coefficients of no correction, by fluoroscope."""
 
     @abstractmethod
-    def series(
-        self, f: int, coefficients: NDArray[np.float64], covariance: NDArray[np.float64]
-    ) -> Series:
-        """Return the series of fluoroscope f from its coefficients (p,) and their covariance."""
-
-    @abstractmethod
     def renew(
         self, network: Network, matrix: FactorizedNormalMatrix, adjustment: Adjustment
     ) -> tuple[bool, tuple[NDArray[np.float64], ...]]:
@@ -294,13 +299,9 @@ class AdjustedTerms(ABC):
         """
         return np.zeros(int(adjustment.inliers[network.rows(f)].sum()))
 
+    @abstractmethod
     def fitted_series(self, f: int, adjustment: Adjustment, precise: Precision) -> Series:
         """Return the series of fluoroscope f that an adjustment has estimated."""
-        coefficients = adjustment.parameters.additional[f]
-        covariance = precise.additional[f]
-        if coefficients is None or covariance is None:
-            raise ValueError(f'no terms were estimated for fluoroscope number {f}')
-        return self.series(f, coefficients, covariance)
 
 
 class RegressionStep(ABC, Generic[Model_co]):
@@ -388,6 +389,20 @@ def require_training(count: int) -> None:
 def coefficients_of(adjustment: Adjustment) -> tuple[NDArray[np.float64], ...]:
     """Coefficients of the additional parameters by fluoroscope, which all have some."""
     return tuple(c for c in adjustment.parameters.additional if c is not None)
+
+
+def estimated_terms(
+    f: int, adjustment: Adjustment, precise: Precision
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Coefficients (p,) of the additional parameters of fluoroscope f, and covariance (p, p).
+
+    Raises ValueError where there are none.
+    """
+    coefficients = adjustment.parameters.additional[f]
+    covariance = precise.additional[f]
+    if coefficients is None or covariance is None:
+        raise ValueError(f'no terms were estimated for fluoroscope number {f}')
+    return coefficients, covariance
 
 
 def prior_of_additional(network: Network, f: int) -> NDArray[np.float64]:

@@ -16,7 +16,7 @@ from ..correction.series import Functions, Series, sd_over_image, without_absent
 from ..correction.terms import CUBIC
 from ..photogrammetry.collinearity import AdditionalParameters
 from ..photogrammetry.precision import information_of_additional
-from .estimator import AdjustmentProblem, coefficients_of, prior_of_additional
+from .estimator import AdjustmentProblem, coefficients_of, estimated_terms, prior_of_additional
 from .exposure_terms import (
     AngleFit,
     ExposureTerms,
@@ -246,11 +246,9 @@ class FluoroscopeTerms:
         fit = self._angle_fit
         if fit is not None:
             return self.series(fit.coefficients, fit.covariance)
-        covariance = precise.additional[self.number]
-        if covariance is None:
-            raise ValueError(f'no terms were estimated for fluoroscope number {self.number}')
+        coefficients, covariance = estimated_terms(self.number, adjustment, precise)
         of_series = self.of_series
-        coefficients = coefficients_of(adjustment)[self.number][of_series]
+        coefficients = coefficients[of_series]
         covariance = covariance_of_series(
             self.functions, self.prior, coefficients, covariance[of_series, of_series]
         )

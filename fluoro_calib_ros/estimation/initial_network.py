@@ -16,7 +16,7 @@ from ..errors import DataError
 from ..exposures.frame import Frame, Frames, angles_of, validate_frame
 from ..exposures.phantom import Phantom
 from ..findings import Finding, Kind, Place, Severity
-from ..photogrammetry.adjustment import Adjustment, SolverOptions, adjust
+from ..photogrammetry.adjustment import DEFAULT_OPTIONS, Adjustment, SolverOptions, adjust
 from ..photogrammetry.network import Network
 from ..photogrammetry.noise import Noise
 from ..photogrammetry.outliers import adjust_and_estimate_noise
@@ -64,7 +64,7 @@ def adjusted_with_precision(
     start: Parameters,
     correction: NDArray[np.float64],
     noise: Noise,
-    tolerance: float = 1e-8,
+    tolerance: float = DEFAULT_OPTIONS.tolerance,
     noise_fixed: bool = False,
 ) -> tuple[Adjustment, Precision]:
     """Adjust a network and compute its precision.
@@ -88,23 +88,11 @@ def adjusted_with_precision(
     DataError
         If the network does not determine the unknowns.
     """
+    adjusted = adjust if noise_fixed else adjust_and_estimate_noise
     try:
-        if noise_fixed:
-            result = adjust(
-                network,
-                start,
-                correction=correction,
-                noise=noise,
-                options=SolverOptions(tolerance),
-            )
-        else:
-            result = adjust_and_estimate_noise(
-                network,
-                start,
-                correction=correction,
-                noise=noise,
-                options=SolverOptions(tolerance),
-            )
+        result = adjusted(
+            network, start, correction=correction, noise=noise, options=SolverOptions(tolerance)
+        )
         return result, precision(network, result, correction)
     except np.linalg.LinAlgError:
         raise undetermined(network) from None
@@ -128,8 +116,6 @@ def with_additional(adjustment: Adjustment, values: tuple[NDArray[np.float64], .
 
 MIN_EXPOSURES = 3
 MIN_TARGETS_OF_EXPOSURE = 12
-# Of an exposure whose orientation is known.
-MIN_TARGETS_OF_KNOWN = 1
 # Flat targets that are tilted less in all exposures do not show the principal distance.
 UNTILTED_RAD = np.deg2rad(5.0)
 # As is advised.
@@ -237,7 +223,7 @@ class _Task:
 
     def min_targets(self, name: str) -> int:
         """Number of targets that an exposure needs."""
-        return MIN_TARGETS_OF_KNOWN if name in self.known else MIN_TARGETS_OF_EXPOSURE
+        return 1 if name in self.known else MIN_TARGETS_OF_EXPOSURE
 
 
 @dataclass(frozen=True)

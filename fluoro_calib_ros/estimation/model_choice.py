@@ -29,7 +29,7 @@ from .estimator import (
 )
 from .neighbour_regression import CrossValidation
 from .parametric import StepwiseTerms
-from .priors import GAUGE_SD_PX, prior_precision
+from .priors import GAUGE_SD_PX, prior_precision, trend_columns
 from .rounds import SelfCalibration
 
 # Errors of models that cannot follow a distortion, from their difference to one that can.
@@ -41,7 +41,7 @@ from .rounds import SelfCalibration
 # (Rasmussen and Williams, "Gaussian Processes for Machine Learning", 2006, 2.4). The same holds
 # for object points and orientations, which take up what the correction leaves.
 
-MIN_PIXELS = 20  # of the grid that are within both calibrated areas
+MIN_PIXELS = 20  # of a grid that are within both of two calibrated areas
 
 
 def with_errors_by(
@@ -207,7 +207,7 @@ def _prior_of(terms: CollocationTerms, f: int) -> _SeriesPrior:
     m = len(functions)
     t = functions.trend
     precision = prior_precision(functions, part.prior)
-    at = np.concatenate([np.arange(t), m + np.arange(t)])
+    at = trend_columns(functions)
     rows = gauge_rows(part.values, part.uv, part.interior, part.gauge_kind)
     return _SeriesPrior(
         precision[np.ix_(at, at)],

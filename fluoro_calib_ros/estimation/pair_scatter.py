@@ -253,13 +253,7 @@ def displacements(
             else [_exterior(parameters, a, others[k])]
         )
         one, other = (
-            project(
-                np.broadcast_to(rotation, (len(points), 3, 3)),
-                np.broadcast_to(source, points.shape),
-                points,
-                interior,
-            )
-            for rotation, source in exteriors
+            project(rotation, source, points, interior) for rotation, source in exteriors
         )
         out[k] = np.sqrt(np.mean((one - other) ** 2))
     return np.where(np.isnan(out), np.inf, out)  # NaN: points behind the source

@@ -22,13 +22,14 @@ from scipy.special import stdtrit
 from ..correction.series import Functions, Series, sd_over_image
 from ..correction.terms import HIGHEST, expert_terms
 from ..photogrammetry.collinearity import AdditionalParameters
-from ..photogrammetry.outliers import LOOSE
+from ..photogrammetry.outliers import LOOSE, SIGNIFICANCE
 from ..photogrammetry.precision import information_of_additional
 from .estimator import (
     AdjustedTerms,
     AdjustmentProblem,
     GaugeKind,
     coefficients_of,
+    estimated_terms,
     gauge_basis,
     prior_of_additional,
 )
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from ..photogrammetry.adjustment import Adjustment
     from ..photogrammetry.elimination import FactorizedNormalMatrix
     from ..photogrammetry.network import Network
+    from ..photogrammetry.precision import Precision
 
 # Uncertainty of which terms of a trend exist, and with which variance.
 #
@@ -99,7 +101,6 @@ def covariance_with_uncertain_terms(
     return covariance + along @ along.T
 
 
-SIGNIFICANCE = 0.01  # of all terms together that are tested for one fluoroscope
 ZERO_PRECISION = 1e12  # prior that holds a term at zero
 MIN_DROP = 1e-3  # relative decrease of the RMSE that counts as one
 NEIGHBOURS = 8  # of an image point, whose mean residual shows the trend
@@ -154,10 +155,9 @@ class StepwiseTerms(AdjustedTerms):
         """Coefficients of no correction, by fluoroscope."""
         return tuple(np.zeros(len(self.names)) for _ in self.functions)
 
-    def series(
-        self, f: int, coefficients: NDArray[np.float64], covariance: NDArray[np.float64]
-    ) -> Series:
-        """Return the series of fluoroscope f from its coefficients (31,) and their covariance."""
+    def fitted_series(self, f: int, adjustment: Adjustment, precise: Precision) -> Series:
+        """See `AdjustedTerms`."""
+        coefficients, covariance = estimated_terms(f, adjustment, precise)
         functions = self.functions[f]
         to_polynomials = self._maps[f]
         return Series(
@@ -189,6 +189,7 @@ class StepwiseTerms(AdjustedTerms):
         if network.exterior is not None:
             # Most unknowns are known beforehand.
             dof += network.n_observations - 2 * network.n_image_points
+        # Of all terms together that are tested for one fluoroscope.
         limit = stdtrit(max(dof, 1), 1 - SIGNIFICANCE / (2 * len(self.names)))  # quantile of t
         if self._remove_insignificant(f, information, coefficients, limit):
             return True

@@ -69,26 +69,29 @@ def starting_prior(functions: Functions, sd: float) -> Prior:
     _, count = trend_transformation(functions.degree, functions.rings)
     signal = starting_signal(0.3 * sd, max(functions.image_size))
     trend = np.full(count, MAX_VARIANCE)
-    trend[count - 4 * functions.rings :] = ABSENT_VARIANCE
+    trend[_first_ring(functions) :] = ABSENT_VARIANCE
     return Prior(signal, trend)
+
+
+def _first_ring(functions: Functions) -> int:
+    """Number of the first term of the rings, each of which has four; they are the last terms."""
+    _, count = trend_transformation(functions.degree, functions.rings)
+    return count - 4 * functions.rings
 
 
 def has_rings(functions: Functions, prior: Prior) -> bool:
     """Whether a term of the rings exists."""
-    return bool(np.any(prior.trend[len(prior.trend) - 4 * functions.rings :] > ABSENT_VARIANCE))
+    return bool(np.any(prior.trend[_first_ring(functions) :] > ABSENT_VARIANCE))
 
 
 def prior_precision(functions: Functions, prior: Prior) -> NDArray[np.float64]:
     """Precision matrix (2m, 2m) of the coefficients of a series."""
-    m = len(functions)
-    t = functions.trend
-    out = np.zeros((2 * m, 2 * m))
+    out = np.zeros((2 * len(functions),) * 2)
     if functions.modes:
         signal = signal_precision(functions, prior)
-        for axis in (0, 1):
-            own = slice(axis * m + t, (axis + 1) * m)
+        for own in _sines(functions):
             out[own, own] = signal
-    at = _trend_columns(functions)
+    at = trend_columns(functions)
     out[np.ix_(at, at)] = _trend_precision(functions, prior)
     return out
 
@@ -107,15 +110,21 @@ def signal_precision(functions: Functions, prior: Prior) -> NDArray[np.float64]:
 def _terms_that_can_exist(functions: Functions) -> list[int]:
     """Numbers of the terms of the polynomials, and of the rings that can exist."""
     _, count = trend_transformation(functions.degree, functions.rings)
-    rings = count - 4 * functions.rings
+    rings = _first_ring(functions)
     return [*range(rings), *(rings + k for k in RING_TERMS if rings + k < count)]
 
 
-def _trend_columns(functions: Functions) -> NDArray[np.int64]:
+def trend_columns(functions: Functions) -> NDArray[np.int64]:
     """Places of the coefficients of polynomials and rings, those of u first."""
     m = len(functions)
     t = functions.trend
     return np.concatenate([np.arange(t), m + np.arange(t)])
+
+
+def _sines(functions: Functions) -> list[slice]:
+    """Places of the coefficients of the sines of u, and of v."""
+    m = len(functions)
+    return [slice(axis * m + functions.trend, (axis + 1) * m) for axis in (0, 1)]
 
 
 def _trend_precision(functions: Functions, prior: Prior) -> NDArray[np.float64]:
@@ -137,7 +146,7 @@ def covariance_of_series(
     to_terms, _ = trend_transformation(functions.degree, functions.rings)
     rows = _terms_that_can_exist(functions)
     whole = np.zeros((len(rows), 2 * len(functions)))
-    whole[:, _trend_columns(functions)] = to_terms[rows]
+    whole[:, trend_columns(functions)] = to_terms[rows]
     return covariance_with_uncertain_terms(whole, prior.trend[rows], coefficients, covariance)
 
 
@@ -238,7 +247,7 @@ def _signal_equations(
     prior: Prior,
 ) -> SignalEquations:
     """Normal equations with every prior but the signal's; information: with the gauge."""
-    at = _trend_columns(functions)
+    at = trend_columns(functions)
     base = information.copy(order='F')
     base[np.ix_(at, at)] += _trend_precision(functions, prior)
     columns = np.setdiff1d(np.arange(len(right)), at)
@@ -258,9 +267,8 @@ def _with_bumps(
     matrix (2m, 2m), right (2m,): of the coefficients. The coefficients of the sines are then what
     the bumps leave.
     """
-    m = len(functions)
     base = bumps(functions, local.nodes)
-    sines = [slice(axis * m + functions.trend, (axis + 1) * m) for axis in (0, 1)]
+    sines = _sines(functions)
     mixed = np.concatenate([matrix[:, own] @ base for own in sines], axis=1)
     corner = np.concatenate([base.T @ mixed[own] for own in sines])
     size = corner.shape[0]
@@ -331,12 +339,9 @@ def with_more_places(
 
     The arguments are those of `most_likely_prior`.
     """
-    m = len(functions)
-    t = functions.trend
     coefficients, covariance = _posterior(functions, information + gauge, right, prior)
-    mean = coefficients.reshape(2, m).T[t:]
-    sines = [slice(axis * m + t, (axis + 1) * m) for axis in (0, 1)]
-    covariances = np.stack([covariance[own, own] for own in sines])
+    mean = coefficients.reshape(2, -1).T[functions.trend :]
+    covariances = np.stack([covariance[own, own] for own in _sines(functions)])
     estimates = SineEstimates.of(signal_precision(functions, prior), mean, covariances)
     return replace(prior, local=with_likely_places(functions, estimates, prior.local))
 
@@ -356,7 +361,7 @@ def _most_likely_trend(
     matrix = back.T @ matrix @ back
     right = back.T @ right
     variance = prior.trend.copy()
-    rings = count - 4 * functions.rings
+    rings = _first_ring(functions)
     for _ in range(SWEEPS):
         for j in _terms_that_can_exist(functions):
             precision = np.concatenate([1 / variance, np.zeros(len(to_terms) - count)])
@@ -381,7 +386,7 @@ def _trend_alone(
     prior: Prior,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Information and right side of the coefficients of the trend, the signal eliminated."""
-    at = _trend_columns(functions)
+    at = trend_columns(functions)
     rest = np.setdiff1d(np.arange(len(right)), at)
     if not len(rest):
         return information, right

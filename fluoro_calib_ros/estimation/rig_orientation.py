@@ -19,15 +19,16 @@ intersected afterwards: C_ei describes that.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from threadpoolctl import threadpool_limits
 
-from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import Calibrations
 from ..errors import DataError
 from ..exposures.collector import displacement
 from ..exposures.frame import Frame, Frames, angles_of, validate_frame
@@ -39,7 +40,7 @@ from ..photogrammetry.network import Network
 from ..photogrammetry.normal_equations import normal_equations
 from ..photogrammetry.precision import covariance_blocks
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation, with_datum_of_points
-from ..photogrammetry.rotations import matrix_from_quaternion
+from ..photogrammetry.rotations import matrix_from_quaternion, nearest_rotation
 from ..photogrammetry.unknowns import (
     RIGID_SD_MM,
     RIGID_SD_RAD,
@@ -85,21 +86,18 @@ def orientation_of_known(
     positions = np.array(
         [np.mean([e.position_mm for e in figures[name].exposures], axis=0) for name in names]
     )
-    size = ORIENTATION_SIZE * len(names)
-    covariance = np.zeros((size, size))
-    for f, name in enumerate(names):
+    blocks = []
+    for name in names:
         sd_mm, sd_rad = known[name].exterior_sd or (RIGID_SD_MM, RIGID_SD_RAD)
-        at = slice(ORIENTATION_SIZE * f, ORIENTATION_SIZE * (f + 1))
-        own = np.diag(np.repeat([sd_mm**2, sd_rad**2, 0.0], 3))
-        own[6:, 6:] = calibrations[name].interior_covariance
-        covariance[at, at] = own
+        blocks.append(np.diag(np.repeat([sd_mm**2, sd_rad**2], 3)))
+        blocks.append(calibrations[name].interior_covariance)
     used = [calibrations[name] for name in names]
     return RigOrientation(
         fluoroscopes=names,
         interior=np.array([calibration.interior for calibration in used]),
         rotation=rotations,
         position_mm=positions,
-        covariance=covariance,
+        covariance=block_diag(*blocks),
         frame_id=FRAME_ID,
         source='capture',
         calibration_ids=tuple(calibration.calibration_id for calibration in used),
@@ -112,8 +110,7 @@ def orientation_of_known(
 def _mean_rotation(figures: FluoroscopeResult) -> NDArray[np.float64]:
     """Mean rotation (3, 3) of exposures: the nearest to the sum of their matrices."""
     total = matrix_from_quaternion([e.quaternion_wxyz for e in figures.exposures]).sum(axis=0)
-    u, _, vt = np.linalg.svd(total)
-    return u @ vt
+    return nearest_rotation(total)
 
 
 # Exposures that are used: with more of them the interior orientations remain the uncertainty.
@@ -123,10 +120,6 @@ MAX_PAIRS = 30
 MAX_STILL_PX = 1.0
 MAX_STILL_SD = 4.0
 MAX_MATCH_SD = 5.0  # distance from the median of a target above which a match is false
-# Of interior orientations that are added as unknowns: their normal matrix can then be inverted
-# also where one pose of the phantom does not determine them. The derivative de/di does not depend
-# on it.
-ASSUMED_SD_PX = 1.0
 
 
 @dataclass(frozen=True)
@@ -442,7 +435,8 @@ def _adjusted(
         raise DataError('the exposures do not determine the orientation of the fluoroscopes')
     blocks = _with_free_interiors(network, after, correction)
     by_interior = blocks.eg @ np.linalg.inv(blocks.gg)
-    return _FixedAdjustment(measured, after, by_interior, blocks, _covariance_of_interiors(used))
+    of_interiors = block_diag(*(calibration.interior_covariance for calibration in used))
+    return _FixedAdjustment(measured, after, by_interior, blocks, of_interiors)
 
 
 def _with_free_interiors(
@@ -450,27 +444,17 @@ def _with_free_interiors(
 ) -> CovarianceBlocks:
     """Covariances of an adjustment with the interiors as further unknowns."""
     count = network.n_fluoroscopes
+    # With a standard deviation of 1 px, their normal matrix can be inverted also where one pose of
+    # the phantom does not determine them. The derivative de/di does not depend on it.
     free = replace(
         network,
         interior_free=np.ones(count, dtype=bool),
         interior_mean=after.parameters.interior,
-        interior_sd=np.full((count, 3), ASSUMED_SD_PX),
+        interior_sd=np.ones((count, 3)),
     )
     factor = after.noise.information_factor(after.q)
     equations = normal_equations(free, after.parameters, correction, after.noise, factor)
     return covariance_blocks(factorize(free, equations))
-
-
-def _covariance_of_interiors(
-    calibrations: Iterable[FluoroscopeCalibration],
-) -> NDArray[np.float64]:
-    """Covariance (3F, 3F) of the interior orientations of calibrations."""
-    used = list(calibrations)
-    out = np.zeros((3 * len(used), 3 * len(used)))
-    for f, calibration in enumerate(used):
-        rows = slice(3 * f, 3 * f + 3)
-        out[rows, rows] = calibration.interior_covariance
-    return out
 
 
 def _mean_of_pairs(

@@ -34,6 +34,7 @@ from ..correction.series import Series
 from ..errors import DataError
 from ..findings import Place
 from ..photogrammetry.adjustment import (
+    DEFAULT_OPTIONS,
     Adjustment,
     SolverOptions,
     adjust_with_matrix,
@@ -136,9 +137,6 @@ def estimator_of(model: Any) -> Estimator:
     if not issubclass(kind, NeighbourModel):
         raise ValueError(f'correction model {model} has no estimator')
     return Estimator(model, regression=partial(NeighbourRegression, kind))
-
-
-TOLERANCE = 1e-8  # decrease of F that an adjustment that is a result may leave
 
 
 def self_calibrate(
@@ -312,13 +310,14 @@ def _adjusted_without_correction(
     options: CalibrationOptions,
 ) -> Adjustment:
     """Adjustment without correction. Raises DataError where it leaves unknowns undetermined."""
+    is_result = options.model == NoCorrection.kind
     try:
         before, precise = adjusted_with_precision(
             measured.network,
             measured.start,
             correction=np.zeros_like(measured.network.uv),
             noise=start_noise(options.loss),
-            tolerance=TOLERANCE if options.model == NoCorrection.kind else FINAL_TOLERANCE,
+            tolerance=DEFAULT_OPTIONS.tolerance if is_result else FINAL_TOLERANCE,
         )
     except DataError as error:
         raise DataError(undetermined_unknowns(measured) or error.finding) from None

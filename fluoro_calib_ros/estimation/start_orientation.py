@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..correction.series import Functions
+from ..correction.terms import CUBIC
 from ..errors import DataError
 from ..exposures.frame import Frame
 from ..findings import Finding, Kind
@@ -41,6 +42,7 @@ from ..photogrammetry.resection import (
     resect,
     robust_dlt,
     robust_p3p,
+    robust_variance,
 )
 
 # Below this flatness the plane of the targets is tried too.
@@ -48,10 +50,8 @@ NEARLY_FLAT = 0.08
 START_TOLERANCE = 1e-2  # a tenth of a standard deviation: the adjustment goes on from there
 # With fewer targets a direct linear transformation may be far off.
 FEW_TARGETS = 20
-# Rounds in which poses of planes and a preliminary correction are estimated in turn, and the
-# degree of its polynomials.
+# Rounds in which poses of planes and a preliminary correction are estimated in turn.
 ROUNDS = 4
-DEGREE = 3
 # Principal distances over the longer side of the image that a fluoroscope can have.
 DISTANCES = (0.5, 30.0)
 
@@ -193,19 +193,13 @@ def _preliminary_correction(
     views: Sequence[View], found: Sequence[Resection | None], interior: NDArray[np.float64]
 ) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
     """Return a polynomial correction fitted robustly to the residuals of all views."""
-    functions = Functions(views[0].frame.image_size, DEGREE)
+    functions = Functions(views[0].frame.image_size, CUBIC)
     pixels = []
     residuals = []
     for view, one in zip(views, found):
         if one is None:
             continue
-        n = len(view.xyz)
-        predicted = project(
-            np.broadcast_to(one.rotation, (n, 3, 3)),
-            np.broadcast_to(one.position_mm, (n, 3)),
-            view.xyz,
-            interior,
-        )
+        predicted = project(one.rotation, one.position_mm, view.xyz, interior)
         in_front = np.isfinite(predicted).all(axis=1)
         pixels.append(view.uv[in_front])
         residuals.append((view.uv - predicted)[in_front])
@@ -216,6 +210,5 @@ def _preliminary_correction(
         root = np.sqrt(weight)[:, None]
         coefficients = np.linalg.lstsq(root * basis, root * values, rcond=1e-9)[0]
         squared = np.sum((values - basis @ coefficients) ** 2, axis=1)
-        variance = max(float(np.median(squared)) / (2 * np.log(2)), 1e-12)
-        weight = Noise(nu=NU).weight(squared / variance)
+        weight = Noise(nu=NU).weight(squared / robust_variance(squared))
     return lambda uv: functions(uv) @ coefficients

@@ -20,6 +20,7 @@ MIN_TARGETS = 4
 # to a frame around a treadmill, with a factor of five in hand. A wrong unit is a factor of ten.
 EXTENT_MM = (2.0, 10_000.0)
 UNITS_MM = {'m': 1000.0, 'cm': 10.0, 'micrometres': 1e-3}
+MISTAKEN_UNITS = {10.0: 'cm', 25.4: 'inches', 1000.0: 'm'}  # that mm are mistaken for
 
 
 @dataclass(frozen=True)

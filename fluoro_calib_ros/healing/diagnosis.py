@@ -55,9 +55,6 @@ class Cause(str, Enum):
 
 # Of the rig; the others are of bodies, and leave its calibration as it is.
 OF_RIG = (Cause.ORIENTATION, Cause.INTERIOR, Cause.DISTORTION)
-# Units of the sizes of a change of a distortion [px], and of a marker [mm].
-DRIFT_PX = 1.0
-MIGRATION_MM = 1.0
 
 
 @dataclass(frozen=True)
@@ -326,14 +323,14 @@ class Diagnostician:
             parts = [(of_rig, part) for part in shift]
         elif change.cause is Cause.DISTORTION:
             drift = number[adjustment.drift].reshape(len(adjustment.functions), -1)
-            one_px = DRIFT_PX * adjustment.sd_of_drift(change.fluoroscope)
+            one_px = adjustment.sd_of_drift(change.fluoroscope)
             parts = [
                 (drift[change.fluoroscope], np.where(part, one_px, 0.0))
                 for part in parts_of_drift(adjustment.functions[change.fluoroscope])
             ]
         elif change.cause is Cause.MIGRATED:
             shape = number[adjustment.shape].reshape(adjustment.xyz.shape)
-            parts = [(shape[change.body, change.markers[0]], MIGRATION_MM)]
+            parts = [(shape[change.body, change.markers[0]], 1.0)]  # [mm], unit of its size
         out = np.zeros((len(parts), adjustment.size))
         for row, (columns, sd) in zip(out, parts):
             row[columns] = sd

@@ -32,12 +32,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bodies.body import POSE_SIZE, Body
+from ..bodies.body import Body
 from ..bodies.correction_errors import covariance_of_means
 from ..bodies.image_points import Cameras, ImagePoints
 from ..correction.series import MARGIN, Functions
+from ..correction.terms import CUBIC
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
 from ..photogrammetry.rotations import cross_matrix, matrix_from_vector
+from ..photogrammetry.unknowns import POSE_SIZE
 from .sizes import Told
 
 FALSE_SHARE = 0.01  # of image points that are expected to be false matches
@@ -46,14 +48,12 @@ MAX_REPEATS = 3
 LAST_GAIN = 0.1  # of the logarithm of the evidence, which decides by differences of about 3
 # Square of a step in standard deviations after which the iteration ends.
 LAST_STEP = 1e-2
-# Of a drift of the distortion: degree of the polynomials, half waves along the longer side.
-DRIFT_DEGREE = 3
+# Half waves along the longer side, of a drift of the distortion beside a cubic trend.
 DRIFT_MODES = 4
 FITTING = 0.8  # share of the image points of a body that are no false matches, at least
 MAX_NOISE_PX = 10.0  # of image points that are no false matches
 LOOSEST = 1e-6  # weight of a pose [1/mm^2, 1/rad^2] that keeps an unseen one where it is
 ROUNDING = POSE_SIZE * np.finfo(float).eps  # of the normal matrix of a pose, over its trace
-_EYE_6 = np.eye(POSE_SIZE)
 
 
 _BY_EXPOSURE = ('uv', 'pixel', 'variance', 'seen')
@@ -191,7 +191,7 @@ class RigAdjustment:
     ) -> None:
         self.orientation = orientation
         self.bodies = tuple(bodies)
-        self.functions = [Functions(size, DRIFT_DEGREE, DRIFT_MODES) for size in image_size]
+        self.functions = [Functions(size, CUBIC, DRIFT_MODES) for size in image_size]
         self._area = np.array([float(w * h) for w, h in image_size])
         count = max(len(body.target_id) for body in bodies)
         self.target_id = np.full((len(bodies), count), -1)
@@ -450,11 +450,12 @@ class RigAdjustment:
         matrix = np.zeros((self.size, self.size))
         right = np.zeros(self.size)
         back = []
+        unit = np.eye(POSE_SIZE)
         for row in range(len(self.bodies)):
             columns, told, cross, normal = _summed(self, linear, row, weight[:, row], unsure)
-            normal[~linear.poses.known[:, row]] = _EYE_6
+            normal[~linear.poses.known[:, row]] = unit
             least = LOOSEST + ROUNDING * np.trace(normal, axis1=1, axis2=2)
-            normal += least[:, None, None] * _EYE_6
+            normal += least[:, None, None] * unit
             inverse = np.linalg.inv(np.linalg.cholesky(normal))
             half = inverse @ cross
             flat = half.reshape(-1, half.shape[2])

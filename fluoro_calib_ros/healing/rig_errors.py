@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bodies.body import POSE_SIZE
 from ..bodies.image_points import Cameras, ImagePoints
+from ..photogrammetry.network import DATUM_DEFECT, similarity_directions
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
-from ..photogrammetry.rotations import cross_matrix
+from ..photogrammetry.unknowns import POSE_SIZE
 from .rig_adjustment import RigAdjustment, root_of
 
 
@@ -97,10 +97,8 @@ class _Intersected:
 
 def _errors(points_mm: NDArray[np.float64], moved: NDArray[np.float64]) -> RigErrors:
     """Errors of points (n, 3) that move by moved (3n, k), times unknowns of variance one."""
-    arm = points_mm - points_mm.mean(axis=0)
-    rigid = np.concatenate([np.broadcast_to(np.eye(3), (len(arm), 3, 3)), -cross_matrix(arm)], 2)
-    rigid = rigid.reshape(-1, POSE_SIZE)
-    similar = np.column_stack([rigid, arm.ravel()])
+    similar = similarity_directions(points_mm, points_mm.mean(axis=0)).reshape(-1, DATUM_DEFECT)
+    rigid = similar[:, :POSE_SIZE].copy()
     scale = np.linalg.pinv(similar)[-1] @ moved
     common = rigid @ (np.linalg.pinv(rigid) @ moved)
     by_coordinate = (np.sqrt(np.mean(np.sum(x**2, axis=1))) for x in (moved - common, common))

@@ -24,10 +24,11 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import pdist, squareform
 from scipy.special import chdtri, erfc
 
-from ..bodies.body import POSE_SIZE, Body, fitted_pose
+from ..bodies.body import Body, fitted_pose
 from ..correction.fluoroscope_calibration import Calibrations
 from ..errors import DataError
 from ..photogrammetry.rig_orientation import RigOrientation
+from ..photogrammetry.unknowns import POSE_SIZE
 from .marker_intensity import (
     MARKER_SCALES,
     FilteredImage,

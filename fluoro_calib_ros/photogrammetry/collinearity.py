@@ -27,7 +27,8 @@ def to_sensor(
 ) -> NDArray[np.float64]:
     """Points in the sensor frame (n, 3) [mm].
 
-    rotation (n, 3, 3) phantom -> sensor; position and points (n, 3) [mm].
+    rotation (n, 3, 3) phantom -> sensor; position and points (n, 3) [mm]. One rotation (3, 3) and
+    position (3,) are those of all points.
     """
     return np.matmul(rotation, (points - position)[..., None])[..., 0]
 
@@ -42,10 +43,10 @@ def project(
 
     Parameters
     ----------
-    rotation : (n, 3, 3) ndarray
-        Rotation phantom -> sensor for each point.
-    position : (n, 3) ndarray
-        Position of the source for each point [mm].
+    rotation : (n, 3, 3) or (3, 3) ndarray
+        Rotation phantom -> sensor for each point, or for all.
+    position : (n, 3) or (3,) ndarray
+        Position of the source for each point, or for all [mm].
     points : (n, 3) ndarray
         Object points [mm].
     interior : (n, 3) or (3,) ndarray

@@ -23,6 +23,7 @@ from .elimination import EliminatePoints
 from .network import Network
 from .noise import Noise
 from .normal_equations import normal_equations
+from .plane_resection import flatness
 from .precision import Precision
 from .unknowns import EXTERIOR_SIZE, Parameters
 
@@ -190,8 +191,7 @@ def _distance_correlations(
 
 def _flatness_remark(network: Network) -> str:
     """A remark where the targets nearly lie in a plane, else an empty string."""
-    extent = np.linalg.svd(network.survey_mm - network.survey_mm.mean(axis=0), compute_uv=False)
-    flat = extent[2] < MAX_FLATNESS * extent[0]
+    flat = flatness(network.survey_mm) < MAX_FLATNESS
     return '; the beads lie nearly in one plane' if flat else ''
 
 

@@ -455,6 +455,12 @@ class FactorizedNormalMatrix:
         """The network that the matrix belongs to."""
         return self.elimination.network
 
+    def solve(self, right: UnknownVector) -> UnknownVector:
+        """Solution (..., 1) of the normal equations with a right side."""
+        block_right, rest_right = self.elimination.right_sides(right)
+        found = self.factor.solve(block_right[..., None], rest_right[:, None])
+        return self.elimination.to_unknowns(*found)
+
 
 def factorize(
     network: Network, equations: NormalEquations, elimination: type[Elimination] | None = None

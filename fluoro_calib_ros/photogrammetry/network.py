@@ -182,7 +182,9 @@ class Network:
 
 
 DATUMS = ('survey', 'inner')
-MIN_RAYS_IN_DATUM = 3  # inliers: two may be a false match and its accidental partner
+# Inliers that show an object point where no survey holds it: two may be a false match and its
+# accidental partner.
+MIN_RAYS = 3
 
 
 @dataclass(frozen=True)
@@ -238,7 +240,7 @@ def in_determined_datum(
     if network.datum == 'survey':
         return network, parameters
     rays = np.bincount(network.point[inliers], minlength=network.n_points)
-    network = replace(network, in_datum=rays >= MIN_RAYS_IN_DATUM)
+    network = replace(network, in_datum=rays >= MIN_RAYS)
     return network, transform_to_datum(network, parameters)
 
 

@@ -185,12 +185,6 @@ class _Linearisation:
         )
 
 
-# The 18 sums by object point: six products of its coordinates, three with the residual, and nine
-# with the interior orientation.
-POINT_PRODUCTS = slice(0, 9)
-INTERIOR_PRODUCTS = slice(9, 18)
-
-
 def _add_by_point(
     lin: _Linearised, point: NDArray[np.int64], sums: NDArray[np.float64], pe: NDArray[np.float64]
 ) -> None:
@@ -398,7 +392,7 @@ def _point_blocks(
     network: Network, parameters: Parameters, sums: _ImageSums
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Blocks pp (n, 3, 3) and right side p (n, 3), with the survey."""
-    products = sums.by_point[:, POINT_PRODUCTS].sum(axis=0)
+    products = sums.by_point[:, :9].sum(axis=0)
     symmetric = products[[0, 1, 2, 1, 3, 4, 2, 4, 5]].T.reshape(-1, 3, 3)
     pp = symmetric + _survey_weight(network)[:, :, None] * np.eye(3)
     return pp, products[6:].T + _survey_pull(network, parameters)
@@ -434,7 +428,7 @@ class _GlobalBlocks:
             self.gg[columns, columns] = sums.by_exposure[own, 6:9, 6:9].sum(axis=0)
             self.g[columns] = sums.by_exposure[own, 6:9, 9].sum(axis=0)
             self.eg[own, :, columns] = sums.by_exposure[own, :6, 6:9]
-            by_point = sums.by_point[f, INTERIOR_PRODUCTS]
+            by_point = sums.by_point[f, 9:]
             self.pg[:, :, columns] = by_point.T.reshape(network.n_points, 3, 3)
         if network.interior_sd is not None:
             columns = network.layout.all_interiors

@@ -31,12 +31,10 @@ from .normal_equations import normal_equations
 from .precision import MIN_WEIGHT, Precision, covariance_blocks, variance_of_projection
 from .unknowns import Parameters
 
-# Probability of any false alarm among all image points, and among all targets.
+# Probability of any false alarm among all that is tested: image points, targets, terms.
 SIGNIFICANCE = 0.01
 # Smallest redundancy of an image point that is tested.
 MIN_TESTED_REDUNDANCY = 0.02
-# Sum of the weights of the rays that intersect a target.
-MIN_RAYS = 2
 # Iterations of the weights of a target's rays.
 INTERSECTION_ITERATIONS = 15
 # Smallest eigenvalue of the scaled normal matrix of an intersection.
@@ -224,7 +222,8 @@ def _intersect(
         count = np.bincount(p, weight, n)
         scale = np.sqrt(np.maximum(np.diagonal(normal, axis1=1, axis2=2), 1e-300))
         smallest = np.linalg.eigvalsh(normal / scale[:, :, None] / scale[:, None, :])[:, 0]
-        good = (count > MIN_RAYS - 0.5) & (smallest > MIN_INTERSECTION_EIGENVALUE)
+        # Two rays, or nearly so by their weights.
+        good = (count > 1.5) & (smallest > MIN_INTERSECTION_EIGENVALUE)
         covariance[good] = np.linalg.inv(normal[good])
         offset[good] = (covariance[good] @ right[good][..., None])[..., 0]
         residual = rays.residual - (a @ offset[p][..., None])[..., 0]

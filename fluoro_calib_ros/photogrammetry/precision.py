@@ -143,10 +143,7 @@ def solved_additional(
         right = UnknownVector(equations.e, equations.p, equations.g)
     else:
         right = right_sides(network, parameters, 0.0, adjustment.noise)
-    elimination = matrix.elimination
-    block_right, rest_right = elimination.right_sides(right)
-    found = matrix.factor.solve(block_right[..., None], rest_right[:, None])
-    step = elimination.to_unknowns(*found).globals[:, 0]
+    step = matrix.solve(right).globals[:, 0]
     return tuple(
         coefficients + step[columns]
         for coefficients, columns in zip(parameters.additional, network.layout.additional)

@@ -276,7 +276,6 @@ def resect(
     uv: NDArray[np.float64],
     interior: NDArray[np.float64],
     projection: NDArray[np.float64] | None = None,
-    max_steps: int = 100,
     tolerance: float = TOLERANCE,
 ) -> Resection:
     """Exterior orientation of one exposure for a given interior orientation.
@@ -293,10 +292,8 @@ def resect(
         xp, yp, c [px].
     projection : (3, 4) ndarray, optional
         Result of robust_dlt; computed by default.
-    max_steps : int
-        Largest number of steps of the refinement.
     tolerance : float
-        Squared step at which it ends, in standard deviations.
+        Squared step at which the refinement ends, in standard deviations.
 
     Raises
     ------
@@ -306,7 +303,7 @@ def resect(
     projection = robust_dlt(xyz, uv) if projection is None else projection
     problem = _Problem(xyz, uv, interior)
     start = _start_orientation(projection, problem)
-    return _refined(problem, *start, max_steps, tolerance)
+    return _refined(problem, *start, tolerance)
 
 
 def refine_resection(
@@ -315,13 +312,12 @@ def refine_resection(
     interior: NDArray[np.float64],
     rotation: NDArray[np.float64],
     position: NDArray[np.float64],
-    max_steps: int = 100,
 ) -> Resection:
     """Exterior orientation of one exposure from start values (3, 3) and (3,) [mm].
 
     The other arguments and the errors are those of `resect`.
     """
-    return _refined(_Problem(xyz, uv, interior), rotation, position, max_steps)
+    return _refined(_Problem(xyz, uv, interior), rotation, position)
 
 
 def resection_at(
@@ -346,12 +342,11 @@ def _refined(
     problem: _Problem,
     rotation: NDArray[np.float64],
     position: NDArray[np.float64],
-    max_steps: int,
     tolerance: float = TOLERANCE,
 ) -> Resection:
     """Refine an exterior orientation. Raises DataError for a target behind the source."""
     mu = START_DAMPING
-    for _ in range(max_steps):
+    for _ in range(100):  # of which it takes a few
         system = problem.linearise(rotation, position)
         rotation, position, step, mu = _damped_step(problem, system, rotation, position, mu)
         if step @ system.normal @ step <= tolerance * system.noise.scale**2:
@@ -382,12 +377,8 @@ class _Problem:
 
     def linearise(self, rotation: NDArray[np.float64], position: NDArray[np.float64]) -> _System:
         """Robustly weighted normal equations. Raises DataError for a target behind the source."""
-        n = len(self.xyz)
         predicted, jacobian, _, _ = project_with_jacobian(
-            np.broadcast_to(rotation, (n, 3, 3)),
-            np.broadcast_to(position, (n, 3)),
-            self.xyz,
-            self.interior,
+            rotation, position, self.xyz, self.interior
         )
         r = self.uv - predicted
         if not np.isfinite(r).all():
@@ -405,13 +396,7 @@ class _Problem:
         self, rotation: NDArray[np.float64], position: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Squared residuals (n,) [px^2]; NaN behind the source."""
-        n = len(self.xyz)
-        predicted = project(
-            np.broadcast_to(rotation, (n, 3, 3)),
-            np.broadcast_to(position, (n, 3)),
-            self.xyz,
-            self.interior,
-        )
+        predicted = project(rotation, position, self.xyz, self.interior)
         return np.sum((self.uv - predicted) ** 2, axis=1)
 
 

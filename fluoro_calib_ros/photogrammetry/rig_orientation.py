@@ -20,18 +20,21 @@ from ..brief import brief_repr
 from ..errors import DataError
 from .collinearity import project_with_jacobian
 from .rotations import (
+    ROTATION_TOLERANCE,
     cross_matrix,
     matrix_from_quaternion,
+    nearest_rotation,
     quaternion_from_matrix,
     vector_from_matrix,
 )
+from .unknowns import EXTERIOR_SIZE, INTERIOR_SIZE
 
-ORIENTATION_SIZE = 9  # unknowns of a fluoroscope: T [mm], w [rad], xp, yp, c [px]
+# Unknowns of a fluoroscope: T [mm], w [rad], xp, yp, c [px].
+ORIENTATION_SIZE = EXTERIOR_SIZE + INTERIOR_SIZE
 SOURCES = ('capture', 'joint calibration', 'healing')
-# Largest deviation of a rotation matrix from orthogonality that rounding explains.
-ORTHOGONALITY_TOLERANCE = 1e-6
-# Largest asymmetry of the correlation matrix, and its most negative eigenvalue.
-CORRELATION_TOLERANCE = 1e-6
+# What rounding explains: of the deviation of a rotation matrix from orthogonality, the asymmetry
+# of a correlation matrix, and of its most negative eigenvalue.
+ROUNDING = 1e-6
 MAX_VALUE = 1e15  # of a position [mm], an interior orientation [px] or a covariance
 # What `rounded` keeps: far coarser than a rounding error, far finer than a standard deviation.
 DIGITS = 40  # binary, of positions and covariances
@@ -279,10 +282,7 @@ def datum_transformation(orientation: RigOrientation, points_mm: ArrayLike) -> N
         rows = slice(2 * f, 2 * f + 2)
         columns = orientation.covariance_rows([f])
         _, by_exterior, by_points[:, rows], by_interior = project_with_jacobian(
-            np.broadcast_to(r, (len(points), 3, 3)),
-            np.broadcast_to(t, points.shape),
-            points,
-            interior,
+            r, t, points, interior
         )
         by_orientation[:, rows, columns[0] : columns[-1] + 1] = np.concatenate(
             [by_exterior, by_interior], axis=2
@@ -305,7 +305,7 @@ def _check_orientation(
     names: Sequence[str], interior: NDArray[np.float64], rotation: np.ndarray
 ) -> None:
     """Raise DataError for a negative principal distance or an invalid rotation matrix."""
-    large = (np.abs(rotation) > 1 + ORTHOGONALITY_TOLERANCE).any(axis=(1, 2))
+    large = (np.abs(rotation) > 1 + ROUNDING).any(axis=(1, 2))
     rotation = np.where(large[:, None, None], 0.0, rotation)  # no overflow; refused below
     product = rotation @ rotation.transpose(0, 2, 1)
     errors = np.max(np.abs(product - np.eye(3)), axis=(1, 2))
@@ -315,7 +315,7 @@ def _check_orientation(
             raise DataError(
                 f'rig orientation: the principal distance of fluoroscope {name} is {c:g} px'
             )
-        if error > ORTHOGONALITY_TOLERANCE or sign < 0:
+        if error > ROUNDING or sign < 0:
             raise DataError(
                 f'rig orientation: the rotation of fluoroscope {name} is not a rotation matrix'
             )
@@ -352,9 +352,9 @@ def _check_covariance(covariance: NDArray[np.float64]) -> None:
     sd = np.sqrt(np.maximum(np.diagonal(covariance), 0))
     scale = np.where(sd > 0, sd, 1.0)
     correlation = covariance / np.outer(scale, scale)
-    if np.max(np.abs(correlation - correlation.T)) > CORRELATION_TOLERANCE:
+    if np.max(np.abs(correlation - correlation.T)) > ROUNDING:
         raise DataError('rig orientation: its covariance is not symmetric')
-    if np.linalg.eigvalsh(correlation)[0] < -CORRELATION_TOLERANCE:
+    if np.linalg.eigvalsh(correlation)[0] < -ROUNDING:
         raise DataError('rig orientation: its covariance has a negative eigenvalue')
 
 
@@ -395,7 +395,6 @@ class ExteriorPrior:
 
 
 MAX_SKEW = 0.05  # of a calibration matrix, and of its ratio of scales, which a correction takes up
-MAX_ROTATION_ERROR = 1e-3  # of R^T R from the unit matrix; a file has few digits
 
 
 @dataclass(frozen=True)
@@ -505,9 +504,8 @@ def _as_rotation(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the rotation nearest to a matrix of few digits. Raises DataError for any other."""
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
         raise DataError('known orientation: R is not 3 x 3 finite numbers')
-    if np.abs(matrix.T @ matrix - np.eye(3)).max() > MAX_ROTATION_ERROR:
+    if np.abs(matrix.T @ matrix - np.eye(3)).max() > ROTATION_TOLERANCE:
         raise DataError('known orientation: R is not a rotation, its columns are not orthonormal')
     if np.linalg.det(matrix) < 0:
         raise DataError('known orientation: R is a reflection, its determinant is -1')
-    u, _, vt = np.linalg.svd(matrix)
-    return u @ vt
+    return nearest_rotation(matrix)

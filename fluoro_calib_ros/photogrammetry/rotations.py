@@ -47,6 +47,19 @@ def square_of_lower(factor: NDArray[np.float64]) -> NDArray[np.float64]:
     return mirror_lower(out)
 
 
+# Of R^T R from the unit matrix, in files: three decimals of a direction leave half a thousandth.
+ROTATION_TOLERANCE = 1e-3
+
+
+def nearest_rotation(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the rotations (..., 3, 3) nearest to matrices with a positive determinant.
+
+    Source: Schoenemann, "A generalized solution of the orthogonal Procrustes problem", 1966.
+    """
+    u, _, vt = np.linalg.svd(matrix)
+    return u @ vt
+
+
 def matrix_from_quaternion(q: ArrayLike) -> NDArray[np.float64]:
     """Rotation matrices (..., 3, 3) of quaternions (..., 4) in w, x, y, z of any norm."""
     q = np.asarray(q, dtype=float)

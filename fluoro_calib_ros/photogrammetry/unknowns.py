@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from .rotations import cross_matrix, matrix_from_vector, vector_from_matrix
 
-POSE_SIZE = 6  # translation [mm], rotation vector [rad]
+POSE_SIZE = 6  # translation [mm], rotation vector [rad], also of a body in the rig frame
 # Standard deviations that stand for a rigid mounting, or for an orientation that is fixed: a
 # thousandth of what one pair of exposures determines from images of 0.25 px noise. The solution
 # is that of the limit within some 1e-5 standard deviations, and rounding errors are still far

@@ -24,7 +24,6 @@ from fluoro_calib_ros.checks.comparison import (
     _test,
     cell_centres,
     image_grid,
-    orientation_fields,
     place_name,
 )
 from fluoro_calib_ros.checks.drift_charts import (
@@ -52,6 +51,7 @@ from fluoro_calib_ros.checks.rig import doubtful, motion_between_stamps
 from fluoro_calib_ros.checks.rig_watch import RigDriftWatch
 from fluoro_calib_ros.correction.base import Correction
 from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.estimation.estimator import orientation_fields
 from fluoro_calib_ros.estimation.exposure_terms import Variation
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.exposures.phantom import Phantom
@@ -559,7 +559,7 @@ def test_grids_lie_evenly_over_the_image():
 
 def test_orientations_absorb_shift_scale_rotation_and_tilt():
     fields = orientation_fields([[2.0, 3.0]])
-    assert fields.tolist() == [[1, 0, 2, -3, 4, 6], [0, 1, 3, 2, 6, 9]]
+    assert fields.tolist() == [[[1, 0, 2, -3, 4, 6], [0, 1, 3, 2, 6, 9]]]
 
 
 def test_difference_of_predictions_is_without_gauge_and_signed():
@@ -1024,9 +1024,9 @@ def test_levels_begin_at_their_thresholds():
         (1.1 * inputs.FIT, True, 1000.0, None, Kind.IMAGE_MIRRORED),
         (1.1 * inputs.FIT, False, 1e6, None, Kind.WRONG_UNIT),
         (1.1 * inputs.FIT, False, None, None, None),
-        (1.1 * inputs.MISFIT, True, 1000.0, None, Kind.OTHER_PHANTOM),
-        (1.1 * inputs.MISFIT, True, 1000.0, 0.9 * inputs.GOOD_MISFIT, Kind.IDS_SHIFTED),
-        (1.1 * inputs.MISFIT, True, 1000.0, 1.1 * inputs.GOOD_MISFIT, Kind.OTHER_PHANTOM),
+        (1.1 * inputs.OFF, True, 1000.0, None, Kind.OTHER_PHANTOM),
+        (1.1 * inputs.OFF, True, 1000.0, 0.9 * inputs.AT, Kind.IDS_SHIFTED),
+        (1.1 * inputs.OFF, True, 1000.0, 1.1 * inputs.AT, Kind.OTHER_PHANTOM),
         (1.1 * inputs.FIT, True, 1000.0, 1.3 * inputs.BETTER * inputs.FIT, Kind.IMAGE_MIRRORED),
     ],
 )

@@ -10,8 +10,8 @@ import pytest
 from scipy import special
 
 from fluoro_calib_ros.checks.body_watch import _inverse
+from fluoro_calib_ros.checks.check import FALSE_ALARM
 from fluoro_calib_ros.checks.residual_tests import (
-    FALSE_ALARM,
     Residuals,
     _cell_sums,
     _joins,

@@ -20,15 +20,13 @@ from fluoro_calib_ros.checks.bead_intersection import (
     intersect,
     least_chi2_without_a_ray,
 )
-from fluoro_calib_ros.checks.beads import FALSE_ALARM as BEADS_FALSE_ALARM
 from fluoro_calib_ros.checks.beads import compare_with_survey, rejected_beads
 from fluoro_calib_ros.checks.calibration_evidence import Evidence, Subject
-from fluoro_calib_ros.checks.check import Check, Validation, verdict_of
-from fluoro_calib_ros.checks.comparison import difference, orientation_fields, place_name
+from fluoro_calib_ros.checks.check import FALSE_ALARM, Check, Validation, verdict_of
+from fluoro_calib_ros.checks.comparison import difference, place_name
 from fluoro_calib_ros.checks.field_checks import PRECISION, TRENDS
 from fluoro_calib_ros.checks.held_out import HELD_OUT
 from fluoro_calib_ros.checks.residual_tests import (
-    FALSE_ALARM,
     Residuals,
     change_of_trend,
     common_trend,
@@ -43,6 +41,7 @@ from fluoro_calib_ros.estimation.calibrate import (
     calibrate,
     calibrate_request,
 )
+from fluoro_calib_ros.estimation.estimator import orientation_fields
 from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.findings import Kind, Place, Severity
@@ -591,7 +590,7 @@ def test_errors_of_intersected_beads_agree_with_their_covariance():
         'na,nab,nb->n', beads.xyz_mm - true, np.linalg.inv(beads.covariance), beads.xyz_mm - true
     )
     assert 2.0 < np.mean(error) < 4.0
-    assert all(check.passed for check in compare_with_survey(beads)) and BEADS_FALSE_ALARM < 0.01
+    assert all(check.passed for check in compare_with_survey(beads)) and FALSE_ALARM < 0.01
 
 
 def test_distances_give_scale_and_precision():

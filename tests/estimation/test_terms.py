@@ -644,7 +644,8 @@ def test_expert_terms_of_a_distortion_are_selected():
     assert converged and {'radial 1', 'spiral 1'} <= names and len(names) <= 4
     coefficients = after.parameters.additional[0]
     assert not np.abs(coefficients[~terms.selected[0]]).max() > 1e-6
-    series = terms.series(0, coefficients, np.diag(np.where(terms.selected[0], 1e-2, 0.0)))
+    covariance = np.diag(np.where(terms.selected[0], 1e-2, 0.0))
+    series = terms.fitted_series(0, after, SimpleNamespace(additional=(covariance,)))
     error = series.predict(network.uv) - radial_and_spiral(network.uv)
     flat = gauge_basis(network.uv, after.parameters.interior[0]).reshape(error.size, -1)
     left = error.ravel() - flat @ np.linalg.lstsq(flat, error.ravel(), rcond=None)[0]

@@ -332,12 +332,13 @@ class ShadowFit(ABC):
     def _correlation(self, residual: np.ndarray, valid: np.ndarray) -> NDArray[np.float64]:
         """Correlation of the noise from standardised residuals (g, m) of windows.
 
-        The background between beads that are dense contains their shadows. It tells the
-        correlation only where windows have too few pixels.
+        These contain what the model lacks, and the background of the image, which tells it as
+        well, the shadows of dense beads: the smaller one contains less of that.
         """
         if valid.sum() < MIN_PIXELS:
             return self.noise.correlation
-        return correlation_of(self._images(residual), self._images(valid))
+        of_windows = correlation_of(self._images(residual), self._images(valid))
+        return min(of_windows, self.noise.correlation, key=np.sum)
 
     @cached_property
     def cosines(self) -> Cosines:

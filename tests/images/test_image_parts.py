@@ -339,6 +339,26 @@ def test_what_windows_have_in_common_is_no_noise_where_it_changes_over_the_image
     np.testing.assert_array_equal(less_common(place, size, given, valid, usual & False), given)
 
 
+def test_correlation_of_the_noise_is_the_smaller_one_of_windows_and_background():
+    """Both contain more than the noise: what the model lacks, shadows of other beads."""
+    fit = fit_of(40)
+    rng = np.random.default_rng(12)
+    white = rng.normal(size=(40, len(fit.offset)))
+    blurred = np.stack([fit._images(white)[:, 1:, :], fit._images(white)[:, :-1, :]]).sum(axis=0)
+    smooth = np.pad(blurred, ((0, 0), (0, 1), (0, 0)))
+    half = int(np.abs(fit.offset).max())
+    correlated = smooth[:, fit.offset[:, 1] + half, fit.offset[:, 0] + half]
+    valid = np.ones(white.shape, dtype=bool)
+    background = np.zeros((2 * LAGS + 1, 2 * LAGS + 1))
+    background[LAGS, LAGS] = 1.0
+    background[LAGS + 1, LAGS] = background[LAGS - 1, LAGS] = 0.2
+    fit.noise = Noise(4.0, 0.0, background)
+    assert fit._correlation(white, valid).sum() < 1.2
+    assert fit._correlation(correlated, valid) is background
+    # Too few pixels tell nothing.
+    assert fit._correlation(white[:2], valid[:2]) is background
+
+
 @pytest.mark.parametrize('neighbours', [0, 2])
 def test_steps_of_a_fit_are_those_of_weighted_least_squares(neighbours):
     fit = fit_of(near=np.tile([1, 2][:neighbours], (3, 1)).reshape(3, neighbours))

@@ -38,7 +38,7 @@ def set_apart(
     half = 0.5 * (1 + float(np.median(relative[row, column])))
     smooth = cv2.GaussianBlur(relative.astype(np.float32), (0, 0), SMOOTH_PX)
     mask = (smooth < half).astype(np.uint8)
-    distance = cv2.distanceTransform(mask, cv2.DIST_L2, cv2.DIST_MASK_5)
+    distance = cv2.distanceTransform(mask, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     distance = cv2.GaussianBlur(distance, (0, 0), BORDER_PX)
     radius = float(np.median(distance[row, column]))
     if radius < MIN_RADIUS_PX:

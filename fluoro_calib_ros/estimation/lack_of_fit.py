@@ -48,15 +48,15 @@ PLACE = 0.1  # of the largest variance of a place, up to which image points are 
 MIN_CORRELATION = 0.05  # with which products show what a series leaves out
 FAR = 30.0  # standard deviations below zero
 # Rejected image points agree within so many standard deviations of an inlier, over so many times
-# the typical distance of an inlier from the next, with so many others; larger residuals than so
-# many standard deviations are no error of a correction.
+# the typical distance of an inlier from the next (as many times farther where only one exposure
+# has image points), with so many others; larger residuals than so many standard deviations are
+# no error of a correction.
 AGREE_SD = 5.0
 AGREE_REACH = 3.0
 AGREE_WITH = 2
 # Where only one exposure has image points: part of the larger residual that the difference of two
 # residuals that agree does not exceed.
 ALONE_AGREE = 0.6
-ALONE_REACH = 3.0  # of such neighbours, relative to that of others
 AGREE_SIGNIFICANT = 1.5  # standard errors by which more pairs agree than are opposite
 LARGEST_SD = 40.0
 # Areas in which they are looked at together: cells that overlap by half, so many side by side,
@@ -288,7 +288,7 @@ def _pairs_of_rejected(
     apart = cKDTree(rejected.uv).query_pairs(reach, output_type='ndarray')
     apart = apart[exposure[apart[:, 0]] != exposure[apart[:, 1]]]
     same = alone[
-        cKDTree(rejected.uv[alone]).query_pairs(ALONE_REACH * reach, output_type='ndarray')
+        cKDTree(rejected.uv[alone]).query_pairs(AGREE_REACH * reach, output_type='ndarray')
     ]
     same = same[exposure[same[:, 0]] == exposure[same[:, 1]]]
     i, j = np.concatenate([apart, same]).T

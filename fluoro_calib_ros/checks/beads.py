@@ -25,6 +25,7 @@ from scipy.special import bdtrc, chdtri, pdtrc
 from ..bodies.body import by_pose
 from ..estimation.rounds import ResidualTable
 from ..findings import Kind, Place, first_few
+from ..photogrammetry.outliers import CONTRADICTION, FALSE_ALARM
 from ..photogrammetry.unknowns import POSE_SIZE
 from .bead_intersection import (
     Beads,
@@ -34,12 +35,11 @@ from .bead_intersection import (
     rays_of,
 )
 from .calibration_evidence import Evidence, Subject
-from .check import FALSE_ALARM, Check
+from .check import Check
 from .exchanged_beads import exchanged_beads, rate_of
 
 MIN_LAYER = 8  # of a layer, and of the rest
 BORDERS = 40  # between layers that are tried along each axis
-FALSE_ALARM_LAYER = 1e-3
 # Gap beside a border [sd of the survey's difference of two beads]. In a smaller one the survey's
 # own errors decide which bead lies on which side, and a layer seems displaced by its selection.
 BORDER_SDS = 3.0
@@ -121,7 +121,7 @@ def displaced_layer(beads: Beads) -> DisplacedLayer | None:
     if not tried:
         return None
     best = max(tried, key=lambda candidate: candidate.gain)
-    critical = float(chdtri(POSE_SIZE, FALSE_ALARM_LAYER / len(tried)))
+    critical = float(chdtri(POSE_SIZE, CONTRADICTION / len(tried)))
     if (
         best.gain < critical
         or fit.excess <= 0

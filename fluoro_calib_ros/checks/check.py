@@ -16,7 +16,6 @@ from ..brief import brief_repr
 from ..exposures.collector import RECOMMENDED_EXPOSURES
 from ..findings import Finding, Kind, Place, Severity, sentence_of
 
-FALSE_ALARM = 2e-3  # chance that a check of a good calibration, phantom or image fails
 MIN_MORE_EXPOSURES = 5  # that are worth recording
 WITHOUT_TREND = 'check this again when the residuals no longer have a trend'
 

@@ -27,6 +27,7 @@ from ..correction.fluoroscope_calibration import FluoroscopeCalibration, at_comm
 from ..errors import DataError
 from ..estimation.estimator import interior_about, orientation_fields
 from ..estimation.model_choice import MIN_PIXELS
+from ..estimation.signal import MIN_SD_PX
 from ..exposures.frame import cells_of
 
 # Comparison of two independent calibrations of one fluoroscope, and names of image areas.
@@ -36,7 +37,6 @@ from ..exposures.frame import cells_of
 # what the orientation absorbs and for their noise.
 
 GRID = 24  # points across the image at which predictions are compared
-MIN_SD_PX = 1e-3  # of a prediction: a model without uncertainty would cause a division by 0
 
 
 @dataclass(frozen=True)
@@ -127,8 +127,6 @@ def describe_place(uv: ArrayLike, image_size: tuple[int, int]) -> str:
 
 CELLS = 64  # along the longer side of the image
 LEVEL = 0.99  # of confidence
-# Of the area: this much differs at the level by chance, doubled for the cells' correlation.
-CHANCE = 2 * (1 - LEVEL)
 
 
 @dataclass(frozen=True)
@@ -171,8 +169,11 @@ class Comparison:
 
     @property
     def field_changed(self) -> bool:
-        """Whether the field differs in more of the image than by chance."""
-        return bool(self.significant.mean() > CHANCE)
+        """Whether the field differs in more of the image than by chance.
+
+        By chance the rest of the LEVEL does, doubled as the cells are correlated.
+        """
+        return bool(self.significant.mean() > 2 * (1 - LEVEL))
 
     @property
     def interior_changed(self) -> bool:

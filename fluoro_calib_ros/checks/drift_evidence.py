@@ -19,13 +19,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..photogrammetry.noise import SURE
 from .body_watch import COMPONENTS
 from .drift_charts import MIN_INFORMATION, CusumCharts
 
 WINDOW_S = 30.0  # newest blocks from which place and size of a drift are estimated
 # Log-likelihood of another fluoroscope, over that of the likeliest one, from which both are named.
 SIMILAR = 0.8
-MIN_CONFIRMATION = 3.0  # standard deviations by which the other bodies must show a drift too
 REFERENCES = ('calibration', 'start')  # of the charts of epipolar residuals
 EPIPOLAR = 'epipolar'  # source of a drift that residuals show
 SERIES_OF_PAIR = 4  # images a and b against the calibration, then against the start
@@ -255,7 +255,7 @@ class BodyEvidence(Evidence):
         factor = float(np.median(self.charts.variance_factor()[series]))
         others = np.arange(len(score)) != strongest
         noise = np.sqrt(max(information[others].sum() * factor, MIN_INFORMATION))
-        confirmed = bool(sign * score[others].sum() / noise > MIN_CONFIRMATION)
+        confirmed = bool(sign * score[others].sum() / noise > SURE)
         source = f'cluster {self._bodies[strongest]}'
         return np.eye(COMPONENTS)[series % COMPONENTS], source, confirmed
 

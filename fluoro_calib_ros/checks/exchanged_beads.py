@@ -20,12 +20,12 @@ from scipy.special import bdtrc, xlogy
 from ..estimation.result import Targets
 from ..photogrammetry.collinearity import project_with_jacobian
 from ..photogrammetry.noise import INLIER_Q
+from ..photogrammetry.outliers import FALSE_ALARM
+from ..photogrammetry.resection import ROUNDING
 from .bead_intersection import Rays
-from .check import FALSE_ALARM
 
 NOWHERE = -1  # an image point that agrees with no bead
 FAR = 1e9  # [px]: in the place of NaN, as of a bead behind the source
-ROUNDING = 1e-9
 
 
 def exchanged_beads(rays: Rays, targets: Targets) -> NDArray[np.int64]:

@@ -18,10 +18,11 @@ from ..correction.base import CorrectionModel
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError
 from ..estimation.exposure_terms import MIN_POINTS, VARYING
-from ..estimation.initial_network import MIN_EXPOSURES
 from ..estimation.options import AUTO
+from ..exposures.collector import MIN_EXPOSURES
 from ..exposures.frame import angles_of
 from ..findings import Kind, Place
+from ..photogrammetry.noise import SURE
 from .calibration_evidence import MIN_VARYING_EXPOSURES, CommonTrend, Evidence, Subject
 from .check import Check, more_exposures, too_little_data
 from .comparison import describe_place, difference
@@ -191,10 +192,6 @@ def _agreement(
 HALVES = Subject(check_halves, steps=1)
 
 
-# Standard deviations of the correction by which the mean residual of an area may be off.
-CLAIMED_SD = 3.0
-
-
 def check_trends(evidence: Evidence, names: Sequence[str]) -> list[Check]:
     """Test the residuals of all exposures for a common trend, and for a change of it."""
     checks = []
@@ -249,7 +246,7 @@ def _worst_area(evidence: Evidence, name: str, common: CommonTrend) -> Check:
         f'{more_exposures(len(evidence.frames[name]))} that show beads there, or choose '
         'another model',
         value=trend.cell_size,
-        limit=np.hypot(trend.cell_limit, CLAIMED_SD * claimed),
+        limit=np.hypot(trend.cell_limit, SURE * claimed),
         unit='px',
     )
 

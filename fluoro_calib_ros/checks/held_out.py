@@ -21,7 +21,7 @@ from ..estimation.rounds import ResidualTable
 from ..exposures.collector import RECOMMENDED_EXPOSURES
 from ..exposures.frame import Frame, Frames
 from ..findings import Finding, Kind, Place
-from ..photogrammetry.noise import INLIER_Q
+from ..photogrammetry.noise import INLIER_Q, NORMAL_MEDIAN
 from .calibration_evidence import Evidence, Subject
 from .check import Check, more_exposures, rms, too_little_data
 from .residual_tests import RejectedExposure, noise_of, residuals_of
@@ -306,11 +306,11 @@ def exposure_limits(ratio: NDArray[np.float64], white: NDArray[np.float64]) -> N
 
     ratio (m,): of all exposures; half of them or fewer are at fault. white (m,): the same of the
     noise of each exposure alone, by which its limit may grow. The scatter of the logarithms is the
-    median absolute deviation, times 1.4826 (Huber, "Robust Statistics", 1981). The largest of 6 to
-    100 normal deviates exceeds the limit in 0.5 to 1.5 % of samples.
+    median absolute deviation over NORMAL_MEDIAN (Huber, "Robust Statistics", 1981). The largest of
+    6 to 100 normal deviates exceeds the limit in 0.5 to 1.5 % of samples.
     """
     size = np.log(ratio)
-    scatter = 1.4826 * np.median(np.abs(size - np.median(size)))
+    scatter = np.median(np.abs(size - np.median(size))) / NORMAL_MEDIAN
     factor = EXPOSURE_SCATTER + SCATTER_OF_FEW / len(ratio)
     of_noise = EXPOSURE_LIMIT * np.maximum(1.0, white)
     return np.clip(np.exp(factor * scatter), EXPOSURE_LIMIT, of_noise)

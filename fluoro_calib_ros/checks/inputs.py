@@ -26,6 +26,8 @@ from ..errors import DataError
 from ..estimation.estimator import interior_about
 from ..estimation.options import CalibrationRequest
 from ..estimation.result import CalibrationResult, FluoroscopeResult
+from ..estimation.rounds import MIN_FITTING
+from ..estimation.start_orientation import FEW_TARGETS
 from ..exposures.collector import MIN_COMMON_TARGETS
 from ..exposures.frame import Frame, Frames, validate_frame
 from ..exposures.phantom import MISTAKEN_UNITS, Phantom
@@ -38,7 +40,6 @@ from ..photogrammetry.rig_orientation import KnownOrientation
 from .check import rms
 from .mixed_units import AT, DISTANCES_MM, FIT, MAX_TESTED, OFF, mixed_units
 
-MIN_TESTED = 20  # targets of a single exposure that is tested
 BETTER = 0.35  # median residual of other ids over that of the given ones from which they are right
 MAX_COORDINATE_MM = 1e6  # a kilometre
 EXTENT_SHARE = 0.9  # of the targets, within the extent of the phantom
@@ -288,11 +289,11 @@ def valid_frames(frames: Frames) -> dict[str, list[Frame]]:
 def require_phantom(frames: Frames, phantom: Phantom) -> None:
     """Raise DataError where exposures of a calibrated fluoroscope cannot be of the phantom.
 
-    Exposures with fewer than MIN_TESTED targets are not tested, nor those that are not valid.
+    Exposures with fewer than FEW_TARGETS targets are not tested, nor those that are not valid.
     """
     found = []
     for name, exposures in valid_frames(frames).items():
-        tested = [frame for frame in exposures if len(frame.target_id) >= MIN_TESTED]
+        tested = [frame for frame in exposures if len(frame.target_id) >= FEW_TARGETS]
         wrong = _wrong_exposures(tested, phantom)
         if wrong is not None:
             found.append(replace(wrong, place=Place((name,))))
@@ -502,9 +503,9 @@ def _are_copied(uv: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray
 # passes. These tests compare with what is physically possible, whatever the input claims. Their
 # limits are far from every calibration that was right (docs/verdict.md).
 
-MAX_MISFIT = 0.0025  # RMSE after the correction over the longer side of the image
+# RMSE after the correction, or displacement between pairs, over the longer side of the image.
+MAX_MISFIT = 0.0025
 MAX_MISFIT_SD = 4.0  # the same over the a-priori standard deviation of the image points
-MIN_INLIERS = 0.5  # share of the image points
 MAX_DISTANCE_CHANGE = 0.2  # of one that is fixed, by the scale of the correction
 MAX_SD_POINT = 0.15  # of the principal point over the longer side of the image
 MAX_OFF_CENTRE = 1.0  # distance of the principal point from the middle over the longer side
@@ -545,11 +546,11 @@ def _large_residuals(figures: FluoroscopeResult, frames: Sequence[Frame]) -> Fin
 
 def _few_inliers(figures: FluoroscopeResult) -> Finding | None:
     share = figures.inliers / figures.observations
-    if share >= MIN_INLIERS:
+    if share >= MIN_FITTING:
         return None
     return Finding(
         Kind.FEW_INLIERS,
-        f'only {100 * share:.0f} % of the image points fit, at least {100 * MIN_INLIERS:.0f} % '
+        f'only {100 * share:.0f} % of the image points fit, at least {100 * MIN_FITTING:.0f} % '
         'are needed; the others are false matches',
         numbers={'share': share},
     )

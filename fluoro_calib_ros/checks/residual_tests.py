@@ -27,19 +27,20 @@ from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..estimation.lack_of_fit import (
     CELLS,
     LARGEST_SD,
-    MIN_EXPOSURES,
     FittedPoints,
     areas_of_rejected,
 )
 from ..estimation.result import CalibrationResult
 from ..estimation.rounds import ResidualTable
+from ..exposures.collector import MIN_EXPOSURES
 from ..exposures.decisions import Doubtful
 from ..exposures.frame import Frame, angles_of, cells_of
 from ..findings import Finding, Kind, Severity
 from ..photogrammetry.collinearity import project
 from ..photogrammetry.noise import INLIER_Q
+from ..photogrammetry.outliers import FALSE_ALARM
 from ..photogrammetry.rotations import matrix_from_quaternion
-from .check import FALSE_ALARM, Check
+from .check import Check
 
 MIN_IN_CELL = 10  # image points
 

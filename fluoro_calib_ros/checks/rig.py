@@ -29,14 +29,14 @@ from ..estimation.options import CalibrationRequest
 from ..estimation.pair_scatter import MOVED_SHARE, PairScatter, steps_of
 from ..estimation.result import CalibrationResult, ExposureResult, FluoroscopeResult
 from ..estimation.rig_orientation import orientation_and_scatter, orientation_of_known
-from ..exposures.collector import displacement
+from ..exposures.collector import MIN_EXPOSURES, displacement
 from ..exposures.frame import Frame, Frames
 from ..findings import Finding, Kind, Place, Severity
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import matrix_from_quaternion, rotation_angle, vector_from_matrix
 from .check import Check
+from .inputs import MAX_MISFIT
 
-MIN_PAIRS = 3
 # Distance, in radians and relative shift, from which a pair is not one of the rig.
 INTERCHANGED = 0.4
 # Median deviation of the pairs from their median, far above that of a rig whose mounting gives.
@@ -47,7 +47,6 @@ MAX_TURN_RAD = np.deg2rad(1.0)
 # it is 1.0 to 1.4, and 3 where the model does not follow the distortion at all.
 DOUBTFUL_GROWTH = 2.0
 MAX_GROWTH = 8.0  # above which there is no orientation, where the displacement is large as well
-MAX_OFF = 0.0025  # median displacement of image points over the longer side of the image
 MIN_PAIRS_MOVED = 6
 # What findings on the orientation of a rig are about.
 ORIENTED = 'orientation of the rig'
@@ -62,7 +61,7 @@ def interchanged(
     The relative orientation of such a pair is far from the others, and its inverse is near them.
     """
     pairs = _pairs(one, other)
-    if len(pairs) < MIN_PAIRS:
+    if len(pairs) < MIN_EXPOSURES:
         return None
     turn, shift = _relative(pairs)
     numbers = [a.exposure for a, _ in pairs]
@@ -123,7 +122,7 @@ def contradiction(
     Exposures of the same number belong together. Fewer than three pairs cannot contradict.
     """
     pairs = _pairs(one, other)
-    if len(pairs) < MIN_PAIRS:
+    if len(pairs) < MIN_EXPOSURES:
         return None
     turn, shift = _relative(pairs)
     deviation = np.linalg.norm(shift - np.median(shift, axis=0), axis=1)
@@ -161,7 +160,7 @@ def doubtful(scatter: PairScatter, side_px: int, noise_px: float) -> tuple[bool,
     off = float(np.median(scatter.off_px[scatter.used]))
     place = Place((a, b), name=ORIENTED)
     if scatter.unexplained > DOUBTFUL_GROWTH and off >= noise_px:
-        usable = off <= MAX_OFF * side_px or scatter.unexplained <= MAX_GROWTH
+        usable = off <= MAX_MISFIT * side_px or scatter.unexplained <= MAX_GROWTH
         kind, moved, why = _cause(scatter)
         found = Finding(
             kind,

@@ -26,17 +26,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..healing.sizes import Told, parts_of_interior, parts_of_knock
+from ..photogrammetry.noise import CERTAIN, NORMAL_MEDIAN
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
 from ..reconstruction.epipolar import EpipolarGeometry, EpipolarResiduals
 
-FALSE_MATCH_SD = 4.0  # standard deviations above which rays do not meet
 WINDOW = 8  # newest blocks that tell of a change
 SIZES = np.geomspace(2.0**-7, 4.0, 10)  # of a change, relative to a knock
 # Variance of the median of normal errors over that of their mean.
 MEDIAN_VARIANCE = np.pi / 2
 ITERATIONS = 10
 NU = 4.0  # degrees of freedom of the distribution by which residuals are weighted
-NORMAL_MEDIAN = 0.455  # of chi-squared with one degree of freedom
 # Blocks in a row, with so many markers and most of their rays apart, that show a knock.
 KNOCKED_BLOCKS = 2
 MIN_MARKERS = 3
@@ -98,7 +97,7 @@ class RigChange:
             found.residual,
             noise,
             found.sd_total**2 - noise,
-            np.abs(found.residual) > FALSE_MATCH_SD * found.sd_total,
+            np.abs(found.residual) > CERTAIN * found.sd_total,
         )
         self._open[number].append(tuple(column[good] for column in columns))
 
@@ -181,7 +180,7 @@ class RigChange:
 
 def _cap(residual: NDArray[np.float64]) -> float:
     """Square of a residual beyond which it counts as false in a mean."""
-    return float(9 * np.median(residual**2) / NORMAL_MEDIAN)
+    return float(9 * np.median(residual**2) / NORMAL_MEDIAN**2)
 
 
 def _joined(parts: Sequence[_Rays]) -> _Rays:
@@ -224,6 +223,6 @@ def _weights(
         rest = residual - design @ (inverse @ (design.T @ (weight * residual)))
         squares = rest**2 / variance
         free = max(len(rest) - len(unit) + float(np.trace(inverse)), 1.0)
-        factor = max(1.0, float(np.median(squares)) / NORMAL_MEDIAN * len(rest) / free)
+        factor = max(1.0, float(np.median(squares)) / NORMAL_MEDIAN**2 * len(rest) / free)
         weight = (NU + 1) / (NU + squares / factor) / (variance * factor)
     return factor, weight

@@ -17,6 +17,7 @@ import numpy as np
 
 from ..bodies.body import Body
 from ..findings import Finding, Kind
+from ..photogrammetry.noise import CERTAIN
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.epipolar import UNKNOWN, EpipolarGeometry, missing_rays
 from ..reconstruction.intersection import OK as INTERSECTED
@@ -34,9 +35,9 @@ from .drift_charts import (
 )
 from .drift_evidence import EPIPOLAR
 from .drift_watch import DriftWatch
-from .rig_change import FALSE_MATCH_SD, Addition, RigChange
+from .rig_change import Addition, RigChange
 
-# A residual above FALSE_MATCH_SD standard deviations and so many pixels more is that of a false
+# A residual above CERTAIN standard deviations and so many pixels more is that of a false
 # match. Up to there it may be that of a drift, even if the intersection rejects it.
 FALSE_MATCH_PX = 3.0
 
@@ -125,7 +126,7 @@ class RigDriftWatch:
         for number, (i, j, geometry) in enumerate(self._pairs):
             found = geometry.residuals(uv[i], uv[j], sigma[i], sigma[j])
             noise = found.factor_a**2 * noise2[i] + found.factor_b**2 * noise2[j]
-            limit = FALSE_MATCH_SD * found.sd_total + FALSE_MATCH_PX
+            limit = CERTAIN * found.sd_total + FALSE_MATCH_PX
             self._change.add(number, target_id, (uv[i], uv[j]), found, noise=noise)
             good = np.flatnonzero(np.abs(found.residual) <= limit)
             observations = EpipolarObservations(

@@ -32,11 +32,12 @@ from ..photogrammetry.collinearity import AdditionalParameters
 from ..photogrammetry.elimination import factorize
 from ..photogrammetry.network import Network, similarity_directions
 from ..photogrammetry.normal_equations import normal_equations
+from ..photogrammetry.outliers import FALSE_ALARM
 from ..photogrammetry.precision import covariance_times_points
 from ..photogrammetry.unknowns import UnknownVector
 from .beads import MIN_BEADS, SD_FACTOR
 from .calibration_evidence import Evidence, Subject
-from .check import FALSE_ALARM, Check
+from .check import Check
 
 STRAINS = 5  # symmetric, without the common scale
 # Increase of the NSE of the points by a strain that is no fault: up to 1.25 it is honest.

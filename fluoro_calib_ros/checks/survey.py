@@ -15,13 +15,13 @@ from scipy.special import chdtri
 from ..estimation.survey import SurveyedBeads
 from ..findings import Finding, Kind, Place, Severity, first_few
 from ..photogrammetry.network import DATUM_DEFECT, MIN_RAYS, similarity_directions
+from ..photogrammetry.outliers import CONTRADICTION
 from .beads import MIN_BEADS
 from .check import Check
 
 # Errors along two rays are cot(angle / 2) times those across: 6 times at 20 degrees. A single sd
 # for all axes would then be wrong by more than half for the worst of them.
 MIN_ANGLE_RAD = np.deg2rad(20.0)
-FALSE_ALARM = 1e-3
 # Mean square of the normalised differences of two halves: docs/how_good.md. It is 1.41 at most in
 # simulated surveys whose sds are right, and was 1.64 in one with an NSE of 1.6 (8 exposures, seed
 # 7 of benchmarks.survey).
@@ -67,7 +67,7 @@ def displaced(beads: SurveyedBeads) -> Finding | None:
     variance = beads.covariance + beads.given_sd_mm[:, None, None] ** 2 * np.eye(3)
     off = beads.xyz_mm - beads.given_mm
     square = np.einsum('na,nab,nb->n', off, np.linalg.inv(variance), off)
-    wrong = square > chdtri(3, FALSE_ALARM / len(off))
+    wrong = square > chdtri(3, CONTRADICTION / len(off))
     if not wrong.any():
         return None
     order = np.flatnonzero(wrong)[np.argsort(-beads.off_mm[wrong])]
@@ -123,7 +123,7 @@ def check_survey_halves(one: SurveyedBeads, other: SurveyedBeads) -> Check:
         advice='see that phantom and fluoroscope stand still in each exposure, and take more',
         numbers={'difference_mm': rms, 'predicted_mm': expected, 'beads': len(common)},
         value=square / freedom,
-        limit=max(HALVES_LIMIT, float(chdtri(freedom, FALSE_ALARM)) / freedom),
+        limit=max(HALVES_LIMIT, float(chdtri(freedom, CONTRADICTION)) / freedom),
         unit='predicted variance',
     )
 
@@ -200,7 +200,7 @@ def _check_distances(beads: SurveyedBeads) -> Check:
         'measure again, between the centres of the beads, or give a larger sd',
         numbers={**numbers, 'error_mm': off, 'normalised': float(ratio[worst])},
         value=beads.scaled.chi2,
-        limit=float(chdtri(beads.scaled.freedom, FALSE_ALARM)),
+        limit=float(chdtri(beads.scaled.freedom, CONTRADICTION)),
         unit='chi2',
     )
 

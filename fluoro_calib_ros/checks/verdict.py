@@ -34,6 +34,7 @@ from ..estimation.options import CalibrationRequest
 from ..estimation.result import CalibrationResult
 from ..exposures.frame import Frame, Frames
 from ..findings import Finding, Kind, Place, Severity
+from ..photogrammetry.noise import CERTAIN
 from .beads import BEADS
 from .calibration_evidence import Evidence
 from .check import Check, Validation, rms, verdict_of
@@ -43,7 +44,6 @@ from .rig import RigFindings, check_rig, rig_findings
 from .shape import SHAPE, trusted_shape
 
 REPAIR_FIRST = 'check this again when the given interior orientation fits the exposures'
-MAX_SD = 4.0  # by which what the exposures show may deviate from what was given
 # RMSE with what was given over that without, from which it is the cause; without a correction
 # model, the distortion is a better one.
 MIN_GAIN = 1.05
@@ -100,9 +100,9 @@ def _given_interior_check(
     sd = np.sqrt(np.diag(free.interior_covariance))
     off = np.abs(free.interior - given) / np.hypot(given_sd, sd)
     least = MIN_GAIN if present.model.corrects else MIN_GAIN_UNCORRECTED
-    if not gain > least or not off.max() > MAX_SD:
+    if not gain > least or not off.max() > CERTAIN:
         return None
-    wrong = [i for i in np.argsort(-off) if off[i] > MAX_SD]
+    wrong = [i for i in np.argsort(-off) if off[i] > CERTAIN]
     stated = ', '.join(f'{LABELS[i]} = {given[i]:.1f} (sd {given_sd[i]:g})' for i in wrong)
     shown = ', '.join(f'{LABELS[i]} = {free.interior[i]:.1f} (sd {sd[i]:.1f})' for i in wrong)
     return Check(
@@ -117,7 +117,7 @@ def _given_interior_check(
             **{f'sd_{label}_px': float(x) for label, x in zip(LABELS, sd)},
         },
         value=off.max(),
-        limit=MAX_SD,
+        limit=CERTAIN,
         unit='sd',
     )
 

@@ -81,13 +81,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Write poses and joints of a recording. Raises DataError."""
+    from ..io.bags.mcap_file import is_bag
     from ..io.bodies import read_bodies, read_joints
     from ..io.calibration import orientation_path
     from ..io.folder import check_output_folder
     from ..io.versions import write_learned_shapes
     from ..jobs.bodies import BODIES_FOLDER, BodiesOptions, Film, save_bodies, track_bodies
     from ..jobs.learning import learn_shapes
-    from ..jobs.sources import is_bag
 
     path = arguments.orientation or orientation_path(arguments.calibration)
     inputs = [arguments.source, arguments.calibration, path, arguments.bodies]

@@ -55,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def check(arguments: argparse.Namespace, error: Callable[[str], NoReturn]) -> None:
     """Read the bodies; call error with a sentence for arguments that exclude each other."""
-    from ..jobs.sources import is_bag
+    from ..io.bags.mcap_file import is_bag
 
     arguments.bodies = rigid_clusters(arguments, error)
     if arguments.bodies and arguments.no_drift_watch:
@@ -70,11 +70,11 @@ def check(arguments: argparse.Namespace, error: Callable[[str], NoReturn]) -> No
 def run(arguments: argparse.Namespace) -> None:
     """Write the points of a recording. Raises DataError."""
     from ..io.access import write_bytes
+    from ..io.bags.mcap_file import is_bag
     from ..io.bodies import write_reconstruction
     from ..io.calibration import orientation_path
     from ..io.folder import check_output_file
     from ..jobs.reconstruction import ReconstructionOptions, reconstruct
-    from ..jobs.sources import is_bag
 
     path = arguments.orientation or orientation_path(arguments.calibration)
     check_output_file(arguments.out, (arguments.source, arguments.calibration, path))

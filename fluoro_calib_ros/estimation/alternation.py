@@ -28,7 +28,13 @@ from ..photogrammetry.normal_equations import normal_equations
 from ..photogrammetry.outliers import SETTLED, estimate_noise
 from ..photogrammetry.precision import Precision, covariance_blocks, residual_covariance
 from .estimator import AdjustedTerms, RegressionStep
-from .initial_network import Measured, adjusted_with_precision, undetermined, with_additional
+from .initial_network import (
+    ROUND_TOLERANCE,
+    Measured,
+    adjusted_with_precision,
+    undetermined,
+    with_additional,
+)
 from .options import CalibrationOptions
 from .rounds import History, Round, SelfCalibration
 
@@ -76,9 +82,6 @@ class Anderson:
         scale = np.maximum(np.linalg.norm(d_residual, axis=0), 1e-300)
         gamma, *_ = np.linalg.lstsq(d_residual / scale, residual[-1], rcond=RELATIVE_RANK)
         return f - sum(g * (b - a) for g, a, b in zip(gamma / scale, self._f, self._f[1:]))
-
-
-ROUND_TOLERANCE = 1e-4  # decrease of F that a round may leave to the next: a hundredth of a sigma
 
 
 class Regressions:

@@ -21,6 +21,7 @@ from ..correction.fluoroscope_calibration import (
     NoiseProfile,
     digest_of_sources,
 )
+from ..exposures.collector import MIN_EXPOSURES
 from ..exposures.frame import Frames, validate_frame
 from ..exposures.phantom import Phantom
 from ..findings import Finding
@@ -43,7 +44,7 @@ from .fixed_calibration import (
     too_few_rays_for_noise,
 )
 from .initial_network import (
-    MIN_EXPOSURES,
+    ROUND_TOLERANCE,
     Measured,
     StartValues,
     adjusted_with_precision,
@@ -67,7 +68,6 @@ from .self_calibration import self_calibrate
 
 MAX_REPEATS = 3  # of a calibration, to exclude exposures that do not fit
 EQUAL_WEIGHTS_NU = 100.0  # degrees of freedom from which weights of inliers hardly differ
-TOLERANCE_WITHOUT_CORRECTION = 1e-4  # its residuals are only reported
 
 
 def calibrate(
@@ -349,7 +349,7 @@ def adjust_with_calibrations(
                 after.parameters,
                 np.zeros_like(correction),
                 after.noise,
-                tolerance=TOLERANCE_WITHOUT_CORRECTION,
+                tolerance=ROUND_TOLERANCE,  # its residuals are only reported
             )
     figures = {
         name: _figures(

@@ -66,7 +66,6 @@ class GaugeKind(Enum):
 
 
 UNIT_PX = 512.0  # of the image coordinates in the basis; any fixed length would do
-TURN_STEP = 1e-3  # rad, as large as a pixel of the principal point for the search of both
 
 
 def orientation_fields(xy: ArrayLike) -> NDArray[np.float64]:
@@ -199,7 +198,8 @@ def interior_about(
         return gauge_coefficients(uv, uv - ideal, reference)
 
     start = np.concatenate([interior, np.zeros(3)])
-    scale = [1.0, 1.0, 1.0, TURN_STEP, TURN_STEP, TURN_STEP]
+    # A turn by 1/c displaces the image as a pixel of the principal point does.
+    scale = np.repeat([1.0, 1 / interior[2]], 3)
     return least_squares(misclosure, start, x_scale=scale).x[:3]
 
 

@@ -28,6 +28,7 @@ from ..photogrammetry.precision import (
 )
 from ..photogrammetry.unknowns import Parameters
 from .initial_network import (
+    ROUND_TOLERANCE,
     Known,
     KnownSensor,
     Measured,
@@ -155,9 +156,6 @@ class SolvedNetwork:
 # Mean number of image points of a target from which the noise can be estimated: with fewer the
 # noise cannot be told from errors of the survey.
 MIN_RAYS_FOR_NOISE = 3
-# Decrease of the cost at which an adjustment with too large a noise ends: a point that is off by a
-# standard deviation costs 1/2.
-GRADUATED_TOLERANCE = 0.1
 
 
 def network_of_calibrations(
@@ -245,7 +243,7 @@ def start_within_survey(
     scale = float(np.hypot(noise.scale, np.median(survey_px / network.sigma)))
     while scale > 2 * noise.scale:
         wide = replace(noise, scale=scale)
-        options = SolverOptions(tolerance=GRADUATED_TOLERANCE)
+        options = SolverOptions(tolerance=ROUND_TOLERANCE)
         wider = adjust(network, start, correction=correction, noise=wide, options=options)
         start = wider.parameters
         scale /= 2

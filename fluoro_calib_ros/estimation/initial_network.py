@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..correction.series import Series
 from ..errors import DataError
+from ..exposures.collector import MIN_EXPOSURES
 from ..exposures.frame import Frame, Frames, angles_of, validate_frame
 from ..exposures.phantom import Phantom
 from ..findings import Finding, Kind, Place, Severity
@@ -57,6 +58,10 @@ def start_noise(loss: str) -> Noise:
     A Student-t noise comes with a share of gross errors.
     """
     return Noise(loss, gross=START_GROSS if loss == 'student_t' else 0.0)
+
+
+# Decrease of F that an adjustment may leave which is not the last: a hundredth of a sigma.
+ROUND_TOLERANCE = 1e-4
 
 
 def adjusted_with_precision(
@@ -114,7 +119,6 @@ def with_additional(adjustment: Adjustment, values: tuple[NDArray[np.float64], .
     return replace(adjustment, parameters=replace(adjustment.parameters, additional=values))
 
 
-MIN_EXPOSURES = 3
 MIN_TARGETS_OF_EXPOSURE = 12
 # Flat targets that are tilted less in all exposures do not show the principal distance.
 UNTILTED_RAD = np.deg2rad(5.0)

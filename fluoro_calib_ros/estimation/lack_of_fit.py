@@ -34,45 +34,43 @@ from scipy.special import bdtrc, log_ndtr
 from ..correction.calibration_record import SD_GRID
 from ..correction.fluoroscope_calibration import MAX_FACTOR, NoiseProfile, square_distance
 from ..correction.series import Series, sd_grid_pixels
+from ..exposures.collector import MIN_EXPOSURES
+from ..photogrammetry.noise import CERTAIN
+from ..photogrammetry.outliers import CONTRADICTION, FALSE_ALARM
 
 NEIGHBOURS = 5  # of an image point, those of its own exposure not counted
 POINTS = 60  # image points about a node of the grid
-# Standard errors above which a mean product is not chance: of all image points, of those about one
-# of the nodes.
-SIGNIFICANT = 4.0
+# Standard errors above which the mean product about one of the nodes is not chance; of all image
+# points they are CERTAIN.
 SIGNIFICANT_LOCAL = 4.5
 MAX_GROWTH = 4.0  # of a mean product that is extrapolated to no distance
 PLACE = 0.1  # of the largest variance of a place, up to which image points are in it
 MIN_CORRELATION = 0.05  # with which products show what a series leaves out
 FAR = 30.0  # standard deviations below zero
 # Rejected image points agree within so many standard deviations of an inlier, over so many times
-# the typical distance of an inlier from the next, with so many others; larger residuals than so
-# many standard deviations are no error of a correction.
+# the typical distance of an inlier from the next (as many times farther where only one exposure
+# has image points), with so many others; larger residuals than so many standard deviations are
+# no error of a correction.
 AGREE_SD = 5.0
 AGREE_REACH = 3.0
 AGREE_WITH = 2
 # Where only one exposure has image points: part of the larger residual that the difference of two
 # residuals that agree does not exceed.
 ALONE_AGREE = 0.6
-ALONE_REACH = 3.0  # of such neighbours, relative to that of others
 AGREE_SIGNIFICANT = 1.5  # standard errors by which more pairs agree than are opposite
 LARGEST_SD = 40.0
 # Areas in which they are looked at together: cells that overlap by half, so many side by side,
 # with image points of so many targets that agree in so many exposures.
 CELLS = 8
 MIN_TARGETS = 6
-FALSE_ALARM = 2e-3  # chance that false matches agree in any of the areas
-# The same where so many of the image points of an area are rejected that this is no chance, and
-# the limit of that.
+# Chance that false matches agree in any of the areas where so many of the image points of an area
+# are rejected that this is no chance; elsewhere it is a FALSE_ALARM.
 CLUSTERED_FALSE_ALARM = 0.05
-CLUSTERED = 1e-3
 # At a border, few image points may be all there are: so many targets in so many exposures are
 # enough where they are clustered. Draws of the directions that so few have by chance.
 FEW_TARGETS = 3
 FEW_EXPOSURES = 2
 DRAWS = 10_000
-# Exposures whose scatter is the standard error of a mean product, and that may agree.
-MIN_EXPOSURES = 3
 
 
 @dataclass(frozen=True)
@@ -157,7 +155,7 @@ class _Products:
     def is_significant(self) -> bool:
         """Whether the mean product is above zero."""
         mean, error = self.mean_of_all()
-        return mean > SIGNIFICANT * error
+        return mean > CERTAIN * error
 
 
 def _products(points: FittedPoints) -> _Products:
@@ -290,7 +288,7 @@ def _pairs_of_rejected(
     apart = cKDTree(rejected.uv).query_pairs(reach, output_type='ndarray')
     apart = apart[exposure[apart[:, 0]] != exposure[apart[:, 1]]]
     same = alone[
-        cKDTree(rejected.uv[alone]).query_pairs(ALONE_REACH * reach, output_type='ndarray')
+        cKDTree(rejected.uv[alone]).query_pairs(AGREE_REACH * reach, output_type='ndarray')
     ]
     same = same[exposure[same[:, 0]] == exposure[same[:, 1]]]
     i, j = np.concatenate([apart, same]).T
@@ -332,7 +330,7 @@ def areas_of_rejected(
             continue
         total = len(rows) + len(_inside(inliers, np.array(corner) / 2, cell))
         by_chance = len(corners) * bdtrc(number - 1, total, rate)
-        area = _Area.of(rejected, target, rows, clustered=bool(by_chance < CLUSTERED))
+        area = _Area.of(rejected, target, rows, clustered=bool(by_chance < CONTRADICTION))
         if number >= MIN_TARGETS:
             several.append(area)
         elif area.clustered:
@@ -448,7 +446,6 @@ MIN_POINTS = 100
 # Gain of deviance over the dispersion from which a profile is taken. Chance exceeds it in one of
 # 20 images (chi squared with one degree of freedom), with factors that hardly differ from one.
 MIN_GAIN = 4.0
-MIN_DISPERSION = 0.1
 MIN_SQUARE = 1e-6  # of the mean: the logarithm of a zero would count for ever
 REACH_QUANTILE = 0.99
 # Steps of the regression: at most so many, of so much, and the one at which it ends.
@@ -475,7 +472,7 @@ def fitted_profile(
     # Two coordinates are chi squared with two degrees of freedom: a dispersion of one.
     dispersion = float(np.mean((y / expected - 1) ** 2))
     gain = -2 * float(np.sum(np.log(expected)))  # of deviance; the mean of y / expected is one
-    if gain < MIN_GAIN * max(dispersion, MIN_DISPERSION):
+    if gain <= MIN_GAIN * dispersion:
         return None
     reach = float(np.sqrt(np.quantile(square, REACH_QUANTILE)))
     limit = 2 * np.log(MAX_FACTOR)

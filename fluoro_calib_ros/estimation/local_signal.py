@@ -24,17 +24,16 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import j0
 
 from ..correction.series import Functions
-from .signal import MIN_DETERMINED
+from .signal import MIN_DETERMINED, correlation_of
 
 NODES = 32  # bumps along the longer side of the image
 WIDTH = 0.75 / NODES  # of a bump (one standard deviation), relative to that side
 WINDOWS = 8  # windows along that side; they overlap by half
-# Bands: directions of their lines, half their width and the distance of the next [bumps], and
-# number of those that are looked at more closely. They have as many bumps as a side or more.
-DIRECTIONS = 32
+# Bands: half their width and the distance of the next [bumps], and number of those that are looked
+# at more closely. They have as many bumps as a side or more, and as many directions: from one to
+# the next, the end of a line moves by half its width.
 BAND = 1.5
 LIKELY_BANDS = 8
 # Gain of the logarithm of the likelihood from which a place is added: anywhere, which chance does
@@ -43,10 +42,6 @@ MIN_GAIN = 6.0
 MIN_GAIN_BESIDE = 1.5
 VARIANCES = np.geomspace(1e-3, 30.0, 40)  # of the heights [px^2] that are tried
 MIN_VARIANCE = 2e-4  # [px^2] below which a window is left out again
-# Frequencies of a quadrature, from the lowest to so many times it.
-QUADRATURE = 60
-SHORTEST = 6.0
-MIN_LEVEL = 1e-30  # of the evidence of a bump that no image point shows
 
 
 @dataclass(frozen=True)
@@ -135,10 +130,8 @@ def bumps(functions: Functions, nodes: NDArray[np.float64]) -> NDArray[np.float6
 
 def correlation_beyond(functions: Functions, distance: NDArray[np.float64]) -> NDArray[np.float64]:
     """Correlation (n,), at distances (n,) [px], of what the sines leave out of the bumps."""
-    f = functions.highest * np.geomspace(1, SHORTEST, QUADRATURE)
-    # f df on a geometric grid
-    weight = np.exp(-((f * WIDTH * max(functions.image_size)) ** 2)) * f**2
-    return j0(np.outer(distance, f)) @ weight / np.sum(weight)
+    width = WIDTH * max(functions.image_size)
+    return correlation_of(lambda f: np.exp(-((f * width) ** 2)), functions.highest, distance)
 
 
 def with_likely_places(
@@ -223,7 +216,10 @@ class _ShownBumps:
         Those whose bumps, each alone, are the least likely to be zero are looked at.
         """
         level = np.diagonal(self.products, axis1=1, axis2=2).T
-        excess = np.sum(self.pulls**2 / np.maximum(level, MIN_LEVEL) - 1, axis=1)
+        squares = self.pulls**2
+        # No image point shows a bump whose level is zero.
+        ratio = np.divide(squares, level, out=np.zeros_like(squares), where=level > 0)
+        excess = np.sum(ratio - 1, axis=1)
         bands = _bands(self.image_size)
         number = bands @ ~taken
         score = (bands @ np.where(taken, 0.0, excess)) / np.sqrt(np.maximum(number, 1))
@@ -263,7 +259,7 @@ def _bands(image_size: tuple[int, int]) -> NDArray[np.float64]:
     nodes = _all_nodes(image_size)
     half = BAND * max(image_size) / NODES
     out = []
-    for angle in np.arange(DIRECTIONS) * np.pi / DIRECTIONS:
+    for angle in np.arange(NODES) * np.pi / NODES:
         across = nodes @ [np.cos(angle), np.sin(angle)]
         lines = np.arange(across.min(), across.max() + half, half)
         out.append(np.abs(across - lines[:, None]) <= half)

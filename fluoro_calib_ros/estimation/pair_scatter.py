@@ -24,6 +24,7 @@ from ..correction.angle_field import harmonics
 from ..correction.calibration_record import HARMONICS
 from ..photogrammetry.collinearity import project
 from ..photogrammetry.network import Network
+from ..photogrammetry.noise import CERTAIN
 from ..photogrammetry.unknowns import (
     Parameters,
     RelativeConstraint,
@@ -33,14 +34,12 @@ from ..photogrammetry.unknowns import (
 )
 from .exposure_terms import can_be_fitted
 
-# A pair of exposures is left out of the mean where its deviation is so many times its standard
-# deviation, and so many times the median of all pairs; at most this share of them is.
-MAX_PAIR_SD = 4.0
+# A pair of exposures is left out of the mean where its deviation is CERTAIN times its standard
+# deviation, and as many times the median of all pairs; at most this share of them is.
 MAX_LEFT_OUT = 1 / 3
 MIN_PAIRS_ROBUST = 4
-ROBUST_STEPS = 5
 PAIRS_OF_COLUMN = 2  # that a function of the angle needs at least
-TREND_STEPS = 20
+STEPS = 20  # of reweighting
 CORE = 3.0  # deviation over the median one at which a pair has half its weight in a trend
 MAX_REMAINING = 0.5  # of the variance of the pairs that a trend leaves
 MOVED_SHARE = 0.2  # of the variance about a trend that is left when the rig was moved once
@@ -129,7 +128,7 @@ def _plain(
     robust = len(pairs) >= MIN_PAIRS_ROBUST
     pose = mean_pose(parameters, pairs, None if robust else weights)
     used = every
-    for _ in range(ROBUST_STEPS if robust else 0):
+    for _ in range(STEPS if robust else 0):
         deviation = _deviations(parameters, constraint, pose, weights)
         before, used = used, _near(deviation)
         pose = mean_pose(parameters, pairs[used], weights[used])
@@ -140,7 +139,7 @@ def _plain(
 
 def _near(deviation: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Which (k,) pairs agree; all where too many do not."""
-    near = deviation <= MAX_PAIR_SD * max(1.0, float(np.median(deviation)))
+    near = deviation <= CERTAIN * max(1.0, float(np.median(deviation)))
     return near if np.sum(~near) <= MAX_LEFT_OUT * len(near) else np.ones(len(near), dtype=bool)
 
 
@@ -160,7 +159,7 @@ def _with_trend(
     pairs = constraint.pairs
     off = discrepancies(constraint, mean_pose(parameters, pairs), parameters)
     share = np.ones(len(pairs))
-    for _ in range(TREND_STEPS):
+    for _ in range(STEPS):
         deviation, _ = _about_trend(off, weights * share[:, None, None], weights, columns)
         median = max(float(np.median(deviation)), 1e-12)
         share = 1 / (1 + (deviation / (CORE * median)) ** 2)

@@ -20,6 +20,7 @@ from scipy.linalg import block_diag, cho_factor, cho_solve, lapack
 
 from ..correction.series import Functions
 from ..correction.terms import ABSENT_VARIANCE, trend_transformation
+from ..photogrammetry.noise import SURE
 from .estimator import GaugeKind, gauge_rows
 from .local_signal import LocalSignal, SineEstimates, bumps, largest_gain, with_likely_places
 from .parametric import covariance_with_uncertain_terms
@@ -35,13 +36,12 @@ MAX_VARIANCE = 1e8  # of a trend term that exists
 RING_TERMS = (0, 1, 4)
 # Square of such a term over its variance from which it exists. It costs errors beyond the
 # calibrated area, where it grows fast; at 1, chance alone would make one of three exist.
-RING_EXISTS = 9.0
+RING_EXISTS = SURE**2
 # Gain of the logarithm of the likelihood by a place, with the signal of fewer sines, from which
-# the signal is estimated with more; renewals of it then.
+# the signal is estimated with more.
 SUSPECTED_GAIN = 2.0
-SIGNAL_ROUNDS = 3
+SWEEPS = 3  # renewals of the signal then, and over the terms of the trend
 RIDGE = 1e-9  # increase of a diagonal relative to its largest value
-SWEEPS = 3  # over the terms of the trend
 
 
 @dataclass(frozen=True)
@@ -323,7 +323,7 @@ def with_shown_places(
     both = np.asfortranarray(block_diag(matrix, matrix))
     equations = SignalEquations(functions.frequency, both, right.T.ravel(), columns)
     side = max(functions.image_size)
-    for _ in range(SIGNAL_ROUNDS):
+    for _ in range(SWEEPS):
         prior = replace(prior, signal=most_likely_signal(prior.signal, equations, side))
     return replace(prior, local=with_likely_places(functions, estimates(prior), prior.local))
 

@@ -18,13 +18,12 @@ from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..exposures.phantom import Phantom
 from ..findings import Finding
 from ..photogrammetry.network import similarity_directions
+from ..photogrammetry.rig_orientation import ROUNDING
 from ..photogrammetry.rotations import matrix_from_quaternion
 from .constraints import RelativeOrientation
 from .fixed_calibration import SolvedNetwork
 from .initial_network import StartValues
 from .rounds import AdjustmentStatistics, ResidualTable, Round, SelfCalibration
-
-ROUNDING = 1e-6  # of the information of object points, relative to that of the survey
 
 
 @dataclass(frozen=True)

@@ -37,6 +37,7 @@ from ..photogrammetry.adjustment import Adjustment
 from ..photogrammetry.collinearity import to_sensor
 from ..photogrammetry.elimination import CovarianceBlocks, factorize
 from ..photogrammetry.network import Network
+from ..photogrammetry.noise import CERTAIN
 from ..photogrammetry.normal_equations import normal_equations
 from ..photogrammetry.precision import covariance_blocks
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation, with_datum_of_points
@@ -115,10 +116,9 @@ def _mean_rotation(figures: FluoroscopeResult) -> NDArray[np.float64]:
 
 # Exposures that are used: with more of them the interior orientations remain the uncertainty.
 MAX_PAIRS = 30
-# The phantom moves where the median displacement between two frames of a capture exceeds both
-# limits, in pixels and in standard deviations of the noise.
+# The phantom moves where the median displacement between two frames of a capture exceeds so many
+# pixels, and CERTAIN standard deviations of the noise.
 MAX_STILL_PX = 1.0
-MAX_STILL_SD = 4.0
 MAX_MATCH_SD = 5.0  # distance from the median of a target above which a match is false
 
 
@@ -339,7 +339,7 @@ def _mean_frame(frames: Sequence[Frame], image_sd: float) -> Frame:
     """Mean of the frames of a fluoroscope; image_sd: noise of an image coordinate [px]."""
     if len(frames) == 1:
         return frames[0]
-    _require_still(frames, max(MAX_STILL_PX, MAX_STILL_SD * image_sd))
+    _require_still(frames, max(MAX_STILL_PX, CERTAIN * image_sd))
     ids, row = np.unique(np.concatenate([f.target_id for f in frames]), return_inverse=True)
     uv = np.concatenate([f.uv for f in frames])
     sigma = np.concatenate(

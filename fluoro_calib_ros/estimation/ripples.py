@@ -18,16 +18,14 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from ..correction.series import MARGIN, Functions
-from .lack_of_fit import MIN_EXPOSURES
+from ..exposures.collector import MIN_EXPOSURES
 
 # Sines along the image that are looked at: ripples shorter than 53 px on 1024 px.
 SEARCHED_BANDS = 50
 # Standard deviations by which the mean power of a band with ripples exceeds that of noise.
 SIGNIFICANT = 5.0
-INDEPENDENT = 1 / MARGIN**2  # part of the sines, over their rectangle, that the image can tell
 # Chance that ripples which differ between exposures agree in a band.
 FALSE_ALARM = 1e-5
-BESIDE = 1  # bands next to one with ripples that are used, too: the image ends, and waves do not
 BESIDE_PEAK = 0.2  # part of the power of the strongest band, up to which others belong to it
 LEAST_EXCESS = 0.1  # power that a band starts with, over that of noise
 
@@ -71,8 +69,13 @@ class Ripples:
         largest = float(variances.max())
         if variances[self.bands[0]] > BESIDE_PEAK * largest:
             return None
-        used = np.convolve(variances > BESIDE_PEAK * largest, np.ones(2 * BESIDE + 1), 'same') > 0
+        used = _and_next(variances > BESIDE_PEAK * largest)
         return replace(self, variances=tuple(float(v) for v in np.where(used, variances, 0.0)))
+
+
+def _and_next(bands: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return bands (n,) and those next to them: the image ends, and waves do not."""
+    return np.convolve(bands, np.ones(3), 'same') > 0
 
 
 def ripples_of(functions: Functions, coefficients: NDArray[np.float64]) -> Ripples | None:
@@ -114,13 +117,14 @@ def shown_ripples(
     number = np.maximum(np.bincount(functions.band), 1)
     excess = np.bincount(functions.band, power) / number - 1
     bands = np.arange(len(number))
-    # The power of a sine has a standard deviation of one: it is a mean of two squares.
-    shown = (excess > SIGNIFICANT / np.sqrt(INDEPENDENT * number)) & (bands > complete)
+    # The power of a sine has a standard deviation of one: it is a mean of two squares. The
+    # image can tell a part of the sines over their rectangle.
+    shown = (excess > SIGNIFICANT * MARGIN / np.sqrt(number)) & (bands > complete)
     if shown.any():
         shown[shown] = _are_common(functions, uv, residuals, exposure, bands[shown])
     if not shown.any():
         return None
-    used = np.convolve(shown, np.ones(2 * BESIDE + 1), 'same') > 0
+    used = _and_next(shown)
     used &= (bands > complete) & (bands <= SEARCHED_BANDS)
     variances = np.maximum(excess, LEAST_EXCESS) * noise / float(np.mean(squares))
     return Ripples(

@@ -270,7 +270,7 @@ def residuals_of_adjustment(
     )
 
 
-MIN_FITTING = 0.5  # share of the image points of an exposure that is used
+MIN_FITTING = 0.5  # share of the image points of an exposure, or of a fluoroscope, that is used
 
 
 def undetermined_unknowns(measured: Measured) -> Finding | None:

@@ -15,6 +15,7 @@ means and variances of the coefficients (MacKay, "Bayesian interpolation", Neura
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -127,9 +128,7 @@ class Signal:
 
         Ripples shorter than the distance of image points hardly show in products of neighbours.
         """
-        f = frequency * np.geomspace(1, SHORTEST, QUADRATURE)
-        weight = self.density(f) * f**2  # f df on a geometric grid
-        return j0(np.outer(distance, f)) @ weight / np.sum(weight)
+        return correlation_of(self.density, frequency, distance)
 
     def with_short_field(self, side: float) -> Signal:
         """Return a signal with a short field to start with; side: of the image [px]."""
@@ -143,6 +142,20 @@ class Signal:
         """Mean change of the logarithms of the variances at frequency (s,) from another signal."""
         ratio = self.variance(frequency) / other.variance(frequency)
         return float(np.mean(np.abs(np.log(ratio))))
+
+
+def correlation_of(
+    density: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+    lowest: float,
+    distance: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return the correlation (n,) at distances (n,) [px] of a field, by a Hankel transform.
+
+    density: of its spectrum over frequencies [1/px] from the lowest on.
+    """
+    f = lowest * np.geomspace(1, SHORTEST, QUADRATURE)
+    weight = density(f) * f**2  # f df on a geometric grid
+    return j0(np.outer(distance, f)) @ weight / np.sum(weight)
 
 
 def spectral_density(

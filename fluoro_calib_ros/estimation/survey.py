@@ -32,9 +32,8 @@ from ..exposures.phantom import Phantom
 from ..findings import Kind, Place
 from ..photogrammetry.adjustment import Adjustment
 from ..photogrammetry.network import Network
+from ..photogrammetry.resection import ROUNDING
 from .result import CalibrationResult
-
-CHECKED = 1e-9  # least redundancy of a distance, above rounding
 
 # Blocks (k, 3, 3) of object points p (k,) with object points q (k,).
 Between = Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.float64]]
@@ -112,7 +111,7 @@ def scaled_by_distances(
     pull = inverse @ left
     # Of the pulls; zero for what no other distance checks.
     variance_of_pull = np.diagonal(inverse - variance * np.outer(weight, weight))
-    is_checked = variance_of_pull > CHECKED * np.diagonal(inverse)
+    is_checked = variance_of_pull > ROUNDING * np.diagonal(inverse)
     variance_of_pull = np.where(is_checked, variance_of_pull, np.inf)
     return Scaled(
         xyz_mm + change * arm + moved,

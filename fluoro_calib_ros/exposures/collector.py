@@ -290,6 +290,7 @@ def _is_stream(frames: Sequence[Frame], still: StillOptions) -> bool:
     return bool(0 < np.median(gaps) <= still.still_time_s * 1e9)
 
 
+MIN_EXPOSURES = 3  # of a calibration, or that tell by their scatter
 RECOMMENDED_EXPOSURES = 15  # docs/usage.md; accuracy by number: docs/how_good/accuracy.md
 RECOMMENDED_COVERAGE = 0.9  # share of the image
 MAX_AREAS = 2  # named at once

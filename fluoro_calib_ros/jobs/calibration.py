@@ -38,11 +38,10 @@ from ..checks.verdict import validate_or_report
 from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
 from ..errors import DataError
 from ..estimation.calibrate import adjust_with_calibrations, calibrate_request
-from ..estimation.initial_network import MIN_EXPOSURES
 from ..estimation.options import CalibrationRequest
 from ..estimation.result import CalibrationResult
 from ..estimation.rounds import Round
-from ..exposures.collector import without_repeats
+from ..exposures.collector import MIN_EXPOSURES, without_repeats
 from ..exposures.frame import Frame, Frames, frames_without_strays
 from ..exposures.phantom import Phantom
 from ..findings import Finding, Kind, Place, Severity

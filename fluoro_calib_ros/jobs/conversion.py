@@ -22,6 +22,7 @@ from ..exposures.angles import AngleOptions
 from ..exposures.frame import Frame, Frames
 from ..images.corrector import ImageCorrector
 from ..io.access import PathLike
+from ..io.bags.mcap_file import is_bag
 from ..io.bags.reader import read_frames, with_angles
 from ..io.calibration import (
     OBSERVATIONS,
@@ -51,7 +52,7 @@ from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import matrix_from_quaternion
 from .result_folder import belongs_to
 from .simulation import write_bag
-from .sources import is_bag, require_observed, select_calibrations
+from .sources import require_observed, select_calibrations
 
 BAG = 'bag'
 PHANTOM_BODY = 'phantom'  # name of the phantom as a rigid body
@@ -151,12 +152,7 @@ def convert(request: ConversionRequest) -> Written:
 def _read(request: ConversionRequest, settings: FileSettings) -> tuple[Content, bool]:
     """Return the content of the source, and whether it is in the conventions of this package."""
     source = Path(request.source)
-    from_bag = (
-        not is_result_folder(source)
-        and not registry_reads(source)
-        and request.source_kind is None
-        and is_bag(source)
-    )
+    from_bag = not is_result_folder(source) and request.source_kind is None and is_bag(source)
     if request.angles.angle_joint and not request.angles.of_rig and not from_bag:
         raise DataError(f'{source}: the angle of a joint needs a bag, this is none')
     if is_result_folder(source):
@@ -198,14 +194,6 @@ def _parts_written(kind: str) -> tuple[str, ...]:
 def is_result_folder(path: Path) -> bool:
     """Return whether a path is a folder with calibrations."""
     return path.is_dir() and any(name.name.endswith(SUFFIX) for name in path.iterdir())
-
-
-def registry_reads(path: Path) -> bool:
-    """Return whether a path is a folder of files that are not of a bag."""
-    if not path.is_dir():
-        return False
-    names = [p.name for p in path.iterdir()]
-    return 'metadata.yaml' not in names and not any(name.endswith('.mcap') for name in names)
 
 
 def _selected(content: Content, request: ConversionRequest) -> Content:

@@ -16,6 +16,8 @@ import numpy as np
 
 from ..errors import DataError
 from ..exposures.angles import AngleOptions, JointAngles
+from ..io.bags.mcap_file import METADATA, is_bag
+from ..io.bags.metadata import TARGET_OBSERVATIONS
 from ..io.bags.reader import angles_in, image_topics, images_of_topic, topics_of
 from ..io.image_reading import (
     DICOM_SUFFIXES,
@@ -24,11 +26,8 @@ from ..io.image_reading import (
     image_suffix_of,
     listed,
     open_images,
-    suffix_of,
 )
 from ..io.recordings import read_dicom_header
-
-BAG_SUFFIXES = ('.mcap', '.db3')
 
 
 @dataclass(frozen=True)
@@ -134,10 +133,7 @@ def open_sources(
 
 def is_image_bag(source: Path) -> bool:
     """Return whether a source is a bag with images. Raises DataError for a damaged bag."""
-    folder = source.is_dir() and (source / 'metadata.yaml').exists()
-    if not folder and suffix_of(source) not in BAG_SUFFIXES:
-        return False
-    return bool(image_topics(source))
+    return is_bag(source) and bool(image_topics(source))
 
 
 def fluoroscope_folders(source: Path) -> dict[str, Path]:
@@ -189,19 +185,17 @@ def _dose(path: Path, changed_ns: int) -> tuple[float | None, float | None]:
 
 def contains_images(source: Path) -> bool:
     """Return whether a source is an image, a folder of images, a video, or a bag of images."""
-    if not source.is_dir() and image_suffix_of(source):
-        return True
-    if source.is_dir() and not (source / 'metadata.yaml').exists():
+    if source.is_dir() and not (source / METADATA).exists():
         direct = any(image_suffix_of(path) in EXPOSURE_SUFFIXES for path in source.iterdir())
-        return direct or bool(fluoroscope_folders(source))
-    if source.is_dir() or suffix_of(source) in BAG_SUFFIXES:
-        observations = 'fluoro_calib_msgs/msg/TargetObservations'
-        try:
-            known = [info.type for info in topics_of(source).values()]
-            return observations not in known and bool(image_topics(source))
-        except DataError:
-            return False  # the reader of bags says what is wrong
-    return False
+        if direct or fluoroscope_folders(source):
+            return True
+    if not is_bag(source):
+        return not source.is_dir() and bool(image_suffix_of(source))
+    try:
+        known = [info.type for info in topics_of(source).values()]
+        return TARGET_OBSERVATIONS not in known and bool(image_topics(source))
+    except DataError:
+        return False  # the reader of bags says what is wrong
 
 
 def _images_in(folder: Path) -> list[Path]:

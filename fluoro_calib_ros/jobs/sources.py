@@ -24,7 +24,8 @@ from ..exposures.names import Names
 from ..exposures.pairing import PairingOptions, disagreement_of_recording
 from ..exposures.phantom import Phantom, require_size
 from ..findings import Kind, sentences
-from ..io.access import PathLike, check_regular_file
+from ..io.access import PathLike
+from ..io.bags.mcap_file import is_bag
 from ..io.bags.reader import joint_topics, read_frames, with_angles
 from ..io.calibration import disagreements, load_calibrations
 from ..io.csv_table import read_names
@@ -43,8 +44,6 @@ from ..photogrammetry.rig_orientation import KnownOrientation
 
 if TYPE_CHECKING:
     import pandas
-
-MAGIC = b'\x89MCAP'  # of a bag
 
 
 @dataclass(frozen=True)
@@ -135,19 +134,6 @@ class Survey:
     phantom: Phantom
     names: Names
     notes: tuple[str, ...] = ()
-
-
-def is_bag(path: PathLike) -> bool:
-    """Return whether a source is a bag, which contains times; else it is a file of exposures."""
-    path = Path(path)
-    if path.is_dir() or path.suffix.lower() in ('', '.mcap', '.db3'):
-        return True
-    check_regular_file(path)
-    try:
-        with path.open('rb') as file:
-            return file.read(len(MAGIC)) == MAGIC
-    except OSError:
-        return False
 
 
 def read_content(path: PathLike, settings: FileSettings, part: str, default: str) -> Content:
@@ -251,7 +237,7 @@ def read_source(
     """
     settings = settings or FileSettings()
     selection = selection or BagSelection()
-    bag = is_bag(path)
+    bag = Path(path).is_dir() or is_bag(path)  # a folder that is none: its reader says so
     if bag:
         contents = read_frames(path, validate)
         found = selection.frames(path, contents.frames)

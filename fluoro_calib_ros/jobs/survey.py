@@ -26,11 +26,11 @@ from ..checks.survey import (
 )
 from ..errors import DataError
 from ..estimation.calibrate import calibrate_request
-from ..estimation.initial_network import MIN_EXPOSURES
 from ..estimation.options import CalibrationOptions, CalibrationRequest
 from ..estimation.result import CalibrationResult
 from ..estimation.rounds import Round
 from ..estimation.survey import MeasuredDistance, SurveyedBeads, surveyed_beads
+from ..exposures.collector import MIN_EXPOSURES
 from ..exposures.frame import Frames
 from ..exposures.phantom import MIN_TARGETS, Phantom
 from ..findings import Finding, Kind, Severity

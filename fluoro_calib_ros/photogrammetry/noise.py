@@ -32,8 +32,11 @@ from scipy.optimize import minimize_scalar
 # Leroy, "Robust Regression and Outlier Detection", 1987, 5.1). Only what exceeds chance widens a
 # limit: where the errors are as stated, the factor is 1.
 
-# Standard deviations of the observed scale that are taken for chance.
+# Standard deviations that chance seldom exceeds, of a single comparison, and that it hardly ever
+# does (6 in 100,000), of one that accuses, leaves out, or is made many times.
 SURE = 3.0
+CERTAIN = 4.0
+NORMAL_MEDIAN = 0.6745  # of the absolute value of a standard normal variable
 # Relative standard deviation of the median of n absolute normal errors, times the root of n:
 # 1 / (2 f(m) m) with the density f at the median m. For lengths of errors of two coordinates it is
 # 0.72, but tails can be heavy.

@@ -33,14 +33,15 @@ from .unknowns import Parameters
 
 # Probability of any false alarm among all that is tested: image points, targets, terms.
 SIGNIFICANCE = 0.01
+FALSE_ALARM = 2e-3  # chance that one test of good observations fails
 # Smallest redundancy of an image point that is tested.
 MIN_TESTED_REDUNDANCY = 0.02
 # Iterations of the weights of a target's rays.
 INTERSECTION_ITERATIONS = 15
 # Smallest eigenvalue of the scaled normal matrix of an intersection.
 MIN_INTERSECTION_EIGENVALUE = 1e-4
-# Significance at which the rays of a target contradict each other.
-CONTRADICTION_SIGNIFICANCE = 1e-3
+# The same of a test that says what contradicts what: rays, beads and their survey, false matches.
+CONTRADICTION = 1e-3
 
 
 @dataclass(frozen=True)
@@ -229,7 +230,7 @@ def _intersect(
         residual = rays.residual - (a @ offset[p][..., None])[..., 0]
         square = np.einsum('ni,nij,nj->n', residual, rays.information, residual)
         weight = noise.weight(square) if noise.loss != 'gaussian' else weight
-    limit = special.chdtri(np.maximum(2 * count, 1), CONTRADICTION_SIGNIFICANCE)
+    limit = special.chdtri(np.maximum(2 * count, 1), CONTRADICTION)
     contradicting = np.bincount(p, square * weight, n) > limit
     offset[~good | contradicting] = np.nan
     return offset, covariance, square

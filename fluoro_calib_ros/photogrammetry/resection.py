@@ -40,7 +40,7 @@ MIN_DAMPING = 1e-12
 MAX_DAMPING = 1e10
 MIN_EXTENT_MM = 1e-3
 DAMPING_FACTOR = 10
-# Relative increase of the cost that rounding errors can cause.
+# Relative change of a cost, a redundancy or a distance that rounding errors can cause.
 ROUNDING = 1e-9
 # Squared step at which the refinement ends, in the metric of its normal matrix and noise variance.
 TOLERANCE = 1e-4

@@ -33,7 +33,7 @@ from .unknowns import EXTERIOR_SIZE, INTERIOR_SIZE
 ORIENTATION_SIZE = EXTERIOR_SIZE + INTERIOR_SIZE
 SOURCES = ('capture', 'joint calibration', 'healing')
 # What rounding explains: of the deviation of a rotation matrix from orthogonality, the asymmetry
-# of a correlation matrix, and of its most negative eigenvalue.
+# of a correlation matrix, and of an eigenvalue.
 ROUNDING = 1e-6
 MAX_VALUE = 1e15  # of a position [mm], an interior orientation [px] or a covariance
 # What `rounded` keeps: far coarser than a rounding error, far finer than a standard deviation.

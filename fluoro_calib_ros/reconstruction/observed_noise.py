@@ -27,20 +27,18 @@ from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibr
 from ..exposures.frame import Frame, Frames
 from ..exposures.pairing import RecordedPairing
 from ..findings import Finding, Kind, Severity
-from ..photogrammetry.noise import MEDIAN_SD, SURE, trimmed_scale
+from ..photogrammetry.noise import CERTAIN, MEDIAN_SD, NORMAL_MEDIAN, SURE, trimmed_scale
 from ..photogrammetry.rig_orientation import RigOrientation
 from .epipolar import EpipolarGeometry
 from .reconstruct import corrected_view, match_views, pair_recording
 
 MAX_PAIRS = 200  # of consecutive exposures, evenly spread over a recording
 MIN_DIFFERENCES = 30
-GROSS = 4.0  # standard deviations of a difference, beyond which it is of a false match
 NEAR = 1 / 32  # of the width of an image: errors of the correction are the same at such a distance
 # Noise over that of the calibration from which it is taken: less does no harm.
 MIN_FACTOR = 1.25
 # Residuals over what the noise explains, up to which nothing else need be wrong.
 MAX_UNEXPLAINED = 1.5
-NORMAL_MEDIAN = 0.6745  # of the absolute value of a standard normal variable
 
 
 class _Residuals(NamedTuple):
@@ -107,7 +105,7 @@ def _finding(factor: float, calibrations: Sequence[FluoroscopeCalibration]) -> F
 def _factor(pairs: Sequence[tuple[_Residuals, _Residuals]]) -> float:
     """Return the noise in consecutive exposures over that of the calibration, 1 where unknown."""
     differences = np.concatenate([_differences(*pair) for pair in pairs])
-    factor, count = trimmed_scale(differences / NORMAL_MEDIAN, GROSS / NORMAL_MEDIAN)
+    factor, count = trimmed_scale(differences / NORMAL_MEDIAN, CERTAIN / NORMAL_MEDIAN)
     if count < MIN_DIFFERENCES:
         return 1.0
     # A residual is in two differences.

@@ -10,7 +10,6 @@ import pytest
 from scipy import special
 
 from fluoro_calib_ros.checks.body_watch import _inverse
-from fluoro_calib_ros.checks.check import FALSE_ALARM
 from fluoro_calib_ros.checks.residual_tests import (
     Residuals,
     _cell_sums,
@@ -26,6 +25,7 @@ from fluoro_calib_ros.checks.rig import doubtful
 from fluoro_calib_ros.estimation.pair_scatter import PairScatter
 from fluoro_calib_ros.findings import Kind
 from fluoro_calib_ros.photogrammetry.noise import INLIER_Q
+from fluoro_calib_ros.photogrammetry.outliers import FALSE_ALARM
 from fluoro_calib_ros.photogrammetry.rotations import (
     matrix_from_vector,
     quaternion_from_matrix,

@@ -22,7 +22,7 @@ from fluoro_calib_ros.checks.bead_intersection import (
 )
 from fluoro_calib_ros.checks.beads import compare_with_survey, rejected_beads
 from fluoro_calib_ros.checks.calibration_evidence import Evidence, Subject
-from fluoro_calib_ros.checks.check import FALSE_ALARM, Check, Validation, verdict_of
+from fluoro_calib_ros.checks.check import Check, Validation, verdict_of
 from fluoro_calib_ros.checks.comparison import difference, place_name
 from fluoro_calib_ros.checks.field_checks import PRECISION, TRENDS
 from fluoro_calib_ros.checks.held_out import HELD_OUT
@@ -48,6 +48,7 @@ from fluoro_calib_ros.findings import Kind, Place, Severity
 from fluoro_calib_ros.io.calibration import load_calibrations, save_calibration
 from fluoro_calib_ros.io.calibration_request import read_request, write_request
 from fluoro_calib_ros.io.result_document import validation_document
+from fluoro_calib_ros.photogrammetry.outliers import FALSE_ALARM
 from fluoro_calib_ros.report.tables import verdict_text
 from fluoro_calib_ros.simulation.rig import Detection, simulate_exposures, virtual_rig
 

@@ -14,6 +14,7 @@ import rigs
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.angles import AngleOptions
 from fluoro_calib_ros.exposures.frame import Frame
+from fluoro_calib_ros.io.bags.mcap_file import is_bag
 from fluoro_calib_ros.io.calibration import RESULT_NAME, save_calibration, save_orientation
 from fluoro_calib_ros.io.formats.content import FileSettings
 from fluoro_calib_ros.io.observations import read_observations_csv, write_observations_csv
@@ -22,7 +23,6 @@ from fluoro_calib_ros.jobs.conversion import (
     ConversionRequest,
     convert,
     is_result_folder,
-    registry_reads,
     result_content,
     stations_of,
 )
@@ -159,16 +159,16 @@ def test_what_belongs_to_another_kind_of_source_is_refused(table, result, tmp_pa
 
 
 def test_folders_are_told_apart_by_their_files(result, tmp_path):
-    assert is_result_folder(result) and registry_reads(result)
+    assert is_result_folder(result) and not is_bag(result)
     bag = tmp_path / 'bag'
     write_bag(bag, frames())
-    assert not is_result_folder(bag) and not registry_reads(bag)
+    assert not is_result_folder(bag) and is_bag(bag)
     (bag / 'metadata.yaml').unlink()
-    assert not registry_reads(bag)  # its files are enough
+    assert is_bag(bag)  # its files are enough
     file = next(bag.iterdir())
-    assert not is_result_folder(file) and not registry_reads(file)
+    assert not is_result_folder(file) and is_bag(file)
     (tmp_path / 'empty').mkdir()
-    assert registry_reads(tmp_path / 'empty') and not is_result_folder(tmp_path / 'empty')
+    assert not is_bag(tmp_path / 'empty') and not is_result_folder(tmp_path / 'empty')
 
 
 # ---- result folders

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from rosbags.rosbag2 import Reader
 
 MAGIC = b'\x89MCAP0\r\n'
+SQLITE = b'SQLite format 3\0'  # how a bag of that storage begins
 CHUNK_HEAD = 100  # bytes that contain sizes and compression of a chunk
 FOOTER = struct.Struct('<BQQQI')  # opcode, length, two offsets, checksum
 RECORD = struct.Struct('<BQ')  # opcode and length
@@ -250,7 +251,30 @@ def _cause(error: Exception, most: int) -> str:
 # Storage files of a bag: an .mcap file, or those in the folder of a rosbag2 bag.
 
 METADATA = 'metadata.yaml'
+SUFFIXES = ('.mcap', '.db3')
 NO_METADATA = 'this is not the metadata of a bag, or it is damaged'
+
+
+def is_bag(source: PathLike) -> bool:
+    """Return whether a source is a bag: by its files, its name, or its first bytes.
+
+    What is not there counts as a bag where its name has no ending. Raises DataError for a pipe.
+    """
+    path = Path(source)
+    if path.is_dir():
+        names = os.listdir(path)
+        return METADATA in names or any(name.endswith('.mcap') for name in names)
+    if path.suffix.lower() in SUFFIXES or not (path.suffix or path.exists()):
+        return True
+    check_regular_file(path)
+    return _beginning(path).startswith((MAGIC, SQLITE))
+
+
+def _beginning(path: PathLike) -> bytes:
+    """Return the first bytes of a file, none of one that cannot be read."""
+    with suppress(OSError), open(path, 'rb') as file:
+        return file.read(len(SQLITE))
+    return b''
 
 
 def storage_files(source: PathLike) -> list[str]:
@@ -336,7 +360,6 @@ def _listed_files(source: PathLike) -> list[str]:
 # A bag is compressed by rosbag2 file by file (`file`) or message by message (`message`).
 
 MAX_FOREIGN_CAUSE = 200  # characters
-SQLITE = b'SQLite format 3\0'
 
 
 def is_foreign(source: PathLike) -> bool:
@@ -347,13 +370,7 @@ def is_foreign(source: PathLike) -> bool:
             mode = str(information.get('compression_mode') or 'none').lower()
             return str(information['storage_identifier']) == 'sqlite3' or mode != 'none'
         return False
-    if not os.path.isfile(source):
-        return False
-    try:
-        with open(source, 'rb') as file:
-            return file.read(len(SQLITE)) == SQLITE
-    except OSError:
-        return False
+    return os.path.isfile(source) and _beginning(source) == SQLITE
 
 
 def channels_of_bag(source: PathLike) -> list[ChannelInfo]:

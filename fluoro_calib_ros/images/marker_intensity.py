@@ -30,17 +30,15 @@ from .detection import (
     responses,
 )
 from .light import Light, Noise, estimate_noise, vertex
-from .marker_motion import MarkerStates, Motion, assign
+from .marker_motion import GIVEN_GATE, GIVEN_SD_PX, MarkerStates, Motion, assign
 from .measurement import estimate_profile
 from .shadow_fit import Profile
 
 MARKER_SCALES = SCALES[:5]  # markers are smaller than beads
 NOISE_WEIGHT = 0.1  # of the response, in the noise that it is compared with
-NEAR_PX = 3  # from a given point, within which its shadow is
 MIN_CONTRAST = 0.02  # of a response, as a fraction of the light around it
 MIN_SNR = 4.5  # of a response, over the noise of the response
-WINDOW_BACKGROUND_PX = 6  # the same along the rows of a window
-BACKGROUND_PX = 15  # half the width of the box whose mean is the light around a pixel
+BACKGROUND_PX = 6  # half the width of the box whose mean is the light around a pixel
 SAMPLED = 4  # rows and columns from one pixel to the next, where all are of one kind
 SAME_PX = 1.0  # between maxima that are one shadow
 BORDER = 3  # scales of the blur at the edge of a window that are not searched
@@ -267,9 +265,13 @@ def search_image(image: np.ndarray, look: MarkerLook, share: float) -> Shadows:
     """Search a whole image for shadows with a share of the strength of a typical marker."""
     grey = image.astype(np.float32)
     light = float(np.iinfo(image.dtype).max) - grey if look.inverted else grey
-    around = cv2.blur(light, (2 * BACKGROUND_PX + 1,) * 2)
+    return _found(look, _filtered(light, (2 * BACKGROUND_PX + 1,) * 2, look), share)
+
+
+def _filtered(light: NDArray[np.float32], box: tuple[int, int], look: MarkerLook) -> FilteredLight:
+    """Filter light for shadows of a look; the light around is the mean of a box."""
     (response,) = responses(light, look.scale, (False,))
-    return _found(look, FilteredLight(look.scale, look.inverted, light, response, around), share)
+    return FilteredLight(look.scale, look.inverted, light, response, cv2.blur(light, box))
 
 
 @dataclass(frozen=True)
@@ -283,7 +285,7 @@ class _Typical:
     def near(cls, light: FilteredLight, uv: NDArray[np.float64]) -> _Typical:
         """The median near points (n, 2)."""
         height, width = light.response.shape
-        around = np.rint(uv).astype(int)[:, None] + _square(NEAR_PX)
+        around = np.rint(uv).astype(int)[:, None] + _square(int(np.ceil(GIVEN_GATE * GIVEN_SD_PX)))
         column = np.clip(around[..., 0], 0, width - 1)
         row = np.clip(around[..., 1], 0, height - 1)
         return cls(light, float(np.median(light.relative_at((row, column)).max(axis=1))))
@@ -340,17 +342,12 @@ def search_windows(
     border = int(np.ceil(BORDER * look.scale))
     size = 2 * (half + border) + 1
     grey, valid = windows.read(middle, _square(half + border))
-    around = cv2.blur(grey.reshape(-1, size), (2 * WINDOW_BACKGROUND_PX + 1, 1))
-    (response,) = responses(grey.reshape(-1, size), look.scale, (False,))
-    response = _relative(response, around, look)
-    response = response.reshape(len(middle), size, size)
-    response *= valid.reshape(response.shape)
+    light = _filtered(grey.reshape(-1, size), (2 * BACKGROUND_PX + 1, 1), look)
     # The seams between windows lie in their borders.
-    response[:, :border] = 0
-    response[:, -border:] = 0
-    response[:, :, :border] = 0
-    response[:, :, -border:] = 0
-    found = _peaks(response.reshape(-1, size), look, share)
+    searched = np.zeros((len(middle), size, size), dtype=bool)
+    inner = np.s_[:, border:-border, border:-border]
+    searched[inner] = valid.reshape(searched.shape)[inner]
+    found = _found(replace(look, field=searched.reshape(-1, size)), light, share)
     number = (found.uv[:, 1] + 0.5).astype(int) // size
     place = found.uv.copy()
     place[:, 1] -= number * size
@@ -366,28 +363,10 @@ def _square(half: int) -> NDArray[np.int64]:
     return np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
 
 
-def _relative(
-    response: NDArray[np.floating], around: NDArray[np.floating], look: MarkerLook
-) -> NDArray[np.floating]:
-    """Responses over the light around, 0 where noise explains them."""
-    relative = response / np.maximum(around, 1e-3 * look.light)
-    relative[relative < _floor(look, around)] = 0
-    return np.asarray(relative)
-
-
 def _floor(look: MarkerLook, around: NDArray[np.floating]) -> NDArray[np.floating]:
     """Relative response below which noise is, by the light around: it grows in the dark."""
     light = np.maximum(around, 1e-3 * look.light)
     return np.asarray(look.floor * np.sqrt(np.maximum(look.light / light, 1.0)))
-
-
-def _peaks(response: NDArray[np.float32], look: MarkerLook, share: float) -> Shadows:
-    """Local maxima of a response (h, w) that is 0 at its edge, to a part of a pixel."""
-    dilated = cv2.dilate(response, np.ones((_size_of_maximum(look.scale),) * 2, np.uint8))
-    row, column = np.nonzero(
-        (response >= dilated) & (response > max(share * look.strength, look.floor))
-    )
-    return _shadows_at(response, row, column)
 
 
 def _size_of_maximum(scale: float) -> int:
@@ -409,8 +388,6 @@ def _shadows_at(
     return Shadows(uv, at)
 
 
-FIRST_SD_PX = 1.5  # of a given place of the first frame
-FIRST_GATE = 3.0  # standard deviations from a given place, within which its shadow is
 MIN_DENSITY = 2e-6  # of false shadows [1/px^2]
 
 
@@ -443,7 +420,7 @@ def learn_start(image: FilteredImage, target_id: NDArray[np.int64], uv: np.ndarr
         raise DataError(f'marker {bad} of the first frame lies outside of the image')
     look, filtered = _learn_look(image, given)
     found = _found(look, filtered, SHARE)
-    row, column = assign(given, np.full(len(given), FIRST_SD_PX**2), found.uv, FIRST_GATE)
+    row, column = assign(given, np.full(len(given), GIVEN_SD_PX**2), found.uv, GIVEN_GATE)
     if len(row) < max(1, len(given) // 2):
         raise DataError(
             f'only {len(row)} of {len(given)} markers of the first frame are in the image'
@@ -455,7 +432,7 @@ def learn_start(image: FilteredImage, target_id: NDArray[np.int64], uv: np.ndarr
     unseen[seen] = 0
     light = filtered.light
     return MarkerStart(
-        MarkerStates.start(Motion.start(place, FIRST_SD_PX), unseen),
+        MarkerStates.start(Motion.start(place, GIVEN_SD_PX), unseen),
         look,
         profile=estimate_profile(
             Light(light, look.field), place[seen], np.ones(len(seen)), look.radius_px
@@ -467,8 +444,7 @@ def learn_start(image: FilteredImage, target_id: NDArray[np.int64], uv: np.ndarr
 
 
 SHARE = 0.35  # of the response to a typical marker, from which a shadow may be a marker
-MIN_HALF = 4  # of a search window [px]
-MAX_HALF = 48
+MAX_HALF = 48  # of a search window [px]
 STRIPS = 6  # of an image that is searched in turn: a whole one takes as long as five exposures
 
 
@@ -507,7 +483,7 @@ class MarkerSearch:
             parts.append(self._of_strip(image, number // self._every % self._strips))
         reach = np.ceil(self._gate * np.sqrt(states.shadow_variance))
         near = ~lost | (reach <= MAX_HALF)
-        half = np.clip(reach, MIN_HALF, MAX_HALF).astype(int)
+        half = np.minimum(reach, MAX_HALF).astype(int)
         middle = np.rint(states.motion.uv).astype(int)
         # Few markers need wide windows; those of the others stay small.
         sizes = np.sort(half[near])

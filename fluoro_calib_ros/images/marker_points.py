@@ -22,9 +22,8 @@ from ..correction.fluoroscope_calibration import Calibrations, CorrectedPoints
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.epipolar import EpipolarGeometry
 from ..reconstruction.intersection import OK, OUTSIDE, IntersectedPoints
+from .marker_motion import SHADOW_SD_PX
 from .marker_rays import AGREE, RayFit, project_observed
-
-SHADOW_SD_PX = 0.25  # of the place of a shadow that is not measured
 
 
 @dataclass(frozen=True)

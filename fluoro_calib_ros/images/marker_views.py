@@ -293,7 +293,7 @@ class JoinedViews:
         found, missing = find_bodies(seen, rig, list(wanted.values()))
         for view in self._views:
             if view.name in found:
-                view.tracker.relocate(found[view.name])
+                view.tracker.place(found[view.name])
         there = [body for body in wanted.values() if body.name not in missing]
         placed = self._among(there)
         self._missed &= ~placed

@@ -286,18 +286,18 @@ def states_at(uv):
 def test_places_of_a_body_tell_the_velocity_by_the_second_image():
     states = states_at([[100, 100], [200, 100], [300, 100]])
     states.advance(1, None)
-    states.place(np.array([0, 2]), np.array([[120.0, 110], [300.2, 100]]), 1.5, frames=1)
+    states.place(np.array([0, 2]), np.array([[120.0, 110], [300.2, 100]]), frames=1)
     # The third marker is there anyway, and the second one was not asked for.
     assert states.motion.uv.tolist() == [[120, 110], [200, 100], [300, 100]]
     assert states.motion.covariance[0].tolist() == [[2.25, 0], [0, 36]]
     assert not states.motion.velocity.any() and states.placed[0] == 0 and states.unseen[0] == 1
     states.unseen[:] = 0  # measured
     states.advance(2, None)
-    states.place(np.array([0]), np.array([[150.0, 116]]), 1.5, frames=2)
+    states.place(np.array([0]), np.array([[150.0, 116]]), frames=2)
     assert states.motion.velocity[0].tolist() == [15, 3]
     assert states.motion.covariance[0].tolist() == [[2.25, 0], [0, 2.25]]
     states.unseen[0] = 9  # long not seen: the place before says nothing
-    states.place(np.array([0]), np.array([[10.0, 20]]), 1.5, frames=1)
+    states.place(np.array([0]), np.array([[10.0, 20]]), frames=1)
     assert states.motion.uv[0].tolist() == [10, 20] and not states.motion.velocity[0].any()
 
 

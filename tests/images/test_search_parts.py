@@ -28,13 +28,8 @@ from fluoro_calib_ros.images.growth import (
 )
 from fluoro_calib_ros.images.lattice import FlatGrid, _view
 from fluoro_calib_ros.images.marker_fit import _MarkerFit
-from fluoro_calib_ros.images.marker_intensity import (
-    FIRST_SD_PX,
-    LightWindows,
-    Shadows,
-    check_image,
-)
-from fluoro_calib_ros.images.marker_motion import MeasuredMarkers, Motion
+from fluoro_calib_ros.images.marker_intensity import LightWindows, Shadows, check_image
+from fluoro_calib_ros.images.marker_motion import GIVEN_SD_PX, MeasuredMarkers, Motion
 from fluoro_calib_ros.images.marker_watch import MarkerDoubts, MarkerWatch
 from fluoro_calib_ros.images.matching import SHIFTS, _common
 from fluoro_calib_ros.images.pose_search import (
@@ -377,7 +372,7 @@ def test_places_of_the_first_image_tell_no_markers_apart_that_are_nearer_to_each
 ):
     """They are given to a pixel or two, whoever gives them."""
     at = np.array([[500.0, 300], [500 + apart, 300], [900, 900]])
-    watch, doubts, states = watched(at, FIRST_SD_PX**2, [0, 0, 0])
+    watch, doubts, states = watched(at, GIVEN_SD_PX**2, [0, 0, 0])
     states.motion.covariance[:, 1, 1] = 1e6  # no velocity is known
     seen = found_at(at, [1, 1, 1])
     assert not watch.shadows_met(seen, states, 4)[1]

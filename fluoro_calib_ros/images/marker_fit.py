@@ -45,7 +45,6 @@ SETTINGS = FitSettings(
     crossed=1.2,
 )
 STEPS_ALONE = 2
-CONVERGED_PX = 0.1  # a longer last step is followed by another one
 WAY_PX = 2.0  # of the largest motion, for each further point along the way
 
 
@@ -126,7 +125,6 @@ class _MarkerFit(ShadowFit):
 
     def run(self) -> None:
         """Take Gauss-Newton steps; the last one gives standard deviations as well."""
-        moved = np.zeros(len(self.uv))
         for step in range(self.settings.steps):
             if step in self.settings.crossing_steps and len(self.crowded):
                 self._cross()
@@ -135,22 +133,10 @@ class _MarkerFit(ShadowFit):
                 if alone and step >= STEPS_ALONE:
                     continue
                 final = step == (STEPS_ALONE if alone else self.settings.steps) - 1
-                moved[rows] = self._take_step(rows, near, final)
-        for rows, near in self.groups:
-            again = moved[rows] > CONVERGED_PX
-            if again.any():
-                self._take_step(rows[again], near[again], True)
-
-    def _take_step(
-        self, rows: NDArray[np.int64], near: NDArray[np.int64], final: bool
-    ) -> NDArray[np.float64]:
-        """Take a step of some markers; return how far (g,) their centres move [px]."""
-        uv, depth, background = self._step(rows, near, final)
-        moved = np.abs(uv - self.uv[rows]).max(axis=1)
-        self.uv[rows] = uv
-        self.depth[rows] = depth
-        self.background[rows] = background
-        return np.asarray(moved)
+                uv, depth, background = self._step(rows, near, final)
+                self.uv[rows] = uv
+                self.depth[rows] = depth
+                self.background[rows] = background
 
     def _shadow(
         self, rows: NDArray[np.int64], middle: NDArray[np.int64]
@@ -275,7 +261,6 @@ class _MarkerFit(ShadowFit):
 
 MAX_MISFIT = 10.0
 DEPTH = (0.5, 1.8)  # of a shadow, over that of its marker
-SAME_PLACE = 0.35  # of the radius, at which two markers are one shadow
 
 
 class MarkerMeasurement:
@@ -366,8 +351,4 @@ class MarkerMeasurement:
         good = beads.measured & (beads.sigma < MAX_SIGMA_PX) & (beads.misfit < MAX_MISFIT)
         good &= (away * away).sum(axis=1) < (self._gate + 1) ** 2 * variance
         good &= (relative > DEPTH[0]) & (relative < DEPTH[1])
-        if len(rows) > 1:
-            apart = cdist(beads.uv, beads.uv)
-            np.fill_diagonal(apart, np.inf)
-            good &= apart.min(axis=1) > SAME_PLACE * self.profile.radius_px
         return good

@@ -37,12 +37,10 @@ from .marker_intensity import (
 )
 from .marker_points import CalibratedRig, ShadowPoints, all_among, shadow_points
 from .marker_rays import project_observed
-from .markers import FirstMarkers
+from .markers import MIN_MEMBERS, FirstMarkers
 
-SHARE = 0.4  # of the response to a typical marker
 REJECT = 4.0  # standardised deviation above which a distance is not that of two members
 CHANCE = float(erfc(REJECT / 2**0.5))  # of the same deviation
-MIN_MEMBERS = 4
 MIN_SHARE = 0.6  # of the members that are found
 BETTER = 4.0  # factor on the square sum of another way to fit as many members
 # Number of fits as good that chance gives in an exposure: one in a day at 100 exposures a second.
@@ -173,7 +171,7 @@ class _ImageSearch:
 def _shadows_of(image: FilteredImage, kind: tuple[float, int]) -> np.ndarray:
     """Places (k, 2) of shadows, whose scale and strongest ones are of a kind. Raises DataError."""
     scale, strongest = kind
-    return first_shadows(image.of_scale(scale), strongest, SHARE).strongest(MAX_SHADOWS).uv
+    return first_shadows(image.of_scale(scale), strongest).strongest(MAX_SHADOWS).uv
 
 
 def identifiable(bodies: Sequence[Body]) -> tuple[Body, ...]:

@@ -35,9 +35,9 @@ from .measurement import estimate_profile
 from .shadow_fit import Profile
 
 MARKER_SCALES = SCALES[:5]  # markers are smaller than beads
-NOISE_WEIGHT = 0.1  # of the response, in the noise that it is compared with
 MIN_CONTRAST = 0.02  # of a response, as a fraction of the light around it
 MIN_SNR = 4.5  # of a response, over the noise of the response
+SHARE = 0.35  # of the response to a typical marker, from which a shadow may be a marker
 BACKGROUND_PX = 6  # half the width of the box whose mean is the light around a pixel
 SAMPLED = 4  # rows and columns from one pixel to the next, where all are of one kind
 SAME_PX = 1.0  # between maxima that are one shadow
@@ -118,7 +118,8 @@ class FilteredLight:
     @cached_property
     def maxima(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Rows and columns (k,) of the local maxima."""
-        dilated = cv2.dilate(self.relative, np.ones((_size_of_maximum(self.scale),) * 2, np.uint8))
+        around = np.ones((2 * max(1, round(self.scale)) + 1,) * 2, np.uint8)
+        dilated = cv2.dilate(self.relative, around)
         largest = self.relative >= dilated
         largest &= self.relative > 0
         row, column = np.divmod(np.flatnonzero(largest), largest.shape[1])
@@ -127,13 +128,9 @@ class FilteredLight:
     @cached_property
     def noise(self) -> float:
         """Median response where there is any; a part of the pixels tells it."""
-        return _positive_median(self.relative_at(np.s_[::SAMPLED, ::SAMPLED]))
-
-    @cached_property
-    def noise_in_field(self) -> float:
-        """The same in the field of view."""
         part = self.relative_at(np.s_[::SAMPLED, ::SAMPLED])
-        return _positive_median(part[self.field[::SAMPLED, ::SAMPLED]])
+        positive = part[part > 0]
+        return float(np.median(positive)) if len(positive) else 0.0
 
     @cached_property
     def usual(self) -> float:
@@ -141,12 +138,6 @@ class FilteredLight:
         part = self.light[::SAMPLED, ::SAMPLED]
         field = self.field[::SAMPLED, ::SAMPLED]
         return float(np.median(part[field])) if field.any() else float(self.light.mean())
-
-
-def _positive_median(values: NDArray[np.float32]) -> float:
-    """Median of the positive values, 0 without any."""
-    positive = values[values > 0]
-    return float(np.median(positive)) if len(positive) else 0.0
 
 
 class FilteredImage:
@@ -250,22 +241,22 @@ def _learn_look(
     return best.look('there is nothing round where the markers should be'), best.light
 
 
-def first_shadows(lights: Iterable[FilteredLight], count: int, share: float) -> Shadows:
+def first_shadows(lights: Iterable[FilteredLight], count: int) -> Shadows:
     """Find the shadows in an image that says itself what markers look like.
 
-    lights: dark and bright ones of one size. count: of the strongest shadows, which tell the look;
-    share: of their response that is found. Raises DataError where there is nothing round.
+    lights: dark and bright ones of one size. count: of the strongest shadows, which tell the look.
+    Raises DataError where there is nothing round.
     """
     best = max((_Typical.strongest(light, count) for light in lights), key=lambda one: one.merit)
     look = best.look('there are no markers in the image, nothing round rises above the noise')
-    return _found(look, best.light, share)
+    return _found(look, best.light)
 
 
-def search_image(image: np.ndarray, look: MarkerLook, share: float) -> Shadows:
-    """Search a whole image for shadows with a share of the strength of a typical marker."""
+def search_image(image: np.ndarray, look: MarkerLook) -> Shadows:
+    """Search a whole image for shadows that may be markers."""
     grey = image.astype(np.float32)
     light = float(np.iinfo(image.dtype).max) - grey if look.inverted else grey
-    return _found(look, _filtered(light, (2 * BACKGROUND_PX + 1,) * 2, look), share)
+    return _found(look, _filtered(light, (2 * BACKGROUND_PX + 1,) * 2, look))
 
 
 def _filtered(light: NDArray[np.float32], box: tuple[int, int], look: MarkerLook) -> FilteredLight:
@@ -299,44 +290,53 @@ class _Typical:
     @property
     def merit(self) -> float:
         """How much it stands out: small scales have the strongest response to noise, too."""
-        noise = (self.light.noise or 1.0) + NOISE_WEIGHT * self.strength
-        return self.strength**2 / noise
+        return self.strength**2 / max(self.strength + self.light.noise, 1e-9)
 
     @property
     def clear(self) -> bool:
         """Whether noise does not explain it."""
-        return self.strength >= max(MIN_SNR * self.light.noise, MIN_CONTRAST)
+        return self.strength >= self.floor
+
+    @property
+    def floor(self) -> float:
+        """Response below which noise is."""
+        return max(MIN_SNR * self.light.noise, MIN_CONTRAST)
 
     def look(self, cause: str) -> MarkerLook:
         """Return what markers look like. Raises DataError with the cause where there is noise."""
         light = self.light
-        floor = max(MIN_SNR * light.noise_in_field, MIN_CONTRAST)
-        if self.strength < floor:
+        if not self.clear:
             raise DataError(cause, kind=Kind.NO_MARKERS)
         return MarkerLook(
             light.scale,
             light.inverted,
             field=light.field,
             strength=self.strength,
-            floor=floor,
+            floor=self.floor,
             light=max(light.usual, 1.0),
         )
 
 
-def _found(look: MarkerLook, light: FilteredLight, share: float) -> Shadows:
+def _found(look: MarkerLook, light: FilteredLight) -> Shadows:
     """Find the shadows of a whole filtered image."""
     row, column = light.maxima
     height, width = light.light.shape
-    strong = light.relative[row, column] > max(share * look.strength, look.floor)
+    strong = light.relative[row, column] > max(SHARE * look.strength, look.floor)
     inside = (row > 0) & (row < height - 1) & (column > 0) & (column < width - 1)
     rows = np.flatnonzero(strong & inside & look.field[row, column])
     row, column = row[rows], column[rows]
     clear = light.relative[row, column] >= _floor(look, light.around[row, column])
-    return _shadows_at(light.relative, row[clear], column[clear])
+    row, column = row[clear], column[clear]
+    response = light.relative
+    at = response[row, column]
+    # To a part of a pixel.
+    u = column + vertex(response[row, column - 1], at, response[row, column + 1])
+    v = row + vertex(response[row - 1, column], at, response[row + 1, column])
+    return Shadows(np.column_stack([u, v]), at)
 
 
 def search_windows(
-    windows: LightWindows, middle: NDArray[np.int64], half: int, look: MarkerLook, share: float
+    windows: LightWindows, middle: NDArray[np.int64], half: int, look: MarkerLook
 ) -> Shadows:
     """Search windows of 2 half + 1 px around pixels middle (n, 2), each shadow found once."""
     border = int(np.ceil(BORDER * look.scale))
@@ -347,7 +347,7 @@ def search_windows(
     searched = np.zeros((len(middle), size, size), dtype=bool)
     inner = np.s_[:, border:-border, border:-border]
     searched[inner] = valid.reshape(searched.shape)[inner]
-    found = _found(replace(look, field=searched.reshape(-1, size)), light, share)
+    found = _found(replace(look, field=searched.reshape(-1, size)), light)
     number = (found.uv[:, 1] + 0.5).astype(int) // size
     place = found.uv.copy()
     place[:, 1] -= number * size
@@ -367,25 +367,6 @@ def _floor(look: MarkerLook, around: NDArray[np.floating]) -> NDArray[np.floatin
     """Relative response below which noise is, by the light around: it grows in the dark."""
     light = np.maximum(around, 1e-3 * look.light)
     return np.asarray(look.floor * np.sqrt(np.maximum(look.light / light, 1.0)))
-
-
-def _size_of_maximum(scale: float) -> int:
-    """Width of the square in which a shadow is the strongest [px]."""
-    return 2 * max(1, round(scale)) + 1
-
-
-def _shadows_at(
-    response: NDArray[np.float32], row: NDArray[np.int64], column: NDArray[np.int64]
-) -> Shadows:
-    """Shadows at local maxima of a response (h, w), to a part of a pixel."""
-    at = response[row, column]
-    uv = np.column_stack(
-        [
-            column + vertex(response[row, column - 1], at, response[row, column + 1]),
-            row + vertex(response[row - 1, column], at, response[row + 1, column]),
-        ]
-    )
-    return Shadows(uv, at)
 
 
 MIN_DENSITY = 2e-6  # of false shadows [1/px^2]
@@ -419,7 +400,7 @@ def learn_start(image: FilteredImage, target_id: NDArray[np.int64], uv: np.ndarr
         bad = int(target_id[known][~inside][0])
         raise DataError(f'marker {bad} of the first frame lies outside of the image')
     look, filtered = _learn_look(image, given)
-    found = _found(look, filtered, SHARE)
+    found = _found(look, filtered)
     row, column = assign(given, np.full(len(given), GIVEN_SD_PX**2), found.uv, GIVEN_GATE)
     if len(row) < max(1, len(given) // 2):
         raise DataError(
@@ -443,7 +424,6 @@ def learn_start(image: FilteredImage, target_id: NDArray[np.int64], uv: np.ndarr
     )
 
 
-SHARE = 0.35  # of the response to a typical marker, from which a shadow may be a marker
 MAX_HALF = 48  # of a search window [px]
 STRIPS = 6  # of an image that is searched in turn: a whole one takes as long as five exposures
 
@@ -467,7 +447,7 @@ class MarkerSearch:
 
     def everywhere(self, image: np.ndarray) -> Shadows:
         """Find the shadows of a whole image."""
-        return search_image(image, self._look, SHARE)
+        return search_image(image, self._look)
 
     def lost(self, states: MarkerStates) -> NDArray[np.bool_]:
         """Return (n,) whether markers are searched in the whole image."""
@@ -491,7 +471,7 @@ class MarkerSearch:
         for rows in (near & (half <= small), near & (half > small)):
             if rows.any():
                 size = int(half[rows].max())
-                parts.append(search_windows(windows, middle[rows], size, self._look, SHARE))
+                parts.append(search_windows(windows, middle[rows], size, self._look))
         if len(parts) == 1:
             return parts[0]
         uv = np.concatenate([np.zeros((0, 2)), *(part.uv for part in parts)])
@@ -506,7 +486,7 @@ class MarkerSearch:
         first = max(top - margin, 0)
         seen = slice(first, min(bottom + margin, height))
         look = replace(self._look, field=self._look.field[seen])
-        found = search_image(image[seen], look, SHARE)
+        found = search_image(image[seen], look)
         uv = found.uv + [0, first]
         inside = (uv[:, 1] >= top - 0.5) & (uv[:, 1] < bottom - 0.5)
         return Shadows(uv[inside], found.strength[inside])

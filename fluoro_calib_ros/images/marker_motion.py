@@ -34,7 +34,6 @@ MODEL_SD_PX = 0.05  # of a place, beyond the noise of the measurement
 FAR = 1e6
 VOTE_PX = 2.0  # from a shadow, within which a marker votes for a shift
 MIN_VOTES = 1.5
-MIN_VOTE_SHARE = 0.3
 
 
 @dataclass
@@ -262,7 +261,7 @@ def common_shift(
     close = np.minimum(there.reshape(len(near), -1) / VOTE_PX, 1.0)
     score = (1 - close**2).sum(axis=1) - 0.5 * np.linalg.norm(shift, axis=1) / reach_px
     best = int(np.argmax(score))
-    if score[best] < max(MIN_VOTES, MIN_VOTE_SHARE * len(beside)):
+    if score[best] < MIN_VOTES:
         return None
     return np.asarray(shift[best])
 

@@ -26,8 +26,9 @@ from .marker_motion import (
 )
 
 FALSE_SHADOWS = 0.02  # expected in the gate, from which a marker found again is doubtful
-MERGED_PX = 5.0  # between predictions, within which two markers are one shadow
-MERGED_FRAMES = 6  # for which neither of them is measured; then one is, with a doubt
+# Between predictions, within which two markers are one shadow. Neither of them is measured, until
+# one is lost; then the other one is, with a doubt.
+MERGED_PX = 5.0
 
 
 class MarkerWatch:
@@ -42,6 +43,8 @@ class MarkerWatch:
         Distance from its prediction within which a marker is looked for [standard deviations].
     margin : float
         Difference of twice the log likelihood below which two ids may have been exchanged.
+    lost_after : int
+        Images without a marker after which it is lost.
     density : float
         Of false shadows [1/px^2].
     """
@@ -53,6 +56,7 @@ class MarkerWatch:
         *,
         gate: float,
         margin: float,
+        lost_after: int,
         density: float,
     ) -> None:
         self._target_id = target_id
@@ -60,6 +64,7 @@ class MarkerWatch:
         self._company = MarkerCompany(len(target_id))
         self._gate = gate
         self._margin = margin
+        self._lost_after = lost_after
         self._density = density
 
     def shadows_met(
@@ -90,7 +95,7 @@ class MarkerWatch:
             else:
                 if not (both_settled or distance < MERGED_PX):
                     continue
-                if max(states.unseen[one], states.unseen[two]) <= MERGED_FRAMES:
+                if max(states.unseen[one], states.unseen[two]) <= self._lost_after:
                     measured[one] = measured[two] = False
                     continue
             if two not in self._doubts.partners(one):

@@ -138,7 +138,7 @@ class MarkerFrame:
         return '' if self.finding is None else self.finding.cause
 
 
-MIN_SUGGESTED = 4  # markers that are suggested in an image with which following begins
+MIN_MEMBERS = 4  # of a body, that tell ids; following begins with as many that are suggested
 
 
 def _inside(uv: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.bool_]:
@@ -151,26 +151,6 @@ def _filtered(image: np.ndarray, first: FirstMarkers | None) -> FilteredImage:
     if first is None or first.filtered is None or first.filtered.image is not image:
         return FilteredImage(image)
     return first.filtered
-
-
-def _none_seen(
-    frame: int, target_id: NDArray[np.int64], finding: Finding, seconds: float
-) -> MarkerFrame:
-    """Return an image in which no marker was ever seen."""
-    count = len(target_id)
-    return MarkerFrame(
-        frame,
-        target_id[:0],
-        uv=np.zeros((0, 2)),
-        sigma=np.zeros(0),
-        overlapped=np.zeros(0, dtype=bool),
-        doubtful=np.zeros(0, dtype=bool),
-        missing=target_id,
-        predicted=np.full((count, 2), np.nan),
-        lost=np.ones(count, dtype=bool),
-        finding=finding,
-        seconds=seconds,
-    )
 
 
 @dataclass(frozen=True)
@@ -211,6 +191,7 @@ class _Followed:
                 doubts,
                 gate=options.gate,
                 margin=options.margin,
+                lost_after=options.lost_after,
                 density=start.density,
             ),
         )
@@ -268,19 +249,16 @@ class MarkerTracker:
             if image is None:
                 raise DataError('there is no image')
             check_image(image, None if followed is None else followed.size)
-            if followed is None:
-                self._followed = self._start(image, frame)
+            start = self._start(image, frame) if followed is None else None
         except DataError as error:
-            if followed is None:
-                return self._not_begun(frame, error, begin)
+            if followed is None and self.first is not None:
+                raise
             self._advance(frame)
             self._given = []
             nothing = MeasuredMarkers.nothing(len(self.target_id))
             return self._result(nothing, (), error.finding, begin)
-        if followed is None:
-            self._frame = frame
-        else:
-            self._advance(frame)
+        self._advance(frame)
+        self._followed = start or followed
         given = self._place_given()
         found, doubts = self._measure(image, frame)
         doubts = self._believe(given, found, doubts)
@@ -397,28 +375,21 @@ class MarkerTracker:
         for rows, uv, _, sd in self._suggested:
             near = _inside(uv, shape) & (sd < GIVEN_SD_PX)
             places[rows[near]] = uv[near]
-        if np.isfinite(places[:, 0]).sum() < MIN_SUGGESTED or frame < self._tried:
+        if np.isfinite(places[:, 0]).sum() < MIN_MEMBERS or frame < self._tried:
             raise DataError('no marker is seen', kind=Kind.NO_MARKERS)
         self._tried = frame + self.options.search_every
         return places
 
-    def _not_begun(self, frame: int, error: DataError, begin: float) -> MarkerFrame:
-        """Return an image without markers, or raise the error where the first ones are given."""
-        if self.first is not None:
-            raise error
-        self._suggested = []
-        seconds = time.perf_counter() - begin
-        return _none_seen(frame, self.target_id, error.finding, seconds)
-
     def _advance(self, frame: int) -> None:
-        """Predict all markers for an image."""
-        states = self._known().states
-        self._gap = frame - self._frame
+        """Predict all markers that are followed for an image."""
+        if self._followed is not None:
+            states = self._followed.states
+            self._gap = frame - self._frame
+            self._images += 1
+            states.advance(self._gap, self._led)
+            for suggested in self._suggested:
+                states.motion.place(*suggested)
         self._frame = frame
-        self._images += 1
-        states.advance(self._gap, self._led)
-        for suggested in self._suggested:
-            states.motion.place(*suggested)
         self._suggested = []
 
     def _place_given(self) -> NDArray[np.int64]:
@@ -475,20 +446,27 @@ class MarkerTracker:
         begin: float,
     ) -> MarkerFrame:
         """Return the markers of the present image."""
-        followed = self._known()
+        followed = self._followed
         measured = found.measured
         missing = ~measured
-        predicted = followed.states.motion.uv[missing]
+        doubtful = np.zeros(len(measured), dtype=bool)
+        predicted = np.full((len(measured), 2), np.nan)
+        lost = ~doubtful
+        if followed is not None:
+            doubtful = followed.doubts.doubtful
+            uv = followed.states.motion.uv
+            predicted = np.where(uv > NOWHERE_PX / 2, uv, np.nan)
+            lost = followed.search.lost(followed.states)
         return MarkerFrame(
             self._frame,
             self.target_id[measured],
             uv=found.uv[measured],
             sigma=found.sigma[measured],
             overlapped=found.overlapped[measured],
-            doubtful=followed.doubts.doubtful[measured],
+            doubtful=doubtful[measured],
             missing=self.target_id[missing],
-            predicted=np.where(predicted > NOWHERE_PX / 2, predicted, np.nan),
-            lost=followed.search.lost(followed.states)[missing],
+            predicted=predicted[missing],
+            lost=lost[missing],
             doubts=doubts,
             finding=finding,
             seconds=time.perf_counter() - begin,

@@ -609,7 +609,7 @@ def image_search(monkeypatch, outcomes):
         lambda image: Fake(of_scale=lambda scale: filtered.append((image, scale)) or image),
     )
 
-    def first_shadows(lights, count, share):
+    def first_shadows(lights, count):
         if outcomes[0] == 'blind':
             outcomes.pop(0)
             raise DataError('nothing round')

@@ -428,7 +428,8 @@ def watched(found_uv, free=(), measured=None, unseen=0, variance=0.1, speed_sd=0
     motion = moving(uv, np.zeros(2), np.sqrt(variance), speed_sd)
     states = MarkerStates.start(motion, np.full(4, unseen))
     doubts = MarkerDoubts(4)
-    watch = MarkerWatch(IDS, doubts, **{'gate': 4.5, 'margin': 14.0, 'density': 1e-5, **changes})
+    usual = {'gate': 4.5, 'margin': 14.0, 'lost_after': 6, 'density': 1e-5}
+    watch = MarkerWatch(IDS, doubts, **{**usual, **changes})
     found = Fake(
         uv=np.array(found_uv, dtype=float),
         free=np.array(free, dtype=float).reshape(-1, 2),
@@ -564,8 +565,6 @@ def test_ways_are_compared_over_images_and_begin_anew():
         ({'depth': 2.89}, False),
         ({'off': 3.2}, True),  # 5.5 deviations of 0.1 x 2 + 0.15 + 0.05^2 px^2
         ({'off': 3.3}, False),
-        ({'beside': 1.0}, False),  # 0.35 of a radius of 3 px: 1.05
-        ({'beside': 1.1}, True),
     ],
 )
 def test_fitted_shadows_are_those_of_markers_within_their_limits(changes, good):
@@ -573,9 +572,6 @@ def test_fitted_shadows_are_those_of_markers_within_their_limits(changes, good):
     states.depth[:] = 1.6
     uv = PLACES[[2, 0]].copy()
     uv[0] += [0, changes.get('off', 0.0)]
-    if 'beside' in changes:
-        uv[1] = uv[0] + [changes['beside'], 0]
-        states.motion.uv[0] = uv[1]
     beads = Beads(
         uv,
         np.array([changes.get('sigma', np.sqrt(0.04)), 0.1]),
@@ -585,7 +581,7 @@ def test_fitted_shadows_are_those_of_markers_within_their_limits(changes, good):
         np.zeros(2, bool),
         np.array([changes.get('measured', True), True]),
     )
-    measurement = MarkerMeasurement(Fake(radius_px=3.0), None, gate=4.5, shutter=0.5)
+    measurement = MarkerMeasurement(None, None, gate=4.5, shutter=0.5)
     found = measurement._acceptable(beads, np.array([2, 0]), states)
     assert bool(found[0]) is good
 

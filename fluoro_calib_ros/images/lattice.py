@@ -27,7 +27,7 @@ from .growth import Match, Seen, settle
 from .view import Lens, View, fit_view
 
 FLAT = 0.02  # thickness over the extent of a phantom that counts as flat
-REACH = 0.3  # of the spacing, within which a bead lies at its place in the lattice
+REACH = 0.3  # of the distance between neighbours, within which a bead lies at its place
 MIN_ANGLE = np.deg2rad(35.0)  # between the steps of a lattice, also in an oblique view
 STARTS = 8  # beads from which the numbering is tried
 MIN_NUMBERED = 0.6  # share of the beads that a numbering must reach

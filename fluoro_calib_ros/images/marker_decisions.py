@@ -200,9 +200,8 @@ class EarlierImages:
 DECIDED = 3  # exposures that agree before an id is confirmed, or disagree before it is wrong
 NEAR_PX = 1.0  # from where its body says, that a marker is; or so many
 NEAR_SIGMAS = 3.5
-# Times that, from which it may be something else: chance exceeds 4.5 standard deviations in one of
-# 25,000 places.
-FAR = 4.5 / NEAR_SIGMAS
+FAR = 1.5  # times that, from which it is something else
+DOUBT_SIGMAS = 4.5  # from which it may be: chance exceeds them in one of 25,000 places
 
 
 class BodyDecisions:
@@ -237,7 +236,8 @@ class BodyDecisions:
         wrong |= contradicted
         self._seen_right[right] = frame
         view.counts.disagree(wrong)
-        view.doubt(np.flatnonzero(wrong & ~doubtful), frame)
+        strange = wrong | (away > np.maximum(NEAR_PX, DOUBT_SIGMAS * scatter))
+        view.doubt(np.flatnonzero(strange & ~doubtful), frame)
         suspects = np.flatnonzero(np.isfinite(away) & (doubtful | (view.counts.wrong > 0)))
         crossed = _crossed(seen, place, near, suspects)
         out = [self._exchange(rows, frame) for rows in crossed]

@@ -36,21 +36,16 @@ from .marker_intensity import (
     first_shadows,
 )
 from .marker_points import CalibratedRig, ShadowPoints, all_among, shadow_points
-from .marker_rays import project_observed
+from .marker_rays import AGREE, project_observed
 from .markers import MIN_MEMBERS, FirstMarkers
 
-REJECT = 4.0  # standardised deviation above which a distance is not that of two members
-CHANCE = float(erfc(REJECT / 2**0.5))  # of the same deviation
+CHANCE = float(erfc(AGREE / 2**0.5))  # of a distance between two members that does not agree
 MIN_SHARE = 0.6  # of the members that are found
 BETTER = 4.0  # factor on the square sum of another way to fit as many members
 # Number of fits as good that chance gives in an exposure: one in a day at 100 exposures a second.
 MAX_CHANCE = 1e-7
 MAX_SHADOWS = 120
 MAX_STEPS = 200_000  # of the search
-# Choices of points that are judged together, in about the time of one: an eighth of those before,
-# for what fits ends the search for fewer members, and at most 64.
-PART_AT_ONCE = 8
-MAX_AT_ONCE = 64
 
 
 @dataclass(frozen=True)
@@ -273,7 +268,7 @@ class _Search:
         # Whether two points may be two members: (member, member, point, point).
         self.may_be = [
             [
-                (given - distance) ** 2 < REJECT**2 * (variance + one**2 + other**2)
+                (given - distance) ** 2 < AGREE**2 * (variance + one**2 + other**2)
                 for distance, other in zip(of_member, body.sd_mm)
             ]
             for of_member, one in zip(wanted, body.sd_mm)
@@ -303,7 +298,8 @@ class _Search:
             return
         if member == size:
             self.choices.append(self.point.copy())
-            if len(self.choices) >= min(1 + self.judged // PART_AT_ONCE, MAX_AT_ONCE):
+            # Many are judged in the time of one, but what fits ends the search for fewer members.
+            if len(self.choices) > self.judged:
                 self._judge()
             return
         fits = free.copy()

@@ -22,11 +22,9 @@ from scipy.spatial import cKDTree
 from .shadow_fit import DEPTH_SD
 
 FIRST_SPEED_PX = 6.0  # standard deviation of the unknown first velocity [px a frame]
-FIRST_ACCELERATION_PX = 0.5
-MIN_ACCELERATION_PX = 0.05  # px a squared frame
 FORGET = 0.9  # share that a running mean keeps of what was before
 COMPARED = 5  # images before the motion of two markers is known to be alike
-STRANGE_PX = 0.4  # difference of velocities that is not strange [px a frame]
+UNSTEADY_PX = 0.4  # by which velocities usually change in a frame, and differ [px a frame]
 LEADERS = 4  # markers whose motion another one follows
 LED = 0.5  # share of the acceleration that they do not explain
 MAX_SD_PX = 60.0  # of a prediction
@@ -54,7 +52,7 @@ class Motion:
         covariance = np.zeros((n, 2, 2))
         covariance[:, 0, 0] = sd_px**2
         covariance[:, 1, 1] = FIRST_SPEED_PX**2
-        squared = np.full(n, FIRST_ACCELERATION_PX**2)
+        squared = np.full(n, UNSTEADY_PX**2)
         unlike = np.full((n, n), FIRST_SPEED_PX**2)
         np.fill_diagonal(unlike, np.inf)
         together = np.zeros((n, n), dtype=int)
@@ -80,9 +78,9 @@ class Motion:
         t = float(frames)
         self.uv += t * self.velocity
         pooled = float(np.median(self.squared)) if len(self.squared) else 0.0
-        q = np.maximum(np.maximum(self.squared, pooled), MIN_ACCELERATION_PX**2)
+        q = np.maximum(self.squared, pooled)
         if led is not None:
-            q = np.where(led, LED**2 * pooled + MIN_ACCELERATION_PX**2, q)
+            q = np.where(led, LED**2 * pooled, q)
         p = self.covariance
         cross = p[:, 0, 1] + t * p[:, 1, 1]
         p[:, 0, 0] += t * (p[:, 0, 1] + cross) + q * t**4 / 4
@@ -173,7 +171,7 @@ class Motion:
         usual = np.take_along_axis(unlike, order, axis=1).mean(axis=1)
         others = np.median(self.velocity[rows][order], axis=1)
         squared = ((self.velocity[rows] - others) ** 2).sum(axis=1)
-        return rows, squared / (usual + STRANGE_PX**2), others
+        return rows, squared / (usual + UNSTEADY_PX**2), others
 
     def place(
         self,

@@ -25,7 +25,7 @@ from ..reconstruction.intersection import (
 from ..reconstruction.reconstruct import IntersectedViews, MatchedViews
 from .markers import MarkerFrame
 
-AGREE = 4.0  # standardised lack of fit up to which rays belong together
+AGREE = 4.0  # standardised deviation up to which rays, or members of a body, belong together
 SYSTEMATIC_PX = 0.1  # of a corrected image point, beyond its standard deviation
 
 
@@ -290,7 +290,6 @@ def project_observed(
 
 
 RIGID_MM = 0.1  # what a marker may move in its body, a standard deviation
-RIGID_SIGMAS = 5.0
 MIN_MEMBERS = 3  # of a body that give its pose
 # Share of the markers of a body that are seen again. Where there are fewer, something has moved
 # the body elsewhere, and what is seen may be anything.
@@ -436,7 +435,7 @@ class MarkerBodies:
         if self._tracker is None:
             return
         away = np.linalg.norm(exposure.xyz_mm - self.present.xyz_mm, axis=1)
-        use = sure & ~(away >= RIGID_SIGMAS * RIGID_MM)
+        use = sure & ~(away >= AGREE * RIGID_MM)
         changed = False
         for number, rows in enumerate(self._rows):
             known = self._bodies[number].known

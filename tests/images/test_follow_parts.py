@@ -183,7 +183,7 @@ def test_a_prediction_is_that_of_a_white_acceleration():
     led.squared[:] = [0.2, 0.6]
     led.predict(1, np.array([True, False]))
     told = led.covariance[:, 1, 1] - 0.01
-    np.testing.assert_allclose(told, [0.25 * 0.4 + 0.05**2, 0.6])
+    np.testing.assert_allclose(told, [0.25 * 0.4, 0.6])
     led.covariance[0, 0, 0] = 1e5
     led.predict(1)
     assert led.covariance[0, 0, 0] == pytest.approx(3600.0)
@@ -410,7 +410,7 @@ def test_extent_of_a_phantom_does_not_depend_on_its_origin():
 def test_a_pose_of_a_grid_could_be_by_what_speaks_against_it(against, could):
     best = GridPose(None, 10, 110)
     log_odds = np.log(110 / 11)
-    assert bool((against - 10) * log_odds < matching.GRID_MARGIN) is could
+    assert bool((against - 10) * log_odds < matching.LIKELIER) is could
     assert matching._could_be(GridPose(None, against, 110), best) is could
 
 
@@ -519,12 +519,12 @@ def test_a_known_shape_is_not_learned_and_markers_off_their_place_are_not_used(m
     bodies.learn(seen_at(xyz), every)
     assert not learned
     bodies, learned, _ = bodies_that_learn(monkeypatch, [True, True, True, False])
-    for off, use in ((0.49, True), (0.51, False)):
+    for off, use in ((0.39, True), (0.41, False)):
         bodies.present = replace(bodies.present, xyz_mm=xyz + [0, 0, off] * np.eye(5)[1][:, None])
         del learned[:]
         bodies._seen[0].clear()
         bodies.learn(seen_at(xyz), every)
-        assert bool(np.isfinite(learned[0][0][0, 0]).all()) is use  # five times 0.1 mm
+        assert bool(np.isfinite(learned[0][0][0, 0]).all()) is use  # four times 0.1 mm
 
 
 def test_bodies_are_lost_whose_pose_is_not_known(monkeypatch):
@@ -713,7 +713,7 @@ def test_poses_are_compared_by_the_sizes_of_the_beads_that_all_of_them_have(monk
 
     monkeypatch.setattr(matching, '_likelihood_of_sizes', likelihood)
     model = PhantomModel.of(xyz, diameter)
-    values[:] = [5.0, 5.0 + matching.SIZE_MARGIN]
+    values[:] = [5.0, 5.0 + matching.LIKELIER]
     assert matching._best_by_size(matches, seen, model) is matches[1]
     for one, (size, response, uv) in zip(matches, asked):
         bead, detection = one.bead[:12], one.detection[:12]
@@ -721,7 +721,7 @@ def test_poses_are_compared_by_the_sizes_of_the_beads_that_all_of_them_have(monk
         expected = np.log(np.maximum(seen.strength[detection], 1e-3))
         np.testing.assert_allclose(response, expected)
         assert uv.tolist() == seen.uv[detection].tolist()
-    values[:] = [5.0, 4.9 + matching.SIZE_MARGIN]
+    values[:] = [5.0, 4.9 + matching.LIKELIER]
     assert matching._best_by_size(matches, seen, model) is None  # none stands out
     values[:] = [99.0, 5.0]
     assert matching._best_by_size(matches, seen, model) is matches[0]

@@ -214,7 +214,7 @@ def test_covered_cells_are_green_where_they_are(size):
 
     assert at(0.2, 0.1) == overlay.COVERED and at(0.8, 0.1) == overlay.MISSING
     assert at(0.2, 0.9) == overlay.MISSING and at(0.8, 0.9) == overlay.COVERED
-    assert colours_at(picture, 160, 3) == overlay.LINES == colours_at(picture, 320, 3)
+    assert colours_at(picture, 160, 3) == overlay.TEXT == colours_at(picture, 320, 3)
     assert colours_at(picture, 3, rows // 3) == colours_at(picture, 3, 2 * rows // 3)
     framed = (picture[:rows] == overlay.NEXT).all(axis=2)
     v, u = np.nonzero(framed)

@@ -25,9 +25,8 @@ from fluoro_calib_ros.images.lattice import _basis
 from fluoro_calib_ros.images.marker_motion import (
     FIRST_SPEED_PX,
     MAX_SD_PX,
-    MIN_ACCELERATION_PX,
     MODEL_SD_PX,
-    STRANGE_PX,
+    UNSTEADY_PX,
     MarkerStates,
     MeasuredMarkers,
     Motion,
@@ -250,7 +249,7 @@ def test_prediction_adds_velocity_and_acceleration():
     still = motion()
     still.squared[:] = 0
     still.predict(1)
-    assert still.variance[0] == pytest.approx(1 + 0.01 + MIN_ACCELERATION_PX**2 / 4)
+    assert still.variance[0] == pytest.approx(1 + 0.01)
     for _ in range(99):
         one.predict(5)
     assert one.variance.max() == pytest.approx(MAX_SD_PX**2)
@@ -368,7 +367,7 @@ def test_marker_that_leaves_its_body_is_strange():
     assert rows.tolist() == [k for k in range(12) if k != 7]
     np.testing.assert_allclose(others, np.where(rows[:, None] % 2, [8.0, 0.0], [0.0, 3.0]))
     usual = np.zeros(11)
-    np.testing.assert_allclose(ratio[rows == 3], 36 / STRANGE_PX**2)
+    np.testing.assert_allclose(ratio[rows == 3], 36 / UNSTEADY_PX**2)
     np.testing.assert_allclose(ratio[rows != 3], usual[rows != 3], atol=1e-12)
     assert not len(one.strangeness(np.arange(12) < 4)[0])
     # Those that were compared in few images tell nothing.

@@ -148,8 +148,8 @@ def test_an_id_is_dropped_after_three_exposures_elsewhere(began):
 @pytest.mark.parametrize(
     ('off', 'sd', 'sigma', 'is_doubted'),
     [
-        (1.28, 0.0, 0.0, False),  # 4.5 / 3.5 times a pixel
-        (1.29, 0.0, 0.0, True),
+        (0.99, 0.0, 0.0, False),
+        (1.01, 0.0, 0.0, True),
         (2.24, 0.3, 0.4, False),  # 4.5 deviations of both
         (2.26, 0.3, 0.4, True),
         (np.nan, 0.0, 0.0, False),
@@ -171,12 +171,12 @@ def test_a_place_that_chance_does_not_explain_is_doubted_at_once(off, sd, sigma,
     [
         (0.99, 0.0, 0.0, ['confirmed']),
         (1.01, 0.0, 0.0, []),
-        (1.28, 0.0, 0.0, []),
-        (1.29, 0.0, 0.0, ['dropped']),
+        (1.49, 0.0, 0.0, []),
+        (1.51, 0.0, 0.0, ['dropped']),
         (1.74, 0.3, 0.4, ['confirmed']),  # 3.5 deviations of both
         (1.76, 0.3, 0.4, []),
-        (2.24, 0.3, 0.4, []),
-        (2.26, 0.3, 0.4, ['dropped']),
+        (2.62, 0.3, 0.4, []),
+        (2.63, 0.3, 0.4, ['dropped']),
         (np.nan, 0.0, 0.0, []),
     ],
 )
@@ -189,7 +189,7 @@ def test_a_marker_is_in_its_place_within_a_pixel_or_its_deviations(off, sd, sigm
 
 
 def test_an_id_stays_doubtful_where_another_could_be_as_well():
-    for apart, kinds in ((1.2, []), (1.4, ['confirmed'])):
+    for apart, kinds in ((1.4, []), (1.6, ['confirmed'])):
         place = PLACES.copy()
         place[1] = PLACES[0] + [0, apart]
         one = view()
@@ -227,7 +227,7 @@ def test_pairs_have_crossed_where_both_are_where_the_other_should_be(off, pairs)
     assert _crossed(seen, PLACES, np.ones(4), np.array([2, 0])) == [one[::-1] for one in pairs]
 
 
-@pytest.mark.parametrize(('apart', 'is_pair'), [(1.2, False), (1.4, True)])
+@pytest.mark.parametrize(('apart', 'is_pair'), [(1.4, False), (1.6, True)])
 def test_markers_beside_each_other_have_crossed_only_if_they_are_apart(apart, is_pair):
     place = PLACES.copy()
     place[1] = place[0] + [apart, 0]

@@ -127,13 +127,13 @@ def test_what_is_near_a_bead_is_marked():
 
 @pytest.mark.parametrize('neighbours', [(2, 4), (4, 2)])
 def test_a_search_is_sure_where_all_neighbours_are_a_bead_s_own(monkeypatch, neighbours):
-    monkeypatch.setattr(pose_search, 'FOUND', 1.1)
+    monkeypatch.setattr(pose_search, 'MIN_FOUND', 1.1)
     five = 50 * np.array([(0, 0, 0), (1, 0, 0), (0, 1.1, 0), (0, 0, 1.2), (1, 1.3, 1)])
     chance = _chances(five, 1.0, 1e-3, neighbours)
     np.testing.assert_array_equal(chance, np.ones(pose_search.VIEWS))
     # One of 2^10 is less than one of a thousand.
     assert enough_seeds(five, 5, 1e-3, neighbours) == 5
-    monkeypatch.setattr(pose_search, 'SEEN', 1.0)
+    monkeypatch.setattr(pose_search, 'MIN_EXPLAINED', 1.0)
     assert enough_seeds(five, 50, 1e-3, neighbours) == 10
     assert not len(_chances(five[:3], 1.0, 1e-3, neighbours))
     (once, *_), (half, *_) = (_chances(BEADS, share, 1e-3, (23, 6)) for share in (1.0, 0.5))
@@ -496,7 +496,7 @@ def test_support_is_the_share_of_the_nearest_beads_in_space(count):
     good = rng.random(count) < 0.5
     near = np.argsort(np.linalg.norm(xyz[:, None] - xyz[None], axis=2), axis=1)[:, 1:]
     share = good[near[:, : growth.SUPPORT]].mean(axis=1)
-    assert supported(xyz, good).tolist() == (share >= growth.MIN_SUPPORT).tolist()
+    assert supported(xyz, good).tolist() == (share >= growth.MIN_SHARE).tolist()
     assert 0 < supported(xyz, good).mean() < 1 or count < 40
 
 

@@ -45,6 +45,7 @@ SETTINGS = FitSettings(
     crossed=1.2,
 )
 STEPS_ALONE = 2
+CONVERGED_PX = 0.1  # a longer last step is followed by another one
 WAY_PX = 2.0  # of the largest motion, for each further point along the way
 
 
@@ -125,6 +126,7 @@ class _MarkerFit(ShadowFit):
 
     def run(self) -> None:
         """Take Gauss-Newton steps; the last one gives standard deviations as well."""
+        moved = np.zeros(len(self.uv))
         for step in range(self.settings.steps):
             if step in self.settings.crossing_steps and len(self.crowded):
                 self._cross()
@@ -133,10 +135,22 @@ class _MarkerFit(ShadowFit):
                 if alone and step >= STEPS_ALONE:
                     continue
                 final = step == (STEPS_ALONE if alone else self.settings.steps) - 1
-                uv, depth, background = self._step(rows, near, final)
-                self.uv[rows] = uv
-                self.depth[rows] = depth
-                self.background[rows] = background
+                moved[rows] = self._take_step(rows, near, final)
+        for rows, near in self.groups:
+            again = moved[rows] > CONVERGED_PX
+            if again.any():
+                self._take_step(rows[again], near[again], True)
+
+    def _take_step(
+        self, rows: NDArray[np.int64], near: NDArray[np.int64], final: bool
+    ) -> NDArray[np.float64]:
+        """Take a step of some markers; return how far (g,) their centres move [px]."""
+        uv, depth, background = self._step(rows, near, final)
+        moved = np.abs(uv - self.uv[rows]).max(axis=1)
+        self.uv[rows] = uv
+        self.depth[rows] = depth
+        self.background[rows] = background
+        return np.asarray(moved)
 
     def _shadow(
         self, rows: NDArray[np.int64], middle: NDArray[np.int64]

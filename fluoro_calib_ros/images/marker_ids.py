@@ -35,8 +35,8 @@ from .marker_intensity import (
     check_image,
     first_shadows,
 )
-from .marker_points import CalibratedRig, ShadowPoints, all_among, shadow_points
-from .marker_rays import AGREE, project_observed
+from .marker_points import ShadowPoints, all_among, shadow_points
+from .marker_rays import AGREE, CalibratedRig
 from .markers import MIN_MEMBERS, FirstMarkers
 
 CHANCE = float(erfc(AGREE / 2**0.5))  # of a distance between two members that does not agree
@@ -355,7 +355,6 @@ def _first(
 ) -> FirstMarkers | None:
     """Return the markers of a view with these shadows, None where it sees none of the bodies."""
     name = rig.orientation.fluoroscopes[view]
-    calibration = rig.calibrations[name]
     ids = [np.zeros(0, dtype=np.int64)]
     places = [np.zeros((0, 2))]
     for body, fit in fits:
@@ -366,9 +365,9 @@ def _first(
             continue
         rotation, shift = fitted_pose(body.xyz_mm[chosen], points.xyz[fit.point[chosen]])
         members = body.xyz_mm @ rotation.T + shift
-        place = project_observed(rig.orientation, view, calibration, members, rig.angles.get(name))
+        place = rig.project(view, members)
         place[np.flatnonzero(chosen)[seen]] = shadows[shadow[seen]]
-        width, height = calibration.image_size
+        width, height = rig.calibrations[name].image_size
         inside = ((place > 0) & (place < np.array([width - 1, height - 1]))).all(axis=1)
         ids.append(np.asarray(body.target_id)[inside])
         places.append(place[inside])

@@ -24,14 +24,15 @@ from .shadow_fit import DEPTH_SD
 FIRST_SPEED_PX = 6.0  # standard deviation of the unknown first velocity [px a frame]
 FORGET = 0.9  # share that a running mean keeps of what was before
 COMPARED = 5  # images before the motion of two markers is known to be alike
-UNSTEADY_PX = 0.4  # by which velocities usually change in a frame, and differ [px a frame]
+UNSTEADY_PX = 0.5  # by which velocities usually change in a frame, and differ [px a frame]
 LEADERS = 4  # markers whose motion another one follows
 LED = 0.5  # share of the acceleration that they do not explain
 MAX_SD_PX = 60.0  # of a prediction
 MODEL_SD_PX = 0.05  # of a place, beyond the noise of the measurement
+SHADOW_SD_PX = 0.25  # of the place of a shadow before it is measured
+GIVEN_SD_PX = 1.5  # of a place that is given, or told by markers beside
 FAR = 1e6
-VOTE_PX = 2.0  # from a shadow, within which a marker votes for a shift
-MIN_VOTES = 1.5
+MIN_VOTES = 1.5  # for a shift of markers together
 
 
 @dataclass
@@ -256,7 +257,7 @@ def common_shift(
         return None
     shift = found.data[near] - uv[row]
     there = found.query((uv[beside][None] + shift[:, None]).reshape(-1, 2))[0]
-    close = np.minimum(there.reshape(len(near), -1) / VOTE_PX, 1.0)
+    close = np.minimum(there.reshape(len(near), -1) / GIVEN_SD_PX, 1.0)
     score = (1 - close**2).sum(axis=1) - 0.5 * np.linalg.norm(shift, axis=1) / reach_px
     best = int(np.argmax(score))
     if score[best] < MIN_VOTES:
@@ -297,8 +298,6 @@ def doubtful_pairs(
 
 # What is known of markers from image to image: motion, depth of the shadow, images unseen.
 
-SHADOW_SD_PX = 0.25  # of the place of a shadow before it is measured
-GIVEN_SD_PX = 1.5  # of a place that is given, or told by markers beside
 GIVEN_GATE = 3.0  # standard deviations from a given place, within which its marker is
 KNOWN_DEPTH_SD = 0.15
 RECENT = 4  # images in which a place tells the velocity

@@ -39,7 +39,6 @@ MIN_BEADS = 10
 # Shares found and explained from which a pose is accepted. Where many beads overlap, fewer are
 # found, but nothing else is seen.
 EVIDENT = ((MIN_FOUND, MIN_EXPLAINED), (0.6, 0.85))
-SETTLINGS = 6  # of a match that is nearly evident
 # The same at which the search ends.
 SURE = ((0.85, MIN_EXPLAINED), (0.75, 0.95))
 # By how much the score of the best pose must exceed that of another one: as a share of it, and in
@@ -64,7 +63,6 @@ MANY = 160
 CENTRAL = 8  # beads of the middle that are tried first
 APART = 0.6  # share of the beads, those farthest from their neighbours, that are tried next
 AGREED = 3  # matches of the same pose after which the search ends, if it is evident
-CLIMBS = 12  # from a match to a better one by a symmetry
 RIVAL_STEPS = 3
 MIN_SIZES = 0.1  # relative difference of diameters from which sizes tell beads apart
 LIKELIER = 10.0  # log-likelihood by which a pose must exceed another one
@@ -241,9 +239,7 @@ def _improved(one: Match, seen: Seen, model: PhantomModel) -> Match:
 
     Where faces are seen from the edge, a pose reaches the far side of the phantom only by and by.
     """
-    for _ in range(SETTLINGS):
-        if is_sure(one) or one.found < EVIDENT[1][0] or one.explained < MIN_EXPLAINED:
-            break
+    while not is_sure(one) and one.found >= EVIDENT[1][0] and one.explained >= MIN_EXPLAINED:
         again = settle(one.view, model.xyz, seen)
         if again is None or again.score <= one.score:
             break
@@ -353,13 +349,12 @@ def _climbed(
     On a nearly regular phantom the search finds poses that are several steps of its pattern off.
     """
     symmetries = [one for one in model.symmetries if one.turn_rad <= turn_rad]
-    for _ in range(CLIMBS):
+    while True:
         rivals = list(_alternatives(best, seen, model, symmetries))
         better = max(rivals, key=lambda one: one.score, default=best)
         if better.score <= best.score:
-            break
+            return best, rivals
         best = better
-    return best, rivals
 
 
 def _alternatives(

@@ -197,7 +197,7 @@ def test_velocities_are_compared_once_markers_were_seen_together(together, is_kn
     motion.together[:] = together
     rows, ratio, others = motion.strangeness(np.ones(6, bool))
     assert rows.tolist() == list(range(6)) and others.tolist() == [[1, 1]] * 6
-    expected = 25 / (0.09 + 0.4**2) if is_known else 0.0
+    expected = 25 / (0.09 + 0.5**2) if is_known else 0.0
     assert ratio[0] == pytest.approx(expected)
     assert len(motion.strangeness(np.arange(6) < 4)[0]) == 0  # four have no four others
 

@@ -29,8 +29,7 @@ from fluoro_calib_ros.images.codec import encode
 from fluoro_calib_ros.images.marker_decisions import Decision, revise
 from fluoro_calib_ros.images.marker_ids import find_bodies, identify_markers
 from fluoro_calib_ros.images.marker_motion import Motion, doubtful_pairs
-from fluoro_calib_ros.images.marker_points import CalibratedRig
-from fluoro_calib_ros.images.marker_rays import project_observed
+from fluoro_calib_ros.images.marker_rays import CalibratedRig
 from fluoro_calib_ros.images.marker_views import MarkerViews, ViewsFrame
 from fluoro_calib_ros.images.markers import FirstMarkers, MarkerFrame, MarkerOptions, MarkerTracker
 from fluoro_calib_ros.images.overlay import draw_markers
@@ -660,8 +659,8 @@ def test_points_are_projected_to_where_they_are_seen_at_an_angle():
     xyz = np.random.default_rng(1).uniform(-10, 10, (20, 3))
     for view, name in enumerate('ab'):
         each = turning()[name]
-        ideal = project_observed(turning_orientation(), view, calibration()[0][name], xyz)
-        seen = project_observed(turning_orientation(), view, each, xyz, 0.7)
+        ideal = CalibratedRig(turning_orientation(), calibration()[0], {}).project(view, xyz)
+        seen = CalibratedRig(turning_orientation(), turning(), {name: 0.7}).project(view, xyz)
         assert np.abs(seen - ideal).max() > 1
         assert np.abs(each.correct(seen, angle=0.7).uv - ideal).max() < 0.01
 

@@ -16,7 +16,7 @@ from .view import TAIL, Lens, View, fit_view
 
 START_BEADS = 14  # within the first radius
 GROWTH = 1.25  # of the radius in a step
-MIN_SHARE = 0.5  # of the predicted beads that are found, below which a pose is given up
+MIN_SHARE = 0.5  # of the beads that are expected, below which a pose is given up
 DEGREE = 5
 LAST_DEGREE = 6
 LAST_STEPS = 4

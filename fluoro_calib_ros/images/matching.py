@@ -23,7 +23,7 @@ from ..errors import DataError
 from ..findings import Kind
 from ..photogrammetry.rotations import rotation_angle
 from .growth import LAST_TOLERANCE_PX, Match, Seen, grow, settle, start_view
-from .lattice import REACH, FlatGrid, GridPose, grid_poses
+from .lattice import CENTRAL, REACH, STEPS, FlatGrid, GridPose, grid_poses
 from .pose_search import (
     MIN_EXPLAINED,
     MIN_FOUND,
@@ -60,10 +60,8 @@ LEVELS = (
 # Beads of a phantom from which the search is ended by evidence. With fewer, the whole search takes
 # 2 s, and one of 20 images of large beads that overlap was lost where it ended.
 MANY = 160
-CENTRAL = 8  # beads of the middle that are tried first
 APART = 0.6  # share of the beads, those farthest from their neighbours, that are tried next
 AGREED = 3  # matches of the same pose after which the search ends, if it is evident
-RIVAL_STEPS = 3
 MIN_SIZES = 0.1  # relative difference of diameters from which sizes tell beads apart
 LIKELIER = 10.0  # log-likelihood by which a pose must exceed another one
 SIZE_TAIL = 6.0  # residual of a response beyond which it counts no more [standard deviations]
@@ -370,7 +368,7 @@ def _alternatives(
             symmetry.turned(best.view),
             model.xyz[other[known]],
             seen.uv[best.detection[known]],
-            RIVAL_STEPS,
+            STEPS,
             0.3,
         )
         # In the end, beads are matched within this.

@@ -37,9 +37,15 @@ from fluoro_calib_ros.bodies.body import Body, declared_bodies
 from fluoro_calib_ros.correction.fluoroscope_calibration import FluoroscopeCalibration
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.images.marker_decisions import revise
-from fluoro_calib_ros.images.marker_ids import MIN_MEMBERS, identify_markers
+from fluoro_calib_ros.images.marker_ids import identify_markers
 from fluoro_calib_ros.images.marker_views import MarkerViews
-from fluoro_calib_ros.images.markers import FirstMarkers, MarkerFrame, MarkerOptions, MarkerTracker
+from fluoro_calib_ros.images.markers import (
+    MIN_MEMBERS,
+    FirstMarkers,
+    MarkerFrame,
+    MarkerOptions,
+    MarkerTracker,
+)
 from fluoro_calib_ros.images.overlay import draw_markers
 from fluoro_calib_ros.jobs.followers import MarkerSettings
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation

@@ -16,7 +16,7 @@ from .view import TAIL, Lens, View, fit_view
 
 START_BEADS = 14  # within the first radius
 GROWTH = 1.25  # of the radius in a step
-MIN_SHARE = 0.5  # of the predicted beads that are found, below which a pose is given up
+MIN_SHARE = 0.5  # of the beads that are expected, below which a pose is given up
 DEGREE = 5
 LAST_DEGREE = 6
 LAST_STEPS = 4
@@ -24,8 +24,7 @@ LAST_TOLERANCE_PX = 2.5
 CELLS = 5  # regions across the image
 MIN_CELL = 5  # predicted beads of a region that is judged
 AMBIGUOUS_PX = 1.5  # by which another prediction must be farther
-SUPPORT = 12  # neighbours in space, and the share of them that must be found as well
-MIN_SUPPORT = 0.5
+SUPPORT = 12  # neighbours in space, of which MIN_SHARE must be found as well
 # Of the residuals of a view, as a share of half the image: a polynomial of degree 6 has five
 # extrema across it.
 LENGTH = 0.5
@@ -258,7 +257,7 @@ def supported(xyz: NDArray[np.float64], good: NDArray[np.bool_]) -> NDArray[np.b
     near = near.reshape(len(xyz), -1)
     other = near != np.arange(len(xyz))[:, None]
     share = np.sum(good[near] & other, axis=1) / np.maximum(other.sum(axis=1), 1)
-    return np.asarray(share >= MIN_SUPPORT)
+    return np.asarray(share >= MIN_SHARE)
 
 
 def _good_cells(

@@ -23,20 +23,19 @@ from scipy.ndimage import binary_closing, binary_erosion
 from scipy.spatial import cKDTree
 
 from ..findings import Finding, Kind, Severity
-from .growth import Match, Seen, settle
+from .growth import MIN_SHARE, Match, Seen, settle
 from .view import Lens, View, fit_view
 
 FLAT = 0.02  # thickness over the extent of a phantom that counts as flat
-REACH = 0.3  # of the spacing, within which a bead lies at its place in the lattice
+REACH = 0.3  # of the distance between neighbours, within which a bead lies at its place
 MIN_ANGLE = np.deg2rad(35.0)  # between the steps of a lattice, also in an oblique view
-STARTS = 8  # beads from which the numbering is tried
+CENTRAL = 8  # beads of the middle from which a search begins
 MIN_NUMBERED = 0.6  # share of the beads that a numbering must reach
 GAP = 2  # missing beads side by side, twice
 SHIFTS = 6  # best shifts of each basis
 SETTLED = 12  # best candidates that are refined
-MIN_OVERLAP = 0.5  # of the numbered beads that fall on beads of the phantom
 DEGREE = 3  # of the distortion while a candidate is refined
-STEPS = 3
+STEPS = 3  # in which a candidate is refined
 
 # What is said of images of a grid of which any place is taken.
 NOT_MARKED = Finding(
@@ -84,7 +83,7 @@ def number_lattice(points: NDArray[np.float64]) -> Lattice | None:
         return None
     tree = cKDTree(points)
     middle = np.argsort(np.linalg.norm(points - np.median(points, axis=0), axis=1), kind='stable')
-    for start in middle[:STARTS]:
+    for start in middle[:CENTRAL]:
         basis = _basis(points, tree, int(start))
         if basis is None:
             continue
@@ -182,7 +181,7 @@ def grid_poses(
         places = found.index @ change + shift
         bead = np.array([row_at.get((int(a), int(b)), -1) for a, b in places])
         known = bead >= 0
-        if np.count_nonzero(known) < MIN_OVERLAP * len(known):
+        if np.count_nonzero(known) < MIN_SHARE * len(known):
             continue
         view = _view(grid, xyz[bead[known]], seen.uv[found.row[known]], lens)
         match = None if view is None else settle(view, xyz, seen)

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from .marker_rays import AGREE, MarkerExposure, MarkerRays
 from .markers import MarkerFrame, MarkerTracker
@@ -65,10 +64,6 @@ class ViewCounts:
         """Exposures (n,) that disagree."""
         return self._wrong
 
-    def clear_wrong(self, row: int) -> None:
-        """Count anew the exposures that disagree."""
-        self._wrong[row] = 0
-
     def clear(self, rows: Sequence[int]) -> None:
         """Count anew for some markers."""
         self._wrong[list(rows)] = 0
@@ -114,7 +109,7 @@ class DecidedView:
         """Give up a marker that was something else since an image."""
         ids = self.ids(row)
         self.tracker.forget(*ids)
-        self.counts.clear_wrong(row)
+        self.counts.clear([row])
         return Decision('dropped', self.name, frame, since, ids)
 
     def revised(
@@ -202,13 +197,11 @@ class EarlierImages:
         return out[::-1]
 
 
-DECIDED = 3  # exposures that agree before an id is confirmed
-WRONG = 3  # exposures that disagree before an id is wrong
+DECIDED = 3  # exposures that agree before an id is confirmed, or disagree before it is wrong
 NEAR_PX = 1.0  # from where its body says, that a marker is; or so many
 NEAR_SIGMAS = 3.5
 FAR = 1.5  # times that, from which it is something else
 DOUBT_SIGMAS = 4.5  # from which it may be: chance exceeds them in one of 25,000 places
-MAX_DISTANCE_PX = 50.0  # beyond it, distances are alike
 
 
 class BodyDecisions:
@@ -275,8 +268,8 @@ class BodyDecisions:
         agreed = view.counts.agree(row, agrees, frame, began)
         if began is not None and agreed >= DECIDED:
             return [view.confirm(row, frame)]
-        if view.counts.wrong[row] >= WRONG:
-            return [view.drop(row, frame, began or frame - WRONG + 1)]
+        if view.counts.wrong[row] >= DECIDED:
+            return [view.drop(row, frame, began or frame - DECIDED + 1)]
         return []
 
 
@@ -294,11 +287,10 @@ def _crossed(
         return []
     distance = np.linalg.norm(seen[suspects][:, None] - place[suspects][None], axis=2)
     own = np.diagonal(distance)
-    cost = np.minimum(distance, MAX_DISTANCE_PX)
-    _, column = linear_sum_assignment(cost)
+    nearest = distance.argmin(axis=1).tolist()
     out = []
-    for one, two in enumerate(column.tolist()):
-        if one < two and column[two] == one:
+    for one, two in enumerate(nearest):
+        if one < two and nearest[two] == one:
             limit = float(near[suspects[[one, two]]].min())
             both = max(distance[one, two], distance[two, one])
             if both < limit and min(own[one], own[two]) > FAR * limit:

@@ -46,8 +46,7 @@ SETTINGS = FitSettings(
 )
 STEPS_ALONE = 2
 CONVERGED_PX = 0.1  # a longer last step is followed by another one
-# Largest motion [px] for a number of points along the way.
-QUADRATURE = ((0.7, 1), (3.0, 2), (6.0, 3), (10.0, 5), (np.inf, 7))
+WAY_PX = 2.0  # of the largest motion, for each further point along the way
 
 
 @dataclass(frozen=True)
@@ -97,8 +96,7 @@ class _MarkerFit(ShadowFit):
     ) -> None:
         length = np.sqrt((guess.motion**2).sum(axis=1))
         longest = float(length.max(initial=0.0))
-        points = next(count for limit, count in QUADRATURE if longest <= limit)
-        node, weight = _gauss_points(points)
+        node, weight = _gauss_points(1 + round(longest / WAY_PX))
         self.way = 0.5 * node[:, None, None] * guess.motion  # (q, n, 2)
         self.way_weight = 0.5 * weight
         reach = profile.reach_px + 0.5 * np.ceil(longest)
@@ -275,10 +273,8 @@ class _MarkerFit(ShadowFit):
 
 # Measurement of markers: shadows are assigned to all of them together, fitted and checked.
 
-LOST_SD_PX = 25.0  # of a prediction, from which only markers that move together are found again
 MAX_MISFIT = 10.0
 DEPTH = (0.5, 1.8)  # of a shadow, over that of its marker
-SAME_PLACE = 0.35  # of the radius, at which two markers are one shadow
 
 
 class MarkerMeasurement:
@@ -330,9 +326,7 @@ class MarkerMeasurement:
         """Places (n, 2) of shadows or predictions, which have one (n,), and free ones (k, 2)."""
         motion = states.motion
         variance = states.shadow_variance
-        near = np.flatnonzero(variance < LOST_SD_PX**2)
-        row, column = assign(motion.uv[near], variance[near], found.uv, self._gate)
-        row = near[row]
+        row, column = assign(motion.uv, variance, found.uv, self._gate)
         start = motion.uv.copy()
         start[row] = found.uv[column]
         assigned = np.zeros(len(start), dtype=bool)
@@ -371,8 +365,4 @@ class MarkerMeasurement:
         good = beads.measured & (beads.sigma < MAX_SIGMA_PX) & (beads.misfit < MAX_MISFIT)
         good &= (away * away).sum(axis=1) < (self._gate + 1) ** 2 * variance
         good &= (relative > DEPTH[0]) & (relative < DEPTH[1])
-        if len(rows) > 1:
-            apart = cdist(beads.uv, beads.uv)
-            np.fill_diagonal(apart, np.inf)
-            good &= apart.min(axis=1) > SAME_PLACE * self.profile.radius_px
         return good

@@ -35,24 +35,17 @@ from .marker_intensity import (
     check_image,
     first_shadows,
 )
-from .marker_points import CalibratedRig, ShadowPoints, all_among, shadow_points
-from .marker_rays import project_observed
-from .markers import FirstMarkers
+from .marker_points import ShadowPoints, all_among, shadow_points
+from .marker_rays import AGREE, CalibratedRig
+from .markers import MIN_MEMBERS, FirstMarkers
 
-SHARE = 0.4  # of the response to a typical marker
-REJECT = 4.0  # standardised deviation above which a distance is not that of two members
-CHANCE = float(erfc(REJECT / 2**0.5))  # of the same deviation
-MIN_MEMBERS = 4
+CHANCE = float(erfc(AGREE / 2**0.5))  # of a distance between two members that does not agree
 MIN_SHARE = 0.6  # of the members that are found
 BETTER = 4.0  # factor on the square sum of another way to fit as many members
 # Number of fits as good that chance gives in an exposure: one in a day at 100 exposures a second.
 MAX_CHANCE = 1e-7
 MAX_SHADOWS = 120
 MAX_STEPS = 200_000  # of the search
-# Choices of points that are judged together, in about the time of one: an eighth of those before,
-# for what fits ends the search for fewer members, and at most 64.
-PART_AT_ONCE = 8
-MAX_AT_ONCE = 64
 
 
 @dataclass(frozen=True)
@@ -173,7 +166,7 @@ class _ImageSearch:
 def _shadows_of(image: FilteredImage, kind: tuple[float, int]) -> np.ndarray:
     """Places (k, 2) of shadows, whose scale and strongest ones are of a kind. Raises DataError."""
     scale, strongest = kind
-    return first_shadows(image.of_scale(scale), strongest, SHARE).strongest(MAX_SHADOWS).uv
+    return first_shadows(image.of_scale(scale), strongest).strongest(MAX_SHADOWS).uv
 
 
 def identifiable(bodies: Sequence[Body]) -> tuple[Body, ...]:
@@ -275,7 +268,7 @@ class _Search:
         # Whether two points may be two members: (member, member, point, point).
         self.may_be = [
             [
-                (given - distance) ** 2 < REJECT**2 * (variance + one**2 + other**2)
+                (given - distance) ** 2 < AGREE**2 * (variance + one**2 + other**2)
                 for distance, other in zip(of_member, body.sd_mm)
             ]
             for of_member, one in zip(wanted, body.sd_mm)
@@ -305,7 +298,8 @@ class _Search:
             return
         if member == size:
             self.choices.append(self.point.copy())
-            if len(self.choices) >= min(1 + self.judged // PART_AT_ONCE, MAX_AT_ONCE):
+            # Many are judged in the time of one, but what fits ends the search for fewer members.
+            if len(self.choices) > self.judged:
                 self._judge()
             return
         fits = free.copy()
@@ -361,7 +355,6 @@ def _first(
 ) -> FirstMarkers | None:
     """Return the markers of a view with these shadows, None where it sees none of the bodies."""
     name = rig.orientation.fluoroscopes[view]
-    calibration = rig.calibrations[name]
     ids = [np.zeros(0, dtype=np.int64)]
     places = [np.zeros((0, 2))]
     for body, fit in fits:
@@ -372,9 +365,9 @@ def _first(
             continue
         rotation, shift = fitted_pose(body.xyz_mm[chosen], points.xyz[fit.point[chosen]])
         members = body.xyz_mm @ rotation.T + shift
-        place = project_observed(rig.orientation, view, calibration, members, rig.angles.get(name))
+        place = rig.project(view, members)
         place[np.flatnonzero(chosen)[seen]] = shadows[shadow[seen]]
-        width, height = calibration.image_size
+        width, height = rig.calibrations[name].image_size
         inside = ((place > 0) & (place < np.array([width - 1, height - 1]))).all(axis=1)
         ids.append(np.asarray(body.target_id)[inside])
         places.append(place[inside])

@@ -30,17 +30,15 @@ from .detection import (
     responses,
 )
 from .light import Light, Noise, estimate_noise, vertex
-from .marker_motion import MarkerStates, Motion, assign
+from .marker_motion import GIVEN_GATE, GIVEN_SD_PX, MarkerStates, Motion, assign
 from .measurement import estimate_profile
 from .shadow_fit import Profile
 
 MARKER_SCALES = SCALES[:5]  # markers are smaller than beads
-NOISE_WEIGHT = 0.1  # of the response, in the noise that it is compared with
-NEAR_PX = 3  # from a given point, within which its shadow is
 MIN_CONTRAST = 0.02  # of a response, as a fraction of the light around it
 MIN_SNR = 4.5  # of a response, over the noise of the response
-WINDOW_BACKGROUND_PX = 6  # the same along the rows of a window
-BACKGROUND_PX = 15  # half the width of the box whose mean is the light around a pixel
+SHARE = 0.35  # of the response to a typical marker, from which a shadow may be a marker
+BACKGROUND_PX = 6  # half the width of the box whose mean is the light around a pixel
 SAMPLED = 4  # rows and columns from one pixel to the next, where all are of one kind
 SAME_PX = 1.0  # between maxima that are one shadow
 BORDER = 3  # scales of the blur at the edge of a window that are not searched
@@ -120,7 +118,8 @@ class FilteredLight:
     @cached_property
     def maxima(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Rows and columns (k,) of the local maxima."""
-        dilated = cv2.dilate(self.relative, np.ones((_size_of_maximum(self.scale),) * 2, np.uint8))
+        around = np.ones((2 * max(1, round(self.scale)) + 1,) * 2, np.uint8)
+        dilated = cv2.dilate(self.relative, around)
         largest = self.relative >= dilated
         largest &= self.relative > 0
         row, column = np.divmod(np.flatnonzero(largest), largest.shape[1])
@@ -129,13 +128,9 @@ class FilteredLight:
     @cached_property
     def noise(self) -> float:
         """Median response where there is any; a part of the pixels tells it."""
-        return _positive_median(self.relative_at(np.s_[::SAMPLED, ::SAMPLED]))
-
-    @cached_property
-    def noise_in_field(self) -> float:
-        """The same in the field of view."""
         part = self.relative_at(np.s_[::SAMPLED, ::SAMPLED])
-        return _positive_median(part[self.field[::SAMPLED, ::SAMPLED]])
+        positive = part[part > 0]
+        return float(np.median(positive)) if len(positive) else 0.0
 
     @cached_property
     def usual(self) -> float:
@@ -143,12 +138,6 @@ class FilteredLight:
         part = self.light[::SAMPLED, ::SAMPLED]
         field = self.field[::SAMPLED, ::SAMPLED]
         return float(np.median(part[field])) if field.any() else float(self.light.mean())
-
-
-def _positive_median(values: NDArray[np.float32]) -> float:
-    """Median of the positive values, 0 without any."""
-    positive = values[values > 0]
-    return float(np.median(positive)) if len(positive) else 0.0
 
 
 class FilteredImage:
@@ -252,24 +241,28 @@ def _learn_look(
     return best.look('there is nothing round where the markers should be'), best.light
 
 
-def first_shadows(lights: Iterable[FilteredLight], count: int, share: float) -> Shadows:
+def first_shadows(lights: Iterable[FilteredLight], count: int) -> Shadows:
     """Find the shadows in an image that says itself what markers look like.
 
-    lights: dark and bright ones of one size. count: of the strongest shadows, which tell the look;
-    share: of their response that is found. Raises DataError where there is nothing round.
+    lights: dark and bright ones of one size. count: of the strongest shadows, which tell the look.
+    Raises DataError where there is nothing round.
     """
     best = max((_Typical.strongest(light, count) for light in lights), key=lambda one: one.merit)
     look = best.look('there are no markers in the image, nothing round rises above the noise')
-    return _found(look, best.light, share)
+    return _found(look, best.light)
 
 
-def search_image(image: np.ndarray, look: MarkerLook, share: float) -> Shadows:
-    """Search a whole image for shadows with a share of the strength of a typical marker."""
+def search_image(image: np.ndarray, look: MarkerLook) -> Shadows:
+    """Search a whole image for shadows that may be markers."""
     grey = image.astype(np.float32)
     light = float(np.iinfo(image.dtype).max) - grey if look.inverted else grey
-    around = cv2.blur(light, (2 * BACKGROUND_PX + 1,) * 2)
+    return _found(look, _filtered(light, (2 * BACKGROUND_PX + 1,) * 2, look))
+
+
+def _filtered(light: NDArray[np.float32], box: tuple[int, int], look: MarkerLook) -> FilteredLight:
+    """Filter light for shadows of a look; the light around is the mean of a box."""
     (response,) = responses(light, look.scale, (False,))
-    return _found(look, FilteredLight(look.scale, look.inverted, light, response, around), share)
+    return FilteredLight(look.scale, look.inverted, light, response, cv2.blur(light, box))
 
 
 @dataclass(frozen=True)
@@ -283,7 +276,7 @@ class _Typical:
     def near(cls, light: FilteredLight, uv: NDArray[np.float64]) -> _Typical:
         """The median near points (n, 2)."""
         height, width = light.response.shape
-        around = np.rint(uv).astype(int)[:, None] + _square(NEAR_PX)
+        around = np.rint(uv).astype(int)[:, None] + _square(int(np.ceil(GIVEN_GATE * GIVEN_SD_PX)))
         column = np.clip(around[..., 0], 0, width - 1)
         row = np.clip(around[..., 1], 0, height - 1)
         return cls(light, float(np.median(light.relative_at((row, column)).max(axis=1))))
@@ -297,60 +290,64 @@ class _Typical:
     @property
     def merit(self) -> float:
         """How much it stands out: small scales have the strongest response to noise, too."""
-        noise = (self.light.noise or 1.0) + NOISE_WEIGHT * self.strength
-        return self.strength**2 / noise
+        return self.strength**2 / max(self.strength + self.light.noise, 1e-9)
 
     @property
     def clear(self) -> bool:
         """Whether noise does not explain it."""
-        return self.strength >= max(MIN_SNR * self.light.noise, MIN_CONTRAST)
+        return self.strength >= self.floor
+
+    @property
+    def floor(self) -> float:
+        """Response below which noise is."""
+        return max(MIN_SNR * self.light.noise, MIN_CONTRAST)
 
     def look(self, cause: str) -> MarkerLook:
         """Return what markers look like. Raises DataError with the cause where there is noise."""
         light = self.light
-        floor = max(MIN_SNR * light.noise_in_field, MIN_CONTRAST)
-        if self.strength < floor:
+        if not self.clear:
             raise DataError(cause, kind=Kind.NO_MARKERS)
         return MarkerLook(
             light.scale,
             light.inverted,
             field=light.field,
             strength=self.strength,
-            floor=floor,
+            floor=self.floor,
             light=max(light.usual, 1.0),
         )
 
 
-def _found(look: MarkerLook, light: FilteredLight, share: float) -> Shadows:
+def _found(look: MarkerLook, light: FilteredLight) -> Shadows:
     """Find the shadows of a whole filtered image."""
     row, column = light.maxima
     height, width = light.light.shape
-    strong = light.relative[row, column] > max(share * look.strength, look.floor)
+    strong = light.relative[row, column] > max(SHARE * look.strength, look.floor)
     inside = (row > 0) & (row < height - 1) & (column > 0) & (column < width - 1)
     rows = np.flatnonzero(strong & inside & look.field[row, column])
     row, column = row[rows], column[rows]
     clear = light.relative[row, column] >= _floor(look, light.around[row, column])
-    return _shadows_at(light.relative, row[clear], column[clear])
+    row, column = row[clear], column[clear]
+    response = light.relative
+    at = response[row, column]
+    # To a part of a pixel.
+    u = column + vertex(response[row, column - 1], at, response[row, column + 1])
+    v = row + vertex(response[row - 1, column], at, response[row + 1, column])
+    return Shadows(np.column_stack([u, v]), at)
 
 
 def search_windows(
-    windows: LightWindows, middle: NDArray[np.int64], half: int, look: MarkerLook, share: float
+    windows: LightWindows, middle: NDArray[np.int64], half: int, look: MarkerLook
 ) -> Shadows:
     """Search windows of 2 half + 1 px around pixels middle (n, 2), each shadow found once."""
     border = int(np.ceil(BORDER * look.scale))
     size = 2 * (half + border) + 1
     grey, valid = windows.read(middle, _square(half + border))
-    around = cv2.blur(grey.reshape(-1, size), (2 * WINDOW_BACKGROUND_PX + 1, 1))
-    (response,) = responses(grey.reshape(-1, size), look.scale, (False,))
-    response = _relative(response, around, look)
-    response = response.reshape(len(middle), size, size)
-    response *= valid.reshape(response.shape)
+    light = _filtered(grey.reshape(-1, size), (2 * BACKGROUND_PX + 1, 1), look)
     # The seams between windows lie in their borders.
-    response[:, :border] = 0
-    response[:, -border:] = 0
-    response[:, :, :border] = 0
-    response[:, :, -border:] = 0
-    found = _peaks(response.reshape(-1, size), look, share)
+    searched = np.zeros((len(middle), size, size), dtype=bool)
+    inner = np.s_[:, border:-border, border:-border]
+    searched[inner] = valid.reshape(searched.shape)[inner]
+    found = _found(replace(look, field=searched.reshape(-1, size)), light)
     number = (found.uv[:, 1] + 0.5).astype(int) // size
     place = found.uv.copy()
     place[:, 1] -= number * size
@@ -366,51 +363,12 @@ def _square(half: int) -> NDArray[np.int64]:
     return np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
 
 
-def _relative(
-    response: NDArray[np.floating], around: NDArray[np.floating], look: MarkerLook
-) -> NDArray[np.floating]:
-    """Responses over the light around, 0 where noise explains them."""
-    relative = response / np.maximum(around, 1e-3 * look.light)
-    relative[relative < _floor(look, around)] = 0
-    return np.asarray(relative)
-
-
 def _floor(look: MarkerLook, around: NDArray[np.floating]) -> NDArray[np.floating]:
     """Relative response below which noise is, by the light around: it grows in the dark."""
     light = np.maximum(around, 1e-3 * look.light)
     return np.asarray(look.floor * np.sqrt(np.maximum(look.light / light, 1.0)))
 
 
-def _peaks(response: NDArray[np.float32], look: MarkerLook, share: float) -> Shadows:
-    """Local maxima of a response (h, w) that is 0 at its edge, to a part of a pixel."""
-    dilated = cv2.dilate(response, np.ones((_size_of_maximum(look.scale),) * 2, np.uint8))
-    row, column = np.nonzero(
-        (response >= dilated) & (response > max(share * look.strength, look.floor))
-    )
-    return _shadows_at(response, row, column)
-
-
-def _size_of_maximum(scale: float) -> int:
-    """Width of the square in which a shadow is the strongest [px]."""
-    return 2 * max(1, round(scale)) + 1
-
-
-def _shadows_at(
-    response: NDArray[np.float32], row: NDArray[np.int64], column: NDArray[np.int64]
-) -> Shadows:
-    """Shadows at local maxima of a response (h, w), to a part of a pixel."""
-    at = response[row, column]
-    uv = np.column_stack(
-        [
-            column + vertex(response[row, column - 1], at, response[row, column + 1]),
-            row + vertex(response[row - 1, column], at, response[row + 1, column]),
-        ]
-    )
-    return Shadows(uv, at)
-
-
-FIRST_SD_PX = 1.5  # of a given place of the first frame
-FIRST_GATE = 3.0  # standard deviations from a given place, within which its shadow is
 MIN_DENSITY = 2e-6  # of false shadows [1/px^2]
 
 
@@ -442,8 +400,8 @@ def learn_start(image: FilteredImage, target_id: NDArray[np.int64], uv: np.ndarr
         bad = int(target_id[known][~inside][0])
         raise DataError(f'marker {bad} of the first frame lies outside of the image')
     look, filtered = _learn_look(image, given)
-    found = _found(look, filtered, SHARE)
-    row, column = assign(given, np.full(len(given), FIRST_SD_PX**2), found.uv, FIRST_GATE)
+    found = _found(look, filtered)
+    row, column = assign(given, np.full(len(given), GIVEN_SD_PX**2), found.uv, GIVEN_GATE)
     if len(row) < max(1, len(given) // 2):
         raise DataError(
             f'only {len(row)} of {len(given)} markers of the first frame are in the image'
@@ -455,7 +413,7 @@ def learn_start(image: FilteredImage, target_id: NDArray[np.int64], uv: np.ndarr
     unseen[seen] = 0
     light = filtered.light
     return MarkerStart(
-        MarkerStates.start(Motion.start(place, FIRST_SD_PX), unseen),
+        MarkerStates.start(Motion.start(place, GIVEN_SD_PX), unseen),
         look,
         profile=estimate_profile(
             Light(light, look.field), place[seen], np.ones(len(seen)), look.radius_px
@@ -466,9 +424,7 @@ def learn_start(image: FilteredImage, target_id: NDArray[np.int64], uv: np.ndarr
     )
 
 
-SHARE = 0.35  # of the response to a typical marker, from which a shadow may be a marker
-MIN_HALF = 4  # of a search window [px]
-MAX_HALF = 48
+MAX_HALF = 48  # of a search window [px]
 STRIPS = 6  # of an image that is searched in turn: a whole one takes as long as five exposures
 
 
@@ -491,7 +447,7 @@ class MarkerSearch:
 
     def everywhere(self, image: np.ndarray) -> Shadows:
         """Find the shadows of a whole image."""
-        return search_image(image, self._look, SHARE)
+        return search_image(image, self._look)
 
     def lost(self, states: MarkerStates) -> NDArray[np.bool_]:
         """Return (n,) whether markers are searched in the whole image."""
@@ -507,7 +463,7 @@ class MarkerSearch:
             parts.append(self._of_strip(image, number // self._every % self._strips))
         reach = np.ceil(self._gate * np.sqrt(states.shadow_variance))
         near = ~lost | (reach <= MAX_HALF)
-        half = np.clip(reach, MIN_HALF, MAX_HALF).astype(int)
+        half = np.minimum(reach, MAX_HALF).astype(int)
         middle = np.rint(states.motion.uv).astype(int)
         # Few markers need wide windows; those of the others stay small.
         sizes = np.sort(half[near])
@@ -515,7 +471,7 @@ class MarkerSearch:
         for rows in (near & (half <= small), near & (half > small)):
             if rows.any():
                 size = int(half[rows].max())
-                parts.append(search_windows(windows, middle[rows], size, self._look, SHARE))
+                parts.append(search_windows(windows, middle[rows], size, self._look))
         if len(parts) == 1:
             return parts[0]
         uv = np.concatenate([np.zeros((0, 2)), *(part.uv for part in parts)])
@@ -530,7 +486,7 @@ class MarkerSearch:
         first = max(top - margin, 0)
         seen = slice(first, min(bottom + margin, height))
         look = replace(self._look, field=self._look.field[seen])
-        found = search_image(image[seen], look, SHARE)
+        found = search_image(image[seen], look)
         uv = found.uv + [0, first]
         inside = (uv[:, 1] >= top - 0.5) & (uv[:, 1] < bottom - 0.5)
         return Shadows(uv[inside], found.strength[inside])

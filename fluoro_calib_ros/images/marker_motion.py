@@ -19,20 +19,20 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
+from .shadow_fit import DEPTH_SD
+
 FIRST_SPEED_PX = 6.0  # standard deviation of the unknown first velocity [px a frame]
-FIRST_ACCELERATION_PX = 0.5
-MIN_ACCELERATION_PX = 0.05  # px a squared frame
-FORGET = 0.9  # share of the earlier squared innovations that is kept
+FORGET = 0.9  # share that a running mean keeps of what was before
 COMPARED = 5  # images before the motion of two markers is known to be alike
-STRANGE_PX = 0.4  # difference of velocities that is not strange [px a frame]
-LEADERS = 4  # markers whose changes of velocity an unseen one follows
+UNSTEADY_PX = 0.5  # by which velocities usually change in a frame, and differ [px a frame]
+LEADERS = 4  # markers whose motion another one follows
 LED = 0.5  # share of the acceleration that they do not explain
 MAX_SD_PX = 60.0  # of a prediction
 MODEL_SD_PX = 0.05  # of a place, beyond the noise of the measurement
+SHADOW_SD_PX = 0.25  # of the place of a shadow before it is measured
+GIVEN_SD_PX = 1.5  # of a place that is given, or told by markers beside
 FAR = 1e6
-VOTE_PX = 2.0  # from a shadow, within which a marker votes for a shift
-MIN_VOTES = 1.5
-MIN_VOTE_SHARE = 0.3
+MIN_VOTES = 1.5  # for a shift of markers together
 
 
 @dataclass
@@ -53,7 +53,7 @@ class Motion:
         covariance = np.zeros((n, 2, 2))
         covariance[:, 0, 0] = sd_px**2
         covariance[:, 1, 1] = FIRST_SPEED_PX**2
-        squared = np.full(n, FIRST_ACCELERATION_PX**2)
+        squared = np.full(n, UNSTEADY_PX**2)
         unlike = np.full((n, n), FIRST_SPEED_PX**2)
         np.fill_diagonal(unlike, np.inf)
         together = np.zeros((n, n), dtype=int)
@@ -79,9 +79,9 @@ class Motion:
         t = float(frames)
         self.uv += t * self.velocity
         pooled = float(np.median(self.squared)) if len(self.squared) else 0.0
-        q = np.maximum(np.maximum(self.squared, pooled), MIN_ACCELERATION_PX**2)
+        q = np.maximum(self.squared, pooled)
         if led is not None:
-            q = np.where(led, LED**2 * pooled + MIN_ACCELERATION_PX**2, q)
+            q = np.where(led, LED**2 * pooled, q)
         p = self.covariance
         cross = p[:, 0, 1] + t * p[:, 1, 1]
         p[:, 0, 0] += t * (p[:, 0, 1] + cross) + q * t**4 / 4
@@ -92,9 +92,11 @@ class Motion:
             factor = np.where(too_wide, MAX_SD_PX**2 / p[:, 0, 0], 1.0)
             p *= factor[:, None, None]
 
-    def innovation_variance(self, sigma: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Variances (n,) of a measured less a predicted coordinate."""
-        return self.variance + sigma**2 + MODEL_SD_PX**2
+    def innovation_variance(
+        self, sigma: NDArray[np.float64], rows: NDArray[np.int64] | slice = np.s_[:]
+    ) -> NDArray[np.float64]:
+        """Variances (n,) of a measured less a predicted coordinate, of some markers."""
+        return self.variance[rows] + sigma**2 + MODEL_SD_PX**2
 
     def update(
         self,
@@ -105,14 +107,13 @@ class Motion:
     ) -> None:
         """Take in measured centres (m, 2) of some markers."""
         innovation = uv - self.uv[rows]
+        settled = self.settled[rows]
         p = self.covariance[rows]
-        s = p[:, 0, 0] + sigma**2 + MODEL_SD_PX**2
-        gain = p[:, :, 0] / s[:, None]
+        gain = p[:, :, 0] / self.innovation_variance(sigma, rows)[:, None]
         self.uv[rows] += gain[:, :1] * innovation
         self.velocity[rows] += gain[:, 1:] * innovation
         self.covariance[rows] = p - gain[:, :, None] * p[:, None, 0, :]
         # What the innovation says of the acceleration; a first or late one says little.
-        settled = self.settled[rows] & (p[:, 1, 1] < FIRST_SPEED_PX**2 / 4)
         seen = 0.5 * (innovation**2).sum(axis=1) / float(frames) ** 4
         seen = np.maximum(seen - sigma**2, 0)
         update = FORGET * self.squared[rows] + (1 - FORGET) * seen
@@ -140,12 +141,19 @@ class Motion:
         np.fill_diagonal(before_unlike, 0.0)
         self.unlike[both] = (1 - share) * before_unlike + share * difference
         self.unlike[rows, rows] = np.inf
-        change = velocity - before[rows]
         for row in np.flatnonzero(~seen & self.settled).tolist():
-            alike = np.argsort(self.unlike[row, rows], kind='stable')[:LEADERS]
-            self.velocity[row] += np.median(change[alike], axis=0)
+            alike = self.company(row, rows)
+            self.velocity[row] += np.median(self.velocity[alike] - before[alike], axis=0)
             led[row] = True
         return led
+
+    def company(self, row: int, among: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the LEADERS of some markers that move with one.
+
+        They are those that moved most alike, and the nearest where that is not known.
+        """
+        away = np.linalg.norm(self.uv[among] - self.uv[row], axis=1)
+        return among[np.lexsort((away, self.unlike[row, among]))[:LEADERS]]
 
     def strangeness(
         self, seen: NDArray[np.bool_]
@@ -164,7 +172,7 @@ class Motion:
         usual = np.take_along_axis(unlike, order, axis=1).mean(axis=1)
         others = np.median(self.velocity[rows][order], axis=1)
         squared = ((self.velocity[rows] - others) ** 2).sum(axis=1)
-        return rows, squared / (usual + STRANGE_PX**2), others
+        return rows, squared / (usual + UNSTEADY_PX**2), others
 
     def place(
         self,
@@ -175,10 +183,7 @@ class Motion:
     ) -> None:
         """Put some markers where a better prediction says, if it is better."""
         better = sd_px**2 < self.variance[rows]
-        rows = rows[better]
-        self.uv[rows] = uv[better]
-        self.velocity[rows] = velocity[better]
-        self.covariance[rows] = np.eye(2) * (sd_px[better] ** 2)[:, None, None]
+        self.redirect(rows[better], uv[better], velocity[better], sd_px[better])
 
     def scatter(self, row: int) -> None:
         """Forget where a marker is."""
@@ -190,12 +195,16 @@ class Motion:
         return np.asarray(self.covariance[:, 1, 1] < FIRST_SPEED_PX**2 / 4)
 
     def redirect(
-        self, row: int, uv: NDArray[np.float64], velocity: NDArray[np.float64], sd_px: float
+        self,
+        rows: NDArray[np.int64] | int,
+        uv: NDArray[np.float64],
+        velocity: NDArray[np.float64],
+        sd_px: NDArray[np.float64] | float,
     ) -> None:
-        """Put a marker at a place (2,), with a velocity (2,) [px a frame]."""
-        self.uv[row] = uv
-        self.velocity[row] = velocity
-        self.covariance[row] = np.eye(2) * sd_px**2
+        """Put markers (k,) at places (k, 2), with velocities (k, 2) [px a frame]."""
+        self.uv[rows] = uv
+        self.velocity[rows] = velocity
+        self.covariance[rows] = np.eye(2) * np.square(sd_px)[..., None, None]
 
     def exchange(self, one: int, other: int) -> None:
         """Exchange the states of two markers."""
@@ -248,10 +257,10 @@ def common_shift(
         return None
     shift = found.data[near] - uv[row]
     there = found.query((uv[beside][None] + shift[:, None]).reshape(-1, 2))[0]
-    close = np.minimum(there.reshape(len(near), -1) / VOTE_PX, 1.0)
+    close = np.minimum(there.reshape(len(near), -1) / GIVEN_SD_PX, 1.0)
     score = (1 - close**2).sum(axis=1) - 0.5 * np.linalg.norm(shift, axis=1) / reach_px
     best = int(np.argmax(score))
-    if score[best] < max(MIN_VOTES, MIN_VOTE_SHARE * len(beside)):
+    if score[best] < MIN_VOTES:
         return None
     return np.asarray(shift[best])
 
@@ -289,12 +298,9 @@ def doubtful_pairs(
 
 # What is known of markers from image to image: motion, depth of the shadow, images unseen.
 
-SHADOW_SD_PX = 0.35  # of the place of a shadow before it is measured
-DEPTH_SD = 1.0  # of the depth of a marker that is not known yet
+GIVEN_GATE = 3.0  # standard deviations from a given place, within which its marker is
 KNOWN_DEPTH_SD = 0.15
-DEPTH_MEMORY = 0.9
 RECENT = 4  # images in which a place tells the velocity
-THERE_SD = 3.0  # standard deviations from where a marker is expected
 
 
 @dataclass(frozen=True)
@@ -327,7 +333,7 @@ class MarkerStates:
     depth: NDArray[np.float64]
     depth_sd: NDArray[np.float64]
     unseen: NDArray[np.int64]  #: (n,), images since a marker was measured
-    placed: NDArray[np.int64]  #: (n,), images since its body was found by its shape
+    placed: NDArray[np.int64]  #: (n,), images since its place was given
 
     @classmethod
     def start(cls, motion: Motion, unseen: np.ndarray) -> MarkerStates:
@@ -347,25 +353,23 @@ class MarkerStates:
         self.unseen += 1
         self.placed += 1
 
-    def place(
-        self, rows: NDArray[np.int64], uv: NDArray[np.float64], sd_px: float, frames: int
-    ) -> None:
-        """Put markers at places (k, 2) where their body is, frames after the image before.
+    def place(self, rows: NDArray[np.int64], uv: NDArray[np.float64], frames: int) -> None:
+        """Put markers at given places (k, 2), frames after the image before.
 
         The second of two such images tells their velocities. Markers that are followed and there
         anyway go on as they are.
         """
         motion = self.motion
         away = ((uv - motion.uv[rows]) ** 2).sum(axis=1)
-        there = away < THERE_SD**2 * motion.innovation_variance(np.array(sd_px))[rows]
+        there = away < GIVEN_GATE**2 * (motion.variance[rows] + GIVEN_SD_PX**2)
         elsewhere = ~there | (self.unseen[rows] > 1) | (self.placed[rows] < RECENT)
         rows, uv = rows[elsewhere], uv[elsewhere]
-        again = (self.placed[rows] < RECENT) & (self.unseen[rows] <= self.placed[rows])
+        again = there[elsewhere] & (self.placed[rows] < RECENT)
+        again &= self.unseen[rows] <= self.placed[rows]
         since = (self.unseen[rows] + frames - 1)[:, None]  # that they were measured
         before = motion.uv[rows] - since * motion.velocity[rows]
-        motion.uv[rows] = uv
-        motion.velocity[rows] = np.where(again[:, None], (uv - before) / since, 0.0)
-        motion.covariance[rows] = np.eye(2) * sd_px**2
+        velocity = np.where(again[:, None], (uv - before) / since, 0.0)
+        motion.redirect(rows, uv, velocity, GIVEN_SD_PX)
         motion.covariance[rows[~again], 1, 1] = FIRST_SPEED_PX**2
         self.unseen[rows] = 1
         self.placed[rows] = 0
@@ -378,7 +382,7 @@ class MarkerStates:
         # The depth of a shadow is that of its marker alone.
         free = rows[~found.overlapped[rows]]
         first = self.depth_sd[free] > KNOWN_DEPTH_SD
-        memory = np.where(first, 0.0, DEPTH_MEMORY)
+        memory = np.where(first, 0.0, FORGET)
         self.depth[free] = memory * self.depth[free] + (1 - memory) * found.depth[free]
         self.depth_sd[free] = KNOWN_DEPTH_SD
 

@@ -10,7 +10,7 @@ left out where points of more views explain all its shadows.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -18,22 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from ..correction.fluoroscope_calibration import Calibrations, CorrectedPoints
+from ..correction.fluoroscope_calibration import CorrectedPoints
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.epipolar import EpipolarGeometry
 from ..reconstruction.intersection import OK, OUTSIDE, IntersectedPoints
-from .marker_rays import AGREE, RayFit, project_observed
-
-SHADOW_SD_PX = 0.25  # of the place of a shadow that is not measured
-
-
-@dataclass(frozen=True)
-class CalibratedRig:
-    """Orientation and calibrations of fluoroscopes, and the angles of their C-arms [rad]."""
-
-    orientation: RigOrientation
-    calibrations: Calibrations
-    angles: Mapping[str, float | None]
+from .marker_motion import SHADOW_SD_PX
+from .marker_rays import AGREE, CalibratedRig, RayFit
 
 
 @dataclass(frozen=True)
@@ -64,15 +54,11 @@ def shadow_points(shadows: Sequence[NDArray[np.float64]], rig: CalibratedRig) ->
     shadow = rays.pairs()
     points, agree = rays.intersect(shadow)
     shadow, xyz = shadow[agree], points.xyz_mm[agree]
-    for view, name in enumerate(names):
+    for view in range(len(names)):
         open_rows = np.flatnonzero(shadow[:, view] < 0)
         if not len(open_rows) or not len(shadows[view]):
             continue
-        calibration = rig.calibrations[name]
-        place = project_observed(
-            rig.orientation, view, calibration, xyz[open_rows], rig.angles.get(name)
-        )
-        _, nearest = cKDTree(shadows[view]).query(place)
+        _, nearest = cKDTree(shadows[view]).query(rig.project(view, xyz[open_rows]))
         joined = shadow[open_rows]
         joined[:, view] = nearest
         points, agree = rays.intersect(joined)

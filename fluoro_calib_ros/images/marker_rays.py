@@ -15,7 +15,7 @@ from ..bodies.body import Body, by_pose
 from ..bodies.motion import POSE
 from ..bodies.shapes import learned_shape
 from ..bodies.tracking import BodyTracker
-from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import Calibrations
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.intersection import (
     IntersectedPoints,
@@ -25,7 +25,7 @@ from ..reconstruction.intersection import (
 from ..reconstruction.reconstruct import IntersectedViews, MatchedViews
 from .markers import MarkerFrame
 
-AGREE = 4.0  # standardised lack of fit up to which rays belong together
+AGREE = 4.0  # standardised deviation up to which rays, or members of a body, belong together
 SYSTEMATIC_PX = 0.1  # of a corrected image point, beyond its standard deviation
 
 
@@ -105,24 +105,65 @@ class MarkerPlaces:
         return MarkerPlaces(self.xyz_mm + way, wider + unsteady)
 
 
+STEPS = 3  # the correction changes slowly
+
+
+@dataclass(frozen=True)
+class CalibratedRig:
+    """Orientation and calibrations of fluoroscopes, and the angles of their C-arms [rad]."""
+
+    orientation: RigOrientation
+    calibrations: Calibrations
+    angles: Mapping[str, float | None]
+
+    def project(self, view: int, xyz_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Observed pixels (k, 2) of points (k, 3) in the rig frame [mm]; NaN where a point is.
+
+        view is the row of the fluoroscope in the orientation. The correction is a function of the
+        observed pixel, so it is solved for by fixed-point iteration; where it is not defined, it
+        is 0.
+        """
+        rig = self.orientation
+        name = rig.fluoroscopes[view]
+        xp, yp, c = rig.interior[view]
+        sensor = (xyz_mm - rig.position_mm[view]) @ rig.rotation[view].T
+        ideal = sensor[:, :2] * (c / sensor[:, 2:]) + np.array([xp, yp])
+        observed = ideal
+        for _ in range(STEPS):
+            u, v, _, _, _ = self.calibrations[name].correct_arrays(
+                observed[:, 0].copy(), observed[:, 1].copy(), angle=self.angles.get(name)
+            )
+            step = ideal - np.stack([u, v], axis=1)
+            observed = observed + np.where(np.isfinite(step), step, 0.0)
+        return observed
+
+    def spread(
+        self, view: int, xyz_mm: NDArray[np.float64], covariance: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Standard deviations (k,) of a coordinate in a view [px] of points (k, 3).
+
+        covariance (k, 3, 3) is that of the points [mm^2].
+        """
+        rig = self.orientation
+        axes = rig.rotation[view]
+        sensor = (xyz_mm - rig.position_mm[view]) @ axes.T
+        depth = sensor[:, 2, None, None]
+        slope = rig.interior[view, 2] / depth * (axes[:2] - sensor[:, :2, None] / depth * axes[2])
+        variance = np.trace(slope @ covariance @ np.swapaxes(slope, 1, 2), axis1=1, axis2=2)
+        return np.asarray(np.sqrt(variance / 2))
+
+
 class MarkerRays:
     """Rays of markers in calibrated views.
 
-    orientation: that they belong to. names: the fluoroscopes. target_id: (n,) of all markers,
-    ascending.
+    target_id: (n,) of all markers, ascending.
     """
 
-    def __init__(
-        self,
-        calibrations: Calibrations,
-        orientation: RigOrientation,
-        names: Sequence[str],
-        target_id: NDArray[np.int64],
-    ) -> None:
-        self._calibrations = calibrations
-        self._names = names
+    def __init__(self, rig: CalibratedRig, target_id: NDArray[np.int64]) -> None:
+        self._calibrations = rig.calibrations
+        self._names = rig.orientation.fluoroscopes
         self._target_id = target_id
-        self._fit = RayFit(orientation.subset(names))
+        self._fit = RayFit(rig.orientation)
 
     def intersect(
         self, views: Mapping[str, MarkerFrame], angles: Mapping[str, float | None]
@@ -183,41 +224,6 @@ class MarkerRays:
         out.covariance[rows[agree]] = points.covariance[agree]
         return out
 
-    def project(
-        self, view: int, xyz_mm: NDArray[np.float64], angles: Mapping[str, float | None]
-    ) -> NDArray[np.float64]:
-        """Observed pixels (k, 2) of points (k, 3) in the rig frame [mm] at angles [rad].
-
-        They are NaN where a point is.
-        """
-        name = self._names[view]
-        uv = np.full((len(xyz_mm), 2), np.nan)
-        known = np.isfinite(xyz_mm).all(axis=1)
-        if known.any():
-            uv[known] = project_observed(
-                self._fit.orientation,
-                view,
-                self._calibrations[name],
-                xyz_mm[known],
-                angles.get(name),
-            )
-        return uv
-
-    def spread(
-        self, view: int, xyz_mm: NDArray[np.float64], covariance: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Standard deviations (k,) of a coordinate in a view [px] of points (k, 3).
-
-        covariance (k, 3, 3) is that of the points [mm^2].
-        """
-        rig = self._fit.orientation
-        axes = rig.rotation[view]
-        sensor = (xyz_mm - rig.position_mm[view]) @ axes.T
-        depth = sensor[:, 2, None, None]
-        slope = rig.interior[view, 2] / depth * (axes[:2] - sensor[:, :2, None] / depth * axes[2])
-        variance = np.trace(slope @ covariance @ np.swapaxes(slope, 1, 2), axis1=1, axis2=2)
-        return np.asarray(np.sqrt(variance / 2))
-
 
 class RayFit:
     """Intersects rays, and says which of them belong together.
@@ -260,37 +266,7 @@ class RayFit:
         return IntersectedPoints(**values), standardised
 
 
-STEPS = 3  # the correction changes slowly
-
-
-def project_observed(
-    orientation: RigOrientation,
-    view: int,
-    calibration: FluoroscopeCalibration,
-    xyz: NDArray[np.float64],
-    angle: float | None = None,
-) -> NDArray[np.float64]:
-    """Observed pixels (k, 2) of points (k, 3) in the rig frame [mm].
-
-    view is the row of the fluoroscope in the orientation; angle that of its C-arm [rad], None
-    where it is unknown. The correction is a function of the
-    observed pixel, so it is solved for by fixed-point iteration; where it is not defined, it is 0.
-    """
-    xp, yp, c = orientation.interior[view]
-    sensor = (xyz - orientation.position_mm[view]) @ orientation.rotation[view].T
-    ideal = sensor[:, :2] * (c / sensor[:, 2:]) + np.array([xp, yp])
-    observed = ideal
-    for _ in range(STEPS):
-        u, v, _, _, _ = calibration.correct_arrays(
-            observed[:, 0].copy(), observed[:, 1].copy(), angle=angle
-        )
-        step = ideal - np.stack([u, v], axis=1)
-        observed = observed + np.where(np.isfinite(step), step, 0.0)
-    return observed
-
-
 RIGID_MM = 0.1  # what a marker may move in its body, a standard deviation
-RIGID_SIGMAS = 5.0
 MIN_MEMBERS = 3  # of a body that give its pose
 # Share of the markers of a body that are seen again. Where there are fewer, something has moved
 # the body elsewhere, and what is seen may be anything.
@@ -436,7 +412,7 @@ class MarkerBodies:
         if self._tracker is None:
             return
         away = np.linalg.norm(exposure.xyz_mm - self.present.xyz_mm, axis=1)
-        use = sure & ~(away >= RIGID_SIGMAS * RIGID_MM)
+        use = sure & ~(away >= AGREE * RIGID_MM)
         changed = False
         for number, rows in enumerate(self._rows):
             known = self._bodies[number].known

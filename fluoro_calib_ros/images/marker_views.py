@@ -26,8 +26,13 @@ from ..photogrammetry.rig_orientation import RigOrientation
 from .marker_decisions import BodyDecisions, DecidedView, Decision, RayDecisions, ViewCounts
 from .marker_ids import MAX_SHADOWS, find_bodies, identifiable
 from .marker_intensity import check_image
-from .marker_points import CalibratedRig
-from .marker_rays import MarkerBodies, MarkerExposure, MarkerPlaces, MarkerRays
+from .marker_rays import (
+    CalibratedRig,
+    MarkerBodies,
+    MarkerExposure,
+    MarkerPlaces,
+    MarkerRays,
+)
 from .markers import FirstMarkers, MarkerFrame, MarkerOptions, MarkerTracker
 
 
@@ -151,8 +156,10 @@ class JoinedViews:
             for view, (name, tracker) in enumerate(trackers.items())
         ]
         self._target_id = target_id
+        # At the angles of the last exposure, and of the one before.
         self._rig = rig
-        self._rays = MarkerRays(rig.calibrations, rig.orientation, list(trackers), target_id)
+        self._rig_before = rig
+        self._rays = MarkerRays(rig, target_id)
         self._bodies = MarkerBodies(rig.orientation, target_id, bodies)
         self._by_body = [BodyDecisions(view) for view in self._views]
         self._by_rays = [RayDecisions(view, self._rays) for view in self._views]
@@ -165,9 +172,6 @@ class JoinedViews:
         self._again: list[Body] = []  # found in the last exposure: another one tells their speed
         self._measured = np.zeros((len(self._views), len(target_id)), dtype=bool)
         self._missed = np.zeros(len(target_id), dtype=bool)  # of bodies that are elsewhere
-        # Of the C-arms [rad], in the last exposure and in the one before.
-        self._angles: Mapping[str, float | None] = {}
-        self._angles_before: Mapping[str, float | None] = {}
 
     def expect(
         self,
@@ -178,13 +182,13 @@ class JoinedViews:
         """Tell the views where to look in the next images. Raises DataError for other sizes."""
         if self._frame == 0:
             self._check_sizes(images)
-        self._angles_before, self._angles = self._angles, dict(angles)
+        self._rig_before, self._rig = self._rig, replace(self._rig, angles=dict(angles))
         if self._frame:
             self._suggest(frame, self._search(images, frame))
 
     def decided(self, found: Mapping[str, MarkerFrame], frame: int) -> ViewsFrame:
         """Return the markers of the views, after what they say of each other."""
-        exposure = self._rays.intersect(self._without_missed(found, frame), self._angles)
+        exposure = self._rays.intersect(self._without_missed(found, frame), self._rig.angles)
         self._bodies.update(exposure, frame)
         self._missed &= ~self._bodies.present.known  # their own markers may tell where they are
         self._doubt_unsupported(exposure, frame)
@@ -263,10 +267,10 @@ class JoinedViews:
             rows = rows[(here.known & last.known & ~placed)[rows]]
             if not len(rows):
                 continue
-            uv = self._rays.project(view.view, here.xyz_mm[rows], self._angles)
-            uv_before = self._rays.project(view.view, last.xyz_mm[rows], self._angles_before)
+            uv = self._rig.project(view.view, here.xyz_mm[rows])
+            uv_before = self._rig_before.project(view.view, last.xyz_mm[rows])
             velocity = (uv - uv_before) / (frame - self._frame)
-            sd = self._rays.spread(view.view, here.xyz_mm[rows], here.covariance[rows])
+            sd = self._rig.spread(view.view, here.xyz_mm[rows], here.covariance[rows])
             view.tracker.suggest(self._target_id[rows], uv, velocity, sd)
 
     def _search(self, images: Mapping[str, np.ndarray | None], frame: int) -> NDArray[np.bool_]:
@@ -288,12 +292,11 @@ class JoinedViews:
             every = self._views[0].tracker.options.search_every
             self._next_search = frame + self._pause
             self._pause = min(2 * self._pause, every)
-        rig = replace(self._rig, angles=self._angles)
         seen = [np.zeros((0, 2)) if of_view is None else of_view for of_view in shadows]
-        found, missing = find_bodies(seen, rig, list(wanted.values()))
+        found, missing = find_bodies(seen, self._rig, list(wanted.values()))
         for view in self._views:
             if view.name in found:
-                view.tracker.relocate(found[view.name])
+                view.tracker.place(found[view.name])
         there = [body for body in wanted.values() if body.name not in missing]
         placed = self._among(there)
         self._missed &= ~placed
@@ -324,8 +327,8 @@ class JoinedViews:
         ]
         expected = [self._bodies.present.filled(told.places) for told in self._told]
         for view, (by_body, of_view) in enumerate(zip(self._by_body, expected)):
-            place = self._rays.project(view, of_view.xyz_mm, self._angles)
-            sd = self._rays.spread(view, of_view.xyz_mm, of_view.covariance)
+            place = self._rig.project(view, of_view.xyz_mm)
+            sd = self._rig.spread(view, of_view.xyz_mm, of_view.covariance)
             out += by_body.decide(exposure, place, sd, frame)
         for by_rays, of_view in zip(self._by_rays, expected):
             out += by_rays.decide(exposure, of_view.known | self._missed, frame)

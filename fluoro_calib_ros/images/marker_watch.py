@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ..findings import Finding, Kind, Place, Severity
-from .marker_intensity import Shadows
+from .marker_intensity import MAX_HALF, Shadows
 from .marker_motion import (
+    GIVEN_SD_PX,
+    LEADERS,
     SHADOW_SD_PX,
     MarkerStates,
     MeasuredMarkers,
@@ -24,8 +26,9 @@ from .marker_motion import (
 )
 
 FALSE_SHADOWS = 0.02  # expected in the gate, from which a marker found again is doubtful
-MERGED_PX = 5.0  # between predictions, within which two markers are one shadow
-MERGED_FRAMES = 6  # for which neither of them is measured; then one is, with a doubt
+# Between predictions, within which two markers are one shadow. Neither of them is measured, until
+# one is lost; then the other one is, with a doubt.
+MERGED_PX = 5.0
 
 
 class MarkerWatch:
@@ -40,6 +43,8 @@ class MarkerWatch:
         Distance from its prediction within which a marker is looked for [standard deviations].
     margin : float
         Difference of twice the log likelihood below which two ids may have been exchanged.
+    lost_after : int
+        Images without a marker after which it is lost.
     density : float
         Of false shadows [1/px^2].
     """
@@ -51,6 +56,7 @@ class MarkerWatch:
         *,
         gate: float,
         margin: float,
+        lost_after: int,
         density: float,
     ) -> None:
         self._target_id = target_id
@@ -58,6 +64,7 @@ class MarkerWatch:
         self._company = MarkerCompany(len(target_id))
         self._gate = gate
         self._margin = margin
+        self._lost_after = lost_after
         self._density = density
 
     def shadows_met(
@@ -88,7 +95,7 @@ class MarkerWatch:
             else:
                 if not (both_settled or distance < MERGED_PX):
                     continue
-                if max(states.unseen[one], states.unseen[two]) <= MERGED_FRAMES:
+                if max(states.unseen[one], states.unseen[two]) <= self._lost_after:
                     measured[one] = measured[two] = False
                     continue
             if two not in self._doubts.partners(one):
@@ -183,9 +190,7 @@ class MarkerDoubts:
 
     def add(self, row: int, frame: int) -> None:
         """Note that a marker may be something else since an image."""
-        if not self._partners[row]:
-            self._since[row] = frame
-        self._partners[row].add(row)
+        self.add_pair(row, row, frame)
 
     def add_pair(self, one: int, other: int, frame: int) -> None:
         """Note that two markers may have been exchanged since an image."""
@@ -218,11 +223,6 @@ def doubt_in(kind: Kind, frame: int, *target_id: int, **numbers: int) -> Finding
     return Finding(kind, cause, place, severity=Severity.WARNING, numbers=numbers)
 
 
-WIDE_PX = 8.0  # standard deviation of a prediction from which markers beside help
-BESIDE = 8
-MIN_BESIDE = 4
-MAX_SHIFT_PX = 60.0
-SHIFTED_SD_PX = 1.2
 STRANGE = 7.0  # squared difference of velocities, over what it used to be
 STRANGE_FRAMES = 2
 SHARED_PX = 15.0  # way of the others since a doubt, after which a marker is no other shadow
@@ -235,51 +235,51 @@ def follow_beside(states: MarkerStates, frames: int) -> None:
     frames is the number of them since the image before.
     """
     motion = states.motion
-    unsettled = np.flatnonzero(~motion.settled).tolist()
+    unsettled = np.flatnonzero(~motion.settled & (states.placed > 0)).tolist()
     beside = {row: velocity_beside(states, row) for row in unsettled}
     for row, found in beside.items():
         if found is not None:
             velocity, spread = found
             uv = motion.uv[row] + frames * (velocity - motion.velocity[row])
-            motion.redirect(row, uv, velocity, max(spread, SHIFTED_SD_PX))
+            motion.redirect(row, uv, velocity, max(spread, GIVEN_SD_PX))
 
 
 def velocity_beside(states: MarkerStates, row: int) -> tuple[NDArray[np.float64], float] | None:
-    """Velocity (2,) of the markers beside one, and how much theirs differ; None without some."""
+    """Velocity (2,) of the company of a marker, and how much theirs differ; None without some."""
     motion = states.motion
     known = np.flatnonzero(motion.settled & (states.unseen <= 1))
     known = known[known != row]
-    if len(known) < MIN_BESIDE:
+    if len(known) < LEADERS:
         return None
-    away = np.linalg.norm(motion.uv[known] - motion.uv[row], axis=1)
-    beside = known[np.argsort(away, kind='stable')[:MIN_BESIDE]]
+    beside = motion.company(row, known)
     velocity = np.median(motion.velocity[beside], axis=0)
     return velocity, float(np.abs(motion.velocity[beside] - velocity).max())
 
 
-def shift_together(motion: Motion, found: Shadows, gate: float, frames: int) -> None:
-    """Move markers whose velocity is not known, or that are lost, with those beside them.
+def shift_together(states: MarkerStates, found: Shadows, gate: float, frames: int) -> None:
+    """Move markers with those beside them: of unknown velocity, or with too wide a gate to search.
 
     One alone could be any shadow in a wide gate; several that keep their places to each other
     are hardly others. frames is the number of them since the image before.
     """
-    wide = ~motion.settled | (motion.variance > WIDE_PX**2)
+    motion = states.motion
+    wide = (~motion.settled | (gate * np.sqrt(motion.variance) > MAX_HALF)) & (states.placed > 0)
     if not wide.any() or len(found.uv) < 2 or len(motion.uv) < 2:
         return
     tree = cKDTree(found.uv)
     before = motion.uv.copy()
     for row in np.flatnonzero(wide).tolist():
         beside = np.argsort(np.linalg.norm(before - before[row], axis=1), kind='stable')
-        beside = beside[(beside != row) & wide[beside]][:BESIDE]
+        beside = beside[(beside != row) & wide[beside]][:LEADERS]
         if not len(beside):
             continue
-        reach = min(gate * float(np.sqrt(motion.variance[row])), MAX_SHIFT_PX)
+        reach = gate * float(np.sqrt(motion.variance[row]))
         shift = common_shift(before, row, beside, tree, reach)
         if shift is not None:
             velocity = motion.velocity[row]
             if not motion.settled[row]:
                 velocity = shift / frames
-            motion.redirect(row, before[row] + shift, velocity, SHIFTED_SD_PX)
+            motion.redirect(row, before[row] + shift, velocity, GIVEN_SD_PX)
 
 
 class MarkerCompany:

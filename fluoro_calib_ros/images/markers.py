@@ -22,7 +22,6 @@ from ..findings import Finding, Kind
 from ..options import option, validate_options
 from .marker_fit import MarkerMeasurement
 from .marker_intensity import (
-    FIRST_SD_PX,
     NOWHERE_PX,
     FilteredImage,
     LightWindows,
@@ -33,13 +32,12 @@ from .marker_intensity import (
     check_image,
     learn_start,
 )
-from .marker_motion import MarkerStates, MeasuredMarkers
+from .marker_motion import GIVEN_SD_PX, MarkerStates, MeasuredMarkers
 from .marker_watch import (
     MarkerDoubts,
     MarkerWatch,
     follow_beside,
     shift_together,
-    velocity_beside,
 )
 
 
@@ -140,7 +138,7 @@ class MarkerFrame:
         return '' if self.finding is None else self.finding.cause
 
 
-MIN_SUGGESTED = 4  # markers that are suggested in an image with which following begins
+MIN_MEMBERS = 4  # of a body, that tell ids; following begins with as many that are suggested
 
 
 def _inside(uv: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.bool_]:
@@ -153,26 +151,6 @@ def _filtered(image: np.ndarray, first: FirstMarkers | None) -> FilteredImage:
     if first is None or first.filtered is None or first.filtered.image is not image:
         return FilteredImage(image)
     return first.filtered
-
-
-def _none_seen(
-    frame: int, target_id: NDArray[np.int64], finding: Finding, seconds: float
-) -> MarkerFrame:
-    """Return an image in which no marker was ever seen."""
-    count = len(target_id)
-    return MarkerFrame(
-        frame,
-        target_id[:0],
-        uv=np.zeros((0, 2)),
-        sigma=np.zeros(0),
-        overlapped=np.zeros(0, dtype=bool),
-        doubtful=np.zeros(0, dtype=bool),
-        missing=target_id,
-        predicted=np.full((count, 2), np.nan),
-        lost=np.ones(count, dtype=bool),
-        finding=finding,
-        seconds=seconds,
-    )
 
 
 @dataclass(frozen=True)
@@ -213,6 +191,7 @@ class _Followed:
                 doubts,
                 gate=options.gate,
                 margin=options.margin,
+                lost_after=options.lost_after,
                 density=start.density,
             ),
         )
@@ -245,9 +224,7 @@ class MarkerTracker:
         self._images = 0  # since the first one
         self._led: NDArray[np.bool_] | None = None
         self._suggested: list[tuple[np.ndarray, ...]] = []
-        # Of the next image: by a person, and by the shapes of bodies.
-        self._given: FirstMarkers | None = None
-        self._relocated: FirstMarkers | None = None
+        self._given: list[FirstMarkers] = []  # in the next image
         self._anew = np.zeros(len(self.target_id), dtype=bool)
         self._tried = 0  # image from which suggested markers are looked for again
 
@@ -272,19 +249,16 @@ class MarkerTracker:
             if image is None:
                 raise DataError('there is no image')
             check_image(image, None if followed is None else followed.size)
-            if followed is None:
-                self._followed = self._start(image, frame)
+            start = self._start(image, frame) if followed is None else None
         except DataError as error:
-            if followed is None:
-                return self._not_begun(frame, error, begin)
+            if followed is None and self.first is not None:
+                raise
             self._advance(frame)
-            self._given = None
+            self._given = []
             nothing = MeasuredMarkers.nothing(len(self.target_id))
             return self._result(nothing, (), error.finding, begin)
-        if followed is None:
-            self._frame = frame
-        else:
-            self._advance(frame)
+        self._advance(frame)
+        self._followed = start or followed
         given = self._place_given()
         found, doubts = self._measure(image, frame)
         doubts = self._believe(given, found, doubts)
@@ -340,20 +314,17 @@ class MarkerTracker:
         """Ids (k,) of markers that were measured last, and whose motion was not known before."""
         return self.target_id[self._anew]
 
-    def relocate(self, found: FirstMarkers) -> None:
-        """Follow markers from where their bodies are found in the next image; ids are sure."""
-        self._relocated = found
-
     def shadows(self, image: np.ndarray) -> Shadows:
         """Return all shadows in an image that look like markers."""
         return self._known().search.everywhere(image)
 
     def place(self, given: FirstMarkers) -> None:
-        """Follow markers from where a person sees them in the next image.
+        """Follow markers from where they are in the next image, by a person or by their bodies.
 
-        Their ids are then sure. A marker that is there anyway goes on as it is.
+        Ids of those that are measured there are then sure. A marker that is there anyway goes on
+        as it is. Of two places, the one that is told first counts.
         """
-        self._given = given
+        self._given.append(given)
 
     def suggest(
         self,
@@ -402,59 +373,39 @@ class MarkerTracker:
             places[: len(self.first.uv)] = self.first.uv
             return places
         for rows, uv, _, sd in self._suggested:
-            near = _inside(uv, shape) & (sd < FIRST_SD_PX)
+            near = _inside(uv, shape) & (sd < GIVEN_SD_PX)
             places[rows[near]] = uv[near]
-        if np.isfinite(places[:, 0]).sum() < MIN_SUGGESTED or frame < self._tried:
+        if np.isfinite(places[:, 0]).sum() < MIN_MEMBERS or frame < self._tried:
             raise DataError('no marker is seen', kind=Kind.NO_MARKERS)
         self._tried = frame + self.options.search_every
         return places
 
-    def _not_begun(self, frame: int, error: DataError, begin: float) -> MarkerFrame:
-        """Return an image without markers, or raise the error where the first ones are given."""
-        if self.first is not None:
-            raise error
-        self._suggested = []
-        seconds = time.perf_counter() - begin
-        return _none_seen(frame, self.target_id, error.finding, seconds)
-
     def _advance(self, frame: int) -> None:
-        """Predict all markers for an image."""
-        states = self._known().states
-        self._gap = frame - self._frame
+        """Predict all markers that are followed for an image."""
+        if self._followed is not None:
+            states = self._followed.states
+            self._gap = frame - self._frame
+            self._images += 1
+            states.advance(self._gap, self._led)
+            for suggested in self._suggested:
+                states.motion.place(*suggested)
         self._frame = frame
-        self._images += 1
-        states.advance(self._gap, self._led)
-        for suggested in self._suggested:
-            states.motion.place(*suggested)
         self._suggested = []
-        found, self._relocated = self._relocated, None
-        if found is not None:
-            rows = np.array([self._row(int(i)) for i in found.target_id])
-            states.place(rows, found.uv, FIRST_SD_PX, self._gap)
-            for row in rows.tolist():
-                self._known().doubts.confirm(row)
 
     def _place_given(self) -> NDArray[np.int64]:
-        """Put markers where a person sees them in this image; returns the rows of all of them."""
-        given, self._given = self._given, None
-        if given is None:
-            return np.zeros(0, dtype=np.int64)
-        rows = np.array([self._row(int(i)) for i in given.target_id])
-        states = self._known().states
-        motion = states.motion
-        away = np.linalg.norm(motion.uv[rows] - given.uv, axis=1)
-        reach = self.options.gate * np.sqrt(motion.variance[rows] + FIRST_SD_PX**2)
-        elsewhere = (states.unseen[rows] > 1) | (away > reach)
-        for row, uv in zip(rows[elsewhere], given.uv[elsewhere]):
-            velocity, _ = velocity_beside(states, row) or (np.zeros(2), 0.0)
-            motion.redirect(row, uv, velocity, FIRST_SD_PX)
-            states.unseen[row] = 1
-        return rows
+        """Put markers where they are given in this image; returns the rows of all of them."""
+        given = [np.zeros(0, dtype=np.int64)]
+        for markers in reversed(self._given):  # what was told first counts, so it is told last
+            rows = np.array([self._row(int(i)) for i in markers.target_id])
+            self._known().states.place(rows, markers.uv, self._gap)
+            given.append(rows)
+        self._given = []
+        return np.unique(np.concatenate(given))
 
     def _believe(
         self, given: NDArray[np.int64], found: MeasuredMarkers, doubts: tuple[Finding, ...]
     ) -> tuple[Finding, ...]:
-        """Take back the doubts in markers that a person has given; returns those that remain."""
+        """Take back the doubts in markers that were given; returns those that remain."""
         sure = given[found.measured[given]]
         for row in sure.tolist():
             self._known().doubts.confirm(row)
@@ -472,13 +423,13 @@ class MarkerTracker:
         shadows = followed.search.shadows(image, windows, states, self._images)
         if self._images:
             follow_beside(states, self._gap)
-            shift_together(states.motion, shadows, self.options.gate, self._gap)
+            shift_together(states, shadows, self.options.gate, self._gap)
         found = followed.measurement.measure(windows, shadows, states)
         unknown = ~states.motion.settled | (states.unseen > 1)
         found, doubts = watch.shadows_met(found, states, frame, is_first=self._images == 0)
         doubts += watch.found_again(found, states, frame)
         doubts += watch.other_shadows(found, states, frame)
-        # In the first image, and where bodies have just been found, their shapes tell the ids.
+        # In the first image, and where places are given, ids are sure.
         self._anew = found.measured & unknown & (states.placed > 0) & (self._images > 0)
         velocity_before = states.motion.velocity.copy()
         states.update(found, self._gap)
@@ -495,20 +446,27 @@ class MarkerTracker:
         begin: float,
     ) -> MarkerFrame:
         """Return the markers of the present image."""
-        followed = self._known()
+        followed = self._followed
         measured = found.measured
         missing = ~measured
-        predicted = followed.states.motion.uv[missing]
+        doubtful = np.zeros(len(measured), dtype=bool)
+        predicted = np.full((len(measured), 2), np.nan)
+        lost = ~doubtful
+        if followed is not None:
+            doubtful = followed.doubts.doubtful
+            uv = followed.states.motion.uv
+            predicted = np.where(uv > NOWHERE_PX / 2, uv, np.nan)
+            lost = followed.search.lost(followed.states)
         return MarkerFrame(
             self._frame,
             self.target_id[measured],
             uv=found.uv[measured],
             sigma=found.sigma[measured],
             overlapped=found.overlapped[measured],
-            doubtful=followed.doubts.doubtful[measured],
+            doubtful=doubtful[measured],
             missing=self.target_id[missing],
-            predicted=np.where(predicted > NOWHERE_PX / 2, predicted, np.nan),
-            lost=followed.search.lost(followed.states)[missing],
+            predicted=predicted[missing],
+            lost=lost[missing],
             doubts=doubts,
             finding=finding,
             seconds=time.perf_counter() - begin,

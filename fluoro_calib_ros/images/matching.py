@@ -23,19 +23,24 @@ from ..errors import DataError
 from ..findings import Kind
 from ..photogrammetry.rotations import rotation_angle
 from .growth import LAST_TOLERANCE_PX, Match, Seen, grow, settle, start_view
-from .lattice import FlatGrid, GridPose, grid_poses
-from .pose_search import Triples, enough_seeds, local_poses, nearby_map, triples_of
+from .lattice import CENTRAL, REACH, STEPS, FlatGrid, GridPose, grid_poses
+from .pose_search import (
+    MIN_EXPLAINED,
+    MIN_FOUND,
+    Triples,
+    enough_seeds,
+    local_poses,
+    nearby_map,
+    triples_of,
+)
 from .view import Lens, View, fit_view
 
 MIN_BEADS = 10
-MIN_EXPLAINED = 0.4
 # Shares found and explained from which a pose is accepted. Where many beads overlap, fewer are
 # found, but nothing else is seen.
-EVIDENT = ((0.72, MIN_EXPLAINED), (0.6, 0.85))
-NEARLY_FOUND = 0.6
-SETTLINGS = 6  # of a match that is nearly evident
+EVIDENT = ((MIN_FOUND, MIN_EXPLAINED), (0.6, 0.85))
 # The same at which the search ends.
-SURE = ((0.85, 0.4), (0.75, 0.95))
+SURE = ((0.85, MIN_EXPLAINED), (0.75, 0.95))
 # By how much the score of the best pose must exceed that of another one: as a share of it, and in
 # beads. What is missed by chance is less.
 MARGIN = 0.06
@@ -55,14 +60,10 @@ LEVELS = (
 # Beads of a phantom from which the search is ended by evidence. With fewer, the whole search takes
 # 2 s, and one of 20 images of large beads that overlap was lost where it ended.
 MANY = 160
-CENTRAL = 8  # beads of the middle that are tried first
 APART = 0.6  # share of the beads, those farthest from their neighbours, that are tried next
 AGREED = 3  # matches of the same pose after which the search ends, if it is evident
-CLIMBS = 12  # from a match to a better one by a symmetry
-RIVAL_STEPS = 3
 MIN_SIZES = 0.1  # relative difference of diameters from which sizes tell beads apart
-SIZE_MARGIN = 10.0  # log-likelihood by which sizes must prefer a pose
-GRID_MARGIN = 10.0  # log-likelihood by which a pose of a grid must exceed another one
+LIKELIER = 10.0  # log-likelihood by which a pose must exceed another one
 SIZE_TAIL = 6.0  # residual of a response beyond which it counts no more [standard deviations]
 SIZE_NEIGHBOURS = 12  # that tell what response is usual
 # Of the logarithm of a response to that of a radius r. A disc has r^2 exp(-r^2 / 2 s^2) at a scale
@@ -70,7 +71,6 @@ SIZE_NEIGHBOURS = 12  # that tell what response is usual
 SIZE_SLOPES = (0.5, 3.0)
 CLOSER = 2.0  # factor on the residuals of one pose from which another is the better one
 SYMMETRY_SHARE = 0.4  # of the beads that a symmetry takes near to a bead
-SYMMETRY_REACH = 0.3  # of the distance between neighbours
 SHIFTS = 6  # to neighbours, as candidates of symmetries
 SCALE_BY_SIZE = (0.55, 1.6)  # of a bead's image over its diameter, with the blur
 
@@ -214,7 +214,7 @@ def _could_be(pose: GridPose, best: GridPose) -> bool:
     pose shows (with one more, for what it does not show).
     """
     log_odds = np.log(best.numbered / (best.against + 1))
-    return bool((pose.against - best.against) * log_odds < GRID_MARGIN)
+    return bool((pose.against - best.against) * log_odds < LIKELIER)
 
 
 def _ambiguous(best: Match, other: Match) -> DataError:
@@ -237,9 +237,7 @@ def _improved(one: Match, seen: Seen, model: PhantomModel) -> Match:
 
     Where faces are seen from the edge, a pose reaches the far side of the phantom only by and by.
     """
-    for _ in range(SETTLINGS):
-        if is_sure(one) or one.found < NEARLY_FOUND or one.explained < MIN_EXPLAINED:
-            break
+    while not is_sure(one) and one.found >= EVIDENT[1][0] and one.explained >= MIN_EXPLAINED:
         again = settle(one.view, model.xyz, seen)
         if again is None or again.score <= one.score:
             break
@@ -316,7 +314,7 @@ def _best_by_size(matches: list[Match], seen: Seen, model: PhantomModel) -> Matc
         for one, row in zip(matches, rows)
     ]
     order = np.argsort(likelihoods)
-    if likelihoods[order[-1]] - likelihoods[order[-2]] < SIZE_MARGIN:
+    if likelihoods[order[-1]] - likelihoods[order[-2]] < LIKELIER:
         return None
     return matches[order[-1]]
 
@@ -349,13 +347,12 @@ def _climbed(
     On a nearly regular phantom the search finds poses that are several steps of its pattern off.
     """
     symmetries = [one for one in model.symmetries if one.turn_rad <= turn_rad]
-    for _ in range(CLIMBS):
+    while True:
         rivals = list(_alternatives(best, seen, model, symmetries))
         better = max(rivals, key=lambda one: one.score, default=best)
         if better.score <= best.score:
-            break
+            return best, rivals
         best = better
-    return best, rivals
 
 
 def _alternatives(
@@ -371,7 +368,7 @@ def _alternatives(
             symmetry.turned(best.view),
             model.xyz[other[known]],
             seen.uv[best.detection[known]],
-            RIVAL_STEPS,
+            STEPS,
             0.3,
         )
         # In the end, beads are matched within this.
@@ -466,7 +463,7 @@ def _symmetries(xyz: NDArray[np.float64]) -> Iterator[Symmetry]:
     centre = (xyz.min(axis=0) + xyz.max(axis=0)) / 2
     tree = cKDTree(xyz)
     distance, near = tree.query(xyz, k=min(SHIFTS + 1, len(xyz)))
-    reach = SYMMETRY_REACH * float(np.median(distance[:, 1]))
+    reach = REACH * float(np.median(distance[:, 1]))
     _, _, principal = np.linalg.svd(xyz - xyz.mean(axis=0), full_matrices=False)
     seen: set[bytes] = {np.arange(len(xyz)).tobytes()}
     turns = [axes.T @ turn @ axes for axes in (np.eye(3), principal) for turn in _turns_of_cube()]

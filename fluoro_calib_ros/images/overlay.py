@@ -219,7 +219,6 @@ def draw_bodies(image: np.ndarray, title: str, bodies: Sequence[BodyView]) -> ND
 
 COVERED = (60, 150, 70)  # RGB
 MISSING = (90, 90, 90)
-LINES = (235, 235, 235)
 NEXT = (255, 200, 0)
 TEXT_ROWS = 22  # px a line of text
 WIDTH = 480  # px
@@ -245,8 +244,8 @@ def coverage_picture(
     )
     picture = cv2.resize(colours, (WIDTH, rows), interpolation=cv2.INTER_NEAREST)
     for i in (1, 2):  # the areas that the advice names
-        cv2.line(picture, (WIDTH * i // 3, 0), (WIDTH * i // 3, rows), LINES, 1)
-        cv2.line(picture, (0, rows * i // 3), (WIDTH, rows * i // 3), LINES, 1)
+        cv2.line(picture, (WIDTH * i // 3, 0), (WIDTH * i // 3, rows), TEXT, 1)
+        cv2.line(picture, (0, rows * i // 3), (WIDTH, rows * i // 3), TEXT, 1)
     for area in areas:
         row, column = divmod(area, 3)
         first = (WIDTH * column // 3 + 3, rows * row // 3 + 3)
@@ -257,5 +256,5 @@ def coverage_picture(
         place = (6, TEXT_ROWS * (i + 1) - 6)
         size = cv2.getTextSize(line, FONT, 0.45, 1)[0][0]
         scale = 0.45 * min(1.0, (WIDTH - 12) / max(size, 1))
-        cv2.putText(text, line, place, FONT, scale, LINES, 1, cv2.LINE_AA)
+        cv2.putText(text, line, place, FONT, scale, TEXT, 1, cv2.LINE_AA)
     return np.vstack([picture, text])

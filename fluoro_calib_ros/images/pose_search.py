@@ -315,8 +315,8 @@ def _rotation(
 
 VIEWS = 48
 LEAST = 4  # beads that stand apart in a view in which the phantom can be found
-FOUND = 0.72  # share of the beads that are found, at least
-SEEN = 0.4  # share of what is found that are beads, at least
+MIN_FOUND = 0.72  # share of the beads that are found
+MIN_EXPLAINED = 0.4  # share of what is found that are beads
 MERGED = 2.0  # radii between beads that are found as one
 # Chance that a search from three right beads leads to the pose. Of 47 images of the renderings
 # with a share of 0.95 of such beads, 31 were found from the first one, 8 from the second.
@@ -340,7 +340,7 @@ def enough_seeds(
     neighbours : tuple of int
         Neighbours of a bead in the phantom and in the image that make triples with it.
     """
-    share = float(np.clip(FOUND * len(xyz) / found, SEEN, 1.0))
+    share = float(np.clip(MIN_FOUND * len(xyz) / found, MIN_EXPLAINED, 1.0))
     chance = LEADS * _chances(xyz, share, MERGED * radius, neighbours)
     missed = np.ones(len(chance))
     seeds = 0
@@ -365,7 +365,7 @@ def _chances(
     for turn in Rotation.random(VIEWS, random_state=0).as_matrix():
         uv = xyz @ turn[:2].T
         apart = cKDTree(uv).query(uv, k=[2])[0][:, 0] > merged
-        bead = np.flatnonzero(apart & (rng.random(len(xyz)) < FOUND))
+        bead = np.flatnonzero(apart & (rng.random(len(xyz)) < MIN_FOUND))
         if len(bead) < LEAST:
             continue
         others = round(len(bead) * (1 / share - 1))

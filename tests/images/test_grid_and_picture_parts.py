@@ -16,13 +16,8 @@ from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.images import corrector, lattice, marker_ids, overlay
 from fluoro_calib_ros.images.marker_decisions import DecidedView, ViewCounts
 from fluoro_calib_ros.images.marker_motion import MarkerStates, Motion
-from fluoro_calib_ros.images.marker_points import (
-    CalibratedRig,
-    ShadowPoints,
-    _explaining,
-    shadow_points,
-)
-from fluoro_calib_ros.images.marker_rays import MarkerBodies, MarkerPlaces, MarkerRays
+from fluoro_calib_ros.images.marker_points import ShadowPoints, _explaining, shadow_points
+from fluoro_calib_ros.images.marker_rays import CalibratedRig, MarkerBodies, MarkerPlaces
 from fluoro_calib_ros.images.marker_views import JoinedViews, _later, _names, _Told
 from fluoro_calib_ros.images.view import Lens
 from fluoro_calib_ros.simulation.rig import virtual_rig
@@ -214,7 +209,7 @@ def test_covered_cells_are_green_where_they_are(size):
 
     assert at(0.2, 0.1) == overlay.COVERED and at(0.8, 0.1) == overlay.MISSING
     assert at(0.2, 0.9) == overlay.MISSING and at(0.8, 0.9) == overlay.COVERED
-    assert colours_at(picture, 160, 3) == overlay.LINES == colours_at(picture, 320, 3)
+    assert colours_at(picture, 160, 3) == overlay.TEXT == colours_at(picture, 320, 3)
     assert colours_at(picture, 3, rows // 3) == colours_at(picture, 3, 2 * rows // 3)
     framed = (picture[:rows] == overlay.NEXT).all(axis=2)
     v, u = np.nonzero(framed)
@@ -286,18 +281,18 @@ def states_at(uv):
 def test_places_of_a_body_tell_the_velocity_by_the_second_image():
     states = states_at([[100, 100], [200, 100], [300, 100]])
     states.advance(1, None)
-    states.place(np.array([0, 2]), np.array([[120.0, 110], [300.2, 100]]), 1.5, frames=1)
+    states.place(np.array([0, 2]), np.array([[120.0, 110], [300.2, 100]]), frames=1)
     # The third marker is there anyway, and the second one was not asked for.
     assert states.motion.uv.tolist() == [[120, 110], [200, 100], [300, 100]]
     assert states.motion.covariance[0].tolist() == [[2.25, 0], [0, 36]]
     assert not states.motion.velocity.any() and states.placed[0] == 0 and states.unseen[0] == 1
     states.unseen[:] = 0  # measured
     states.advance(2, None)
-    states.place(np.array([0]), np.array([[150.0, 116]]), 1.5, frames=2)
+    states.place(np.array([0]), np.array([[150.0, 116]]), frames=2)
     assert states.motion.velocity[0].tolist() == [15, 3]
     assert states.motion.covariance[0].tolist() == [[2.25, 0], [0, 2.25]]
     states.unseen[0] = 9  # long not seen: the place before says nothing
-    states.place(np.array([0]), np.array([[10.0, 20]]), 1.5, frames=1)
+    states.place(np.array([0]), np.array([[10.0, 20]]), frames=1)
     assert states.motion.uv[0].tolist() == [10, 20] and not states.motion.velocity[0].any()
 
 
@@ -322,7 +317,7 @@ def test_a_body_of_which_less_than_half_is_seen_again_is_elsewhere():
 def test_a_missed_body_that_its_markers_place_is_not_missed_any_more(is_placed):
     joined = JoinedViews.__new__(JoinedViews)
     joined._views, joined._told, joined._by_body, joined._by_rays = [], [], [], []
-    joined._target_id, joined._angles = np.array([3, 5]), {}
+    joined._target_id, joined._rig = np.array([3, 5]), Fake(angles={})
     joined._measured = np.zeros((0, 2), dtype=bool)
     joined._missed, joined._again = np.array([True, False]), []
     none = np.zeros(2, dtype=bool)
@@ -402,7 +397,6 @@ def rig():
 def test_spread_of_a_point_is_that_of_its_projection(rig):
     """By finite differences along the axes of its covariance."""
     made, known = rig
-    rays = MarkerRays(known.calibrations, known.orientation, ['a', 'b', 'c'], np.arange(2))
     xyz = np.array([[10.0, -20, 30]])
     half = RNG.normal(size=(3, 3))
     covariance = half @ half.T
@@ -412,8 +406,8 @@ def test_spread_of_a_point_is_that_of_its_projection(rig):
             for one in half.T
         ]
         expected = np.sqrt(np.sum(np.square(steps)) / 2)
-        assert rays.spread(view, xyz, covariance[None])[0] == pytest.approx(expected, rel=1e-4)
-        uv = rays.project(view, np.vstack([xyz, [[np.nan] * 3]]), {})
+        assert known.spread(view, xyz, covariance[None])[0] == pytest.approx(expected, rel=1e-4)
+        uv = known.project(view, np.vstack([xyz, [[np.nan] * 3]]))
         np.testing.assert_allclose(uv[0], fluoroscope.ideal(xyz)[0], atol=1e-6)
         assert np.isnan(uv[1]).all()
 
@@ -448,7 +442,7 @@ def test_views_are_told_where_unsure_markers_are_expected():
     joined = JoinedViews.__new__(JoinedViews)
     tracker = Tracker(unsure=[5, 8])
     joined._target_id = ids
-    joined._frame, joined._angles, joined._angles_before = 10, {'a': 1.0}, {'a': 2.0}
+    joined._frame = 10
     joined._views = [DecidedView(0, 'a', tracker, ids, ViewCounts(3))]
 
     def at(values):
@@ -460,10 +454,11 @@ def test_views_are_told_where_unsure_markers_are_expected():
     )
     told = at([7.0, 7.0, 8.0])
     joined._told = [Fake(places=told, expected=lambda frame: at([9.0, 9.0, 10.0]))]
-    joined._rays = Fake(
-        project=lambda view, xyz, angles: xyz[:, :2] * 10 * angles['a'],
+    joined._rig = Fake(
+        project=lambda view, xyz: xyz[:, :2] * 10,
         spread=lambda view, xyz, covariance: xyz[:, 0] / 100,
     )
+    joined._rig_before = Fake(project=lambda view, xyz: xyz[:, :2] * 20)
     joined._suggest(12, np.zeros(3, dtype=bool))
     ((told_ids, uv, velocity, sd),) = tracker.told
     assert told_ids == [5, 8]

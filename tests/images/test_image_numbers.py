@@ -25,9 +25,8 @@ from fluoro_calib_ros.images.lattice import _basis
 from fluoro_calib_ros.images.marker_motion import (
     FIRST_SPEED_PX,
     MAX_SD_PX,
-    MIN_ACCELERATION_PX,
     MODEL_SD_PX,
-    STRANGE_PX,
+    UNSTEADY_PX,
     MarkerStates,
     MeasuredMarkers,
     Motion,
@@ -250,7 +249,7 @@ def test_prediction_adds_velocity_and_acceleration():
     still = motion()
     still.squared[:] = 0
     still.predict(1)
-    assert still.variance[0] == pytest.approx(1 + 0.01 + MIN_ACCELERATION_PX**2 / 4)
+    assert still.variance[0] == pytest.approx(1 + 0.01)
     for _ in range(99):
         one.predict(5)
     assert one.variance.max() == pytest.approx(MAX_SD_PX**2)
@@ -300,14 +299,14 @@ def test_marker_of_unknown_velocity_follows_those_beside_it():
     assert one.settled.tolist() == [k != 2 for k in range(7)]
     one.velocity[2] = [50.0, 50.0]
     before = one.uv.copy()
-    follow_beside(Fake(motion=one, unseen=np.ones(7)), 2)
+    follow_beside(MarkerStates.start(one, np.ones(7, int)), 2)
     np.testing.assert_allclose(one.uv[2], before[2] + 2 * (np.array([3, -1]) - 50))
     np.testing.assert_allclose(one.velocity[2], [3, -1])
     np.testing.assert_allclose(one.uv[[0, 1, 3, 4]], before[[0, 1, 3, 4]])
     few = motion(4)
     few.covariance[2, 1, 1] = 1e4
     before = few.uv.copy()
-    follow_beside(Fake(motion=few, unseen=np.ones(4)), 2)
+    follow_beside(MarkerStates.start(few, np.ones(4, int)), 2)
     assert np.array_equal(few.uv, before)
 
 
@@ -368,7 +367,7 @@ def test_marker_that_leaves_its_body_is_strange():
     assert rows.tolist() == [k for k in range(12) if k != 7]
     np.testing.assert_allclose(others, np.where(rows[:, None] % 2, [8.0, 0.0], [0.0, 3.0]))
     usual = np.zeros(11)
-    np.testing.assert_allclose(ratio[rows == 3], 36 / STRANGE_PX**2)
+    np.testing.assert_allclose(ratio[rows == 3], 36 / UNSTEADY_PX**2)
     np.testing.assert_allclose(ratio[rows != 3], usual[rows != 3], atol=1e-12)
     assert not len(one.strangeness(np.arange(12) < 4)[0])
     # Those that were compared in few images tell nothing.
@@ -481,17 +480,17 @@ def test_lost_markers_are_shifted_together_with_the_velocity_that_they_have():
     """Or with that of the shift, where it is not known; those that are sure stay."""
     one = motion(6)
     one.uv[:] = [[100.0, 100], [130, 100], [100, 140], [150, 150], [120, 170], [400, 400]]
-    one.covariance[:4, 0, 0] = 15.0**2  # lost
+    one.covariance[:4, 0, 0] = 17.0**2  # lost
     one.covariance[0, 1, 1] = 1e4  # and of unknown velocity
     one.covariance[4:, 0, 0] = 0.01
     one.velocity[:] = [2.0, 1.0]
     before = one.uv.copy()
     shift = np.array([8.0, -6.0])
-    shift_together(one, Fake(uv=before[:5] + shift), 3.0, 2)
+    shift_together(MarkerStates.start(one, np.ones(6, int)), Fake(uv=before[:5] + shift), 3.0, 2)
     np.testing.assert_allclose(one.uv[:4], before[:4] + shift)
     np.testing.assert_allclose(one.velocity[0], shift / 2)
     np.testing.assert_allclose(one.velocity[1:], np.tile([2.0, 1.0], (5, 1)))
     np.testing.assert_allclose(one.uv[4:], before[4:])
     still = motion(6)
-    shift_together(still, Fake(uv=before + shift), 3.0, 2)
+    shift_together(MarkerStates.start(still, np.ones(6, int)), Fake(uv=before + shift), 3.0, 2)
     np.testing.assert_allclose(still.velocity, motion(6).velocity)

@@ -182,7 +182,7 @@ def negative(image):
 
 def test_markers_are_found_in_a_turned_image_and_in_its_negative():
     image = scene()
-    found = search_image(image, look_of(image), 0.35)
+    found = search_image(image, look_of(image))
     assert len(found.uv) == 12
     away = np.linalg.norm(found.uv[:, None] - PLACES[None], axis=2)
     assert away.min(axis=0).max() < 1.0
@@ -191,15 +191,15 @@ def test_markers_are_found_in_a_turned_image_and_in_its_negative():
         (transposed, look_of(transposed), swapped),
         (negative(image), look_of(negative(image), True), np.asarray),
     ):
-        again = search_image(other, look, 0.35)
+        again = search_image(other, look)
         np.testing.assert_allclose(in_order(back(again.uv)), in_order(found.uv), atol=0.02)
         assert sorted(again.strength) == pytest.approx(sorted(found.strength), rel=1e-2)
 
 
 def test_an_image_says_itself_whether_its_markers_are_bright():
     image = scene()
-    dark = first_shadows(FilteredImage(image).of_scale(3.0), 12, 0.35)
-    bright = first_shadows(FilteredImage(negative(image)).of_scale(3.0), 12, 0.35)
+    dark = first_shadows(FilteredImage(image).of_scale(3.0), 12)
+    bright = first_shadows(FilteredImage(negative(image)).of_scale(3.0), 12)
     np.testing.assert_allclose(in_order(bright.uv), in_order(dark.uv), atol=0.02)
     sides = FilteredImage(image).of_scale(3.0)
     turned = FilteredImage(negative(image)).of_scale(3.0)
@@ -237,19 +237,19 @@ def test_windows_show_the_shadows_that_the_whole_image_has_there():
     """Each once, wherever it is in one or in two windows."""
     image = scene()
     look = look_of(image)
-    whole = search_image(image, look, 0.35)
+    whole = search_image(image, look)
     windows = LightWindows(image, look)
     shifts = [[5, -6], [-7, 7], [-3, 6], [2, 1], [0, 8]]
     middle = np.rint(PLACES).astype(int)[[0, 1, 1, 7, 10]] + shifts
-    found = search_windows(windows, middle, 12, look, 0.35)
+    found = search_windows(windows, middle, 12, look)
     expected = [uv for uv in whole.uv if np.abs(uv - middle).max(axis=1).min() <= 12.4]
     assert len(found.uv) == len(expected) == 4
     np.testing.assert_allclose(in_order(found.uv), in_order(np.array(expected)), atol=0.25)
-    none = search_windows(windows, np.array([[30, 75]]), 8, look, 0.35)
+    none = search_windows(windows, np.array([[30, 75]]), 8, look)
     assert len(none.uv) == 0
     transposed = np.ascontiguousarray(image.T)
     look = look_of(transposed)
-    turned = search_windows(LightWindows(transposed, look), middle[:, ::-1], 12, look, 0.35)
+    turned = search_windows(LightWindows(transposed, look), middle[:, ::-1], 12, look)
     # The light around a pixel is that along the rows.
     np.testing.assert_allclose(in_order(swapped(turned.uv)), in_order(found.uv), atol=0.25)
 
@@ -339,7 +339,7 @@ def test_strips_of_an_image_are_searched_in_turn(every):
     look = look_of(image)
     states = MarkerStates.start(Motion.start(PLACES - 500.0, 30.0), np.full(12, 99))
     search = MarkerSearch(look, gate=4.5, lost_after=10, search_every=every)
-    whole = search_image(image, look, 0.35)
+    whole = search_image(image, look)
     windows = LightWindows(image, look)
     found = [search.shadows(image, windows, states, number) for number in range(60, 60 + every)]
     assert np.count_nonzero([len(one.uv) for one in found]) <= min(every, 6)
@@ -374,7 +374,7 @@ def test_shadows_in_the_middle_of_which_the_image_ends_are_not_found(edge):
         there = there @ [[0, -1], [1, 0]]
     there = there + [[0, 0], [0, 189], [189, 149], [149, 0]][edge]
     look = look_of(cut)
-    found = search_image(cut, look, 0.35)
+    found = search_image(cut, look)
     away = np.linalg.norm(found.uv[:, None] - there[None], axis=2)
     assert len(found.uv) == len(there) == 10
     assert away.min(axis=0).max() < 1 and away.min(axis=1).max() < 1

@@ -28,9 +28,8 @@ from fluoro_calib_ros.findings import Finding, Kind
 from fluoro_calib_ros.images.codec import encode
 from fluoro_calib_ros.images.marker_decisions import Decision, revise
 from fluoro_calib_ros.images.marker_ids import find_bodies, identify_markers
-from fluoro_calib_ros.images.marker_motion import Motion
-from fluoro_calib_ros.images.marker_points import CalibratedRig
-from fluoro_calib_ros.images.marker_rays import project_observed
+from fluoro_calib_ros.images.marker_motion import Motion, doubtful_pairs
+from fluoro_calib_ros.images.marker_rays import CalibratedRig
 from fluoro_calib_ros.images.marker_views import MarkerViews, ViewsFrame
 from fluoro_calib_ros.images.markers import FirstMarkers, MarkerFrame, MarkerOptions, MarkerTracker
 from fluoro_calib_ros.images.overlay import draw_markers
@@ -140,12 +139,12 @@ def followed_bodies() -> tuple[Body, ...]:
 
 
 @cache
-def followed_in_both() -> tuple[ViewsFrame, ...]:
+def followed_in_both(options: MarkerOptions = OPTIONS) -> tuple[ViewsFrame, ...]:
     _, images = sequence()
     calibrations, orientation = calibration()
     bodies = followed_bodies()
     first = {name: given(name) for name in 'ab'}
-    views = MarkerViews(calibrations, orientation, OPTIONS, first=first, bodies=bodies)
+    views = MarkerViews(calibrations, orientation, options, first=first, bodies=bodies)
     return tuple(
         views.update({name: image.image for name, image in of.items()}, number)
         for number, of in enumerate(images, 1)
@@ -561,6 +560,7 @@ def test_pictures_show_ids_and_doubts():
 # ---- a correction that depends on the angle of the C-arm
 
 TURNED = 20  # exposures
+DOUBTING = replace(OPTIONS, margin=200.0)  # with so many doubts that there is something to decide
 JOINT = {'a': 1.0, 'b': -1.0}  # the arms turn against each other
 
 
@@ -624,7 +624,7 @@ def followed_while_turning(known: bool) -> list[ViewsFrame]:
     views = MarkerViews(
         turning(),
         turning_orientation(),
-        OPTIONS,
+        DOUBTING,
         first=turned_first(),
         bodies=followed_bodies(),
     )
@@ -642,7 +642,7 @@ def decided(frames: Iterable[ViewsFrame]) -> list[tuple[str, str, tuple[int, ...
 def test_doubts_are_decided_at_the_angles_of_the_arms_as_without_distortion():
     """The mean over the angles, whose standard deviation is larger, decides nothing else."""
     assert np.abs(displaced('b', 1, given('b').uv) - given('b').uv).max() > 5
-    straight = decided(followed_in_both()[:TURNED])
+    straight = decided(followed_in_both(DOUBTING)[:TURNED])
     at_angle = decided(followed_while_turning(True))
     assert straight and set(straight) <= set(at_angle)
     assert {kind for kind, *_ in at_angle} == {'confirmed'}
@@ -659,8 +659,8 @@ def test_points_are_projected_to_where_they_are_seen_at_an_angle():
     xyz = np.random.default_rng(1).uniform(-10, 10, (20, 3))
     for view, name in enumerate('ab'):
         each = turning()[name]
-        ideal = project_observed(turning_orientation(), view, calibration()[0][name], xyz)
-        seen = project_observed(turning_orientation(), view, each, xyz, 0.7)
+        ideal = CalibratedRig(turning_orientation(), calibration()[0], {}).project(view, xyz)
+        seen = CalibratedRig(turning_orientation(), turning(), {name: 0.7}).project(view, xyz)
         assert np.abs(seen - ideal).max() > 1
         assert np.abs(each.correct(seen, angle=0.7).uv - ideal).max() < 0.01
 
@@ -863,7 +863,7 @@ def write_turned_first(path: Path) -> None:
 
 
 @pytest.mark.long
-def test_command_follows_markers_at_the_angles_of_a_bag(tmp_path, capsys):
+def test_command_follows_markers_at_the_angles_of_a_bag(tmp_path, capsys, monkeypatch):
     """The angles also stand in the table that it writes; without them a note says so."""
     time = message_class('builtin_interfaces/msg/Time')
     header = message_class('std_msgs/msg/Header')
@@ -885,6 +885,10 @@ def test_command_follows_markers_at_the_angles_of_a_bag(tmp_path, capsys):
                 )
                 topic = f'/{name}/image_raw/compressed'
                 bag.write(topic, COMPRESSED_IMAGE, message, number * 10**9)
+    monkeypatch.setattr(
+        'fluoro_calib_ros.images.marker_watch.doubtful_pairs',
+        lambda *given: doubtful_pairs(*given[:-1], DOUBTING.margin),
+    )
     save_turning(tmp_path / 'result')
     write_turned_first(tmp_path / 'first.csv')
     words = ['extract', tmp_path / 'bag', '--markers', tmp_path / 'first.csv', '--json']

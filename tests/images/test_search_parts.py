@@ -28,13 +28,8 @@ from fluoro_calib_ros.images.growth import (
 )
 from fluoro_calib_ros.images.lattice import FlatGrid, _view
 from fluoro_calib_ros.images.marker_fit import _MarkerFit
-from fluoro_calib_ros.images.marker_intensity import (
-    FIRST_SD_PX,
-    LightWindows,
-    Shadows,
-    check_image,
-)
-from fluoro_calib_ros.images.marker_motion import MeasuredMarkers, Motion
+from fluoro_calib_ros.images.marker_intensity import LightWindows, Shadows, check_image
+from fluoro_calib_ros.images.marker_motion import GIVEN_SD_PX, MeasuredMarkers, Motion
 from fluoro_calib_ros.images.marker_watch import MarkerDoubts, MarkerWatch
 from fluoro_calib_ros.images.matching import SHIFTS, _common
 from fluoro_calib_ros.images.pose_search import (
@@ -133,13 +128,13 @@ def test_what_is_near_a_bead_is_marked():
 
 @pytest.mark.parametrize('neighbours', [(2, 4), (4, 2)])
 def test_a_search_is_sure_where_all_neighbours_are_a_bead_s_own(monkeypatch, neighbours):
-    monkeypatch.setattr(pose_search, 'FOUND', 1.1)
+    monkeypatch.setattr(pose_search, 'MIN_FOUND', 1.1)
     five = 50 * np.array([(0, 0, 0), (1, 0, 0), (0, 1.1, 0), (0, 0, 1.2), (1, 1.3, 1)])
     chance = _chances(five, 1.0, 1e-3, neighbours)
     np.testing.assert_array_equal(chance, np.ones(pose_search.VIEWS))
     # One of 2^10 is less than one of a thousand.
     assert enough_seeds(five, 5, 1e-3, neighbours) == 5
-    monkeypatch.setattr(pose_search, 'SEEN', 1.0)
+    monkeypatch.setattr(pose_search, 'MIN_EXPLAINED', 1.0)
     assert enough_seeds(five, 50, 1e-3, neighbours) == 10
     assert not len(_chances(five[:3], 1.0, 1e-3, neighbours))
     (once, *_), (half, *_) = (_chances(BEADS, share, 1e-3, (23, 6)) for share in (1.0, 0.5))
@@ -308,7 +303,9 @@ def watched(uv, variance, unseen=None):
     motion.covariance[:, 0, 0] = variance
     motion.covariance[:-1, 1, 1] = 0.01
     doubts = MarkerDoubts(len(uv))
-    watch = MarkerWatch(np.arange(len(uv)) + 10, doubts, gate=4.0, margin=6.0, density=1e-4)
+    watch = MarkerWatch(
+        np.arange(len(uv)) + 10, doubts, gate=4.0, margin=6.0, lost_after=6, density=1e-4
+    )
     return watch, doubts, Fake(motion=motion, unseen=np.array(unseen or len(uv) * [0]))
 
 
@@ -377,7 +374,7 @@ def test_places_of_the_first_image_tell_no_markers_apart_that_are_nearer_to_each
 ):
     """They are given to a pixel or two, whoever gives them."""
     at = np.array([[500.0, 300], [500 + apart, 300], [900, 900]])
-    watch, doubts, states = watched(at, FIRST_SD_PX**2, [0, 0, 0])
+    watch, doubts, states = watched(at, GIVEN_SD_PX**2, [0, 0, 0])
     states.motion.covariance[:, 1, 1] = 1e6  # no velocity is known
     seen = found_at(at, [1, 1, 1])
     assert not watch.shadows_met(seen, states, 4)[1]
@@ -512,7 +509,7 @@ def test_support_is_the_share_of_the_nearest_beads_in_space(count):
     good = rng.random(count) < 0.5
     near = np.argsort(np.linalg.norm(xyz[:, None] - xyz[None], axis=2), axis=1)[:, 1:]
     share = good[near[:, : growth.SUPPORT]].mean(axis=1)
-    assert supported(xyz, good).tolist() == (share >= growth.MIN_SUPPORT).tolist()
+    assert supported(xyz, good).tolist() == (share >= growth.MIN_SHARE).tolist()
     assert 0 < supported(xyz, good).mean() < 1 or count < 40
 
 

@@ -29,8 +29,8 @@ from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.findings import Kind
 from fluoro_calib_ros.images.codec import encode
 from fluoro_calib_ros.images.marker_ids import find_bodies, identify_markers
-from fluoro_calib_ros.images.marker_points import CalibratedRig, shadow_points
-from fluoro_calib_ros.images.marker_rays import AGREE, RayFit
+from fluoro_calib_ros.images.marker_points import shadow_points
+from fluoro_calib_ros.images.marker_rays import AGREE, CalibratedRig, RayFit
 from fluoro_calib_ros.images.marker_views import MarkerViews
 from fluoro_calib_ros.images.markers import FirstMarkers, MarkerFrame, MarkerOptions
 from fluoro_calib_ros.io.bodies import write_bodies

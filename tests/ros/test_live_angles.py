@@ -400,7 +400,7 @@ def test_markers_are_followed_at_the_angles_of_their_images(graph, tmp_path):
     def unknown():
         """Show an exposure that is too late for the last state, one after the other."""
         count = len(found['b'])
-        show(last + 2, START_NS + next(late) * 10**9)
+        show(last + 1, START_NS + next(late) * 10**9)
         client.wait_until(lambda: len(found['b']) > count, what='its markers')
         status = client.statuses.get('extraction_node: a')
         return status if status is not None and 'predicted by the mean' in status.message else None

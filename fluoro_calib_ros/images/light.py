@@ -28,7 +28,7 @@ from scipy.special import expit, logit, logsumexp
 MIN_VARIANCE = 1 / 12  # of rounding
 SAMPLED = 100_000  # pixels that tell the noise: a median of each level to 2 %
 LEVELS = 30  # of light, at which it is estimated
-MIN_CORRELATION = 0.08  # that is told from slow changes of the light
+SURE_CORRELATION = 3.0  # standard deviations of one that is none
 LAGS = 4  # pixels over which noise is correlated
 SECOND = np.array([1.0, -2.0, 1.0])  # differences
 MIN_SEEN = 0.1  # of the variance: what second differences see of noise blurred by a pixel
@@ -122,10 +122,13 @@ def _seen_by(kernel: NDArray[np.float64], correlation: NDArray[np.float64]) -> f
 def _correlation(light: NDArray[np.float32], field: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Correlation of the noise, from the background less its blur, clipped at beads."""
     height, width = light.shape
-    middle = np.s_[height // 4 : height - height // 4, width // 4 : width - width // 4]
-    light = light[middle]
-    field = field[middle]
-    rest = light - cv2.GaussianBlur(light, (0, 0), 3 * LAGS)
+    top, left = height // 4, width // 4
+    # A blur mirrors the light at its border, where a slope would look like noise.
+    edge = min(9 * LAGS, top, left)
+    wider = light[top - edge : height - top + edge, left - edge : width - left + edge]
+    rest = wider - cv2.GaussianBlur(wider, (0, 0), 3 * LAGS)
+    rest = rest[edge : edge + height - 2 * top, edge : edge + width - 2 * left]
+    field = field[top : height - top, left : width - left]
     white = np.zeros((2 * LAGS + 1, 2 * LAGS + 1))
     white[LAGS, LAGS] = 1
     if np.count_nonzero(field) < MIN_PIXELS:
@@ -165,7 +168,8 @@ def correlation_of(
             out[LAGS + row, LAGS + column] = out[LAGS - row, LAGS - column] = mean
     edge = float(np.median(np.concatenate([out[0], out[-1], out[:, 0], out[:, -1]])))
     out = np.clip((out - edge) / max(1 - edge, 1 - MAX_SLOW), 0, 1)
-    out[out < MIN_CORRELATION] = 0
+    # Estimates of noise that is not correlated scatter by the root of the number of pixels.
+    out[out < SURE_CORRELATION / np.sqrt(max(float(seen.sum()), 1.0))] = 0
     out[LAGS, LAGS] = 1
     return out
 

@@ -101,7 +101,7 @@ def detect_beads(
         return next(likely_detections(image, beads))
     sight = _Sight.of(image, beads, look.noise)
     scale = max(look.radius_px / BLOB_RADIUS, 1.0)
-    found = sight.detections(scale, look.inverted, look.alike)
+    found = sight.detections(scale, look.inverted, look.radius_px if look.alike else None)
     if found is None:
         raise _nothing(image, sight)
     return found
@@ -225,10 +225,13 @@ class _Sight:
             best = max(best, float((blobs.response / light).max(initial=0.0)))
         return best
 
-    def detections(self, scale: float, inverted: bool, alike: bool = False) -> Detections | None:
+    def detections(
+        self, scale: float, inverted: bool, radius_px: float | None = None
+    ) -> Detections | None:
         """Return what is found with a scale and a polarity, None for nothing.
 
-        alike: no bead is much larger than a typical one.
+        radius_px: that of all beads, where they were seen before. Where several are one blob, the
+        pose of before tells it.
         """
         grey = self.grey
         light = float(grey.max()) - grey if inverted else grey
@@ -239,9 +242,13 @@ class _Sight:
             field &= field_of_view(grey, scale)
         for wider in WIDER:
             blobs = _beads(self.blobs(wider * scale, inverted), field, self.typical)
-            uv = blobs.uv if alike else self.merged(blobs, wider * scale, inverted)
+            uv = blobs.uv
+            radius = radius_px
+            if radius_px is None:
+                uv = self.merged(blobs, wider * scale, inverted)
+                if len(uv):
+                    uv, radius = set_apart(light / _light_around(light, scale), uv)
             if len(uv):
-                uv, radius = set_apart(light / _light_around(light, scale), uv)
                 return Detections(
                     Light(light, field, low, high),
                     estimate_noise(light, field) if inverted else self.noise,

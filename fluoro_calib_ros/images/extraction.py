@@ -28,6 +28,7 @@ SURE_SIGMA_PX = 0.5 / np.sqrt(2 * np.log(1000))
 MAX_SIGMAS = 2.9  # times that of a usual bead of the image: an eighth of its weight
 MAX_MISFIT = 5.0
 DEPTH = (0.55, 1.7)  # of the shadow of a bead, 1 for what is usual in such light
+RADII = (0.2, 5.0)  # of shadows of equal beads, over that of a typical one
 MIN_CONTRASTS = 20  # beads that tell what is usual
 CONTRAST_STEPS = 8
 MIN_USUAL_DEPTH = 0.1
@@ -182,8 +183,8 @@ def _measured(
     light = detections.light
     for steps in passes:
         rows = np.flatnonzero(seen.in_field(predicted))
-        depth = view.depth(model.xyz)
-        shadows = _expected(predicted, rows, bead, uv, seen=seen, depth=depth)
+        outlines = view.outlines(model.xyz)
+        shadows = _expected(predicted, rows, bead, uv, seen=seen, outlines=outlines)
         if imaging is None:
             told = _relative_sizes(model)
             imaging = first_imaging(light, detections.noise, shadows, seen.radius_px, size=told)
@@ -193,7 +194,7 @@ def _measured(
         beads = measure_beads(
             light,
             uv=shadows.uv,
-            relative_radius=shadows.radius,
+            shape=shadows.shape,
             size=size,
             profile=imaging.profile,
             noise=imaging.noise,
@@ -322,7 +323,7 @@ def _expected(
     bead: NDArray[np.int64],
     uv: NDArray[np.float64],
     seen: Seen,
-    depth: NDArray[np.float64],
+    outlines: NDArray[np.float64],
 ) -> Expected:
     """Shadows of predicted beads: where one alone was found, else where it is predicted."""
     start = predicted.copy()
@@ -331,9 +332,11 @@ def _expected(
         apart[rows] = cKDTree(predicted[rows]).query(predicted[rows], k=[2])[0][:, 0]
     alone = apart > ALONE_RADII * seen.radius_px
     start[bead[alone[bead]]] = uv[alone[bead]]
-    typical = np.median(depth)
-    radius = np.clip(typical / np.where(depth > 0, depth, typical), 0.2, 5.0)
-    return Expected(rows, start[rows], radius[rows], np.isin(rows, bead), alone[rows])
+    size = np.sqrt(np.abs(np.linalg.det(outlines)))
+    typical = float(np.median(size))
+    usable = (size > RADII[0] * typical) & (size < RADII[1] * typical)
+    shape = np.where(usable[:, None, None], outlines / typical, np.eye(2))
+    return Expected(rows, start[rows], shape[rows], np.isin(rows, bead), alone[rows])
 
 
 def _relative_sizes(model: PhantomModel) -> NDArray[np.float64]:

@@ -31,7 +31,7 @@ from .detection import (
 )
 from .light import Light, Noise, estimate_noise, vertex
 from .marker_motion import GIVEN_GATE, GIVEN_SD_PX, MarkerStates, Motion, assign
-from .measurement import estimate_profile
+from .measurement import circles, estimate_profile
 from .shadow_fit import Profile
 
 MARKER_SCALES = SCALES[:5]  # markers are smaller than beads
@@ -416,7 +416,7 @@ def learn_start(image: FilteredImage, target_id: NDArray[np.int64], uv: np.ndarr
         MarkerStates.start(Motion.start(place, GIVEN_SD_PX), unseen),
         look,
         profile=estimate_profile(
-            Light(light, look.field), place[seen], np.ones(len(seen)), look.radius_px
+            Light(light, look.field), place[seen], circles(np.ones(len(seen))), look.radius_px
         ),
         noise=estimate_noise(light, look.field),
         size=(width, height),

@@ -26,6 +26,7 @@ from .shadow_fit import (
     MIN_PASSED,
     TERMS,
     UNDISTURBED,
+    Absorbed,
     Beads,
     FineGrid,
     FitSettings,
@@ -72,29 +73,34 @@ SETTLED = 0.1 * RADIUS_SD  # change of a radius at which a profile is kept
 HELD = 1e12  # weight of a term that stays zero
 
 
+def circles(radius: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Matrices (n, 2, 2) of circles of relative radii (n,)."""
+    return radius[:, None, None] * np.eye(2)
+
+
 def estimate_profile(
     light: Light,
     uv: NDArray[np.float64],
-    relative_radius: NDArray[np.float64],
+    shape: NDArray[np.float64],
     radius_px: float,
+    size: NDArray[np.float64] | None = None,
 ) -> Profile:
     """Estimate the shadow of a typical bead from those that stand alone.
 
-    uv: (n, 2) beads [px]. relative_radius: (n,) 1 for a typical bead. radius_px: first value of
-    its radius.
+    radius_px: first value of its radius. The other arguments are those of `measure_beads`.
     """
     distance = cKDTree(uv).query(uv, k=[2])[0][:, 0] if len(uv) > 1 else np.full(1, np.inf)
     alone = np.argsort(-distance, kind='stable')[:PROFILE_BEADS]
     place = uv[alone]
-    radius = relative_radius[alone]
+    shapes = shape[alone], None if size is None else size[alone]
     profiles = [Profile(radius_px * 0.95, START_BLUR_PX, START_ATTENUATION, START_SCATTER)]
     lacks: list[float] = []
     while len(lacks) < PROFILE_ROUNDS and len(lacks) - int(np.argmin(lacks or [0])) <= PATIENCE:
         before = profiles[-1]
-        fit = _profile_fit(light, place, radius, before)
+        fit = _profile_fit(light, place, shapes, before)
         place = fit.uv
         lacks.append(fit.typical())
-        profile = fit_profile(*fit.absorbed(), before)
+        profile = fit_profile(fit.absorbed(), before)
         if not radius_px / MOST < profile.radius_px < radius_px * MOST:
             break
         profiles.append(profile)
@@ -103,7 +109,7 @@ def estimate_profile(
     reach_px = max(profile.reach_px for profile in profiles)
     # The first one is no estimate. Of shadows as small as their blur it fits about as well.
     estimates = profiles[1:] or profiles
-    fits = [_profile_fit(light, uv[alone], radius, profile, reach_px) for profile in estimates]
+    fits = [_profile_fit(light, uv[alone], shapes, profile, reach_px) for profile in estimates]
     return min(fits, key=ShadowFit.typical).profile
 
 
@@ -117,13 +123,17 @@ def _settled(profile: Profile, before: Profile) -> bool:
 def _profile_fit(
     light: Light,
     uv: NDArray[np.float64],
-    radius: NDArray[np.float64],
+    shapes: tuple[NDArray[np.float64], NDArray[np.float64] | None],
     profile: Profile,
     reach_px: float = 0.0,
 ) -> _BeadFit:
-    """Return the fit of shadows with a profile, in windows for a reach that is no smaller."""
+    """Return the fit of shadows with a profile, in windows for a reach that is no smaller.
+
+    shapes: those and the sizes of the beads, as of `measure_beads`.
+    """
     noise = Noise(0.0, 1.0, np.ones((1, 1)))
-    fit = _BeadFit(light, uv, radius, profile=profile, noise=noise, reach_px=reach_px)
+    shape, size = shapes
+    fit = _BeadFit(light, uv, shape, profile=profile, noise=noise, size=size, reach_px=reach_px)
     fit.plane_only = True
     fit.run(PROFILE_STEPS)
     return fit
@@ -132,7 +142,7 @@ def _profile_fit(
 def measure_beads(
     light: Light,
     uv: NDArray[np.float64],
-    relative_radius: NDArray[np.float64],
+    shape: NDArray[np.float64],
     profile: Profile,
     noise: Noise,
     steps: int = STEPS,
@@ -140,11 +150,11 @@ def measure_beads(
 ) -> Beads:
     """Measure all beads near pixels uv (n, 2) at once, in so many Gauss-Newton steps.
 
-    size: (n,) of the beads, 1 for a typical one, apart from what makes the radii of equal ones
-    differ; None for equal ones. The other arguments are those of `estimate_profile` and what was
-    estimated.
+    shape: (n, 2, 2) matrices from the circle of a typical bead to the borders of shadows. size:
+    (n,) of the beads, 1 for a typical one, apart from what makes the shadows of equal ones differ;
+    None for equal ones.
     """
-    fit = _BeadFit(light, uv, relative_radius, profile=profile, noise=noise, size=size)
+    fit = _BeadFit(light, uv, shape, profile=profile, noise=noise, size=size)
     fit.run(steps)
     return fit.result()
 
@@ -152,7 +162,7 @@ def measure_beads(
 def lack_of_fit(
     light: Light,
     uv: NDArray[np.float64],
-    relative_radius: NDArray[np.float64],
+    shape: NDArray[np.float64],
     profile: Profile,
     noise: Noise,
     size: NDArray[np.float64],
@@ -164,7 +174,7 @@ def lack_of_fit(
     fit = _BeadFit(
         light,
         uv,
-        relative_radius,
+        shape,
         profile=profile,
         noise=noise,
         size=size,
@@ -181,18 +191,20 @@ class _BeadFit(ShadowFit):
         self,
         light: Light,
         uv: NDArray[np.float64],
-        relative_radius: NDArray[np.float64],
+        shape: NDArray[np.float64],
         profile: Profile,
         noise: Noise,
         size: NDArray[np.float64] | None = None,
         reach_px: float = 0.0,
     ) -> None:
-        self.stretch = np.asarray(relative_radius, dtype=float)
+        self.stretch = np.sqrt(np.linalg.det(shape))
+        # Distances to a metric are those from the centre of the shadow of a typical bead.
+        inverse = np.linalg.inv(shape)
+        self.metric = np.swapaxes(inverse, 1, 2) @ inverse
         self.size = np.ones(len(uv)) if size is None else size
         # Sizes that differ by less than a radius is known share a table.
-        step = np.log1p(RADIUS_SD)
-        kinds, self.kind = np.unique(np.rint(np.log(self.size) / step), return_inverse=True)
-        self.shadows = Shadows([profile.sized(float(np.exp(step * one))) for one in kinds])
+        sizes, self.kind = np.unique(rounded(self.size, 1 + RADIUS_SD), return_inverse=True)
+        self.shadows = Shadows([profile.sized(size) for size in sizes.tolist()])
         own_reach = np.maximum(profile.reach_px * self.size, reach_px) * self.stretch
         reach = float(own_reach.max(initial=profile.reach_px))
         window = reach + MARGIN_PX
@@ -202,6 +214,7 @@ class _BeadFit(ShadowFit):
         self.radius = self.stretch * self.size
         self.measured = np.zeros(len(uv), dtype=bool)
         self.disturbed = np.zeros(len(uv), dtype=bool)
+        self.moved = np.zeros(len(uv))  # by relative errors of 1 of the radii [px]
         self.plane_only = False
         self.residual = np.zeros((len(uv), len(self.offset)), dtype=np.float32)  # of the last step
         self.counted = np.zeros(self.residual.shape, dtype=bool)
@@ -302,21 +315,27 @@ class _BeadFit(ShadowFit):
             there = column >= 0
             bead = np.where(there, column, 0)
             centre = self.uv[bead] - self.middle[rows]
-            scale = 1 / self.radius[bead]
             depth = self.depth[bead] * there
-            squared = (axis[None, :, None] - centre[:, 1, None, None]) ** 2 + (
-                axis[None, None, :] - centre[:, 0, None, None]
-            ) ** 2
+            x = axis[None, None, :] - centre[:, 0, None, None]
+            y = axis[None, :, None] - centre[:, 1, None, None]
             size = self.size[bead, None, None]
-            absorbed = self.profile.absorbed(squared * scale[:, None, None] ** 2, size)
+            squared = self._squared(bead, x, y) / size**2
+            absorbed = self.profile.absorbed(squared, size)
             raw *= (1 - depth[:, None, None] * absorbed).astype(np.float32)
-            away = np.linalg.norm(self.offset - centre[:, None], axis=2)
-            away /= self.stretch[bead, None]
+            x, y = np.moveaxis(self.offset - centre[:, None], 2, 0)
+            away = np.sqrt(self._squared(bead, x, y))
             blurred *= 1 - depth[:, None] * self.shadows.shadow(away, self.kind[bead])[0]
         out = np.empty_like(blurred)
         for number, image in enumerate(raw):
             out[number] = grid.blurred(image)
         return out - blurred
+
+    def _squared(
+        self, beads: NDArray[np.int64], x: NDArray[np.float64], y: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Squared distances of pixels (g, ...) from beads (g,), in their metrics [px^2]."""
+        metric = self.metric[beads].reshape(-1, 4, *[1] * (np.ndim(x) - 1))
+        return metric[:, 0] * x * x + 2 * metric[:, 1] * x * y + metric[:, 3] * y * y
 
     def _model(
         self, rows: NDArray[np.int64], near: NDArray[np.int64]
@@ -324,14 +343,16 @@ class _BeadFit(ShadowFit):
         """Light (g, m) and its derivatives (g, OWN + 3 k, m), of single precision."""
         everyone = np.concatenate([rows[:, None], near], axis=1)
         there = everyone >= 0
-        scale = (1 / self.stretch[everyone]).astype(np.float32)[..., None]
         centre = (self.middle[rows, None] - self.uv[everyone]).astype(np.float32)
         x = centre[..., :1] + self.offset[:, 0].astype(np.float32)
         y = centre[..., 1:] + self.offset[:, 1].astype(np.float32)
-        distance = np.sqrt(x * x + y * y)
-        shadow, slope = self.shadows.shadow(distance * scale, self.kind[everyone])
+        metric = self.metric[everyone].astype(np.float32)
+        by_x = metric[..., 0, :1] * x + metric[..., 0, 1:] * y
+        by_y = metric[..., 1, :1] * x + metric[..., 1, 1:] * y
+        distance = np.sqrt(x * by_x + y * by_y)
+        shadow, slope = self.shadows.shadow(distance, self.kind[everyone])
         shadow *= there[..., None]
-        slope *= there[..., None] * scale / np.maximum(distance, 1e-6)
+        slope *= there[..., None] / np.maximum(distance, 1e-6)
         depth = self.depth[everyone].astype(np.float32)[..., None]
         passed = np.maximum(1 - depth * shadow, np.float32(MIN_PASSED))
         product = np.prod(passed, axis=1)
@@ -343,8 +364,8 @@ class _BeadFit(ShadowFit):
         by_shadow = (-transmitted * plane * product)[:, None] / passed
         by_distance = -by_shadow * depth * slope
         jacobian = self._jacobian(relative, everyone.shape[1])
-        np.multiply(by_distance, x, out=jacobian[:, TERMS::3])
-        np.multiply(by_distance, y, out=jacobian[:, TERMS + 1 :: 3])
+        np.multiply(by_distance, by_x, out=jacobian[:, TERMS::3])
+        np.multiply(by_distance, by_y, out=jacobian[:, TERMS + 1 :: 3])
         np.multiply(by_shadow, shadow, out=jacobian[:, TERMS + 2 :: 3])
         return plane * relative, jacobian
 
@@ -371,32 +392,50 @@ class _BeadFit(ShadowFit):
     ) -> np.ndarray:
         if final:
             self._note_precision(rows, equations)
+            self.moved[rows] = self._moved_by_radii(rows, near, equations)
             self.measured[rows] = self.usable[rows] & np.isfinite(self.sigma[rows])
             self.residual[rows] = equations.residual
             self.counted[rows] = equations.valid
         return np.linalg.solve(equations.matrix, equations.right[..., None])[..., 0]
 
-    def absorbed(self) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float32]]:
-        """Distances [px] of pixels from beads, absorbed shares there, and weights (n,)."""
+    def _moved_by_radii(
+        self, rows: NDArray[np.int64], near: NDArray[np.int64], equations: NormalEquations
+    ) -> NDArray[np.float64]:
+        """Shifts (g,) of a coordinate of centres by relative errors of 1 of all radii, RMS [px].
+
+        A shadow of which others hide a part of the edge moves with its radius, and with theirs.
+        """
+        if not near.shape[1]:
+            return np.zeros(len(rows))
+        _, jacobian = self._model(rows, near)
+        beads = np.concatenate([rows[:, None], near], axis=1)
+        centre = self.uv[beads] - self.middle[rows, None]
+        x, y = np.moveaxis(self.offset - centre[:, :, None], 3, 0)
+        growth = jacobian[:, TERMS::3] * x + jacobian[:, TERMS + 1 :: 3] * y
+        right = equations.weighted @ np.swapaxes(growth, 1, 2)
+        moved = np.linalg.solve(equations.plain, right)[:, TERMS : TERMS + 2]
+        return np.asarray(np.sqrt(0.5 * (moved**2).sum(axis=(1, 2))))
+
+    def absorbed(self) -> Absorbed:
+        """Return what beads absorb, in the pixels of those whose fit is good."""
         plane = self._plane(np.arange(len(self.uv)))
-        away = self.middle[:, None] + self.offset - self.uv[:, None]
-        distance = np.hypot(away[..., 0], away[..., 1]) / self.radius[:, None]
+        x, y = np.moveaxis(self.middle[:, None] + self.offset - self.uv[:, None], 2, 0)
+        distance = np.sqrt(self._squared(np.arange(len(self.uv)), x, y))
         known = self.valid & (self.grey > self.low) & (self.grey < self.high)
         good = (
             known & (self.measured & (self.misfit < UNDISTURBED * np.median(self.misfit)))[:, None]
         )
         weight = plane / np.maximum(np.median(plane), 1e-9)
-        return distance[good], (1 - self.grey / plane)[good], weight[good]
+        size = np.broadcast_to(rounded(self.size, 1 + RADIUS_SD)[:, None], good.shape)
+        return Absorbed(distance[good], (1 - self.grey / plane)[good], weight[good], size[good])
 
     def result(self) -> Beads:
         """Return what was measured."""
         measured = self.measured & np.isfinite(self.uv).all(axis=1)
         typical = float(np.median(self.misfit[measured])) if measured.any() else 1.0
         beads = self._beads(measured, typical, self._noise(measured))
-        return replace(
-            beads,
-            sigma=np.hypot(beads.sigma, self._moved_by_radius()),
-        )
+        radius_sd = np.where(self._is_light_clipped(), CLIPPED_RADIUS_SD, RADIUS_SD)
+        return replace(beads, sigma=np.hypot(beads.sigma, radius_sd * self.moved))
 
     def _noise(self, measured: NDArray[np.bool_]) -> NDArray[np.float64]:
         """Lack of fit (n,) beyond what the windows of usual beads show alike.
@@ -409,18 +448,6 @@ class _BeadFit(ShadowFit):
         whole = (self.residual**2 * self.counted).sum(axis=1)
         share = np.minimum((rest**2).sum(axis=1) / np.maximum(whole, 1e-12), 1.0)
         return np.where(self.strength > 0, 1.0, share) * self.misfit
-
-    def _moved_by_radius(self) -> NDArray[np.float64]:
-        """Standard deviations (n,) of centres from that of the radius, 0 for beads alone.
-
-        Where another bead hides an arc of the edge, half as long as the angle of its middle from
-        the ends, the rest moves the centre with the radius: by least squares over what is seen.
-        """
-        radius = self.profile.radius_px * self.radius
-        angle = np.arccos(np.clip(self.distance / (2 * radius), 0, 1))
-        moved = 2 * np.sin(angle) / (np.pi - angle - 0.5 * np.sin(2 * angle))
-        sd = np.where(self._is_light_clipped(), CLIPPED_RADIUS_SD, RADIUS_SD)
-        return np.asarray(sd * radius * moved / np.sqrt(2))
 
     def _is_light_clipped(self) -> NDArray[np.bool_]:
         """Whether (n,) hardly any pixel beside the shadows of a window is not clipped."""
@@ -438,7 +465,6 @@ class _BeadFit(ShadowFit):
 # A phantom that does not tell its sizes may have several. A bead that stands alone has the size
 # with which its shadow fits best; where nearly all of a sample have the same size, all have.
 
-TYPICAL = 1 / 3  # of the beads of a phantom with several sizes
 STEP = 1.25  # factor between sizes that are compared
 SIZES = STEP ** np.arange(-4, 5)
 FINER_STEPS = (STEP**0.5, STEP**0.25, STEP**0.125)  # between those that are compared then
@@ -454,9 +480,15 @@ class Expected:
 
     row: NDArray[np.int64]  #: (n,), of the phantom
     uv: NDArray[np.float64]  #: (n, 2) [px]
-    radius: NDArray[np.float64]  #: (n,), relative radii that beads of one size have here
+    #: (n, 2, 2), matrices from the circle of a typical bead to the borders of shadows of that size
+    shape: NDArray[np.float64]
     seen: NDArray[np.bool_]  #: (n,), something was found there
     alone: NDArray[np.bool_]  #: (n,), no other shadow is near
+
+    @property
+    def radius(self) -> NDArray[np.float64]:
+        """Relative radii (n,) that beads of one size have here."""
+        return np.sqrt(np.abs(np.linalg.det(self.shape)))
 
 
 @dataclass(frozen=True)
@@ -504,26 +536,30 @@ def first_imaging(
     if sizes.are_equal(alone[:: len(alone) // SAMPLE + 1]):
         return replace(imaging, size=np.ones_like(size))
     for _ in range(ROUNDS):
-        found = _Sizes(light, shadows, imaging).best(alone)
-        size = np.full_like(size, np.nan)
-        size[shadows.row[alone]] = found / np.median(found)
-        radius_px = imaging.profile.radius_px * float(np.median(found))
-        imaging = Imaging(noise, _typical(light, shadows, size, radius_px), size)
-    return imaging
+        sizes = sizes.with_sizes(alone, sizes.best(alone))
+    return sizes.imaging
 
 
 def _typical(
     light: Light, shadows: Expected, size: NDArray[np.float64], radius_px: float
 ) -> Profile:
-    """Return the profile of beads of about the typical size: a third, and all equals."""
+    """Return the profile of a bead of size 1 from beads that stand alone."""
     seen = np.flatnonzero(shadows.seen & shadows.alone)
     if len(seen) < FEW:
         seen = np.flatnonzero(shadows.seen)
-    relative = np.nan_to_num(size[shadows.row[seen]], nan=1.0)
-    off = np.abs(np.log(relative))
-    near = off <= np.quantile(off, TYPICAL) + RADIUS_SD
-    radius = (shadows.radius[seen] * relative)[near]
-    return estimate_profile(light, shadows.uv[seen[near]], radius, radius_px)
+    relative = size[shadows.row[seen]]
+    known = np.isfinite(relative)
+    if known.any():
+        seen = seen[known]
+    relative = relative[known] if known.any() else np.ones(len(seen))
+    alike = rounded(relative, FINER_STEPS[1])
+    shape = shadows.shape[seen] * (relative / alike)[:, None, None]
+    return estimate_profile(light, shadows.uv[seen], shape, radius_px, alike)
+
+
+def rounded(size: NDArray[np.float64], step: float) -> NDArray[np.float64]:
+    """Relative sizes (n,), rounded to powers of a step: few different ones."""
+    return np.asarray(step ** np.rint(np.log(size) / np.log(step)))
 
 
 class _Sizes:
@@ -545,12 +581,22 @@ class _Sizes:
         smaller, common, larger = self.lacks(rows, [same / STEP, same, same * STEP])
         if np.mean(common > DISTURBED * np.minimum(smaller, larger)) <= OTHERS:
             return True
-        size = self.best(rows)
-        middle = np.median(size)
-        own, common = self.lacks(rows, [size, middle * same])
-        differs = np.abs(np.log(size / middle)) > 0.5 * np.log(STEP)
+        # A profile of beads of several sizes fits few of them.
+        sized = self.with_sizes(rows, self.best(rows))
+        size = sized.imaging.size[self.shadows.row[rows]]
+        own, common = sized.lacks(rows, [size, same])
+        differs = np.abs(np.log(size)) > 0.5 * np.log(STEP)
         differs &= common > DISTURBED * own
         return bool(np.mean(differs[own < DISTURBED * np.median(own)]) <= OTHERS)
+
+    def with_sizes(self, rows: NDArray[np.int64], found: NDArray[np.float64]) -> _Sizes:
+        """Return it with a profile of some beads, of which sizes (m,) were found."""
+        middle = float(np.median(found))
+        size = np.full_like(self.imaging.size, np.nan)
+        size[self.shadows.row[rows]] = found / middle
+        radius_px = self.imaging.profile.radius_px * middle
+        profile = _typical(self.light, self.shadows, size, radius_px)
+        return _Sizes(self.light, self.shadows, Imaging(self.imaging.noise, profile, size))
 
     def best(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
         """Sizes (m,) of best fit of some beads."""
@@ -587,7 +633,7 @@ class _Sizes:
                 lack_of_fit(
                     self.light,
                     shadows.uv[every],
-                    shadows.radius[every],
+                    shadows.shape[every],
                     profile=imaging.profile,
                     noise=imaging.noise,
                     size=np.concatenate([size, known]),

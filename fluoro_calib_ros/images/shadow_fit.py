@@ -11,7 +11,7 @@ All windows of an image take their Gauss-Newton steps at once.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
@@ -466,6 +466,7 @@ REACH_SIGMAS = 3.2
 LOW = (0.5, 0.35, 0.05, 0.0)
 HIGH = (40.0, 6.0, 6.0, 0.6)
 CHANGE = 1.5  # factor on the first three in one fit
+RING_PX = 0.25  # width of the rings whose means a profile is fitted to
 
 
 @dataclass(frozen=True)
@@ -634,32 +635,59 @@ def shadow_derivatives(profile: Profile, distance: NDArray[np.float64]) -> NDArr
     return np.column_stack([np.interp(distance, blurred.distance, one) for one in columns])
 
 
-def fit_profile(
-    distance: NDArray[np.float64],
-    absorbed: NDArray[np.floating],
-    weight: NDArray[np.floating],
-    start: Profile,
-) -> Profile:
-    """Fit a profile to absorbed shares (n,) of the light at distances (n,) [px] from beads."""
-    edges = np.arange(0, start.reach_px + 1, 0.25)
-    cell = np.digitize(distance, edges)
-    total = np.bincount(cell, weights=weight, minlength=len(edges) + 1)[1:-1]
-    sums = np.bincount(cell, weights=weight * absorbed, minlength=len(edges) + 1)[1:-1]
-    moments = np.bincount(cell, weights=weight * distance, minlength=len(edges) + 1)[1:-1]
-    used = total > 0
-    mean = sums[used] / total[used]
-    place = moments[used] / total[used]
-    root = np.sqrt(total[used])
+@dataclass(frozen=True)
+class Absorbed:
+    """What beads absorb in pixels, n of them."""
 
-    def residual(unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
-        value, _ = Profile(*unknowns[:3]).shadow(place)
-        return root * ((1 - unknowns[3]) * value - mean)
+    distance: NDArray[np.float64]  #: (n,), from the centres, over the relative radii [px]
+    share: NDArray[np.floating]  #: (n,), of the light
+    weight: NDArray[np.floating]  #: (n,)
+    size: NDArray[np.float64]  #: (n,), relative sizes of the beads: few different ones
 
-    def slopes(unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
-        profile = Profile(*unknowns[:3])
-        by_shape = (1 - unknowns[3]) * shadow_derivatives(profile, place)
-        return root[:, None] * np.column_stack([by_shape, -profile.shadow(place)[0]])
+    def binned(self, profile: Profile) -> Iterator[_Binned]:
+        """Yield means of rings of the beads of each size, as wide as the profile reaches."""
+        for size in np.unique(self.size):
+            own = self.size == size
+            edges = np.arange(0, profile.sized(float(size)).reach_px + 1, RING_PX)
+            cell = np.digitize(self.distance[own], edges)
+            sums = [
+                np.bincount(cell, weights=one, minlength=len(edges) + 1)[1:-1]
+                for one in (
+                    self.weight[own],
+                    self.weight[own] * self.share[own],
+                    self.weight[own] * self.distance[own],
+                )
+            ]
+            total, share, distance = np.array(sums)[:, sums[0] > 0]
+            yield _Binned(float(size), distance / total, share / total, np.sqrt(total))
 
+
+@dataclass(frozen=True)
+class _Binned:
+    """Mean absorbed shares (n,) of beads of a size in rings at mean distances (n,) [px]."""
+
+    size: float
+    distance: NDArray[np.float64]
+    share: NDArray[np.float64]
+    root: NDArray[np.float64]  #: (n,), of weights
+
+    def residual(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Weighted residuals (n,) of a profile's radius, blur, attenuation and scatter."""
+        value, _ = Profile(*unknowns[:3]).sized(self.size).shadow(self.distance)
+        return self.root * ((1 - unknowns[3]) * value - self.share)
+
+    def slopes(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Derivatives (n, 4) of the residuals."""
+        profile = Profile(*unknowns[:3]).sized(self.size)
+        by_shape = (1 - unknowns[3]) * shadow_derivatives(profile, self.distance)
+        by_scatter = -profile.shadow(self.distance)[0]
+        columns = np.column_stack([by_shape * (self.size, 1.0, self.size), by_scatter])
+        return self.root[:, None] * columns
+
+
+def fit_profile(absorbed: Absorbed, start: Profile) -> Profile:
+    """Fit the profile of a bead of size 1 to what beads absorb."""
+    parts = list(absorbed.binned(start))
     first = np.array([start.radius_px, start.blur_px, start.attenuation, start.scatter])
     first = np.clip(first, np.asarray(LOW) * 1.01 + 1e-3, np.asarray(HIGH) * 0.99)
     # The backgrounds belong to the shadows before.
@@ -667,5 +695,12 @@ def fit_profile(
     bounds = (np.maximum(LOW, first / change), np.minimum(HIGH, first * change))
     # A few steps: `absorbed` is renewed with each profile, and radius and attenuation of a small
     # shadow are hardly told apart.
-    found = least_squares(residual, first, jac=slopes, bounds=bounds, x_scale=first, max_nfev=5)
+    found = least_squares(
+        lambda unknowns: np.concatenate([part.residual(unknowns) for part in parts]),
+        first,
+        jac=lambda unknowns: np.concatenate([part.slopes(unknowns) for part in parts]),
+        bounds=bounds,
+        x_scale=first,
+        max_nfev=5,
+    )
     return Profile(*map(float, found.x))

@@ -126,6 +126,22 @@ class View:
         """Distances (n,) of points (n, 3) from the source along the axis [mm]."""
         return (xyz - self.position) @ self.rotation[2]
 
+    def outlines(self, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Matrices (n, 2, 2) from unit circles to borders of shadows of spheres [px/mm].
+
+        xyz: (n, 3) their centres [mm]. The rays that touch a small sphere form a cone, whose
+        section is longer in the direction from the principal point by one over the cosine of the
+        angle there. Zero for spheres behind the source.
+        """
+        x = (xyz - self.position) @ self.rotation.T
+        depth = np.where(x[:, 2] > 0, x[:, 2], np.inf)
+        tangent = x[:, :2] / depth[:, None]
+        squared = np.sum(tangent**2, axis=1)[:, None, None]
+        along = tangent[:, :, None] * tangent[:, None] / (1 + np.sqrt(1 + squared))
+        slope = self._distortion(self.lens.centre + self.principal_distance_px * tangent)[1]
+        factor = (self.principal_distance_px / depth)[:, None, None]
+        return np.asarray(factor * (np.eye(2) + slope) @ (np.eye(2) + along))
+
     def _distortion(
         self, ideal: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:

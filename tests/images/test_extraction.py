@@ -21,10 +21,10 @@ from fluoro_calib_ros.images.detection import Look, detect_beads
 from fluoro_calib_ros.images.extraction import Extraction, extract_beads
 from fluoro_calib_ros.images.following import Far, follow, moved_on
 from fluoro_calib_ros.images.growth import Seen
-from fluoro_calib_ros.images.light import Light, estimate_noise
+from fluoro_calib_ros.images.light import Light, Noise, estimate_noise
 from fluoro_calib_ros.images.matching import PhantomModel, match
-from fluoro_calib_ros.images.measurement import measure_beads
-from fluoro_calib_ros.images.shadow_fit import Profile, fit_profile, shadow_derivatives
+from fluoro_calib_ros.images.measurement import circles, measure_beads
+from fluoro_calib_ros.images.shadow_fit import Absorbed, Profile, fit_profile, shadow_derivatives
 from fluoro_calib_ros.images.view import Lens, View, exponents, fit_view, may_be_found
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.simulation.radiographs import HARD, Radiography
@@ -113,18 +113,25 @@ def test_each_refused_bead_has_a_reason():
 OVERLAPPING = np.array([[40.2, 40.4], [55.9, 40.9], [100.3, 40.1]])
 
 
+def blurred_shadows(
+    centres: np.ndarray, radii: np.ndarray, light: float, attenuation: float
+) -> np.ndarray:
+    """Light (80, 140) behind spheres (n,), attenuation along a radius of 12 px, blur of 1 px."""
+    axis = np.arange(0, 560) / 4
+    u, v = np.meshgrid(axis, axis[:320])
+    grey = light * np.ones(u.shape)
+    for centre, radius in zip(centres, radii):
+        squared = (u - centre[0]) ** 2 + (v - centre[1]) ** 2
+        grey *= np.exp(-attenuation / 12 * 2 * np.sqrt(np.maximum(radius**2 - squared, 0)))
+    return cv2.GaussianBlur(grey, (0, 0), 4 * np.sqrt(1.0**2 + 1 / 12))[::4, ::4]
+
+
 def overlapping_beads(radius_px, most=np.inf):
     """Beads with a radius of 12 px, two of which overlap, measured with another radius.
 
     most: light beyond which grey values are clipped.
     """
-    axis = np.arange(0, 560) / 4
-    u, v = np.meshgrid(axis, axis[:320])
-    light = 800.0 * np.ones(u.shape)
-    for centre in OVERLAPPING:
-        squared = (u - centre[0]) ** 2 + (v - centre[1]) ** 2
-        light *= np.exp(-1.9 * 2 * np.sqrt(np.maximum(12.0**2 - squared, 0)) / 12.0)
-    light = cv2.GaussianBlur(light, (0, 0), 4 * np.sqrt(1.0**2 + 1 / 12))[::4, ::4]
+    light = blurred_shadows(OVERLAPPING, np.full(3, 12.0), 800.0, 1.9)
     image = np.minimum(np.random.default_rng(3).poisson(light), most).astype(np.float32)
     field = np.ones(image.shape, bool)
     noise = replace(
@@ -132,7 +139,7 @@ def overlapping_beads(radius_px, most=np.inf):
     )
     profile = Profile(radius_px, 1.0, 1.9, 0.0)
     shown = Light(image, field, high=most)
-    return measure_beads(shown, OVERLAPPING + 0.2, np.ones(3), profile, noise)
+    return measure_beads(shown, OVERLAPPING + 0.2, circles(np.ones(3)), profile, noise)
 
 
 def test_beads_that_overlap_are_as_sure_as_their_radius_is_known():
@@ -142,7 +149,28 @@ def test_beads_that_overlap_are_as_sure_as_their_radius_is_known():
     assert list(beads.overlapped) == [True, True, False]
     assert off[:2].min() > 0.03 and off[2] < 0.03
     assert (off < 3 * beads.sigma).all()
-    assert beads.sigma[2] < 0.25 * beads.sigma[:2].min()
+    # Alone, it is as sure as the noise lets it be.
+    assert beads.sigma[2] < 0.01 < 0.025 < beads.sigma[:2].min()
+
+
+def test_a_shadow_that_a_larger_one_hides_is_less_sure():
+    """By the radii of both, as far as the edge is hidden; the larger one hardly moves."""
+    profile = Profile(6.0, 1.0, 0.6, 0.0)
+    size = np.array([1.0, 2.0])
+    uv = np.array([[40.2, 40.4], [50.6, 40.9]])
+    light = blurred_shadows(uv, 6.0 * size, 1e5, 1.2)
+    shown = Light(light.astype(np.float32), np.ones(light.shape, bool))
+    noise = Noise(0.1, 1.0, np.ones((1, 1)))
+    small, right, large = (
+        measure_beads(shown, uv, circles(np.full(2, radius)), profile, noise, size=size)
+        for radius in (0.999, 1.0, 1.001)
+    )
+    moved = np.linalg.norm(large.uv - small.uv, axis=1) / 2
+    assert moved[0] > 2 * moved[1]
+    # A coordinate, by a hundredth of the radii; both change here, and the larger one moves less.
+    expected = 10 * moved / np.sqrt(2)
+    assert right.sigma[0] == pytest.approx(expected[0], rel=0.2)
+    assert expected[1] < right.sigma[1] < 2 * expected[1]
 
 
 def test_beads_that_overlap_in_clipped_light_are_less_sure():
@@ -178,7 +206,7 @@ def test_two_overlapping_beads_have_honest_sigmas():
         )
         start = true + rng.normal(0, 0.3, true.shape)
         beads = measure_beads(
-            Light(image, np.ones(image.shape, bool)), start, np.ones(2), profile, noise
+            Light(image, np.ones(image.shape, bool)), start, circles(np.ones(2)), profile, noise
         )
         assert beads.overlapped.all()
         normalised.append((beads.uv - true) / beads.sigma[:, None])
@@ -198,7 +226,7 @@ def test_shadow_whose_border_the_image_cuts_is_not_measured():
         light *= 1 - profile.shadow(np.linalg.norm(grid - centre, axis=2))[0]
     image = np.random.default_rng(3).poisson(light).astype(np.float32)
     noise = replace(estimate_noise(image, field), constant=0.1, gain=1.0)
-    beads = measure_beads(Light(image, field), true, np.ones(4), profile, noise)
+    beads = measure_beads(Light(image, field), true, circles(np.ones(4)), profile, noise)
     assert beads.measured.tolist() == [False, False, True, True]
     assert np.abs(beads.uv - true)[2:].max() < 4 * beads.sigma[2:].max() < 0.2
 
@@ -219,10 +247,11 @@ def test_shadow_has_the_derivatives_of_its_differences(shape):
 def test_profile_is_fitted_to_its_shadow():
     true = Profile(3.4, 0.8, 1.3, 0.1)
     distance = np.random.default_rng(2).uniform(0, 6, 4000)
-    absorbed = 0.9 * true.shadow(distance)[0]
+    share = 0.9 * true.shadow(distance)[0]
+    absorbed = Absorbed(distance, share, np.ones(4000), np.ones(4000))
     start = Profile(3.0, 1.0, 1.5, 0.1)
     for _ in range(10):  # of a few steps each
-        start = fit_profile(distance, absorbed, np.ones(4000), start)
+        start = fit_profile(absorbed, start)
     assert start.radius_px == pytest.approx(3.4, rel=0.002)
     assert start.blur_px == pytest.approx(0.8, rel=0.02)
     assert (1 - start.scatter) * start.shadow(np.zeros(1))[0] == pytest.approx(

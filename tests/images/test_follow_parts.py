@@ -29,7 +29,7 @@ from fluoro_calib_ros.images.marker_rays import MarkerBodies
 from fluoro_calib_ros.images.marker_watch import MarkerDoubts
 from fluoro_calib_ros.images.markers import FirstMarkers, MarkerTracker
 from fluoro_calib_ros.images.matching import PhantomModel
-from fluoro_calib_ros.images.measurement import measure_beads
+from fluoro_calib_ros.images.measurement import circles, measure_beads
 from fluoro_calib_ros.images.pose_search import _hits, triples_of
 from fluoro_calib_ros.images.shadow_fit import FineGrid, Profile, window_offsets
 from fluoro_calib_ros.images.view import Lens, View
@@ -70,7 +70,7 @@ def test_beads_that_touch_are_where_they_are_without_noise(apart):
     found = measure_beads(
         Light(light.astype(np.float32), np.ones(light.shape, bool)),
         places + [[0.4, -0.3], [-0.3, 0.3], [0.3, 0.3]],
-        np.ones(3),
+        circles(np.ones(3)),
         profile=Profile(5.0, 1.2, 0.9),
         noise=Noise(100.0**2, 0.0, WHITE),
     )

@@ -42,6 +42,7 @@ from fluoro_calib_ros.images.marker_watch import (
     follow_beside,
     shift_together,
 )
+from fluoro_calib_ros.images.measurement import circles
 from fluoro_calib_ros.images.shadow_fit import Profile
 from fluoro_calib_ros.images.view import Lens, View
 
@@ -215,12 +216,12 @@ def test_beads_of_a_line_start_where_they_were_found_alone():
     rows = np.arange(4)
     bead = np.array([0, 1, 3])
     uv = np.array([[1.0, 1], [31, 1], [81, 1]])
-    depth = np.array([500.0, 1000, 1000, 2000, -3])
-    found = extraction._expected(predicted, rows, bead, uv, Fake(radius_px=2.0), depth)
+    outlines = circles(np.array([9.0, 4.5, 4.5, 2.25, 0]))
+    found = extraction._expected(predicted, rows, bead, uv, Fake(radius_px=2.0), outlines)
     assert found.uv.tolist() == [[1, 1], [30, 0], [33, 0], [81, 1]]
     assert found.seen.tolist() == [True, True, False, True]
     assert found.alone.tolist() == [True, False, False, True]
-    assert found.radius.tolist() == [2, 1, 1, 0.5]
+    np.testing.assert_allclose(found.radius, [2, 1, 1, 0.5])
 
 
 # ---- markers in motion

@@ -6,6 +6,7 @@
 from dataclasses import replace
 from types import SimpleNamespace as Fake
 
+import cv2
 import numpy as np
 import pytest
 from scipy.signal import convolve2d
@@ -42,6 +43,7 @@ from fluoro_calib_ros.images.shadow_fit import (
     DEPTHS,
     OWN,
     TERMS,
+    Absorbed,
     FitSettings,
     Profile,
     ShadowFit,
@@ -472,7 +474,8 @@ def test_a_profile_is_fitted_to_what_it_absorbs():
     rng = np.random.default_rng(10)
     distance = rng.uniform(0, 9, 4000)
     share = (1 - true.scatter) * true.shadow(distance)[0] + rng.normal(0, 0.01, 4000)
-    found = fit_profile(distance, share, np.ones(4000), Profile(4.5, 1.0, 0.9, 0.05))
+    absorbed = Absorbed(distance, share, np.ones(4000), np.ones(4000))
+    found = fit_profile(absorbed, Profile(4.5, 1.0, 0.9, 0.05))
     assert found.radius_px == pytest.approx(5.0, abs=0.15)
     assert found.blur_px == pytest.approx(1.2, abs=0.15)
     fitted = (1 - found.scatter) * found.shadow(distance)[0]
@@ -616,3 +619,60 @@ def test_seeds_begin_in_the_middle_and_go_on_with_beads_apart():
     spacing = np.sort(np.linalg.norm(uv[:, None] - uv[None], axis=2), axis=1)[:, 3]
     later = order[8:180]
     assert np.median(spacing[later[:160]]) > np.median(spacing[order[200:]])
+
+
+def test_borders_of_shadows_are_those_of_the_cones_that_touch_spheres():
+    """Of a wide view with a distortion; the borders are projected ray by ray."""
+    lens = Lens((1000, 1000), 1200.0)
+    coefficients = np.zeros((2, len(exponents(3))))
+    coefficients[:, 5:] = [[20.0, 0.0, 20.0, 0.0], [0.0, 20.0, 0.0, 20.0]]
+    view = View(lens, np.eye(3), np.array([0.0, 0.0, -900.0]), 1200.0, coefficients, 3)
+    xyz = np.array([[0.0, 0.0, 0.0], [250.0, -120.0, 30.0], [-300.0, 280.0, -60.0]])
+    radius = 0.5
+    turn = 2 * np.pi * np.arange(48) / 48
+    circle = np.column_stack([np.cos(turn), np.sin(turn)])
+    for centre, outline in zip(xyz, view.outlines(xyz)):
+        away = centre - view.position
+        distance = np.linalg.norm(away)
+        across = np.cross(away, [0.3, 1.0, 0.2])
+        across /= np.linalg.norm(across)
+        down = np.cross(away / distance, across)
+        sine = radius / distance
+        touched = centre - sine**2 * away
+        touched = touched + radius * np.sqrt(1 - sine**2) * circle @ np.stack([across, down])
+        border = view.project(touched)
+        border -= border.mean(axis=0)
+        seen = np.linalg.norm(border @ np.linalg.inv(radius * outline).T, axis=1)
+        np.testing.assert_allclose(seen, 1.0, atol=2e-3)
+    assert (view.outlines(np.array([[0.0, 0.0, -901.0]])) == 0).all()
+
+
+def test_beads_of_several_sizes_tell_attenuation_from_scattered_light():
+    """Those of one size hardly do: a harder edge with a wider blur looks alike."""
+    true = Profile(5.0, 1.2, 0.8, 0.1)
+    rng = np.random.default_rng(11)
+    size = rng.choice([0.7, 1.0, 1.4], 12000)
+    distance = rng.uniform(0, 11, 12000)
+    share = np.empty(12000)
+    for one in (0.7, 1.0, 1.4):
+        own = size == one
+        share[own] = (1 - true.scatter) * true.sized(one).shadow(distance[own])[0]
+    share += rng.normal(0, 0.01, 12000)
+    found = Profile(4.5, 1.0, 1.5, 0.1)
+    for _ in range(4):  # of a few steps each
+        found = fit_profile(Absorbed(distance, share, np.ones(12000), size), found)
+    assert found.radius_px == pytest.approx(5.0, abs=0.03)
+    assert found.attenuation == pytest.approx(0.8, abs=0.05)
+    assert found.scatter == pytest.approx(0.1, abs=0.015)
+
+
+def test_noise_that_is_blurred_is_correlated_in_two_directions_as_well():
+    """A blur of half a pixel: a correlation of .27 along the rows, .07 across both."""
+    rng = np.random.default_rng(12)
+    noise = cv2.GaussianBlur(rng.normal(size=(1, 300, 300))[0], (0, 0), 0.5)[None]
+    found = correlation_of(noise, np.ones(noise.shape))
+    along = found[LAGS, LAGS + 1]
+    assert along == pytest.approx(0.27, abs=0.02)
+    assert found[LAGS + 1, LAGS + 1] == pytest.approx(along**2, abs=0.02)
+    white = correlation_of(rng.normal(size=(1, 300, 300)), np.ones((1, 300, 300)))
+    assert white.sum() == 1

@@ -14,6 +14,7 @@ from fluoro_calib_ros.images.measurement import (
     Imaging,
     _BeadFit,
     _Sizes,
+    circles,
     estimate_profile,
     first_imaging,
     measure_beads,
@@ -51,7 +52,7 @@ def completed(
     light = Light(image, np.ones(image.shape, bool))
     n = len(uv)
     size = np.full(n, np.nan) if size is None else size
-    shadows = Expected(np.arange(n), uv, np.ones(n), np.ones(n, bool), np.ones(n, bool))
+    shadows = Expected(np.arange(n), uv, circles(np.ones(n)), np.ones(n, bool), np.ones(n, bool))
     noise = estimate_noise(image, light.field)
     return first_imaging(light, noise, shadows, radius_px, size=size), light, uv
 
@@ -86,15 +87,17 @@ def test_profile_of_small_shadows_that_move_is_an_estimate():
     size = pitch * across
     light = light.reshape(size, FINE, size, FINE).mean(axis=(1, 3))
     image = Light(rng.poisson(light).astype(np.float32), np.ones(light.shape, bool))
-    profile = estimate_profile(image, uv + 0.3, np.ones(count), 1.875)
+    profile = estimate_profile(image, uv + 0.3, circles(np.ones(count)), 1.875)
     # Motion adds to the blur.
     assert 1.0 < profile.blur_px < 1.4
     assert 1.0 < profile.radius_px < 1.7
 
 
 @pytest.mark.parametrize('radius_px', [5.5, 8.0])
-def test_sizes_that_are_not_told_are_seen(radius_px):
-    radii = np.tile([5.5, 8.0, 8.0, 10.5], 4)
+@pytest.mark.parametrize('others', [[8.0, 8.0, 10.5], [5.5, 8.0, 10.5]])
+def test_sizes_that_are_not_told_are_seen(radius_px, others):
+    """A first profile of beads of all sizes fits few of them."""
+    radii = np.tile([5.5, *others], 4)
     imaging, *_ = completed(radii, None, radius_px)
     size = imaging.size / np.median(imaging.size[radii == 8])
     np.testing.assert_allclose(size, radii / 8, rtol=0.05)
@@ -108,7 +111,7 @@ def test_centres_of_beads_of_several_sizes_are_as_good_as_their_sigma(told):
     beads = measure_beads(
         light,
         uv + 0.2,
-        np.ones(len(uv)),
+        circles(np.ones(len(uv))),
         profile=imaging.profile,
         noise=imaging.noise,
         size=imaging.size,
@@ -126,7 +129,7 @@ def test_windows_hold_the_largest_shadow_and_each_its_own():
     size = np.array([0.8, 1.0, 2.5])
     profile = Profile(8.0, 1.2, 0.1, 0.0)
     noise = estimate_noise(image, light.field)
-    fit = _BeadFit(light, uv, np.ones(3), profile=profile, noise=noise, size=size)
+    fit = _BeadFit(light, uv, circles(np.ones(3)), profile=profile, noise=noise, size=size)
     reach = profile.reach_px * size
     length = np.linalg.norm(fit.offset, axis=1)
     assert length.max() >= reach.max()
@@ -143,9 +146,13 @@ def test_centres_in_a_compressed_image_are_as_good_as_their_sigma():
         image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE).astype(np.float32)
         light = Light(image, np.ones(image.shape, bool))
         noise = estimate_noise(image, light.field)
-        shadows = Expected(np.arange(36), uv, np.ones(36), np.ones(36, bool), np.ones(36, bool))
+        shadows = Expected(
+            np.arange(36), uv, circles(np.ones(36)), np.ones(36, bool), np.ones(36, bool)
+        )
         imaging = first_imaging(light, noise, shadows, 7.0, size=np.ones(36))
-        beads = measure_beads(light, uv + 0.2, np.ones(36), profile=imaging.profile, noise=noise)
+        beads = measure_beads(
+            light, uv + 0.2, circles(np.ones(36)), profile=imaging.profile, noise=noise
+        )
         error.append(beads.uv - uv)
         off.append(error[-1] / beads.sigma[:, None])
     assert np.sqrt(np.mean(np.square(error))) < 0.2
@@ -156,7 +163,9 @@ def test_something_beside_a_few_beads_is_no_other_size():
     image, uv = image_of(np.full(36, 8.0), 1.2)
     image[40:, :60] *= 0.8  # the edge of a plate, across the first beads of the rows
     light = Light(image, np.ones(image.shape, bool))
-    shadows = Expected(np.arange(36), uv, np.ones(36), np.ones(36, bool), np.ones(36, bool))
+    shadows = Expected(
+        np.arange(36), uv, circles(np.ones(36)), np.ones(36, bool), np.ones(36, bool)
+    )
     noise = estimate_noise(image, light.field)
     imaging = first_imaging(light, noise, shadows, 8.0, size=np.full(36, np.nan))
     assert (imaging.size == 1).all()
@@ -181,10 +190,10 @@ def measured_in(
     n = len(uv)
     light = Light(image, np.ones(image.shape, bool))
     noise = estimate_noise(image, light.field)
-    shadows = Expected(np.arange(n), uv, np.ones(n), np.ones(n, bool), np.ones(n, bool))
+    shadows = Expected(np.arange(n), uv, circles(np.ones(n)), np.ones(n, bool), np.ones(n, bool))
     imaging = first_imaging(light, noise, shadows, radius_px, size=size)
     beads = measure_beads(
-        light, uv + 0.2, np.ones(n), profile=imaging.profile, noise=noise, size=size
+        light, uv + 0.2, circles(np.ones(n)), profile=imaging.profile, noise=noise, size=size
     )
     return beads.uv - uv, beads.sigma
 
@@ -228,7 +237,7 @@ def sizes_of(count=5, others=()):
     """Comparison of the sizes of beads in a row, whose lack of fit is a function of them."""
     uv = np.vstack([100.0 * np.arange(count)[:, None] * [1, 0], *others])
     n = len(uv)
-    shadows = Expected(np.arange(n), uv, np.ones(n), np.ones(n, bool), np.ones(n, bool))
+    shadows = Expected(np.arange(n), uv, circles(np.ones(n)), np.ones(n, bool), np.ones(n, bool))
     imaging = Imaging(
         None, Profile(5.0, 1.0, 1.0), np.append(np.ones(count), np.full(n - count, 2))
     )
@@ -293,6 +302,9 @@ def test_sizes_differ_where_the_common_one_fits_badly(monkeypatch, common, own, 
         return np.array(out)
 
     monkeypatch.setattr(_Sizes, 'lacks', lacks)
+    monkeypatch.setattr(
+        'fluoro_calib_ros.images.measurement._typical', lambda *_: sizes.imaging.profile
+    )
     assert sizes.are_equal(rows) is is_equal
     assert sizes.are_equal(rows[:0])
 
@@ -309,7 +321,7 @@ def test_windows_at_the_edge_of_an_image_have_the_pixels_that_are_there():
     profile = Profile(4.0, 1.0, 1.0)
     u = np.array([40.0, 76, 74.9, 75, 4, 3.9, 40, 40, 40, 31, 60])
     uv = np.column_stack([u, [30, 30, 30, 30, 30, 30, 55, 56, 4, 30, 55.1]])
-    fit = _BeadFit(Light(grey, field), uv, np.ones(11), profile=profile, noise=NOISE)
+    fit = _BeadFit(Light(grey, field), uv, circles(np.ones(11)), profile=profile, noise=NOISE)
     reach = profile.reach_px + 2
     for row, (u, v) in enumerate(np.rint(uv).astype(int)):
         for k, (du, dv) in enumerate(fit.offset):
@@ -326,7 +338,7 @@ def test_neighbours_are_those_within_reach_the_nearest_first():
     uv = np.array([[40.0, 30], [47, 30], [40, 42], [200, 30], [47, 30]])
     light = Light(np.full((90, 260), 100.0, np.float32), np.ones((90, 260), bool))
     profile = Profile(4.0, 1.0, 1.0)
-    fit = _BeadFit(light, uv, np.ones(5), profile=profile, noise=NOISE)
+    fit = _BeadFit(light, uv, circles(np.ones(5)), profile=profile, noise=NOISE)
     together = 2 * profile.reach_px + 2
     away = np.linalg.norm(uv[:, None] - uv[None], axis=2)
     np.fill_diagonal(away, np.inf)
@@ -346,13 +358,13 @@ def test_windows_of_beads_that_look_larger_are_larger():
     light = Light(np.full((100, 400), 100.0, np.float32), np.ones((100, 400), bool))
     profile = Profile(5.0, 1.0, 1.0)
     stretch, size = np.array([0.5, 1.0, 1.6, 1.6]), np.array([1.0, 1.0, 1.0, 0.5])
-    fit = _BeadFit(light, uv, stretch, profile=profile, noise=NOISE, size=size)
+    fit = _BeadFit(light, uv, circles(stretch), profile=profile, noise=NOISE, size=size)
     reach = profile.reach_px * size * stretch + 2
     length = np.linalg.norm(fit.offset, axis=1)
     for valid, own in zip(fit.valid, reach):
         assert valid.tolist() == (length <= own).tolist()
     assert length.max() <= reach.max() and fit.radius.tolist() == (stretch * size).tolist()
-    wide = _BeadFit(light, uv, stretch, profile, NOISE, size=size, reach_px=12.0)
+    wide = _BeadFit(light, uv, circles(stretch), profile, NOISE, size=size, reach_px=12.0)
     length = np.linalg.norm(wide.offset, axis=1)
     for valid, own in zip(wide.valid, 12.0 * stretch + 2):
         assert valid.tolist() == (length <= own).tolist()

@@ -214,7 +214,7 @@ class _BeadFit(ShadowFit):
         self.radius = self.stretch * self.size
         self.measured = np.zeros(len(uv), dtype=bool)
         self.disturbed = np.zeros(len(uv), dtype=bool)
-        self.moved = np.zeros(len(uv))  # by relative errors of 1 of the radii [px]
+        self.moved = np.zeros(len(uv))  # by relative errors of 1 of radii, RMS of u and v [px]
         self.plane_only = False
         self.residual = np.zeros((len(uv), len(self.offset)), dtype=np.float32)  # of the last step
         self.counted = np.zeros(self.residual.shape, dtype=bool)
@@ -289,19 +289,21 @@ class _BeadFit(ShadowFit):
         crossed = np.zeros(len(self.uv), dtype=bool)
         if self.crossing is None:
             self.crossing = np.zeros((len(self.uv), len(self.offset)), dtype=np.float32)
-        reach = 2 * (self.profile.radius_px + self.profile.blur_px)
         for rows, near in self.groups:
-            if not near.shape[1]:
-                continue
-            first = near[:, 0]
-            touching = np.linalg.norm(self.uv[rows] - self.uv[first], axis=1) < reach
-            touching &= first >= 0
+            touching = self._touching(rows, near[:, :2])
             if touching.any():
                 chosen = rows[touching]
                 members = np.concatenate([chosen[:, None], near[touching, :2]], axis=1)
                 self.crossing[chosen] = self._crossing(chosen, members)
                 crossed[chosen] = True
         return crossed
+
+    def _touching(self, rows: NDArray[np.int64], near: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Whether (g,) the shadows of beads touch those of some others (g, k), -1 for none."""
+        apart = np.linalg.norm(self.uv[rows, None] - self.uv[near], axis=2)
+        radii = self.profile.radius_px * (self.radius[rows, None] + self.radius[near])
+        reach = radii + 2 * self.profile.blur_px
+        return np.asarray(((near >= 0) & (apart < reach)).any(axis=1))
 
     def _crossing(
         self, rows: NDArray[np.int64], members: NDArray[np.int64]
@@ -392,29 +394,33 @@ class _BeadFit(ShadowFit):
     ) -> np.ndarray:
         if final:
             self._note_precision(rows, equations)
-            self.moved[rows] = self._moved_by_radii(rows, near, equations)
+            touching = np.flatnonzero(self._touching(rows, near))
+            if len(touching):
+                self._note_shifts(rows[touching], near[touching], equations, touching)
             self.measured[rows] = self.usable[rows] & np.isfinite(self.sigma[rows])
             self.residual[rows] = equations.residual
             self.counted[rows] = equations.valid
         return np.linalg.solve(equations.matrix, equations.right[..., None])[..., 0]
 
-    def _moved_by_radii(
-        self, rows: NDArray[np.int64], near: NDArray[np.int64], equations: NormalEquations
-    ) -> NDArray[np.float64]:
-        """Shifts (g,) of a coordinate of centres by relative errors of 1 of all radii, RMS [px].
+    def _note_shifts(
+        self,
+        rows: NDArray[np.int64],
+        near: NDArray[np.int64],
+        equations: NormalEquations,
+        part: NDArray[np.int64],
+    ) -> None:
+        """Note the shifts of centres (g,) by relative errors of 1 of radii, given their equations.
 
         A shadow of which others hide a part of the edge moves with its radius, and with theirs.
         """
-        if not near.shape[1]:
-            return np.zeros(len(rows))
         _, jacobian = self._model(rows, near)
         beads = np.concatenate([rows[:, None], near], axis=1)
         centre = self.uv[beads] - self.middle[rows, None]
         x, y = np.moveaxis(self.offset - centre[:, :, None], 3, 0)
         growth = jacobian[:, TERMS::3] * x + jacobian[:, TERMS + 1 :: 3] * y
-        right = equations.weighted @ np.swapaxes(growth, 1, 2)
-        moved = np.linalg.solve(equations.plain, right)[:, TERMS : TERMS + 2]
-        return np.asarray(np.sqrt(0.5 * (moved**2).sum(axis=(1, 2))))
+        right = equations.weighted[part] @ np.swapaxes(growth, 1, 2)
+        moved = np.linalg.solve(equations.plain[part], right)[:, TERMS : TERMS + 2]
+        self.moved[rows] = np.sqrt(0.5 * (moved**2).sum(axis=(1, 2)))
 
     def absorbed(self) -> Absorbed:
         """Return what beads absorb, in the pixels of those whose fit is good."""
@@ -434,7 +440,9 @@ class _BeadFit(ShadowFit):
         measured = self.measured & np.isfinite(self.uv).all(axis=1)
         typical = float(np.median(self.misfit[measured])) if measured.any() else 1.0
         beads = self._beads(measured, typical, self._noise(measured))
-        radius_sd = np.where(self._is_light_clipped(), CLIPPED_RADIUS_SD, RADIUS_SD)
+        radius_sd = np.full(len(self.uv), RADIUS_SD)
+        rows = np.flatnonzero(self.moved)
+        radius_sd[rows[self._is_light_clipped(rows)]] = CLIPPED_RADIUS_SD
         return replace(beads, sigma=np.hypot(beads.sigma, radius_sd * self.moved))
 
     def _noise(self, measured: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -449,14 +457,14 @@ class _BeadFit(ShadowFit):
         share = np.minimum((rest**2).sum(axis=1) / np.maximum(whole, 1e-12), 1.0)
         return np.where(self.strength > 0, 1.0, share) * self.misfit
 
-    def _is_light_clipped(self) -> NDArray[np.bool_]:
-        """Whether (n,) hardly any pixel beside the shadows of a window is not clipped."""
-        if not (len(self.uv) and np.isfinite(self.high)):
-            return np.zeros(len(self.uv), dtype=bool)
+    def _is_light_clipped(self, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Whether (g,) hardly any pixel beside the shadows of windows is not clipped."""
+        if not (len(rows) and np.isfinite(self.high)):
+            return np.zeros(len(rows), dtype=bool)
         reach = self.profile.reach_px * self.radius.max()
-        away, _ = cKDTree(self.uv).query(self.middle[:, None] + self.offset)
-        light = self.valid & (away > reach)
-        seen = light & (self.grey < self.high)
+        away, _ = cKDTree(self.uv).query(self.middle[rows, None] + self.offset)
+        light = self.valid[rows] & (away > reach)
+        seen = light & (self.grey[rows] < self.high)
         return np.asarray(seen.sum(axis=1) < SEEN_LIGHT * light.sum(axis=1))
 
 

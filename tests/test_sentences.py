@@ -232,7 +232,7 @@ def bead(**changes):
 
 
 def not_measured(n=20):
-    view = Fake(depth=lambda _: np.ones(n))
+    view = Fake(outlines=lambda _: np.tile(np.eye(2), (n, 1, 1)))
     found = Fake(view=view, predicted=np.zeros((n, 2)), bead=np.arange(n), detection=np.arange(n))
     seen = Fake(uv=np.zeros((n, 2)), in_field=lambda uv: np.ones(n, bool), radius_px=1.0)
     imaging = Fake(completed=lambda *_: imaging, size=np.ones(n), profile=None, noise=None)

@@ -298,7 +298,11 @@ def follow(
                     shown = {name: image.image for name, image in images.items()}
                     first = identify_markers(shown, calibrations, orientation, bodies)
                 follower = MarkerViews(
-                    calibrations, orientation, options, first=first, bodies=bodies
+                    calibrations,
+                    orientation,
+                    options,
+                    first={name: first.get(name) for name in names},
+                    bodies=bodies,
                 )
             found = follower.update({n: image.image for n, image in images.items()}, exposure)
             for name, image in images.items():

@@ -197,7 +197,7 @@ class _BeadFit(ShadowFit):
         size: NDArray[np.float64] | None = None,
         reach_px: float = 0.0,
     ) -> None:
-        self.stretch = np.sqrt(np.linalg.det(shape))
+        self.stretch = np.sqrt(np.abs(np.linalg.det(shape)))
         # Distances to a metric are those from the centre of the shadow of a typical bead.
         inverse = np.linalg.inv(shape)
         self.metric = np.swapaxes(inverse, 1, 2) @ inverse

@@ -133,14 +133,10 @@ def _farther(seen: Seen, model: PhantomModel, near: View) -> Iterator[Match | No
     neighbours = LEVELS[0][1]
     reach = FAR_REACH * max(seen.field.shape)
     for seed in seeds_of(seen)[:FAR_SEEDS]:
-        _, around = seen.tree.query(seen.uv[seed], k=min(neighbours + 1, len(seen.uv)))
-        around = around[around != seed]
         with np.errstate(invalid='ignore'):
             close = np.linalg.norm(predicted - seen.uv[seed], axis=1) < reach
         triples = model.triples(LEVELS[0][0]).of_beads(close)
-        poses = local_poses(
-            int(seed), seen.uv, near=around, triples=triples, found=beads, scales=scales
-        )
+        poses = local_poses(seed, seen.uv, neighbours, triples, beads, scales=scales)
         turned = [_turned(pose, near, model.xyz) for pose in poses]
         started = [(pose, view) for pose, view in zip(poses, turned) if view is not None]
         for pose, view in started[:FAR_POSES]:

@@ -400,11 +400,7 @@ def _candidates(seen: Seen, model: PhantomModel, lens: Lens) -> Iterator[Match]:
             continue
         triples = model.triples(wide)
         for seed in order[first : min(last, enough)]:
-            _, around = seen.tree.query(seen.uv[seed], k=min(neighbours + 1, len(seen.uv)))
-            around = around[around != seed]
-            for pose in local_poses(
-                seed, seen.uv, near=around, triples=triples, found=beads, scales=scales
-            ):
+            for pose in local_poses(seed, seen.uv, neighbours, triples, beads, scales=scales):
                 view = start_view(pose, lens, model.xyz)
                 found = grow(view, pose.bead, model.xyz, seen)
                 if found is not None:

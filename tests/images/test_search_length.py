@@ -8,12 +8,14 @@ from __future__ import annotations
 import numpy as np
 from rigs import refused
 
+from benchmarks.extraction import pose_of, seen_points
 from fluoro_calib_ros.findings import Kind
 from fluoro_calib_ros.images import matching
 from fluoro_calib_ros.images.growth import Seen
 from fluoro_calib_ros.images.pose_search import enough_seeds
 from fluoro_calib_ros.images.view import Lens
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
+from fluoro_calib_ros.simulation.rig import virtual_rig
 
 LENS = Lens((1024, 1024), 4000.0)
 NEIGHBOURS = (8, 6)
@@ -43,6 +45,21 @@ def test_more_beads_are_tried_where_their_shadows_touch():
 def test_a_phantom_whose_shadows_would_all_be_one_is_not_looked_for():
     sheet = np.array([(x, y, 0.0) for x in range(0, 60, 6) for y in range(0, 60, 6)])
     assert enough_seeds(sheet, 80, 6.5, NEIGHBOURS) == 0
+
+
+def test_a_phantom_is_found_where_all_its_faces_are_seen_from_the_edge():
+    v, u = np.mgrid[:1024, :1024]
+    field = np.hypot(u - 511.5, v - 511.5) < 490
+    rig = virtual_rig(3000, 0.9)
+    model = matching.PhantomModel.of(rig.phantom.xyz_mm)
+    for number, fluoroscope in enumerate(5 * rig.fluoroscopes):
+        rng = np.random.default_rng(number)
+        rotation, shift = pose_of('tube', rng, fluoroscope)
+        true = fluoroscope.ideal(rig.true_mm @ rotation.T + shift)
+        uv = seen_points(rng, fluoroscope.distortion.distort(true), field)
+        found = matching.match(Seen.of(uv, field, 2.6), model, LENS)
+        away = uv[found.detection] - fluoroscope.distortion.distort(true[found.bead])
+        assert np.mean(np.linalg.norm(away, axis=1) < 4) > 0.98
 
 
 def test_another_phantom_is_refused_after_as_many_beads_as_would_tell(monkeypatch):

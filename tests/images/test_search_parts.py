@@ -40,6 +40,7 @@ from fluoro_calib_ros.images.pose_search import (
     _votes,
     enough_seeds,
     nearby_map,
+    neighbours_of,
     triples_of,
 )
 from fluoro_calib_ros.images.view import Lens
@@ -115,6 +116,24 @@ def test_three_beads_give_the_scale_and_the_rotation():
 def test_votes_are_shares_of_the_voters_in_the_field():
     hits, inside = np.array([5, 5, 5]), np.array([10, 8, 2])
     np.testing.assert_allclose(_votes(hits, inside, 10), [0.5, 5 / 8, 5 / 6])
+
+
+def test_neighbours_in_several_directions_come_before_nearer_ones():
+    line = [(u, 0.0) for u in (0, 1, 2, -1.5, 3, 4, -5, 6)]
+    away = [(1.0, 9.0), (-1.0, 10.0), (1.5, -11.0), (-1.5, -12.0), (2.0, 9.5)]
+    uv = np.array(line + away)
+    first, _ = neighbours_of(uv, np.array([0, 8]), 6)
+    # Of 60 degrees each, from the direction of the nearest one.
+    np.testing.assert_array_equal(first, [1, 3, 8, 9, 10, 11])
+    # The others follow where there is nothing in a direction.
+    np.testing.assert_array_equal(neighbours_of(uv[:8], np.array([0]), 6)[0], [1, 3, 2, 4, 5, 6])
+    assert set(neighbours_of(uv[:3], np.array([1]), 6)[0].tolist()) == {0, 2}
+
+
+def test_a_bead_is_not_its_own_neighbour_where_another_one_is_at_its_place():
+    uv = np.array([(0.0, 0.0), (0.0, 0.0), (1.0, 0.0), (0.0, 2.0)])
+    for row in range(4):
+        assert row not in neighbours_of(uv, np.array([row]), 3)[0]
 
 
 def test_what_is_near_a_bead_is_marked():

@@ -12,8 +12,9 @@ hole of a sheet tells where it is.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
 
 import cv2
@@ -33,7 +34,6 @@ CENTRAL = 8  # beads of the middle from which a search begins
 MIN_NUMBERED = 0.6  # share of the beads that a numbering must reach
 GAP = 2  # missing beads side by side, twice
 SHIFTS = 6  # best shifts of each basis
-SETTLED = 12  # best candidates that are refined
 DEGREE = 3  # of the distortion while a candidate is refined
 STEPS = 3  # in which a candidate is refined
 
@@ -89,8 +89,27 @@ def number_lattice(points: NDArray[np.float64]) -> Lattice | None:
             continue
         number = _numbered(points, tree, int(start), basis)
         if len(number) >= MIN_NUMBERED * len(points):
-            return Lattice(np.array(list(number)), np.array(list(number.values())))
+            row = np.array(list(number))
+            return Lattice(row, _shortest_steps(np.array(list(number.values())), points[row]))
     return None
+
+
+def _shortest_steps(index: NDArray[np.int64], points: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return places (n, 2) of points (n, 2) along the two shortest steps of their lattice.
+
+    Where beads are missing around the first one, its steps are longer ones. Reduction of Gauss
+    (Cohen, A Course in Computational Algebraic Number Theory, 1993, algorithm 1.3.14).
+    """
+    short, long = _steps(index, points)
+    change = np.eye(2, dtype=np.int64)
+    while True:
+        if short @ short > long @ long:
+            short, long, change = long, short, change[:, ::-1]
+        times = round(float(short @ long / (short @ short)))
+        if times == 0:
+            return index @ change
+        long = long - times * short
+        change = change + np.outer(change[:, 1], [times, 0])
 
 
 def _basis(points: NDArray[np.float64], tree: cKDTree, start: int) -> NDArray[np.float64] | None:
@@ -139,12 +158,12 @@ def _numbered(
 
 @dataclass(frozen=True)
 class GridPose:
-    """A pose of a flat grid."""
+    """A way to lay what was found over a flat grid."""
 
-    match: Match
     #: beads found where the grid has none, and beads of the grid that are missing among others
     against: int
     numbered: int  #: beads found in rows and columns
+    fit: Callable[[], Match | None]  #: its match, None where no pose fits
 
 
 def grid_poses(
@@ -176,20 +195,18 @@ def grid_poses(
             candidates.append((key, change, shift))
     candidates.sort(key=lambda candidate: candidate[0])
     row_at = {tuple(place): row for place, row in zip(grid.lattice.index, grid.lattice.row)}
-    settled = 0
-    for (against, *_), change, shift in candidates:
+
+    def fit(change: NDArray[np.int64], shift: NDArray[np.int64]) -> Match | None:
         places = found.index @ change + shift
         bead = np.array([row_at.get((int(a), int(b)), -1) for a, b in places])
         known = bead >= 0
         if np.count_nonzero(known) < MIN_SHARE * len(known):
-            continue
+            return None
         view = _view(grid, xyz[bead[known]], seen.uv[found.row[known]], lens)
-        match = None if view is None else settle(view, xyz, seen)
-        if match is not None:
-            yield GridPose(match, against, len(known))
-            settled += 1
-            if settled >= SETTLED:
-                return
+        return None if view is None else settle(view, xyz, seen)
+
+    for (against, *_), change, shift in candidates:
+        yield GridPose(against, len(found.index), partial(fit, change, shift))
 
 
 def _steps(index: NDArray[np.int64], points: NDArray[np.float64]) -> np.ndarray:

@@ -60,6 +60,7 @@ LEVELS = (
 # Beads of a phantom from which the search is ended by evidence. With fewer, the whole search takes
 # 2 s, and one of 20 images of large beads that overlap was lost where it ended.
 MANY = 160
+FITTED = 12  # ways to lay a grid over what was found that are refined, where they fit
 APART = 0.6  # share of the beads, those farthest from their neighbours, that are tried next
 AGREED = 3  # matches of the same pose after which the search ends, if it is evident
 MIN_SIZES = 0.1  # relative difference of diameters from which sizes tell beads apart
@@ -186,24 +187,26 @@ def _grid_match(grid: FlatGrid, seen: Seen, model: PhantomModel, lens: Lens) -> 
 
     Raises DataError where the grid fits elsewhere as well, unless any place will do.
     """
-    best: GridPose | None = None
-    rivals: list[Match] = []
+    best: tuple[GridPose, Match] | None = None
+    fitted: list[Match] = []
     for pose in grid_poses(grid, model.xyz, seen, lens):
-        if best is None:
-            if is_evident(pose.match):
-                best = pose
-            continue
-        if model.regular or not _could_be(pose, best):
+        if len(fitted) >= FITTED or (best and (model.regular or not _could_be(pose, best[0]))):
             break
-        if pose.match.scale_px * CLOSER < best.match.scale_px:
-            best = pose
-        elif pose.match.scale_px < CLOSER * best.match.scale_px:
-            rivals.append(pose.match)
-    if best is None or not rivals:
-        return None if best is None else best.match
-    by_size = _best_by_size([best.match, *rivals], seen, model)
+        match = pose.fit()
+        if match is None:
+            continue
+        fitted.append(match)
+        if is_evident(match) and (not best or match.scale_px * CLOSER < best[1].scale_px):
+            best = pose, match
+    if best is None:
+        return None
+    limit = CLOSER * best[1].scale_px
+    rivals = [one for one in fitted if one is not best[1] and one.scale_px < limit]
+    if not rivals:
+        return best[1]
+    by_size = _best_by_size([best[1], *rivals], seen, model)
     if by_size is None:
-        raise _ambiguous(best.match, rivals[0])
+        raise _ambiguous(best[1], rivals[0])
     return by_size
 
 

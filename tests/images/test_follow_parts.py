@@ -408,22 +408,22 @@ def test_extent_of_a_phantom_does_not_depend_on_its_origin():
 
 @pytest.mark.parametrize(('against', 'could'), [(10, True), (11, True), (40, False)])
 def test_a_pose_of_a_grid_could_be_by_what_speaks_against_it(against, could):
-    best = GridPose(None, 10, 110)
+    best = GridPose(10, 110, None)
     log_odds = np.log(110 / 11)
     assert bool((against - 10) * log_odds < matching.LIKELIER) is could
-    assert matching._could_be(GridPose(None, against, 110), best) is could
+    assert matching._could_be(GridPose(against, 110, None), best) is could
 
 
 def grid_match(monkeypatch, scales, regular=False, by_size=None):
-    poses = [
-        GridPose(Fake(scale_px=scale, bead=np.arange(20 + k)), 0, 100)
-        for k, scale in enumerate(scales)
+    matches = [
+        scale and Fake(scale_px=scale, bead=np.arange(20 + k)) for k, scale in enumerate(scales)
     ]
+    poses = [GridPose(0, 100, lambda match=match: match) for match in matches]
     monkeypatch.setattr(matching, 'grid_poses', lambda *given: iter(poses))
     monkeypatch.setattr(matching, 'is_evident', lambda found: True)
     monkeypatch.setattr(matching, '_best_by_size', lambda matches, seen, model: by_size)
     found = matching._grid_match(None, None, Fake(xyz=None, regular=regular), None)
-    return None if found is None else [pose.match for pose in poses].index(found)
+    return None if found is None else matches.index(found)
 
 
 def test_of_two_poses_of_a_grid_one_has_half_the_residuals(monkeypatch):
@@ -431,6 +431,10 @@ def test_of_two_poses_of_a_grid_one_has_half_the_residuals(monkeypatch):
     assert grid_match(monkeypatch, [0.5]) == 0
     assert grid_match(monkeypatch, [0.5, 1.0]) == 0
     assert grid_match(monkeypatch, [0.5, 0.24]) == 1
+    assert grid_match(monkeypatch, [0.5, 0.9, 0.24]) == 2
+    assert grid_match(monkeypatch, [None, 0.5, None]) == 1
+    # So many fit that others are not looked at.
+    assert grid_match(monkeypatch, [0.5, *[1.0] * (matching.FITTED - 1), 0.5]) == 0
     for rival in (0.99, 0.25, 0.5):
         with pytest.raises(DataError, match='ambiguous') as told:
             grid_match(monkeypatch, [0.5, rival])

@@ -13,7 +13,8 @@ from rigs import refused
 
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.findings import Kind
-from fluoro_calib_ros.images.growth import Seen
+from fluoro_calib_ros.images import lattice
+from fluoro_calib_ros.images.growth import Seen, settle
 from fluoro_calib_ros.images.lattice import number_lattice
 from fluoro_calib_ros.images.matching import PhantomModel, match
 from fluoro_calib_ros.images.view import Lens
@@ -173,6 +174,33 @@ def test_a_grid_is_told_whatever_the_frame_of_its_survey_is(turn):
     away = np.linalg.norm(seen.uv[found.detection] - true[found.bead], axis=1)
     assert np.mean(away < 1) > 0.97
     assert len(found.bead) > 0.9 * np.isfinite(true[:, 0]).sum()
+
+
+@pytest.mark.parametrize('steps', [SQUARE, HEXAGONAL])
+def test_a_lattice_is_numbered_along_its_shortest_steps_also_where_it_begins_in_a_gap(steps):
+    place = np.array([(i, j) for i in range(-4, 5) for j in range(-4, 5)])
+    gone = [(1, 0), (-1, 0), (0, 1), (-1, 1), (1, -1)]
+    place = place[~(place[:, None] == gone).all(axis=2).any(axis=1)]
+    found = number_lattice(place @ steps)
+    assert len(found.row) == len(place)
+    known = np.column_stack([found.index, np.ones(len(place))])
+    along = np.linalg.lstsq(known, (place @ steps)[found.row], rcond=None)[0][:2]
+    np.testing.assert_allclose(np.linalg.norm(along, axis=1), 10, rtol=1e-3)
+
+
+def test_a_grid_that_is_told_by_its_first_pose_is_not_fitted_elsewhere(monkeypatch):
+    fitted = []
+    monkeypatch.setattr(lattice, 'settle', lambda *given: fitted.append(1) or settle(*given))
+    rng = np.random.default_rng(2)
+    xyz = grid(SQUARE, 21, missing=25)
+    true = pixels(xyz, (0.2, -0.1, 0.7))
+    found = match(seen_of(true), PhantomModel.of(xyz), LENS)
+    assert len(found.bead) > 0.9 * np.isfinite(true[:, 0]).sum() and len(fitted) == 1
+    # Of poses with as much against them, those fit that are turned.
+    fitted.clear()
+    xyz[:, :2] = (grid(SQUARE, 21) + rng.uniform(-1.5, 1.5, (441, 3)))[: len(xyz), :2]
+    match(seen_of(pixels(xyz, (0.2, -0.1, 0.7))), PhantomModel.of(xyz), LENS)
+    assert len(fitted) <= 8
 
 
 def test_a_lattice_of_unlike_steps_is_numbered_around_its_gaps():

@@ -32,7 +32,6 @@ from ..errors import DataError
 from .documents import read_toml
 
 NAME = 'rig.toml'
-MAX_ABOUT = 100  # entries
 MAX_ABOUT_TEXT = 1000  # characters of an entry
 
 
@@ -155,8 +154,8 @@ def _about(path: Path, value: Any) -> dict[str, str] | None:
     """Return texts that the report shows, by name."""
     if value is None:
         return None
-    if not isinstance(value, dict) or len(value) > MAX_ABOUT:
-        raise DataError(f'{path}, key about: a table of at most {MAX_ABOUT} texts and numbers')
+    if not isinstance(value, dict):
+        raise DataError(f'{path}, key about: a table of texts and numbers')
     for key, text in value.items():
         if not isinstance(text, str | int | float) or len(f'{key}{text}') > MAX_ABOUT_TEXT:
             raise DataError(

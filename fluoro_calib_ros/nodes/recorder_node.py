@@ -17,7 +17,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from ..errors import DataError
-from ..io.bags.recording import MEGABYTE, Recording, RecordingOptions, TopicToRecord, lost_text
+from ..io.bags.recording import Recording, RecordingOptions, TopicToRecord, lost_text
 from ..options import option
 from .runtime.diagnostics import (
     DiagnosticsPublisher,
@@ -194,7 +194,7 @@ class RecorderNode(ParameterNode):
             'messages lost at the input': self._overrun.total(),
             'topics': len(self._topics),
             'files': recording.files,
-            'waiting [MB]': f'{recording.waiting_bytes / MEGABYTE:.1f}',
+            'waiting [MB]': f'{recording.waiting_bytes / 1e6:.1f}',
         }
         state = RecorderState(recording.fault, self._loss(), self._lost_at_input())
         self._diagnostics.publish([Status('recorder', *health_of(state, CONDITIONS), counts)])
@@ -215,7 +215,7 @@ class RecorderNode(ParameterNode):
         self.get_logger().info(
             f'{self._recording.counts.total()} messages of {len(self._topics)} topics recorded to '
             f'{self._recording.path}, {self._recording.dropped.total()} dropped; at most '
-            f'{self._recording.most_waiting_bytes / MEGABYTE:.1f} MB waited'
+            f'{self._recording.most_waiting_bytes / 1e6:.1f} MB waited'
         )
 
 

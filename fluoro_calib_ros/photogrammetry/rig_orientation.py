@@ -20,8 +20,8 @@ from ..brief import brief_repr
 from ..errors import DataError
 from .collinearity import project_with_jacobian
 from .rotations import (
-    ROTATION_TOLERANCE,
     cross_matrix,
+    is_rotation,
     matrix_from_quaternion,
     nearest_rotation,
     quaternion_from_matrix,
@@ -504,8 +504,8 @@ def _as_rotation(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the rotation nearest to a matrix of few digits. Raises DataError for any other."""
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
         raise DataError('known orientation: R is not 3 x 3 finite numbers')
-    if np.abs(matrix.T @ matrix - np.eye(3)).max() > ROTATION_TOLERANCE:
-        raise DataError('known orientation: R is not a rotation, its columns are not orthonormal')
-    if np.linalg.det(matrix) < 0:
+    if is_rotation(-matrix):
         raise DataError('known orientation: R is a reflection, its determinant is -1')
+    if not is_rotation(matrix):
+        raise DataError('known orientation: R is not a rotation, its columns are not orthonormal')
     return nearest_rotation(matrix)

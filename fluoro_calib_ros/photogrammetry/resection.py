@@ -34,12 +34,11 @@ SETTLED_WEIGHTS = 0.02  # change of the robust weights at which the iterations e
 TINY = 1e-14  # of the trace of normal equations, added to the diagonal of singular ones
 NU = 3.0  # of the Student-t of the robust weights: heavy tails
 MIN_VARIANCE = 1e-12  # [px^2], for exact observations
-# Damping of the refinement: start, minimum, maximum and factor.
+# Damping of the refinement: start, minimum and maximum.
 START_DAMPING = 1e-4
 MIN_DAMPING = 1e-12
 MAX_DAMPING = 1e10
 MIN_EXTENT_MM = 1e-3
-DAMPING_FACTOR = 10
 # Relative change of a cost, a redundancy or a distance that rounding errors can cause.
 ROUNDING = 1e-9
 # Squared step at which the refinement ends, in the metric of its normal matrix and noise variance.
@@ -421,8 +420,8 @@ def _damped_step(
         new_position = position + step[:3]
         squared = problem.squared_residuals(new_rotation, new_position)
         if noise.cost(squared / noise.scale**2, sigma) <= cost + ROUNDING * abs(cost):
-            return new_rotation, new_position, step, max(mu / DAMPING_FACTOR, MIN_DAMPING)
-        mu *= DAMPING_FACTOR
+            return new_rotation, new_position, step, max(mu / 10, MIN_DAMPING)
+        mu *= 10
     return rotation, position, np.zeros(6), mu
 
 

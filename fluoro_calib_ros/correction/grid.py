@@ -133,7 +133,6 @@ CHUNK = 8192  # points that are looked up at once, so that their workspace fits 
 # Numbers of points for which workspaces are made: steps of 32 for frames, then powers of two.
 MAX_STEPPED = 512  # points up to which workspaces grow in steps
 WORKSPACE_SIZES = (*range(0, MAX_STEPPED + 1, 32), 1024, 2048, 4096, CHUNK)
-CHECKS_OF_DIVIDED = 20  # random points in each divided cell at which its error is measured
 
 
 class CorrectionGrid:
@@ -198,7 +197,7 @@ class CorrectionGrid:
         self, model: CorrectionModel, divided: DividedCells
     ) -> NDArray[np.float64]:
         """Errors (2, d) [px] of correction and standard deviation left in divided cells."""
-        place = np.random.default_rng(0).random((2, CHECKS_OF_DIVIDED, self.divided))
+        place = np.random.default_rng(0).random((2, 20, self.divided))  # 20 places in each
         u, v = (
             axis[k] + part * (axis[k + 1] - axis[k])
             for axis, k, part in zip(self.nodes, (divided.column, divided.row), place)

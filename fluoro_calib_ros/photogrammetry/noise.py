@@ -43,7 +43,7 @@ NORMAL_MEDIAN = float(ndtri(0.75))  # of the absolute value of a standard normal
 # 0.72, but tails can be heavy.
 MEDIAN_SD = np.sqrt(2 * np.pi) * np.exp(NORMAL_MEDIAN**2 / 2) / (4 * NORMAL_MEDIAN)
 MAX_WIDENING = 2.0  # beyond it, something else than the stated standard deviations is wrong
-MIN_ERRORS = 12
+MIN_ERRORS = 12  # fewer tell no scale
 WINDOW = 2000  # latest errors of a recording that count
 RENEWED = 0.1  # part of them after which the factor is calculated anew
 

@@ -306,7 +306,6 @@ def _fluoroscope(fluoroscope: VirtualFluoroscope) -> dict[str, Any]:
 
 SETTINGS = {'clean': CLEAN, 'hard': HARD}
 MARKER_MM = 1.0  # diameter of a marker
-MARKER_ATTENUATION = 7.0  # of tantalum at 55 keV (NIST XCOM) [1/mm]
 
 
 @dataclass(frozen=True)
@@ -359,7 +358,7 @@ def _camera(
     )
 
 
-HOUR_NS = 3600 * 10**9
+HOUR_NS = 3600 * 10**9  # from one recording to the next
 NAMES = 'abcdefgh'  # of fluoroscopes
 DATA_SET = FolderKind(
     'a data set of the virtual rig',

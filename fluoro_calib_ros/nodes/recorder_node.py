@@ -33,12 +33,17 @@ from .runtime.diagnostics import (
 from .runtime.main import run
 from .runtime.parameters import ParameterGroup, ParameterNode, expand_path
 from .runtime.streams import FaultHandlers, StreamReader
-from .runtime.topics import TopicDiscovery, adapted_qos, definition_of, installed_type
+from .runtime.topics import (
+    DISCOVERY_S,
+    RECORDED_LATCHED_DEPTH,
+    TopicDiscovery,
+    adapted_qos,
+    definition_of,
+    installed_type,
+)
 
-DISCOVERY_S = 0.1  # period in which new topics are looked for
 JOINT_STATES = 'joint_states'
 DEPTH = 1000  # messages that wait for the reading thread, of one topic
-LATCHED_DEPTH = 100  # messages of latched topics that are kept for the next file
 
 
 @dataclass(frozen=True)
@@ -152,7 +157,7 @@ class RecorderNode(ParameterNode):
                 types[0],
                 [qos_document(publisher.qos_profile) for publisher in publishers],
                 definition_of(types[0], type_hash_text(publishers[0])),
-                LATCHED_DEPTH if is_latched else 0,
+                RECORDED_LATCHED_DEPTH if is_latched else 0,
             )
         )
 

@@ -41,7 +41,7 @@ from .body import Body, robust_pose
 from .image_points import Cameras, ImagePoints, Linear
 from .motion import EYE_3, EYE_6, PoseInformation, turn_of_twists, twist_between
 
-MAX_STEPS = 8
+MAX_STEPS = 8  # of Gauss-Newton
 # Square of the next step in standard deviations below which the iteration ends. A step of
 # Gauss-Newton leaves a share of about its own rotation, and of its shift over the distance.
 LAST_STEP = 1e-8  # a ten-thousandth of a standard deviation

@@ -25,7 +25,7 @@ from .base import BULK_CHUNK, Correction, CorrectionModel, Smoothness
 BLOCK = 200  # pixels of a block
 MIN_BLOCK = 9  # where training points are dense
 MAX_BLOCK_PX = 64.0  # its largest side, for pixels that are far apart
-BLOCKS_PER_QUERY = 32
+BLOCKS_PER_QUERY = 32  # that one call of scipy searches
 MAX_AT_ONCE = 2_000_000  # candidates of a query, and weights, to bound the memory
 # In candidates of a pixel: what a block costs, and each neighbour in the search from its centre.
 WORK_OF_BLOCK = 5000

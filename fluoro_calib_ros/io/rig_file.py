@@ -209,7 +209,6 @@ OF_TRIALS = ('extract', 'reconstruct', 'bodies')  # commands, in their order
 CONVERT = 'convert'  # a table of tables: one for each format
 CALIBRATE = 'calibrate'
 SOURCE = 'source'
-MAX_TRIALS = 10_000  # of a study
 Options = Mapping[str, Any]
 
 
@@ -292,8 +291,6 @@ def _trials(path: Path, patterns: Any, out: Path) -> tuple[Trial, ...]:
                     f'{path}, key trials: {other.path} and {trial.path} would have the same '
                     f'results; name one of them, or move it to a folder of its own'
                 )
-    if len(found) > MAX_TRIALS:
-        raise DataError(f'{path}, key trials: {len(found)} trials, more than {MAX_TRIALS}')
     return tuple(found.values())
 
 

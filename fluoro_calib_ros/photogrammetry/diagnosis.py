@@ -25,12 +25,10 @@ from .noise import Noise
 from .normal_equations import normal_equations
 from .plane_resection import flatness
 from .precision import Precision
-from .unknowns import EXTERIOR_SIZE, Parameters
+from .unknowns import EXTERIOR_SIZE, SINGULAR, Parameters
 
 # Correlation above which two unknowns are reported.
 HIGH_CORRELATION = 0.95
-# Eigenvalue of the scaled normal matrix below which it is a rounding error.
-MAX_OPEN_EIGENVALUE = 1e-11
 # A network is judged at this image noise at most, so that distorted images do not make it look
 # weaker.
 NOMINAL_NOISE_PX = 1.0
@@ -227,7 +225,7 @@ def undetermined_directions(
     skipped = network.layout.datum_defect
     out = []
     for value, vector in zip(values[skipped:], vectors.T[skipped:]):
-        if value > MAX_OPEN_EIGENVALUE:
+        if value > SINGULAR:
             break
         square = vector**2
         order = np.argsort(-square, kind='stable')

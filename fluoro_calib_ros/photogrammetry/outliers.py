@@ -27,8 +27,8 @@ from .collinearity import project_with_jacobian
 from .elimination import CovarianceBlocks, factorize
 from .network import Network
 from .noise import DEFAULT_NOISE, MIN_REDUNDANCY, Noise
-from .normal_equations import normal_equations
-from .precision import MIN_WEIGHT, Precision, covariance_blocks, variance_of_projection
+from .normal_equations import MIN_WEIGHT, normal_equations
+from .precision import Precision, covariance_blocks, variance_of_projection
 from .unknowns import Parameters
 
 # Probability of any false alarm among all that is tested: image points, targets, terms.

@@ -34,6 +34,8 @@ POSE_SIZE = 6  # translation [mm], rotation vector [rad], also of a body in the 
 # away.
 RIGID_SD_MM = 3e-4
 RIGID_SD_RAD = 1e-7
+# Eigenvalue of a normal matrix of unit diagonal below which it is a rounding error.
+SINGULAR = 1e-11
 
 
 @dataclass(frozen=True)

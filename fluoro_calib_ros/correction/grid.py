@@ -12,6 +12,7 @@ of numpy for a small frame, are what a lookup costs.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from typing import Any
 
 import numpy as np
@@ -131,8 +132,7 @@ class LookupWorkspace:
 DIVIDED = 4  # added to the status of a cell that is divided
 CHUNK = 8192  # points that are looked up at once, so that their workspace fits the cache
 # Numbers of points for which workspaces are made: steps of 32 for frames, then powers of two.
-MAX_STEPPED = 512  # points up to which workspaces grow in steps
-WORKSPACE_SIZES = (*range(0, MAX_STEPPED + 1, 32), 1024, 2048, 4096, CHUNK)
+WORKSPACE_SIZES = (*range(0, 512, 32), 512, 1024, 2048, 4096, CHUNK)
 
 
 class CorrectionGrid:
@@ -245,7 +245,7 @@ class CorrectionGrid:
     ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
         """Look up at most CHUNK points; see `look_up`."""
         n = len(u)
-        number = (n + 31) // 32 if n <= MAX_STEPPED else 16 + (n - 1 >> 9).bit_length()
+        number = bisect_left(WORKSPACE_SIZES, n)
         workspaces = self._workspaces[number]
         try:
             workspace = workspaces.pop()  # a thread that pops one has it alone, and puts it back

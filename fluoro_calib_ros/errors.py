@@ -35,6 +35,11 @@ def shortened(text: str, limit: int = MAX_MESSAGE) -> str:
     return text[: limit - end - len(_ELLIPSIS)] + _ELLIPSIS + text[-end:]
 
 
+def quoted(text: str) -> str:
+    """Return what a file holds in quotation marks, as a message repeats it."""
+    return repr(shortened(text, 100))
+
+
 class DataError(ValueError):
     """A fault in the data, as findings; the message is their sentences.
 

@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import DataError
 from ..photogrammetry.rotations import (
     ROTATION_TOLERANCE,
+    is_rotation,
     matrix_from_quaternion,
     nearest_rotation,
 )
@@ -51,10 +52,10 @@ class AnatomicalFrame:
             raise DataError('a frame has three axes and an origin of three coordinates')
         if not (np.isfinite(rotation).all() and np.isfinite(origin).all()):
             raise DataError('the frame has coordinates that are not finite')
-        if np.abs(rotation.T @ rotation - np.eye(3)).max() > ROTATION_TOLERANCE:
-            raise DataError('the axes of the frame are not perpendicular unit vectors')
-        if np.linalg.det(rotation) < 0:
+        if is_rotation(-rotation):
             raise DataError('the axes of the frame are left-handed')
+        if not is_rotation(rotation):
+            raise DataError('the axes of the frame are not perpendicular unit vectors')
         for name, array in (('rotation', nearest_rotation(rotation)), ('origin_mm', origin)):
             array.setflags(write=False)
             object.__setattr__(self, name, array)

@@ -262,8 +262,6 @@ class BodyPoses:
 
 # Rigid motions of points.
 
-MAX_TRIPLES = 84  # of points that are tried: all of nine points
-
 
 def fitted_pose(
     source: NDArray[np.float64],
@@ -297,7 +295,7 @@ def robust_pose(
     """
     count = len(source)
     triples = np.array(list(combinations(range(count), 3)))
-    triples = triples[np.linspace(0, len(triples) - 1, MAX_TRIPLES).astype(int)]
+    triples = triples[np.linspace(0, len(triples) - 1, 84).astype(int)]  # all of nine points
     rotation, shift = fitted_pose(source[triples], target[triples])
     away = np.linalg.norm(source @ np.swapaxes(rotation, 1, 2) + shift[:, None] - target, axis=2)
     middle = max(count // 2, 2)

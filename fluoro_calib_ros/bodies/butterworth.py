@@ -21,7 +21,6 @@ from ..errors import DataError
 from ..photogrammetry.rotations import matrix_from_quaternion, quaternion_from_matrix
 from .body import BodyPoses, PoseStatus
 
-ORDER = 2  # in each direction
 SETTLED = 1e-6  # share of the impulse response that is left out
 
 
@@ -39,7 +38,7 @@ def filtered_poses(poses: BodyPoses, cutoff_hz: float) -> BodyPoses:
         raise DataError(
             f'a cutoff of {cutoff_hz:g} Hz is not between 0 and half of the rate, {rate / 2:g} Hz'
         )
-    b, a = scipy.signal.butter(ORDER, cutoff_hz, fs=rate)
+    b, a = scipy.signal.butter(2, cutoff_hz, fs=rate)  # of second order in each direction
     time = np.arange(len(known))
 
     def smooth(values: NDArray[np.float64]) -> NDArray[np.float64]:

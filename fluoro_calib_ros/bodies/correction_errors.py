@@ -12,7 +12,6 @@ from scipy.spatial.distance import cdist
 # Errors of a correction at two pixels are correlated by exp(-distance / REACH), in longer sides
 # of the image, as benchmarks/reach.py measures it.
 REACH = 0.15
-SPREAD = 100  # exposures of a recording, evenly spread, that tell where its markers are seen
 
 
 def covariance_of_means(uv: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -22,7 +21,8 @@ def covariance_of_means(uv: NDArray[np.float64]) -> NDArray[np.float64]:
     the mean correlation of the errors of two markers in any two exposures, 0 for a marker that is
     not seen.
     """
-    rows = np.unique(np.linspace(0, len(uv) - 1, SPREAD).astype(int))
+    # 100 exposures of a recording, evenly spread, tell where its markers are seen.
+    rows = np.unique(np.linspace(0, len(uv) - 1, 100).astype(int))
     out = []
     for path in np.moveaxis(uv[rows], 2, 0):
         seen = np.isfinite(path).all(axis=2)

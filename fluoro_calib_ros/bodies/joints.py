@@ -36,9 +36,6 @@ LOCK_SDS = 5.0
 # Below it the second-order part of an angle's error is less than 1 % of the first-order one, and
 # translations of 50 mm along turning axes are linear to 0.01 mm.
 LINEAR_SD_RAD = 0.02
-# Of the Gauss-Hermite rule along each axis: for quadratic errors, and near gimbal lock.
-NODES = 3
-LOCK_NODES = 9
 MIN_VOLUME = 1e-9  # of the axes: the Jacobian is finite in gimbal lock, and not used there
 BLOCK = 256  # exposures that are integrated at once
 
@@ -164,7 +161,8 @@ def joint_motion(
     jacobian = _jacobian(of, axes, relative.translation)
     covariance = jacobian @ relative.covariance @ np.swapaxes(jacobian, 1, 2)
     locked = _near_lock(of, angles, covariance)
-    for nodes, bent in ((NODES, _is_nonlinear(covariance) & ~locked), (LOCK_NODES, locked)):
+    # Nodes of the Gauss-Hermite rule along each axis: for quadratic errors, and near gimbal lock.
+    for nodes, bent in ((3, _is_nonlinear(covariance) & ~locked), (9, locked)):
         exposures = np.flatnonzero(bent)
         for start in range(0, len(exposures), BLOCK):
             rows = exposures[start : start + BLOCK]

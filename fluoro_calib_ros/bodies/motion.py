@@ -46,7 +46,7 @@ from scipy.spatial.transform import Rotation
 
 from ..photogrammetry.rotations import left_jacobian, vector_from_matrix
 
-STATE = 18
+STATE = 18  # pose, velocity and acceleration
 POSE = slice(0, 6)
 KINDS = (slice(0, 3), slice(3, 6))  # of the components of a pose: position, rotation
 
@@ -59,12 +59,11 @@ START_LOG = np.array([18.0, 8.0])
 START_LOG_SD = 6.0
 # First variance of the walk of h in a second, then estimated: h changes by about 3 in 0.1 s.
 WALK = 90.0
-MAX_ROUNDS = 12
 ROUND_ENDS = 0.1  # largest change of h in a round; it changes a standard deviation by 1 %
 MAX_STEP = 2.5  # of h in a round
 LOST_DIGITS = 1e-9  # of a variance, where the difference keeps too few of sixteen digits
 ADAPTATIONS = 4  # rounds of h in an exposure, live
-LOG_RANGE = (-20.0, 50.0)
+LOG_RANGE = (-20.0, 50.0)  # of h, four standard deviations and more beyond START_LOG
 
 EYE_3 = np.eye(3)
 EYE_6 = np.eye(6)
@@ -492,7 +491,7 @@ def smooth_trial(first: MotionFilter, seen: Sequence[PoseInformation]) -> Motion
     log_q = np.stack([step.log_q for step in steps])
     walk = np.full(log_q.shape[1:], WALK)
     motion, scores = _smooth(steps)
-    for _ in range(MAX_ROUNDS):
+    for _ in range(12):
         log_q, change, walk = _improved(log_q, scores, dt, walk)
         follower = MotionFilter(len(first.alive), lag=None)
         for k, step in enumerate(steps):

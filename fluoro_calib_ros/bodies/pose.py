@@ -35,13 +35,13 @@ from scipy.special import chdtri, erfc
 
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import cross_matrix, vector_from_matrix
-from ..photogrammetry.unknowns import POSE_SIZE
+from ..photogrammetry.unknowns import POSE_SIZE, SINGULAR
 from ..reconstruction.reconstruct import IntersectedViews
 from .body import Body, robust_pose
 from .image_points import Cameras, ImagePoints, Linear
 from .motion import EYE_3, EYE_6, PoseInformation, turn_of_twists, twist_between
 
-MAX_STEPS = 8
+MAX_STEPS = 8  # of Gauss-Newton
 # Square of the next step in standard deviations below which the iteration ends. A step of
 # Gauss-Newton leaves a share of about its own rotation, and of its shift over the distance.
 LAST_STEP = 1e-8  # a ten-thousandth of a standard deviation
@@ -51,8 +51,6 @@ LINEAR_RAD = 0.05
 # An exposure alone gives a pose if it determines the rotation so that derivatives hold at two
 # standard deviations.
 ALONE_SD_RAD = LINEAR_RAD / 2
-# Smallest eigenvalue of a normal matrix of unit diagonal that counts as regular.
-SINGULAR = 1e-11
 # One below which others do not predict a marker, and with which a matrix is held that may be
 # singular: far above rounding, which a constant beside large elements is not.
 WEAK = 1e-9

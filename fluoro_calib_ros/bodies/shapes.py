@@ -25,18 +25,18 @@ from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri
+from scipy.special import chdtri, ndtr
 
 from ..brief import brief_repr
 from ..errors import DataError
 from ..exposures.phantom import MISTAKEN_UNITS
 from ..findings import Finding, Kind, Place, Severity
+from ..photogrammetry.noise import CERTAIN
 from ..photogrammetry.rotations import cross_matrix, nearest_rotation
 from ..photogrammetry.unknowns import POSE_SIZE
 from .body import Body, by_pose, fitted_pose
 from .correction_errors import covariance_of_means
 
-ROUNDS = 4  # the problem is nearly linear once poses are known
 # Share of the places of a marker that may be false matches, and are left out: of 1 % false image
 # points some 0.3 % are near enough to the epipolar line to become a place. A marker with more of
 # them moves against the others.
@@ -46,7 +46,7 @@ FALSE_SHARE = 0.05
 # of rigid-body fitting [mm] above which a body is not stable.
 MAX_CONDITION = 120.0
 MAX_MEAN_ERROR_MM = 0.35
-REJECT_TAIL = 6.3e-5  # probability of four standard deviations, as everywhere
+REJECT_TAIL = 2 * float(ndtr(-CERTAIN))
 # Of the coordinates of a body in another unit, or mirrored, the images tell at once: by the fit of
 # its shape to points in space.
 SCALE_TOLERANCE = 0.05
@@ -281,7 +281,7 @@ def _adjust(
     problem = _problem(body, places, xyz, (rows, known))
     shape = xyz[known].copy()
     rotation, shift = fitted_pose(shape, problem.place, problem.seen.astype(float))
-    for _ in range(ROUNDS):
+    for _ in range(4):  # the problem is nearly linear once poses are known
         reduced = _reduced(problem, shape, rotation, shift)
         covariance = np.linalg.inv(reduced.matrix)
         step = covariance @ reduced.right

@@ -41,7 +41,6 @@ class CorrectionStatus(IntEnum):
 # at random, a disc would be empty with the chance exp(-9 pi) (Poisson), and with exp(-pi) where
 # they are nine times less dense.
 HOLE_SPACINGS = 3.0
-HOLE_STEPS = 3  # centres of discs that are tried along a radius
 BULK_CHUNK = 2048  # pixels evaluated in one call of `evaluate_in_bulk`: some milliseconds
 
 
@@ -224,7 +223,7 @@ def _holes_of(uv: NDArray[np.float64], hull: NDArray[np.float64]) -> Holes | Non
     radius = max(
         HOLE_SPACINGS * float(np.sqrt(area / len(uv))), float(np.max(high - low)) / (SD_GRID - 1)
     )
-    u, v = (np.arange(a, b, radius / HOLE_STEPS) for a, b in zip(low, high))
+    u, v = (np.arange(a, b, radius / 3) for a, b in zip(low, high))  # centres that are tried
     tried = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
     tried = tried[~_beyond(hull, tried)]
     distance, _ = cKDTree(uv).query(tried, distance_upper_bound=radius)

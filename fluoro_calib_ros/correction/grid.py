@@ -12,6 +12,7 @@ of numpy for a small frame, are what a lookup costs.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from typing import Any
 
 import numpy as np
@@ -131,9 +132,7 @@ class LookupWorkspace:
 DIVIDED = 4  # added to the status of a cell that is divided
 CHUNK = 8192  # points that are looked up at once, so that their workspace fits the cache
 # Numbers of points for which workspaces are made: steps of 32 for frames, then powers of two.
-MAX_STEPPED = 512  # points up to which workspaces grow in steps
-WORKSPACE_SIZES = (*range(0, MAX_STEPPED + 1, 32), 1024, 2048, 4096, CHUNK)
-CHECKS_OF_DIVIDED = 20  # random points in each divided cell at which its error is measured
+WORKSPACE_SIZES = (*range(0, 512, 32), 512, 1024, 2048, 4096, CHUNK)
 
 
 class CorrectionGrid:
@@ -198,7 +197,7 @@ class CorrectionGrid:
         self, model: CorrectionModel, divided: DividedCells
     ) -> NDArray[np.float64]:
         """Errors (2, d) [px] of correction and standard deviation left in divided cells."""
-        place = np.random.default_rng(0).random((2, CHECKS_OF_DIVIDED, self.divided))
+        place = np.random.default_rng(0).random((2, 20, self.divided))  # 20 places in each
         u, v = (
             axis[k] + part * (axis[k + 1] - axis[k])
             for axis, k, part in zip(self.nodes, (divided.column, divided.row), place)
@@ -246,7 +245,7 @@ class CorrectionGrid:
     ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
         """Look up at most CHUNK points; see `look_up`."""
         n = len(u)
-        number = (n + 31) // 32 if n <= MAX_STEPPED else 16 + (n - 1 >> 9).bit_length()
+        number = bisect_left(WORKSPACE_SIZES, n)
         workspaces = self._workspaces[number]
         try:
             workspace = workspaces.pop()  # a thread that pops one has it alone, and puts it back

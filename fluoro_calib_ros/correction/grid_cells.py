@@ -96,7 +96,7 @@ CELL_PX = (8, 4, 2)  # sizes of cells that are tried; those of a saved lookup gr
 MAX_SHARE_DIVIDED = 0.01  # of cells, so that not all of them have to be smaller
 MAX_DIVIDED = 2500  # cells, the worst ones
 MAX_PARTS = 16  # of a divided cell along a side
-MAX_TABLE_BYTES = 128_000_000
+MAX_TABLE_BYTES = 128_000_000  # up to 5 megapixels all sizes of cells are tried
 MAX_CELL_PX = 64  # larger ones would not resemble the model
 # Work of the values at the corners of cells (`CorrectionModel.bulk_work`): some six seconds. That
 # of the errors may be a quarter of it, that of the divided cells half.

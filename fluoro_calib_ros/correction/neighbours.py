@@ -25,9 +25,8 @@ from .base import BULK_CHUNK, Correction, CorrectionModel, Smoothness
 BLOCK = 200  # pixels of a block
 MIN_BLOCK = 9  # where training points are dense
 MAX_BLOCK_PX = 64.0  # its largest side, for pixels that are far apart
-BLOCKS_PER_QUERY = 32
+BLOCKS_PER_QUERY = 32  # that one call of scipy searches
 MAX_AT_ONCE = 2_000_000  # candidates of a query, and weights, to bound the memory
-REACH_SAMPLES = 32
 # In candidates of a pixel: what a block costs, and each neighbour in the search from its centre.
 WORK_OF_BLOCK = 5000
 WORK_OF_NEIGHBOUR = 10
@@ -71,7 +70,7 @@ def _circles(
     tree: cKDTree, uv: NDArray[np.float64], k: int, per_query: int
 ) -> Iterator[tuple[list[NDArray[np.int64]], NDArray[np.float64], NDArray[np.float64]]]:
     """Yield per_query blocks at a time, with centres and radii of the circles of candidates."""
-    reach = np.median(tree.query(uv[:: len(uv) // REACH_SAMPLES + 1], k=[k])[0])
+    reach = np.median(tree.query(uv[:: len(uv) // 32 + 1], k=[k])[0])  # of some pixels
     blocks = _blocks(uv, reach)
     for start in range(0, len(blocks), per_query):
         some = blocks[start : start + per_query]

@@ -81,7 +81,6 @@ class CollocationModel(SeriesModel):
 
 
 MAX_CELLS = 128  # along a side of the image, to bound the size of files and messages
-MIN_NODES = 2  # along a side
 
 
 class LookupModel(CorrectionModel):
@@ -130,7 +129,7 @@ def grid_nodes(image_size: tuple[int, int]) -> NDArray[np.float64]:
     """Nodes (n, 2) [px] of the lookup grid of an image (width, height), row by row."""
     size = max(*CELL_PX, max(image_size) / MAX_CELLS)
     u, v = (
-        np.linspace(-0.5, length - 0.5, max(MIN_NODES, int(np.ceil(length / size)) + 1))
+        np.linspace(-0.5, length - 0.5, max(2, int(np.ceil(length / size)) + 1))
         for length in image_size
     )
     return np.stack([np.tile(u, len(v)), np.repeat(v, len(u))], axis=1)
@@ -158,7 +157,7 @@ def _grid_shape(uv: NDArray[np.float64]) -> tuple[int, int]:
     rows = int(np.cumprod(same_columns & same_row).sum())
     steps = np.diff(uv[:columns, 0]), np.diff(table[:rows, 0, 1]) if columns else np.zeros(0)
     regular = all(len(step) and step.min() > 0 and np.ptp(step) < 1e-6 for step in steps)
-    if columns < MIN_NODES or rows < MIN_NODES or not regular:
+    if columns < 2 or rows < 2 or not regular:
         raise ValueError('the training points of the model lookup do not begin with a grid')
     return columns, rows
 

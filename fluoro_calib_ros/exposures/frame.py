@@ -28,6 +28,7 @@ from ..errors import DataError
 from ..findings import Finding, Kind, Place, Severity, first_few
 from .phantom import Phantom, first_repeated, is_positive
 
+DECIMALS = 4  # of a pixel, and of its standard deviation, in files
 MAX_ANGLE = 4 * np.pi  # two turns either way: more is no angle in radians
 
 

@@ -21,6 +21,7 @@ MIN_TARGETS = 4
 EXTENT_MM = (2.0, 10_000.0)
 UNITS_MM = {'m': 1000.0, 'cm': 10.0, 'micrometres': 1e-3}
 MISTAKEN_UNITS = {10.0: 'cm', 25.4: 'inches', 1000.0: 'm'}  # that mm are mistaken for
+EXACT_SD_MM = 1e-6  # of coordinates that count as known; files have six decimals
 
 
 @dataclass(frozen=True)

@@ -28,8 +28,6 @@ from ..errors import DataError
 from ..limits import read_limits
 from .access import PathLike, atomic_file, read_bytes
 
-_DATE = (1980, 1, 1, 0, 0, 0)  # of every member, so that the same arrays give the same bytes
-_UNIX = 3  # system of every member, for the same reason
 # The beginning of an .npy file, versions 1 to 3, of plain numbers or text (numpy.lib.format).
 # numpy evaluates it as Python, which raises almost anything for a crafted one.
 _HEADER = re.compile(
@@ -39,7 +37,6 @@ _HEADER = re.compile(
     rb"'shape': \(((?:[0-9]{1,18}, ?)*(?:[0-9]{1,18})?)\), ?\} *\n",
     re.DOTALL,
 )
-_SURROGATES = 0xD800 >> 11
 _DTYPES = {'int': np.dtype('<i8'), 'float': np.dtype('<f8'), 'bool': np.dtype('?')}
 
 
@@ -119,8 +116,8 @@ def _to_array(where: object, value: Any, spec: Field) -> np.ndarray:
 
 
 def _write_member(archive: zipfile.ZipFile, name: str, array: np.ndarray) -> None:
-    info = zipfile.ZipInfo(f'{name}.npy', date_time=_DATE)
-    info.create_system = _UNIX
+    info = zipfile.ZipInfo(f'{name}.npy')  # of 1980: the same arrays give the same bytes
+    info.create_system = 3  # Unix, on every system
     info.external_attr = 0o644 << 16
     buffer = io.BytesIO()
     np.lib.format.write_array(buffer, array, version=(1, 0), allow_pickle=False)
@@ -198,7 +195,8 @@ def _read_member(path: PathLike, archive: zipfile.ZipFile, name: str) -> np.ndar
         raise _no_plain_array(path, name) from None
     if dtype.kind == 'U':
         codes = np.frombuffer(content, np.dtype('u4').newbyteorder(dtype.byteorder), offset=offset)
-        if ((codes > sys.maxunicode) | ((codes >> 11) == _SURROGATES)).any():  # no characters
+        is_surrogate = (codes >> 11) == 0xD800 >> 11
+        if ((codes > sys.maxunicode) | is_surrogate).any():  # no characters
             raise _no_plain_array(path, name)
     return array.astype(dtype.newbyteorder('='))  # a copy that can be written to
 

@@ -138,13 +138,9 @@ def _marker_rows(body: Body) -> Iterator[list[object]]:
         yield [body.name, marker, *values]
 
 
-KEYS = (
-    *('name', 'proximal', 'distal', 'convention', 'side', 'neutral'),
-    *('proximal_frame', 'distal_frame'),
-)
-REQUIRED = KEYS[:4]
+REQUIRED = ('name', 'proximal', 'distal', 'convention')
+KEYS = (*REQUIRED, 'side', 'neutral', 'proximal_frame', 'distal_frame')
 FRAME_KEYS = ('landmarks', 'axes', 'quaternion_wxyz', 'matrix', 'origin')
-MAX_EXPOSURE = 2**53
 JOINT_COLUMNS = (
     'joint',
     'exposure',
@@ -233,7 +229,7 @@ def _neutral(where: str, value: Any) -> tuple[int, int] | None:
     if value is None:
         return None
     whole = isinstance(value, list) and all(type(v) is int for v in value)
-    if not whole or len(value) != 2 or not 0 <= value[0] <= value[1] <= MAX_EXPOSURE:
+    if not whole or len(value) != 2 or not 0 <= value[0] <= value[1]:
         raise DataError(f'{where}, key neutral: first and last exposure, such as [1, 100]')
     return value[0], value[1]
 

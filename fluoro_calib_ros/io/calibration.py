@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..correction.calibration_record import FIELDS, VERSION, Field
 from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibration
@@ -37,7 +36,6 @@ from .documents import read_json, to_json_values
 
 SUFFIX = '.calibration.npz'
 
-COINCIDENT_PX = 1e-3  # image points closer than this lie on one place
 LAYOUT = Layout('a calibration', FIELDS, VERSION)
 
 
@@ -144,7 +142,9 @@ def _check_content(where: object, arrays: Mapping[str, Any]) -> None:
             f'{where}: {lengths["train_uv"]} training points, more than '
             f'{limits.max_training_points} are not read'
         )
-    if _largest_heap(arrays['train_uv']) > MAX_COINCIDENT:
+    # Points of one place in single precision: no search tree can divide them.
+    heaps = np.unique(arrays['train_uv'].astype(np.float32), axis=0, return_counts=True)[1]
+    if heaps.max(initial=0) > MAX_COINCIDENT:
         raise DataError(
             f'{where}: more than {MAX_COINCIDENT} training points lie on one place of the image'
         )
@@ -157,16 +157,6 @@ def _check_content(where: object, arrays: Mapping[str, Any]) -> None:
             f'{where}: the images have {width} x {height} px, those of more than '
             f'{limits.max_image_megapixels} megapixels are not read'
         )
-
-
-def _largest_heap(uv: NDArray[np.float64]) -> int:
-    """Return the largest number of points (n, 2) in one cell: no search tree can divide them."""
-    if not len(uv):
-        return 0
-    column, row = np.floor(uv / COINCIDENT_PX).astype(np.int64).T
-    keys = np.sort(column * 2**32 + row)
-    ends = np.flatnonzero(np.diff(keys, append=keys[-1] + 1))
-    return int(np.diff(ends, prepend=-1).max())
 
 
 # The file DIR/rig_orientation.npz, described in docs/files.md.

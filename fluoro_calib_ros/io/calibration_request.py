@@ -21,6 +21,7 @@ from ..estimation.options import CalibrationOptions, CalibrationRequest
 from ..exposures.frame import Frame, Frames, validate_frame
 from ..exposures.phantom import Phantom
 from ..images.codec import JPEG_START
+from ..limits import MEGABYTE
 from .access import PathLike, check_safe_name, make_folder, read_bytes, write_bytes
 from .calibration import KNOWN_ORIENTATION, OBSERVATIONS, OPTIONS, PHANTOM
 from .csv_table import read_names, write_names
@@ -172,7 +173,6 @@ def read_options(path: Path) -> tuple[CalibrationOptions, bool, float | None]:
 # A file is named <fluoroscope>_<exposure>.jpg.
 
 RADIOGRAPHS = 'radiographs'
-MAX_BYTES = 2**20  # of a file: grey pixels of 512 x 512 px have a quarter of it
 
 Radiographs = Mapping[str, Mapping[int, bytes]]  # JPEG by fluoroscope and exposure
 
@@ -199,8 +199,8 @@ def read_radiographs(
         path = _path(directory, name, exposure)
         if not path.is_file():
             continue
-        if path.stat().st_size > MAX_BYTES:
-            raise DataError(f'{path}: this is no small radiograph, it has over {MAX_BYTES} bytes')
+        if path.stat().st_size > MEGABYTE:  # grey pixels of 512 x 512 px have a quarter of it
+            raise DataError(f'{path}: this is no small radiograph, it has over {MEGABYTE} bytes')
         content = read_bytes(path)
         if not content.startswith(JPEG_START):
             raise DataError(f'{path}: this is no JPEG image')

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import DataError
+from ..errors import DataError, quoted
 from ..exposures.names import MAX_ID, Names, number_names
 from ..limits import MAX_ROWS_CSV
 from .access import PathLike, atomic_file, check_rows, check_safe_name, delete_file, read_text
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     import pandas
 
 BLOCK = 10_000  # rows converted at a time, to bound the memory
-MAX_HEADER = 200  # characters of a header in a message
 
 
 @dataclass(frozen=True)
@@ -234,10 +233,9 @@ def _check_header(where: str, header: Sequence[str], required: Sequence[str]) ->
     """Raise DataError for missing and repeated columns; where begins its message."""
     missing = [name for name in required if name not in header]
     if missing:
-        found = ','.join(header)[:MAX_HEADER]
         raise DataError(
             f'{where}: the header has no column {" and no column ".join(missing)}; '
-            f'{",".join(required)} is expected, the header is {found!r}'
+            f'{",".join(required)} is expected, the header is {quoted(",".join(header))}'
         )
     for name in header:
         if name and header.count(name) > 1:

@@ -31,7 +31,6 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-MAX_WHOLE = 2**63
 MAX_DIGITS = 400  # of a number of YAML
 _NUMBERS = ('tag:yaml.org,2002:int', 'tag:yaml.org,2002:float')
 # Brackets of nested lists and tables; those in texts count, too.
@@ -189,10 +188,10 @@ def _check_whole(value: Any) -> None:
 
 
 def _whole(value: str | int) -> int:
-    number = int(value) if not isinstance(value, str) or len(value) < 20 else MAX_WHOLE + 1
-    if abs(number) > MAX_WHOLE:
+    # Numbers of 64 bits have up to 19 digits; those of many take quadratic time.
+    if (isinstance(value, str) and len(value) > 19) or abs(int(value)) > 2**63:
         raise ValueError('a whole number is too large')
-    return number
+    return int(value)
 
 
 def _not_finite(word: str) -> NoReturn:

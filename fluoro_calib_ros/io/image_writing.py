@@ -78,13 +78,12 @@ def write_images(out: Path, source: ImageSource, progress: Progress) -> int:
 
 
 CLASSIC_BYTES = 4 * 10**9  # size from which a file needs 64-bit offsets, with some reserve
-PAGE_OVERHEAD = 1024  # bytes
 
 
 def _write_stack(out: Path, source: ImageSource, progress: Progress) -> int:
     """Write an uncompressed TIFF file, page by page; returns the number of pages."""
     _, image = next(source.images)
-    large = max(source.count, 1) * (image.nbytes + PAGE_OVERHEAD) > CLASSIC_BYTES
+    large = max(source.count, 1) * (image.nbytes + 1024) > CLASSIC_BYTES  # with heads of pages
     with (
         atomic_file(out) as file,
         TiffWriter(file, bigtiff=large, byteorder='<') as writer,

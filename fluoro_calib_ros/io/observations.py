@@ -25,6 +25,7 @@ from ..correction.fluoroscope_calibration import (
 )
 from ..errors import DataError
 from ..exposures.frame import (
+    DECIMALS,
     MAX_ANGLE,
     Frame,
     Frames,
@@ -352,8 +353,6 @@ def _csv_rows(
 #
 # Markers that were followed have a further column `doubtful`, and images with the angle of a
 # C-arm have `angle_deg` as the last one.
-
-DECIMALS = 4  # of a pixel, and of its standard deviation
 
 
 FLAGS = ('overlapped', 'doubtful')

@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 
 from ..errors import DataError, ErrorsAt
 from ..images.codec import check_size
+from ..limits import MAX_FRAMES
 from .access import check_regular_file, opened, os_errors
 
 # Transfer syntaxes (PS3.5, annex A) that are read: implicit and explicit little endian, explicit
@@ -197,12 +198,6 @@ BITMAP_HEADER = struct.Struct('<IiiHHIIiiII')
 SETUP_MARK = 140  # offset in SETUP of the letters ST, which newer files have, and of its length
 FRAME_RATE = 768  # offset in SETUP, 32 bits; SETUP begins with a frame rate of 16 bits
 ANNOTATION = 8  # bytes at least
-CINE_GREY = 0  # compression of the file header; 1: JPEG, 2: mosaic of a colour sensor
-UNPACKED = 0  # biCompression
-PACKED_10 = 0x100  # biCompression of 10 bits
-PACKED_12 = 0x400  # biCompression of 12 bits
-MAX_IMAGES = 100_000_000  # of a recording: more than a day at 1000 Hz
-SIDES = 2**30  # px, more cannot be meant
 
 
 @dataclass(frozen=True)
@@ -248,7 +243,7 @@ def _cine_header(file: BinaryIO, size: int) -> CineHeader:
     signature, _, compression, _, _, _, _, count, at_bitmap, at_setup, at_offsets, _ = fields
     if signature != SIGNATURE:
         raise DataError('this is no cine file: it does not begin with CI')
-    if compression != CINE_GREY:
+    if compression:
         kind = {1: 'JPEG images', 2: 'the mosaic of a colour sensor'}.get(
             compression, 'an unknown kind of images'
         )
@@ -256,10 +251,10 @@ def _cine_header(file: BinaryIO, size: int) -> CineHeader:
     bitmap = _unpack(file, at_bitmap, BITMAP_HEADER)
     width, height = bitmap[1], bitmap[2]
     bits = _bits(bitmap[4], bitmap[5])
-    if not 0 < width < SIDES or not 0 < abs(height) < SIDES:
+    if width <= 0 or abs(height) in (0, 2**31):
         raise DataError(f'the cine file is damaged: images of {width} x {height} px')
     check_size(width, abs(height))
-    if not 0 < count < MAX_IMAGES or at_offsets + 8 * count > size:
+    if not 0 < count <= MAX_FRAMES or at_offsets + 8 * count > size:
         raise DataError(f'the cine file is damaged or cut off: it claims {count} images')
     file.seek(at_offsets)
     offsets = np.frombuffer(file.read(8 * count), '<i8')
@@ -283,14 +278,14 @@ def _cine_header(file: BinaryIO, size: int) -> CineHeader:
 
 
 def _bits(bit_count: int, compression: int) -> int:
-    """Return the bits of a stored pixel. Raises DataError."""
-    if compression == PACKED_10:
+    """Return the bits of a stored pixel, from biBitCount and biCompression. Raises DataError."""
+    if compression == 0x100:
         return 10
-    if compression == UNPACKED and bit_count in (8, 16):
+    if not compression and bit_count in (8, 16):
         return bit_count
-    if compression == PACKED_12:
+    if compression == 0x400:
         kind = 'packed pixels of 12 bits'
-    elif compression == UNPACKED and bit_count in (24, 48):
+    elif not compression and bit_count in (24, 48):
         kind = 'colours'
     else:
         kind = f'pixels of {bit_count} bits with compression {compression}'

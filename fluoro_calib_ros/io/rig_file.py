@@ -32,7 +32,6 @@ from ..errors import DataError
 from .documents import read_toml
 
 NAME = 'rig.toml'
-MAX_ABOUT = 100  # entries
 MAX_ABOUT_TEXT = 1000  # characters of an entry
 
 
@@ -155,8 +154,8 @@ def _about(path: Path, value: Any) -> dict[str, str] | None:
     """Return texts that the report shows, by name."""
     if value is None:
         return None
-    if not isinstance(value, dict) or len(value) > MAX_ABOUT:
-        raise DataError(f'{path}, key about: a table of at most {MAX_ABOUT} texts and numbers')
+    if not isinstance(value, dict):
+        raise DataError(f'{path}, key about: a table of texts and numbers')
     for key, text in value.items():
         if not isinstance(text, str | int | float) or len(f'{key}{text}') > MAX_ABOUT_TEXT:
             raise DataError(
@@ -210,7 +209,6 @@ OF_TRIALS = ('extract', 'reconstruct', 'bodies')  # commands, in their order
 CONVERT = 'convert'  # a table of tables: one for each format
 CALIBRATE = 'calibrate'
 SOURCE = 'source'
-MAX_TRIALS = 10_000  # of a study
 Options = Mapping[str, Any]
 
 
@@ -293,8 +291,6 @@ def _trials(path: Path, patterns: Any, out: Path) -> tuple[Trial, ...]:
                     f'{path}, key trials: {other.path} and {trial.path} would have the same '
                     f'results; name one of them, or move it to a folder of its own'
                 )
-    if len(found) > MAX_TRIALS:
-        raise DataError(f'{path}, key trials: {len(found)} trials, more than {MAX_TRIALS}')
     return tuple(found.values())
 
 

@@ -81,7 +81,7 @@ def has_drift_alarm(directory: PathLike, orientation_id: str) -> bool:
 # Shapes of bodies that a healthy rig has learned: learned_shapes.json beside its calibrations.
 
 LEARNED_SHAPES = 'learned_shapes.json'
-VERSION = 1
+VERSION = 1  # of learned_shapes.json
 
 
 def write_learned_shapes(directory: PathLike, learned: LearnedShapes) -> None:

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -26,6 +27,7 @@ from ..correction.fluoroscope_calibration import Calibrations, FluoroscopeCalibr
 from ..errors import DataError
 from ..exposures.frame import Frames
 from ..exposures.pairing import RecordedPairing
+from ..exposures.stamps import NS_PER_S
 from ..findings import Finding, Kind, Place, Severity, sentences
 from ..images.corrector import iterated
 from ..images.overlay import BodyView, draw_bodies
@@ -132,8 +134,6 @@ if TYPE_CHECKING:
 
 SMOOTH = ('auto', 'none', 'lag', 'butterworth')
 SHAPE_EXPOSURES = 600  # of a recording that shapes are estimated from, evenly spread
-NS_PER_S = 1_000_000_000
-EVERY_EXPOSURE = (0, 2**63 - 1)
 
 
 @dataclass(frozen=True)
@@ -320,7 +320,7 @@ def track_bodies(
     at_rest = []
     if options.neutral is not None:
         at_rest = _poses_alone(options.neutral, calibrations, orientation, usable, options)
-        joints = [replace(one, neutral=EVERY_EXPOSURE) for one in joints]
+        joints = [replace(one, neutral=(0, sys.maxsize)) for one in joints]
     findings = [finding for shape in shapes for finding in shape.findings]
     named = {one.place for one in findings if one.kind is Kind.BODY_UNSEEN}
     unseen = [_unseen(one) for one in poses if not one.known.any()]

@@ -37,7 +37,6 @@ from .sources import Recording, Survey
 
 FOLLOWED = 12  # images of a video after which the pose is searched for anew
 RADIOGRAPH_PX = 512  # largest side of the radiographs of a report
-MAX_MIRRORED = 2  # images that are tried mirrored, where none gives observations
 
 Progress = Callable[[int, int], None]
 
@@ -385,10 +384,10 @@ def _mirrored(
 ) -> Finding | None:
     """Return a finding where the phantom is found in a mirrored image, None where it is not.
 
-    Some images are tried, none of which gives observations as it is.
+    Two images are tried, none of which gives observations as it is.
     """
     found = [result.exposure for result in results if may_be_found(result.finding)]
-    tried = set(found[:MAX_MIRRORED])
+    tried = set(found[:2])
     for source in sources.images():
         if source.exposure not in tried or isinstance(source.image, DataError):
             continue

@@ -35,8 +35,6 @@ from ..images.view import Lens, View, assumed_lens, may_be_found, shared_lens
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..processes import OF_STREAM, WorkerProcess
 
-VIEWS = 30  # solved images whose distortion helps where a pose is not found
-
 
 @dataclass(frozen=True)
 class Observations:
@@ -103,7 +101,8 @@ class PhantomFollower:
         self._settings = settings
         self._model = _model_of(phantom.xyz_mm.tobytes(), diameters, settings.regular_grid)
         self._lens = settings.lens
-        self._views: deque[View] = deque(maxlen=VIEWS)
+        # Solved images whose distortion helps where a pose is not found.
+        self._views: deque[View] = deque(maxlen=30)
         self._near: Nearby | None = None
         # Numbers and views of the last two exposures that were solved.
         self._track: deque[tuple[int, View]] = deque(maxlen=2)

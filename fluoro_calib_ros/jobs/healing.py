@@ -57,7 +57,7 @@ from ..reconstruction.reconstruct import orientation_of_recorded, pair_recording
 
 BLOCKS = 10  # of a recording, used in turn for the diagnosis and for its verdict
 MAX_EXPOSURES = 100  # of a recording that are used for each, evenly spread
-MIN_EXPOSURES = 10
+MIN_EXPOSURES = BLOCKS
 # Standard deviation of a direction of a change, relative to that of a change as it may be, above
 # which the data do not identify it: they have told less than half of it.
 IDENTIFIED = 0.5
@@ -557,7 +557,7 @@ def _unused(rest: Diagnosis | None, half: int, rig: _Rig) -> Check:
 
 # The folder with a healed rig: calibrations, orientation, and what was changed and why.
 
-VERSION = 1
+VERSION = 1  # of healing.json
 
 
 HEALING_FOLDER = FolderKind(

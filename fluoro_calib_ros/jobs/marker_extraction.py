@@ -47,7 +47,6 @@ from .image_sources import (
 )
 
 MAX_TRIES = 30  # exposures in which markers are identified by their shapes
-AHEAD = 3  # images that are read before they are wanted
 
 
 @dataclass(frozen=True)
@@ -447,7 +446,7 @@ def _ahead(images: Iterator[SourceImage]) -> Iterator[SourceImage]:
     waiting: deque[Future[SourceImage | None]] = deque()
     with ThreadPoolExecutor(1) as pool:
         while True:
-            while len(waiting) < AHEAD:
+            while len(waiting) < 3:  # images are read before they are wanted
                 waiting.append(pool.submit(next, images, None))
             image = waiting.popleft().result()
             if image is None:

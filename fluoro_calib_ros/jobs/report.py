@@ -220,7 +220,6 @@ PLACES = (
     '/Applications/Google Chrome.app/Contents/MacOS/Google Chrome',
     '/Applications/Microsoft Edge.app/Contents/MacOS/Microsoft Edge',
 )
-TIMEOUT_S = 300.0  # a report takes some seconds
 PDF_START = b'%PDF-'
 
 
@@ -250,7 +249,7 @@ def print_page(page: PathLike, out: PathLike) -> None:
                 1, '--no-sandbox'
             )  # with which it refuses to run as root, as in containers
         try:
-            done = subprocess.run(words, capture_output=True, timeout=TIMEOUT_S, check=False)
+            done = subprocess.run(words, capture_output=True, timeout=300, check=False)
             content = printed.read_bytes() if printed.exists() else b''
         except (OSError, subprocess.TimeoutExpired) as error:
             raise DataError(f'{out}: {browser} does not print the report ({error})') from None

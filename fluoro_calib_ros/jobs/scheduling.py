@@ -27,7 +27,6 @@ Result = TypeVar('Result')
 
 QUEUED = 3  # tasks that wait for each worker
 CONNECT_S = 10  # to wait for a scheduler and its first worker
-RETRIES = 2  # of a task that fails
 
 
 class Workers(Protocol):
@@ -214,7 +213,7 @@ class DaskWorkers:
         try:
             yield from _in_order(
                 lambda task: self._client.submit(
-                    _alone, function, task, limits, pure=False, retries=RETRIES
+                    _alone, function, task, limits, pure=False, retries=2
                 ),
                 tasks,
                 QUEUED * threads,

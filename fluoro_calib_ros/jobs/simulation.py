@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..exposures.frame import Frame, Frames
-from ..exposures.phantom import Phantom
+from ..exposures.phantom import EXACT_SD_MM, Phantom
 from ..images.codec import encode
 from ..io.access import PathLike, make_folder, write_bytes, write_text
 from ..io.bags.writer import BagWriter
@@ -76,7 +76,6 @@ BODIES = 'bodies.csv'
 JOINTS = 'joints.toml'
 CLUSTERS = 'clusters.txt'  # markers that are rigid together, a line for each cluster
 TRUTH = 'truth'  # folder of what a data set was made with
-TRUE_SD_MM = 1e-6  # the file of the true coordinates has to contain a standard deviation
 
 
 def write_bag(path: PathLike, frames: Frames) -> None:
@@ -275,7 +274,7 @@ def write_rig(directory: PathLike, rig: VirtualRig, options: Mapping[str, Any]) 
     write_phantom(directory / 'phantom.csv', rig.phantom)
     write_phantom(
         directory / TRUTH / 'phantom.csv',
-        Phantom(rig.phantom.target_id, rig.true_mm, np.full(len(rig.true_mm), TRUE_SD_MM)),
+        Phantom(rig.phantom.target_id, rig.true_mm, np.full(len(rig.true_mm), EXACT_SD_MM)),
     )
     write_json(
         directory / TRUTH / 'rig.json',
@@ -307,7 +306,6 @@ def _fluoroscope(fluoroscope: VirtualFluoroscope) -> dict[str, Any]:
 
 SETTINGS = {'clean': CLEAN, 'hard': HARD}
 MARKER_MM = 1.0  # diameter of a marker
-MARKER_ATTENUATION = 7.0  # of tantalum at 55 keV (NIST XCOM) [1/mm]
 
 
 @dataclass(frozen=True)
@@ -360,7 +358,7 @@ def _camera(
     )
 
 
-HOUR_NS = 3600 * 10**9
+HOUR_NS = 3600 * 10**9  # from one recording to the next
 NAMES = 'abcdefgh'  # of fluoroscopes
 DATA_SET = FolderKind(
     'a data set of the virtual rig',

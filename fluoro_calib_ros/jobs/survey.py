@@ -32,12 +32,9 @@ from ..estimation.rounds import Round
 from ..estimation.survey import MeasuredDistance, SurveyedBeads, surveyed_beads
 from ..exposures.collector import MIN_EXPOSURES
 from ..exposures.frame import Frames
-from ..exposures.phantom import MIN_TARGETS, Phantom
+from ..exposures.phantom import EXACT_SD_MM, MIN_TARGETS, Phantom
 from ..findings import Finding, Kind, Severity
 from .calibration import run_calibration
-
-DECIMALS = 6  # of mm in the file
-EXACT_SD_MM = 10.0**-DECIMALS  # of coordinates that count as known
 
 
 @dataclass(frozen=True)
@@ -240,8 +237,8 @@ def _phantom(request: SurveyRequest, beads: SurveyedBeads) -> Phantom:
     """Return the phantom with the coordinates that were found."""
     given = request.given
     row = given.index(beads.target_id)
-    found_mm = np.round(beads.xyz_mm, DECIMALS)
-    found_sd = np.maximum(np.round(beads.sd_mm, DECIMALS), EXACT_SD_MM)
+    found_mm = np.round(beads.xyz_mm, 6)
+    found_sd = np.maximum(np.round(beads.sd_mm, 6), EXACT_SD_MM)
     if not request.keep_given:
         diameter = None if given.diameter_mm is None else given.diameter_mm[row]
         return Phantom(beads.target_id, found_mm, found_sd, diameter)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
 
 from ..exposures.angles import AngleOptions
+from ..limits import MEGABYTE
 from .messages.observations import JointStates, decode_joint_state
 from .runtime.diagnostics import WARN, Health, RateLimitedLogger, StartError
 from .runtime.lifecycle import StreamNode
@@ -21,7 +22,6 @@ from .runtime.streams import FaultHandlers, StreamReader
 from .runtime.topics import observations_qos
 
 TOPIC = 'joint_states'
-MAX_BYTES = 1_000_000  # of a message
 
 
 class Asked(NamedTuple):
@@ -67,7 +67,7 @@ class AngleInput:
                 self._on_state,
                 observations_qos(),
                 decode=decode_joint_state,
-                max_bytes=MAX_BYTES,
+                max_bytes=MEGABYTE,
             )
             # An exposure that waits among others must not get the angle of the first of them.
             reader.take_first(TOPIC, self._faults(faults))

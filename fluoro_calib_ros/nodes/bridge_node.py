@@ -34,10 +34,16 @@ from .recorder_node import type_hash_text
 from .runtime.diagnostics import RateLimitedLogger, StartError
 from .runtime.main import run
 from .runtime.parameters import ParameterGroup, ParameterNode
-from .runtime.topics import TopicDiscovery, adapted_qos, definition_of, installed_type
+from .runtime.topics import (
+    DISCOVERY_S,
+    IMAGE_DEPTH,
+    TopicDiscovery,
+    adapted_qos,
+    definition_of,
+    installed_type,
+)
 
-MAX_HEAD = 16_384  # bytes of a request
-HEAD_S = 5.0  # in which it has to come
+HEAD_S = 5.0  # in which the head of a request has to come
 MAX_CLIENTS = 32  # connections at a time
 CLIENT_ERRORS = (
     OSError,
@@ -102,9 +108,7 @@ class Gate:
         self._on_refused = on_refused
         self._clients: set[asyncio.Task[None]] = set()
         self._loop = asyncio.new_event_loop()
-        server = self._loop.run_until_complete(
-            asyncio.start_server(self._serve, host, port, limit=MAX_HEAD)
-        )
+        server = self._loop.run_until_complete(asyncio.start_server(self._serve, host, port))
         self.port: int = server.sockets[0].getsockname()[1]
         threading.Thread(target=self._loop.run_forever, name='gate', daemon=True).start()
 
@@ -153,10 +157,6 @@ async def _pass_on(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -
         while data := await reader.read(65_536):
             writer.write(data)
             await writer.drain()
-
-
-DISCOVERY_S = 0.2  # period in which new topics, and new readers, are looked for
-DEPTH = 10  # messages that wait, of one topic
 
 
 @dataclass(frozen=True)
@@ -288,7 +288,7 @@ class BridgeNode(ParameterNode):
             self._shown[topic] = _Shown(topic, kind, channel)
 
     def _subscribe(self, shown: _Shown) -> None:
-        qos = adapted_qos(self.get_publishers_info_by_topic(shown.topic), DEPTH)
+        qos = adapted_qos(self.get_publishers_info_by_topic(shown.topic), IMAGE_DEPTH)
         is_latched = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
 
         def on_message(data: bytes) -> None:

@@ -24,7 +24,7 @@ from ..exposures.pairing import CompletePairer
 from ..exposures.phantom import Phantom
 from ..exposures.stamps import nanoseconds_from_stamp
 from ..images.codec import JPEG_START
-from ..io.calibration_request import MAX_BYTES
+from ..limits import MEGABYTE
 from .calibration_output import CalibrationOutput
 from .calibration_settings import (
     NOT_ACTIVE,
@@ -206,7 +206,7 @@ class ExposureInput:
     def add_radiograph(self, name: str, message: CompressedImage) -> None:
         """Take a small radiograph; what is none is refused."""
         jpeg = bytes(message.data)
-        if len(jpeg) > MAX_BYTES or not jpeg.startswith(JPEG_START):
+        if len(jpeg) > MEGABYTE or not jpeg.startswith(JPEG_START):
             error = DataError(f'{name}/{RADIOGRAPH}: this is no small JPEG')
             self.streams[name].refusals.refuse(error)
             return

@@ -40,6 +40,7 @@ from ..jobs.followers import (
 )
 from ..jobs.reconstruction import check_orientation
 from ..jobs.sources import read_calibrations, read_source, read_survey
+from ..limits import MAX_IMAGE_SIDE
 from ..options import option
 from .angle_input import AngleInput
 from .image_node import INPUTS
@@ -69,7 +70,6 @@ from .runtime.streams import remember
 from .runtime.topics import images_qos, observations_qos
 
 MODES = ('phantom', 'markers')
-LARGEST_PX = 2**14  # of an image, for points whose image is not known yet
 
 
 @dataclass(frozen=True)
@@ -186,7 +186,7 @@ def _of_phantom(
 
 def _first_markers(path: Path, names: Sequence[str]) -> dict[str, FirstMarkers]:
     """Return ids and first places of the markers of each fluoroscope. Raises DataError."""
-    size = (LARGEST_PX, LARGEST_PX)
+    size = (MAX_IMAGE_SIDE, MAX_IMAGE_SIDE)  # their image is not known yet
     recording = read_source(path, image_size=size, fluoroscopes=names)
     out = {}
     for name, frames in recording.frames.items():

@@ -39,9 +39,8 @@ from .messages.self_calibration import fill_healing
 from .runtime.services import in_thread, telling_service, wake, within
 
 MAX_FRAMES = 20_000  # of a fluoroscope that are collected, whatever its rate
-MAX_SECONDS = 60.0
+MAX_SECONDS = 60.0  # of collecting: what has changed shows in a few
 PAUSE_S = 1.0  # between frames that show markers; a longer one is no time in which they are seen
-FEEDBACK_S = 0.5
 CHANGED = 'the rig in use has changed meanwhile, heal it again'
 
 
@@ -211,7 +210,7 @@ class Healing(Job):
             goal.publish_feedback(Heal.Feedback(stage='collecting', frames=collection.count))
 
         tell()
-        timer = self._node.create_timer(FEEDBACK_S, tell)
+        timer = self._node.create_timer(0.5, tell)
         self._collection = collection
         try:
             await within(self._node, seconds, collection.done, collection.finish)

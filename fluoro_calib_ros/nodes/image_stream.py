@@ -32,6 +32,7 @@ from .runtime.lifecycle import (
     refused_messages,
     stalled_stream,
 )
+from .runtime.streams import REMEMBERED
 
 
 class ImageStream(Stream):
@@ -177,7 +178,6 @@ CONDITIONS = (
 
 T = TypeVar('T')
 
-REMEMBERED = 1000  # numbers of exposures that were begun or shed
 LATE = 3  # exposures that one view may come after the other
 
 

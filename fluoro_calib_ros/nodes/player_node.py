@@ -36,8 +36,7 @@ from .runtime.topics import (
     wait_until_acknowledged,
 )
 
-LONGEST_WAIT_S = 0.2  # after which a change of the speed, or a pause, is noticed
-PAUSED_WAIT_S = 0.02  # after which the end of a pause, or a step, is noticed
+WAIT_S = 0.02  # after which a change of the speed, a pause and its end, or a step is noticed
 
 
 class Pace:
@@ -96,7 +95,7 @@ class Pace:
                 if self._steps.acquire(blocking=False):
                     self._anchor = (time.monotonic(), position_s, 0.0)
                     return stop.is_set()
-                if stop.wait(PAUSED_WAIT_S):
+                if stop.wait(WAIT_S):
                     return True
                 continue
             then, position, rate = self._anchor
@@ -105,7 +104,7 @@ class Pace:
             left = then + (position_s - position) / rate - time.monotonic()
             if left <= 0:
                 return stop.is_set()
-            if stop.wait(min(left, LONGEST_WAIT_S)):
+            if stop.wait(min(left, WAIT_S)):
                 return True
 
 

@@ -17,7 +17,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from ..errors import DataError
-from ..io.bags.recording import MEGABYTE, Recording, RecordingOptions, TopicToRecord, lost_text
+from ..io.bags.recording import Recording, RecordingOptions, TopicToRecord, lost_text
 from ..options import option
 from .runtime.diagnostics import (
     DiagnosticsPublisher,
@@ -33,12 +33,17 @@ from .runtime.diagnostics import (
 from .runtime.main import run
 from .runtime.parameters import ParameterGroup, ParameterNode, expand_path
 from .runtime.streams import FaultHandlers, StreamReader
-from .runtime.topics import TopicDiscovery, adapted_qos, definition_of, installed_type
+from .runtime.topics import (
+    DISCOVERY_S,
+    RECORDED_LATCHED_DEPTH,
+    TopicDiscovery,
+    adapted_qos,
+    definition_of,
+    installed_type,
+)
 
-DISCOVERY_S = 0.1  # period in which new topics are looked for
 JOINT_STATES = 'joint_states'
 DEPTH = 1000  # messages that wait for the reading thread, of one topic
-LATCHED_DEPTH = 100  # messages of latched topics that are kept for the next file
 
 
 @dataclass(frozen=True)
@@ -152,7 +157,7 @@ class RecorderNode(ParameterNode):
                 types[0],
                 [qos_document(publisher.qos_profile) for publisher in publishers],
                 definition_of(types[0], type_hash_text(publishers[0])),
-                LATCHED_DEPTH if is_latched else 0,
+                RECORDED_LATCHED_DEPTH if is_latched else 0,
             )
         )
 
@@ -194,7 +199,7 @@ class RecorderNode(ParameterNode):
             'messages lost at the input': self._overrun.total(),
             'topics': len(self._topics),
             'files': recording.files,
-            'waiting [MB]': f'{recording.waiting_bytes / MEGABYTE:.1f}',
+            'waiting [MB]': f'{recording.waiting_bytes / 1e6:.1f}',
         }
         state = RecorderState(recording.fault, self._loss(), self._lost_at_input())
         self._diagnostics.publish([Status('recorder', *health_of(state, CONDITIONS), counts)])
@@ -215,7 +220,7 @@ class RecorderNode(ParameterNode):
         self.get_logger().info(
             f'{self._recording.counts.total()} messages of {len(self._topics)} topics recorded to '
             f'{self._recording.path}, {self._recording.dropped.total()} dropped; at most '
-            f'{self._recording.most_waiting_bytes / MEGABYTE:.1f} MB waited'
+            f'{self._recording.most_waiting_bytes / 1e6:.1f} MB waited'
         )
 
 

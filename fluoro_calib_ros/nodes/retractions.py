@@ -26,7 +26,6 @@ from .runtime.streams import remember
 from .runtime.topics import observations_qos
 
 TOPIC = 'retractions'
-REMEMBERED = 1000  # exposures or views, and retractions of those that are still to come
 MAX_IDS = 10_000  # of a retraction
 
 
@@ -56,7 +55,7 @@ class BodyRetractions:
     def note(self, content: BodiesContent) -> None:
         """Remember an exposure that was published."""
         with self._lock:
-            remember(self._published, content.stamp_ns, _Published(content), REMEMBERED)
+            remember(self._published, content.stamp_ns, _Published(content))
             wrong = self._early.pop(content.stamp_ns, None)
             if wrong:
                 self._take_back(self._published[content.stamp_ns], wrong)
@@ -69,7 +68,7 @@ class BodyRetractions:
                 self._take_back(published, target_id)
             else:
                 wrong = self._early.get(stamp_ns, set()) | set(target_id)
-                remember(self._early, stamp_ns, wrong, REMEMBERED)
+                remember(self._early, stamp_ns, wrong)
 
     def _take_back(self, published: _Published, target_id: Collection[int]) -> None:
         content = published.content
@@ -137,7 +136,7 @@ class PointRetractions:
         """Remember an exposure that was reconstructed, by the stamps of its views."""
         with self._lock:
             for key in stamps_ns.items():
-                remember(self._exposures, key, content, REMEMBERED)
+                remember(self._exposures, key, content)
                 if key in self._early:
                     self._publish(content, self._early.pop(key))
 
@@ -148,7 +147,7 @@ class PointRetractions:
             if key in self._exposures:
                 self._publish(self._exposures[key], message)
             elif len(message.target_id) <= MAX_IDS:
-                remember(self._early, key, message, REMEMBERED)
+                remember(self._early, key, message)
 
     def _publish(self, content: PointsContent, message: Retraction) -> None:
         wrong = np.intersect1d(content.target_id, message.target_id)

@@ -21,9 +21,10 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
 from ..exposures.frame import Frame
-from ..jobs.simulation import MARKER_ATTENUATION, MARKER_MM, SETTINGS, RenderedScene, Renderers
+from ..jobs.simulation import MARKER_MM, SETTINGS, RenderedScene, Renderers
 from ..options import option
 from ..photogrammetry.rotations import matrix_from_vector, vector_from_matrix
+from ..simulation.marker_images import MarkerScene
 from ..simulation.rig import (
     CLUSTER_MARKERS,
     Detection,
@@ -204,7 +205,7 @@ class SimulatorNode(ParameterNode):
         """Start the processes that render, and wait until they are ready."""
         settings = SETTINGS[self._settings.images]
         if self._settings.scene == 'markers':
-            settings = replace(settings, bead_attenuation=MARKER_ATTENUATION)
+            settings = replace(settings, bead_attenuation=MarkerScene.attenuation)
         self._renderers = Renderers(self._rig.fluoroscopes, settings)
         self._renderers.start()
         self._renderers.images(self._rendered_scene(1))  # so that the first one is not late

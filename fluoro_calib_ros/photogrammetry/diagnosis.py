@@ -25,13 +25,10 @@ from .noise import Noise
 from .normal_equations import normal_equations
 from .plane_resection import flatness
 from .precision import Precision
-from .unknowns import EXTERIOR_SIZE, Parameters
+from .unknowns import EXTERIOR_SIZE, SINGULAR, Parameters
 
-# Correlation above which two unknowns are reported, and how many pairs at most.
+# Correlation above which two unknowns are reported.
 HIGH_CORRELATION = 0.95
-MAX_CORRELATIONS = 20  # pairs that are listed
-# Eigenvalue of the scaled normal matrix below which it is a rounding error.
-MAX_OPEN_EIGENVALUE = 1e-11
 # A network is judged at this image noise at most, so that distorted images do not make it look
 # weaker.
 NOMINAL_NOISE_PX = 1.0
@@ -41,8 +38,6 @@ MAX_RELATIVE_SD = 0.05
 MAX_DISTANCE_CORRELATION = 0.9999
 # Components of an eigenvector are reported from this part of its largest squared component on.
 MIN_SHARE = 0.1
-# Smallest over largest extent of targets that are called nearly flat.
-MAX_FLATNESS = 0.1
 INTERIOR = ('xp', 'yp', 'c')
 EXTERIOR = ('X', 'Y', 'Z', 'rotation about x', 'rotation about y', 'rotation about z')
 
@@ -100,7 +95,7 @@ def high_correlations(
     correlations = np.concatenate([with_globals, with_exteriors], axis=1)
     column_names = names + exterior_names(network, fluoroscopes, numbers)
     row, column = np.nonzero(np.abs(correlations) > HIGH_CORRELATION)
-    order = np.argsort(-np.abs(correlations[row, column]), kind='stable')[:MAX_CORRELATIONS]
+    order = np.argsort(-np.abs(correlations[row, column]), kind='stable')[:20]  # that are listed
     return tuple(
         (names[row[i]], column_names[column[i]], float(correlations[row[i], column[i]]))
         for i in order
@@ -191,7 +186,7 @@ def _distance_correlations(
 
 def _flatness_remark(network: Network) -> str:
     """A remark where the targets nearly lie in a plane, else an empty string."""
-    flat = flatness(network.survey_mm) < MAX_FLATNESS
+    flat = flatness(network.survey_mm) < 0.1  # smallest over largest extent
     return '; the beads lie nearly in one plane' if flat else ''
 
 
@@ -230,7 +225,7 @@ def undetermined_directions(
     skipped = network.layout.datum_defect
     out = []
     for value, vector in zip(values[skipped:], vectors.T[skipped:]):
-        if value > MAX_OPEN_EIGENVALUE:
+        if value > SINGULAR:
             break
         square = vector**2
         order = np.argsort(-square, kind='stable')

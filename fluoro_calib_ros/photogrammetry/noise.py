@@ -22,6 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize_scalar
+from scipy.special import ndtri
 
 # How far normalised errors scatter beyond what is stated, for limits that tell gross errors.
 #
@@ -36,14 +37,13 @@ from scipy.optimize import minimize_scalar
 # does (6 in 100,000), of one that accuses, leaves out, or is made many times.
 SURE = 3.0
 CERTAIN = 4.0
-NORMAL_MEDIAN = 0.6745  # of the absolute value of a standard normal variable
+NORMAL_MEDIAN = float(ndtri(0.75))  # of the absolute value of a standard normal variable
 # Relative standard deviation of the median of n absolute normal errors, times the root of n:
 # 1 / (2 f(m) m) with the density f at the median m. For lengths of errors of two coordinates it is
 # 0.72, but tails can be heavy.
-MEDIAN_SD = 1.166
+MEDIAN_SD = np.sqrt(2 * np.pi) * np.exp(NORMAL_MEDIAN**2 / 2) / (4 * NORMAL_MEDIAN)
 MAX_WIDENING = 2.0  # beyond it, something else than the stated standard deviations is wrong
-MIN_ERRORS = 12
-ITERATIONS = 20
+MIN_ERRORS = 12  # fewer tell no scale
 WINDOW = 2000  # latest errors of a recording that count
 RENEWED = 0.1  # part of them after which the factor is calculated anew
 
@@ -57,15 +57,14 @@ def trimmed_scale(size: NDArray[np.float64], limit: float) -> tuple[float, int]:
     size = size[np.isfinite(size)]
     scale = 1.0
     count = 0
-    for _ in range(ITERATIONS):
+    while True:
         inside = size[size <= limit * scale]
         if len(inside) < MIN_ERRORS:
             return 1.0, 0
-        if len(inside) == count:
-            break
+        if len(inside) <= count:  # there are never fewer than before
+            return scale, count
         count = len(inside)
         scale = max(1.0, float(np.median(inside)))
-    return scale, count
 
 
 def widening(size: NDArray[np.float64], limit: float, common: float = 0.0) -> float:
@@ -140,8 +139,7 @@ MAX_REJECTED = 1e-3
 MIN_TAIL_NU = 8.0
 # Iterations of the estimation of the Student-t, and relative changes at which they end. Steps of
 # the scale are cheap compared with the search for nu.
-MAX_NU_STEPS = 50
-MAX_SCALE_STEPS = 100
+MAX_STEPS = 100
 NU_TOLERANCE = 1e-3
 SCALE_TOLERANCE = 1e-4
 SCALE_STEP_TOLERANCE = 1e-6
@@ -289,7 +287,7 @@ class Noise:
         """Student-t with scale, nu and share of gross errors."""
         noise = self
         variance = self.scale**2
-        for _ in range(MAX_NU_STEPS):
+        for _ in range(MAX_STEPS):
             nu = noise.nu
             before = variance
             noise, variance, core = noise._estimate_variance(variance, squared, unresolved)
@@ -306,7 +304,7 @@ class Noise:
         """Share of gross errors, variance and core probabilities (n,) for the present nu."""
         noise = self
         nu = self.nu
-        for _ in range(MAX_SCALE_STEPS):
+        for _ in range(MAX_STEPS):
             q = squared / variance + unresolved
             noise = replace(noise, scale=float(np.sqrt(variance)))
             core = noise.core_probability(q)

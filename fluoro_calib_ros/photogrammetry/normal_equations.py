@@ -28,10 +28,10 @@ from .unknowns import (
 
 # Image points that are linearised at once: their arrays stay in the cache.
 CHUNK = 8_000
-# Smallest weight of a gross error in a free network, where no survey holds a point that is left
-# with one ray. It moves nothing, and only that point, not the whole network, is found to be
-# undetermined.
-MIN_FREE_WEIGHT = 1e-8
+# Smallest weight of a gross error, so that its variance stays finite, and in a free network, where
+# no survey holds a point that is left with one ray: it moves nothing, and only that point, not the
+# whole network, is found to be undetermined.
+MIN_WEIGHT = 1e-8
 
 
 @dataclass(frozen=True)
@@ -164,7 +164,7 @@ class _Linearisation:
         variance = (self.noise.scale * network.sigma[rows]) ** 2
         weight = self.noise.weight((ru * ru + rv * rv) / variance)
         if network.datum == 'inner':
-            weight = np.maximum(weight, MIN_FREE_WEIGHT)
+            weight = np.maximum(weight, MIN_WEIGHT)
         root = np.sqrt(self.image_factor * weight / variance)
         b = c * root
         a = b * sensor.inverse_depth

@@ -26,18 +26,14 @@ from .adjustment import DEFAULT_OPTIONS, Adjustment, SolverOptions, adjust, resi
 from .collinearity import project_with_jacobian
 from .elimination import CovarianceBlocks, factorize
 from .network import Network
-from .noise import DEFAULT_NOISE, Noise
-from .normal_equations import normal_equations
-from .precision import MIN_WEIGHT, Precision, covariance_blocks, variance_of_projection
+from .noise import DEFAULT_NOISE, MIN_REDUNDANCY, Noise
+from .normal_equations import MIN_WEIGHT, normal_equations
+from .precision import Precision, covariance_blocks, variance_of_projection
 from .unknowns import Parameters
 
 # Probability of any false alarm among all that is tested: image points, targets, terms.
 SIGNIFICANCE = 0.01
 FALSE_ALARM = 2e-3  # chance that one test of good observations fails
-# Smallest redundancy of an image point that is tested.
-MIN_TESTED_REDUNDANCY = 0.02
-# Iterations of the weights of a target's rays.
-INTERSECTION_ITERATIONS = 15
 # Smallest eigenvalue of the scaled normal matrix of an intersection.
 MIN_INTERSECTION_EIGENVALUE = 1e-4
 # The same of a test that says what contradicts what: rays, beads and their survey, false matches.
@@ -107,7 +103,7 @@ def image_statistics(
     unit = np.eye(2)
     # C_r = s^2 / w - P, so this is 1 - w P / s^2.
     part = precision.residual * (weight / variance)[:, None, None]
-    tested = np.linalg.eigvalsh(part)[:, 0] > MIN_TESTED_REDUNDANCY
+    tested = np.linalg.eigvalsh(part)[:, 0] > MIN_REDUNDANCY
     inverse = np.linalg.inv(np.where(tested[:, None, None], part, unit))
     fitted = (unit - part) * (variance / weight)[:, None, None]
     factor = noise.information_factor(adjustment.q)
@@ -214,7 +210,7 @@ def _intersect(
     weight = np.ones(len(p))
     offset = np.zeros((n, 3))
     covariance = np.tile(np.eye(3), (n, 1, 1))
-    for _ in range(INTERSECTION_ITERATIONS):
+    for _ in range(15):  # of the weights
         weighted = (weight[:, None, None] * a.transpose(0, 2, 1)) @ rays.information
         normal = np.zeros((n, 3, 3))
         right = np.zeros((n, 3))
@@ -245,7 +241,6 @@ def _intersect(
 # variance components in photogrammetry Foerstner and Wrobel, "Photogrammetric Computer Vision",
 # Springer 2016, 4.2.4).
 
-MAX_ROUNDS = 40
 # Relative change of the scale at which the rounds end: a hundredth of its standard deviation.
 SETTLED = 2e-3
 # Tolerance of the adjustments before the last one.
@@ -279,7 +274,7 @@ def adjust_and_estimate_noise(
     loose = replace(options, tolerance=LOOSE)
     parameters = start
     settled = False
-    for _ in range(MAX_ROUNDS):
+    for _ in range(40):  # of which it takes a few
         result = adjust(
             network,
             parameters,

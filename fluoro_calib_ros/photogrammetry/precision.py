@@ -20,14 +20,10 @@ from .collinearity import AdditionalParameters, project_with_jacobian
 from .elimination import CovarianceBlocks, Elimination, FactorizedNormalMatrix, factorize
 from .network import Gauge, Network, STransformation
 from .noise import Noise
-from .normal_equations import NormalEquations, normal_equations, right_sides
+from .normal_equations import CHUNK, MIN_WEIGHT, NormalEquations, normal_equations, right_sides
 from .rotations import square_of_lower
 from .unknowns import Parameters, UnknownVector, discrepancies_with_jacobian
 
-# Smallest weight of a gross error, so that its variance stays finite.
-MIN_WEIGHT = 1e-9
-# Image points handled at once, to limit memory.
-CHUNK = 5_000
 # Object points up to which their covariances with each other are kept. The more there are, the
 # less these matter: what all have in common is the datum.
 MAX_JOINT_POINTS = 150

@@ -24,22 +24,20 @@ from .collinearity import project, project_with_jacobian
 from .noise import Noise
 from .rotations import matrix_from_vector
 
-MIN_TARGETS = 8
+MIN_TARGETS = 8  # two more than the DLT needs
 SAMPLE_SIZE = 6  # the DLT has 11 unknowns, and a target gives two equations
 SAMPLES = 200  # with 20 % false matches 1 - (1 - 0.8^6)^200: a good sample is certain
 # Smallest over largest extent of the targets below which they lie in one plane.
 MIN_FLATNESS = 1e-2
 DLT_ITERATIONS = 10
 SETTLED_WEIGHTS = 0.02  # change of the robust weights at which the iterations end
-TINY = 1e-14  # of the trace of normal equations, added to the diagonal of singular ones
 NU = 3.0  # of the Student-t of the robust weights: heavy tails
 MIN_VARIANCE = 1e-12  # [px^2], for exact observations
-# Damping of the refinement: start, minimum, maximum and factor.
+# Damping of the refinement: start, minimum and maximum.
 START_DAMPING = 1e-4
 MIN_DAMPING = 1e-12
 MAX_DAMPING = 1e10
 MIN_EXTENT_MM = 1e-3
-DAMPING_FACTOR = 10
 # Relative change of a cost, a redundancy or a distance that rounding errors can cause.
 ROUNDING = 1e-9
 # Squared step at which the refinement ends, in the metric of its normal matrix and noise variance.
@@ -68,7 +66,8 @@ def least_vectors_with_last_one(forms: NDArray[np.float64]) -> NDArray[np.float6
     (Hartley and Zisserman 4.1.2, inhomogeneous solution).
     """
     k = forms.shape[-1] - 1
-    ridge = TINY * np.trace(forms, axis1=-2, axis2=-1)[..., None, None] * np.eye(k)
+    # So little more on the diagonal solves singular equations, too.
+    ridge = 1e-14 * np.trace(forms, axis1=-2, axis2=-1)[..., None, None] * np.eye(k)
     found = np.linalg.solve(forms[..., :k, :k] + ridge, -forms[..., :k, k:])
     return np.concatenate([found[..., 0], np.ones_like(found[..., :1, 0])], axis=-1)
 
@@ -421,8 +420,8 @@ def _damped_step(
         new_position = position + step[:3]
         squared = problem.squared_residuals(new_rotation, new_position)
         if noise.cost(squared / noise.scale**2, sigma) <= cost + ROUNDING * abs(cost):
-            return new_rotation, new_position, step, max(mu / DAMPING_FACTOR, MIN_DAMPING)
-        mu *= DAMPING_FACTOR
+            return new_rotation, new_position, step, max(mu / 10, MIN_DAMPING)
+        mu *= 10
     return rotation, position, np.zeros(6), mu
 
 

@@ -20,8 +20,8 @@ from ..brief import brief_repr
 from ..errors import DataError
 from .collinearity import project_with_jacobian
 from .rotations import (
-    ROTATION_TOLERANCE,
     cross_matrix,
+    is_rotation,
     matrix_from_quaternion,
     nearest_rotation,
     quaternion_from_matrix,
@@ -38,8 +38,7 @@ ROUNDING = 1e-6
 MAX_VALUE = 1e15  # of a position [mm], an interior orientation [px] or a covariance
 # What `rounded` keeps: far coarser than a rounding error, far finer than a standard deviation.
 DIGITS = 40  # binary, of positions and covariances
-QUATERNION_STEP = 2.0**-44
-LARGE_COMPONENT = 0.43  # of a unit quaternion; one of four is always larger
+QUATERNION_STEP = 2.0**-44  # of attitudes
 
 
 @dataclass(frozen=True)
@@ -339,7 +338,7 @@ def _rounded_rotation(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     """
     q = quaternion_from_matrix(rotation)
     rows = np.arange(len(q))
-    large = np.argmax(np.abs(q) > LARGE_COMPONENT, axis=1)
+    large = np.argmax(np.abs(q) > 0.43, axis=1)  # one of four is 0.5 or more
     q = np.where(q[rows, large] < 0, -1.0, 1.0)[:, None] * q
     q = _to_steps(q, QUATERNION_STEP)
     q[rows, large] = 0.0
@@ -504,8 +503,8 @@ def _as_rotation(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the rotation nearest to a matrix of few digits. Raises DataError for any other."""
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
         raise DataError('known orientation: R is not 3 x 3 finite numbers')
-    if np.abs(matrix.T @ matrix - np.eye(3)).max() > ROTATION_TOLERANCE:
-        raise DataError('known orientation: R is not a rotation, its columns are not orthonormal')
-    if np.linalg.det(matrix) < 0:
+    if is_rotation(-matrix):
         raise DataError('known orientation: R is a reflection, its determinant is -1')
+    if not is_rotation(matrix):
+        raise DataError('known orientation: R is not a rotation, its columns are not orthonormal')
     return nearest_rotation(matrix)

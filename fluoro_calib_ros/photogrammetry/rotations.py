@@ -51,6 +51,12 @@ def square_of_lower(factor: NDArray[np.float64]) -> NDArray[np.float64]:
 ROTATION_TOLERANCE = 1e-3
 
 
+def is_rotation(matrix: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """True (...) where matrices (..., 3, 3) are rotations, but for the few digits of a file."""
+    error = np.abs(matrix @ np.swapaxes(matrix, -1, -2) - np.eye(3)).max(axis=(-1, -2))
+    return (error <= ROTATION_TOLERANCE) & (np.linalg.det(matrix) > 0)
+
+
 def nearest_rotation(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the rotations (..., 3, 3) nearest to matrices with a positive determinant.
 

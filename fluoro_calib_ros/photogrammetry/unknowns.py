@@ -34,6 +34,8 @@ POSE_SIZE = 6  # translation [mm], rotation vector [rad], also of a body in the 
 # away.
 RIGID_SD_MM = 3e-4
 RIGID_SD_RAD = 1e-7
+# Eigenvalue of a normal matrix of unit diagonal below which it is a rounding error.
+SINGULAR = 1e-11
 
 
 @dataclass(frozen=True)
@@ -245,11 +247,6 @@ class Parameters:
         return coefficients
 
 
-# Iterations of the mean pose, and the step [mm, rad] at which they end.
-MEAN_ITERATIONS = 10
-MEAN_TOLERANCE = 1e-12
-
-
 def inverse_left_jacobian(w: NDArray[np.float64]) -> NDArray[np.float64]:
     """Derivatives (..., 3, 3) of log(exp(v) exp(w)) with respect to v at v = 0.
 
@@ -337,7 +334,7 @@ def mean_pose(
     median = np.median(shift, axis=0)
     start = int(np.argmin(np.sum((shift - median) ** 2, axis=1)))
     pose = RelativePose(turn[start], median)
-    for _ in range(MEAN_ITERATIONS):
+    for _ in range(10):  # of which it takes a few
         difference = np.concatenate(
             [shift - pose.translation_mm, vector_from_matrix(turn @ pose.rotation.T)], axis=1
         )
@@ -348,7 +345,7 @@ def mean_pose(
                 weights.sum(axis=0), (weights @ difference[..., None]).sum(axis=0)[:, 0]
             )
         pose = pose.updated(step)
-        if np.max(np.abs(step)) < MEAN_TOLERANCE:
+        if np.max(np.abs(step)) < 1e-12:  # mm, rad
             break
     return pose
 

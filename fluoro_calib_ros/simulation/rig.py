@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..exposures.frame import Frame, points_on_image
+from ..exposures.frame import DECIMALS, Frame, points_on_image
 from ..exposures.phantom import Phantom
 from ..photogrammetry.collinearity import project
 from ..photogrammetry.rotations import matrix_from_vector
@@ -144,9 +144,7 @@ def virtual_rig(
     return VirtualRig(tuple(fluoroscopes), true_mm, phantom)
 
 
-EDGE_PX = 512.0  # half the width of an image; the parts of a field are given by their size there
-MAX_ITERATIONS = 100  # of the inversion of a field
-TOLERANCE_PX = 1e-11  # rounding
+EDGE_PX = IMAGE_SIZE[0] / 2  # the parts of a field are given by their size there
 RIPPLES = 14  # parts of a random field
 
 
@@ -186,10 +184,10 @@ class DistortionField:
         uv = np.asarray(uv, dtype=float)
         with np.errstate(over='ignore', invalid='ignore'):
             observed = uv + self(uv)
-            for _ in range(MAX_ITERATIONS):
+            for _ in range(100):
                 last = observed
                 observed = uv + self(observed)
-                if np.max(np.abs(observed - last), initial=0.0) < TOLERANCE_PX:
+                if np.max(np.abs(observed - last), initial=0.0) < 1e-11:  # rounding
                     break
         return observed
 
@@ -216,9 +214,6 @@ def random_field(rng: np.random.Generator, strength: float = 1.0) -> DistortionF
     return DistortionField(centre, pincushion, s_shape, spiral, ripples)
 
 
-# Of an observed pixel, as target extraction writes it. It also hides differences between CPUs in
-# the last bit.
-DECIMALS = 4
 START_NS = 1_767_225_600_000_000_000  # stamp of the first frame
 
 
@@ -337,6 +332,7 @@ def detect_beads(
     visible = np.flatnonzero(points_on_image(observed, fluoroscope.image_size))
     low, high = detection.beads
     found = np.sort(rng.permutation(visible)[: rng.integers(low, high + 1)])
+    # Rounding also hides differences between CPUs in the last bit.
     seen = np.round(observed[found], DECIMALS)
     for row in np.flatnonzero(rng.random(len(found)) < detection.false_matches):
         distance = np.sum((observed[visible] - observed[found[row]]) ** 2, axis=1)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import rigs
 from rigs import kinds
+from scipy.special import ndtri
 
 from fluoro_calib_ros.checks import field_checks, held_out, inputs, shape, verdict
 from fluoro_calib_ros.checks.bead_intersection import Beads, _scale, distances
@@ -462,7 +463,7 @@ def test_limits_of_exposures_follow_their_scatter_and_noise():
     assert exposure_limits(calm, calm).tolist() == [1.6] * 10
     ratio = np.exp(np.tile([-0.1, 0.1], 5))
     factor = 4 + 20 / 10
-    wide = np.exp(factor * 0.1 / 0.6745)
+    wide = np.exp(factor * 0.1 / ndtri(0.75))
     np.testing.assert_allclose(exposure_limits(ratio, np.full(10, 9.0)), wide)
     np.testing.assert_allclose(exposure_limits(ratio, np.full(10, 1.2)), 1.6 * 1.2)
     np.testing.assert_allclose(exposure_limits(ratio, np.full(10, 0.2)), 1.6)

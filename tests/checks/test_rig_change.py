@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from rigs import true_calibrations, true_orientation
+from scipy.special import ndtri
 
 from fluoro_calib_ros.bodies.body import Body
 from fluoro_calib_ros.checks.drift_charts import ERROR
@@ -159,7 +160,7 @@ def test_what_is_added_grows_with_what_the_rays_show(geometry):
     assert shown_blocks(geometry, [APART[:2]]).addition(1) is None
     change = shown_blocks(geometry, [APART, MEETS, MEETS])
     newest, all_three = change.addition(2), change.addition(3)
-    capped = (3 * 0.1 / 0.6745) ** 2  # three robust standard deviations
+    capped = (3 * 0.1 / ndtri(0.75)) ** 2  # three robust standard deviations
     assert newest.miss == pytest.approx(0.1)
     assert all_three.miss == pytest.approx(np.sqrt((capped + 2 * 0.1**2) / 3))
     assert np.trace(all_three.covariance) > np.trace(newest.covariance)

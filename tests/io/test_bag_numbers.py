@@ -33,7 +33,7 @@ from fluoro_calib_ros.io.bags.reader import (
     image_topics,
     images_of_topic,
 )
-from fluoro_calib_ros.io.bags.recording import Recording, RecordingOptions, lost_text
+from fluoro_calib_ros.io.bags.recording import Recording, lost_text
 from fluoro_calib_ros.io.bags.salvage import (
     Damage,
     FileSalvage,
@@ -377,9 +377,9 @@ def test_images_of_a_bag_are_those_of_a_topic_of_each_fluoroscope(tmp_path):
 @pytest.fixture
 def queue(tmp_path, monkeypatch):
     """A recording that does not begin, with a queue of 100 bytes."""
-    monkeypatch.setattr(recording, 'MEGABYTE', 1)
     monkeypatch.setattr(recording, 'SMALL_BYTES', 10)
-    made = Recording(tmp_path / 'bag', RecordingOptions(queue_size=100))
+    made = Recording(tmp_path / 'bag')
+    made.options = Fake(queue_size=100 / 1e6)
     return made
 
 
@@ -415,7 +415,7 @@ def test_what_is_not_on_the_disk_yet_counts_as_dropped(queue):
     [(0, 0, False), (50, 0, True), (51, 0, False), (0, 5, True), (0, 6, False), (51, 5, True)],
 )
 def test_file_is_full_by_its_size_or_its_age(queue, monkeypatch, size, seconds, full):
-    queue.options = Fake(split_size=size, split_duration=seconds)
+    queue.options = Fake(split_size=size / 1e6, split_duration=seconds)
     queue._writer = Fake(file_bytes=50)
     queue._file_start = 10.0
     monkeypatch.setattr(recording, 'time', Fake(monotonic=lambda: 15.0))

@@ -538,7 +538,7 @@ def test_pace_of_a_player_stops_goes_on_and_changes(monkeypatch):
 
     stop = Fake(wait=wait, is_set=lambda: False)
     assert pace.wait(13.0, stop) is False and sum(waited) == pytest.approx(0.25)
-    assert max(waited) <= player_node.LONGEST_WAIT_S
+    assert max(waited) <= player_node.WAIT_S
     assert pace.wait(2.0, Fake(is_set=lambda: True)) is True
     assert pace.wait(99.0, Fake(wait=lambda _: True)) is True
     paused = player_node.Pace(1.0, paused=True)

@@ -34,10 +34,8 @@ if TYPE_CHECKING:
 
 MAGIC = b'\x89MCAP0\r\n'
 SQLITE = b'SQLite format 3\0'  # how a bag of that storage begins
-CHUNK_HEAD = 100  # bytes that contain sizes and compression of a chunk
 FOOTER = struct.Struct('<BQQQI')  # opcode, length, two offsets, checksum
 RECORD = struct.Struct('<BQ')  # opcode and length
-MAX_CAUSE = 120  # characters
 
 
 class BagMessage(NamedTuple):
@@ -143,7 +141,7 @@ def _open_checked(path: str) -> Iterator[BinaryIO]:
     except (EndOfFile, struct.error):
         raise DataError(f'{path}: the bag is damaged, a record ends too early') from None
     except Exception as error:  # damaged bytes make the reader raise almost anything
-        raise DataError(f'{path}: the bag is damaged ({_cause(error, MAX_CAUSE)})') from None
+        raise DataError(f'{path}: the bag is damaged ({_cause(error)})') from None
 
 
 def _check_ends(path: str, file: BinaryIO) -> None:
@@ -174,9 +172,9 @@ def _check_chunks(file: BinaryIO) -> None:
     size = file.seek(0, os.SEEK_END)
     while position + RECORD.size <= size:
         file.seek(position)
-        head = file.read(CHUNK_HEAD)
+        head = file.read(100)  # with sizes and compression, where it is that of a chunk
         opcode, length = RECORD.unpack_from(head)
-        if opcode == Opcode.CHUNK and len(head) == CHUNK_HEAD:
+        if opcode == Opcode.CHUNK:
             (held,) = struct.unpack_from('<Q', head, RECORD.size + 16)
             (name_length,) = struct.unpack_from('<I', head, RECORD.size + 28)
             start = RECORD.size + 32 + name_length + 8
@@ -243,9 +241,9 @@ def _records(file: BinaryIO) -> Iterator[McapRecord]:
     return StreamReader(file, validate_crcs=True).records
 
 
-def _cause(error: Exception, most: int) -> str:
-    """Return the text of an error in one line of so many characters, or its type."""
-    return ' '.join(str(error).split())[:most] or type(error).__name__
+def _cause(error: Exception) -> str:
+    """Return the text of an error in one line, or its type."""
+    return ' '.join(str(error).split()) or type(error).__name__
 
 
 # Storage files of a bag: an .mcap file, or those in the folder of a rosbag2 bag.
@@ -359,8 +357,6 @@ def _listed_files(source: PathLike) -> list[str]:
 #
 # A bag is compressed by rosbag2 file by file (`file`) or message by message (`message`).
 
-MAX_FOREIGN_CAUSE = 200  # characters
-
 
 def is_foreign(source: PathLike) -> bool:
     """Return whether a bag is not stored in plain .mcap files."""
@@ -423,5 +419,4 @@ def _opened(source: PathLike) -> Iterator[Reader]:
     except DataError:
         raise
     except Exception as error:  # a damaged bag makes the library raise almost anything
-        cause = _cause(error, MAX_FOREIGN_CAUSE)
-        raise DataError(f'{source}: the bag cannot be read ({cause})') from None
+        raise DataError(f'{source}: the bag cannot be read ({_cause(error)})') from None

@@ -35,8 +35,6 @@ ADDED = {
         for version in range(3, VERSION + 1)
     )
 }
-PADDING = 4  # bytes at the end of a message that Fast DDS reserves for an empty float64[]
-MAX_PADDING = 10 * PADDING  # of a message with ten of them
 SEPARATOR = '=' * 80  # between the definitions of a schema
 
 
@@ -162,10 +160,11 @@ def _read_cdr(store: Typestore, data: bytes, msg_type: str) -> Any:
     try:
         return store.deserialize_cdr(data, msg_type)
     except Exception as error:  # generated code raises almost anything for damaged bytes
-        for padding in range(PADDING, MAX_PADDING + 1, PADDING):
+        # Fast DDS reserves four bytes at the end for an empty float64[]; a message has ten at most
+        for empty in range(1, 11):
             with suppress(Exception):
-                message = store.deserialize_cdr(data[:-padding], msg_type)
-                if padding <= PADDING * _count_empty(message):
+                message = store.deserialize_cdr(data[: -4 * empty], msg_type)
+                if empty <= _count_empty(message):
                     return message
         raise DataError(f'the content is not a {msg_type} ({error})') from None
 
@@ -392,7 +391,6 @@ _Dumper.add_representer(
 )
 
 
-BAG_VERSION = 9  # of metadata.yaml, as rosbag2 of Jazzy writes it
 NO_MESSAGE_NS = 2**63 - 1  # starting time of a bag without messages [ns]
 
 
@@ -440,7 +438,7 @@ def bag_metadata(
 ) -> dict[str, Any]:
     """Return the content of rosbag2_bagfile_information; the order of the keys counts."""
     return {
-        'version': BAG_VERSION,
+        'version': 9,  # as rosbag2 of Jazzy writes it
         'storage_identifier': 'mcap',
         'duration': total.duration,
         'starting_time': total.starting_time,

@@ -21,10 +21,8 @@ from ..access import PathLike
 from .metadata import Definition
 from .writer import BagWriter
 
-MEGABYTE = 10**6
 SMALL_BYTES = 65536  # of a message that is no image
 LARGE_SHARE = 0.9  # of the queue that large messages may fill: images must not displace frames
-WAIT_S = 0.1  # after which the thread looks whether it has to flush or to end
 
 
 @dataclass(frozen=True)
@@ -150,7 +148,7 @@ class Recording:
         """Queue a message; returns False where it had to be dropped."""
         with self._condition:
             share = 1.0 if len(data) <= SMALL_BYTES else LARGE_SHARE
-            full = self.waiting_bytes + len(data) > share * self.options.queue_size * MEGABYTE
+            full = self.waiting_bytes + len(data) > share * self.options.queue_size * 1e6
             if self.fault or (full and self.waiting_bytes):
                 self.dropped[topic] += 1
                 return False
@@ -176,7 +174,7 @@ class Recording:
         while not self.fault:
             with self._condition:
                 if not self._queue and not self._stopping:
-                    self._condition.wait(WAIT_S)
+                    self._condition.wait(max(flushed + self._period_s - time.monotonic(), 0))
                 items = list(self._queue)
                 self._queue.clear()
                 if not items and self._stopping:
@@ -195,10 +193,14 @@ class Recording:
                     [item for item in items if item is not None],
                 )
 
+    @property
+    def _period_s(self) -> float:
+        """Time between two flushes: a part of each period is left for the flush itself."""
+        return 0.5 * self.options.flush_period
+
     def _flush_if_due(self, flushed: float) -> float:
         """Flush what is written to disk once in a period; returns when this was last done."""
-        # A part of each period is left for the flush itself.
-        if time.monotonic() - flushed <= 0.5 * self.options.flush_period:
+        if time.monotonic() - flushed <= self._period_s:
             return flushed
         self._writer.flush(to_disk=True)
         self._unflushed.clear()
@@ -249,7 +251,7 @@ class Recording:
 
     def _is_full(self) -> bool:
         """Return whether a new file is to be begun."""
-        size = self.options.split_size * MEGABYTE
+        size = self.options.split_size * 1e6
         duration = self.options.split_duration
         return bool(
             (size and self._writer.file_bytes >= size)

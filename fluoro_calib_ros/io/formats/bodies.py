@@ -29,11 +29,17 @@ from numpy.typing import NDArray
 from ...bodies.joints import JointMotion
 from ...errors import DataError
 from ...exposures.phantom import first_repeated
-from ...photogrammetry.rotations import matrix_from_quaternion, quaternion_from_matrix
+from ...photogrammetry.rotations import (
+    ROTATION_TOLERANCE,
+    is_rotation,
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+)
 from ..access import PathLike, atomic_file
 from ..bodies import COLUMNS as POSE_COLUMNS
 from ..csv_table import as_text, read_all
 from .content import (
+    UNITS_MM,
     Bodies,
     Content,
     FileSettings,
@@ -44,7 +50,6 @@ from .content import (
     in_units,
 )
 from .tables import (
-    NS,
     Row,
     bodies_of,
     frame_numbers,
@@ -61,8 +66,6 @@ COLUMNS = (
     *('TX', 'TY', 'TZ', '1'),
 )
 _FIRST = re.compile(r'(?P<body>.+)_R11(?P<filter>_[\d.]+Hz)?')
-ROTATION_TOLERANCE = 1e-6  # rounding of 12 digits is far below
-LAST_TOLERANCE = 1e-9  # of the last row, 0, 0, 0, 1
 
 
 def _read_xmalab(path: Path, settings: FileSettings) -> Content:
@@ -108,11 +111,9 @@ def _check(row: Row, matrices: NDArray[np.float64], names: list[str]) -> None:
     for name, matrix in zip(names, matrices):
         if np.isnan(matrix).any():
             continue
-        turn = matrix[:3, :3]
-        error = np.abs(turn @ turn.T - np.eye(3)).max()
-        if error > ROTATION_TOLERANCE or np.linalg.det(turn) < 0:
+        if not is_rotation(matrix[:3, :3]):
             row.fail(f'the matrix of {name} is not a rotation')
-        if np.abs(matrix[3] - [0, 0, 0, 1]).max() > LAST_TOLERANCE:
+        if (matrix[3] != [0, 0, 0, 1]).any():
             row.fail(f'the columns 01, 02, 03 and 1 of {name} are not 0, 0, 0 and 1')
 
 
@@ -172,7 +173,6 @@ AUTOSCOPER = Format(
 # poses.csv of the command bodies, so that its poses go into the files of other programs.
 
 _POSES = POSE_COLUMNS[:10]  # the poses without standard deviations, as the truth has them
-NORM_TOLERANCE = 1e-6  # of a quaternion: rounding of nine digits is far below
 
 
 def _read_poses(path: Path, settings: FileSettings) -> Content:
@@ -196,7 +196,7 @@ def _read_poses(path: Path, settings: FileSettings) -> Content:
             f'{rows.lines[first]}',
         )
     known = ~np.isnan(values).any(axis=1)
-    wrong = known & ~(np.abs(np.linalg.norm(values[:, 3:], axis=1) - 1) < NORM_TOLERANCE)
+    wrong = known & ~(np.abs(np.linalg.norm(values[:, 3:], axis=1) - 1) < ROTATION_TOLERANCE)
     if wrong.any():
         rows.fail(int(np.argmax(wrong)), 'the quaternion does not have length one')
     shape = (len(frames), len(names), 3)
@@ -205,7 +205,7 @@ def _read_poses(path: Path, settings: FileSettings) -> Content:
     at = row[known], place[known]
     translation[at] = values[known, :3]
     rotation[at] = matrix_from_quaternion(values[known][:, [6, 3, 4, 5]])
-    rate = rate_of(frame, seconds * NS)
+    rate = rate_of(frame, seconds * 1e9)
     return Content(bodies=Bodies(tuple(names), frames, rotation, translation, rate))
 
 
@@ -220,7 +220,6 @@ POSES = Format(
 
 
 END = 'endheader'
-METRE = 1000.0  # mm
 
 
 def write(path: Path, content: Content, settings: FileSettings) -> Written:
@@ -232,7 +231,7 @@ def write(path: Path, content: Content, settings: FileSettings) -> Written:
     known = np.isfinite(bodies.rotation).all(axis=(2, 3))
     quaternions = np.full((*known.shape, 4), np.nan)
     quaternions[known] = quaternion_from_matrix(bodies.rotation[known])
-    metres = in_units(bodies.translation_mm, METRE)
+    metres = in_units(bodies.translation_mm, UNITS_MM['m'])
     for out, kind, values in ((path, 'Quaternion', quaternions), (positions, 'Vec3', metres)):
         header = (f'DataRate={frames.rate_hz!r}', f'DataType={kind}', 'version=3')
         cells = ([joined(element) for element in row] for row in values)
@@ -258,7 +257,7 @@ def write_joint_motion(path: PathLike, motions: Sequence[JointMotion], start_ns:
         for name in (*m.angle_names, *m.translation_names)
     ]
     values = np.hstack(
-        [part for m in motions for part in (np.rad2deg(m.angles), m.translations / METRE)]
+        [part for m in motions for part in (np.rad2deg(m.angles), m.translations / 1000)]
     )
     known = np.isfinite(values).all(axis=1)
     if not known.any():

@@ -45,7 +45,6 @@ from .xmalab_points import camera_order
 
 NAME = 'bundle'  # of the files written
 WIDTHS = {'.pho': 8, '.iop': 25, '.eop': 8, '.xyz': 7}
-_SIGMA_PX = 1.0  # of observations whose precision is unknown
 
 
 @dataclass(frozen=True)
@@ -248,7 +247,7 @@ def write(path: Path, content: Content, settings: FileSettings) -> Written:
     order = ', '.join(f'{number} is {name}' for name, number in numbering.camera.items())
     more: tuple[str, ...] = (f'{path}: camera {order}',) if names else ()
     if any(f.sigma is None for of in observations.values() for f in of):
-        more += (f'{path}: image points without sigma have a noise of {_SIGMA_PX:g} px',)
+        more += (f'{path}: image points without sigma have a noise of 1 px',)
     return Written(tuple(paths), notes + more)
 
 
@@ -271,7 +270,7 @@ def _pho(observations: Frames, numbering: _Numbering) -> list[str]:
     for name, frames in observations.items():
         for frame in frames:
             station = numbering.station(name, frame.number)
-            noise = np.full(len(frame.uv), _SIGMA_PX) if frame.sigma is None else frame.sigma
+            noise = np.ones(len(frame.uv)) if frame.sigma is None else frame.sigma
             for target, (u, v), sd in zip(frame.target_id.tolist(), frame.uv.tolist(), noise):
                 numbers = joined([u, -v, sd, sd, 0.0, 0.0], ' ')
                 lines.append(f'{target} {station} {numbers}')

@@ -20,6 +20,7 @@ from ...errors import DataError
 from ...exposures.frame import Frames
 from ...exposures.names import Names
 from ...exposures.phantom import Phantom
+from ...photogrammetry.rotations import is_rotation
 from ..access import PathLike, check_safe_name, make_folder, write_text
 
 # Camera axes x right, y up, z backwards -> x right, y down, z forwards.
@@ -328,8 +329,6 @@ class Format:
 
 # What the formats of cameras have in common: one file a fluoroscope, in a folder.
 
-ROTATION_TOLERANCE = 1e-5  # of rotations that other programs rounded to six digits
-
 
 def write_cameras(
     folder: Path, cameras: Sequence[Camera], ending: str, text_of: Callable[[Camera], str]
@@ -355,11 +354,10 @@ def name_of_file(path: Path, ending: str) -> str:
 
 def check_rotation(where: object, rotation: NDArray[np.float64]) -> None:
     """Raise DataError for a matrix (3, 3) that is not a rotation."""
-    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if not error <= ROTATION_TOLERANCE:
-        raise DataError(f'{where}: the matrix is not a rotation, its rows are not orthonormal')
-    if np.linalg.det(rotation) < 0:
+    if is_rotation(-rotation):
         raise DataError(f'{where}: the matrix is not a rotation, it mirrors')
+    if not is_rotation(rotation):
+        raise DataError(f'{where}: the matrix is not a rotation, its rows are not orthonormal')
 
 
 def check_matrix(where: object, matrix: NDArray[np.float64]) -> None:

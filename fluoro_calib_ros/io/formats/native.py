@@ -43,7 +43,7 @@ from .content import (
     common_focal_length,
     refuse_distortion,
 )
-from .tables import NS, rate_of
+from .tables import rate_of
 
 POINTS_NEEDED = ('frame', 'target_id', 'x', 'y', 'z')
 GRID = ('fluoroscope', 'u', 'v', 'u_reference', 'v_reference')
@@ -148,7 +148,7 @@ def _point_rows(
         cells = {
             **dict.fromkeys(POINTS, ''),
             'frame': number,
-            'stamp_ns': '' if rate is None else round((number - first) / rate * NS),
+            'stamp_ns': '' if rate is None else round((number - first) / rate * 1e9),
             'target_id': target,
             **dict(zip('xyz', points.xyz_mm[row, column].tolist())),
             'residual': float(points.residual_px[row, column]),

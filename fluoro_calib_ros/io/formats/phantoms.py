@@ -19,14 +19,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import DataError, ErrorsAt
+from ...errors import DataError, ErrorsAt, quoted
 from ...exposures.names import MAX_ID, Names, number_names, without_trivial
 from ...exposures.phantom import Phantom
 from ...limits import read_limits
 from ..access import read_text, write_text
 from ..csv_table import decimal_point, is_number
 from .content import UNITS_MM, Content, FileSettings, Format, Sample, Written, from_units, in_units
-from .tables import MAX_SHOWN, Row, joined, separator_of, table_of
+from .tables import Row, joined, separator_of, table_of
 
 _COLUMN = re.compile(r'"?([a-z]+)(?:[ _]*[\[(]?(mm|cm|m)[\])]?)?"?')
 # Names of columns that mean the same.
@@ -169,7 +169,7 @@ def _numbers(row: Row, layout: _Layout, names: Sequence[str]) -> list[float]:
     for name in names:
         cell = row.cells[layout.columns[name]]
         if not is_number(cell) or not np.isfinite(float(cell)):
-            row.fail(f'{name} is {cell[:MAX_SHOWN]!r}, not a finite number')
+            row.fail(f'{name} is {quoted(cell)}, not a finite number')
         out.append(float(cell))
     return out
 
@@ -192,12 +192,12 @@ def _ids(rows: Sequence[Row], layout: _Layout) -> dict[str, int]:
             row.fail('the bead has no id')
         other = first.setdefault(cell, row)
         if other is not row:
-            row.fail(f'bead {cell[:MAX_SHOWN]!r} is already given in row {other.line}')
+            row.fail(f'bead {quoted(cell)} is already given in row {other.line}')
     if not all(cell.isascii() and cell.isdigit() for cell in cells):
         return number_names(cells)
     for row, cell in zip(rows, cells):
         if len(cell) > len(str(MAX_ID)) or int(cell) > MAX_ID:
-            row.fail(f'id is {cell[:MAX_SHOWN]!r}, not between 0 and {MAX_ID}')
+            row.fail(f'id is {quoted(cell)}, not between 0 and {MAX_ID}')
     return {cell: int(cell) for cell in cells}
 
 

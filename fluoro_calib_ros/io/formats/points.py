@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import DataError
+from ...photogrammetry.rotations import is_rotation
 from ..access import atomic_file, read_bytes, read_text, write_bytes
 from ..csv_table import as_text
 from .content import (
@@ -63,16 +64,11 @@ from .tables import (
     write_frames,
 )
 
-MISSING = -1.0  # residual of a point that is not there (C3D)
-STEPS = 255  # of the byte of a residual, in units of POINT:SCALE
 MAX_FRAME = 65535  # the header counts in uint16
-_MAGIC = 0x50  # second byte of a C3D file
-_INTEL = 84  # processor type
-# Places of the scale factor and of the first block of the data in the header [bytes].
-_SCALE = 12
-_DATA = 16
+# Points, analog values, first and last frame, scale factor and first block of the data: from byte
+# 2 of the header on.
+_HEADER = struct.Struct('<4H2xfH')
 BLOCK = 512  # bytes
-ROTATION_TOLERANCE = 1e-4  # float32, and programs that compute in it
 
 
 def _ezc3d() -> Any:
@@ -135,8 +131,7 @@ def _bodies(path: Path, arrays: dict[str, np.ndarray], settings: FileSettings) -
     translation = matrices[..., :3, 3] * mm
     missing = np.isnan(matrices).any(axis=(2, 3))
     turn = np.where(missing[..., None, None], np.eye(3), rotation)
-    error = np.abs(turn @ np.swapaxes(turn, 2, 3) - np.eye(3)).max(axis=(2, 3))
-    wrong = (error > ROTATION_TOLERANCE) | (np.linalg.det(turn) < 0)
+    wrong = ~is_rotation(turn)
     first = int(arrays['first'])
     if wrong.any():
         row, column = np.argwhere(wrong)[0]
@@ -167,16 +162,14 @@ def _check_size(path: Path, content: bytes) -> None:
 
     The header is that of c3d.org, of a file with the numbers of Intel processors.
     """
-    if content[1:2] != bytes([_MAGIC]):
+    if content[1:2] != b'P':
         raise DataError(f'{path}: this is not a C3D file')
     if len(content) < BLOCK:
         raise DataError(f'{path}: this C3D file is truncated')
     start = (content[0] - 1) * BLOCK
-    if content[start + 3 : start + 4] != bytes([_INTEL]):
+    if content[start + 3 : start + 4] != bytes([84]):  # numbers of Intel processors
         return
-    points, analog, first, last = struct.unpack_from('<4H', content, 2)
-    (scale,) = struct.unpack_from('<f', content, _SCALE)
-    (data,) = struct.unpack_from('<H', content, _DATA)
+    points, analog, first, last, scale, data = _HEADER.unpack_from(content, 2)
     values = (last - first + 1) * (4 * points + analog)
     if last < MAX_FRAME and (data - 1) * BLOCK + values * (4 if scale < 0 else 2) > len(content):
         raise DataError(f'{path}: this C3D file is truncated, or its header is damaged')
@@ -216,10 +209,10 @@ def _add_points(file: Any, points: Points, mm: float) -> None:
     xyz = np.where(missing[..., None], 0.0, points.xyz_mm / mm)
     with_one = np.concatenate([xyz, np.ones((*xyz.shape[:2], 1))], axis=2)
     sd = np.nan_to_num(points.sd_mm / mm)
-    step = max(float(sd.max(initial=0.0)) / STEPS, 1e-6)
+    step = max(float(sd.max(initial=0.0)) / 255, 1e-6)
     file['parameters']['POINT']['SCALE']['value'] = [-step]
     file['data']['points'] = with_one.transpose(2, 1, 0)
-    file['data']['meta_points']['residuals'] = np.where(missing, MISSING, sd).T[None]
+    file['data']['meta_points']['residuals'] = np.where(missing, -1.0, sd).T[None]
 
 
 def _bytes_of(file: Any, path: Path) -> bytes:
@@ -235,11 +228,11 @@ def _bytes_of(file: Any, path: Path) -> bytes:
     # of the parameter. It writes residuals into the byte of the cameras, where large ones have the
     # sign of a missing point.
     (scale,) = file['parameters']['POINT']['SCALE']['value']
-    struct.pack_into('<f', content, _SCALE, scale)
+    struct.pack_into('<f', content, 12, scale)
+    *_, data = _HEADER.unpack_from(content, 2)
     residual = file['data']['meta_points']['residuals'][0].T
-    (data,) = struct.unpack_from('<H', content, _DATA)
     words = np.frombuffer(content, '<f4', 4 * residual.size, (data - 1) * BLOCK)
-    words[3::4] = np.where(residual < 0, MISSING, np.round(residual / -scale)).ravel()
+    words[3::4] = np.where(residual < 0, -1.0, np.round(residual / -scale)).ravel()
     return bytes(content)
 
 
@@ -247,7 +240,7 @@ C3D = Format(
     'c3d',
     'C3D',
     parts=('points', 'bodies'),
-    recognise=lambda sample: sample.suffix == '.c3d' and sample.head[1:2] == bytes([_MAGIC]),
+    recognise=lambda sample: sample.suffix == '.c3d' and sample.head[1:2] == b'P',
     read=read_c3d,
     write=write_c3d,
 )

@@ -29,10 +29,9 @@ from ...processes import run_module, watch_parent
 from .pandas_hdf5 import is_pandas, table_arrays, texts
 
 HDF5 = b'\x89HDF\r\n\x1a\n'  # with which a file begins
-# Bytes of address space: for the program, for each byte of the file, and at most.
+# Bytes of address space: for the program, and for each byte of the file.
 BASE_MEMORY = 3 * 2**30
 MEMORY_OF_BYTE = 100
-MAX_MEMORY = 8 * 2**30
 
 
 def labels_of(parameters: Any) -> list[str]:
@@ -75,9 +74,6 @@ def c3d_arrays(path: str) -> dict[str, Any]:
     }
 
 
-DEC = 85  # processor type of a C3D file
-
-
 def _residuals(path: str, xyz: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
     """Return the residuals (m, n) of the points of a C3D file, -1 where there is none.
 
@@ -90,7 +86,7 @@ def _residuals(path: str, xyz: NDArray[np.float64], scale: float) -> NDArray[np.
     width = 4 * points + analog
     kind = '<f4' if scale < 0 else '<i2'
     values = np.frombuffer(content, kind, frames * width, (data - 1) * 512)
-    if scale < 0 and content[(content[0] - 1) * 512 + 3] == DEC:
+    if scale < 0 and content[(content[0] - 1) * 512 + 3] == 85:  # numbers of DEC processors
         values = values.view('<u2').reshape(-1, 2)[:, ::-1].copy().view('<f4') / 4
     words = values.reshape(frames, width)[:, 3 : 4 * points : 4]
     steps = np.where(words >= 0, words, -1).astype(np.int64)
@@ -148,7 +144,7 @@ def main() -> None:
         import resource
 
         size = os.path.getsize(sys.argv[2])
-        memory = min(BASE_MEMORY + MEMORY_OF_BYTE * size, MAX_MEMORY)
+        memory = BASE_MEMORY + MEMORY_OF_BYTE * size
         resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
     try:
         arrays = READERS[sys.argv[1]](sys.argv[2])
@@ -160,10 +156,9 @@ def main() -> None:
     sys.stdout.buffer.write(buffer.getvalue())
 
 
-# Of the process that reads: to start, for each byte of the file, and at most.
+# Of the process that reads: to start, and for each byte of the file.
 BASE_SECONDS = 10
 SECONDS_OF_BYTE = 1e-6
-MAX_SECONDS = 60
 
 
 def hdf5_arrays(kind: str, path: Path) -> dict[str, np.ndarray]:
@@ -183,7 +178,7 @@ def require_h5py(path: Path) -> None:
 
 def arrays_apart(kind: str, path: Path, title: str) -> dict[str, np.ndarray]:
     """Return the arrays of a file, read by the process. Raises DataError where it cannot be."""
-    seconds = min(BASE_SECONDS + SECONDS_OF_BYTE * path.stat().st_size, MAX_SECONDS)
+    seconds = BASE_SECONDS + SECONDS_OF_BYTE * path.stat().st_size
     try:
         done = run_module(__name__, kind, os.fspath(path.resolve()), timeout_s=seconds)
     except TimeoutError:

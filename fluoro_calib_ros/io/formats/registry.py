@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from ...errors import DataError
+from ...errors import DataError, quoted
 from ...exposures.frame import Frame
 from ...exposures.names import Names
 from ..access import PathLike, encoding_of, kind_not_read, opened
@@ -28,7 +28,6 @@ from .xmalab_cameras import DLT, LOOKUP, MAYACAM1, MAYACAM2
 
 HEAD = 65536  # bytes by which a format is recognised
 LINES = 20  # lines by which a format is recognised
-MAX_SHOWN = 60  # characters of a line in a message
 
 # The order is that in which a file is compared with them, and that of help texts.
 FORMATS: dict[str, Format] = {
@@ -115,7 +114,7 @@ def _beginning(path: Path) -> str:
     kind = kind_not_read(sample.head)
     if kind or not sample.lines:
         return f'it is {kind or "not text"}'
-    return f'it begins with {sample.lines[0][:MAX_SHOWN]!r}'
+    return f'it begins with {quoted(sample.lines[0])}'
 
 
 def _read_folder(folder: Path, settings: FileSettings, kind: str | None) -> Content:

@@ -16,7 +16,7 @@ from typing import NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import DataError
+from ...errors import DataError, quoted
 from ...exposures.frame import Frame, points_on_image
 from ...exposures.names import Names, number_names, without_trivial
 from ...limits import MAX_ROWS
@@ -25,7 +25,6 @@ from ..csv_table import decimal_point
 from .content import Bodies, Content, FileSettings, Points
 
 MISSING = ('', 'nan', 'none', 'null', 'na', 'n/a')
-MAX_SHOWN = 40  # characters of a cell in a message
 
 
 def with_sigma_of_likelihood(
@@ -102,7 +101,7 @@ class Row:
             except ValueError:
                 value = math.inf
             if math.isinf(value):
-                self.fail(f'column {column + 1} is {cell[:MAX_SHOWN]!r}, not a number')
+                self.fail(f'column {column + 1} is {quoted(cell)}, not a number')
             out.append(value)
         return out
 
@@ -110,7 +109,7 @@ class Row:
         """Return a cell as a whole number from 0. Raises DataError."""
         cell = self.cells[column]
         if not cell.isascii() or not cell.isdigit():
-            self.fail(f'{what} is {cell[:MAX_SHOWN]!r}, not a whole number')
+            self.fail(f'{what} is {quoted(cell)}, not a whole number')
         return int(cell)
 
 
@@ -233,10 +232,6 @@ def are_numbers(lines: Sequence[str], rows: int, columns: int = 0) -> bool:
     return len(lines) == rows and len(widths) == 1 and columns in (0, *widths)
 
 
-MAX_FRAMES = 10**6
-NS = 1e9  # of a second
-
-
 @dataclass(frozen=True)
 class Frames:
     """All frames of a recording: the first, how many there are, and their rate, NaN if unknown."""
@@ -280,7 +275,7 @@ def frames_of(
         raise DataError(f'{path}: the source does not contain the frame rate, --rate HZ is needed')
     first = min(int(part.frame[0]) for part in parts)
     count = max(int(part.frame[-1]) for part in parts) - first + 1
-    if count > MAX_FRAMES:
+    if count > MAX_ROWS:
         raise DataError(f'{path}: frames {first} to {first + count - 1} are too many to write')
     return Frames(first, count, float(rate))
 
@@ -312,7 +307,7 @@ def rate_of(frame: NDArray[np.int64], stamp_ns: np.ndarray) -> float | None:
     """Return the frames per second between the first and the last time stamp, None without."""
     first = int(np.argmin(frame))
     last = int(np.argmax(frame))
-    seconds = (stamp_ns[last] - stamp_ns[first]) / NS
+    seconds = (stamp_ns[last] - stamp_ns[first]) / 1e9
     if not seconds > 0:
         return None
     rate = (frame[last] - frame[first]) / seconds

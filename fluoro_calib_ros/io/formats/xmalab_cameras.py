@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from scipy.linalg import rq
 from scipy.spatial.transform import Rotation
 
-from ...errors import DataError
+from ...errors import DataError, quoted
 from ...limits import MAX_IMAGE_SIDE
 from ..access import atomic_file, check_rows, check_safe_name, make_folder, read_text, write_text
 from .content import (
@@ -60,8 +60,6 @@ from .tables import (
 
 _MAYACAM2 = '_MayaCam2.txt'
 _TITLES = {1: 'image size', 4: 'camera matrix', 9: 'rotation', 14: 'translation'}
-_UNDISTORTION = 19  # line of its title
-_COEFFICIENTS = 8  # k1, k2, p1, p2, k3 to k6 of OpenCV
 
 
 def _read_mayacam2(path: Path, settings: FileSettings) -> Content:
@@ -70,7 +68,7 @@ def _read_mayacam2(path: Path, settings: FileSettings) -> Content:
     for number, title in _TITLES.items():
         if _line(path, lines, number).strip() != title:
             raise DataError(
-                f'{path}, row {number}: {_line(path, lines, number)[:40]!r} stands where MayaCam '
+                f'{path}, row {number}: {quoted(_line(path, lines, number))} stands where MayaCam '
                 f'2.0 has the line {title!r}'
             )
     width, height = _numbers(path, lines, 2, 2)
@@ -82,9 +80,8 @@ def _read_mayacam2(path: Path, settings: FileSettings) -> Content:
     check_matrix(f'{path}, row 5', matrix)
     check_rotation(f'{path}, row 10', rotation)
     distortion: tuple[float, ...] = ()
-    if len(lines) >= _UNDISTORTION and lines[_UNDISTORTION - 1].strip() == 'undistortion':
-        numbers = range(_UNDISTORTION + 1, _UNDISTORTION + 1 + _COEFFICIENTS)
-        distortion = tuple(_numbers(path, lines, number, 1)[0] for number in numbers)
+    if len(lines) >= 19 and _line(path, lines, 19).strip() == 'undistortion':
+        distortion = tuple(_numbers(path, lines, number, 1)[0] for number in range(20, 28))
     camera = Camera(
         name_of_file(path, _MAYACAM2),
         matrix,
@@ -137,7 +134,7 @@ def _mayacam2_text(camera: Camera, mm: float) -> str:
         *map(number_text, in_units(translation, mm)),
     ]
     if camera.is_distorted:
-        padded = [*camera.distortion, *[0.0] * _COEFFICIENTS][:_COEFFICIENTS]
+        padded = [*camera.distortion, *[0.0] * 8][:8]  # k1, k2, p1, p2, k3 to k6 of OpenCV
         lines += ['', 'undistortion', *map(number_text, padded)]
     return '\n'.join(lines) + '\n'
 
@@ -162,15 +159,13 @@ MAYACAM2 = Format(
 # along -z, y upwards. The unit is that of the calibration object, and the file does not say it.
 
 _MAYACAM1 = '_MayaCam.csv'
-_DEFAULT_SIZE = 1024
-_ROWS_MAYACAM1 = 5  # numbers of three columns each
 
 
 def _read_mayacam1(path: Path, settings: FileSettings) -> Content:
     """Read a camera, which is called like the file. Raises DataError that names the row."""
     rows = read_table(path)
-    if len(rows) != _ROWS_MAYACAM1:
-        raise DataError(f'{path}: {len(rows)} rows, but MayaCam 1.0 has {_ROWS_MAYACAM1}')
+    if len(rows) != 5:
+        raise DataError(f'{path}: {len(rows)} rows, but MayaCam 1.0 has 5')
     require_width(rows, 3, 'MayaCam 1.0')
     position, angles, _, (u0, v0, z), (_, width, height) = (row.numbers() for row in rows)
     size = (_pixels(rows[4], width), _pixels(rows[4], height))
@@ -192,14 +187,14 @@ def _read_mayacam1(path: Path, settings: FileSettings) -> Content:
 def _pixels(row: Row, value: float) -> int:
     if value < 0 or value != int(value):
         row.fail(f'{value:g} px is not a side of an image')
-    return int(value) or _DEFAULT_SIZE
+    return int(value) or 1024
 
 
 MAYACAM1 = Format(
     'mayacam1',
     'MayaCam 1.0',
     parts=('cameras',),
-    recognise=lambda sample: are_numbers(sample.lines, _ROWS_MAYACAM1, 3),
+    recognise=lambda sample: are_numbers(sample.lines, 5, 3),
     read=_read_mayacam1,
     write=None,
     says_units=False,
@@ -215,8 +210,6 @@ MAYACAM1 = Format(
 # camera, if y is taken as upwards. The unit is that of the calibration object, and the file does
 # not say it.
 
-_ROWS_DLT = 11  # coefficients of the direct linear transformation
-
 
 def _read_dlt(path: Path, settings: FileSettings) -> Content:
     """Read the cameras, which are called cam1, cam2, ... unless settings name them.
@@ -224,10 +217,8 @@ def _read_dlt(path: Path, settings: FileSettings) -> Content:
     Raises DataError, also without the image size.
     """
     rows = read_table(path)
-    if len(rows) != _ROWS_DLT:
-        raise DataError(
-            f'{path}: {len(rows)} rows, but there are {_ROWS_DLT} coefficients of a DLT'
-        )
+    if len(rows) != 11:
+        raise DataError(f'{path}: {len(rows)} rows, but there are 11 coefficients of a DLT')
     require_width(rows, len(rows[0].cells), 'the first row')
     size = settings.image_size_of(path)
     mm = settings.unit_read(path)
@@ -290,7 +281,7 @@ def _write_dlt(path: Path, content: Content, settings: FileSettings) -> Written:
                 f'{path}: the origin lies in the plane of the source of {camera.name}, a DLT with '
                 'eleven coefficients does not exist'
             )
-        columns.append((projection / projection[2, 3]).ravel()[:_ROWS_DLT])
+        columns.append((projection / projection[2, 3]).ravel()[:-1])
     write_text(path, '\n'.join(map(joined, np.array(columns).T)) + '\n')
     order = ', '.join(camera.name for camera in content.cameras)
     return Written((str(path),), (*notes, f'{path}: the columns are {order}'))
@@ -300,7 +291,7 @@ DLT = Format(
     'dlt',
     'DLT coefficients',
     parts=('cameras',),
-    recognise=lambda sample: are_numbers(sample.lines, _ROWS_DLT),
+    recognise=lambda sample: are_numbers(sample.lines, 11),
     read=_read_dlt,
     write=_write_dlt,
     says_units=False,

@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 
 from ...errors import DataError
 from ...exposures.frame import Frame, points_on_image
+from ...limits import MAX_ROWS
 from ..access import atomic_file
 from ..csv_table import as_text
 from .content import Content, FileSettings, Format, Written
 from .tables import (
-    MAX_FRAMES,
     Row,
     default_name,
     frame_numbers,
@@ -159,10 +159,8 @@ def write(path: Path, content: Content, settings: FileSettings) -> Written:
     ids = sorted({int(i) for of in frames.values() for f in of.values() for i in f.target_id})
     labels = [named.get(i, default_name(i)) for i in ids]
     shift = int(numbers[0] == 0)
-    if numbers[-1] + shift > MAX_FRAMES:
-        raise DataError(
-            f'{path}: frame {numbers[-1]} would need as many rows, at most {MAX_FRAMES}'
-        )
+    if numbers[-1] + shift > MAX_ROWS:
+        raise DataError(f'{path}: frame {numbers[-1]} would need as many rows, at most {MAX_ROWS}')
     with atomic_file(path, 'w') as file:
         file.write(
             ','.join(

@@ -35,10 +35,6 @@ from .content import Camera, Content, FileSettings, Format, Station, check_matri
 from .phantoms import content_of
 from .tables import Row, default_name, frame_of, named_targets, table_of
 
-_SEEN = 0  # a marker is seen where its status is above
-_INLIER = 1  # flag of a grid point that is used
-NO_POINT = -1.0  # coordinates of a grid point that was not found
-
 
 def read(path: Path, settings: FileSettings) -> Content:
     """Read the wanted parts of a project. Raises DataError."""
@@ -208,7 +204,7 @@ class _Observations(_Part):
                 f'{self._path}, {file}: {len(uv)} points and {len(inlier)} inliers, but the '
                 f'calibration object has {count} beads'
             )
-        used = (inlier[:, 0] == _INLIER) & ~(uv == NO_POINT).all(axis=1)
+        used = (inlier[:, 0] == 1) & ~(uv == -1).all(axis=1)  # -1, -1 where it was not found
         points = (self._bead_ids(count)[used], uv[used])
         return frame_of(f'{self._path}, {file}', name, number, *points, size)
 
@@ -244,7 +240,7 @@ class _Observations(_Part):
                     f'columns, but there are {count} cameras'
                 )
             uv = uv.reshape(len(uv), count, 2)
-            tables.append(np.where((status > _SEEN)[..., None], uv, np.nan))
+            tables.append(np.where((status > 0)[..., None], uv, np.nan))  # 0: not seen
         if len({len(table) for table in tables}) > 1:
             raise DataError(f'{self._path}: the markers of the trial have different frames')
         target_id = np.array([ids[name] for name in labels], dtype=np.int64)
@@ -342,7 +338,7 @@ class _Calibration(_Part):
                     f'{self._path}: the undistortion grid of {label} has {len(observed)}, '
                     f'{len(reference)} and {len(inlier)} points'
                 )
-            used = inlier[:, 0] == _INLIER
+            used = inlier[:, 0] == 1
             yield name, np.hstack([observed, reference])[used]
 
 

@@ -29,13 +29,11 @@ from ..messages.image import ImageConverter
 from ..messages.rig_orientation import orientation_from_message
 from ..runtime.diagnostics import Refused
 from ..runtime.streams import remember
-from ..runtime.topics import adapted_qos
+from ..runtime.topics import OBSERVATION_DEPTH, adapted_qos
 
 IDLE_S = 10.0  # after which a topic that nobody looks at is no longer subscribed
 LARGEST_PX = 768  # of a radiograph that is shown
 KEPT = 16  # radiographs that wait for their image points, which come later
-WAITING = 100  # image points that wait to be taken: three seconds at 30 Hz
-METRE_MM = 1000.0
 
 
 @dataclass
@@ -89,9 +87,10 @@ class Scene:
         """
         film = self._films.setdefault(name, _Film(ImageConverter(name)))
         has_images = self._take_image(name, film)
-        depth = WAITING if has_images else 1
+        depth = OBSERVATION_DEPTH if has_images else 1  # three seconds at 30 Hz
         for message in self._taken(f'{name}/target_observations', TargetObservations, depth):
-            remember(film.points, nanoseconds_from_stamp(message.header.stamp), message, WAITING)
+            stamp_ns = nanoseconds_from_stamp(message.header.stamp)
+            remember(film.points, stamp_ns, message, OBSERVATION_DEPTH)
             film.found_at = time.monotonic()
         if has_images and film.images:
             stamp = _shown(film)
@@ -156,7 +155,7 @@ class Scene:
                 out['sources'] = _sources(orientation_from_message(orientation))
         points = self._last('reconstruction/points_with_covariance', ReconstructedPoints)
         if points is not None:
-            xyz = METRE_MM * np.column_stack([points.x, points.y, points.z])
+            xyz = 1000 * np.column_stack([points.x, points.y, points.z])
             seen = np.atleast_1d(np.isfinite(xyz).all(axis=1))
             rows = zip(points.target_id, xyz.round(3).tolist(), points.status, seen.tolist())
             out['frame'] = points.frame_number

@@ -36,7 +36,6 @@ CONFIRMATIONS = {
     'roll_back_healing': 'press b again to return to the rig before it was healed',
 }
 BAR = 20  # characters of the coverage bar
-LOG_LINES = 6  # that are shown
 
 
 def session_text(state: SessionState) -> Group:
@@ -220,7 +219,7 @@ class Dashboard(App[None]):
         if self._note and time.monotonic() > self._confirm_until:
             self._note = ''
         lines = [*state.log, *([self._note] if self._note else [])]
-        self._update('#log', Text('\n'.join(map(plain, lines[-LOG_LINES:]))))
+        self._update('#log', Text('\n'.join(map(plain, lines[-6:]))))
 
     def _update(self, selector: str, content: RenderableType) -> None:
         """Update a widget; while the application ends, it may be gone before the timer is."""

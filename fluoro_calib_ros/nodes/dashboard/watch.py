@@ -59,8 +59,6 @@ NODES = (
 )
 SILENT_S = 5.0  # a node reports once a second
 ANSWER_S = 10.0  # capture and orient wait for 5 s unless the parameter capture_timeout says more
-ORIENT_FRAMES = 10  # captured by the key o
-LOG_LINES = 50  # that are kept
 STATES = {
     CalibrationStatus.COLLECTING: 'collecting',
     CalibrationStatus.CALIBRATING: 'calibrating',
@@ -83,7 +81,7 @@ class SessionClient(Node):
         self._functions: dict[str, dict[str, NodeState]] = {}  # by node, then by function
         self._heard_at: dict[str, float] = {}
         self._meters: dict[tuple[str, str], RateMeter] = {}
-        self._log: deque[str] = deque(maxlen=LOG_LINES)
+        self._log: deque[str] = deque(maxlen=50)
         self._session = SessionState(self.get_namespace())
         self._points_at: tuple[int, float] | None = None  # exposures reconstructed, and since when
         self._settings = AsyncParameterClient(self, 'calibration_node')
@@ -142,7 +140,7 @@ class SessionClient(Node):
             return
         requests = {
             CAPTURE: Capture.Request,
-            ORIENT: lambda: Orient.Request(frames=ORIENT_FRAMES),
+            ORIENT: lambda: Orient.Request(frames=10),
         }
         self._say(f'{action.replace("_", " ")} ...')
         future = client.call_async(requests.get(action, Reset.Request)())
@@ -328,9 +326,6 @@ def _until_shutdown(spin: Callable[[], None]) -> Callable[[], None]:
     return run
 
 
-FIRST_REPORT_S = 5.0  # nodes report once a second, and have to be discovered first
-
-
 def main(args: Sequence[str] | None = None) -> None:
     """Show the session in the terminal or a browser until it is ended; with --once, print it."""
     parser = argparse.ArgumentParser('fluoro-calib watch')
@@ -366,7 +361,7 @@ def _print(client: SessionClient) -> None:
 
     from .terminal import session_text
 
-    end = time.monotonic() + FIRST_REPORT_S
+    end = time.monotonic() + SILENT_S
     while time.monotonic() < end:
         time.sleep(0.1)
     state = client.state()
@@ -374,5 +369,5 @@ def _print(client: SessionClient) -> None:
     if not state.nodes:
         sys.exit(
             f'fluoro-calib watch: no node has reported in the namespace {state.namespace} within '
-            f'{FIRST_REPORT_S:g} s'
+            f'{SILENT_S:g} s'
         )

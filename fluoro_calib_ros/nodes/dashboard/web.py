@@ -49,7 +49,6 @@ REPORT_POLICY = (
     "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline'; "
     "style-src 'unsafe-inline'; img-src data:"
 )
-MAX_BODY = 1000  # bytes of a request
 REFUSAL = 'open the address that fluoro-calib watch has printed, with its token'
 
 
@@ -291,7 +290,8 @@ async def run_server(
         token=options.token or secrets.token_urlsafe(16),
     )
     server = HTTPServer(
-        application(Desk(session, scene, options, residuals={})), max_body_size=MAX_BODY
+        application(Desk(session, scene, options, residuals={})),
+        max_body_size=1000,  # bytes: a request names an action
     )
     server.add_sockets(sockets)
     started(f'http://{options.host}:{options.port}/?token={options.token}')

@@ -120,9 +120,6 @@ def message_from_calibration(
     return message
 
 
-SAME_PX = 1e-6  # rounding; both are copies of one calibration
-
-
 def calibration_from_message(
     message: FluoroscopeCalibration,
 ) -> calibration_result.FluoroscopeCalibration:
@@ -193,7 +190,7 @@ def image_size_of(
             'another camera'
         )
     k = message.k[[2, 5, 0]]  # row by row: c, 0, xp, 0, c, yp, 0, 0, 1
-    if interior is not None and not np.allclose(k, interior, rtol=0, atol=SAME_PX):
+    if interior is not None and not np.allclose(k, interior, rtol=0, atol=1e-6):  # rounding
         raise DataError(
             f'topic {topic}: the camera_info of {message.width} x {message.height} px has the '
             f'principal distance {k[2]:g} px, the orientation {np.asarray(interior)[2]:g} px: it '

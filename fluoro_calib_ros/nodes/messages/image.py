@@ -16,7 +16,7 @@ from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Header
 
 from ...correction.fluoroscope_calibration import FluoroscopeCalibration
-from ...errors import DataError
+from ...errors import DataError, quoted
 from ...findings import Kind
 from ...images.codec import decode, encode
 from ..runtime.diagnostics import TOO_LARGE, Refused
@@ -95,9 +95,8 @@ class ImageConverter:
     def _view(self, message: Image) -> np.ndarray:
         pixel_type = PIXEL_TYPES.get(message.encoding)
         if pixel_type is None:
-            raise self.refusal(
-                'encoding', message, f'its encoding {message.encoding!r} is not mono8 or mono16'
-            )
+            cause = f'its encoding {quoted(message.encoding)} is not mono8 or mono16'
+            raise self.refusal('encoding', message, cause)
         dtype = np.dtype(pixel_type)
         width = message.width
         height = message.height

@@ -39,7 +39,6 @@ UINT32 = Struct('<I')
 TWO_UINT32 = Struct('<II')
 TIME = Struct('<iI')
 _HEADER = Struct('<iII')  # seconds, nanoseconds, length of the frame id
-_EMPTY = np.zeros(0)
 TRUNCATED = 'the message is shorter than it says'
 
 
@@ -73,7 +72,7 @@ def read_float64_sequence(data: bytes, start: int) -> tuple[NDArray[np.float64],
     (count,) = UINT32.unpack_from(data, start)
     start += 4
     if not count:
-        return _EMPTY, start
+        return np.zeros(0), start
     start += (4 - start) % 8
     end = start + 8 * count
     if end > len(data):

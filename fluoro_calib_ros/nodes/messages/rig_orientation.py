@@ -16,15 +16,12 @@ from ...exposures.stamps import nanoseconds_from_stamp
 from ...limits import read_limits
 from ...photogrammetry import rig_orientation as rig
 from ...photogrammetry.rotations import (
+    ROTATION_TOLERANCE,
     matrix_from_quaternion,
     quaternion_from_matrix,
     vector_from_matrix,
 )
 from .observations import float64_field, stamp_from_nanoseconds
-
-# Of an orientation that goes through a message and back.
-ROUNDING_MM = 1e-6
-ROUNDING_RAD = 1e-7
 
 # Static transforms of the optical frames of a rig.
 
@@ -121,8 +118,6 @@ def _transform(message: RigOrientation, parent: str, child: str) -> TransformSta
 _INTERIOR = ('xp', 'yp', 'c')
 _POSITION = ('x', 'y', 'z')
 _ATTITUDE = ('qw', 'qx', 'qy', 'qz')
-MAX_NUMBER = 1e30  # of any array: far beyond a rig, and far from overflow
-MIN_QUATERNION_NORM = 0.5  # below, a quaternion is damaged and not only rounded
 
 
 def message_from_orientation(orientation: rig.RigOrientation) -> RigOrientation:
@@ -182,16 +177,16 @@ def content_of_orientation(message: RigOrientation) -> rig.RigOrientation:
             f'rig orientation: {count} fluoroscopes, but the array {wrong[0]} has another length'
         )
     for name, column in (*columns.items(), ('covariance', np.array(message.covariance))):
-        if not (np.abs(column) <= MAX_NUMBER).all():
+        if not (np.abs(column) <= rig.MAX_VALUE).all():
             raise DataError(
                 f'rig orientation: the array {name} holds a number that is not finite or beyond '
-                f'{MAX_NUMBER:g}'
+                f'{rig.MAX_VALUE:g}'
             )
     scale = _metre_scale(count)
     covariance = np.array(message.covariance).reshape(len(scale), -1) / (scale * scale[:, None])
     attitude = np.stack([columns[name] for name in _ATTITUDE], axis=1)
     norm = np.linalg.norm(attitude, axis=1)
-    if not (norm > MIN_QUATERNION_NORM).all():
+    if not (np.abs(norm - 1) <= ROTATION_TOLERANCE).all():
         raise DataError('rig orientation: an attitude is not a unit quaternion')
     return rig.RigOrientation(
         fluoroscopes=tuple(message.fluoroscope),
@@ -231,7 +226,7 @@ def _moved_by(before: rig.RigOrientation, after: rig.RigOrientation, name: str) 
     old, f = before.index(name), after.index(name)
     shift = np.linalg.norm(after.position_mm[f] - before.position_mm[old])
     turn = np.linalg.norm(vector_from_matrix(after.rotation[f] @ before.rotation[old].T))
-    if not (shift > ROUNDING_MM or turn > ROUNDING_RAD):
+    if shift < 1e-6 and turn < 1e-7:  # what a message and back leaves of an orientation
         return ''
     return f'{shift:.2f} mm and {np.degrees(turn):.3f} degrees'
 

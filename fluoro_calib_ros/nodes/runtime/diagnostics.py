@@ -118,8 +118,6 @@ class RateLimitedLogger:
 
 # Messages that a node refuses: counted by kind, logged, and shown in the diagnostics.
 
-# Names in a message may have any length, and error messages go into log and diagnostics.
-MAX_LENGTH = 500
 TOO_LARGE = 'too large'
 # Parameters that limit the bytes of a message, by the item in it.
 _LIMITS = {'frame': 'max_points', 'image': 'max_image_megapixels'}
@@ -129,7 +127,7 @@ class Refused(DataError):
     """Reason why a message is refused, and its kind, by which refusals are counted."""
 
     def __init__(self, kind: str, message: str) -> None:
-        super().__init__(message if len(message) <= MAX_LENGTH else f'{message[:MAX_LENGTH]}...')
+        super().__init__(message)
         self.kind = kind
 
 

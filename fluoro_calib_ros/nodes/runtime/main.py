@@ -37,7 +37,6 @@ from .parameters import parameters_of, settable_parameters, unknown_parameters
 from .services import guard_services
 
 MAX_FAILURES = 100  # of callbacks within a second: nothing else works
-INTERRUPTED = 130  # exit status after a second interrupt
 # Time in which further signals belong to the first one: launch and service managers signal a group
 # of processes and each of them, with SIGINT and SIGTERM.
 ONE_INTERRUPT_S = 1.0
@@ -191,7 +190,7 @@ def _call_on_interrupt(end: Callable[[], None], patience_s: Callable[[], float])
             os.read(reading, 1000)
         patience = patience_s()
         if select.select([reading], [], [], patience - ONE_INTERRUPT_S)[0]:
-            os._exit(INTERRUPTED)
+            os._exit(128 + signal.SIGINT)  # as shells tell what ended by a signal
         rclpy.logging.get_logger('fluoro_calib').fatal(
             f'ended by force: the work in hand takes longer than {patience:g} s'
         )

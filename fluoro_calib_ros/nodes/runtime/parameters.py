@@ -35,7 +35,7 @@ from ...options import Option, declared, option
 from .diagnostics import PrintableLogger, StartError
 
 MAX_TIMEOUT_S = 86400.0  # longest time that a request may ask a node to wait
-MAX_INTEGER = 2**63 - 1
+MAX_INTEGER = 2**63 - 1  # of a parameter of ROS
 # A fluoroscope's name is part of file names and topics.
 FLUOROSCOPE_NAME = re.compile('[A-Za-z_][A-Za-z0-9_]{0,99}')
 

@@ -41,18 +41,27 @@ from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 
 from ...limits import read_limits
-from .topics import incompatible_qos_message, needs_best_effort, qos_overrides
+from .topics import (
+    OBSERVATION_DEPTH,
+    incompatible_qos_message,
+    needs_best_effort,
+    qos_overrides,
+)
 
 WAIT_NS = 50_000_000  # after which the thread checks whether it has to end
 # Messages of a topic that are handled before the next topic has its turn: views wait for each
 # other.
 MAX_BATCH = 8
-MAX_FIRST = 100  # messages of a topic that comes first that are handled at once
 # What decoding a damaged message raises, in our decoders and in those of the middleware.
 DECODING_ERRORS = (ValueError, RCLError, RuntimeError, MemoryError)
 
 
-def remember(table: OrderedDict[Any, Any], key: object, value: object, most: int) -> None:
+REMEMBERED = 1000  # exposures, by what may come later of them
+
+
+def remember(
+    table: OrderedDict[Any, Any], key: object, value: object, most: int = REMEMBERED
+) -> None:
     """Keep a value by its key; of more than that many, the oldest is forgotten."""
     table[key] = value
     if len(table) > most:
@@ -320,7 +329,7 @@ class StreamReader:
                 return
             for other in first:
                 if other is not route:
-                    self._drain(other, [], MAX_FIRST)
+                    self._drain(other, [], OBSERVATION_DEPTH)  # all that can wait
             self._count_overrun(route, received[1]['publication_sequence_number'])
             self._handle(route, *received)
 

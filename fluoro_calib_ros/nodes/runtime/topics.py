@@ -40,6 +40,7 @@ from ...io.bags.metadata import Definition, fields_of, known_definition, with_de
 # Time in which readers discover a publisher that has discovered them, several times the measured
 # one.
 SETTLING_S = 0.3
+DISCOVERY_S = 0.1  # period in which new topics are looked for
 
 
 def wait_for_readers(

@@ -49,12 +49,16 @@ def square_of_lower(factor: NDArray[np.float64]) -> NDArray[np.float64]:
 
 # Of R^T R from the unit matrix, in files: three decimals of a direction leave half a thousandth.
 ROTATION_TOLERANCE = 1e-3
+# The same where a matrix is taken as it is: single precision, and programs that compute in it.
+TAKEN_TOLERANCE = 1e-4
 
 
-def is_rotation(matrix: NDArray[np.float64]) -> NDArray[np.bool_]:
+def is_rotation(
+    matrix: NDArray[np.float64], tolerance: float = ROTATION_TOLERANCE
+) -> NDArray[np.bool_]:
     """True (...) where matrices (..., 3, 3) are rotations, but for the few digits of a file."""
     error = np.abs(matrix @ np.swapaxes(matrix, -1, -2) - np.eye(3)).max(axis=(-1, -2))
-    return (error <= ROTATION_TOLERANCE) & (np.linalg.det(matrix) > 0)
+    return (error <= tolerance) & (np.linalg.det(matrix) > 0)
 
 
 def nearest_rotation(matrix: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -31,6 +31,7 @@ from ...errors import DataError
 from ...exposures.phantom import first_repeated
 from ...photogrammetry.rotations import (
     ROTATION_TOLERANCE,
+    TAKEN_TOLERANCE,
     is_rotation,
     matrix_from_quaternion,
     quaternion_from_matrix,
@@ -111,7 +112,7 @@ def _check(row: Row, matrices: NDArray[np.float64], names: list[str]) -> None:
     for name, matrix in zip(names, matrices):
         if np.isnan(matrix).any():
             continue
-        if not is_rotation(matrix[:3, :3]):
+        if not is_rotation(matrix[:3, :3], TAKEN_TOLERANCE):
             row.fail(f'the matrix of {name} is not a rotation')
         if (matrix[3] != [0, 0, 0, 1]).any():
             row.fail(f'the columns 01, 02, 03 and 1 of {name} are not 0, 0, 0 and 1')

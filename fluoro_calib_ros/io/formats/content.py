@@ -20,7 +20,7 @@ from ...errors import DataError
 from ...exposures.frame import Frames
 from ...exposures.names import Names
 from ...exposures.phantom import Phantom
-from ...photogrammetry.rotations import is_rotation
+from ...photogrammetry.rotations import TAKEN_TOLERANCE, is_rotation
 from ..access import PathLike, check_safe_name, make_folder, write_text
 
 # Camera axes x right, y up, z backwards -> x right, y down, z forwards.
@@ -354,9 +354,9 @@ def name_of_file(path: Path, ending: str) -> str:
 
 def check_rotation(where: object, rotation: NDArray[np.float64]) -> None:
     """Raise DataError for a matrix (3, 3) that is not a rotation."""
-    if is_rotation(-rotation):
+    if is_rotation(-rotation, TAKEN_TOLERANCE):
         raise DataError(f'{where}: the matrix is not a rotation, it mirrors')
-    if not is_rotation(rotation):
+    if not is_rotation(rotation, TAKEN_TOLERANCE):
         raise DataError(f'{where}: the matrix is not a rotation, its rows are not orthonormal')
 
 

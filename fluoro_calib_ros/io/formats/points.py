@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import DataError
-from ...photogrammetry.rotations import is_rotation
+from ...photogrammetry.rotations import TAKEN_TOLERANCE, is_rotation
 from ..access import atomic_file, read_bytes, read_text, write_bytes
 from ..csv_table import as_text
 from .content import (
@@ -131,7 +131,7 @@ def _bodies(path: Path, arrays: dict[str, np.ndarray], settings: FileSettings) -
     translation = matrices[..., :3, 3] * mm
     missing = np.isnan(matrices).any(axis=(2, 3))
     turn = np.where(missing[..., None, None], np.eye(3), rotation)
-    wrong = ~is_rotation(turn)
+    wrong = ~is_rotation(turn, TAKEN_TOLERANCE)
     first = int(arrays['first'])
     if wrong.any():
         row, column = np.argwhere(wrong)[0]

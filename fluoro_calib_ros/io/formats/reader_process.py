@@ -29,9 +29,10 @@ from ...processes import run_module, watch_parent
 from .pandas_hdf5 import is_pandas, table_arrays, texts
 
 HDF5 = b'\x89HDF\r\n\x1a\n'  # with which a file begins
-# Bytes of address space: for the program, and for each byte of the file.
+# Bytes of address space: for the program, for each byte of the file, and at most.
 BASE_MEMORY = 3 * 2**30
 MEMORY_OF_BYTE = 100
+MAX_MEMORY = 8 * 2**30
 
 
 def labels_of(parameters: Any) -> list[str]:
@@ -144,7 +145,7 @@ def main() -> None:
         import resource
 
         size = os.path.getsize(sys.argv[2])
-        memory = BASE_MEMORY + MEMORY_OF_BYTE * size
+        memory = min(BASE_MEMORY + MEMORY_OF_BYTE * size, MAX_MEMORY)
         resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
     try:
         arrays = READERS[sys.argv[1]](sys.argv[2])

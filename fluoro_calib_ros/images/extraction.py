@@ -11,6 +11,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.special import chndtr
 from threadpoolctl import ThreadpoolController
 
 from ..errors import DataError
@@ -23,8 +24,11 @@ from .measurement import FIRST_STEPS, STEPS, Expected, Imaging, first_imaging, m
 from .shadow_fit import MAX_SIGMA_PX, Beads
 from .view import Lens, View, fit_view
 
-# Of a bead of which one in a thousand is half a pixel off (Rayleigh's distribution).
-SURE_SIGMA_PX = 0.5 / np.sqrt(2 * np.log(1000))
+# Of beads with the largest standard deviation, one in a thousand is wrong: half a pixel off
+# (Rayleigh's distribution).
+WRONG_SHARE = 1e-3
+WRONG_SIGMAS = np.sqrt(-2 * np.log(WRONG_SHARE))
+SURE_SIGMA_PX = 0.5 / WRONG_SIGMAS
 MAX_SIGMAS = 2.9  # times that of a usual bead of the image: an eighth of its weight
 MAX_MISFIT = 5.0
 DEPTH = (0.55, 1.7)  # of the shadow of a bead, 1 for what is usual in such light
@@ -255,16 +259,22 @@ def _checked(
     predicted = measured.predicted[measured.rows]
     residual = np.linalg.norm(beads.uv - predicted, axis=1)
     good = np.array([reason is None for reason in reasons], dtype=bool)
-    limit = RESIDUAL_SIGMAS * np.hypot(np.maximum(measured.sd_px, MIN_SCATTER_PX), beads.sigma)
-    far = good & ~(residual < limit)
+    scatter = np.maximum(measured.sd_px, MIN_SCATTER_PX)
+    far = good & ~(residual < RESIDUAL_SIGMAS * np.hypot(scatter, beads.sigma))
+    usual = float(np.median(beads.sigma[good & ~far]))
+    largest = max(SURE_SIGMA_PX, MAX_SIGMAS * usual)
+    vague = good & ~far & (beads.sigma > largest)
+    sure = np.flatnonzero(good & ~far & ~vague)
+    wrong = _chances_of_wrong(
+        residual[sure], beads.sigma[sure], scatter[sure], wrong_px=WRONG_SIGMAS * largest
+    )
+    far[sure] = wrong > WRONG_SHARE
     for number in np.flatnonzero(far):
         cause = f'{residual[number]:.2f} px from where its neighbours say'
         reasons[number] = Finding(
             Kind.BEAD_AWAY, cause, numbers={'off_px': float(residual[number])}
         )
     good &= ~far
-    usual = float(np.median(beads.sigma[good]))
-    vague = good & (beads.sigma > max(SURE_SIGMA_PX, MAX_SIGMAS * usual))
     for number in np.flatnonzero(vague):
         cause = f'sigma {beads.sigma[number]:.2f} px, that of most is {usual:.2f} px'
         reasons[number] = Finding(
@@ -287,6 +297,24 @@ def _checked(
         match=found,
         imaging=imaging,
     )
+
+
+def _chances_of_wrong(
+    residual: NDArray[np.float64],
+    sigma: NDArray[np.float64],
+    scatter: NDArray[np.float64],
+    wrong_px: float,
+) -> NDArray[np.float64]:
+    """Chances (n,) that centres are off by more than wrong_px, given what their neighbours say.
+
+    residual: (n,) distances from the predictions; sigma, scatter: (n,) standard deviations of
+    coordinates of centres and of predictions. Given its residual, an error is normal about the
+    share of it that is not the prediction's.
+    """
+    total = sigma**2 + scatter**2
+    mean = residual * sigma**2 / total
+    variance = sigma**2 * scatter**2 / total
+    return 1 - chndtr(wrong_px**2 / variance, 2, mean**2 / variance)
 
 
 def _with_support(

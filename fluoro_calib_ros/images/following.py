@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from ..errors import DataError
 from ..photogrammetry.rotations import matrix_from_vector, rotation_angle, vector_from_matrix
 from .growth import Match, Seen, grow, settle, start_view
-from .matching import LEVELS, MIN_BEADS, PhantomModel, is_evident, seeds_of, unambiguous
+from .matching import MIN_BEADS, NEIGHBOURS, PhantomModel, is_evident, seeds_of, unambiguous
 from .pose_search import LocalPose, local_poses, nearby_map
 from .view import View
 
@@ -130,13 +130,12 @@ def _farther(seen: Seen, model: PhantomModel, near: View) -> Iterator[Match | No
     beads[~seen.field] = 2
     scale = near.principal_distance_px / float(np.median(near.depth(model.xyz[seen_before])))
     scales = (FAR_SCALES[0] * scale, FAR_SCALES[1] * scale)
-    neighbours = LEVELS[0][1]
     reach = FAR_REACH * max(seen.field.shape)
     for seed in seeds_of(seen)[:FAR_SEEDS]:
         with np.errstate(invalid='ignore'):
             close = np.linalg.norm(predicted - seen.uv[seed], axis=1) < reach
-        triples = model.triples(LEVELS[0][0]).of_beads(close)
-        poses = local_poses(seed, seen.uv, neighbours, triples, beads, scales=scales)
+        triples = model.triples.of_beads(close)
+        poses = local_poses(seed, seen.uv, NEIGHBOURS[1], triples, beads, scales=scales)
         turned = [_turned(pose, near, model.xyz) for pose in poses]
         started = [(pose, view) for pose, view in zip(poses, turned) if view is not None]
         for pose, view in started[:FAR_POSES]:

@@ -45,21 +45,17 @@ SURE = ((0.85, MIN_EXPLAINED), (0.75, 0.95))
 # beads. What is missed by chance is less.
 MARGIN = 0.06
 MARGIN_BEADS = 8
-# Levels of the search: neighbours of a bead in the phantom, in the image, beads tried (from, to),
-# and limits of the scale by the extent of what is seen. The first finds most poses, the second and
-# third find those that see all faces of a phantom from the edge. The others find a phantom with
-# other things around it, and a small part of a phantom. Beads are tried until a right pose would
-# have been found (pose_search.py); the third is for phantoms with which so many are not enough.
+NEIGHBOURS = (8, 6)  # of a bead in the phantom and in the image, which make triples with it
+# Levels of the search: beads tried (from, to), and limits of the scale by the extent of what is
+# seen. The first finds most poses, the second those that see all faces of a phantom from the edge.
+# The others find a phantom with other things around it, and a small part of a phantom. Beads are
+# tried until a right pose would have been found (pose_search.py).
 LEVELS = (
-    (8, 6, (0, 8), (0.85, 1.4)),
-    (8, 6, (8, 80), (0.85, 1.4)),
-    (14, 8, (0, 12), (0.85, 1.4)),
-    (8, 6, (0, 24), (0.6, 0.85)),
-    (8, 6, (0, 6), (1.4, 3.0)),
+    ((0, 8), (0.85, 1.4)),
+    ((8, 80), (0.85, 1.4)),
+    ((0, 24), (0.6, 0.85)),
+    ((0, 6), (1.4, 3.0)),
 )
-# Beads of a phantom from which the search is ended by evidence. With fewer, the whole search takes
-# 2 s, and one of 20 images of large beads that overlap was lost where it ended.
-MANY = 160
 FITTED = 12  # ways to lay a grid over what was found that are refined, where they fit
 APART = 0.6  # share of the beads, those farthest from their neighbours, that are tried next
 AGREED = 3  # matches of the same pose after which the search ends, if it is evident
@@ -138,14 +134,9 @@ class PhantomModel:
         return diameter is not None and np.ptp(diameter) >= MIN_SIZES * diameter.min()
 
     @cached_property
-    def _triples(self) -> dict[int, Triples]:
-        return {}
-
-    def triples(self, neighbours: int) -> Triples:
-        """Return the triples of beads with so many neighbours, made when they are first needed."""
-        if neighbours not in self._triples:
-            self._triples[neighbours] = triples_of(self.xyz, neighbours)
-        return self._triples[neighbours]
+    def triples(self) -> Triples:
+        """Triples of beads, made when they are first needed."""
+        return triples_of(self.xyz, NEIGHBOURS[0])
 
 
 def match(seen: Seen, model: PhantomModel, lens: Lens) -> Match:
@@ -394,28 +385,19 @@ def _candidates(seen: Seen, model: PhantomModel, lens: Lens) -> Iterator[Match]:
     beads[~seen.field] = 2
     order = seeds_of(seen)
     enough = len(order)
-    for wide, neighbours, (first, last), limits in LEVELS:
+    for (first, last), limits in LEVELS:
         scales = _scales(seen, model, limits)
         if first == CENTRAL:
-            enough = _enough(seen, model)
-        elif wide > LEVELS[0][0] and enough < LEVELS[1][2][1]:
-            # Fewer neighbours were enough.
-            continue
-        triples = model.triples(wide)
+            radius_mm = seen.radius_px / _scale_by_extent(seen, model)
+            enough = enough_seeds(model.xyz, len(seen.uv), radius_mm, NEIGHBOURS)
         for seed in order[first : min(last, enough)]:
-            for pose in local_poses(seed, seen.uv, neighbours, triples, beads, scales=scales):
+            for pose in local_poses(
+                seed, seen.uv, NEIGHBOURS[1], model.triples, beads, scales=scales
+            ):
                 view = start_view(pose, lens, model.xyz)
                 found = grow(view, pose.bead, model.xyz, seen)
                 if found is not None:
                     yield found
-
-
-def _enough(seen: Seen, model: PhantomModel) -> int:
-    """From how many beads the search for the phantom, in view as a whole, is long enough."""
-    if len(model.xyz) < MANY:
-        return len(seen.uv)
-    radius_mm = seen.radius_px / _scale_by_extent(seen, model)
-    return enough_seeds(model.xyz, len(seen.uv), radius_mm, LEVELS[0][:2])
 
 
 def seeds_of(seen: Seen) -> NDArray[np.int64]:

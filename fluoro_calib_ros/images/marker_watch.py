@@ -125,7 +125,8 @@ class MarkerWatch:
         if not len(found.free) or not len(rows):
             return ()
         variance = motion.variance[rows] + SHADOW_SD_PX**2
-        own = ((motion.uv[rows] - found.uv[rows]) ** 2).sum(axis=1) / variance
+        # As they were found: a fit moves on to where the shadow of something else fits best.
+        own = ((motion.uv[rows] - found.shadow[rows]) ** 2).sum(axis=1) / variance
         away = motion.uv[rows][:, None] - found.free[None]
         other = (away**2).sum(axis=2) / variance[:, None]
         out = []

@@ -465,10 +465,11 @@ def test_states_of_markers_are_exchanged_and_taken_in_together():
     found = MeasuredMarkers(
         measured,
         states.motion.uv + 1,
-        np.full(12, 0.2),
-        np.full(12, 4.0),
-        overlapped,
-        np.zeros((0, 2)),
+        states.motion.uv + 1,
+        sigma=np.full(12, 0.2),
+        depth=np.full(12, 4.0),
+        overlapped=overlapped,
+        free=np.zeros((0, 2)),
     )
     states.advance(1, None)
     states.update(found, 1)

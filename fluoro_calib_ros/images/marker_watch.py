@@ -271,7 +271,8 @@ def shift_together(states: MarkerStates, found: Shadows, gate: float, frames: in
     before = motion.uv.copy()
     for row in np.flatnonzero(wide).tolist():
         beside = np.argsort(np.linalg.norm(before - before[row], axis=1), kind='stable')
-        beside = beside[(beside != row) & wide[beside]][:LEADERS]
+        # Where two bones overlap, half of the nearest are of the other one.
+        beside = beside[(beside != row) & wide[beside]][: 2 * LEADERS]
         if not len(beside):
             continue
         reach = gate * float(np.sqrt(motion.variance[row]))

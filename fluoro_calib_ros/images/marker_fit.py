@@ -317,7 +317,7 @@ class MarkerMeasurement:
         depth = states.depth.copy()
         depth[tried] = beads.depth
         return MeasuredMarkers(
-            measured, uv, sigma=sigma, depth=depth, overlapped=overlapped, free=free
+            measured, uv, start, sigma=sigma, depth=depth, overlapped=overlapped, free=free
         )
 
     def _assign(

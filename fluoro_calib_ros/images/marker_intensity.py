@@ -232,7 +232,7 @@ def _learn_look(
         lights: Sequence[FilteredLight] = image.of_scale(scale)
         if best is not None and best.clear:  # dark or bright
             lights = lights[int(best.light.inverted) :][:1]
-        found = max((_Typical.near(one, near) for one in lights), key=lambda one: one.merit)
+        found = max((_Typical.near(one, near) for one in lights), key=lambda one: one.snr)
         if best is None or found.merit > best.merit:
             best = found
         elif best.clear:
@@ -247,7 +247,7 @@ def first_shadows(lights: Iterable[FilteredLight], count: int) -> Shadows:
     lights: dark and bright ones of one size. count: of the strongest shadows, which tell the look.
     Raises DataError where there is nothing round.
     """
-    best = max((_Typical.strongest(light, count) for light in lights), key=lambda one: one.merit)
+    best = max((_Typical.strongest(light, count) for light in lights), key=lambda one: one.snr)
     look = best.look('there are no markers in the image, nothing round rises above the noise')
     return _found(look, best.light)
 
@@ -288,8 +288,16 @@ class _Typical:
         return cls(light, float(np.median(values)) if len(values) else 0.0)
 
     @property
+    def snr(self) -> float:
+        """Strength over the noise, which tells whether markers are dark or bright.
+
+        Noise is the stronger, the less light there is, and may be stronger than markers.
+        """
+        return self.strength / max(self.light.noise, 1e-9)
+
+    @property
     def merit(self) -> float:
-        """How much it stands out: small scales have the strongest response to noise, too."""
+        """How much its size stands out: small ones have the strongest response to noise, too."""
         return self.strength**2 / max(self.strength + self.light.noise, 1e-9)
 
     @property

@@ -309,6 +309,7 @@ class MeasuredMarkers:
 
     measured: NDArray[np.bool_]  #: (n,), the other values say nothing where it is False
     uv: NDArray[np.float64]  #: (n, 2), centres [px]
+    shadow: NDArray[np.float64]  #: (n, 2), where their shadows were found, before the fit [px]
     sigma: NDArray[np.float64]  #: (n,), standard deviation of a coordinate [px]
     depth: NDArray[np.float64]  #: (n,)
     #: (n,), the shadow of another marker reaches into that of the marker
@@ -321,7 +322,8 @@ class MeasuredMarkers:
         nowhere = np.zeros(count, dtype=bool)
         none = np.zeros(count)
         uv = np.zeros((count, 2))
-        return cls(nowhere, uv, sigma=none, depth=none, overlapped=nowhere, free=np.zeros((0, 2)))
+        free = np.zeros((0, 2))
+        return cls(nowhere, uv, uv, sigma=none, depth=none, overlapped=nowhere, free=free)
 
 
 @dataclass

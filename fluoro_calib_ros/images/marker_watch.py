@@ -125,7 +125,8 @@ class MarkerWatch:
         if not len(found.free) or not len(rows):
             return ()
         variance = motion.variance[rows] + SHADOW_SD_PX**2
-        own = ((motion.uv[rows] - found.uv[rows]) ** 2).sum(axis=1) / variance
+        # As they were found: a fit moves on to where the shadow of something else fits best.
+        own = ((motion.uv[rows] - found.shadow[rows]) ** 2).sum(axis=1) / variance
         away = motion.uv[rows][:, None] - found.free[None]
         other = (away**2).sum(axis=2) / variance[:, None]
         out = []
@@ -270,7 +271,8 @@ def shift_together(states: MarkerStates, found: Shadows, gate: float, frames: in
     before = motion.uv.copy()
     for row in np.flatnonzero(wide).tolist():
         beside = np.argsort(np.linalg.norm(before - before[row], axis=1), kind='stable')
-        beside = beside[(beside != row) & wide[beside]][:LEADERS]
+        # Where two bones overlap, half of the nearest are of the other one.
+        beside = beside[(beside != row) & wide[beside]][: 2 * LEADERS]
         if not len(beside):
             continue
         reach = gate * float(np.sqrt(motion.variance[row]))

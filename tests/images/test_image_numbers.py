@@ -465,10 +465,11 @@ def test_states_of_markers_are_exchanged_and_taken_in_together():
     found = MeasuredMarkers(
         measured,
         states.motion.uv + 1,
-        np.full(12, 0.2),
-        np.full(12, 4.0),
-        overlapped,
-        np.zeros((0, 2)),
+        states.motion.uv + 1,
+        sigma=np.full(12, 0.2),
+        depth=np.full(12, 4.0),
+        overlapped=overlapped,
+        free=np.zeros((0, 2)),
     )
     states.advance(1, None)
     states.update(found, 1)
@@ -495,3 +496,15 @@ def test_lost_markers_are_shifted_together_with_the_velocity_that_they_have():
     still = motion(6)
     shift_together(MarkerStates.start(still, np.ones(6, int)), Fake(uv=before + shift), 3.0, 2)
     np.testing.assert_allclose(still.velocity, motion(6).velocity)
+
+
+def test_a_marker_among_those_of_another_bone_is_shifted_with_its_own():
+    """Of two bones that overlap, the four nearest markers are of the other one."""
+    own = np.array([[100.0, 100], [130, 80], [60, 120], [110, 150], [90, 60]])
+    other = np.array([[112.0, 101], [89, 97], [103, 113], [98, 86]])
+    start = Motion.start(np.concatenate([own, other]), 4.0)
+    states = MarkerStates.start(start, np.ones(9, int))
+    shift = np.array([7.0, -4.0])
+    shift_together(states, Fake(uv=np.concatenate([own + shift, other - [5, 9]])), 4.5, 1)
+    np.testing.assert_allclose(start.uv[0], own[0] + shift)
+    np.testing.assert_allclose(start.velocity[0], shift)

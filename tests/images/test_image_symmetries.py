@@ -210,6 +210,18 @@ def test_an_image_says_itself_whether_its_markers_are_bright():
     np.testing.assert_allclose(sides[1].response, turned[0].response, atol=2.0)
 
 
+@pytest.mark.parametrize('is_bright', [False, True])
+def test_markers_are_told_from_noise_that_is_stronger_where_there_is_less_light(is_bright):
+    """The light of bright markers is what dark ones leave below the largest grey value."""
+    v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    light = np.full(SHAPE, 57000.0)
+    for x, y in PLACES:
+        light *= 1 - 0.2 * np.exp(-0.5 * ((u - x) ** 2 + (v - y) ** 2) / 1.6**2)
+    image = np.rint(np.random.default_rng(4).normal(light, 1300.0)).astype(np.uint16)
+    found = first_shadows(FilteredImage(negative(image) if is_bright else image).of_scale(1.5), 12)
+    np.testing.assert_allclose(in_order(found.uv), in_order(PLACES), atol=0.7)
+
+
 def test_windows_are_read_as_the_image_is_beyond_its_edges_too():
     image = scene()
     field = np.ones(SHAPE, bool)

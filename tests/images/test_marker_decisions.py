@@ -432,6 +432,7 @@ def watched(found_uv, free=(), measured=None, unseen=0, variance=0.1, speed_sd=0
     watch = MarkerWatch(IDS, doubts, **{**usual, **changes})
     found = Fake(
         uv=np.array(found_uv, dtype=float),
+        shadow=np.array(found_uv, dtype=float),
         free=np.array(free, dtype=float).reshape(-1, 2),
         measured=np.ones(4, bool) if measured is None else np.array(measured),
         sigma=np.full(4, 0.05),
@@ -523,7 +524,13 @@ def test_one_shadow_of_two_markers_is_taken_back_for_some_images(
 
 def found_frame(found):
     return MeasuredMarkers(
-        found.measured, found.uv, found.sigma, np.ones(4), np.zeros(4, bool), found.free
+        found.measured,
+        found.uv,
+        found.shadow,
+        sigma=found.sigma,
+        depth=np.ones(4),
+        overlapped=np.zeros(4, bool),
+        free=found.free,
     )
 
 

@@ -328,11 +328,12 @@ def watched(uv, variance, unseen=None):
     return watch, doubts, Fake(motion=motion, unseen=np.array(unseen or len(uv) * [0]))
 
 
-def found_at(uv, measured, free=()):
+def found_at(uv, measured, free=(), shadow=None):
     nothing = np.zeros(len(uv))
     return MeasuredMarkers(
         np.array(measured, bool),
         np.array(uv, float),
+        np.array(uv if shadow is None else shadow, float),
         sigma=nothing + 0.1,
         depth=nothing,
         overlapped=nothing > 0,
@@ -356,6 +357,17 @@ def test_a_shadow_of_no_marker_leaves_open_which_one_is_meant():
     assert doubts.since(0) == 7
     assert not watch.other_shadows(seen, states, 8) and doubts.since(0) == 7
     assert not watch.other_shadows(found_at(at, 5 * [1]), states, 8)
+
+
+@pytest.mark.parametrize('moved', [0.0, 1.0, 2.0])
+def test_a_fit_makes_no_shadow_likelier_than_one_as_near_to_the_prediction(moved):
+    """Inside a disc of metal, a fit goes from a false shadow to the place that is predicted."""
+    at = np.array([[0.0, 0], [100, 0]])
+    watch, doubts, states = watched(at, 0.1)
+    shadow = at + [2.0, 0]
+    found = found_at(shadow - [moved, 0], [1, 1], free=[[-2.0, 0]], shadow=shadow)
+    (told,) = watch.other_shadows(found, states, 7)
+    assert told.place.target_id == (10,) and doubts.doubtful.tolist() == [True, False]
 
 
 @pytest.mark.parametrize(

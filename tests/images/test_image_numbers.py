@@ -211,6 +211,42 @@ def test_beads_that_stray_or_are_vague_are_refused_by_the_scatter_of_the_others(
         assert (3 in checked().bead) is is_kept
 
 
+def test_chance_of_a_wrong_centre_is_that_of_errors_with_such_a_residual():
+    rng = np.random.default_rng(4)
+    sigma, scatter, wrong_px = 0.2, 0.12, 0.5
+    error = rng.normal(0, sigma, (4_000_000, 2))
+    residual = np.linalg.norm(error - rng.normal(0, scatter, error.shape), axis=1)
+    is_wrong = np.linalg.norm(error, axis=1) > wrong_px
+    places = np.array([0.3, 0.5, 0.7])
+    near = [np.abs(residual - place) < 0.01 for place in places]
+    drawn = [is_wrong[one].mean() for one in near]
+    told = extraction._chances_of_wrong(
+        places, np.full(3, sigma), np.full(3, scatter), wrong_px=wrong_px
+    )
+    np.testing.assert_allclose(told, drawn, rtol=0.05, atol=5e-4)
+    nothing = extraction._chances_of_wrong(np.zeros(1), np.full(1, 0.1), np.full(1, 9.0), wrong_px)
+    alone = np.exp(-(wrong_px**2) / (2 * 0.1**2))
+    np.testing.assert_allclose(nothing, alone, rtol=0.01)
+
+
+@pytest.mark.parametrize(('scatter', 'is_kept'), [(0.05, False), (0.3, True)])
+def test_bead_that_is_likely_half_a_pixel_off_is_not_observed(scatter, is_kept):
+    n = 20
+    predicted = np.arange(2.0 * n).reshape(n, 2)
+    uv = predicted.copy()
+    uv[4, 0] += 0.5
+    sigma = np.full(n, 0.05)
+    sigma[4] = 0.12
+    beads = Fake(uv=uv, sigma=sigma, overlapped=np.zeros(n, bool))
+    measured = extraction._Measured(
+        np.arange(n), beads, [None] * n, predicted, np.full(n, scatter)
+    )
+    # By its standard deviation, it may be where its neighbours say.
+    assert extraction.RESIDUAL_SIGMAS * np.hypot(0.05, 0.12) > 0.5
+    found = extraction._checked(None, None, None, measured, 'imaging')
+    assert (4 in found.bead) is is_kept and len(found.bead) == n - 1 + is_kept
+
+
 def test_beads_of_a_line_start_where_they_were_found_alone():
     predicted = np.array([[0.0, 0], [30, 0], [33, 0], [80, 0], [200, 0]])
     rows = np.arange(4)

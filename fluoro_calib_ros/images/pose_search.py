@@ -24,7 +24,9 @@ from scipy.spatial.transform import Rotation
 
 MIN_SINE = 0.3  # of the angle between the sides of a triple of the phantom
 MIN_IMAGE_SINE = 0.2  # of the angle between the sides of three beads in the image
-VOTERS = 18  # neighbours that vote
+# Neighbours that vote, of up to half of the beads: perspective moves those farther away from where
+# a scaled-orthographic pose has them, on a phantom of 18 balls by more than the tolerance.
+VOTERS = 18
 # The nearest of them, which select the poses that the others vote on: one of the first few must be
 # found, and the share FIRST_VOTE of all.
 FIRST_VOTERS = (3, 6)
@@ -48,7 +50,7 @@ class Triples:
     bead: NDArray[np.int64]  #: (t, 3)
     #: (4, t), squares of both sides, their product [mm^2], and the determinant of these [mm^4]
     products: NDArray[np.float64]
-    #: (VOTERS, 3, t), neighbours of the first bead, the nearest first, in the axes of both sides
+    #: (k, 3, t), neighbours of the first bead, the nearest first, in the axes of both sides
     #: and their cross product
     voter: NDArray[np.float32]
     sides: NDArray[np.float64]  #: (t, 2, 3), from the first bead [mm]
@@ -82,7 +84,8 @@ class LocalPose:
 def triples_of(xyz: NDArray[np.float64], neighbours: int) -> Triples:
     """Return the triples of beads (n, 3) [mm] with so many neighbours each."""
     n = len(xyz)
-    count = min(max(neighbours, VOTERS) + 1, n)
+    voters = min(VOTERS, max(FIRST_VOTERS[1], n // 2))
+    count = min(max(neighbours, voters) + 1, n)
     _, near = cKDTree(xyz).query(xyz, k=count)
     first, second = np.nonzero(~np.eye(min(neighbours, count - 1), dtype=bool))
     bead = np.stack(
@@ -105,7 +108,7 @@ def triples_of(xyz: NDArray[np.float64], neighbours: int) -> Triples:
     a = a[good]
     b = b[good]
     axes = np.linalg.inv(np.stack([a, b, np.cross(a, b)], axis=2))
-    others = near[bead[:, 0], 1 : 1 + VOTERS]
+    others = near[bead[:, 0], 1 : 1 + voters]
     offsets = xyz[others] - xyz[bead[:, 0], None]
     coordinates = axes @ np.swapaxes(offsets, 1, 2)
     height_mm = np.abs(coordinates[:, 2]) * np.linalg.norm(np.cross(a, b), axis=1)[:, None]

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 from rigs import refused
+from scipy.spatial.transform import Rotation
 
 from benchmarks.extraction import pose_of, seen_points
 from fluoro_calib_ros.findings import Kind
@@ -60,6 +61,21 @@ def test_a_phantom_is_found_where_all_its_faces_are_seen_from_the_edge():
         found = matching.match(Seen.of(uv, field, 2.6), model, LENS)
         away = uv[found.detection] - fluoroscope.distortion.distort(true[found.bead])
         assert np.mean(np.linalg.norm(away, axis=1) < 4) > 0.98
+
+
+def test_few_beads_are_found_though_perspective_moves_the_far_ones():
+    for number in range(8):
+        rng = np.random.default_rng(number)
+        xyz = rng.uniform(-1, 1, (18, 3)) * [60, 60, 35]
+        x = xyz @ Rotation.random(random_state=number).as_matrix().T + [0, 0, 600]
+        uv = 3300 * x[:, :2] / x[:, 2:] + 511.5
+        there = np.flatnonzero(((uv > 0) & (uv < 1023)).all(axis=1))[1:]
+        points = np.concatenate([uv[there], rng.uniform(200, 800, (2, 2))])
+        seen = Seen.of(points, np.ones((1024, 1024), bool), 8.0)
+        found = matching.match(seen, matching.PhantomModel.of(xyz), Lens((1024, 1024), 3300.0))
+        own = found.detection < len(there)
+        assert len(found.bead) >= len(there) - 1
+        np.testing.assert_array_equal(there[found.detection[own]], found.bead[own])
 
 
 def test_another_phantom_is_refused_after_as_many_beads_as_would_tell(monkeypatch):

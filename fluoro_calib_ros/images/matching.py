@@ -157,6 +157,8 @@ def match(seen: Seen, model: PhantomModel, lens: Lens) -> Match:
     agreed = 0
     for candidate in _candidates(seen, model, lens):
         candidate = _improved(candidate, seen, model)
+        if len(candidate.bead) < MIN_BEADS:
+            continue
         agreed += best is not None and _same(candidate, best)
         if best is None or candidate.score > best.score:
             agreed = agreed if best is not None and _same(candidate, best) else 1

@@ -221,6 +221,13 @@ def _measured(
         nearby = nearby_residuals(view, model.xyz, bead, uv)
         predicted = view.project(model.xyz) + nearby.value
     measured = _Measured(rows, beads, reasons, predicted, nearby.sd_px[rows])
+    away = _away(measured)
+    if away.any():
+        # What is not where it should be has told its neighbours where they should be.
+        kept = good & ~away
+        nearby = nearby_residuals(view, model.xyz, rows[kept], beads.uv[kept])
+        predicted = view.project(model.xyz) + nearby.value
+        measured = _Measured(rows, beads, reasons, predicted, nearby.sd_px[rows])
     assert imaging is not None
     extraction = _checked(detections, found, view, measured, imaging)
     extraction = _with_support(extraction, model, rows)
@@ -245,6 +252,23 @@ class _Measured:
     #: (n,), of the difference of a coordinate from that; it contains what the survey leaves open
     sd_px: NDArray[np.float64]
 
+    @property
+    def residual(self) -> NDArray[np.float64]:
+        """Distances (n,) from where neighbours say [px]."""
+        return np.linalg.norm(self.beads.uv - self.predicted[self.rows], axis=1)
+
+
+def _away(measured: _Measured) -> NDArray[np.bool_]:
+    """Whether (n,) beads that were measured well are not where their neighbours say."""
+    good = np.array([reason is None for reason in measured.reasons], dtype=bool)
+    sigma = measured.beads.sigma[good]
+    scatter = np.maximum(measured.sd_px[good], MIN_SCATTER_PX)
+    residual = measured.residual[good]
+    near = residual < RESIDUAL_SIGMAS * np.hypot(scatter, sigma)
+    away = np.zeros(len(good), dtype=bool)
+    away[good] = ~near | (_chances_of_wrong(residual, sigma, scatter) > WRONG_SHARE)
+    return away
+
 
 def _checked(
     detections: Detections,
@@ -256,25 +280,13 @@ def _checked(
     """Exclude beads that are not where their neighbours say, or measured badly."""
     beads = measured.beads
     reasons = list(measured.reasons)
-    predicted = measured.predicted[measured.rows]
-    residual = np.linalg.norm(beads.uv - predicted, axis=1)
+    for number in np.flatnonzero(_away(measured)):
+        off = float(measured.residual[number])
+        cause = f'{off:.2f} px from where its neighbours say'
+        reasons[number] = Finding(Kind.BEAD_AWAY, cause, numbers={'off_px': off})
     good = np.array([reason is None for reason in reasons], dtype=bool)
-    scatter = np.maximum(measured.sd_px, MIN_SCATTER_PX)
-    far = good & ~(residual < RESIDUAL_SIGMAS * np.hypot(scatter, beads.sigma))
-    usual = float(np.median(beads.sigma[good & ~far]))
-    largest = max(SURE_SIGMA_PX, MAX_SIGMAS * usual)
-    vague = good & ~far & (beads.sigma > largest)
-    sure = np.flatnonzero(good & ~far & ~vague)
-    wrong = _chances_of_wrong(
-        residual[sure], beads.sigma[sure], scatter[sure], wrong_px=WRONG_SIGMAS * largest
-    )
-    far[sure] = wrong > WRONG_SHARE
-    for number in np.flatnonzero(far):
-        cause = f'{residual[number]:.2f} px from where its neighbours say'
-        reasons[number] = Finding(
-            Kind.BEAD_AWAY, cause, numbers={'off_px': float(residual[number])}
-        )
-    good &= ~far
+    usual = float(np.median(beads.sigma[good]))
+    vague = good & (beads.sigma > max(SURE_SIGMA_PX, MAX_SIGMAS * usual))
     for number in np.flatnonzero(vague):
         cause = f'sigma {beads.sigma[number]:.2f} px, that of most is {usual:.2f} px'
         reasons[number] = Finding(
@@ -283,7 +295,7 @@ def _checked(
     good &= ~vague
     refused = tuple(
         Refusal(int(row), uv, reason)
-        for row, uv, reason in zip(measured.rows, predicted, reasons)
+        for row, uv, reason in zip(measured.rows, measured.predicted[measured.rows], reasons)
         if reason is not None
     )
     return Extraction(
@@ -300,17 +312,16 @@ def _checked(
 
 
 def _chances_of_wrong(
-    residual: NDArray[np.float64],
-    sigma: NDArray[np.float64],
-    scatter: NDArray[np.float64],
-    wrong_px: float,
+    residual: NDArray[np.float64], sigma: NDArray[np.float64], scatter: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Chances (n,) that centres are off by more than wrong_px, given what their neighbours say.
+    """Chances (n,) that centres are wrong, given what their neighbours say.
 
     residual: (n,) distances from the predictions; sigma, scatter: (n,) standard deviations of
     coordinates of centres and of predictions. Given its residual, an error is normal about the
-    share of it that is not the prediction's.
+    share of it that is not the prediction's. Wrong are errors by half a pixel, and by what one in
+    a thousand of such centres have.
     """
+    wrong_px = WRONG_SIGMAS * np.maximum(sigma, SURE_SIGMA_PX)
     total = sigma**2 + scatter**2
     mean = residual * sigma**2 / total
     variance = sigma**2 * scatter**2 / total

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import permutations, product
+from itertools import islice, permutations, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,7 +56,7 @@ LEVELS = (
     ((0, 24), (0.6, 0.85)),
     ((0, 6), (1.4, 3.0)),
 )
-FITTED = 12  # ways to lay a grid over what was found that are refined, where they fit
+FITTED = 12  # ways to lay a grid over what was found; a hexagonal one lies on itself in so many
 APART = 0.6  # share of the beads, those farthest from their neighbours, that are tried next
 AGREED = 3  # matches of the same pose after which the search ends, if it is evident
 MIN_SIZES = 0.1  # relative difference of diameters from which sizes tell beads apart
@@ -182,8 +182,8 @@ def _grid_match(grid: FlatGrid, seen: Seen, model: PhantomModel, lens: Lens) -> 
     """
     best: tuple[GridPose, Match] | None = None
     fitted: list[Match] = []
-    for pose in grid_poses(grid, model.xyz, seen, lens):
-        if len(fitted) >= FITTED or (best and (model.regular or not _could_be(pose, best[0]))):
+    for pose in islice(grid_poses(grid, model.xyz, seen, lens), FITTED):
+        if best and (model.regular or not _could_be(pose, best[0])):
             break
         match = pose.fit()
         if match is None:

@@ -383,15 +383,15 @@ class ExtractionNode(StreamNode):
             subject='images',
             angles=self._angles,
         )
-        health = health_of(state, CONDITIONS)
         values = {
             **stream.values(self._workers.waiting(name)),
             'lost at the input': stream.overrun,
-            'readers': self._observations[stream.name].get_subscription_count(),
+            'readers': self._observations[name].get_subscription_count(),
+            'readers of retractions': self._retractions[name].get_subscription_count(),
             **self._angles.values(name),
             **stream.latencies.values(),
         }
-        return Status(name, *health, values)
+        return Status(name, *health_of(state, CONDITIONS), values)
 
 
 main = partial(run, ExtractionNode)

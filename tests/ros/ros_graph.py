@@ -258,11 +258,11 @@ class Graph:
         self.wait_for_readers(1)
         return nodes
 
-    def wait_for_readers(self, count, node='correction_node', names=NAMES):
+    def wait_for_readers(self, count, node='correction_node', names=NAMES, key='readers'):
         """Wait until a node has discovered `count` readers of its output of every fluoroscope."""
         for name in names:
             self.client.wait_for_diagnostics(
-                node, lambda s: int(value_of(s, 'readers') or 0) >= count, name, 'the readers'
+                node, lambda s: int(value_of(s, key) or 0) >= count, name, f'the {key}'
             )
 
     def play(self, bag, readers, rate=10.0):

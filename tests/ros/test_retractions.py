@@ -72,6 +72,7 @@ def test_a_marker_that_was_something_else_is_taken_back(rig):
         'the orientation',
     )
     rig.wait_for_readers(2, 'extraction_node')  # the correction node, and the client
+    rig.wait_for_readers(2, 'extraction_node', key='readers of retractions')
     rig.wait_for_readers(1)
     for number, message in enumerate(iterate_messages(rig.folder / 'images')):
         outputs[message.topic.split('/')[1]].publish(message.data)

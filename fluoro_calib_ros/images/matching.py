@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import islice, permutations, product
+from itertools import permutations, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -182,7 +182,10 @@ def _grid_match(grid: FlatGrid, seen: Seen, model: PhantomModel, lens: Lens) -> 
     """
     best: tuple[GridPose, Match] | None = None
     fitted: list[Match] = []
-    for pose in islice(grid_poses(grid, model.xyz, seen, lens), FITTED):
+    for tried, pose in enumerate(grid_poses(grid, model.xyz, seen, lens)):
+        # A right one is among the first; others that fit as well may come later.
+        if (len(fitted) if best else tried) >= FITTED:
+            break
         if best and (model.regular or not _could_be(pose, best[0])):
             break
         match = pose.fit()

@@ -433,6 +433,9 @@ def test_of_two_poses_of_a_grid_one_has_half_the_residuals(monkeypatch):
     assert grid_match(monkeypatch, [0.5, 0.24]) == 1
     assert grid_match(monkeypatch, [0.5, 0.9, 0.24]) == 2
     assert grid_match(monkeypatch, [None, 0.5, None]) == 1
+    assert grid_match(monkeypatch, [*[None] * matching.FITTED, 0.5]) is None
+    with pytest.raises(DataError, match='ambiguous'):
+        grid_match(monkeypatch, [0.5, *[None] * matching.FITTED, 0.5])
     # So many fit that others are not looked at.
     assert grid_match(monkeypatch, [0.5, *[1.0] * (matching.FITTED - 1), 0.5]) == 0
     for rival in (0.99, 0.25, 0.5):

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Self-calibration by adjustment and regression in turn (section 3.1 of Chow et al.).
+"""Self-calibration by alternating adjustment and regression (section 3.1 of Chow et al.).
 
-One round: a correction model is fitted to (residual + present correction) of the inliers, its k
-chosen by cross-validation; then the network is adjusted with that correction fixed. The rounds are
-a fixed-point iteration of the values the model is fitted to, and Anderson acceleration shortens
-it. Model and adjustment of a round belong together.
+Each round fits a correction model to (residual + present correction) of the inliers, with k chosen
+by cross-validation, and then adjusts the network with that correction fixed. The rounds are a
+fixed-point iteration of the values that the model is fitted to; Anderson acceleration shortens it.
+The model and the adjustment of a round belong together.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ from .rounds import History, Round, SelfCalibration
 # Walker and Ni, "Anderson acceleration for fixed-point iterations", SIAM Journal on Numerical
 # Analysis 49, 2011.
 
-RELATIVE_RANK = 1e-6  # singular values of the differences below that part of the largest are zero
+RELATIVE_RANK = 1e-6  # drop singular values of the differences below this part of the largest
 
 
 class Anderson:
-    """Mixes the last iterates of x -> f(x) so that the residual f(x) - x becomes smallest.
+    """Mix the last iterates of x -> f(x) so that the residual f(x) - x is smallest.
 
     depth: number of earlier iterates used. The iterates are arrays of one shape.
     """
@@ -57,7 +57,7 @@ class Anderson:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the earlier iterates: the map has changed."""
+        """Forget the earlier iterates, because the map has changed."""
         self._x: list[NDArray[np.float64]] = []
         self._f: list[NDArray[np.float64]] = []
 
@@ -67,7 +67,7 @@ class Anderson:
         f: NDArray[np.float64],
         counted: NDArray[np.bool_] | slice = slice(None),
     ) -> NDArray[np.float64]:
-        """Return the next iterate from the present one x and its image f.
+        """Return the next iterate from the present iterate x and its image f.
 
         counted: entries whose residual is minimised.
         """
@@ -77,17 +77,16 @@ class Anderson:
             return f
         residual = [(b - a)[counted].ravel() for a, b in zip(self._x, self._f)]
         d_residual = np.stack([b - a for a, b in pairwise(residual)], axis=1)
-        # Columns are scaled and small singular values dropped: late differences are nearly
-        # parallel.
+        # Scale the columns and drop small singular values: late differences are nearly parallel.
         scale = np.maximum(np.linalg.norm(d_residual, axis=0), 1e-300)
         gamma, *_ = np.linalg.lstsq(d_residual / scale, residual[-1], rcond=RELATIVE_RANK)
         return f - sum(g * (b - a) for g, a, b in zip(gamma / scale, self._f, self._f[1:]))
 
 
 class Regressions:
-    """The regression steps of all fluoroscopes of a network, as one smoother of values (N, 2).
+    """Regression steps of all fluoroscopes of a network, as one smoother of values (N, 2).
 
-    steps {fluoroscope: RegressionStep}, in the order of the network.
+    steps: {fluoroscope: RegressionStep}, in the order of the network.
     """
 
     def __init__(
@@ -98,18 +97,18 @@ class Regressions:
 
     @property
     def iterate(self) -> bool:
-        """Whether more than one round can make a difference."""
+        """Whether a second round can give another correction than the first."""
         return any(step.iterates for step in self.steps.values())
 
     @property
     def k(self) -> dict[str, int]:
-        """Number of neighbours by fluoroscope."""
+        """Number of neighbours, by fluoroscope."""
         return {name: step.k for name, step in self.steps.items()}
 
     def choose(
         self, values: NDArray[np.float64], q: NDArray[np.float64], information: NDArray[np.float64]
     ) -> tuple[float, bool]:
-        """Update inliers and k of all fluoroscopes; return G and whether any of them changed.
+        """Update the inliers and k of all fluoroscopes; return G and whether any of them changed.
 
         Raises DataError where a fluoroscope has too few inliers.
         """
@@ -122,7 +121,7 @@ class Regressions:
         return score, any(step.changed for step in self.steps.values())
 
     def inliers(self) -> NDArray[np.bool_]:
-        """True (N,) for the image points to which the models are fitted."""
+        """Return True (N,) for the image points to which the models are fitted."""
         out = np.zeros(sum(len(rows) for rows in self._rows.values()), dtype=bool)
         for name, rows in self._rows.items():
             out[rows] = self.steps[name].inliers
@@ -131,14 +130,14 @@ class Regressions:
     def without_gauge(
         self, values: NDArray[np.float64], interior: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Values (N, 2) with a fitted correction that is orthogonal to the gauge."""
+        """Change values (N, 2) so that their fitted correction is orthogonal to the gauge."""
         out = values.copy()
         for f, (name, rows) in enumerate(self._rows.items()):
             out[rows] = self.steps[name].without_gauge(values[rows], interior[f])
         return out
 
     def smooth(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Fitted corrections (N, 2) of values (N, 2)."""
+        """Fit values (N, 2) at the inliers; return the corrections (N, 2) at all image points."""
         out = np.zeros_like(values)
         for name, rows in self._rows.items():
             out[rows] = self.steps[name].smooth(values[rows])
@@ -151,7 +150,7 @@ class Regressions:
         after: Adjustment,
         precise: Precision,
     ) -> dict[str, CorrectionModel]:
-        """Models of values (N, 2) by fluoroscope, with their terms from the last adjustment."""
+        """Return the models of values (N, 2) by fluoroscope, with terms of the last adjustment."""
         out = {}
         for f, (name, rows) in enumerate(self._rows.items()):
             series = None if terms is None else terms.fitted_series(f, after, precise)
@@ -166,11 +165,11 @@ class _Iterate:
     values: NDArray[np.float64]  #: (N, 2) values to which the models are fitted [px]
     information: NDArray[np.float64]  #: (N, 2, 2) inverse covariance of the residuals [1/px^2]
     after: Adjustment  #: adjustment of the round
-    noise: Noise  #: noise model that its residuals show
+    noise: Noise  #: noise model estimated from its residuals
 
 
 class _Alternation:
-    """Rounds of regression and adjustment of one network."""
+    """Rounds of regression and adjustment for one network."""
 
     def __init__(
         self,
@@ -188,11 +187,11 @@ class _Alternation:
         self._acceleration = Anderson()
         self._image = start.residuals
         information, _ = _information(network, start, self.correction)
-        #: after the last round
+        #: state after the last round
         self.state = _Iterate(start.residuals, information, start, start.noise)
 
     def advance(self) -> None:
-        """Make one round: fit the models, adjust with their correction fixed, and record it."""
+        """Make one round: fit the models, adjust with their correction fixed, record the round."""
         regressions = self._regressions
         state = self.state
         score, self.changed = regressions.choose(state.values, state.after.q, state.information)
@@ -217,14 +216,14 @@ class _Alternation:
         self.state = _Iterate(values, information, after, noise)
 
     def has_settled(self, tolerance: float) -> bool:
-        """Whether another round would give the same."""
+        """Whether another round would hardly change the result."""
         scale = self.state.noise.scale
         steady = abs(scale - self.state.after.noise.scale) <= SETTLED * scale
         return not self.changed and steady and self._history.has_settled(tolerance)
 
     def accelerate(self) -> None:
-        """Replace the values of the next round by those of Anderson acceleration."""
-        # Outliers follow the acceleration, but do not steer it.
+        """Replace the values of the next round by those that Anderson acceleration gives."""
+        # Outliers are accelerated too, but only the residuals of inliers choose the mixture.
         values = self._acceleration.next(
             self.state.values, self._image, self._regressions.inliers()
         )
@@ -239,11 +238,11 @@ def calibrate_by_regression(
     regressions: Regressions,
     progress: Callable[[Round], None] | None = None,
 ) -> SelfCalibration:
-    """Self-calibrate by adjustment and regression in turn.
+    """Self-calibrate by alternating adjustment and regression.
 
-    before: adjustment without correction. terms: those of the correction that are estimated in the
-    adjustments. regressions: what fits the rest of it. progress: called with the Round after every
-    round.
+    before: adjustment without correction. terms: terms of the correction that the adjustments
+    estimate. regressions: fit the remaining correction. progress: called with the Round after
+    every round.
 
     Raises DataError if there are too few inliers, or the exposures do not determine the unknowns.
     """
@@ -262,7 +261,7 @@ def calibrate_by_regression(
             break
         if iteration < options.max_iterations:
             rounds.accelerate()
-    # The correction of the last round stays; its adjustment is completed here.
+    # Keep the correction of the last round, and complete its adjustment.
     last = rounds.state.after
     network, start = in_determined_datum(network, last.parameters, last.inliers)
     after, precise = adjusted_with_precision(
@@ -288,7 +287,7 @@ def calibrate_by_regression(
 def _information(
     network: Network, adjustment: Adjustment, correction: NDArray[np.float64]
 ) -> tuple[np.ndarray, Noise]:
-    """C_r^-1 (N, 2, 2) [1/px^2] of the residuals, and the noise model that they show.
+    """Return C_r^-1 (N, 2, 2) [1/px^2] of the residuals, and the noise model they show.
 
     Raises DataError where the normal matrix is singular.
     """

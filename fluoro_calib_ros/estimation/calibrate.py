@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A whole calibration or adjustment: from frames to what is published and saved."""
+"""A complete calibration or adjustment, from the frames to the results to publish and save."""
 
 from __future__ import annotations
 
@@ -66,8 +66,8 @@ from .rounds import (
 )
 from .self_calibration import self_calibrate
 
-MAX_REPEATS = 3  # of a calibration, to exclude exposures that do not fit
-EQUAL_WEIGHTS_NU = 100.0  # degrees of freedom from which weights of inliers hardly differ
+MAX_REPEATS = 3  # most repetitions of a calibration to exclude exposures that do not fit
+EQUAL_WEIGHTS_NU = 100.0  # degrees of freedom above which the weights of inliers hardly differ
 
 
 def calibrate(
@@ -80,18 +80,18 @@ def calibrate(
 ) -> CalibrationResult:
     """Self-calibrate fluoroscopes, one after the other or in one adjustment.
 
-    The result is the same to the last bit for the same observations, whatever their order.
+    For the same observations, in any order, the result is identical to the last bit.
 
     Parameters
     ----------
     frames : mapping of str to sequence of Frame
-        By fluoroscope.
+        Frames of each fluoroscope.
     phantom : Phantom
     options : CalibrationOptions, optional
     joint : bool
         True for one adjustment of all fluoroscopes.
     principal_distance : float, optional
-        Start value [px]; by default it is taken from the observations.
+        Initial value [px]; by default it is found from the observations.
     progress : callable, optional
         Called with the name of the fluoroscope and the Round after every round; may raise to stop.
 
@@ -115,10 +115,10 @@ def calibrate_request(
 ) -> CalibrationResult:
     """Self-calibrate the fluoroscopes of a request; see `calibrate` for the other arguments.
 
-    starts: of an earlier calibration with these exposures.
+    starts: start values from an earlier calibration with these exposures.
 
-    Raises DataError and ValueError as `calibrate`, ValueError also for options that exclude known
-    orientations.
+    Raises DataError and ValueError as `calibrate`, and ValueError for options that are
+    incompatible with known orientations.
     """
     _require_compatible(request)
     options = request.options
@@ -126,7 +126,7 @@ def calibrate_request(
     figures: dict[str, FluoroscopeResult] = {}
     calibrations: dict[str, FluoroscopeCalibration] = {}
     runs: dict[str, SelfCalibration] = {}
-    # One thread: faster than two for these sizes, and sums are always made in the same order.
+    # One thread is faster than two for these sizes, and keeps the order of summation fixed.
     with threadpool_limits(1):
         for group in request.groups:
             start = time.perf_counter()
@@ -175,10 +175,10 @@ def calibrate_request(
 def calibrate_part(
     request: CalibrationRequest, starts: StartValues, whole: Calibrations
 ) -> dict[str, FluoroscopeCalibration]:
-    """Self-calibrate with a part of the exposures of an earlier calibration.
+    """Self-calibrate with some of the exposures of an earlier calibration.
 
-    request: with the frames of the part. starts, whole: of the calibration of all exposures, whose
-    noise of image coordinates is taken over. Raises DataError if the exposures do not suffice.
+    request: has the frames of these exposures. starts, whole: from the calibration of all
+    exposures, whose noise is used. Raises DataError if the exposures do not suffice.
     """
     out: dict[str, FluoroscopeCalibration] = {}
     with threadpool_limits(1):
@@ -197,18 +197,18 @@ def calibrate_part(
 
 
 def _solved(run: SelfCalibration) -> SolvedNetwork:
-    """Network and adjustment of a self-calibration."""
+    """Return the network and the adjustment of a self-calibration."""
     estimated = run.measured.network.additional_correction(run.after.parameters)
     return SolvedNetwork(run.measured, run.after, run.correction - estimated, stated=run.stated)
 
 
 def _now() -> str:
-    """Date and time (UTC, ISO 8601)."""
+    """Return the date and time (UTC, ISO 8601)."""
     return datetime.now(timezone.utc).isoformat(timespec='seconds')
 
 
 def _figures_of_run(run: SelfCalibration) -> dict[str, FluoroscopeResult]:
-    """Figures of the fluoroscopes of a self-calibration."""
+    """Return the figures of the fluoroscopes of a self-calibration."""
     return {
         name: _figures(
             run.measured,
@@ -225,7 +225,7 @@ def _figures_of_run(run: SelfCalibration) -> dict[str, FluoroscopeResult]:
 def _calibrations_of_run(
     run: SelfCalibration, frames: Frames, phantom: Phantom, seconds: float
 ) -> dict[str, FluoroscopeCalibration]:
-    """Calibrations of the fluoroscopes of a self-calibration that took some seconds."""
+    """Return the calibrations of the fluoroscopes of a self-calibration that took `seconds`."""
     return {
         name: _calibration(
             run,
@@ -245,7 +245,7 @@ def _calibrated_group(
     progress: Callable[[Round], None] | None,
     starts: StartValues | None,
 ) -> SelfCalibration:
-    """Calibrate fluoroscopes in one adjustment, without exposures of which too little fits."""
+    """Calibrate fluoroscopes in one adjustment, and exclude exposures that do not fit."""
     excluded: tuple[Finding, ...] = ()
     for _ in range(MAX_REPEATS):
         measured = measured_network(
@@ -272,7 +272,7 @@ def _calibrated_group(
 
 
 def _require_compatible(request: CalibrationRequest) -> None:
-    """Raise ValueError for options that exclude each other."""
+    """Raise ValueError for incompatible options."""
     options = request.options
     if options.relative_orientation != 'none' and not request.joint:
         raise ValueError('a relative orientation constraint needs the joint adjustment')
@@ -287,14 +287,14 @@ def _require_compatible(request: CalibrationRequest) -> None:
 def _progress_of(
     label: str, progress: Callable[[str, Round], None] | None
 ) -> Callable[[Round], None] | None:
-    """Report rounds with the name of what is calibrated."""
+    """Return a callback that reports rounds under a label; None: nothing is to be reported."""
     if progress is None:
         return None
     return lambda one: progress(label, one)
 
 
 def _outliers_of_all(runs: Iterable[SelfCalibration]) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-    """Outliers of all runs: image points, and targets."""
+    """Return the outliers of all runs: image points, and targets."""
     found = [outliers_of(run) for run in runs]
     return (
         tuple(point for points, _ in found for point in points),
@@ -310,15 +310,16 @@ def adjust_with_calibrations(
     known: Mapping[str, KnownOrientation] | None = None,
     starts: StartValues | None = None,
 ) -> CalibrationResult:
-    """Adjust frames with calibrations fixed: interior orientations and corrections do not change.
+    """Adjust frames with interior orientations and corrections fixed at their calibrations.
 
-    Covariances hold the uncertainty of both: that of the interior orientation is common to all
-    exposures, that of the correction is part of the noise of every image point.
+    Covariances include the uncertainty of both. That of the interior orientation is common to all
+    exposures; that of the correction is part of the noise of every image point.
 
     frames: by fluoroscope; all share the object points. loss: noise model of the image points.
-    known: orientations that are known beforehand, by fluoroscope. starts: of an earlier adjustment
-    of the frames, for its residuals; the residuals without correction are then not computed again,
-    their RMSE is NaN, and covariances are without the uncertainty of the interior orientations.
+    known: orientations known beforehand, by fluoroscope. starts: start values from an earlier
+    adjustment of the frames, if only its residuals are needed. The residuals without correction
+    are then not computed, their RMSE is NaN, and covariances exclude the uncertainty of the
+    interior orientations.
 
     Raises DataError if a frame is invalid or has another image size than its calibration.
     """
@@ -349,7 +350,7 @@ def adjust_with_calibrations(
                 after.parameters,
                 np.zeros_like(correction),
                 after.noise,
-                tolerance=ROUND_TOLERANCE,  # its residuals are only reported
+                tolerance=ROUND_TOLERANCE,  # only the residuals of this adjustment are reported
             )
     figures = {
         name: _figures(
@@ -387,7 +388,7 @@ def _figures(
     f: int,
     model: CorrectionModel,
 ) -> FluoroscopeResult:
-    """Figures of fluoroscope number f of an adjustment; before: the one without correction."""
+    """Return the figures of fluoroscope number f; before: adjustment without correction."""
     rows = measured.network.rows(f)
     exposures = []
     for j in np.flatnonzero(measured.network.fluoroscope == f):
@@ -424,12 +425,12 @@ class _ImageNoise:
 
 
 def _image_noise(run: SelfCalibration, f: int, name: str) -> _ImageNoise:
-    """Noise of an image coordinate of fluoroscope number f.
+    """Return the noise of an image coordinate of fluoroscope number f.
 
-    It is that of the inlier residuals, which are smaller than the noise by the root of their
-    redundancy numbers, together with what the distortion of an exposure differs from the model.
-    The scale of a Student-t noise is no substitute: where the tails are heavy it is smaller than
-    the standard deviation of its core.
+    It is estimated from the residuals of the inliers, which are smaller than the noise by the root
+    of their redundancy numbers, plus the difference between the distortion of an exposure and the
+    model. The scale of a Student-t noise cannot replace it: where the tails are heavy, that scale
+    is smaller than the standard deviation of its core.
     """
     noise_model = run.after.noise
     if noise_model.loss != 'huber' and noise_model.nu >= EQUAL_WEIGHTS_NU:
@@ -454,7 +455,7 @@ def _calibration(
     seconds: float,
     noise: _ImageNoise,
 ) -> FluoroscopeCalibration:
-    """Calibration of fluoroscope number f of a self-calibration."""
+    """Return the calibration of fluoroscope number f of a self-calibration."""
     rows = run.measured.network.rows(f)
     last = run.history[-1]
     frames = [frame for frame in run.measured.frames if frame.fluoroscope == name]

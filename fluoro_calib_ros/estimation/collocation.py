@@ -1,26 +1,26 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The model `collocation`: trend and signal estimated in the adjustment.
+"""The model `collocation`: the adjustment estimates trend and signal of the distortion.
 
 Least-squares collocation (Moritz, "Advanced Physical Geodesy", 1980): the distortion is a cubic
-trend plus a random field, both among the unknowns of the adjustment, with priors that are
-estimated from the observations (see `priors`). Radial terms of degree 5 and 7 and a spiral of
-degree 5 join the trend where the observations make them likely: beyond the image points a field
-returns to zero, and a trend goes on.
+trend plus a random field. Both are unknowns of the adjustment, with priors that are estimated from
+the observations (see `priors`). Radial terms of degree 5 and 7 and a spiral of degree 5 join the
+trend where the observations make them likely: outside the image points a field returns to zero,
+whereas a trend continues.
 
 After each adjustment:
 
-1. The variances of the terms of exposures, where there are such terms, are renewed.
-2. The prior of each fluoroscope is renewed by one step towards the largest marginal likelihood.
-   Where the signal varies more in places, more of these are looked for.
-3. The number of sines becomes that which the image points can tell with this prior.
-4. Once the priors are steady, the residuals are searched for what the terms cannot follow yet, one
-   after the other: ripples; rejected image points that agree; exposures that differ; places where
-   the signal varies more.
+1. Update the variances of the terms of exposures, where there are such terms.
+2. Update the prior of each fluoroscope by one step towards the largest marginal likelihood. Where
+the signal has places of larger variance, search for more of them.
+3. Set the number of sines to the number that the image points determine with this prior.
+4. Once the priors are steady, search the residuals, one after the other, for what the terms cannot
+follow yet: ripples; rejected image points that agree; exposures that differ; places where the
+signal has a larger variance.
 
-A change of 3 or 4 leads to another adjustment. After two renewals that change nothing, the priors
-stay as they are.
+A change in step 3 or 4 leads to another adjustment. After two updates that change nothing, the
+priors stay fixed.
 """
 
 from __future__ import annotations
@@ -61,11 +61,12 @@ if TYPE_CHECKING:
     from ..photogrammetry.network import Network
     from ..photogrammetry.precision import Precision
 
-SETTLED_VARIATION = 0.05  # relative change of the size of what differs between exposures
-# Renewals without visible change after which the priors stay. Noise and signal would otherwise
-# swing about their solution for long where the signal is as short as the distance of the points.
+SETTLED_VARIATION = 0.05  # relative change of the RMS change of the distortion between exposures
+# Number of updates without visible change after which the priors stay fixed. Noise and signal
+# would otherwise oscillate about their solution for long where the correlation length of the
+# signal is as short as the distance between image points.
 STAY_AFTER = 2
-# Decrease of F that terms which continue an earlier calibration may leave: a thirtieth of a sigma.
+# Decrease of F that an adjustment of continued terms may leave: a thirtieth of a sigma.
 CONTINUED_TOLERANCE = 1e-3
 
 
@@ -74,19 +75,20 @@ class EarlierTerms:
     """Terms of an earlier calibration with more exposures."""
 
     series: Sequence[Series]  #: by fluoroscope
-    priors: Sequence[Prior | None]  #: priors by fluoroscope; None: to be estimated from the series
+    priors: Sequence[Prior | None]  #: by fluoroscope; None: estimate the prior from the series
     is_varying: bool  #: whether the distortion differs between exposures
 
 
 class CollocationTerms(AdjustedTerms):
-    """Trend and signal of all fluoroscopes of a network, and their priors.
+    """Trend and signal of all fluoroscopes of a network, with their priors.
 
-    modes: number of sines along the image to start with; 0: there is no signal, and the trend has
-    no rings (see `series.Functions`). earlier: what to start with instead.
+    modes: initial number of sines along the image; 0: no signal, and a trend without rings (see
+    `series.Functions`). earlier: terms to start with instead.
     """
 
-    intermediate_tolerance = 1.0  # noise and prior still change
-    # A third of the standard deviation of the noise of 1000 image points; what is left is less.
+    intermediate_tolerance = 1.0  # loose, because noise and prior still change
+    # A third of the standard deviation of the noise scale of 1000 image points; the remaining
+    # change is smaller.
     noise_tolerance = 5e-3
 
     def __init__(
@@ -109,24 +111,24 @@ class CollocationTerms(AdjustedTerms):
         self._start = self.zeros()
         self._refinements: list[Refinement] = [
             NumberOfSines(),
-            Once(ripples),  # they may pass for a change between exposures
-            AgreeingOutliers(),  # and so may a dent whose image points are rejected
+            Once(ripples),  # before exposure_terms: ripples may be mistaken for such a change
+            AgreeingOutliers(),  # likewise, for dents whose image points are rejected
             Once(exposure_terms),
             Once(places),
         ]
 
     def _continue(self, problem: AdjustmentProblem, earlier: EarlierTerms) -> None:
-        """Start with earlier series, and with the priors that are most likely for them."""
+        """Start with earlier series, and with the most likely priors for them."""
         self.final_tolerance = CONTINUED_TOLERANCE
         start = []
         for f, (series, prior) in enumerate(zip(earlier.series, earlier.priors)):
             part, coefficients = FluoroscopeTerms.continued(problem, f, series, prior)
             self.parts.append(part)
             start.append(coefficients)
-            # A prior that is given was refined where it was estimated.
+            # A given prior has already been refined where it was estimated.
             self._more_places.append(MorePlaces() if prior is None else MorePlaces(0))
         self._start = tuple(start)
-        # The ripples of the earlier series stay, and its number of sines is not the first.
+        # The ripples of the earlier series stay, and its number of sines is not an initial guess.
         self._refinements = [NumberOfSines(changes=1), AgreeingOutliers()]
         if earlier.is_varying:
             self._refinements.append(Once(exposure_terms))
@@ -135,7 +137,7 @@ class CollocationTerms(AdjustedTerms):
 
     @property
     def functions(self) -> list[Functions]:
-        """Functions by fluoroscope."""
+        """Functions, by fluoroscope."""
         return [part.functions for part in self.parts]
 
     @property
@@ -145,32 +147,32 @@ class CollocationTerms(AdjustedTerms):
 
     @property
     def priors(self) -> list[Prior]:
-        """Present priors by fluoroscope."""
+        """Present priors, by fluoroscope."""
         return [part.prior for part in self.parts]
 
     @property
     def exposure_terms(self) -> list[ExposureTerms | None]:
-        """Terms of exposures by fluoroscope."""
+        """Terms of exposures, by fluoroscope."""
         return [part.own for part in self.parts]
 
     def start(self) -> tuple[NDArray[np.float64], ...]:
-        """Coefficients to start with, by fluoroscope."""
+        """Return the initial coefficients, by fluoroscope."""
         return self._start
 
     def zeros(self) -> tuple[NDArray[np.float64], ...]:
-        """Coefficients of no correction, by fluoroscope."""
+        """Return the coefficients of no correction, by fluoroscope."""
         return tuple(np.zeros(part.count) for part in self.parts)
 
     def with_additional(self, network: Network) -> Network:
-        """Return the network with the terms under their present priors."""
+        """Return the network with the terms as additional parameters with their priors."""
         return replace(network, additional=tuple(part.additional() for part in self.parts))
 
     def renew(
         self, network: Network, matrix: FactorizedNormalMatrix, adjustment: Adjustment
     ) -> tuple[bool, tuple[NDArray[np.float64], ...]]:
-        """Renew priors, gauges and functions at a solution.
+        """Update priors, gauges and functions at a solution.
 
-        Returns whether the priors have settled, and the coefficients with which to continue.
+        Returns whether the priors have settled, and the coefficients to continue with.
         """
         coefficients = coefficients_of(adjustment)
         if self._steady_renewals == STAY_AFTER:
@@ -187,7 +189,7 @@ class CollocationTerms(AdjustedTerms):
     def _renewed(
         self, network: Network, matrix: FactorizedNormalMatrix, adjustment: Adjustment
     ) -> Solution:
-        """Renew what the priors assume; return the solution with what that shows."""
+        """Update gauges, exposure terms and priors; return the solution with its equations."""
         for part, interior in zip(self.parts, adjustment.parameters.interior):
             part.use_interior(interior)
         solved = solved_additional(matrix, network, adjustment)
@@ -200,7 +202,7 @@ class CollocationTerms(AdjustedTerms):
         return Solution(self.parts, adjustment, equations, all(steady))
 
     def _renew_exposure_terms(self, network: Network, adjustment: Adjustment) -> None:
-        """Renew the variances of the terms of exposures."""
+        """Update the variances of the terms of exposures."""
         if all(part.own is None for part in self.parts):
             return
         estimates = estimates_beside_free_points(network, adjustment)
@@ -216,7 +218,7 @@ class CollocationTerms(AdjustedTerms):
     def _changed(
         self, change: Change, coefficients: Sequence[NDArray[np.float64]]
     ) -> tuple[NDArray[np.float64], ...]:
-        """Change the terms; return the coefficients with which to continue."""
+        """Change the terms; return the coefficients to continue with."""
         out = []
         for part, modes, present in zip(self.parts, change.modes, coefficients):
             f = part.number
@@ -234,11 +236,11 @@ class CollocationTerms(AdjustedTerms):
         return None if fit is None else fit.field
 
     def fitted_series(self, f: int, adjustment: Adjustment, precise: Precision) -> Series:
-        """See `AdjustedTerms`; beside a field of the angle, that which belongs to it."""
+        """See `AdjustedTerms`; with a field of the angle, the series that belongs to it."""
         return self.parts[f].fitted_series(adjustment, precise)
 
     def left_out(self, f: int) -> LeftOut | None:
-        """The signal beyond the sines of fluoroscope f."""
+        """Return the signal that the sines of fluoroscope f omit."""
         return self.parts[f].left_out()
 
     def variance_between_exposures(
@@ -254,7 +256,7 @@ class CollocationTerms(AdjustedTerms):
 def _renew_prior(
     part: FluoroscopeTerms, equations: SeriesEquations, more_places: MorePlaces
 ) -> bool:
-    """Renew the prior of a fluoroscope; return whether it hardly changes."""
+    """Update the prior of a fluoroscope; return whether it hardly changes."""
     last = part.prior
     prior = most_likely_prior(
         part.functions, equations.information, equations.right, part.gauge, prior=last

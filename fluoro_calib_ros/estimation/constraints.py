@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Constraints of a self-calibration, and the relative orientations it gives.
+"""Constraints of a self-calibration, and the relative orientations that it estimates.
 
-Constraints are relative orientations of the fluoroscopes, interior orientations that are known
-beforehand, and the datum.
+Constraints are relative orientations of the fluoroscopes, interior orientations known beforehand,
+and the datum.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from .initial_network import Measured
 from .options import CalibrationOptions
 from .rounds import SelfCalibration
 
-MIN_PAIRS = 2  # of exposures for a constraint of the relative orientation
+MIN_PAIRS = 2  # pairs of exposures that a constraint of the relative orientation needs
 
 
 @dataclass(frozen=True)
@@ -43,9 +43,9 @@ class RelativeOrientation:
 
     fluoroscopes: tuple[str, str]  #: names of fluoroscopes a and b
     pose: RelativePose  #: Q = R_b R_a^T and t = R_a (T_b - T_a) [mm]
-    #: (6, 6) of t [mm] and of Q [rad] about the axes of b's sensor
+    #: (6, 6) covariance of t [mm], and of Q [rad] about the axes of the sensor of b
     covariance: NDArray[np.float64]
-    #: (3,) standard deviations of the exposures about it
+    #: (3,) standard deviations of single exposures about the pose
     scatter_mm: NDArray[np.float64]
     scatter_rad: NDArray[np.float64]
     exposures: int  #: number of pairs of exposures
@@ -63,7 +63,7 @@ class RelativeOrientation:
 
 
 def paired_exposures(measured: Measured, b: int) -> NDArray[np.int64]:
-    """Rows (k, 2) of the exposures of fluoroscopes 0 and b that have the same number."""
+    """Return the rows (k, 2) of exposures of fluoroscopes 0 and b with the same number."""
     row = {
         (int(f), frame.number): j
         for j, (f, frame) in enumerate(zip(measured.network.fluoroscope, measured.frames))
@@ -75,10 +75,10 @@ def paired_exposures(measured: Measured, b: int) -> NDArray[np.int64]:
 
 
 def interiors_to_estimate(measured: Measured, options: CalibrationOptions) -> NDArray[np.bool_]:
-    """Whether (F,) the interior orientation of each fluoroscope is estimated.
+    """Return whether (F,) the interior orientation of each fluoroscope is estimated.
 
-    It is fixed where it is known and has no standard deviation, and where flat targets parallel to
-    the image cannot show it.
+    It is fixed where it is known without a standard deviation, and where flat targets parallel to
+    the image do not determine it.
     """
     estimated = options.interior == 'estimated'
     out = np.full(len(measured.fluoroscopes), estimated)
@@ -91,10 +91,10 @@ def interiors_to_estimate(measured: Measured, options: CalibrationOptions) -> ND
 
 
 def gauges_of(measured: Measured, options: CalibrationOptions) -> tuple[GaugeKind, ...]:
-    """What the orientation of each fluoroscope can express.
+    """Return which changes the orientation of each fluoroscope can absorb.
 
-    Targets parallel to the image show no shift or scale that the exterior orientations could not
-    take up, though the interior orientation is fixed.
+    With targets parallel to the image, the exterior orientations can absorb any shift and scale,
+    even if the interior orientation is fixed.
     """
     fixed = GaugeKind.TURNS if options.interior == 'fixed' else GaugeKind.FULL
     return tuple(
@@ -112,9 +112,9 @@ def _is_untilted(measured: Measured, f: int) -> bool:
 
 
 def _interior_sd(measured: Measured, options: CalibrationOptions) -> NDArray[np.float64] | None:
-    """Standard deviations (F, 3) [px] of the start values of the interior orientations.
+    """Return the standard deviations (F, 3) [px] of the initial interior orientations.
 
-    None where nothing is known of any.
+    None if all are unknown.
     """
     sd = np.full((len(measured.fluoroscopes), 3), np.inf)
     if options.interior_sd is not None:
@@ -153,7 +153,7 @@ def with_constraints(measured: Measured, options: CalibrationOptions) -> Measure
 def _relative_constraints(
     measured: Measured, options: CalibrationOptions
 ) -> tuple[RelativeConstraint, ...]:
-    """Constraints of every further fluoroscope with the first. Raises DataError."""
+    """Return the constraints of every other fluoroscope with the first. Raises DataError."""
     first, *others = measured.fluoroscopes
     if not others:
         raise DataError(
@@ -175,7 +175,7 @@ def _relative_constraints(
 
 
 def _without_targets_of_few_rays(measured: Measured) -> Measured:
-    """Return the network without targets that fewer than MIN_RAYS image points show."""
+    """Return the network without targets that have fewer than MIN_RAYS image points."""
     network = measured.network
     rays = np.bincount(network.point, minlength=network.n_points)
     few = rays < MIN_RAYS
@@ -215,10 +215,10 @@ def _without_targets_of_few_rays(measured: Measured) -> Measured:
 def relative_orientations(
     run: SelfCalibration, constraint: str
 ) -> tuple[RelativeOrientation, ...]:
-    """Relative orientation of every further fluoroscope with the first, where exposures pair.
+    """Return the relative orientation of every other fluoroscope to the first.
 
-    constraint: that of the CalibrationOptions. Without one it is the weighted mean of the
-    exposures.
+    Without a constraint, fluoroscopes that share no exposures with the first are skipped, and the
+    result is the weighted mean of the exposures. constraint: that of the CalibrationOptions.
     """
     measured = run.measured
     parameters = run.after.parameters
@@ -253,10 +253,10 @@ def relative_orientations(
 def _mean_of_pairs(
     run: SelfCalibration, pairs: NDArray[np.int64]
 ) -> tuple[RelativePose, NDArray[np.float64]]:
-    """Weighted mean of the relative orientations of pairs (k, 2), and its covariance (6, 6).
+    """Return the weighted mean of relative orientations of pairs (k, 2), and covariance (6, 6).
 
-    The exposures are correlated through interior orientation and object points, so their mixed
-    covariances count.
+    The exposures are correlated through interior orientation and object points, so the covariances
+    between pairs are included.
     """
     network = run.measured.network
     after = run.after

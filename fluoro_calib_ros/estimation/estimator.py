@@ -3,24 +3,26 @@
 
 """How a self-calibration obtains a correction model, and the gauge between it and orientations.
 
-The gauge between a free correction and the orientation of the sensor. A correction that can
-reproduce what a change of interior and exterior orientation does to the image competes with them.
-To first order these changes move an image point (x, y) = (u - xp, v - yp) by
+The gauge is the freedom between a free correction and the orientation of the sensor. A correction
+competes with the orientations if it can reproduce the effect of a change of interior and exterior
+orientation on the image. To first order, such a change moves an image point (x, y) = (u - xp, v -
+yp) by
 
     (1, 0), (0, 1)                    principal point,
     (x, y)                            principal distance,
-    (-y, x)                           turn of the sensor about its axis,
-    (x x, x y)/c, (x y, y y)/c        turn of the sensor about its rows and columns, less a shift
+        (-y, x)                           rotation of the sensor about its axis,
+        (x x, x y)/c, (x y, y y)/c        rotation about its rows and columns, without a shift
 
 (derivatives of the collinearity condition; the last three are common to all exposures and leave
-sources and object points where they are). The fitted correction is kept orthogonal to them. Where
-the interior orientation is fixed, only the turns are left, with their shifts: (-y, x), (c + x x/c,
-x y/c), (x y/c, c + y y/c). Where the exterior orientations are known too, nothing competes.
+sources and object points where they are). The fitted correction is kept orthogonal to these
+fields. Where the interior orientation is fixed, only the rotations remain, with their shifts: (-y,
+x), (c + x x/c, x y/c), (x y/c, c + y y/c). Where the exterior orientations are known too, nothing
+competes.
 
-Flat targets parallel to the image show neither principal distance nor principal point, and any
-distance of the source takes up a scale. Where these are given, they are those of a distortion
-without shift, scale and tilt, such as that of Brown: the part in the gauge vanishes of the cubic
-polynomial that fits the correction best, not of the correction as a whole.
+Flat targets parallel to the image determine neither principal distance nor principal point, and
+the distance of the source absorbs any scale. Where these are given, they are those of a distortion
+without shift, scale and tilt, such as that of Brown. The gauge part then vanishes in the cubic
+polynomial that fits the correction best, not in the correction as a whole.
 """
 
 from __future__ import annotations
@@ -51,12 +53,12 @@ if TYPE_CHECKING:
 
 
 class GaugeKind(Enum):
-    """What the orientation can express, and a correction must not.
+    """Changes that the orientation can absorb, and a correction must not reproduce.
 
-    FULL: interior orientation and turns. TREND: the same, where the interior orientation is given
-    as that of a cubic distortion, and the exposures do not show it. TURNS: the interior
-    orientation is fixed, and its errors are learned by the correction. NONE: the exterior
-    orientations are known too.
+    FULL: interior orientation and rotations. TREND: the same, where the interior orientation is
+    given as that of a cubic distortion, and the exposures do not determine it. TURNS: rotations
+    only; the interior orientation is fixed, and the correction learns its errors. NONE: the
+    exterior orientations are known too.
     """
 
     FULL = 'full'
@@ -65,14 +67,14 @@ class GaugeKind(Enum):
     NONE = 'none'
 
 
-UNIT_PX = 512.0  # of the image coordinates in the basis; any fixed length would do
+UNIT_PX = 512.0  # unit of the image coordinates in the basis; any fixed length would do
 
 
 def orientation_fields(xy: ArrayLike) -> NDArray[np.float64]:
     """Return the displacements (n, 2, 6) of points xy (n, 2) that orientations absorb.
 
-    In any unit of xy: a shift of the image in both directions, its scale, its rotation, and its
-    tilt about both axes (the linearised projective map of a rotated sensor).
+    xy may have any unit. The displacements are a shift of the image in both directions, its scale,
+    its rotation, and its tilt about both axes (the linearised projective map of a rotated sensor).
     """
     x, y = np.asarray(xy, dtype=float).T
     one = np.ones_like(x)
@@ -84,9 +86,9 @@ def orientation_fields(xy: ArrayLike) -> NDArray[np.float64]:
 def gauge_basis(
     uv: ArrayLike, interior: NDArray[np.float64], kind: GaugeKind = GaugeKind.FULL
 ) -> NDArray[np.float64]:
-    """Basis (n, 2, g) of the gauge at pixels uv (n, 2), scaled to about one; interior (3,) [px].
+    """Return the basis (n, 2, g) of the gauge at pixels uv (n, 2), of magnitude about one.
 
-    g is 3 for the turns, 0 for none, else 6.
+    interior: (3,) xp, yp, c [px]. g is 3 for the rotations (TURNS), 0 for NONE, else 6.
     """
     xy = (np.asarray(uv) - interior[:2]) / UNIT_PX
     if kind is GaugeKind.NONE:
@@ -109,10 +111,9 @@ def gauge_coefficients(
     interior: NDArray[np.float64],
     kind: GaugeKind = GaugeKind.FULL,
 ) -> NDArray[np.float64]:
-    """Coefficients (g,) of the part of fitted corrections that is in the gauge.
+    """Return the coefficients (g,) of the part of fitted corrections that is in the gauge.
 
     uv: (n, 2) pixels. fitted: (n, 2) corrections there [px]. interior: (3,) xp, yp, c [px].
-    Returns (g,).
     """
     basis = gauge_basis(uv, interior, kind)
     if kind is GaugeKind.TREND:
@@ -129,10 +130,10 @@ def gauge_rows(
     interior: NDArray[np.float64],
     kind: GaugeKind = GaugeKind.FULL,
 ) -> NDArray[np.float64]:
-    """Rows (g, 2m) whose products with the coefficients of a series vanish without a gauge part.
+    """Return rows (g, 2m) whose products with the coefficients of a series give its gauge part.
 
-    values (n, m): functions of the series at pixels uv (n, 2); interior (3,) [px]. The
-    coefficients are those of u, then those of v.
+    The products vanish for a series without a gauge part. values (n, m): functions of the series
+    at pixels uv (n, 2); interior (3,) [px]. The coefficients of u precede those of v.
     """
     basis = gauge_basis(uv, interior, kind)
     count = basis.shape[2]
@@ -146,7 +147,7 @@ def gauge_rows(
 
 
 def _cubic_terms(uv: ArrayLike, interior: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Terms (n, 2, 14) that complete the gauge to all cubic polynomials about (xp, yp)."""
+    """Return terms (n, 2, 14) that complete the gauge to all cubic polynomials about (xp, yp)."""
     x, y = (np.asarray(uv) - interior[:2]).T / UNIT_PX
     powers = np.stack([x**i * y**j for i, j in polynomial_powers(CUBIC)], axis=1)
     terms = [polynomial_coefficients(CUBIC, parts) for parts in cubic_terms().values()]
@@ -159,13 +160,13 @@ def interior_about(
     correction: NDArray[np.float64],
     interior: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Interior orientation (3,) [px] in the gauge about another principal point.
+    """Return the interior orientation (3,) [px] in the gauge about another principal point.
 
-    A sensor that is turned by R and has another camera matrix K' sees the same rays where the
+    A sensor that is rotated by R and has another camera matrix K' sees the same rays if its
     corrected image is that of the homography K' R K^-1 (Hartley and Zisserman, "Multiple View
-    Geometry", 2003, 8.4). To second order, a turn with its shift d of the principal point
-    stretches the image by d^2/c^2: a correction with a large affine part is orthogonal to the
-    gauge about a near principal point, and about far ones, with which it may be smaller.
+    Geometry", 2003, 8.4). To second order, a rotation with its shift d of the principal point
+    stretches the image by d^2/c^2. A correction with a large affine part is therefore orthogonal
+    to the gauge about a near principal point, and also about far ones, where it may be smaller.
 
     Parameters
     ----------
@@ -185,7 +186,7 @@ def interior_about(
     Raises
     ------
     ValueError
-        If there is none: the corrections are no numbers, or image points come to lie behind.
+            If there is none: the corrections are not finite, or image points come to lie behind.
     """
     rays = np.column_stack([(uv - correction - interior[:2]) / interior[2], np.ones(len(uv))])
     reference = np.array([*centre, interior[2]])
@@ -198,30 +199,30 @@ def interior_about(
         return gauge_coefficients(uv, uv - ideal, reference)
 
     start = np.concatenate([interior, np.zeros(3)])
-    # A turn by 1/c displaces the image as a pixel of the principal point does.
+    # A rotation by 1/c displaces the image as much as a shift of the principal point by a pixel.
     scale = np.repeat([1.0, 1 / interior[2]], 3)
     return least_squares(misclosure, start, x_scale=scale).x[:3]
 
 
 MIN_TRAINING = 60  # inliers of a fluoroscope that a correction model needs
-# An inlier becomes an outlier above STAY_IN times the limit (five sigma of each coordinate), an
-# outlier an inlier below half of it.
+# An inlier becomes an outlier above STAY_IN times the limit (five sigma of each coordinate); an
+# outlier becomes an inlier below half the limit.
 STAY_IN = 1.5
-FOLDS = 10  # of the cross-validation
+FOLDS = 10  # number of folds of the cross-validation
 FINAL_TOLERANCE = 1e-5  # decrease of F that the last adjustment may leave
 
-Model_co = TypeVar('Model_co', covariant=True)  # the correction model that a regression gives
+Model_co = TypeVar('Model_co', covariant=True)  # correction model that a regression returns
 
 
 @dataclass(frozen=True)
 class AdjustmentProblem:
-    """A network whose adjustment is to estimate terms of the correction."""
+    """A network whose adjustment will estimate terms of the correction."""
 
     network: Network  #: network without additional parameters
     #: width and height [px] of the image of each fluoroscope
     image_sizes: Sequence[tuple[int, int]]
     before: Adjustment  #: adjustment of the network without correction
-    gauges: Sequence[GaugeKind]  #: what the orientation of each fluoroscope can express
+    gauges: Sequence[GaugeKind]  #: changes that the orientation of each fluoroscope can absorb
     #: (e,) angles of the C-arm [rad] in the exposures of each fluoroscope, in the order of the
     #: network; NaN where unknown; None: all are unknown
     angles: Sequence[NDArray[np.float64]] | None = None
@@ -234,21 +235,21 @@ class TrainingPoints:
     uv: NDArray[np.float64]  #: (N, 2) observed pixels; they do not change between rounds
     exposure: NDArray[np.int64]  #: (N,) exposure of each image point
     image_size: tuple[int, int]  #: width and height of the image [px]
-    gauge: GaugeKind  #: what the orientation can express
-    #: (N, m) functions whose coefficients are estimated in the adjustment, the same for u and v;
-    #: the correction is then kept orthogonal to all of them instead of the gauge
+    gauge: GaugeKind  #: changes that the orientation can absorb
+    #: (N, m) functions whose coefficients the adjustment estimates, the same for u and v; the
+    #: correction is then kept orthogonal to all of them instead of the gauge
     trend: NDArray[np.float64] | None = None
 
 
 class AdjustedTerms(ABC):
-    """Terms of the correction, of all fluoroscopes of a network, that the adjustment estimates."""
+    """Terms of the corrections of all fluoroscopes of a network that the adjustment estimates."""
 
     #: decrease of the cost at which an adjustment before the last may stop
     intermediate_tolerance: float
     final_tolerance = FINAL_TOLERANCE  #: decrease of the cost that the last adjustment may leave
-    #: relative change of the scale of the noise at which the terms may settle
+    #: relative change of the noise scale at which the terms may settle
     noise_tolerance = SETTLED
-    #: whether terms are renewed with the normal matrix at a solution, not with one near it
+    #: whether updating the terms needs the normal matrix at a solution, not one near it
     needs_solution = False
 
     @property
@@ -261,41 +262,41 @@ class AdjustedTerms(ABC):
         """Return the network with the terms as additional parameters."""
 
     def start(self) -> tuple[NDArray[np.float64], ...]:
-        """Coefficients to start with, by fluoroscope."""
+        """Return the initial coefficients, by fluoroscope."""
         return self.zeros()
 
     @abstractmethod
     def zeros(self) -> tuple[NDArray[np.float64], ...]:
-        """Coefficients of no correction, by fluoroscope."""
+        """Return the coefficients of no correction, by fluoroscope."""
 
     @abstractmethod
     def renew(
         self, network: Network, matrix: FactorizedNormalMatrix, adjustment: Adjustment
     ) -> tuple[bool, tuple[NDArray[np.float64], ...]]:
-        """Renew what the terms assume, from the solved normal matrix of an adjustment.
+        """Update the assumptions of the terms from the solved normal matrix of an adjustment.
 
-        Returns whether nothing changed, and the coefficients with which to continue.
+        Returns whether nothing changed, and the coefficients to continue with.
         """
 
     def left_out(self, f: int) -> LeftOut | None:
-        """What the series of fluoroscope f leaves out by design; None: nothing."""
+        """Return what the series of fluoroscope f omits by design; None: nothing."""
         return None
 
     def fit_angles(self, f: int, adjustment: Adjustment, precise: Precision) -> AngleField | None:
-        """Fit what differs between the exposures of fluoroscope f to the angles of the C-arm.
+        """Fit differences between the exposures of fluoroscope f to the angles of the C-arm.
 
-        The series and the variance between exposures are then those beside this field. None: there
-        is no such field.
+        Afterwards the series and the variance between exposures are those that remain with this
+        field. None: there is no such field.
         """
         return None
 
     def variance_between_exposures(
         self, f: int, network: Network, adjustment: Adjustment, precise: Precision
     ) -> NDArray[np.float64]:
-        """Variances [px^2] by which the distortion of fluoroscope f differs between exposures.
+        """Return variances [px^2] between exposures of the distortion of fluoroscope f.
 
-        They are those of its inliers (i,), without what orientations absorb. network: that with
-        the terms as additional parameters; adjustment and precise: of this network.
+        The variances are those of the inliers (i,), without the part that orientations absorb.
+        network: with the terms as additional parameters; adjustment and precise: of this network.
         """
         return np.zeros(int(adjustment.inliers[network.rows(f)].sum()))
 
@@ -311,9 +312,9 @@ class RegressionStep(ABC, Generic[Model_co]):
 
     def __init__(self, points: TrainingPoints) -> None:
         self.points = points
-        self.k = 0  #: number of neighbours chosen; 0 for a model without
+        self.k = 0  #: number of neighbours that was chosen; 0 for a model without neighbours
         self.score = 0.0  #: G, weighted square sum of the errors of cross-validation
-        self.changed = False  #: whether inliers or k differ from the last round
+        self.changed = False  #: whether inliers or k differ from those of the last round
         #: (N,) image points to which the model is fitted
         self.inliers: NDArray[np.bool_] | None = None
 
@@ -340,16 +341,16 @@ class RegressionStep(ABC, Generic[Model_co]):
 
     @abstractmethod
     def model(self, values: NDArray[np.float64], series: Series | None = None) -> Model_co:
-        """Return the correction model of values (N, 2) with its noise and bias.
+        """Return the correction model of values (N, 2), with its noise and bias.
 
-        series: terms that were estimated in the adjustment and are not in the values.
+        series: terms that the adjustment has estimated and the values do not contain.
         """
 
     def _updated_inliers(self, q: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Inliers (N,) by normalised squared residuals q (N,); sets `changed`.
+        """Return the inliers (N,) by normalised squared residuals q (N,); set `changed`.
 
-        The limit depends on the last state: a point that moves about it would otherwise start the
-        neighbour search and the acceleration anew in every round.
+        The limit depends on the last state, because a point that fluctuates about a single limit
+        would restart the neighbour search and the acceleration in every round.
         """
         inliers = q <= INLIER_Q
         if self.inliers is not None:
@@ -359,27 +360,27 @@ class RegressionStep(ABC, Generic[Model_co]):
 
 
 def no_terms(problem: AdjustmentProblem) -> None:
-    """No terms of the model are unknowns of the adjustment."""
+    """Estimate no terms in the adjustment."""
 
 
 def no_regression(points: TrainingPoints, k: int | None) -> None:
-    """Nothing is fitted to the residuals between adjustments."""
+    """Fit nothing to the residuals between adjustments."""
 
 
 @dataclass(frozen=True)
 class Estimator:
-    """How a self-calibration obtains the models of a kind."""
+    """How a self-calibration obtains models of one kind."""
 
     kind: str
     #: returns the terms that are unknowns of the adjustment; None: there are none
     adjusted_terms: Callable[[AdjustmentProblem], AdjustedTerms | None] = no_terms
-    #: returns the regression of the residuals between adjustments for the number k of neighbours
+    #: returns the regression of the residuals between adjustments with the number k of neighbours
     #: that the user asks for (None: to be chosen); None: the model needs no regression
     regression: Callable[[TrainingPoints, int | None], RegressionStep[Any] | None] = no_regression
 
 
 def require_training(count: int) -> None:
-    """Raise ValueError where count inliers are too few for a correction model."""
+    """Raise ValueError if count inliers are too few for a correction model."""
     if count < MIN_TRAINING:
         raise ValueError(
             f'{count} inliers are too few for the correction model, {MIN_TRAINING} are needed'
@@ -387,16 +388,16 @@ def require_training(count: int) -> None:
 
 
 def coefficients_of(adjustment: Adjustment) -> tuple[NDArray[np.float64], ...]:
-    """Coefficients of the additional parameters by fluoroscope, which all have some."""
+    """Return the additional parameters that are not None, in the order of the fluoroscopes."""
     return tuple(c for c in adjustment.parameters.additional if c is not None)
 
 
 def estimated_terms(
     f: int, adjustment: Adjustment, precise: Precision
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Coefficients (p,) of the additional parameters of fluoroscope f, and covariance (p, p).
+    """Return additional parameters (p,) of fluoroscope f, and their covariance (p, p).
 
-    Raises ValueError where there are none.
+    Raises ValueError if there are none.
     """
     coefficients = adjustment.parameters.additional[f]
     covariance = precise.additional[f]
@@ -406,16 +407,16 @@ def estimated_terms(
 
 
 def prior_of_additional(network: Network, f: int) -> NDArray[np.float64]:
-    """Prior precision matrix (p, p) of the additional parameters of fluoroscope f."""
+    """Return the prior precision matrix (p, p) of the additional parameters of fluoroscope f."""
     additional = network.additional[f]
     assert additional is not None
     return additional.prior
 
 
 def exposure_folds(exposure: NDArray[np.int64], folds: int = FOLDS) -> NDArray[np.int64]:
-    """Fold (N,) of each image point: the exposures (N,) are dealt out in turn.
+    """Deal the exposures (N,) out in turn; return the fold (N,) of each image point.
 
-    Of a single exposure the image points are dealt out.
+    If there is only one exposure, its image points are dealt out.
     """
     _, number = np.unique(exposure, return_inverse=True)
     if not number.any():

@@ -4,20 +4,20 @@
 """Distortion that differs between exposures: low-order terms of each exposure.
 
 The magnetic field about an image intensifier, and so its distortion, changes with the angle of a
-C-arm. The change is smooth: the 14 terms of the cubic trend, less what the orientation of an
+C-arm. The change is smooth: the 14 terms of the cubic trend, without what the orientation of an
 exposure absorbs, describe it (Gronenschild, Medical Physics 26, 1999). Their coefficients are
-random effects with mean zero (Robinson, "That BLUP is a good thing", Statistical Science 6, 1991);
-the variance of each term over the exposures has the largest marginal likelihood (MacKay, Neural
-Computation 4, 1992) and vanishes where nothing changes.
+random effects with mean zero (Robinson, "That BLUP is a good thing", Statistical Science 6, 1991).
+The variance of each term over the exposures is the one with the largest marginal likelihood
+(MacKay, Neural Computation 4, 1992), and vanishes where nothing changes.
 
-A change of the principal distance is hardly different from one of the distance of the source: its
-variance over the exposures can be estimated many times too small, and its stated standard
-deviation with it. Terms of the interior orientation change about as much as the others do. This is
-the prior of their variances: inverse chi squared with a few degrees of freedom, about the mean
-variance of the others (Smyth, "Linear models and empirical Bayes methods", Statistical
-Applications in Genetics and Molecular Biology 3, 2004). Their variances are the means of the
-posterior (Gelman et al., "Bayesian Data Analysis", 2013, 2.6): what is not known of them enlarges
-the stated standard deviations.
+A change of the principal distance hardly differs from a change of the distance of the source. Its
+variance over the exposures may be estimated many times too small, and its stated standard
+deviation with it. Terms of the interior orientation change about as much as the other terms do.
+The prior of their variances is therefore inverse chi squared with a few degrees of freedom, about
+the mean variance of the other terms (Smyth, "Linear models and empirical Bayes methods",
+Statistical Applications in Genetics and Molecular Biology 3, 2004). Their variances are the
+posterior means (Gelman et al., "Bayesian Data Analysis", 2013, 2.6), so that their uncertainty
+enlarges the stated standard deviations.
 """
 
 from __future__ import annotations
@@ -47,15 +47,15 @@ from ..photogrammetry.precision import information_of_additional, solved_additio
 from ..photogrammetry.unknowns import EXTERIOR_SIZE, INTERIOR_SIZE
 from .estimator import GaugeKind, gauge_basis
 
-TERMS = len(cubic_terms())  # of the cubic trend without the gauge
-# Square sum of the terms over its expectation for independent residuals from which distortion is
-# taken to vary. Object points and the common distortion absorb a part of the residuals: constant
+TERMS = len(cubic_terms())  # number of terms of the cubic trend without the gauge
+# Square sum of the terms over its expectation for independent residuals above which the distortion
+# varies. Object points and the common distortion absorb a part of the residuals: constant
 # distortions have 0.4 to 0.8 (docs/how_good/pathologies.md).
 VARYING = 0.85
-# Exposures as many as which the other terms tell of the variances of a change of the interior
-# orientation. Variances of the terms of a smooth field scatter like this.
+# Number of exposures that the other terms count as for the variances of a change of the interior
+# orientation. Variances of the terms of a smooth field scatter as if estimated from so many.
 LIKE_OTHERS = 4
-MIN_POINTS = 30  # of an exposure whose terms are tested
+MIN_POINTS = 30  # image points of an exposure whose terms are tested
 
 
 @dataclass(frozen=True)
@@ -64,8 +64,8 @@ class Variation:
 
     #: square sum of the terms of all exposures over its expectation for independent residuals
     chi2_per_dof: float
-    size_px: float  #: RMS of a coordinate of the change [px], without what the noise contributes
-    noise_px: float  #: standard deviation of a coordinate of what the terms leave [px]
+    size_px: float  #: RMS of a coordinate of the change [px], less the contribution of noise
+    noise_px: float  #: standard deviation of a coordinate of the residuals without the terms [px]
 
     @property
     def is_varying(self) -> bool:
@@ -79,11 +79,11 @@ def exposure_functions(
     interior: NDArray[np.float64],
     with_interior: bool = False,
 ) -> NDArray[np.float64]:
-    """Values (N, 2, 14) of the terms at pixels uv (N, 2), orthogonal and with an RMS of one.
+    """Return values (N, 2, 14) of the terms at pixels uv (N, 2), orthogonal and of RMS one.
 
     They are orthogonal to the gauge about interior (3,), which orientations absorb. with_interior:
-    three further terms are what a turn of the sensor does not absorb of the gauge, a change of the
-    interior orientation.
+    add three terms for a change of the interior orientation, which is the part of the gauge that a
+    rotation of the sensor does not absorb.
     """
     to_terms, count = trend_transformation(CUBIC)
     as_polynomials = np.linalg.inv(to_terms)[:, :count].reshape(2, -1, count)
@@ -101,7 +101,7 @@ def exposure_functions(
 
 
 def is_determined(exposure: NDArray[np.int64], fewest: int) -> bool:
-    """Whether at least `fewest` exposures have enough of the image points of exposure (n,)."""
+    """Return whether at least `fewest` of the exposures (n,) have enough image points."""
     return int(np.sum(np.unique(exposure, return_counts=True)[1] >= MIN_POINTS)) >= fewest
 
 
@@ -111,7 +111,8 @@ def variation(
     """Return the change of the distortion that residuals show.
 
     residuals (n, 2) [px] of inliers, their exposures (n,), and the values (n, 2, 14) of
-    `exposure_functions`. The variance of the noise is that which the terms leave.
+    `exposure_functions`. The variance of the noise is estimated from the residuals without the
+    terms.
     """
     explained = 0.0
     left = 0.0
@@ -141,8 +142,8 @@ def variation(
 class ExposureTerms:
     """Terms of every exposure of a fluoroscope as additional parameters.
 
-    The coefficients of one exposure stand after those of the one before. size_px: RMS of a
-    coordinate of the change to start with [px].
+    Coefficients are ordered exposure by exposure. size_px: initial RMS of a coordinate of the
+    change [px].
     """
 
     def __init__(
@@ -150,7 +151,7 @@ class ExposureTerms:
     ) -> None:
         numbers, place = np.unique(exposure, return_inverse=True)
         self.exposures = len(numbers)
-        #: at the image points; the groups are the exposures
+        #: functions at the image points; the groups are the exposures
         self.functions = GroupedFunctions(functions, place)
         count = functions.shape[2]
         #: (t,) variance of the coefficients of each term over the exposures [px^2]; t: 14, or 17
@@ -164,7 +165,7 @@ class ExposureTerms:
 
     @property
     def values(self) -> NDArray[np.float64]:
-        """Functions (N, 2, t e) at the image points; zero but for those of the own exposure."""
+        """Functions (N, 2, t e) at the image points; those of other exposures are zero."""
         own = self.functions
         out = np.zeros((len(own.group), 2, self.exposures, own.values.shape[2]))
         out[np.arange(len(own.group)), :, own.group] = own.values
@@ -181,7 +182,7 @@ class ExposureTerms:
         return float(np.sqrt(np.sum(self.variance)))
 
     def renew(self, mean: NDArray[np.float64], posterior: NDArray[np.float64]) -> None:
-        """Renew the variances from coefficients (t e,) and their posterior variances (t e,)."""
+        """Update the variances from coefficients (t e,) and their posterior variances (t e,)."""
         mean = mean.reshape(self.exposures, -1)
         posterior = posterior.reshape(self.exposures, -1)
         determined = np.clip(1 - posterior / self.variance, 1e-6, 1).sum(axis=0)
@@ -200,9 +201,9 @@ def without_exposure_terms(
     precision: NDArray[np.float64],
     count: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Information (c, c) and right side (c,) of the first coefficients, the others eliminated.
+    """Eliminate all but the first coefficients; return information (c, c) and right side (c,).
 
-    precision (p - c,): prior of the coefficients that are eliminated.
+    precision (p - c,): prior precisions of the eliminated coefficients.
     """
     rest = information[count:, count:] + np.diag(precision)
     mixed = information[count:, :count]
@@ -211,29 +212,29 @@ def without_exposure_terms(
     return reduced, right[:count] - mixed.T @ solved[:, -1]
 
 
-# What the terms of exposures (see `exposure_terms`) are if the survey has errors in common.
+# Robustness of the terms of exposures (see `exposure_terms`) against common errors of the survey.
 #
-# Errors of the survey are taken to be independent. Errors that it has in common, such as a sheet
-# that is bent or has shrunk in one direction, look like terms that change as the phantom is
-# turned: such terms are more likely than errors of so many points. Object points must not lend
-# the terms their likelihood. The variances of the terms are therefore estimated with object
-# points that are nearly free, by restricted likelihood (Patterson and Thompson, "Recovery of
-# inter-block information when block sizes are unequal", Biometrika 58, 1971). How far the
-# distortion of a later exposure differs is the size of the part which neither orientations nor
-# object points absorb, a variance component by the method of moments (Searle, Casella and
-# McCulloch, "Variance Components", Wiley 1992, chapter 5).
+# Errors of the survey are assumed to be independent. Common errors, such as of a sheet that is
+# bent or has shrunk in one direction, look like terms that change as the phantom is turned,
+# because such terms are more likely than errors of so many points. Object points must not lend the
+# terms their likelihood. The variances of the terms are therefore estimated with nearly free
+# object points, by restricted likelihood (Patterson and Thompson, "Recovery of inter-block
+# information when block sizes are unequal", Biometrika 58, 1971). The difference to expect of a
+# later exposure is the size of the part that neither orientations nor object points absorb, a
+# variance component by the method of moments (Searle, Casella and McCulloch, "Variance
+# Components", Wiley 1992, chapter 5).
 
-UNUSED = 1e6  # factor of the standard deviation of an outlier
+UNUSED = 1e6  # factor of the standard deviation of an outlier, to give it no weight
 NEARLY_FREE = 10.0  # factor of the standard deviations of the survey
 
 
 def estimates_beside_free_points(
     network: Network, adjustment: Adjustment
 ) -> tuple[tuple[NDArray[np.float64], NDArray[np.float64]], ...]:
-    """Coefficients (p,) and their variances (p,) by fluoroscope, with points that are nearly free.
+    """Return coefficients (p,) and their variances (p,) by fluoroscope, with nearly free points.
 
-    network has additional parameters for each fluoroscope; it is linearised at the adjustment.
-    Raises numpy.linalg.LinAlgError where it does not determine them.
+    network: has additional parameters for each fluoroscope; it is linearised at the adjustment.
+    Raises numpy.linalg.LinAlgError where it does not determine the coefficients.
     """
     free = replace(network, survey_sd_mm=NEARLY_FREE * network.survey_sd_mm)
     factor = adjustment.noise.information_factor(adjustment.q)
@@ -252,17 +253,17 @@ def variance_between_exposures(
     coefficients: NDArray[np.float64],
     covariance: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Variances [px^2] of image coordinates by terms of exposures, less what orientations absorb.
+    """Return variances [px^2] of terms of exposures, less what orientations absorb.
 
     Parameters
     ----------
     network : Network
     adjustment : Adjustment
-        Of the network.
+            Adjustment of the network.
     f : int
         Number of the fluoroscope.
     terms : ExposureTerms
-        Of its exposures.
+            Terms of the exposures of this fluoroscope.
     coefficients : (p,) ndarray
         Estimated coefficients of the terms [px].
     covariance : (p, p) ndarray
@@ -271,7 +272,7 @@ def variance_between_exposures(
     Returns
     -------
     (i,) ndarray
-        Of the inliers among the image points of the fluoroscope.
+            Variances of the inliers among the image points of the fluoroscope.
 
     Raises
     ------
@@ -290,7 +291,7 @@ def variance_between_exposures(
 def _information(
     network: Network, adjustment: Adjustment, f: int, terms: ExposureTerms
 ) -> NDArray[np.float64]:
-    """Information (p, p) of the terms where only orientations and object points are unknown."""
+    """Return the information (p, p) of the terms if only orientations and points are unknown."""
     additional: list[AdditionalParameters | None] = [None] * network.n_fluoroscopes
     start: list[NDArray[np.float64] | None] = [None] * network.n_fluoroscopes
     none = np.zeros((len(network.rows(f)), 0))
@@ -311,7 +312,7 @@ def _information(
 def _variances_left(
     network: Network, adjustment: Adjustment, f: int, terms: ExposureTerms
 ) -> NDArray[np.float64]:
-    """Expected squares (i,) [px^2] of the terms, without what orientations absorb, of inliers."""
+    """Return expected squares (i,) [px^2] of the terms at inliers, less what orientations absorb."""
     rows = network.rows(f)
     inliers = adjustment.inliers[rows]
     _, by_exterior, _, _ = project_with_jacobian(*network.per_image_point(adjustment.parameters))
@@ -320,7 +321,7 @@ def _variances_left(
     for number in np.unique(exposure):
         at = inliers & (exposure == number)
         own = terms.functions.values[at].reshape(2 * int(at.sum()), -1)
-        # In units in which the six unknowns matter alike.
+        # Scale the six unknowns so that they matter alike.
         absorbed = by_exterior[rows[at]].reshape(len(own), -1)
         absorbed = absorbed / np.linalg.norm(absorbed, axis=0)
         left = own - absorbed @ np.linalg.lstsq(absorbed, own, rcond=None)[0]
@@ -330,15 +331,16 @@ def _variances_left(
 
 # Estimation of a distortion that changes with the angle of a C-arm.
 #
-# The terms that the adjustment estimates of every exposure are a function of the angle, a sum of
-# its harmonics (see `angle_field`), plus what differs at random. All coefficients are random
-# effects whose variances have the largest marginal likelihood (MacKay, "Bayesian interpolation",
-# Neural Computation 4, 1992).
+# The terms that the adjustment estimates for every exposure are a function of the angle, a sum of
+# its harmonics (see `angle_field`), plus a random difference. All coefficients are random effects
+# whose variances have the largest marginal likelihood (MacKay, "Bayesian interpolation", Neural
+# Computation 4, 1992).
 
-MIN_SPREAD = np.deg2rad(2)  # of the angles
-STEPS = 60  # of the variances
-SETTLED = 1e-3  # relative change of the variances
-MIN_SHARE = 0.05  # of what differs between exposures that the angle explains, else it is no cause
+MIN_SPREAD = np.deg2rad(2)  # least RMS spread of the angles
+STEPS = 60  # most iterations of the variances
+SETTLED = 1e-3  # relative change of the variances at convergence
+# Least share of the variance between exposures that the angle must explain to be a cause.
+MIN_SHARE = 0.05
 
 
 @dataclass(frozen=True)
@@ -347,25 +349,25 @@ class Effects:
 
     mean: NDArray[np.float64]  #: (q,) [px]
     covariance: NDArray[np.float64]  #: (q, q)
-    mixed: NDArray[np.float64]  #: (c, q) covariance of the coefficients of the series with these
+    mixed: NDArray[np.float64]  #: (c, q) covariance of the series coefficients with the effects
 
 
 @dataclass(frozen=True)
 class AngleFit:
-    """A series and the terms of exposures, once these are a function of the angle."""
+    """A series and its terms of exposures, once the terms are a function of the angle."""
 
     field: AngleField
-    coefficients: NDArray[np.float64]  #: (c,) of the series, those of u first [px]
+    coefficients: NDArray[np.float64]  #: (c,) coefficients of the series, those of u first [px]
     covariance: NDArray[np.float64]  #: (c, c)
     remaining: float  #: share of the variance between exposures that the angle does not explain
-    effects: Effects  #: of which the field is made
+    effects: Effects  #: effects from which the field is made
 
 
 @dataclass(frozen=True)
 class SeriesWithExposures:
-    """Estimated coefficients of a series, and after them those of terms of exposures."""
+    """Estimated coefficients of a series, followed by those of terms of exposures."""
 
-    functions: Functions  #: of the series
+    functions: Functions  #: functions of the series
     uv: NDArray[np.float64]  #: (N, 2) image points to whose exposures the terms belong [px]
     terms: ExposureTerms
     coefficients: NDArray[np.float64]  #: (p,) [px]
@@ -373,7 +375,7 @@ class SeriesWithExposures:
 
 
 def can_be_fitted(angles: NDArray[np.float64]) -> bool:
-    """Whether angles (e,) [rad] of exposures are known, enough, and not all alike."""
+    """Return whether the angles (e,) [rad] of exposures are known, enough, and spread."""
     if len(angles) < HARMONICS or not np.isfinite(angles).all():
         return False
     return bool(np.sqrt(np.mean(np.var(harmonics(angles)[:, :2], axis=0))) > MIN_SPREAD)
@@ -382,7 +384,7 @@ def can_be_fitted(angles: NDArray[np.float64]) -> bool:
 def fit_angles(estimated: SeriesWithExposures, angles: NDArray[np.float64]) -> AngleFit | None:
     """Return series and terms as a function of the angles (e,) [rad] of the exposures.
 
-    None where they do not explain the terms, or the terms are not determined.
+    None if the angles do not explain the terms, or the terms are not determined.
     """
     with suppress(np.linalg.LinAlgError):
         return _fit(estimated, angles)
@@ -390,7 +392,7 @@ def fit_angles(estimated: SeriesWithExposures, angles: NDArray[np.float64]) -> A
 
 
 def _fit(estimated: SeriesWithExposures, angles: NDArray[np.float64]) -> AngleFit | None:
-    """See `fit_angles`; raises LinAlgError."""
+    """Compute `fit_angles`; raises LinAlgError."""
     h = harmonics(angles) - harmonics(angles).mean(axis=0)
     c = 2 * len(estimated.functions)
     own = estimated.covariance[c:, c:]
@@ -402,7 +404,7 @@ def _fit(estimated: SeriesWithExposures, angles: NDArray[np.float64]) -> AngleFi
     )
     if effects.explained(h) < MIN_SHARE:
         return None
-    # What changes of the terms changes the series as their covariance says.
+    # A change of the terms changes the series by their covariance.
     by_terms = np.linalg.solve(own, estimated.covariance[c:, :c]).T
     moved = effects.design @ mean - estimated.coefficients[c:]
     lost = own - effects.design @ covariance @ effects.design.T
@@ -420,10 +422,10 @@ def _fit(estimated: SeriesWithExposures, angles: NDArray[np.float64]) -> AngleFi
 
 
 class _Effects:
-    """Coefficients of the harmonics of every term, then what differs of it in every exposure.
+    """Coefficients of the harmonics of every term, then the remainder of it in every exposure.
 
-    The terms keep the proportions of their variances over the exposures. One factor for each order
-    of the harmonics, and one for what is random, are estimated from all terms.
+    The variances of the terms keep their proportions over the exposures. One factor for each order
+    of the harmonics, and one for the random remainder, are estimated from all terms.
     """
 
     def __init__(self, own: ExposureTerms, h: NDArray[np.float64]) -> None:
@@ -444,7 +446,7 @@ class _Effects:
     def estimate(
         self, information: NDArray[np.float64], right: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Mean and covariance of all effects, with the most likely variances.
+        """Return mean and covariance of all effects, with the most likely variances.
 
         information, right: normal equations of the terms of the exposures, without their prior.
         """
@@ -465,7 +467,7 @@ class _Effects:
         return covariance @ vector, covariance
 
     def explained(self, h: NDArray[np.float64]) -> float:
-        """Share of the variance between exposures that harmonics h (e, 4) explain."""
+        """Return the share of the variance between exposures that harmonics h (e, 4) explain."""
         variance = self._variance
         of_harmonics = variance[: self.count].reshape(HARMONICS, -1).sum(axis=1)
         by_angle = float(np.mean(h**2, axis=0) @ of_harmonics)
@@ -474,7 +476,7 @@ class _Effects:
 
 
 def _inverse_root(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Lower triangular matrix R with the inverse R^T R of a positive definite matrix."""
+    """Return a lower triangular R such that R^T R is the inverse of a positive definite matrix."""
     factor = np.asfortranarray(np.linalg.cholesky(matrix))
     root, failed = lapack.dtrtri(factor, lower=1, overwrite_c=1)
     if failed:
@@ -485,12 +487,12 @@ def _inverse_root(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
 def field_of(
     estimated: SeriesWithExposures, angles: NDArray[np.float64], effects: Effects
 ) -> AngleField:
-    """Field of the effects of angles (e,) [rad] on estimated terms."""
+    """Return the field of the effects of angles (e,) [rad] on estimated terms."""
     size = estimated.functions.image_size
     cubic = Functions(size, CUBIC)
     values = cubic(estimated.uv)
     of_terms = estimated.terms.functions.values
-    # Terms are cubic polynomials: this solution is exact.
+    # This solution is exact, because the terms are cubic polynomials.
     to_cubic = [np.linalg.lstsq(values, of_terms[:, axis], rcond=None)[0] for axis in (0, 1)]
     by_harmonic = effects.mean.reshape(HARMONICS, -1)
     coefficients = np.stack([by_harmonic @ matrix.T for matrix in to_cubic], axis=1)

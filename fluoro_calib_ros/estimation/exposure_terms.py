@@ -312,7 +312,7 @@ def _information(
 def _variances_left(
     network: Network, adjustment: Adjustment, f: int, terms: ExposureTerms
 ) -> NDArray[np.float64]:
-    """Return expected squares (i,) [px^2] of the terms at inliers, less what orientations absorb."""
+    """Return expected squares (i,) [px^2] of terms at inliers, less what orientations absorb."""
     rows = network.rows(f)
     inliers = adjustment.inliers[rows]
     _, by_exterior, _, _ = project_with_jacobian(*network.per_image_point(adjustment.parameters))

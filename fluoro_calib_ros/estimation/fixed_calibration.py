@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Networks whose interior orientations and corrections are fixed at their calibrations."""
+"""Networks with interior orientations and corrections fixed at their calibrations."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ from .initial_network import (
     start_noise,
 )
 
-# Covariance matrix of all unknowns of an adjustment, computed on request.
+# The covariance matrix of all unknowns of an adjustment, computed on request.
 
-# Position of the source in the frame of the phantom, rotation about the axes of the sensor.
+# Position of the source in the frame of the phantom; rotation about the axes of the sensor.
 EXTERIOR = ('x', 'y', 'z', 'turn x', 'turn y', 'turn z')
 
 
@@ -47,12 +47,13 @@ EXTERIOR = ('x', 'y', 'z', 'turn x', 'turn y', 'turn z')
 class JointPrecision:
     """Covariance matrix of all unknowns of an adjustment."""
 
-    #: of the unknowns: x, y, z of the source [mm] and its turns about the axes of the sensor [rad]
-    #: of each exposure; x, y, z [mm] of each target; xp, yp, c [px] of each fluoroscope; relative
-    #: orientations and coefficients of the correction, where they were estimated
+    #: (u,) names of the unknowns: x, y, z of the source [mm] and its rotations about the axes of
+    #: the sensor [rad] for each exposure; x, y, z [mm] of each target; xp, yp, c [px] of each
+    #: fluoroscope; relative orientations and coefficients of the correction, where they were
+    #: estimated
     names: tuple[str, ...]
-    values: NDArray[np.float64]  #: (u,) NaN for rotations, which have no value
-    covariance: NDArray[np.float64]  #: (u, u) zeros for what was fixed
+    values: NDArray[np.float64]  #: (u,) estimates; NaN for rotations, which have no value
+    covariance: NDArray[np.float64]  #: (u, u); zeros for fixed unknowns
 
 
 @dataclass(frozen=True)
@@ -61,17 +62,17 @@ class SolvedNetwork:
 
     measured: Measured
     adjustment: Adjustment
-    correction: NDArray[np.float64]  #: (N, 2) correction that was fixed [px]
-    #: (F, 3, 3) covariances of interior orientations that were fixed [px^2]
+    correction: NDArray[np.float64]  #: (N, 2) fixed correction [px]
+    #: (F, 3, 3) covariances of fixed interior orientations [px^2]
     fixed: NDArray[np.float64] | None = None
-    #: what the unknowns claim where that is not the precision of the network: the matrix then has
-    #: these standard deviations, and the correlations of the network
+    #: stated precision, where it differs from that of the network: the matrix then has these
+    #: standard deviations, and the correlations of the network
     stated: Precision | None = None
 
     def joint_precision(self) -> JointPrecision:
-        """Covariance matrix of all unknowns.
+        """Return the covariance matrix of all unknowns.
 
-        Raises numpy.linalg.LinAlgError where the network does not determine them.
+        Raises numpy.linalg.LinAlgError if the network does not determine them.
         """
         blocks = self._blocks()
         network = self.measured.network
@@ -96,9 +97,9 @@ class SolvedNetwork:
     def covariance_of_points(
         self,
     ) -> Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.float64]]:
-        """Return what gives the blocks (k, 3, 3) of targets p (k,) with targets q (k,) [mm^2].
+        """Return a function of p, q (k,): covariances (k, 3, 3) of targets p with q [mm^2].
 
-        p and q are rows. Raises numpy.linalg.LinAlgError as `joint_precision`.
+        p and q are rows of targets. Raises numpy.linalg.LinAlgError as `joint_precision`.
         """
         blocks = self._blocks()
         factor = np.ones((len(blocks.pp), 3))
@@ -113,7 +114,7 @@ class SolvedNetwork:
         return between
 
     def _blocks(self) -> CovarianceBlocks:
-        """Return blocks of the covariance matrix, those of the network."""
+        """Return the blocks of the covariance matrix of the network."""
         network = self.measured.network
         noise = self.adjustment.noise
         if self.fixed is not None:
@@ -128,7 +129,7 @@ class SolvedNetwork:
         return covariance_blocks(factorize(network, equations))
 
     def _as_stated(self, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Scale a covariance matrix to the standard deviations that the unknowns claim."""
+        """Scale a covariance matrix to the stated standard deviations of the unknowns."""
         if self.stated is None:
             return covariance
         claimed = np.concatenate(
@@ -139,12 +140,12 @@ class SolvedNetwork:
         )
         variance = np.diagonal(covariance)[: len(claimed)]
         scale = np.ones(len(covariance))
-        free = variance > 0  # not of what was fixed
+        free = variance > 0  # exclude fixed unknowns
         scale[: len(claimed)][free] = np.sqrt(claimed[free] / variance[free])
         return scale[:, None] * covariance * scale
 
     def _names(self) -> list[str]:
-        """Names of the unknowns of exposures and targets."""
+        """Return the names of the unknowns of exposures and targets."""
         exposures = [f'exposure {f.number} of {f.fluoroscope}' for f in self.measured.frames]
         targets = [f'target {number}' for number in self.measured.target_id]
         return [
@@ -153,8 +154,8 @@ class SolvedNetwork:
         ]
 
 
-# Mean number of image points of a target from which the noise can be estimated: with fewer the
-# noise cannot be told from errors of the survey.
+# Mean number of image points of a target that estimation of the noise needs: with fewer, the noise
+# cannot be separated from errors of the survey.
 MIN_RAYS_FOR_NOISE = 3
 
 
@@ -165,18 +166,18 @@ def network_of_calibrations(
     known: Known | None = None,
     starts: StartValues | None = None,
 ) -> Measured:
-    """Return network and start values of frames {fluoroscope: [Frame, ...]}.
+    """Return the network and the initial values of frames {fluoroscope: [Frame, ...]}.
 
-    calibrations {fluoroscope: FluoroscopeCalibration} are fixed, as are exterior orientations that
-    are known {fluoroscope: KnownOrientation}. starts: of an earlier adjustment of the frames.
-    Raises DataError as `measured_network`.
+    calibrations {fluoroscope: FluoroscopeCalibration} are fixed, and so are known exterior
+    orientations {fluoroscope: KnownOrientation}. starts: initial values from an earlier adjustment
+    of the frames. Raises DataError as `measured_network`.
     """
     sensors = {name: _sensor(calibrations[name]) for name in frames}
     return measured_network(frames, phantom, known=known, starts=starts, sensors=sensors)
 
 
 def _sensor(calibration: FluoroscopeCalibration) -> KnownSensor:
-    """Return interior orientation and correction of a calibration."""
+    """Return the interior orientation and the correction of a calibration."""
 
     def correction(frame: Frame) -> NDArray[np.float64]:
         if calibration.angle_field is None:
@@ -187,18 +188,18 @@ def _sensor(calibration: FluoroscopeCalibration) -> KnownSensor:
 
 
 def _angles(measured: Measured, rows: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Angle [rad] of the C-arm for image points (r,), NaN where it is unknown."""
+    """Return the angles [rad] of the C-arm of image points (r,); NaN where unknown."""
     return angles_of(measured.frames)[measured.network.exposure[rows]]
 
 
 def fixed_corrections(
     measured: Measured, calibrations: Calibrations
 ) -> tuple[NDArray[np.float64], Network]:
-    """Corrections (N, 2) [px] by calibrations, and the network with their uncertainty in sigma.
+    """Return corrections (N, 2) [px] by calibrations, and the network with their sd in sigma.
 
-    Where a correction is uncertain, at the border and beyond the calibrated area, an image point
-    has less weight, and where the noise of the calibration is larger, unless it has a sigma
-    itself.
+    An image point has less weight where its correction is uncertain, at the border and beyond the
+    calibrated area. Without a sigma of its own, it also has less weight where the noise of the
+    calibration is larger.
     """
     network = measured.network
     correction = np.zeros_like(network.uv)
@@ -228,11 +229,11 @@ def noise_of_calibrations(loss: str, calibrations: Iterable[FluoroscopeCalibrati
 def start_within_survey(
     network: Network, start: Parameters, correction: NDArray[np.float64], noise: Noise
 ) -> Parameters:
-    """Return start values near which no image point seems false by the survey of its target.
+    """Return initial values near which the survey makes no image point seem false.
 
-    Where the errors of the survey are larger in the image than its noise, a robust adjustment that
-    begins at the survey would keep them, and reject the image points. So the noise contains them
-    first, and is halved from adjustment to adjustment (graduated non-convexity: Blake and
+    Where errors of the survey are larger in the image than the noise, a robust adjustment that
+    starts at the survey would keep them and reject the image points. Therefore the noise includes
+    them at first, and is halved from adjustment to adjustment (graduated non-convexity: Blake and
     Zisserman, "Visual Reconstruction", MIT Press 1987).
     """
     if network.datum != 'survey' or not len(network.uv):
@@ -251,5 +252,5 @@ def start_within_survey(
 
 
 def too_few_rays_for_noise(network: Network) -> bool:
-    """Whether the noise of a network cannot be estimated and is that of the calibrations."""
+    """Whether a network has too few rays to estimate the noise; calibrations then give it."""
     return len(network.uv) < MIN_RAYS_FOR_NOISE * len(network.survey_mm)

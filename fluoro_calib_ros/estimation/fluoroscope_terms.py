@@ -46,8 +46,8 @@ if TYPE_CHECKING:
     from ..photogrammetry.network import Network
     from ..photogrammetry.precision import Precision
 
-RINGS = 2  # radial polynomials of degree 5 and 7: what a curved screen adds at the border
-# Least standard deviation [px] to start with: a detector without distortion leaves only noise.
+RINGS = 2  # radial polynomials of degree 5 and 7, which a curved screen adds at the border
+# Least initial standard deviation [px]: residuals of a detector without distortion are only noise.
 MIN_START_SD_PX = 0.1
 
 
@@ -55,7 +55,7 @@ MIN_START_SD_PX = 0.1
 class SeriesEquations:
     """Normal equations of the coefficients of a series, all other unknowns eliminated."""
 
-    information: NDArray[np.float64]  #: (2m, 2m) without a prior
+    information: NDArray[np.float64]  #: (2m, 2m), without a prior
     right: NDArray[np.float64]  #: (2m,)
 
 
@@ -66,7 +66,7 @@ class FluoroscopeTerms:
 
     def __init__(self, problem: AdjustmentProblem, number: int, functions: Functions) -> None:
         network = problem.network
-        self.number = number  #: of the fluoroscope in the network
+        self.number = number  #: number of the fluoroscope in the network
         self.rows = network.rows(number)
         self.uv = network.uv[self.rows]  #: (n, 2) image points [px]
         self.sigma = network.sigma[self.rows]
@@ -74,11 +74,11 @@ class FluoroscopeTerms:
         self.point = network.point[self.rows]
         self.image_size = problem.image_sizes[number]  #: width and height [px]
         self.gauge_kind = problem.gauges[number]
-        #: (e,) angles of the C-arm [rad]; empty where unknown
+        #: (e,) angles of the C-arm [rad]; empty if unknown
         self.angles = np.zeros(0) if problem.angles is None else problem.angles[number]
         #: (3,) xp, yp, c [px] at the last solution
         self.interior = problem.before.parameters.interior[number]
-        self._offset = np.zeros(3)  # of the interior orientation estimated last from this one
+        self._offset = np.zeros(3)  # last estimate of the interior orientation less self.interior
         self._relaxation = 1.0
         #: terms of the exposures; None: the distortion does not vary
         self.own: ExposureTerms | None = None
@@ -87,7 +87,7 @@ class FluoroscopeTerms:
 
     @classmethod
     def first(cls, problem: AdjustmentProblem, number: int, modes: int) -> FluoroscopeTerms:
-        """Return terms to start with; modes: of the sines, 0: trend without rings or signal."""
+        """Return initial terms; modes: number of sines, 0: trend without rings or signal."""
         functions = Functions(
             problem.image_sizes[number], CUBIC, modes, rings=RINGS if modes else 0
         )
@@ -103,7 +103,7 @@ class FluoroscopeTerms:
     ) -> tuple[FluoroscopeTerms, NDArray[np.float64]]:
         """Return terms with the functions of an earlier series, and its coefficients (2m,).
 
-        prior: None, it is to be estimated from the series.
+        prior: None to estimate it from the series.
         """
         functions = series.functions
         rings = RINGS if functions.modes else 0
@@ -114,9 +114,9 @@ class FluoroscopeTerms:
         return out, matrix.ravel()
 
     def _prior_of(self, matrix: NDArray[np.float64], scale: float) -> Prior:
-        """Prior that is most likely for coefficients (2, m); scale: of the noise.
+        """Return the most likely prior for coefficients (2, m); scale: scale of the noise.
 
-        Orientations are taken to be known, which is near enough to start with.
+        Orientations are assumed to be known, which is accurate enough for an initial value.
         """
         weighted = self.weighted(self.values, scale)
         information = block_diag(*[weighted.T @ weighted] * 2)
@@ -128,7 +128,7 @@ class FluoroscopeTerms:
         return most_likely_prior(self.functions, information, right, self.gauge, prior=start)
 
     def weighted(self, values: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
-        """Values (n, k) at image points over the sd of their noise, of a scale."""
+        """Divide values (n, k) at image points by the standard deviation of their noise."""
         return values / (scale * self.sigma)[:, None]
 
     def _use(self, functions: Functions) -> None:
@@ -139,16 +139,16 @@ class FluoroscopeTerms:
         self._last_equations: SeriesEquations | None = None  # with these functions
 
     def gauge_of(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Precision matrix (2m, 2m) of the gauge for values (n, m) of functions."""
+        """Return the precision matrix (2m, 2m) of the gauge for values (n, m) of functions."""
         return gauge_precision(values, self.uv, self.interior, self.gauge_kind)
 
     def use_interior(self, estimated: NDArray[np.float64]) -> None:
-        """Let the gauge follow an estimated interior orientation (3,).
+        """Update the gauge to an estimated interior orientation (3,).
 
-        The estimate depends on the gauge. Where the image points hardly tell the principal point,
-        a step of the gauge may move the estimate back and farther: such steps are relaxed (Aitken;
-        Irons and Tuck, "A version of the Aitken accelerator for computer iteration", Int. J. Num.
-        Meth. Eng. 1, 1969).
+        The estimate depends on the gauge. Where the image points hardly determine the principal
+        point, a step of the gauge may move the estimate back and farther. Such steps are relaxed
+        (Aitken; Irons and Tuck, "A version of the Aitken accelerator for computer iteration", Int.
+        J. Num. Meth. Eng. 1, 1969).
         """
         offset = estimated - self.interior
         change = offset - self._offset
@@ -164,7 +164,7 @@ class FluoroscopeTerms:
 
     @property
     def count(self) -> int:
-        """Number of coefficients, with those of the exposures."""
+        """Number of coefficients, including those of the exposures."""
         return 2 * len(self.functions) + (0 if self.own is None else self.own.count)
 
     @property
@@ -173,7 +173,7 @@ class FluoroscopeTerms:
         return slice(2 * len(self.functions))
 
     def additional(self) -> AdditionalParameters:
-        """Additional parameters: the series, then the terms of the exposures."""
+        """Return the additional parameters: the series, then the terms of the exposures."""
         prior = prior_precision(self.functions, self.prior) + self.gauge
         if self.own is None:
             return AdditionalParameters(self.values, prior)
@@ -181,18 +181,18 @@ class FluoroscopeTerms:
         return AdditionalParameters(self.values, prior, self.own.functions)
 
     def correction(self, coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Corrections (n, 2) [px] of the image points by the series."""
+        """Return the corrections (n, 2) [px] of the image points by the series."""
         return self.values @ coefficients[self.of_series].reshape(2, -1).T
 
     def inliers(self, adjustment: Adjustment) -> FittedPoints:
-        """Inliers of an adjustment."""
+        """Return the inliers of an adjustment."""
         core = adjustment.inliers[self.rows]
         return FittedPoints(
             self.uv[core], adjustment.residuals[self.rows][core], self.exposure[core]
         )
 
     def functions_with(self, modes: int, prior: Prior) -> Functions:
-        """Functions with all sines up to a number of modes, and those of ripples of a prior."""
+        """Return functions with all sines up to a number of modes, and with ripples of a prior."""
         ripples = prior.signal.ripples
         bands = ripples.bands if ripples is not None else ()
         highest = max((modes, *bands))
@@ -202,7 +202,7 @@ class FluoroscopeTerms:
     def use_modes(self, modes: int, coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
         """Use all sines up to a number of modes, and those of the ripples of the prior.
 
-        Returns the coefficients for them.
+        Returns the coefficients of the new functions.
         """
         end = self.of_series.stop
         before = self.functions
@@ -213,9 +213,9 @@ class FluoroscopeTerms:
     def equations(
         self, network: Network, matrix: FactorizedNormalMatrix, solved: NDArray[np.float64]
     ) -> SeriesEquations:
-        """Normal equations of the series at a solution.
+        """Return the normal equations of the series at a solution.
 
-        network: with the terms under their last priors; solved (p,): estimates with these.
+        network: has the terms with their last priors. solved (p,): estimates with these priors.
         """
         present = prior_of_additional(network, self.number)
         information = information_of_additional(matrix, self.number) - present
@@ -231,7 +231,7 @@ class FluoroscopeTerms:
     def series(self, coefficients: NDArray[np.float64], covariance: NDArray[np.float64]) -> Series:
         """Return the series, without the terms of the exposures.
 
-        coefficients (p,), those of u first, and their covariance (p, p).
+        coefficients: (p,), those of u first. covariance: (p, p).
         """
         functions = self.functions
         sd = sd_over_image(functions, covariance[self.of_series, self.of_series])
@@ -242,7 +242,7 @@ class FluoroscopeTerms:
         return Series(plain, plain.converted(functions, values.ravel()).reshape(2, -1), sd)
 
     def fitted_series(self, adjustment: Adjustment, precise: Precision) -> Series:
-        """See `AdjustedTerms`; beside a field of the angle, that which belongs to it."""
+        """See `AdjustedTerms`; with a field of the angle, the series that belongs to it."""
         fit = self._angle_fit
         if fit is not None:
             return self.series(fit.coefficients, fit.covariance)
@@ -260,7 +260,7 @@ class FluoroscopeTerms:
         return self.series(coefficients, covariance)
 
     def fit_angles(self, adjustment: Adjustment, precise: Precision) -> AngleFit | None:
-        """Fit the terms of the exposures to the angles of the C-arm; None: they do not follow."""
+        """Fit the terms of exposures to the angles of the C-arm; None: they do not follow them."""
         covariance = precise.additional[self.number]
         if self.own is None or covariance is None or not can_be_fitted(self.angles):
             return None
@@ -272,7 +272,7 @@ class FluoroscopeTerms:
         return self._angle_fit
 
     def left_out(self) -> LeftOut | None:
-        """The signal beyond the sines; None: there is no signal."""
+        """Return the signal that the sines omit; None: there is no signal."""
         functions = self.functions
         if not functions.modes:
             return None

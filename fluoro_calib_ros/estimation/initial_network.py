@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""From frames to a network: validation, start values and what has to be excluded."""
+"""Make a network from frames: validation, initial values, and exclusion of frames."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ from .start_orientation import (
     view_of,
 )
 
-# Adjustment of a network with its precision, as every step of a calibration needs it.
+# Adjustment of a network with its precision, for every step of a calibration.
 
-START_GROSS = 0.01  # share of gross errors with which the estimation of the noise begins
+START_GROSS = 0.01  # initial share of gross errors when the noise is estimated
 ADVICE = 'add exposures with the phantom turned and moved'
 TOO_FLAT = replace(
     UNTILTED,
@@ -53,14 +53,14 @@ SINGULAR = f'the exposures do not determine the unknowns: the normal matrix is s
 
 
 def start_noise(loss: str) -> Noise:
-    """Return the noise model with which an estimation begins.
+    """Return the initial noise model of an estimation.
 
-    A Student-t noise comes with a share of gross errors.
+    A Student-t noise also has a share of gross errors.
     """
     return Noise(loss, gross=START_GROSS if loss == 'student_t' else 0.0)
 
 
-# Decrease of F that an adjustment may leave which is not the last: a hundredth of a sigma.
+# Decrease of F that an adjustment before the last may leave: a hundredth of a sigma.
 ROUND_TOLERANCE = 1e-4
 
 
@@ -78,15 +78,15 @@ def adjusted_with_precision(
     ----------
     network : Network
     start : Parameters
-        Start values of the unknowns.
+            Initial values of the unknowns.
     correction : (N, 2) ndarray
         Corrections of the image points [px], fixed.
     noise : Noise
-        Start values of the noise model, or the noise model where noise_fixed.
+            Initial values of the noise model, or the noise model itself with noise_fixed.
     tolerance : float
         Decrease of the cost at which the adjustment stops.
     noise_fixed : bool
-        True where the noise model is not to be estimated.
+            Whether to keep the noise model fixed instead of estimating it.
 
     Raises
     ------
@@ -106,8 +106,8 @@ def adjusted_with_precision(
 def undetermined(network: Network) -> DataError:
     """Return the error of a network whose normal matrix is singular.
 
-    Of flat targets that are tilted a little, noise decides whether it is; the cause is that they
-    are flat.
+    For flat targets that are tilted little, noise decides whether the matrix is singular; the
+    reported cause is that they are flat.
     """
     if flatness(network.survey_mm) < MIN_FLATNESS:
         return DataError(TOO_FLAT)
@@ -120,34 +120,32 @@ def with_additional(adjustment: Adjustment, values: tuple[NDArray[np.float64], .
 
 
 MIN_TARGETS_OF_EXPOSURE = 12
-# Flat targets that are tilted less in all exposures do not show the principal distance.
+# Least tilt of flat targets, in any exposure, that determines the principal distance.
 UNTILTED_RAD = np.deg2rad(5.0)
-# As is advised.
-TILTED_RAD = np.deg2rad(20.0)
-# Smaller differences of rotation and distance make two exposures show one pose of the phantom.
+TILTED_RAD = np.deg2rad(20.0)  # least tilt of flat targets that is advised
+# Two exposures show the same pose of the phantom if their rotation and distance differ by less.
 MIN_POSE_RAD = np.deg2rad(2.0)
 MIN_POSE_MM = 20.0
-# A distance along the optical axis is determined this many times worse than one across it.
-AXIAL_FACTOR = 10.0
-MAX_MISFIT = 8.0  # residuals of a resection relative to the median of the exposures
+AXIAL_FACTOR = 10.0  # uncertainty of a distance along the optical axis, relative to one across it
+MAX_MISFIT = 8.0  # limit of the residuals of a resection, relative to the median of the exposures
 
 Known = Mapping[str, KnownOrientation]  # by fluoroscope
 
 
 @dataclass(frozen=True)
 class Measured:
-    """A network and what it was made from."""
+    """A network and its sources."""
 
     network: Network
-    start: Parameters  #: start values
+    start: Parameters  #: initial values of the unknowns
     fluoroscopes: tuple[str, ...]  #: names, in the order of the network
     image_size: tuple[tuple[int, int], ...]  #: width and height [px] by fluoroscope
     frames: tuple[Frame, ...]  #: the frame of every exposure of the network
-    target_id: NDArray[np.int64]  #: (n,) of the object points
-    excluded: tuple[Finding, ...]  #: one for every frame that is not used
-    #: by fluoroscope, whether all exposures show flat targets parallel to the image
+    target_id: NDArray[np.int64]  #: (n,) target ids of the object points
+    excluded: tuple[Finding, ...]  #: one finding for every frame that is not used
+    #: by fluoroscope: whether all exposures show flat targets parallel to the image
     untilted: tuple[bool, ...] = ()
-    #: orientations that are known beforehand, by fluoroscope
+    #: orientations known beforehand, by fluoroscope
     known: Known = field(default_factory=dict)
 
     @property
@@ -164,7 +162,7 @@ class Measured:
 class KnownSensor:
     """A fluoroscope whose interior orientation (3,) [px] and correction are known.
 
-    correction: of the n image points of a frame, (n, 2) [px].
+    correction: function of a Frame with n image points that returns their corrections (n, 2) [px].
     """
 
     interior: NDArray[np.float64]
@@ -173,36 +171,37 @@ class KnownSensor:
 
 @dataclass(frozen=True)
 class EarlierCalibration:
-    """What a calibration with some exposures can take over from one with more of them."""
+    """Results of a calibration that one with fewer of its exposures can use."""
 
     series: Mapping[str, Series]  #: corrections by fluoroscope
     varying: frozenset[str]  #: fluoroscopes whose distortion differs between exposures
     noise: Noise
     target_id: NDArray[np.int64]  #: (n,) targets with object points, ascending
     points_mm: NDArray[np.float64]  #: (n, 3)
-    #: of the corrections by fluoroscope: those that the last of several such calibrations has
-    #: found, with which the next one starts
+    #: priors of the corrections by fluoroscope, found by the last of several such calibrations;
+    #: the next one starts with them
     priors: dict[str, Prior] = field(default_factory=dict)
 
     def points(self, target_id: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Object points (k, 3) [mm] of targets (k,)."""
+        """Return the object points (k, 3) [mm] of targets (k,)."""
         return self.points_mm[np.searchsorted(self.target_id, target_id)]
 
 
 @dataclass(frozen=True)
 class StartValues:
-    """Start values from an earlier adjustment of the same exposures, instead of resections."""
+    """Initial values from an earlier adjustment of the same exposures, replacing resections."""
 
     interior: Mapping[str, NDArray[np.float64]]  #: (3,) xp, yp, c [px] by fluoroscope
     #: (3, 3) rotation and position [mm] by fluoroscope and exposure
     exterior: Mapping[tuple[str, int], tuple[NDArray[np.float64], NDArray[np.float64]]]
-    #: that of the same exposures and others; the orientations are those with its corrections
+    #: earlier calibration with these and other exposures; orientations are those with its
+    #: corrections
     earlier: EarlierCalibration | None = None
 
 
 @dataclass(frozen=True)
 class _Task:
-    """What start values are made from; sensors None: the fluoroscopes are to be calibrated."""
+    """Input for the initial values; sensors None: the fluoroscopes are to be calibrated."""
 
     phantom: Phantom
     sensors: Mapping[str, KnownSensor] | None
@@ -211,7 +210,7 @@ class _Task:
     starts: StartValues | None = None
 
     def has_starts(self, name: str, frames: Sequence[Frame]) -> bool:
-        """Whether there are start values of all these exposures of a fluoroscope."""
+        """Whether there are initial values for all these exposures of a fluoroscope."""
         starts = self.starts
         return (
             starts is not None
@@ -220,19 +219,19 @@ class _Task:
         )
 
     def min_exposures(self, name: str, untilted: bool = True) -> int:
-        """Number of exposures that a fluoroscope needs; untilted: of flat targets at rest."""
+        """Return the number of exposures needed; untilted: targets are parallel to the image."""
         if self.sensors is not None or name in self.known:
             return 1
         return 1 if untilted and self.principal_distance is not None else MIN_EXPOSURES
 
     def min_targets(self, name: str) -> int:
-        """Number of targets that an exposure needs."""
+        """Return the number of targets that an exposure needs."""
         return 1 if name in self.known else MIN_TARGETS_OF_EXPOSURE
 
 
 @dataclass(frozen=True)
 class _Resected:
-    """Exposures of one fluoroscope that fit the phantom, and findings on those that do not."""
+    """Exposures of one fluoroscope that fit the phantom, and findings on the others."""
 
     frames: list[Frame]
     resections: list[Resection]
@@ -244,7 +243,7 @@ class _Resected:
 def nominal_interior(
     image_size: tuple[int, int], principal_distance: float
 ) -> NDArray[np.float64]:
-    """Interior orientation (3,) [px] with the principal point at the centre of the image."""
+    """Return the interior orientation (3,) [px] with the principal point at the image centre."""
     return np.array([(image_size[0] - 1) / 2, (image_size[1] - 1) / 2, principal_distance])
 
 
@@ -256,13 +255,14 @@ def measured_network(
     starts: StartValues | None = None,
     sensors: Mapping[str, KnownSensor] | None = None,
 ) -> Measured:
-    """Return network and start values of the frames of fluoroscopes that are to be calibrated.
+    """Return the network of frames, with initial values for an adjustment.
 
-    principal_distance: start value [px]; by default it is taken from the observations. known:
-    orientations that are known beforehand, by fluoroscope. starts: used for a fluoroscope with
-    start values of all its exposures. sensors {fluoroscope: KnownSensor}: interior orientations
-    and corrections that are fixed; one exposure of a fluoroscope is then enough. Raises DataError
-    if a frame is invalid, if exposures or targets are too few, or if all exposures show one pose.
+    principal_distance: initial value [px]; by default it is found from the observations. known:
+    orientations known beforehand, by fluoroscope. starts: used for a fluoroscope if it has initial
+    values of all its exposures. sensors {fluoroscope: KnownSensor}: fixed interior orientations
+    and corrections; by default fluoroscopes are to be calibrated. With sensors, one exposure of a
+    fluoroscope is enough. Raises DataError if a frame is invalid, if there are too few exposures
+    or targets, or if all exposures show the same pose.
     """
     task = _Task(phantom, sensors, principal_distance, known or {}, starts)
     return _measured(
@@ -303,7 +303,7 @@ def _measured(task: _Task, found: Mapping[str, _Resected]) -> Measured:
 
 
 def _exterior_prior(task: _Task, frames: Sequence[Frame]) -> ExteriorPrior:
-    """What is known of the exterior orientations of exposures."""
+    """Return the prior of the exterior orientations of exposures."""
     rotation = np.tile(np.eye(3), (len(frames), 1, 1))
     position = np.zeros((len(frames), 3))
     sd = np.full((len(frames), EXTERIOR_SIZE), np.inf)
@@ -358,7 +358,7 @@ def _no_correction(frame: Frame) -> NDArray[np.float64]:
 def _place_all(
     task: _Task, name: str, frames: Sequence[Frame]
 ) -> tuple[list[Resection | None], NDArray[np.float64], list[Finding]]:
-    """Known orientations of the frames of one fluoroscope; returns as _resect_all."""
+    """Use the known orientation for all frames of one fluoroscope; returns as `_resect_all`."""
     known = task.known[name]
     sensor = None if task.sensors is None else task.sensors[name]
     correction = _no_correction if sensor is None else sensor.correction
@@ -377,7 +377,7 @@ def _place_all(
 def _start_all(
     task: _Task, name: str, frames: Sequence[Frame]
 ) -> tuple[list[Resection | None], NDArray[np.float64], list[Finding]]:
-    """Start values that are given for the frames of one fluoroscope; returns as _resect_all."""
+    """Use the given initial values for the frames of one fluoroscope; returns as `_resect_all`."""
     assert task.starts is not None
     sensor = None if task.sensors is None else task.sensors[name]
     earlier = task.starts.earlier
@@ -391,7 +391,7 @@ def _start_all(
             uv = frame.uv - earlier.series[name].predict(frame.uv)
             found.append(resection_at(rotation, position, xyz, uv, interior))
             continue
-        # The sensor may have another gauge than that of the earlier adjustment.
+        # The sensor may have another gauge than the earlier adjustment.
         found.append(
             refine_resection(xyz, frame.uv - correction(frame), interior, rotation, position)
         )
@@ -399,7 +399,7 @@ def _start_all(
 
 
 def _are_untilted(task: _Task, frames: Sequence[Frame], found: Sequence[Resection | None]) -> bool:
-    """Whether all exposures show flat targets that are parallel to the image."""
+    """Whether all exposures show flat targets parallel to the image."""
     for frame, one in zip(frames, found):
         if one is None:
             continue
@@ -410,7 +410,7 @@ def _are_untilted(task: _Task, frames: Sequence[Frame], found: Sequence[Resectio
 
 
 def is_hardly_tilted(measured: Measured) -> bool:
-    """Whether all targets are flat, and tilted less than is advised where a network begins."""
+    """Whether all targets are flat, and initially tilted less than advised."""
     survey = measured.network.survey_mm
     if flatness(survey) >= MIN_FLATNESS:
         return False
@@ -421,7 +421,7 @@ def is_hardly_tilted(measured: Measured) -> bool:
 def _require_determined(
     task: _Task, name: str, found: Sequence[Resection | None], untilted: bool
 ) -> None:
-    """Raise DataError where poses determine no principal distance."""
+    """Raise DataError if the poses do not determine the principal distance."""
     if not untilted:
         _require_different_poses(name, found)
     elif task.principal_distance is None:
@@ -431,7 +431,7 @@ def _require_determined(
 def _usable_frames(
     task: _Task, name: str, frames: Sequence[Frame]
 ) -> tuple[list[Frame], list[Finding]]:
-    """Frames with enough targets, ordered by number, and a finding for each of the others."""
+    """Return frames with enough targets, ordered by number, and findings on the others."""
     ordered: list[Frame] = []
     excluded: list[Finding] = []
     needed_targets = task.min_targets(name)
@@ -459,7 +459,7 @@ def _usable_frames(
 
 
 def _too_few(name: str, count: int, needed: int, excluded: Sequence[Finding]) -> Finding:
-    """Return the finding that the exposures of a fluoroscope are too few."""
+    """Return the finding that a fluoroscope has too few exposures."""
     few = f', {len(excluded)} more have too few targets' if excluded else ''
     return Finding(
         Kind.FEW_EXPOSURES,
@@ -472,10 +472,10 @@ def _too_few(name: str, count: int, needed: int, excluded: Sequence[Finding]) ->
 def _resect_all(
     task: _Task, name: str, frames: Sequence[Frame]
 ) -> tuple[list[Resection | None], NDArray[np.float64], list[Finding]]:
-    """Resections of the frames of one fluoroscope.
+    """Resect the frames of one fluoroscope.
 
-    Returns them, None where one fails; the interior orientation (3,); and a finding for every
-    failure.
+    Returns the resections, None for each failure; the interior orientation (3,); and a finding for
+    each failure.
     """
     sensor = None if task.sensors is None else task.sensors[name]
     correction = _no_correction if sensor is None else sensor.correction
@@ -504,7 +504,7 @@ def _resect_all(
 
 
 def _start_interior(task: _Task, name: str, views: Sequence[View]) -> NDArray[np.float64]:
-    """Start values (3,) [px] of the interior orientation. Raises DataError."""
+    """Return the initial interior orientation (3,) [px]. Raises DataError."""
     size = views[0].frame.image_size
     middle = nominal_interior(size, 1.0)[:2]
     try:
@@ -515,7 +515,7 @@ def _start_interior(task: _Task, name: str, views: Sequence[View]) -> NDArray[np
 
 
 def _reject_poor_fits(frames: Sequence[Frame], found: list[Resection | None]) -> list[Finding]:
-    """Set resections to None whose residuals are too large; return a finding for each."""
+    """Replace resections with too large residuals by None; return a finding for each."""
     scales = [one.scale for one in found if one is not None]
     typical = np.median(scales) if scales else np.inf
     out = []
@@ -536,13 +536,13 @@ def _reject_poor_fits(frames: Sequence[Frame], found: list[Resection | None]) ->
 
 
 def _not_oriented(frame: Frame, why: Finding) -> Finding:
-    """Return why an exposure is excluded that has no orientation."""
+    """Return the reason why an exposure without orientation is excluded."""
     kind = Kind.NOT_ORIENTED if why.kind is Kind.DATA else why.kind
     return replace(why, kind=kind, place=frame.place, severity=Severity.NOTE)
 
 
 def _require_different_poses(name: str, resections: Sequence[Resection | None]) -> None:
-    """Raise DataError where all exposures show the phantom in one pose."""
+    """Raise DataError if all exposures show the phantom in the same pose."""
     found = [one for one in resections if one is not None]
     if len(found) < 2:
         return
@@ -562,7 +562,7 @@ def _require_different_poses(name: str, resections: Sequence[Resection | None]) 
 def _index(
     frames: Sequence[Frame], fluoroscope: NDArray[np.int64], task: _Task, n_fluoroscopes: int
 ) -> tuple[Network, NDArray[np.int64]]:
-    """The network of frames, and the target ids (n,) of its object points."""
+    """Return the network of frames, and the target ids (n,) of its object points."""
     counts = [len(frame.target_id) for frame in frames]
     rows = task.phantom.index(np.concatenate([frame.target_id for frame in frames]))
     used, point = np.unique(rows, return_inverse=True)

@@ -1,24 +1,24 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What residuals show: what a model cannot follow, and where in the image the noise is larger.
+"""Analysis of residuals: lack of fit of a model, and noise that differs over the image.
 
-What a correction model cannot follow, seen in its residuals. Residuals of neighbouring image
-points of different exposures have independent noise (joins in the sense of Moran, Biometrika 37,
-1950). Their mean product is therefore the square of the error that all exposures have in common,
-less the variance of the correction, which makes residuals of neighbours opposite. Of both, a
-residual shows the part that its redundancy number says (Foerstner and Wrobel, "Photogrammetric
-Computer Vision", Springer 2016, 4.6): orientations and object points absorb the rest. The square
-is part of the variance of the correction.
+Lack of fit of a correction model, seen in its residuals. Residuals of neighbouring image points of
+different exposures have independent noise (joins in the sense of Moran, Biometrika 37, 1950).
+Their mean product is therefore the square of the error that all exposures have in common, less the
+variance of the correction, which makes residuals of neighbours opposite. A residual shows only the
+part of both that its redundancy number gives (Foerstner and Wrobel, "Photogrammetric Computer
+Vision", Springer 2016, 4.6); orientations and object points absorb the remainder. The square is
+part of the variance of the correction.
 
 Where the error is large, its image points are rejected like gross errors. False matches differ
-from each other, but these agree.
+from each other, but these image points agree.
 
-Estimate where in the image the noise is larger. Blur, shading and oblique shadows make the noise
-of most cameras and detectors larger towards the border, a correction magnifies it where it
-stretches the image, and distortions that differ between exposures do so most at the border. The
-profile is estimated as a gamma regression of the squares by quasi-likelihood (McCullagh and
-Nelder, "Generalized Linear Models", 1989, 10.3).
+Noise profile over the image. Blur, shading and oblique shadows make the noise of most cameras and
+detectors larger towards the border; a correction magnifies it where it stretches the image; and
+distortions that differ between exposures do so most at the border. The profile is estimated as a
+gamma regression of the squares by quasi-likelihood (McCullagh and Nelder, "Generalized Linear
+Models", 1989, 10.3).
 """
 
 from __future__ import annotations
@@ -38,47 +38,47 @@ from ..exposures.collector import MIN_EXPOSURES
 from ..photogrammetry.noise import CERTAIN
 from ..photogrammetry.outliers import CONTRADICTION, FALSE_ALARM
 
-NEIGHBOURS = 5  # of an image point, those of its own exposure not counted
+NEIGHBOURS = 5  # nearest neighbours of an image point; those of its own exposure are ignored
 POINTS = 60  # image points about a node of the grid
-# Standard errors above which the mean product about one of the nodes is not chance; of all image
-# points they are CERTAIN.
+# Standard errors above which the mean product about a node is significant; for the mean product of
+# all image points the limit is CERTAIN.
 SIGNIFICANT_LOCAL = 4.5
-MAX_GROWTH = 4.0  # of a mean product that is extrapolated to no distance
-PLACE = 0.1  # of the largest variance of a place, up to which image points are in it
-MIN_CORRELATION = 0.05  # with which products show what a series leaves out
-FAR = 30.0  # standard deviations below zero
-# Rejected image points agree within so many standard deviations of an inlier, over so many times
-# the typical distance of an inlier from the next (as many times farther where only one exposure
-# has image points), with so many others; larger residuals than so many standard deviations are
-# no error of a correction.
+MAX_GROWTH = 4.0  # largest ratio of a mean product, extrapolated to distance zero, to its value
+PLACE = 0.1  # image points with more than this part of the largest variance are in a place
+MIN_CORRELATION = 0.05  # least correlation at which products show what a series omits
+FAR = 30.0  # standard deviations below zero beyond which the posterior is taken as exponential
+# Rejected image points agree if their residuals differ by less than AGREE_SD standard deviations
+# of an inlier, and their distance is less than AGREE_REACH times the typical distance between
+# inliers (the square of AGREE_REACH where only one exposure has image points). Each must agree
+# with AGREE_WITH others.
 AGREE_SD = 5.0
 AGREE_REACH = 3.0
 AGREE_WITH = 2
-# Where only one exposure has image points: part of the larger residual that the difference of two
-# residuals that agree does not exceed.
+# Where only one exposure has image points, residuals also agree if their difference is below this
+# part of the larger one.
 ALONE_AGREE = 0.6
-AGREE_SIGNIFICANT = 1.5  # standard errors by which more pairs agree than are opposite
-LARGEST_SD = 40.0
-# Areas in which they are looked at together: cells that overlap by half, so many side by side,
-# with image points of so many targets that agree in so many exposures.
-CELLS = 8
+AGREE_SIGNIFICANT = 1.5  # standard errors by which agreeing pairs must outnumber opposite pairs
+LARGEST_SD = 40.0  # larger residuals [standard deviations] are no errors of a correction
+# Rejected image points are tested together in areas, which are cells that overlap by half. An area
+# needs image points of MIN_TARGETS targets that agree in MIN_EXPOSURES exposures.
+CELLS = 8  # cells side by side along the image
 MIN_TARGETS = 6
-# Chance that false matches agree in any of the areas where so many of the image points of an area
-# are rejected that this is no chance; elsewhere it is a FALSE_ALARM.
+# Chance that false matches agree in any of the areas where more image points are rejected than
+# chance explains; elsewhere it is FALSE_ALARM.
 CLUSTERED_FALSE_ALARM = 0.05
-# At a border, few image points may be all there are: so many targets in so many exposures are
-# enough where they are clustered. Draws of the directions that so few have by chance.
+# At a border there may be few image points. Where rejected ones are clustered, so many targets in
+# so many exposures are enough.
 FEW_TARGETS = 3
 FEW_EXPOSURES = 2
-DRAWS = 10_000
+DRAWS = 10_000  # random draws of the directions of few residuals
 
 
 @dataclass(frozen=True)
 class FittedPoints:
     """Inliers of one fluoroscope.
 
-    uv (n, 2) [px], residuals (n, 2) [px] with the correction, exposure (n,), redundancy (n,):
-    redundancy number of a coordinate, 1 where they do not matter.
+    uv (n, 2) [px]; residuals (n, 2) [px] with the correction; exposure (n,); redundancy (n,):
+    redundancy number of a coordinate, 1 where it does not matter.
     """
 
     uv: NDArray[np.float64]
@@ -91,8 +91,8 @@ class FittedPoints:
 class RejectedArea:
     """Rejected image points of an area.
 
-    size_px: length of their mean residual; limit_px: that which false matches hardly exceed in any
-    of the areas; rows: the image points.
+    size_px: length of their mean residual; limit_px: length that false matches hardly exceed in
+    any of the areas; rows: the image points.
     """
 
     size_px: float
@@ -102,10 +102,10 @@ class RejectedArea:
 
 @dataclass(frozen=True)
 class LeftOut:
-    """What a series leaves out by design, as its covariance function expects it.
+    """Signal that a series omits by design, as expected from its covariance function.
 
-    sd_px: standard deviation [px]; correlation: callable, of distances (n,) [px]; places: the same
-    for what is left out in places, None: nowhere.
+    sd_px: standard deviation [px]; correlation: function of distances (n,) [px]; places: what is
+    omitted in places of larger variance, None: there are no such places.
     """
 
     sd_px: float
@@ -115,9 +115,10 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class LeftOutInPlaces:
-    """What a series leaves out where the signal varies more.
+    """Signal that a series omits in places where the signal has a larger variance.
 
-    variance: callable, variances [px^2] at pixels (n, 2); correlation: as in `LeftOut`.
+    variance: function of pixels (n, 2) that returns variances [px^2]; correlation: as in
+    `LeftOut`.
     """
 
     variance: Callable[[NDArray[np.float64]], NDArray[np.float64]]
@@ -129,9 +130,9 @@ class _Products:
     """Products of the residuals of n image points with those of their neighbours.
 
     uv (n, 2) [px]; value (n,): mean product of a coordinate [px^2]; shown (n,): mean product of
-    the redundancy numbers, the part of a common error that the products show; exposure (n,);
-    distance (n,): mean distance of the neighbours [px]; growth: mean product at no distance over
-    that at the distance of the neighbours, 1 where there is none.
+    the redundancy numbers, which is the part of a common error that the products show; exposure
+    (n,); distance (n,): mean distance of the neighbours [px]; growth: mean product at distance
+    zero over that at the distance of the neighbours, 1 where it does not grow.
     """
 
     uv: NDArray[np.float64]
@@ -142,7 +143,7 @@ class _Products:
     growth: float
 
     def mean_of_all(self) -> tuple[float, float]:
-        """Mean product, and its standard error from the scatter between exposures."""
+        """Return the mean product, and its standard error from the scatter between exposures."""
         _, place = np.unique(self.exposure, return_inverse=True)
         number = np.bincount(place)
         if len(number) < MIN_EXPOSURES:
@@ -153,13 +154,13 @@ class _Products:
         return float(mean), float(np.sqrt(variance))
 
     def is_significant(self) -> bool:
-        """Whether the mean product is above zero."""
+        """Whether the mean product is significantly above zero."""
         mean, error = self.mean_of_all()
         return mean > CERTAIN * error
 
 
 def _products(points: FittedPoints) -> _Products:
-    """Products of the image points that have neighbours of other exposures."""
+    """Return the products of the image points that have neighbours of other exposures."""
     count = min(NEIGHBOURS + 1, len(points.uv))
     distance, near = cKDTree(points.uv).query(points.uv, k=np.arange(2, count + 1))
     other = points.exposure[near] != points.exposure[:, None]
@@ -185,10 +186,11 @@ def _products(points: FittedPoints) -> _Products:
 def _growth(
     product: NDArray[np.float64], distance: NDArray[np.float64], other: NDArray[np.bool_]
 ) -> float:
-    """Mean product at no distance over the mean of products (n, k) at distances (n, k) [px].
+    """Extrapolate the mean of products (n, k) at distances (n, k) [px] to distance zero.
 
-    The covariance of a smooth error falls with the square of the distance: it is extrapolated
-    from nearer and farther neighbours. other (n, k): pairs that count.
+    Returns the extrapolated mean over the mean. The covariance of a smooth error falls with the
+    square of the distance, so that nearer and farther neighbours determine it. other (n, k): pairs
+    to use.
     """
     nearer = other & (distance < np.median(distance))
     farther = other & ~nearer
@@ -206,9 +208,9 @@ def _growth(
 def sd_with_lack_of_fit(
     points: FittedPoints, series: Series, left_out: LeftOut | None = None
 ) -> NDArray[np.float64]:
-    """Standard deviations (33, 33) [px] of a series with what it cannot follow, on its grid.
+    """Return standard deviations (33, 33) [px] of a series with its lack of fit, on its grid.
 
-    series: with the standard deviations of its coefficients alone.
+    series: its standard deviations are those of its coefficients alone.
     """
     products = _products(points)
     variance = series.sd**2
@@ -236,12 +238,12 @@ def sd_with_lack_of_fit(
 def sd_of_rejected(
     inliers: FittedPoints, rejected: FittedPoints, series: Series
 ) -> NDArray[np.float64]:
-    """Standard deviations (33, 33) [px] on the grid of a series where rejected points agree.
+    """Return standard deviations (33, 33) [px] on the grid of a series by agreeing rejected points.
 
-    They are the largest RMS residual of those nearby, and zero where there are none, or where
-    chance explains that they agree. Inliers beside them count as image points without that error.
-    Points of one exposure count where no other exposure has inliers: at a border that a single one
-    shows, nothing contradicts them.
+    They are the largest RMS residual of such points nearby, and zero where there are none, or
+    where chance explains that they agree. Inliers nearby count as image points without that error.
+    Points of one exposure count where no other exposure has inliers: at a border that only one
+    exposure shows, nothing contradicts them.
     """
     out = np.zeros(series.sd.size)
     noise = float(np.sqrt(np.mean(inliers.residuals**2)))
@@ -264,7 +266,7 @@ def sd_of_rejected(
     beside = cKDTree(inliers.uv).query_ball_point(uv, reach, return_length=True)
     share = (number + 1) / (number + 1 + beside)
     pixels = sd_grid_pixels(series.functions.image_size)
-    # Every one of them reaches the nodes about it.
+    # Each of them affects the nodes about it.
     cell = np.linalg.norm(np.asarray(series.functions.image_size) / (SD_GRID - 1))
     for row in found:
         near = np.linalg.norm(pixels - uv[row], axis=1) < max(reach, cell)
@@ -275,10 +277,10 @@ def sd_of_rejected(
 def _pairs_of_rejected(
     inliers: FittedPoints, rejected: FittedPoints, reach: float, limit: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_], NDArray[np.bool_]]:
-    """Pairs (k,), (k,) of neighbouring rejected points; which (k,) agree, and which are opposite.
+    """Return pairs (k,), (k,) of neighbouring rejected points; which agree, which are opposite.
 
-    reach [px]: of neighbours of different exposures; limit [px]: difference of residuals that
-    agree. Chance makes as many pairs opposite as it makes agree.
+    reach [px]: largest distance of neighbours of different exposures; limit [px]: largest
+    difference of residuals that agree. Chance makes as many pairs opposite as it makes agree.
     """
     near = cKDTree(inliers.uv).query_ball_point(rejected.uv, reach)
     exposure = rejected.exposure
@@ -308,13 +310,13 @@ def areas_of_rejected(
     inliers: NDArray[np.float64],
     image_size: tuple[int, int],
 ) -> list[RejectedArea]:
-    """Return the areas with enough rejected image points, of targets (n,), to see what they share.
+    """Return the areas with enough rejected image points to test whether their residuals agree.
 
-    inliers (k, 2): the other image points [px]. False matches are as frequent in an area as in the
-    whole image, and have residuals of any direction (Rayleigh's test; Mardia and Jupp,
-    "Directional Statistics", 2000, 6.3, here with the lengths). What a correction does not follow
-    gives those of one place the same. The image points of one target count once: its survey may be
-    wrong.
+    target (n,): targets of the rejected image points. inliers (k, 2): the other image points [px].
+    False matches are as frequent in an area as in the whole image, and have residuals of any
+    direction (Rayleigh's test; Mardia and Jupp, "Directional Statistics", 2000, 6.3, here with the
+    lengths). An error of the correction gives the image points of one place the same residual. The
+    image points of one target count once, because its survey may be wrong.
     """
     if len(target) < FEW_TARGETS:
         return []
@@ -335,7 +337,7 @@ def areas_of_rejected(
             several.append(area)
         elif area.clustered:
             few.append(area)
-    # Bonferroni. Areas with few targets are a question of their own, asked of clusters only.
+    # Bonferroni correction. Areas with few targets are a separate test, of clusters only.
     return [area.tested(len(several)) for area in several] + [
         area.tested_by_draws(len(few)) for area in few
     ]
@@ -344,7 +346,7 @@ def areas_of_rejected(
 def _inside(
     uv: NDArray[np.float64], corner: NDArray[np.float64], cell: NDArray[np.float64]
 ) -> NDArray[np.int64]:
-    """Rows of image points (n, 2) in a cell of a size (2,) [px]; corner (2,): in such cells."""
+    """Return rows of image points (n, 2) in a cell (2,) [px]; corner (2,): in units of cells."""
     at = (uv + 0.5) / cell - corner
     return np.flatnonzero(((at >= 0) & (at < 1)).all(axis=1))
 
@@ -354,7 +356,8 @@ class _Area:
     """Rejected image points of an area.
 
     rows (n,): the image points; of_target (k, 2): mean residual of each target [px]; exposures:
-    number of exposures that agree with the mean of all; clustered: so many by no chance.
+    number of exposures that agree with the mean of all; clustered: whether more are rejected than
+    by chance.
     """
 
     rows: NDArray[np.int64]
@@ -366,7 +369,7 @@ class _Area:
     def of(
         rejected: FittedPoints, target: NDArray[np.int64], rows: NDArray[np.int64], clustered: bool
     ) -> _Area:
-        """Area of rows of rejected image points, of targets (n,)."""
+        """Return the area of rows of rejected image points, of targets (n,)."""
         _, place = np.unique(target[rows], return_inverse=True)
         number = np.bincount(place)
         r = rejected.residuals[rows]
@@ -375,14 +378,14 @@ class _Area:
         return _Area(rows, of_target, int(np.count_nonzero(along > 0)), clustered)
 
     def tested(self, areas: int) -> RejectedArea:
-        """Test of the mean residual: many residuals of any direction have a Gaussian mean."""
+        """Test the mean residual: many residuals of any direction have a Gaussian mean."""
         chance = float(np.sqrt(np.sum(self.of_target**2))) / len(self.of_target)
         alarm = CLUSTERED_FALSE_ALARM if self.clustered else FALSE_ALARM
         limit = chance * float(np.sqrt(np.log(areas / alarm)))
         return RejectedArea(self._size(MIN_EXPOSURES), limit, self.rows)
 
     def tested_by_draws(self, areas: int) -> RejectedArea:
-        """Test of the mean of few residuals: by draws of their directions."""
+        """Test the mean of few residuals, by random draws of their directions."""
         length = np.linalg.norm(self.of_target, axis=1)
         angle = np.random.default_rng(0).uniform(0, 2 * np.pi, (DRAWS, len(length)))
         drawn = np.abs(np.mean(length * np.exp(1j * angle), axis=1))
@@ -390,7 +393,7 @@ class _Area:
         return RejectedArea(self._size(FEW_EXPOSURES), limit, self.rows)
 
     def _size(self, exposures: int) -> float:
-        """Length of the mean residual [px], 0 where fewer exposures agree."""
+        """Return the length of the mean residual [px], 0 if fewer exposures agree."""
         agree = self.exposures >= exposures
         return float(np.linalg.norm(self.of_target.mean(axis=0))) if agree else 0.0
 
@@ -398,9 +401,9 @@ class _Area:
 def _variance_in_places(
     products: _Products, series: Series, places: LeftOutInPlaces, pixels: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Variances (n,) [px^2] at pixels (n, 2) of what a series leaves out in places.
+    """Return variances (n,) [px^2] at pixels (n, 2) of what a series omits in places.
 
-    The share of what is expected there is that which the products of these places show.
+    The expected variances are scaled to those that the products in these places show.
     """
     expected = places.variance(products.uv)
     inside = expected > PLACE * np.max(expected, initial=0.0)
@@ -419,13 +422,13 @@ def _variance_in_places(
 
 
 def _variance_beyond(products: _Products, series: Series, left_out: LeftOut) -> float:
-    """Variance [px^2] of what a series leaves out, by its covariance function and the residuals.
+    """Return the variance [px^2] that a series omits, by covariance function and residuals.
 
-    The covariance function was estimated from the functions that the series has; beyond them it
-    is an extrapolation. As the variance that it expects is uncertain and positive, it is given an
-    exponential prior; that which the residuals show has a Gaussian error. The posterior is a
-    truncated Gaussian, of which this is the mean; what exceeds the expectation may also be what
-    exposures differ, and is left to the test of significance.
+    The covariance function was estimated from the functions that the series has; beyond them it is
+    an extrapolation. The expected variance is uncertain and positive, and gets an exponential
+    prior; the variance that the residuals show has a Gaussian error. The result is the mean of the
+    posterior, a truncated Gaussian, and at most the expected variance: a larger value may also
+    come from differences between exposures, and is left to the test of significance.
     """
     mean, error = products.mean_of_all()
     expected = left_out.sd_px**2
@@ -442,13 +445,13 @@ def _variance_beyond(products: _Products, series: Series, left_out: LeftOut) -> 
     return min(float(error * (at + density)), expected)
 
 
-MIN_POINTS = 100
-# Gain of deviance over the dispersion from which a profile is taken. Chance exceeds it in one of
-# 20 images (chi squared with one degree of freedom), with factors that hardly differ from one.
+MIN_POINTS = 100  # image points that a profile needs
+# Least gain of deviance, over the dispersion, for a profile. Chance exceeds it in one of 20 images
+# (chi squared with one degree of freedom), with factors that hardly differ from one.
 MIN_GAIN = 4.0
-MIN_SQUARE = 1e-6  # of the mean: the logarithm of a zero would count for ever
-REACH_QUANTILE = 0.99
-# Steps of the regression: at most so many, of so much, and the one at which it ends.
+MIN_SQUARE = 1e-6  # of the mean; avoids the logarithm of zero
+REACH_QUANTILE = 0.99  # quantile of the distances at which a profile ends
+# Fisher scoring: most steps, largest step, and step at convergence.
 MAX_STEPS = 100
 MAX_STEP = 1.0
 MIN_STEP = 1e-6
@@ -457,10 +460,10 @@ MIN_STEP = 1e-6
 def fitted_profile(
     uv: NDArray[np.float64], squares: NDArray[np.float64], image_size: tuple[int, int]
 ) -> NoiseProfile | None:
-    """Return the profile that squares of errors show, None where they are the same everywhere.
+    """Return the noise profile that squares of errors show; None: the same everywhere.
 
-    uv: (n, 2) image points [px]. squares: (n,) squared error of a coordinate of each [px^2], mean
-    of both. image_size: width and height [px].
+    uv: (n, 2) image points [px]. squares: (n,) squared error of a coordinate [px^2], mean of both
+    coordinates. image_size: width and height [px].
     """
     mean = float(np.mean(squares)) if len(squares) else 0.0
     if len(uv) < MIN_POINTS or not mean > 0:
@@ -469,7 +472,7 @@ def fitted_profile(
     y = np.maximum(squares / mean, MIN_SQUARE)
     y /= np.mean(y)
     slope, expected = _gamma_regression(square, y)
-    # Two coordinates are chi squared with two degrees of freedom: a dispersion of one.
+    # Two coordinates give chi squared with two degrees of freedom: a dispersion of one.
     dispersion = float(np.mean((y / expected - 1) ** 2))
     gain = -2 * float(np.sum(np.log(expected)))  # of deviance; the mean of y / expected is one
     if gain <= MIN_GAIN * dispersion:
@@ -484,7 +487,7 @@ def fitted_profile(
 def _gamma_regression(
     x: NDArray[np.float64], y: NDArray[np.float64]
 ) -> tuple[float, NDArray[np.float64]]:
-    """Slope of the logarithm of the expectation of y (n,) over x (n,), and the expectations (n,).
+    """Fit the logarithm of the expectation of y (n,) over x (n,); return slope and expectations.
 
     Fisher scoring: with a logarithmic link, all weights are one (McCullagh and Nelder, 8.4).
     """

@@ -10,8 +10,8 @@ yp) by
 
     (1, 0), (0, 1)                    principal point,
     (x, y)                            principal distance,
-        (-y, x)                           rotation of the sensor about its axis,
-        (x x, x y)/c, (x y, y y)/c        rotation about its rows and columns, without a shift
+    (-y, x)                           rotation of the sensor about its axis,
+    (x x, x y)/c, (x y, y y)/c        rotation about its rows and columns, without a shift
 
 (derivatives of the collinearity condition; the last three are common to all exposures and leave
 sources and object points where they are). The fitted correction is kept orthogonal to these
@@ -186,7 +186,7 @@ def interior_about(
     Raises
     ------
     ValueError
-            If there is none: the corrections are not finite, or image points come to lie behind.
+        If there is none: the corrections are not finite, or image points come to lie behind.
     """
     rays = np.column_stack([(uv - correction - interior[:2]) / interior[2], np.ones(len(uv))])
     reference = np.array([*centre, interior[2]])

@@ -259,11 +259,11 @@ def variance_between_exposures(
     ----------
     network : Network
     adjustment : Adjustment
-            Adjustment of the network.
+        Adjustment of the network.
     f : int
         Number of the fluoroscope.
     terms : ExposureTerms
-            Terms of the exposures of this fluoroscope.
+        Terms of the exposures of this fluoroscope.
     coefficients : (p,) ndarray
         Estimated coefficients of the terms [px].
     covariance : (p, p) ndarray
@@ -272,7 +272,7 @@ def variance_between_exposures(
     Returns
     -------
     (i,) ndarray
-            Variances of the inliers among the image points of the fluoroscope.
+        Variances of the inliers among the image points of the fluoroscope.
 
     Raises
     ------

@@ -78,15 +78,15 @@ def adjusted_with_precision(
     ----------
     network : Network
     start : Parameters
-            Initial values of the unknowns.
+        Initial values of the unknowns.
     correction : (N, 2) ndarray
         Corrections of the image points [px], fixed.
     noise : Noise
-            Initial values of the noise model, or the noise model itself with noise_fixed.
+        Initial values of the noise model, or the noise model itself with noise_fixed.
     tolerance : float
         Decrease of the cost at which the adjustment stops.
     noise_fixed : bool
-            Whether to keep the noise model fixed instead of estimating it.
+        Whether to keep the noise model fixed instead of estimating it.
 
     Raises
     ------

@@ -238,7 +238,7 @@ def sd_with_lack_of_fit(
 def sd_of_rejected(
     inliers: FittedPoints, rejected: FittedPoints, series: Series
 ) -> NDArray[np.float64]:
-    """Return standard deviations (33, 33) [px] on the grid of a series by agreeing rejected points.
+    """Return standard deviations (33, 33) [px] on a series grid by rejected points that agree.
 
     They are the largest RMS residual of such points nearby, and zero where there are none, or
     where chance explains that they agree. Inliers nearby count as image points without that error.

@@ -1,20 +1,20 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Places where the signal of a distortion varies more than elsewhere.
+"""Places where the signal of a distortion has a larger variance than elsewhere.
 
 A dent of the input screen or the seam of two fibre plates is no stationary field: one covariance
 function for the whole image follows it too little there, and follows noise elsewhere. Places are
-square windows, or bands along straight lines, with Gaussian bumps whose heights have a variance of
-their own. The bumps are written as sums of the sines of the series, so that a place changes only
+square windows, or bands along straight lines, with Gaussian bumps whose heights have their own
+variance. The bumps are written as sums of the sines of the series, so that a place changes only
 the prior of their coefficients.
 
-Windows are added where they raise the marginal likelihood clearly, and then those beside them
-where they raise it at all: an edge goes on. A low edge, which no window shows alone, is shown by
-the band along it. For one more component of a covariance the gain is known exactly without a new
-solution (Tipping and Faul, "Fast marginal likelihood maximisation for sparse Bayesian models",
-2003; here for the bumps of a place together). Variances are renewed as in MacKay, "Bayesian
-interpolation", Neural Computation 4, 1992.
+A window is added where it raises the marginal likelihood clearly. Windows next to it are then
+added where they raise the likelihood at all, because an edge continues. A low edge, which no
+single window shows, is found by the band along it. The gain of one more component of a covariance
+is known exactly without a new solution (Tipping and Faul, "Fast marginal likelihood maximisation
+for sparse Bayesian models", 2003; here for the bumps of a place together). Variances are updated
+as in MacKay, "Bayesian interpolation", Neural Computation 4, 1992.
 """
 
 from __future__ import annotations
@@ -29,28 +29,29 @@ from ..correction.series import Functions
 from .signal import MIN_DETERMINED, correlation_of
 
 NODES = 32  # bumps along the longer side of the image
-WIDTH = 0.75 / NODES  # of a bump (one standard deviation), relative to that side
-WINDOWS = 8  # windows along that side; they overlap by half
-# Bands: half their width and the distance of the next [bumps], and number of those that are looked
-# at more closely. They have as many bumps as a side or more, and as many directions: from one to
-# the next, the end of a line moves by half its width.
+WIDTH = 0.75 / NODES  # standard deviation of a bump, relative to the longer side of the image
+WINDOWS = 8  # windows along the longer side of the image; they overlap by half
+# Bands: BAND is half their width and the distance to the next one [bumps]; LIKELY_BANDS is the
+# number of bands whose gain is computed. A band has at least as many bumps as a side. There are
+# NODES directions: from one to the next, the end of a line moves by half the width of a band.
 BAND = 1.5
 LIKELY_BANDS = 8
-# Gain of the logarithm of the likelihood from which a place is added: anywhere, which chance does
-# in one of twenty images, and for windows beside those that there are.
+# Least gain of the logarithm of the likelihood for which a place is added: anywhere, where chance
+# exceeds it in one of twenty images, and next to places that are there already.
 MIN_GAIN = 6.0
 MIN_GAIN_BESIDE = 1.5
-VARIANCES = np.geomspace(1e-3, 30.0, 40)  # of the heights [px^2] that are tried
-MIN_VARIANCE = 2e-4  # [px^2] below which a window is left out again
+VARIANCES = np.geomspace(1e-3, 30.0, 40)  # variances of the heights to try [px^2]
+MIN_VARIANCE = 2e-4  # windows with a smaller variance are removed [px^2]
 
 
 @dataclass(frozen=True)
 class LocalSignal:
-    """Bumps of the windows and bands where the signal varies more."""
+    """Bumps of the windows and bands where the signal has a larger variance."""
 
-    nodes: NDArray[np.float64]  #: (n, 2) middles of the bumps [px]
+    nodes: NDArray[np.float64]  #: (n, 2) centres of the bumps [px]
     window: NDArray[np.int64]  #: (n,) window or band of each bump
-    #: (w,) variances of the heights of the bumps of each of them [px^2], the same for u and v
+    #: (w,) variance of the heights of the bumps of each window or band [px^2], the same for u and
+    #: v
     variances: NDArray[np.float64]
 
     @property
@@ -61,14 +62,14 @@ class LocalSignal:
     def variance_beyond(
         self, functions: Functions, uv: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Variances (n,) [px^2] at pixels uv (n, 2) of what the sines of a series leave out."""
+        """Return variances (n,) [px^2] at pixels uv (n, 2) of what the sines of a series omit."""
         width = WIDTH * max(functions.image_size)
         squares = np.sum((uv[:, None] - self.nodes[None]) ** 2, axis=2)
         whole = np.exp(-squares / width**2) @ self.of_bumps
         return whole * np.exp(-((functions.highest * width) ** 2))
 
     def change(self, other: LocalSignal | None) -> float:
-        """Mean change of the logarithms of the variances; infinite where windows differ."""
+        """Return the mean change of the log variances; infinite if the windows differ."""
         if other is None or len(other.variances) != len(self.variances):
             return np.inf
         return float(np.mean(np.abs(np.log(self.variances / other.variances))))
@@ -76,9 +77,9 @@ class LocalSignal:
     def renewed(
         self, mean: NDArray[np.float64], variance: NDArray[np.float64]
     ) -> LocalSignal | None:
-        """Return the windows with more likely variances, without those that have vanished.
+        """Return the windows with more likely variances; omit those that have vanished.
 
-        mean, variance (2, n): of the heights [px], [px^2]. None: no window is left.
+        mean, variance (2, n): of the heights [px], [px^2]. None: all windows have vanished.
         """
         count = len(self.variances)
         squares = np.bincount(self.window, np.sum(mean**2, axis=0), count)
@@ -95,15 +96,14 @@ class LocalSignal:
 
 @dataclass(frozen=True)
 class SineEstimates:
-    """What the image points say about the coefficients of the sines of u and of v.
+    """Information of the image points on the coefficients of the sines of u and of v.
 
-    Both times (s, 2) and (2, s, s), with K the prior covariance matrix of the coefficients of one
-    coordinate.
+    K is the prior covariance matrix of the coefficients of one coordinate.
     """
 
-    pull: NDArray[np.float64]  #: (s, 2) inverse of K times their estimates
-    #: (k, s, s) inverse of K less that of K times their covariance times that of K: for u and v,
-    #: or one for both
+    pull: NDArray[np.float64]  #: (s, 2) K^-1 times the estimates
+    #: (k, s, s) K^-1 - K^-1 C K^-1 with the covariance C of the estimates: for u and v, or one for
+    #: both
     evidence: NDArray[np.float64]
 
     @classmethod
@@ -113,13 +113,13 @@ class SineEstimates:
         mean: NDArray[np.float64],
         covariances: NDArray[np.float64],
     ) -> SineEstimates:
-        """Return them from the inverse of K (s, s), estimates (s, 2) and covariances (k, s, s)."""
+        """Return them from K^-1 (s, s), estimates (s, 2) and covariances (k, s, s)."""
         evidence = [precision - precision @ one @ precision for one in covariances]
         return cls(precision @ mean, np.stack(evidence))
 
 
 def bumps(functions: Functions, nodes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Coefficients (s, n) of the sines for bumps of height one about nodes (n, 2) [px].
+    """Return coefficients (s, n) of the sines for bumps of height one about nodes (n, 2) [px].
 
     A sine is an eigenfunction of the convolution with a Gaussian.
     """
@@ -129,7 +129,7 @@ def bumps(functions: Functions, nodes: NDArray[np.float64]) -> NDArray[np.float6
 
 
 def correlation_beyond(functions: Functions, distance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Correlation (n,), at distances (n,) [px], of what the sines leave out of the bumps."""
+    """Return the correlation (n,), at distances (n,) [px], of what the sines omit of the bumps."""
     width = WIDTH * max(functions.image_size)
     return correlation_of(lambda f: np.exp(-((f * width) ** 2)), functions.highest, distance)
 
@@ -137,9 +137,9 @@ def correlation_beyond(functions: Functions, distance: NDArray[np.float64]) -> N
 def with_likely_places(
     functions: Functions, estimates: SineEstimates, local: LocalSignal | None
 ) -> LocalSignal | None:
-    """Return the windows and bands with those that raise the marginal likelihood.
+    """Add the windows and bands that raise the marginal likelihood.
 
-    estimates: with the present places, local. Returns these where there are no more.
+    estimates: with the present places, local. Returns local if there are no more places.
     """
     shown = _ShownBumps.of(functions, estimates)
     taken = np.zeros(len(shown.nodes), dtype=bool)
@@ -148,7 +148,7 @@ def with_likely_places(
     windows = shown.windows()
     band = shown.most_likely_band(taken)
     if band is not None and band.gain > max(MIN_GAIN, *(place.gain for place in windows)):
-        # What windows gain is known again when this band is in the prior.
+        # The gains of the windows change with this band in the prior, and are computed next time.
         return _joined(local, shown.nodes[band.rows], band.variance)
     out = local
     reach = 1.01 * max(functions.image_size) / NODES
@@ -166,7 +166,7 @@ def with_likely_places(
 
 
 def largest_gain(functions: Functions, estimates: SineEstimates) -> float:
-    """Largest gain of the logarithm of the likelihood by one more window or band."""
+    """Return the largest gain of the logarithm of the likelihood by one more window or band."""
     shown = _ShownBumps.of(functions, estimates)
     places = shown.windows()
     band = shown.most_likely_band(np.zeros(len(shown.nodes), dtype=bool))
@@ -175,9 +175,10 @@ def largest_gain(functions: Functions, estimates: SineEstimates) -> float:
 
 @dataclass(frozen=True)
 class _Place:
-    """Bumps that have a variance in common.
+    """Bumps with a common variance.
 
-    rows (b,); gain: of the logarithm of the likelihood; variance: the most likely one [px^2].
+    rows (b,): of the bumps; gain: of the logarithm of the likelihood; variance: most likely
+    [px^2].
     """
 
     rows: NDArray[np.int64]
@@ -187,7 +188,7 @@ class _Place:
 
 @dataclass(frozen=True)
 class _ShownBumps:
-    """What the image points say about all bumps that an image may have.
+    """Information of the image points on all bumps that an image may have.
 
     nodes (n, 2) [px]; pulls (n, 2) and products (k, n, n), for u and v or one for both: q and s of
     Tipping and Faul 2003.
@@ -200,7 +201,7 @@ class _ShownBumps:
 
     @classmethod
     def of(cls, functions: Functions, estimates: SineEstimates) -> _ShownBumps:
-        """Return it for what the image points say about the sines."""
+        """Return the information on the bumps from that on the sines."""
         nodes = _all_nodes(functions.image_size)
         base = bumps(functions, nodes)
         products = np.stack([base.T @ (one @ base) for one in estimates.evidence])
@@ -211,13 +212,13 @@ class _ShownBumps:
         return [self._place(rows) for rows in _windows(self.image_size, self.nodes)]
 
     def most_likely_band(self, taken: NDArray[np.bool_]) -> _Place | None:
-        """Return the band that gains most, without the bumps that are taken (n,).
+        """Return the band with the largest gain, without the bumps that are taken (n,).
 
-        Those whose bumps, each alone, are the least likely to be zero are looked at.
+        Only the bands whose single bumps are least likely to be zero are examined.
         """
         level = np.diagonal(self.products, axis1=1, axis2=2).T
         squares = self.pulls**2
-        # No image point shows a bump whose level is zero.
+        # A bump has level zero if no image point shows it.
         ratio = np.divide(squares, level, out=np.zeros_like(squares), where=level > 0)
         excess = np.sum(ratio - 1, axis=1)
         bands = _bands(self.image_size)
@@ -232,20 +233,20 @@ class _ShownBumps:
         return max(likely, key=lambda band: band.gain, default=None)
 
     def _place(self, rows: NDArray[np.int64]) -> _Place:
-        """Return the place of some bumps (b,)."""
+        """Return the place with some bumps (b,)."""
         products = [product[np.ix_(rows, rows)] for product in self.products]
         return _Place(rows, *_largest_gain(self.pulls[rows], products))
 
 
 def _all_nodes(image_size: tuple[int, int]) -> NDArray[np.float64]:
-    """Middles (n, 2) [px] of the bumps that an image may have."""
+    """Return the centres (n, 2) [px] of the bumps that an image may have."""
     spacing = max(image_size) / NODES
     u, v = ((np.arange(max(1, round(size / spacing))) + 0.5) * spacing for size in image_size)
     return np.stack(np.meshgrid(u, v, indexing='ij'), axis=-1).reshape(-1, 2)
 
 
 def _windows(image_size: tuple[int, int], nodes: NDArray[np.float64]) -> list[NDArray[np.int64]]:
-    """Rows of the nodes (n, 2) [px] of each window."""
+    """Return the rows of the nodes (n, 2) [px] of each window."""
     size = max(image_size) / WINDOWS
     count = [max(1, int(np.ceil(2 * side / size)) - 1) for side in image_size]
     corners = np.array(list(np.ndindex(*count))) * size / 2
@@ -255,7 +256,7 @@ def _windows(image_size: tuple[int, int], nodes: NDArray[np.float64]) -> list[ND
 
 @lru_cache(maxsize=4)
 def _bands(image_size: tuple[int, int]) -> NDArray[np.float64]:
-    """Ones (b, n) for the bumps within a distance of each of many lines across the image."""
+    """Return ones (b, n) for the bumps within BAND of each of many lines across the image."""
     nodes = _all_nodes(image_size)
     half = BAND * max(image_size) / NODES
     out = []
@@ -269,7 +270,7 @@ def _bands(image_size: tuple[int, int]) -> NDArray[np.float64]:
 def _largest_gain(
     pulls: NDArray[np.float64], products: list[NDArray[np.float64]]
 ) -> tuple[float, float]:
-    """Largest gain of the logarithm of the likelihood by one more place, and its variance.
+    """Return the largest gain of the log likelihood by one more place, and its variance.
 
     pulls (b, 2) and products (b, b), for u and v or one for both: q and s of Tipping and Faul 2003
     for b bumps.

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Automatic choice of the model by cross-validation, whole exposures held out."""
+"""Automatic choice of the model by cross-validation with whole exposures held out."""
 
 from __future__ import annotations
 
@@ -32,25 +32,25 @@ from .parametric import StepwiseTerms
 from .priors import GAUGE_SD_PX, prior_precision, trend_columns
 from .rounds import SelfCalibration
 
-# Errors of models that cannot follow a distortion, from their difference to one that can.
+# Errors of models that cannot follow a distortion, from their difference to a model that can.
 #
-# The residuals of a forced model show only a part of its errors: orientations and object points
-# absorb the rest, in every round. Collocation of the same exposures gives the distortion as the
-# posterior of a random field, with its covariance. The expected squared error of any other
-# correction is then its squared difference from the posterior mean plus the posterior variance
-# (Rasmussen and Williams, "Gaussian Processes for Machine Learning", 2006, 2.4). The same holds
-# for object points and orientations, which take up what the correction leaves.
+# The residuals of a forced model show only a part of its errors, because orientations and object
+# points absorb the remainder in every round. Collocation of the same exposures gives the
+# distortion as the posterior of a random field, with its covariance. The expected squared error of
+# any other correction is then its squared difference from the posterior mean plus the posterior
+# variance (Rasmussen and Williams, "Gaussian Processes for Machine Learning", 2006, 2.4). The same
+# holds for object points and orientations, which absorb what the correction does not follow.
 
-MIN_PIXELS = 20  # of a grid that are within both of two calibrated areas
+MIN_PIXELS = 20  # grid pixels needed within both calibrated areas
 
 
 def with_errors_by(
     reference: SelfCalibration, run: SelfCalibration, gauges: Sequence[GaugeKind]
 ) -> SelfCalibration:
-    """Return a self-calibration whose models and unknowns state their errors by a reference.
+    """Return a self-calibration that states errors of models and unknowns by a reference.
 
-    reference: self-calibration of the same exposures by collocation; gauges: what the orientation
-    of each fluoroscope can express.
+    reference: self-calibration of the same exposures by collocation; gauges: changes that the
+    orientation of each fluoroscope can absorb.
     """
     models = {}
     for f, (name, model) in enumerate(run.models.items()):
@@ -64,7 +64,7 @@ def with_errors_by(
         if inside.sum() < MIN_PIXELS:
             models[name] = model
             continue
-        # What the gauges differ is no error.
+        # A difference of the gauges is no error.
         basis = gauge_basis(uv, interior, gauges[f])
         flat = (model.predict(uv) - other.predict(uv)).ravel()
         shared = np.linalg.lstsq(basis.reshape(len(flat), -1), flat, rcond=None)[0]
@@ -77,9 +77,10 @@ def with_errors_by(
 
 
 def _precision_by(reference: SelfCalibration, run: SelfCalibration) -> Precision:
-    """Precision of a run: covariances of a reference, and the products of the differences.
+    """Add the products of the differences from a reference to its covariances.
 
-    Its covariances with additional parameters and other global unknowns are those of the network.
+    Returns the precision of the run. Covariances with additional parameters and other global
+    unknowns are those of its network.
     """
     found = run.after.parameters
     other = reference.after.parameters
@@ -99,7 +100,7 @@ def _precision_by(reference: SelfCalibration, run: SelfCalibration) -> Precision
 
 
 def _squares(differences: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Products (n, s, s) of the components of differences (n, s)."""
+    """Return products (n, s, s) of the components of differences (n, s)."""
     return differences[:, :, None] * differences[:, None, :]
 
 
@@ -111,8 +112,8 @@ def _with_variance(
 ) -> CorrectionModel:
     """Return a model with variances (n,) [px^2] at the pixels (n, 2) of the grid of a series.
 
-    A series has them as they are; of any other model the mean over the calibrated area, where
-    inside (n,), is that of the variances.
+    A series gets these variances. For any other model, the mean variance over the calibrated area,
+    inside (n,), becomes that of the given variances.
     """
     if isinstance(model, SeriesModel):
         sd = np.sqrt(square).reshape(model.series.sd.shape)
@@ -123,30 +124,30 @@ def _with_variance(
 
 
 START_MODEL = 'collocation'
-# Another model is preferred where its squared errors are smaller by more than 1 %.
+# Another model is preferred if its squared errors are smaller by more than 1 %.
 MAX_RATIO = 0.99
 ALTERNATIVES = ('local_linear', 'knn', 'parametric')
-# Neighbour models with the largest k that is tried: more neighbours follow a distortion no closer
-# than collocation does.
+# Neighbour models and the largest k to try: with more neighbours they follow a distortion no
+# better than collocation does.
 MAX_NEIGHBOURS: dict[type[NeighbourModel], int] = {LocalLinearModel: 100, KnnModel: 40}
-# Image points of a fluoroscope whose predictions are compared: more tell the models no better.
+# Most predictions compared for a fluoroscope: more do not discriminate the models better.
 MAX_TESTED = 5_000
-# With more image points of a fluoroscope no other model was better than collocation.
+# With more image points of a fluoroscope, no other model was better than collocation.
 MAX_IMAGE_POINTS = 40_000
 
 
 def better_model(run: SelfCalibration, terms: AdjustedTerms) -> str | None:
     """Return the model that predicts held-out exposures clearly better than collocation, or None.
 
-    The criterion is the square sum of the errors of predictions of (residual + correction) of the
-    inliers with their robust weights: Eq. 2 of Chow et al. with one variance for all image points,
-    summed over the fluoroscopes.
+    The criterion is the weighted square sum of the errors of predicted (residual + correction) of
+    the inliers, with their robust weights: Eq. 2 of Chow et al. with one variance for all image
+    points, summed over the fluoroscopes.
 
     run: self-calibration by collocation; terms: its terms.
     """
     assert isinstance(terms, CollocationTerms)
     if any(own is not None for own in terms.exposure_terms):
-        return None  # no other model knows what differs between exposures
+        return None  # no other model can follow differences between exposures
     network = run.measured.network
     after = run.after
     inside = after.inliers
@@ -193,15 +194,15 @@ def better_model(run: SelfCalibration, terms: AdjustedTerms) -> str | None:
 class _SeriesPrior:
     """Prior precisions of the coefficients of a series, in parts."""
 
-    trend: NDArray[np.float64]  #: (2t, 2t) of the trend, u first
+    trend: NDArray[np.float64]  #: (2t, 2t) of the trend; u precedes v
     signal: NDArray[np.float64]  #: (s, s) of the sines, the same for u and v
-    #: (2, g, t + s) products with the coefficients of u and of v whose sums have the precision of
-    #: one
+    #: (2, g, t + s) factors of the coefficients of u and of v; the sums of the products have unit
+    #: precision
     gauge: NDArray[np.float64]
 
 
 def _prior_of(terms: CollocationTerms, f: int) -> _SeriesPrior:
-    """Prior of the series of fluoroscope f."""
+    """Return the prior of the series of fluoroscope f."""
     part = terms.parts[f]
     functions = part.functions
     m = len(functions)
@@ -223,7 +224,7 @@ def _held_out(
     weight: NDArray[np.float64],
     fold: NDArray[np.int64],
 ) -> NDArray[np.float64]:
-    """Predictions (N, 2) of values (N, 2) by functions fitted without the own fold.
+    """Predict values (N, 2) by functions fitted without the fold of each value.
 
     functions: (N, m) trend, then sines. values: (N, 2). weight, fold: (N,). Returns (N, 2).
     """
@@ -244,10 +245,10 @@ def _held_out(
 def _solved(
     prior: _SeriesPrior, gram: NDArray[np.float64], right: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Coefficients (m, 2) of u and v from their normal equations (m, m) and (m, 2).
+    """Solve normal equations (m, m) and (m, 2) for the coefficients (m, 2) of u and v.
 
-    The sines, whose matrix u and v have in common, are eliminated first; what remains are trend
-    and gauge, whose products are unknowns of their own.
+    The sines, which have the same matrix for u and v, are eliminated first. Trend and gauge
+    remain; the products of the gauge are unknowns of their own.
     """
     t = len(gram) - len(prior.signal)
     g = prior.gauge.shape[1]
@@ -288,7 +289,7 @@ def _held_out_of_terms(
     weight: NDArray[np.float64],
     fold: NDArray[np.int64],
 ) -> NDArray[np.float64]:
-    """Predictions (N, 2) of values (N, 2) by terms (N, 2, t) fitted without the own fold.
+    """Predict values (N, 2) by terms (N, 2, t) fitted without the fold of each value.
 
     weight, fold (N,).
     """

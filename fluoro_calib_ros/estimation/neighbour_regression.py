@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The regression step of a self-calibration for neighbour models."""
+"""Regression step of a self-calibration for neighbour models."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ from .estimator import (
 
 # Choice of k by cross-validation with whole exposures held out (Eq. 2 of Chow et al.).
 
-MAX_CACHED_WEIGHTS = 12_000_000  # weights that are stored between rounds
+MAX_CACHED_WEIGHTS = 12_000_000  # most weights to store between rounds
 
 
 class CrossValidation:
-    """Cross-validation of a neighbour model over training points that do not move.
+    """Cross-validation of a neighbour model over fixed training points.
 
-    Neighbours are looked up once, and their weights stored as long as they are few: between the
-    rounds of a self-calibration only the values change.
+    Neighbours are searched once, and their weights stored if there are few: between the rounds of
+    a self-calibration only the values change.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ class CrossValidation:
     candidates : (K,) array_like of int
         Values of k, ascending.
     near : NeighbourTable, optional
-        Table of uv, where there is one already.
+        Table of uv, if it exists already.
     tested : (T,) ndarray of int, optional
         Training points whose values are predicted; by default all.
 
@@ -93,13 +93,13 @@ class CrossValidation:
         self._weights = list(self._all_weights()) if cached else None
 
     def _all_weights(self) -> Iterable[NDArray[np.float64]]:
-        """Weights (T, k) for every candidate k."""
+        """Yield the weights (T, k) for every candidate k."""
         return (self.model_type.weights(self._near, k) for k in self.candidates)
 
     def _neighbour_values(
         self, values: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Values less trend at the neighbours (2, T, K), and trend (T, 2), of the other folds."""
+        """Return values less trend at neighbours (2, T, K), and trend (T, 2), by other folds."""
         near = np.empty((2,) + self._index.shape)
         trend = np.zeros((len(self._tested), 2))
         for held_out, train, fit in self._trend:
@@ -110,7 +110,7 @@ class CrossValidation:
         return near, trend
 
     def predictions(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Held-out predictions (K, T, 2) of values (N, 2), for every candidate."""
+        """Return held-out predictions (K, T, 2) of values (N, 2), for every candidate."""
         near, trend = self._neighbour_values(values)
         if self.model_type.equal_weights:
             sums = np.cumsum(near, axis=2)[:, :, self.candidates - 1]
@@ -121,7 +121,7 @@ class CrossValidation:
         )
 
     def predictions_for(self, k: int, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Held-out predictions (T, 2) of values (N, 2) with k neighbours."""
+        """Return held-out predictions (T, 2) of values (N, 2) with k neighbours."""
         near, trend = self._neighbour_values(values)
         weights = self.model_type.weights(self._near, k)
         return trend + np.einsum('nk,cnk->nc', weights, near[:, :, :k])
@@ -129,7 +129,7 @@ class CrossValidation:
     def scores(
         self, values: NDArray[np.float64], information: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """G (K,) for every candidate: errors weighted by information (N, 2, 2) = C_r^-1."""
+        """Return G (K,) of every candidate: errors weighted by information (N, 2, 2) = C_r^-1."""
         error = values[self._tested] - self.predictions(values)
         return weighted_square_sum(error, information[self._tested])
 
@@ -137,18 +137,18 @@ class CrossValidation:
 def weighted_square_sum(
     error: NDArray[np.float64], information: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Sums (K,) of e^T W e over errors e (K, N, 2) with weights W (N, 2, 2)."""
+    """Return the sums (K,) of e^T W e over errors e (K, N, 2) with weights W (N, 2, 2)."""
     return np.sum((error[:, :, None, :] @ information)[:, :, 0] * error, axis=(1, 2))
 
 
 MIN_GAIN = 1e-3  # relative gain in G for which k is changed
-SEARCH_FACTOR = 2.0  # k is looked for within this factor of the last one first
+SEARCH_FACTOR = 2.0  # k is first searched within this factor of the last one
 
 
 class NeighbourRegression(RegressionStep[NeighbourModel]):
     """A neighbour model of one fluoroscope through the rounds of a self-calibration.
 
-    The image points do not move, so neighbours are looked up again only when the inliers change.
+    The image points do not move, so neighbours are searched again only when the inliers change.
 
     k: number of neighbours; None: chosen by cross-validation.
     """
@@ -191,7 +191,7 @@ class NeighbourRegression(RegressionStep[NeighbourModel]):
             self._prepare_smoothing(inliers)
 
     def _prepare_smoothing(self, inliers: NDArray[np.bool_]) -> None:
-        """Look up the k nearest inliers of all image points, and their weights."""
+        """Find the k nearest inliers of all image points, and their weights."""
         uv = self.points.uv
         assert self._table is not None
         self._index = self._table.nearest(np.arange(len(uv)), inliers, self.k)
@@ -213,7 +213,7 @@ class NeighbourRegression(RegressionStep[NeighbourModel]):
         if self._table is None:
             self._table = NeighbourTable(self.points.uv, candidates[-1])
         self._all_candidates = candidates
-        if given is None and self.k:  # it changes little from round to round
+        if given is None and self.k:  # k changes little from round to round
             near = (candidates >= self.k / SEARCH_FACTOR) & (candidates <= self.k * SEARCH_FACTOR)
             candidates = candidates[near]
         self._validation = CrossValidation(
@@ -225,7 +225,7 @@ class NeighbourRegression(RegressionStep[NeighbourModel]):
         )
 
     def _at_border(self, best: int) -> bool:
-        """Whether the best candidate is the first or last of those tried, but not of all."""
+        """Whether the best candidate is first or last of those tried, but not of all."""
         tried = self._validation.candidates
         possible = self._all_candidates
         at_start = best == 0 and tried[0] > possible[0]
@@ -263,7 +263,7 @@ class NeighbourRegression(RegressionStep[NeighbourModel]):
         fitted: NDArray[np.float64],
         interior: NDArray[np.float64],
     ) -> np.ndarray:
-        """Coefficients of the part of corrections fitted at the inliers that is in the gauge."""
+        """Return the gauge coefficients of corrections (i, 2) fitted at the inliers."""
         if self._trend is None:
             uv = self.points.uv[self.inliers]
             return gauge_coefficients(uv, fitted, interior, self.points.gauge)
@@ -271,12 +271,12 @@ class NeighbourRegression(RegressionStep[NeighbourModel]):
         return np.linalg.lstsq(flat, fitted.reshape(-1), rcond=None)[0]
 
     def model(self, values: NDArray[np.float64], series: Series | None = None) -> NeighbourModel:
-        """Return the correction model of values (N, 2) with its noise and bias.
+        """Return the correction model of values (N, 2), with its noise and bias.
 
-        For a linear smoother S without bias E|y - S y|^2 = s^2 (1 - 2 tr(S)/N + tr(S S')/N)
-        (Hastie, Tibshirani and Friedman, "The Elements of Statistical Learning", 2009, 5.5). Of a
-        point that is held out the noise of the point and of the prediction add up; what exceeds
-        them is bias.
+        For a linear smoother S without bias, E|y - S y|^2 = s^2 (1 - 2 tr(S)/N + tr(S S')/N)
+        (Hastie, Tibshirani and Friedman, "The Elements of Statistical Learning", 2009, 5.5). At a
+        held-out point, the noise of the point and of the prediction add up; an excess over their
+        sum is bias.
         """
         inside = self.inliers
         error2 = np.mean((values[inside] - self.smooth(values)[inside]) ** 2)

@@ -3,11 +3,11 @@
 
 """Options of a self-calibration; a user's own scikit-learn regressor as its model.
 
-A user's own scikit-learn regressor as correction model. Any regressor with `fit(X, y)` and
-`predict(X)` will do: it is fitted to the residuals of the inliers between adjustments, as other
-models are. X (n, 2) are image coordinates relative to the centre of the image in units of half its
-longer side, so from -1 to 1; y (n, 2) is (du, dv) [px]. A regressor of one output is fitted to
-each of them. What is saved is the fitted correction on a grid, the model `lookup`.
+Correction model from a user's own scikit-learn regressor. Any regressor with `fit(X, y)` and
+`predict(X)` will do; like other models, it is fitted to the residuals of the inliers between
+adjustments. X (n, 2) are image coordinates relative to the centre of the image in units of half
+its longer side, so from -1 to 1; y (n, 2) is (du, dv) [px]. A regressor with one output is fitted
+to du and to dv. The saved model is `lookup`, the fitted correction on a grid.
 """
 
 from __future__ import annotations
@@ -52,15 +52,15 @@ from .neighbour_regression import weighted_square_sum
 if TYPE_CHECKING:
     from sklearn.base import RegressorMixin
 
-CV_FOLDS = 5  # fewer than for the other models: each costs a fit
+CV_FOLDS = 5  # fewer than for the other models, because each fold costs a fit
 
 
 def resolve_model(name: str) -> Any:
-    """Return what the option --model means: a name as it is, or the regressor of 'module:Class'.
+    """Resolve the option --model: a name as it is, 'module:Class' to a regressor.
 
-    The module is imported from the Python path. The object may be a class or function, which is
-    called without arguments, or a regressor. It must never come from a file or a message, as it
-    runs code.
+    The module is imported from the Python path. The object may be a regressor, or a class or
+    function that is called without arguments. It must never come from a file or a message, because
+    it runs code.
 
     Raises ValueError if there is no such object, or if it is not a regressor.
     """
@@ -89,22 +89,22 @@ def is_regressor(thing: Any) -> bool:
 
 
 def regressor_name(regressor: Any) -> str:
-    """Module and class of a regressor, 'module:Class'."""
+    """Return module and class of a regressor as 'module:Class'."""
     return f'{type(regressor).__module__}:{type(regressor).__qualname__}'
 
 
 def user_estimator(regressor: Any) -> Estimator:
-    """Return the estimator that fits a scikit-learn regressor to the residuals."""
+    """Return an estimator that fits a scikit-learn regressor to the residuals."""
     return Estimator(
         LookupModel.kind, regression=lambda points, k: UserRegression(regressor, points)
     )
 
 
 class UserRegression(RegressionStep[LookupModel]):
-    """A user's regressor of one fluoroscope through the rounds of a self-calibration.
+    """A user's regressor for one fluoroscope through the rounds of a self-calibration.
 
-    The correction is always that of the lookup grid, so that the saved model is the one with
-    which the network was adjusted.
+    The correction is always that of the lookup grid, so that the network is adjusted with the same
+    model that is saved.
     """
 
     def __init__(self, regressor: Any, points: TrainingPoints) -> None:
@@ -113,14 +113,14 @@ class UserRegression(RegressionStep[LookupModel]):
         self._nodes = grid_nodes(points.image_size)
         self._interior: NDArray[np.float64] | None = None
         self._held_out_error2 = 0.0
-        # The fits of a round: of the values and of the next ones. `model` wants the first again,
-        # with the gauge of its own round.
+        # Fits of the last round: those of its values and of the next values. `model` needs the
+        # first again, with the gauge of its round.
         self._last_fits: deque[tuple[NDArray[np.float64], LookupModel]] = deque(maxlen=2)
 
     def choose(
         self, values: NDArray[np.float64], q: NDArray[np.float64], information: NDArray[np.float64]
     ) -> None:
-        """Update the inliers; G is that of held-out exposures."""
+        """Update the inliers, and compute G by cross-validation over exposures."""
         from sklearn.model_selection import GroupKFold, cross_val_predict
 
         inliers = self._updated_inliers(q)
@@ -141,7 +141,7 @@ class UserRegression(RegressionStep[LookupModel]):
     def without_gauge(
         self, values: NDArray[np.float64], interior: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the values: `smooth` takes the gauge of this interior orientation out."""
+        """Return the values unchanged; `smooth` removes the gauge of this interior orientation."""
         self._interior = interior
         return values
 
@@ -157,7 +157,7 @@ class UserRegression(RegressionStep[LookupModel]):
         For a least-squares fit and for a mean of neighbours, the error variance of a training
         point is below the noise variance by as much as that of a held-out point is above it
         (Efron, Journal of the American Statistical Association 81, 1986): by the variance of the
-        prediction. Both are estimated so.
+        prediction. Noise and prediction variance are estimated from these two errors.
         """
         known = [fit for fitted_to, fit in self._last_fits if np.array_equal(fitted_to, values)]
         fitted = known[0] if known else self._fit(values)
@@ -189,13 +189,13 @@ class UserRegression(RegressionStep[LookupModel]):
         return gauge_basis(uv, self._interior, self.points.gauge)
 
     def _features(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Image coordinates (n, 2) from -1 to 1 along the longer side."""
+        """Return image coordinates (n, 2) from -1 to 1 along the longer side."""
         size = np.asarray(self.points.image_size)
         return (uv - (size - 1) / 2) / (size.max() / 2)
 
 
 def _repeatable_multi_output(regressor: Any) -> Any:
-    """Return a regressor of two outputs that gives the same numbers for the same observations."""
+    """Return a regressor with two outputs that repeats its numbers for the same observations."""
     from sklearn.base import clone
     from sklearn.multioutput import MultiOutputRegressor
 
@@ -216,7 +216,7 @@ RELATIVE_ORIENTATIONS = ('none', 'soft', 'hard')
 
 
 def model_choices() -> tuple[str, ...]:
-    """Names of the correction models that can be asked for, 'auto' first."""
+    """Return the names of the correction models that a user can select, 'auto' first."""
     return (AUTO, *selectable_models())
 
 
@@ -227,14 +227,14 @@ class CalibrationOptions:
     Attributes
     ----------
     model : str or scikit-learn regressor
-        Correction model; 'auto': chosen by cross-validation. A regressor of the user's own is
-        given as an object (see `estimation.options.resolve_model`).
+        Correction model; 'auto': chosen by cross-validation. A user's own regressor is given
+        as an object (see `estimation.options.resolve_model`).
     interior : str
-        'estimated', or 'fixed', its error being learned by the model.
+        'estimated', or 'fixed'; the model then learns the error of the interior orientation.
     loss : str
         Noise model of the image points.
     k : int or None
-        Number of neighbours of a model that has any; None: chosen by cross-validation.
+        Number of neighbours, for models that use neighbours; None: chosen by cross-validation.
     max_iterations : int
         Largest number of rounds.
     tolerance : float
@@ -242,16 +242,16 @@ class CalibrationOptions:
     relative_orientation : str
         Constraint on fluoroscopes that are adjusted together: 'none', 'soft' or 'hard'.
     relative_sd : (float, float)
-        Standard deviations of each component of a soft one [mm, rad].
+        Standard deviations of each component of a soft constraint [mm, rad].
     datum : str
         'survey': weighted surveyed coordinates; 'inner': a free network.
     interior_sd : (float, float, float) or None
-        Standard deviations of the start values of xp, yp and c [px]; None: they are not known.
+        Standard deviations of the initial values of xp, yp and c [px]; None: unknown.
 
     Raises
     ------
     ValueError
-        If a value is not allowed, or two options exclude each other.
+        If a value is not allowed, or two options are incompatible.
     """
 
     model: str | RegressorMixin = option(  # noqa: RUF009
@@ -303,7 +303,7 @@ class CalibrationOptions:
         for name, size in (('relative_sd', 2), ('interior_sd', 3)):
             value = getattr(self, name)
             if value is not None:
-                # As read from a file it is a list.
+                # a list if it was read from a file
                 object.__setattr__(self, name, tuple(float(v) for v in value))
                 if len(value) != size or not all(v > 0 for v in value):
                     raise ValueError(f'{name} is {size} numbers above 0')
@@ -325,16 +325,16 @@ class CalibrationOptions:
 
     @property
     def model_name(self) -> str:
-        """Name of the model; of a user's regressor its module and class, 'module:Class'."""
+        """Name of the model, or 'module:Class' of a user's regressor."""
         return self.model if isinstance(self.model, str) else regressor_name(self.model)
 
     def to_document(self) -> dict[str, Any]:
-        """Return the options as plain values for a file, a user's regressor by its name."""
+        """Return the options as plain values for a file, with a user's regressor by its name."""
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         return {**values, 'model': self.model_name}
 
 
-# What a calibration is made from.
+# Input of a calibration.
 
 
 @dataclass(frozen=True)
@@ -346,19 +346,20 @@ class CalibrationRequest:
     frames : mapping of str to sequence of Frame
         Exposures of the phantom by fluoroscope.
     phantom : Phantom
-        Its survey.
+        The phantom, with its survey.
     options : CalibrationOptions
     joint : bool
-        Whether all fluoroscopes are adjusted together; else one after the other.
+        Whether to adjust all fluoroscopes together, or one after the other.
     principal_distance : float or None
-        Start value, or with interior 'fixed' the value [px]; None: from the observations.
+        Initial value [px], or with interior 'fixed' the value; None: from the observations.
     names : Names
-        Names of targets, exposures and fluoroscopes in the files that they were read from.
+        Names of targets, exposures and fluoroscopes in the files that were read.
     known_orientations : mapping of str to KnownOrientation
-        Orientations that are known beforehand, by fluoroscope; the phantom is then surveyed in
-        their frame.
+        Orientations known beforehand, by fluoroscope; the phantom is then surveyed in their
+        frame.
     about : mapping of str to str
-        What the report says of rig and input, such as site and operator; no calculation uses it.
+        Notes on rig and input for the report, such as site and operator; not used in
+        calculations.
     """
 
     __repr__ = brief_repr
@@ -373,7 +374,7 @@ class CalibrationRequest:
     about: Mapping[str, str] = field(default_factory=dict)
 
     def with_exposures(self, numbers: Mapping[str, Container[int]]) -> CalibrationRequest:
-        """Return the request with the exposures of these numbers, by fluoroscope, only."""
+        """Return the request with only the exposures of these numbers, by fluoroscope."""
         frames = {
             name: [frame for frame in of_one if frame.number in numbers[name]]
             for name, of_one in self.frames.items()

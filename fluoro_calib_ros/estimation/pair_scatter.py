@@ -1,15 +1,16 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Scatter of the relative orientations of exposures about that of the rig.
+"""Scatter of the relative orientations of exposures about the relative orientation of the rig.
 
-The pairs of exposures of a rigid rig have one relative orientation. A pair whose frames are not of
-one exposure, or between whose frames the phantom moved, has another one, and is left out.
+All pairs of exposures of a rigid rig have the same relative orientation. A pair differs, and is
+excluded, if its frames are not of one exposure, or if the phantom moved between them.
 
-Where a distortion changes with the angle of a C-arm, the part of the change that is a shift, turn
-or scale of the image goes into the orientation of each exposure, and their relative orientations
-are a function of the angle: of its harmonics, as the correction (`correction.angle_field`). So
-they are where an arm bends. What these harmonics do not explain is as unexpected as elsewhere.
+Where a distortion changes with the angle of a C-arm, the orientation of each exposure absorbs the
+part of the change that is a shift, rotation or scale of the image. The relative orientations are
+then a function of the angle, or of its harmonics, like the correction (`correction.angle_field`).
+The same holds where an arm bends. A scatter that these harmonics do not explain is as unexpected
+as elsewhere.
 """
 
 from __future__ import annotations
@@ -34,56 +35,57 @@ from ..photogrammetry.unknowns import (
 )
 from .exposure_terms import can_be_fitted
 
-# A pair of exposures is left out of the mean where its deviation is CERTAIN times its standard
-# deviation, and as many times the median of all pairs; at most this share of them is.
+# A pair of exposures is excluded from the mean if its deviation exceeds CERTAIN times its standard
+# deviation, and CERTAIN times the median of all pairs; at most this share of the pairs is.
 MAX_LEFT_OUT = 1 / 3
 MIN_PAIRS_ROBUST = 4
-PAIRS_OF_COLUMN = 2  # that a function of the angle needs at least
-STEPS = 20  # of reweighting
-CORE = 3.0  # deviation over the median one at which a pair has half its weight in a trend
-MAX_REMAINING = 0.5  # of the variance of the pairs that a trend leaves
-MOVED_SHARE = 0.2  # of the variance about a trend that is left when the rig was moved once
+PAIRS_OF_COLUMN = 2  # pairs of exposures needed for each function of the angle
+STEPS = 20  # number of iterations of reweighting
+CORE = 3.0  # deviation, relative to the median, at which a pair has half its weight in a trend
+MAX_REMAINING = 0.5  # share of the variance of the pairs that may remain about a trend
+MOVED_SHARE = 0.2  # share of the variance about a trend that may remain if the rig moved once
 
 
 @dataclass(frozen=True)
 class PairScatter:
-    """How the relative orientations of k pairs of exposures scatter about the one of the rig."""
+    """Scatter of the relative orientations of k pairs of exposures about that of the rig."""
 
     fluoroscopes: tuple[str, str]
-    exposures: NDArray[np.int64]  #: (k,)
+    exposures: NDArray[np.int64]  #: (k,) numbers of the exposures
     #: (k,) RMS displacement of a coordinate of the image points of the second fluoroscope [px],
-    #: less what the angle of a C-arm explains
+    #: without the part that the angle of a C-arm explains
     off_px: NDArray[np.float64]
-    off_sd: NDArray[np.float64]  #: (k,) deviation over its standard deviation, also less that
-    used: NDArray[np.bool_]  #: (k,) whether the pair has part in the mean
-    #: factor, at least 1, by which the used pairs scatter more than their standard deviations
+    off_sd: NDArray[np.float64]  #: (k,) deviation over its standard deviation, likewise
+    used: NDArray[np.bool_]  #: (k,) whether the pair contributes to the mean
+    #: factor, at least 1, by which the scatter of the used pairs exceeds their standard deviations
     growth: float
-    unexplained: float  #: the same, less what the angle of a C-arm explains
-    angle_px: float  #: RMS displacement that the angle explains [px], 0 where there is none
+    unexplained: float  #: the same factor without the part that the angle of a C-arm explains
+    angle_px: float  #: RMS displacement that the angle explains [px], or 0
     columns: NDArray[np.float64]  #: (k, p) functions of the angle, the first of them 1
-    corrected: bool  #: whether the correction of one of them changes with the angle
+    corrected: bool  #: whether the correction of a fluoroscope changes with the angle
     #: (k, 3, 3) rotations from the sensor of the first fluoroscope to that of the second
     turn: NDArray[np.float64]
-    shift_mm: NDArray[np.float64]  #: (k, 3) of the second source in the sensor frame of the first
+    shift_mm: NDArray[np.float64]  #: (k, 3) second source in the sensor frame of the first
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """Which pairs agree on the relative orientation of a rig."""
+    """Pairs that agree on the relative orientation of a rig."""
 
-    used: NDArray[np.bool_]  #: (k,)
+    used: NDArray[np.bool_]  #: (k,) whether the pair agrees
     #: (k,) deviations of all pairs over their standard deviations, less the trend
     off_sd: NDArray[np.float64]
     #: see `PairScatter`
     growth: float
     unexplained: float
-    trend: NDArray[np.float64]  #: (k, 6) what the angle explains: translation [mm], rotation [rad]
+    trend: NDArray[np.float64]  #: (k, 6) part explained by the angle: shift [mm], rotation [rad]
 
 
 def functions_of_angles(angles: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Functions (k, p) of angles (k,) [rad] of the fluoroscopes of k pairs, the first of them 1.
+    """Return functions (k, p) of the angles (k,) [rad] of both fluoroscopes of k pairs.
 
-    As many orders of the harmonics as there are pairs for; none where angles are not known.
+    The first function is 1. The number of orders of the harmonics is limited by the number of
+    pairs; there are none if the angles are unknown.
     """
     count = len(angles[0])
     one, other = angles
@@ -102,10 +104,10 @@ def agreeing(
     weights: np.ndarray,
     columns: NDArray[np.float64],
 ) -> Agreement:
-    """Return which pairs agree.
+    """Find the pairs that agree.
 
-    weights (k, 6, 6) are those of the pairs, columns (k, p) functions of the angle. Where more
-    than a few pairs contradict the others, none is left out: there is no majority to rely on.
+    weights (k, 6, 6): of the pairs; columns (k, p): functions of the angle. If more than a few
+    pairs contradict the others, none is excluded, because there is no majority to rely on.
     """
     pairs = constraint.pairs
     used, off_sd = _plain(parameters, constraint, weights)
@@ -122,7 +124,7 @@ def agreeing(
 def _plain(
     parameters: Parameters, constraint: RelativeConstraint, weights: NDArray[np.float64]
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-    """Return which (k,) pairs agree, and the deviations (k,) of all over their sd."""
+    """Return which pairs (k,) agree, and the deviations (k,) of all pairs over their sd."""
     pairs = constraint.pairs
     every = np.ones(len(pairs), dtype=bool)
     robust = len(pairs) >= MIN_PAIRS_ROBUST
@@ -138,13 +140,13 @@ def _plain(
 
 
 def _near(deviation: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which (k,) pairs agree; all where too many do not."""
+    """Return which pairs (k,) agree; all if too many disagree."""
     near = deviation <= CERTAIN * max(1.0, float(np.median(deviation)))
     return near if np.sum(~near) <= MAX_LEFT_OUT * len(near) else np.ones(len(near), dtype=bool)
 
 
 def _growth(off_sd: NDArray[np.float64], used: NDArray[np.bool_], columns: int) -> float:
-    """Factor by which used pairs scatter more than stated about so many functions."""
+    """Return the factor by which used pairs scatter more than stated about so many functions."""
     freedom = max(6 * (int(used.sum()) - columns), 1)
     return float(np.sqrt(max(1.0, 6 * np.sum(off_sd[used] ** 2) / freedom)))
 
@@ -155,7 +157,7 @@ def _with_trend(
     weights: NDArray[np.float64],
     columns: NDArray[np.float64],
 ) -> Agreement:
-    """Return which pairs agree on a relative orientation that changes with the angle."""
+    """Find the pairs that agree on a relative orientation that changes with the angle."""
     pairs = constraint.pairs
     off = discrepancies(constraint, mean_pose(parameters, pairs), parameters)
     share = np.ones(len(pairs))
@@ -165,7 +167,7 @@ def _with_trend(
         share = 1 / (1 + (deviation / (CORE * median)) ** 2)
     used = _near(deviation)
     if np.sum(~used) > 1 and _moved_once(off, weights, columns):
-        used[:] = True  # these are no single exposures
+        used[:] = True  # the disagreeing pairs are not single exposures
     pose = mean_pose(parameters, pairs[used], weights[used])
     off = discrepancies(constraint, pose, parameters)
     deviation, trend = _about_trend(off, weights * used[:, None, None], weights, columns)
@@ -182,7 +184,7 @@ def _with_trend(
 def _moved_once(
     off: NDArray[np.float64], weights: NDArray[np.float64], columns: NDArray[np.float64]
 ) -> bool:
-    """Whether one step explains nearly all that a trend leaves of discrepancies (k, 6)."""
+    """Whether one step explains nearly all of discrepancies (k, 6) about a trend."""
     left = [
         np.sum(_about_trend(off, weights, weights, np.hstack([columns, step]))[0] ** 2)
         for step in steps_of(len(off))
@@ -192,9 +194,9 @@ def _moved_once(
 
 
 def steps_of(count: int) -> list[NDArray[np.float64]]:
-    """Functions (count, 1) that are 0 before one of count pairs in order, and 1 from it on.
+    """Return step functions (count, 1) for ordered pairs: 0 before a pair, and 1 from it on.
 
-    At least two pairs are on either side.
+    At least two pairs are on either side of a step.
     """
     return [(np.arange(count) >= k)[:, None].astype(float) for k in range(2, count - 1)]
 
@@ -205,9 +207,9 @@ def _about_trend(
     weights: NDArray[np.float64],
     columns: NDArray[np.float64],
 ) -> tuple[np.ndarray, NDArray[np.float64]]:
-    """Deviations (k,) over their sd about a trend of discrepancies (k, 6), and the trend (k, 6).
+    """Return deviations (k,) over their sd from a trend of discrepancies (k, 6), and trend (k, 6).
 
-    The trend is estimated with the weights shared (k, 6, 6).
+    The trend is estimated with the weights `shared` (k, 6, 6).
     """
     size = off.shape[1] * columns.shape[1]
     normal = np.einsum('ka,kb,kij->aibj', columns, columns, shared).reshape(size, size)
@@ -224,7 +226,7 @@ def _deviations(
     pose: RelativePose,
     weights: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Deviations (k,) of pairs from a relative orientation over their standard deviations."""
+    """Return the deviations (k,) of pairs from a relative orientation over their sd."""
     off = discrepancies(constraint, pose, parameters)
     return np.sqrt(np.einsum('ki,kij,kj->k', off, weights, off) / 6)
 
@@ -236,10 +238,10 @@ def displacements(
     poses: Sequence[RelativePose],
     others: Sequence[RelativePose] | None = None,
 ) -> NDArray[np.float64]:
-    """RMS (k,) [px] of a coordinate by which image points of pairs (k, 2) of exposures are off.
+    """Return the RMS displacement (k,) [px] of image coordinates for pairs (k, 2) of exposures.
 
-    They are displaced by one relative orientation of each pair against another, by default that
-    of the adjusted exposures.
+    The displacement is between two relative orientations of each pair. By default the second is
+    that of the adjusted exposures.
     """
     out = np.zeros(len(pairs))
     for k, (a, b) in enumerate(pairs):
@@ -261,6 +263,6 @@ def displacements(
 def _exterior(
     parameters: Parameters, a: int, pose: RelativePose
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Rotation (3, 3) and source (3,) [mm] that a relative orientation to exposure a gives."""
+    """Return rotation (3, 3) and source (3,) [mm] by a relative orientation to exposure a."""
     rotation = parameters.rotation[a]
     return pose.rotation @ rotation, parameters.position_mm[a] + rotation.T @ pose.translation_mm

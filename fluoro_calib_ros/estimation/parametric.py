@@ -3,10 +3,10 @@
 
 """The model `parametric`: terms of the expert, selected stepwise without the expert.
 
-Section 3 of Chow et al.: additional parameters are added one at a time. One stays if it reduces
-the RMSE of the residuals, is significant by Student's t-test, and reduces the trend that is left
-in the residuals. Where the last two disagree the expert decides; here a significant term stays if
-one of the other two criteria holds.
+Section 3 of Chow et al.: additional parameters are added one at a time. A parameter stays if it
+reduces the RMSE of the residuals, is significant by Student's t-test, and reduces the remaining
+trend of the residuals. Where the last two disagree, the expert decides; here a significant term
+stays if either of the other two criteria holds.
 """
 
 from __future__ import annotations
@@ -43,24 +43,25 @@ if TYPE_CHECKING:
 # Uncertainty of which terms of a trend exist, and with which variance.
 #
 # The prior variances of the trend terms are those of the largest marginal likelihood (see
-# `priors`), and the posterior takes them as known. A term that hardly exceeds its noise may then
-# be left out, or kept with too small a standard deviation: its mean squared error is up to three
-# times its variance. Here each term is averaged over its prior: with equal odds it does not exist
+# `priors`), and the posterior treats them as known. A term that hardly exceeds its noise may then
+# be omitted, or kept with too small a standard deviation: its mean squared error is up to three
+# times its variance. Here each term is averaged over its prior. With equal odds, it does not exist
 # (Mitchell and Beauchamp, "Bayesian variable selection in linear regression", JASA 83, 1988), or
 # it has a variance with the uniform shrinkage prior (Daniels, "A prior for the variance in
 # hierarchical models", Canadian Journal of Statistics 27, 1999).
 
-NODES = 64  # of a quadrature
-FAR = 8.0  # standard deviations of a Gaussian beyond which nothing is left
+NODES = 64  # nodes of a quadrature
+FAR = 8.0  # standard deviations beyond which the tail of a Gaussian is negligible
 
 
 def squared_error_of_kept(
     ratio: NDArray[np.float64], kept: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Expected squared errors (t,) of terms, in units of the variances of their estimates.
+    """Return expected squared errors (t,) of terms, in units of the variances of their estimates.
 
-    ratio: (t,) estimates without a prior, over their standard deviations. kept: (t,) parts of
-    these estimates that are kept, 0 to 1. Returns (t,) posterior variances about the kept values.
+    ratio: (t,) estimates without a prior, over their standard deviations. kept: (t,) fractions of
+    these estimates that are kept, 0 to 1. The errors are posterior variances about the kept
+    values.
     """
     half = np.square(ratio) / 2
     x, weight = np.polynomial.legendre.leggauss(NODES)
@@ -84,9 +85,9 @@ def covariance_with_uncertain_terms(
     mean: NDArray[np.float64],
     covariance: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return the covariance (p, p) of coefficients with that of which terms exist.
+    """Add the uncertainty of which terms exist to the covariance (p, p) of coefficients.
 
-    Each term in turn, the prior variances of the others taken as known.
+    Each term is treated in turn, with the prior variances of the others as known.
 
     to_terms: (t, p) from coefficients to terms. variance: (t,) prior variances of the terms. mean,
     covariance: (p, p) posterior of the coefficients with these variances. Returns (p, p).
@@ -101,20 +102,20 @@ def covariance_with_uncertain_terms(
     return covariance + along @ along.T
 
 
-ZERO_PRECISION = 1e12  # prior that holds a term at zero
-MIN_DROP = 1e-3  # relative decrease of the RMSE that counts as one
-NEIGHBOURS = 8  # of an image point, whose mean residual shows the trend
+ZERO_PRECISION = 1e12  # prior precision that fixes a term at zero
+MIN_DROP = 1e-3  # least relative decrease of the RMSE by a term
+NEIGHBOURS = 8  # neighbours of an image point, whose mean residual shows the trend
 
 
 class StepwiseTerms(AdjustedTerms):
-    """The 31 terms of every fluoroscope of a network, and which of them are in the model."""
+    """The 31 terms of every fluoroscope of a network, and their selection for the model."""
 
     intermediate_tolerance = LOOSE  # the tests of significance need a solution
     needs_solution = True
 
     def __init__(self, problem: AdjustmentProblem) -> None:
         self.network = problem.network
-        # What no orientation can take up is left to the terms.
+        # The terms keep what no orientation can absorb.
         self.names, terms = expert_terms(GaugeKind.NONE in problem.gauges)
         self.functions: list[Functions] = []
         self._values: list[NDArray[np.float64]] = []
@@ -134,7 +135,7 @@ class StepwiseTerms(AdjustedTerms):
             self._values.append(np.einsum('nm,tam->nat', values, terms_f))
             count = min(NEIGHBOURS + 1, len(uv))
             self._near.append(cKDTree(uv).query(uv, k=np.arange(2, count + 1))[1])
-        #: by fluoroscope, which terms (31,) are in the model
+        #: by fluoroscope: whether each term (31,) is in the model
         self.selected = [np.zeros(len(terms), dtype=bool) for _ in self.functions]
         self._rejected = [np.zeros(len(terms), dtype=bool) for _ in self.functions]
 
@@ -144,7 +145,7 @@ class StepwiseTerms(AdjustedTerms):
         return self._values
 
     def with_additional(self, network: Network) -> Network:
-        """Return the network with the terms; those that are not selected are fixed at zero."""
+        """Return the network with the terms; terms that are not selected are fixed at zero."""
         additional = tuple(
             AdditionalParameters(values, np.diag(np.where(selected, 0.0, ZERO_PRECISION)))
             for values, selected in zip(self._values, self.selected)
@@ -152,7 +153,7 @@ class StepwiseTerms(AdjustedTerms):
         return replace(network, additional=additional)
 
     def zeros(self) -> tuple[NDArray[np.float64], ...]:
-        """Coefficients of no correction, by fluoroscope."""
+        """Return the coefficients of no correction, by fluoroscope."""
         return tuple(np.zeros(len(self.names)) for _ in self.functions)
 
     def fitted_series(self, f: int, adjustment: Adjustment, precise: Precision) -> Series:
@@ -171,7 +172,7 @@ class StepwiseTerms(AdjustedTerms):
     ) -> tuple[bool, tuple[NDArray[np.float64], ...]]:
         """Add or remove a term of every fluoroscope.
 
-        Returns whether no term was, and the coefficients with which to continue.
+        Returns whether all terms stay the same, and the coefficients to continue with.
         """
         changed = [self._step(f, network, matrix, adjustment) for f in range(len(self.functions))]
         return not any(changed), coefficients_of(adjustment)
@@ -179,7 +180,7 @@ class StepwiseTerms(AdjustedTerms):
     def _step(
         self, f: int, network: Network, matrix: FactorizedNormalMatrix, result: Adjustment
     ) -> bool:
-        """Add the best term of fluoroscope f, or remove one that is not significant any more."""
+        """Add the best term of fluoroscope f, or remove a term that has become insignificant."""
         present = prior_of_additional(network, f)
         information = information_of_additional(matrix, f) - present
         coefficients = coefficients_of(result)[f]
@@ -189,7 +190,7 @@ class StepwiseTerms(AdjustedTerms):
         if network.exterior is not None:
             # Most unknowns are known beforehand.
             dof += network.n_observations - 2 * network.n_image_points
-        # Of all terms together that are tested for one fluoroscope.
+        # Significance of all terms together that are tested for one fluoroscope.
         limit = stdtrit(max(dof, 1), 1 - SIGNIFICANCE / (2 * len(self.names)))  # quantile of t
         if self._remove_insignificant(f, information, coefficients, limit):
             return True
@@ -249,7 +250,7 @@ class StepwiseTerms(AdjustedTerms):
         return self._trend(f, residuals - change, core) < self._trend(f, residuals, core)
 
     def _trend(self, f: int, residuals: NDArray[np.float64], core: NDArray[np.bool_]) -> float:
-        """Mean product of the residuals with the mean residual of their neighbours [px^2]."""
+        """Return the mean product of residuals with the mean of their neighbours [px^2]."""
         inside = np.where(core[:, None], residuals, 0.0)
         return float(np.mean(np.sum(inside * inside[self._near[f]].mean(axis=1), axis=1)))
 
@@ -257,7 +258,7 @@ class StepwiseTerms(AdjustedTerms):
 def _without_gauge(
     terms: NDArray[np.float64], values: NDArray[np.float64], gauge: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Terms (t, 2, m) less their part in the gauge.
+    """Remove the gauge part of terms (t, 2, m).
 
     terms: (t, 2, m) coefficients of the polynomials in u and v. values: (n, m) polynomials at the
     image points. gauge: (n, 2, g) gauge at the image points. Returns (t, 2, m).

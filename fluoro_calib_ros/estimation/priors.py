@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Prior distributions of the coefficients of a distortion's trend and signal.
+"""Prior distributions of the coefficients of trend and signal of a distortion.
 
 Least-squares collocation (Moritz, "Advanced Physical Geodesy", 1980): the signal is a random field
-with a covariance function (see `signal`). That, and for each term of the trend whether it exists,
-is estimated from the observations themselves by their marginal likelihood (Rasmussen and Williams,
+with a covariance function (see `signal`). This function, and the existence of each term of the
+trend, are estimated from the observations by their marginal likelihood (Rasmussen and Williams,
 "Gaussian Processes for Machine Learning", 2006, 5.4; for the trend Tipping and Faul, "Fast
 marginal likelihood maximisation for sparse Bayesian models", 2003).
 """
@@ -26,22 +26,22 @@ from .local_signal import LocalSignal, SineEstimates, bumps, largest_gain, with_
 from .parametric import covariance_with_uncertain_terms
 from .signal import Signal, SignalEquations, most_likely_signal, plausible_signals, starting_signal
 
-# Standard deviation to which the gauge is fixed; a much smaller one would damp the steps of the
+# Standard deviation that fixes the gauge; a much smaller value would damp the steps of the
 # adjustment.
 GAUGE_SD_PX = 3e-5
-# Prior variance of a trend term that does not exist, relative to that with which it is determined.
+# Prior variance of a non-existing trend term, relative to the variance of its estimate.
 MIN_RELATIVE_VARIANCE = 1e-3
-MAX_VARIANCE = 1e8  # of a trend term that exists
-# Terms of the rings that can exist: the radial one and the spiral of degree 5, the radial of 7.
+MAX_VARIANCE = 1e8  # largest prior variance of a trend term
+# Ring terms that can exist: radial and spiral of degree 5, radial of degree 7.
 RING_TERMS = (0, 1, 4)
-# Square of such a term over its variance from which it exists. It costs errors beyond the
-# calibrated area, where it grows fast; at 1, chance alone would make one of three exist.
+# Least square of a ring term, over its variance, to exist. Such a term costs errors beyond the
+# calibrated area, where it grows fast; with 1, chance alone would make one in three exist.
 RING_EXISTS = SURE**2
-# Gain of the logarithm of the likelihood by a place, with the signal of fewer sines, from which
-# the signal is estimated with more.
+# Gain of the logarithm of the likelihood by a place, with the signal of fewer sines, above which
+# the signal is estimated again with more sines.
 SUSPECTED_GAIN = 2.0
-SWEEPS = 3  # renewals of the signal then, and over the terms of the trend
-RIDGE = 1e-9  # increase of a diagonal relative to its largest value
+SWEEPS = 3  # updates of the signal in that case, and sweeps over the terms of the trend
+RIDGE = 1e-9  # increase of a diagonal, relative to its largest value
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Prior:
     """Prior of a distortion.
 
     signal: covariance function of the signal; trend (t,): variances of the trend terms [px^2];
-    local: where the signal varies more, None: nowhere.
+    local: places where the signal has a larger variance, None: there are none.
     """
 
     signal: Signal
@@ -57,7 +57,7 @@ class Prior:
     local: LocalSignal | None = None
 
     def change(self, other: Prior, functions: Functions) -> float:
-        """Mean change of the logarithms of the variances of the signal from another prior."""
+        """Return the mean change of the log variances of the signal from another prior."""
         change = self.signal.change(other.signal, functions.frequency)
         if self.local is None:
             return change if other.local is None else np.inf
@@ -65,7 +65,7 @@ class Prior:
 
 
 def starting_prior(functions: Functions, sd: float) -> Prior:
-    """Return a prior to start with; sd: RMS residual without correction [px]."""
+    """Return an initial prior; sd: RMS residual without correction [px]."""
     _, count = trend_transformation(functions.degree, functions.rings)
     signal = starting_signal(0.3 * sd, max(functions.image_size))
     trend = np.full(count, MAX_VARIANCE)
@@ -74,7 +74,7 @@ def starting_prior(functions: Functions, sd: float) -> Prior:
 
 
 def _first_ring(functions: Functions) -> int:
-    """Number of the first term of the rings, each of which has four; they are the last terms."""
+    """Return the number of the first ring term; each ring has four terms, the last of all."""
     _, count = trend_transformation(functions.degree, functions.rings)
     return count - 4 * functions.rings
 
@@ -85,7 +85,7 @@ def has_rings(functions: Functions, prior: Prior) -> bool:
 
 
 def prior_precision(functions: Functions, prior: Prior) -> NDArray[np.float64]:
-    """Precision matrix (2m, 2m) of the coefficients of a series."""
+    """Return the precision matrix (2m, 2m) of the coefficients of a series."""
     out = np.zeros((2 * len(functions),) * 2)
     if functions.modes:
         signal = signal_precision(functions, prior)
@@ -97,7 +97,7 @@ def prior_precision(functions: Functions, prior: Prior) -> NDArray[np.float64]:
 
 
 def signal_precision(functions: Functions, prior: Prior) -> NDArray[np.float64]:
-    """Precision matrix (s, s) of the coefficients of the sines of u, or of v."""
+    """Return the precision matrix (s, s) of the coefficients of the sines of u, or of v."""
     variance = prior.signal.variance(functions.frequency)
     if prior.local is None:
         return np.diag(1 / variance)
@@ -108,27 +108,27 @@ def signal_precision(functions: Functions, prior: Prior) -> NDArray[np.float64]:
 
 
 def _terms_that_can_exist(functions: Functions) -> list[int]:
-    """Numbers of the terms of the polynomials, and of the rings that can exist."""
+    """Return the numbers of the terms of the polynomials, and of rings that can exist."""
     _, count = trend_transformation(functions.degree, functions.rings)
     rings = _first_ring(functions)
     return [*range(rings), *(rings + k for k in RING_TERMS if rings + k < count)]
 
 
 def trend_columns(functions: Functions) -> NDArray[np.int64]:
-    """Places of the coefficients of polynomials and rings, those of u first."""
+    """Return the indices of the coefficients of polynomials and rings, those of u first."""
     m = len(functions)
     t = functions.trend
     return np.concatenate([np.arange(t), m + np.arange(t)])
 
 
 def _sines(functions: Functions) -> list[slice]:
-    """Places of the coefficients of the sines of u, and of v."""
+    """Return the slices of the coefficients of the sines of u, and of v."""
     m = len(functions)
     return [slice(axis * m + functions.trend, (axis + 1) * m) for axis in (0, 1)]
 
 
 def _trend_precision(functions: Functions, prior: Prior) -> NDArray[np.float64]:
-    """Precision matrix of the coefficients of the trend; zero for what the gauge holds."""
+    """Return the precision matrix of the trend coefficients; zero for directions of the gauge."""
     to_terms, count = trend_transformation(functions.degree, functions.rings)
     return to_terms[:count].T @ (to_terms[:count] / prior.trend[:, None])
 
@@ -139,7 +139,7 @@ def covariance_of_series(
     coefficients: NDArray[np.float64],
     covariance: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return the covariance (2m, 2m) of a series with that of which trend terms exist.
+    """Add the uncertainty of which trend terms exist to the covariance (2m, 2m) of a series.
 
     coefficients, covariance: (2m, 2m) posterior with this prior. Returns (2m, 2m).
     """
@@ -157,11 +157,11 @@ def covariance_by_signal(
     gauge: NDArray[np.float64],
     prior: Prior,
 ) -> NDArray[np.float64]:
-    """Return what a series' covariance (2m, 2m) grows by as its signal is only estimated.
+    """Return the covariance (2m, 2m) that a series gains because its signal is only estimated.
 
-    It is the mean over plausible signals of the covariance with each and of the square of the
-    change of the coefficients, less the covariance with the most likely signal. The arguments are
-    those of `most_likely_prior`.
+    It is the mean over plausible signals of the covariance with each and of the squared change of
+    the coefficients, less the covariance with the most likely signal. Arguments as in
+    `most_likely_prior`.
     """
     base = information + gauge
     out = np.zeros_like(base)
@@ -183,7 +183,7 @@ def _posterior(
     right: NDArray[np.float64],
     prior: Prior,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Coefficients (2m,) and their covariance (2m, 2m); information: with the gauge."""
+    """Return coefficients (2m,) and their covariance (2m, 2m); information includes the gauge."""
     precision = information + prior_precision(functions, prior)
     factor, _ = cho_factor(precision, lower=True)
     half, _ = lapack.dpotri(factor, lower=1)
@@ -197,7 +197,7 @@ def gauge_precision(
     interior: NDArray[np.float64],
     kind: GaugeKind = GaugeKind.FULL,
 ) -> NDArray[np.float64]:
-    """Precision matrix that keeps a series orthogonal to the gauge at image points.
+    """Return the precision matrix that keeps a series orthogonal to the gauge at image points.
 
     values: (n, m) functions of the series at the image points. uv: (n, 2) image points [px].
     interior: (3,) xp, yp, c [px]. Returns (2m, 2m).
@@ -215,7 +215,7 @@ def most_likely_prior(
 ) -> Prior:
     """Return a prior with a larger marginal likelihood: signal first, then trend.
 
-    It is to be repeated until the prior does not change.
+    Repeat until the prior does not change.
 
     information, right: (2m,) normal equations of the coefficients without a prior, all other
     unknowns eliminated. gauge: (2m, 2m) precision matrix of the gauge. prior: present prior.
@@ -231,7 +231,7 @@ def _most_likely_signal(
     right: NDArray[np.float64],
     prior: Prior,
 ) -> Prior:
-    """Return the prior with a renewed signal."""
+    """Return the prior with an updated signal."""
     equations = _signal_equations(functions, information, right, prior)
     found = most_likely_signal(prior.signal, equations, max(functions.image_size))
     local = prior.local
@@ -246,7 +246,7 @@ def _signal_equations(
     right: NDArray[np.float64],
     prior: Prior,
 ) -> SignalEquations:
-    """Normal equations with every prior but the signal's; information: with the gauge."""
+    """Return normal equations with all priors except the signal's; information: with the gauge."""
     at = trend_columns(functions)
     base = information.copy(order='F')
     base[np.ix_(at, at)] += _trend_precision(functions, prior)
@@ -262,10 +262,10 @@ def _with_bumps(
     right: NDArray[np.float64],
     local: LocalSignal,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Normal equations with the heights of the bumps as further unknowns, those of u first.
+    """Add the heights of the bumps to normal equations as unknowns, those of u first.
 
-    matrix (2m, 2m), right (2m,): of the coefficients. The coefficients of the sines are then what
-    the bumps leave.
+    matrix (2m, 2m), right (2m,): of the coefficients. The coefficients of the sines are then those
+    of the signal without the bumps.
     """
     base = bumps(functions, local.nodes)
     sines = _sines(functions)
@@ -295,10 +295,10 @@ def _renewed(
 def with_shown_places(
     functions: Functions, values: NDArray[np.float64], observed: NDArray[np.float64], prior: Prior
 ) -> Prior:
-    """Return the prior with places where the signal varies more, as image points show them.
+    """Return the prior with places of larger signal variance, as image points show them.
 
-    Orientations are taken to be known, and the trend to have no prior, so that u and v have the
-    same matrices. The signal is estimated anew only where a place may be found.
+    Orientations are assumed to be known, and the trend to have no prior, so that u and v have the
+    same matrices. The signal is estimated again only where a place may be found.
 
     values: (n, m) functions at the image points, divided by the standard deviation of their noise.
     observed: (n, 2) corrections that they show, divided likewise.
@@ -306,7 +306,7 @@ def with_shown_places(
     t = functions.trend
     matrix = values.T @ values
     right = values.T @ observed
-    # Terms that the image points do not tell apart.
+    # Terms that the image points do not separate.
     matrix[np.arange(t), np.arange(t)] += RIDGE * np.max(np.diagonal(matrix))
 
     def estimates(given: Prior) -> SineEstimates:
@@ -335,9 +335,9 @@ def with_more_places(
     gauge: NDArray[np.float64],
     prior: Prior,
 ) -> Prior:
-    """Return the prior with more places where the signal varies more, if there are any.
+    """Return the prior with more places of larger signal variance, if there are any.
 
-    The arguments are those of `most_likely_prior`.
+    Arguments as in `most_likely_prior`.
     """
     coefficients, covariance = _posterior(functions, information + gauge, right, prior)
     mean = coefficients.reshape(2, -1).T[functions.trend :]
@@ -352,7 +352,7 @@ def _most_likely_trend(
     right: NDArray[np.float64],
     prior: Prior,
 ) -> Prior:
-    """Return the prior with renewed variances of the trend terms, one after the other."""
+    """Return the prior with updated variances of the trend terms, one after the other."""
     to_terms, count = trend_transformation(functions.degree, functions.rings)
     if not count:
         return prior
@@ -366,8 +366,8 @@ def _most_likely_trend(
         for j in _terms_that_can_exist(functions):
             precision = np.concatenate([1 / variance, np.zeros(len(to_terms) - count)])
             precision[j] = 0
-            # The term is estimated without its prior; its square exceeds its own variance by that
-            # of the prior.
+            # The term is estimated without its prior; the expectation of its square is the sum of
+            # the variance of the estimate and of the prior.
             c = np.linalg.solve(
                 matrix + np.diag(precision), np.stack([right, np.eye(len(right))[j]], axis=1)
             )
@@ -385,7 +385,7 @@ def _trend_alone(
     right: NDArray[np.float64],
     prior: Prior,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Information and right side of the coefficients of the trend, the signal eliminated."""
+    """Eliminate the signal; return information and right side of the trend coefficients."""
     at = trend_columns(functions)
     rest = np.setdiff1d(np.arange(len(right)), at)
     if not len(rest):

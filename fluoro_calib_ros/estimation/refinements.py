@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Refinements of a collocation: what a solution shows that its terms do not have yet.
+"""Refinements of a collocation, proposed where a solution shows that its terms do not suffice.
 
 A refinement of one prior proposes another prior for the same functions. A refinement of the terms
-proposes a `Change` of functions, priors and terms of exposures, with which the network is adjusted
-again. None: nothing is proposed. `collocation` has their order.
+proposes a `Change` of functions, priors and terms of exposures; the network is then adjusted
+again. None means no proposal. `collocation` defines their order.
 """
 
 from __future__ import annotations
@@ -25,55 +25,55 @@ from .lack_of_fit import LARGEST_SD, FittedPoints, areas_of_rejected
 from .priors import Prior, most_likely_prior, prior_precision, with_more_places, with_shown_places
 from .ripples import Ripples, shown_ripples
 
-START_MODES = 16  # half waves along the image, until the signal is known
-MIN_MODES = 10  # least number
-# That tell the bumps of a place where the signal varies more. Rejected image points that agree
-# start with them, too: more may follow.
+START_MODES = 16  # initial number of half waves along the image
+MIN_MODES = 10  # least number of half waves
+# Half waves that resolve the bumps of a place with larger signal variance. A search from rejected
+# image points that agree starts with as many, because more places may follow.
 LOCAL_MODES = 24
-# Bands up to which a smooth field has its sines where others of few bands follow ripples.
+# Highest band of a smooth field, where a few other bands follow ripples.
 GAP_FROM = 12
-MAX_PLACE_SEARCHES = 4  # for more such places, beside those that there are
-MAX_MODES = 30  # the time grows with the sixth power
+MAX_PLACE_SEARCHES = 4  # most searches for further places
+MAX_MODES = 30  # limits the time, which grows with the sixth power
 # Prior variance times information of a sine below which the image points say nothing about it.
 NEGLIGIBLE = 0.2
-# Part of the present modes below which fewer are worth a change: nearly half of the functions.
+# A smaller number of modes must be below this part of the present one: nearly half the functions.
 FEWER_MODES = 0.75
-MODE_CHANGES = 3  # at most: numbers must not alternate for ever
-# Mean change of the logarithms of the variances of the signal that changes no correction visibly.
+MODE_CHANGES = 3  # most changes, so that numbers do not alternate for ever
+# Mean change of the log variances of the signal below which no correction changes visibly.
 SETTLED_PRIOR = 0.3
-MAX_VARYING_EXPOSURES = 60  # of a fluoroscope that can have terms of their own, to limit the time
+MAX_VARYING_EXPOSURES = 60  # exposures of a fluoroscope with terms of their own; limits the time
 
 
 @dataclass(frozen=True)
 class Solution:
-    """A solution of the adjustment, with the priors renewed."""
+    """A solution of the adjustment, with updated priors."""
 
     parts: Sequence[FluoroscopeTerms]
     adjustment: Adjustment
     equations: Sequence[SeriesEquations]  #: by fluoroscope, linearised at the solution
-    is_steady: bool  #: whether the renewal changed no prior visibly
+    is_steady: bool  #: whether the update changed no prior visibly
 
     @property
     def coefficients(self) -> tuple[NDArray[np.float64], ...]:
-        """Coefficients by fluoroscope."""
+        """Coefficients, by fluoroscope."""
         return coefficients_of(self.adjustment)
 
     @property
     def modes(self) -> list[int]:
-        """Modes up to which each fluoroscope has all sines."""
+        """Number of modes up to which each fluoroscope has all sines."""
         return [part.functions.complete for part in self.parts]
 
 
 @dataclass(frozen=True)
 class Change:
-    """Terms with which the network is to be adjusted again."""
+    """Terms with which to adjust the network again."""
 
-    modes: Sequence[int]  #: modes up to which each fluoroscope gets all sines
-    #: by number of the fluoroscope, where it changes
+    modes: Sequence[int]  #: number of modes up to which each fluoroscope gets all sines
+    #: changed priors, by number of the fluoroscope
     priors: Mapping[int, Prior] = field(default_factory=dict)
-    #: of fluoroscopes whose distortion varies
+    #: terms of exposures of the fluoroscopes whose distortion varies
     exposure_terms: Mapping[int, ExposureTerms] = field(default_factory=dict)
-    #: (p,) of the series with which to continue, where they are not those of the solution
+    #: (p,) coefficients of the series to continue with, where they are not those of the solution
     coefficients: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
 
 
@@ -81,11 +81,11 @@ class Refinement(Protocol):
     """A refinement of the terms."""
 
     def propose(self, solution: Solution) -> Change | None:
-        """Return the change that a solution shows to be due, or None."""
+        """Return the change that a solution requires, or None."""
 
 
 class MorePlaces:
-    """More places where the signal varies more, beside those that there are."""
+    """Search for further places where the signal has a larger variance."""
 
     def __init__(self, searches: int = MAX_PLACE_SEARCHES) -> None:
         self._left = searches
@@ -93,7 +93,7 @@ class MorePlaces:
     def propose(
         self, part: FluoroscopeTerms, equations: SeriesEquations, renewed: Prior
     ) -> Prior | None:
-        """Return a prior in place of the renewed one, or None; part: with the last prior."""
+        """Return a prior to replace the updated one, or None; part: still has the last prior."""
         if not self._left or renewed.local is None:
             return None
         self._left -= 1
@@ -103,7 +103,7 @@ class MorePlaces:
 
 
 class NumberOfSines:
-    """As many sines as the image points can tell with the present priors.
+    """Choose as many sines as the image points determine with the present priors.
 
     changes: how often the number has changed before.
     """
@@ -115,7 +115,7 @@ class NumberOfSines:
     def propose(self, solution: Solution) -> Change | None:
         """See `Refinement`."""
         varying = any(part.own is not None for part in solution.parts)
-        if varying and not self._varying:  # what varied may have passed for a short signal
+        if varying and not self._varying:  # a variation may have been mistaken for a short signal
             self._changes = 0
         self._varying = varying
         modes = [
@@ -128,9 +128,9 @@ class NumberOfSines:
         return Change(modes)
 
     def _wanted(self, part: FluoroscopeTerms, information: NDArray[np.float64]) -> int:
-        """Number of modes with which image points can tell the signal.
+        """Return the number of modes with which image points can determine the signal.
 
-        information (2m, 2m) of its coefficients without prior.
+        information: (2m, 2m) of its coefficients without prior.
         """
         functions = part.functions
         if not functions.modes:
@@ -148,7 +148,7 @@ class NumberOfSines:
 
 
 class Once:
-    """A change that is looked for once, at steady priors."""
+    """A change that is searched for once, at steady priors."""
 
     def __init__(self, search: Callable[[Solution], Change | None]) -> None:
         self._search = search
@@ -163,10 +163,10 @@ class Once:
 
 
 def ripples(solution: Solution) -> Change | None:
-    """Ripples in few bands of frequencies.
+    """Search for ripples in few bands of frequencies.
 
-    Residuals show them, or what the sines of these bands have already followed, with all others
-    that are as short.
+    They are shown by the residuals, or by what the sines of these bands have already followed
+    together with all other sines that are as short.
     """
     modes = solution.modes
     priors = {}
@@ -189,7 +189,7 @@ def ripples(solution: Solution) -> Change | None:
 def _followed_ripples(
     part: FluoroscopeTerms, points: FittedPoints, coefficients: NDArray[np.float64]
 ) -> Ripples | None:
-    """Ripples that the sines beyond those of a smooth field have followed, or None."""
+    """Return ripples that the sines beyond those of a smooth field have followed, or None."""
     functions = part.functions
     short = np.concatenate([np.zeros(functions.trend), functions.band > GAP_FROM])
     own = coefficients[part.of_series].reshape(2, -1) * short
@@ -201,14 +201,14 @@ def _followed_ripples(
 def _shown_ripples(
     part: FluoroscopeTerms, points: FittedPoints, values: NDArray[np.float64], complete: int
 ) -> Ripples | None:
-    """Ripples that values (n, 2) [px] at image points show beyond the complete bands."""
+    """Return ripples that values (n, 2) [px] at image points show beyond the complete bands."""
     return shown_ripples(
         part.image_size, points.uv, values, exposure=points.exposure, complete=complete
     )
 
 
 def exposure_terms(solution: Solution) -> Change | None:
-    """Terms of the exposures where residuals show that these differ."""
+    """Return terms of exposures where residuals show that the exposures differ."""
     found = {}
     for part in solution.parts:
         functions = exposure_functions(part.uv, part.image_size, part.interior)
@@ -230,12 +230,12 @@ def exposure_terms(solution: Solution) -> Change | None:
 
 
 class AgreeingOutliers:
-    """Rejected image points that agree: they are not false matches.
+    """Search for rejected image points that agree, and so are not false matches.
 
-    Weights that were found while only long waves were in the model reject the image points of a
-    dent, and at that solution they have no weight, however many they are. They are looked for at
-    every solution with steady priors: before, they may be too few. Those that have been taken back
-    once, and were rejected again, are not tried again.
+    Weights that were found while the model had only long waves reject the image points of a dent;
+    at that solution they have no weight, however many they are. The search is made at every
+    solution with steady priors, because there may be too few before. Image points that were
+    restored once and rejected again are not tried again.
     """
 
     def __init__(self) -> None:
@@ -270,7 +270,7 @@ class AgreeingOutliers:
 
 
 def _agreeing(part: FluoroscopeTerms, adjustment: Adjustment) -> NDArray[np.int64]:
-    """Rows, of those of a fluoroscope, of rejected image points that agree."""
+    """Return the rows, among those of a fluoroscope, of rejected image points that agree."""
     residuals = adjustment.residuals[part.rows]
     inliers = adjustment.inliers[part.rows]
     noise = adjustment.noise.scale * part.sigma
@@ -289,12 +289,12 @@ def _followed(
     used: NDArray[np.bool_],
     scale: float,
 ) -> tuple[Prior, NDArray[np.float64]]:
-    """Prior and coefficients that follow the values (n, 2) [px] of the points used (n,).
+    """Return prior and coefficients that follow values (n, 2) [px] of the used points (n,).
 
-    The robust adjustment goes on from there: at a solution that rejects image points they have no
-    weight, however many they are. A dent is a place where the signal varies more; where none is
-    shown, the signal is given a short field. Orientations are taken to be known, which is near
-    enough to start with. scale: of the noise.
+    The robust adjustment continues from there: at a solution that rejects image points they have
+    no weight, however many they are. A dent is a place with a larger variance of the signal; if no
+    place is shown, the signal gets a short field. Orientations are assumed to be known, which is
+    accurate enough for initial values. scale: scale of the noise.
     """
     functions = part.functions_with(modes, part.prior)
     at_points = functions(part.uv)
@@ -313,7 +313,7 @@ def _followed(
 
 
 def places(solution: Solution) -> Change | None:
-    """Places where the signal varies more."""
+    """Search for places where the signal has a larger variance."""
     modes = solution.modes
     priors = {}
     noise = solution.adjustment.noise

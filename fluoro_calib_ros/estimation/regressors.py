@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The neighbour models as scikit-learn estimators, for pipelines and cross-validation.
+"""Neighbour models as scikit-learn estimators, for pipelines and cross-validation.
 
-A self-calibration does not go through them: it looks up neighbours once for all rounds (see
-`neighbour_regression`). The numbers are the same.
+A self-calibration does not use them: it searches neighbours once for all rounds (see
+`neighbour_regression`). The predictions are the same.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from ..correction.neighbours import RIDGE
 if TYPE_CHECKING:
     from sklearn.utils import Tags
 
-# What scikit-learn 1.6 has renamed, for 1.4 (Ubuntu 24.04) and later.
+# Names that scikit-learn 1.6 has changed, for 1.4 (Ubuntu 24.04) and later.
 
 try:
     from sklearn.utils import get_tags
@@ -49,7 +49,7 @@ def supports_multi_output(estimator: BaseEstimator) -> bool:
     return estimator._get_tags()['multioutput']
 
 
-MIN_BANDWIDTH = 1e-6  # of coincident neighbours
+MIN_BANDWIDTH = 1e-6  # bandwidth of coincident neighbours
 
 
 class KnnRegressor(KNeighborsRegressor):
@@ -57,7 +57,7 @@ class KnnRegressor(KNeighborsRegressor):
 
     The parameters are those of scikit-learn. The search of scipy is used where it gives the same
     neighbours: for dense samples, uniform weights and Euclidean distances. Sample weights weight
-    the mean of the neighbours; a sample of weight 0 is left out.
+    the mean of the neighbours; samples of weight 0 are ignored.
     """
 
     def fit(
@@ -97,7 +97,7 @@ class LocalLinearRegressor(RegressorMixin, BaseEstimator):
     """The model `local_linear`: a polynomial trend, and planes fitted to the nearest remainders.
 
     n_neighbors: number of neighbours; at most the number of samples is used. trend_degree: degree
-    of the trend; None: there is none, as in the model `hybrid`.
+    of the trend; None: no trend, as in the model `hybrid`.
     """
 
     def __init__(self, n_neighbors: int = 30, trend_degree: int | None = 3) -> None:
@@ -117,7 +117,7 @@ class LocalLinearRegressor(RegressorMixin, BaseEstimator):
     ) -> LocalLinearRegressor:
         """Fit to samples X (N, d) with targets y (N,) or (N, outputs).
 
-        Sample weights weight the fits of trend and planes; a sample of weight 0 is left out.
+        Sample weights weight the fits of trend and planes; samples of weight 0 are ignored.
         """
         samples, targets = validated(
             self, X, y, multi_output=True, y_numeric=True, dtype=np.float64
@@ -158,7 +158,7 @@ class LocalLinearRegressor(RegressorMixin, BaseEstimator):
         return predicted[:, 0] if self._single_output else predicted
 
     def _basis(self, X: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Values (n, p) of the polynomials of the trend."""
+        """Return the values (n, p) of the polynomials of the trend."""
         if self.trend_degree is None:
             return np.zeros((len(X), 0))
         return PolynomialFeatures(self.trend_degree).fit_transform(
@@ -169,9 +169,10 @@ class LocalLinearRegressor(RegressorMixin, BaseEstimator):
 def _plane_weights(
     offset: NDArray[np.float64], kernel: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Weights (n, k) that evaluate at 0 the plane fitted at offset (n, k, d) with kernel (n, k).
+    """Return weights (n, k) that evaluate at 0 a plane fitted at offset (n, k, d).
 
-    The offsets are in units of the bandwidth, to which the ridge of the slopes is relative.
+    kernel: (n, k). The offsets are in units of the bandwidth; the ridge of the slopes is relative
+    to it.
     """
     design = np.concatenate([np.ones((*kernel.shape, 1)), offset], axis=2)
     weighted = kernel[:, :, None] * design

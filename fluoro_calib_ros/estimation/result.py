@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a calibration or an adjustment found, and the object points of several of them."""
+"""Results of a calibration or an adjustment, and combination of their object points."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from .rounds import AdjustmentStatistics, ResidualTable, Round, SelfCalibration
 class ExposureResult:
     """Exterior orientation of an exposure."""
 
-    exposure: int  #: its number
+    exposure: int  #: number of the exposure
     position_mm: NDArray[np.float64]  #: (3,) position of the source
     quaternion_wxyz: NDArray[np.float64]  #: (4,) rotation phantom -> sensor
     #: (3,) standard deviations of the position, and of the rotation about the axes of the sensor
@@ -51,7 +51,7 @@ class FluoroscopeResult:
     #: (2,) RMSE of the inlier residuals in u and v [px], without and with the correction
     rmse_before: NDArray[np.float64]
     rmse_after: NDArray[np.float64]
-    #: numbers of image points
+    #: numbers of all image points and of the inliers
     observations: int
     inliers: int
     exposures: tuple[ExposureResult, ...]
@@ -64,7 +64,7 @@ class Targets:
     target_id: NDArray[np.int64]  #: (n,)
     xyz_mm: NDArray[np.float64]  #: (n, 3)
     covariance: NDArray[np.float64]  #: (n, 3, 3) [mm^2]
-    #: (3n, 3n) of all object points with each other [mm^2]; None where they are too many
+    #: (3n, 3n) covariance of all object points [mm^2]; None if there are too many
     joint_covariance: NDArray[np.float64] | None = None
 
 
@@ -79,16 +79,16 @@ class CalibrationResult:
     targets : Targets
         Object points of all fluoroscopes together.
     history : dict of str to tuple of Round
-        By fluoroscope, or by '+'.join(fluoroscopes) where they were adjusted together.
+        By fluoroscope, or by '+'.join(fluoroscopes) if they were adjusted together.
     runs : dict of str to SelfCalibration
-        By the same names; for the report.
+        By the same names as the history; for the report.
     findings : tuple of Finding
-        NOTE: an exposure or image points that are excluded; WARNING: what is doubtful about the
-        orientation of the rig; ERROR: why the calibration cannot be right, though it was forced.
+        NOTE: excluded exposures or image points; WARNING: doubts about the orientation of the rig;
+        ERROR: why the calibration cannot be right, although it was forced.
     converged : bool
     seconds : float
     relative : tuple of RelativeOrientation
-        Of every further fluoroscope with the first, where they were adjusted together.
+        Of every other fluoroscope to the first, if they were adjusted together.
     outliers : (tuple, tuple)
         Dicts of the image points and of the targets that fail their tests.
     correlations : tuple of (str, str, float)
@@ -96,11 +96,11 @@ class CalibrationResult:
     statistics : tuple of AdjustmentStatistics
         Of each adjustment.
     residuals : ResidualTable or None
-        Of all image points; None where they were not kept.
+        Of all image points; None if they were not kept.
     created : str
         Date and time of the end (UTC, ISO 8601).
     solved : dict of str to SolvedNetwork
-        What the covariance matrix of all unknowns is computed from, by the names of the history.
+        Input for the covariance matrix of all unknowns, by the names of the history.
     """
 
     __repr__ = brief_repr
@@ -131,7 +131,7 @@ class CalibrationResult:
 
     @property
     def starts(self) -> StartValues:
-        """Start values of other adjustments of the same exposures."""
+        """Initial values for other adjustments of the same exposures."""
         return StartValues(
             {name: figures.interior for name, figures in self.fluoroscopes.items()},
             {
@@ -147,12 +147,12 @@ def combined_targets(
 ) -> Targets:
     """Return one set of object points from separate adjustments of the same phantom.
 
-    Every adjustment holds the survey. In the sum of their information it counts once, so the
-    information of the survey is subtracted for every further adjustment; weighted False: none of
-    them holds the survey. open_datum: shift, turn and scale of all points follow from the survey
-    alone, in every adjustment; their errors are those of the survey, and all points have them in
-    common. Where the errors of a model make the points of an adjustment worse than the survey,
-    they add nothing to it.
+    Every adjustment includes the survey. In the sum of their information the survey must count
+    once, so its information is subtracted for every further adjustment; with weighted False, no
+    adjustment includes the survey. open_datum: in every adjustment, shift, rotation and scale of
+    all points follow from the survey alone; their errors are those of the survey and common to all
+    points. If the errors of a model make the points of an adjustment worse than the survey, these
+    points add nothing to it.
     """
     if len(parts) == 1:
         return parts[0]
@@ -184,7 +184,7 @@ def combined_targets(
         is_better = value > 0
         better = (vector * (value * is_better)[:, None, :]) @ vector.transpose(0, 2, 1)
         information[at] += better
-        # The point that the adjustment would find without the survey.
+        # The point that the adjustment would give without the survey.
         added = own @ part.xyz_mm[..., None] - (surveyed @ phantom.xyz_mm[row, :, None])[at]
         inside = (vector * is_better[:, None, :]) @ vector.transpose(0, 2, 1)
         right[at] += (inside @ added)[..., 0]
@@ -195,7 +195,7 @@ def combined_targets(
 def _common_covariance(
     xyz_mm: NDArray[np.float64], sd_mm: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the covariances (n, 3, 3) of surveyed points (n, 3) that their datum has [mm^2]."""
+    """Return the covariances (n, 3, 3) [mm^2] of surveyed points (n, 3) due to their datum."""
     directions = similarity_directions(xyz_mm, xyz_mm.mean(axis=0))
     scaled = (directions / sd_mm[:, None, None]).reshape(-1, directions.shape[2])
     of_datum = np.linalg.pinv(scaled.T @ scaled, hermitian=True)
@@ -203,7 +203,7 @@ def _common_covariance(
 
 
 def _contains(part: Targets, common: NDArray[np.float64]) -> bool:
-    """Whether the covariances of points are larger than common ones (n, 3, 3)."""
+    """Whether the covariances of points are larger than the common covariances (n, 3, 3)."""
     return bool((np.linalg.eigvalsh(part.covariance - common) > 0).all())
 
 
@@ -215,12 +215,12 @@ def _combined_jointly(
 ) -> Targets | None:
     """Return one set of object points from their joint covariances.
 
-    None where the points of an adjustment are worse than the survey. The errors of few beads have
-    much in common: the datum, which is the same survey in every part. Information of single beads
-    would count it once a part.
+    None if the points of an adjustment are worse than the survey. The errors of a few beads have a
+    large common part: the datum, which is the same survey in every adjustment. Adding the
+    information of single beads would count it once for each adjustment.
 
-    joint: their joint covariances [mm^2]. further: (n, 3, 3) information of the survey that is
-    subtracted.
+    joint: their joint covariances [mm^2]. further: (n, 3, 3) information of the survey to
+    subtract.
     """
     target_id = np.unique(np.concatenate([p.target_id for p in parts]))
     n = len(target_id)

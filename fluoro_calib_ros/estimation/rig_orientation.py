@@ -1,20 +1,20 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Orientation of the fluoroscopes of a rig, from a capture of the phantom or from the exposures.
+"""Orientation of the fluoroscopes of a rig, from a capture of the phantom or from exposures.
 
 Interior orientations and corrections are fixed at their calibrations, so that rays and corrected
-image points are consistent. The uncertainty of the interior orientation is propagated, not
-estimated again. With N the normal matrix of the adjustment of exteriors e and object points, with
-the interiors i as further unknowns,
+image points are consistent. The uncertainty of the interior orientation is propagated; it is not
+estimated again. Let N be the normal matrix of the adjustment of exteriors e and object points,
+with the interiors i as further unknowns. Then
 
     de/di = -N_ee^-1 N_ei (object points eliminated),
     C_e = N_ee^-1 + de/di C_i (de/di)^T,   C_ei = de/di C_i,
 
-the covariance of an estimate with parameters that are fixed, but not known (consider parameters of
-Schmidt: Bierman, "Factorization Methods for Discrete Sequential Estimation", Academic Press 1977,
-ch. VIII). An error of the principal distance moves the source, but hardly the points that are
-intersected afterwards: C_ei describes that.
+is the covariance of an estimate with parameters that are fixed, but not known (consider parameters
+of Schmidt: Bierman, "Factorization Methods for Discrete Sequential Estimation", Academic Press
+1977, ch. VIII). An error of the principal distance moves the source, but hardly the points that
+are intersected afterwards; C_ei describes this.
 """
 
 from __future__ import annotations
@@ -76,11 +76,11 @@ FRAME_ID = 'lab'
 def orientation_of_known(
     known: Known, figures: Mapping[str, FluoroscopeResult], calibrations: Calibrations
 ) -> RigOrientation:
-    """Return the orientation of the rig in the frame in which its fluoroscopes are known.
+    """Return the orientation of the rig in the frame of the known orientations.
 
-    It is the mean of those of the exposures: the known one where it is fixed, else the weighted
-    one. Its standard deviations are the given ones: an error of a known orientation is the same in
-    all exposures.
+    It is the mean of the adjusted orientations of the exposures, which equal the known orientation
+    if that is fixed, and else are adjusted with it as a weighted observation. Its standard
+    deviations are the given ones: an error of a known orientation is the same in all exposures.
     """
     names = tuple(figures)
     rotations = np.array([_mean_rotation(figures[name]) for name in names])
@@ -109,15 +109,15 @@ def orientation_of_known(
 
 
 def _mean_rotation(figures: FluoroscopeResult) -> NDArray[np.float64]:
-    """Mean rotation (3, 3) of exposures: the nearest to the sum of their matrices."""
+    """Return the mean rotation (3, 3) of exposures: the nearest to the sum of their matrices."""
     total = matrix_from_quaternion([e.quaternion_wxyz for e in figures.exposures]).sum(axis=0)
     return nearest_rotation(total)
 
 
-# Exposures that are used: with more of them the interior orientations remain the uncertainty.
+# Most exposures used: with more, the interior orientations dominate the uncertainty.
 MAX_PAIRS = 30
-# The phantom moves where the median displacement between two frames of a capture exceeds so many
-# pixels, and CERTAIN standard deviations of the noise.
+# The phantom moves if the median displacement between two frames of a capture exceeds this limit
+# [px], and CERTAIN standard deviations of the noise.
 MAX_STILL_PX = 1.0
 MAX_MATCH_SD = 5.0  # distance from the median of a target above which a match is false
 
@@ -130,17 +130,17 @@ class _FixedAdjustment:
     after: Adjustment
     #: (m, 6, 3F) derivatives de/di of the exteriors by the interiors
     by_interior: NDArray[np.float64]
-    blocks: CovarianceBlocks  #: of the adjustment with the interiors among the unknowns
+    blocks: CovarianceBlocks  #: blocks of the adjustment with the interiors among the unknowns
     interiors: NDArray[np.float64]  #: (3F, 3F) covariance of the interiors
 
     def covariance(self, e: NDArray[np.int64], f: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Covariances (k, 6, 6) of exposures e (k,) with others f (k,), the interiors known."""
+        """Return covariances (k, 6, 6) of exposures e (k,) with f (k,), for known interiors."""
         derivative = self.by_interior
         of_interiors = derivative[e] @ self.blocks.gg @ derivative[f].transpose(0, 2, 1)
         return self.blocks.between(e, f) - of_interiors
 
     def covariance_of_all(self) -> NDArray[np.float64]:
-        """Covariance (6m, 6m) of all exposures, the interiors known."""
+        """Return the covariance (6m, 6m) of all exposures, for known interiors."""
         count = len(self.measured.frames)
         every = np.arange(count)
         rows = [
@@ -156,13 +156,13 @@ class _Exteriors:
 
     rotation: NDArray[np.float64]  #: (F, 3, 3)
     position_mm: NDArray[np.float64]  #: (F, 3)
-    covariance: NDArray[np.float64]  #: (6F, 6F) with the interiors known
+    covariance: NDArray[np.float64]  #: (6F, 6F), for known interiors
     by_interior: NDArray[np.float64]  #: (6F, 3F) derivatives by the interiors
 
 
 @dataclass(frozen=True)
 class _Origin:
-    """Where an orientation comes from; see `RigOrientation`."""
+    """Origin of an orientation; see `RigOrientation`."""
 
     frame_id: str
     source: str
@@ -176,18 +176,18 @@ def orientation_of_capture(
     calibrations: Calibrations,
     frame_id: str = 'rig',
 ) -> RigOrientation:
-    """Orientation from a capture of the phantom at rest, whose frame is that of the rig.
+    """Estimate the orientation from a capture of the phantom at rest, in the phantom's frame.
 
-    The object points are estimated, too, with their survey as weighted observations.
+    The object points are estimated too, with their survey as weighted observations.
 
     Parameters
     ----------
     frames : mapping of str to sequence of Frame
-        One or more of every fluoroscope; they need not be paired.
+        One or more frames of every fluoroscope; they need not be paired.
     phantom : Phantom
-        Survey of its targets.
+        The phantom, with the survey of its targets.
     calibrations : mapping of str to FluoroscopeCalibration
-        Fixed.
+        Fixed calibrations.
     frame_id : str
         Name of the rig frame.
 
@@ -195,7 +195,7 @@ def orientation_of_capture(
     ------
     DataError
         If there are fewer than two fluoroscopes, calibrations are missing, frames are invalid or
-        of another image size, targets are too few, or the phantom moves.
+        of another image size, there are too few targets, or the phantom moves.
     """
     _validate(frames, phantom, calibrations)
     still = {name: [frame] for name, frame in standing_frames(frames, calibrations).items()}
@@ -228,17 +228,17 @@ def orientation_and_scatter(
     calibrations: Calibrations,
     starts: StartValues | None = None,
 ) -> tuple[RigOrientation, tuple[PairScatter, ...]]:
-    """Orientation in the optical frame of the first fluoroscope, from exposures of the phantom.
+    """Estimate the orientation in the optical frame of the first fluoroscope, from exposures.
 
-    The relative orientation is the weighted mean of those of the exposures, a few of which are
-    left out where they contradict the others. Where these scatter more than their standard
-    deviations, its covariance is enlarged accordingly. The frame is the estimated one of the
-    sensor, and its covariance is given a datum where the phantom was (`with_datum_of_points`).
+    The relative orientation is the weighted mean over the exposures; a few exposures that
+    contradict the others are excluded. If the exposures scatter more than their standard
+    deviations, the covariance is enlarged accordingly. The frame is the estimated frame of the
+    sensor; the covariance gets a datum at the place of the phantom (`with_datum_of_points`).
 
-    frames: those of the same number belong together. calibrations: fixed. starts: of an earlier
-    adjustment of the frames. Returns also how the exposures scatter about the orientation, a
-    PairScatter for every fluoroscope but the first. Raises DataError as `orientation_of_capture`,
-    and if no exposures can be paired.
+    frames: of the phantom; those with the same number belong together. calibrations: fixed.
+    starts: initial values from an earlier adjustment of the frames. Also returns the scatter of
+    the exposures about the orientation, a PairScatter for every fluoroscope but the first. Raises
+    DataError as `orientation_of_capture`, and if no exposures can be paired.
     """
     _validate(frames, phantom, calibrations)
     paired = _paired(frames)
@@ -263,10 +263,10 @@ def orientation_and_scatter(
 def _relative_to_first(
     fixed: _FixedAdjustment, turning: Collection[str]
 ) -> tuple[_Exteriors, tuple[PairScatter, ...]]:
-    """Exteriors relative to the first fluoroscope, and the scatter of the paired exposures.
+    """Return exteriors relative to the first fluoroscope, and the scatter of paired exposures.
 
-    turning: names of those whose corrections change with the angle of a C-arm.
-    Raises DataError where no exposures can be paired.
+    turning: names of the fluoroscopes whose corrections change with the angle of a C-arm. Raises
+    DataError if no exposures can be paired.
     """
     names = fixed.measured.fluoroscopes
     count = len(names)
@@ -292,7 +292,7 @@ def _relative_to_first(
 
 
 def _seen_by_first(fixed: _FixedAdjustment) -> NDArray[np.float64]:
-    """Object points (n, 3) [mm] that the first fluoroscope sees, in its sensor frame."""
+    """Return object points (n, 3) [mm] that the first fluoroscope sees, in its sensor frame."""
     network = fixed.measured.network
     parameters = fixed.after.parameters
     rows = network.rows(0)
@@ -302,7 +302,7 @@ def _seen_by_first(fixed: _FixedAdjustment) -> NDArray[np.float64]:
 
 
 def _validate(frames: Frames, phantom: Phantom, calibrations: Calibrations) -> None:
-    """Raise DataError for frames and calibrations that do not belong together."""
+    """Raise DataError if frames and calibrations do not belong together."""
     if len(frames) < 2:
         raise DataError(
             'a rig has two fluoroscopes or more, there are frames of '
@@ -324,11 +324,11 @@ def _last_stamp(frames: Frames) -> int:
 
 
 def standing_frames(frames: Frames, calibrations: Calibrations) -> dict[str, Frame]:
-    """One frame by fluoroscope of a capture of the phantom at rest.
+    """Return one frame by fluoroscope of a capture of the phantom at rest.
 
-    Its image points are the weighted means of those of every target. An image point that is far
-    from the median of its target is a false match and left out. Raises DataError where the phantom
-    moves.
+    Its image points are weighted means over the frames, for every target. An image point that is
+    far from the median of its target is a false match and excluded. Raises DataError if the
+    phantom moves.
     """
     return {
         name: _mean_frame(of_one, calibrations[name].image_sd) for name, of_one in frames.items()
@@ -336,7 +336,7 @@ def standing_frames(frames: Frames, calibrations: Calibrations) -> dict[str, Fra
 
 
 def _mean_frame(frames: Sequence[Frame], image_sd: float) -> Frame:
-    """Mean of the frames of a fluoroscope; image_sd: noise of an image coordinate [px]."""
+    """Average the frames of a fluoroscope; image_sd: noise of an image coordinate [px]."""
     if len(frames) == 1:
         return frames[0]
     _require_still(frames, max(MAX_STILL_PX, CERTAIN * image_sd))
@@ -370,9 +370,9 @@ def _mean_frame(frames: Sequence[Frame], image_sd: float) -> Frame:
 
 
 def _require_still(frames: Sequence[Frame], still_px: float) -> None:
-    """Raise DataError where a frame shows the phantom displaced by more than still_px.
+    """Raise DataError if the phantom moves by more than still_px between frames.
 
-    Every frame is compared with the one before, and with the first.
+    Every frame is compared with the previous frame, and with the first.
     """
     to_first = ((frames[0], frame) for frame in frames[2:])
     for before, frame in [*pairwise(frames), *to_first]:
@@ -385,16 +385,16 @@ def _require_still(frames: Sequence[Frame], still_px: float) -> None:
 
 
 def _paired(frames: Frames) -> dict[str, list[Frame]]:
-    """Frames that the first fluoroscope and another have in common, at most MAX_PAIRS each.
+    """Return frames that the first fluoroscope shares with another, at most MAX_PAIRS each.
 
-    Raises DataError where a fluoroscope has none in common with the first.
+    Raises DataError if a fluoroscope shares no frames with the first.
     """
     first, *others = frames
     numbers = {name: {frame.number for frame in of_one} for name, of_one in frames.items()}
     for b, name in enumerate(others, 1):
         if not numbers[name] & numbers[first]:
             raise DataError(_unpaired(tuple(frames), b))
-    # Exposures that all fluoroscopes took are preferred; they are spread evenly over the numbers.
+    # Exposures of all fluoroscopes are preferred; they are spread evenly over the numbers.
     common = sorted(numbers[first].intersection(n for name in others for n in numbers[name]))
     complete = [n for n in common if all(n in numbers[name] for name in others)]
     usable = complete if len(complete) >= MAX_PAIRS else common
@@ -407,7 +407,7 @@ def _paired(frames: Frames) -> dict[str, list[Frame]]:
 
 
 def _unpaired(names: Sequence[str], b: int) -> str:
-    """Return the sentence on fluoroscopes without paired exposures."""
+    """Return the message on fluoroscopes without paired exposures."""
     return (
         f'fluoroscopes {names[0]} and {names[b]}: no exposures have the same number, so that '
         'their relative orientation is not known'
@@ -419,8 +419,8 @@ def _adjusted(
 ) -> _FixedAdjustment:
     """Adjust a network with the calibrations fixed.
 
-    noise_fixed: the noise is that of the calibrations; else only where the exposures are too few
-    to estimate it. Raises DataError.
+    noise_fixed: use the noise of the calibrations; otherwise it is used only if there are too few
+    exposures to estimate it. Raises DataError.
     """
     used = [calibrations[name] for name in measured.fluoroscopes]
     correction, network = fixed_corrections(measured, calibrations)
@@ -442,10 +442,10 @@ def _adjusted(
 def _with_free_interiors(
     network: Network, after: Adjustment, correction: NDArray[np.float64]
 ) -> CovarianceBlocks:
-    """Covariances of an adjustment with the interiors as further unknowns."""
+    """Return covariances of an adjustment with the interiors as further unknowns."""
     count = network.n_fluoroscopes
-    # With a standard deviation of 1 px, their normal matrix can be inverted also where one pose of
-    # the phantom does not determine them. The derivative de/di does not depend on it.
+    # With a standard deviation of 1 px, their normal matrix can be inverted even if one pose of
+    # the phantom does not determine them. The derivative de/di does not depend on this value.
     free = replace(
         network,
         interior_free=np.ones(count, dtype=bool),
@@ -460,10 +460,10 @@ def _with_free_interiors(
 def _mean_of_pairs(
     fixed: _FixedAdjustment, pairs: NDArray[np.int64], corrected: bool
 ) -> tuple[RelativePose, NDArray[np.float64], PairScatter]:
-    """Weighted mean of the relative orientations of pairs (k, 2) of exposures.
+    """Return the weighted mean of the relative orientations of pairs (k, 2) of exposures.
 
     corrected: whether a correction changes with the angle of a C-arm. Returns the mean, its
-    derivatives (6, 6m) by the exposures, and how the pairs scatter about it.
+    derivatives (6, 6m) by the exposures, and the scatter of the pairs about it.
     """
     parameters = fixed.after.parameters
     frames = fixed.measured.frames
@@ -510,9 +510,9 @@ def _covariance_of_pairs(
     d_a: NDArray[np.float64],
     d_b: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Covariances (k, 6, 6) of the relative orientations of pairs (k, 2) of exposures.
+    """Return covariances (k, 6, 6) of the relative orientations of pairs (k, 2) of exposures.
 
-    d_a, d_b (k, 6, 6) are their derivatives by the exposures.
+    d_a, d_b: (k, 6, 6) their derivatives by the exposures.
     """
     a, b = pairs.T
     mixed = d_a @ fixed.covariance(a, b) @ d_b.transpose(0, 2, 1)
@@ -527,7 +527,7 @@ def _covariance_of_pairs(
 def _orientation(
     fixed: _FixedAdjustment, exteriors: _Exteriors, calibrations: Calibrations, origin: _Origin
 ) -> RigOrientation:
-    """Rig orientation of exteriors, with the uncertainty of the interiors."""
+    """Return the rig orientation of exteriors, with the uncertainty of the interiors."""
     names = fixed.measured.fluoroscopes
     used = [calibrations[name] for name in names]
     by_interior = exteriors.by_interior

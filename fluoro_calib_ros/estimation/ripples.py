@@ -3,10 +3,10 @@
 
 """Ripples: a part of the signal of a distortion within a few bands of spatial frequency.
 
-A weave, a moire pattern or the seams of fibre plates repeat with a wavelength. A covariance
-function of Matern's family has to hold all longer waves, too, to hold such ripples; a series for
-it has as many sines. The periodogram of the residuals (Scargle, "Studies in astronomical time
-series analysis II", ApJ 263, 1982) shows which few bands of frequencies there are.
+A weave, a moire pattern or the seams of fibre plates repeat with a wavelength. To follow such
+ripples, a covariance function of Matern's family has to include all longer waves too, and a series
+for it needs as many sines. The periodogram of the residuals (Scargle, "Studies in astronomical
+time series analysis II", ApJ 263, 1982) shows the few bands of frequencies that the ripples have.
 """
 
 from __future__ import annotations
@@ -20,21 +20,22 @@ from scipy.special import stdtrit
 from ..correction.series import MARGIN, Functions
 from ..exposures.collector import MIN_EXPOSURES
 
-# Sines along the image that are looked at: ripples shorter than 53 px on 1024 px.
+# Number of sines along the image to search: ripples shorter than 53 px on 1024 px.
 SEARCHED_BANDS = 50
-# Standard deviations by which the mean power of a band with ripples exceeds that of noise.
+# Standard deviations by which the mean power of a band with ripples must exceed that of noise.
 SIGNIFICANT = 5.0
 # Chance that ripples which differ between exposures agree in a band.
 FALSE_ALARM = 1e-5
-BESIDE_PEAK = 0.2  # part of the power of the strongest band, up to which others belong to it
-LEAST_EXCESS = 0.1  # power that a band starts with, over that of noise
+BESIDE_PEAK = 0.2  # least power of a band of the ripples, relative to the strongest band
+LEAST_EXCESS = 0.1  # least initial power of a band in excess of the noise
 
 
 @dataclass(frozen=True)
 class Ripples:
     """Prior variances of the sines of bands of frequencies.
 
-    width: of a band [1/px]; variances: [px^2] of the bands 0, 1, ..., zero where there are none.
+    width: of a band [1/px]; variances: [px^2] of the bands 0, 1, ..., zero for bands without
+    ripples.
     """
 
     width: float
@@ -46,17 +47,17 @@ class Ripples:
         return tuple(band for band, variance in enumerate(self.variances) if variance > 0)
 
     def band(self, frequency: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Band (s,) of frequency (s,) [1/px]."""
+        """Return the band (s,) of frequency (s,) [1/px]."""
         return np.rint(frequency / self.width).astype(int)
 
     def variance(self, frequency: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Variances (s,) of sines of frequency (s,) [1/px]."""
+        """Return the variances (s,) of sines of frequency (s,) [1/px]."""
         band = self.band(frequency)
         inside = band < len(self.variances)
         return np.where(inside, np.asarray(self.variances)[np.where(inside, band, 0)], 0.0)
 
     def with_variances(self, variances: NDArray[np.float64]) -> Ripples:
-        """Return ripples in the same bands with these variances (n,), of all bands."""
+        """Return ripples in the same bands, with these variances (n,) of all bands."""
         own = np.where(np.asarray(self.variances) > 0, variances, 0.0)
         return replace(self, variances=tuple(float(value) for value in own))
 
@@ -74,12 +75,12 @@ class Ripples:
 
 
 def _and_next(bands: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return bands (n,) and those next to them: the image ends, and waves do not."""
+    """Return bands (n,) and their neighbours, because the image ends and the waves do not."""
     return np.convolve(bands, np.ones(3), 'same') > 0
 
 
 def ripples_of(functions: Functions, coefficients: NDArray[np.float64]) -> Ripples | None:
-    """Ripples of a series that has them, as its coefficients (2, m) show them, or None."""
+    """Return the ripples of a series from its coefficients (2, m), or None if it has none."""
     if not functions.absent:
         return None
     count = functions.modes + 1
@@ -108,7 +109,7 @@ def shown_ripples(
     exposure : (n,) ndarray
         Exposures of the image points.
     complete : int
-        Bands up to which the series has all sines.
+        Number of bands of which the series has all sines.
     """
     functions = Functions(image_size, -1, SEARCHED_BANDS)
     products, squares = functions.sums_of_sines(uv, residuals)
@@ -117,8 +118,8 @@ def shown_ripples(
     number = np.maximum(np.bincount(functions.band), 1)
     excess = np.bincount(functions.band, power) / number - 1
     bands = np.arange(len(number))
-    # The power of a sine has a standard deviation of one: it is a mean of two squares. The
-    # image can tell a part of the sines over their rectangle.
+    # The power of a sine is a mean of two squares and has a standard deviation of one. The image
+    # determines only a part of the sines over their rectangle.
     shown = (excess > SIGNIFICANT * MARGIN / np.sqrt(number)) & (bands > complete)
     if shown.any():
         shown[shown] = _are_common(functions, uv, residuals, exposure, bands[shown])
@@ -141,8 +142,8 @@ def _are_common(
 ) -> NDArray[np.bool_]:
     """Whether the ripples of residuals (n, 2) in bands (b,) are common to the exposures (n,).
 
-    The products of pairs of exposures are compared with zero by Student's t: those of different
-    pairs are uncorrelated where the ripples of an exposure have their own signs.
+    The products of pairs of exposures are compared with zero by Student's t. Those of different
+    pairs are uncorrelated if the ripples of each exposure have random signs.
     """
     sums = np.stack(
         [

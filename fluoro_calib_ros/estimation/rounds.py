@@ -37,10 +37,10 @@ class Round:
 
     iteration: int  #: number of the round, from 1
     F: float  #: negative log-likelihood of the adjustment
-    #: weighted square sum of the cross-validation; of the inlier residuals where the model is
+    #: weighted square sum of the cross-validation, or of the inlier residuals if the model is
     #: estimated in the adjustment
     G: float
-    k: Mapping[str, int]  #: number of neighbours by fluoroscope; 0 for a model without
+    k: Mapping[str, int]  #: number of neighbours by fluoroscope; 0 for a model without neighbours
     #: (2,) RMSE of the inlier residuals in u and v [px], by fluoroscope
     rmse: Mapping[str, NDArray[np.float64]]
     quadratic: float  #: robustly weighted square sum of the residuals [px^2]
@@ -58,34 +58,34 @@ class SelfCalibration:
     """Result of a self-calibration."""
 
     measured: Measured  #: the network, with the additional parameters of the model
-    #: adjustments without correction and with the final one
+    #: adjustments without correction and with the final correction
     before: Adjustment
     after: Adjustment
-    precision: Precision  #: of the adjustment after
+    precision: Precision  #: precision of the adjustment `after`
     #: (N, 2) correction of the image points [px], additional parameters included
     correction: NDArray[np.float64]
     trained: NDArray[np.bool_]  #: (N,) image points to which the models were fitted
     models: Mapping[str, CorrectionModel]  #: by fluoroscope
     history: tuple[Round, ...]
-    converged: bool  #: False where the largest number of rounds ended it
-    #: with the errors of the models (see `model_errors`); None: these are in the precision
+    converged: bool  #: False if the largest number of rounds was reached
+    #: precision with the errors of the models (see `model_choice`); None: it is `precision`
     stated: Precision | None = None
-    #: (i,) variances [px^2], at the inliers of a fluoroscope, by which its distortion differs
-    #: between exposures, without what orientations absorb
+    #: (i,) variances [px^2] by which the distortion of a fluoroscope differs between exposures at
+    #: its inliers, without what orientations absorb
     between_exposures: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
-    #: of the fluoroscopes whose distortion changes with the angle of the C-arm
+    #: by fluoroscope, where the distortion changes with the angle of the C-arm
     angle_fields: Mapping[str, AngleField] = field(default_factory=dict)
 
     @property
     def claims(self) -> Precision:
-        """What the unknowns claim, errors of the models included."""
+        """Stated precision of the unknowns, including errors of the models."""
         return self.stated or self.precision
 
 
 class History:
     """The rounds of a running self-calibration.
 
-    progress(Round) is called after every round.
+    progress: called with the Round after every round.
     """
 
     def __init__(self, measured: Measured, progress: Callable[[Round], None] | None) -> None:
@@ -126,20 +126,20 @@ def _has_settled(rounds: Sequence[Round], tolerance: float) -> bool:
         return False
     last = rounds[-2]
     now = rounds[-1]
-    # F is a log-likelihood and may pass zero, so its change is also related to G, which is about
-    # the number of image points.
+    # F is a log-likelihood and may pass through zero, so its change is also compared with G, which
+    # is about the number of image points.
     d_f = abs(now.F - last.F) / max(abs(now.F), now.G)
     d_g = abs(now.G - last.G) / max(now.G, 1e-300)
     return d_f <= tolerance and d_g <= tolerance and now.change <= SETTLED_PX
 
 
 def rmse_of_inliers(adjustment: Adjustment, rows: NDArray[np.int64]) -> NDArray[np.float64]:
-    """RMSE (2,) [px] in u and v of the raw inlier residuals of the image points rows."""
+    """Return the unweighted RMSE (2,) [px] in u and v of the inliers among some image points."""
     r = adjustment.residuals[rows][adjustment.inliers[rows]]
     return np.sqrt(np.mean(r * r, axis=0)) if len(r) else np.full(2, np.nan)
 
 
-# Statistics and residuals of adjustments, as they are reported.
+# Statistics and residuals of adjustments, for reports.
 
 
 @dataclass(frozen=True)
@@ -149,22 +149,22 @@ class AdjustmentStatistics:
     fluoroscopes: tuple[str, ...]
     loss: str  #: noise model of the image points
     #: scale of the noise: standard deviation of an image coordinate of weight one [px], or its
-    #: ratio to sigma where sigma is given
+    #: ratio to sigma if sigma is given
     sigma0: float
     nu: float  #: degrees of freedom of the Student-t; infinite for other noise models
-    #: weighted square sum of all residuals over the degrees of freedom; expected: 1
+    #: weighted square sum of all residuals over the degrees of freedom; expected value 1
     variance_factor: float
-    #: scalar observations without priors, and unknowns
+    #: numbers of scalar observations without priors, and of unknowns
     observations: int
     unknowns: int
-    #: sum of the redundancy numbers; with priors, as those of a signal, it is more than
-    #: observations - unknowns
+    #: sum of the redundancy numbers; with priors, such as of a signal, it exceeds observations -
+    #: unknowns
     degrees_of_freedom: float
     image_points: int
     outliers: int
     exposures: int
     targets: int
-    #: of the image coordinates of weight one half or more
+    #: redundancy numbers of image coordinates of weight one half or more
     least_redundancy: float
     mean_redundancy: float
     #: image points of a target
@@ -177,7 +177,7 @@ class ResidualTable:
     """Residuals of all image points of adjustments."""
 
     fluoroscope: NDArray[np.str_]  #: (N,)
-    #: (N,)
+    #: (N,) numbers of exposure and target
     exposure: NDArray[np.int64]
     target_id: NDArray[np.int64]
     uv: NDArray[np.float64]  #: (N, 2) observed pixels
@@ -186,8 +186,8 @@ class ResidualTable:
     #: (N, 2) redundancy numbers: part of an error that the residual shows
     redundancy: NDArray[np.float64]
     weight: NDArray[np.float64]  #: (N,) robust weights, 0 to about 1
-    #: (N,) beyond the core of the noise: four standard deviations, more where the tails are heavy
-    #: or the image points of the exposure scatter more than those of others
+    #: (N,) outside the core of the noise: four standard deviations, more if the tails are heavy or
+    #: the image points of the exposure scatter more than those of other exposures
     outlier: NDArray[np.bool_]
 
     @classmethod
@@ -237,7 +237,7 @@ def statistics_of(
 
 
 def _square_of_others(measured: Measured, adjustment: Adjustment) -> float:
-    """Weighted square sum of the residuals of survey and relative orientation constraints."""
+    """Return the weighted square sum of residuals of survey and relative orientations."""
     network = measured.network
     parameters = adjustment.parameters
     out = 0.0
@@ -252,7 +252,7 @@ def _square_of_others(measured: Measured, adjustment: Adjustment) -> float:
 def residuals_of_adjustment(
     measured: Measured, adjustment: Adjustment, precise: Precision, correction: NDArray[np.float64]
 ) -> ResidualTable:
-    """Return the residuals of an adjustment; correction (N, 2) [px], all parts of it."""
+    """Return the residuals of an adjustment; correction: (N, 2) [px], including all its parts."""
     network = measured.network
     frames = measured.frames
     name = np.array([frame.fluoroscope for frame in frames])
@@ -270,11 +270,11 @@ def residuals_of_adjustment(
     )
 
 
-MIN_FITTING = 0.5  # share of the image points of an exposure, or of a fluoroscope, that is used
+MIN_FITTING = 0.5  # least share of fitting image points, of an exposure or of a fluoroscope
 
 
 def undetermined_unknowns(measured: Measured) -> Finding | None:
-    """Return the unknowns that a network leaves undetermined at its start values, if any."""
+    """Return a finding on unknowns that are undetermined at the initial values, or None."""
     found = undetermined_directions(
         measured.network, measured.start, measured.fluoroscopes, _exposure_numbers(measured)
     )
@@ -289,7 +289,7 @@ def undetermined_unknowns(measured: Measured) -> Finding | None:
 
 
 def raise_if_undetermined(measured: Measured, adjustment: Adjustment, precise: Precision) -> None:
-    """Raise DataError, one finding a fluoroscope, for undetermined interior orientations."""
+    """Raise DataError for undetermined interior orientations, with a finding for each."""
     scale = adjustment.noise.scale
     found = undetermined_interiors(
         measured.network, adjustment.parameters, precise, measured.fluoroscopes, scale
@@ -299,7 +299,7 @@ def raise_if_undetermined(measured: Measured, adjustment: Adjustment, precise: P
 
 
 def correlations_of(run: SelfCalibration) -> tuple[tuple[str, str, float], ...]:
-    """High correlations between unknowns of a self-calibration: ((name, name, value), ...)."""
+    """Return high correlations between unknowns: ((name, name, value), ...)."""
     return high_correlations(
         run.measured.network,
         run.after.parameters,
@@ -310,7 +310,7 @@ def correlations_of(run: SelfCalibration) -> tuple[tuple[str, str, float], ...]:
 
 
 def outliers_of(run: SelfCalibration) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Outliers of a self-calibration: image points and targets, with their test statistics."""
+    """Return outliers of a self-calibration: image points and targets, with test statistics."""
     measured = run.measured
     found = find_outliers(measured.network, run.after, run.precision)
     exposures = measured.network.exposure[found.image_point]
@@ -339,12 +339,12 @@ def outliers_of(run: SelfCalibration) -> tuple[list[dict[str, Any]], list[dict[s
 def exposures_that_do_not_fit(run: SelfCalibration) -> dict[tuple[str, int], Finding]:
     """Return a finding for every exposure of which less than half fits, by name and number.
 
-    Where most exposures of a fluoroscope are like that, none of them stands out, and the whole
-    calibration is to be judged instead.
+    If most exposures of a fluoroscope are like this, none of them stands out, and the calibration
+    as a whole has to be judged.
     """
     network = run.measured.network
     count = np.bincount(network.exposure, minlength=network.n_exposures)
-    # By the core of the noise: the false matches of such an exposure make its tails heavy, and so
+    # Use the core of the noise: false matches of such an exposure make the tails heavy, and thus
     # the limit of gross errors wide.
     fits = run.after.noise.inliers(run.after.q)
     fitting = np.bincount(network.exposure, fits, network.n_exposures)

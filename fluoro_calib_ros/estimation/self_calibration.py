@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The self-calibration of a network: a robust bundle adjustment and a model of the distortion.
+"""Self-calibration of a network: robust bundle adjustment and a model of the distortion.
 
-How a model is obtained is up to the model. Its coefficients are unknowns of the adjustment
+Each model determines how it is obtained. Its coefficients are unknowns of the adjustment
 (`adjusted_terms`, see `calibrate_by_adjustment`), or it is fitted to the residuals between
 adjustments (`regression`, see `alternation`), or both. `ESTIMATORS` is the only place that lists
-them; a model over the k nearest residuals needs no entry there, `NeighbourRegression` fits it.
+them; a model over the k nearest residuals needs no entry, because `NeighbourRegression` fits it.
 """
 
 from __future__ import annotations
@@ -77,14 +77,14 @@ from .rounds import History, Round, SelfCalibration, raise_if_undetermined, unde
 
 
 class NoRegression(RegressionStep[NoCorrection]):
-    """The regression step of the model that corrects nothing."""
+    """Regression step of the model that corrects nothing."""
 
     iterates = False
 
     def choose(
         self, values: NDArray[np.float64], q: NDArray[np.float64], information: NDArray[np.float64]
     ) -> None:
-        """Update the inliers and sum up their weighted residuals."""
+        """Update the inliers and sum their weighted squared residuals."""
         self.inliers = self._updated_inliers(q)
         inside = values[self.inliers]
         self.score = float(np.einsum('na,nab,nb', inside, information[self.inliers], inside))
@@ -122,8 +122,8 @@ ESTIMATORS = {
 def estimator_of(model: Any) -> Estimator:
     """Return the estimator of a model.
 
-    model: the name of a model, or a scikit-learn regressor. Raises ValueError for a name that a
-    user cannot ask for.
+    model: name of a model, or a scikit-learn regressor. Raises ValueError for a name that a user
+    cannot select.
     """
     if not isinstance(model, str):
         return user_estimator(model)
@@ -147,13 +147,13 @@ def self_calibrate(
 ) -> SelfCalibration:
     """Self-calibrate the fluoroscopes of a network.
 
-    The standard deviations of models other than collocation hold their difference from it (see
-    `model_errors`), so it is calibrated, too.
+    The standard deviations of models other than collocation include the difference from
+    collocation (see `model_choice`), so that a collocation is calibrated too.
 
     measured: from `measured_network`. progress: called with the Round after every round. earlier:
-    by collocation, with these exposures and others; the network starts with its solution; the
-    adjustment without correction is then not made: its residuals are those of the start. Raises
-    DataError if the observations do not suffice.
+    calibration by collocation with these exposures and others; the network starts with its
+    solution. The adjustment without correction is then skipped: its residuals are those of the
+    initial values. Raises DataError if the observations do not suffice.
     """
     options = options or CalibrationOptions()
     network = replace(measured.network, interior_free=interiors_to_estimate(measured, options))
@@ -174,7 +174,7 @@ def self_calibrate(
         return run
     try:
         reference, _ = job.by_collocation(None)
-    except DataError:  # what its own residuals show has to do
+    except DataError:  # only the model's own residuals are available to state its errors
         return run
     return with_errors_by(reference, run, job.gauges)
 
@@ -185,7 +185,7 @@ def _continued(
     options: CalibrationOptions,
     progress: Callable[[Round], None] | None,
 ) -> SelfCalibration:
-    """Self-calibrate by collocation from the solution of an earlier calibration."""
+    """Self-calibrate by collocation, starting at the solution of an earlier calibration."""
     network = measured.network
     residuals, q = residuals_and_q(network, measured.start, 0.0, earlier.noise)
     start = Adjustment(
@@ -224,16 +224,16 @@ def _continued(
 
 @dataclass(frozen=True)
 class _Job:
-    """A network that is calibrated with one model or more."""
+    """A network to calibrate with one model or more."""
 
     measured: Measured
-    before: Adjustment  #: without correction
+    before: Adjustment  #: adjustment without correction
     gauges: Sequence[GaugeKind]
     options: CalibrationOptions
 
     @property
     def problem(self) -> AdjustmentProblem:
-        """What terms in the adjustment are made for."""
+        """The problem that terms in the adjustment are made for."""
         measured = self.measured
         return AdjustmentProblem(
             measured.network, measured.image_size, self.before, self.gauges, measured.angles
@@ -242,7 +242,7 @@ class _Job:
     def by_model(
         self, source: Estimator, progress: Callable[[Round], None] | None
     ) -> SelfCalibration:
-        """Self-calibrate with a model in the way it asks for."""
+        """Self-calibrate with a model by its estimator."""
         terms = source.adjusted_terms(self.problem)
         steps = self._regression_steps(source, terms)
         if steps is None:
@@ -259,7 +259,7 @@ class _Job:
     def by_collocation(
         self, progress: Callable[[Round], None] | None
     ) -> tuple[SelfCalibration, CollocationTerms]:
-        """Self-calibrate with collocation; return its terms, too."""
+        """Self-calibrate with collocation; return its terms too."""
         terms = CollocationTerms(self.problem)
         return self._by_terms(estimator_of(START_MODEL), terms, progress), terms
 
@@ -286,7 +286,7 @@ class _Job:
     def _regression_steps(
         self, source: Estimator, terms: AdjustedTerms | None
     ) -> dict[str, RegressionStep[CorrectionModel]] | None:
-        """The regression step of every fluoroscope; None for a model that needs none."""
+        """Return the regression step of every fluoroscope, or None for a model that needs none."""
         network = self.measured.network
         steps = {}
         for f, name in enumerate(self.measured.fluoroscopes):
@@ -309,7 +309,7 @@ def _adjusted_without_correction(
     measured: Measured,
     options: CalibrationOptions,
 ) -> Adjustment:
-    """Adjustment without correction. Raises DataError where it leaves unknowns undetermined."""
+    """Adjust without correction. Raises DataError if unknowns are undetermined."""
     is_result = options.model == NoCorrection.kind
     try:
         before, precise = adjusted_with_precision(
@@ -327,15 +327,15 @@ def _adjusted_without_correction(
 
 # Self-calibration with the distortion among the unknowns of the adjustment.
 #
-# In the alternation of Chow et al. the orientations and object points take up part of the
-# distortion before the regressor sees it. Here all are adjusted together. What is still renewed
-# between adjustments is the noise model, and what the terms of the distortion assume: the prior of
-# a signal, or which terms there are.
+# In the alternation of Chow et al. the orientations and object points absorb part of the
+# distortion before the regressor sees it. Here all are adjusted together. Between adjustments,
+# only the noise model and the assumptions of the distortion terms are updated: the prior of a
+# signal, or the selection of terms.
 
-# Decrease of F by image point that the first adjustment may leave: its noise is still that of an
-# adjustment without correction.
+# Decrease of F for each image point that the first adjustment may leave: its noise is still that
+# of an adjustment without correction.
 FIRST_TOLERANCE = 1e-3
-# Information factor from which noise and prior are estimated with the matrix of the last steps.
+# Information factor above which the matrix of the last step is used to estimate noise and prior.
 NEARLY_ONE = 0.98
 
 
@@ -347,10 +347,11 @@ def calibrate_by_adjustment(
     max_rounds: int,
     progress: Callable[[Round], None] | None = None,
 ) -> SelfCalibration:
-    """Self-calibrate with the model among the unknowns.
+    """Self-calibrate with the coefficients of the model as unknowns.
 
-    before: adjustment without correction. model_type: a model that is a series. terms: of that
-    model, for the network of measured. progress: called with the Round after every adjustment.
+    before: adjustment without correction. model_type: a model that is a series. terms: terms of
+    that model, for the network of measured. progress: called with the Round after every
+    adjustment.
 
     Raises DataError if there are too few inliers, or the exposures do not determine the unknowns.
     """
@@ -405,9 +406,9 @@ def _models(
     after: Adjustment,
     precise: Precision,
 ) -> dict[str, CorrectionModel]:
-    """Models by fluoroscope, from the terms that an adjustment has estimated.
+    """Return models by fluoroscope, from the terms that an adjustment has estimated.
 
-    measured is the network with these terms as additional parameters.
+    measured: network with these terms as additional parameters.
     """
     network = measured.network
     values = after.residuals + network.additional_correction(after.parameters)
@@ -435,13 +436,13 @@ def _models(
 
 
 def _require_inliers(measured: Measured, adjustment: Adjustment) -> None:
-    """Raise DataError where a fluoroscope has too few inliers for a correction model."""
+    """Raise DataError if a fluoroscope has too few inliers for a correction model."""
     for f, name in enumerate(measured.fluoroscopes):
         try:
             require_training(int(adjustment.inliers[measured.network.rows(f)].sum()))
         except ValueError as error:
             if measured.network.interior_free[f] and is_hardly_tilted(measured):
-                # The principal distance has gone astray, and the residuals with it.
+                # The principal distance has diverged, and the residuals with it.
                 raise DataError(replace(TOO_FLAT, place=Place((name,)))) from None
             raise DataError(f'fluoroscope {name}: {error}') from None
 

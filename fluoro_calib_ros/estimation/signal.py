@@ -4,13 +4,13 @@
 """Covariance function of the signal of a distortion, and its estimation.
 
 The signal is the sum of two random fields with covariance functions of Matern's family, the same
-for u and v: a long one for what bends over the image, a short one for the local ripples that the
-first, with one correlation length for all, would smooth away. Their standard deviations,
-correlation lengths and common smoothness are those of the largest marginal likelihood (Rasmussen
-and Williams, "Gaussian Processes for Machine Learning", 2006, 5.4) with weak priors, found by
-Fisher scoring: the slopes and the expected curvature of the likelihood follow from the posterior
-means and variances of the coefficients (MacKay, "Bayesian interpolation", Neural Computation 4,
-1992).
+for u and v. A long field follows what bends over the image; a short field follows local ripples
+that the long field, with one correlation length for all, would smooth away. Standard deviations,
+correlation lengths and the smoothness of the long field maximise the marginal likelihood
+(Rasmussen and Williams, "Gaussian Processes for Machine Learning", 2006, 5.4) with weak priors.
+They are found by Fisher scoring: the slopes and the expected curvature of the likelihood follow
+from the posterior means and variances of the coefficients (MacKay, "Bayesian interpolation",
+Neural Computation 4, 1992).
 """
 
 from __future__ import annotations
@@ -26,59 +26,59 @@ from scipy.special import j0
 from ..correction.terms import ABSENT_VARIANCE
 from .ripples import Ripples
 
-# Smoothness nu of the long field: its range, and the median and the standard deviation of its
-# logarithm before it is estimated. It tells how much of the signal the sines leave out.
+# Smoothness nu of the long field: its range, and the median and the standard deviation of the
+# prior of its logarithm. It determines how much of the signal the sines omit.
 SMOOTHNESS_RANGE = (1.0, 4.0)
 SMOOTHNESS = 3.0
 SMOOTHNESS_SD = 0.5
 FINE_SMOOTHNESS = 2.5
-MIN_SD_PX = 1e-3  # of a field
-# Ranges of the correlation lengths relative to the longer side of the image.
+MIN_SD_PX = 1e-3  # least standard deviation of a field
+# Ranges of the correlation lengths, relative to the longer side of the image.
 REACH_RANGE = (0.02, 1.0)
 FINE_RANGE = (0.012, 0.2)
-# Prior of the short field: scales of the inverse of its correlation length, over the inverse of
-# the extent of the sines, and of its standard deviation [px]. Their densities are exponential
+# Prior of the short field: scale of the inverse of its correlation length, relative to the inverse
+# extent of the sines, and scale of its standard deviation [px]. The densities are exponential
 # (Fuglstad et al., "Constructing priors that penalize the complexity of Gaussian random fields",
-# JASA 114, 2019), so that it only exists where the observations need it.
+# JASA 114, 2019), so that the field exists only where the observations need it.
 FINE_PER_EXTENT = 15.0
 FINE_PX = 0.5
-# Correlation lengths relative to the image of the long and the short field to start with.
+# Initial correlation lengths of the long and the short field, relative to the image.
 START_REACH = 0.15
 START_FINE_REACH = 0.06
-START_FINE_SHARE = 0.1  # of the standard deviation of the long field
-# Standard deviation and relative correlation length of a short field that residuals show.
+START_FINE_SHARE = 0.1  # initial standard deviation of the short field, relative to the long field
+# Initial standard deviation and relative correlation length of a short field shown by residuals.
 SHOWN_PX = 0.2
 SHOWN_REACH = 0.03
-MAX_STEP = 0.8  # of the logarithm of a standard deviation or length
-STEPS = 4  # of the likelihood in one renewal
-RIPPLE_STEPS = 2  # of the variances of ripples in one renewal
-MIN_DETERMINED = 1e-3  # least number of coefficients that a sum counts as determined
-# Quadrature over the parameters of the long field, which are these: distance of the two nodes on
-# an axis from the most likely value [standard deviations]. Their weights are then those of the
-# three axes, and what is most likely has none.
+MAX_STEP = 0.8  # largest step of the logarithm of a standard deviation or length
+STEPS = 4  # steps of Fisher scoring in one update
+RIPPLE_STEPS = 2  # steps of the variances of ripples in one update
+MIN_DETERMINED = 1e-3  # least number of determined coefficients in a sum
+# Quadrature over the parameters of the long field, which have these indices. NODE is the distance
+# of the two nodes on an axis from the most likely value [standard deviations], for which the nodes
+# of three axes have all the weight and the most likely value has none.
 LONG_FIELD = [0, 1, 4]
 NODE = np.sqrt(3)
-NODE_TRIALS = 5
-NODE_TOLERANCE = 0.2  # of the logarithm of that distance
-MIN_RATIO = 0.1  # of that distance to the one before
-MIN_RISE = 1e-3  # of the cost that counts as one
-AT_LIMIT = 0.1  # part of a step that leads out of the range of a parameter: it keeps its value
-# Largest step from the most likely logarithms. The likelihood is level where the signal is lost in
+NODE_TRIALS = 5  # most iterations for the distance of a node
+NODE_TOLERANCE = 0.2  # tolerance of the logarithm of that distance
+MIN_RATIO = 0.1  # least ratio of that distance to the previous distance
+MIN_RISE = 1e-3  # least increase of the cost
+AT_LIMIT = 0.1  # a parameter is fixed if this part of a step leads out of its range
+# Largest step from the most likely logarithms. The likelihood is flat where the signal is lost in
 # the noise. From 1.5 to 4, NSE of 0.9 to 2 change by 3 %; without distortion, 0.5 falls to 0.2.
 FARTHEST = 2.5
-# Frequencies of a quadrature, from the lowest to so many times it.
+# Number of frequencies of a quadrature, and ratio of the highest to the lowest.
 QUADRATURE = 120
 SHORTEST = 30.0
-MIN_GAIN = 0.1  # of the logarithm of the likelihood that is worth another step
-RIDGE = 0.05  # least damping: added to the expected curvature, it keeps what hardly matters
+MIN_GAIN = 0.1  # gain of the logarithm of the likelihood that justifies another step
+RIDGE = 0.05  # least damping, added to the expected curvature; fixes parameters of little effect
 
 
 @dataclass(frozen=True)
 class Signal:
     """Standard deviations [px] and correlation lengths [px] of the long and the short field.
 
-    smoothness: nu of the long field. ripples: further variances of the sines of some bands; they
-    are no part of the fields.
+    smoothness: nu of the long field. ripples: additional variances of the sines of some bands;
+    they are not part of the fields.
     """
 
     sd: float
@@ -96,24 +96,24 @@ class Signal:
         return (long, fine) if self.fine_sd else (long,)
 
     def density(self, frequency: np.ndarray) -> NDArray[np.float64]:
-        """Variances (s,) of the coefficients by the fields alone."""
+        """Return the variances (s,) of the coefficients by the fields alone."""
         return np.sum([spectral_density(frequency, *field) for field in self.fields], axis=0)
 
     def variance(self, frequency: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Prior variances (s,) of the coefficients of sines of frequency (s,) [1/px]."""
+        """Return prior variances (s,) of the coefficients of sines of frequency (s,) [1/px]."""
         return np.maximum(self.density(frequency) + self.of_ripples(frequency), ABSENT_VARIANCE)
 
     def of_ripples(self, frequency: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Parts (s,) of these variances that are those of the ripples."""
+        """Return the parts (s,) of these variances that are due to the ripples."""
         if self.ripples is None:
             return np.zeros_like(frequency)
         return self.ripples.variance(frequency)
 
     def sd_beyond(self, frequency: float) -> float:
-        """Standard deviation [px] of the part of the signal with larger frequencies [1/px].
+        """Return the standard deviation [px] of the signal with larger frequencies [1/px].
 
-        It is the integral of the spectral density of the fields over the plane outside of a
-        circle: the sines of ripples are all in the series.
+        It is the integral of the spectral density of the fields over the plane outside a circle.
+        All sines of ripples are in the series.
         """
         variance = 0.0
         for sd, reach, nu in self.fields:
@@ -124,22 +124,23 @@ class Signal:
     def correlation_beyond(
         self, frequency: float, distance: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Correlation (n,) of that part at distances (n,) [px]: its Hankel transform.
+        """Return the correlation (n,) of that part at distances (n,) [px]: its Hankel transform.
 
-        Ripples shorter than the distance of image points hardly show in products of neighbours.
+        Ripples shorter than the distance between image points hardly show in products of
+        neighbours.
         """
         return correlation_of(self.density, frequency, distance)
 
     def with_short_field(self, side: float) -> Signal:
-        """Return a signal with a short field to start with; side: of the image [px]."""
+        """Return a signal with an initial short field; side: of the image [px]."""
         return replace(self, fine_sd=SHOWN_PX, fine_reach=SHOWN_REACH * side)
 
     def without_short_field(self, side: float) -> Signal:
-        """Return a signal whose short field starts anew, very small; side: of the image [px]."""
+        """Return a signal with a very small new short field; side: of the image [px]."""
         return replace(self, fine_sd=MIN_SD_PX, fine_reach=START_FINE_REACH * side)
 
     def change(self, other: Signal, frequency: NDArray[np.float64]) -> float:
-        """Mean change of the logarithms of the variances at frequency (s,) from another signal."""
+        """Return the mean change of the log variances at frequency (s,) from another signal."""
         ratio = self.variance(frequency) / other.variance(frequency)
         return float(np.mean(np.abs(np.log(ratio))))
 
@@ -151,7 +152,7 @@ def correlation_of(
 ) -> NDArray[np.float64]:
     """Return the correlation (n,) at distances (n,) [px] of a field, by a Hankel transform.
 
-    density: of its spectrum over frequencies [1/px] from the lowest on.
+    density: spectral density at frequencies [1/px], from the lowest on.
     """
     f = lowest * np.geomspace(1, SHORTEST, QUADRATURE)
     weight = density(f) * f**2  # f df on a geometric grid
@@ -161,7 +162,7 @@ def correlation_of(
 def spectral_density(
     frequency: NDArray[np.float64], sd: float, reach: float, nu: float = SMOOTHNESS
 ) -> NDArray[np.float64]:
-    """Variances (s,) of the coefficients of sines: Matern's covariance in two dimensions.
+    """Return variances (s,) of coefficients of sines, for Matern's covariance in two dimensions.
 
     frequency (s,) [1/px]; sd, reach [px]; nu: smoothness (Rasmussen and Williams 2006, Eq. 4.15
     for D = 2).
@@ -171,18 +172,18 @@ def spectral_density(
 
 
 def starting_signal(sd: float, side: float) -> Signal:
-    """Return a signal to start with; sd: standard deviation of the long field, side [px]."""
+    """Return an initial signal; sd: standard deviation of the long field, side [px]."""
     return Signal(sd, START_REACH * side, START_FINE_SHARE * sd, START_FINE_REACH * side)
 
 
 def _parameters(signal: Signal) -> NDArray[np.float64]:
-    """Logarithms (5,) of the parameters of a signal."""
+    """Return the logarithms (5,) of the parameters of a signal."""
     fine = [signal.fine_sd, signal.fine_reach]
     return np.log([signal.sd, signal.reach, *fine, signal.smoothness])
 
 
 def _slopes(signal: Signal, frequency: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Derivatives (s, 5) of the logarithms of the variances by those of the parameters."""
+    """Return derivatives (s, 5) of the log variances by the logarithms of the parameters."""
     out = []
     for sd, reach, nu in signal.fields:
         a = 2 * nu / reach**2
@@ -198,13 +199,13 @@ def _slopes(signal: Signal, frequency: NDArray[np.float64]) -> NDArray[np.float6
 
 @dataclass(frozen=True)
 class SignalEquations:
-    """Normal equations of all coefficients of a series, every prior but the signal's included."""
+    """Normal equations of all coefficients of a series, with all priors except the signal's."""
 
     frequency: NDArray[np.float64]  #: (s,) frequencies of the sines [1/px]
-    #: (p,)
+    #: (p, p) and (p,)
     information: NDArray[np.float64]
     right: NDArray[np.float64]
-    columns: NDArray[np.int64]  #: (2 s,) places of the coefficients of the sines, those of u first
+    columns: NDArray[np.int64]  #: (2 s,) indices of the coefficients of the sines, u first
 
     @property
     def extent(self) -> float:
@@ -216,7 +217,7 @@ class SignalEquations:
 class _Likelihood:
     """Marginal likelihood of a signal, with the priors of its parameters.
 
-    cost: its negative logarithm, without constants; slopes (5,) and curvature (5, 5) by the
+    cost: negative logarithm, without constants; slopes (5,) and curvature (5, 5): by the
     logarithms of the parameters.
     """
 
@@ -259,15 +260,15 @@ def _more_likely(signal: Signal, coefficients: SignalEquations, side: float) -> 
 
 
 def plausible_signals(signal: Signal, coefficients: SignalEquations, side: float) -> list[Signal]:
-    """Return signals of which any may be the true one, all with the same weight.
+    """Return signals of which any may be the true signal, all with the same weight.
 
-    Their mean stands for that over the posterior of the parameters of the long field (3-point
-    Gauss-Hermite quadrature along the principal axes of its curvature). The posterior is skewed:
-    in each direction it is scaled by its own decrease (Rue, Martino and Chopin, "Approximate
-    Bayesian inference for latent Gaussian models", JRSS B 71, 2009, 6.5).
+    A mean over them approximates the mean over the posterior of the parameters of the long field
+    (3-point Gauss-Hermite quadrature along the principal axes of its curvature). The posterior is
+    skewed; in each direction it is scaled by its own decrease (Rue, Martino and Chopin,
+    "Approximate Bayesian inference for latent Gaussian models", JRSS B 71, 2009, 6.5).
 
-    signal: the most likely one; side: longer side of the image [px]. Empty where there is no
-    posterior.
+    signal: the most likely signal; side: longer side of the image [px]. Returns an empty list if
+    there is no posterior.
     """
     here = _likelihood(_parameters(signal), coefficients, ripples=signal.ripples)
     if here is None:
@@ -291,7 +292,7 @@ def _node(
 ) -> Signal:
     """Return the signal along a step (5,) that is as likely as a node of a normal distribution.
 
-    cost: of the most likely signal.
+    cost: cost of the most likely signal.
     """
     at = _parameters(signal)
     low, high = _ranges(side)
@@ -306,7 +307,7 @@ def _node(
     for _ in range(NODE_TRIALS):
         node = _signal(at + scale * step, signal.ripples)
         rise = max(_cost(node, coefficients) - cost, MIN_RISE)
-        ratio = max(NODE / np.sqrt(2 * rise), MIN_RATIO)  # without a likelihood, it is zero
+        ratio = max(NODE / np.sqrt(2 * rise), MIN_RATIO)  # zero if there is no likelihood
         if abs(np.log(ratio)) < NODE_TOLERANCE or (ratio > 1 and scale == farthest):
             break
         scale = min(scale * ratio, farthest)
@@ -314,7 +315,7 @@ def _node(
 
 
 def _cost(signal: Signal, coefficients: SignalEquations) -> float:
-    """Return the cost of the likelihood of a signal, infinite where there is none."""
+    """Return the cost of the likelihood of a signal; infinite if there is no likelihood."""
     variance = np.tile(signal.variance(coefficients.frequency), 2)
     found = _factorised(variance, coefficients)
     if found is None:
@@ -323,7 +324,7 @@ def _cost(signal: Signal, coefficients: SignalEquations) -> float:
 
 
 def _signal(at: NDArray[np.float64], ripples: Ripples | None) -> Signal:
-    """Signal with these logarithms (5,) of its parameters."""
+    """Return the signal with these logarithms (5,) of its parameters."""
     sd, reach, fine_sd, fine_reach, smoothness = (float(value) for value in np.exp(at))
     return Signal(
         sd, reach, fine_sd=fine_sd, fine_reach=fine_reach, smoothness=smoothness, ripples=ripples
@@ -335,8 +336,8 @@ def _with_likely_ripples(
 ) -> Signal:
     """Return the signal with ripples of a larger marginal likelihood (MacKay 1992).
 
-    The variance of a band is the square sum of its coefficients over the number of those that the
-    observations determine.
+    The variance of a band is the square sum of its coefficients over the number of coefficients
+    that the observations determine.
     """
     frequency = coefficients.frequency
     band = ripples.band(frequency)
@@ -359,7 +360,7 @@ def _with_likely_ripples(
 
 
 def _ranges(side: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Least and largest logarithms (5,) of the parameters; side: of the image [px]."""
+    """Return least and largest logarithms (5,) of the parameters; side: of the image [px]."""
     return (
         np.log(
             [
@@ -376,7 +377,7 @@ def _ranges(side: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 @dataclass(frozen=True)
 class _Posterior:
-    """Coefficients of the sines, with a prior.
+    """Posterior of the coefficients of the sines.
 
     cost: negative logarithm of the marginal likelihood, without constants; mean and variance
     (2 s,): of the coefficients.
@@ -391,7 +392,7 @@ class _Posterior:
 class _Factorised:
     """Normal equations with a prior.
 
-    cost: as in `_Posterior`; factor (p, p): lower triangular; z (p,): solution with it alone.
+    cost: as in `_Posterior`; factor (p, p): lower triangular; z (p,): solution with factor alone.
     """
 
     cost: float
@@ -402,7 +403,7 @@ class _Factorised:
 def _factorised(
     variance: NDArray[np.float64], coefficients: SignalEquations
 ) -> _Factorised | None:
-    """Return the equations for prior variances (2 s,), or None where they have no solution."""
+    """Return the equations for prior variances (2 s,), or None if they have no solution."""
     columns = coefficients.columns
     matrix = coefficients.information.copy(order='F')
     matrix[columns, columns] += 1 / variance
@@ -419,7 +420,7 @@ def _posterior(
 ) -> _Posterior | None:
     """Return the posterior for prior variances (2 s,).
 
-    None where there is none, or where its cost is found to be above a limit.
+    None if there is no posterior, or its cost exceeds the limit.
     """
     found = _factorised(variance, coefficients)
     if found is None or found.cost > limit:
@@ -429,7 +430,7 @@ def _posterior(
     inverse, failed = lapack.dtrtri(found.factor, lower=1, overwrite_c=1)
     if failed:
         return None
-    # Columns are contiguous, and what is above the diagonal is zero.
+    # Columns are contiguous, and zero above the diagonal.
     squares = np.sum(np.square(inverse, out=inverse), axis=0)
     return _Posterior(found.cost, mean[columns], squares[columns])
 
@@ -442,7 +443,7 @@ def _likelihood(
 ) -> _Likelihood | None:
     """Return the likelihood at logarithms (5,) of the parameters, with given ripples.
 
-    None where there is none, or where its cost is found to be above a limit.
+    None if there is no likelihood, or its cost exceeds the limit.
     """
     signal = _signal(at, ripples)
     frequency = coefficients.frequency
@@ -471,19 +472,19 @@ def _with_priors(likelihood: _Likelihood, at: NDArray[np.float64], extent: float
 
 
 def _cost_of_priors(at: NDArray[np.float64], extent: float) -> float:
-    """Negative logarithm of the prior density of logarithms (5,) of the parameters.
+    """Return the negative logarithm of the prior density of logarithms (5,) of the parameters.
 
     The density of the standard deviation of the long field grows with it (Chung et al., "A
     nondegenerate penalized likelihood estimator for variance parameters in multilevel models",
-    Psychometrika 78, 2013): the likelihood of few image points is often largest at zero, and the
-    claim would be that nothing is left.
+    Psychometrika 78, 2013). Without that, the likelihood of few image points is often largest at
+    zero, which would claim that no signal is left.
     """
     large, short, rough = _parts_of_priors(at, extent)
     return large + short + rough**2 / 2 - float(at[0])
 
 
 def _parts_of_priors(at: NDArray[np.float64], extent: float) -> tuple[float, float, float]:
-    """Size and shortness of the short field, and smoothness of the long one, in their scales."""
+    """Return scaled size and shortness of the short field, and smoothness of the long field."""
     _, _, fine_sd, fine_reach, smoothness = (float(value) for value in at)
     large = np.exp(fine_sd) / FINE_PX
     short = extent / np.exp(fine_reach) / FINE_PER_EXTENT

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Start values of the exterior orientations of one fluoroscope, and of its principal distance.
+"""Initial exterior orientations of one fluoroscope, and its initial principal distance.
 
-An exposure of targets in space starts with a direct linear transformation, one of targets in a
-plane with a homography, in the better of its two poses. Where the targets are few or nearly in a
-plane, minimal samples with the interior orientation known (P3P) compete with both.
+For targets in space, an exposure starts with a direct linear transformation; for targets in a
+plane, with a homography, in the better of its two poses. If there are few targets, or they are
+nearly in a plane, minimal samples with known interior orientation (P3P) compete with both.
 """
 
 from __future__ import annotations
@@ -45,14 +45,14 @@ from ..photogrammetry.resection import (
     robust_variance,
 )
 
-# Below this flatness the plane of the targets is tried too.
+# Below this flatness, the plane of the targets is tried too.
 NEARLY_FLAT = 0.08
-START_TOLERANCE = 1e-2  # a tenth of a standard deviation: the adjustment goes on from there
-# With fewer targets a direct linear transformation may be far off.
+START_TOLERANCE = 1e-2  # a tenth of a standard deviation; the adjustment continues from there
+# With fewer targets, a direct linear transformation may be far off.
 FEW_TARGETS = 20
-# Rounds in which poses of planes and a preliminary correction are estimated in turn.
+# Iterations that alternate between poses of planes and a preliminary correction.
 ROUNDS = 4
-# Principal distances over the longer side of the image that a fluoroscope can have.
+# Range of principal distances, relative to the longer side of the image.
 DISTANCES = (0.5, 30.0)
 
 UNTILTED = Finding(
@@ -64,16 +64,16 @@ UNTILTED = Finding(
 
 @dataclass(frozen=True)
 class View:
-    """The targets of an exposure, and what is known of it before any orientation."""
+    """The targets of an exposure, with all that is known before its orientation."""
 
     frame: Frame
     xyz: NDArray[np.float64]  #: (n, 3) targets [mm]
-    #: (n, 2) image points without distortion, as far as that is known [px]
+    #: (n, 2) image points without the distortion, as far as it is known [px]
     uv: NDArray[np.float64]
-    projection: NDArray[np.float64] | None = None  #: (3, 4) where the targets are not in a plane
-    plane: Plane | None = None  #: where the targets are nearly in a plane
+    projection: NDArray[np.float64] | None = None  #: (3, 4), unless the targets are in a plane
+    plane: Plane | None = None  #: plane of the targets, if they are nearly in a plane
     plane_image: NDArray[np.float64] | None = None  #: (3, 3) homography of the plane
-    error: Finding | None = None  #: why neither is known
+    error: Finding | None = None  #: reason why projection and homography are unknown
 
     @property
     def is_flat(self) -> bool:
@@ -105,9 +105,9 @@ def view_of(frame: Frame, xyz: NDArray[np.float64], uv: NDArray[np.float64]) -> 
 def principal_distance_of_views(
     views: Sequence[View], principal_point: NDArray[np.float64], image_size: tuple[int, int]
 ) -> float:
-    """Return the principal distance [px] that views show, those in space before those of planes.
+    """Return the median principal distance [px] of views in space, else that of views of planes.
 
-    Raises DataError where there are only planes that are not tilted.
+    Raises DataError if there are only planes that are not tilted.
     """
     solid = [v.projection for v in views if v.projection is not None and not v.needs_samples]
     in_space = solid or [v.projection for v in views if v.projection is not None]
@@ -141,7 +141,7 @@ def orient_view(view: View, interior: NDArray[np.float64]) -> Resection:
 
 
 def _starts(view: View, interior: NDArray[np.float64]) -> list[Callable[[], Resection]]:
-    """Return the resections that compete."""
+    """Return the candidate resections."""
     xyz = view.xyz
     uv = view.uv
     out: list[Callable[[], Resection]] = []
@@ -160,8 +160,8 @@ def settle_planes(
 ) -> list[Resection | None]:
     """Return resections in which views of planes have the better of their two poses.
 
-    Distortion bends a plane as a tilt does. It is the same in all exposures: a preliminary
-    correction of all residuals, and the poses with it, are estimated in turn.
+    Distortion bends a plane like a tilt, but is the same in all exposures. The estimation
+    alternates between a preliminary correction of all residuals and the poses with it.
     """
     out = list(found)
     if not any(view.is_flat and one is not None for view, one in zip(views, out)):
@@ -176,7 +176,7 @@ def settle_planes(
 
 
 def _better_pose(view: View, present: Resection, interior: NDArray[np.float64]) -> Resection:
-    """Return the pose of a view refined; of a plane the better of its two."""
+    """Refine the pose of a view; for a plane, return the better of its two poses."""
     starts = [(present.rotation, present.position_mm)]
     if view.is_flat and view.plane is not None:
         starts.append(mirrored_pose(*starts[0], view.plane))

@@ -1,22 +1,23 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The survey of a phantom from its own exposures: a free network at a measured scale.
+"""Survey of a phantom from its own exposures: a free network at a measured scale.
 
-Scale of a free network from measured distances between its object points. The distances are
-weighted observations that follow the adjustment of the images: with the coordinates x of the free
-network, their covariance C and the unknown scale 1 + s about the centre,
+The scale of a free network is estimated from measured distances between its object points. The
+distances are weighted observations that are added after the adjustment of the images. With the
+coordinates x of the free network, their covariance C and the unknown scale 1 + s about the centre,
 
     d - l = l s + A e + noise,    e with covariance C, noise with the variances of the distances,
 
 where l are the distances in the network and A their derivatives. This is sequential least squares
-(Foerstner and Wrobel, "Photogrammetric Computer Vision", Springer 2016, 4.2.7) and gives what the
-distances in the adjustment would give. C keeps the inner constraints, and so do the coordinates:
-position and attitude stay those of the datum, only the scale becomes that of the distances.
+(Foerstner and Wrobel, "Photogrammetric Computer Vision", Springer 2016, 4.2.7), and gives the same
+as distances in the adjustment would. C satisfies the inner constraints, and so do the coordinates:
+position and attitude remain those of the datum, and only the scale is changed to that of the
+distances.
 
 The self-calibration with inner constraints gives the shape of the phantom. Position and attitude
-are those of the given coordinates; the scale is that of measured distances, or else that of the
-given coordinates, too.
+are those of the given coordinates. The scale is that of the measured distances, or else that of
+the given coordinates.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from ..photogrammetry.network import Network
 from ..photogrammetry.resection import ROUNDING
 from .result import CalibrationResult
 
-# Blocks (k, 3, 3) of object points p (k,) with object points q (k,).
+# Returns blocks (k, 3, 3) of object points p (k,) with object points q (k,).
 Between = Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.float64]]
 
 
@@ -55,11 +56,11 @@ class Scaled:
 
     xyz_mm: NDArray[np.float64]  #: (n, 3)
     covariance: NDArray[np.float64]  #: (n, 3, 3) [mm^2]
-    #: factor on the network, and its standard deviation
+    #: scale factor of the network, and its standard deviation
     scale: float
     scale_sd: float
-    #: (k,) measured distances less those that the images and the other distances give; 0 where
-    #: nothing checks a distance
+    #: (k,) measured distances less those from the images and the other distances; 0 if nothing
+    #: checks a distance
     error_mm: NDArray[np.float64]
     #: (k,) the same over their standard deviations (Baarda's test)
     normalised: NDArray[np.float64]
@@ -80,18 +81,18 @@ def scaled_by_distances(
     ----------
     xyz_mm : (n, 3) ndarray
     covariance : (n, 3, 3) ndarray
-        In the datum of inner constraints [mm^2].
+        Covariances in the datum of inner constraints [mm^2].
     between : callable
-        Their covariances with each other.
+        Returns covariances between object points.
     distances : Distances
     centre_mm : (3,) ndarray
-        Centre of the datum, which the scale leaves in place.
+        Centre of the datum, which the scale does not move.
     """
     first, second = distances.pairs.T
     offset = xyz_mm[second] - xyz_mm[first]
     length = np.linalg.norm(offset, axis=1)
     direction = offset / length[:, None]
-    # C A^T: of every object point with every distance.
+    # C A^T: covariances of every object point with every distance.
     n, k = len(xyz_mm), len(length)
     rows = np.repeat(np.arange(n), k)
     ends = [between(rows, np.tile(end, n)).reshape(n, k, 3, 3) for end in (first, second)]
@@ -109,7 +110,7 @@ def scaled_by_distances(
     arm = xyz_mm - centre_mm
     along = arm - gain @ length
     pull = inverse @ left
-    # Of the pulls; zero for what no other distance checks.
+    # Variances of the pulls; infinite for a distance that no other distance checks.
     variance_of_pull = np.diagonal(inverse - variance * np.outer(weight, weight))
     is_checked = variance_of_pull > ROUNDING * np.diagonal(inverse)
     variance_of_pull = np.where(is_checked, variance_of_pull, np.inf)
@@ -129,7 +130,7 @@ def scaled_by_distances(
 
 @dataclass(frozen=True)
 class MeasuredDistance:
-    """Distance between the centres of two beads, as measured with a caliper or the like.
+    """Distance between the centres of two beads, measured with a caliper or similar.
 
     Attributes
     ----------
@@ -152,29 +153,29 @@ class MeasuredDistance:
 
     @property
     def name(self) -> str:
-        """What it is called in a sentence."""
+        """Name of the distance in a sentence."""
         return f'distance {self.first} to {self.second}'
 
 
 @dataclass(frozen=True)
 class SurveyedBeads:
-    """Beads found from the images of an adjustment."""
+    """Beads surveyed from the images of an adjustment."""
 
     target_id: NDArray[np.int64]  #: (n,)
     xyz_mm: NDArray[np.float64]  #: (n, 3)
-    #: (n, 3, 3) [mm^2]; with the uncertainty of the scale, which is common to all
+    #: (n, 3, 3) [mm^2]; includes the uncertainty of the scale, which is common to all beads
     covariance: NDArray[np.float64]
-    given_mm: NDArray[np.float64]  #: (n, 3) coordinates at the start
+    given_mm: NDArray[np.float64]  #: (n, 3) initial coordinates
     given_sd_mm: NDArray[np.float64]  #: (n,)
-    rays: NDArray[np.int64]  #: (n,) image points that agree
-    angle_rad: NDArray[np.float64]  #: (n,) largest angle between two of these rays
-    #: factor on the given coordinates, and its standard deviation
+    rays: NDArray[np.int64]  #: (n,) number of inlier image points
+    angle_rad: NDArray[np.float64]  #: (n,) largest angle between two of their rays
+    #: scale factor of the given coordinates, and its standard deviation
     scale: float
     scale_sd: float
     distances: tuple[MeasuredDistance, ...] = ()
-    scaled: Scaled | None = None  #: how the distances agree; None without any
-    #: (3n, 3n) of all beads in the free network, without scale [mm^2]; None where they are too
-    #: many
+    scaled: Scaled | None = None  #: agreement of the distances; None without distances
+    #: (3n, 3n) covariance of all beads in the free network, without scale [mm^2]; None if there
+    #: are too many beads
     joint_covariance: NDArray[np.float64] | None = None
 
     @property
@@ -183,7 +184,7 @@ class SurveyedBeads:
         return np.sqrt(np.trace(self.covariance, axis1=1, axis2=2) / 3)
 
     def without(self, target_id: Iterable[int]) -> SurveyedBeads:
-        """Return the beads except those with a target id; the scale stays."""
+        """Return the beads except those with some target ids; the scale does not change."""
         keep = ~np.isin(self.target_id, list(target_id))
         of_beads = ('target_id', 'xyz_mm', 'covariance', 'given_mm', 'given_sd_mm')
         names = (*of_beads, 'rays', 'angle_rad')
@@ -205,7 +206,7 @@ def surveyed_beads(
 ) -> SurveyedBeads:
     """Return the beads of a joint calibration with inner constraints, at a measured scale.
 
-    Raises DataError for a distance whose ends are not among its targets.
+    Raises DataError for a distance with an end that is not among its targets.
     """
     (solved,) = result.solved.values()
     targets = result.targets
@@ -271,7 +272,7 @@ def _rows(distances: Sequence[MeasuredDistance], target_id: NDArray[np.int64]) -
 
 
 def _scale_sd(given_mm: NDArray[np.float64], given_sd: NDArray[np.float64]) -> float:
-    """Standard deviation of the scale of given coordinates with independent errors."""
+    """Return the standard deviation of the scale of given coordinates with independent errors."""
     square = np.sum((given_mm - given_mm.mean(axis=0)) ** 2, axis=1)
     return float(np.sqrt(np.sum(given_sd**2 * square)) / np.sum(square))
 
@@ -279,7 +280,7 @@ def _scale_sd(given_mm: NDArray[np.float64], given_sd: NDArray[np.float64]) -> f
 def _rays(
     network: Network, adjustment: Adjustment
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Number (n,) of the inlier rays of each object point, and largest angle (n,) of two."""
+    """Return the number (n,) of inlier rays of each object point, and their largest angle (n,)."""
     parameters = adjustment.parameters
     rows = np.flatnonzero(adjustment.inliers)
     point = network.point[rows]
@@ -290,6 +291,6 @@ def _rays(
     angle = np.zeros(network.n_points)
     for number, own in enumerate(np.split(ray[order], np.cumsum(count)[:-1])):
         if len(own) > 1:
-            # Rays from both sides are one direction: they meet as badly as parallel ones.
+            # Rays from opposite sides have the same line, and intersect as badly as parallel rays.
             angle[number] = np.arccos(np.clip(np.abs(own @ own.T).min(), 0, 1))
     return count, angle

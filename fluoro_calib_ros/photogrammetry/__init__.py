@@ -3,8 +3,8 @@
 
 """Photogrammetry: collinearity, resection, robust bundle adjustment, precision and diagnosis.
 
-The functions take and return numpy arrays and frozen dataclasses. A bundle adjustment passes
-through these modules: `network` (data), `unknowns` (layout and values), `normal_equations`,
-`elimination` (solution), `adjustment` (Levenberg-Marquardt), `outliers` (noise around it),
+The functions take and return numpy arrays and frozen dataclasses. A bundle adjustment uses these
+modules in order: `network` (data), `unknowns` (layout and values), `normal_equations`,
+`elimination` (solution), `adjustment` (Levenberg-Marquardt), `outliers` (estimation of the noise),
 `precision`, then `diagnosis` and `outliers`.
 """

@@ -3,11 +3,11 @@
 
 """Robust bundle adjustment of one or more fluoroscopes that observe one phantom.
 
-Maximum likelihood of the image points (Student-t, Huber or Gaussian) and of the surveyed
-coordinates (Gaussian; they define the datum unless inner constraints do), for a given noise model.
-Levenberg-Marquardt with Nielsen's damping (Madsen, Nielsen and Tingleff, "Methods for non-linear
-least squares problems", DTU 2004), iteratively reweighted. `outliers` estimates the noise
-model around it.
+For a given noise model, maximise the likelihood of the image points (Student-t, Huber or Gaussian)
+and of the surveyed coordinates (Gaussian; they define the datum unless inner constraints do). The
+solver is Levenberg-Marquardt with Nielsen's damping (Madsen, Nielsen and Tingleff, "Methods for
+non-linear least squares problems", DTU 2004), iteratively reweighted. `outliers` estimates the
+noise model in an outer loop.
 """
 
 from __future__ import annotations
@@ -32,22 +32,21 @@ from .unknowns import Parameters, discrepancies
 
 # Relative increase of the cost that rounding errors can cause.
 ROUNDING = 1e-12
-# A refused step that predicts less than this part of the tolerance, or less than so much of what
-# the tolerance allows, ends the adjustment: rounding errors hide the decrease that is left.
+# A refused step ends the adjustment if it predicts a decrease below this part of the tolerance, or
+# below NEGLIGIBLE_DECREASE (or a smaller tolerance): rounding errors then hide the decrease.
 NEGLIGIBLE = 1e-3
 NEGLIGIBLE_DECREASE = 1e-6
-# Image points from which steps with the normal matrix of the last one pay, without additional
-# parameters, with which they always do.
+# Image points from which repeated steps with the last normal matrix save time. With additional
+# parameters they always do.
 LARGE = 5_000
-# Damping that changes no covariance visibly.
-UNDAMPED = 1e-6
-# Part of the decrease of F by the last step up to which one with the same normal matrix pays, and
-# up to which it does where new normal matrices bring no faster convergence, as with heavy tails.
+UNDAMPED = 1e-6  # damping that changes no covariance visibly
+# A step with the same normal matrix saves time if it predicts less than this part of the last
+# decrease of F; REPEATED_SLOW: if new matrices converge no faster, as with heavy tails.
 REPEATED = 0.5
 REPEATED_SLOW = 0.9
 SLOWER = 1.2  # rate of convergence, relative to that of new normal matrices
-# Decrease of F for an image point by a step with the normal matrix of the last one, at most: the
-# weights of the image points change with larger steps.
+# Largest decrease of F for each image point by a step with the last normal matrix: larger steps
+# change the weights of the image points.
 REPEATED_DECREASE = 0.01
 
 
@@ -56,9 +55,9 @@ class SolverOptions:
     """Options of the adjustment."""
 
     tolerance: float = 1e-8  #: predicted decrease of the cost F at which the iteration ends
-    max_steps: int = 100  #: largest number of steps, refused ones included
-    #: what the solution of the normal equations eliminates; by default what leaves the smaller
-    #: system
+    max_steps: int = 100  #: largest number of steps, including refused steps
+    #: unknowns that the solution of the normal equations eliminates; by default the elimination
+    #: that leaves the smaller system
     elimination: type[Elimination] | None = None
 
 
@@ -74,15 +73,15 @@ class Adjustment:
     q: NDArray[np.float64]  #: (N,) normalised squared residuals
     noise: Noise  #: noise model of the adjustment
     cost: float  #: F, the negative log-likelihood
-    steps: int  #: number of steps, refused ones included
+    steps: int  #: number of steps, including refused steps
     converged: bool
-    exposure: NDArray[np.int64]  #: (N,) exposures of the image points
+    exposure: NDArray[np.int64]  #: (N,) exposure of each image point
 
     @cached_property
     def inliers(self) -> NDArray[np.bool_]:
         """True (N,) for the image points in the core of the noise distribution.
 
-        An exposure whose image points scatter more than those of others has a wider limit.
+        The limit is wider for an exposure whose image points scatter more than those of others.
         """
         size = np.sqrt(self.q / self.noise.median)
         limit = float(np.sqrt(self.noise.limit / self.noise.median))
@@ -92,9 +91,9 @@ class Adjustment:
 def residuals_and_q(
     network: Network, parameters: Parameters, correction: NDArray[np.float64] | float, noise: Noise
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Residuals (N, 2) [px] and normalised squared residuals (N,).
+    """Return residuals (N, 2) [px] and normalised squared residuals (N,).
 
-    Both are NaN where a point is behind the source.
+    Both are NaN if a point is behind the source.
     """
     additional = network.additional_correction(parameters)
     r = network.uv - correction - additional - project_network(network, parameters)
@@ -104,9 +103,9 @@ def residuals_and_q(
 def total_cost(
     network: Network, parameters: Parameters, q: NDArray[np.float64], noise: Noise
 ) -> float:
-    """F: negative log-likelihood of image points, surveyed coordinates, constraints and priors.
+    """Return F, the negative log-likelihood of all observations, constraints and priors.
 
-    Infinite where a point is behind the source. Constants of Gaussian terms are left out.
+    Infinite if a point is behind the source. Constants of Gaussian terms are omitted.
     """
     if not np.isfinite(q).all():
         return np.inf
@@ -143,7 +142,7 @@ class _Iterate:
 
 @dataclass(frozen=True)
 class _Solver:
-    """Normal equations, and their factors with a damping mu."""
+    """Normal equations, and their factors with damping mu."""
 
     system: BorderedSystem
     factor: BorderedFactor
@@ -152,7 +151,7 @@ class _Solver:
 
 @dataclass(frozen=True)
 class _Step:
-    """A step as `BorderedFactor.solve` gives it, and the decrease of F that it predicts."""
+    """A step from `BorderedFactor.solve`, and the decrease of F that it predicts."""
 
     x_blocks: NDArray[np.float64]
     x_rest: NDArray[np.float64]
@@ -161,7 +160,7 @@ class _Step:
 
 @dataclass(frozen=True)
 class _Problem:
-    """What an adjustment minimises: the cost of a network for a correction and a noise model."""
+    """Minimisation problem: the cost of a network for a correction and a noise model."""
 
     network: Network
     correction: NDArray[np.float64]
@@ -169,12 +168,12 @@ class _Problem:
     elimination: Elimination
 
     def evaluate(self, parameters: Parameters) -> _Iterate:
-        """Cost at some parameters."""
+        """Evaluate the cost at some parameters."""
         r, q = residuals_and_q(self.network, parameters, self.correction, self.noise)
         return _Iterate(parameters, r, q, total_cost(self.network, parameters, q, self.noise))
 
     def linearise(self, parameters: Parameters) -> BorderedSystem:
-        """Normal equations at some parameters."""
+        """Return the normal equations at some parameters."""
         equations = normal_equations(self.network, parameters, self.correction, self.noise)
         return self.elimination.bordered_system(equations)
 
@@ -186,22 +185,22 @@ class _Problem:
         return has_additional or network.n_image_points >= LARGE
 
     def factorize(self, system: BorderedSystem, mu: float) -> _Solver:
-        """Normal equations that are damped by mu, factorized.
+        """Factorize normal equations that are damped by mu.
 
-        Raises numpy.linalg.LinAlgError where the damped matrix is singular, ValueError where it is
-        not finite.
+        Raises numpy.linalg.LinAlgError if the damped matrix is singular, ValueError if it is not
+        finite.
         """
         return _Solver(system, system.damped(mu).factorize(), mu)
 
     def at(self, parameters: Parameters, solver: _Solver) -> _Solver:
-        """The same factors with the right sides at other parameters."""
+        """Return the same factors with the right sides at other parameters."""
         right = right_sides(self.network, parameters, self.correction, self.noise)
         block_right, rest_right = self.elimination.right_sides(right)
         system = replace(solver.system, block_right=block_right, rest_right=rest_right)
         return replace(solver, system=system)
 
     def step(self, solver: _Solver) -> _Step:
-        """The step that the normal equations give."""
+        """Return the step that solves the normal equations."""
         system = solver.system
         x_blocks, x_rest = solver.factor.solve(
             system.block_right[..., None], system.rest_right[:, None]
@@ -212,10 +211,10 @@ class _Problem:
         return _Step(x_blocks, x_rest, predicted)
 
     def after(self, iterate: _Iterate, step: _Step) -> _Iterate:
-        """Iterate after a step.
+        """Return the iterate after a step.
 
         The robustly weighted normal matrix is larger than the Fisher information. With heavy
-        tails, stretched steps converge in a third of the iterations.
+        tails, steps stretched by their ratio converge in a third of the iterations.
         """
         stretch = 1 / self.noise.information_factor(iterate.q)
         x = self.elimination.to_unknowns(stretch * step.x_blocks, stretch * step.x_rest)
@@ -223,7 +222,7 @@ class _Problem:
 
 
 class _NielsenDamping:
-    """Damping mu that follows the gain ratio, and grows faster with each refused step in a row."""
+    """Damping mu that follows the gain ratio, and grows faster with each consecutive refusal."""
 
     START = 1e-10
     MIN = 1e-15
@@ -236,14 +235,14 @@ class _NielsenDamping:
     def accept(self, gain: float) -> None:
         """Update after an accepted step; gain: actual over predicted decrease.
 
-        At a minimum both are rounding errors, and their ratio may be any number.
+        At a minimum both decreases are rounding errors, and their ratio may be any number.
         """
         gain = min(max(gain, 0.0), 2.0)
         self.mu = max(self.mu * max(1 / 3, 1 - (2 * gain - 1) ** 3), self.MIN)
         self._growth = 2.0
 
     def refuse(self) -> bool:
-        """Update after a refused step; True where the damping exceeds its maximum."""
+        """Update after a refused step; return True if the damping exceeds its maximum."""
         self.mu = max(self.mu, self.START) * self._growth
         self._growth = 2 * self._growth
         return self.mu > self.MAX
@@ -252,8 +251,8 @@ class _NielsenDamping:
 class _LevenbergMarquardt:
     """Levenberg-Marquardt iteration.
 
-    `current` is the best iterate so far, `steps` the number of steps, refused ones included.
-    `finished` ends the iteration, `converged` tells whether at a minimum. `used`: the normal
+    `current` is the best iterate so far; `steps` is the number of steps, including refused steps.
+    `finished` ends the iteration; `converged` is True at a minimum. `used` has the normal
     equations of the last accepted step, or at the minimum; None with relative orientations.
     """
 
@@ -266,10 +265,10 @@ class _LevenbergMarquardt:
         self._tolerance = tolerance
         self._damping = _NielsenDamping()
         self._system: BorderedSystem | None = None  # at the current parameters
-        self._last: _Solver | None = None  # of the last step, if it may be used again
+        self._last: _Solver | None = None  # solver of the last step, if it may be used again
         self.used: _Solver | None = None
         self._predicted = np.inf  # decrease of F by the last accepted step
-        self._rate = 0.0  # that decrease over the one before, at the last new normal matrix
+        self._rate = 0.0  # ratio of the last two such decreases, at the last new normal matrix
 
     def step(self) -> None:
         """Take or refuse one damped step."""
@@ -278,7 +277,7 @@ class _LevenbergMarquardt:
             return
         self._last = None
         if self._system is None:
-            self.used = None  # frees its memory before that of the next is taken
+            self.used = None  # free its memory before the next matrix is allocated
             self._system = self._problem.linearise(self.current.parameters)
         try:
             solver = self._problem.factorize(self._system, self._damping.mu)
@@ -305,7 +304,7 @@ class _LevenbergMarquardt:
             self.used = solver
 
     def _repeat(self, solver: _Solver) -> bool:
-        """Take a step with the factors of the last one; False where they do not serve.
+        """Take a step with the factors of the last step; return False if they are unsuitable.
 
         Near the solution the normal matrix hardly changes, and the simplified Newton method
         converges as fast at a fraction of the cost (Deuflhard, "Newton Methods for Nonlinear
@@ -315,7 +314,7 @@ class _LevenbergMarquardt:
         step = self._problem.step(solver)
         slow = min(SLOWER * self._rate, REPEATED_SLOW)
         limit = REPEATED_DECREASE * self._problem.network.n_image_points
-        # Where an exposure had almost no weight, the step may be of any size, even infinite.
+        # If an exposure had almost no weight, the step may be of any size, even infinite.
         if not step.predicted <= min(max(REPEATED, slow) * self._predicted, limit):
             return False
         trial = self._problem.after(self.current, step)
@@ -354,17 +353,17 @@ def adjust(
     ----------
     network : Network
     start : Parameters
-        Start values.
+        Initial values.
     correction : (N, 2) ndarray, optional
-        Correction of the image points [px], without that of the additional parameters.
+        Correction of the image points [px], excluding the additional parameters.
     noise : Noise
-        Noise model; it is not changed.
+        Noise model; it is fixed.
     options : SolverOptions
 
     Returns
     -------
     Adjustment
-        `converged` is False where `max_steps` ended the iteration or no step was found.
+        `converged` is False if `max_steps` ended the iteration or no step was found.
     """
     return adjust_with_matrix(
         network,
@@ -382,10 +381,10 @@ def adjust_with_matrix(
     noise: Noise = DEFAULT_NOISE,
     options: SolverOptions = DEFAULT_OPTIONS,
 ) -> tuple[Adjustment, FactorizedNormalMatrix | None]:
-    """Adjust a network; return also the normal matrix of the last steps.
+    """Adjust a network; also return the normal matrix of the last steps.
 
     The matrix belongs to parameters near the solution. It is None for a free network, with
-    relative orientations, and where the steps were damped. The arguments are those of `adjust`.
+    relative orientations, and if the steps were damped. Arguments as in `adjust`.
     """
     correction = np.zeros_like(network.uv) if correction is None else correction
     elimination = (options.elimination or choose_elimination(network))(network)

@@ -3,10 +3,10 @@
 
 """The collinearity condition of an X-ray image, and its derivatives.
 
-X = R (P - T);  u = xp + c X/Z,  v = yp + c Y/Z: Eq. 1 of Chow et al. turned by 180 degrees about
+X = R (P - T);  u = xp + c X/Z,  v = yp + c Y/Z: Eq. 1 of Chow et al. rotated by 180 degrees about
 x, so that z points from the source to the image. P is the object point [mm], T the source [mm], R
-the rotation phantom -> sensor, (xp, yp, c) the interior orientation [px]. A rotation is varied on
-the left, R -> exp([w]x) R, so that dX/dw = -[X]x.
+the rotation phantom -> sensor, (xp, yp, c) the interior orientation [px]. A rotation is varied
+from the left, R -> exp([w]x) R, so that dX/dw = -[X]x.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from .rotations import cross_matrix, mirror_lower
 def to_sensor(
     rotation: NDArray[np.float64], position: NDArray[np.float64], points: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Points in the sensor frame (n, 3) [mm].
+    """Return points in the sensor frame (n, 3) [mm].
 
-    rotation (n, 3, 3) phantom -> sensor; position and points (n, 3) [mm]. One rotation (3, 3) and
-    position (3,) are those of all points.
+    rotation (n, 3, 3) phantom -> sensor; position and points (n, 3) [mm]. A single rotation (3, 3)
+    and position (3,) apply to all points.
     """
     return np.matmul(rotation, (points - position)[..., None])[..., 0]
 
@@ -39,7 +39,7 @@ def project(
     points: NDArray[np.float64],
     interior: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Image points (n, 2) [px] of object points; NaN for a point that is not before the source.
+    """Return image points (n, 2) [px]; NaN for an object point that is not before the source.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def project_with_jacobian(
     points: NDArray[np.float64],
     interior: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Image points and their derivatives; parameters as in `project`.
+    """Return image points and their derivatives; parameters as in `project`.
 
     Returns
     -------
@@ -100,20 +100,19 @@ def project_with_jacobian(
 # Additional parameters: a correction of the image points that is linear in its coefficients.
 #
 # The coefficients are unknowns of the adjustment. The functions are evaluated at observed pixels,
-# so they do not change while the unknowns are adjusted. A Gaussian prior (mean zero) on the
-# coefficients makes the correction a signal in the sense of least-squares collocation (Moritz,
-# "Advanced Physical Geodesy", Wichmann 1980, part B).
+# so they do not change during the adjustment. A Gaussian prior (mean zero) on the coefficients
+# makes the correction a signal in the sense of least-squares collocation (Moritz, "Advanced
+# Physical Geodesy", Wichmann 1980, part B).
 
 ALL = slice(None)
 
 
 @dataclass(frozen=True)
 class GroupedFunctions:
-    """Further functions with coefficients of their own in every group of image points.
+    """Additional functions with separate coefficients in every group of image points.
 
-    values (N, 2, t): the functions at the image points, shared by u and v; group (N,): group of
-    each image point, ascending from 0. The coefficients of one group stand after those of the one
-    before.
+    values (N, 2, t): functions at the image points, shared by u and v; group (N,): group of each
+    image point, ascending from 0. Coefficients are ordered group by group.
     """
 
     values: NDArray[np.float64]
@@ -125,13 +124,13 @@ class GroupedFunctions:
         return (int(self.group[-1]) + 1) * self.values.shape[2]
 
     def split(self, of_coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Values (..., count) of the coefficients as (..., groups, t)."""
+        """Reshape values (..., count) of the coefficients to (..., groups, t)."""
         return of_coefficients.reshape(*of_coefficients.shape[:-1], -1, self.values.shape[2])
 
 
 @dataclass(frozen=True)
 class _Ordered:
-    """Functions (N, k) of the image points in the order of an index, and where it changes."""
+    """Functions (N, k) of image points ordered by an index, and the rows where it changes."""
 
     index: NDArray[np.int64]
     order: NDArray[np.int64] | slice
@@ -148,13 +147,12 @@ class AdditionalParameters:
     #: coefficients shared by u and v
     functions: NDArray[np.float64]
     prior: NDArray[np.float64]  #: (P, P) precision matrix of the coefficients; zeros for no prior
-    #: with functions (N, k): functions of groups of image points; their coefficients are the last
-    #: ones
+    #: with functions (N, k): functions of groups of image points, whose coefficients are the last
     own: GroupedFunctions | None = None
 
     @property
     def _common(self) -> int:
-        """Number of coefficients that all image points have in common."""
+        """Number of coefficients that are common to all image points."""
         return self.functions.shape[-1] * (2 if self.functions.ndim == 2 else 1)
 
     @property
@@ -164,18 +162,18 @@ class AdditionalParameters:
 
     @cached_property
     def _contiguous(self) -> NDArray[np.float64]:
-        """Functions (2, N, p) of u and v: strided products take four times as long."""
+        """Contiguous functions (2, N, p) of u and v; strided products take four times as long."""
         return np.ascontiguousarray(self.functions.transpose(1, 0, 2))
 
     def _by_axis(self) -> list[tuple[NDArray[np.float64], slice]]:
-        """Functions (N, p or k) of u and of v, and the columns of their coefficients."""
+        """Return functions (N, p or k) of u and of v, and the columns of their coefficients."""
         if self.functions.ndim == 3:
             return [(self._contiguous[axis], ALL) for axis in (0, 1)]
         k = self.functions.shape[1]
         return [(self.functions, slice(axis * k, (axis + 1) * k)) for axis in (0, 1)]
 
     def correction(self, coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Corrections (N, 2) [px] for coefficients (P,)."""
+        """Return the corrections (N, 2) [px] for coefficients (P,)."""
         common = coefficients[: self._common]
         out = np.stack([f @ common[columns] for f, columns in self._by_axis()], axis=1)
         if self.own is not None:
@@ -184,7 +182,7 @@ class AdditionalParameters:
         return out
 
     def normal_matrix(self, weight: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Normal matrix (P, P) of the coefficients for weights (N,) of the image points."""
+        """Return the normal matrix (P, P) of the coefficients for weights (N,) of image points."""
         out = np.zeros((self.count, self.count))
         if self.functions.ndim == 2:
             k = self.functions.shape[1]
@@ -215,7 +213,7 @@ class AdditionalParameters:
         out[: self._common, self._common :] = rows[:, : self._common].T
 
     def right_side(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Sum (P,) over the image points of the functions times values (N, 2)."""
+        """Return the sum (P,) over the image points of the functions times values (N, 2)."""
         out = np.zeros(self.count)
         for axis, (f, columns) in enumerate(self._by_axis()):
             out[: self._common][columns] += values[:, axis] @ f
@@ -225,7 +223,7 @@ class AdditionalParameters:
         return out
 
     def _ordered(self, index: NDArray[np.int64]) -> _Ordered:
-        """Functions (N, k) in the order of an index (N,); the last unordered one is kept."""
+        """Return functions (N, k) ordered by an index (N,); cache the last unordered index."""
         kept: _Ordered | None = self.__dict__.get('_kept')
         if kept is not None and np.array_equal(kept.index, index):
             return kept
@@ -240,9 +238,9 @@ class AdditionalParameters:
     def grouped_products(
         self, index: NDArray[np.int64], count: int, a: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Sums (count, q, P) of a^T times functions over image points with the same index.
+        """Return sums (count, q, P) of a^T times functions over image points with the same index.
 
-        index (N,) from 0 to count - 1; a (N, 2, q) weighted derivatives by other unknowns.
+        index (N,) from 0 to count - 1; a (N, 2, q): weighted derivatives by other unknowns.
         """
         n, _, q = a.shape
         out = np.zeros((count, q, self.count))
@@ -277,9 +275,9 @@ class AdditionalParameters:
     def correction_covariance(
         self, covariance: NDArray[np.float64], part: slice = ALL
     ) -> NDArray[np.float64]:
-        """Covariances (n, 2, 2) [px^2] of the corrections at image points `part`.
+        """Return covariances (n, 2, 2) [px^2] of the corrections at image points `part`.
 
-        covariance (P, P) of the coefficients.
+        covariance (P, P): of the coefficients.
         """
         (fu, cu), (fv, cv) = ((f[part], columns) for f, columns in self._by_axis())
         common = covariance[: self._common, : self._common]
@@ -295,7 +293,7 @@ class AdditionalParameters:
     def correction_variance(
         self, covariance: NDArray[np.float64], part: slice = ALL
     ) -> NDArray[np.float64]:
-        """Traces (n,) [px^2] of `correction_covariance`, for half to a third of its work."""
+        """Return traces (n,) [px^2] of `correction_covariance`, at half to a third of its cost."""
         common = covariance[: self._common, : self._common]
         if self.functions.ndim == 2:
             f = self.functions[part]
@@ -313,7 +311,7 @@ class AdditionalParameters:
     def _own_covariance(
         self, own: GroupedFunctions, covariance: NDArray[np.float64], part: slice
     ) -> NDArray[np.float64]:
-        """What functions of groups add (n, 2, 2) to the covariances of the corrections."""
+        """Return the part (n, 2, 2) of group functions in the covariances of the corrections."""
         values = own.values[part]
         group = own.group[part]
         t = own.values.shape[2]
@@ -330,10 +328,10 @@ class AdditionalParameters:
     def cross_covariance(
         self, covariance: NDArray[np.float64], index: NDArray[np.int64], part: slice = ALL
     ) -> NDArray[np.float64]:
-        """Covariances (n, q, 2) of other unknowns with the corrections at image points `part`.
+        """Return covariances (n, q, 2) of other unknowns with the corrections at points `part`.
 
-        covariance (k, q, P) of k sets of other unknowns with the coefficients; index (n,) of the
-        set that belongs to each image point.
+        covariance (k, q, P): of k sets of other unknowns with the coefficients; index (n,): set
+        that belongs to each image point.
         """
         out = self._common_cross_covariance(covariance[:, :, : self._common], index, part)
         if self.own is not None:
@@ -345,7 +343,7 @@ class AdditionalParameters:
     def _common_cross_covariance(
         self, covariance: NDArray[np.float64], index: NDArray[np.int64], part: slice
     ) -> NDArray[np.float64]:
-        """Covariances (n, q, 2) as cross_covariance, of the common functions alone."""
+        """Return covariances (n, q, 2) as `cross_covariance`, of the common functions alone."""
         sets, q, _ = covariance.shape
         n = len(index)
         order = np.argsort(index, kind='stable')
@@ -371,6 +369,6 @@ class AdditionalParameters:
 
 
 def _groups(index: NDArray[np.int64]) -> list[tuple[int, int, int]]:
-    """First row, row after the last, and value of every value of an ascending index (n,)."""
+    """Return (first row, row after the last, value) for each value of an ascending index (n,)."""
     starts = np.flatnonzero(np.diff(index, prepend=-1)).tolist()
     return list(zip(starts, [*starts[1:], len(index)], index[starts].tolist()))

@@ -1,12 +1,13 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Names what a network cannot determine, and unknowns that can hardly be separated.
+"""Name unknowns that a network cannot determine, and unknowns that can hardly be separated.
 
 Near-zero eigenvalues of the normal matrix, scaled to a unit diagonal, belong to combinations of
-unknowns that the observations leave open. The largest components of their eigenvectors show which
-(Belsley, Kuh and Welsch, "Regression Diagnostics", Wiley 1980, 3.2; for self-calibration Luhmann
-et al., "Close-Range Photogrammetry and 3D Imaging", 3rd ed., de Gruyter 2020, 7.3.2).
+unknowns that the observations do not determine. The largest components of their eigenvectors show
+which unknowns (Belsley, Kuh and Welsch, "Regression Diagnostics", Wiley 1980, 3.2; for
+self-calibration Luhmann et al., "Close-Range Photogrammetry and 3D Imaging", 3rd ed., de Gruyter
+2020, 7.3.2).
 """
 
 from __future__ import annotations
@@ -29,21 +30,21 @@ from .unknowns import EXTERIOR_SIZE, SINGULAR, Parameters
 
 # Correlation above which two unknowns are reported.
 HIGH_CORRELATION = 0.95
-# A network is judged at this image noise at most, so that distorted images do not make it look
+# Largest image noise at which a network is judged, so that distortion does not make it look
 # weaker.
 NOMINAL_NOISE_PX = 1.0
 # Standard deviation of the interior orientation, relative to c, above which it is undetermined.
 MAX_RELATIVE_SD = 0.05
 # Correlation of c with the distance in every exposure above which they cannot be separated.
 MAX_DISTANCE_CORRELATION = 0.9999
-# Components of an eigenvector are reported from this part of its largest squared component on.
+# Components of an eigenvector are reported above this part of its largest squared component.
 MIN_SHARE = 0.1
 INTERIOR = ('xp', 'yp', 'c')
 EXTERIOR = ('X', 'Y', 'Z', 'rotation about x', 'rotation about y', 'rotation about z')
 
 
 def global_names(network: Network, fluoroscopes: Sequence[str]) -> list[str]:
-    """Names of the global unknowns, in the order of the layout."""
+    """Return the names of the global unknowns, in the order of the layout."""
     out = [f'{f}: {part}' for f in fluoroscopes for part in INTERIOR]
     for constraint in network.relative:
         a, b = (fluoroscopes[f] for f in constraint.fluoroscopes)
@@ -57,9 +58,9 @@ def global_names(network: Network, fluoroscopes: Sequence[str]) -> list[str]:
 def exterior_names(
     network: Network, fluoroscopes: Sequence[str], numbers: Sequence[int]
 ) -> list[str]:
-    """Names of the exterior orientations; numbers (m,) of the exposures.
+    """Return the names of the exterior orientations; numbers (m,): of the exposures.
 
-    Coordinates of the source are named in the sensor frame, Z towards the phantom.
+    Coordinates of the source are in the sensor frame, with Z towards the phantom.
     """
     return [
         f'exposure {number} of {fluoroscopes[f]}: {part}'
@@ -75,11 +76,11 @@ def high_correlations(
     fluoroscopes: Sequence[str],
     numbers: Sequence[int],
 ) -> tuple[tuple[str, str, float], ...]:
-    """Correlations above 0.95 of interior and relative orientations with all global unknowns and
-    exterior orientations.
+    """Return high correlations of interior and relative orientations with other unknowns.
 
-    fluoroscopes: names of the fluoroscopes. numbers: numbers of the exposures. Returns two
-    unknowns and their correlation, the largest first, 20 at most.
+    These are all global unknowns and exterior orientations; the limit is 0.95. fluoroscopes: names
+    of the fluoroscopes. numbers: numbers of the exposures. Returns two unknowns and their
+    correlation, the largest first, at most 20.
     """
     orientations = network.layout.all_orientations
     count = orientations.stop
@@ -95,7 +96,7 @@ def high_correlations(
     correlations = np.concatenate([with_globals, with_exteriors], axis=1)
     column_names = names + exterior_names(network, fluoroscopes, numbers)
     row, column = np.nonzero(np.abs(correlations) > HIGH_CORRELATION)
-    order = np.argsort(-np.abs(correlations[row, column]), kind='stable')[:20]  # that are listed
+    order = np.argsort(-np.abs(correlations[row, column]), kind='stable')[:20]  # limit of the list
     return tuple(
         (names[row[i]], column_names[column[i]], float(correlations[row[i], column[i]]))
         for i in order
@@ -105,7 +106,7 @@ def high_correlations(
 def _correlations(
     covariance: NDArray[np.float64], row_sd: NDArray[np.float64], column_sd: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Correlations of covariances (r, c); zero where an unknown is fixed."""
+    """Return correlations of covariances (r, c); zero if an unknown is fixed."""
     with np.errstate(divide='ignore', invalid='ignore'):
         out = covariance / np.outer(row_sd, column_sd)
     return np.where(np.isfinite(out), out, 0.0)
@@ -114,7 +115,7 @@ def _correlations(
 def _turned_to_sensor(
     parameters: Parameters, exterior: NDArray[np.float64], mixed: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Covariances (m, 6, 6) and (m, 6, G) of exposures with the source in the sensor frame."""
+    """Rotate covariances (m, 6, 6) and (m, 6, G) to sources in the sensor frame."""
     turn = np.tile(np.eye(EXTERIOR_SIZE), (len(exterior), 1, 1))
     turn[:, :3, :3] = parameters.rotation
     return turn @ exterior @ turn.transpose(0, 2, 1), turn @ mixed
@@ -127,9 +128,9 @@ def undetermined_interiors(
     fluoroscopes: Sequence[str],
     scale: float,
 ) -> tuple[Finding, ...]:
-    """One finding for every fluoroscope whose interior orientation is not determined.
+    """Return a finding for every fluoroscope whose interior orientation is not determined.
 
-    precision: it is judged at an image noise of one pixel at most. fluoroscopes: names of the
+    precision: judged at an image noise of at most one pixel. fluoroscopes: names of the
     fluoroscopes. scale: scale of the noise model of the precision.
     """
     out = []
@@ -169,9 +170,9 @@ def undetermined_interiors(
 def _distance_correlations(
     network: Network, parameters: Parameters, precision: Precision
 ) -> NDArray[np.float64]:
-    """Smallest correlation (F,) of c with the distance of the source along its axis.
+    """Return the smallest correlation (F,) of c with the source distance along its axis.
 
-    The smallest is taken over the exposures of each fluoroscope.
+    It is the smallest over the exposures of each fluoroscope.
     """
     exterior, mixed = _turned_to_sensor(parameters, precision.exterior, precision.exterior_global)
     out = np.ones(network.n_fluoroscopes)
@@ -185,16 +186,16 @@ def _distance_correlations(
 
 
 def _flatness_remark(network: Network) -> str:
-    """A remark where the targets nearly lie in a plane, else an empty string."""
+    """Return a remark if the targets nearly lie in a plane, else an empty string."""
     flat = flatness(network.survey_mm) < 0.1  # smallest over largest extent
     return '; the beads lie nearly in one plane' if flat else ''
 
 
 def reduced_normal_matrix(network: Network, parameters: Parameters) -> NDArray[np.float64]:
-    """Normal matrix of the exposures and free global unknowns, object points eliminated.
+    """Return the normal matrix of exposures and free global unknowns, object points eliminated.
 
-    Shape (6m + G, 6m + G), with the sources in the sensor frame and all weights equal. It may be
-    singular.
+    Its shape is (6m + G, 6m + G); sources are in the sensor frame, and all weights are equal. It
+    may be singular.
     """
     noise = Noise('gaussian', NOMINAL_NOISE_PX / float(np.median(network.sigma)))
     equations = normal_equations(network, parameters, 0.0, noise)
@@ -213,9 +214,9 @@ def undetermined_directions(
     fluoroscopes: Sequence[str],
     numbers: Sequence[int],
 ) -> tuple[tuple[str, ...], ...]:
-    """Names of the unknowns that dominate each combination that the network leaves open.
+    """Return the unknowns that dominate each combination that the network does not determine.
 
-    numbers (m,) of the exposures. The datum of a free network is not reported.
+    numbers (m,): of the exposures. The datum of a free network is not reported.
     """
     matrix = reduced_normal_matrix(network, parameters)
     scale = np.sqrt(np.maximum(np.diagonal(matrix), 1e-300))
@@ -235,7 +236,7 @@ def undetermined_directions(
 
 
 def describe_directions(directions: Sequence[Sequence[str]]) -> str:
-    """One sentence about the combinations of unknowns that are left open."""
+    """Describe undetermined combinations of unknowns in one sentence."""
     parts = []
     for names in directions[:3]:
         exposures = sorted({name.split(':')[0] for name in names if name.startswith('exposure')})

@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Solution of the normal equations: object points or exposures are eliminated first.
+"""Solution of the normal equations, with object points or exposures eliminated first.
 
 Schur complement: Triggs, McLauchlan, Hartley and Fitzgibbon, "Bundle Adjustment - A Modern
 Synthesis", 2000, section 6. Eliminating the object points leaves a system of exposures, and
-eliminating the exposures one of object points, each bordered by the global unknowns. Exposures
-that a relative orientation couples are eliminated together. Everything that depends on this choice
-is behind the interface `Elimination`.
+eliminating the exposures leaves one of object points; each is bordered by the global unknowns.
+Exposures that are coupled by a relative orientation are eliminated together. The interface
+`Elimination` hides everything that depends on this choice.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from .unknowns import EXTERIOR_SIZE, POINT_SIZE, ReducedLayout, UnknownVector
 class BorderedSystem:
     """Normal equations [B C; C^T D] (x_b, x_r) = (b, r) with a block-diagonal part B."""
 
-    blocks: NDArray[np.float64]  #: (k, s, s) B: blocks of the unknowns that are eliminated
+    blocks: NDArray[np.float64]  #: (k, s, s) B: blocks of the eliminated unknowns
     border: NDArray[np.float64]  #: (k, s, q) C: their mixed blocks with the remaining unknowns
     rest: NDArray[np.float64]  #: (q, q) D: normal matrix of the remaining unknowns
     block_right: NDArray[np.float64]  #: (k, s) right side b
     rest_right: NDArray[np.float64]  #: (q,) right side r
 
     def damped(self, mu: float) -> BorderedSystem:
-        """A copy with the diagonal multiplied by 1 + mu."""
+        """Return a copy with the diagonal multiplied by 1 + mu."""
         blocks = self.blocks + mu * self.blocks * np.eye(self.blocks.shape[1])
         rest = self.rest.copy()
         rest.ravel()[:: len(rest) + 1] *= 1 + mu
@@ -46,9 +46,9 @@ class BorderedSystem:
     def predicted_decrease(
         self, x_blocks: NDArray[np.float64], x_rest: NDArray[np.float64], mu: float
     ) -> float:
-        """Decrease of the cost that a step damped by mu makes in the linearised problem.
+        """Return the decrease of the linearised cost by a step damped by mu.
 
-        Not finite where the step is too large for it.
+        Not finite if the step is too large for floating point.
         """
         with np.errstate(over='ignore', invalid='ignore'):
             undamped = np.sum(x_blocks * self.block_right) + np.sum(x_rest * self.rest_right)
@@ -59,17 +59,17 @@ class BorderedSystem:
             return float((undamped + damping) / 2)
 
     def singular_schur_complement(self) -> NDArray[np.float64]:
-        """Schur complement (q, q) of the rest by pseudo-inverses: the blocks may be singular."""
+        """Return the Schur complement (q, q) by pseudo-inverses, as the blocks may be singular."""
         inverse = np.linalg.pinv(self.blocks, hermitian=True)
         size = len(self.rest)
         flat = self.border.reshape(-1, size)
         return self.rest - flat.T @ (inverse @ self.border).reshape(-1, size)
 
     def factorize(self) -> BorderedFactor:
-        """Cholesky factors of the system; the rest is overwritten.
+        """Return Cholesky factors of the system; overwrites `rest`.
 
-        Raises numpy.linalg.LinAlgError where the matrix is not positive definite, and ValueError
-        where it is not finite.
+        Raises numpy.linalg.LinAlgError if the matrix is not positive definite, and ValueError if
+        it is not finite.
         """
         inverse = np.linalg.inv(np.linalg.cholesky(self.blocks))
         half = (inverse @ self.border).reshape(-1, self.border.shape[2])
@@ -94,7 +94,7 @@ class BorderedFactor:
     def solve(
         self, block_right: NDArray[np.float64], rest_right: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Solutions x_b (k, s, d) and x_r (q, d) for right sides (k, s, d) and (q, d)."""
+        """Return x_b (k, s, d) and x_r (q, d) for right sides (k, s, d) and (q, d)."""
         columns = block_right.shape[2]
         half = (self.inverse @ block_right).reshape(-1, columns)
         x_rest = cho_solve((self.schur, True), rest_right - self.half_border.T @ half)
@@ -102,11 +102,11 @@ class BorderedFactor:
         return self.inverse.transpose(0, 2, 1) @ remaining, x_rest
 
     def covariance(self) -> BorderedCovariance:
-        """Blocks of the inverse of the matrix."""
+        """Return the blocks of the inverse of the matrix."""
         k, size = self.inverse.shape[:2]
         q = len(self.schur)
         lower, _ = lapack.dpotri(self.schur, lower=1)
-        rest = mirror_lower(lower).T  # by rows
+        rest = mirror_lower(lower).T  # stored by rows
         transposed = self.inverse.transpose(0, 2, 1)
         gain = transposed @ self.half_border.reshape(k, size, q)
         border = -(gain.reshape(-1, q) @ rest).reshape(k, size, q)
@@ -121,9 +121,9 @@ class BorderedCovariance:
 
     blocks: NDArray[np.float64]  #: (k, s, s)
     border: NDArray[np.float64]  #: (k, s, q)
-    #: (q, q) the inverse; of the part between two different blocks, see `conditional` and `gain`
+    #: (q, q); for the part between two different blocks, see `conditional` and `gain`
     rest: NDArray[np.float64]
-    #: (k, s, s) B^-1: covariances of the blocks with the rest fixed
+    #: (k, s, s) B^-1: covariances of the blocks with the remaining unknowns fixed
     conditional: NDArray[np.float64]
     #: (k, s, q) B^-1 C. The inverse between blocks i and j is (i = j) B^-1 - border[i] gain[j]^T
     gain: NDArray[np.float64]
@@ -131,7 +131,7 @@ class BorderedCovariance:
 
 @dataclass(frozen=True)
 class CovarianceBlocks:
-    """Blocks of the inverse normal matrix; zeros where a global unknown is fixed."""
+    """Blocks of the inverse normal matrix; zeros if a global unknown is fixed."""
 
     ee: NDArray[np.float64]  #: (m, 6, 6) of exposures e
     pp: NDArray[np.float64]  #: (n, 3, 3) of object points p
@@ -147,7 +147,7 @@ class CovarianceBlocks:
 
 
 class Elimination(ABC):
-    """How the unknowns of a network are ordered for the solution of its normal equations.
+    """Order of the unknowns of a network for the solution of its normal equations.
 
     `layout` is the order of the unknowns that remain after the elimination.
     """
@@ -159,31 +159,31 @@ class Elimination(ABC):
 
     @abstractmethod
     def bordered_system(self, equations: NormalEquations) -> BorderedSystem:
-        """Normal equations in the order of this elimination.
+        """Return the normal equations in the order of this elimination.
 
-        Fixed global unknowns are left out. The open directions of a free network are fixed in the
-        part that remains.
+        Fixed global unknowns are omitted. The undetermined directions of a free network are fixed
+        in the part that remains.
         """
 
     @abstractmethod
     def right_sides(self, right: UnknownVector) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Right sides (k, s) and (q,) of the eliminated and the remaining unknowns."""
+        """Return right sides (k, s) of the eliminated and (q,) of the remaining unknowns."""
 
     @abstractmethod
     def to_unknowns(
         self, x_blocks: NDArray[np.float64], x_rest: NDArray[np.float64]
     ) -> UnknownVector:
-        """Values (k, s, ...) of the eliminated and (q, ...) of the remaining unknowns, by kind."""
+        """Return eliminated (k, s, ...) and remaining (q, ...) unknowns by kind."""
 
     @abstractmethod
     def right_side_of_points(
         self, values: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Right sides (k, s, d) and (q, d) with values (n, 3, d) of the points, else zeros."""
+        """Return right sides (k, s, d) and (q, d): values (n, 3, d) for points, else zeros."""
 
     @abstractmethod
     def covariance_blocks(self, covariance: BorderedCovariance) -> CovarianceBlocks:
-        """Covariances by kind of unknown."""
+        """Return covariances by kind of unknown."""
 
     def _globals_of(self, x_rest: NDArray[np.float64]) -> NDArray[np.float64]:
         return self.network.layout.expand_globals(x_rest[self.layout.globals])
@@ -194,7 +194,7 @@ class Elimination(ABC):
         own_globals: NDArray[np.float64],
         equations: NormalEquations,
     ) -> NDArray[np.float64]:
-        """Matrix (q, q) of the remaining blocks (c, s, s), their mixed ones (c, s, G), and gg."""
+        """Return the matrix (q, q) of remaining blocks (c, s, s), mixed blocks (c, s, G), gg."""
         rows = self.layout.block_rows
         blocks = self.layout.blocks
         border = self.layout.globals
@@ -207,7 +207,7 @@ class Elimination(ABC):
         return out
 
     def _fix_gauge(self, rest: NDArray[np.float64], directions: NDArray[np.float64]) -> None:
-        """Fix the open directions (c, s, 7) of the remaining blocks in their matrix."""
+        """Fix the undetermined directions (c, s, 7) of the remaining blocks in their matrix."""
         blocks = self.layout.blocks
         directions = directions.reshape(blocks.stop, -1)
         factor = stabilising_factor(directions, np.diagonal(rest)[blocks])
@@ -216,7 +216,7 @@ class Elimination(ABC):
     def _split_rest(
         self, covariance: BorderedCovariance
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Covariances of the rest: its blocks (c, s, s), gg (G, G) and mixed ones (c, s, G)."""
+        """Split covariances of the remaining unknowns: (c, s, s), gg (G, G), mixed (c, s, G)."""
         rest = covariance.rest
         rows = self.layout.block_rows
         free = self.network.layout.free
@@ -230,9 +230,10 @@ class Elimination(ABC):
     def _split_border(
         self, border: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Covariances (k, t, q) of other unknowns with the rest, split.
+        """Split covariances (k, t, q) of other unknowns with the remaining unknowns.
 
-        Returns those with its blocks (k, t, c, s) and with all global unknowns (k, t, G).
+        Returns covariances with the remaining blocks (k, t, c, s) and all global unknowns (k, t,
+        G).
         """
         shape = border.shape[:2]
         with_globals = np.zeros((*shape, self.network.layout.n_globals))
@@ -242,14 +243,14 @@ class Elimination(ABC):
 
 
 class EliminatePoints(Elimination):
-    """Object points are eliminated; exposures and global unknowns remain."""
+    """Eliminate object points; exposures and global unknowns remain."""
 
     def __init__(self, network: Network) -> None:
         super().__init__(network)
         self.layout = network.layout.without_points
 
     def bordered_system(self, equations: NormalEquations) -> BorderedSystem:
-        """Blocks of object points, bordered by exposures and free global unknowns."""
+        """Return blocks of object points, bordered by exposures and free global unknowns."""
         network = self.network
         m = network.n_exposures
         n = network.n_points
@@ -269,25 +270,25 @@ class EliminatePoints(Elimination):
         return BorderedSystem(equations.pp, border, rest, *right)
 
     def right_sides(self, right: UnknownVector) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Right sides of object points (n, 3), and of exposures and free global unknowns (q,)."""
+        """Return right sides of points (n, 3), and of exposures and free globals (q,)."""
         free = self.network.layout.free
         return right.points, np.concatenate([right.exteriors.ravel(), right.globals[free]])
 
     def to_unknowns(
         self, x_blocks: NDArray[np.float64], x_rest: NDArray[np.float64]
     ) -> UnknownVector:
-        """Values of object points (n, 3, ...) and of the remaining unknowns (q, ...), by kind."""
+        """Return object points (n, 3, ...) and remaining unknowns (q, ...) by kind."""
         exteriors = x_rest[self.layout.blocks].reshape(-1, EXTERIOR_SIZE, *x_rest.shape[1:])
         return UnknownVector(exteriors, x_blocks, self._globals_of(x_rest))
 
     def right_side_of_points(
         self, values: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The values themselves, and zeros for the remaining unknowns."""
+        """Return the values themselves, and zeros for the remaining unknowns."""
         return values, np.zeros((self.layout.size, values.shape[2]))
 
     def covariance_blocks(self, covariance: BorderedCovariance) -> CovarianceBlocks:
-        """Covariances of object points from the blocks, of exposures from the rest."""
+        """Return covariances of points from the blocks, of exposures from the remaining part."""
         rows = self.layout.block_rows
         ee, gg, eg = self._split_rest(covariance)
         pairs, pg = self._split_border(covariance.border)
@@ -310,9 +311,9 @@ class EliminatePoints(Elimination):
 
 
 class EliminateExposures(Elimination):
-    """Exposures are eliminated; object points and global unknowns remain.
+    """Eliminate exposures; object points and global unknowns remain.
 
-    Exposures coupled by a constraint share a cell: that of the exposure of their first
+    Exposures coupled by a constraint share a cell, that of the exposure of their first
     fluoroscope. The normal matrix of the exposures is block-diagonal by cells. `cell` and `place`
     (m,) locate each exposure; every cell has `n_places`.
     """
@@ -332,7 +333,7 @@ class EliminateExposures(Elimination):
         self.n_places = len(network.relative) + 1
 
     def bordered_system(self, equations: NormalEquations) -> BorderedSystem:
-        """Blocks of cells, bordered by object points and free global unknowns."""
+        """Return blocks of cells, bordered by object points and free global unknowns."""
         rest = self._rest_matrix(equations.pp, equations.pg, equations)
         if equations.gauge is not None:
             self._fix_gauge(rest, equations.gauge.points)
@@ -342,7 +343,7 @@ class EliminateExposures(Elimination):
         )
 
     def right_sides(self, right: UnknownVector) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Right sides of cells (k, s), and of object points and free global unknowns (q,)."""
+        """Return right sides of cells (k, s), and of points and free globals (q,)."""
         of_cells = np.zeros((self.n_cells, self.n_places, EXTERIOR_SIZE))
         of_cells[self.cell, self.place] = right.exteriors
         free = self.network.layout.free
@@ -350,7 +351,7 @@ class EliminateExposures(Elimination):
         return of_cells.reshape(self.n_cells, -1), rest
 
     def _cell_blocks(self, equations: NormalEquations) -> NDArray[np.float64]:
-        """Blocks (k, s, s) of the cells; an empty place has ones in its diagonal."""
+        """Return blocks (k, s, s) of the cells; an empty place has ones in its diagonal."""
         cell = self.cell
         place = self.place
         shape = (self.n_cells, self.n_places, EXTERIOR_SIZE)
@@ -365,7 +366,7 @@ class EliminateExposures(Elimination):
         return blocks.reshape(self.n_cells, width, width)
 
     def _cell_border(self, equations: NormalEquations) -> NDArray[np.float64]:
-        """Mixed blocks (k, s, q) of the cells with object points and global unknowns."""
+        """Return mixed blocks (k, s, q) of the cells with points and global unknowns."""
         network = self.network
         shape = (self.n_cells, self.n_places, EXTERIOR_SIZE)
         border = np.zeros((*shape, self.layout.size))
@@ -380,21 +381,21 @@ class EliminateExposures(Elimination):
     def to_unknowns(
         self, x_blocks: NDArray[np.float64], x_rest: NDArray[np.float64]
     ) -> UnknownVector:
-        """Values of the cells (k, s, ...) and of the remaining unknowns (q, ...), by kind."""
+        """Return cells (k, s, ...) and remaining unknowns (q, ...) by kind."""
         points = x_rest[self.layout.blocks].reshape(-1, POINT_SIZE, *x_rest.shape[1:])
         return UnknownVector(self._of_exposures(x_blocks), points, self._globals_of(x_rest))
 
     def right_side_of_points(
         self, values: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Zeros for the cells, and the values in the rows of the object points."""
+        """Return zeros for the cells, and the values in the rows of the object points."""
         columns = values.shape[2]
         rest = np.zeros((self.layout.size, columns))
         rest[self.layout.blocks] = values.reshape(-1, columns)
         return np.zeros((self.n_cells, EXTERIOR_SIZE * self.n_places, columns)), rest
 
     def covariance_blocks(self, covariance: BorderedCovariance) -> CovarianceBlocks:
-        """Covariances of exposures from the cells, of object points from the rest."""
+        """Return covariances of exposures from the cells, of points from the remaining part."""
         pp, gg, pg = self._split_rest(covariance)
         border = self._of_exposures(covariance.border)
         pairs, eg = self._split_border(border)
@@ -423,13 +424,13 @@ class EliminateExposures(Elimination):
         )
 
     def _of_exposures(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Values (m, 6, ...) of the exposures from those (k, s, ...) of their cells."""
+        """Return values (m, 6, ...) of the exposures from those of their cells (k, s, ...)."""
         shape = (self.n_cells, self.n_places, EXTERIOR_SIZE, *values.shape[2:])
         return values.reshape(shape)[self.cell, self.place]
 
 
 def choose_elimination(network: Network) -> type[Elimination]:
-    """The elimination that leaves the smaller system."""
+    """Choose the elimination that leaves the smaller system."""
     layout = network.layout
     if layout.without_points.blocks.stop < layout.without_exposures.blocks.stop:
         return EliminatePoints
@@ -440,9 +441,9 @@ def choose_elimination(network: Network) -> type[Elimination]:
 class FactorizedNormalMatrix:
     """A normal matrix after elimination and Cholesky factorization.
 
-    gauge: the directions that the network leaves open, None where there are none.
-    information_factor: part of the weights of the image points that is information (see `Noise`),
-    where the matrix has all of them; 1 where it has that part.
+    gauge: undetermined directions of the network, or None. information_factor: part of the weights
+    of the image points that is information (see `Noise`), if the matrix has the full weights; 1 if
+    it already has that part.
     """
 
     elimination: Elimination
@@ -456,7 +457,7 @@ class FactorizedNormalMatrix:
         return self.elimination.network
 
     def solve(self, right: UnknownVector) -> UnknownVector:
-        """Solution (..., 1) of the normal equations with a right side."""
+        """Solve the normal equations for a right side; returns (..., 1)."""
         block_right, rest_right = self.elimination.right_sides(right)
         found = self.factor.solve(block_right[..., None], rest_right[:, None])
         return self.elimination.to_unknowns(*found)
@@ -465,9 +466,9 @@ class FactorizedNormalMatrix:
 def factorize(
     network: Network, equations: NormalEquations, elimination: type[Elimination] | None = None
 ) -> FactorizedNormalMatrix:
-    """Factorize normal equations; by default the elimination that leaves the smaller system.
+    """Factorize normal equations; by default with the elimination that leaves the smaller system.
 
-    Raises numpy.linalg.LinAlgError where the matrix is singular.
+    Raises numpy.linalg.LinAlgError if the matrix is singular.
     """
     strategy = (elimination or choose_elimination(network))(network)
     factor = strategy.bordered_system(equations).factorize()

@@ -1,17 +1,17 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The data of a bundle adjustment: image points, what they connect, survey, constraints, datum.
+"""Data of a bundle adjustment: image points, their links, survey, constraints and datum.
 
 Datum of a free network: inner constraints over the object points. Without surveyed coordinates the
-images leave seven directions open: the network can be shifted, turned and scaled. The datum makes
-the least-squares similarity transformation between object points and surveyed coordinates the
-identity: B^T (P - P0) = 0, where B holds the seven directions at the surveyed coordinates. The
-adjustment itself fixes other seven directions, which changes neither residuals nor estimable
-quantities; parameters and covariances are transformed into the datum afterwards (S-transformation:
-Baarda, "S-transformations and criterion matrices", Netherlands Geodetic Commission 1973; inner
-constraints in photogrammetry: Granshaw, "Bundle adjustment methods in engineering photogrammetry",
-Photogrammetric Record 10, 1980).
+images leave seven directions undetermined: the network can be shifted, rotated and scaled. The
+datum makes the least-squares similarity transformation between object points and surveyed
+coordinates the identity: B^T (P - P0) = 0, where B contains the seven directions at the surveyed
+coordinates. The adjustment itself fixes another seven directions, which changes neither residuals
+nor estimable quantities; parameters and covariances are transformed into the datum afterwards
+(S-transformation: Baarda, "S-transformations and criterion matrices", Netherlands Geodetic
+Commission 1973; inner constraints in photogrammetry: Granshaw, "Bundle adjustment methods in
+engineering photogrammetry", Photogrammetric Record 10, 1980).
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ from .unknowns import (
     exposures_after_step,
 )
 
-DATUM_DEFECT = 7  # unknowns that the datum of a free network fixes: shift, turn and scale
+DATUM_DEFECT = 7  # unknowns that the datum of a free network fixes: shift, rotation and scale
 
 
 @dataclass(frozen=True)
 class Network:
-    """Image points of one or more fluoroscopes, and what is known about their network.
+    """Image points of one or more fluoroscopes, with prior information on their network.
 
     N image points, m exposures, n object points, F fluoroscopes.
     """
@@ -67,7 +67,7 @@ class Network:
     #: prior
     interior_mean: NDArray[np.float64] | None = None
     interior_sd: NDArray[np.float64] | None = None
-    exterior: ExteriorPrior | None = None  #: what is known of the exterior orientations
+    exterior: ExteriorPrior | None = None  #: prior of the exterior orientations
     #: 'survey': the surveyed coordinates are weighted observations. 'inner': they have no weight,
     #: and inner constraints over the object points define the datum: {'survey', 'inner'}
     datum: str = 'survey'
@@ -131,11 +131,11 @@ class Network:
         return tuple(np.flatnonzero(fluoroscope == f) for f in range(self.n_fluoroscopes))
 
     def rows(self, f: int) -> NDArray[np.int64]:
-        """Rows of the image points of fluoroscope f."""
+        """Return the rows of the image points of fluoroscope f."""
         return self._rows[f]
 
     def additional_correction(self, parameters: Parameters) -> NDArray[np.float64]:
-        """Corrections (N, 2) [px] by the additional parameters; zeros where there are none."""
+        """Return corrections (N, 2) [px] by the additional parameters; zeros if there are none."""
         out = np.zeros_like(self.uv)
         for f, additional in enumerate(self.additional):
             coefficients = parameters.additional[f] if additional is not None else None
@@ -146,7 +146,7 @@ class Network:
     def per_image_point(
         self, parameters: Parameters
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Rotation, position, object point and interior orientation of every image point."""
+        """Return rotation, position, object point and interior orientation by image point."""
         return (
             parameters.rotation[self.exposure],
             parameters.position_mm[self.exposure],
@@ -155,7 +155,7 @@ class Network:
         )
 
     def parameters_after(self, parameters: Parameters, step: UnknownVector) -> Parameters:
-        """Parameters after a step; rotations are varied on the left, R -> exp([w]x) R.
+        """Return parameters after a step; rotations are varied from the left, R -> exp([w]x) R.
 
         The second exposures of constrained pairs follow their constraint (see
         unknowns.exposures_after_step).
@@ -182,33 +182,33 @@ class Network:
 
 
 DATUMS = ('survey', 'inner')
-# Inliers that show an object point where no survey holds it: two may be a false match and its
-# accidental partner.
+# Inliers that an object point without a survey needs: two may be a false match and an accidental
+# partner.
 MIN_RAYS = 3
 
 
 @dataclass(frozen=True)
 class Gauge:
-    """Directions that the images leave open."""
+    """Directions that the images do not determine."""
 
     exteriors: NDArray[np.float64]  #: (m, 6, 7)
     points: NDArray[np.float64]  #: (n, 3, 7)
     globals: NDArray[np.float64]  #: (G, 7) changes of the unknowns along the directions
-    #: (n, 3, 7) B: the directions of the object points at the surveyed coordinates
+    #: (n, 3, 7) B: directions of the object points at the surveyed coordinates
     constraint: NDArray[np.float64]
 
 
 def similarity_directions(
     points: NDArray[np.float64], centre: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Changes (n, 3, 7) of points (n, 3) [mm] by shift, turn and scale about a centre (3,)."""
+    """Return changes (n, 3, 7) of points (n, 3) [mm] by shift, rotation, scale about a centre."""
     offset = points - centre
     shift = np.broadcast_to(np.eye(3), (len(points), 3, 3))
     return np.concatenate([shift, -cross_matrix(offset), offset[:, :, None]], axis=2)
 
 
 def open_gauge(network: Network, parameters: Parameters) -> Gauge | None:
-    """Gauge of a network at some parameters; None where the survey defines the datum."""
+    """Return the gauge of a network at some parameters; None if the survey defines the datum."""
     if network.datum == 'survey':
         return None
     centre = network.survey_mm.mean(axis=0)
@@ -232,10 +232,10 @@ def open_gauge(network: Network, parameters: Parameters) -> Gauge | None:
 def in_determined_datum(
     network: Network, parameters: Parameters, inliers: NDArray[np.bool_]
 ) -> tuple[Network, Parameters]:
-    """Free network whose datum is that of the object points that enough inliers (N,) show.
+    """Define the datum of a free network by object points with enough inliers (N,).
 
-    A point with one ray is anywhere along it. Among those that define the datum, it would shift,
-    turn and scale all others by its own uncertainty.
+    A point with one ray may lie anywhere along it. As part of the datum, it would shift, rotate
+    and scale all other points by its own uncertainty.
     """
     if network.datum == 'survey':
         return network, parameters
@@ -247,20 +247,20 @@ def in_determined_datum(
 def stabilising_factor(
     directions: NDArray[np.float64], diagonal: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Matrix D (q, 7) such that adding D D^T to a normal matrix fixes its open directions.
+    """Return D (q, 7) such that adding D D^T to a normal matrix fixes its undetermined directions.
 
-    directions (q, 7) are open; diagonal (q,) is that of the normal matrix. D D^T is a projector in
-    the unknowns scaled by the diagonal, so that it is as large as the matrix itself.
+    directions (q, 7): undetermined; diagonal (q,): of the normal matrix. D D^T is a projector in
+    the unknowns scaled by the diagonal, so that its size is that of the matrix.
     """
     scaled = diagonal[:, None] * directions
     return np.linalg.solve(np.linalg.cholesky(directions.T @ scaled), scaled.T).T
 
 
 def transform_to_datum(network: Network, parameters: Parameters) -> Parameters:
-    """Parameters of a free network in its datum; unchanged where the survey defines the datum.
+    """Transform the parameters of a free network into its datum.
 
-    Least-squares rotation: Horn, Hilden and Negahdaripour, JOSA A 5, 1988. The scale is the one at
-    which the survey fits the points.
+    They are unchanged if the survey defines the datum. Least-squares rotation: Horn, Hilden and
+    Negahdaripour, JOSA A 5, 1988. The scale is the one at which the survey fits the points.
     """
     if network.datum == 'survey':
         return parameters
@@ -290,8 +290,8 @@ def transform_to_datum(network: Network, parameters: Parameters) -> Parameters:
 class STransformation:
     """Covariances in the datum of a free network: S C S^T with S = 1 - E (B^T E)^-1 B^T.
 
-    gauge: directions E and constraint B; covariance_times_b: the products C B of the covariance C
-    at hand. Blocks are transformed one by one: each side of a block is a pair (H, V) of rows of
+    gauge: directions E and constraint B; covariance_times_b: products C B of the covariance C to
+    transform. Blocks are transformed one by one: each side of a block is a pair (H, V) of rows of
     E (B^T E)^-1 and of C B, from `exteriors`, `points` or `globals`.
     """
 
@@ -308,7 +308,7 @@ class STransformation:
         left: tuple[NDArray[np.float64], NDArray[np.float64]],
         right: tuple[NDArray[np.float64], NDArray[np.float64]],
     ) -> NDArray[np.float64]:
-        """Covariances (..., i, j) in the new datum; left and right are the sides of the block."""
+        """Return covariances (..., i, j) in the new datum; left and right: sides of the block."""
         h_left, v_left = left
         h_right, v_right = right
         h_right_t = np.swapaxes(h_right, -1, -2)

@@ -3,15 +3,15 @@
 
 """Noise models of image points: Student-t, Huber and Gaussian, with estimation of their scale.
 
-An image point has D = 2 coordinates with one scale. q = r^T r / (scale * sigma)^2 is its
-normalised squared residual. Besides the core of the distribution, a share of gross errors (false
-matches) can be estimated, spread evenly over a wide area. If they are left to the tails of the
-Student-t, they make the tails heavy, and good image points are no longer used efficiently.
-Sources: Lange, Little and Taylor, "Robust statistical modeling using the t distribution", JASA
-1989 (weights, information); Liu and Rubin, "ML estimation of the t distribution using EM and its
-extensions, ECM and ECME", Statistica Sinica 1995 (scale and degrees of freedom); Fraley and
-Raftery, "Model-based clustering, discriminant analysis, and density estimation", JASA 2002, 3.1
-(uniform background); Huber, "Robust Statistics", Wiley 1981.
+An image point has D = 2 coordinates with a common scale. q = r^T r / (scale * sigma)^2 is its
+normalised squared residual. In addition to the core of the distribution, a share of gross errors
+(false matches) can be estimated, spread evenly over a wide area. If they are left to the tails of
+the Student-t instead, they make the tails heavy, and good image points are no longer used
+efficiently. Sources: Lange, Little and Taylor, "Robust statistical modeling using the t
+distribution", JASA 1989 (weights, information); Liu and Rubin, "ML estimation of the t
+distribution using EM and its extensions, ECM and ECME", Statistica Sinica 1995 (scale and degrees
+of freedom); Fraley and Raftery, "Model-based clustering, discriminant analysis, and density
+estimation", JASA 2002, 3.1 (uniform background); Huber, "Robust Statistics", Wiley 1981.
 """
 
 from __future__ import annotations
@@ -24,35 +24,35 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize_scalar
 from scipy.special import ndtri
 
-# How far normalised errors scatter beyond what is stated, for limits that tell gross errors.
+# Scatter of normalised errors beyond their stated standard deviations, for limits of gross errors.
 #
-# A limit in standard deviations rejects true observations where these are stated too small. The
-# scale of the errors is observed robustly: the median of those within the limit, over the median
-# of the stated distribution; the limit follows it until it is steady, from the stated one
-# upwards, so that gross errors beyond it do not count (trimmed scale by iteration: Rousseeuw and
-# Leroy, "Robust Regression and Outlier Detection", 1987, 5.1). Only what exceeds chance widens a
-# limit: where the errors are as stated, the factor is 1.
+# A limit in standard deviations rejects true observations if these are stated too small. The scale
+# of the errors is therefore observed robustly: it is the median of the errors within the limit,
+# over the median of the stated distribution. The limit follows the scale until it is steady, from
+# the stated scale upwards, so that gross errors beyond it do not count (trimmed scale by
+# iteration: Rousseeuw and Leroy, "Robust Regression and Outlier Detection", 1987, 5.1). Only an
+# excess over chance widens a limit: if the errors are as stated, the factor is 1.
 
-# Standard deviations that chance seldom exceeds, of a single comparison, and that it hardly ever
-# does (6 in 100,000), of one that accuses, leaves out, or is made many times.
+# Standard deviations that chance seldom exceeds in a single comparison, and that it hardly ever
+# exceeds (6 in 100,000) in a comparison that accuses, excludes, or is made many times.
 SURE = 3.0
 CERTAIN = 4.0
-NORMAL_MEDIAN = float(ndtri(0.75))  # of the absolute value of a standard normal variable
-# Relative standard deviation of the median of n absolute normal errors, times the root of n:
-# 1 / (2 f(m) m) with the density f at the median m. For lengths of errors of two coordinates it is
-# 0.72, but tails can be heavy.
+NORMAL_MEDIAN = float(ndtri(0.75))  # median of the absolute value of a standard normal variable
+# Relative standard deviation of the median of n absolute normal errors, times the root of n: 1 /
+# (2 f(m) m) with the density f at the median m. For lengths of two-coordinate errors it is 0.72,
+# but tails can be heavy.
 MEDIAN_SD = np.sqrt(2 * np.pi) * np.exp(NORMAL_MEDIAN**2 / 2) / (4 * NORMAL_MEDIAN)
-MAX_WIDENING = 2.0  # beyond it, something else than the stated standard deviations is wrong
-MIN_ERRORS = 12  # fewer tell no scale
-WINDOW = 2000  # latest errors of a recording that count
-RENEWED = 0.1  # part of them after which the factor is calculated anew
+MAX_WIDENING = 2.0  # a larger factor has another cause than the stated standard deviations
+MIN_ERRORS = 12  # fewer errors determine no scale
+WINDOW = 2000  # number of latest errors of a recording to use
+RENEWED = 0.1  # part of these errors after which the factor is computed again
 
 
 def trimmed_scale(size: NDArray[np.float64], limit: float) -> tuple[float, int]:
-    """Return the scale of 1 or more of errors without the gross ones, and how many are left.
+    """Return the scale, at least 1, of errors without gross errors, and the number of these.
 
-    size, limit: as of `widening`. With fewer errors than MIN_ERRORS, the scale is 1 and none are
-    left.
+    size, limit: as in `widening`. With fewer errors than MIN_ERRORS, the scale is 1 and the number
+    0.
     """
     size = size[np.isfinite(size)]
     scale = 1.0
@@ -61,18 +61,18 @@ def trimmed_scale(size: NDArray[np.float64], limit: float) -> tuple[float, int]:
         inside = size[size <= limit * scale]
         if len(inside) < MIN_ERRORS:
             return 1.0, 0
-        if len(inside) <= count:  # there are never fewer than before
+        if len(inside) <= count:  # the number never decreases
             return scale, count
         count = len(inside)
         scale = max(1.0, float(np.median(inside)))
 
 
 def widening(size: NDArray[np.float64], limit: float, common: float = 0.0) -> float:
-    """Factor of 1 or more by which errors scatter beyond what is stated and beyond chance.
+    """Return the factor, at least 1, by which errors scatter more than stated and than by chance.
 
-    size: (n,) absolute errors over the median that is expected of them. limit: size beyond which
-    an error is gross. common: part of the stated variance that all errors have in common: it may
-    be far off in all of them, and still as stated.
+    size: (n,) absolute errors over their expected median. limit: size beyond which an error is
+    gross. common: part of the stated variance that is common to all errors; it may be far off in
+    all of them, and still be as stated.
     """
     scale, count = trimmed_scale(size, limit)
     if not count:
@@ -84,7 +84,7 @@ def widening(size: NDArray[np.float64], limit: float, common: float = 0.0) -> fl
 def widening_by_group(
     size: NDArray[np.float64], limit: float, group: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Factors (n,) of errors (n,), each that of its group (n,), such as an exposure."""
+    """Return the factors (n,) of errors (n,) by group (n,), such as an exposure."""
     out = np.ones(len(size))
     order = np.argsort(group, kind='stable')
     starts = np.flatnonzero(np.diff(group[order], prepend=-1))
@@ -94,7 +94,7 @@ def widening_by_group(
 
 
 class ObservedScatter:
-    """Factor by which the latest errors of a recording scatter beyond what is stated."""
+    """Factor by which the latest errors of a recording scatter more than stated."""
 
     def __init__(self) -> None:
         self.factor = 1.0
@@ -103,7 +103,7 @@ class ObservedScatter:
         self._new = 0
 
     def add(self, size: NDArray[np.float64], common: NDArray[np.float64], limit: float) -> None:
-        """Take in errors and their common parts (n,) as `widening` takes them."""
+        """Add errors and their common parts (n,), defined as in `widening`."""
         self._latest.append((size, common))
         self._count += len(size)
         self._new += len(size)
@@ -120,25 +120,25 @@ class ObservedScatter:
 
 LOSSES = ('student_t', 'huber', 'gaussian')
 HUBER_DELTA = 1.345  # 95 % efficiency at the Gaussian (Huber 1981)
-# Below 3, the likelihood rewards an exact fit of some image points at the expense of the others.
+# Below 3, the likelihood rewards an exact fit of some image points at the expense of others.
 # Above 200, a t distribution cannot be distinguished from a Gaussian.
 NU_RANGE = (3.0, 200.0)
-# Area over which gross errors are spread, in squares of scale * sigma, where the image is not
+# Area over which gross errors are spread, in squares of scale * sigma, unless the image is
 # smaller. A factor of ten moves the border between core and gross errors by 0.4 sigma.
 GROSS_AREA = 1e6
-# Share of gross errors.
+# Range of the share of gross errors.
 GROSS_RANGE = (1e-5, 0.4)
-# Smallest redundancy of an image point: with less, its residual says nothing about the noise.
+# Least redundancy of an image point: with less, its residual says nothing about the noise.
 MIN_REDUNDANCY = 0.05
 # 0.9999 quantile of chi-square with two degrees of freedom: about four sigma of each coordinate.
 INLIER_Q = -2 * np.log(1e-4)
-# Share of the true image points that may lie beyond the limit where the tails are heavy.
+# Largest share of the true image points that may lie beyond the limit if the tails are heavy.
 MAX_REJECTED = 1e-3
-# Degrees of freedom with the heaviest tails that widen the limit, to about six sigma: heavier ones
-# are also what a wrong model or many false matches leave.
+# Least degrees of freedom that widen the limit, to about six sigma: heavier tails may also come
+# from a wrong model or many false matches.
 MIN_TAIL_NU = 8.0
-# Iterations of the estimation of the Student-t, and relative changes at which they end. Steps of
-# the scale are cheap compared with the search for nu.
+# Iterations of the estimation of the Student-t, and relative changes at convergence. Steps of the
+# scale are cheap compared with the search for nu.
 MAX_STEPS = 100
 NU_TOLERANCE = 1e-3
 SCALE_TOLERANCE = 1e-4
@@ -153,11 +153,11 @@ class Noise:
     """
 
     loss: str = 'student_t'  #: {'student_t', 'huber', 'gaussian'}
-    scale: float = 1.0  #: scale [px], or a factor of sigma where sigma is given
-    nu: float = 5.0  #: degrees of freedom of the Student-t; infinite for the others
-    #: share of gross errors besides the Student-t. 0: there are none, and none are estimated
+    scale: float = 1.0  #: scale [px], or a factor of sigma if sigma is given
+    nu: float = 5.0  #: degrees of freedom of the Student-t; infinite for other losses
+    #: share of gross errors in addition to the Student-t; 0: none, and none are estimated
     gross: float = 0.0
-    #: area over which gross errors can be spread, in the unit of scale, squared
+    #: largest area over which gross errors can be spread, in squares of the unit of scale
     widest: float = np.inf
 
     def __post_init__(self) -> None:
@@ -170,7 +170,7 @@ class Noise:
             object.__setattr__(self, 'nu', NU_RANGE[1])
 
     def weight(self, q: np.ndarray) -> NDArray[np.float64]:
-        """Weights (n,) of iteratively reweighted least squares for normalised squares q (n,)."""
+        """Return weights (n,) of iteratively reweighted least squares for normalised squares q."""
         if self.loss == 'student_t':
             return self.core_probability(q) * (self.nu + 2) / (self.nu + q)
         if self.loss == 'huber':
@@ -183,7 +183,7 @@ class Noise:
         return float(min(GROSS_AREA, self.widest / self.scale**2))
 
     def core_probability(self, q: np.ndarray) -> NDArray[np.float64]:
-        """Probability (n,) that an image point is not a gross error."""
+        """Return the probability (n,) that an image point is not a gross error."""
         if not self.gross:
             return np.ones_like(q)
         background = self.gross / (1 - self.gross) * 2 * np.pi / self._gross_area
@@ -191,7 +191,7 @@ class Noise:
         return 1 / (1 + background * np.exp(exponent))
 
     def cost(self, q: NDArray[np.float64], sigma: NDArray[np.float64]) -> float:
-        """Negative log-likelihood of image points with normalised squares q (n,), sigma (n,)."""
+        """Return the negative log-likelihood of image points with squares q (n,), sigma (n,)."""
         if self.loss == 'student_t':
             # Logarithm of the bivariate t density; its constant is Gamma(nu/2 + 1)/(Gamma(nu/2) nu
             # pi) = 1/(2 pi).
@@ -213,7 +213,7 @@ class Noise:
         )
 
     def information_factor(self, q: NDArray[np.float64]) -> float:
-        """Fisher information over the expected weighted normal matrix.
+        """Return the Fisher information over the expected weighted normal matrix.
 
         The weighted normal matrix of a robust fit is optimistic. For the t with D = 2 the factor
         is (nu+2)/(nu+4) (Lange et al. 1989). For Huber it is that of the sandwich covariance, from
@@ -228,12 +228,12 @@ class Noise:
         return float(np.mean(slope) ** 2 / (np.mean(w * w * q) / 2 * np.mean(w)))
 
     def inliers(self, q: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """True (n,) where an image point belongs to the core of the distribution."""
+        """Return True (n,) for image points in the core of the distribution."""
         return q <= INLIER_Q
 
     @property
     def median(self) -> float:
-        """Median of the normalised square of image points that are no gross errors.
+        """Median of the normalised square of image points that are not gross errors.
 
         P(q > x) = (1 + x/nu)^(-nu/2) for D = 2.
         """
@@ -243,11 +243,11 @@ class Noise:
 
     @property
     def limit(self) -> float:
-        """Normalised square beyond which an image point is taken for a gross error.
+        """Normalised square beyond which an image point is considered a gross error.
 
-        About four sigma; of heavier tails, which a Student-t has with few degrees of freedom, the
-        quantile that rejects MAX_REJECTED of the true points: P(q > x) = (1 + x/nu)^(-nu/2) for
-        D = 2, with nu of MIN_TAIL_NU or more.
+        It is about four sigma. For heavier tails, as of a Student-t with few degrees of freedom,
+        it is the quantile that rejects MAX_REJECTED of the true points: P(q > x) = (1 +
+        x/nu)^(-nu/2) for D = 2, with nu of at least MIN_TAIL_NU.
         """
         if self.loss != 'student_t':
             return float(INLIER_Q)
@@ -256,14 +256,15 @@ class Noise:
         return float(max(INLIER_Q, tail))
 
     def accepts(self, q: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """True (n,) where an image point is no gross error, for this noise with its own tails."""
+        """Return True (n,) for image points that are not gross errors by this noise model."""
         return (q <= self.limit) & (self.core_probability(q) >= 0.5)
 
     def estimate_from(self, squared: ArrayLike, unresolved: ArrayLike = 0.0) -> Noise:
-        """Noise model with its scale and, for Student-t, nu and share of gross errors estimated.
+        """Estimate the scale and, for Student-t, nu and the share of gross errors.
 
-        Method: ECME, started from this model. The unknowns of the adjustment are missing data, so
-        the expected squared error is that of the residual plus what the unknowns leave unresolved.
+        Method: ECME, starting from this model. The unknowns of the adjustment are missing data, so
+        the expected squared error is that of the residual plus the part that the unknowns leave
+        unresolved.
 
         squared: (n,) squared residuals r^T r / sigma^2 of the image points. unresolved: (n,) tr(A
         C A^T) / (scale * sigma)^2 of each image point; for a point of weight one it is two minus
@@ -284,7 +285,7 @@ class Noise:
     def _estimate_student_t(
         self, squared: NDArray[np.float64], unresolved: NDArray[np.float64]
     ) -> Noise:
-        """Student-t with scale, nu and share of gross errors."""
+        """Estimate scale, nu and share of gross errors of a Student-t."""
         noise = self
         variance = self.scale**2
         for _ in range(MAX_STEPS):
@@ -301,7 +302,7 @@ class Noise:
     def _estimate_variance(
         self, variance: float, squared: NDArray[np.float64], unresolved: NDArray[np.float64]
     ) -> tuple[Noise, float, NDArray[np.float64]]:
-        """Share of gross errors, variance and core probabilities (n,) for the present nu."""
+        """Estimate share of gross errors, variance and core probabilities (n,) for present nu."""
         noise = self
         nu = self.nu
         for _ in range(MAX_STEPS):
@@ -322,14 +323,14 @@ DEFAULT_NOISE = Noise()
 
 
 def _weighted_median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
-    """Median of values (n,) with weights (n,)."""
+    """Return the median of values (n,) with weights (n,)."""
     order = np.argsort(values)
     sums = np.cumsum(weights[order])
     return float(values[order][np.searchsorted(sums, sums[-1] / 2)])
 
 
 def _estimate_nu(q: NDArray[np.float64], share: NDArray[np.float64]) -> float:
-    """Degrees of freedom of bivariate t variables with squared norms q (n,) and weights (n,)."""
+    """Estimate nu of bivariate t variables with squared norms q (n,) and weights share (n,)."""
 
     def cost(log_nu: float) -> float:
         nu = np.exp(log_nu)

@@ -26,10 +26,10 @@ from .unknowns import (
     discrepancies_with_jacobian,
 )
 
-# Image points that are linearised at once: their arrays stay in the cache.
+# Image points that are linearised at once, so that their arrays stay in the cache.
 CHUNK = 8_000
-# Smallest weight of a gross error, so that its variance stays finite, and in a free network, where
-# no survey holds a point that is left with one ray: it moves nothing, and only that point, not the
+# Least weight of a gross error. It keeps the variance finite. In a free network, where no survey
+# determines a point with a single remaining ray, it affects nothing else: only that point, not the
 # whole network, is found to be undetermined.
 MIN_WEIGHT = 1e-8
 
@@ -59,7 +59,7 @@ class NormalEquations:
 def _by_component(
     values: NDArray[np.float64], index: NDArray[np.int64] | None = None
 ) -> NDArray[np.float64]:
-    """Components of values (n, ...) as rows (c, n), or (c, N) taken at index (N,)."""
+    """Return components of values (n, ...) as rows (c, n), or (c, N) at index (N,)."""
     rows = values.reshape(len(values), -1).T
     return np.ascontiguousarray(rows) if index is None else np.take(rows, index, axis=1)
 
@@ -80,7 +80,7 @@ class _SensorPoints:
 
 
 def _to_sensor(network: Network, parameters: Parameters, rows: slice) -> _SensorPoints:
-    """Object points of the image points `rows` in the sensor frame."""
+    """Return the object points of the image points `rows` in the sensor frame."""
     exposure = network.exposure[rows]
     rotation = _by_component(parameters.rotation, exposure)
     offset = _by_component(parameters.points_mm, network.point[rows]) - _by_component(
@@ -99,7 +99,7 @@ def _to_sensor(network: Network, parameters: Parameters, rows: slice) -> _Sensor
 
 
 def project_network(network: Network, parameters: Parameters) -> NDArray[np.float64]:
-    """Image points (N, 2) [px] of a network; NaN where a point is behind the source."""
+    """Return image points (N, 2) [px] of a network; NaN if a point is behind the source."""
     out = np.empty_like(network.uv)
     for start in range(0, len(out), CHUNK):
         rows = slice(start, start + CHUNK)
@@ -126,9 +126,10 @@ class _Linearised:
     def by_image_point(
         self,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Arrays (k, 2, ...) with one image point a row.
+        """Return arrays (k, 2, ...) by image point.
 
-        Derivatives by exterior orientation, object point and interior orientation, and residuals.
+        They are derivatives by exterior orientation, object point and interior orientation, and
+        residuals.
         """
         a = np.stack([self.u.T, self.v.T], axis=1)
         a_p = np.stack([self.pu.T, self.pv.T], axis=1)
@@ -137,7 +138,7 @@ class _Linearised:
 
 @dataclass(frozen=True)
 class _Linearisation:
-    """The weighted problem: correction (N, 2) [px] by models and additional parameters."""
+    """The weighted problem; correction (N, 2) [px]: by models and additional parameters."""
 
     network: Network
     parameters: Parameters
@@ -146,11 +147,11 @@ class _Linearisation:
     image_factor: float
 
     def at(self, rows: slice) -> _Linearised:
-        """Derivatives of the image points `rows`.
+        """Return the derivatives of the image points `rows`.
 
-        With s the derivative of the image point by the point X in the sensor frame, those by P, T
-        and w are s R, -s R and -s [X]x. T is turned into the sensor frame here; turning it back is
-        the same for a whole exposure, and is done after summation.
+        Let s be the derivative of the image point by the point X in the sensor frame. The
+        derivatives by P, T and w are s R, -s R and -s [X]x. T is rotated into the sensor frame
+        here; rotating it back is the same for a whole exposure, and is done after summation.
         """
         network = self.network
         sensor = _to_sensor(network, self.parameters, rows)
@@ -190,9 +191,9 @@ def _add_by_point(
 ) -> None:
     """Add products of k image points to the sums by object point, and fill in pe (k, 18).
 
-    point (k,) are their object points. The sums (18, n) are the products with P and the residual -
-    xx, xy, xz, yy, yz, zz, rx, ry, rz - and by component of P those with xp, yp and c. A product
-    with T is one with P with the opposite sign.
+    point (k,): their object points. sums (18, n): the products with P and the residual - xx, xy,
+    xz, yy, yz, zz, rx, ry, rz - and, by component of P, those with xp, yp and c. A product with T
+    is the negative product with P.
     """
     n = sums.shape[1]
     number = 0
@@ -214,10 +215,10 @@ def _add_by_point(
 
 
 def _chunks(network: Network) -> Iterator[tuple[int, int, NDArray[np.int64]]]:
-    """Ranges of exposures of one fluoroscope with about CHUNK image points.
+    """Yield ranges of exposures of one fluoroscope with about CHUNK image points.
 
-    Yields the first exposure, the one after the last, and the rows (k + 1,) at which the image
-    points of the k exposures start and end.
+    Each has the first exposure, the exposure after the last, and the rows (k + 1,) at which the
+    image points of the k exposures start and end.
     """
     m = network.n_exposures
     starts = np.searchsorted(network.exposure, np.arange(m + 1))
@@ -236,7 +237,7 @@ class _ImageSums:
     """Products of the linearised image points.
 
     by_exposure (m, 10, 10) with the rows of _Linearised.u; by_point (F, 18, n) of _add_by_point;
-    pe (N, 3, 6); linearised: the chunks, where additional parameters need them.
+    pe (N, 3, 6); linearised: the chunks, if additional parameters need them.
     """
 
     by_exposure: NDArray[np.float64]
@@ -277,7 +278,7 @@ def normal_equations(
     noise: Noise,
     image_factor: float = 1.0,
 ) -> NormalEquations:
-    """Normal equations of the weighted linearised problem.
+    """Return the normal equations of the weighted linearised problem.
 
     Parameters
     ----------
@@ -285,7 +286,7 @@ def normal_equations(
     parameters : Parameters
         Values at which the problem is linearised.
     correction : (N, 2) ndarray or float
-        Correction of the image points [px], without that of the additional parameters.
+        Correction of the image points [px], excluding the additional parameters.
     noise : Noise
         Noise model; its weights are those at the residuals.
     image_factor : float
@@ -325,9 +326,9 @@ def normal_equations(
 def right_sides(
     network: Network, parameters: Parameters, correction: NDArray[np.float64] | float, noise: Noise
 ) -> UnknownVector:
-    """Right sides of `normal_equations` alone, for a network without relative orientations.
+    """Return the right sides of `normal_equations`, for a network without relative orientations.
 
-    It takes a small part of the time where there are additional parameters.
+    With additional parameters, this takes a small part of the time.
     """
     correction = correction + network.additional_correction(parameters)
     correction = np.broadcast_to(correction, network.uv.shape)
@@ -364,26 +365,26 @@ def right_sides(
 
 
 def _survey_weight(network: Network) -> NDArray[np.float64]:
-    """Weights (n, 1) of the surveyed coordinates; zeros in a free network."""
+    """Return the weights (n, 1) of the surveyed coordinates; zeros in a free network."""
     if network.datum != 'survey':
         return np.zeros((network.n_points, 1))
     return 1 / network.survey_sd_mm[:, None] ** 2
 
 
 def _survey_pull(network: Network, parameters: Parameters) -> NDArray[np.float64]:
-    """What the survey adds (n, 3) to the right side."""
+    """Return the contribution (n, 3) of the survey to the right side."""
     return _survey_weight(network) * (network.survey_mm - parameters.points_mm)
 
 
 def _exterior_pull(network: Network, parameters: Parameters) -> NDArray[np.float64]:
-    """What known exterior orientations add (m, 6) to the right side."""
+    """Return the contribution (m, 6) of known exterior orientations to the right side."""
     assert network.exterior is not None
     off = network.exterior.discrepancies(parameters.rotation, parameters.position_mm)
     return -network.exterior.weights * off
 
 
 def _interior_pull(network: Network, parameters: Parameters) -> NDArray[np.float64]:
-    """What the prior of the interior orientations adds (3 F,) to the right side."""
+    """Return the contribution (3 F,) of the prior of interior orientations to the right side."""
     assert network.interior_mean is not None
     return (network.interior_weight * (network.interior_mean - parameters.interior)).ravel()
 
@@ -391,7 +392,7 @@ def _interior_pull(network: Network, parameters: Parameters) -> NDArray[np.float
 def _point_blocks(
     network: Network, parameters: Parameters, sums: _ImageSums
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Blocks pp (n, 3, 3) and right side p (n, 3), with the survey."""
+    """Return blocks pp (n, 3, 3) and right side p (n, 3), including the survey."""
     products = sums.by_point[:, :9].sum(axis=0)
     symmetric = products[[0, 1, 2, 1, 3, 4, 2, 4, 5]].T.reshape(-1, 3, 3)
     pp = symmetric + _survey_weight(network)[:, :, None] * np.eye(3)
@@ -410,7 +411,7 @@ class _GlobalBlocks:
 
     @classmethod
     def zeros(cls, network: Network) -> _GlobalBlocks:
-        """Blocks of zeros."""
+        """Return blocks of zeros."""
         size = network.layout.n_globals
         return cls(
             network,

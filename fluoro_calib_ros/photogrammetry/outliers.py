@@ -3,15 +3,15 @@
 
 """Outliers and noise of an adjusted network.
 
-Tests of single image points and surveyed coordinates for gross errors.
+Single image points and surveyed coordinates are tested for gross errors.
 
 Data snooping (Baarda, "A testing procedure for use in geodetic networks", Netherlands Geodetic
-Commission 1968) for observations of two and three coordinates: each is compared with what all
-other observations predict. Under robust weights an adjustment hardly follows a gross error, so its
-residual is tested by its covariance at full weight. With P = A C_x A^T and weight w, the residual
-without the observation is (1 - w P / s^2)^-1 r, with covariance s^2 + P (1 - w P / s^2)^-1
-(Foerstner and Wrobel, "Photogrammetric Computer Vision", Springer 2016, 4.6). Where the scale is
-estimated from the same residuals, Pope's test replaces chi-square (NOAA TR NOS 65 NGS 1, 1976).
+Commission 1968) for observations of two and three coordinates: each observation is compared with
+its prediction by all others. Under robust weights an adjustment hardly follows a gross error, so
+its residual is tested by its covariance at full weight. With P = A C_x A^T and weight w, the
+residual without the observation is (1 - w P / s^2)^-1 r, with covariance s^2 + P (1 - w P /
+s^2)^-1 (Foerstner and Wrobel, "Photogrammetric Computer Vision", Springer 2016, 4.6). If the scale
+is estimated from the same residuals, Pope's test replaces chi-square (NOAA TR NOS 65 NGS 1, 1976).
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from .normal_equations import MIN_WEIGHT, normal_equations
 from .precision import Precision, covariance_blocks, variance_of_projection
 from .unknowns import Parameters
 
-# Probability of any false alarm among all that is tested: image points, targets, terms.
+# Probability of any false alarm among all tests: image points, targets, terms.
 SIGNIFICANCE = 0.01
 FALSE_ALARM = 2e-3  # chance that one test of good observations fails
-# Smallest eigenvalue of the scaled normal matrix of an intersection.
+# Least eigenvalue of the scaled normal matrix of an intersection.
 MIN_INTERSECTION_EIGENVALUE = 1e-4
-# The same of a test that says what contradicts what: rays, beads and their survey, false matches.
+# FALSE_ALARM for a test that says what contradicts what: rays, beads and survey, false matches.
 CONTRADICTION = 1e-3
 
 
@@ -50,7 +50,7 @@ class Outliers:
     target: NDArray[np.int64]  #: (l,) rows of object points
     target_value: NDArray[np.float64]  #: (l,) their statistics
     critical_target: float  #: critical value of the targets
-    #: (l, 3) position of the targets in the images minus their survey
+    #: (l, 3) position of the targets by the images minus their survey
     offset_mm: NDArray[np.float64]
     tested: tuple[int, int]  #: numbers of image points and of targets that could be tested
 
@@ -59,20 +59,20 @@ class Outliers:
 class TargetTest:
     """Test of the surveyed coordinates of all targets."""
 
-    value: NDArray[np.float64]  #: (n,) statistics; NaN where a target cannot be tested
+    value: NDArray[np.float64]  #: (n,) statistics; NaN for a target that cannot be tested
     critical: float  #: critical value
-    #: (n, 3) position of the targets in the images minus their survey; zeros where not tested
+    #: (n, 3) position of the targets by the images minus their survey; zeros if not tested
     offset_mm: NDArray[np.float64]
     #: (N,) statistics of the image points at the intersected targets
     ray_square: NDArray[np.float64]
 
 
 def find_outliers(network: Network, adjustment: Adjustment, precision: Precision) -> Outliers:
-    """Image points and targets that fail the test."""
+    """Find image points and targets that fail the test."""
     targets = target_statistics(network, adjustment, precision)
     wrong = np.flatnonzero(targets.value > targets.critical)
     image, critical_image = image_statistics(network, adjustment, precision)
-    # An image point that fits its target where the images see it is not at fault.
+    # An image point that fits its target at the position by the images is not at fault.
     explained = np.isin(network.point, wrong) & (targets.ray_square <= critical_image)
     found = np.flatnonzero((image > critical_image) & ~explained)
     return Outliers(
@@ -93,9 +93,9 @@ def image_statistics(
     precision: Precision,
     significance: float = SIGNIFICANCE,
 ) -> tuple[NDArray[np.float64], float]:
-    """Statistics (N,) of the image points and their critical value.
+    """Return statistics (N,) of the image points, and their critical value.
 
-    A statistic is NaN where the redundancy is too small.
+    A statistic is NaN if the redundancy is too small.
     """
     noise = adjustment.noise
     weight = np.maximum(noise.weight(adjustment.q), MIN_WEIGHT)
@@ -114,14 +114,14 @@ def image_statistics(
     count = max(int(tested.sum()), 1)
     redundancy = float(precision.redundancy.sum())
     if noise.loss == 'gaussian':
-        # Refer to the variance estimated without the image point, which contributes to it.
+        # Use the variance without the contribution of the image point itself.
         value = value * (redundancy - 2) / np.maximum(redundancy - value, 1e-3 * redundancy)
     critical = 2 * _f_limit(significance / count, min(noise.nu, redundancy - 2))
     return np.where(tested, value, np.nan), float(critical)
 
 
 def _f_limit(probability: float, freedom: float) -> float:
-    """Value that F of 2 and some degrees of freedom exceeds with a probability.
+    """Return the value that F of 2 and `freedom` degrees of freedom exceeds with a probability.
 
     F of 2 and n exceeds x with the probability (1 + 2 x / n)^(-n / 2).
     """
@@ -163,8 +163,8 @@ def target_statistics(
 class _Rays:
     """Rays of the image points with the uncertainty of their orientations.
 
-    derivative (N, 2, 3) by the object points; information (N, 2, 2) inverse covariances [1/px^2];
-    residual (N, 2) [px] at the surveyed coordinates.
+    derivative (N, 2, 3): by the object points; information (N, 2, 2): inverse covariances
+    [1/px^2]; residual (N, 2) [px]: at the surveyed coordinates.
     """
 
     derivative: NDArray[np.float64]
@@ -173,7 +173,7 @@ class _Rays:
 
 
 def _rays_of(network: Network, adjustment: Adjustment, precision: Precision) -> _Rays:
-    """Rays of all image points."""
+    """Return the rays of all image points."""
     parameters = adjustment.parameters
     e = network.exposure
     f = network.fluoroscope[e]
@@ -201,8 +201,8 @@ def _intersect(
     """Intersect the targets from their rays.
 
     Returns offsets (n, 3) [mm], their covariances (n, 3, 3) and squares (N,) of the rays'
-    residuals. Rays of one target that contradict each other are downweighted; offsets are NaN
-    where fewer than two are left.
+    residuals. Rays of one target that contradict each other are downweighted; offsets are NaN if
+    fewer than two rays remain.
     """
     n = network.n_points
     p = network.point
@@ -210,7 +210,7 @@ def _intersect(
     weight = np.ones(len(p))
     offset = np.zeros((n, 3))
     covariance = np.tile(np.eye(3), (n, 1, 1))
-    for _ in range(15):  # of the weights
+    for _ in range(15):  # iterations of reweighting
         weighted = (weight[:, None, None] * a.transpose(0, 2, 1)) @ rays.information
         normal = np.zeros((n, 3, 3))
         right = np.zeros((n, 3))
@@ -219,7 +219,7 @@ def _intersect(
         count = np.bincount(p, weight, n)
         scale = np.sqrt(np.maximum(np.diagonal(normal, axis1=1, axis2=2), 1e-300))
         smallest = np.linalg.eigvalsh(normal / scale[:, :, None] / scale[:, None, :])[:, 0]
-        # Two rays, or nearly so by their weights.
+        # two rays, or nearly so by their weights
         good = (count > 1.5) & (smallest > MIN_INTERSECTION_EIGENVALUE)
         covariance[good] = np.linalg.inv(normal[good])
         offset[good] = (covariance[good] @ right[good][..., None])[..., 0]
@@ -232,23 +232,24 @@ def _intersect(
     return offset, covariance, square
 
 
-# Estimation of the noise model around the adjustment, from the marginal likelihood of its scale.
+# Estimation of the noise model in a loop around the adjustment, by the marginal likelihood of its
+# scale.
 #
-# Residuals are smaller than the noise, because the unknowns follow it. How much smaller depends on
-# the scale itself: the less the image points weigh, the more the survey holds the object points.
-# Adjustment and expected squared errors are therefore updated in turn until the scale settles: the
-# EM algorithm with the unknowns as missing data (Dempster, Laird and Rubin, JRSS B 39, 1977; for
-# variance components in photogrammetry Foerstner and Wrobel, "Photogrammetric Computer Vision",
-# Springer 2016, 4.2.4).
+# Residuals are smaller than the noise, because the unknowns follow it. The difference depends on
+# the scale itself: the less the image points weigh, the more the survey determines the object
+# points. Adjustment and expected squared errors are therefore updated alternately until the scale
+# settles. This is the EM algorithm with the unknowns as missing data (Dempster, Laird and Rubin,
+# JRSS B 39, 1977; for variance components in photogrammetry Foerstner and Wrobel, "Photogrammetric
+# Computer Vision", Springer 2016, 4.2.4).
 
-# Relative change of the scale at which the rounds end: a hundredth of its standard deviation.
+# Relative change of the scale at convergence: a hundredth of its standard deviation.
 SETTLED = 2e-3
 # Tolerance of the adjustments before the last one.
 LOOSE = 0.1
-# No target is measured better than this. Where redundancy is scarce, the scale could vanish.
+# No target is measured better than this. With little redundancy, the scale could vanish.
 MIN_NOISE_PX = 0.01
-# Part of the image points of an exposure that are no gross errors, from which its start values
-# are good: with half of its matches false it is about 0.5, with wrong start values nearly zero.
+# Share of the image points of an exposure that must not be gross errors if its initial values are
+# good: with half of the matches false it is about 0.5, with wrong initial values nearly zero.
 MIN_CORE = 0.25
 
 
@@ -261,11 +262,12 @@ def adjust_and_estimate_noise(
 ) -> Adjustment:
     """Adjust a network and estimate its noise model; see `adjust` for the arguments.
 
-    noise: loss and start values of the noise model. options: of the last adjustment; those before
-    it have a looser tolerance.
+    noise: loss and initial values of the noise model. options: of the last adjustment; earlier
+    adjustments have a looser tolerance.
 
-    `converged` of the result is False where adjustment or scale did not settle, `steps` are those
-    of the last adjustment. Raises LinAlgError where the network does not determine the unknowns.
+    `converged` of the result is False if the adjustment or the scale did not settle; `steps`
+    counts the last adjustment only. Raises LinAlgError if the network does not determine the
+    unknowns.
     """
     correction = np.zeros_like(network.uv) if correction is None else correction
     _, q = residuals_and_q(network, start, correction, noise)
@@ -274,7 +276,7 @@ def adjust_and_estimate_noise(
     loose = replace(options, tolerance=LOOSE)
     parameters = start
     settled = False
-    for _ in range(40):  # of which it takes a few
+    for _ in range(40):  # a few are enough
         result = adjust(
             network,
             parameters,
@@ -301,10 +303,10 @@ def adjust_and_estimate_noise(
 
 
 def _first_noise(network: Network, squared: NDArray[np.float64], noise: Noise) -> Noise:
-    """Return the noise model at the start values; squared (N,): residuals over sigma, squared.
+    """Return the noise model at the initial values; squared (N,): squared residuals over sigma.
 
-    Far from the solution, whole exposures may look like gross errors: these are told apart only
-    where every exposure has image points that are none.
+    Far from the solution, whole exposures may look like gross errors. Gross errors are therefore
+    estimated only if every exposure has image points that are not gross errors.
     """
     area = np.prod(np.ptp(network.uv, axis=0)) / np.median(network.sigma) ** 2
     noise = replace(noise, widest=max(float(area), 1.0))
@@ -320,9 +322,9 @@ def _first_noise(network: Network, squared: NDArray[np.float64], noise: Noise) -
 def estimate_noise(
     network: Network, adjustment: Adjustment, blocks: CovarianceBlocks, factor: float = 1.0
 ) -> Noise:
-    """Noise model from the residuals of an adjustment and the covariances of its unknowns.
+    """Estimate the noise model from the residuals of an adjustment and covariances of unknowns.
 
-    factor: information factor near one that the covariances are without.
+    factor: information factor near one that the covariances do not include.
     """
     noise = adjustment.noise
     variance = (noise.scale * network.sigma) ** 2

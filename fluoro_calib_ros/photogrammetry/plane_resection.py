@@ -4,13 +4,13 @@
 """Resection from targets in one plane: grids, boards, and the visible face of a phantom.
 
 The image of a plane is a homography (Hartley and Zisserman, "Multiple View Geometry", 2nd ed.,
-2004, 4.1 and 8.1). It gives the exterior orientation where the interior orientation is known, and
-where the plane is tilted one condition each for principal distance and principal point (Zhang,
-"A flexible new technique for camera calibration", IEEE Trans. Pattern Anal. Mach. Intell. 22,
-2000). A narrow beam images a plane nearly as parallel projection would, which does not tell a tilt
-from the opposite one: each pose has a second one, mirrored at the line of sight (Schweighofer and
-Pinz, "Robust pose estimation from a planar target", IEEE Trans. Pattern Anal. Mach. Intell. 28,
-2006).
+2004, 4.1 and 8.1). It gives the exterior orientation if the interior orientation is known. If the
+plane is tilted, it also gives one condition each for principal distance and principal point
+(Zhang, "A flexible new technique for camera calibration", IEEE Trans. Pattern Anal. Mach. Intell.
+22, 2000). A narrow beam images a plane nearly like a parallel projection, which cannot
+discriminate a tilt from the opposite tilt: each pose has a second pose, mirrored at the line of
+sight (Schweighofer and Pinz, "Robust pose estimation from a planar target", IEEE Trans. Pattern
+Anal. Mach. Intell. 28, 2006).
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ from .resection import (
 )
 
 SAMPLE_SIZE = 4  # a homography has 8 unknowns, and a target gives two equations
-# Smallest singular value of the conditions on the principal distance over the largest possible one
-# below which no plane is tilted enough to find it: some 3 degrees in a beam of 15 degrees.
+# Smallest singular value of the conditions on the principal distance, over its largest possible
+# value, below which no plane is tilted enough: some 3 degrees in a beam of 15 degrees.
 MIN_TILT = 1e-3
 
 
@@ -49,12 +49,12 @@ class Plane:
     axes: NDArray[np.float64]
 
     def coordinates(self, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Coordinates (n, 2) [mm] in the plane of targets (n, 3)."""
+        """Return the coordinates (n, 2) [mm] of targets (n, 3) in the plane."""
         return (xyz - self.centre_mm) @ self.axes[:2].T
 
 
 def flatness(xyz: NDArray[np.float64]) -> float:
-    """Smallest over largest extent of targets (n, 3): 0 for a plane, about 1 for a cube."""
+    """Return smallest over largest extent of targets (n, 3): 0 for a plane, about 1 for a cube."""
     extent = np.linalg.svd(xyz - xyz.mean(axis=0), compute_uv=False)
     return float(extent[-1] / extent[0]) if extent[0] > 0 else 0.0
 
@@ -72,7 +72,7 @@ def plane_of(xyz: NDArray[np.float64]) -> Plane:
 def homography(
     xy: NDArray[np.float64], uv: NDArray[np.float64], weights: NDArray[np.float64] | None = None
 ) -> NDArray[np.float64]:
-    """Homographies (..., 3, 3) with uv ~ H (xy, 1) by the direct linear transformation.
+    """Return homographies (..., 3, 3), uv ~ H (xy, 1), by the direct linear transformation.
 
     xy (..., n, 2), uv (..., n, 2) and weights (..., n) of n >= 4 points. Coordinates are
     normalised (Hartley and Zisserman, algorithm 4.2).
@@ -86,7 +86,7 @@ def homography(
 
 
 def _normalised(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Points (..., n, 2) about zero at a mean distance of about one; the matrix back from them."""
+    """Return points (..., n, 2) centred and scaled to about one, and the matrix that reverts this."""
     mean = points.mean(axis=-2, keepdims=True)
     square = np.mean(np.sum((points - mean) ** 2, axis=-1), axis=-1)[..., None, None]
     size = np.sqrt(np.maximum(square, 1e-300) / 2)
@@ -98,11 +98,11 @@ def _normalised(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArr
 
 
 def robust_homography(xy: NDArray[np.float64], uv: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Homography (3, 3) of targets of which up to half may be falsely matched.
+    """Return the homography (3, 3) of targets with up to half false matches.
 
     The sample with the least median of squared residuals (Rousseeuw 1984) is refined on all points
-    with robust weights. xy (n, 2) [mm] and uv (n, 2) [px] of n >= 8 targets. Raises DataError
-    where they are too few or their image points lie on a line.
+    with robust weights. xy (n, 2) [mm] and uv (n, 2) [px] of n >= 8 targets. Raises DataError if
+    there are too few targets, or their image points lie on a line.
     """
     if len(xy) < MIN_TARGETS:
         raise DataError(f'{len(xy)} targets are too few for a resection, {MIN_TARGETS} are needed')
@@ -124,11 +124,11 @@ def robust_homography(xy: NDArray[np.float64], uv: NDArray[np.float64]) -> NDArr
 def principal_distance_of_planes(
     homographies: Sequence[NDArray[np.float64]], principal_point: NDArray[np.float64]
 ) -> float | None:
-    """Principal distance [px] from homographies (3, 3) of planes in mm, None: no plane is tilted.
+    """Return the principal distance [px] by homographies (3, 3) of planes in mm.
 
-    Zhang's conditions h1' B h2 = 0 and h1' B h1 = h2' B h2 with B = K^-T K^-1; with the principal
-    point (2,) [px] known they are linear in 1/c^2. They are weighted with what they tell of it: a
-    plane that is not tilted tells nothing.
+    None: no plane is tilted. Zhang's conditions are h1' B h2 = 0 and h1' B h1 = h2' B h2 with B =
+    K^-T K^-1; for a known principal point (2,) [px] they are linear in 1/c^2. They are weighted by
+    their information on it; a plane that is not tilted has none.
     """
     product = 0.0
     size = 0.0
@@ -152,15 +152,15 @@ def principal_distance_of_planes(
 def poses_of_homography(
     found: NDArray[np.float64], plane: Plane, interior: NDArray[np.float64]
 ) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Rotation (3, 3) and position (3,) [mm] of a homography, and those mirrored.
+    """Return rotation (3, 3) and position (3,) [mm] by a homography, and the mirrored pose.
 
     interior (3,) [px]. The second pose is that of the plane mirrored at the line of sight to the
-    middle of the targets.
+    centre of the targets.
     """
     xp, yp, c = interior
     m = np.linalg.solve(np.array([[c, 0, xp], [0, c, yp], [0, 0, 1.0]]), found)
     m = m / np.sqrt(np.linalg.norm(m[:, 0]) * np.linalg.norm(m[:, 1]))
-    if m[2, 2] < 0:  # the middle of the targets is before the source
+    if m[2, 2] < 0:  # the centre of the targets is in front of the source
         m = -m
     u, _, vt = np.linalg.svd(m[:, :2], full_matrices=False)
     first = u @ vt
@@ -170,13 +170,13 @@ def poses_of_homography(
 def mirrored_pose(
     rotation: NDArray[np.float64], position: NDArray[np.float64], plane: Plane
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Rotation (3, 3) and position (3,) of the pose mirrored at the line of sight."""
+    """Return rotation (3, 3) and position (3,) of the pose mirrored at the line of sight."""
     middle = rotation @ (plane.centre_mm - position)
     return _pose(_mirrored(rotation @ plane.axes[:2].T, middle), middle, plane)
 
 
 def _mirrored(axes: NDArray[np.float64], middle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Axes (3, 2) of a plane in the sensor frame, mirrored at the line of sight to its middle."""
+    """Mirror the axes (3, 2) of a plane in the sensor frame at the line of sight to its centre."""
     sight = middle / np.linalg.norm(middle)
     return axes - 2 * np.outer(sight, sight @ axes)
 
@@ -184,12 +184,12 @@ def _mirrored(axes: NDArray[np.float64], middle: NDArray[np.float64]) -> NDArray
 def _pose(
     axes: NDArray[np.float64], middle: NDArray[np.float64], plane: Plane
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Pose with these axes (3, 2) and middle (3,) of the plane in the sensor frame."""
+    """Return the pose with these axes (3, 2) and centre (3,) of the plane in the sensor frame."""
     turned = np.column_stack([axes, np.cross(axes[:, 0], axes[:, 1])])
     rotation = turned @ plane.axes
     return rotation, plane.centre_mm - rotation.T @ middle
 
 
 def tilt_of(rotation: NDArray[np.float64], plane: Plane) -> float:
-    """Angle [rad] between the normal of a plane and the axis of the sensor."""
+    """Return the angle [rad] between the normal of a plane and the axis of the sensor."""
     return float(np.arccos(min(abs(rotation[2] @ plane.axes[2]), 1.0)))

@@ -24,8 +24,8 @@ from .normal_equations import CHUNK, MIN_WEIGHT, NormalEquations, normal_equatio
 from .rotations import square_of_lower
 from .unknowns import Parameters, UnknownVector, discrepancies_with_jacobian
 
-# Object points up to which their covariances with each other are kept. The more there are, the
-# less these matter: what all have in common is the datum.
+# Largest number of object points whose joint covariance is stored. The more there are, the less it
+# matters: their common part is the datum.
 MAX_JOINT_POINTS = 150
 
 
@@ -33,11 +33,11 @@ MAX_JOINT_POINTS = 150
 class Precision:
     """Covariances and redundancy numbers of an adjustment.
 
-    The redundancy numbers sum to the number of observations less that of the unknowns, where no
+    The redundancy numbers sum to the number of observations less the number of unknowns, unless a
     prior adds to them.
     """
 
-    #: (F, 3, 3) of the interior orientations [px^2]; zeros where fixed
+    #: (F, 3, 3) of the interior orientations [px^2]; zeros if fixed
     interior: NDArray[np.float64]
     exterior: NDArray[np.float64]  #: (m, 6, 6) of T [mm] and w [rad] of the exposures
     points: NDArray[np.float64]  #: (n, 3, 3) of the object points [mm^2]
@@ -53,12 +53,12 @@ class Precision:
     relative_redundancy: tuple[NDArray[np.float64], ...]
     all_global: NDArray[np.float64]  #: (G, G) of all global unknowns
     exterior_global: NDArray[np.float64]  #: (m, 6, G) of the exposures with the global unknowns
-    #: (3n, 3n) of all object points with each other; None where they are too many
+    #: (3n, 3n) of all object points [mm^2]; None if there are too many
     joint_points: NDArray[np.float64] | None = None
 
 
 def covariance_blocks(matrix: FactorizedNormalMatrix) -> CovarianceBlocks:
-    """Blocks of the inverse of a normal matrix; those of a free network in its datum."""
+    """Return blocks of the inverse of a normal matrix; for a free network, in its datum."""
     blocks = matrix.elimination.covariance_blocks(matrix.factor.covariance())
     return blocks if matrix.gauge is None else _in_datum(matrix, matrix.gauge, blocks)
 
@@ -66,7 +66,7 @@ def covariance_blocks(matrix: FactorizedNormalMatrix) -> CovarianceBlocks:
 def _in_datum(
     matrix: FactorizedNormalMatrix, gauge: Gauge, blocks: CovarianceBlocks
 ) -> CovarianceBlocks:
-    """Covariances in the datum of a free network, from those with other directions fixed."""
+    """Transform covariances with other directions fixed into the datum of a free network."""
     s = STransformation(gauge, covariance_times_points(matrix, gauge.constraint))
 
     def exteriors(index: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -91,9 +91,9 @@ def _in_datum(
 def covariance_times_points(
     matrix: FactorizedNormalMatrix, values: NDArray[np.float64]
 ) -> UnknownVector:
-    """Products of the inverse normal matrix with columns of values (n, 3, d) of the points.
+    """Multiply the inverse normal matrix by columns of values (n, 3, d) of the points.
 
-    Of a free network they are those with other directions fixed than those of its datum.
+    For a free network, the inverse is the one with other directions fixed than in its datum.
     """
     elimination = matrix.elimination
     solution = matrix.factor.solve(*elimination.right_side_of_points(values))
@@ -101,9 +101,9 @@ def covariance_times_points(
 
 
 def information_of_additional(matrix: FactorizedNormalMatrix, f: int) -> NDArray[np.float64]:
-    """Information (p, p) of the additional parameters of fluoroscope f, prior included.
+    """Return information (p, p) of the additional parameters of fluoroscope f, with the prior.
 
-    All other unknowns are eliminated. The last rows of a Cholesky factor are the factor of their
+    All other unknowns are eliminated. The last rows of a Cholesky factor are the factor of the
     Schur complement.
     """
     layout = matrix.network.layout
@@ -124,14 +124,14 @@ def information_of_additional(matrix: FactorizedNormalMatrix, f: int) -> NDArray
 def solved_additional(
     matrix: FactorizedNormalMatrix, network: Network, adjustment: Adjustment
 ) -> tuple[NDArray[np.float64], ...]:
-    """Coefficients (p,) of the additional parameters at the solution, by fluoroscope.
+    """Return coefficients (p,) of the additional parameters at the solution, by fluoroscope.
 
-    An adjustment ends where F hardly decreases any more. A coefficient whose prior variance is
-    small may then still be off by many times what the observations pull it, and its prior times
-    its value says little about that pull. One step with the normal matrix leads to the solution.
+    An adjustment ends when F hardly decreases any more. A coefficient with a small prior variance
+    may then still be off by many times the pull of the observations, and its prior times its value
+    says little about that pull. One step with the normal matrix leads to the solution.
 
-    network has additional parameters, and only these correct its image points; matrix is its
-    normal matrix near the solution.
+    network: has additional parameters, and only these correct its image points; matrix: its normal
+    matrix near the solution.
     """
     parameters = adjustment.parameters
     if network.relative:
@@ -150,7 +150,7 @@ def solved_additional(
 def covariance_of_projection(
     network: Network, parameters: Parameters, blocks: CovarianceBlocks
 ) -> NDArray[np.float64]:
-    """A C_x A^T (N, 2, 2) [px^2] of the image points; additional parameters are unknowns too."""
+    """Return A C_x A^T (N, 2, 2) [px^2] of the image points, including additional parameters."""
     out = np.empty((network.n_image_points, 2, 2))
     for f, local, a in _design(network, parameters):
         part = network.rows(f)[local]
@@ -168,7 +168,7 @@ def covariance_of_projection(
 def variance_of_projection(
     network: Network, parameters: Parameters, blocks: CovarianceBlocks
 ) -> NDArray[np.float64]:
-    """Traces (N,) [px^2] of `covariance_of_projection`, for less work."""
+    """Return traces (N,) [px^2] of `covariance_of_projection` at a lower cost."""
     out = np.empty(network.n_image_points)
     for f, local, a in _design(network, parameters):
         part = network.rows(f)[local]
@@ -186,9 +186,9 @@ def variance_of_projection(
 def _design(
     network: Network, parameters: Parameters
 ) -> Iterator[tuple[int, slice, NDArray[np.float64]]]:
-    """Derivatives (k, 2, 12) of image points by exterior, object point and interior orientation.
+    """Yield derivatives (k, 2, 12) by exterior orientation, object point, interior orientation.
 
-    Yields fluoroscope f, a range among its image points, and their derivatives.
+    Yields fluoroscope f, a range of its image points, and their derivatives.
     """
     per_image_point = network.per_image_point(parameters)
     for f in range(network.n_fluoroscopes):
@@ -203,9 +203,9 @@ def _design(
 def _covariance_of_orientation(
     network: Network, blocks: CovarianceBlocks, f: int, rows: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Covariances (k, 12, 12) of exterior orientation, object point and interior orientation.
+    """Return covariances (k, 12, 12) of exterior orientation, object point, interior orientation.
 
-    rows (k,) of image points of fluoroscope f.
+    rows (k,): of image points of fluoroscope f.
     """
     e = network.exposure[rows]
     p = network.point[rows]
@@ -229,7 +229,7 @@ def _mixed_covariance(
     f: int,
     local: slice,
 ) -> NDArray[np.float64]:
-    """Covariances (k, 12, 2) of the orientation with the corrections by additional parameters.
+    """Return covariances (k, 12, 2) of orientations with corrections by additional parameters.
 
     local: rows among the image points of fluoroscope f, whose parameters are `additional`.
     """
@@ -254,15 +254,14 @@ def precision(
     correction: NDArray[np.float64] | None = None,
     elimination: type[Elimination] | None = None,
 ) -> Precision:
-    """Covariances and redundancy numbers of an adjustment.
+    """Return covariances and redundancy numbers of an adjustment.
 
-    Covariances of the unknowns hold under the noise distribution (Fisher information). Those of
+    Covariances of the unknowns are based on the noise distribution (Fisher information). Those of
     the residuals and the redundancy numbers belong to the weighted least-squares problem at the
     solution.
 
     correction: (N, 2) correction of the image points [px] in the adjustment. elimination: as in
-    SolverOptions. Raises numpy.linalg.LinAlgError where the network does not determine the
-    unknowns.
+    SolverOptions. Raises numpy.linalg.LinAlgError if the network does not determine the unknowns.
     """
     correction = np.zeros_like(network.uv) if correction is None else correction
 
@@ -307,7 +306,7 @@ def precision(
 
 @dataclass(frozen=True)
 class JointCovariance:
-    """Covariances of all unknowns with each other."""
+    """Joint covariances of all unknowns."""
 
     exteriors: NDArray[np.float64]  #: (6m, 6m)
     points: NDArray[np.float64]  #: (3n, 3n)
@@ -319,7 +318,7 @@ class JointCovariance:
 
     @property
     def matrix(self) -> NDArray[np.float64]:
-        """All of them: exposures, object points, global unknowns."""
+        """Joint matrix of exposures, object points and global unknowns."""
         return np.block(
             [
                 [self.exteriors, self.points_exteriors.T, self.exteriors_globals],
@@ -330,7 +329,7 @@ class JointCovariance:
 
 
 def joint_covariance(blocks: CovarianceBlocks) -> JointCovariance:
-    """Covariances of all unknowns with each other, from blocks of an inverse normal matrix."""
+    """Return joint covariances of all unknowns from blocks of an inverse normal matrix."""
     m = len(blocks.ee)
     n = len(blocks.pp)
 
@@ -359,7 +358,7 @@ def joint_covariance(blocks: CovarianceBlocks) -> JointCovariance:
 def _relative_redundancy(
     network: Network, parameters: Parameters, blocks: CovarianceBlocks
 ) -> tuple[NDArray[np.float64], ...]:
-    """Redundancy numbers (k, 6) of the pairs of every relative orientation constraint."""
+    """Return redundancy numbers (k, 6) of the pairs of every relative orientation constraint."""
     out = []
     for constraint, pose, columns in zip(
         network.relative, parameters.relative, network.layout.relative
@@ -381,7 +380,7 @@ def _relative_redundancy(
 
 
 def _weighted_variance(network: Network, adjustment: Adjustment) -> NDArray[np.float64]:
-    """Variances (N,) [px^2] of the image points in the weighted least-squares problem."""
+    """Return variances (N,) [px^2] of image points in the weighted least-squares problem."""
     weight = np.maximum(adjustment.noise.weight(adjustment.q), MIN_WEIGHT)
     return (adjustment.noise.scale * network.sigma) ** 2 / weight
 
@@ -392,9 +391,9 @@ def residual_covariance(
     blocks: CovarianceBlocks,
     projected: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float64]:
-    """Covariances C_r (N, 2, 2) [px^2] of the residuals.
+    """Return covariances C_r (N, 2, 2) [px^2] of the residuals.
 
-    projected: A C_x A^T from covariance_of_projection; computed where it is None.
+    projected: A C_x A^T from covariance_of_projection; None: it is computed.
     """
     if projected is None:
         projected = covariance_of_projection(network, adjustment.parameters, blocks)
@@ -404,11 +403,11 @@ def residual_covariance(
 def geometric_redundancy(
     network: Network, parameters: Parameters, noise: Noise
 ) -> NDArray[np.float64]:
-    """Redundancy numbers (N,) of the image points under equal weights, mean of u and v.
+    """Return redundancy numbers (N,) of the image points at equal weights, mean of u and v.
 
-    They depend on the geometry only. Those of the weighted problem follow the residuals, so they
-    cannot be used to estimate the noise from the residuals. Raises numpy.linalg.LinAlgError where
-    the network does not determine the unknowns.
+    They depend on the geometry only. Those of the weighted problem follow the residuals, and so
+    cannot be used to estimate the noise from the residuals. Raises numpy.linalg.LinAlgError if the
+    network does not determine the unknowns.
     """
     plain = Noise('gaussian', noise.scale)
     equations = normal_equations(network, parameters, 0.0, plain)
@@ -417,15 +416,15 @@ def geometric_redundancy(
     return 1 - variance_of_projection(network, parameters, blocks) / (2 * variance)
 
 
-# Precision of an adjustment that holds interior orientations which are not known exactly.
+# Precision of an adjustment with fixed interior orientations that are not known exactly.
 #
-# What is fixed has the covariance S, and moves the other unknowns by J = -N^-1 B, where N is their
-# normal matrix and B its mixed blocks with what is fixed. Their covariance is N^-1 + J S J^T, with
-# "consider parameters" (Tapley, Schutz and Born, "Statistical Orbit Determination", 2004, 6.2).
-# It is a block of the inverse of the normal matrix with D = S^-1 + B^T N^-1 B for what is fixed,
-# in which the observations do not improve it.
+# Fixed parameters with covariance S move the other unknowns by J = -N^-1 B, where N is the normal
+# matrix of the unknowns and B its mixed blocks with the fixed parameters. The covariance of the
+# unknowns is N^-1 + J S J^T ("consider parameters": Tapley, Schutz and Born, "Statistical Orbit
+# Determination", 2004, 6.2). It is a block of the inverse of the normal matrix with D = S^-1 + B^T
+# N^-1 B for the fixed parameters, in which the observations do not improve these.
 
-MIN_SD_PX = 1e-6  # of an interior orientation that is fixed
+MIN_SD_PX = 1e-6  # least standard deviation of a fixed interior orientation
 
 
 def precision_with_fixed_interiors(
@@ -440,14 +439,14 @@ def precision_with_fixed_interiors(
     Parameters
     ----------
     network : Network
-        With interior orientations that are fixed.
+        Network with fixed interior orientations.
     adjustment : Adjustment
     correction : (N, 2) ndarray
         Correction of the image points [px] in the adjustment.
     precise : Precision
-        Of the adjustment as if the interior orientations were known.
+        Precision of the adjustment as if the interior orientations were known.
     covariances : (F, 3, 3) ndarray
-        Of the interior orientations [px^2].
+        Covariances of the interior orientations [px^2].
 
     Returns
     -------
@@ -457,7 +456,7 @@ def precision_with_fixed_interiors(
     Raises
     ------
     numpy.linalg.LinAlgError
-        Where the network does not determine the unknowns.
+        If the network does not determine the unknowns.
     """
     free, equations = equations_with_fixed_interiors(network, adjustment, correction, covariances)
     blocks = covariance_blocks(factorize(free, equations))
@@ -480,7 +479,7 @@ def equations_with_fixed_interiors(
     correction: np.ndarray,
     covariances: NDArray[np.float64],
 ) -> tuple[Network, NormalEquations]:
-    """Network and normal equations whose inverse holds the uncertainty of fixed interiors.
+    """Return network and normal equations whose inverse has the uncertainty of fixed interiors.
 
     See `precision_with_fixed_interiors` for the arguments.
     """

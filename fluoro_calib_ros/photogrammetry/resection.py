@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Resection: exterior orientation of one exposure from the phantom, without start values.
+"""Resection: exterior orientation of one exposure from the phantom, without initial values.
 
 The direct linear transformation (Abdel-Aziz and Karara 1971; Hartley and Zisserman, "Multiple View
 Geometry", 2nd ed., 2004, 7.1 and 6.2) is computed from random samples. The one with the least
-median of squared residuals is selected (Rousseeuw 1984) and refined on all points with robust
+median of squared residuals is selected (Rousseeuw 1984), and refined on all points with robust
 weights.
 """
 
@@ -27,20 +27,20 @@ from .rotations import matrix_from_vector
 MIN_TARGETS = 8  # two more than the DLT needs
 SAMPLE_SIZE = 6  # the DLT has 11 unknowns, and a target gives two equations
 SAMPLES = 200  # with 20 % false matches 1 - (1 - 0.8^6)^200: a good sample is certain
-# Smallest over largest extent of the targets below which they lie in one plane.
+# Targets with a smaller ratio of smallest to largest extent are considered to lie in one plane.
 MIN_FLATNESS = 1e-2
 DLT_ITERATIONS = 10
-SETTLED_WEIGHTS = 0.02  # change of the robust weights at which the iterations end
-NU = 3.0  # of the Student-t of the robust weights: heavy tails
+SETTLED_WEIGHTS = 0.02  # change of the robust weights at convergence
+NU = 3.0  # degrees of freedom of the Student-t of the robust weights: heavy tails
 MIN_VARIANCE = 1e-12  # [px^2], for exact observations
-# Damping of the refinement: start, minimum and maximum.
+# Damping of the refinement: initial, least and largest value.
 START_DAMPING = 1e-4
 MIN_DAMPING = 1e-12
 MAX_DAMPING = 1e10
 MIN_EXTENT_MM = 1e-3
 # Relative change of a cost, a redundancy or a distance that rounding errors can cause.
 ROUNDING = 1e-9
-# Squared step at which the refinement ends, in the metric of its normal matrix and noise variance.
+# Squared step at convergence, in the metric of its normal matrix and noise variance.
 TOLERANCE = 1e-4
 
 
@@ -55,18 +55,19 @@ class Resection:
 
 
 def least_vectors(forms: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Unit vectors (..., k) with the least values of quadratic forms (..., k, k)."""
+    """Return unit vectors (..., k) with the least values of quadratic forms (..., k, k)."""
     return np.linalg.eigh(forms)[1][..., 0]
 
 
 def least_vectors_with_last_one(forms: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Vectors (..., k) with the least values whose last component is one, in a tenth of the time.
+    """Return vectors (..., k) with the least values, and one as last component.
 
-    That of a projection matrix is the depth of the centre of the points, which is not zero
-    (Hartley and Zisserman 4.1.2, inhomogeneous solution).
+    This takes a tenth of the time of `least_vectors`. The last component of a projection matrix is
+    the depth of the centre of the points, which is not zero (Hartley and Zisserman 4.1.2,
+    inhomogeneous solution).
     """
     k = forms.shape[-1] - 1
-    # So little more on the diagonal solves singular equations, too.
+    # This small addition to the diagonal also solves singular equations.
     ridge = 1e-14 * np.trace(forms, axis1=-2, axis2=-1)[..., None, None] * np.eye(k)
     found = np.linalg.solve(forms[..., :k, :k] + ridge, -forms[..., :k, k:])
     return np.concatenate([found[..., 0], np.ones_like(found[..., :1, 0])], axis=-1)
@@ -75,7 +76,7 @@ def least_vectors_with_last_one(forms: NDArray[np.float64]) -> NDArray[np.float6
 def dlt_rows(
     x: NDArray[np.float64], u: NDArray[np.float64], weights: NDArray[np.float64] | None
 ) -> NDArray[np.float64]:
-    """Rows (..., 2n, 3 (k + 1)) of u ~ P (x, 1) in P, row by row: x (..., n, k), u (..., n, 2)."""
+    """Return rows (..., 2n, 3 (k + 1)) of u ~ P (x, 1) in P: x (..., n, k), u (..., n, 2)."""
     x1 = np.concatenate([x, np.ones_like(x[..., :1])], axis=-1)
     zero = np.zeros_like(x1)
     rows = np.concatenate(
@@ -96,11 +97,11 @@ def direct_linear_transformation(
     weights: NDArray[np.float64] | None = None,
     least: Callable[[NDArray[np.float64]], NDArray[np.float64]] = least_vectors,
 ) -> NDArray[np.float64]:
-    """Projection matrices (..., 3, 4) with uv ~ P (xyz, 1).
+    """Return projection matrices (..., 3, 4) with uv ~ P (xyz, 1).
 
     xyz (..., n, 3), uv (..., n, 2) and weights (..., n) of n >= 6 points. Coordinates are
-    normalised (Hartley and Zisserman, algorithm 7.1). least: vectors (..., 12) that make the
-    quadratic forms of matrices (..., 12, 12) small.
+    normalised (Hartley and Zisserman, algorithm 7.1). least: returns vectors (..., 12) that
+    minimise quadratic forms (..., 12, 12).
     """
     return _dlt_of_weights(xyz, uv, least)(weights)
 
@@ -140,7 +141,7 @@ def _dlt_of_weights(
 def decompose(
     projection: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], np.ndarray]:
-    """Calibration matrix (3, 3), rotation (3, 3) and source (3,) of a projection matrix (3, 4).
+    """Return calibration matrix (3, 3), rotation (3, 3) and source (3,) of a projection (3, 4).
 
     The calibration matrix has a positive diagonal and a one in the corner (Hartley and Zisserman
     6.2.4).
@@ -159,11 +160,11 @@ def decompose(
 def squared_residuals(
     projection: NDArray[np.float64], xyz: NDArray[np.float64], uv: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Squared residuals (..., n) of projection matrices (..., 3, 4) or homographies (..., 3, 3).
+    """Return squared residuals (..., n) of projections (..., 3, 4) or homographies (..., 3, 3).
 
     They are infinite for points in the plane of the source.
     """
-    # The points run along the last axis: a sum over an axis of two would take ten times as long.
+    # Points are on the last axis: a sum over an axis of two would take ten times as long.
     x = projection[..., :-1] @ np.swapaxes(xyz, -1, -2) + projection[..., -1:]
     with np.errstate(divide='ignore', invalid='ignore'):
         r = (x[..., 0, :] / x[..., 2, :] - uv[..., 0]) ** 2
@@ -172,16 +173,16 @@ def squared_residuals(
 
 
 def robust_variance(squared: NDArray[np.float64]) -> float:
-    """Variance [px^2] of each coordinate by the median of squared residuals (n,)."""
+    """Return the variance [px^2] of a coordinate by the median of squared residuals (n,)."""
     # The median of chi-square with two degrees of freedom is 2 ln 2.
     return max(np.median(squared) / (2 * np.log(2)), MIN_VARIANCE)
 
 
 def robust_dlt(xyz: NDArray[np.float64], uv: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Projection matrix (3, 4) of targets of which up to half may be falsely matched.
+    """Return the projection matrix (3, 4) of targets with up to half false matches.
 
-    xyz (n, 3) [mm] and uv (n, 2) [px] of n >= 8 targets. Raises DataError where the targets are
-    too few or lie in one plane.
+    xyz (n, 3) [mm] and uv (n, 2) [px] of n >= 8 targets. Raises DataError if there are too few
+    targets, or they lie in one plane.
     """
     if len(xyz) < MIN_TARGETS:
         raise DataError(
@@ -219,12 +220,13 @@ def robust_dlt(xyz: NDArray[np.float64], uv: NDArray[np.float64]) -> NDArray[np.
 def robust_p3p(
     xyz: NDArray[np.float64], uv: NDArray[np.float64], interior: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Rotation (3, 3) and position (3,) [mm] of few targets of which up to half may be false.
+    """Return rotation (3, 3) and position (3,) [mm] of few targets, up to half of them false.
 
-    The solution of three targets (Ke and Roumeliotis, "An efficient algebraic solution to the
-    perspective-three-point problem", CVPR 2017) with the least median of squared residuals, then
-    that of the half of the targets that fits it (SQPnP of Terzakis and Lourakis, ECCV 2020), if it
-    is better. xyz (n, 3), uv (n, 2), interior (3,) [px]. Raises DataError where there is none.
+    The first candidate is the solution of three targets (Ke and Roumeliotis, "An efficient
+    algebraic solution to the perspective-three-point problem", CVPR 2017) with the least median of
+    squared residuals. The solution of the half of the targets that fits it best (SQPnP of Terzakis
+    and Lourakis, ECCV 2020) replaces it if it is better. xyz (n, 3), uv (n, 2), interior (3,)
+    [px]. Raises DataError if there is no solution.
     """
     rng = np.random.default_rng(0)
     rays = (uv - interior[:2]) / interior[2]
@@ -265,7 +267,7 @@ def robust_p3p(
 
 
 def principal_distance_of(projection: NDArray[np.float64]) -> float:
-    """Principal distance [px] of a projection matrix (3, 4): mean of its two scale factors."""
+    """Return principal distance [px] of a projection (3, 4): geometric mean of two scale factors."""
     k, _, _ = decompose(projection)
     return float(np.sqrt(abs(k[0, 0] * k[1, 1])))
 
@@ -277,9 +279,9 @@ def resect(
     projection: NDArray[np.float64] | None = None,
     tolerance: float = TOLERANCE,
 ) -> Resection:
-    """Exterior orientation of one exposure for a given interior orientation.
+    """Return the exterior orientation of one exposure for a given interior orientation.
 
-    Robust to false matches.
+    The result is robust to false matches.
 
     Parameters
     ----------
@@ -292,12 +294,12 @@ def resect(
     projection : (3, 4) ndarray, optional
         Result of robust_dlt; computed by default.
     tolerance : float
-        Squared step at which the refinement ends, in standard deviations.
+        Squared step at convergence, in standard deviations.
 
     Raises
     ------
     DataError
-        As robust_dlt, and where no orientation with the targets before the source is found.
+        As robust_dlt, and if no orientation with the targets in front of the source is found.
     """
     projection = robust_dlt(xyz, uv) if projection is None else projection
     problem = _Problem(xyz, uv, interior)
@@ -312,7 +314,7 @@ def refine_resection(
     rotation: NDArray[np.float64],
     position: NDArray[np.float64],
 ) -> Resection:
-    """Exterior orientation of one exposure from start values (3, 3) and (3,) [mm].
+    """Refine the exterior orientation of one exposure from initial values (3, 3) and (3,) [mm].
 
     The other arguments and the errors are those of `resect`.
     """
@@ -345,7 +347,7 @@ def _refined(
 ) -> Resection:
     """Refine an exterior orientation. Raises DataError for a target behind the source."""
     mu = START_DAMPING
-    for _ in range(100):  # of which it takes a few
+    for _ in range(100):  # a few are enough
         system = problem.linearise(rotation, position)
         rotation, position, step, mu = _damped_step(problem, system, rotation, position, mu)
         if step @ system.normal @ step <= tolerance * system.noise.scale**2:
@@ -375,7 +377,7 @@ class _Problem:
     interior: NDArray[np.float64]
 
     def linearise(self, rotation: NDArray[np.float64], position: NDArray[np.float64]) -> _System:
-        """Robustly weighted normal equations. Raises DataError for a target behind the source."""
+        """Return robust normal equations. Raises DataError for a target behind the source."""
         predicted, jacobian, _, _ = project_with_jacobian(
             rotation, position, self.xyz, self.interior
         )
@@ -394,7 +396,7 @@ class _Problem:
     def squared_residuals(
         self, rotation: NDArray[np.float64], position: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Squared residuals (n,) [px^2]; NaN behind the source."""
+        """Return squared residuals (n,) [px^2]; NaN behind the source."""
         predicted = project(rotation, position, self.xyz, self.interior)
         return np.sum((self.uv - predicted) ** 2, axis=1)
 
@@ -406,9 +408,10 @@ def _damped_step(
     position: NDArray[np.float64],
     mu: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], np.ndarray, float]:
-    """Orientation after a step that does not increase the cost, the step (6,), and the damping.
+    """Return the orientation after a step that does not increase the cost.
 
-    The orientation is returned unchanged, with a step of zeros, where no such step is found.
+    Also returns the step (6,) and the damping. If no such step is found, the orientation is
+    unchanged and the step is zero.
     """
     noise = system.noise
     sigma = np.ones(len(problem.xyz))
@@ -428,11 +431,11 @@ def _damped_step(
 def _start_orientation(
     projection: NDArray[np.float64], problem: _Problem
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Rotation (3, 3) and position (3,) from a projection matrix and the interior orientation.
+    """Return rotation (3, 3) and position (3,) by a projection matrix and interior orientation.
 
-    The projection matrix has a principal distance of its own. The ratio of distance and principal
-    distance is preserved, so the image scale stays. Then the sensor is turned about the source
-    until the centre of the targets is imaged at the median image point.
+    The projection matrix has its own principal distance. The ratio of distance and principal
+    distance is preserved, so that the image scale does not change. Then the sensor is rotated
+    about the source until the centre of the targets is imaged at the median image point.
     """
     k, rotation, position = decompose(projection)
     xp, yp, c = problem.interior

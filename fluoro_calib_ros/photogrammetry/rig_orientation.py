@@ -32,13 +32,13 @@ from .unknowns import EXTERIOR_SIZE, INTERIOR_SIZE
 # Unknowns of a fluoroscope: T [mm], w [rad], xp, yp, c [px].
 ORIENTATION_SIZE = EXTERIOR_SIZE + INTERIOR_SIZE
 SOURCES = ('capture', 'joint calibration', 'healing')
-# What rounding explains: of the deviation of a rotation matrix from orthogonality, the asymmetry
-# of a correlation matrix, and of an eigenvalue.
+# Largest rounding error: of a rotation matrix (from orthogonality), of the symmetry of a
+# correlation matrix, and of an eigenvalue.
 ROUNDING = 1e-6
-MAX_VALUE = 1e15  # of a position [mm], an interior orientation [px] or a covariance
-# What `rounded` keeps: far coarser than a rounding error, far finer than a standard deviation.
-DIGITS = 40  # binary, of positions and covariances
-QUATERNION_STEP = 2.0**-44  # of attitudes
+MAX_VALUE = 1e15  # largest position [mm], interior orientation [px] or covariance
+# Precision of `rounded`: far coarser than a rounding error, far finer than a standard deviation.
+DIGITS = 40  # binary digits of positions and covariances
+QUATERNION_STEP = 2.0**-44  # step of the quaternion components of attitudes
 
 
 @dataclass(frozen=True)
@@ -58,13 +58,13 @@ class RigOrientation:
     position_mm : (F, 3) ndarray
         Positions of the sources in the rig frame.
     covariance : (9F, 9F) ndarray
-        Of T [mm], w [rad], xp, yp, c [px] of each fluoroscope in turn. Rotations are varied on the
-        left, R -> exp([w]x) R, as in collinearity.
+        Covariance of T [mm], w [rad], xp, yp, c [px] of each fluoroscope in turn. Rotations are
+        varied from the left, R -> exp([w]x) R, as in collinearity.
     frame_id : str
         Name of the rig frame.
     source : {'capture', 'joint calibration', 'healing'}
-        'capture': the phantom defines the rig frame. 'joint calibration': the optical frame of the
-        first fluoroscope is the rig frame. 'healing': the rig frame is that of an earlier
+        'capture': the phantom defines the rig frame. 'joint calibration': the rig frame is the
+        optical frame of the first fluoroscope. 'healing': the rig frame is that of an earlier
         orientation, which was changed.
     calibration_ids : tuple of str
         Calibrations that the orientation belongs to.
@@ -121,7 +121,7 @@ class RigOrientation:
     def _check_names(
         self, names: tuple[str, ...], ids: tuple[str, ...], frames: tuple[str, ...]
     ) -> None:
-        """Raise DataError for names that are not unique, not complete or not known."""
+        """Raise DataError for names that are not unique, incomplete or unknown."""
         count = len(names)
         if not names or len(set(names)) < count:
             raise DataError(
@@ -139,7 +139,7 @@ class RigOrientation:
             raise DataError('rig orientation: the rig frame has no name')
 
     def _array(self, name: str, shape: tuple[int, ...]) -> NDArray[np.float64]:
-        """A read-only copy of an array. Raises DataError for a wrong shape or infinite values."""
+        """Return a read-only copy of an array. Raises DataError for a wrong shape or value."""
         value = np.array(getattr(self, name), dtype=float)
         if value.shape != shape:
             raise DataError(f'rig orientation: {name} has shape {value.shape}, not {shape}')
@@ -154,7 +154,7 @@ class RigOrientation:
         return value
 
     def _digest(self) -> str:
-        """SHA-256 (hex) of the content."""
+        """Return the SHA-256 (hex) of the content."""
         digest = hashlib.sha256()
         for array in (self.interior, self.rotation, self.position_mm, self.covariance):
             digest.update(array.tobytes())
@@ -184,7 +184,7 @@ class RigOrientation:
         return np.sqrt(np.diagonal(self.covariance).reshape(-1, ORIENTATION_SIZE)[:, columns])
 
     def index(self, fluoroscope: str) -> int:
-        """Index of a fluoroscope by its name. Raises DataError for an unknown name."""
+        """Return the index of a fluoroscope. Raises DataError for an unknown name."""
         if fluoroscope not in self.fluoroscopes:
             raise DataError(
                 f'rig orientation: there is no fluoroscope {fluoroscope!r}, '
@@ -193,12 +193,12 @@ class RigOrientation:
         return self.fluoroscopes.index(fluoroscope)
 
     def covariance_rows(self, indices: Sequence[int]) -> NDArray[np.int64]:
-        """Rows (9k,) of k fluoroscopes in the covariance, from their indices."""
+        """Return the rows (9k,) of k fluoroscopes in the covariance, from their indices."""
         first = ORIENTATION_SIZE * np.asarray(indices, dtype=int)
         return (first[:, None] + np.arange(ORIENTATION_SIZE)).ravel()
 
     def subset(self, fluoroscopes: Sequence[str]) -> RigOrientation:
-        """Orientation of some of the fluoroscopes, in the given order. Raises DataError."""
+        """Return the orientation of some fluoroscopes, in the given order. Raises DataError."""
         indices = [self.index(name) for name in fluoroscopes]
         rows = self.covariance_rows(indices)
         return replace(
@@ -215,9 +215,9 @@ class RigOrientation:
     def rounded(self) -> RigOrientation:
         """Return the orientation with values that survive a change of units.
 
-        A message has metres and quaternions, so its values differ from these in the last bits. As
-        they are rounded to coarser steps, far below any standard deviation, both sides find the
-        same values again, and the same id. Rounding again changes nothing.
+        A message has metres and quaternions, so its values differ from these in the last bits.
+        Because the values are rounded to coarser steps, far below any standard deviation, both
+        sides recover the same values and the same id. Rounding again changes nothing.
         """
         return replace(
             self,
@@ -241,7 +241,7 @@ class RigOrientation:
                 )
 
     def covariance_root(self) -> NDArray[np.float64]:
-        """Matrix L (9F, 9F) with L L^T the covariance, which may be singular."""
+        """Return L (9F, 9F) such that L L^T is the covariance, which may be singular."""
         sd = np.sqrt(np.diagonal(self.covariance))
         scale = np.where(sd > 0, sd, 1.0)  # mm, rad and px differ by orders of magnitude
         values, vectors = np.linalg.eigh(self.covariance / np.outer(scale, scale))
@@ -249,11 +249,11 @@ class RigOrientation:
 
 
 def with_datum_of_points(orientation: RigOrientation, points_mm: ArrayLike) -> RigOrientation:
-    """The orientation with its covariance in the datum of points (n, 3) [mm].
+    """Return the orientation with its covariance in the datum of points (n, 3) [mm].
 
-    Centre and attitude of the points then define the rig frame. A rig frame that was derived from
-    the images themselves is a convention, and the choice matters: relative to a sensor whose
-    principal point is uncertain, all points turn together about the source. An S-transformation
+    Centre and attitude of the points then define the rig frame. A rig frame derived from the
+    images themselves is a convention, and the choice matters: relative to a sensor with an
+    uncertain principal point, all points rotate together about the source. An S-transformation
     (Baarda, "S-transformations and criterion matrices", Delft 1973; Foerstner and Wrobel,
     "Photogrammetric Computer Vision", Springer 2016, 4.5) removes the part of the errors that
     moves the points together as a rigid body. Variances of distances and angles do not change.
@@ -264,9 +264,9 @@ def with_datum_of_points(orientation: RigOrientation, points_mm: ArrayLike) -> R
 
 
 def datum_transformation(orientation: RigOrientation, points_mm: ArrayLike) -> NDArray[np.float64]:
-    """Matrix S (9F, 9F) that transforms errors of an orientation into the datum of points.
+    """Return S (9F, 9F) that transforms errors of an orientation into the datum of points.
 
-    points_mm (n, 3), see with_datum_of_points.
+    points_mm: (n, 3), see with_datum_of_points.
     """
     points = np.asarray(points_mm, dtype=float)
     count = len(orientation.fluoroscopes)
@@ -286,7 +286,7 @@ def datum_transformation(orientation: RigOrientation, points_mm: ArrayLike) -> N
         by_orientation[:, rows, columns[0] : columns[-1] + 1] = np.concatenate(
             [by_exterior, by_interior], axis=2
         )
-        # Change of the unknowns when the frame is moved back by a shift and a small rotation about
+        # Change of the unknowns if the frame is moved back by a shift and a small rotation about
         # the centre.
         frame_motion[columns[:3]] = np.concatenate([-np.eye(3), cross_matrix(t - centre)], axis=1)
         frame_motion[columns[3:6], 3:] = r
@@ -305,7 +305,7 @@ def _check_orientation(
 ) -> None:
     """Raise DataError for a negative principal distance or an invalid rotation matrix."""
     large = (np.abs(rotation) > 1 + ROUNDING).any(axis=(1, 2))
-    rotation = np.where(large[:, None, None], 0.0, rotation)  # no overflow; refused below
+    rotation = np.where(large[:, None, None], 0.0, rotation)  # avoid overflow; refused below
     product = rotation @ rotation.transpose(0, 2, 1)
     errors = np.max(np.abs(product - np.eye(3)), axis=(1, 2))
     signs = np.linalg.det(rotation)
@@ -334,11 +334,11 @@ def _to_digits(values: NDArray[np.float64]) -> NDArray[np.float64]:
 def _rounded_rotation(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     """Round the quaternions of rotation matrices (F, 3, 3) to QUATERNION_STEP.
 
-    The first component that is large follows from the other three, so that the norm is one.
+    The first large component is computed from the other three, so that the norm is one.
     """
     q = quaternion_from_matrix(rotation)
     rows = np.arange(len(q))
-    large = np.argmax(np.abs(q) > 0.43, axis=1)  # one of four is 0.5 or more
+    large = np.argmax(np.abs(q) > 0.43, axis=1)  # at least one component is 0.5 or more
     q = np.where(q[rows, large] < 0, -1.0, 1.0)[:, None] * q
     q = _to_steps(q, QUATERNION_STEP)
     q[rows, large] = 0.0
@@ -357,18 +357,19 @@ def _check_covariance(covariance: NDArray[np.float64]) -> None:
         raise DataError('rig orientation: its covariance has a negative eigenvalue')
 
 
-# Orientation of a fluoroscope that is known before the calibration, as from another program.
+# Orientation of a fluoroscope that is known before the calibration, for example from another
+# program.
 #
-# Any reader can fill it: `KnownOrientation.from_matrices` takes K, R and t of the pinhole camera
-# x ~ K (R X + t) (Hartley and Zisserman, "Multiple View Geometry", 2nd ed., 2004, 6.1), as OpenCV,
-# MayaCam and XMALab write them.
+# Any reader can provide it: `KnownOrientation.from_matrices` takes K, R and t of the pinhole
+# camera x ~ K (R X + t) (Hartley and Zisserman, "Multiple View Geometry", 2nd ed., 2004, 6.1), as
+# OpenCV, MayaCam and XMALab write them.
 
-# Exterior orientations that are known beforehand: weighted observations of the adjustment.
+# Exterior orientations known beforehand are weighted observations of the adjustment.
 
 
 @dataclass(frozen=True)
 class ExteriorPrior:
-    """Exterior orientations of m exposures as observed."""
+    """Observed exterior orientations of m exposures."""
 
     rotation: NDArray[np.float64]  #: (m, 3, 3) rotations phantom -> sensor
     position_mm: NDArray[np.float64]  #: (m, 3) positions of the sources
@@ -384,16 +385,16 @@ class ExteriorPrior:
     def discrepancies(
         self, rotation: NDArray[np.float64], position_mm: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Discrepancies (m, 6) of orientations from the observed ones.
+        """Return the discrepancies (m, 6) of orientations from the observed orientations.
 
-        Those of a rotation R are log(R R0^T), whose derivative by a rotation on the left is the
+        For a rotation R they are log(R R0^T), whose derivative by a rotation from the left is the
         unit matrix to first order (Barfoot, "State Estimation for Robotics", 2017, 7.1).
         """
         turned = rotation @ self.rotation.transpose(0, 2, 1)
         return np.concatenate([position_mm - self.position_mm, vector_from_matrix(turned)], axis=1)
 
 
-MAX_SKEW = 0.05  # of a calibration matrix, and of its ratio of scales, which a correction takes up
+MAX_SKEW = 0.05  # of a calibration matrix, and of its ratio of scales; the correction absorbs them
 
 
 @dataclass(frozen=True)
@@ -465,8 +466,8 @@ class KnownOrientation:
         Parameters
         ----------
         matrix : (3, 3) array_like
-            K [px]. One principal distance is used, the mean of its two scales: the correction that
-            is estimated with it takes up the rest.
+            K [px]. A single principal distance is used, the geometric mean of its two scales; the correction
+            that is estimated with it absorbs the difference.
         rotation : (3, 3) array_like
             R, lab -> sensor: x to the right, y down, z from the source to the image.
         translation_mm : (3,) array_like

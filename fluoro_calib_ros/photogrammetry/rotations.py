@@ -4,13 +4,13 @@
 """Rotations as arrays: unit quaternions (w, x, y, z), rotation matrices and rotation vectors.
 
 Source of the formulas: Diebel, "Representing Attitude: Euler Angles, Unit Quaternions, and
-Rotation Vectors", Stanford 2006. Quaternion and matrix of one rotation turn a vector the same way:
+Rotation Vectors", Stanford 2006. Quaternion and matrix of a rotation rotate a vector the same way:
 R(q) p = q p q*.
 
-Why not scipy.spatial.transform.Rotation: the recorded bags are reproduced to the last bit from
-their seed, under any version of SciPy. Its results differ by some 1e-16, enough to change them.
-Speed is no reason: for 15 rotations it takes 0.2 (vector to matrix) to 9 times (angle of a matrix)
-as long, 15 to 125 microseconds a call.
+scipy.spatial.transform.Rotation is not used because recorded bags must be reproduced to the last
+bit from their seed, under any version of SciPy. Its results differ by some 1e-16, enough to change
+the bags. Speed is not the reason: for 15 rotations it takes 0.2 times (vector to matrix) to 9
+times (angle of a matrix) as long, 15 to 125 microseconds per call.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import blas
 
-# Symmetric matrices of which one triangle is given.
+# Symmetric matrices with only one triangle given.
 
-BLOCK = 128  # rows and columns that are handled at once: they stay in the cache
+BLOCK = 128  # rows and columns handled at once, so that they stay in the cache
 
 
 def mirror_lower(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Copy the lower triangle of a matrix (n, n) to its upper one, in place; return the matrix."""
+    """Copy the lower triangle of a matrix (n, n) to its upper triangle in place, and return it."""
     n = len(matrix)
     for start in range(0, n, BLOCK):
         stop = min(start + BLOCK, n)
@@ -36,7 +36,7 @@ def mirror_lower(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def square_of_lower(factor: NDArray[np.float64]) -> NDArray[np.float64]:
-    """L L^T (n, n) of a lower triangular matrix L; the upper triangle of factor is not used."""
+    """Return L L^T (n, n) of a lower triangular L; the upper triangle of factor is ignored."""
     n = len(factor)
     out = np.zeros((n, n), order='F')
     for start in range(0, n, BLOCK):
@@ -47,16 +47,16 @@ def square_of_lower(factor: NDArray[np.float64]) -> NDArray[np.float64]:
     return mirror_lower(out)
 
 
-# Of R^T R from the unit matrix, in files: three decimals of a direction leave half a thousandth.
+# Tolerance of R^T R - I for matrices in files: three decimals leave an error of half a thousandth.
 ROTATION_TOLERANCE = 1e-3
-# The same where a matrix is taken as it is: single precision, and programs that compute in it.
+# Tolerance for matrices that are used unchanged: single precision, also of other programs.
 TAKEN_TOLERANCE = 1e-4
 
 
 def is_rotation(
     matrix: NDArray[np.float64], tolerance: float = ROTATION_TOLERANCE
 ) -> NDArray[np.bool_]:
-    """True (...) where matrices (..., 3, 3) are rotations, but for the few digits of a file."""
+    """Return True (...) for matrices (..., 3, 3) that are rotations, up to rounding in a file."""
     error = np.abs(matrix @ np.swapaxes(matrix, -1, -2) - np.eye(3)).max(axis=(-1, -2))
     return (error <= tolerance) & (np.linalg.det(matrix) > 0)
 
@@ -71,7 +71,7 @@ def nearest_rotation(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def matrix_from_quaternion(q: ArrayLike) -> NDArray[np.float64]:
-    """Rotation matrices (..., 3, 3) of quaternions (..., 4) in w, x, y, z of any norm."""
+    """Return rotation matrices (..., 3, 3) of quaternions (..., 4) in w, x, y, z of any norm."""
     q = np.asarray(q, dtype=float)
     w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
     rows = [
@@ -83,9 +83,9 @@ def matrix_from_quaternion(q: ArrayLike) -> NDArray[np.float64]:
 
 
 def quaternion_from_matrix(rotation: ArrayLike) -> NDArray[np.float64]:
-    """Unit quaternions (..., 4) in w, x, y, z, with w >= 0, of rotation matrices (..., 3, 3).
+    """Return unit quaternions (..., 4) in w, x, y, z, with w >= 0, of matrices (..., 3, 3).
 
-    The formula with the largest divisor of four equivalent ones is used (Shepperd's method).
+    Of four equivalent formulas, the one with the largest divisor is used (Shepperd's method).
     """
     r = np.asarray(rotation, dtype=float)
     xx = r[..., 0, 0]
@@ -112,7 +112,7 @@ def quaternion_from_matrix(rotation: ArrayLike) -> NDArray[np.float64]:
 
 
 def cross_matrix(v: ArrayLike) -> NDArray[np.float64]:
-    """Matrices (..., 3, 3) with cross_matrix(v) w = v x w, of vectors (..., 3)."""
+    """Return matrices (..., 3, 3) of vectors v (..., 3) such that cross_matrix(v) w = v x w."""
     v = np.asarray(v, dtype=float)
     out = np.zeros((*v.shape, 3))
     out[..., 0, 1] = -v[..., 2]
@@ -125,7 +125,7 @@ def cross_matrix(v: ArrayLike) -> NDArray[np.float64]:
 
 
 def matrix_from_vector(w: ArrayLike) -> NDArray[np.float64]:
-    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad] (Rodrigues' formula)."""
+    """Return rotation matrices (..., 3, 3) of vectors (..., 3) [rad] (Rodrigues' formula)."""
     w = np.asarray(w, dtype=float)
     angle = np.linalg.norm(w, axis=-1)[..., None, None]
     k = cross_matrix(w)
@@ -136,7 +136,7 @@ def matrix_from_vector(w: ArrayLike) -> NDArray[np.float64]:
 
 
 def vector_from_matrix(rotation: ArrayLike) -> NDArray[np.float64]:
-    """Rotation vectors (..., 3) [rad] of rotation matrices (..., 3, 3) with angles below pi."""
+    """Return rotation vectors (..., 3) [rad] of matrices (..., 3, 3) with angles below pi."""
     q = quaternion_from_matrix(rotation)
     sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
     angle = 2 * np.arctan2(sine, q[..., :1])
@@ -144,7 +144,7 @@ def vector_from_matrix(rotation: ArrayLike) -> NDArray[np.float64]:
 
 
 def rotation_angle(rotation: ArrayLike) -> np.ndarray:
-    """Angles (...) [rad] in [0, pi] of rotation matrices (..., 3, 3)."""
+    """Return the angles (...) [rad] in [0, pi] of rotation matrices (..., 3, 3)."""
     r = np.asarray(rotation, dtype=float)
     sine = 0.5 * np.sqrt(
         (r[..., 2, 1] - r[..., 1, 2]) ** 2
@@ -156,7 +156,7 @@ def rotation_angle(rotation: ArrayLike) -> np.ndarray:
 
 
 def left_jacobian(w: ArrayLike) -> NDArray[np.float64]:
-    """Matrices J (..., 3, 3) of vectors (..., 3): exp(w + d) = exp(J d) exp(w) to first order.
+    """Return J (..., 3, 3) of vectors (..., 3): exp(w + d) = exp(J d) exp(w) to first order.
 
     Source: Sola, Deray and Atchuthan, "A micro Lie theory for state estimation in robotics", 2018,
     Eq. 145.
@@ -164,7 +164,7 @@ def left_jacobian(w: ArrayLike) -> NDArray[np.float64]:
     w = np.asarray(w, dtype=float)
     square = (w * w).sum(axis=-1)[..., None, None]
     k = cross_matrix(w)
-    # Their series where the quotients (1 - cos a) / a^2 and (a - sin a) / a^3 would lose digits.
+    # Use series where the quotients (1 - cos a) / a^2 and (a - sin a) / a^3 would lose digits.
     small = square < 0.05**2
     first = (1 - square / 12 * (1 - square / 30)) / 2
     second = (1 - square / 20 * (1 - square / 42)) / 6

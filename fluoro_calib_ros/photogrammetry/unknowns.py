@@ -1,16 +1,16 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The unknowns of a bundle adjustment; relative orientations that are the same in all exposures.
+"""Unknowns of a bundle adjustment; relative orientations that are the same in all exposures.
 
-Unknowns that belong to one exposure or to one object point form small blocks. All others are
-global, as they touch many image points: interior orientations, relative orientations, additional
+The unknowns of each exposure and of each object point form small blocks. All other unknowns are
+global, as they affect many image points: interior orientations, relative orientations, additional
 parameters, in this order.
 
-Where the relative orientation of two fluoroscopes is the same in every common exposure, Q = R_b
-R_a^T and t = R_a (T_b - T_a) [mm, sensor frame of a] are unknowns of the adjustment, six for each
-pair of fluoroscopes. Each common exposure observes them: R_a (T_b - T_a) - t = 0 and log(R_b R_a^T
-Q^T) = 0, with standard deviations. A rigid mounting is the limit of small standard deviations.
+If the relative orientation of two fluoroscopes is the same in every common exposure, Q = R_b R_a^T
+and t = R_a (T_b - T_a) [mm, sensor frame of a] are unknowns of the adjustment, six for each pair
+of fluoroscopes. Each common exposure observes them: R_a (T_b - T_a) - t = 0 and log(R_b R_a^T Q^T)
+= 0, with standard deviations. A rigid mounting is the limit of small standard deviations.
 Relative orientation constraints: Lerma, Navarro, Cabrelles and Seguí, "Camera calibration with
 baseline distance constraints", Photogrammetric Record 25, 2010. Derivatives of rotations: Barfoot,
 "State Estimation for Robotics", Cambridge 2017, 7.1.
@@ -28,10 +28,9 @@ from numpy.typing import NDArray
 from .rotations import cross_matrix, matrix_from_vector, vector_from_matrix
 
 POSE_SIZE = 6  # translation [mm], rotation vector [rad], also of a body in the rig frame
-# Standard deviations that stand for a rigid mounting, or for an orientation that is fixed: a
-# thousandth of what one pair of exposures determines from images of 0.25 px noise. The solution
-# is that of the limit within some 1e-5 standard deviations, and rounding errors are still far
-# away.
+# Standard deviations for a rigid mounting, or a fixed orientation: a thousandth of what one pair
+# of exposures determines from images with 0.25 px noise. The solution differs from the limit by
+# some 1e-5 standard deviations, and rounding errors are still negligible.
 RIGID_SD_MM = 3e-4
 RIGID_SD_RAD = 1e-7
 # Eigenvalue of a normal matrix of unit diagonal below which it is a rounding error.
@@ -47,8 +46,8 @@ class RelativeConstraint:
     #: standard deviations of each component of translation and rotation
     sd_mm: float
     sd_rad: float
-    #: distance of the sources at which `sd_mm` holds; it makes the constraint follow the scale of
-    #: a free network; None where the scale is fixed
+    #: distance of the sources at which `sd_mm` holds; the constraint then follows the scale of a
+    #: free network; None if the scale is fixed
     length_mm: float | None = None
 
     @property
@@ -61,15 +60,15 @@ class RelativeConstraint:
 class RelativePose:
     """Relative orientation of fluoroscope b with respect to a.
 
-    rotation (3, 3) from the sensor frame of a to that of b; translation_mm (3,) of the source of b
-    in the sensor frame of a.
+    rotation (3, 3): from the sensor frame of a to that of b; translation_mm (3,): source of b in
+    the sensor frame of a.
     """
 
     rotation: NDArray[np.float64]
     translation_mm: NDArray[np.float64]
 
     def updated(self, step: np.ndarray) -> RelativePose:
-        """The pose after a step (6,): translation [mm], rotation [rad] on the left."""
+        """Return the pose after a step (6,): translation [mm], rotation [rad] from the left."""
         step = np.asarray(step)
         return RelativePose(
             matrix_from_vector(step[3:]) @ self.rotation, self.translation_mm + step[:3]
@@ -113,7 +112,7 @@ class ReducedLayout:
 
 @dataclass(frozen=True)
 class UnknownLayout:
-    """Where the unknowns of a network stand."""
+    """Layout of the unknowns of a network."""
 
     #: numbers of the block unknowns
     n_exposures: int
@@ -122,10 +121,9 @@ class UnknownLayout:
     interiors: tuple[slice, ...]
     #: columns of each constrained relative orientation among the global unknowns
     relative: tuple[slice, ...]
-    #: columns of the additional parameters of each fluoroscope among the global unknowns, empty
-    #: where there are none
+    #: columns of the additional parameters of each fluoroscope among the global unknowns, or empty
     additional: tuple[slice, ...]
-    free: NDArray[np.bool_]  #: (G,) which global unknowns are estimated
+    free: NDArray[np.bool_]  #: (G,) whether each global unknown is estimated
     datum_defect: int  #: number of unknowns that the datum of a free network fixes
 
     @classmethod
@@ -137,7 +135,7 @@ class UnknownLayout:
         additional_sizes: Sequence[int],
         datum_defect: int,
     ) -> UnknownLayout:
-        """Layout of the unknowns of a network.
+        """Return the layout of the unknowns of a network.
 
         Parameters
         ----------
@@ -212,7 +210,7 @@ class UnknownLayout:
         return ReducedLayout(self.n_points, POINT_SIZE, self.n_free_globals)
 
     def expand_globals(self, free_values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Values (G, ...) of all global unknowns from the free ones; zeros where fixed."""
+        """Return all global unknowns (G, ...) from the free unknowns; fixed unknowns are zero."""
         out = np.zeros((self.n_globals, *free_values.shape[1:]))
         out[self.free] = free_values
         return out
@@ -224,7 +222,7 @@ class UnknownVector:
 
     exteriors: NDArray[np.float64]  #: (m, 6, ...) of T [mm] and w [rad] of the exposures
     points: NDArray[np.float64]  #: (n, 3, ...) of the object points [mm]
-    globals: NDArray[np.float64]  #: (G, ...) of the global unknowns; zeros where fixed
+    globals: NDArray[np.float64]  #: (G, ...) of the global unknowns; zeros if fixed
 
 
 @dataclass(frozen=True)
@@ -241,16 +239,16 @@ class Parameters:
     relative: tuple[RelativePose, ...] = ()
 
     def additional_of(self, f: int) -> NDArray[np.float64]:
-        """Coefficients of the additional parameters of fluoroscope f, which has some."""
+        """Return the additional parameters of fluoroscope f, which must have some."""
         coefficients = self.additional[f]
         assert coefficients is not None
         return coefficients
 
 
 def inverse_left_jacobian(w: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Derivatives (..., 3, 3) of log(exp(v) exp(w)) with respect to v at v = 0.
+    """Return derivatives (..., 3, 3) of log(exp(v) exp(w)) with respect to v at v = 0.
 
-    w (..., 3) are rotation vectors [rad] (Barfoot 7.1.3).
+    w (..., 3): rotation vectors [rad] (Barfoot 7.1.3).
     """
     half = np.linalg.norm(w, axis=-1)[..., None, None] / 2
     k = cross_matrix(w)
@@ -264,9 +262,9 @@ def inverse_left_jacobian(w: NDArray[np.float64]) -> NDArray[np.float64]:
 def relative_poses(
     parameters: Parameters, pairs: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Rotations (k, 3, 3) and translations (k, 3) [mm] of b relative to a in pairs of exposures.
+    """Return rotations (k, 3, 3) and translations (k, 3) [mm] of b relative to a.
 
-    pairs (k, 2) are rows of exposures.
+    pairs (k, 2): rows of exposures of a and b.
     """
     a, b = pairs.T
     r_a = parameters.rotation[a]
@@ -277,7 +275,7 @@ def relative_poses(
 def discrepancies(
     constraint: RelativeConstraint, pose: RelativePose, parameters: Parameters
 ) -> NDArray[np.float64]:
-    """Discrepancies (k, 6) of the pairs from a pose: translation [mm], rotation [rad]."""
+    """Return discrepancies (k, 6) of the pairs from a pose: translation [mm], rotation [rad]."""
     turn, shift = relative_poses(parameters, constraint.pairs)
     scale, _ = _translation_scale(constraint, pose)
     return np.concatenate(
@@ -288,7 +286,7 @@ def discrepancies(
 def _translation_scale(
     constraint: RelativeConstraint, pose: RelativePose
 ) -> tuple[float, NDArray[np.float64]]:
-    """Factor of the translations, and its derivative (3,) by the translation of the pose."""
+    """Return the factor of the translations, and its derivative (3,) by the pose translation."""
     if constraint.length_mm is None:
         return 1.0, np.zeros(3)
     length = np.linalg.norm(pose.translation_mm)
@@ -299,10 +297,10 @@ def _translation_scale(
 def discrepancies_with_jacobian(
     constraint: RelativeConstraint, pose: RelativePose, parameters: Parameters
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Discrepancies (k, 6) and their derivatives.
+    """Return discrepancies (k, 6) and their derivatives.
 
-    Returns the discrepancies and their derivatives (k, 6, 6) by the exposure of a, by the exposure
-    of b (T [mm] and w [rad] each), and by the pose (as in RelativePose.updated).
+    The derivatives (k, 6, 6) are by the exposure of a, by the exposure of b (T [mm] and w [rad]
+    each), and by the pose (as in RelativePose.updated).
     """
     a, _ = constraint.pairs.T
     turn, shift = relative_poses(parameters, constraint.pairs)
@@ -325,16 +323,16 @@ def discrepancies_with_jacobian(
 def mean_pose(
     parameters: Parameters, pairs: NDArray[np.int64], weights: np.ndarray | None = None
 ) -> RelativePose:
-    """Mean relative orientation of pairs (k, 2) of exposures.
+    """Return the mean relative orientation of pairs (k, 2) of exposures.
 
-    With weights (k, 6, 6) of translation and rotation of each pair, the weighted mean. Without
-    them the component-wise median: a start value that is robust to single pairs.
+    With weights (k, 6, 6) of translation and rotation of each pair, it is the weighted mean;
+    without weights, the component-wise median, an initial value that is robust to single pairs.
     """
     turn, shift = relative_poses(parameters, pairs)
     median = np.median(shift, axis=0)
     start = int(np.argmin(np.sum((shift - median) ** 2, axis=1)))
     pose = RelativePose(turn[start], median)
-    for _ in range(10):  # of which it takes a few
+    for _ in range(10):  # a few are enough
         difference = np.concatenate(
             [shift - pose.translation_mm, vector_from_matrix(turn @ pose.rotation.T)], axis=1
         )
@@ -356,7 +354,7 @@ def exposures_from_pose(
     pose: RelativePose,
     offset: NDArray[np.float64] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Exterior orientations of b's exposures from those of a and a relative orientation.
+    """Return exterior orientations of b's exposures from those of a and a relative orientation.
 
     Parameters
     ----------
@@ -367,7 +365,7 @@ def exposures_from_pose(
     pose : RelativePose
         Relative orientation of b with respect to a.
     offset : (k, 6) ndarray, optional
-        Discrepancies from the pose that the result has; zeros by default.
+        Discrepancies of the result from the pose; zeros by default.
 
     Returns
     -------
@@ -392,11 +390,11 @@ def exposures_after_step(
     after: Parameters,
     step: UnknownVector,
 ) -> Parameters:
-    """Parameters after a step, with b's exposures moved along their constraints.
+    """Return parameters after a step, with b's exposures moved along their constraints.
 
-    Their discrepancies become what the linearised constraint predicts. To first order they are so
-    already, but a stiff constraint is curved, and a straight step would leave it by more than its
-    standard deviation.
+    Their discrepancies become those that the linearised constraint predicts. To first order they
+    already are, but a stiff constraint is curved, and a straight step would leave it by more than
+    its standard deviation.
 
     constraints: the constraints of the network. before, after: parameters before and after the
     straight step.

@@ -115,7 +115,7 @@ def calibrate_request(
 ) -> CalibrationResult:
     """Self-calibrate the fluoroscopes of a request; see `calibrate` for the other arguments.
 
-    starts: start values from an earlier calibration with these exposures.
+    starts: initial values from an earlier calibration with these exposures.
 
     Raises DataError and ValueError as `calibrate`, and ValueError for options that are
     incompatible with known orientations.
@@ -178,7 +178,7 @@ def calibrate_part(
     """Self-calibrate with some of the exposures of an earlier calibration.
 
     request: has the frames of these exposures. starts, whole: from the calibration of all
-    exposures, whose noise is used. Raises DataError if the exposures do not suffice.
+    exposures, whose image noise is used. Raises DataError if the exposures do not suffice.
     """
     out: dict[str, FluoroscopeCalibration] = {}
     with threadpool_limits(1):
@@ -316,10 +316,9 @@ def adjust_with_calibrations(
     exposures; that of the correction is part of the noise of every image point.
 
     frames: by fluoroscope; all share the object points. loss: noise model of the image points.
-    known: orientations known beforehand, by fluoroscope. starts: start values from an earlier
-    adjustment of the frames, if only its residuals are needed. The residuals without correction
-    are then not computed, their RMSE is NaN, and covariances exclude the uncertainty of the
-    interior orientations.
+    known: orientations known beforehand, by fluoroscope. starts: initial values from an earlier
+    adjustment of the frames, if only residuals are needed: residuals without correction are then
+    not computed (their RMSE is NaN), and covariances exclude the uncertainty of the interiors.
 
     Raises DataError if a frame is invalid or has another image size than its calibration.
     """
@@ -427,10 +426,10 @@ class _ImageNoise:
 def _image_noise(run: SelfCalibration, f: int, name: str) -> _ImageNoise:
     """Return the noise of an image coordinate of fluoroscope number f.
 
-    It is estimated from the residuals of the inliers, which are smaller than the noise by the root
-    of their redundancy numbers, plus the difference between the distortion of an exposure and the
-    model. The scale of a Student-t noise cannot replace it: where the tails are heavy, that scale
-    is smaller than the standard deviation of its core.
+    Its variance is that of the inlier residuals, which are smaller than the noise by the root of
+    their redundancy numbers, plus that of the distortion of an exposure about the model. The scale
+    of a Student-t noise cannot replace it: where the tails are heavy, that scale is smaller than
+    the standard deviation of its core.
     """
     noise_model = run.after.noise
     if noise_model.loss != 'huber' and noise_model.nu >= EQUAL_WEIGHTS_NU:

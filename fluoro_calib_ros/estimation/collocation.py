@@ -13,11 +13,11 @@ After each adjustment:
 
 1. Update the variances of the terms of exposures, where there are such terms.
 2. Update the prior of each fluoroscope by one step towards the largest marginal likelihood. Where
-the signal has places of larger variance, search for more of them.
+   the signal has places of larger variance, search for more of them.
 3. Set the number of sines to the number that the image points determine with this prior.
 4. Once the priors are steady, search the residuals, one after the other, for what the terms cannot
-follow yet: ripples; rejected image points that agree; exposures that differ; places where the
-signal has a larger variance.
+   follow yet: ripples; rejected image points that agree; exposures that differ; places where the
+   signal has a larger variance.
 
 A change in step 3 or 4 leads to another adjustment. After two updates that change nothing, the
 priors stay fixed.
@@ -61,10 +61,9 @@ if TYPE_CHECKING:
     from ..photogrammetry.network import Network
     from ..photogrammetry.precision import Precision
 
-SETTLED_VARIATION = 0.05  # relative change of the RMS change of the distortion between exposures
-# Number of updates without visible change after which the priors stay fixed. Noise and signal
-# would otherwise oscillate about their solution for long where the correlation length of the
-# signal is as short as the distance between image points.
+SETTLED_VARIATION = 0.05  # relative change of the RMS variation between exposures
+# Number of updates without visible change after which the priors stay fixed. Otherwise noise and
+# signal oscillate for long where the correlation length is no longer than the point distance.
 STAY_AFTER = 2
 # Decrease of F that an adjustment of continued terms may leave: a thirtieth of a sigma.
 CONTINUED_TOLERANCE = 1e-3
@@ -87,8 +86,7 @@ class CollocationTerms(AdjustedTerms):
     """
 
     intermediate_tolerance = 1.0  # loose, because noise and prior still change
-    # A third of the standard deviation of the noise scale of 1000 image points; the remaining
-    # change is smaller.
+    # A third of the standard deviation of the noise of 1000 image points; less remains to change.
     noise_tolerance = 5e-3
 
     def __init__(

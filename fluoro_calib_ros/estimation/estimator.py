@@ -3,10 +3,9 @@
 
 """How a self-calibration obtains a correction model, and the gauge between it and orientations.
 
-The gauge is the freedom between a free correction and the orientation of the sensor. A correction
-competes with the orientations if it can reproduce the effect of a change of interior and exterior
-orientation on the image. To first order, such a change moves an image point (x, y) = (u - xp, v -
-yp) by
+A free correction competes with the orientation of the sensor if it can reproduce the effect of a
+change of interior and exterior orientation on the image: this effect is the gauge. To first order,
+such changes move an image point (x, y) = (u - xp, v - yp) by
 
     (1, 0), (0, 1)                    principal point,
     (x, y)                            principal distance,
@@ -14,10 +13,9 @@ yp) by
     (x x, x y)/c, (x y, y y)/c        rotation about its rows and columns, without a shift
 
 (derivatives of the collinearity condition; the last three are common to all exposures and leave
-sources and object points where they are). The fitted correction is kept orthogonal to these
-fields. Where the interior orientation is fixed, only the rotations remain, with their shifts: (-y,
-x), (c + x x/c, x y/c), (x y/c, c + y y/c). Where the exterior orientations are known too, nothing
-competes.
+sources and object points where they are). The fitted correction is kept orthogonal to them. If
+the interior orientation is fixed, only the rotations remain, with their shifts: (-y, x),
+(c + x x/c, x y/c), (x y/c, c + y y/c). If the exterior orientations are known too, none remains.
 
 Flat targets parallel to the image determine neither principal distance nor principal point, and
 the distance of the source absorbs any scale. Where these are given, they are those of a distortion

@@ -52,8 +52,8 @@ TERMS = len(cubic_terms())  # number of terms of the cubic trend without the gau
 # varies. Object points and the common distortion absorb a part of the residuals: constant
 # distortions have 0.4 to 0.8 (docs/how_good/pathologies.md).
 VARYING = 0.85
-# Number of exposures that the other terms count as for the variances of a change of the interior
-# orientation. Variances of the terms of a smooth field scatter as if estimated from so many.
+# Prior degrees of freedom of the variances of a change of the interior orientation: the number of
+# exposures that the other terms count as. Variances of the terms of a smooth field scatter so.
 LIKE_OTHERS = 4
 MIN_POINTS = 30  # image points of an exposure whose terms are tested
 
@@ -65,7 +65,7 @@ class Variation:
     #: square sum of the terms of all exposures over its expectation for independent residuals
     chi2_per_dof: float
     size_px: float  #: RMS of a coordinate of the change [px], less the contribution of noise
-    noise_px: float  #: standard deviation of a coordinate of the residuals without the terms [px]
+    noise_px: float  #: standard deviation of a coordinate after a fit of the terms [px]
 
     @property
     def is_varying(self) -> bool:
@@ -111,8 +111,7 @@ def variation(
     """Return the change of the distortion that residuals show.
 
     residuals (n, 2) [px] of inliers, their exposures (n,), and the values (n, 2, 14) of
-    `exposure_functions`. The variance of the noise is estimated from the residuals without the
-    terms.
+    `exposure_functions`. The noise variance is that of the residuals after a fit of the terms.
     """
     explained = 0.0
     left = 0.0
@@ -339,8 +338,7 @@ def _variances_left(
 MIN_SPREAD = np.deg2rad(2)  # least RMS spread of the angles
 STEPS = 60  # most iterations of the variances
 SETTLED = 1e-3  # relative change of the variances at convergence
-# Least share of the variance between exposures that the angle must explain to be a cause.
-MIN_SHARE = 0.05
+MIN_SHARE = 0.05  # of the variance between exposures that the angle must explain to be a cause
 
 
 @dataclass(frozen=True)

@@ -49,8 +49,7 @@ class JointPrecision:
 
     #: (u,) names of the unknowns: x, y, z of the source [mm] and its rotations about the axes of
     #: the sensor [rad] for each exposure; x, y, z [mm] of each target; xp, yp, c [px] of each
-    #: fluoroscope; relative orientations and coefficients of the correction, where they were
-    #: estimated
+    #: fluoroscope; estimated relative orientations and coefficients of the correction
     names: tuple[str, ...]
     values: NDArray[np.float64]  #: (u,) estimates; NaN for rotations, which have no value
     covariance: NDArray[np.float64]  #: (u, u); zeros for fixed unknowns

@@ -194,8 +194,7 @@ class StartValues:
     interior: Mapping[str, NDArray[np.float64]]  #: (3,) xp, yp, c [px] by fluoroscope
     #: (3, 3) rotation and position [mm] by fluoroscope and exposure
     exterior: Mapping[tuple[str, int], tuple[NDArray[np.float64], NDArray[np.float64]]]
-    #: earlier calibration with these and other exposures; orientations are those with its
-    #: corrections
+    #: calibration with these and other exposures; the orientations belong to its corrections
     earlier: EarlierCalibration | None = None
 
 
@@ -260,9 +259,8 @@ def measured_network(
     principal_distance: initial value [px]; by default it is found from the observations. known:
     orientations known beforehand, by fluoroscope. starts: used for a fluoroscope if it has initial
     values of all its exposures. sensors {fluoroscope: KnownSensor}: fixed interior orientations
-    and corrections; by default fluoroscopes are to be calibrated. With sensors, one exposure of a
-    fluoroscope is enough. Raises DataError if a frame is invalid, if there are too few exposures
-    or targets, or if all exposures show the same pose.
+    and corrections, with which one exposure is enough; by default these are to be calibrated.
+    Raises DataError for invalid frames, too few exposures or targets, or a single common pose.
     """
     task = _Task(phantom, sensors, principal_distance, known or {}, starts)
     return _measured(

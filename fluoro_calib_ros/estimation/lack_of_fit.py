@@ -66,8 +66,8 @@ MIN_TARGETS = 6
 # Chance that false matches agree in any of the areas where more image points are rejected than
 # chance explains; elsewhere it is FALSE_ALARM.
 CLUSTERED_FALSE_ALARM = 0.05
-# At a border there may be few image points. Where rejected ones are clustered, so many targets in
-# so many exposures are enough.
+# A border may have few image points: FEW_TARGETS targets in FEW_EXPOSURES exposures are enough for
+# a test where the rejected image points are clustered.
 FEW_TARGETS = 3
 FEW_EXPOSURES = 2
 DRAWS = 10_000  # random draws of the directions of few residuals
@@ -117,8 +117,7 @@ class LeftOut:
 class LeftOutInPlaces:
     """Signal that a series omits in places where the signal has a larger variance.
 
-    variance: function of pixels (n, 2) that returns variances [px^2]; correlation: as in
-    `LeftOut`.
+    variance: function of pixels (n, 2), returns [px^2]; correlation: as in `LeftOut`.
     """
 
     variance: Callable[[NDArray[np.float64]], NDArray[np.float64]]
@@ -188,9 +187,8 @@ def _growth(
 ) -> float:
     """Extrapolate the mean of products (n, k) at distances (n, k) [px] to distance zero.
 
-    Returns the extrapolated mean over the mean. The covariance of a smooth error falls with the
-    square of the distance, so that nearer and farther neighbours determine it. other (n, k): pairs
-    to use.
+    Returns its ratio to the mean. The covariance of a smooth error falls with the square of the
+    distance, so that nearer and farther neighbours determine it. other (n, k): pairs to use.
     """
     nearer = other & (distance < np.median(distance))
     farther = other & ~nearer
@@ -356,8 +354,7 @@ class _Area:
     """Rejected image points of an area.
 
     rows (n,): the image points; of_target (k, 2): mean residual of each target [px]; exposures:
-    number of exposures that agree with the mean of all; clustered: whether more are rejected than
-    by chance.
+    number of exposures that agree with the mean of all; clustered: more rejected than by chance.
     """
 
     rows: NDArray[np.int64]

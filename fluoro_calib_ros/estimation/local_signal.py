@@ -50,8 +50,7 @@ class LocalSignal:
 
     nodes: NDArray[np.float64]  #: (n, 2) centres of the bumps [px]
     window: NDArray[np.int64]  #: (n,) window or band of each bump
-    #: (w,) variance of the heights of the bumps of each window or band [px^2], the same for u and
-    #: v
+    #: (w,) variance of the bump heights of each window or band [px^2], the same for u and v
     variances: NDArray[np.float64]
 
     @property
@@ -177,8 +176,7 @@ def largest_gain(functions: Functions, estimates: SineEstimates) -> float:
 class _Place:
     """Bumps with a common variance.
 
-    rows (b,): of the bumps; gain: of the logarithm of the likelihood; variance: most likely
-    [px^2].
+    rows (b,): of the bumps; gain: of the log likelihood; variance: most likely [px^2].
     """
 
     rows: NDArray[np.int64]

@@ -79,8 +79,7 @@ def with_errors_by(
 def _precision_by(reference: SelfCalibration, run: SelfCalibration) -> Precision:
     """Add the products of the differences from a reference to its covariances.
 
-    Returns the precision of the run. Covariances with additional parameters and other global
-    unknowns are those of its network.
+    Covariances with additional parameters and other global unknowns are those of the network.
     """
     found = run.after.parameters
     other = reference.after.parameters

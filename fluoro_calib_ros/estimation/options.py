@@ -358,8 +358,7 @@ class CalibrationRequest:
         Orientations known beforehand, by fluoroscope; the phantom is then surveyed in their
         frame.
     about : mapping of str to str
-        Notes on rig and input for the report, such as site and operator; not used in
-        calculations.
+        Notes on rig and input for the report, such as site and operator; not used to calculate.
     """
 
     __repr__ = brief_repr

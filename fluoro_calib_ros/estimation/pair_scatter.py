@@ -8,9 +8,8 @@ excluded, if its frames are not of one exposure, or if the phantom moved between
 
 Where a distortion changes with the angle of a C-arm, the orientation of each exposure absorbs the
 part of the change that is a shift, rotation or scale of the image. The relative orientations are
-then a function of the angle, or of its harmonics, like the correction (`correction.angle_field`).
-The same holds where an arm bends. A scatter that these harmonics do not explain is as unexpected
-as elsewhere.
+then a function of the harmonics of the angle, like the correction (`correction.angle_field`), as
+also if an arm bends. Scatter that the harmonics do not explain is as unexpected as elsewhere.
 """
 
 from __future__ import annotations
@@ -84,8 +83,7 @@ class Agreement:
 def functions_of_angles(angles: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
     """Return functions (k, p) of the angles (k,) [rad] of both fluoroscopes of k pairs.
 
-    The first function is 1. The number of orders of the harmonics is limited by the number of
-    pairs; there are none if the angles are unknown.
+    The first is 1; few pairs allow fewer orders of harmonics, and unknown angles allow none.
     """
     count = len(angles[0])
     one, other = angles
@@ -146,7 +144,7 @@ def _near(deviation: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def _growth(off_sd: NDArray[np.float64], used: NDArray[np.bool_], columns: int) -> float:
-    """Return the factor by which used pairs scatter more than stated about so many functions."""
+    """Return the factor by which used pairs scatter more than stated; columns: of their fit."""
     freedom = max(6 * (int(used.sum()) - columns), 1)
     return float(np.sqrt(max(1.0, 6 * np.sum(off_sd[used] ** 2) / freedom)))
 

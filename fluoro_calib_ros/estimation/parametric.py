@@ -60,8 +60,7 @@ def squared_error_of_kept(
     """Return expected squared errors (t,) of terms, in units of the variances of their estimates.
 
     ratio: (t,) estimates without a prior, over their standard deviations. kept: (t,) fractions of
-    these estimates that are kept, 0 to 1. The errors are posterior variances about the kept
-    values.
+    these estimates that are kept, 0 to 1. Errors are posterior variances about the kept values.
     """
     half = np.square(ratio) / 2
     x, weight = np.polynomial.legendre.leggauss(NODES)

@@ -171,8 +171,7 @@ def _plane_weights(
 ) -> NDArray[np.float64]:
     """Return weights (n, k) that evaluate at 0 a plane fitted at offset (n, k, d).
 
-    kernel: (n, k). The offsets are in units of the bandwidth; the ridge of the slopes is relative
-    to it.
+    kernel: (n, k). Offsets, and thus the ridge of the slopes, are in units of the bandwidth.
     """
     design = np.concatenate([np.ones((*kernel.shape, 1)), offset], axis=2)
     weighted = kernel[:, :, None] * design

@@ -34,8 +34,7 @@ LEAST_EXCESS = 0.1  # least initial power of a band in excess of the noise
 class Ripples:
     """Prior variances of the sines of bands of frequencies.
 
-    width: of a band [1/px]; variances: [px^2] of the bands 0, 1, ..., zero for bands without
-    ripples.
+    width: of a band [1/px]; variances: [px^2] of bands 0, 1, ..., zero if there are no ripples.
     """
 
     width: float

@@ -349,9 +349,8 @@ def calibrate_by_adjustment(
 ) -> SelfCalibration:
     """Self-calibrate with the coefficients of the model as unknowns.
 
-    before: adjustment without correction. model_type: a model that is a series. terms: terms of
-    that model, for the network of measured. progress: called with the Round after every
-    adjustment.
+    before: adjustment without correction. model_type: a model that is a series. terms: of this
+    model, for the network of measured. progress: called with the Round after every adjustment.
 
     Raises DataError if there are too few inliers, or the exposures do not determine the unknowns.
     """

@@ -126,8 +126,7 @@ class Signal:
     ) -> NDArray[np.float64]:
         """Return the correlation (n,) of that part at distances (n,) [px]: its Hankel transform.
 
-        Ripples shorter than the distance between image points hardly show in products of
-        neighbours.
+        Ripples shorter than the distance of image points hardly show in products of neighbours.
         """
         return correlation_of(self.density, frequency, distance)
 

@@ -12,8 +12,7 @@ coordinates x of the free network, their covariance C and the unknown scale 1 + 
 where l are the distances in the network and A their derivatives. This is sequential least squares
 (Foerstner and Wrobel, "Photogrammetric Computer Vision", Springer 2016, 4.2.7), and gives the same
 as distances in the adjustment would. C satisfies the inner constraints, and so do the coordinates:
-position and attitude remain those of the datum, and only the scale is changed to that of the
-distances.
+position and attitude remain those of the datum, only the scale becomes that of the distances.
 
 The self-calibration with inner constraints gives the shape of the phantom. Position and attitude
 are those of the given coordinates. The scale is that of the measured distances, or else that of

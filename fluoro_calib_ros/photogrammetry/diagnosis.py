@@ -4,10 +4,9 @@
 """Name unknowns that a network cannot determine, and unknowns that can hardly be separated.
 
 Near-zero eigenvalues of the normal matrix, scaled to a unit diagonal, belong to combinations of
-unknowns that the observations do not determine. The largest components of their eigenvectors show
-which unknowns (Belsley, Kuh and Welsch, "Regression Diagnostics", Wiley 1980, 3.2; for
-self-calibration Luhmann et al., "Close-Range Photogrammetry and 3D Imaging", 3rd ed., de Gruyter
-2020, 7.3.2).
+unknowns that the observations do not determine. The largest components of their eigenvectors name
+them (Belsley, Kuh and Welsch, "Regression Diagnostics", Wiley 1980, 3.2; for self-calibration
+Luhmann et al., "Close-Range Photogrammetry and 3D Imaging", 3rd ed., de Gruyter 2020, 7.3.2).
 """
 
 from __future__ import annotations
@@ -78,9 +77,8 @@ def high_correlations(
 ) -> tuple[tuple[str, str, float], ...]:
     """Return high correlations of interior and relative orientations with other unknowns.
 
-    These are all global unknowns and exterior orientations; the limit is 0.95. fluoroscopes: names
-    of the fluoroscopes. numbers: numbers of the exposures. Returns two unknowns and their
-    correlation, the largest first, at most 20.
+    The others are all global unknowns and exterior orientations. fluoroscopes: names. numbers: of
+    the exposures. Returns pairs of unknowns with correlations above 0.95, largest first, up to 20.
     """
     orientations = network.layout.all_orientations
     count = orientations.stop

@@ -232,8 +232,7 @@ class Elimination(ABC):
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Split covariances (k, t, q) of other unknowns with the remaining unknowns.
 
-        Returns covariances with the remaining blocks (k, t, c, s) and all global unknowns (k, t,
-        G).
+        Returns those with the remaining blocks (k, t, c, s) and with all globals (k, t, G).
         """
         shape = border.shape[:2]
         with_globals = np.zeros((*shape, self.network.layout.n_globals))

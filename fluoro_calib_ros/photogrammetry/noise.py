@@ -38,9 +38,9 @@ from scipy.special import ndtri
 SURE = 3.0
 CERTAIN = 4.0
 NORMAL_MEDIAN = float(ndtri(0.75))  # median of the absolute value of a standard normal variable
-# Relative standard deviation of the median of n absolute normal errors, times the root of n: 1 /
-# (2 f(m) m) with the density f at the median m. For lengths of two-coordinate errors it is 0.72,
-# but tails can be heavy.
+# Relative standard deviation of the median of n absolute normal errors, times the root of n:
+# 1 / (2 f(m) m) with the density f at the median m. For lengths of two-coordinate errors it is
+# 0.72, but tails can be heavy.
 MEDIAN_SD = np.sqrt(2 * np.pi) * np.exp(NORMAL_MEDIAN**2 / 2) / (4 * NORMAL_MEDIAN)
 MAX_WIDENING = 2.0  # a larger factor has another cause than the stated standard deviations
 MIN_ERRORS = 12  # fewer errors determine no scale
@@ -49,10 +49,9 @@ RENEWED = 0.1  # part of these errors after which the factor is computed again
 
 
 def trimmed_scale(size: NDArray[np.float64], limit: float) -> tuple[float, int]:
-    """Return the scale, at least 1, of errors without gross errors, and the number of these.
+    """Return the scale, at least 1, of the errors that are not gross, and their number.
 
-    size, limit: as in `widening`. With fewer errors than MIN_ERRORS, the scale is 1 and the number
-    0.
+    size, limit: as in `widening`. With fewer than MIN_ERRORS such errors, returns 1 and 0.
     """
     size = size[np.isfinite(size)]
     scale = 1.0
@@ -246,8 +245,8 @@ class Noise:
         """Normalised square beyond which an image point is considered a gross error.
 
         It is about four sigma. For heavier tails, as of a Student-t with few degrees of freedom,
-        it is the quantile that rejects MAX_REJECTED of the true points: P(q > x) = (1 +
-        x/nu)^(-nu/2) for D = 2, with nu of at least MIN_TAIL_NU.
+        it is the quantile that rejects MAX_REJECTED of the true points:
+        P(q > x) = (1 + x/nu)^(-nu/2) for D = 2, with nu of at least MIN_TAIL_NU.
         """
         if self.loss != 'student_t':
             return float(INLIER_Q)
@@ -262,9 +261,8 @@ class Noise:
     def estimate_from(self, squared: ArrayLike, unresolved: ArrayLike = 0.0) -> Noise:
         """Estimate the scale and, for Student-t, nu and the share of gross errors.
 
-        Method: ECME, starting from this model. The unknowns of the adjustment are missing data, so
-        the expected squared error is that of the residual plus the part that the unknowns leave
-        unresolved.
+        ECME, starting from this model. The unknowns of the adjustment are missing data: the square
+        to expect of an error is that of its residual plus what the unknowns leave unresolved.
 
         squared: (n,) squared residuals r^T r / sigma^2 of the image points. unresolved: (n,) tr(A
         C A^T) / (scale * sigma)^2 of each image point; for a point of weight one it is two minus

@@ -128,8 +128,7 @@ class _Linearised:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Return arrays (k, 2, ...) by image point.
 
-        They are derivatives by exterior orientation, object point and interior orientation, and
-        residuals.
+        Derivatives by exterior orientation, object point, interior orientation; and residuals.
         """
         a = np.stack([self.u.T, self.v.T], axis=1)
         a_p = np.stack([self.pu.T, self.pv.T], axis=1)

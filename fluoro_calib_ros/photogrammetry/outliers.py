@@ -9,9 +9,10 @@ Data snooping (Baarda, "A testing procedure for use in geodetic networks", Nethe
 Commission 1968) for observations of two and three coordinates: each observation is compared with
 its prediction by all others. Under robust weights an adjustment hardly follows a gross error, so
 its residual is tested by its covariance at full weight. With P = A C_x A^T and weight w, the
-residual without the observation is (1 - w P / s^2)^-1 r, with covariance s^2 + P (1 - w P /
-s^2)^-1 (Foerstner and Wrobel, "Photogrammetric Computer Vision", Springer 2016, 4.6). If the scale
-is estimated from the same residuals, Pope's test replaces chi-square (NOAA TR NOS 65 NGS 1, 1976).
+residual without the observation is (1 - w P / s^2)^-1 r, with covariance
+s^2 + P (1 - w P / s^2)^-1 (Foerstner and Wrobel, "Photogrammetric Computer Vision", Springer 2016,
+4.6). If the scale is estimated from the same residuals, Pope's test replaces chi-square (NOAA TR
+NOS 65 NGS 1, 1976).
 """
 
 from __future__ import annotations
@@ -232,8 +233,7 @@ def _intersect(
     return offset, covariance, square
 
 
-# Estimation of the noise model in a loop around the adjustment, by the marginal likelihood of its
-# scale.
+# Estimation of the noise model around the adjustment, by the marginal likelihood of its scale.
 #
 # Residuals are smaller than the noise, because the unknowns follow it. The difference depends on
 # the scale itself: the less the image points weigh, the more the survey determines the object
@@ -265,9 +265,8 @@ def adjust_and_estimate_noise(
     noise: loss and initial values of the noise model. options: of the last adjustment; earlier
     adjustments have a looser tolerance.
 
-    `converged` of the result is False if the adjustment or the scale did not settle; `steps`
-    counts the last adjustment only. Raises LinAlgError if the network does not determine the
-    unknowns.
+    `converged` of the result is False if adjustment or scale did not settle; `steps` counts the
+    last adjustment only. Raises LinAlgError if the network does not determine the unknowns.
     """
     correction = np.zeros_like(network.uv) if correction is None else correction
     _, q = residuals_and_q(network, start, correction, noise)

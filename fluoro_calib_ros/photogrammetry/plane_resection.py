@@ -86,7 +86,7 @@ def homography(
 
 
 def _normalised(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return points (..., n, 2) centred and scaled to about one, and the matrix that reverts this."""
+    """Return points (..., n, 2) centred and scaled to about one, and the matrix back."""
     mean = points.mean(axis=-2, keepdims=True)
     square = np.mean(np.sum((points - mean) ** 2, axis=-1), axis=-1)[..., None, None]
     size = np.sqrt(np.maximum(square, 1e-300) / 2)
@@ -126,9 +126,9 @@ def principal_distance_of_planes(
 ) -> float | None:
     """Return the principal distance [px] by homographies (3, 3) of planes in mm.
 
-    None: no plane is tilted. Zhang's conditions are h1' B h2 = 0 and h1' B h1 = h2' B h2 with B =
-    K^-T K^-1; for a known principal point (2,) [px] they are linear in 1/c^2. They are weighted by
-    their information on it; a plane that is not tilted has none.
+    None: no plane is tilted. Zhang's conditions are h1' B h2 = 0 and h1' B h1 = h2' B h2 with
+    B = K^-T K^-1; for a known principal point (2,) [px] they are linear in 1/c^2. They are
+    weighted by their information on it; a plane that is not tilted has none.
     """
     product = 0.0
     size = 0.0

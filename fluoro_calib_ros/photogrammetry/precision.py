@@ -421,8 +421,8 @@ def geometric_redundancy(
 # Fixed parameters with covariance S move the other unknowns by J = -N^-1 B, where N is the normal
 # matrix of the unknowns and B its mixed blocks with the fixed parameters. The covariance of the
 # unknowns is N^-1 + J S J^T ("consider parameters": Tapley, Schutz and Born, "Statistical Orbit
-# Determination", 2004, 6.2). It is a block of the inverse of the normal matrix with D = S^-1 + B^T
-# N^-1 B for the fixed parameters, in which the observations do not improve these.
+# Determination", 2004, 6.2). It is a block of the inverse of the normal matrix with
+# D = S^-1 + B^T N^-1 B for the fixed parameters, in which the observations do not improve these.
 
 MIN_SD_PX = 1e-6  # least standard deviation of a fixed interior orientation
 

@@ -62,9 +62,8 @@ def least_vectors(forms: NDArray[np.float64]) -> NDArray[np.float64]:
 def least_vectors_with_last_one(forms: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return vectors (..., k) with the least values, and one as last component.
 
-    This takes a tenth of the time of `least_vectors`. The last component of a projection matrix is
-    the depth of the centre of the points, which is not zero (Hartley and Zisserman 4.1.2,
-    inhomogeneous solution).
+    It takes a tenth of the time. The last component of a projection is the depth of the centre of
+    the points, which is not zero (Hartley and Zisserman 4.1.2, inhomogeneous solution).
     """
     k = forms.shape[-1] - 1
     # This small addition to the diagonal also solves singular equations.
@@ -225,7 +224,7 @@ def robust_p3p(
     The first candidate is the solution of three targets (Ke and Roumeliotis, "An efficient
     algebraic solution to the perspective-three-point problem", CVPR 2017) with the least median of
     squared residuals. The solution of the half of the targets that fits it best (SQPnP of Terzakis
-    and Lourakis, ECCV 2020) replaces it if it is better. xyz (n, 3), uv (n, 2), interior (3,)
+    and Lourakis, ECCV 2020) is used instead if it is better. xyz (n, 3), uv (n, 2), interior (3,)
     [px]. Raises DataError if there is no solution.
     """
     rng = np.random.default_rng(0)
@@ -267,7 +266,7 @@ def robust_p3p(
 
 
 def principal_distance_of(projection: NDArray[np.float64]) -> float:
-    """Return principal distance [px] of a projection (3, 4): geometric mean of two scale factors."""
+    """Return principal distance [px] of a projection (3, 4): geometric mean of its scales."""
     k, _, _ = decompose(projection)
     return float(np.sqrt(abs(k[0, 0] * k[1, 1])))
 
@@ -410,8 +409,7 @@ def _damped_step(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], np.ndarray, float]:
     """Return the orientation after a step that does not increase the cost.
 
-    Also returns the step (6,) and the damping. If no such step is found, the orientation is
-    unchanged and the step is zero.
+    Also returns step (6,) and damping. Without such a step, nothing moves and the step is zero.
     """
     noise = system.noise
     sigma = np.ones(len(problem.xyz))

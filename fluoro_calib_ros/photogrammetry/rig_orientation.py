@@ -357,8 +357,7 @@ def _check_covariance(covariance: NDArray[np.float64]) -> None:
         raise DataError('rig orientation: its covariance has a negative eigenvalue')
 
 
-# Orientation of a fluoroscope that is known before the calibration, for example from another
-# program.
+# Orientation of a fluoroscope known before the calibration, for example from another program.
 #
 # Any reader can provide it: `KnownOrientation.from_matrices` takes K, R and t of the pinhole
 # camera x ~ K (R X + t) (Hartley and Zisserman, "Multiple View Geometry", 2nd ed., 2004, 6.1), as
@@ -466,7 +465,7 @@ class KnownOrientation:
         Parameters
         ----------
         matrix : (3, 3) array_like
-            K [px]. A single principal distance is used, the geometric mean of its two scales; the correction
+            K [px]. The principal distance is the geometric mean of its two scales; the correction
             that is estimated with it absorbs the difference.
         rotation : (3, 3) array_like
             R, lab -> sensor: x to the right, y down, z from the source to the image.

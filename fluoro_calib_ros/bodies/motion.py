@@ -28,10 +28,10 @@ Stat. Assoc. 84, 1989), which runs backwards:
 
 The log of each density, h = log q, follows a random walk. The derivative of the likelihood of all
 data with respect to h_k is (r'Qr - tr QN) / 2 with r and N of step k (Koopman, "Disturbance
-smoother for state space models", Biometrika 80, 1993); its expected information is about tr(QN) /
-2. The most probable course of h therefore follows by Fisher scoring with a tridiagonal matrix, and
-the variance of its steps by EM. The trial determines how quickly h changes, so there is nothing to
-choose. Live, h is updated with the derivative of the likelihood of each exposure.
+smoother for state space models", Biometrika 80, 1993); its expected information is about
+tr(QN) / 2. The most probable course of h therefore follows by Fisher scoring with a tridiagonal
+matrix, and the variance of its steps by EM. The trial determines how quickly h changes, so there
+is nothing to choose. Live, h is updated with the derivative of the likelihood of each exposure.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ STATE = 18  # pose, velocity and acceleration
 POSE = slice(0, 6)
 KINDS = (slice(0, 3), slice(3, 6))  # components of a pose: position, rotation
 
-# For a body that appears: wide enough for any motion of a living joint. A fall from 2 m ends at 6
-# m/s, a golf swing rotates the forearm at 40 rad/s; impacts reach 100 g and 5000 rad/s^2.
+# For a body that appears: wide enough for any motion of a living joint. A fall from 2 m ends at
+# 6 m/s, a golf swing rotates the forearm at 40 rad/s; impacts reach 100 g and 5000 rad/s^2.
 START_SD = np.repeat([0.0, 6e3, 1e6], 6) * np.tile(np.repeat([1.0, 1 / 150], 3), 3)
 # Log of the density of jerk of a body that appears, [mm^2/s^5] and [rad^2/s^5], and its standard
 # deviation: from a body at rest (a jerk of 1 mm/s^3 for 1 s) to an impact (1e8 mm/s^3 for 1 ms).

@@ -6,10 +6,10 @@
 The image residuals are minimised by Gauss-Newton least squares (Foerstner and Wrobel,
 "Photogrammetric Computer Vision", Springer 2016, 4.8 and 12.2). An image point seen in one view
 contributes as one seen in two views does. Let the image points of a marker have the derivatives A
-with respect to its place in space, weights W and residuals r. Their information on its place is S
-= A'WA and s = A'Wr; a coordinate of the shape with standard deviation x changes this to M S and M
-s with M = (I + x^2 S)^-1. With the derivatives D = [I, -[Rx]x] of the place with respect to the
-pose, the normal equations are
+with respect to its place in space, weights W and residuals r. Their information on its place is
+S = A'WA and s = A'Wr; a coordinate of the shape with standard deviation x changes this to
+M S and M s with M = (I + x^2 S)^-1. With the derivatives D = [I, -[Rx]x] of the place with respect
+to the pose, the normal equations are
 
     N = sum D'MSD,  b = sum D'Ms.
 
@@ -481,8 +481,8 @@ def _variance_of_last(
 ) -> NDArray[np.float64]:
     """Return the variance of the last of `number` observations that share an error.
 
-    With variance r of their noise and c of the shared error, n observations have the information n
-    / (r + n c), and the last one contributes r / ((r + n c) (r + (n - 1) c)) to it.
+    With variance r of their noise and c of the shared error, n observations have the information
+    n / (r + n c), and the last one contributes r / ((r + n c) (r + (n - 1) c)) to it.
     """
     return (noise + number * fixed) * (noise + (number - 1) * fixed) / noise
 

@@ -6,10 +6,11 @@
 A shift along an epipolar line moves the intersected point in depth, and all rays still meet. If
 one of two markers of a body is in the area that has drifted and the other is not, the points no
 longer fit the shape of the body. With the pose of a body from its image points (see bodies.pose),
-let the image points of a marker have the derivatives B with respect to its place, weights W, S =
-B'WB and the displacement p = S^-1 B'Wr from the place predicted by the body. A shift of one pixel
-in an area moves its markers by q = S^-1 B'W, part of which the pose absorbs: with the derivative D
-of the place with respect to the pose, N = sum D'SD and g = sum D'Sq over the area, the shift has
+let the image points of a marker have the derivatives B with respect to its place, weights W,
+S = B'WB and the displacement p = S^-1 B'Wr from the place predicted by the body. A shift of one
+pixel in an area moves its markers by q = S^-1 B'W, part of which the pose absorbs: with the
+derivative D of the place with respect to the pose, N = sum D'SD and g = sum D'Sq over the area,
+the shift has
 
     score = sum q'S p - g'N^-1 sum D'Sp,  information = sum q'Sq - g'N^-1 g
 

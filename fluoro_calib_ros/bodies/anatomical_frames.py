@@ -250,8 +250,7 @@ def _vector(
 #
 # A joint coordinate system after Grood and Suntay (1983) is a Cardan sequence: the first axis is
 # fixed in the proximal bone, the third one in the distal bone, and the second (floating) axis is
-# perpendicular to both. R = R_i(1) R_j(2) R_k(3) transforms distal into proximal axes. For sources
-# see the anatomical frames.
+# perpendicular to both. R = R_i(1) R_j(2) R_k(3) maps distal to proximal axes (sources above).
 
 
 @dataclass(frozen=True)

@@ -26,8 +26,7 @@ AXIS_MM = 20.0  # length of a drawn axis, about the size of a cluster of markers
 class Body:
     """Rigid body with the coordinates of its markers.
 
-    Raises DataError for arrays of different lengths, repeated markers and values that are not
-    finite.
+    Raises DataError for arrays of different lengths, repeated markers and non-finite values.
 
     Attributes
     ----------
@@ -296,8 +295,7 @@ def robust_pose(
     """
     count = len(source)
     triples = np.array(list(combinations(range(count), 3)))
-    # all triples of nine points
-    triples = triples[np.linspace(0, len(triples) - 1, 84).astype(int)]
+    triples = triples[np.linspace(0, len(triples) - 1, 84).astype(int)]  # all of nine points
     rotation, shift = fitted_pose(source[triples], target[triples])
     away = np.linalg.norm(source @ np.swapaxes(rotation, 1, 2) + shift[:, None] - target, axis=2)
     middle = max(count // 2, 2)

@@ -4,9 +4,9 @@
 """Low-pass filter that labs use, for comparison: Butterworth, forwards and backwards.
 
 The total order is 4, two in each direction, as in Winter ("Biomechanics and motor control of human
-movement", 4th ed., 2009, 2.2.4.4). The cutoff is chosen by whoever uses it. Standard deviations
-are propagated for errors that are independent from exposure to exposure; what the filter takes
-from the motion itself they do not contain.
+movement", 4th ed., 2009, 2.2.4.4). The user chooses the cutoff. Standard deviations are propagated
+from errors that are independent between exposures; they do not include motion that is filtered
+out.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ LOCK_SDS = 5.0
 # Standard deviation below which the second-order part of an angle's error is less than 1 % of the
 # first-order part; translations of 50 mm along rotating axes are then linear to 0.01 mm.
 LINEAR_SD_RAD = 0.02
-MIN_VOLUME = 1e-9  # of the axes; makes the Jacobian finite in gimbal lock, where it is not used
+MIN_VOLUME = 1e-9  # minimum of the triple product of the axes: keeps the Jacobian finite
 BLOCK = 256  # exposures per integration
 
 
@@ -395,8 +395,7 @@ def _second_moments(
 ) -> NDArray[np.float64]:
     """Return second moments (T, 6, 6) of the errors of angles and translations.
 
-    Uses a Gauss-Hermite rule over the rotation error; the independent part of the translation is
-    linear.
+    Gauss-Hermite rule over the rotation error; the independent part of the translation is linear.
     """
     node, weight = np.polynomial.hermite_e.hermegauss(nodes)
     z = np.stack(np.meshgrid(node, node, node, indexing='ij'), axis=-1).reshape(-1, 3)

@@ -90,8 +90,7 @@ class PoseInformation:
     rotation : (B, 3, 3) ndarray
     centre_mm : (B, 3) ndarray
     normal : (B, 6, 6) ndarray
-        Normal matrix of position and rotation for the random errors; 0 for a body that is not
-        seen.
+        Normal matrix of position and rotation for the random errors; 0 for an unseen body.
     right : (B, 6) ndarray
         Right-hand side; 0 at the most likely pose.
     """
@@ -107,9 +106,9 @@ class _Step:
     """Exposure of the filter: its prediction, and the changes due to the exposure.
 
     into (B, 18, 18): transition from the previous exposure; 0 for a body that appears. dt_s: time
-    since the previous exposure. reference (B, 3, 3): predicted rotations. mean (B, 18): predicted
-    state, without rotation. z (B, 6), m (B, 6, 6): for the smoother. log_q (B, 2): h of the noise
-    into this exposure.
+    since then. reference (B, 3, 3): predicted rotations. mean (B, 18): predicted state, without
+    rotation. z (B, 6), m (B, 6, 6): for the smoother. log_q (B, 2): h of the noise into this
+    exposure.
     """
 
     dt_s: float
@@ -181,7 +180,7 @@ def _vector(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def turn_of_twists(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return matrices (B, 6, 6) that turn deviations at first into those at second rotations."""
+    """Return matrices (B, 6, 6) that turn deviations at first to second rotations (B, 3, 3)."""
     out = np.zeros((len(first), 6, 6))
     out[:, :3, :3] = out[:, 3:, 3:] = second @ np.swapaxes(first, 1, 2)
     return out

@@ -53,8 +53,7 @@ LINEAR_RAD = 0.05
 # derivatives are then valid at two standard deviations.
 ALONE_SD_RAD = LINEAR_RAD / 2
 # Eigenvalue of a matrix of unit diagonal below which the other markers do not predict a marker;
-# also added to regularise such matrices. It is far above rounding, unlike a constant next to large
-# elements.
+# also added to regularise such matrices. It is far above rounding errors.
 WEAK = 1e-9
 
 

@@ -50,7 +50,7 @@ REJECT_TAIL = 2 * float(ndtr(-CERTAIN))
 # The images directly show if the coordinates of a body are mirrored or in another unit, by fitting
 # its shape to points in space. Relative tolerance of the scale.
 SCALE_TOLERANCE = 0.05
-REGULAR = 1e-10  # times the largest element of a normal matrix, added to its diagonal
+REGULAR = 1e-10  # share of the largest element that is added to the diagonal
 _MOVED = (Kind.MARKER_MIGRATED, Kind.MARKERS_EXCHANGED)
 
 
@@ -95,11 +95,11 @@ class LearnedShapes:
 
     __repr__ = brief_repr
 
-    #: with the covariance of their coordinates; excluding markers that were not seen
+    #: bodies with the covariance of their coordinates, without markers that were not seen
     bodies: tuple[Body, ...]
-    #: of the orientation with which they were learned, then of the orientations healed with them
+    #: id of the orientation with which they were learned, then of those healed with them
     orientation_ids: tuple[str, ...]
-    calibration_ids: Mapping[str, str]  #: by fluoroscope, at the time of learning
+    calibration_ids: Mapping[str, str]  #: ids by fluoroscope, at the time of learning
     begin_ns: int  #: stamps of the first and of the last exposure
     end_ns: int
     exposures: int  #: seen by the drift watch and used to estimate the shapes
@@ -221,8 +221,8 @@ class _Adjustment:
 def _start(body: Body, places: BodyPlaces) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
     """Return initial coordinates (m, 3), NaN for unseen markers, and exposures that give poses.
 
-    The shape is that of the images, so that wrong CT coordinates cannot mislead; CT defines where
-    its frame is.
+    The shape is that of the images, so that wrong CT coordinates cannot mislead; CT defines its
+    frame.
     """
     seen = places.seen
     least = min(3, len(body.target_id))  # a body of two markers needs only two

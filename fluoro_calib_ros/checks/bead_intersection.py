@@ -90,8 +90,7 @@ def intersect(job: CalibrationResult, frames: Frames, phantom: Phantom) -> Beads
     """Intersect the beads of an adjustment from the images of all its fluoroscopes.
 
     The survey only enters through the orientations, which depend on all beads together. The
-    intersection is robust: it first minimises residual lengths, then the squares of the image
-    points that agree.
+    intersection is robust: it first minimises residual lengths, then squares of points that agree.
     """
     rays = rays_of(job, frames)
     target_id, bead = np.unique(rays.target_id, return_inverse=True)

@@ -43,8 +43,7 @@ BORDERS = 40  # number of borders between layers to try along each axis
 # Minimum gap at a border [sd of the survey's difference of two beads]. In a smaller gap the errors
 # of the survey decide on which side a bead lies, and a layer seems displaced by its selection.
 BORDER_SDS = 3.0
-# minimum share of the excess of the sum of squares that a displaced layer explains
-EXPLAINED = 0.5
+EXPLAINED = 0.5  # minimum share of the excess sum of squares that a displaced layer explains
 IMPROVED = 2.0  # minimum factor by which the median square of its beads decreases
 
 
@@ -57,8 +56,7 @@ class DisplacedLayer:
     low: float | None
     high: float | None
     target_id: NDArray[np.int64]  #: (k,) beads of the layer
-    #: (3,) images - survey at its centre, relative to the other beads
-    shift_mm: NDArray[np.float64]
+    shift_mm: NDArray[np.float64]  #: (3,) images - survey at its centre, relative to the others
     tilt_rad: float  #: rotation relative to the other beads
     #: RMS displacement of its beads by this motion, and the largest one that is not significant
     size_mm: float

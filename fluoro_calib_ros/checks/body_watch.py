@@ -107,8 +107,7 @@ class BodyWatch:
         self._set_bodies(self._given)
         self._seen: list[_Seen] = []
         self._learning: list[_Seen] = []
-        # number of blocks in which each marker was seen
-        self._blocks = np.zeros(self._known.shape, dtype=int)
+        self._blocks = np.zeros(self._known.shape, dtype=int)  # blocks that show each marker
 
     def _set_bodies(self, bodies: Sequence[Body]) -> None:
         """Set the shapes; markers whose places are not known yet are ignored."""

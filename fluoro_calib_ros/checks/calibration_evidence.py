@@ -43,7 +43,7 @@ from .residual_tests import (
 MAX_ROUNDS = 25
 # Maximum excess of the share of rejected image points in a part over the share in the whole.
 MAX_LOST = 0.03
-MIN_VARYING_EXPOSURES = 4  # with enough image points, to detect a varying distortion
+MIN_VARYING_EXPOSURES = 4  # exposures with enough points to detect a varying distortion
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ class Evidence:
         size = calibration.image_size
         rejected = residuals.rejected(noise)
         area = rejected_trend(rejected, inliers, size)
-        # Do not blame an exposure for what the correction does not follow in an area.
+        # Do not blame an exposure for distortion that the correction does not follow in an area.
         if area is not None and area.size > area.limit:
             rejected = unexplained(rejected, max(size) / CELLS / 2)
         return CommonTrend(

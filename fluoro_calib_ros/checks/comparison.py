@@ -10,8 +10,7 @@ is compared with the standard deviations of both, which are assumed to be indepe
 Each interior orientation belongs to a gauge that depends on the distribution of the image points
 of its exposures. For example, a rotation of the sensor by 10 mrad together with the corresponding
 shift of the principal point, some 40 px, changes the corrections by less than a pixel. Interior
-orientations are therefore compared in a common gauge, that of the area which both calibrations
-cover.
+orientations are therefore compared in a common gauge, that of the area common to both.
 """
 
 from __future__ import annotations
@@ -170,8 +169,8 @@ class Comparison:
     def field_changed(self) -> bool:
         """Whether the field differs in a larger part of the image than by chance.
 
-        By chance, a fraction 1 - LEVEL of the cells exceeds the quantile; it is doubled because
-        cells are correlated.
+        By chance, a fraction 1 - LEVEL of the cells exceeds the quantile; the limit is twice
+        that, as cells are correlated.
         """
         return bool(self.significant.mean() > 2 * (1 - LEVEL))
 

@@ -83,7 +83,7 @@ class DriftOptions:
     """Options of the drift watch.
 
     The dead band of a chart is the root sum of squares of the tolerance and of band_calibration or
-    band_start systematic standard deviations. Raises ValueError for values out of range, and for
+    band_start systematic standard deviations. Raises ValueError for values out of range and for
     inconsistent combinations.
     """
 
@@ -326,11 +326,10 @@ def _side(edges: float, low: str, high: str) -> str:
 
 
 MEMORY = 160  # number of blocks over which the variance is estimated
-# weight of the pooled variance in the variance of an area, in pairs of blocks
-PRIOR_DIFFERENCES = 20
+PRIOR_DIFFERENCES = 20  # weight of the pooled variance in that of an area, in pairs of blocks
 VARIANCE_MARGIN = 1.25  # a variance estimated from 100 differences has a relative sd of 15 %
 MIN_BLOCKS_TO_ALARM = 4
-EVIDENCE_CAP = 1.5  # times the threshold of ERROR; lets evidence fall soon after a drift ends
+EVIDENCE_CAP = 1.5  # multiple of the threshold of ERROR; evidence falls soon after a drift ends
 MIN_INFORMATION = 1e-300  # avoids division by zero
 
 

@@ -26,7 +26,7 @@ from .drift_charts import MIN_INFORMATION, CusumCharts
 WINDOW_S = 30.0  # newest blocks from which place and size of a drift are estimated
 # Minimum ratio of the log-likelihoods of another and the likeliest fluoroscope to name both.
 SIMILAR = 0.8
-REFERENCES = ('calibration', 'start')  # for the charts of epipolar residuals
+REFERENCES = ('calibration', 'start')  # references of the charts of epipolar residuals
 EPIPOLAR = 'epipolar'  # source of a drift shown by residuals
 SERIES_OF_PAIR = 4  # images a and b against the calibration, then against the start
 
@@ -47,7 +47,7 @@ class BlockRecord:
 
 @dataclass(frozen=True)
 class DriftEstimate:
-    """Drift as shown by the newest blocks."""
+    """Drift estimated from the newest blocks."""
 
     fluoroscopes: tuple[str, ...]  #: likeliest first, then those that are about as likely
     area: int  #: number of the area
@@ -127,8 +127,7 @@ class Evidence(ABC):
     def _run(self, series: int, area: int, begin_ns: int) -> tuple[int, list[BlockRecord]]:
         """Return the start of a drift [ns] and the blocks since then, those of largest likelihood.
 
-        If the drift is older than the window, its start is at most begin_ns, that of the chart's
-        run.
+        If the drift is older than the window, its start is at most begin_ns, that of the run.
         """
         records = list(self._records)
         sums = np.cumsum(
@@ -180,8 +179,7 @@ class EpipolarEvidence(Evidence):
         self._pairs = list(combinations(self._names, 2))
 
     def _preferred(self, likelihood: NDArray[np.float64]) -> NDArray[np.float64]:
-        # Charts against the start are sharper, as the start includes the errors of the
-        # calibration.
+        # Charts against the start are sharper: the start includes calibration errors.
         start = np.arange(likelihood.shape[1]) % SERIES_OF_PAIR >= 2
         if likelihood[:, start].max() >= 0:
             likelihood[:, ~start] = -1

@@ -60,8 +60,8 @@ from .drift_evidence import (
 )
 from .pair_watch import PairWatch
 
-BODY_STEP = 2.0  # times step_px in the charts of the bodies, which have less information
-HYSTERESIS = 0.5  # times the threshold of WARN; below it an alarm ends
+BODY_STEP = 2.0  # multiple of step_px for the charts of bodies, which have less information
+HYSTERESIS = 0.5  # multiple of the threshold of WARN below which an alarm ends
 
 
 class DriftWatch:
@@ -69,8 +69,8 @@ class DriftWatch:
 
     image_sizes: width and height of the images by fluoroscope [px], in the order of the
     orientation. bodies: shapes that are not given are learned; bodies require the orientation.
-    Raises ValueError for fewer than two fluoroscopes and for bodies without orientation, and
-    errors of BodyWatch.
+    Raises ValueError for fewer than two fluoroscopes, for bodies without orientation, and as
+    BodyWatch.
     """
 
     def __init__(

@@ -80,8 +80,7 @@ def _nearness(ids: NDArray[np.int64], targets: Targets) -> NDArray[np.int64]:
 def _places(rays: Rays, targets: Targets) -> NDArray[np.int64]:
     """Return the target ids (n,) of the beads at whose places image points lie.
 
-    This is the image point's own id if it agrees with its bead, and NOWHERE if it agrees with
-    none.
+    An image point gets its own id if it agrees with its bead, and NOWHERE if with none.
     """
     out = rays.target_id.copy()
     for exposure in np.unique(rays.exposure):

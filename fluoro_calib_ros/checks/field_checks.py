@@ -29,8 +29,7 @@ from .comparison import describe_place, difference
 from .residual_tests import RejectedTrend, change_of_trend
 
 # Maximum ratio of the standard deviations of the correction and of an image coordinate.
-# Independent errors add in square: at this ratio, those of corrected points are 1.14 times those
-# with known distortion.
+# Independent errors add in square: this ratio makes them 1.14 times those with known distortion.
 MAX_RATIO = 0.55
 
 
@@ -133,8 +132,7 @@ def _angles(evidence: Evidence, name: str) -> str:
     angles = angles_of(evidence.frames[name])
     if not np.isfinite(angles).all() or np.ptp(angles) == 0:
         return 'a C-arm at another angle'
-    # given in degrees, these span less than a full turn in radians
-    if np.ptp(angles) < np.deg2rad(2 * np.pi):
+    if np.ptp(angles) < np.deg2rad(2 * np.pi):  # as degrees, less than a full turn in radians
         return 'angles of the C-arm that are in radians, not in degrees'
     return 'angles of the C-arm that are not those of these exposures'
 
@@ -149,7 +147,7 @@ def _how_to_give_angles(evidence: Evidence, name: str) -> str:
 VARIATION = Subject(check_variation)
 
 
-LIMIT = 1.9  # from simulated rigs: docs/verdict.md, benchmarks/verdict.py
+LIMIT = 1.9  # predicted sds, from simulated rigs: docs/verdict.md, benchmarks/verdict.py
 
 
 def check_halves(evidence: Evidence, names: Sequence[str]) -> list[Check]:

@@ -141,7 +141,7 @@ FOLDS = 4
 # Limits from simulated rigs: docs/verdict.md, benchmarks/verdict.py.
 # Margin over the expectation with RECOMMENDED_EXPOSURES; proportional to 1 / sqrt(exposures).
 MARGIN = 0.13
-EXPOSURE_LIMIT = 1.6  # times the expectation
+EXPOSURE_LIMIT = 1.6  # minimum limit, as a multiple of the expectation
 # Maximum deviation of the worst of many exposures, in robust standard deviations of the logarithms
 # over all exposures; n exposures add SCATTER_OF_FEW / n. If noise differs between exposures, an
 # exposure with much noise is not at fault. But noise also differs between neighbouring image

@@ -506,8 +506,7 @@ def _are_copied(uv: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray
 # Maximum RMSE after correction, or displacement between pairs, over the longer image side.
 MAX_MISFIT = 0.0025
 MAX_MISFIT_SD = 4.0  # maximum RMSE over the a-priori standard deviation of the image points
-# maximum relative change of a fixed distance by the scale of the correction
-MAX_DISTANCE_CHANGE = 0.2
+MAX_DISTANCE_CHANGE = 0.2  # maximum change of a fixed distance by the scale of the correction
 MAX_SD_POINT = 0.15  # maximum sd of the principal point over the longer side of the image
 # maximum distance of the principal point from the middle over the longer side
 MAX_OFF_CENTRE = 1.0

@@ -169,8 +169,7 @@ def _whole_group(
 ) -> tuple[NDArray[np.bool_], float]:
     """Return which (n,) targets fit by the factor in most exposures, and the source's distance.
 
-    group (n,): a part of these targets. The distance [mm] is computed with these targets
-    multiplied.
+    group (n,): a part of these targets. The distance [mm] is that with them multiplied.
     """
     votes = np.zeros(len(phantom.target_id))
     distances: list[float] = []
@@ -194,8 +193,7 @@ def _whole_group(
             is_multiple = (scaled < AT * limit) & (own > OFF * limit)
             is_own = own < AT * limit
             if is_multiple.any() and is_own.sum() < MIN_GROUP:
-                # without other targets, the multiples look like a larger phantom, farther away
-                continue
+                continue  # multiples alone look like a larger phantom, farther away
             votes[rows] += is_multiple
             votes[rows] -= is_own
             distances.append(float(np.linalg.norm(source - xyz[rows].mean(axis=0))))

@@ -15,7 +15,7 @@ from .drift_charts import MEMORY, DriftOptions, EpipolarObservations, ImageAreas
 
 LAGS = (1, 2, 4)  # frame lags at which the noise of a marker is compared
 MIN_CORRELATION = 0.05
-MAX_CORRELATION = 0.97  # of the noise of a marker in successive frames
+MAX_CORRELATION = 0.97  # maximum for the noise of a marker in successive frames
 NUGGET = 0.35  # fraction of the systematic standard deviation that the nodes cannot represent
 
 

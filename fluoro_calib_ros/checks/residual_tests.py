@@ -73,8 +73,7 @@ class Residuals:
 
     uv: NDArray[np.float64]  #: (n, 2) observed pixels
     r: NDArray[np.float64]  #: (n, 2) observed - correction - projected [px]
-    #: (n,) index of the exposure of each residual, 0 to m - 1 in order
-    exposure: NDArray[np.int64]
+    exposure: NDArray[np.int64]  #: (n,) index of its exposure, 0 to m - 1 in order
     target_id: NDArray[np.int64]  #: (n,)
     numbers: NDArray[np.int64]  #: (m,) numbers of the exposures
     angles: NDArray[np.float64]  #: (m,) angles of the C-arm [rad]; NaN if unknown
@@ -235,8 +234,7 @@ def rejected_trend(
 ) -> RejectedTrend | None:
     """Test whether rejected image points of different exposures agree near some place.
 
-    Returns the place where this is most significant, or None if rejected points are few
-    everywhere.
+    Returns the most significant place, or None if rejected points are few everywhere.
     """
     points = FittedPoints(rejected.uv, rejected.r, rejected.exposure)
     areas = areas_of_rejected(points, rejected.target_id, inliers.uv, image_size)
@@ -354,8 +352,7 @@ def _cell_sums(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return the residuals by cell and exposure.
 
-    overlap: number of parts of a cell along each side; there is a cell at every position of such a
-    square of parts.
+    overlap: number of parts of a cell along each side; every such square of parts is a cell.
 
     Returns the sums (c, m, 2) [px], counts (c, m) and centres (c, 2) of the cells [px].
     """

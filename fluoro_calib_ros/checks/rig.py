@@ -260,17 +260,14 @@ CAPTURE = 'orient the rig from a capture'
 class RigFindings:
     """Results of the exposures on the orientation of a rig."""
 
-    #: empty if there is no rig, or its orientation is known otherwise
-    fluoroscopes: tuple[str, ...] = ()
+    fluoroscopes: tuple[str, ...] = ()  #: empty: no rig, or its orientation is known
     #: None if the exposures do not determine it; the doubts contain the reason
     orientation: RigOrientation | None = None
     doubts: tuple[Finding, ...] = ()
     #: for every fluoroscope except the first; empty if unknown
     scatter: tuple[PairScatter, ...] = ()
-    #: standard deviation of an image coordinate, maximum over fluoroscopes [px]
-    noise_px: float = 0.0
-    #: assumptions that the exposures cannot verify
-    trusted: tuple[Finding, ...] = field(default=())
+    noise_px: float = 0.0  #: largest standard deviation of an image coordinate [px]
+    trusted: tuple[Finding, ...] = field(default=())  #: unverified assumptions
 
     @property
     def notes(self) -> tuple[Finding, ...]:

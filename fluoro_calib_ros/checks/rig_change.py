@@ -13,8 +13,8 @@ covariance P and evidence Z,
 Points are still intersected with the rig as it was calibrated, so d is its error. The second
 moment of d is added to the covariance of the rig: the mean of m m' + P over causes and sizes,
 weighted by Z. In directions that the rays do not determine, along epipolar lines, it is that of a
-change as large as in the determined ones. Residuals that no change of the rig explains increase
-the noise of image points.
+change as large as in the determined ones. Unexplained residuals increase the noise of image
+points.
 """
 
 from __future__ import annotations
@@ -37,8 +37,7 @@ SIZES = np.geomspace(2.0**-7, 4.0, 10)  # sizes of a change, relative to a knock
 MEDIAN_VARIANCE = np.pi / 2
 ITERATIONS = 10
 NU = 4.0  # degrees of freedom of the t distribution that weights residuals
-# A knock is shown by this many consecutive blocks, each with a minimum number of markers and most
-# rays apart.
+# Consecutive blocks, with a minimum number of markers and most rays apart, that show a knock.
 KNOCKED_BLOCKS = 2
 MIN_MARKERS = 3
 
@@ -48,7 +47,7 @@ class Addition:
     """Addition to the errors of a rig and of its image points."""
 
     covariance: NDArray[np.float64]  #: (9F, 9F)
-    image_sd: float  #: of each coordinate of an image point [px]
+    image_sd: float  #: standard deviation of each image coordinate [px]
     miss: float  #: RMS of the distances by which rays miss each other [px]
 
 

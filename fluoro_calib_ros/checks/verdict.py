@@ -7,16 +7,15 @@ A given interior orientation may be why a calibration fails. If it is given with
 deviation, it fixes the adjustment where the exposures contradict it: the lack of fit looks like a
 trend of the residuals, or like a distortion that differs between exposures. If checks fail, the
 fluoroscope is calibrated again without the given values. If the residuals are then clearly
-smaller, and the interior orientation is clearly different, the given values are the cause, and a
-separate check reports it.
+smaller, and the interior orientation is clearly different, the given values are the cause, which a
+separate check reports.
 
 The interior orientation of an image with distortion depends on the definition of distortion. A
-given interior orientation which the exposures move away from, with good residuals, is therefore no
-fault.
+given one which the exposures move away from, with good residuals, is therefore no fault.
 
 Every check is a number with a limit. docs/verdict.md describes how the limits were found, how
 often good calibrations exceed them and how large a fault must be to be detected. `validate`
-recalibrates two halves and four folds of the exposures, which takes about twice as long as the
+recalibrates two halves and four folds of the exposures, in about twice the time of the
 calibration.
 """
 

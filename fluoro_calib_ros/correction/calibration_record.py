@@ -36,7 +36,7 @@ class Field:
     unit: str = '-'
     meaning: str = ''
     minimum: float | None = None
-    maximum: float | None = None  #: of the absolute value, where it is finite
+    maximum: float | None = None  #: maximum of the absolute value of finite numbers
     longest: int | None = None  #: maximum length that a letter can stand for
     #: the only length other than 0 that a letter of the shape can stand for
     lengths: Mapping[str, int] = field(default_factory=dict)
@@ -51,15 +51,14 @@ class Field:
     identity: str = ''
 
 
-VERSION = 4  # of the file format
+VERSION = 4  # version of the file format
 MAX_DEGREE = 15  # maximum degree of a series on reading
 MAX_MODES = 100  # maximum number of modes of a series on reading
 SD_GRID = 33  # nodes of the standard deviation along each side of the image
 ORDERS = 2  # number of harmonics of the angle
 HARMONICS = 2 * ORDERS
 TERMS = (CUBIC + 1) * (CUBIC + 2) // 2  # number of terms of a cubic polynomial of two variables
-# with the series, and of each pair of harmonics
-VARIANCES = HARMONICS + HARMONICS * (HARMONICS + 1) // 2
+VARIANCES = HARMONICS + HARMONICS * (HARMONICS + 1) // 2  # with the series, and of each pair
 
 _correction = partial(Field, identity='correction')
 _detail = partial(Field, identity='detail')

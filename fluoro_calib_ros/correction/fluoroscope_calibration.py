@@ -31,8 +31,7 @@ from .grid import CorrectionGrid
 from .registry import MODEL_FIELDS, model_from_values
 from .series import Functions, Series
 
-# maximum ratio of the factors at the border and in the middle, or of its inverse
-MAX_FACTOR = 10.0
+MAX_FACTOR = 10.0  # maximum ratio of the factors of border and middle, or of its inverse
 
 
 @dataclass(frozen=True)
@@ -315,8 +314,7 @@ class FluoroscopeCalibration:
             True to evaluate the model itself instead of its grid. The grid differs from it by up
             to grid.error_px and reports OUTSIDE up to a cell before the calibrated area ends.
         angle : float or (n,) array_like, optional
-            Angle of the C-arm [rad], for a correction that changes with it; None or NaN if
-            unknown.
+            Angle of the C-arm [rad], if the correction changes with it; None or NaN if unknown.
 
         Returns
         -------

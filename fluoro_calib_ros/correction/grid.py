@@ -246,8 +246,7 @@ class CorrectionGrid:
         number = bisect_left(WORKSPACE_SIZES, n)
         workspaces = self._workspaces[number]
         try:
-            # the thread has it exclusively until it is appended again
-            workspace = workspaces.pop()
+            workspace = workspaces.pop()  # exclusive to this thread until it is appended
         except IndexError:
             workspace = LookupWorkspace(WORKSPACE_SIZES[number], self._shape, self.image_size)
         workspace.locate(u, v)

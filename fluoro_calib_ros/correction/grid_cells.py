@@ -28,8 +28,7 @@ TARGET_PX = 0.6 * LIMIT_PX
 # differences: minimum and maximum number of such cells, which bounds the time.
 MIN_MEASURED = 500
 MAX_MEASURED = 25_000
-# positions within a cell where it is measured
-PLACES = ((0.5, 0.5), (0.5, 0.0), (0.0, 0.5), (0.5, 1.0), (1.0, 0.5))
+PLACES = ((0.5, 0.5), (0.5, 0.0), (0.0, 0.5), (0.5, 1.0), (1.0, 0.5))  # positions within a cell
 
 
 def errors_of_finer_grid(values: NDArray[np.float64]) -> NDArray[np.float64]:

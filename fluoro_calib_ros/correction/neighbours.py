@@ -70,7 +70,7 @@ def _circles(
     tree: cKDTree, uv: NDArray[np.float64], k: int, per_query: int
 ) -> Iterator[tuple[list[NDArray[np.int64]], NDArray[np.float64], NDArray[np.float64]]]:
     """Yield per_query blocks at a time, with centres and radii of their circles of candidates."""
-    reach = np.median(tree.query(uv[:: len(uv) // 32 + 1], k=[k])[0])  # of a sample of pixels
+    reach = np.median(tree.query(uv[:: len(uv) // 32 + 1], k=[k])[0])  # for a sample of pixels
     blocks = _blocks(uv, reach)
     for start in range(0, len(blocks), per_query):
         some = blocks[start : start + per_query]
@@ -109,7 +109,7 @@ def _blocks(uv: NDArray[np.float64], reach: float) -> list[NDArray[np.int64]]:
 
 # Nearest neighbours of image points, and the weights of linear smoothers over them.
 
-RIDGE = 1e-6  # of the slopes, relative to the kernel weights; handles collinear neighbours
+RIDGE = 1e-6  # on the slopes, relative to the kernel weights; handles collinear neighbours
 
 
 class Neighbourhoods:
@@ -185,8 +185,7 @@ class NeighbourTable:
     The table is built once and can then be queried for varying subsets of the points.
 
     uv: (N, 2) points. count: maximum number of neighbours per query; some more are stored, so that
-    excluded points can be skipped. rows: (T,) points whose neighbours will be queried; by default
-    all.
+    excluded points can be skipped. rows: (T,) points to be queried; by default all.
     """
 
     def __init__(
@@ -276,7 +275,7 @@ def least_squares_map(basis: np.ndarray) -> NDArray[np.float64]:
 
 # Models that predict a weighted sum of the k nearest training corrections.
 
-MAX_CANDIDATES = 50  # per neighbour; distinct training points never have more
+MAX_CANDIDATES = 50  # candidates per neighbour; distinct points never have more
 
 
 class NeighbourModel(CorrectionModel):
@@ -289,9 +288,8 @@ class NeighbourModel(CorrectionModel):
 
     smoothness = Smoothness.KINKED
     min_k: ClassVar[int]
-    trend_degree: ClassVar[int | None] = None  # of the polynomial trend; None: no trend
-    # weights are 1/k; a running mean then yields all k at once
-    equal_weights: ClassVar[bool] = False
+    trend_degree: ClassVar[int | None] = None  # degree of the polynomial trend, or None
+    equal_weights: ClassVar[bool] = False  # all weights are 1/k; running means yield all k
     gauge_passes: ClassVar[int] = 3  # a smoother reproduces the gauge only approximately
 
     tree: cKDTree
@@ -417,8 +415,7 @@ class NeighbourModel(CorrectionModel):
 # but the mean of the neighbours has. However, a plane flattens curvature within its neighbourhood.
 # In the alternation with the adjustment the flattened part is lost: orientations and object points
 # absorb it. Pincushion, S-shape and spiral distortion bend over the whole image and are cubic
-# polynomials to first order (Gronenschild, Medical Physics 24, 1997), so a cubic polynomial is
-# fitted first.
+# polynomials to first order (Gronenschild, Medical Physics 24, 1997), so a cubic is fitted first.
 
 
 def _distances(

@@ -25,8 +25,7 @@ from scipy.ndimage import map_coordinates
 from .calibration_record import MAX_DEGREE, MAX_MODES, SD_GRID
 from .terms import CUBIC, ring_coefficients
 
-# size of the rectangle of the sines, relative to the image; they vanish at its border
-MARGIN = 1.3
+MARGIN = 1.3  # size of the rectangle at whose border the sines vanish, relative to the image
 RING_DEGREE = CUBIC + 2  # degree of the first radial polynomial beyond a cubic trend
 PREDICTION_CHUNK = 20_000  # pixels per evaluation of a series
 
@@ -147,9 +146,8 @@ class Functions:
     ) -> tuple[Functions, NDArray[np.float64]]:
         """Return functions with rings, and their coefficients (2, m) for the same series.
 
-        This is the inverse of `as_polynomials`. If these functions cannot express the series, the
-        result is the nearest one (least squares). coefficients (2, n): for these functions, which
-        have no rings.
+        This is the inverse of `as_polynomials`, or the nearest series (least squares) if there is
+        none. coefficients (2, n): for these functions, which have no rings.
         """
         out = Functions(self.image_size, degree, self.modes, rings)
         matrix = out.converted(self, coefficients.ravel()).reshape(2, -1)

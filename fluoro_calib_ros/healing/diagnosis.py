@@ -5,8 +5,7 @@
 
 Bodies whose shapes were learned while the rig was healthy provide scale and rigidity. Each cause
 widens the prior of some unknowns by the usual size of such a change. Causes are added one by one,
-in each step the one with the largest evidence, as long as the evidence increases (MacKay 2003,
-ch. 28).
+the one with the largest evidence first, as long as it increases (MacKay 2003, ch. 28).
 """
 
 from __future__ import annotations
@@ -34,8 +33,7 @@ MAX_CAUSES = 3
 # The search for causes ends if the probability of no further change exceeds 1 - SURE.
 SURE = 0.95
 # Probability of a cause below which it is not accepted, as another one also explains the data. The
-# evidence of two causes depends on the units of four sizes, each of which is known to a factor of
-# eight.
+# evidence of two causes depends on the units of four sizes, each known to a factor of eight.
 SURE_OF_CAUSE = 1 - 8.0**-4
 # Share of inliers below which a pose does not fit: most of its image points are false.
 FITS = 0.5
@@ -73,10 +71,10 @@ class Change:
 class Diagnosis:
     """Result of a diagnosis."""
 
-    changes: tuple[Change, ...]  #: in the order of their evidence; empty if nothing has changed
-    probability: tuple[float, ...]  #: of each change against its rival causes
+    changes: tuple[Change, ...]  #: ordered by evidence; empty if nothing has changed
+    probability: tuple[float, ...]  #: probability of each change against its rivals
     rivals: tuple[Change | None, ...]  #: the most likely rival of each change, or None
-    observed: ObservedBodies  #: with the exchanged ids corrected
+    observed: ObservedBodies  #: observations with exchanged ids corrected
     prior: Prior
     solution: RigSolution
     noise: float  #: factor by which image points scatter more than claimed, at least 1
@@ -216,7 +214,7 @@ class Diagnostician:
         derivatives.
         """
         told = self.adjustment.told(best.observed, best.prior, best.solution)
-        lost = (best.solution.inliers_of_pose < FITS).any()  # by a change, hardly by chance
+        lost = (best.solution.inliers_of_pose < FITS).any()  # due to a change, hardly by chance
         places = self._of_rig()
         places += [Change(Cause.MIGRATED, body=b, markers=(m,)) for b, m in self._markers]
         gains = [

@@ -30,7 +30,7 @@ from .rig_errors import drift_errors
 class HealedRig:
     """Present orientation of a rig, and the drifts of its images."""
 
-    orientation: RigOrientation  #: with the ids of the previous calibrations
+    orientation: RigOrientation  #: contains the ids of the previous calibrations
     #: by fluoroscope: drift to be added to its correction
     drift: Mapping[int, tuple[Functions, NDArray[np.float64], NDArray[np.float64]]]
     #: by fluoroscope without such a drift: functions, and second moments (2n, 2n) of the
@@ -109,8 +109,7 @@ def _of_unseen_knocks(diagnostician: Diagnostician, diagnosis: Diagnosis) -> NDA
 
     They are the mean over sizes of a knock, of its shift and rotation together: the moments of one
     size alone would be those of a rig that has certainly been knocked this hard. Bodies only show
-    a knock: their shapes were learned with the errors of the calibration, which are added
-    unchanged.
+    a knock: their shapes were learned with calibration errors, which are added unchanged.
     """
     adjustment = diagnostician.adjustment
     calibrated = diagnosis.prior.orientation

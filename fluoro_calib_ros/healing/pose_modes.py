@@ -30,7 +30,7 @@ from .rig_adjustment import (
 MAX_TRIED = 200  # choices of false matches; with many image points, two do not mislead a pose
 # Maximum share of poses with several false matches by chance; above it, the rig is different.
 BY_CHANCE = 0.1
-STEPS = 4  # of a pose with the trusted image points, and as many with all
+STEPS = 4  # iterations with the trusted image points, and as many with all
 
 
 def with_best_modes(

@@ -44,15 +44,15 @@ from .sizes import Told
 FALSE_SHARE = 0.01  # expected share of false matches among the image points
 MAX_STEPS = 20
 MAX_REPEATS = 3
-LAST_GAIN = 0.1  # of the log evidence, which decides by differences of about 3
+LAST_GAIN = 0.1  # gain of log evidence that ends repeats; differences of about 3 decide
 # Square of a step in standard deviations below which the iteration ends.
 LAST_STEP = 1e-2
 # Half waves along the longer side of a drift of the distortion, in addition to a cubic trend.
 DRIFT_MODES = 4
 FITTING = 0.8  # minimum share of the image points of a body that are not false matches
-MAX_NOISE_PX = 10.0  # of image points that are not false matches
+MAX_NOISE_PX = 10.0  # maximum noise of image points that are not false matches
 LOOSEST = 1e-6  # weight of a pose [1/mm^2, 1/rad^2] that keeps an unseen one in place
-ROUNDING = POSE_SIZE * np.finfo(float).eps  # of the normal matrix of a pose, relative to its trace
+ROUNDING = POSE_SIZE * np.finfo(float).eps  # of a pose's normal matrix, relative to its trace
 
 
 _BY_EXPOSURE = ('uv', 'pixel', 'variance', 'seen')

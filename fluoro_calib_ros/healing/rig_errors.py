@@ -22,7 +22,7 @@ class RigErrors:
     """Errors of points due to those of a rig: relative to each other, and common to all."""
 
     scale: float  #: standard deviation of the scale
-    place_mm: float  #: of a coordinate, after removing the common rigid motion
+    place_mm: float  #: sd of a coordinate, after removing the common rigid motion
     #: RMS distance of the common motion of the points as a rigid body
     common_mm: float
 

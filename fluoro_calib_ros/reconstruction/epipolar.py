@@ -161,7 +161,7 @@ def _essential_jacobian(
     """Return derivatives (9, 18) of the elements of E, by rows, by T, w, xp, yp, c of a and b.
 
     The derivatives by the interior orientation are those of E acting on the present directions. A
-    changed interior orientation maps a direction x to M x, where to first order M = 1 - (dc, 0,
+    changed interior orientation maps a direction x to M x, to first order with M = 1 - (dc, 0,
     dxp; 0, dc, dyp; 0, 0, 0)/c.
     """
     cross = cross_matrix(shift)

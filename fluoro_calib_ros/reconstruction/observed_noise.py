@@ -32,9 +32,9 @@ from ..photogrammetry.rig_orientation import RigOrientation
 from .epipolar import EpipolarGeometry
 from .reconstruct import corrected_view, match_views, pair_recording
 
-MAX_PAIRS = 200  # of consecutive exposures, evenly spread over a recording
+MAX_PAIRS = 200  # pairs of consecutive exposures, evenly spread over a recording
 MIN_DIFFERENCES = 30
-NEAR = 1 / 32  # of the image width; correction errors are the same within such a distance
+NEAR = 1 / 32  # distance within which correction errors are equal, over the image width
 # Minimum ratio to the noise of the calibration to use the estimate: less does no harm.
 MIN_FACTOR = 1.25
 # Maximum ratio of residuals to explained ones for which no other error is assumed.

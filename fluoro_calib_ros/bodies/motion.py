@@ -135,7 +135,7 @@ class Motion:
     velocity, acceleration : (T, B, 6) ndarray
         [mm/s, rad/s] and [mm/s^2, rad/s^2], about the axes of the rig frame.
     covariance : (T, B, 18, 18) ndarray
-        Of position, rotation, velocities and accelerations.
+        Covariance of position, rotation, velocities and accelerations.
     log_q : (T, B, 2) ndarray
         Log of the densities of the jerk of position and rotation.
     """

@@ -59,8 +59,8 @@ class BodyPlaces:
     """Places of the markers of a body in T exposures, as points in space."""
 
     xyz_mm: NDArray[np.float64]  #: (T, m, 3) NaN where a marker is unknown in space
-    covariance: NDArray[np.float64]  #: (T, m, 3, 3) of the random errors
-    #: (T, m, 3, 3) of the errors of the correction, constant while a marker stands still
+    covariance: NDArray[np.float64]  #: (T, m, 3, 3) covariance of the random errors
+    #: (T, m, 3, 3) covariance of correction errors, constant while a marker stands still
     fixed: NDArray[np.float64]
     #: (m, m) covariance of their means over all exposures, relative to `fixed`; None if they are
     #: the same in all exposures and independent between markers

@@ -45,7 +45,7 @@ class TrackedExposure:
     #: (B, 6) [mm/s, rad/s] and [mm/s^2, rad/s^2]; NaN without a filter
     velocity: NDArray[np.float64]
     acceleration: NDArray[np.float64]
-    #: (B, 18, 18) of the random errors of pose, velocity and acceleration
+    #: (B, 18, 18) covariance of the random errors of pose, velocity and acceleration
     covariance: NDArray[np.float64]
     fixed: NDArray[np.float64]  #: (B, 6, 6) covariance of the constant errors of the pose
     rig_root: NDArray[np.float64]  #: (B, 6, k)

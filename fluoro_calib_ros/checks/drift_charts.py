@@ -379,13 +379,13 @@ class CusumCharts:
         Parameters
         ----------
         score, information : ndarray
-            (K, A), of the drifts [1/px, 1/px^2].
+            (K, A), score and information of the drifts [1/px, 1/px^2].
         band : ndarray
             (K, A), dead bands [px].
         testing : ndarray
             (K, A), where the block counts as evidence.
         stamp_ns : int
-            Time at which the block began.
+            Time at which the block began [ns].
         """
         seen = information > 0
         factor = self._update_variance(score, information, seen)

@@ -75,7 +75,7 @@ class RigDriftWatch:
         self._of_charts = self._watch.state  # state of the last block
         self._state = self._of_charts
         self._addition: Addition | None = None
-        self._wide: tuple[Intersector, Intersector] | None = None  # as given, and widened
+        self._wide: tuple[Intersector, Intersector] | None = None  # given and widened
         #: addition of an alarm to standard deviations; None without an alarm
         self.widening: Finding | None = None
 

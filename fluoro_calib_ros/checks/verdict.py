@@ -142,7 +142,7 @@ def validate(
     request : CalibrationRequest
         Data and options of the calibrations.
     calibrations : mapping of str to FluoroscopeCalibration
-        By fluoroscope.
+        Calibrations by fluoroscope.
     progress : callable, optional
         Called with the name of a step, the number of steps done and their total before each step.
     rig : RigFindings, optional

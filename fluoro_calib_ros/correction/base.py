@@ -26,8 +26,6 @@ from ..limits import MAX_CORNERS
 from .calibration_record import SD_GRID
 from .series import Series, packed
 
-# Status of a corrected image point.
-
 
 class CorrectionStatus(IntEnum):
     """Status of a corrected image point, as sent in messages and written to files."""

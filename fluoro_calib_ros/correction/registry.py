@@ -80,7 +80,7 @@ class CollocationModel(SeriesModel):
     description = 'cubic trend and random field in the adjustment'
 
 
-MAX_CELLS = 128  # along a side of the image, to bound the size of files and messages
+MAX_CELLS = 128  # maximum number along an image side, to bound the size of files and messages
 
 
 class LookupModel(CorrectionModel):

@@ -167,7 +167,7 @@ class Diagnostician:
     # -- hypotheses
 
     def _tried(self, best: _Tried, first: Poses) -> list[_Tried]:
-        """Solve for the causes that may be added, of those that the derivatives make likely."""
+        """Solve for the additional causes that the derivatives make likely."""
         changes = [*self._changes_of_unknowns(best), *self._scattering(best)]
         changes += self._exchanges(best)
         start = np.zeros(self.adjustment.size), first

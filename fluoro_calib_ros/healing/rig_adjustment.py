@@ -177,7 +177,7 @@ class _Back(NamedTuple):
 class RigAdjustment:
     """Adjustment of one recording for any hypothesis.
 
-    orientation: as it was calibrated. bodies: with known places of all markers. image_size: of
+    orientation: calibrated orientation. bodies: with known places of all markers. image_size: of
     each fluoroscope [px].
     """
 

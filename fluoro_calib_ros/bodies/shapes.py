@@ -47,10 +47,10 @@ FALSE_SHARE = 0.05
 MAX_CONDITION = 120.0
 MAX_MEAN_ERROR_MM = 0.35
 REJECT_TAIL = 2 * float(ndtr(-CERTAIN))
-# The images directly show if the coordinates of a body are mirrored or in another unit, by fitting
-# its shape to points in space. Relative tolerance of the scale.
+# Relative tolerance for recognising another unit of the coordinates, from the fit of the shape to
+# points in space.
 SCALE_TOLERANCE = 0.05
-REGULAR = 1e-10  # share of the largest element that is added to the diagonal
+REGULAR = 1e-10  # share of a normal matrix' largest element that is added to its diagonal
 _MOVED = (Kind.MARKER_MIGRATED, Kind.MARKERS_EXCHANGED)
 
 

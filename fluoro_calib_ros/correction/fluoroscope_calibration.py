@@ -31,7 +31,7 @@ from .grid import CorrectionGrid
 from .registry import MODEL_FIELDS, model_from_values
 from .series import Functions, Series
 
-MAX_FACTOR = 10.0  # maximum ratio of the factors of border and middle, or of its inverse
+MAX_FACTOR = 10.0  # maximum estimated ratio of the factors of border and middle, or of its inverse
 
 
 @dataclass(frozen=True)

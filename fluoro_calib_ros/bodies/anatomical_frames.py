@@ -29,7 +29,7 @@ from ..photogrammetry.rotations import (
 
 AXES = 'xyz'
 SIDES = ('left', 'right')
-# A landmark picked to 1 mm leaves the direction of a line of 50 mm open by this angle [rad].
+# If a landmark is picked to 1 mm, the direction of a line of 50 mm is uncertain by this [rad].
 MIN_SINE = 0.02
 MIN_LENGTH_MM = 1.0
 
@@ -65,7 +65,7 @@ BODY_FRAME = AnatomicalFrame(np.eye(3), np.zeros(3))
 
 
 def frame_of_quaternion(wxyz: ArrayLike, origin_mm: ArrayLike) -> AnatomicalFrame:
-    """Return the frame of a quaternion (4,), anatomical axes -> body. Raises DataError."""
+    """Return the frame of a quaternion (4,) from anatomical to body axes. Raises DataError."""
     q = np.array(wxyz, dtype=float)
     if q.shape != (4,) or not abs(np.linalg.norm(q) - 1) <= ROTATION_TOLERANCE:
         raise DataError('the quaternion of the frame does not have four numbers and length one')
@@ -96,10 +96,10 @@ def frame_of_axes(axes: Mapping[str, ArrayLike], origin_mm: ArrayLike) -> Anatom
 
 @dataclass(frozen=True)
 class Direction:
-    """An axis from the mean of some landmarks to that of others.
+    """Axis from the mean of some landmarks to the mean of others.
 
-    A lateral one is that of a right limb; on the left it is reversed, so that it points to the
-    right of the person, too.
+    A lateral axis is defined for a right limb. For a left limb it is reversed, so that it also
+    points to the right of the person.
     """
 
     axis: str
@@ -110,11 +110,11 @@ class Direction:
 
 @dataclass(frozen=True)
 class LandmarkFrame:
-    """How landmarks make a frame."""
+    """Definition of a frame by landmarks."""
 
-    origin: tuple[str, ...]  #: landmarks with this mean
-    first: Direction  #: an axis of the frame
-    #: spans a plane with the first; its part that is perpendicular to the first is an axis
+    origin: tuple[str, ...]  #: landmarks whose mean is the origin
+    first: Direction  #: one axis of the frame
+    #: spans a plane with the first; its component perpendicular to the first is another axis
     second: Direction
 
     @property
@@ -169,7 +169,7 @@ LANDMARK_FRAMES = {
         Direction('z', ('trigonum_spinae',), ('acromial_angle',), lateral=True),
         Direction('y', ('inferior_angle',), ('trigonum_spinae',)),
     ),
-    # The first option of the recommendation: the humerus without the forearm.
+    # First option of the recommendation: the humerus without the forearm.
     'humerus_isb': LandmarkFrame(
         ('glenohumeral_centre',),
         Direction('y', _EPICONDYLES, ('glenohumeral_centre',)),
@@ -185,7 +185,7 @@ LANDMARK_FRAMES = {
         Direction('y', ('distal_radius',), ('proximal_radius',)),
         Direction('z', ('sigmoid_notch',), ('radial_styloid',), lateral=True),
     ),
-    # The palmar point lies in the plane that halves the bone.
+    # The palmar point lies in the plane that bisects the bone.
     'metacarpal_isb': LandmarkFrame(
         ('metacarpal_head', 'metacarpal_base'),
         Direction('y', ('metacarpal_head',), ('metacarpal_base',)),
@@ -199,8 +199,8 @@ def frame_of_landmarks(
 ) -> AnatomicalFrame:
     """Return the frame of a kind of bone from landmarks (3,) in the coordinates of its body [mm].
 
-    kind is a name of LANDMARK_FRAMES, side one of SIDES. Raises DataError for landmarks that are
-    missing, unknown or not finite, coincide, or lie on a line.
+    kind is a key of LANDMARK_FRAMES, side one of SIDES. Raises DataError for landmarks that are
+    missing, unknown, not finite, coincident or collinear.
     """
     recipe = LANDMARK_FRAMES[kind]
     names = recipe.landmarks
@@ -234,7 +234,7 @@ def _mean(
 def _vector(
     direction: Direction, points: Mapping[str, NDArray[np.float64]], side: str
 ) -> NDArray[np.float64]:
-    """Return a direction (3,) of length one. Raises DataError."""
+    """Return a unit vector (3,). Raises DataError for landmarks that are too close."""
     vector = _mean(direction.end, points) - _mean(direction.start, points)
     length = np.linalg.norm(vector)
     if length < MIN_LENGTH_MM:
@@ -246,34 +246,33 @@ def _vector(
     return sign * vector / length
 
 
-# Conventions of joints: sequences of rotations, and which sign has which clinical name.
+# Conventions of joints: sequences of rotations, and the clinical names of their signs.
 #
 # A joint coordinate system after Grood and Suntay (1983) is a Cardan sequence: the first axis is
-# one of the proximal bone, the third one of the distal bone, and the second (floating) axis is
-# perpendicular to both. R = R_i(1) R_j(2) R_k(3) takes distal into proximal axes. The sources are
-# those of the anatomical frames.
+# fixed in the proximal bone, the third one in the distal bone, and the second (floating) axis is
+# perpendicular to both. R = R_i(1) R_j(2) R_k(3) maps distal to proximal axes (sources above).
 
 
 @dataclass(frozen=True)
 class Convention:
-    """How the motion of a joint is expressed."""
+    """Convention that expresses the motion of a joint."""
 
     name: str
     sequence: str  #: axes of the rotations, such as 'zxy'
-    #: names; each says which direction is positive
+    #: names that state the positive direction
     angles: tuple[str, str, str]
     translations: tuple[str, str, str]
-    #: of the named quantities, of a right limb
+    #: signs of the named quantities for a right limb
     angle_signs: tuple[int, int, int] = (1, 1, 1)
     translation_signs: tuple[int, int, int] = (1, 1, 1)
-    #: number of the axis that points to the right of the person: a left limb is mirrored along it;
-    #: None where sides do not differ
+    #: index of the axis that points to the right of the person, along which a left limb is
+    #: mirrored; None if sides do not differ
     lateral: int | None = None
-    #: whether translations are along the three axes of rotation, or else along x, y and z of the
+    #: True: translations are along the three axes of rotation; False: along x, y and z of the
     #: proximal frame
     along_axes: bool = True
     branch: int = 1  #: sign of the second angle of an Euler sequence
-    #: kinds of landmark frames, empty where there are none
+    #: kinds of landmark frames; empty if there are none
     proximal_landmarks: str = ''
     distal_landmarks: str = ''
 
@@ -283,14 +282,14 @@ class Convention:
         return self.sequence[0] == self.sequence[2]
 
     def mirror(self, side: str) -> NDArray[np.float64]:
-        """Return the matrix (3, 3) that makes a right limb of one of this side."""
+        """Return the matrix (3, 3) that mirrors a limb of this side to a right limb."""
         matrix = np.eye(3)
         if side == 'left' and self.lateral is not None:
             matrix[self.lateral, self.lateral] = -1
         return matrix
 
     def check_side(self, side: str) -> None:
-        """Raise DataError for a side that is none, or missing where it matters."""
+        """Raise DataError for an invalid side, or a missing one if it matters."""
         if side not in SIDES and (side or self.lateral is not None):
             raise DataError(f'the side is {side!r}, {self.name} needs left or right')
 
@@ -311,7 +310,7 @@ def _sequences() -> Iterator[Convention]:
 
 
 def _isb(name: str, angles: str, translations: str, proximal: str, distal: str) -> Convention:
-    """Return a convention of the ISB: flexion about z, the floating x, rotation about y."""
+    """Return an ISB convention: flexion about z, floating axis x, rotation about y."""
     first, second, third = angles.split()
     lateral, anterior, along = translations.split()
     return Convention(
@@ -325,7 +324,7 @@ def _isb(name: str, angles: str, translations: str, proximal: str, distal: str) 
     )
 
 
-# Elevation is the negative rotation about x, in a plane turned about y.
+# Elevation is the negative rotation about x, in a plane rotated about y.
 _SHOULDER = Convention(
     'isb_glenohumeral',
     'yxy',
@@ -340,7 +339,7 @@ _SHOULDER = Convention(
 )
 _SHIFTS = 'lateral_shift anterior_shift proximal_shift'
 _CLINICAL = (
-    # Flexion turns the distal end of the tibia back, against the right-hand rule about x.
+    # Flexion rotates the distal end of the tibia backwards, against the right-hand rule about x.
     Convention(
         'grood_suntay_knee',
         'xyz',
@@ -377,7 +376,7 @@ CONVENTIONS = {one.name: one for one in (*_sequences(), *_CLINICAL)}
 
 
 def convention(name: str) -> Convention:
-    """Return the convention of a name. Raises DataError for an unknown one."""
+    """Return the convention of a given name. Raises DataError for an unknown name."""
     if name not in CONVENTIONS:
         raise DataError(f'the convention {name!r} is unknown, there are {", ".join(CONVENTIONS)}')
     return CONVENTIONS[name]

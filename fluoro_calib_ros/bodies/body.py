@@ -24,24 +24,24 @@ AXIS_MM = 20.0  # length of a drawn axis, about the size of a cluster of markers
 
 @dataclass(frozen=True)
 class Body:
-    """A rigid body and the coordinates of its markers.
+    """Rigid body with the coordinates of its markers.
 
-    Raises DataError for arrays of other lengths, repeated markers and values that are not finite.
+    Raises DataError for arrays of different lengths, repeated markers and non-finite values.
 
     Attributes
     ----------
     name : str
     target_id : (m,) ndarray
-        Markers, ascending.
+        Marker ids, ascending.
     xyz_mm : (m, 3) ndarray
-        In the frame of the body; NaN for a marker whose place is to be estimated.
+        Coordinates in the frame of the body; NaN for a marker whose place is to be estimated.
     sd_mm : (m,) ndarray
-        Standard deviations of each of these coordinates; infinite where they are not known.
+        Standard deviation of the coordinates of each marker; infinite if unknown.
     frame_covariance : (6, 6) ndarray
-        Of the frame itself against the markers: a shift [mm] and a rotation [rad] about their
-        centre, along the axes of the body. 0 where sd_mm contains it.
+        Covariance of the frame itself relative to the markers: shift [mm] and rotation [rad] about
+        their centre, along the axes of the body. 0 if sd_mm includes it.
     covariance_mm2 : (3 m, 3 m) ndarray
-        Of the coordinates relative to each other; by default sd_mm, independent of each other.
+        Covariance of the coordinates relative to each other; by default independent, from sd_mm.
     """
 
     __repr__ = brief_repr
@@ -93,11 +93,11 @@ class Body:
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """Whether the place of a marker (m,) is known."""
+        """Whether the place of each marker (m,) is known."""
         return np.asarray(np.isfinite(self.xyz_mm).all(axis=1))
 
     def rows(self, chosen: NDArray[np.bool_]) -> Body:
-        """The body with some of its markers (m,) only."""
+        """Return the body with a subset of its markers, chosen (m,)."""
         covariance = self.covariance_mm2
         if covariance is not None:
             covariance = covariance[np.ix_(np.repeat(chosen, 3), np.repeat(chosen, 3))]
@@ -116,7 +116,7 @@ class Body:
 
 
 def check_bodies(bodies: Sequence[Body]) -> None:
-    """Raise DataError for no bodies, two of one name, and a marker of two bodies."""
+    """Raise DataError without bodies, for two of the same name, and for a shared marker."""
     if not bodies:
         raise DataError('there are no bodies')
     owners: dict[int, str] = {}
@@ -135,9 +135,9 @@ def check_bodies(bodies: Sequence[Body]) -> None:
 
 
 def declared_bodies(texts: Iterable[str]) -> tuple[Body, ...]:
-    """Bodies of unknown shapes from texts such as 'tibia: 1001 1002 1003'.
+    """Return bodies of unknown shapes from texts such as 'tibia: 1001 1002 1003'.
 
-    Raises DataError for a text of another form, fewer than two markers, and as check_bodies.
+    Raises DataError for a text of another form, for fewer than two markers, and like check_bodies.
     """
     bodies = tuple(_declared_body(text) for text in texts)
     if bodies:
@@ -161,9 +161,9 @@ def _declared_body(text: str) -> Body:
 
 
 def solvable_bodies(bodies: Sequence[Body]) -> tuple[Body, ...]:
-    """Return bodies without the markers whose place is unknown.
+    """Return bodies without the markers whose places are unknown.
 
-    Raises DataError for a body with fewer than three known markers, and for a place without a
+    Raises DataError for a body with fewer than three known markers, and for a marker without a
     standard deviation.
     """
     out = []
@@ -185,13 +185,13 @@ def solvable_bodies(bodies: Sequence[Body]) -> tuple[Body, ...]:
 
 
 class PoseStatus(IntEnum):
-    """How a pose was obtained; the values are those of the messages."""
+    """Origin of a pose; the values are those of the messages."""
 
     OK = 0
-    WEAK = 1  # too few markers or views for all of it: what is missing is predicted
-    FILLED = 2  # no marker of the body was seen: predicted, or interpolated
+    WEAK = 1  # too few markers or views for the full pose; the missing part is predicted
+    FILLED = 2  # no marker of the body was seen; predicted or interpolated
     FAILED = 3  # unknown
-    AMBIGUOUS = 4  # markers nearly on a plane or a line fit in a second pose, too
+    AMBIGUOUS = 4  # markers nearly in a plane or on a line also fit in a second pose
 
 
 STATUS_NAMES = tuple(status.name for status in PoseStatus)
@@ -199,28 +199,28 @@ STATUS_NAMES = tuple(status.name for status in PoseStatus)
 
 @dataclass(frozen=True)
 class BodyPoses:
-    """Poses of one body, body -> rig frame: P = R x + t.
+    """Poses of one body, from body to rig frame: P = R x + t.
 
-    Errors are (dt, w): t + dt [mm] and exp([w]x) R [rad], about the axes of the rig frame.
+    Errors are (dt, w) about the axes of the rig frame: t + dt [mm] and exp([w]x) R [rad].
 
     Attributes
     ----------
     body : str
     number, stamp_ns : (T,) ndarray
-        Of the exposures.
+        Number and stamp of each exposure.
     rotation : (T, 3, 3) ndarray
         NaN where there is no pose.
     position_mm : (T, 3) ndarray
-        Of the origin of the body.
+        Position of the origin of the body.
     covariance_noise : (T, 6, 6) ndarray
-        Of the random errors, which differ from exposure to exposure.
+        Covariance of the random errors, which are independent between exposures.
     covariance_fixed : (T, 6, 6) ndarray
-        Of errors of this body that stay: its shape, and the corrections of the images.
+        Covariance of constant errors of this body: of its shape, and of the image corrections.
     rig_root : (T, 6, k) ndarray
-        By k independent unknowns of variance one of the orientation of the rig, which the poses of
-        all bodies and exposures have in common.
+        Derivatives with respect to k independent unknowns of unit variance of the orientation of
+        the rig, which are common to the poses of all bodies and exposures.
     markers : (T,) ndarray
-        Number of markers that were used.
+        Number of markers used.
     status : (T,) ndarray
         PoseStatus as uint8.
     """
@@ -240,23 +240,23 @@ class BodyPoses:
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """Whether (T,) there is a pose."""
+        """Whether there is a pose in each exposure (T,)."""
         return np.asarray(np.isfinite(self.rotation[:, 0, 0]))
 
     def rows(self, chosen: NDArray[np.bool_]) -> BodyPoses:
-        """Poses of some exposures (T,)."""
+        """Return the poses of a subset of the exposures, chosen (T,)."""
         names = (entry.name for entry in fields(self) if entry.name != 'body')
         return replace(self, **{name: getattr(self, name)[chosen] for name in names})
 
     @property
     def covariance(self) -> NDArray[np.float64]:
-        """Covariances (T, 6, 6) by all errors [mm, rad]."""
+        """Covariances (T, 6, 6) from all errors [mm, rad]."""
         by_rig = self.rig_root @ np.swapaxes(self.rig_root, 1, 2)
         return self.covariance_noise + self.covariance_fixed + by_rig
 
     @property
     def sd(self) -> NDArray[np.float64]:
-        """Standard deviations (T, 6) by all errors [mm, rad]."""
+        """Standard deviations (T, 6) from all errors [mm, rad]."""
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
 
@@ -268,10 +268,10 @@ def fitted_pose(
     target: NDArray[np.float64],
     weight: NDArray[np.float64] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Rotations (..., 3, 3) and shifts (..., 3) that take points (..., k, 3) to others.
+    """Return rotations (..., 3, 3) and shifts (..., 3) that move points (..., k, 3) to target.
 
-    By least squares; weight (..., k): of the points, by default the same for all. Kabsch, "A
-    solution for the best rotation to relate two sets of vectors", Acta Cryst. A32, 1976.
+    Least-squares fit; weight (..., k): of the points, by default equal. Kabsch, "A solution for
+    the best rotation to relate two sets of vectors", Acta Cryst. A32, 1976.
     """
     weight = np.ones(source.shape[:-1]) if weight is None else weight
     share = (weight / weight.sum(axis=-1, keepdims=True))[..., None]
@@ -287,11 +287,11 @@ def fitted_pose(
 def robust_pose(
     source: NDArray[np.float64], target: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Rotation (3, 3) and shift (3,) that take most of at least three points (k, 3) to others.
+    """Return the rotation (3, 3) and shift (3,) that move most of k >= 3 points (k, 3) to target.
 
-    Of the motions of three points, the one with the least median of the distances, then of all
-    points within three of these medians. Rousseeuw, "Least median of squares regression", J. Am.
-    Stat. Assoc. 79, 1984.
+    Among the motions of three points, the one with the smallest median distance selects all points
+    within three of these medians for the final fit. Rousseeuw, "Least median of squares
+    regression", J. Am. Stat. Assoc. 79, 1984.
     """
     count = len(source)
     triples = np.array(list(combinations(range(count), 3)))
@@ -306,7 +306,7 @@ def robust_pose(
 
 
 def by_pose(arm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Derivatives (..., 3, 6) of places by position and rotation; arm (..., 3): R x."""
+    """Return derivatives (..., 3, 6) of places by position and rotation; arm (..., 3): R x."""
     out = np.zeros((*arm.shape, 6))
     out[..., :3] = np.eye(3)
     out[..., 3:] = -cross_matrix(arm)

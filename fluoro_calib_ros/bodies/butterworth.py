@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The low-pass filter that labs use, for comparison: Butterworth, forwards and backwards.
+"""Low-pass filter that labs use, for comparison: Butterworth, forwards and backwards.
 
-Of order 4 in total, two each way, as in Winter ("Biomechanics and motor control of human
-movement", 4th ed., 2009, 2.2.4.4). The cutoff is chosen by whoever uses it. Standard deviations
-are propagated for errors that are independent from exposure to exposure; what the filter takes
-from the motion itself they do not contain.
+The total order is 4, two in each direction, as in Winter ("Biomechanics and motor control of human
+movement", 4th ed., 2009, 2.2.4.4). The user chooses the cutoff. Standard deviations are propagated
+from errors that are independent between exposures; they do not include motion that is filtered
+out.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from ..errors import DataError
 from ..photogrammetry.rotations import matrix_from_quaternion, quaternion_from_matrix
 from .body import BodyPoses, PoseStatus
 
-SETTLED = 1e-6  # share of the impulse response that is left out
+SETTLED = 1e-6  # share of the impulse response that is truncated
 
 
 def filtered_poses(poses: BodyPoses, cutoff_hz: float) -> BodyPoses:
-    """Return poses after a low-pass filter; gaps are interpolated before, and marked.
+    """Return poses after a low-pass filter; gaps are interpolated beforehand, and marked.
 
-    Raises DataError for a cutoff that the rate does not allow, exposures that are not equally far
-    apart, and fewer than ten poses.
+    Raises DataError for a cutoff that the rate does not allow, for exposures that are not
+    equidistant in time, and for fewer than ten poses.
     """
     known = poses.known
     if np.count_nonzero(known) < 10:
@@ -38,7 +38,7 @@ def filtered_poses(poses: BodyPoses, cutoff_hz: float) -> BodyPoses:
         raise DataError(
             f'a cutoff of {cutoff_hz:g} Hz is not between 0 and half of the rate, {rate / 2:g} Hz'
         )
-    b, a = scipy.signal.butter(2, cutoff_hz, fs=rate)  # of second order in each direction
+    b, a = scipy.signal.butter(2, cutoff_hz, fs=rate)  # second order in each direction
     time = np.arange(len(known))
 
     def smooth(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -62,7 +62,7 @@ def filtered_poses(poses: BodyPoses, cutoff_hz: float) -> BodyPoses:
 
 
 def _rate(poses: BodyPoses) -> float:
-    """Rate [Hz] of the exposures. Raises DataError where they are not equally far apart."""
+    """Return the rate [Hz] of the exposures. Raises DataError if they are not equidistant."""
     dt = np.diff(poses.stamp_ns) / 1e9
     typical = float(np.median(dt))
     if typical <= 0 or np.abs(dt - typical).max() > 0.2 * typical:
@@ -73,7 +73,7 @@ def _rate(poses: BodyPoses) -> float:
 
 
 def _continuous(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Quaternions (T, 4) without changes of sign."""
+    """Return quaternions (T, 4) without sign changes."""
     same = np.sum(quaternion[1:] * quaternion[:-1], axis=1) >= 0
     sign = np.cumprod(np.concatenate([[1.0], np.where(same, 1.0, -1.0)]))
     return quaternion * sign[:, None]
@@ -84,7 +84,7 @@ def _propagated(
     known: NDArray[np.bool_],
     filter_: tuple[NDArray[np.float64], NDArray[np.float64]],
 ) -> NDArray[np.float64]:
-    """Covariances (T, 6, 6) after the filter: sums by the square of its impulse response."""
+    """Return filtered covariances (T, 6, 6): sums weighted by the squared impulse response."""
     size = len(covariance)
     impulse = np.zeros(2 * size + 1)
     impulse[size] = 1.0
@@ -99,7 +99,7 @@ def _propagated(
 
 
 def _nearest(values: NDArray[np.float64], known: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Values (T, ...) with those of the nearest known exposure where there are none."""
+    """Return values (T, ...), replaced by the nearest known exposure's where unknown."""
     rows = np.flatnonzero(known)
     after = np.searchsorted(rows, np.arange(len(known))).clip(0, len(rows) - 1)
     before = np.maximum(after - 1, 0)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Errors of the correction that markers have in common, and that stay while they move little."""
+"""Errors of the correction that markers share, and that are constant while they move little."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-# Errors of a correction at two pixels are correlated by exp(-distance / REACH), in longer sides
-# of the image, as benchmarks/reach.py measures it.
+# The errors of a correction at two pixels are correlated by exp(-distance / REACH). Unit: longer
+# side of the image, as measured by benchmarks/reach.py.
 REACH = 0.15
 
 
 def covariance_of_means(uv: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Covariances (F, m, m) of the mean errors of m markers over T exposures; that of one is 1.
+    """Return covariances (F, m, m) of m markers' mean errors over T exposures, for unit variance.
 
-    uv (T, m, F, 2): image points in longer sides of the images, NaN where there are none. It is
-    the mean correlation of the errors of two markers in any two exposures, 0 for a marker that is
-    not seen.
+    uv (T, m, F, 2): image points in units of the longer side of the images, NaN where not seen.
+    The covariance is the mean correlation of the errors of two markers in any two exposures; it is
+    0 for a marker that is not seen.
     """
-    # 100 exposures of a recording, evenly spread, tell where its markers are seen.
+    # 100 evenly spread exposures of a recording suffice to locate its markers.
     rows = np.unique(np.linspace(0, len(uv) - 1, 100).astype(int))
     out = []
     for path in np.moveaxis(uv[rows], 2, 0):

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Image points of bodies, sorted by body and marker, and their derivatives at poses."""
+"""Image points of bodies, sorted by body and marker, and their derivatives at given poses."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ class ImagePoints:
 
 @dataclass(frozen=True)
 class Linear:
-    """Image points at a pose: residuals (B, M, F, 2), and derivatives by place (B, M, F, 2, 3)."""
+    """Image points at a pose: residuals (B, M, F, 2) and derivatives by place (B, M, F, 2, 3)."""
 
     residual: NDArray[np.float64]
     by_place: NDArray[np.float64]
     uv: NDArray[np.float64]  # predicted
-    by_pose: NDArray[np.float64]  # (B, M, 3, 6), derivatives D of places by the pose
+    by_pose: NDArray[np.float64]  # (B, M, 3, 6), derivatives D of places with respect to the pose
 
 
 class Cameras:
-    """The fluoroscopes of a rig, as they see the markers of bodies.
+    """Fluoroscopes of a rig and their views of the markers of bodies.
 
-    target_id: (B, M) markers of B bodies, -1 where a body has fewer.
+    target_id: (B, M) markers of B bodies; -1 pads bodies with fewer markers.
     """
 
     def __init__(self, orientation: RigOrientation, target_id: NDArray[np.int64]) -> None:
@@ -54,7 +54,7 @@ class Cameras:
         self._shift = -(rows @ orientation.position_mm[:, :, None]).reshape(-1)
         self._uv_rows = rows[:, :2]
         self._depth_rows = rows[:, 2:]
-        # (F, 9, k): of the covariance of the orientation, by independent unknowns of variance one.
+        # (F, 9, k): root of the orientation covariance, by independent unknowns of unit variance.
         self.root = orientation.covariance_root().reshape(self._views, ORIENTATION_SIZE, -1)
         self._ids: NDArray[np.integer] | None = None
         self._rows = np.zeros(0, dtype=int)
@@ -71,7 +71,7 @@ class Cameras:
             self._rows = np.where(known, rows, len(ids))
             self._ids = ids
         shape = (*self.target_id.shape, self._views)
-        # One row more for markers that are not there.
+        # One additional row for markers that are not present.
         padded = np.full((self._views, len(ids) + 1, 4), np.nan)
         padded[:, :-1, :2] = views.uv
         padded[:, :-1, 2] = views.sigma
@@ -88,7 +88,7 @@ class Cameras:
         return ImagePoints(sorted_[..., :2], noise, correction, seen)
 
     def places(self, exposure: IntersectedViews) -> NDArray[np.float64]:
-        """Places (B, M, 3) of the markers of the exposure that was sorted last [mm], or NaN."""
+        """Return places (B, M, 3) [mm] of markers in the last sorted exposure; NaN if unknown."""
         points = exposure.points
         good = (points.status == OK) | (points.status == OUTSIDE)
         xyz = np.concatenate([np.where(good[:, None], points.xyz_mm, np.nan), [[np.nan] * 3]])
@@ -100,9 +100,9 @@ class Cameras:
         pose: tuple[NDArray[np.float64], NDArray[np.float64]],
         points: ImagePoints,
     ) -> Linear:
-        """Residuals and derivatives of all image points at poses.
+        """Return residuals and derivatives of all image points at given poses.
 
-        xyz (B, M, 3): markers about the centre of their body; pose: rotations (B, 3, 3) and
+        xyz (B, M, 3): markers relative to the centre of their body. pose: rotations (B, 3, 3) and
         centres (B, 3).
         """
         rotation, centre = pose
@@ -118,7 +118,7 @@ class Cameras:
         return Linear(residual, by_place, uv, by_pose(arm))
 
     def by_orientation(self, linear: Linear) -> NDArray[np.float64]:
-        """Derivatives (B, M, F, 2, 9) of image points by T, w, xp, yp, c, see collinearity."""
+        """Return derivatives (B, M, F, 2, 9) by T, w, xp, yp, c; see collinearity."""
         interior = self._interior
         c = interior[:, 2]
         xy = (linear.uv - interior[:, :2]) / c[:, None]

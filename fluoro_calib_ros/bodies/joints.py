@@ -1,17 +1,17 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Joints: angles and translations between two bodies, with the covariance of both.
+"""Joints: angles and translations between two bodies, with the covariance of all of them.
 
 With proximal and distal anatomical axes P and D in the rig frame, R = P^T D is resolved into three
-rotations about the axes e1, e2, e3 of the convention. Errors (dt, w) of the poses, as BodyPoses
-has them, turn R by w_r = P^T (w_d - w_p). As w_r = E da with E = (e1 e2 e3), the angles change by
-da = E^-1 w_r (the Jacobian of a joint coordinate system, Woltring, J. Biomech. 27, 1994).
+rotations about the axes e1, e2, e3 of the convention. Errors (dt, w) of the poses, as defined in
+BodyPoses, rotate R by w_r = P^T (w_d - w_p). As w_r = E da with E = (e1 e2 e3), the angles change
+by da = E^-1 w_r (the Jacobian of a joint coordinate system, Woltring, J. Biomech. 27, 1994).
 
 E is singular where e1 and e3 are parallel (gimbal lock). Close to it the angle about e1 is the
 direction of a short vector, with errors that are neither small nor Gaussian. There, and where
-angles are uncertain for other reasons, the second moments of their errors are integrated over the
-distribution of w_r.
+angles are uncertain for other reasons, the second moments of their errors are computed by
+integration over the distribution of w_r.
 """
 
 from __future__ import annotations
@@ -30,25 +30,25 @@ from ..photogrammetry.rotations import cross_matrix, matrix_from_vector
 from .anatomical_frames import AXES, BODY_FRAME, AnatomicalFrame, Convention, convention
 from .body import BodyPoses, PoseStatus
 
-# Distance from gimbal lock in standard deviations: the first angle has one of 0.2 rad (11 degrees)
-# there, and one of its errors in two million crosses the lock.
+# Distance from gimbal lock in standard deviations. At this distance the first angle has a standard
+# deviation of 0.2 rad (11 degrees), and one in two million of its errors crosses the lock.
 LOCK_SDS = 5.0
-# Below it the second-order part of an angle's error is less than 1 % of the first-order one, and
-# translations of 50 mm along turning axes are linear to 0.01 mm.
+# Standard deviation below which the second-order part of an angle's error is less than 1 % of the
+# first-order part; translations of 50 mm along rotating axes are then linear to 0.01 mm.
 LINEAR_SD_RAD = 0.02
-MIN_VOLUME = 1e-9  # of the axes: the Jacobian is finite in gimbal lock, and not used there
-BLOCK = 256  # exposures that are integrated at once
+MIN_VOLUME = 1e-9  # minimum of the triple product of the axes: keeps the Jacobian finite
+BLOCK = 256  # exposures per integration
 
 
 class JointStatus(IntEnum):
-    """How the motion of a joint was obtained; 0 to 4 are the PoseStatus of the worse body."""
+    """Origin of the motion of a joint; 0 to 4 are the PoseStatus of the worse body."""
 
     OK = 0
     WEAK = 1
     FILLED = 2
     FAILED = 3
     AMBIGUOUS = 4
-    GIMBAL = 5  # so close to gimbal lock that the first and the third angle mean little
+    GIMBAL = 5  # so close to gimbal lock that the first and third angle are hardly meaningful
 
 
 STATUS_NAMES = tuple(status.name for status in JointStatus)
@@ -56,21 +56,21 @@ STATUS_NAMES = tuple(status.name for status in JointStatus)
 
 @dataclass(frozen=True)
 class Joint:
-    """A joint between two bodies.
+    """Joint between two bodies.
 
     Raises DataError for a joint of a body with itself, an unknown convention, and a missing side.
 
     Attributes
     ----------
     name, proximal, distal : str
-        Of the joint and its bodies.
+        Names of the joint and of its bodies.
     convention : str
         Name in `anatomical_frames.CONVENTIONS`.
     proximal_frame, distal_frame : AnatomicalFrame
     side : {'left', 'right', ''}
-        '' only where the convention has no sides.
+        '' only if the convention does not depend on the side.
     neutral_covariance : (3, 3) ndarray
-        Of the neutral rotation, about the proximal axes [rad^2].
+        Covariance of the neutral rotation, about the proximal axes [rad^2].
     """
 
     __repr__ = brief_repr
@@ -103,13 +103,13 @@ class JointMotion:
     ----------
     joint : Joint
     number, stamp_ns : (T,) ndarray
-        Of the exposures.
+        Number and stamp of each exposure.
     angles : (T, 3) ndarray
-        [rad], by `angle_names`; full turns are counted over the trial.
+        [rad], in the order of `angle_names`; full turns are counted over the trial.
     translations : (T, 3) ndarray
-        Of the distal origin from the proximal one [mm], by `translation_names`.
+        Of the distal relative to the proximal origin [mm], in the order of `translation_names`.
     covariance : (T, 6, 6) ndarray
-        Of angles and translations [rad, mm]; near gimbal lock second moments of their errors.
+        Of angles and translations [rad, mm]; second moments of their errors near gimbal lock.
     status : (T,) ndarray
         JointStatus as uint8.
     """
@@ -126,12 +126,12 @@ class JointMotion:
 
     @property
     def angle_names(self) -> tuple[str, str, str]:
-        """Clinical names; each says which direction is positive."""
+        """Clinical names that state the positive direction."""
         return convention(self.joint.convention).angles
 
     @property
     def translation_names(self) -> tuple[str, str, str]:
-        """Clinical names; each says which direction is positive."""
+        """Clinical names that state the positive direction."""
         return convention(self.joint.convention).translations
 
     @property
@@ -148,10 +148,10 @@ def joint_motion(
 ) -> JointMotion:
     """Return the motion of a joint from the poses of its bodies.
 
-    The errors of the anatomical frames themselves are not part of the covariance: they stay over
-    all trials of a person. before: angles (3,) [rad] to count full turns from; live, the last ones
-    that are not GIMBAL give the numbers of the whole trial. Raises DataError for poses of other
-    bodies or of other exposures.
+    The covariance does not include errors of the anatomical frames themselves, which are constant
+    over all trials of a person. before: angles (3,) [rad] from which full turns are counted; in
+    live use, pass the last ones that are not GIMBAL to get the same values as for the whole trial.
+    Raises DataError for poses of other bodies or of different exposures.
     """
     _check_poses(joint, proximal, distal)
     relative = _relative(joint, proximal, distal)
@@ -161,7 +161,7 @@ def joint_motion(
     jacobian = _jacobian(of, axes, relative.translation)
     covariance = jacobian @ relative.covariance @ np.swapaxes(jacobian, 1, 2)
     locked = _near_lock(of, angles, covariance)
-    # Nodes of the Gauss-Hermite rule along each axis: for quadratic errors, and near gimbal lock.
+    # Number of Gauss-Hermite nodes per axis: 3 for quadratic errors, 9 near gimbal lock.
     for nodes, bent in ((3, _is_nonlinear(covariance) & ~locked), (9, locked)):
         exposures = np.flatnonzero(bent)
         for start in range(0, len(exposures), BLOCK):
@@ -180,13 +180,13 @@ def joint_motion(
 
 
 def with_neutral(joint: Joint, proximal: BodyPoses, distal: BodyPoses) -> Joint:
-    """Return a joint whose rotation is zero in the mean over a neutral trial.
+    """Return a joint whose mean rotation over a neutral trial is zero.
 
-    The distal axes become parallel to the proximal ones there, as ISB has it for the ankle; the
-    origins stay. The mean is that of rotation matrices (Moakher, SIAM J. Matrix Anal. 24, 2002),
-    its covariance that of the random errors, independent from exposure to exposure. Errors that
-    stay would cancel in part: the standard deviations of angles are then too large, not too
-    small. Raises DataError where no exposure has poses of both bodies that were measured.
+    The distal axes become parallel to the proximal ones there, as the ISB defines it for the
+    ankle; the origins do not change. The mean is that of rotation matrices (Moakher, SIAM J.
+    Matrix Anal. 24, 2002). Its covariance is that of the random errors, independent between
+    exposures. Constant errors would partly cancel: the standard deviations of angles are then too
+    large, not too small. Raises DataError if no exposure has measured poses of both bodies.
     """
     _check_poses(joint, proximal, distal)
     measured = np.isin(proximal.status, (PoseStatus.OK, PoseStatus.WEAK))
@@ -204,7 +204,7 @@ def with_neutral(joint: Joint, proximal: BodyPoses, distal: BodyPoses) -> Joint:
 
 
 def check_joints(joints: Sequence[Joint], bodies: Iterable[str]) -> None:
-    """Raise DataError for two joints of one name, for unknown bodies and for a cycle."""
+    """Raise DataError for two joints of the same name, unknown bodies, and cycles."""
     known = tuple(bodies)
     names: set[str] = set()
     children: dict[str, list[str]] = {}
@@ -230,7 +230,7 @@ def check_joints(joints: Sequence[Joint], bodies: Iterable[str]) -> None:
 
 
 def _check_poses(joint: Joint, proximal: BodyPoses, distal: BodyPoses) -> None:
-    """Raise DataError for poses that are not those of the joint."""
+    """Raise DataError for poses that do not belong to the joint."""
     for wanted, poses in ((joint.proximal, proximal), (joint.distal, distal)):
         if poses.body != wanted:
             raise DataError(f'joint {joint.name}: the poses are of {poses.body}, not of {wanted}')
@@ -240,9 +240,9 @@ def _check_poses(joint: Joint, proximal: BodyPoses, distal: BodyPoses) -> None:
 
 @dataclass(frozen=True)
 class _Relative:
-    """Distal -> proximal anatomical axes, of a right limb.
+    """Transformation from distal to proximal anatomical axes, for a right limb.
 
-    rotation (T, 3, 3), translation (T, 3) [mm], covariance (T, 6, 6) of the rotation errors about
+    rotation (T, 3, 3); translation (T, 3) [mm]; covariance (T, 6, 6) of the rotation errors about
     the proximal axes and of the translation.
     """
 
@@ -267,13 +267,13 @@ def _relative(
     rotation = to_p @ distal.rotation @ frame_d.rotation @ mirror
     translation = (to_p @ between[..., None])[..., 0]
 
-    # Rotation errors are axial vectors: a mirror turns them round, too.
+    # Rotation errors are axial vectors: a mirror also reverses them.
     to_p_axial = np.linalg.det(mirror) * to_p
     by_p = np.zeros((len(rotation), 6, 6))
     by_d = np.zeros_like(by_p)
     by_p[:, :3, 3:] = -to_p_axial
     by_d[:, :3, 3:] = to_p_axial
-    # w x a = -[a]x w; the proximal axes turn against what is seen in them.
+    # w x a = -[a]x w; the proximal axes rotate in the opposite sense to what is seen in them.
     by_p[:, 3:, :3] = -to_p
     by_p[:, 3:, 3:] = to_p @ cross_matrix(arm_p + between)
     by_d[:, 3:, :3] = to_p
@@ -297,7 +297,7 @@ def _relative(
 def _angles(of: Convention, rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the angles (..., 3) [rad] of R = R_i R_j R_k, matrices (..., 3, 3).
 
-    The third angle is that of R_i^T R, so that the three give R also in gimbal lock.
+    The third angle is computed from R_i^T R, so that the angles reproduce R even in gimbal lock.
     """
     i, j, k = (AXES.index(axis) for axis in of.sequence)
     m = 3 - i - j
@@ -316,7 +316,7 @@ def _angles(of: Convention, rotation: NDArray[np.float64]) -> NDArray[np.float64
 
 
 def _axes(of: Convention, angles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the axes of rotation (..., 3, 3), in the columns, in the proximal frame.
+    """Return the rotation axes (..., 3, 3) in the proximal frame, as columns.
 
     They are the unit vectors i, R_i j and R_i R_j k.
     """
@@ -325,7 +325,7 @@ def _axes(of: Convention, angles: NDArray[np.float64]) -> NDArray[np.float64]:
     sign = 1.0 if (j - i) % 3 == 1 else -1.0
     sine_1, sine_2 = np.moveaxis(np.sin(angles[..., :2]), -1, 0)
     cosine_1, cosine_2 = np.moveaxis(np.cos(angles[..., :2]), -1, 0)
-    # Of R_j k, along i and along the third unit vector, which R_i turns.
+    # Components of R_j k along i and along the third unit vector, which R_i rotates.
     along, across = (cosine_2, -sign * sine_2) if of.is_euler else (sign * sine_2, cosine_2)
     axes = np.zeros((*angles.shape, 3))
     axes[..., i, 0] = 1.0
@@ -349,7 +349,7 @@ def _translations(
 def _jacobian(
     of: Convention, axes: NDArray[np.float64], translation: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Derivatives (T, 6, 6) of angles and translations by rotation error and translation."""
+    """Return derivatives (T, 6, 6) of angles and translations by rotation error, translation."""
     e1, e2, e3 = (axes[..., n] for n in range(3))
     by_1, by_2, between = np.cross(np.stack([e1, e1, e2]), np.stack([e2, e3, e3]))
     volume = np.sum(between * e1, axis=1)
@@ -361,7 +361,7 @@ def _jacobian(
     if not of.along_axes:
         jacobian[:, 3:, 3:] = np.eye(3)
         return jacobian
-    # The second axis turns about the first, the third one about both.
+    # The second axis rotates about the first one, the third axis about both.
     by_angle = np.zeros_like(axes)
     by_angle[:, 1, 0] = np.sum(by_1 * translation, axis=1)
     by_angle[:, 2, 0] = np.sum(by_2 * translation, axis=1)
@@ -374,7 +374,7 @@ def _jacobian(
 def _near_lock(
     of: Convention, angles: NDArray[np.float64], covariance: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Return whether exposures with covariances (T, 6, 6) are LOCK_SDS from gimbal lock or less.
+    """Return whether exposures with covariances (T, 6, 6) are within LOCK_SDS of gimbal lock.
 
     The third axis has the polar coordinates (distance from the lock, first angle) about the first.
     """
@@ -395,7 +395,7 @@ def _second_moments(
 ) -> NDArray[np.float64]:
     """Return second moments (T, 6, 6) of the errors of angles and translations.
 
-    By a Gauss-Hermite rule over the rotation error; what the translation has besides is linear.
+    Gauss-Hermite rule over the rotation error; the independent part of the translation is linear.
     """
     node, weight = np.polynomial.hermite_e.hermegauss(nodes)
     z = np.stack(np.meshgrid(node, node, node, indexing='ij'), axis=-1).reshape(-1, 3)
@@ -430,8 +430,8 @@ def angle_errors(
 ) -> NDArray[np.float64]:
     """Return the differences (..., 3) [rad] of two sets of angles, without full turns.
 
-    Close to gimbal lock the sum or difference of the first and the third angle is known well where
-    each of them is not: full turns are taken from it, not from the third angle alone.
+    Close to gimbal lock the sum or difference of the first and third angle is known well even if
+    neither angle is. Full turns are therefore taken from it, not from the third angle alone.
     """
     difference = angles - true
     i, j, _ = (AXES.index(axis) for axis in of.sequence)
@@ -450,12 +450,12 @@ def _unwrapped(
 ) -> NDArray[np.float64]:
     """Return angles (T, 3) without jumps by full turns.
 
-    Near gimbal lock an angle may turn by noise; each is compared with the last one that is not.
+    Near gimbal lock noise may turn an angle, so each is compared with the last angle away from it.
     """
     known = np.isfinite(angles).all(axis=1)
     firm = known & ~locked
     chain = angles[firm]
-    # Whole turns are counted, so that one exposure after the other gives the same numbers.
+    # Count whole turns, so that processing one exposure at a time gives the same values.
     turns = -np.cumsum(_turns(np.diff(chain, axis=0, prepend=chain[:1])), axis=0)
     if before is not None:
         start = np.asarray(before, dtype=float)
@@ -471,7 +471,7 @@ def _unwrapped(
 
 
 def _turns(angle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the nearest numbers of full turns."""
+    """Return the nearest number of full turns."""
     return np.round(angle / (2 * np.pi))
 
 
@@ -481,9 +481,9 @@ def _status(
     locked: NDArray[np.bool_],
     angles: NDArray[np.float64],
 ) -> NDArray[np.uint8]:
-    """Return the JointStatus (T,): of the worse body, and of gimbal lock."""
+    """Return the JointStatus (T,) from the worse body and gimbal lock."""
     status = np.full(len(angles), JointStatus.OK, dtype=np.uint8)
-    # What a user has to know most comes last.
+    # Later assignments have priority: the most important status comes last.
     status[(proximal == PoseStatus.WEAK) | (distal == PoseStatus.WEAK)] = JointStatus.WEAK
     status[locked] = JointStatus.GIMBAL
     for code in (PoseStatus.AMBIGUOUS, PoseStatus.FILLED, PoseStatus.FAILED):

@@ -1,37 +1,37 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Motion of rigid bodies over a trial: a Kalman filter and smoother without a cutoff to choose.
+"""Motion of rigid bodies over a trial: Kalman filter and smoother without a cutoff to choose.
 
-State: position of the centre of a body and rotation about the axes of the rig frame, their
-velocities and accelerations. The jerk is white noise whose density changes in time,
+The state is the position of the centre of a body and its rotation about the axes of the rig frame,
+with their velocities and accelerations. The jerk is white noise whose density changes in time,
 
     x' = F x + w,  w ~ N(0, Q),  Q = diag(q_t, q_r) (x) Q_3(dt)
 
 (Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001,
-6.2.3). What an exposure tells of a pose has the form of a normal matrix, which may be singular: an
-image point of one view is used, too.
+6.2.3). The information of an exposure on a pose has the form of a normal matrix, which may be
+singular: an image point of a single view also contributes.
 
 Deviations of a pose are twists (s, w) about the predicted centre, exp(w) R and c + J(w) s with the
-left Jacobian J (Sola et al. 2018, Eq. 172), and turn with the body. So a turn about a line through
-two markers, which nothing sees, is the same deviation whatever the turn is estimated to be. With
-differences of centres in their place the unseen direction would depend on the estimate, and
-exposures that are linearised at different estimates would seem to see it together (Barrau and
-Bonnabel, "The invariant extended Kalman filter as a stable observer", IEEE Trans. Autom. Control
-62, 2017; Huang, Mourikis and Roumeliotis, "Observability-based rules for designing consistent EKF
-SLAM estimators", Int. J. Robot. Res. 29, 2010).
+left Jacobian J (Sola et al. 2018, Eq. 172), and rotate with the body. A rotation about a line
+through two markers, which is unobservable, is therefore the same deviation whatever its estimate
+is. If differences of centres were used instead, the unobservable direction would depend on the
+estimate, and exposures linearised at different estimates would together seem to observe it (Barrau
+and Bonnabel, "The invariant extended Kalman filter as a stable observer", IEEE Trans. Autom.
+Control 62, 2017; Huang, Mourikis and Roumeliotis, "Observability-based rules for designing
+consistent EKF SLAM estimators", Int. J. Robot. Res. 29, 2010).
 
-Smoothing is that of de Jong ("Smoothing and interpolation with the state-space model", J. Am.
-Stat. Assoc. 84, 1989): backwards,
+The smoother is that of de Jong ("Smoothing and interpolation with the state-space model", J. Am.
+Stat. Assoc. 84, 1989), which runs backwards:
 
     r <- H'z + L'F'r,  N <- H'MH + L'F'N F L,  x_T = x + P r,  P_T = P - P N P.
 
 The log of each density, h = log q, follows a random walk. The derivative of the likelihood of all
-data by h_k is (r'Qr - tr QN) / 2 with r and N of the step k (Koopman, "Disturbance smoother for
-state space models", Biometrika 80, 1993), its expected information about tr(QN) / 2. So the most
-probable course of h follows by Fisher scoring with a tridiagonal matrix, and the variance of its
-steps by EM. A trial tells how quickly it changes: nothing is to be chosen. Live, h is updated by
-the derivative of the likelihood of each exposure.
+data with respect to h_k is (r'Qr - tr QN) / 2 with r and N of step k (Koopman, "Disturbance
+smoother for state space models", Biometrika 80, 1993); its expected information is about
+tr(QN) / 2. The most probable course of h therefore follows by Fisher scoring with a tridiagonal
+matrix, and the variance of its steps by EM. The trial determines how quickly h changes, so there
+is nothing to choose. Live, h is updated with the derivative of the likelihood of each exposure.
 """
 
 from __future__ import annotations
@@ -48,28 +48,28 @@ from ..photogrammetry.rotations import left_jacobian, vector_from_matrix
 
 STATE = 18  # pose, velocity and acceleration
 POSE = slice(0, 6)
-KINDS = (slice(0, 3), slice(3, 6))  # of the components of a pose: position, rotation
+KINDS = (slice(0, 3), slice(3, 6))  # components of a pose: position, rotation
 
-# Of a body that appears: wide enough for any motion of a living joint. A fall from 2 m ends with
-# 6 m/s, a golf swing turns the forearm at 40 rad/s; impacts reach 100 g and 5000 rad/s^2.
+# For a body that appears: wide enough for any motion of a living joint. A fall from 2 m ends at
+# 6 m/s, a golf swing rotates the forearm at 40 rad/s; impacts reach 100 g and 5000 rad/s^2.
 START_SD = np.repeat([0.0, 6e3, 1e6], 6) * np.tile(np.repeat([1.0, 1 / 150], 3), 3)
 # Log of the density of jerk of a body that appears, [mm^2/s^5] and [rad^2/s^5], and its standard
 # deviation: from a body at rest (a jerk of 1 mm/s^3 for 1 s) to an impact (1e8 mm/s^3 for 1 ms).
 START_LOG = np.array([18.0, 8.0])
 START_LOG_SD = 6.0
-# First variance of the walk of h in a second, then estimated: h changes by about 3 in 0.1 s.
+# Initial variance of the random walk of h per second, later estimated: h changes by 3 in 0.1 s.
 WALK = 90.0
-ROUND_ENDS = 0.1  # largest change of h in a round; it changes a standard deviation by 1 %
-MAX_STEP = 2.5  # of h in a round
-LOST_DIGITS = 1e-9  # of a variance, where the difference keeps too few of sixteen digits
-ADAPTATIONS = 4  # rounds of h in an exposure, live
-LOG_RANGE = (-20.0, 50.0)  # of h, four standard deviations and more beyond START_LOG
+ROUND_ENDS = 0.1  # change of h below which rounds end; changes a standard deviation by 1 %
+MAX_STEP = 2.5  # maximum change of h in a round
+LOST_DIGITS = 1e-9  # relative variance below which a difference has too few of sixteen digits
+ADAPTATIONS = 4  # rounds of h per exposure, live
+LOG_RANGE = (-20.0, 50.0)  # range of h, four standard deviations and more about START_LOG
 
 EYE_3 = np.eye(3)
 EYE_6 = np.eye(6)
 _EYE_STATE = np.eye(STATE)
 _POSE_ROWS = np.eye(6, STATE)
-# Of each element of the state its row in noise_factors, and of each kind the elements it moves.
+# Row in noise_factors of each element of the state, and the elements that each kind affects.
 _FACTOR_ROWS = np.repeat(np.arange(3), 6)[:, None]
 _KIND_SHARES = np.array(
     [
@@ -83,16 +83,16 @@ _DIVISORS = np.array([[20.0, 8, 6], [8, 3, 2], [6, 2, 1]])
 
 @dataclass(frozen=True)
 class PoseInformation:
-    """What one exposure tells of the poses of B bodies, about a pose that it was linearised at.
+    """Information of one exposure on the poses of B bodies, relative to a linearisation pose.
 
     Attributes
     ----------
     rotation : (B, 3, 3) ndarray
     centre_mm : (B, 3) ndarray
     normal : (B, 6, 6) ndarray
-        Normal matrix of position and rotation by the random errors, 0 for a body that is not seen.
+        Normal matrix of position and rotation for the random errors; 0 for an unseen body.
     right : (B, 6) ndarray
-        Right side: 0 at the most likely pose.
+        Right-hand side; 0 at the most likely pose.
     """
 
     rotation: NDArray[np.float64]
@@ -103,11 +103,12 @@ class PoseInformation:
 
 @dataclass
 class _Step:
-    """One exposure of the filter: its prediction, and what the exposure changed.
+    """Exposure of the filter: its prediction, and the changes due to the exposure.
 
-    into (B, 18, 18): transition from the exposure before, 0 where a body appears. dt_s: time since
-    it. reference (B, 3, 3): predicted rotations; mean (B, 18): predicted state, without rotation.
-    z (B, 6), m (B, 6, 6): of the smoother. log_q (B, 2): h of the noise into this exposure.
+    into (B, 18, 18): transition from the previous exposure; 0 for a body that appears. dt_s: time
+    since then. reference (B, 3, 3): predicted rotations. mean (B, 18): predicted state, without
+    rotation. z (B, 6), m (B, 6, 6): for the smoother. log_q (B, 2): h of the noise into this
+    exposure.
     """
 
     dt_s: float
@@ -125,7 +126,7 @@ class _Step:
 class Motion:
     """Smoothed motion of B bodies in T exposures.
 
-    NaN before a body appears. Covariances are those of the random errors.
+    Values are NaN before a body appears. Covariances are those of the random errors.
 
     Attributes
     ----------
@@ -134,7 +135,7 @@ class Motion:
     velocity, acceleration : (T, B, 6) ndarray
         [mm/s, rad/s] and [mm/s^2, rad/s^2], about the axes of the rig frame.
     covariance : (T, B, 18, 18) ndarray
-        Of position, rotation, velocities and accelerations.
+        Covariance of position, rotation, velocities and accelerations.
     log_q : (T, B, 2) ndarray
         Log of the densities of the jerk of position and rotation.
     """
@@ -150,7 +151,7 @@ class Motion:
 def pose_after(
     rotation: NDArray[np.float64], centre: NDArray[np.float64], twist: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Rotations (B, 3, 3) and centres (B, 3) after twists (B, 6) about these centres."""
+    """Return rotations (B, 3, 3) and centres (B, 3) after twists (B, 6) about these centres."""
     shift = left_jacobian(twist[:, 3:]) @ twist[:, :3, None]
     turned = Rotation.from_rotvec(twist[:, 3:]).as_matrix() @ rotation
     return turned, centre + shift[:, :, 0]
@@ -160,33 +161,33 @@ def twist_between(
     first: tuple[NDArray[np.float64], NDArray[np.float64]],
     second: tuple[NDArray[np.float64], NDArray[np.float64]],
 ) -> NDArray[np.float64]:
-    """Twists (B, 6) that move first to second rotations and centres by pose_after."""
+    """Return twists (B, 6) with which pose_after moves first to second poses."""
     turn = _vector(second[0] @ np.swapaxes(first[0], 1, 2))
     shift = np.linalg.solve(left_jacobian(turn), (second[1] - first[1])[:, :, None])
     return np.concatenate([shift[:, :, 0], turn], axis=1)
 
 
 def _vector(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rotation vectors (B, 3) of rotations (B, 3, 3), most of them small."""
+    """Return rotation vectors (B, 3) of rotations (B, 3, 3), most of them small."""
     skew = (rotation - np.swapaxes(rotation, 1, 2)) / 2
     vector = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=1)
     sine = np.sqrt((vector * vector).sum(axis=1))
     cosine = (rotation[:, 0, 0] + rotation[:, 1, 1] + rotation[:, 2, 2] - 1) / 2
-    if (cosine < 0).any():  # above 90 degrees the sine is that of a smaller angle, too
+    if (cosine < 0).any():  # above 90 degrees, a smaller angle has the same sine
         return vector_from_matrix(rotation)
     angle = np.arctan2(sine, cosine)
     return vector * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 1.0)[:, None]
 
 
 def turn_of_twists(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Matrices (B, 6, 6) that turn deviations at first to those at second rotations (B, 3, 3)."""
+    """Return matrices (B, 6, 6) that turn deviations at first to second rotations (B, 3, 3)."""
     out = np.zeros((len(first), 6, 6))
     out[:, :3, :3] = out[:, 3:, 3:] = second @ np.swapaxes(first, 1, 2)
     return out
 
 
 def noise_factors(dt_s: float) -> NDArray[np.float64]:
-    """Covariance (3, 3) of position, velocity and acceleration after dt_s of white jerk."""
+    """Return the covariance (3, 3) of position, velocity, acceleration by white jerk over dt_s."""
     return dt_s**_POWERS / _DIVISORS
 
 
@@ -198,7 +199,7 @@ class MotionFilter:
     count : int
         Number of bodies B.
     lag : int
-        Exposures that are kept to smooth with; None keeps all.
+        Exposures that are stored for smoothing; None stores all.
     """
 
     def __init__(self, count: int, lag: int | None = 0) -> None:
@@ -207,19 +208,19 @@ class MotionFilter:
         self.alive = np.zeros(count, dtype=bool)
         self.rotation = np.broadcast_to(np.eye(3), (count, 3, 3)).copy()
         self.mean = np.zeros((count, STATE))  # the rotation is a deviation, 0 after each step
-        # Of deviations at the last prediction; _turned makes them those at the estimate.
+        # For deviations at the last prediction; _turned converts them to those at the estimate.
         self.covariance = np.zeros((count, STATE, STATE))
         self._turned = np.broadcast_to(EYE_6, (count, 6, 6))
         self.log_q = np.broadcast_to(START_LOG, (count, 2)).copy()
         self._log_variance = np.full((count, 2), START_LOG_SD**2)
-        # Derivatives of the covariance by the two log densities.
+        # Derivatives of the covariance with respect to the two log densities.
         self._slope = np.zeros((count, 2, STATE, STATE))
-        # Of the prediction, which may be repeated before it is updated.
+        # For the prediction, which may be repeated before it is updated.
         self._predicted: _Step | None = None
         self._pending = self._slope, self._log_variance
 
     def predict(self, dt_s: float, log_q: NDArray[np.float64] | None = None) -> None:
-        """Predict the next exposure, dt_s later; log_q (B, 2) are given densities."""
+        """Predict the next exposure, dt_s later; log_q (B, 2): given densities, if any."""
         count = len(self.alive)
         if log_q is not None:
             self.log_q = log_q
@@ -257,9 +258,9 @@ class MotionFilter:
         return step.reference, step.mean[:, :3], step.covariance[:, POSE, POSE]
 
     def update(self, seen: PoseInformation, start: NDArray[np.bool_], adapt: bool = True) -> None:
-        """Take what an exposure tells; start (B,): bodies that appear, whose pose it determines.
+        """Update with an exposure; start (B,): bodies that appear, whose pose it determines.
 
-        adapt: whether the densities follow the exposures.
+        adapt: whether the densities are adapted to the exposure.
         """
         step = self._predicted
         assert step is not None
@@ -289,18 +290,18 @@ class MotionFilter:
             del self.steps[: -(self.lag + 1)]
 
     def lose(self, lost: NDArray[np.bool_]) -> None:
-        """Forget bodies (B,) whose prediction is worth nothing any more."""
+        """Discard bodies (B,) whose prediction has become useless."""
         self.alive = self.alive & ~lost
 
     def _start(self, step: _Step, seen: PoseInformation, start: NDArray[np.bool_]) -> None:
-        """Let bodies begin at the pose of an exposure."""
+        """Start bodies at the pose of an exposure."""
         step.started = start
         step.into = np.where(start[:, None, None], 0, step.into)
         step.reference = np.where(start[:, None, None], seen.rotation, step.reference)
         mean = np.zeros((len(start), STATE))
         mean[:, :3] = seen.centre_mm
         step.mean = np.where(start[:, None], mean, step.mean)
-        # The pose itself is unknown before: ten times the standard deviations of this exposure.
+        # The prior of the pose is diffuse: ten times the standard deviations of this exposure.
         wide = np.zeros((len(start), STATE, STATE)) + np.diag(START_SD**2)
         known = np.where(start[:, None, None], seen.normal, np.eye(6))
         wide[:, POSE, POSE] = 100 * np.linalg.inv(known)
@@ -311,18 +312,18 @@ class MotionFilter:
         self._slope[start] = 0
 
     def _adapt(self, step: _Step, seen: tuple[NDArray[np.float64], NDArray[np.float64]]) -> None:
-        """Improve the log densities by the likelihood of an exposure.
+        """Improve the log densities with the likelihood of an exposure.
 
-        With S the covariance of the prediction error and D its derivative by h, the derivative of
-        the log likelihood is (e'S^-1 D S^-1 e - tr S^-1 D) / 2, its expected information
-        tr(S^-1 D S^-1 D) / 2 (Ljung, "System Identification", 1999, 7.4, of a prediction error
-        that itself does not depend on h). Here S^-1 e is z, and S^-1 is M. Where a density grows,
-        the prediction was less sure than it seemed: its covariance grows with it. All rounds have
-        the same prior.
+        With the covariance S of the prediction error and its derivative D with respect to h, the
+        derivative of the log likelihood is (e'S^-1 D S^-1 e - tr S^-1 D) / 2, and its expected
+        information is tr(S^-1 D S^-1 D) / 2 (Ljung, "System Identification", 1999, 7.4, for a
+        prediction error that itself does not depend on h). Here S^-1 e is z, and S^-1 is M. Where
+        a density increases, the prediction was less certain than it seemed, so its covariance
+        increases too. All rounds have the same prior.
         """
         first = self._slope[:, :, POSE, POSE]
         prior = self.log_q
-        growth = np.ones(self.log_q.shape)  # of the derivatives
+        growth = np.ones(self.log_q.shape)  # factor on the derivatives
         for _ in range(ADAPTATIONS):
             slope = growth[:, :, None, None] * first
             z = step.z[:, None, :, None]
@@ -345,7 +346,7 @@ class MotionFilter:
         self._slope = grown
 
     def smoothed(self) -> Motion:
-        """Motion of the exposures that are kept, by all of them."""
+        """Return the motion in the stored exposures, smoothed by all of them."""
         if self.lag != 0:
             return _smooth(self.steps)[0]
         return Motion(
@@ -363,7 +364,7 @@ def _weigh(
     covariance: NDArray[np.float64],
     seen: tuple[NDArray[np.float64], NDArray[np.float64]],
 ) -> None:
-    """Weigh an exposure (B, 6, 6), (B, 6) against the covariance (B, 6, 6) of its prediction."""
+    """Weigh exposures (B, 6, 6), (B, 6) against covariances (B, 6, 6) of their prediction."""
     normal, right = seen
     inner = np.linalg.inv(EYE_6 + normal @ covariance)
     step.z = (inner @ right[:, :, None])[:, :, 0]
@@ -373,7 +374,7 @@ def _weigh(
 
 @dataclass
 class _Scores:
-    """Derivatives (T, B, 2) of the log likelihood by h, and twice their information."""
+    """Derivatives (T, B, 2) of the log likelihood with respect to h, and their information."""
 
     gradient: NDArray[np.float64]
     information: NDArray[np.float64]
@@ -401,7 +402,7 @@ def _smooth(steps: Sequence[_Step]) -> tuple[Motion, _Scores]:
         seen[k] = alive
     for k in range(total - 1, -1, -1):
         step = steps[k]
-        # L'F'r and L'F'N F L of the next step are in r and n already.
+        # r and n already contain L'F'r and L'F'N F L of the next step.
         gain = step.covariance[:, :, POSE]
         kept = _EYE_STATE - gain @ step.m @ _POSE_ROWS
         back = np.swapaxes(kept, 1, 2)
@@ -435,7 +436,7 @@ def _smooth(steps: Sequence[_Step]) -> tuple[Motion, _Scores]:
 def _moved(
     step: _Step, change: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Rotations and states (B, 18), whose deviation is 0, after a change of a prediction."""
+    """Return rotations and states (B, 18) after a change of a prediction; deviations are 0."""
     mean = step.mean + change
     rotation, mean[:, :3] = pose_after(step.reference, step.mean[:, :3], change[:, POSE])
     mean[:, 3:6] = 0
@@ -445,7 +446,7 @@ def _moved(
 def _turned_covariance(
     covariance: NDArray[np.float64], turned: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Covariance (B, 18, 18) with its deviations of poses turned by matrices (B, 6, 6)."""
+    """Return covariances (B, 18, 18) after turning pose deviations by matrices (B, 6, 6)."""
     out = covariance.copy()
     out[:, POSE] = turned @ out[:, POSE]
     out[:, :, POSE] = out[:, :, POSE] @ np.swapaxes(turned, 1, 2)
@@ -455,10 +456,10 @@ def _turned_covariance(
 def _smoothed_covariance(
     covariance: NDArray[np.float64], n: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """P - P N P (B, 18, 18).
+    """Return P - P N P (B, 18, 18).
 
-    Where a body appears, variances fall by twelve digits, which the difference loses. There it is
-    L (I - L'NL) L' with P = LL', whose eigenvalues have to be positive.
+    Where a body appears, variances decrease by twelve digits, which cancel in the difference.
+    There it is L (I - L'NL) L' with P = LL', whose middle factor gets no negative eigenvalues.
     """
     out = covariance - covariance @ n @ covariance
     left, whole = (np.diagonal(each, axis1=1, axis2=2) for each in (out, covariance))
@@ -478,9 +479,9 @@ def smooth_trial(first: MotionFilter, seen: Sequence[PoseInformation]) -> Motion
     Parameters
     ----------
     first : MotionFilter
-        That has followed the trial, and kept all of its exposures.
+        Filter that has followed the trial and stored all of its exposures.
     seen : sequence of PoseInformation
-        What they told.
+        Information of these exposures.
 
     Returns
     -------
@@ -510,7 +511,7 @@ def _improved(
     dt_s: NDArray[np.float64],
     walk: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], float, NDArray[np.float64]]:
-    """Return log densities (T, B, 2) after a step of scoring, its size, and walks (B, 2)."""
+    """Return log densities (T, B, 2) after a scoring step, its size, and walks (B, 2)."""
     out = log_q.copy()
     new_walk = walk.copy()
     largest = 0.0
@@ -527,7 +528,7 @@ def _improved(
         right[:-1] += pull
         right[1:] -= pull
         step = solveh_banded(banded, right)
-        # At rest the likelihood hardly depends on h any more; a step down is taken in q.
+        # At rest the likelihood hardly depends on h; a decreasing step is taken in q.
         step = np.where(step < 0, np.log1p(np.maximum(step, -0.99)), step)
         step = np.clip(step, -MAX_STEP, MAX_STEP)
         out[:, body, kind] = np.clip(h + step, *LOG_RANGE)
@@ -539,7 +540,7 @@ def _improved(
 
 
 def _variance_of_steps(banded: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Variances (T - 1,) of the differences of neighbours, from a tridiagonal normal matrix.
+    """Return variances (T - 1,) of differences of neighbours, from a tridiagonal normal matrix.
 
     The elements of its inverse near the diagonal follow from a forward and a backward elimination
     (Meurant, "A review on the inverse of symmetric tridiagonal and block tridiagonal matrices",
@@ -561,7 +562,7 @@ def _variance_of_steps(banded: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _transition(dt_s: float, turn: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Transitions (B, 18, 18) over dt_s of bodies that turn by vectors (B, 3)."""
+    """Return transitions (B, 18, 18) over dt_s of bodies that rotate by vectors (B, 3)."""
     out = np.broadcast_to(_EYE_STATE, (len(turn), STATE, STATE)).copy()
     jacobian = left_jacobian(turn)
     out[:, 0:3, 6:9] = dt_s * EYE_3
@@ -574,6 +575,6 @@ def _transition(dt_s: float, turn: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _noise(dt_s: float, log_q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Covariances (B, 2, 18, 18) of the noise of positions and of rotations over dt_s."""
+    """Return covariances (B, 2, 18, 18) of the noise of positions and rotations over dt_s."""
     shares = noise_factors(dt_s)[_FACTOR_ROWS, _FACTOR_ROWS.T] * _KIND_SHARES
     return np.exp(log_q)[:, :, None, None] * shares

@@ -1,18 +1,19 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Poses of rigid bodies in one exposure, straight from corrected image points of any views.
+"""Poses of rigid bodies in one exposure, directly from corrected image points of any views.
 
-Least squares of the image residuals by Gauss-Newton (Foerstner and Wrobel, "Photogrammetric
-Computer Vision", Springer 2016, 4.8 and 12.2). An image point of one view counts as one of two
-views does. Let the image points of a marker have the derivatives A by its place in space, weights
-W and residuals r. About its place they tell S = A'WA and s = A'Wr; a coordinate of the shape that
-has a standard deviation x changes this to M S and M s with M = (I + x^2 S)^-1. With the
-derivatives D = [I, -[Rx]x] of the place by the pose, the normal equations are
+The image residuals are minimised by Gauss-Newton least squares (Foerstner and Wrobel,
+"Photogrammetric Computer Vision", Springer 2016, 4.8 and 12.2). An image point seen in one view
+contributes as one seen in two views does. Let the image points of a marker have the derivatives A
+with respect to its place in space, weights W and residuals r. Their information on its place is
+S = A'WA and s = A'Wr; a coordinate of the shape with standard deviation x changes this to
+M S and M s with M = (I + x^2 S)^-1. With the derivatives D = [I, -[Rx]x] of the place with respect
+to the pose, the normal equations are
 
     N = sum D'MSD,  b = sum D'Ms.
 
-Each marker has one test, whether its image points agree with all others (Baarda, "A testing
+Each marker has one test of whether its image points agree with all others (Baarda, "A testing
 procedure for use in geodetic networks", Delft 1968): the sum of squares that they add,
 
     T = r'Wr - x^2 s'Ms + g'(N - D'MSD)^-1 g,  g = D'Ms,
@@ -41,27 +42,27 @@ from .body import Body, robust_pose
 from .image_points import Cameras, ImagePoints, Linear
 from .motion import EYE_3, EYE_6, PoseInformation, turn_of_twists, twist_between
 
-MAX_STEPS = 8  # of Gauss-Newton
-# Square of the next step in standard deviations below which the iteration ends. A step of
-# Gauss-Newton leaves a share of about its own rotation, and of its shift over the distance.
+MAX_STEPS = 8  # maximum number of Gauss-Newton steps
+# Square of the next step in standard deviations below which the iteration ends. The error after a
+# Gauss-Newton step is about the step times its own rotation, and its shift over the distance.
 LAST_STEP = 1e-8  # a ten-thousandth of a standard deviation
-# Rotation [rad] up to which derivatives hold: what they neglect of a marker's place is half of its
-# square, 0.1 % of the distance from the centre.
+# Rotation [rad] up to which derivatives are valid: the neglected part of a marker's place is half
+# of its square, 0.1 % of the distance from the centre.
 LINEAR_RAD = 0.05
-# An exposure alone gives a pose if it determines the rotation so that derivatives hold at two
-# standard deviations.
+# Maximum standard deviation of the rotation for which an exposure alone gives a pose: the
+# derivatives are then valid at two standard deviations.
 ALONE_SD_RAD = LINEAR_RAD / 2
-# One below which others do not predict a marker, and with which a matrix is held that may be
-# singular: far above rounding, which a constant beside large elements is not.
+# Eigenvalue of a matrix of unit diagonal below which the other markers do not predict a marker;
+# also added to regularise such matrices. It is far above rounding errors.
 WEAK = 1e-9
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """Poses that are expected: rotations (B, 3, 3), centres (B, 3) [mm], covariances (B, 6, 6).
+    """Expected poses: rotations (B, 3, 3), centres (B, 3) [mm], covariances (B, 6, 6).
 
-    known (B,): whether there is one. weak (B,): exposures since one alone gave the pose, with the
-    one that is expected.
+    known (B,): whether there is one. weak (B,): number of exposures since one alone gave the pose,
+    including the expected one.
     """
 
     rotation: NDArray[np.float64]
@@ -73,34 +74,34 @@ class Prediction:
 
 @dataclass(frozen=True)
 class FramePoses:
-    """Poses of B bodies in one exposure, of the centres of their markers."""
+    """Poses of B bodies in one exposure, relative to the centres of their markers."""
 
-    rotation: NDArray[np.float64]  #: (B, 3, 3) NaN where the exposure alone gives no pose
+    rotation: NDArray[np.float64]  #: (B, 3, 3) NaN if the exposure alone gives no pose
     centre_mm: NDArray[np.float64]  #: (B, 3)
     alone: NDArray[np.bool_]  #: (B,) whether the exposure alone gives the pose
-    #: (B,) whether a second pose fits as well, and the prediction does not tell which is right
+    #: (B,) whether a second pose fits as well, and the prediction does not exclude it
     ambiguous: NDArray[np.bool_]
-    #: (B, 6, 6) see BodyPoses; where the exposure alone does not give the pose, by its prediction,
-    #: too
+    #: (B, 6, 6) see BodyPoses; if the exposure alone does not give the pose, the prediction
+    #: contributes
     covariance_noise: NDArray[np.float64]
     covariance_fixed: NDArray[np.float64]
     rig_root: NDArray[np.float64]  #: (B, 6, k)
-    information: PoseInformation  #: for a filter, by the random errors
-    used: NDArray[np.bool_]  #: (B, M) markers, by their row in the body
-    test: NDArray[np.float64]  #: (B, M) test of a marker over its limit; NaN where it needs none
-    #: (B,) weighted sum of squares of the used image points, and its expectation
+    information: PoseInformation  #: for a filter, from the random errors only
+    used: NDArray[np.bool_]  #: (B, M) markers used, by their row in the body
+    test: NDArray[np.float64]  #: (B, M) test of a marker over its limit; NaN if not needed
+    #: (B,) weighted sum of squares of the image points used, and its expectation
     chi2: NDArray[np.float64]
     freedom: NDArray[np.float64]
 
     @property
     def markers(self) -> NDArray[np.int64]:
-        """Number (B,) of markers that are used."""
+        """Number (B,) of markers used."""
         return self.used.sum(axis=1)
 
 
 @dataclass(frozen=True)
 class _Marker:
-    """What markers tell: S, s, r'Wr (B, M), M, and M S, M s."""
+    """Sums of markers: S, s, r'Wr (B, M), M, and M S, M s."""
 
     weight: NDArray[np.float64]  # (B, M, F), W
     s_matrix: NDArray[np.float64]
@@ -113,7 +114,7 @@ class _Marker:
 
 @dataclass(frozen=True)
 class _Solution:
-    """Poses of B bodies, whether (B,) the exposure alone gives them, parts of normal matrices."""
+    """Poses of B bodies, whether (B,) the exposure alone gives them, normal matrix parts."""
 
     rotation: NDArray[np.float64]
     centre: NDArray[np.float64]
@@ -124,13 +125,13 @@ class _Solution:
 
 
 class PoseSolver:
-    """Poses of bodies for one RigOrientation, built once for all exposures.
+    """Solver for the poses of bodies and one RigOrientation, built once for all exposures.
 
     Parameters
     ----------
     orientation : RigOrientation
     bodies : sequence of Body
-        With known places of all markers.
+        Bodies with known places of all markers.
     reject : float
         Standardised deviation above which a marker does not belong to its body; the limit of
         chi-square is the quantile of the same probability.
@@ -154,7 +155,7 @@ class PoseSolver:
             self.variance[row, :count] = body.sd_mm**2
         self._variance_3 = self.variance[..., None, None]
         self.cameras = Cameras(orientation, self.target_id)
-        # Of each element of a step, how much of it the next one is about.
+        # Fraction of each element of a step that remains as the next step.
         source = orientation.position_mm
         far = np.linalg.norm(source - source.mean(axis=0), axis=1).max()
         self._share_left = np.repeat([1 / max(far, 1.0), 1.0], 3)
@@ -163,7 +164,7 @@ class PoseSolver:
         self._limit = np.where(freedom > 0, chdtri(np.maximum(freedom, 1), tail), np.inf)
 
     def solve(self, exposure: IntersectedViews, prediction: Prediction) -> FramePoses:
-        """Solve for the poses of one exposure; the views are those of the orientation."""
+        """Solve for the poses in one exposure; the views are those of the orientation."""
         points = self.cameras.sorted(exposure)
         rotation = np.where(prediction.known[:, None, None], prediction.rotation, np.eye(3))
         centre = np.where(prediction.known[:, None], prediction.centre_mm, 0.0)
@@ -174,13 +175,13 @@ class PoseSolver:
         used = seen & started[:, None]
         test = np.full(used.shape, np.nan)
         from_prediction = prediction.known
-        # Each body may lose all its markers, one at a time, and is started again once.
+        # Each body may lose all its markers, one at a time, and is restarted once.
         for _ in range(self.xyz.shape[1] + len(self.bodies)):
             solution = self._converge((rotation, centre), points, used, prediction)
             wrong, worst = self._false_markers(solution, (points, used), prediction, test)
             rotation, centre = solution.rotation, solution.centre
-            # From a prediction that is far off, as after two stamps that are nearly the same, an
-            # iteration may end elsewhere: the points in space tell where to start.
+            # From a prediction that is far off, as after two almost equal stamps, an iteration may
+            # converge elsewhere. Then restart from the points in space.
             doubted = ~solution.alone & from_prediction
             doubted[wrong] = from_prediction[wrong]
             again = self._start(
@@ -199,9 +200,9 @@ class PoseSolver:
     def _ambiguous(
         self, solution: _Solution, points: ImagePoints, used: np.ndarray, prediction: Prediction
     ) -> NDArray[np.bool_]:
-        """Whether (B,) a body that one view sees alone fits in a second pose, too.
+        """Return whether (B,) a body that only one view sees also fits in a second pose.
 
-        Under a weak perspective, markers near a plane look the same when the plane is tilted the
+        Under weak perspective, markers near a plane look the same when the plane is tilted the
         other way: R and S_l R S_n, where S reflects along the line of sight l and along the normal
         n of the plane (Schweighofer and Pinz, "Robust pose estimation from a planar target", IEEE
         PAMI 28, 2006).
@@ -214,7 +215,7 @@ class PoseSolver:
             normal = np.linalg.svd(markers - markers.mean(axis=0))[2][-1]
             rotation = solution.rotation.copy()
             rotation[row] = _mirror(sight) @ rotation[row] @ _mirror(normal)
-            # The centre of these markers stays where it is.
+            # The centre of these markers does not move.
             centre = solution.centre.copy()
             centre[row] += (solution.rotation[row] - rotation[row]) @ markers.mean(axis=0)
             only = used & (np.arange(len(used)) == row)[:, None]
@@ -235,9 +236,9 @@ class PoseSolver:
         rows: NDArray[np.int64],
         pose: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]],
     ) -> bool:
-        """Start bodies at points in space; returns whether there are enough of any.
+        """Start bodies at points in space; return whether any body has enough of them.
 
-        pose: rotations, centres, and whether (B,) there are any; they are changed.
+        pose: rotations, centres, and whether (B,) they are known; modified in place.
         """
         if not len(rows):
             return False
@@ -258,9 +259,9 @@ class PoseSolver:
         used: NDArray[np.bool_],
         prediction: Prediction | None,
     ) -> _Solution:
-        """Iterate from rotations and centres.
+        """Iterate from given rotations and centres.
 
-        Where an exposure alone does not give a pose, the prediction holds what is not seen.
+        If an exposure alone does not give a pose, the prediction determines what is not observed.
         """
         rotation, centre = pose
         weight = _weight(points, used, points.noise + points.correction)
@@ -282,7 +283,7 @@ class PoseSolver:
             left = ((step * self._share_left) ** 2).sum(axis=1)
             if not (left * (step * right).sum(axis=1) > LAST_STEP).any():
                 break
-        # The derivatives hold; only the residuals change by the last step.
+        # The derivatives remain valid; only the residuals change by the last step.
         moved = (linear.by_pose @ step[:, None, :, None])[:, :, None]
         linear = replace(linear, residual=linear.residual - (linear.by_place @ moved)[..., 0])
         s_vector = _vectors(_weighted(linear, weight), linear.residual)
@@ -302,7 +303,7 @@ class PoseSolver:
         )
 
     def _marker(self, linear: Linear, weight: NDArray[np.float64]) -> _Marker:
-        """Sum up the image points of each marker with weights (B, M, F)."""
+        """Sum the image points of each marker with weights (B, M, F)."""
         s_matrix, s_vector = marker_sums(linear, weight)
         m = np.linalg.inv(EYE_3 + self._variance_3 * s_matrix)
         return _Marker(
@@ -322,12 +323,12 @@ class PoseSolver:
         prediction: Prediction,
         test: NDArray[np.float64],
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Rows of bodies that contain a false marker, and its row in each; fill in the tests.
+        """Return rows of bodies with a false marker, and its row in each; fill in the tests.
 
         observed: image points, and whether (B, M) a marker is used.
 
-        The sum of squares of a body is at least that which one of its markers adds: most bodies
-        need no test of single markers.
+        The sum of squares of a body is at least the contribution of any of its markers: most
+        bodies need no test of single markers.
         """
         points, used = observed
         marker = solution.marker
@@ -335,8 +336,8 @@ class PoseSolver:
         transposed = np.swapaxes(d, 2, 3)
         by_marker = transposed @ marker.ms_matrix @ d
         gradient = (transposed @ marker.ms_vector[..., None])[..., 0]
-        # Markers are compared with each other. A prediction that they contradict is no reason to
-        # reject them: the body may have been hit.
+        # Markers are compared with each other only. A prediction that they contradict is no reason
+        # to reject them: the body may have been hit.
         normal = by_marker.sum(axis=1)
         own = _own_squares(marker, self.variance)
         if not solution.alone.all():
@@ -364,8 +365,8 @@ class PoseSolver:
         test[suspect] = np.where(used[suspect], excess, test[suspect])
         if not (excess > 1).any():
             return suspect[:0], suspect[:0]
-        # Of several that contradict each other, the one goes without which the rest agrees best,
-        # with the prediction, too.
+        # If several contradict each other, exclude the one without which the others agree best
+        # with each other and with the prediction.
         held, away = _pull_of(prediction, (solution.rotation, solution.centre))
         held = held[suspect]
         pulled = (held @ away[suspect, :, None])[:, None, :, 0] - gradient
@@ -393,7 +394,7 @@ class PoseSolver:
         noise, fixed, rig_root = _covariances(
             inverse, solution, (points, self.variance), self.cameras
         )
-        # A filter takes shape and correction as they are: their errors stay.
+        # A filter treats shape and correction as exact, since their errors are constant.
         linear = solution.linear
         variance = points.noise
         held = np.flatnonzero(seen & ~alone)
@@ -426,7 +427,7 @@ class PoseSolver:
 
 
 def _excludes(prediction: Prediction, row: int, second: _Solution, limit: float) -> bool:
-    """Whether the prediction of a body excludes a second pose."""
+    """Return whether the prediction of a body excludes a second pose."""
     if not prediction.known[row]:
         return False
     turn = second.rotation[row] @ prediction.rotation[row].T
@@ -442,9 +443,9 @@ def _growth_by_rig(
     normal: NDArray[np.float64],
     rows: NDArray[np.int64],
 ) -> NDArray[np.float64]:
-    """Factor (S, M) of the expected squares of markers by errors of the rig's orientation.
+    """Return factors (S, M) by which errors of rig orientation increase squares of markers.
 
-    What the pose takes up of these errors is no part of it. rows (S,): bodies.
+    The part of these errors that the pose absorbs does not count. rows (S,): bodies.
     """
     linear = solution.linear
     weight = solution.marker.weight[rows]
@@ -463,13 +464,13 @@ def _growth_by_rig(
 def _of_unit_diagonal(
     normal: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Normal matrices (..., 6, 6) in units in which their diagonal is 1, and these (..., 6)."""
+    """Scale normal matrices (..., 6, 6) to unit diagonal; also return the scale (..., 6)."""
     scale = np.sqrt(np.maximum(np.diagonal(normal, axis1=-2, axis2=-1), 1e-12))
     return normal / (scale[..., :, None] * scale[..., None, :]), scale
 
 
 def _own_squares(marker: _Marker, variance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Weighted sum of squares (B, M) of each marker, its shape having a variance (B, M)."""
+    """Return the weighted squares (B, M) of each marker, with shape variances (B, M)."""
     shape = variance * np.sum(marker.s_vector * marker.ms_vector, axis=-1)
     return np.maximum(marker.squares - shape, 0.0)
 
@@ -477,10 +478,10 @@ def _own_squares(marker: _Marker, variance: NDArray[np.float64]) -> NDArray[np.f
 def _variance_of_last(
     noise: NDArray[np.float64], fixed: NDArray[np.float64], number: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Variance of the last of `number` observations that have an error in common.
+    """Return the variance of the last of `number` observations that share an error.
 
-    With a variance r of their noise and c of this error, n of them tell n / (r + n c), and the
-    last of them adds r / ((r + n c) (r + (n - 1) c)) to this.
+    With variance r of their noise and c of the shared error, n observations have the information
+    n / (r + n c), and the last one contributes r / ((r + n c) (r + (n - 1) c)) to it.
     """
     return (noise + number * fixed) * (noise + (number - 1) * fixed) / noise
 
@@ -488,13 +489,14 @@ def _variance_of_last(
 def _curvature(
     by_place: NDArray[np.float64], by_pose: NDArray[np.float64], covariance: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Mean squares (B, M, F) of what derivatives neglect of image points, per coordinate.
+    """Return mean squares (B, M, F) of the nonlinearity of image points, per coordinate.
 
-    Where few markers are seen, a turn is unsure by more than derivatives hold for. Exposures that
-    are linearised at different turns would seem to see it together, so what is neglected counts
-    as noise (second-order filter: Bar-Shalom, Li and Kirubarajan 2001, 10.3). A twist (s, w) moves
-    a marker p by u = s + w x p and, to second order, w x u / 2. With the derivatives a of an image
-    coordinate this is u'[a]x w / 2, whose mean square follows from Isserlis' theorem.
+    If few markers are seen, a rotation is more uncertain than the range in which derivatives are
+    valid. Exposures linearised at different rotations would then together seem to observe it, so
+    the neglected part counts as noise (second-order filter: Bar-Shalom, Li and Kirubarajan 2001,
+    10.3). A twist (s, w) moves a marker p by u = s + w x p and, to second order, w x u / 2. With
+    the derivatives a of an image coordinate this is u'[a]x w / 2, whose mean square follows from
+    Isserlis' theorem.
     """
     by_turn = covariance[:, None, 3:, :] @ np.swapaxes(by_pose, 2, 3)
     by_move = (by_pose @ covariance[:, None] @ np.swapaxes(by_pose, 2, 3))[:, :, None, None]
@@ -515,9 +517,9 @@ def _covariances(
     observed: tuple[ImagePoints, NDArray[np.float64]],
     cameras: Cameras,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Covariances (B, 6, 6) of poses by noise and by what stays, and the root by the rig.
+    """Return covariances (B, 6, 6) of poses from noise and constant errors, and the rig's root.
 
-    inverse (B, 6, 6): of the normal matrix; observed: image points, and variances (B, M) of the
+    inverse (B, 6, 6): of the normal matrix. observed: image points, and variances (B, M) of the
     coordinates of the shape.
     """
     points, variance = observed
@@ -542,7 +544,7 @@ def _covariances(
 def _sum(
     marker: _Marker, by_pose: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Normal matrices (B, 6, 6) and right sides (B, 6) of poses."""
+    """Return normal matrices (B, 6, 6) and right-hand sides (B, 6) of poses."""
     transposed = np.swapaxes(by_pose, 2, 3)
     normal = (transposed @ marker.ms_matrix @ by_pose).sum(axis=1)
     right = (transposed @ marker.ms_vector[..., None])[..., 0].sum(axis=1)
@@ -552,32 +554,32 @@ def _sum(
 def _weight(
     points: ImagePoints, used: NDArray[np.bool_], variance: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Weights (B, M, F) of image points by their variances; 0 for those that are not used."""
+    """Return weights (B, M, F) of image points from variances; 0 for those that are not used."""
     return np.where(used[..., None] & points.seen, 1 / variance, 0.0)
 
 
 def marker_sums(
     linear: Linear, weight: NDArray[np.float64]
 ) -> tuple[np.ndarray, NDArray[np.float64]]:
-    """S (B, M, 3, 3) and s (B, M, 3) of markers."""
+    """Return S (B, M, 3, 3) and s (B, M, 3) of markers."""
     weighted = _weighted(linear, weight)
     s_matrix = weighted @ linear.by_place.reshape(*weight.shape[:2], -1, 3)
     return s_matrix, _vectors(weighted, linear.residual)
 
 
 def _weighted(linear: Linear, weight: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A'W (B, M, 3, 2 F) of markers."""
+    """Return A'W (B, M, 3, 2 F) of markers."""
     weighted = linear.by_place * weight[..., None, None]
     return np.swapaxes(weighted.reshape(*weight.shape[:2], -1, 3), 2, 3)
 
 
 def _vectors(weighted: NDArray[np.float64], residual: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Vectors s (B, M, 3) of markers."""
+    """Return vectors s (B, M, 3) of markers."""
     return (weighted @ residual.reshape(*weighted.shape[:2], -1, 1))[..., 0]
 
 
 def _squares(linear: Linear, weight: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Sums r'Wr (B, M) of markers."""
+    """Return sums r'Wr (B, M) of markers."""
     return ((linear.residual**2).sum(axis=-1) * weight).sum(axis=-1)
 
 
@@ -595,7 +597,7 @@ def _eigen(normal: NDArray[np.float64]) -> _Eigen:
 
 
 def _inverse(parts: _Eigen, wanted: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Inverses (B, 6, 6) of those normal matrices that are wanted (B,), else NaN."""
+    """Return inverses (B, 6, 6) of the wanted (B,) normal matrices; NaN for the others."""
     values, vectors, scale = parts
     regular = (wanted & (values[:, 0] > SINGULAR))[:, None]
     scaled = vectors / scale[:, :, None]
@@ -604,7 +606,7 @@ def _inverse(parts: _Eigen, wanted: NDArray[np.bool_]) -> NDArray[np.float64]:
 
 
 def _is_determined(parts: _Eigen) -> NDArray[np.bool_]:
-    """Whether (B,) normal matrices determine a pose so that derivatives hold about it."""
+    """Return whether (B,) normal matrices determine a pose to the validity of derivatives."""
     values = np.maximum(parts.values, SINGULAR)
     variance = (
         np.sum(parts.vectors[:, 3:] ** 2 / values[:, None], axis=2) / parts.scale[:, 3:] ** 2
@@ -613,7 +615,7 @@ def _is_determined(parts: _Eigen) -> NDArray[np.bool_]:
 
 
 def _solved(parts: _Eigen, right: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Steps (B, 6); 0 in directions that are not determined."""
+    """Return steps (B, 6); 0 in directions that are not determined."""
     values, vectors, scale = parts
     inverse = np.where(values > 1e-10, 1 / np.maximum(values, 1e-10), 0.0)
     reduced = np.swapaxes(vectors, 1, 2) @ (right / scale)[:, :, None]
@@ -621,7 +623,7 @@ def _solved(parts: _Eigen, right: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _mirror(direction: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Reflection (3, 3) along a direction (3,)."""
+    """Return the reflection (3, 3) along a direction (3,)."""
     unit = direction / np.linalg.norm(direction)
     return np.eye(3) - 2 * np.outer(unit, unit)
 
@@ -629,7 +631,7 @@ def _mirror(direction: NDArray[np.float64]) -> NDArray[np.float64]:
 def _pull_of(
     prediction: Prediction, pose: tuple[NDArray[np.float64], NDArray[np.float64]]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Normal matrices (B, 6, 6) of predictions at poses, and twists (B, 6) to the predictions."""
+    """Return normal matrices (B, 6, 6) of predictions at poses, and twists (B, 6) to them."""
     normal = np.linalg.inv(prediction.covariance + 1e-12 * EYE_6)
     normal = np.where(prediction.known[:, None, None], normal, 0.0)
     turned = turn_of_twists(prediction.rotation, pose[0])

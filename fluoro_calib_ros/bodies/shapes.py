@@ -1,20 +1,20 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Shapes of rigid bodies from a recording, together with what CT says of them.
+"""Shapes of rigid bodies from a recording, combined with their CT measurements.
 
-One least-squares adjustment has the coordinates of all markers of a body in its frame, and its
-pose in every exposure. Places measured by CT are observations with their standard deviations; a
-marker without one is estimated from the image points alone. Poses are eliminated exposure by
-exposure: with S and s of a marker, its derivatives D by the pose and R by its coordinates (see
-`pose`),
+One least-squares adjustment estimates the coordinates of all markers of a body in its frame, and
+its pose in every exposure. Places measured by CT are observations with their standard deviations;
+a marker without a CT measurement is estimated from the image points alone. Poses are eliminated
+exposure by exposure: with S and s of a marker, its derivatives D with respect to the pose and R
+with respect to its coordinates (see `pose`),
 
     H = sum R'SR - (R'SD) N^-1 (D'SR),   h = sum R's - (R'SD) N^-1 D's.
 
-What markers have in common, a motion of all of them in the frame of the body, images do not tell:
-it follows from CT, and is the uncertainty of the frame. The coordinates relative to each other are
-in the datum of the markers (S-transformation; Baarda 1973). Tests of single markers follow Baarda
-1968, the condition number and the mean error of rigid-body fitting ISO 16087:2013.
+Images cannot determine a common motion of all markers in the frame of the body: it follows from
+CT, and is the uncertainty of the frame. The relative coordinates are in the datum of the markers
+(S-transformation; Baarda 1973). Tests of single markers follow Baarda 1968, the condition number
+and the mean error of rigid-body fitting ISO 16087:2013.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ from ..photogrammetry.unknowns import POSE_SIZE
 from .body import Body, by_pose, fitted_pose
 from .correction_errors import covariance_of_means
 
-# Share of the places of a marker that may be false matches, and are left out: of 1 % false image
+# Maximum share of the places of a marker that may be excluded as false matches. Of 1 % false image
 # points some 0.3 % are near enough to the epipolar line to become a place. A marker with more of
-# them moves against the others.
+# them moves relative to the others.
 FALSE_SHARE = 0.05
 # ISO 16087:2013 and Valstar et al., "Guidelines for standardization of radiostereometry", Acta
 # Orthop. 76, 2005: condition number [1/m] above which markers lie too near a line, and mean error
@@ -47,10 +47,10 @@ FALSE_SHARE = 0.05
 MAX_CONDITION = 120.0
 MAX_MEAN_ERROR_MM = 0.35
 REJECT_TAIL = 2 * float(ndtr(-CERTAIN))
-# Of the coordinates of a body in another unit, or mirrored, the images tell at once: by the fit of
-# its shape to points in space.
+# Relative tolerance for recognising another unit of the coordinates, from the fit of the shape to
+# points in space.
 SCALE_TOLERANCE = 0.05
-REGULAR = 1e-10  # of the largest element of a normal matrix, added to its diagonal
+REGULAR = 1e-10  # share of a normal matrix' largest element that is added to its diagonal
 _MOVED = (Kind.MARKER_MIGRATED, Kind.MARKERS_EXCHANGED)
 
 
@@ -58,59 +58,59 @@ _MOVED = (Kind.MARKER_MIGRATED, Kind.MARKERS_EXCHANGED)
 class BodyPlaces:
     """Places of the markers of a body in T exposures, as points in space."""
 
-    xyz_mm: NDArray[np.float64]  #: (T, m, 3) NaN where a marker is not known in space
-    covariance: NDArray[np.float64]  #: (T, m, 3, 3) of the random errors
-    #: (T, m, 3, 3) of the errors that stay while a marker stands still, by the corrections
+    xyz_mm: NDArray[np.float64]  #: (T, m, 3) NaN where a marker is unknown in space
+    covariance: NDArray[np.float64]  #: (T, m, 3, 3) covariance of the random errors
+    #: (T, m, 3, 3) covariance of correction errors, constant while a marker stands still
     fixed: NDArray[np.float64]
-    #: (m, m) covariance of their means over all exposures, relative to `fixed`; None: they are the
-    #: same in all exposures, and those of two markers are independent
+    #: (m, m) covariance of their means over all exposures, relative to `fixed`; None if they are
+    #: the same in all exposures and independent between markers
     alike: NDArray[np.float64] | None = None
 
     @property
     def seen(self) -> NDArray[np.bool_]:
-        """Return (T, m) whether a marker is known in space."""
+        """Whether (T, m) each marker is known in space."""
         return np.asarray(np.isfinite(self.xyz_mm).all(axis=2))
 
     def without(self, places: NDArray[np.bool_]) -> BodyPlaces:
-        """Return the same without some places (T, m)."""
+        """Return a copy that excludes some places (T, m)."""
         return replace(self, xyz_mm=np.where(places[..., None], np.nan, self.xyz_mm))
 
 
 @dataclass(frozen=True)
 class EstimatedShape:
-    """The shape of a body."""
+    """Estimated shape of a body."""
 
-    #: coordinates in its frame, their covariance relative to each other, and that of the frame by
-    #: CT
+    #: coordinates in its frame, their covariance relative to each other, and the covariance of the
+    #: frame from CT
     body: Body
     condition: float  #: condition number [1/m]
     mean_error_mm: float  #: mean error of rigid-body fitting, over all exposures
-    exposures: int  #: exposures that contributed
+    exposures: int  #: number of exposures that contributed
     findings: tuple[Finding, ...]
 
 
 @dataclass(frozen=True)
 class LearnedShapes:
-    """Shapes of bodies as a healthy rig has seen them."""
+    """Shapes of bodies learned with a healthy rig."""
 
     __repr__ = brief_repr
 
-    #: with the covariance of their coordinates; without markers that were not seen
+    #: bodies with the covariance of their coordinates, without markers that were not seen
     bodies: tuple[Body, ...]
-    #: of the orientation that they were learned with, then of those that they have healed
+    #: id of the orientation with which they were learned, then of those healed with them
     orientation_ids: tuple[str, ...]
-    calibration_ids: Mapping[str, str]  #: by fluoroscope, that they were learned with
+    calibration_ids: Mapping[str, str]  #: ids by fluoroscope, at the time of learning
     begin_ns: int  #: stamps of the first and of the last exposure
     end_ns: int
-    exposures: int  #: that the drift watch has seen, and shapes were estimated from
-    findings: tuple[Finding, ...] = ()  #: about bodies, also those that were left out
+    exposures: int  #: seen by the drift watch and used to estimate the shapes
+    findings: tuple[Finding, ...] = ()  #: about bodies, including excluded ones
 
     def with_healed(self, orientation_id: str) -> LearnedShapes:
-        """Return the same for an orientation that they have healed, too."""
+        """Return a copy that also belongs to an orientation healed with it."""
         return replace(self, orientation_ids=(*self.orientation_ids, orientation_id))
 
     def check(self, orientation_id: str) -> None:
-        """Raise DataError unless they belong to an orientation."""
+        """Raise DataError unless the shapes belong to an orientation."""
         if orientation_id not in self.orientation_ids:
             raise DataError(
                 f'the shapes were learned with {self.orientation_ids[0]}, not with the '
@@ -119,11 +119,11 @@ class LearnedShapes:
 
 
 def condition_number(xyz_mm: NDArray[np.float64]) -> float:
-    """Condition number [1/m] of markers (m, 3): how far they lie from the line that fits best.
+    """Return the condition number [1/m] of markers (m, 3), from distances to the best-fit line.
 
-    One over the root of the sum of squared distances from that line (Soderkvist and Wedin,
+    It is one over the root of the sum of squared distances from that line (Soderkvist and Wedin,
     "Determining the movements of the skeleton using well-configured markers", J. Biomech. 26,
-    1993). Infinite for markers on a line.
+    1993); infinite for markers on a line.
     """
     centred = xyz_mm - xyz_mm.mean(axis=0)
     values = np.linalg.svd(centred, compute_uv=False)
@@ -137,14 +137,14 @@ def estimate_shape(body: Body, places: BodyPlaces) -> EstimatedShape:
     Parameters
     ----------
     body : Body
-        With the coordinates that are known.
+        Body with the known coordinates.
     places : BodyPlaces
 
     Returns
     -------
     EstimatedShape
-        With the body unchanged where no exposure shows three of its markers, and where its
-        coordinates are mirrored or in another unit.
+        The body is unchanged if no exposure shows three of its markers, or if its coordinates are
+        mirrored or in another unit.
     """
     start = _start(body, places)
     if start is None:
@@ -153,7 +153,7 @@ def estimate_shape(body: Body, places: BodyPlaces) -> EstimatedShape:
     if wrong:
         return _unchanged(body, wrong)
     adjustment = _adjust(body, places, start)
-    # A false place takes those of the other markers in its exposure with it, which go, too.
+    # A false place also affects the other markers of its exposure, which are then excluded, too.
     while (false := _false_places(adjustment)).any():
         places = places.without(false)
         start = _start(body, places)
@@ -163,7 +163,7 @@ def estimate_shape(body: Body, places: BodyPlaces) -> EstimatedShape:
     known = np.isfinite(adjustment.xyz).all(axis=1)
     findings = _contradictions(body, places, adjustment)
     moved = [marker for one in findings if one.kind in _MOVED for marker in one.place.target_id]
-    if moved:  # what CT says of them is no observation of these markers
+    if moved:  # their CT coordinates are not observations of these markers
         sd = np.where(np.isin(body.target_id, moved), np.inf, body.sd_mm)
         freed = replace(body, sd_mm=sd)
         adjustment = _adjust(freed, places, _start(freed, places) or start)
@@ -187,10 +187,10 @@ def estimate_shape(body: Body, places: BodyPlaces) -> EstimatedShape:
 def learned_shape(
     body: Body, xyz_mm: NDArray[np.float64], covariance: NDArray[np.float64]
 ) -> Body:
-    """Return a body with the shape that places alone tell, in its present frame.
+    """Return a body with a shape learned from places alone, in its present frame.
 
-    xyz_mm (T, m, 3) and covariance (T, m, 3, 3): as of BodyPlaces. Errors that stay are left out:
-    they are those of what is compared with the shape, too.
+    xyz_mm (T, m, 3) and covariance (T, m, 3, 3): as in BodyPlaces. Constant errors are omitted, as
+    later observations that are compared with the shape have the same ones.
     """
     blank = replace(body, xyz_mm=np.full_like(body.xyz_mm, np.nan))
     found = estimate_shape(blank, BodyPlaces(xyz_mm, covariance, np.zeros_like(covariance))).body
@@ -204,10 +204,10 @@ def learned_shape(
 
 @dataclass(frozen=True)
 class _Adjustment:
-    """Coordinates (m, 3), covariance (3k, 3k) of the k known ones, and how markers fit.
+    """Coordinates (m, 3), covariance (3k, 3k) of the k known ones, and fit of the markers.
 
-    test (m,): sum of squares of a marker over its expectation. squares (T, m): weighted ones of
-    the residuals of places, 0 for those that are not used.
+    test (m,): sum of squares of a marker over its expectation. squares (T, m): weighted squares of
+    the residuals of places; 0 for places that are not used.
     """
 
     xyz: NDArray[np.float64]
@@ -219,13 +219,13 @@ class _Adjustment:
 
 
 def _start(body: Body, places: BodyPlaces) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
-    """First coordinates (m, 3), NaN for markers never seen, and the exposures that give poses.
+    """Return initial coordinates (m, 3), NaN for unseen markers, and exposures that give poses.
 
-    The shape is that of the images, so that wrong coordinates of CT do not lead astray; CT says
-    where its frame is.
+    The shape is that of the images, so that wrong CT coordinates cannot mislead; CT defines its
+    frame.
     """
     seen = places.seen
-    least = min(3, len(body.target_id))  # two markers are all of a body that has no more
+    least = min(3, len(body.target_id))  # a body of two markers needs only two
     richest = int(np.argmax(seen.sum(axis=1))) if len(seen) else 0
     if not len(seen) or np.count_nonzero(seen[richest]) < least:
         return None
@@ -260,7 +260,7 @@ class _Problem:
 
 @dataclass(frozen=True)
 class _Reduced:
-    """Normal equations of the shape after the elimination of the poses.
+    """Normal equations of the shape after elimination of the poses.
 
     solved (T, 6, 3k + 1): N^-1 (D'SR, D's); by_pose (T, k, 3, 6); normal (T, 6, 6).
     """
@@ -275,7 +275,7 @@ class _Reduced:
 def _adjust(
     body: Body, places: BodyPlaces, start: tuple[NDArray[np.float64], NDArray[np.int64]]
 ) -> _Adjustment:
-    """Adjust coordinates and poses together, from first coordinates and exposures."""
+    """Adjust coordinates and poses together, from initial coordinates and exposures."""
     xyz, rows = start
     known = np.flatnonzero(np.isfinite(xyz).all(axis=1))
     problem = _problem(body, places, xyz, (rows, known))
@@ -316,10 +316,10 @@ def _problem(
     xyz: NDArray[np.float64],
     chosen: tuple[NDArray[np.int64], NDArray[np.int64]],
 ) -> _Problem:
-    """Return what is observed of the chosen exposures and markers."""
+    """Return the observations in the chosen exposures and of the chosen markers."""
     known = chosen[1]
     given = body.known[known] & np.isfinite(body.sd_mm[known])
-    if np.count_nonzero(given) < 3:  # they define no frame
+    if np.count_nonzero(given) < 3:  # too few to define a frame
         given[:] = False
     weight = np.where(given, 1 / np.maximum(body.sd_mm[known], 1e-6) ** 2, 0.0)
     seen = places.seen[np.ix_(*chosen)]
@@ -340,7 +340,7 @@ def _residual(
     rotation: NDArray[np.float64],
     shift: NDArray[np.float64],
 ) -> np.ndarray:
-    """Residuals (T, k, 3) of the places, 0 where a marker is not seen."""
+    """Return residuals (T, k, 3) of the places; 0 where a marker is not seen."""
     expected = shape @ np.swapaxes(rotation, 1, 2) + shift[:, None]
     return np.where(problem.seen[..., None], problem.place - expected, 0.0)
 
@@ -360,7 +360,7 @@ def _reduced(
     turned = problem.information @ rotation[:, None]  # S R
     told = problem.information @ residual[..., None]  # s
     normal = (transposed @ problem.information @ d).sum(axis=1)
-    # Markers on a line do not tell the rotation about it, which changes nothing else.
+    # Markers on a line leave the rotation about it free, which affects nothing else.
     normal += REGULAR * normal.max(axis=(1, 2), keepdims=True) * np.eye(POSE_SIZE)
     cross = (transposed @ turned).transpose(0, 2, 1, 3).reshape(exposures, POSE_SIZE, 3 * count)
     right = (transposed @ told).sum(axis=1)
@@ -371,7 +371,7 @@ def _reduced(
     for k in range(count):
         matrix[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += own[k]
     if not problem.ct_weight.any():
-        # Inner constraints: the centre and the attitude of the markers are those of the first
+        # Inner constraints: the centre and the attitude of the markers are those of the initial
         # coordinates (Foerstner and Wrobel 2016, 4.3.2).
         motion = _motion(shape)
         matrix += np.trace(matrix) / (3 * count) * (motion @ np.linalg.pinv(motion))
@@ -389,7 +389,7 @@ def _reduced(
 def _squares_over_expectation(
     problem: _Problem, reduced: _Reduced, squares: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Sums (k,) of weighted squares (T, k) over their redundancy, NaN without any."""
+    """Return sums (k,) of weighted squares (T, k) over their redundancy; NaN without any."""
     of_place = reduced.by_pose @ np.linalg.inv(reduced.normal)[:, None]
     of_place = of_place @ np.swapaxes(reduced.by_pose, 2, 3)
     share = np.trace(of_place @ problem.information, axis1=2, axis2=3)
@@ -398,9 +398,9 @@ def _squares_over_expectation(
 
 
 def _false_places(adjustment: _Adjustment) -> NDArray[np.bool_]:
-    """Return the places (T, m) that are false matches: far larger squares than of the marker.
+    """Return places (T, m) that are false matches: much larger squares than usual of the marker.
 
-    A marker that moves has large ones in many exposures; it keeps its places.
+    A marker that moves has large squares in many exposures; its places are not excluded.
     """
     used = np.where(adjustment.squares > 0, adjustment.squares, np.nan)
     ordinary = np.ones(used.shape[1])
@@ -418,10 +418,10 @@ def _stays(
     reduced: _Reduced,
     rotation: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Covariance of the right side of the shape by errors of the corrections.
+    """Return the covariance of the right-hand side of the shape due to errors of corrections.
 
-    They average out only as far as the markers move in the image, and those of markers that are
-    near each other move the body as a whole.
+    These errors average out only as far as the markers move in the image, and those of
+    neighbouring markers move the body as a whole.
     """
     known = chosen[1]
     alike = np.eye(len(known)) if places.alike is None else places.alike[np.ix_(known, known)]
@@ -443,20 +443,20 @@ def _stays(
 
 
 def _root_of(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the symmetric root of a covariance."""
+    """Return the symmetric square root of a covariance."""
     variance, axes = np.linalg.eigh(covariance)
     return np.asarray(axes * np.sqrt(np.maximum(variance, 0.0)) @ axes.T)
 
 
 def _turned(rotation: NDArray[np.float64], w: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rotations (T, 3, 3) varied on the left, made orthogonal again."""
+    """Return rotations (T, 3, 3) multiplied by small ones from the left, orthonormalised."""
     return nearest_rotation((np.eye(3) + cross_matrix(w)) @ rotation)
 
 
 def _datum(
     xyz: NDArray[np.float64], covariance: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Covariance (6, 6) of the frame about the centre, and that of coordinates in their datum."""
+    """Return covariances of the frame (6, 6) about the centre, and of coordinates in its datum."""
     motion = _motion(xyz)
     read = np.linalg.pinv(motion)
     relative = np.eye(len(covariance)) - motion @ read
@@ -464,11 +464,11 @@ def _datum(
 
 
 def _motion(xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Derivatives (3k, 6) of coordinates (k, 3) by a motion of all of them about their centre."""
+    """Return derivatives (3k, 6) of coordinates (k, 3) by a common motion about their centre."""
     return by_pose(xyz - xyz.mean(axis=0)).reshape(-1, POSE_SIZE)
 
 
-# What is wrong with a body.
+# Findings on what is wrong with a body.
 
 
 def _unchanged(body: Body, findings: Sequence[Finding]) -> EstimatedShape:
@@ -505,7 +505,7 @@ def _unseen(body: Body) -> Finding:
 
 
 def _wrong_frame(body: Body, places: BodyPlaces) -> list[Finding]:
-    """Say where coordinates are those of the mirrored body, or in another unit."""
+    """Return a finding if coordinates are mirrored or in another unit."""
     seen = places.seen & body.known
     count = seen.sum(axis=1)
     row = int(np.argmax(count))
@@ -543,7 +543,7 @@ def _wrong_frame(body: Body, places: BodyPlaces) -> list[Finding]:
 
 
 def _contradictions(body: Body, places: BodyPlaces, adjustment: _Adjustment) -> list[Finding]:
-    """Name markers that are loose, have migrated since CT, or are exchanged, and soft bodies."""
+    """Return findings on loose, migrated or exchanged markers, and on bodies that deform."""
     findings = []
     known = body.known & np.isfinite(adjustment.xyz).all(axis=1) & np.isfinite(body.sd_mm)
     if np.count_nonzero(known) >= 4:
@@ -552,7 +552,7 @@ def _contradictions(body: Body, places: BodyPlaces, adjustment: _Adjustment) -> 
     typical = float(np.nanmedian(test)) if np.isfinite(test).any() else 1.0
     limit = _limit_of_ratio(places)
     loose = np.flatnonzero(test > limit * max(1.0, typical))
-    is_stable = adjustment.mean_error_mm <= MAX_MEAN_ERROR_MM  # else that is said
+    is_stable = adjustment.mean_error_mm <= MAX_MEAN_ERROR_MM  # otherwise reported elsewhere
     if typical > limit and not len(loose) and is_stable:
         ratio = float(np.sqrt(typical))
         cause = (
@@ -586,16 +586,16 @@ def _contradictions(body: Body, places: BodyPlaces, adjustment: _Adjustment) -> 
 
 
 def _limit_of_ratio(places: BodyPlaces) -> float:
-    """Largest mean square of residuals of a marker that chance explains.
+    """Return the largest mean square of residuals of a marker that chance explains.
 
-    Errors that stay are the same in many exposures: as if there were ten independent ones.
+    Constant errors are the same in many exposures: count at most ten independent ones.
     """
     independent = 3 * min(10, int(np.count_nonzero(places.seen.any(axis=1))))
     return float(chdtri(independent, REJECT_TAIL) / independent)
 
 
 def _migrated(body: Body, adjustment: _Adjustment, known: NDArray[np.bool_]) -> list[Finding]:
-    """Compare the shape of the images with that of CT, marker by marker."""
+    """Compare the shape in the images with that of CT, marker by marker."""
     rows = np.flatnonzero(known)
     limit = float(chdtri(3, REJECT_TAIL))
     given = body.xyz_mm[rows]
@@ -652,7 +652,7 @@ def _against_others(
     marker: int,
     kept: Sequence[int],
 ) -> float:
-    """Squared deviation of a marker from CT over its variance, by the fit of the others."""
+    """Return the squared deviation of a marker from CT over its variance, fitting the others."""
     others = [k for k in kept if k != marker]
     weight = 1 / sd[others] ** 2
     rotation, shift = fitted_pose(found[others], given[others], weight)
@@ -667,7 +667,7 @@ def _against_others(
 def _misfit(
     given: NDArray[np.float64], found: NDArray[np.float64], sd: NDArray[np.float64]
 ) -> float:
-    """Weighted sum of squares of the fit of coordinates (k, 3) to those of CT, over its limit."""
+    """Return the weighted squares of a fit of coordinates (k, 3) to CT, over their limit."""
     rotation, shift = fitted_pose(found, given, 1 / sd**2)
     away = (found @ rotation.T + shift - given) / sd[:, None]
     return float(np.sum(away**2) / chdtri(3 * len(given) - POSE_SIZE, REJECT_TAIL))
@@ -676,7 +676,7 @@ def _misfit(
 def _exchanged(
     given: NDArray[np.float64], found: NDArray[np.float64], sd: NDArray[np.float64]
 ) -> tuple[int, int] | None:
-    """Two markers that contradict CT, and agree with it when they are exchanged."""
+    """Return two markers that contradict CT, but agree with it when exchanged; or None."""
     if _misfit(given, found, sd) <= 1:
         return None
     pairs = list(combinations(range(len(given)), 2))
@@ -690,7 +690,7 @@ def _exchanged(
 
 
 def _stability(body: Body, condition: float, mean_error_mm: float) -> list[Finding]:
-    """Say where markers lie on a line, or a body is not rigid."""
+    """Return findings on markers on a line, and on a body that is not rigid."""
     findings = []
     if condition > MAX_CONDITION:
         line = not np.isfinite(condition) or condition > 100 * MAX_CONDITION
@@ -718,9 +718,9 @@ def places_of(
 ) -> BodyPlaces:
     """Collect the places of the markers of a body from points in space.
 
-    target_ids: (n,) of each exposure; points: of each, 'xyz_mm' (n, 3), 'noise' and 'fixed'
-    (n, 3, 3), with NaN for points that are not to be used, and 'uv' (n, F, 2), their image points
-    in longer sides of the images.
+    target_ids: (n,) of each exposure. points: for each exposure 'xyz_mm' (n, 3), 'noise' and
+    'fixed' (n, 3, 3), with NaN for points that are not to be used, and 'uv' (n, F, 2), their image
+    points in units of the longer side of the images.
     """
     views = points[0]['uv'].shape[1] if len(points) else 0
     shape = (len(target_ids), len(body.target_id))

@@ -3,10 +3,10 @@
 
 """Poses of all bodies of a rig over a trial, exposure by exposure, live and offline.
 
-Every exposure is solved with the poses that the filter predicts, and then given to the filter. So
-a body is followed where one view or one marker is left. Live, an exposure is reported `lag`
-exposures later, smoothed by those that came after it. Offline, the same object follows the trial
-first; then the whole trial is smoothed, or reported with the same lag and the same numbers.
+Each exposure is solved starting from the poses that the filter predicts, and then passed to the
+filter. A body can thus be tracked with a single view or marker left. Live, an exposure is reported
+`lag` exposures later, smoothed by the subsequent ones. Offline, the same object first tracks the
+trial; then the whole trial is smoothed, or reported with the same lag and the same values.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from .joints import Joint, JointMotion, JointStatus, joint_motion, with_neutral
 from .motion import POSE, Motion, MotionFilter, smooth_trial
 from .pose import FramePoses, PoseSolver, Prediction
 
-# A rotation that is predicted less surely says nothing for the markers that are looked for: at
-# 20 mm from the centre this is as far as the next marker.
+# Standard deviation of a predicted rotation beyond which the prediction cannot locate markers: at
+# 20 mm from the centre it is as far as the next marker.
 LOST_SD_RAD = 0.3
 
 
@@ -40,22 +40,22 @@ class TrackedExposure:
 
     number: int
     stamp_ns: int
-    rotation: NDArray[np.float64]  #: (B, 3, 3) body -> rig; NaN where a body is lost
+    rotation: NDArray[np.float64]  #: (B, 3, 3) from body to rig; NaN for a lost body
     centre_mm: NDArray[np.float64]  #: (B, 3) centres of the markers
     #: (B, 6) [mm/s, rad/s] and [mm/s^2, rad/s^2]; NaN without a filter
     velocity: NDArray[np.float64]
     acceleration: NDArray[np.float64]
-    #: (B, 18, 18) of the random errors of pose, velocity and acceleration
+    #: (B, 18, 18) covariance of the random errors of pose, velocity and acceleration
     covariance: NDArray[np.float64]
-    fixed: NDArray[np.float64]  #: (B, 6, 6) of the errors of the pose that stay
+    fixed: NDArray[np.float64]  #: (B, 6, 6) covariance of the constant errors of the pose
     rig_root: NDArray[np.float64]  #: (B, 6, k)
-    frame: FramePoses  #: what the exposure alone tells
+    frame: FramePoses  #: solution of the exposure alone
     status: NDArray[np.uint8]  #: (B,) PoseStatus as uint8
 
 
 @dataclass(frozen=True)
 class _Taken:
-    """An exposure that the filter has taken, with the last known errors that stay."""
+    """Exposure that the filter has processed, with the last known constant errors."""
 
     number: int
     stamp_ns: int
@@ -66,7 +66,7 @@ class _Taken:
 
 
 class BodyTracker:
-    """Follows bodies from exposure to exposure.
+    """Tracks bodies from exposure to exposure.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ class BodyTracker:
     reject : float
         Standardised deviation above which a marker does not belong to its body.
     lag : int or None
-        Exposures after which a pose is reported; None: only by `smoothed`.
+        Number of exposures after which a pose is reported; None: only by `smoothed`.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class BodyTracker:
         self.filter = MotionFilter(count, lag)
         self._taken: list[_Taken] = []
         self._stamp_ns: int | None = None
-        self._expected: tuple[int, Prediction] | None = None  # of a time, until that is taken
+        self._expected: tuple[int, Prediction] | None = None  # for a given time, until it is used
         self._weak = np.zeros(count, dtype=np.int64)  # exposures since one alone gave the pose
         columns = orientation.covariance.shape[0]
         self._fixed = np.full((count, POSE_SIZE, POSE_SIZE), np.nan)
@@ -100,15 +100,15 @@ class BodyTracker:
 
     @property
     def bodies(self) -> tuple[Body, ...]:
-        """The bodies that are followed."""
+        """Tracked bodies."""
         return self.solver.bodies
 
     def add(
         self, exposure: IntersectedViews, number: int, stamp_ns: int
     ) -> TrackedExposure | None:
-        """Take an exposure; return the one of `lag` exposures before, if there is one.
+        """Add an exposure; return the one `lag` exposures earlier, if any.
 
-        An exposure that is not later than the one before is not taken.
+        An exposure that is not later than the previous one is ignored.
         """
         if self._stamp_ns is not None and stamp_ns <= self._stamp_ns:
             return None
@@ -117,7 +117,7 @@ class BodyTracker:
         self._stamp_ns = stamp_ns
         frame = self.solver.solve(exposure, expected)
         self._weak = np.where(frame.alone, 0, expected.weak)
-        # A body that has just appeared is not expected anywhere yet: its speed is unknown.
+        # A body that has just appeared has no useful prediction yet, as its speed is unknown.
         self.filter.lose(~expected.known & ~frame.alone)
         self.filter.update(frame.information, frame.alone & ~self.filter.alive)
         self._keep(number, stamp_ns, frame)
@@ -126,7 +126,7 @@ class BodyTracker:
         return self._report(self._taken.pop(0), self.filter.smoothed(), 0)
 
     def predict(self, stamp_ns: int) -> Prediction:
-        """Return the poses that are expected at a time after the last exposure."""
+        """Return the expected poses at a time after the last exposure."""
         if self._expected is not None and self._expected[0] == stamp_ns:
             return self._expected[1]
         dt_s = 0.0 if self._stamp_ns is None else (stamp_ns - self._stamp_ns) / NS_PER_S
@@ -139,13 +139,13 @@ class BodyTracker:
         return expected
 
     def lose(self, lost: NDArray[np.bool_]) -> None:
-        """Forget the motion of bodies (B,) that are not where they were expected."""
+        """Discard the motion of bodies (B,) that are not where they were expected."""
         if lost.any():
             self.filter.lose(lost)
             self._expected = None
 
     def reshape(self, bodies: Sequence[Body]) -> None:
-        """Take better shapes of the bodies, in the same frames."""
+        """Replace the shapes of the bodies by better ones in the same frames."""
         before = self.solver.centre
         self.solver = PoseSolver(self.solver.orientation, bodies, self._reject)
         moved = self.filter.rotation @ (self.solver.centre - before)[:, :, None]
@@ -153,12 +153,12 @@ class BodyTracker:
         self._expected = None
 
     def use(self, orientation: RigOrientation) -> None:
-        """Use the same orientation with another covariance from now on."""
+        """Use the same orientation with a different covariance from now on."""
         if orientation is not self.solver.orientation:
             self.solver = PoseSolver(orientation, self.bodies, self._reject)
 
     def flush(self) -> list[TrackedExposure]:
-        """Return the exposures that are not reported yet, at the end of a stream."""
+        """Return the exposures that have not been reported yet, at the end of a stream."""
         if not self._taken or self.lag is None:
             return []
         motion = self.filter.smoothed()
@@ -167,7 +167,7 @@ class BodyTracker:
         return [self._report(one, motion, first + k) for k, one in enumerate(taken)]
 
     def smoothed(self) -> list[TrackedExposure]:
-        """Return all exposures, smoothed by the whole trial; lag is None."""
+        """Return all exposures smoothed by the whole trial; requires lag None."""
         if not self._taken:
             return []
         motion = smooth_trial(self.filter, [one.frame.information for one in self._taken])
@@ -175,7 +175,7 @@ class BodyTracker:
         return [self._report(one, motion, k) for k, one in enumerate(taken)]
 
     def _keep(self, number: int, stamp_ns: int, frame: FramePoses) -> None:
-        """Note an exposure, and the errors that stay of bodies that are seen."""
+        """Store an exposure, and the constant errors of bodies that are seen."""
         seen = np.isfinite(frame.covariance_fixed[:, 0, 0])[:, None, None]
         self._fixed = np.where(seen, frame.covariance_fixed, self._fixed)
         self._rig_root = np.where(seen, frame.rig_root, self._rig_root)
@@ -191,7 +191,7 @@ class BodyTracker:
         )
 
     def _report(self, one: _Taken, motion: Motion, row: int) -> TrackedExposure:
-        """Return an exposure with its row of a motion."""
+        """Return an exposure with the given row of a motion."""
         frame = one.frame
         lost = ~one.alive
         status = np.full(len(lost), PoseStatus.FILLED, dtype=np.uint8)
@@ -222,7 +222,7 @@ class BodyTracker:
 
 
 def _filled_backwards(taken: Sequence[_Taken]) -> list[_Taken]:
-    """Give exposures before the first known errors of a body those that follow."""
+    """Fill unknown constant errors of a body with those of the following exposures."""
     out: list[_Taken] = []
     fixed = taken[-1].fixed
     root = taken[-1].rig_root
@@ -234,7 +234,7 @@ def _filled_backwards(taken: Sequence[_Taken]) -> list[_Taken]:
 
 
 def poses_of(bodies: Sequence[Body], exposures: Sequence[TrackedExposure]) -> list[BodyPoses]:
-    """Poses of the frames of the bodies, from those of the centres of their markers."""
+    """Return poses of the frames of the bodies from poses of the centres of their markers."""
     return _poses(
         bodies,
         exposures,
@@ -248,12 +248,12 @@ def poses_of(bodies: Sequence[Body], exposures: Sequence[TrackedExposure]) -> li
 def twists_of(
     bodies: Sequence[Body], exposure: TrackedExposure
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Velocities (B, 6) of bodies along their own axes, and covariances (B, 6, 6).
+    """Return velocities (B, 6) of bodies along their own axes, and covariances (B, 6, 6).
 
-    Of the origin of a body [mm/s], then of its rotation [rad/s]; by the random errors, NaN where a
-    body is lost. With the velocity v of the centre x of the markers and the angular velocity w,
-    both in the rig frame, they are R'v - R'w x x and R'w; a rotation error th changes R'v by
-    R'(v x th).
+    Velocity of the origin of a body [mm/s], then angular velocity [rad/s]; the covariance is that
+    of the random errors, NaN for a lost body. With the velocity v of the centre x of the markers
+    and the angular velocity w, both in the rig frame, they are R'v - R'w x x and R'w; a rotation
+    error th changes R'v by R'(v x th).
     """
     back = np.swapaxes(exposure.rotation, 1, 2)
     velocity, spin = exposure.velocity[:, :3], exposure.velocity[:, 3:]
@@ -271,7 +271,7 @@ def twists_of(
 
 
 def poses_alone(bodies: Sequence[Body], exposures: Sequence[TrackedExposure]) -> list[BodyPoses]:
-    """Poses that each exposure gives alone, without a filter."""
+    """Return the poses that each exposure gives alone, without a filter."""
     frames = [one.frame for one in exposures]
     alone = _by_body(frames, 'alone')
     return _poses(
@@ -300,7 +300,7 @@ def _poses(
 ) -> list[BodyPoses]:
     """Move poses from the centres of the markers to the origins of B bodies: t = c - R x_c.
 
-    pose: rotations (B, T, 3, 3) and centres (B, T, 3); noise, fixed (B, T, 6, 6).
+    pose: rotations (B, T, 3, 3) and centres (B, T, 3). noise, fixed: (B, T, 6, 6).
     """
     rotation, centre = pose
     arm = (rotation @ np.array([body.centre for body in bodies])[:, None, :, None])[..., 0]
@@ -337,17 +337,17 @@ def _poses(
     ]
 
 
-# Motion of a joint exposure by exposure, with the numbers of the whole trial.
+# Motion of a joint exposure by exposure, with the same values as for the whole trial.
 
 MAX_NEUTRAL = 10_000  # exposures of a neutral trial, some 60 MB
-# Full turns are counted from angles of these: not of those near gimbal lock, which may turn.
+# Statuses of angles from which full turns are counted; near gimbal lock angles may turn.
 _FIRM = (JointStatus.OK, JointStatus.WEAK, JointStatus.FILLED)
 
 
 class JointTracker:
-    """Follows a joint from exposure to exposure.
+    """Tracks a joint from exposure to exposure.
 
-    Until the neutral trial has passed, angles of a joint that needs one are unknown.
+    If a joint requires a neutral trial, its angles are unknown until that trial has ended.
 
     Parameters
     ----------
@@ -366,8 +366,8 @@ class JointTracker:
         self._neutral = neutral
         self._collected: list[tuple[BodyPoses, BodyPoses]] = []
         self._last: NDArray[np.float64] | None = None
-        self.needs_neutral = neutral is not None  #: whether the neutral trial has not passed yet
-        #: why a neutral trial that has passed gave no neutral position
+        self.needs_neutral = neutral is not None  #: whether the neutral trial has not ended yet
+        #: reason why a completed neutral trial gave no neutral position
         self.error: DataError | None = None
 
     def add(self, proximal: BodyPoses, distal: BodyPoses) -> JointMotion:
@@ -382,7 +382,7 @@ class JointTracker:
         return motion
 
     def _collect(self, proximal: BodyPoses, distal: BodyPoses) -> None:
-        """Take an exposure of the neutral trial; at its end use the neutral position."""
+        """Add an exposure of the neutral trial; set the neutral position at its end."""
         assert self._neutral is not None
         first, last = self._neutral
         number = int(proximal.number[0])
@@ -403,7 +403,7 @@ class JointTracker:
 
 
 def _joined(poses: Sequence[BodyPoses]) -> BodyPoses:
-    """Poses of several exposures as those of one trial."""
+    """Return the poses of several exposures as those of one trial."""
     names = [entry.name for entry in fields(BodyPoses) if entry.name != 'body']
     joined: dict[str, Any] = {
         name: np.concatenate([getattr(one, name) for one in poses]) for name in names
@@ -412,7 +412,7 @@ def _joined(poses: Sequence[BodyPoses]) -> BodyPoses:
 
 
 def unknown_motion(motion: JointMotion) -> JointMotion:
-    """Return the same exposures without angles and translations."""
+    """Return a copy without angles and translations."""
     return replace(
         motion,
         angles=np.full_like(motion.angles, np.nan),

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Beads intersected from the images alone, compared with their survey."""
+"""Intersect beads from the images alone and compare them with their survey."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from ..photogrammetry.network import MIN_RAYS, similarity_directions
 from ..photogrammetry.noise import INLIER_Q
 from ..photogrammetry.rotations import matrix_from_quaternion
 
-STEPS_L1 = 12  # of least absolute lengths
-STEPS_L2 = 6  # of least squares
-MAX_SD_MM = 2.0  # of a bead that counts
-DAMPING = 1e-9  # [1/mm^2]: a bead that is seen once stays where it is along its ray
+STEPS_L1 = 12  # iterations that minimise residual lengths (L1)
+STEPS_L2 = 6  # iterations of least squares
+MAX_SD_MM = 2.0  # maximum standard deviation of a usable bead
+DAMPING = 1e-9  # [1/mm^2]; keeps a bead that is seen once in place along its ray
 
 
 @dataclass(frozen=True)
@@ -42,45 +42,45 @@ class Beads:
 
     @property
     def misclosure(self) -> NDArray[np.float64]:
-        """Images - survey (n, 3) [mm]."""
+        """Coordinates from images minus survey (n, 3) [mm]."""
         return self.xyz_mm - self.survey_mm
 
     @property
     def total_covariance(self) -> NDArray[np.float64]:
-        """Covariance (n, 3, 3) of the misclosures, of images and survey together [mm^2]."""
+        """Covariance (n, 3, 3) of the misclosures, from images and survey [mm^2]."""
         return self.covariance + self.survey_sd_mm[:, None, None] ** 2 * np.eye(3)
 
     @property
     def chi2(self) -> NDArray[np.float64]:
-        """Squared misclosures (n,), weighted with their covariance; expected: 3."""
+        """Squared misclosures (n,), weighted by their inverse covariance; the expectation is 3."""
         weight = np.linalg.inv(self.total_covariance)
         return np.einsum('na,nab,nb->n', self.misclosure, weight, self.misclosure)
 
 
 @dataclass(frozen=True)
 class DistanceComparison:
-    """Distances between beads compared with the survey."""
+    """Comparison of the distances between beads with the survey."""
 
-    #: RMS difference from the survey, and its expectation [mm]
+    #: RMS difference from the survey, and its expected value [mm]
     rmse_mm: float
     expected_mm: float
-    #: degrees of freedom of the chi-square distribution that the squared RMS difference has,
-    #: nearly
+    #: degrees of freedom of the chi-square distribution that approximates the distribution of the
+    #: squared RMS difference
     freedom: float
-    #: scale of the images relative to the survey - 1, and its standard deviation
+    #: scale of the images relative to the survey, minus 1, and its standard deviation
     scale: float
     scale_sd: float
 
 
 @dataclass(frozen=True)
 class Rays:
-    """Image points with the orientation of their exposure."""
+    """Image points with the orientation of their exposures."""
 
     rotation: NDArray[np.float64]  #: (n, 3, 3)
     position_mm: NDArray[np.float64]  #: (n, 3)
     interior: NDArray[np.float64]  #: (n, 3) xp, yp, c [px]
-    uv: NDArray[np.float64]  #: (n, 2) corrected [px]
-    #: (n,) of a coordinate, of observation and correction together [px^2]
+    uv: NDArray[np.float64]  #: (n, 2) corrected pixels
+    #: (n,) variance of a coordinate, from observation and correction [px^2]
     variance: NDArray[np.float64]
     target_id: NDArray[np.int64]  #: (n,)
     exposure: NDArray[np.int64]  #: (n,) running number over all fluoroscopes
@@ -89,9 +89,8 @@ class Rays:
 def intersect(job: CalibrationResult, frames: Frames, phantom: Phantom) -> Beads:
     """Intersect the beads of an adjustment from the images of all its fluoroscopes.
 
-    The survey only takes part through the orientations, which depend on all beads together. The
-    intersection is robust: least absolute lengths first, then least squares of the image points
-    that agree.
+    The survey only enters through the orientations, which depend on all beads together. The
+    intersection is robust: it first minimises residual lengths, then squares of points that agree.
     """
     rays = rays_of(job, frames)
     target_id, bead = np.unique(rays.target_id, return_inverse=True)
@@ -102,10 +101,10 @@ def intersect(job: CalibrationResult, frames: Frames, phantom: Phantom) -> Beads
 def least_chi2_without_a_ray(
     job: CalibrationResult, frames: Frames, phantom: Phantom, target_id: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Smallest squared misclosures (n,) of beads with any one of their rays excluded.
+    """Return the smallest weighted squared misclosures (n,) of beads without one of their rays.
 
-    A false match that agrees with the other rays by chance displaces a bead; without it the bead
-    is in place. Zero where too few rays are left.
+    A false match that agrees with the other rays by chance displaces a bead; without this ray the
+    bead is in place. The result is zero where too few rays remain.
 
     job, frames, phantom: as in `intersect`. target_id: (n,) beads. Returns (n,).
     """
@@ -114,7 +113,7 @@ def least_chi2_without_a_ray(
     for number, target in enumerate(target_id):
         own = np.flatnonzero(rays.target_id == target)
         count = len(own)
-        # One copy of the bead for each ray that it lacks.
+        # One copy of the bead for each excluded ray.
         copy, used = np.nonzero(~np.eye(count, dtype=bool))
         part = Rays(*(getattr(rays, name)[own[used]] for name in rays.__dataclass_fields__))
         start = job.targets.xyz_mm[np.searchsorted(job.targets.target_id, target)]
@@ -134,8 +133,8 @@ def _beads(
 ) -> Beads:
     """Intersect beads from rays.
 
-    target_id: (n,). bead: (N,) row of the bead of each ray. start: (n, 3) start values [mm].
-    Returns those that are well determined.
+    target_id: (n,). bead: (N,) row of the bead of each ray. start: (n, 3) initial values [mm].
+    Returns the beads that are well determined.
     """
     points = start.copy()
     for step in range(STEPS_L1 + STEPS_L2):
@@ -172,7 +171,7 @@ def _beads(
 
 
 def distances(beads: Beads) -> DistanceComparison:
-    """Compare the distances between all pairs of two or more beads with the survey."""
+    """Compare the distances between all pairs of beads with the survey; needs two or more."""
     i, j = np.triu_indices(len(beads.target_id), 1)
     found = beads.xyz_mm[j] - beads.xyz_mm[i]
     surveyed = beads.survey_mm[j] - beads.survey_mm[i]
@@ -196,13 +195,14 @@ def distances(beads: Beads) -> DistanceComparison:
 def _degrees_of_freedom(
     direction: NDArray[np.float64], covariance: NDArray[np.float64], variance: NDArray[np.float64]
 ) -> float:
-    """Return those of the sum of squared errors of all distances between n beads.
+    """Return the degrees of freedom of the sum of squared errors of all distances between n beads.
 
-    It is a quadratic form e^T A e of the errors e of the beads, with covariance C, and distributed
-    nearly as chi-square with (tr AC)^2 / tr (AC)^2 degrees of freedom (Box, "Some theorems on
-    quadratic forms", Annals of Mathematical Statistics 25, 1954). A has the blocks -d d^T for
-    directions d (n (n - 1) / 2, 3) of distances, as numpy.triu_indices orders them, and their sums
-    in the diagonal. covariance (n, 3, 3); variance (2, n (n - 1) / 2): d^T C d of both beads.
+    The sum is a quadratic form e^T A e of the errors e of the beads, with covariance C. It
+    approximately follows a chi-square distribution with (tr AC)^2 / tr (AC)^2 degrees of freedom
+    (Box, "Some theorems on quadratic forms", Annals of Mathematical Statistics 25, 1954). A has
+    the off-diagonal blocks -d d^T for directions d (n (n - 1) / 2, 3) of distances, in the order
+    of numpy.triu_indices, and their sums on the diagonal. covariance (n, 3, 3); variance (2, n
+    (n - 1) / 2): d^T C d of both beads.
     """
     diagonal = np.zeros_like(covariance)
     products = direction[:, :, None] * direction[:, None, :]
@@ -214,7 +214,7 @@ def _degrees_of_freedom(
 
 
 def rays_of(job: CalibrationResult, frames: Frames) -> Rays:
-    """Return the image points of all exposures of an adjustment."""
+    """Return the image points of all exposures of an adjustment as rays."""
     parts: list[tuple[np.ndarray, ...]] = []
     for name, figures in job.fluoroscopes.items():
         calibration = job.calibrations[name]
@@ -238,7 +238,7 @@ def rays_of(job: CalibrationResult, frames: Frames) -> Rays:
 
 
 def _scale(beads: Beads) -> tuple[float, float]:
-    """Return the scale - 1 of the similarity from survey to images, and its standard deviation."""
+    """Return scale - 1 of the similarity from survey to images, and its standard deviation."""
     design = similarity_directions(beads.survey_mm, beads.survey_mm.mean(axis=0))
     information = np.linalg.inv(beads.total_covariance)
     normal = np.einsum('nai,nab,nbj->ij', design, information, design)

@@ -3,14 +3,14 @@
 
 """Checks 'beads' and 'distances': beads found from the images alone agree with their survey.
 
-A face or plate of a phantom that is not where its survey says, as a whole. The misclosures of the
-beads, from images alone, are fitted by one rigid motion of the phantom and by two: one of a layer
-of beads, one of the rest. The layer with the largest decrease of the weighted square sum is
-displaced if the decrease is significant (F-test of a general linear hypothesis with known
-variance: Foerstner and Wrobel, "Photogrammetric Computer Vision", Springer 2016, 3.1), explains
-most of what is wrong, and brings the beads of the layer into place. Where the square sum is no
-larger than expected, nothing is wrong: neighbouring beads have errors of the correction in common,
-which the test takes to be independent.
+A face or plate of a phantom may be displaced as a whole against its survey. The misclosures of the
+beads, from images alone, are fitted by one rigid motion of the whole phantom, and by two motions:
+one of a layer of beads and one of all other beads. The layer with the largest decrease of the
+weighted sum of squares is displaced if the decrease is significant (F-test of a general linear
+hypothesis with known variance: Foerstner and Wrobel, "Photogrammetric Computer Vision", Springer
+2016, 3.1), explains most of the excess, and brings the beads of the layer into place. If the sum
+of squares is no larger than expected, no layer is displaced: neighbouring beads share errors of
+the correction, which the test assumes to be independent.
 """
 
 from __future__ import annotations
@@ -38,39 +38,39 @@ from .calibration_evidence import Evidence, Subject
 from .check import Check
 from .exchanged_beads import exchanged_beads, rate_of
 
-MIN_LAYER = 8  # of a layer, and of the rest
-BORDERS = 40  # between layers that are tried along each axis
-# Gap beside a border [sd of the survey's difference of two beads]. In a smaller one the survey's
-# own errors decide which bead lies on which side, and a layer seems displaced by its selection.
+MIN_LAYER = 8  # minimum number of beads in a layer, and outside of it
+BORDERS = 40  # number of borders between layers to try along each axis
+# Minimum gap at a border [sd of the survey's difference of two beads]. In a smaller gap the errors
+# of the survey decide on which side a bead lies, and a layer seems displaced by its selection.
 BORDER_SDS = 3.0
-EXPLAINED = 0.5  # part of the excess of the square sum that a displaced layer explains
-IMPROVED = 2.0  # factor by which the median square of its beads falls
+EXPLAINED = 0.5  # minimum share of the excess sum of squares that a displaced layer explains
+IMPROVED = 2.0  # minimum factor by which the median square of its beads decreases
 
 
 @dataclass(frozen=True)
 class DisplacedLayer:
-    """A layer of beads that is out of place as a whole."""
+    """Layer of beads that is displaced as a whole."""
 
-    axis: int  #: 0, 1 or 2: along which coordinate of the survey the layer is bounded
-    #: its bounds [mm]; None where the phantom ends, so that the layer is a face
+    axis: int  #: 0, 1 or 2: coordinate of the survey that bounds the layer
+    #: bounds [mm]; None where the phantom ends, so that the layer is a face
     low: float | None
     high: float | None
-    target_id: NDArray[np.int64]  #: (k,) its beads
-    shift_mm: NDArray[np.float64]  #: (3,) images - survey of its centre, against the rest
-    tilt_rad: float  #: rotation against the rest
-    #: RMS displacement of its beads by this motion, and that which is not significant
+    target_id: NDArray[np.int64]  #: (k,) beads of the layer
+    shift_mm: NDArray[np.float64]  #: (3,) images - survey at its centre, relative to the others
+    tilt_rad: float  #: rotation relative to the other beads
+    #: RMS displacement of its beads by this motion, and the largest one that is not significant
     size_mm: float
     limit_mm: float
 
     @property
     def numbers(self) -> dict[str, float]:
-        """Size of its motion."""
+        """Size of the motion."""
         shift = float(np.linalg.norm(self.shift_mm))
         return {'shift_mm': shift, 'tilt_deg': float(np.rad2deg(self.tilt_rad))}
 
     @property
     def cause(self) -> str:
-        """What is wrong with the layer, in words."""
+        """Description of the displacement."""
         name = 'xyz'[self.axis]
         if self.low is None:
             where = f'the face of the phantom with {name} < {self.high:.0f} mm'
@@ -90,7 +90,7 @@ class DisplacedLayer:
 
 @dataclass(frozen=True)
 class _Candidate:
-    """A layer to try: the beads order[start:stop] along an axis; gain of its own motion."""
+    """Layer to try: beads order[start:stop] along an axis, and the gain of its own motion."""
 
     axis: int
     order: NDArray[np.int64]
@@ -100,11 +100,11 @@ class _Candidate:
 
     @property
     def own(self) -> NDArray[np.int64]:
-        """Rows of its beads."""
+        """Row indices of its beads."""
         return self.order[self.start : self.stop]
 
     def halves(self) -> list[_Candidate]:
-        """Return the layer and, of two faces with as many beads, the other one."""
+        """Return the layer, and its complement if it is a face with half of the beads."""
         count = len(self.order)
         if 2 * (self.stop - self.start) != count or (self.start and self.stop < count):
             return [self]
@@ -113,7 +113,7 @@ class _Candidate:
 
 
 def displaced_layer(beads: Beads) -> DisplacedLayer | None:
-    """Return the layer of beads that is out of place as a whole, None if there is none."""
+    """Return the layer of beads that is displaced as a whole, or None."""
     if len(beads.target_id) < 2 * MIN_LAYER:
         return None
     fit = _Fit(beads)
@@ -129,13 +129,13 @@ def displaced_layer(beads: Beads) -> DisplacedLayer | None:
         or fit.improvement(best) < IMPROVED
     ):
         return None
-    # Of two plates, either moved against the other: by the smaller motion.
+    # Of two equal plates either may have moved against the other: choose the smaller motion.
     found = [fit.described(candidate, critical) for candidate in best.halves()]
     return min(found, key=lambda layer: float(np.linalg.norm(layer.shift_mm)))
 
 
 class _Fit:
-    """Motions of layers of beads that fit their misclosures."""
+    """Rigid motions of layers of beads, fitted to their misclosures."""
 
     def __init__(self, beads: Beads) -> None:
         self._beads = beads
@@ -149,12 +149,12 @@ class _Fit:
 
     @property
     def excess(self) -> float:
-        """Weighted square sum without a motion of all beads, less its expectation."""
+        """Weighted sum of squares after one motion of all beads, minus its expectation."""
         left = self._beads.misclosure - self._design @ self._all.motion
         return float(self._squares(left, slice(None)).sum() - 3 * len(left))
 
     def candidates(self, axis: int) -> list[_Candidate]:
-        """Layers along an axis, with what their own motion gains."""
+        """Return the layers along an axis, with the gain of their own motion."""
         coordinate = self._beads.survey_mm[:, axis]
         order = np.argsort(coordinate, kind='stable')
         start, stop = _layers(coordinate[order], self._beads.survey_sd_mm[order]).T
@@ -168,7 +168,7 @@ class _Fit:
         ]
 
     def improvement(self, candidate: _Candidate) -> float:
-        """Factor by which the median square of the beads of a layer falls by its own motion."""
+        """Return the factor by which its own motion decreases the median square of a layer."""
         own = candidate.own
         motions = self._motion_and_rest(own)
         after, before = (
@@ -178,7 +178,7 @@ class _Fit:
         return float(before / after)
 
     def described(self, candidate: _Candidate, critical: float) -> DisplacedLayer:
-        """Return a layer with its motion against the rest; critical: gain of no significance."""
+        """Return a layer with its relative motion; critical: largest gain without significance."""
         own = candidate.own
         survey = self._beads.survey_mm
         coordinate = survey[candidate.order, candidate.axis]
@@ -207,21 +207,21 @@ class _Fit:
     def _motion_and_rest(
         self, own: NDArray[np.int64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Motions (6,) of beads and of the rest."""
+        """Return the motions (6,) of the given beads and of all other beads."""
         layer = _Equations(self._normals[own].sum(axis=0), self._rights[own].sum(axis=0))
         return layer.motion, self._all.without(layer).motion
 
     def _squares(
         self, left: NDArray[np.float64], rows: NDArray[np.int64] | slice
     ) -> NDArray[np.float64]:
-        """Weighted squares (k,) of misclosures left (k, 3) of beads."""
+        """Return the weighted squares (k,) of remaining misclosures left (k, 3) of beads."""
         return np.einsum('na,nab,nb->n', left, self._information[rows], left)
 
 
 def _layers(coordinate: NDArray[np.float64], sd: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Starts and stops (k, 2) of the layers to try, from coordinates (n,) in order with their sd.
+    """Return starts and stops (k, 2) of the layers to try, from sorted coordinates (n,), their sd.
 
-    Borders are where the gaps are largest. Of a face and the rest, the smaller one is tried.
+    Borders are at the largest gaps. Of a face and its complement, the smaller one is tried.
     """
     count = len(coordinate)
     gap = np.diff(coordinate)
@@ -238,7 +238,7 @@ def _layers(coordinate: NDArray[np.float64], sd: NDArray[np.float64]) -> NDArray
 def _sums(
     values: NDArray[np.float64], start: NDArray[np.int64], stop: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Sums (k, ...) of values (n, ...) from start (k,) to before stop (k,)."""
+    """Return the sums (k, ...) of values (n, ...) from start (k,) to before stop (k,)."""
     sums = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)])
     return sums[stop] - sums[start]
 
@@ -251,31 +251,31 @@ class _Equations:
     right: NDArray[np.float64]
 
     def without(self, part: _Equations) -> _Equations:
-        """Return those of the beads that are not in a part."""
+        """Return the equations without the beads of a part."""
         return _Equations(self.normal - part.normal, self.right - part.right)
 
     @property
     def motion(self) -> NDArray[np.float64]:
-        """Motions (..., 6); beads on a line do not determine all of them."""
+        """Motions (..., 6); minimum-norm solution for beads on a line."""
         inverse = np.linalg.pinv(self.normal, hermitian=True, rcond=1e-9)
         return (inverse @ self.right[..., None])[..., 0]
 
     @property
     def decrease(self) -> np.ndarray:
-        """Decrease (...) of the weighted square sum by a motion."""
+        """Decrease (...) of the weighted sum of squares by the motion."""
         return np.einsum('...i,...i->...', self.right, self.motion)
 
 
-MIN_BEADS = 10  # that are compared with their survey, or of two halves with each other
-# For the part of the errors of orientations and calibration that all beads have in common.
+MIN_BEADS = 10  # minimum number of beads in a comparison with the survey, or of two halves
+# Factor on sds for errors of orientations and calibration that all beads have in common.
 SD_FACTOR = 1.1
-# Times the expectation, from simulated rigs with some 500 beads: docs/verdict.md. With few beads
-# the limit is that of a FALSE_ALARM.
+# Limit as a multiple of the expectation, from simulated rigs with some 500 beads: docs/verdict.md.
+# With few beads the limit follows from FALSE_ALARM.
 DISTANCES_LIMIT = 1.12
 
 
 def check_beads(evidence: Evidence, names: Sequence[str]) -> list[Check]:
-    """Compare the beads that all fluoroscopes see with their survey."""
+    """Compare the beads intersected from all fluoroscopes with their survey."""
     found = intersect(evidence.result, evidence.frames, evidence.phantom)
     has_trend = any(common.is_significant for common in evidence.trends.values())
 
@@ -297,11 +297,11 @@ def check_beads(evidence: Evidence, names: Sequence[str]) -> list[Check]:
 
 
 def rejected_beads(residuals: ResidualTable | None) -> NDArray[np.int64]:
-    """Return the target ids of beads of which most image points are rejected, and not by chance.
+    """Return target ids of beads most of whose image points are rejected, more than by chance.
 
-    Too few rays of such a bead may agree to intersect it, but false matches are as frequent among
-    its image points as among those of the others. That chance rejects all of the few image points
-    of one bead is likely; that it does so with several beads is not.
+    Too few rays of such a bead may agree to intersect it, while false matches are as frequent
+    among its image points as among those of other beads. It is likely that all image points of one
+    bead with few of them are rejected by chance; it is unlikely for several beads.
     """
     if residuals is None or not len(residuals.target_id):
         return np.zeros(0, dtype=np.int64)
@@ -319,7 +319,7 @@ def rejected_beads(residuals: ResidualTable | None) -> NDArray[np.int64]:
 
 
 def _rate_of_exposure(residuals: ResidualTable) -> NDArray[np.float64]:
-    """Return how often image points are rejected in the exposure of each (N,)."""
+    """Return the rate (N,) of rejected image points in the exposure of each image point."""
     _, name = np.unique(residuals.fluoroscope, return_inverse=True)
     exposures = np.stack([name, residuals.exposure])
     exposure = np.unique(exposures, axis=1, return_inverse=True)[1].ravel()
@@ -327,7 +327,7 @@ def _rate_of_exposure(residuals: ResidualTable) -> NDArray[np.float64]:
 
 
 def _rejected(target_id: NDArray[np.int64]) -> Check:
-    """Return check 'beads' that fails because the image points of some beads are rejected."""
+    """Return the failed check 'beads' for beads whose image points are rejected."""
     return Check(
         Kind.BEADS,
         f'most image points of bead {first_few(target_id)} are rejected, more than false matches '
@@ -342,7 +342,7 @@ def _rejected(target_id: NDArray[np.int64]) -> Check:
 
 
 def _exchanged(pairs: NDArray[np.int64]) -> Check:
-    """Return check 'beads' that fails because beads are exchanged: target ids (n, 2)."""
+    """Return the failed check 'beads' for pairs of exchanged beads, target ids (n, 2)."""
     return Check(
         Kind.BEADS,
         f'bead {first_few(f"{first} is exchanged with {second}" for first, second in pairs)} in '
@@ -363,9 +363,9 @@ def compare_with_survey(
 ) -> list[Check]:
     """Return the checks 'beads' and 'distances'.
 
-    has_trend: whether the residuals of a fluoroscope have a trend. least_chi2: called with target
-    ids; returns their smallest squared misclosures with any ray excluded; a bead is out of place
-    only if it is so by these, too.
+    has_trend: whether the residuals of a fluoroscope have a trend. least_chi2: function of target
+    ids that returns their smallest squared misclosures with one ray excluded; a bead is out of
+    place only if these exceed the limit, too.
     """
     count = len(beads.target_id)
     if count < MIN_BEADS:
@@ -387,7 +387,7 @@ def compare_with_survey(
     )
     value = size[worst]
     highest = value * np.sqrt(limit / max(square[worst], 1e-9))
-    # A face of which no single bead is significant may be so as a whole.
+    # A face may be displaced significantly although none of its beads is on its own.
     layer = displaced_layer(beads)
     if layer is not None:
         named = layer.target_id
@@ -411,13 +411,13 @@ def compare_with_survey(
     )
     return [
         check.after_trend(has_trend),
-        # A bead that is in place without one of its rays has a false match and tells nothing.
+        # A bead that is in place without one of its rays has a false match and is excluded.
         _check_distances(beads.without(beads.target_id[suspects]), has_trend),
     ]
 
 
 def _not_made(kind: Kind, count: int) -> Check:
-    """Return a check that was not made, because too few beads are seen."""
+    """Return a check that could not be made because too few beads are seen."""
     return Check(
         kind,
         f'check {kind.value} could not be made, only {count} beads are seen often enough to be '
@@ -428,7 +428,7 @@ def _not_made(kind: Kind, count: int) -> Check:
 
 
 def _wrong_beads(target_id: NDArray[np.int64], size: NDArray[np.float64]) -> str:
-    """Return the names of the beads with a wrong survey, and their errors [mm]."""
+    """Return the names of the beads with a wrong survey, and their errors [mm], as text."""
     wrong = first_few(f'{target} is wrong by {mm:.1f} mm' for target, mm in zip(target_id, size))
     return f'the survey of bead {wrong}'
 

@@ -1,22 +1,23 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What rigid bodies tell of a drift that epipolar residuals cannot see.
+"""Evidence from rigid bodies of a drift that epipolar residuals cannot show.
 
 A shift along an epipolar line moves the intersected point in depth, and all rays still meet. If
 one of two markers of a body is in the area that has drifted and the other is not, the points no
 longer fit the shape of the body. With the pose of a body from its image points (see bodies.pose),
-let the image points of a marker have the derivatives B by its place, weights W, S = B'WB and the
-displacement p = S^-1 B'Wr from the place that the body says. A shift of one pixel in an area moves
-its markers by q = S^-1 B'W, of which the pose takes up a part: with D of the place by the pose,
-N = sum D'SD and g = sum D'Sq over the area, the shift has
+let the image points of a marker have the derivatives B with respect to its place, weights W,
+S = B'WB and the displacement p = S^-1 B'Wr from the place predicted by the body. A shift of one
+pixel in an area moves its markers by q = S^-1 B'W, part of which the pose absorbs: with the
+derivative D of the place with respect to the pose, N = sum D'SD and g = sum D'Sq over the area,
+the shift has
 
     score = sum q'S p - g'N^-1 sum D'Sp,  information = sum q'Sq - g'N^-1 g
 
-(Foerstner and Wrobel, "Photogrammetric Computer Vision", Springer 2016, 4.6). So each body
+(Foerstner and Wrobel, "Photogrammetric Computer Vision", Springer 2016, 4.6). Each body thus
 measures the drift of an area [px], as every epipolar residual does; displacements across the
-epipolar lines are left to those. Where all markers of a body shift alike the pose takes up
-everything: a drift of the whole image along the epipolar lines moves and turns a body without
+epipolar lines are left to the residuals. If all markers of a body shift alike, the pose absorbs
+everything: a drift of the whole image along the epipolar lines moves and rotates a body without
 deforming it.
 """
 
@@ -38,48 +39,48 @@ from ..photogrammetry.unknowns import POSE_SIZE
 from ..reconstruction.reconstruct import IntersectedViews
 from .drift_charts import DriftOptions, ImageAreas
 
-COMPONENTS = 2  # of a shift in an image, u and v
-# Fraction of the systematic standard deviation that markers in an area have in common. Measured:
-# a fifth to two fifths, since their reference is what they were at the start, and markers some
-# centimetres apart have errors of their own.
+COMPONENTS = 2  # components of a shift in an image, u and v
+# Fraction of the systematic standard deviation that markers in an area have in common. Measured
+# values are 0.2 to 0.4, because their reference is their state at the start, and markers some
+# centimetres apart have individual errors.
 COMMON_SYSTEMATIC = 0.5
-MIN_PAIRS = 2  # of markers in an exposure, one in an area and one outside, to test the area
-LEARNED = 200  # exposures from which a shape is learned: its noise is a fourteenth of theirs
+MIN_PAIRS = 2  # minimum marker pairs per exposure, across the area's border, to test it
+LEARNED = 200  # exposures for learning a shape; divides the noise by 14
 REWEIGHTINGS = 3
-MAX_LEARNING = 5000  # exposures that are kept until all markers are known
+MAX_LEARNING = 5000  # exposures that are stored until all markers are known
 
 
 @dataclass(frozen=True)
 class BodyBlock:
     """Statistics of the bodies in a block.
 
-    The 2F series are the drifts along u and v of the F fluoroscopes.
+    The 2F series are the drifts along u and v in the F fluoroscopes.
     """
 
-    #: (B, 2F, A) of a drift of each area, by body [1/px, 1/px^2]
+    #: (B, 2F, A) score and information of a drift of each area, by body [1/px, 1/px^2]
     score: NDArray[np.float64]
     information: NDArray[np.float64]
-    #: (2F, A) systematic standard deviations of what all bodies show together [px]
+    #: (2F, A) systematic standard deviations of the drift from all bodies together [px]
     systematic: NDArray[np.float64]
-    #: (2F, A) whether enough pairs of markers are on both sides of the border of the area
+    #: (2F, A) whether enough marker pairs are on both sides of the border of the area
     enough: NDArray[np.bool_]
-    count: int  #: number of places of markers
+    count: int  #: number of marker places
 
 
 @dataclass(frozen=True)
 class _Seen:
-    """One exposure: image points of the bodies, and places (B, M, 3) of their markers."""
+    """Exposure with image points of the bodies, and places (B, M, 3) of their markers."""
 
     points: ImagePoints
     places: NDArray[np.float64]
 
 
 class BodyWatch:
-    """Turns the image points of rigid bodies into statistics, block by block.
+    """Converts the image points of rigid bodies into statistics, block by block.
 
     bodies: shapes that are not given are learned at the start of a stream. sizes: (F, 2), width
-    and height of the images [px]. Raises DataError for a marker of two bodies, and for two bodies
-    of the same name.
+    and height of the images [px]. Raises DataError for a marker that belongs to two bodies, and
+    for two bodies of the same name.
     """
 
     def __init__(
@@ -96,7 +97,7 @@ class BodyWatch:
         self._sizes = sizes
         self._areas = areas
         self._options = options
-        # A quarter of the start, for a marker that is hidden in between.
+        # A quarter of the start, for a marker that is hidden part of the time.
         self._least_blocks = max(1, round(options.learn_s / options.block_s / 4))
         self.names = tuple(body.name for body in bodies)
         self.clear()
@@ -106,16 +107,16 @@ class BodyWatch:
         self._set_bodies(self._given)
         self._seen: list[_Seen] = []
         self._learning: list[_Seen] = []
-        self._blocks = np.zeros(self._known.shape, dtype=int)  # in which a marker was seen
+        self._blocks = np.zeros(self._known.shape, dtype=int)  # blocks that show each marker
 
     def _set_bodies(self, bodies: Sequence[Body]) -> None:
-        """Take shapes; markers whose places are not known yet are not used."""
+        """Set the shapes; markers whose places are not known yet are ignored."""
         self.bodies = tuple(bodies)
         shape = (len(bodies), max(len(body.target_id) for body in bodies))
         target_id = np.full(shape, -1)
         self._xyz = np.zeros((*shape, 3))
         self._variance = np.zeros(shape)
-        self._known = np.ones(shape, dtype=bool)  # of rows without a marker, nothing is learned
+        self._known = np.ones(shape, dtype=bool)  # padding without a marker counts as known
         for row, body in enumerate(bodies):
             own = slice(len(body.target_id))
             known = body.known
@@ -131,15 +132,15 @@ class BodyWatch:
             return
         points = self._cameras.sorted(exposure)
         places = self._cameras.places(exposure)
-        # Depth needs two rays that meet.
+        # Depth needs two intersecting rays.
         there = (points.seen.sum(axis=2) > 1) & np.isfinite(places).all(axis=2)
         points = replace(points, seen=points.seen & there[..., None])
         self._seen.append(_Seen(points, np.where(there[..., None], places, np.nan)))
 
     def block(self) -> BodyBlock | None:
-        """Statistics of the exposures since the last call, None without any.
+        """Return the statistics of the exposures since the last call, or None without any.
 
-        Markers that are still being learned contribute nothing.
+        Markers that are still being learned do not contribute.
         """
         if not self._seen:
             return None
@@ -152,9 +153,9 @@ class BodyWatch:
         return self._statistics(_joined(seen), len(seen))
 
     def learn(self) -> None:
-        """Learn the places of markers that were not given, once they have been seen enough.
+        """Learn the places of markers that were not given, once they have been seen often enough.
 
-        To be called after the start of the stream. A marker that appears later is learned then.
+        Call it after the start of the stream. A marker that appears later is learned later.
         """
         fresh = ~self._known & (self._blocks >= self._least_blocks)
         rows = np.flatnonzero(fresh.any(axis=1))
@@ -169,7 +170,7 @@ class BodyWatch:
             self._learning = []
 
     def _learned(self, row: int, fresh: NDArray[np.bool_]) -> Body:
-        """Return a body with the places of fresh (M,) markers; the known ones stay."""
+        """Return a body with learned places of fresh (M,) markers; known places do not change."""
         body = self.bodies[row]
         count = len(body.target_id)
         wanted = (fresh | self._known[row])[:count]
@@ -195,7 +196,7 @@ class BodyWatch:
         )
 
     def _statistics(self, seen: _Seen, exposures: int) -> BodyBlock:
-        """Statistics of the bodies in exposures, all of which are solved at once."""
+        """Return the statistics of the bodies in exposures, all of which are solved at once."""
         there = seen.points.seen.any(axis=2) & np.tile(self._known, (exposures, 1))
         rows = np.flatnonzero(np.count_nonzero(there, axis=1) > 1)
         shape = (COMPONENTS * len(self._sizes), len(self._areas))
@@ -228,7 +229,7 @@ class BodyWatch:
         )
 
     def _inside(self, points: ImagePoints) -> NDArray[np.float64]:
-        """Whether (n, F, M, A) image points are seen in an area."""
+        """Return whether (n, F, M, A) image points are seen in an area."""
         member = self._areas.member.T
         parts = []
         for view, size in enumerate(self._sizes):
@@ -238,10 +239,10 @@ class BodyWatch:
         return np.stack(parts, axis=1)
 
     def _clipped(self, drift: _Drift) -> NDArray[np.float64]:
-        """Displacements (n, M, 3) [mm] from the robust pose, clipped.
+        """Return displacements (n, M, 3) [mm] from the robust pose, clipped.
 
-        Clipped at what noise, systematic errors and the smallest drift to be found explain; the
-        pose is that of Huber 1964, by reweighting.
+        They are clipped at the size that noise, systematic errors and the smallest detectable
+        drift explain. The pose is estimated with Huber weights (1964) by reweighting.
         """
         options = self._options
         noise = np.sqrt(chdtri(3, erfc(options.clip / np.sqrt(2))))
@@ -269,12 +270,12 @@ class BodyWatch:
 
 @dataclass(frozen=True)
 class _Drift:
-    """What markers (n, M) of bodies tell of shifts in the images.
+    """Effect of shifts in the images on markers (n, M) of bodies.
 
-    s_matrix (n, M, 3, 3); displacement (n, M, 3)
-    from the place by the body [mm]; weighted (n, M, F, 2, 3), W B of image points; square
-    (n, M, F, 2), q'Sq; systematic (n, M), variance of a coordinate by systematic errors over that
-    by noise; by_pose D; pulled (n, M, 6, 3), D'S; inverse (n, 6, 6) of N.
+    s_matrix (n, M, 3, 3); displacement (n, M, 3) from the place predicted by the body [mm];
+    weighted (n, M, F, 2, 3), W B of image points; square (n, M, F, 2), q'Sq; systematic (n, M),
+    variance of a coordinate due to systematic errors relative to noise; by_pose D; pulled
+    (n, M, 6, 3), D'S; inverse (n, 6, 6) of N.
     """
 
     s_matrix: NDArray[np.float64]
@@ -288,7 +289,7 @@ class _Drift:
 
     @classmethod
     def of(cls, linear: Linear, points: ImagePoints, variance: NDArray[np.float64]) -> _Drift:
-        """Of image points at a pose, and shapes of variances (n, M) [mm^2]."""
+        """Return the effect for image points at a pose, and shapes of variances (n, M) [mm^2]."""
         weight = np.where(points.seen, 1 / points.noise, 0.0)
         s_matrix, s_vector = marker_sums(linear, weight)
         regular = np.asarray(points.seen.any(axis=2))[..., None, None]
@@ -311,7 +312,7 @@ class _Drift:
 
 
 def _inverse(normal: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Inverses (n, 6, 6) of normal matrices, of which two markers leave a rotation open."""
+    """Return inverses (n, 6, 6) of normal matrices; two markers leave one rotation free."""
     diagonal = REGULAR * normal.max(axis=(1, 2), keepdims=True) * np.eye(POSE_SIZE)
     return np.linalg.inv(normal + diagonal)
 
@@ -319,7 +320,7 @@ def _inverse(normal: NDArray[np.float64]) -> NDArray[np.float64]:
 def _by_area(
     drift: _Drift, displacement: NDArray[np.float64], inside: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Score, information and systematic error of the score (n, 2F, A) of shifts of areas."""
+    """Return score, information, systematic error of the score (n, 2F, A) of shifts of areas."""
     n, views, markers, areas = inside.shape
     told = np.concatenate(
         [
@@ -333,7 +334,7 @@ def _by_area(
     taken = sums[..., 2 * COMPONENTS :].reshape(n, views, areas, COMPONENTS, POSE_SIZE)
     taken = np.sum((taken @ drift.inverse[:, None, None]) * taken, axis=-1)
     information = np.maximum(sums[..., COMPONENTS : 2 * COMPONENTS] - taken, 0.0)
-    # A systematic error of the images is to the score as the noise is, but in all exposures.
+    # A systematic error of the images affects the score like noise, but in all exposures.
     there = inside.any(axis=(1, 3)).sum(axis=1)
     share = drift.systematic.sum(axis=1) / there
     amplitude = np.sqrt(share[:, None, None, None] * information)
@@ -345,7 +346,7 @@ def _by_area(
 
 
 def _joined(seen: Sequence[_Seen]) -> _Seen:
-    """All exposures as one with as many bodies more."""
+    """Return all exposures as a single one with correspondingly more bodies."""
     points = ImagePoints(
         *(
             np.concatenate([getattr(one.points, entry.name) for one in seen])
@@ -356,7 +357,7 @@ def _joined(seen: Sequence[_Seen]) -> _Seen:
 
 
 def _row(seen: _Seen, row: int) -> _Seen:
-    """One body of an exposure."""
+    """Return one body of an exposure."""
     chosen = slice(row, row + 1)
     points = ImagePoints(*(getattr(seen.points, e.name)[chosen] for e in fields(ImagePoints)))
     return _Seen(points, seen.places[chosen])

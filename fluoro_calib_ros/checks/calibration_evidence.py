@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the checks of a calibration work with."""
+"""Data and operations that the checks of a calibration use."""
 
 from __future__ import annotations
 
@@ -38,48 +38,48 @@ from .residual_tests import (
     unexplained,
 )
 
-# The calibration of a part has at most so many rounds: with few exposures it converges slowly, and
-# after these rounds without visible change.
+# Maximum number of rounds when calibrating a part of the exposures. With few exposures convergence
+# is slow, and changes after this number of rounds are not visible.
 MAX_ROUNDS = 25
-# Share of the image points of a part that may be rejected beside that of the whole.
+# Maximum excess of the share of rejected image points in a part over the share in the whole.
 MAX_LOST = 0.03
-MIN_VARYING_EXPOSURES = 4  # with enough image points, to tell whether the distortion varies
+MIN_VARYING_EXPOSURES = 4  # exposures with enough points to detect a varying distortion
 
 
 @dataclass(frozen=True)
 class CommonTrend:
     """Trend that the residuals of all exposures of a fluoroscope have in common."""
 
-    inliers: Residuals  #: those in the core of the noise
+    inliers: Residuals  #: residuals in the core of the noise
     trend: ResidualTrend
-    #: standard deviation that the calibration claims for its correction [px]: an error of this
+    #: standard deviation that the calibration claims for its correction [px]; an error of this
     #: size is no fault
     claimed_sd: float
-    #: what rejected image points have in common; None where they are few everywhere
+    #: trend of rejected image points; None if there are few everywhere
     rejected: RejectedTrend | None = None
-    #: how far those of one exposure agree; None where they are few in all
+    #: agreement of the rejected image points of one exposure; None if all exposures have few
     of_exposure: RejectedExposure | None = None
 
     @property
     def limit(self) -> float:
-        """Size of a trend [px] that is not significant."""
+        """Largest size of a trend [px] that is not significant."""
         return float(np.hypot(self.trend.limit, self.claimed_sd))
 
     @property
     def is_significant(self) -> bool:
-        """Whether the residuals have a trend."""
+        """Whether the residuals have a significant trend."""
         return not self.trend.size <= self.limit
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """A calibration, the exposures it was made from, and what a check may do with them."""
+    """Calibration, the exposures it was made from, and the operations of the checks."""
 
-    #: with the frames that were used only, in the order of their numbers
+    #: contains only the frames that were used, in the order of their numbers
     request: CalibrationRequest
     calibrations: Calibrations
     result: CalibrationResult  #: adjustment of the frames with the calibrations fixed
-    #: to be called with the name of a step before every step of a check
+    #: to be called with the name of a step before each step of a check
     report_step: Callable[[str], None]
 
     @property
@@ -89,7 +89,7 @@ class Evidence:
 
     @property
     def phantom(self) -> Phantom:
-        """The survey of the phantom."""
+        """Survey of the phantom."""
         return self.request.phantom
 
     @cached_property
@@ -108,7 +108,7 @@ class Evidence:
         size = calibration.image_size
         rejected = residuals.rejected(noise)
         area = rejected_trend(rejected, inliers, size)
-        # What the correction does not follow in an area, no exposure is blamed for.
+        # Do not blame an exposure for distortion that the correction does not follow in an area.
         if area is not None and area.size > area.limit:
             rejected = unexplained(rejected, max(size) / CELLS / 2)
         return CommonTrend(
@@ -121,12 +121,12 @@ class Evidence:
 
     @cached_property
     def starts(self) -> StartValues:
-        """Start values of the adjustments of parts."""
+        """Initial values for the adjustments of parts."""
         return self.result.starts
 
     @cached_property
     def earlier(self) -> EarlierCalibration:
-        """What the calibrations of parts take over."""
+        """Results that the calibrations of parts take over."""
         varying = (name for name in self.frames if self._is_varying(name))
         targets = self.result.targets
         return EarlierCalibration(
@@ -149,7 +149,7 @@ class Evidence:
 
     @cached_property
     def variations(self) -> dict[str, Variation | None]:
-        """Changes of distortions between exposures; None with too few image points."""
+        """Variation of the distortion between exposures; None with too few image points."""
         return {name: self._variation(name) for name in self.frames}
 
     def _variation(self, name: str) -> Variation | None:
@@ -161,27 +161,27 @@ class Evidence:
         return variation(residuals.r, residuals.exposure, functions)
 
     def fewest_exposures(self, names: Sequence[str]) -> int:
-        """Return the number of exposures of the fluoroscope that has the fewest."""
+        """Return the smallest number of exposures of any of the fluoroscopes."""
         return min(len(self.frames[name]) for name in names)
 
     def part(
         self, names: Sequence[str], is_chosen: Callable[[int], bool]
     ) -> dict[str, list[Frame]]:
-        """Return the frames of some fluoroscopes whose position in order is chosen."""
+        """Return the frames of some fluoroscopes whose index is chosen."""
         return {
             name: [f for i, f in enumerate(self.frames[name]) if is_chosen(i)] for name in names
         }
 
     def calibrate(self, frames: Frames) -> Calibrations:
-        """Calibrate with a part of the frames. Raises DataError where they do not suffice."""
+        """Calibrate with a part of the frames. Raises DataError if they do not suffice."""
         options = self.request.options
         distance = self.request.principal_distance
-        if options.interior == 'fixed':  # as in the calibration that is validated
+        if options.interior == 'fixed':  # as in the calibration under validation
             distance = float(np.mean([self.calibrations[name].interior[2] for name in frames]))
         options = replace(options, max_iterations=min(options.max_iterations, MAX_ROUNDS))
         kinds = {self.calibrations[name].model.kind for name in frames}
         if options.model == AUTO and len(kinds) == 1 and kinds <= set(selectable_models()):
-            options = replace(options, model=kinds.pop())  # the one that is validated
+            options = replace(options, model=kinds.pop())  # the model under validation
         part = replace(self.request, frames=frames, options=options, principal_distance=distance)
         if options.model == CollocationModel.kind:
             starts = replace(self.starts, earlier=self.earlier)
@@ -189,8 +189,8 @@ class Evidence:
                 found = calibrate_part(part, starts, self.calibrations)
                 if not self._has_lost_points(found, frames):
                     return found
-        # The gauge of the part is another one. Outliers can keep the exposures of a part from it
-        # where the distortion is large.
+        # The part has a different gauge. With a large distortion, outliers can prevent the
+        # exposures of a part from reaching it.
         return calibrate_part(part, self.starts, self.calibrations)
 
     def calibrate_free(self, names: Sequence[str]) -> Calibrations:
@@ -202,7 +202,7 @@ class Evidence:
         return replace(self, request=request).calibrate(self.part(names, lambda i: True))
 
     def _has_lost_points(self, found: Calibrations, frames: Frames) -> bool:
-        """Whether a part rejects clearly more image points than the whole."""
+        """Return whether a part rejects clearly more image points than the whole."""
         for name, calibration in found.items():
             kept = _share_of_inliers(calibration, frames[name])
             of_whole = _share_of_inliers(self.calibrations[name], self.frames[name])
@@ -211,7 +211,7 @@ class Evidence:
         return False
 
     def adjust(self, frames: Frames, calibrations: Calibrations) -> CalibrationResult:
-        """Adjust frames with calibrations fixed. Raises DataError."""
+        """Adjust frames with the calibrations fixed. Raises DataError."""
         return adjust_with_calibrations(
             frames,
             self.phantom,
@@ -228,10 +228,10 @@ def _share_of_inliers(calibration: FluoroscopeCalibration, frames: Sequence[Fram
 
 @dataclass(frozen=True)
 class Subject:
-    """A subject of validation: one or more checks that are made together."""
+    """Subject of validation: one or more checks that are made together."""
 
     #: called with the Evidence and the names of the fluoroscopes that are calibrated together;
-    #: returns their checks; with of_rig it is called once, with all fluoroscopes
+    #: returns their checks; if of_rig is set, it is called once, with all fluoroscopes
     run: Callable[[Evidence, Sequence[str]], list[Check]]
-    steps: int = 0  #: how often run calls `Evidence.report_step`
-    of_rig: bool = False  #: whether the checks are of all fluoroscopes together
+    steps: int = 0  #: number of calls of `Evidence.report_step` by run
+    of_rig: bool = False  #: whether the checks concern all fluoroscopes together

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Checks of a calibration, and the verdict that follows from them."""
+"""Checks of a calibration, and the resulting verdict."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from ..brief import brief_repr
 from ..exposures.collector import RECOMMENDED_EXPOSURES
 from ..findings import Finding, Kind, Place, Severity, sentence_of
 
-MIN_MORE_EXPOSURES = 5  # that are worth recording
+MIN_MORE_EXPOSURES = 5  # minimum number worth recording
 WITHOUT_TREND = 'check this again when the residuals no longer have a trend'
 
 
 @dataclass(frozen=True)
 class Check(Finding):
-    """A finding that decides on a calibration: a value with a limit.
+    """Finding that decides on a calibration: a value with a limit.
 
     Attributes
     ----------
     value, limit : float
-        In `unit`; without a limit (NaN) the check could not be made, and the cause says why.
+        In `unit`. Without a limit (NaN) the check could not be made; the cause says why.
     unit : str
     severity : Severity
         NOTE for a check that passes, ERROR for one that fails.
@@ -45,44 +45,44 @@ class Check(Finding):
 
     @property
     def name(self) -> str:
-        """The kind as text."""
+        """Kind of the check as text."""
         return self.kind.value
 
     @property
     def passed(self) -> bool | None:
-        """Whether the value is within the limit; None where the check could not be made."""
+        """Whether the value is within the limit; None if the check could not be made."""
         return None if math.isnan(self.limit) else self.value <= self.limit
 
     @property
     def sentence(self) -> str:
-        """Place and cause, and what to do unless the check passed."""
+        """Place and cause, with the advice unless the check passed."""
         return sentence_of(self.place, self.cause, '' if self.passed else self.advice)
 
     def after_trend(self, has_trend: bool) -> Check:
-        """Return the check with the advice to repair a trend first, where residuals have one.
+        """Return the check with the advice to repair a trend first, if the residuals have one.
 
-        The trend may be the cause of a failure.
+        The trend may have caused the failure.
         """
         return replace(self, advice=WITHOUT_TREND) if has_trend else self
 
 
 @dataclass(frozen=True)
 class Validation:
-    """The verdict on the calibrations of a job.
+    """Verdict on the calibrations of a job.
 
     Attributes
     ----------
     verdict : {'pass', 'fail', 'cannot tell'}
     checks : tuple of Check
     calibration_id : mapping of str to str
-        Id of the calibration by fluoroscope.
+        Ids of the calibrations by fluoroscope.
     seconds : float
         Duration of the validation [s].
     achieved_sd_px : mapping of str to float
         Standard deviation of a coordinate of the correction that the checks confirm [px], by
-        fluoroscope; whatever the verdict is, it says what the calibration is good for.
+        fluoroscope; whatever the verdict, it states the usable accuracy of the calibration.
     notes : tuple of Finding
-        What a user has to know beside the verdict, such as what it takes on trust.
+        Further information for the user, such as assumptions that were not verified.
     """
 
     __repr__ = brief_repr
@@ -96,14 +96,14 @@ class Validation:
 
     @property
     def findings(self) -> tuple[Check, ...]:
-        """The checks that failed, then those that could not be made."""
+        """Checks that failed, then those that could not be made."""
         return tuple(
             check for passed in (False, None) for check in self.checks if check.passed is passed
         )
 
 
 def rms(values: ArrayLike) -> float:
-    """Return the root of the mean square of values."""
+    """Return the root mean square of values."""
     return float(np.sqrt(np.mean(np.square(values))))
 
 
@@ -119,7 +119,7 @@ def verdict_of(checks: Iterable[Check]) -> str:
 
 
 def too_little_data(kind: Kind, fluoroscope: str, reason: str, count: int) -> Check:
-    """Return a check that could not be made for a reason in `count` exposures of a fluoroscope."""
+    """Return a check that could not be made, for a reason in `count` exposures."""
     return Check(
         kind,
         f'check {kind.value} could not be made, {reason}',
@@ -130,6 +130,6 @@ def too_little_data(kind: Kind, fluoroscope: str, reason: str, count: int) -> Ch
 
 
 def more_exposures(count: int) -> str:
-    """Return the advice how many exposures to record in addition to `count`."""
+    """Return the advice on how many exposures to record in addition to `count`."""
     more = max(RECOMMENDED_EXPOSURES - count, MIN_MORE_EXPOSURES)
     return f'take {more} more exposures (there are {count})'

@@ -1,16 +1,16 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What changed between two calibrations of a fluoroscope: the field and the interior orientation.
+"""Compare two calibrations of a fluoroscope: correction field and interior orientation.
 
-The corrections of two calibrations may differ by what shifts, turns and scales the image: their
-interior and exterior orientations absorb it (the gauge). What is left is compared with the
-standard deviations of both, which are taken as independent.
+The corrections of two calibrations may differ by fields that shift, rotate and scale the image:
+their interior and exterior orientations absorb such fields (the gauge). The remaining difference
+is compared with the standard deviations of both, which are assumed to be independent.
 
-Each interior orientation belongs to a gauge that depends on where the image points of its
-exposures were: a turn of the sensor by 10 mrad with its shift of the principal point, some 40 px,
-changes the corrections by less than a pixel. Interior orientations are therefore compared in one
-gauge, that of the area which both calibrations cover.
+Each interior orientation belongs to a gauge that depends on the distribution of the image points
+of its exposures. For example, a rotation of the sensor by 10 mrad together with the corresponding
+shift of the principal point, some 40 px, changes the corrections by less than a pixel. Interior
+orientations are therefore compared in a common gauge, that of the area common to both.
 """
 
 from __future__ import annotations
@@ -30,10 +30,8 @@ from ..estimation.model_choice import MIN_PIXELS
 from ..estimation.signal import MIN_SD_PX
 from ..exposures.frame import cells_of
 
-# Comparison of two independent calibrations of one fluoroscope, and names of image areas.
-#
-# The comparison is the cross-validation of mrcal (D. Kogan, mrcal documentation, "A tour of
-# mrcal: cross-validation"): two calibrations that share no exposure predict the same, except for
+# The comparison is the cross-validation of mrcal (D. Kogan, mrcal documentation, "A tour of mrcal:
+# cross-validation"): two calibrations that share no exposure make the same predictions, except for
 # what the orientation absorbs and for their noise.
 
 GRID = 24  # points across the image at which predictions are compared
@@ -44,12 +42,12 @@ class FieldDifference:
     """Difference of the predictions of two calibrations."""
 
     uv: NDArray[np.float64]  #: (n, 2) observed pixels
-    duv: NDArray[np.float64]  #: (n, 2) difference [px], without what orientations absorb
+    duv: NDArray[np.float64]  #: (n, 2) difference [px], without the part that orientations absorb
     sd: NDArray[np.float64]  #: (n,) its predicted standard deviation [px]
 
     @property
     def normalised(self) -> float:
-        """RMS of the differences divided by their predicted standard deviations; expected: 1."""
+        """RMS of the differences over their predicted standard deviations; expected to be 1."""
         return float(np.sqrt(np.mean(np.sum(self.duv**2, axis=1) / (2 * self.sd**2))))
 
     @property
@@ -59,7 +57,7 @@ class FieldDifference:
 
     @property
     def worst(self) -> NDArray[np.float64]:
-        """Pixel (2,) with the largest difference divided by its standard deviation."""
+        """Pixel (2,) with the largest ratio of difference and standard deviation."""
         return self.uv[np.argmax(np.linalg.norm(self.duv, axis=1) / self.sd)]
 
 
@@ -72,11 +70,11 @@ def image_grid(image_size: tuple[int, int]) -> NDArray[np.float64]:
 def difference(
     one: FluoroscopeCalibration, other: FluoroscopeCalibration
 ) -> FieldDifference | None:
-    """Compare what two calibrations predict in the area that both cover.
+    """Compare the predictions of two calibrations in the area that both cover.
 
-    An observed pixel u stands for the ray (u - du - (xp, yp)) / c. The rays are compared, as
-    pixels at the mean principal distance, after the best combination of `orientation_fields` is
-    removed. Returns None for an area that is too small.
+    An observed pixel u represents the ray (u - du - (xp, yp)) / c. The rays are compared as pixels
+    at the mean principal distance, after removing the best combination of `orientation_fields`.
+    Returns None if the area is too small.
     """
     grid = image_grid(one.image_size)
     corrections = at_common_angle(grid, one, other)
@@ -96,7 +94,7 @@ def _difference(
     interiors: Sequence[NDArray[np.float64]],
     corrections: Sequence[Correction],
 ) -> FieldDifference:
-    """Return the first less the second prediction at pixels uv (n, 2)."""
+    """Return the first minus the second prediction at pixels uv (n, 2)."""
     rays = [
         (uv - correction.duv - interior[:2]) / interior[2]
         for interior, correction in zip(interiors, corrections)
@@ -112,7 +110,7 @@ def _difference(
 
 
 def place_name(uv: ArrayLike, image_size: tuple[int, int]) -> str:
-    """Return the ninth of the image with a pixel (2,): 'upper left', ..., 'lower right'."""
+    """Return the name of the ninth of the image with a pixel (2,), such as 'upper left'."""
     column, row = cells_of(uv, image_size, 3)
     across = ('left', 'middle', 'right')[column]
     down = ('upper', 'middle', 'lower')[row]
@@ -120,30 +118,30 @@ def place_name(uv: ArrayLike, image_size: tuple[int, int]) -> str:
 
 
 def describe_place(uv: ArrayLike, image_size: tuple[int, int]) -> str:
-    """Return a pixel (2,) in words and numbers."""
+    """Describe a pixel (2,) in words and numbers."""
     u, v = np.asarray(uv)
     return f'the {place_name(uv, image_size)} of the image (about u {u:.0f}, v {v:.0f})'
 
 
-CELLS = 64  # along the longer side of the image
-LEVEL = 0.99  # of confidence
+CELLS = 64  # number of cells along the longer side of the image
+LEVEL = 0.99  # confidence level
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Difference of two calibrations of a fluoroscope, the second minus the first."""
+    """Difference of two calibrations of a fluoroscope, second minus first."""
 
     fluoroscope: str
     image_size: tuple[int, int]
-    #: (3,) difference of xp, yp, c [px], both in one gauge, and its standard deviation
+    #: (3,) difference of xp, yp, c [px], in a common gauge, and its standard deviation
     interior: NDArray[np.float64]
     interior_sd: NDArray[np.float64]
-    #: weighted square sum of the difference, and its 99 % quantile; NaN where both were fixed
+    #: weighted sum of squares of the difference and its 99 % quantile; NaN if both were fixed
     interior_test: float
     interior_limit: float
     uv: NDArray[np.float64]  #: (n, 2) pixels that both calibrations cover
-    duv: NDArray[np.float64]  #: (n, 2) difference of the corrections there, without gauge [px]
-    sd: NDArray[np.float64]  #: (n,) its standard deviation in each coordinate [px]
+    duv: NDArray[np.float64]  #: (n, 2) difference of the corrections, without the gauge [px]
+    sd: NDArray[np.float64]  #: (n,) standard deviation of each coordinate of the difference [px]
 
     @property
     def size(self) -> NDArray[np.float64]:
@@ -152,26 +150,27 @@ class Comparison:
 
     @property
     def significant(self) -> NDArray[np.bool_]:
-        """Whether (n,) a difference exceeds its 99 % quantile."""
+        """Whether (n,) each difference exceeds its 99 % quantile."""
         return self.size**2 > chdtri(2, 1 - LEVEL) * self.sd**2
 
     @property
     def rms_px(self) -> float:
-        """RMS of the differences, of both coordinates together [px]."""
+        """RMS of the differences, both coordinates combined [px]."""
         return float(np.sqrt(np.mean(self.size**2)))
 
     @property
     def largest(self) -> tuple[float, tuple[float, float]]:
-        """The largest difference [px], and its pixel."""
+        """Largest difference [px], and its pixel."""
         index = int(np.argmax(self.size))
         u, v = self.uv[index].tolist()
         return float(self.size[index]), (u, v)
 
     @property
     def field_changed(self) -> bool:
-        """Whether the field differs in more of the image than by chance.
+        """Whether the field differs in a larger part of the image than by chance.
 
-        By chance the rest of the LEVEL does, doubled as the cells are correlated.
+        By chance, a fraction 1 - LEVEL of the cells exceeds the quantile; the limit is twice
+        that, as cells are correlated.
         """
         return bool(self.significant.mean() > 2 * (1 - LEVEL))
 
@@ -215,7 +214,7 @@ def compare_calibrations(
         interior_test=test,
         interior_limit=limit,
         uv=uv,
-        duv=found.duv,  # a ray moves against its correction
+        duv=found.duv,  # rays change by the negative correction
         sd=found.sd,
     )
 
@@ -227,8 +226,8 @@ def _interior_difference(
 ) -> NDArray[np.float64]:
     """Return second - first interior orientation (3,) in the gauge at pixels uv (n, 2).
 
-    The gauge is that about the middle of the image: a strong distortion moves principal points far
-    away, and there are several solutions about these.
+    The gauge is defined about the middle of the image: a strong distortion moves principal points
+    far away, where several solutions exist.
     """
     centre = (np.array(calibrations[0].image_size) - 1) / 2
     first, second = (
@@ -243,7 +242,7 @@ def cell_centres(
 ) -> tuple[list[np.ndarray], NDArray[np.float64]]:
     """Return columns and rows of the centres of cells over an image, and the centres (n, 2).
 
-    cells: along the longer side.
+    cells: number of cells along the longer side.
     """
     step = max(image_size) / cells
     axes = [-0.5 + step / 2 + step * np.arange(max(1, round(size / step))) for size in image_size]
@@ -252,7 +251,7 @@ def cell_centres(
 
 
 def _test(difference: NDArray[np.float64], covariance: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the weighted square sum of a difference (3,) and its limit; NaN without variance."""
+    """Return the weighted sum of squares of a difference (3,), and its limit; NaN if fixed."""
     free = np.diag(covariance) > 0
     if not free.any():
         return float('nan'), float('nan')

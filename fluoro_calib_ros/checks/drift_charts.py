@@ -3,13 +3,13 @@
 
 """Options, input, state and CUSUM control charts of the drift watch.
 
-CUSUM control charts of the drift watch. In every area and in both directions a CUSUM (Page,
-Biometrika 41, 1954) sums the log-likelihood ratio of a drift beyond the dead band against one at
-its edge. The expectation of every factor of the likelihood ratio is at most 1 for all means within
-the band, so the mean number of blocks to a false alarm of a chart is at least exp(threshold)
-(Lorden, Annals of Mathematical Statistics 42, 1971; for composite hypotheses Shin, Ramdas and
-Rinaldo, "E-detectors", New England Journal of Statistics in Data Science 2, 2024). With M charts
-it is at least an M-th of that.
+In every area and in both directions a CUSUM (Page, Biometrika 41, 1954) sums the log-likelihood
+ratio of a drift beyond the dead band against a drift at its edge. The expectation of each factor
+of the likelihood ratio is at most 1 for all means within the band. The mean number of blocks to a
+false alarm of a chart is therefore at least exp(threshold) (Lorden, Annals of Mathematical
+Statistics 42, 1971; for composite hypotheses Shin, Ramdas and Rinaldo, "E-detectors", New England
+Journal of Statistics in Data Science 2, 2024). With M charts it is at least this number divided by
+M.
 """
 
 from __future__ import annotations
@@ -23,8 +23,6 @@ from numpy.typing import NDArray
 from ..exposures.frame import cells_of
 from ..findings import Finding, Severity
 from ..options import option, validate_options
-
-# What the drift watch reports: its level and the drift it has found.
 
 # Levels of an alarm; the values are those of the message DriftStatus.
 OK = Severity.NOTE
@@ -41,24 +39,24 @@ class DriftState:
     Without a drift, size, sd, since_s, area and direction are NaN.
     """
 
-    finding: Finding  #: what the watch says; its severity is the level
+    finding: Finding  #: result of the watch; its severity is the level
     evidence: float  #: largest log-likelihood ratio of all charts
     #: evidence at which the levels WARN and ERROR begin
     threshold_warn: float
     threshold_error: float
-    observations: int  #: residuals and distances since the last reset
-    learning: bool  #: whether the reference is still being learned from the start of the stream
-    #: fluoroscope whose image has drifted, several where they cannot be distinguished
+    observations: int  #: number of residuals and distances since the last reset
+    learning: bool  #: whether the reference is still being learned at the start of the stream
+    #: fluoroscope whose image has drifted; several if they cannot be distinguished
     fluoroscopes: tuple[str, ...] = ()
     #: corners u0, v0, u1, v1 of the area that has drifted [px]
     area: tuple[float, ...] = (NAN,) * 4
     place: str = ''  #: the same area in words
     #: size of the drift along `direction` and its standard deviation [px]; as residuals are
-    #: clipped, a size of more than a pixel is a lower bound
+    #: clipped, a size above a pixel is a lower bound
     size: float = NAN
     sd: float = NAN
-    #: unit vector (2,) in the image: the normal of the epipolar lines, or u or v where the drift
-    #: was found by bodies
+    #: unit vector (2,) in the image: normal of the epipolar lines, or u or v for a drift found by
+    #: bodies
     direction: tuple[float, ...] = (NAN,) * 2
     against: str = ''  #: reference of the drift: 'calibration' or 'start'
     source: str = ''  #: 'epipolar' or 'cluster NAME'
@@ -71,12 +69,12 @@ class DriftState:
 
     @property
     def fluoroscope(self) -> str:
-        """Name of the fluoroscope that has drifted, 'a or b' for one of two, '' for none."""
+        """Name of the drifted fluoroscope, 'a or b' if it is one of two, '' for none."""
         return ' or '.join(self.fluoroscopes)
 
     @property
     def message(self) -> str:
-        """The finding in a sentence."""
+        """Finding as a sentence."""
         return self.finding.sentence
 
 
@@ -84,9 +82,9 @@ class DriftState:
 class DriftOptions:
     """Options of the drift watch.
 
-    The dead band of a chart is the root of the sum of the squares of the tolerance and of
-    band_calibration or band_start systematic standard deviations. Raises ValueError for values out
-    of their range, and for combinations that make no sense.
+    The dead band of a chart is the root sum of squares of the tolerance and of band_calibration or
+    band_start systematic standard deviations. Raises ValueError for values out of range and for
+    inconsistent combinations.
     """
 
     error_interval_h: float = option(
@@ -179,20 +177,20 @@ class DriftOptions:
 class EpipolarObservations:
     """Epipolar residuals of n markers in one pair of views, a and b.
 
-    Rows with a value that is not finite are ignored. Residuals that are too large for a match
-    belong here too: they are clipped, and a large drift has no others.
+    Rows with a value that is not finite are ignored. Include residuals that are too large for a
+    match: they are clipped, and a large drift produces no other residuals.
 
-    Raises ValueError for arrays whose shapes do not agree.
+    Raises ValueError for arrays of inconsistent shape.
     """
 
     target_id: NDArray[np.integer]  #: (n,)
-    #: (n, 2) where the markers are in the images [px]
+    #: (n, 2) positions of the markers in the images [px]
     uv_a: NDArray[np.float64]
     uv_b: NDArray[np.float64]
     residual: NDArray[np.float64]  #: (n,) signed [px]
-    #: (n,) standard deviations of the residuals [px]: by the noise of the image points, which is
-    #: new in every frame, and by the correction and the orientation, which stay the same at a
-    #: place and do not average out
+    #: (n,) standard deviations of the residuals [px]: due to the noise of the image points, which
+    #: is independent in every frame, and due to the correction and the orientation, which are
+    #: constant at a place and do not average out
     sd_noise: NDArray[np.float64]
     sd_systematic: NDArray[np.float64]
     #: (n, 2) normals of the epipolar lines, as in EpipolarResiduals
@@ -215,7 +213,7 @@ class EpipolarObservations:
 
     @property
     def uv(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Pixels of both images."""
+        """Pixels in both images."""
         return self.uv_a, self.uv_b
 
     @property
@@ -225,11 +223,11 @@ class EpipolarObservations:
 
     @property
     def factor(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Factors of both images."""
+        """Factors in both images."""
         return self.factor_a, self.factor_b
 
     def swapped(self) -> EpipolarObservations:
-        """The same residuals with the views in the other order."""
+        """Return the same residuals with the views exchanged."""
         return EpipolarObservations(
             self.target_id,
             self.uv_b,
@@ -244,7 +242,7 @@ class EpipolarObservations:
         )
 
     def usable(self) -> EpipolarObservations:
-        """The rows that are finite and have positive standard deviations and factors."""
+        """Return the rows that are finite and have positive standard deviations and factors."""
         good = (self.sd_noise > 0) & (self.factor_a > 0) & (self.factor_b > 0)
         for field in fields(self):
             finite = np.isfinite(getattr(self, field.name))
@@ -253,7 +251,7 @@ class EpipolarObservations:
 
     @classmethod
     def concatenate(cls, parts: Sequence[EpipolarObservations]) -> EpipolarObservations:
-        """All rows of one or more observations, in their order."""
+        """Return all rows of one or more observations, in order."""
         return cls(
             *(
                 np.concatenate([getattr(part, field.name) for part in parts])
@@ -262,13 +260,13 @@ class EpipolarObservations:
         )
 
 
-# The areas of an image in which the drift watch looks for a drift.
+# Areas of an image in which the drift watch tests for a drift.
 
 
 class ImageAreas:
     """Overlapping areas of an image: n x n cells, windows of half its size, halves, and the whole.
 
-    n: number of cells across the image, even.
+    n: number of cells across the image; must be even.
     """
 
     def __init__(self, n: int) -> None:
@@ -284,7 +282,7 @@ class ImageAreas:
         row, column = np.divmod(np.arange(n * n), n)
         left, top, right, bottom = np.array(boxes).T[:, :, None]
         inside = (column >= left) & (column < right) & (row >= top) & (row < bottom)
-        #: (areas, cells), 1 where a cell belongs to an area, else 0
+        #: (areas, cells), 1 if a cell belongs to an area, else 0
         self.member = inside.astype(float)
 
     def __len__(self) -> int:
@@ -293,7 +291,7 @@ class ImageAreas:
     def cell(
         self, uv: NDArray[np.float64], size: Sequence[float] | np.ndarray
     ) -> NDArray[np.int64]:
-        """Cells (n,) of pixels uv (n, 2) of an image of size (width, height) [px].
+        """Return cells (n,) of pixels uv (n, 2) in an image of size (width, height) [px].
 
         Pixels off the image belong to the nearest cell.
         """
@@ -301,7 +299,7 @@ class ImageAreas:
         return column + self.n * row
 
     def describe(self, area: int, size: Sequence[float]) -> tuple[tuple[float, ...], str]:
-        """Corners (u0, v0, u1, v1) [px] of an area of an image of that size, and its name."""
+        """Return corners (u0, v0, u1, v1) [px] of an area in an image of a size, and its name."""
         u0, v0, u1, v1 = self.box[area]
         corners = tuple(float(x) for x in self.box[area] * np.tile(size, 2) - 0.5)
         across = _side(u0 + u1, 'left', 'right')
@@ -321,17 +319,17 @@ class ImageAreas:
 
 
 def _side(edges: float, low: str, high: str) -> str:
-    """Name of the side of the image on which an interval lies whose edges have this sum."""
+    """Return the side of the image of an interval, given the sum of its edges."""
     if edges == 1:
         return 'middle'
     return low if edges < 1 else high
 
 
-MEMORY = 160  # blocks over which the variance is estimated
-PRIOR_DIFFERENCES = 20  # weight of the pooled variance in that of one area, in pairs of blocks
-VARIANCE_MARGIN = 1.25  # estimated from 100 differences, a variance has a relative sd of 15 %
+MEMORY = 160  # number of blocks over which the variance is estimated
+PRIOR_DIFFERENCES = 20  # weight of the pooled variance in that of an area, in pairs of blocks
+VARIANCE_MARGIN = 1.25  # a variance estimated from 100 differences has a relative sd of 15 %
 MIN_BLOCKS_TO_ALARM = 4
-EVIDENCE_CAP = 1.5  # times the threshold of ERROR, so that evidence falls once a drift has ended
+EVIDENCE_CAP = 1.5  # multiple of the threshold of ERROR; evidence falls soon after a drift ends
 MIN_INFORMATION = 1e-300  # avoids division by zero
 
 
@@ -339,18 +337,18 @@ class CusumCharts:
     """CUSUM charts of K series in A areas and both directions, with estimated variances.
 
     series, areas: K and A. step_px: excess over the dead band to which the charts are most
-    sensitive [px]. cap: largest evidence.
+    sensitive [px]. cap: maximum evidence.
     """
 
     def __init__(self, series: int, areas: int, step_px: float, cap: float) -> None:
         shape = (series, areas)
         self._step = step_px
         self._cap = cap
-        #: (2, K, A), for drifts in the positive and in the negative direction
+        #: (2, K, A), for drifts in positive and in negative direction
         self.evidence = np.zeros((2, *shape))
-        #: (2, K, A), time at which the present run of each chart began [ns]
+        #: (2, K, A), start time of the present run of each chart [ns]
         self.begin = np.zeros((2, *shape), dtype=np.int64)
-        #: (K, 1), variance of a long sum of blocks over that of their differences
+        #: (K, 1), variance of a long sum of blocks over the variance of their differences
         self.stretch = np.ones((series, 1))
         self._run = np.zeros((2, 2, *shape))  # score and information of the runs, by direction
         self._squares = np.zeros(shape)
@@ -359,9 +357,9 @@ class CusumCharts:
         self._decay = 1 - 1 / MEMORY
 
     def variance_factor(self) -> NDArray[np.float64]:
-        """Variance of sums of blocks over the predicted one (K, A).
+        """Return the variance of sums of blocks over the predicted variance (K, A).
 
-        It is the estimate, never below 1, times VARIANCE_MARGIN.
+        It is the estimate, at least 1, times VARIANCE_MARGIN.
         """
         pooled = (1 + self._squares.sum(axis=1)) / (1 + self._count.sum(axis=1))
         pooled = np.maximum(pooled, 1)[:, None]
@@ -381,13 +379,13 @@ class CusumCharts:
         Parameters
         ----------
         score, information : ndarray
-            (K, A), of the drifts [1/px, 1/px^2].
+            (K, A), score and information of the drifts [1/px, 1/px^2].
         band : ndarray
             (K, A), dead bands [px].
         testing : ndarray
             (K, A), where the block counts as evidence.
         stamp_ns : int
-            Time at which the block began.
+            Time at which the block began [ns].
         """
         seen = information > 0
         factor = self._update_variance(score, information, seen)
@@ -406,7 +404,7 @@ class CusumCharts:
     def _update_variance(
         self, score: NDArray[np.float64], information: NDArray[np.float64], seen: NDArray[np.bool_]
     ) -> NDArray[np.float64]:
-        """Add the differences from the last block; return the factor (K, A) as it was before."""
+        """Add the differences from the last block; return the previous factor (K, A)."""
         factor = self.variance_factor()
         with np.errstate(divide='ignore', invalid='ignore'):
             now = np.stack([score / information, 1 / information])
@@ -415,14 +413,14 @@ class CusumCharts:
         decay = np.where(both, self._decay, 1)
         self._squares *= decay
         self._count *= decay
-        # The onset of a drift is one large difference. It must not raise the variance by which
-        # the drift is tested.
+        # The onset of a drift is one large difference. It must not increase the variance with
+        # which the drift is tested.
         self._squares[both] += np.minimum(square, 9 * factor)[both]
         self._count[both] += 1
         self._last = np.where(seen, now, self._last)
         return factor
 
     def log_likelihood(self) -> NDArray[np.float64]:
-        """Log-likelihood (2, K, A) of a drift of any size in the present runs."""
+        """Return the log-likelihood (2, K, A) of a drift of any size in the present runs."""
         score, information = self._run
         return score**2 / (2 * np.maximum(information, MIN_INFORMATION) * self.variance_factor())

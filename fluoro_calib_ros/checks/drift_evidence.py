@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Evidence of a drift, and where it is: control charts together with the newest blocks.
+"""Evidence of a drift and its location: control charts together with the newest blocks.
 
-Epipolar residuals and rigid bodies each have charts of their own. Both find the area and
-the size of a drift in the same way, and differ in how they tell which fluoroscope it belongs to.
+Epipolar residuals and rigid bodies have separate charts. Both locate and size a drift in the same
+way, and differ in how they attribute it to a fluoroscope.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from .body_watch import COMPONENTS
 from .drift_charts import MIN_INFORMATION, CusumCharts
 
 WINDOW_S = 30.0  # newest blocks from which place and size of a drift are estimated
-# Log-likelihood of another fluoroscope, over that of the likeliest one, from which both are named.
+# Minimum ratio of the log-likelihoods of another and the likeliest fluoroscope to name both.
 SIMILAR = 0.8
-REFERENCES = ('calibration', 'start')  # of the charts of epipolar residuals
-EPIPOLAR = 'epipolar'  # source of a drift that residuals show
+REFERENCES = ('calibration', 'start')  # references of the charts of epipolar residuals
+EPIPOLAR = 'epipolar'  # source of a drift shown by residuals
 SERIES_OF_PAIR = 4  # images a and b against the calibration, then against the start
 
 
 @dataclass(frozen=True)
 class BlockRecord:
-    """One block: time of its begin and statistics (K, A) of the series.
+    """Block: start time, and statistics (K, A) of the series.
 
     detail: normals (pairs, 2, A, 2) of the epipolar lines, or a BodyBlock.
     """
@@ -47,23 +47,23 @@ class BlockRecord:
 
 @dataclass(frozen=True)
 class DriftEstimate:
-    """A drift as the newest blocks show it."""
+    """Drift estimated from the newest blocks."""
 
-    fluoroscopes: tuple[str, ...]  #: the likeliest one first, then those that are about as likely
+    fluoroscopes: tuple[str, ...]  #: likeliest first, then those that are about as likely
     area: int  #: number of the area
     #: signed size along `direction` and its standard deviation [px]
     size: float
     sd: float
     direction: NDArray[np.float64]  #: (2,) unit vector in the image
-    against: str  #: one of REFERENCES
+    against: str  #: element of REFERENCES
     source: str  #: 'epipolar' or 'cluster NAME'
-    confirmed: bool  #: False where a single body shows it, in which a marker may have moved
-    begin_ns: int  #: estimated begin
+    confirmed: bool  #: False if only a single body shows it, in which a marker may have moved
+    begin_ns: int  #: estimated start time
 
 
 @dataclass(frozen=True)
 class _Candidate:
-    """The series and area in which a fluoroscope has most likely drifted."""
+    """Series and area in which a fluoroscope has most likely drifted."""
 
     likelihood: float
     series: int
@@ -71,7 +71,7 @@ class _Candidate:
 
 
 class Evidence(ABC):
-    """Charts of one kind of observations and the newest blocks.
+    """Charts of one kind of observations, and the newest blocks.
 
     window: number of blocks from which a drift is estimated.
     """
@@ -87,13 +87,13 @@ class Evidence(ABC):
         return float(self.charts.evidence.max())
 
     def update(self, record: BlockRecord, band: np.ndarray, testing: np.ndarray) -> None:
-        """Add a block; band and testing (K, A) as in CusumCharts.update."""
+        """Add a block; band and testing (K, A) are as in CusumCharts.update."""
         charts = self.charts
         charts.update(record.score, record.information, band, testing, record.begin_ns)
         self._records.append(record)
 
     def estimate(self, min_evidence: float) -> DriftEstimate:
-        """The drift that is most likely among the charts with at least this evidence."""
+        """Return the most likely drift among the charts with at least this evidence."""
         charts = self.charts
         candidates = charts.evidence >= min_evidence
         likelihood = self._preferred(np.where(candidates, charts.log_likelihood(), -1))
@@ -125,9 +125,9 @@ class Evidence(ABC):
         )
 
     def _run(self, series: int, area: int, begin_ns: int) -> tuple[int, list[BlockRecord]]:
-        """Begin of a drift [ns] and the blocks since: the newest ones of largest likelihood.
+        """Return the start of a drift [ns] and the blocks since then, those of largest likelihood.
 
-        begin_ns, that of the run of the chart, holds where the drift is older than the window.
+        If the drift is older than the window, its start is at most begin_ns, that of the run.
         """
         records = list(self._records)
         sums = np.cumsum(
@@ -140,7 +140,7 @@ class Evidence(ABC):
         return (min(begin_ns, begin) if first == 0 else begin), records[first:]
 
     def _ranked(self, candidates: dict[str, _Candidate]) -> tuple[tuple[str, ...], int, int]:
-        """Names of the likeliest fluoroscopes, and series and area of the first of them."""
+        """Return names of the likeliest fluoroscopes, and series and area of the first of them."""
         order = sorted(candidates, key=lambda name: -candidates[name].likelihood)
         best = candidates[order[0]]
         limit = SIMILAR * best.likelihood
@@ -149,26 +149,26 @@ class Evidence(ABC):
 
     @abstractmethod
     def _preferred(self, likelihood: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The likelihood (2, K, A), -1 for series to which others are preferred."""
+        """Return the likelihood (2, K, A), with -1 for series to which others are preferred."""
 
     @abstractmethod
     def _likeliest(
         self, likelihood: NDArray[np.float64], series: int
     ) -> tuple[tuple[str, ...], int, int]:
-        """Names of the likeliest fluoroscopes, and series and area of the first of them.
+        """Return names of the likeliest fluoroscopes, and series and area of the first of them.
 
-        likelihood (K, A); series: that of the largest likelihood.
+        likelihood (K, A). series: the one with the largest likelihood.
         """
 
     @abstractmethod
     def _direction(
         self, run: list[BlockRecord], series: int, area: int
     ) -> tuple[NDArray[np.float64], str, bool]:
-        """Direction (2,) of a drift, its source, and whether it is confirmed."""
+        """Return direction (2,) of a drift, its source, and whether it is confirmed."""
 
     @abstractmethod
     def _reference(self, series: int) -> str:
-        """One of REFERENCES."""
+        """Return one of REFERENCES."""
 
 
 class EpipolarEvidence(Evidence):
@@ -179,7 +179,7 @@ class EpipolarEvidence(Evidence):
         self._pairs = list(combinations(self._names, 2))
 
     def _preferred(self, likelihood: NDArray[np.float64]) -> NDArray[np.float64]:
-        # Those against the start know the errors of the calibration, so they are sharper.
+        # Charts against the start are sharper: the start includes calibration errors.
         start = np.arange(likelihood.shape[1]) % SERIES_OF_PAIR >= 2
         if likelihood[:, start].max() >= 0:
             likelihood[:, ~start] = -1
@@ -214,9 +214,9 @@ class EpipolarEvidence(Evidence):
 
 
 class BodyEvidence(Evidence):
-    """Evidence from rigid bodies: the series are drifts along u and v of each view.
+    """Evidence from rigid bodies: the series are drifts along u and v in each view.
 
-    bodies: their names, in the order of the BodyBlocks.
+    bodies: names, in the order of the BodyBlocks.
     """
 
     def __init__(

@@ -1,26 +1,26 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The drift watch: tells from ordinary tracked markers that the calibration no longer holds.
+"""The drift watch: detect from ordinary tracked markers that the calibration no longer holds.
 
-A calibration is off by a little from its first day, and the markers see that everywhere: a test of
-'mean zero' would raise an alarm at once. So the mean of the epipolar residuals in an area of an
-image is accepted while it stays within a dead band. There are two: what the calibration's own
-uncertainty allows (against the calibration), and a narrower one of what remains unknown after the
-first seconds of markers have shown the errors of the calibration (against the start). A drift
-along an epipolar line does not show in the residuals; it shows in the shapes of rigid bodies (see
-body_watch).
+Every calibration has small errors from the beginning, and the markers show them everywhere: a test
+of 'mean zero' would raise an alarm at once. The mean of the epipolar residuals in an area of an
+image is therefore accepted while it stays within a dead band. There are two dead bands: the
+uncertainty of the calibration (against the calibration), and a narrower one for the uncertainty
+that remains after the first seconds of markers have shown the errors of the calibration (against
+the start). A drift along an epipolar line does not change the residuals; it changes the shapes of
+rigid bodies (see body_watch).
 
-The test is a CUSUM in every area (see charts); its thresholds follow from the mean time between
-false alarms that is asked for. The variance comes from the data, from differences of successive
-blocks and from the correlation of a marker's noise in successive frames, and is never taken
-smaller than predicted. This covers noise that markers share, noise larger than expected and noise
-that is correlated in time (measured: up to 0.9 in frames of 120 Hz). Single residuals are clipped
-(Huber, Annals of Mathematical Statistics 35, 1964), and so is what a block can add to a chart.
+The test is a CUSUM in every area (see drift_charts); its thresholds follow from the requested mean
+time between false alarms. The variance is estimated from the data, from differences of successive
+blocks and from the correlation of a marker's noise in successive frames, and is never smaller than
+predicted. This covers noise that markers share, noise larger than expected and noise that is
+correlated in time (measured: up to 0.9 in frames of 120 Hz). Single residuals are clipped (Huber,
+Annals of Mathematical Statistics 35, 1964), and so is the contribution of a block to a chart.
 
-Not detected: a drift that exists from the start and is within what the calibration claims; along
-the epipolar lines, one without bodies, or one that moves all markers of a body alike, as the
-shift of a whole image does; and any drift where there are no markers.
+Not detected are: a drift that exists from the start and is within the uncertainty of the
+calibration; a drift along the epipolar lines without bodies, or one that moves all markers of a
+body alike, as the shift of a whole image does; and any drift where there are no markers.
 """
 
 from __future__ import annotations
@@ -60,16 +60,17 @@ from .drift_evidence import (
 )
 from .pair_watch import PairWatch
 
-BODY_STEP = 2.0  # times step_px in the charts of the bodies, which have less information
-HYSTERESIS = 0.5  # times the threshold of WARN: an alarm ends below it
+BODY_STEP = 2.0  # multiple of step_px for the charts of bodies, which have less information
+HYSTERESIS = 0.5  # multiple of the threshold of WARN below which an alarm ends
 
 
 class DriftWatch:
-    """The drift watch of a rig.
+    """Drift watch of a rig.
 
     image_sizes: width and height of the images by fluoroscope [px], in the order of the
-    orientation. bodies: shapes that are not given are learned; they need the orientation. Raises
-    ValueError for fewer than two fluoroscopes, for bodies without orientation, and as BodyWatch.
+    orientation. bodies: shapes that are not given are learned; bodies require the orientation.
+    Raises ValueError for fewer than two fluoroscopes, for bodies without orientation, and as
+    BodyWatch.
     """
 
     def __init__(
@@ -105,7 +106,7 @@ class DriftWatch:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything, for a new calibration or orientation."""
+        """Discard all data, for a new calibration or orientation."""
         options = self.options
         cap = EVIDENCE_CAP * self.thresholds[1]
         areas = len(self._areas)
@@ -157,7 +158,7 @@ class DriftWatch:
     def add_points(self, stamp_ns: int, exposure: IntersectedViews) -> DriftState:
         """Add intersected views for the bodies; without bodies they are ignored.
 
-        Returns the present state. Raises ValueError for another number of views.
+        Returns the present state. Raises ValueError for a different number of views.
         """
         views = len(exposure.views.uv)
         if views != len(self._names):
@@ -170,7 +171,7 @@ class DriftWatch:
         return self.state
 
     def _pair_number(self, a: str, b: str) -> tuple[int, bool]:
-        """Number of a pair, and whether its fluoroscopes are in the other order."""
+        """Return the number of a pair, and whether its fluoroscopes are in reverse order."""
         if (a, b) in self._pairs:
             return self._pairs.index((a, b)), False
         if (b, a) in self._pairs:
@@ -180,7 +181,7 @@ class DriftWatch:
         )
 
     def _advance(self, stamp_ns: int) -> None:
-        """Update the charts with the present block if this stamp is after it, and the state."""
+        """If the stamp is after the present block, update the charts and the state."""
         ended_ns = self._clock.advance(stamp_ns)
         if ended_ns is None:
             return
@@ -190,7 +191,7 @@ class DriftWatch:
         self.state = self._present_state()
 
     def _close_residuals(self, begin_ns: int) -> bool:
-        """Update the charts of the residuals; returns whether a drift could be detected."""
+        """Update the charts of the residuals; return whether a drift could be detected."""
         options = self.options
         shape = (SERIES_OF_PAIR * len(self._pairs), len(self._areas))
         score, information, systematic = np.zeros((3, *shape))
@@ -227,7 +228,7 @@ class DriftWatch:
         return bool(testing.any())
 
     def _close_bodies(self, begin_ns: int) -> bool:
-        """Update the charts of the bodies; returns whether a drift could be detected."""
+        """Update the charts of the bodies; return whether a drift could be detected."""
         watch = self._body_watch
         block = watch.block() if watch else None
         if watch is None or block is None:
@@ -247,15 +248,15 @@ class DriftWatch:
     def _dead_band(
         self, factor: float | NDArray[np.float64], systematic: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Dead bands [px] of a number of systematic standard deviations [px]."""
+        """Return dead bands [px] of a number of systematic standard deviations [px]."""
         return np.hypot(self.options.tolerance_px, factor * np.nan_to_num(systematic))
 
     def _has_learned(self, blocks: int) -> bool:
-        """Whether so many blocks cover the start."""
+        """Return whether this number of blocks covers the start."""
         return blocks * self.options.block_s >= self.options.learn_s
 
     def _learn(self, number: int) -> None:
-        """Count a block of the start of a pair; after the last one estimate its error field."""
+        """Count a block of the start of a pair; after the last one, estimate its error field."""
         if self._has_learned(self._learned_blocks[number]):
             return
         self._learned_blocks[number] += 1
@@ -265,13 +266,13 @@ class DriftWatch:
             self._watches[number].field.estimate(float(np.median(factor)))
 
     def _is_learning(self) -> bool:
-        """Whether no start has begun yet, or one is still being learned."""
+        """Return whether no start has begun yet, or one is still being learned."""
         counts = [*self._learned_blocks, self._learned_body_blocks]
         begun = [count for count in counts if count]
         return not begun or not all(self._has_learned(count) for count in begun)
 
     def _present_state(self) -> DriftState:
-        """State by the charts as they are."""
+        """Return the state according to the present charts."""
         warn, error = self.thresholds
         strongest = max((self._epipolar, self._bodies), key=lambda evidence: evidence.peak)
         peak = strongest.peak
@@ -296,7 +297,7 @@ class DriftWatch:
         return DriftState(found, peak, warn, error, self._observations, learning=learning)
 
     def _drift_state(self, level: Severity, estimate: DriftEstimate, peak: float) -> DriftState:
-        """State of an alarm; peak is the largest evidence."""
+        """Return the state of an alarm; peak is the largest evidence."""
         corners, place = self._areas.describe(estimate.area, self._sizes[estimate.fluoroscopes[0]])
         since_s = max(self._clock.newest_ns - estimate.begin_ns, 0) / 1e9
         warn, error = self.thresholds
@@ -320,12 +321,12 @@ class DriftWatch:
 
 
 def _signed_direction(estimate: DriftEstimate) -> tuple[float, ...]:
-    """Direction (2,) in which a drift has a positive size."""
+    """Return the direction (2,) in which a drift has positive size."""
     return tuple(float(x) for x in np.sign(estimate.size) * estimate.direction)
 
 
 def _alarm(level: Severity, estimate: DriftEstimate, place: str, since_s: float) -> Finding:
-    """What an alarm says of a drift."""
+    """Return the finding of an alarm on a drift."""
     size = abs(estimate.size)
     direction = _signed_direction(estimate)
     seen_in = estimate.source
@@ -346,8 +347,8 @@ def _alarm(level: Severity, estimate: DriftEstimate, place: str, since_s: float)
     )
 
 
-# Exposures in a row before the newest one that start a new stream: of a bag shorter than that time
-# which is played in a loop. Late frames are fewer.
+# Number of consecutive exposures before the newest one that start a new stream, such as a bag
+# shorter than RESTART_NS that is played in a loop. Late frames are fewer.
 MAX_LATE = 100
 
 
@@ -360,12 +361,12 @@ class BlockClock:
     def __init__(self, block_s: float) -> None:
         self.newest_ns = 0  #: newest time [ns]
         self._length_ns = round(block_s * 1e9)
-        self._begin_ns: int | None = None  # of the present block
-        self._late = 0  # calls with a stamp before the newest one, since that came
-        self._offset_ns = 0  # added to stamps, so that time goes on where a stream begins anew
+        self._begin_ns: int | None = None  # start of the present block
+        self._late = 0  # consecutive calls with a stamp before the newest one
+        self._offset_ns = 0  # added to stamps, so that time continues when a stream restarts
 
     def advance(self, stamp_ns: int) -> int | None:
-        """Begin of the block that this stamp ends [ns], if any.
+        """Return the start of the block that this stamp ends [ns], or None.
 
         A late frame belongs to the present block.
         """

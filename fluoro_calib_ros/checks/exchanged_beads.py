@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Beads that are exchanged in the survey: their image points lie at each other's place.
+"""Detect beads exchanged in the survey: their image points lie at each other's place.
 
-Beads that few exposures show cannot be intersected from their images, and that all of their few
-image points are rejected may be chance. That the image points of either bead lie where the other
-one is projected is not chance if several exposures show it: a false match lies anywhere, and ids
-that are exchanged in one exposure are right in the others. Both chances are combined (Fisher,
+Beads that few exposures show cannot be intersected from their images, and all of their few image
+points may be rejected by chance. If several exposures show the image points of either bead at the
+projection of the other one, that is not chance: a false match lies anywhere, and ids that are
+exchanged in one exposure are right in the others. Both probabilities are combined (Fisher,
 "Statistical Methods for Research Workers", 4th edition, 1932, 21.1).
 """
 
@@ -24,8 +24,8 @@ from ..photogrammetry.outliers import FALSE_ALARM
 from ..photogrammetry.resection import ROUNDING
 from .bead_intersection import Rays
 
-NOWHERE = -1  # an image point that agrees with no bead
-FAR = 1e9  # [px]: in the place of NaN, as of a bead behind the source
+NOWHERE = -1  # image point that agrees with no bead
+FAR = 1e9  # [px]; replaces NaN, as for a bead behind the source
 
 
 def exchanged_beads(rays: Rays, targets: Targets) -> NDArray[np.int64]:
@@ -44,12 +44,12 @@ def exchanged_beads(rays: Rays, targets: Targets) -> NDArray[np.int64]:
         both = len(np.unique(place[at_other])) == 2
         if not both or 2 * at_other.sum() <= own.sum():
             continue
-        # Of all other beads, by the rule of succession: how often image points are rejected, and
-        # how often these lie at the place of a bead as near as this one.
+        # For all other beads, by the rule of succession: rate of rejected image points, and share
+        # of these that lie at the place of a bead as near as this one.
         others = rejected & ~own
         share = rate_of(others.sum(), (~own).sum())
         share_near = rate_of(np.sum(others & (near <= near[at_other].max())), others.sum())
-        # Image points are false each for itself, or ids are exchanged, which displaces two.
+        # Either image points are false independently, or ids are exchanged, which displaces two.
         chances = []
         for unit in (np.arange(len(own)), rays.exposure):
             count = [len(np.unique(unit[rows])) for rows in (own, own & rejected, at_other)]
@@ -63,12 +63,12 @@ def exchanged_beads(rays: Rays, targets: Targets) -> NDArray[np.int64]:
 
 
 def rate_of(events: ArrayLike, count: ArrayLike) -> NDArray[np.float64]:
-    """Return rates (...) of events of counts, by the rule of succession of Laplace."""
+    """Return rates (...) of events out of counts, by Laplace's rule of succession."""
     return (np.asarray(events) + 1.0) / (np.asarray(count) + 2.0)
 
 
 def _nearness(ids: NDArray[np.int64], targets: Targets) -> NDArray[np.int64]:
-    """Return how many beads are as near to one bead of pairs (n, 2) as the other: (n,)."""
+    """Return for pairs (n, 2) the number (n,) of beads as near to one bead as the other one."""
     first, second = targets.xyz_mm[np.searchsorted(targets.target_id, ids)].transpose(1, 0, 2)
     distance = np.linalg.norm(first - second, axis=1) * (1 + ROUNDING)
     tree = cKDTree(targets.xyz_mm)
@@ -78,9 +78,9 @@ def _nearness(ids: NDArray[np.int64], targets: Targets) -> NDArray[np.int64]:
 
 
 def _places(rays: Rays, targets: Targets) -> NDArray[np.int64]:
-    """Return the target ids (n,) of the beads at whose place image points lie.
+    """Return the target ids (n,) of the beads at whose places image points lie.
 
-    That of an image point itself where it agrees with its bead; NOWHERE where with none.
+    An image point gets its own id if it agrees with its bead, and NOWHERE if with none.
     """
     out = rays.target_id.copy()
     for exposure in np.unique(rays.exposure):

@@ -3,8 +3,8 @@
 
 """Checks of a correction: 'precision', 'variation', 'halves', 'whiteness', 'worst_area', 'drift'.
 
-Checks 'whiteness', 'worst_area' and 'drift': residuals have no trend, and it did not change. An
-area also fails where image points of different exposures were rejected though they agree.
+Checks 'whiteness', 'worst_area' and 'drift': residuals have no trend, and no trend that changed.
+An area also fails if rejected image points of different exposures agree there.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ from .check import Check, more_exposures, too_little_data
 from .comparison import describe_place, difference
 from .residual_tests import RejectedTrend, change_of_trend
 
-# Standard deviation of the correction over that of an image coordinate. Independent errors add in
-# square: with this ratio, those of corrected points are 1.14 times those with known distortion.
+# Maximum ratio of the standard deviations of the correction and of an image coordinate.
+# Independent errors add in square: this ratio makes them 1.14 times those with known distortion.
 MAX_RATIO = 0.55
 
 
 def check_precision(evidence: Evidence, names: Sequence[str]) -> list[Check]:
-    """Compare the claimed precision of the correction with the noise, for each fluoroscope."""
+    """Compare the claimed precision of the correction with the noise; a check per fluoroscope."""
     return [_precision(evidence, name) for name in names]
 
 
 def _precision(evidence: Evidence, name: str) -> Check:
     common = evidence.trends[name]
-    # Residuals are smaller than the noise: orientations, object points and correction follow it.
+    # Use the noise instead of residuals: these are smaller, as all unknowns follow the noise.
     noise = evidence.calibrations[name].image_sd
     count = len(evidence.frames[name])
     advice = f'{more_exposures(count)}, or a phantom with more beads'
     if common.trend.size > common.trend.limit:
-        # What a model cannot follow is in its residuals, and in its claim.
+        # Distortion that a model cannot follow enlarges its residuals and its claimed sd.
         misfit = common.trend.size**2 / _redundancy(evidence, name)
         noise = float(np.sqrt(max(noise**2 - misfit, 0.0)))
         if evidence.request.options.model_name != AUTO:
@@ -69,7 +69,7 @@ def _precision(evidence: Evidence, name: str) -> Check:
 
 
 def _redundancy(evidence: Evidence, name: str) -> float:
-    """Mean redundancy number of the inliers, by which residuals are enlarged to noise."""
+    """Return the mean redundancy number of the inliers, which relates residuals to noise."""
     table = evidence.result.residuals
     if table is None:
         return 1.0
@@ -79,19 +79,19 @@ def _redundancy(evidence: Evidence, name: str) -> float:
 PRECISION = Subject(check_precision)
 
 
-# Size of a change, over the standard deviation of residuals, up to which it is no fault. A later
-# exposure has it as an error beside its noise, which is larger than residuals: the errors of its
-# points are then up to 8 % larger.
+# Maximum harmless change of the distortion, in standard deviations of residuals. In a later
+# exposure the change is an error in addition to its noise, which is larger than residuals: the
+# errors of its points are then up to 8 % larger.
 HARMLESS = 0.45
 
 
 def check_variation(evidence: Evidence, names: Sequence[str]) -> list[Check]:
-    """Fit low-order terms to the residuals of each exposure; a check for each fluoroscope."""
+    """Fit low-order terms to the residuals of each exposure; return a check per fluoroscope."""
     return [_variation(evidence, name) for name in names]
 
 
 def _too_few_points(evidence: Evidence, name: str) -> Check:
-    """Check that could not be made; further exposures with as few image points do not help."""
+    """Return the check that could not be made; more exposures with as few points do not help."""
     count = len(evidence.frames[name])
     reason = f'fewer than {MIN_VARYING_EXPOSURES} exposures have {MIN_POINTS} image points'
     check = too_little_data(Kind.VARIATION, name, reason, count)
@@ -128,7 +128,7 @@ def _variation(evidence: Evidence, name: str) -> Check:
 
 
 def _angles(evidence: Evidence, name: str) -> str:
-    """What may be wrong with the angles of the C-arm."""
+    """Return what may be wrong with the angles of the C-arm."""
     angles = angles_of(evidence.frames[name])
     if not np.isfinite(angles).all() or np.ptp(angles) == 0:
         return 'a C-arm at another angle'
@@ -138,7 +138,7 @@ def _angles(evidence: Evidence, name: str) -> str:
 
 
 def _how_to_give_angles(evidence: Evidence, name: str) -> str:
-    """What else helps where the angles of the C-arm are unknown."""
+    """Return additional advice for unknown angles of the C-arm."""
     if np.isfinite(angles_of(evidence.frames[name])).all():
         return ''
     return '; or give the angle of the C-arm with each exposure (angle_deg, or joint_states)'
@@ -147,11 +147,11 @@ def _how_to_give_angles(evidence: Evidence, name: str) -> str:
 VARIATION = Subject(check_variation)
 
 
-LIMIT = 1.9  # from simulated rigs: docs/verdict.md, benchmarks/verdict.py
+LIMIT = 1.9  # predicted sds, from simulated rigs: docs/verdict.md, benchmarks/verdict.py
 
 
 def check_halves(evidence: Evidence, names: Sequence[str]) -> list[Check]:
-    """Compare the calibrations of two halves of the exposures, a check for each fluoroscope."""
+    """Compare the calibrations of two halves of the exposures; one check per fluoroscope."""
     evidence.report_step(f'{"+".join(names)}: two halves')
     fewest = evidence.fewest_exposures(names)
     if fewest < 2 * MIN_EXPOSURES:
@@ -193,7 +193,7 @@ HALVES = Subject(check_halves, steps=1)
 
 
 def check_trends(evidence: Evidence, names: Sequence[str]) -> list[Check]:
-    """Test the residuals of all exposures for a common trend, and for a change of it."""
+    """Test the residuals of all exposures for a common trend, and for its change."""
     checks = []
     for name in names:
         common = evidence.trends[name]
@@ -221,7 +221,7 @@ def _whiteness(evidence: Evidence, name: str, common: CommonTrend) -> Check:
 
 
 def _advice(requested: str, model: CorrectionModel, count: int) -> str:
-    """Return what to do about a trend: requested is the model option, model the one in use."""
+    """Return the advice on a trend; requested: model option, model: model in use."""
     if not model.corrects:
         return 'calibrate with a correction model (--model auto), it was made without one'
     other = '' if requested == 'auto' else ', or choose another model (--model auto)'
@@ -252,7 +252,7 @@ def _worst_area(evidence: Evidence, name: str, common: CommonTrend) -> Check:
 
 
 def _rejected_area(evidence: Evidence, name: str, rejected: RejectedTrend) -> Check:
-    """Check that fails because image points are rejected though they agree."""
+    """Return the check that fails because rejected image points agree."""
     size = evidence.calibrations[name].image_size
     return Check(
         Kind.WORST_AREA,

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Checks 'held_out' and 'exposures': exposures fit a calibration that has not used them."""
+"""Checks 'held_out' and 'exposures': exposures fit a calibration made without them."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ from .calibration_evidence import Evidence, Subject
 from .check import Check, more_exposures, rms, too_little_data
 from .residual_tests import RejectedExposure, noise_of, residuals_of
 
-# Doubts whether exposures fit calibrations that are fixed.
+# Tests whether exposures fit fixed calibrations.
 #
-# A fixed calibration leaves the noise that it was determined with. Where exposures leave much
-# more, it is not theirs: the image has changed, the fluoroscopes are interchanged, or the image
-# points are corrected already.
+# With a fixed calibration, residuals have the noise with which it was determined. If they are much
+# larger, the calibration does not belong to the exposures: the image has changed, the fluoroscopes
+# are interchanged, or the image points are already corrected.
 
-MAX_NOISE = 2.0  # RMSE of image points over their noise
-CORRECTED = 0.6  # RMSE without the correction over that with it, of points that are corrected
+MAX_NOISE = 2.0  # maximum RMSE of image points over their noise
+CORRECTED = 0.6  # RMSE without over RMSE with correction, of points that are already corrected
 
 
 def uncorrected(calibrations: Calibrations) -> dict[str, FluoroscopeCalibration]:
-    """Return calibrations without their corrections, to try image points that are corrected."""
+    """Return calibrations without corrections, to test for points that are already corrected."""
     return {
         name: replace(
             calibration,
@@ -52,7 +52,7 @@ def uncorrected(calibrations: Calibrations) -> dict[str, FluoroscopeCalibration]
 def misfits(
     result: CalibrationResult, calibrations: Calibrations, frames: Frames
 ) -> dict[str, float]:
-    """Return the residuals over their noise of each fluoroscope that its calibration misfits."""
+    """Return the ratio of residuals and noise of fluoroscopes that their calibration misfits."""
     ratios = {
         name: _lack_of_fit(result.residuals, calibrations[name], (name, frames[name]))
         for name in result.fluoroscopes
@@ -65,9 +65,9 @@ def _lack_of_fit(
     calibration: FluoroscopeCalibration,
     seen: tuple[str, Sequence[Frame]],
 ) -> float:
-    """Return the RMSE of image points that are no false matches, over their noise.
+    """Return the RMSE of image points that are not false matches, over their noise.
 
-    seen: a fluoroscope, and its frames. NaN where residuals were not kept.
+    seen: a fluoroscope and its frames. Returns NaN if residuals were not stored.
     """
     if table is None:
         return float('nan')
@@ -88,9 +88,9 @@ def corrected_already(
     calibrations: Calibrations,
     frames: Frames,
 ) -> Finding | None:
-    """Return a finding on the fluoroscopes whose image points are corrected already.
+    """Return a finding on the fluoroscopes whose image points are already corrected.
 
-    without: the adjustment with the `uncorrected` calibrations, which fits their exposures.
+    without: adjustment with the `uncorrected` calibrations, which fits these exposures.
     """
     fit = misfits(without, calibrations, frames)
     names = [name for name in misfits(result, calibrations, frames) if name not in fit]
@@ -113,7 +113,7 @@ def corrected_already(
 def poor_fits(
     result: CalibrationResult, calibrations: Calibrations, frames: Frames
 ) -> list[Finding]:
-    """Return a finding for every fluoroscope whose exposures its calibration does not fit."""
+    """Return a finding for every fluoroscope whose calibration does not fit its exposures."""
     out = []
     for name, ratio in misfits(result, calibrations, frames).items():
         after = rms(result.fluoroscopes[name].rmse_after)
@@ -139,39 +139,39 @@ def poor_fits(
 KINDS = (Kind.HELD_OUT, Kind.EXPOSURES)
 FOLDS = 4
 # Limits from simulated rigs: docs/verdict.md, benchmarks/verdict.py.
-# Over the expectation, with RECOMMENDED_EXPOSURES; it grows as the root of their number falls.
+# Margin over the expectation with RECOMMENDED_EXPOSURES; proportional to 1 / sqrt(exposures).
 MARGIN = 0.13
-EXPOSURE_LIMIT = 1.6  # times the expectation
-# Robust standard deviations of the logarithms over all exposures that one of many exposures may
-# stand out by; n exposures add SCATTER_OF_FEW / n. Where the noise differs from exposure to
-# exposure, much of it in one is no fault of that one. But noise differs between neighbouring image
-# points, too: an exposure whose neighbours agree has a misfit, however much the others have.
+EXPOSURE_LIMIT = 1.6  # minimum limit, as a multiple of the expectation
+# Maximum deviation of the worst of many exposures, in robust standard deviations of the logarithms
+# over all exposures; n exposures add SCATTER_OF_FEW / n. If noise differs between exposures, an
+# exposure with much noise is not at fault. But noise also differs between neighbouring image
+# points: an exposure whose neighbours agree has a misfit, whatever the scatter.
 EXPOSURE_SCATTER = 4.0
 SCATTER_OF_FEW = 20.0
-MIN_NOISE = 0.05  # part of the squared residuals in sample that is noise, whatever the trend
+MIN_NOISE = 0.05  # minimum noise share of the squared residuals in sample, whatever the trend
 
 
 class ExposureSums(NamedTuple):
-    """Sums of an exposure over its image points."""
+    """Sums over the image points of an exposure."""
 
-    number: int  #: of the exposure
+    number: int  #: number of the exposure
     points: int
-    #: sum of the weights by which points count, one where their noise is that of the fluoroscope;
-    #: what is said to be less precise may have larger residuals
+    #: sum of the weights of points, 1 where their noise is that of the fluoroscope; points that
+    #: are stated to be less precise may have larger residuals
     weight: float
-    #: squared residuals [px^2] with a calibration that has not used the exposure, and with one
-    #: that has; the same exposures are adjusted in the same way, so that the adjustment absorbs
-    #: the same part of the residuals
+    #: squared residuals [px^2] with a calibration made without the exposure, and with one made
+    #: with it; both are adjusted in the same way, so that the adjustment absorbs the same part of
+    #: the residuals
     outside: float
     inside: float
     predicted: float  #: predicted variance of the correction [px^2]
-    #: half the squared differences of the residuals of nearest neighbours [px^2]: what is noise,
-    #: and no misfit of an area
+    #: half the squared differences of the residuals of nearest neighbours [px^2]: noise, without
+    #: the misfit of an area
     white: float
 
 
 def check_held_out(evidence: Evidence, names: Sequence[str]) -> list[Check]:
-    """Compare residuals out of sample with their expectation, two checks a fluoroscope."""
+    """Compare residuals out of sample with their expectation; two checks per fluoroscope."""
     fewest = evidence.fewest_exposures(names)
     folds = min(FOLDS, fewest)
     sums: dict[str, list[ExposureSums]] = {name: [] for name in names}
@@ -193,7 +193,7 @@ def check_held_out(evidence: Evidence, names: Sequence[str]) -> list[Check]:
 def _hold_out(
     evidence: Evidence, names: Sequence[str], fold: int, folds: int
 ) -> dict[str, list[ExposureSums]]:
-    """Calibrate without the exposures of a fold; return their sums by fluoroscope."""
+    """Calibrate without the exposures of a fold; return the sums of the fold by fluoroscope."""
     frames = evidence.part(names, lambda i: i % folds == fold)
     others = evidence.part(names, lambda i: i % folds != fold)
     calibrations = evidence.calibrate(others)
@@ -231,7 +231,7 @@ def _hold_out(
 
 
 def _white(uv: NDArray[np.float64], r: NDArray[np.float64], sd: NDArray[np.float64]) -> float:
-    """Sum of half the squared differences (n, 2) [px] between neighbours, capped as residuals are.
+    """Sum half the squared differences (n, 2) [px] between neighbours, capped like residuals.
 
     Differences of independent residuals have twice their variance (von Neumann, "Distribution of
     the ratio of the mean square successive difference to the variance", Annals of Mathematical
@@ -246,7 +246,7 @@ def _checks(evidence: Evidence, name: str, sums: Sequence[ExposureSums]) -> list
     common = evidence.trends[name]
     count = len(evidence.frames[name])
     number, n, weight, outside, inside, predicted, white = map(np.array, zip(*sums))
-    # A trend that is left in sample is not noise.
+    # A trend that remains in sample is not noise.
     noise = np.maximum(inside - 2 * weight * common.trend.size**2, MIN_NOISE * inside)
     value = float(np.sqrt(outside.sum() / (2 * n.sum())))
     expected = float(np.sqrt((noise + predicted).sum() / (2 * n.sum())))
@@ -262,8 +262,8 @@ def _checks(evidence: Evidence, name: str, sums: Sequence[ExposureSums]) -> list
         limit=limit * expected,
         unit='px',
     )
-    # Where something moved during an exposure, it does not fit in sample either. So the noise of
-    # the others is expected of it.
+    # If something moved during an exposure, it does not fit in sample either. Its expected noise
+    # is therefore that of the other exposures.
     expected_of_one = n * np.median(noise / n) + predicted
     ratio = np.sqrt(outside / expected_of_one)
     limits = exposure_limits(ratio, np.sqrt(white / expected_of_one))
@@ -286,7 +286,7 @@ def _checks(evidence: Evidence, name: str, sums: Sequence[ExposureSums]) -> list
 
 
 def _rejected_exposure(name: str, found: RejectedExposure) -> Check:
-    """Check that fails because rejected image points of an exposure agree with each other."""
+    """Return the check that fails because rejected image points of an exposure agree."""
     return Check(
         Kind.EXPOSURES,
         f'{found.points} of {found.of} image points of exposure {found.number} are rejected as '
@@ -302,12 +302,12 @@ def _rejected_exposure(name: str, found: RejectedExposure) -> Check:
 
 
 def exposure_limits(ratio: NDArray[np.float64], white: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Limits (m,) of the residuals of exposures over their expectation.
+    """Return the limits (m,) of the residuals of exposures over their expectation.
 
-    ratio (m,): of all exposures; half of them or fewer are at fault. white (m,): the same of the
-    noise of each exposure alone, by which its limit may grow. The scatter of the logarithms is the
-    median absolute deviation over NORMAL_MEDIAN (Huber, "Robust Statistics", 1981). The largest of
-    6 to 100 normal deviates exceeds the limit in 0.5 to 1.5 % of samples.
+    ratio (m,): of all exposures; at most half of them are at fault. white (m,): the same ratio for
+    the noise of each exposure alone, by which its limit may increase. The scatter of the
+    logarithms is the median absolute deviation over NORMAL_MEDIAN (Huber, "Robust Statistics",
+    1981). The largest of 6 to 100 normal deviates exceeds the limit in 0.5 to 1.5 % of samples.
     """
     size = np.log(ratio)
     scatter = np.median(np.abs(size - np.median(size))) / NORMAL_MEDIAN

@@ -1,14 +1,14 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Find input that cannot be right before it is calibrated, and say what is wrong with it.
+"""Find input that cannot be right before it is calibrated, and report what is wrong with it.
 
-Each exposure is compared with the phantom by a robust direct linear transformation, which knows
-neither the interior orientation nor the pose and follows a part of the distortion: with the right
-phantom and ids its median residual is a few pixels, also with 40 % false matches or strong
-distortion. Where it is not, the ways in which files are confused are tried in turn: ids that are
-off by one or reversed. A projection matrix of a mirrored image fits as well as the right one, but
-puts all targets behind the source (Hartley and Zisserman, "Multiple View Geometry", 2nd ed., 2004,
+Each exposure is compared with the phantom by a robust direct linear transformation, which requires
+neither the interior orientation nor the pose, and follows a part of the distortion. With the right
+phantom and ids its median residual is a few pixels, even with 40 % false matches or strong
+distortion. If it is larger, common ways to confuse files are tried in turn: ids that are off by
+one or reversed. The projection matrix of a mirrored image fits as well as the right one, but puts
+all targets behind the source (Hartley and Zisserman, "Multiple View Geometry", 2nd ed., 2004,
 21.1: a reflection changes the sign of the depth).
 """
 
@@ -40,18 +40,18 @@ from ..photogrammetry.rig_orientation import KnownOrientation
 from .check import rms
 from .mixed_units import AT, DISTANCES_MM, FIT, MAX_TESTED, OFF, mixed_units
 
-BETTER = 0.35  # median residual of other ids over that of the given ones from which they are right
+BETTER = 0.35  # maximum ratio of median residuals with other and given ids to accept the other ids
 MAX_COORDINATE_MM = 1e6  # a kilometre
-EXTENT_SHARE = 0.9  # of the targets, within the extent of the phantom
-MAX_EXTENT = 6.0  # distance of a target from the middle over that extent
-SD_MM = (1e-6, 1e3)  # of surveyed coordinates
-SIGMA_PX = (1e-4, 1e3)  # of image points
-MIN_REACH = 0.6  # of the image points over the image, to the right and down
-MIN_SHARE = 0.5  # of the targets that other ids must have on the phantom
-# Median residual of a known orientation over the longer side of the image from which it is wrong.
+EXTENT_SHARE = 0.9  # share of the targets within the extent of the phantom
+MAX_EXTENT = 6.0  # maximum distance of a target from the middle, over that extent
+SD_MM = (1e-6, 1e3)  # plausible range for surveyed coordinates
+SIGMA_PX = (1e-4, 1e3)  # plausible range for image points
+MIN_REACH = 0.6  # minimum extent of the image points over the image size, to the right and down
+MIN_SHARE = 0.5  # minimum share of the ids that exist on the phantom
+# Median residual over the longer side of the image above which a known orientation is wrong.
 WRONG_ORIENTATION = 0.1
-SAME_PX = 1e-6  # image points of two exposures that agree so closely are copies
-COPIED = 0.9  # share of common image points that are the same in a copied exposure
+SAME_PX = 1e-6  # image points of two exposures are copies if they agree this closely
+COPIED = 0.9  # minimum share of identical common image points in a copied exposure
 
 Relabel = Callable[[NDArray[np.int64], Phantom], NDArray[np.int64]]
 
@@ -67,7 +67,7 @@ _OTHER_PHANTOM = Finding(
     'wrong',
 )
 _RIGHT_IDS = 'with the right ones the image points fit the phantom'
-# The ways in which ids are confused, and the ids that are then right.
+# Common confusions of ids, and functions that return the right ids.
 CONFUSIONS: tuple[tuple[Finding, Relabel], ...] = (
     (
         Finding(
@@ -94,11 +94,11 @@ CONFUSIONS: tuple[tuple[Finding, Relabel], ...] = (
 
 @dataclass(frozen=True)
 class Fit:
-    """How well an exposure fits the phantom.
+    """Fit of an exposure to the phantom.
 
-    misfit_px is the median residual of the robust direct linear transformation, is_behind whether
-    the targets lie behind the source; distance_mm is that of the source from their middle. A plane
-    that is mirrored is one seen from behind, and its distance is unknown.
+    misfit_px: median residual of the robust direct linear transformation. is_behind: whether the
+    targets lie behind the source. distance_mm: distance of the source from the middle of the
+    targets. A mirrored plane looks like one seen from behind, and its distance is unknown.
     """
 
     misfit_px: float
@@ -107,7 +107,7 @@ class Fit:
 
 
 def validate_magnitudes(frames: Frames, phantom: Phantom) -> None:
-    """Raise DataError for numbers that no measurement has, and that spoil every calculation."""
+    """Raise DataError for implausible numbers, which would spoil every calculation."""
     large = np.abs(phantom.xyz_mm).max(axis=1) > MAX_COORDINATE_MM
     if large.any():
         target = int(phantom.target_id[large][0])
@@ -139,7 +139,7 @@ def validate_magnitudes(frames: Frames, phantom: Phantom) -> None:
 def validate_names(names: Iterable[str]) -> None:
     """Raise DataError for names of fluoroscopes that differ only in capital letters.
 
-    They are one fluoroscope written in two ways, and one file where capitals do not count.
+    Such names denote one fluoroscope, and are the same file on case-insensitive systems.
     """
     seen: dict[str, str] = {}
     for name in names:
@@ -154,13 +154,13 @@ def validate_names(names: Iterable[str]) -> None:
 
 
 def why_excluded(frame: Frame, phantom: Phantom) -> Finding | None:
-    """Return why an exposure that does not fit is excluded, None where the cause is not found."""
+    """Return why a misfitting exposure is excluded, or None if the cause is not found."""
     cause = _cause(frame, phantom)
     return None if cause is None or cause.kind is Kind.OTHER_PHANTOM else cause
 
 
 def find_wrong_phantom(frames: Frames, phantom: Phantom) -> list[Finding]:
-    """Return a finding for every kind of targets in frames whose coordinates cannot be right."""
+    """Return a finding for every group of targets with implausible coordinates."""
     every = [frame.target_id for exposures in frames.values() for frame in exposures]
     seen = np.isin(phantom.target_id, np.concatenate(every or [np.empty(0, int)]))
     if not seen.any():
@@ -168,7 +168,7 @@ def find_wrong_phantom(frames: Frames, phantom: Phantom) -> list[Finding]:
     seen_id = phantom.target_id[seen]
     xyz = phantom.xyz_mm[seen]
     if np.linalg.matrix_rank(xyz - xyz.mean(axis=0)) < 2:
-        return []  # all on a line: the calibration says so
+        return []  # all on a line: reported by the calibration
     out = []
     places, place, count = np.unique(xyz, axis=0, return_inverse=True, return_counts=True)
     if count.max() > 1:
@@ -219,9 +219,9 @@ def _validate_sigma(frame: Frame) -> None:
 
 
 def fit_to_phantom(frame: Frame, phantom: Phantom, target_id: NDArray[np.int64]) -> Fit | None:
-    """Fit an exposure, with target_id (n,) for its ids, to the phantom.
+    """Fit an exposure, using target_id (n,) as its ids, to the phantom.
 
-    Returns None where too few targets are on the phantom, or where they lie on a line.
+    Returns None if too few targets are on the phantom, or if they lie on a line.
     """
     rows = phantom.index(target_id)
     on_phantom = rows >= 0
@@ -258,11 +258,11 @@ def _fit_of_plane(xyz: NDArray[np.float64], uv: NDArray[np.float64]) -> Fit | No
 
 
 def find_wrong_input(frames: Frames, phantom: Phantom) -> list[Finding]:
-    """Return a finding for every fluoroscope whose exposures cannot be of the phantom as given.
+    """Return a finding for every fluoroscope whose exposures do not fit the phantom as given.
 
-    frames are exposures by fluoroscope, valid on their own. Those with the most targets are tested
-    first, and the others only where these raise suspicion; a cause is named where most of all
-    exposures have one. A few wrong exposures are left to the calibration, which excludes them.
+    frames are exposures by fluoroscope, each of them valid. The exposures with the most targets
+    are tested first, and the others only if these are suspicious; a cause is reported if most of
+    all exposures have one. A few wrong exposures are left to the calibration, which excludes them.
     """
     out = []
     for name, exposures in frames.items():
@@ -273,7 +273,7 @@ def find_wrong_input(frames: Frames, phantom: Phantom) -> list[Finding]:
 
 
 def valid_frames(frames: Frames) -> dict[str, list[Frame]]:
-    """Return the frames that are valid on their own, by fluoroscope."""
+    """Return the frames that are valid individually, by fluoroscope."""
     out: dict[str, list[Frame]] = {}
     for name, exposures in frames.items():
         out[name] = []
@@ -287,9 +287,9 @@ def valid_frames(frames: Frames) -> dict[str, list[Frame]]:
 
 
 def require_phantom(frames: Frames, phantom: Phantom) -> None:
-    """Raise DataError where exposures of a calibrated fluoroscope cannot be of the phantom.
+    """Raise DataError if exposures of a calibrated fluoroscope cannot be of the phantom.
 
-    Exposures with fewer than FEW_TARGETS targets are not tested, nor those that are not valid.
+    Invalid exposures and those with fewer than FEW_TARGETS targets are not tested.
     """
     found = []
     for name, exposures in valid_frames(frames).items():
@@ -342,7 +342,7 @@ def find_wrong_orientation(
 
 
 def _median_residual(frames: Sequence[Frame], phantom: Phantom, known: KnownOrientation) -> float:
-    """Median distance [px] of image points from their targets, 0 where there are none."""
+    """Return the median distance [px] of image points from their targets; 0 without any."""
     distances = [
         _residuals(frame, phantom, known)
         for frame in frames
@@ -352,7 +352,7 @@ def _median_residual(frames: Sequence[Frame], phantom: Phantom, known: KnownOrie
 
 
 def _residuals(frame: Frame, phantom: Phantom, known: KnownOrientation) -> NDArray[np.float64]:
-    """Distances (n,) [px] of image points from their targets, infinite behind the source."""
+    """Return distances (n,) [px] of image points from targets; infinite behind the source."""
     xyz = phantom.xyz_mm[phantom.index(frame.target_id)]
     predicted = project(known.rotation, known.position_mm, xyz, known.interior)
     distance = np.linalg.norm(frame.uv - predicted, axis=1)
@@ -360,7 +360,7 @@ def _residuals(frame: Frame, phantom: Phantom, known: KnownOrientation) -> NDArr
 
 
 def _wrong_exposures(exposures: Sequence[Frame], phantom: Phantom) -> Finding | None:
-    """Return the cause that most exposures have in common, None where most have none."""
+    """Return the cause that most exposures have in common, or None."""
     ordered = sorted(exposures, key=lambda f: -len(f.target_id))
     causes = [_cause(frame, phantom) for frame in ordered[:MAX_TESTED]]
     if 2 * sum(cause is not None for cause in causes) <= len(causes):
@@ -371,7 +371,7 @@ def _wrong_exposures(exposures: Sequence[Frame], phantom: Phantom) -> Finding | 
 
 
 def wrong_image_size(exposures: Sequence[Frame]) -> Finding | None:
-    """Return a finding where the image points fill only the upper left part of the image."""
+    """Return a finding if the image points fill only the upper left part of the image."""
     if not exposures:
         return None
     reach = np.max([np.max(frame.uv, axis=0) for frame in exposures], axis=0)
@@ -388,7 +388,7 @@ def wrong_image_size(exposures: Sequence[Frame]) -> Finding | None:
 
 
 def wrong_unit(distance_mm: float, phantom: Phantom) -> Finding | None:
-    """Return a finding where the source is so near or so far that the unit must be wrong.
+    """Return a finding if the distance of the source implies that the unit must be wrong.
 
     A phantom larger than its distance is a wide-angle view in any unit.
     """
@@ -397,7 +397,7 @@ def wrong_unit(distance_mm: float, phantom: Phantom) -> Finding | None:
         return None
     extent = float(np.linalg.norm(np.ptp(phantom.xyz_mm, axis=0)))
     numbers = {'distance_mm': distance_mm, 'extent_mm': extent}
-    if distance_mm < min(low, extent):  # no unit changes their ratio
+    if distance_mm < min(low, extent):  # their ratio is the same in any unit
         return Finding(
             Kind.SOURCE_TOO_NEAR,
             f'the source would be {distance_mm:.3g} mm from a phantom that is {extent:.3g} mm '
@@ -417,7 +417,7 @@ def wrong_unit(distance_mm: float, phantom: Phantom) -> Finding | None:
 
 
 def _cause(frame: Frame, phantom: Phantom) -> Finding | None:
-    """Return what is wrong with an exposure, None where nothing is known to be."""
+    """Return what is wrong with an exposure, or None if no error is found."""
     ids = np.asarray(frame.target_id, dtype=np.int64)
     side = max(frame.image_size)
     given = fit_to_phantom(frame, phantom, ids)
@@ -441,7 +441,7 @@ def _cause(frame: Frame, phantom: Phantom) -> Finding | None:
 
 
 def _unit_cause(phantom: Phantom, fit: Fit) -> Finding | None:
-    """Return the finding on the unit, the same for all exposures: that of a rounded distance."""
+    """Return the finding on the unit from a rounded distance, the same for all exposures."""
     if fit.distance_mm is None:
         return None
     digits = -int(np.floor(np.log10(max(fit.distance_mm, 1e-300))))
@@ -449,10 +449,10 @@ def _unit_cause(phantom: Phantom, fit: Fit) -> Finding | None:
 
 
 def copied_exposures(exposures: Sequence[Frame]) -> list[tuple[Frame, Frame]]:
-    """Return the exposures of a fluoroscope that repeat an earlier one, each with that one.
+    """Return the exposures of a fluoroscope that repeat an earlier one, each with the earlier one.
 
-    Copies have the same image points to the last digit; exposures of a standing phantom differ by
-    their noise.
+    Copies have the same image points to the last digit; real exposures of a standing phantom
+    differ by their noise.
     """
     ordered = sorted(exposures, key=lambda f: f.number)
     if not ordered:
@@ -473,9 +473,9 @@ def copied_exposures(exposures: Sequence[Frame]) -> list[tuple[Frame, Frame]]:
 
 
 def shared_exposures(one: Sequence[Frame], other: Sequence[Frame]) -> list[tuple[Frame, Frame]]:
-    """Return the exposures of two fluoroscopes that have the same image points, in pairs.
+    """Return pairs of exposures of two fluoroscopes that have the same image points.
 
-    No two fluoroscopes have that: one recording was given for both.
+    This does not occur with two fluoroscopes: one recording was given for both.
     """
     both = [replace(f, number=2 * f.number) for f in one]
     both += [replace(f, number=2 * f.number + 1) for f in other]
@@ -489,30 +489,31 @@ def shared_exposures(one: Sequence[Frame], other: Sequence[Frame]) -> list[tuple
 
 
 def _are_copied(uv: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which (k,) of others (k, n, 2) have the image points uv (n, 2) [px]; NaN where unseen."""
+    """Return which (k,) of others (k, n, 2) have image points uv (n, 2) [px]; NaN if unseen."""
     u, v = np.moveaxis(np.abs(others - uv), 2, 0)
-    distance = np.maximum(u, v)  # max() along so short an axis takes ten times as long
+    distance = np.maximum(u, v)  # max() along such a short axis takes ten times as long
     common = np.sum(np.isfinite(distance), axis=1)
     same = np.sum(distance <= SAME_PX, axis=1)
     return (common >= MIN_COMMON_TARGETS) & (same >= COPIED * common)
 
 
-# Absolute tests of a calibration: what no calibration of a fluoroscope can look like.
+# Absolute tests of a calibration, for results that no fluoroscope can have.
 #
-# The verdict compares parts of the exposures with each other, and a fault that all of them share
-# passes. These tests compare with what is physically possible, whatever the input claims. Their
-# limits are far from every calibration that was right (docs/verdict.md).
+# The verdict compares parts of the exposures with each other, so a fault that all of them share
+# passes. These tests compare with physical limits, whatever the input claims. All correct
+# calibrations are far from these limits (docs/verdict.md).
 
-# RMSE after the correction, or displacement between pairs, over the longer side of the image.
+# Maximum RMSE after correction, or displacement between pairs, over the longer image side.
 MAX_MISFIT = 0.0025
-MAX_MISFIT_SD = 4.0  # the same over the a-priori standard deviation of the image points
-MAX_DISTANCE_CHANGE = 0.2  # of one that is fixed, by the scale of the correction
-MAX_SD_POINT = 0.15  # of the principal point over the longer side of the image
-MAX_OFF_CENTRE = 1.0  # distance of the principal point from the middle over the longer side
+MAX_MISFIT_SD = 4.0  # maximum RMSE over the a-priori standard deviation of the image points
+MAX_DISTANCE_CHANGE = 0.2  # maximum change of a fixed distance by the scale of the correction
+MAX_SD_POINT = 0.15  # maximum sd of the principal point over the longer side of the image
+# maximum distance of the principal point from the middle over the longer side
+MAX_OFF_CENTRE = 1.0
 
 
 def implausible(request: CalibrationRequest, result: CalibrationResult) -> list[Finding]:
-    """Return a finding for everything that makes the result of a calibration impossible."""
+    """Return a finding for every implausible figure in the result of a calibration."""
     out = []
     for name, figures in result.fluoroscopes.items():
         frames = request.frames[name]
@@ -527,7 +528,7 @@ def implausible(request: CalibrationRequest, result: CalibrationResult) -> list[
 
 
 def _large_residuals(figures: FluoroscopeResult, frames: Sequence[Frame]) -> Finding | None:
-    """Residuals that are larger than distortion and noise leave."""
+    """Return a finding if residuals are larger than distortion and noise explain."""
     rmse = rms(figures.rmse_after)
     given = [np.median(frame.sigma) for frame in frames if frame.sigma is not None]
     limit = MAX_MISFIT * max(figures.image_size)
@@ -557,7 +558,7 @@ def _few_inliers(figures: FluoroscopeResult) -> Finding | None:
 
 
 def _wrong_distance(figures: FluoroscopeResult, request: CalibrationRequest) -> Finding | None:
-    """A source so near or so far that the unit of the phantom must be wrong."""
+    """Return a finding if the distance of the source implies a wrong unit of the phantom."""
     centre = request.phantom.xyz_mm.mean(axis=0)
     distances = [np.linalg.norm(e.position_mm - centre) for e in figures.exposures]
     return wrong_unit(float(np.median(distances)), request.phantom)
@@ -566,7 +567,7 @@ def _wrong_distance(figures: FluoroscopeResult, request: CalibrationRequest) -> 
 def _wrong_interior(
     figures: FluoroscopeResult, calibration: FluoroscopeCalibration
 ) -> Finding | None:
-    """An interior orientation that is not determined, or outside of anything built."""
+    """Return a finding if the interior orientation is undetermined or implausible."""
     xp, yp, c = figures.interior
     sd = figures.interior_sd
     side = max(figures.image_size)
@@ -595,7 +596,7 @@ def _wrong_interior(
 
 
 def _wrong_given_distance(calibration: FluoroscopeCalibration) -> Finding | None:
-    """A principal distance that is fixed, but far from the one that the correction makes of it."""
+    """Return a finding if the fixed principal distance is far from that of the correction."""
     given = float(calibration.interior[2])
     found = float(_interior_about_middle(calibration)[2])
     if abs(found / given - 1) <= MAX_DISTANCE_CHANGE:
@@ -610,14 +611,14 @@ def _wrong_given_distance(calibration: FluoroscopeCalibration) -> Finding | None
 
 
 def _off_centre(interior: NDArray[np.float64], image_size: tuple[int, int]) -> float:
-    """Distance [px] of a principal point from the middle of the image."""
+    """Return the distance [px] of a principal point from the middle of the image."""
     return float(np.linalg.norm(interior[:2] - (np.array(image_size) - 1) / 2))
 
 
 def _interior_about_middle(calibration: FluoroscopeCalibration) -> NDArray[np.float64]:
-    """Interior orientation (3,) [px] with a correction in the gauge about the middle of the image.
+    """Return the interior orientation (3,) [px] in the gauge about the middle of the image.
 
-    A strong affine distortion can move the principal point far away, and its correction with it.
+    A strong affine distortion can move the principal point far away, together with its correction.
     """
     pixels = sd_grid_pixels(calibration.image_size)
     pixels = pixels[~calibration.model.outside(pixels)]

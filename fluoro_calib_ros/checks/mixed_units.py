@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Find targets of a phantom that are given in another unit than the others.
+"""Find targets of a phantom whose coordinates are in a different unit from the others.
 
-Where most targets are right, the others are those that an exposure shows at the place of their
-multiple: a direct linear transformation of the others predicts it. Where they are about half,
-there is no majority, and the transformation is searched for with both versions of each target: of
-samples of six image points, each matched with the target or with its multiple, the one with the
-least median residual of the better versions is refined.
+If most targets are right, the wrong ones are those whose image points lie where a direct linear
+transformation of the others predicts a multiple of their coordinates. If about half are right,
+there is no majority, and the transformation is searched for with both versions of each target.
+Among samples of six image points, each matched with the target or with its multiple, the one with
+the smallest median residual of the better versions is refined.
 """
 
 from __future__ import annotations
@@ -32,23 +32,23 @@ from ..photogrammetry.resection import (
     squared_residuals,
 )
 
-DISTANCES_MM = (200.0, 10_000.0)  # of the source from a phantom in mm
-MAX_TESTED = 3  # exposures of a fluoroscope, those with the most targets
+DISTANCES_MM = (200.0, 10_000.0)  # plausible distances of the source from a phantom in mm
+MAX_TESTED = 3  # exposures per fluoroscope, those with the most targets
 # Residual over the longer side of the image of a target that is not at its place, and of one that
-# is; the same of the median of an exposure whose ids are wrong, and of one whose ids are right.
+# is. Also limits of the median for an exposure whose ids are wrong, and right.
 OFF = 0.03
 AT = 0.01
-FIT = 0.004  # median of these residuals where all targets have their unit
-UNCLEAR = 0.6  # share of targets at their places below which there may be no majority
-MIN_GROUP = 3  # targets in either unit
+FIT = 0.004  # median of these residuals if all targets have the right unit
+UNCLEAR = 0.6  # share of targets in place below which there may be no majority
+MIN_GROUP = 3  # minimum number of targets in either unit
 SAMPLES = 1500
 STEPS = 10
 
 
 def mixed_units(frames: Frames, phantom: Phantom, is_suspicious: bool = False) -> Finding | None:
-    """Return a finding where a part of the targets is in another unit than the others.
+    """Return a finding if a part of the targets is in a different unit from the others.
 
-    frames: exposures by fluoroscope, valid on their own. is_suspicious: whether the exposures do
+    frames: exposures by fluoroscope, each of them valid. is_suspicious: whether the exposures do
     not fit the phantom, so that there may be no majority.
     """
     every = [_on_phantom(frame, phantom) for of_one in frames.values() for frame in of_one]
@@ -71,7 +71,7 @@ def mixed_units(frames: Frames, phantom: Phantom, is_suspicious: bool = False) -
             continue
         low, high = DISTANCES_MM
         if not low <= distance <= high and low <= distance / factor <= high:
-            scaled, factor = others, 1 / factor  # these have the wrong unit
+            scaled, factor = others, 1 / factor  # these are in the wrong unit
         return _finding(phantom.target_id[scaled], factor)
     return None
 
@@ -87,14 +87,14 @@ def _on_phantom(frame: Frame, phantom: Phantom) -> Frame:
 
 
 def _seen(frames: Sequence[Frame], phantom: Phantom) -> NDArray[np.bool_]:
-    """Return which (n,) targets of a phantom are seen."""
+    """Return which targets (n,) of a phantom are seen."""
     return np.isin(phantom.target_id, np.concatenate([frame.target_id for frame in frames]))
 
 
 def _factor_of(
     frame: Frame, phantom: Phantom, is_suspicious: bool
 ) -> tuple[float, NDArray[np.bool_]] | None:
-    """Return the factor by which some targets fit, and which (n,) of the phantom, or None."""
+    """Return the factor by which some targets fit, and which (n,) targets; or None."""
     rows = phantom.index(frame.target_id)
     xyz = phantom.xyz_mm[rows]
     limit = max(frame.image_size)
@@ -118,7 +118,7 @@ def _factor_of(
 def _factor_by_samples(
     frame: Frame, xyz: NDArray[np.float64], rows: NDArray[np.int64], phantom: Phantom
 ) -> tuple[float, NDArray[np.bool_]] | None:
-    """Return the same as `_factor_of`, found without a majority of the targets (n, 3)."""
+    """Do the same as `_factor_of` without a majority of the targets (n, 3)."""
     rng = np.random.default_rng(0)
     limit = max(frame.image_size)
     samples = np.argsort(rng.random((SAMPLES, len(xyz))), axis=1)[:, :SAMPLE_SIZE]
@@ -145,7 +145,7 @@ def _factor_by_samples(
 def _refined(
     projection: NDArray[np.float64], versions: NDArray[np.float64], uv: NDArray[np.float64]
 ) -> tuple[NDArray[np.bool_], float]:
-    """Return which (n,) targets of versions (2, n, 3) are multiples, and the median residual."""
+    """Return which (n,) of versions (2, n, 3) are multiples, and the median residual."""
     every = np.arange(len(uv))
     scaled = np.zeros(len(uv), dtype=int)
     for _ in range(STEPS):
@@ -169,11 +169,11 @@ def _whole_group(
 ) -> tuple[NDArray[np.bool_], float]:
     """Return which (n,) targets fit by the factor in most exposures, and the source's distance.
 
-    group (n,) is a part of them; the distance [mm] is that with these targets multiplied.
+    group (n,): a part of these targets. The distance [mm] is that with them multiplied.
     """
     votes = np.zeros(len(phantom.target_id))
     distances: list[float] = []
-    for _ in range(STEPS):  # one exposure knows a part of the group only
+    for _ in range(STEPS):  # each exposure shows only a part of the group
         xyz = np.where(group[:, None], factor * phantom.xyz_mm, phantom.xyz_mm)
         votes[:] = 0
         distances = []
@@ -193,7 +193,7 @@ def _whole_group(
             is_multiple = (scaled < AT * limit) & (own > OFF * limit)
             is_own = own < AT * limit
             if is_multiple.any() and is_own.sum() < MIN_GROUP:
-                continue  # multiples alone are the phantom, larger and farther away
+                continue  # multiples alone look like a larger phantom, farther away
             votes[rows] += is_multiple
             votes[rows] -= is_own
             distances.append(float(np.linalg.norm(source - xyz[rows].mean(axis=0))))
@@ -204,7 +204,7 @@ def _whole_group(
 
 
 def _finding(ids: NDArray[np.int64], factor: float) -> Finding:
-    """Return the finding on targets that fit when they are multiplied by a factor."""
+    """Return the finding on targets that fit after multiplication by a factor."""
     unit = MISTAKEN_UNITS.get(factor)
     meant = f' ({unit} in place of mm)' if unit else ''
     return Finding(

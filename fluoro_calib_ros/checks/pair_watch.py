@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the epipolar residuals of one pair of views tell of a drift of both images."""
+"""Evidence of a drift of either image from the epipolar residuals of a pair of views."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from .drift_charts import MEMORY, DriftOptions, EpipolarObservations, ImageAreas
 
-LAGS = (1, 2, 4)  # frames over which the noise of a marker is compared
+LAGS = (1, 2, 4)  # frame lags at which the noise of a marker is compared
 MIN_CORRELATION = 0.05
-MAX_CORRELATION = 0.97  # of the noise of a marker in successive frames
+MAX_CORRELATION = 0.97  # maximum for the noise of a marker in successive frames
 NUGGET = 0.35  # fraction of the systematic standard deviation that the nodes cannot represent
 
 
@@ -23,11 +23,11 @@ NUGGET = 0.35  # fraction of the systematic standard deviation that the nodes ca
 class PairBlock:
     """Statistics of a block of epipolar residuals.
 
-    The four series are: image a and image b against the calibration, image a and image b against
-    the start.
+    The four series are: image a and image b against the calibration, then image a and image b
+    against the start.
     """
 
-    #: (4, A) of a drift of each area [1/px, 1/px^2]
+    #: (4, A) score and information of a drift of each area [1/px, 1/px^2]
     score: NDArray[np.float64]
     information: NDArray[np.float64]
     systematic: NDArray[np.float64]  #: (4, A) systematic standard deviations [px]
@@ -37,14 +37,14 @@ class PairBlock:
 
     @classmethod
     def empty(cls, areas: int) -> PairBlock:
-        """A block of zeros."""
+        """Return a block of zeros."""
         score, information, systematic = np.zeros((3, 4, areas))
         enough = np.zeros((4, areas), dtype=bool)
         return cls(score, information, systematic, enough, np.zeros((2, areas, 2)))
 
 
 class PairWatch:
-    """Turns the epipolar residuals of one pair of views into statistics, block by block.
+    """Converts the epipolar residuals of one pair of views into statistics, block by block.
 
     sizes: (2, 2), width and height of both images [px].
     """
@@ -56,17 +56,17 @@ class PairWatch:
         self._areas = areas
         self._options = options
         self.field = SystematicErrorField(sizes)
-        self._squares = np.zeros(len(LAGS))  # sums of squared differences over the lags, halved
+        self._squares = np.zeros(len(LAGS))  # half the sums of squared differences at the lags
         self._count = 0.0
         self._frames = 0.0
 
     def stretch(self) -> float:
-        """Variance of a long sum of blocks over that of the differences of two blocks.
+        """Return the variance of a long sum of blocks over that of differences of two blocks.
 
-        The noise of a marker is modelled as a white part w and an autoregression of variance s
-        and correlation r in successive frames. Half the mean squares of differences over 1, 2 and
-        4 frames, in which a marker hardly moves, are V1 = w + s (1 - r), V2 = w + s (1 - r^2) and
-        V4 = w + s (1 - r^4), hence (V4 - V2)/(V2 - V1) = r (1 + r).
+        The noise of a marker is modelled as a white part w plus an autoregression of variance s
+        with correlation r between successive frames. Half the mean squared differences over 1, 2
+        and 4 frames, in which a marker hardly moves, are V1 = w + s (1 - r), V2 = w + s (1 - r^2)
+        and V4 = w + s (1 - r^4), hence (V4 - V2)/(V2 - V1) = r (1 + r).
         """
         if not self._count:
             return 1.0
@@ -78,7 +78,7 @@ class PairWatch:
         s = min((v2 - v1) / (r * (1 - r)), v1 / (1 - r))
         n = max(self._frames / self._count, 1.0)
         long = (1 + r) / (1 - r)
-        # Variance of means of n values and covariance of two successive ones, times n.
+        # Variance of means of n values and covariance of two successive means, times n.
         own = long - 2 * r * (1 - r**n) / (n * (1 - r) ** 2)
         shared = r * (1 - r**n) ** 2 / (n * (1 - r) ** 2)
         white = v1 - s * (1 - r)
@@ -102,10 +102,10 @@ class PairWatch:
         self._count = decay * self._count + len(first)
 
     def block(self, observations: EpipolarObservations) -> PairBlock:
-        """Statistics of the usable observations of a block; there must be at least one.
+        """Return the statistics of the usable observations of a block; at least one is needed.
 
-        Until the field of systematic errors is estimated, the residuals go into it and the series
-        against the start are those against the calibration.
+        Until the field of systematic errors is estimated, the residuals are added to it, and the
+        series against the start equal those against the calibration.
         """
         options = self._options
         _, marker = np.unique(observations.target_id, return_inverse=True)
@@ -159,8 +159,8 @@ class PairWatch:
     ) -> None:
         """Fill in the series of one image.
 
-        residuals (2, n): against the calibration and against the start [px]; cell (n,) and
-        marker (n,) of each.
+        residuals (2, n): against the calibration and against the start [px]; cell (n,) and marker
+        (n,): of each observation.
         """
         areas = self._areas
         factor = observations.factor[side]
@@ -187,7 +187,7 @@ class PairWatch:
     def _area_sums(
         self, cell: NDArray[np.int64], columns: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Sums (k, A) of columns (k, n) over the areas, for rows in cells (n,)."""
+        """Return sums (k, A) of columns (k, n) over the areas, for rows in cells (n,)."""
         size = self._areas.n**2
         k = len(columns)
         index = cell + size * np.arange(k)[:, None]
@@ -197,7 +197,7 @@ class PairWatch:
     def _unknown_variance(
         self, cell: NDArray[np.int64], nodes: NDArray[np.int64], weights: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Variance (A,) of the weighted sums of residuals by the uncertainty of the field."""
+        """Return the variance (A,) of weighted sums of residuals due to errors of the field."""
         covariance = np.asarray(self.field.covariance)
         size = len(covariance)
         index = cell[:, None] * size + nodes
@@ -206,8 +206,8 @@ class PairWatch:
         return np.maximum(np.sum((sums @ covariance) * sums, axis=1), 0)
 
 
-NODES = 8  # across an image
-# Correlation lengths over the width of the image: of the correction, and of the orientation.
+NODES = 8  # number of nodes across an image
+# Correlation lengths of the correction and of the orientation, over the image width.
 CORRECTION_LENGTH = 0.12
 ORIENTATION_LENGTH = 1.0
 MIN_VARIANCE_PX2 = 1e-4
@@ -216,8 +216,8 @@ MIN_VARIANCE_PX2 = 1e-4
 class SystematicErrorField:
     """Systematic part of the epipolar residuals of a pair of views, on a grid of nodes.
 
-    Each image has NODES x NODES nodes with bilinear interpolation between them. The prior is what
-    the calibration states of its own uncertainty, with the correlation of a correction and of an
+    Each image has NODES x NODES nodes with bilinear interpolation between them. The prior is the
+    uncertainty that the calibration states, with the correlation of a correction and of an
     orientation. The values are estimated from the residuals of the start, by marker and block, by
     least-squares collocation.
 
@@ -231,14 +231,14 @@ class SystematicErrorField:
         self._right = np.zeros(2 * self._nodes)
         self._square_sum = 0.0
         self._count = 0
-        #: (m,) [px] and (m, m) [px^2] of the nodes; None until `estimate` is called
+        #: (m,) [px] and (m, m) [px^2] of the nodes; None before `estimate` is called
         self.mean: NDArray[np.float64] | None = None
         self.covariance: NDArray[np.float64] | None = None
 
     def interpolation(
         self, uv: NDArray[np.float64], side: int
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Nodes (n, 4) and their bilinear weights (n, 4) at pixels uv (n, 2) of image 0 or 1."""
+        """Return nodes (n, 4) and their bilinear weights (n, 4) at uv (n, 2) of image 0 or 1."""
         x = np.clip((uv + 0.5) * ((NODES - 1) / self._sizes[side]), 0, NODES - 1)
         low = np.minimum(x.astype(int), NODES - 2)
         fu, fv = (x - low).T
@@ -255,12 +255,12 @@ class SystematicErrorField:
         variance: NDArray[np.float64],
         systematic: NDArray[np.float64],
     ) -> None:
-        """Add the residuals of a block; those of one marker count as their mean.
+        """Add the residuals of a block; those of a marker enter as their mean.
 
         Parameters
         ----------
         marker : ndarray
-            (n,), numbers of the markers from 0.
+            (n,), indices of the markers from 0.
         nodes, weights : ndarray
             (n, 8), from `interpolation` in both images.
         residual, variance : ndarray
@@ -283,7 +283,7 @@ class SystematicErrorField:
     def estimate(self, variance_factor: float) -> None:
         """Set mean and covariance.
 
-        variance_factor is the variance of the residuals over the predicted one.
+        variance_factor: ratio of the actual and the predicted variance of the residuals.
         """
         node = np.stack(np.divmod(np.arange(self._nodes), NODES)) / (NODES - 1)
         square = np.sum((node[:, :, None] - node[:, None]) ** 2, axis=0)
@@ -291,7 +291,7 @@ class SystematicErrorField:
             np.exp(-square / (2 * CORRECTION_LENGTH**2))
             + np.exp(-square / (2 * ORIENTATION_LENGTH**2))
         ) / 2
-        # Each image gets the whole stated variance, twice of it in total, so that the prior
+        # Each image gets the full stated variance, twice the variance in total, so that the prior
         # shrinks the estimate as little as possible.
         variance = max(self._square_sum / max(self._count, 1), MIN_VARIANCE_PX2)
         prior = variance * np.kron(np.eye(2), shape + 1e-6 * np.eye(self._nodes))

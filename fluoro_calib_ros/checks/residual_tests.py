@@ -3,12 +3,12 @@
 
 """Tests of residuals for a trend that all exposures have in common, and for a change of it.
 
-Residuals of one exposure are correlated by its orientation, those of different exposures are
+Residuals of one exposure are correlated by its orientation, while those of different exposures are
 nearly uncorrelated. The tests therefore average products of residuals of DIFFERENT exposures that
-are close together on the image: joins in the sense of Moran ("Notes on continuous stochastic
+are close together in the image: joins in the sense of Moran ("Notes on continuous stochastic
 phenomena", Biometrika 37, 1950). Every pair of exposures gives a mean product. Without a trend
-these have the expectation 0 and are uncorrelated, whatever happens within an exposure, and their
-scatter gives the limit of their mean (Student's t-test, weighted by the number of joins).
+these products have expectation 0 and are uncorrelated, whatever happens within an exposure, and
+their scatter gives the limit of their mean (Student's t-test, weighted by the number of joins).
 """
 
 from __future__ import annotations
@@ -42,15 +42,15 @@ from ..photogrammetry.outliers import FALSE_ALARM
 from ..photogrammetry.rotations import matrix_from_quaternion
 from .check import Check
 
-MIN_IN_CELL = 10  # image points
+MIN_IN_CELL = 10  # minimum number of image points
 
 
 class _TestPlan(NamedTuple):
-    """How a trend is looked for.
+    """Parameters of a test for a trend.
 
-    neighbours: of each image point; those of other exposures count. overlap: cells that a part of
-    the image belongs to, along each side. false_alarm, cell_false_alarm: chances of a false alarm
-    in the whole image and in any of the cells.
+    neighbours: number per image point; only those of other exposures count. overlap: number of
+    cells along each side that contain a given part of the image. false_alarm, cell_false_alarm:
+    probability of a false alarm in the whole image, and in any of the cells.
     """
 
     neighbours: int
@@ -60,10 +60,10 @@ class _TestPlan(NamedTuple):
 
 
 COMMON = _TestPlan(8, 1, FALSE_ALARM, FALSE_ALARM)
-# A change has no cause in the calibration itself, so an accusation has to be rarer. Cells that
-# overlap find it wherever it is, and more neighbours average more noise. Earlier and later
-# exposures of 22 simulated rigs that did not change, in 8800 random orders: each of both tests
-# fails in 0.03 % (docs/verdict.md).
+# A change has no cause in the calibration itself, so false accusations have to be rarer.
+# Overlapping cells find it wherever it is, and more neighbours average more noise. For earlier and
+# later exposures of 22 simulated rigs that did not change, in 8800 random orders, each of the two
+# tests fails in 0.03 % (docs/verdict.md).
 CHANGE = _TestPlan(16, 2, 1e-4, 1e-3)
 
 
@@ -73,10 +73,10 @@ class Residuals:
 
     uv: NDArray[np.float64]  #: (n, 2) observed pixels
     r: NDArray[np.float64]  #: (n, 2) observed - correction - projected [px]
-    exposure: NDArray[np.int64]  #: (n,) exposure of a residual, 0 to m - 1 in order
+    exposure: NDArray[np.int64]  #: (n,) index of its exposure, 0 to m - 1 in order
     target_id: NDArray[np.int64]  #: (n,)
     numbers: NDArray[np.int64]  #: (m,) numbers of the exposures
-    angles: NDArray[np.float64]  #: (m,) angles of the C-arm [rad], NaN where they are unknown
+    angles: NDArray[np.float64]  #: (m,) angles of the C-arm [rad]; NaN if unknown
 
     @property
     def angle(self) -> NDArray[np.float64]:
@@ -84,7 +84,7 @@ class Residuals:
         return self.angles[self.exposure]
 
     def capped(self, sd: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return squared lengths (n,) [px^2], capped at the border of the core of the noise.
+        """Return squared lengths (n,) [px^2], capped at the border of the noise core.
 
         sd (n,): standard deviations of the noise [px].
         """
@@ -92,11 +92,11 @@ class Residuals:
         return np.minimum(np.where(np.isfinite(squared), squared, np.inf), INLIER_Q * sd**2)
 
     def inliers(self, sd: np.ndarray) -> Residuals:
-        """Return the residuals in the core of noise of standard deviations sd (n,) [px]."""
+        """Return the residuals in the core of the noise; sd (n,): standard deviations [px]."""
         return self._part(np.sum(self.r**2, axis=1) <= INLIER_Q * sd**2)
 
     def rejected(self, sd: NDArray[np.float64]) -> Residuals:
-        """Return the residuals beyond that core which a distortion may have left."""
+        """Return the residuals beyond that core that may be due to distortion."""
         q = np.sum(self.r**2, axis=1) / sd**2
         return self._part((q > INLIER_Q) & (q < LARGEST_SD**2))
 
@@ -114,43 +114,43 @@ class Residuals:
 class CellTrend(NamedTuple):
     """Trend in the cell of the image where it is most significant."""
 
-    #: [px]
+    #: length of the mean residual, and its limit [px]
     size: float
     limit: float
     place: NDArray[np.float64]  #: (2,) centre of the cell [px]
 
 
 class RejectedTrend(NamedTuple):
-    """What the rejected image points about one place have in common."""
+    """Agreement of the rejected image points near one place."""
 
-    #: length of their mean residual; that which chance hardly exceeds [px]
+    #: length of their mean residual, and the limit that chance hardly exceeds [px]
     size: float
     limit: float
-    place: NDArray[np.float64]  #: (2,) their mean place [px]
-    points: int  #: number of them
+    place: NDArray[np.float64]  #: (2,) mean position [px]
+    points: int  #: number of these points
 
 
 class RejectedExposure(NamedTuple):
-    """How far the rejected image points of one exposure agree with their neighbours."""
+    """Agreement of the rejected image points of one exposure with their neighbours."""
 
-    number: int  #: of the exposure
-    #: rejected image points, and all
+    number: int  #: number of the exposure
+    #: number of rejected image points, and of all image points
     points: int
     of: int
-    #: sum of the products of neighbours, in its standard deviations if they have any direction;
-    #: what chance exceeds with FALSE_ALARM in any of the exposures
+    #: sum of the products of neighbours, in standard deviations for random directions; limit that
+    #: chance exceeds with probability FALSE_ALARM in any of the exposures
     agreement: float
     limit: float
 
 
 @dataclass(frozen=True)
 class ResidualTrend:
-    """A trend in residuals; without one, a limit is exceeded with the chance of its test."""
+    """Trend in residuals; without a trend, each limit is exceeded with its test's probability."""
 
-    #: of the whole image [px]
+    #: size and limit for the whole image [px]
     size: float
     limit: float
-    #: of the cell where the trend is most significant [px]
+    #: size and limit for the cell where the trend is most significant [px]
     cell_size: float
     cell_limit: float
     place: NDArray[np.float64]  #: (2,) centre of that cell [px]
@@ -162,7 +162,7 @@ class Joins:
 
     mean: NDArray[np.float64]  #: (p,) mean product [px^2]
     count: NDArray[np.float64]  #: (p,) number of joins
-    #: (p,) rows of the exposures
+    #: (p,) row indices of the exposures
     earlier: NDArray[np.int64]
     later: NDArray[np.int64]
 
@@ -170,7 +170,7 @@ class Joins:
 def residuals_of(job: CalibrationResult, name: str, frames: Sequence[Frame]) -> Residuals:
     """Return the residuals of the frames of a fluoroscope in an adjustment.
 
-    job: an adjustment with a calibration fixed. name: the fluoroscope.
+    job: adjustment with the calibrations fixed. name: name of the fluoroscope.
     """
     figures = job.fluoroscopes[name]
     calibration = job.calibrations[name]
@@ -216,25 +216,25 @@ def common_trend(residuals: Residuals, image_size: tuple[int, int]) -> ResidualT
 
 
 def change_of_trend(residuals: Residuals, image_size: tuple[int, int]) -> ResidualTrend:
-    """Test for a trend by which the later half of the exposures differs from the earlier.
+    """Test for a trend by which the later half of the exposures differs from the earlier half.
 
-    The sizes are those of the difference. After a change residuals agree within a half, and have
+    The sizes are those of the difference. After a change, residuals agree within a half, and have
     opposite signs across the halves.
     """
     joins = _joins(residuals, CHANGE.neighbours)
     later = np.arange(len(residuals.numbers)) >= len(residuals.numbers) // 2
     same = later[joins.earlier] == later[joins.later]
     squared, limit = _mean_and_limit(joins, same, CHANGE.false_alarm)
-    # Halves that differ by t leave residuals of t/2 on both sides of their mean.
+    # Halves that differ by t have residuals of t/2 on both sides of their mean.
     return _trend(4 * squared, 4 * limit, _worst_cell(residuals, image_size, later, CHANGE))
 
 
 def rejected_trend(
     rejected: Residuals, inliers: Residuals, image_size: tuple[int, int]
 ) -> RejectedTrend | None:
-    """Test whether rejected image points of different exposures agree about some place.
+    """Test whether rejected image points of different exposures agree near some place.
 
-    Returns the place where it is most significant; None where rejected points are few everywhere.
+    Returns the most significant place, or None if rejected points are few everywhere.
     """
     points = FittedPoints(rejected.uv, rejected.r, rejected.exposure)
     areas = areas_of_rejected(points, rejected.target_id, inliers.uv, image_size)
@@ -247,11 +247,11 @@ def rejected_trend(
 
 
 def unexplained(rejected: Residuals, reach: float) -> Residuals:
-    """Return the rejected image points but for those of exposures that agree with the others.
+    """Return the rejected image points, except those that agree with other exposures.
 
-    Where the nearest rejected points of MIN_EXPOSURES other exposures, up to a distance of reach
-    [px], are displaced as those of an exposure are, it is not the exposure that differs. Residuals
-    of false matches have any direction.
+    If the nearest rejected points of MIN_EXPOSURES other exposures, up to a distance of reach
+    [px], are displaced like those of an exposure, it is not this exposure that differs. Residuals
+    of false matches have random directions.
     """
     limit = special.ndtri(1 - FALSE_ALARM)
     keep = np.ones(len(rejected.r), dtype=bool)
@@ -262,7 +262,7 @@ def unexplained(rejected: Residuals, reach: float) -> Residuals:
             continue
         distance, near = cKDTree(rejected.uv[others]).query(rejected.uv[own])
         close = distance <= reach
-        # What is near one point of another exposure counts together: it has one direction.
+        # Points near one point of another exposure count together, as it has one direction.
         sums = np.zeros((len(others), 2))
         np.add.at(sums, near[close], rejected.r[own[close]])
         r = rejected.r[others]
@@ -277,9 +277,9 @@ def unexplained(rejected: Residuals, reach: float) -> Residuals:
 def rejected_exposure(rejected: Residuals, inliers: Residuals) -> RejectedExposure | None:
     """Test whether the rejected image points of an exposure agree with their neighbours.
 
-    The residuals of false matches have any direction, each its own. What an exposure that does not
-    fit leaves is alike in neighbouring image points. Returns the exposure where it is most
-    significant; None where no exposure has two rejected image points.
+    The residuals of false matches have independent random directions. The residuals of an exposure
+    that does not fit are similar in neighbouring image points. Returns the most significant
+    exposure, or None if no exposure has two rejected image points.
     """
     limit = float(special.ndtri(1 - FALSE_ALARM / len(rejected.numbers)))
     found = []
@@ -319,8 +319,8 @@ def _joins(residuals: Residuals, neighbours: int) -> Joins:
 
 
 def _trend(squared: float, limit: float, cell: CellTrend) -> ResidualTrend:
-    """Return a trend from its mean product and the limit of that [px^2]."""
-    # A product of two residuals with a common trend t has the expectation |t|^2, twice that of a
+    """Return a trend from its mean product and the limit of the product [px^2]."""
+    # The product of two residuals with a common trend t has expectation |t|^2, twice that of a
     # coordinate.
     size, size_limit = np.sqrt(np.maximum([squared, limit], 0.0) / 2)
     return ResidualTrend(float(size), float(size_limit), *cell)
@@ -331,7 +331,7 @@ def _mean_and_limit(
 ) -> tuple[float, float]:
     """Return the mean product of the pairs (p,) that are the same, and its limit [px^2].
 
-    Where there are others, half the excess over their mean is returned.
+    If there are other pairs, return half the excess over their mean.
     """
     groups = [group for group in (same, ~same) if group.any()]
     freedom = len(joins.mean) - len(groups)
@@ -352,8 +352,7 @@ def _cell_sums(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return the residuals by cell and exposure.
 
-    overlap: a cell consists of so many parts along each side, and there is one for each place of
-    such a square of parts.
+    overlap: number of parts of a cell along each side; every such square of parts is a cell.
 
     Returns the sums (c, m, 2) [px], counts (c, m) and centres (c, 2) of the cells [px].
     """
@@ -361,7 +360,7 @@ def _cell_sums(
     size = np.asarray(image_size) / parts
     column, row = cells_of(residuals.uv, image_size, parts).T
     m = len(residuals.numbers)
-    # Residuals and their number, by rows of parts, columns and exposures.
+    # Sums and numbers of residuals, by rows of parts, columns and exposures.
     found = np.zeros((parts, parts, m, 3))
     values = np.column_stack([residuals.r, np.ones(len(residuals.r))])
     np.add.at(found, (row, column, residuals.exposure), values)
@@ -379,7 +378,7 @@ def _worst_cell(
 ) -> CellTrend:
     """Return the mean residual of the cell where it is most significant.
 
-    part (m,) selects exposures; where there are others, the difference from their mean counts.
+    part (m,) selects exposures; if there are others, the difference of the two means is tested.
     """
     sums, counts, centres = _cell_sums(residuals, image_size, plan.overlap)
     groups = [group for group in (part, ~part) if group.any()]
@@ -392,7 +391,7 @@ def _worst_cell(
     n = n[:, keep]
     means = [sums[:, g].sum(axis=1) / k[:, None] for g, k in zip(groups, n)]
     scatter, freedom = _scatter(sums, counts, groups, means)
-    # Variance of a residual: that of the cell, or of all cells where it is larger.
+    # Variance of a residual: that of the cell, or of all cells if it is larger.
     pooled = scatter.sum() / max(freedom.sum(), 1)
     variance = np.maximum(scatter / np.maximum(freedom, 1), pooled) * np.sum(1 / n, axis=0)
     length = np.linalg.norm(means[0] if len(means) == 1 else means[0] - means[1], axis=1)
@@ -408,9 +407,9 @@ def _scatter(
     groups: Sequence[np.ndarray],
     means: Sequence[NDArray[np.float64]],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the squared deviations (c,) of the exposures from the mean of their group, by cell.
+    """Return the squared deviations (c,) of exposures from the mean of their group, by cell.
 
-    The second array is their number of degrees of freedom.
+    The second array contains the number of degrees of freedom.
     """
     scatter = np.zeros(len(sums))
     freedom = np.zeros(len(sums))
@@ -422,9 +421,10 @@ def _scatter(
     return scatter, freedom
 
 
-# What a person should look at after an adjustment: bad exposures, and ids that may be wrong.
+# Results of an adjustment for review by a person: bad exposures, and ids that may be wrong.
 
-# Of what is excluded; a repeated pose is joined, and targets of few rays are no fault of a point.
+# Kinds of exclusions that are listed. A repeated pose is merged instead, and targets with few rays
+# are not the fault of an image point.
 BAD = {
     Kind.COPIED_EXPOSURE,
     Kind.FALSE_MATCHES,
@@ -441,7 +441,7 @@ def doubtful_observations(
 ) -> list[Doubtful]:
     """Return exposures that are excluded or fail their check, and image points that fail theirs.
 
-    checks: of the verdict on the calibration.
+    checks: checks of the verdict on the calibration.
     """
     failed = [c for c in checks if c.kind is Kind.EXPOSURES and c.passed is False]
     excluded = [f for f in result.findings if f.severity is Severity.NOTE and f.kind in BAD]
@@ -460,7 +460,7 @@ def _of_finding(found: Finding) -> Iterator[Doubtful]:
 
 
 def _outlying_points(result: CalibrationResult, table: ResidualTable) -> Iterator[Doubtful]:
-    """Yield the image points that fail their test, with the targets that they may be."""
+    """Yield the image points that fail their test, with other targets that they may show."""
 
     def of_exposure(point: Mapping[str, Any]) -> tuple[str, int]:
         return point['fluoroscope'], point['exposure']
@@ -497,11 +497,11 @@ def _may_be(
     rows: NDArray[np.intp],
     limit_px: NDArray[np.float64],
 ) -> list[tuple[int, ...]]:
-    """Return other targets in whose place image points would pass their test, the nearest first.
+    """Return other targets at which image points would pass their test, the nearest first.
 
-    here (N,): the image points of their exposure; rows (k,): those that fail. A target that fits
-    where it is, is none of them, and each is only for the image point that is nearest to it.
-    limit_px (k,): of residuals; at other targets they have about the same standard deviation.
+    here (N,): image points of their exposure; rows (k,): those that fail. Targets that fit their
+    own image points are excluded, and each target is only proposed for the image point nearest to
+    it. limit_px (k,): of residuals; at other targets they have about the same standard deviation.
     """
     name = str(table.fluoroscope[rows[0]])
     figures = result.fluoroscopes[name]

@@ -1,17 +1,17 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Check 'orientation': the exposures of a rig agree on how its fluoroscopes stand to each other.
+"""Check 'orientation': the exposures of a rig agree on its relative orientations.
 
-Fluoroscopes of a rig do not move against each other while the phantom is moved. Where frames of
+Fluoroscopes of a rig do not move relative to each other while the phantom is moved. If frames of
 different exposures have the same number, the relative orientations of the pairs contradict each
 other, however well each fluoroscope is calibrated.
 
-Points in space depend on the orientation of the rig as much as on the corrections. What two
-fluoroscopes see in exposures of one number shows frames of different exposures while the phantom
-moves, but not where the motion between them is the same each time, as on a turntable: such a
-motion looks like another orientation. Stamps exclude it; without them the verdict takes it on
-trust.
+Points in space depend on the orientation of the rig as much as on the corrections. Comparing two
+fluoroscopes in exposures of the same number reveals frames of different exposures while the
+phantom moves. It does not if the motion between the frames is the same each time, as on a
+turntable: such a motion looks like a different orientation. Stamps exclude this; without them the
+verdict takes it on trust.
 """
 
 from __future__ import annotations
@@ -37,18 +37,18 @@ from ..photogrammetry.rotations import matrix_from_quaternion, rotation_angle, v
 from .check import Check
 from .inputs import MAX_MISFIT
 
-# Distance, in radians and relative shift, from which a pair is not one of the rig.
+# Distance, angle [rad] plus relative shift, above which a pair does not belong to the rig.
 INTERCHANGED = 0.4
-# Median deviation of the pairs from their median, far above that of a rig whose mounting gives.
+# Maximum median deviation of the pairs from their median, far above that of a compliant mounting.
 MAX_SHIFT_MM = 10.0
-MAX_SHIFT = 0.01  # the same over the distance of the sources; the larger of both holds
+MAX_SHIFT = 0.01  # maximum over the distance of the sources; the larger of both limits applies
 MAX_TURN_RAD = np.deg2rad(1.0)
-# Scatter of the pairs over their standard deviations above which they are doubtful; of honest rigs
-# it is 1.0 to 1.4, and 3 where the model does not follow the distortion at all.
+# Scatter of the pairs over their standard deviations above which they are doubtful; in correct
+# rigs it is 1.0 to 1.4, and 3 if the model does not follow the distortion at all.
 DOUBTFUL_GROWTH = 2.0
-MAX_GROWTH = 8.0  # above which there is no orientation, where the displacement is large as well
+MAX_GROWTH = 8.0  # above it, and with a large displacement, there is no orientation
 MIN_PAIRS_MOVED = 6
-# What findings on the orientation of a rig are about.
+# Subjects of findings on the orientation of a rig.
 ORIENTED = 'orientation of the rig'
 NOT_ORIENTED = 'no orientation of the rig'
 
@@ -56,9 +56,9 @@ NOT_ORIENTED = 'no orientation of the rig'
 def interchanged(
     names: tuple[str, str], one: FluoroscopeResult, other: FluoroscopeResult
 ) -> Finding | None:
-    """Return a finding where frames of two fluoroscopes are interchanged in some exposures.
+    """Return a finding if frames of two fluoroscopes are interchanged in some exposures.
 
-    The relative orientation of such a pair is far from the others, and its inverse is near them.
+    The relative orientation of such a pair is far from the others, while its inverse is near them.
     """
     pairs = _pairs(one, other)
     if len(pairs) < MIN_EXPOSURES:
@@ -86,7 +86,7 @@ def interchanged(
 def _pairs(
     one: FluoroscopeResult, other: FluoroscopeResult
 ) -> list[tuple[ExposureResult, ExposureResult]]:
-    """Return the exposures of the same number."""
+    """Return pairs of exposures with the same number."""
     by_number = {e.exposure: e for e in other.exposures}
     return [(e, by_number[e.exposure]) for e in one.exposures if e.exposure in by_number]
 
@@ -94,7 +94,7 @@ def _pairs(
 def _relative(
     pairs: Sequence[tuple[ExposureResult, ExposureResult]],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return rotations (k, 3, 3) from sensor to sensor, and shifts (k, 3) [mm] in the first."""
+    """Return rotations (k, 3, 3) from sensor to sensor and shifts (k, 3) [mm] in the first."""
     r_a = matrix_from_quaternion([a.quaternion_wxyz for a, _ in pairs])
     r_b = matrix_from_quaternion([b.quaternion_wxyz for _, b in pairs])
     base = np.array([b.position_mm - a.position_mm for a, b in pairs])
@@ -107,7 +107,7 @@ def _distances(
     other_turn: NDArray[np.float64],
     other_shift: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return how far (k, l) relative orientations are apart: angle [rad] and relative shift."""
+    """Return distances (k, l) of relative orientations: angle [rad] plus relative shift."""
     angle = rotation_angle(turn[:, None] @ other_turn[None].transpose(0, 1, 3, 2))
     length = np.linalg.norm(other_shift, axis=-1)[None]
     apart = np.linalg.norm(shift[:, None] - other_shift[None], axis=-1)
@@ -117,9 +117,9 @@ def _distances(
 def contradiction(
     names: tuple[str, str], one: FluoroscopeResult, other: FluoroscopeResult
 ) -> Finding | None:
-    """Return a finding where the exposures of two fluoroscopes contradict each other.
+    """Return a finding if the exposures of two fluoroscopes contradict each other.
 
-    Exposures of the same number belong together. Fewer than three pairs cannot contradict.
+    Exposures of the same number belong together. Fewer than MIN_EXPOSURES pairs cannot contradict.
     """
     pairs = _pairs(one, other)
     if len(pairs) < MIN_EXPOSURES:
@@ -151,10 +151,10 @@ def contradiction(
 
 
 def doubtful(scatter: PairScatter, side_px: int, noise_px: float) -> tuple[bool, list[Finding]]:
-    """Return whether exposures give an orientation of a rig, and what is doubtful about it.
+    """Return whether exposures determine an orientation of a rig, and doubts about it.
 
-    side_px is the longer side of the image. noise_px: less displaces no point by more than its
-    noise does. Without an orientation the finding says why.
+    side_px: longer side of the image. noise_px: a displacement below it is within the noise of
+    points. Without an orientation the finding contains the reason.
     """
     a, b = scatter.fluoroscopes
     off = float(np.median(scatter.off_px[scatter.used]))
@@ -201,7 +201,7 @@ def doubtful(scatter: PairScatter, side_px: int, noise_px: float) -> tuple[bool,
 
 
 def _size(off_px: NDArray[np.float64]) -> str:
-    """Return the displacements of image points as text."""
+    """Return displacements of image points as text."""
     low, high = float(np.min(off_px)), float(np.max(off_px))
     if not np.isfinite(high):
         return f'{low:.1f} px and more' if np.isfinite(low) else 'more than the image shows'
@@ -209,7 +209,7 @@ def _size(off_px: NDArray[np.float64]) -> str:
 
 
 def _cause(scatter: PairScatter) -> tuple[Kind, tuple[int, ...], str]:
-    """Return why the pairs scatter: one move of the rig, where that explains nearly all.
+    """Return why the pairs scatter: a single move of the rig, if it explains nearly all scatter.
 
     Returns the kind of finding, the exposures between which the rig was moved, and the cause.
     """
@@ -217,7 +217,7 @@ def _cause(scatter: PairScatter) -> tuple[Kind, tuple[int, ...], str]:
     order = np.argsort(scatter.exposures)
     turn = scatter.turn[order]
     columns = scatter.columns[order]
-    # Rotations about the first pair [rad], and shifts over the distance of the sources.
+    # Rotations relative to the first pair [rad], and shifts over the distance of the sources.
     base = float(np.median(np.linalg.norm(scatter.shift_mm, axis=1)))
     place = np.hstack(
         [vector_from_matrix(turn @ turn[0].T), scatter.shift_mm[order] / max(base, 1e-9)]
@@ -248,7 +248,7 @@ def _cause(scatter: PairScatter) -> tuple[Kind, tuple[int, ...], str]:
 def _squares(
     values: NDArray[np.float64], columns: NDArray[np.float64]
 ) -> tuple[float, np.ndarray]:
-    """Fit functions (k, p) to values (k, 6); return the squares left, and coefficients (p, 6)."""
+    """Fit functions (k, p) to values (k, 6); return residual square sum, coefficients (p, 6)."""
     coefficients = np.linalg.lstsq(columns, values, rcond=None)[0]
     return float(np.sum((values - columns @ coefficients) ** 2)), coefficients
 
@@ -258,20 +258,20 @@ CAPTURE = 'orient the rig from a capture'
 
 @dataclass(frozen=True)
 class RigFindings:
-    """What the exposures say about the orientation of a rig."""
+    """Results of the exposures on the orientation of a rig."""
 
-    fluoroscopes: tuple[str, ...] = ()  #: empty: they are no rig, or the rig is oriented otherwise
-    #: None where the exposures give none; the doubts say why
+    fluoroscopes: tuple[str, ...] = ()  #: empty: no rig, or its orientation is known
+    #: None if the exposures do not determine it; the doubts contain the reason
     orientation: RigOrientation | None = None
     doubts: tuple[Finding, ...] = ()
-    #: of every fluoroscope but the first; empty where it is not known
+    #: for every fluoroscope except the first; empty if unknown
     scatter: tuple[PairScatter, ...] = ()
-    noise_px: float = 0.0  #: standard deviation of an image coordinate, the largest of all [px]
-    trusted: tuple[Finding, ...] = field(default=())  #: what the exposures cannot show
+    noise_px: float = 0.0  #: largest standard deviation of an image coordinate [px]
+    trusted: tuple[Finding, ...] = field(default=())  #: unverified assumptions
 
     @property
     def notes(self) -> tuple[Finding, ...]:
-        """What a user has to know beside the check."""
+        """Findings that a user has to know in addition to the check."""
         decided = {Kind.PAIRS_CONTRADICT, Kind.RIG_MOVED, Kind.RIG_NOT_ORIENTED}
         return (*(one for one in self.doubts if one.kind not in decided), *self.trusted)
 
@@ -284,8 +284,8 @@ def rig_findings(
 ) -> RigFindings:
     """Determine the orientation of a rig from exposures of the phantom.
 
-    request: with phantom and known orientations. result: adjustment of fluoroscopes of the rig.
-    frames, calibrations: of all fluoroscopes of the rig, in their order.
+    request: contains phantom and known orientations. result: adjustment of fluoroscopes of the
+    rig. frames, calibrations: of all fluoroscopes of the rig, in their order.
     """
     names = tuple(calibrations)
     if len(names) < 2:
@@ -330,7 +330,7 @@ def rig_findings(
 
 
 def check_rig(found: RigFindings) -> list[Check]:
-    """Return a check for every fluoroscope of a rig but the first."""
+    """Return a check for every fluoroscope of a rig except the first."""
     if not found.fluoroscopes:
         return []
     if not found.scatter:
@@ -352,7 +352,7 @@ def check_rig(found: RigFindings) -> list[Check]:
 
 
 def _check(found: RigFindings, pairs: PairScatter) -> Check:
-    """Check of the scatter of the pairs of two fluoroscopes."""
+    """Return the check of the scatter of the pairs of two fluoroscopes."""
     a, b = pairs.fluoroscopes
     off = float(np.median(pairs.off_px[pairs.used]))
     predicted = off / max(pairs.unexplained, 1.0)
@@ -366,7 +366,7 @@ def _check(found: RigFindings, pairs: PairScatter) -> Check:
         Kind.ORIENTATION,
         wrong[0].cause if wrong else cause,
         wrong[0].place if wrong else Place((a, b), name=ORIENTED),
-        '' if wrong and wrong[0].kind is Kind.RIG_MOVED else CAPTURE,  # its cause says so
+        '' if wrong and wrong[0].kind is Kind.RIG_MOVED else CAPTURE,  # its cause contains it
         numbers={'ratio': float(pairs.unexplained), 'noise_px': found.noise_px},
         value=off,
         limit=max(found.noise_px, DOUBTFUL_GROWTH * predicted),
@@ -375,10 +375,10 @@ def _check(found: RigFindings, pairs: PairScatter) -> Check:
 
 
 def _trusted(frames: Frames, pairs: PairScatter, noise_px: float) -> Finding | None:
-    """Return what is taken on trust: that frames of one number are of one exposure.
+    """Return the assumption that frames of one number are of one exposure, as a finding.
 
-    None where their stamps say so: the image of the phantom, as fast as from exposure to exposure,
-    moves by less than the noise in the time between the frames of a pair.
+    Returns None if their stamps verify it: the image of the phantom, at its speed between
+    exposures, moves by less than the noise in the time between the frames of a pair.
     """
     a, b = pairs.fluoroscopes
     moved = motion_between_stamps(frames[a], frames[b])
@@ -399,9 +399,9 @@ def _trusted(frames: Frames, pairs: PairScatter, noise_px: float) -> Finding | N
 
 
 def motion_between_stamps(one: Sequence[Frame], other: Sequence[Frame]) -> float | None:
-    """Return by how much the image moves between frames of one number [px], None: no stamps.
+    """Return the motion of the image between frames of one number [px]; None without stamps.
 
-    It is the median over the exposures, at the speed from exposure to exposure.
+    It is the median over the exposures, at the speed of the image between exposures.
     """
     there = {frame.number: frame for frame in other if frame.stamp_ns}
     stamped = sorted((f for f in one if f.stamp_ns), key=lambda frame: frame.stamp_ns)

@@ -1,19 +1,20 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the rays of an alarm tell of a change of the rig, as an addition to its covariance.
+"""Estimate a change of the rig from the rays of an alarm, as an addition to its covariance.
 
 The unknowns of the rig have changed by d. Epipolar residuals are r = -J d + noise. A cause, such
-as a knock, and its size s are a normal prior of d with the covariance s^2 D (see healing.sizes).
-With the normal equations N = J'WJ and g = -J'Wr, a cause of a size has the posterior mean m and
-covariance P and the evidence Z,
+as a knock, of size s is a normal prior of d with covariance s^2 D (see healing.sizes). With the
+normal equations N = J'WJ and g = -J'Wr, a cause of a given size has posterior mean m and
+covariance P and evidence Z,
 
     P = (N + (s^2 D)^-1)^-1,  m = P g,  log Z = 1/2 g'Pg - 1/2 log det(I + s^2 N D).
 
-Points are still intersected with the rig as it was calibrated, so d is their error, and its
-second moment is added to the covariance of the rig: the mean of m m' + P over causes and sizes,
-weighted by Z. Where rays tell nothing, along epipolar lines, it is that of a change as large as
-what they tell. What no change of the rig explains is added to the image points.
+Points are still intersected with the rig as it was calibrated, so d is its error. The second
+moment of d is added to the covariance of the rig: the mean of m m' + P over causes and sizes,
+weighted by Z. In directions that the rays do not determine, along epipolar lines, it is that of a
+change as large as in the determined ones. Unexplained residuals increase the noise of image
+points.
 """
 
 from __future__ import annotations
@@ -30,41 +31,41 @@ from ..photogrammetry.noise import CERTAIN, NORMAL_MEDIAN
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
 from ..reconstruction.epipolar import EpipolarGeometry, EpipolarResiduals
 
-WINDOW = 8  # newest blocks that tell of a change
-SIZES = np.geomspace(2.0**-7, 4.0, 10)  # of a change, relative to a knock
-# Variance of the median of normal errors over that of their mean.
+WINDOW = 8  # newest blocks from which a change is estimated
+SIZES = np.geomspace(2.0**-7, 4.0, 10)  # sizes of a change, relative to a knock
+# Ratio of the variances of the median and the mean of normal errors.
 MEDIAN_VARIANCE = np.pi / 2
 ITERATIONS = 10
-NU = 4.0  # degrees of freedom of the distribution by which residuals are weighted
-# Blocks in a row, with so many markers and most of their rays apart, that show a knock.
+NU = 4.0  # degrees of freedom of the t distribution that weights residuals
+# Consecutive blocks, with a minimum number of markers and most rays apart, that show a knock.
 KNOCKED_BLOCKS = 2
 MIN_MARKERS = 3
 
 
 @dataclass(frozen=True)
 class Addition:
-    """What is added to the errors of a rig and of its image points."""
+    """Addition to the errors of a rig and of its image points."""
 
     covariance: NDArray[np.float64]  #: (9F, 9F)
-    image_sd: float  #: of each coordinate of an image point [px]
-    miss: float  #: RMS of what the rays miss each other by [px]
+    image_sd: float  #: standard deviation of each image coordinate [px]
+    miss: float  #: RMS of the distances by which rays miss each other [px]
 
 
 @dataclass(frozen=True)
 class _Rays:
-    """Residuals (n,) of pairs of rays, and their derivatives (n, 9F) by the rig."""
+    """Residuals (n,) of pairs of rays, and their derivatives (n, 9F) with respect to the rig."""
 
     residual: NDArray[np.float64]
     noise: NDArray[np.float64]  # variance
-    systematic: NDArray[np.float64]  # variance of the part that stays
+    systematic: NDArray[np.float64]  # variance of the constant part
     by_rig: NDArray[np.float64]
-    is_apart: NDArray[np.bool_]  # so that they do not meet
+    is_apart: NDArray[np.bool_]  # whether the rays miss each other
 
 
 class RigChange:
-    """Collects the rays of the newest blocks, and says what they tell of a change.
+    """Collects the rays of the newest blocks, and estimates a change from them.
 
-    pairs: fluoroscopes of each pair by their numbers, and their geometry.
+    pairs: indices of the fluoroscopes of each pair, and their geometry.
     """
 
     def __init__(
@@ -76,7 +77,7 @@ class RigChange:
         self._open: list[list[tuple[np.ndarray, ...]]] = [[] for _ in self._pairs]
         self._blocks: deque[_Rays] = deque(maxlen=WINDOW)
         self._has_met = False
-        self.blocks_apart = 0  #: blocks in a row whose rays are apart
+        self.blocks_apart = 0  #: consecutive blocks whose rays are apart
 
     def add(
         self,
@@ -88,7 +89,7 @@ class RigChange:
     ) -> None:
         """Add the image points uv (n, 2) of a pair in an exposure.
 
-        noise (n,): variances of the residuals by noise alone.
+        noise (n,): variances of the residuals due to noise alone.
         """
         good = np.isfinite(found.residual)
         columns = (
@@ -121,16 +122,16 @@ class RigChange:
 
     @property
     def share_apart(self) -> float:
-        """Share of the rays of a rig that has been knocked that miss each other; else 0.
+        """Share of the rays of a knocked rig that miss each other; 0 without a knock.
 
-        Rays that have never met are confused, or the rig is another one.
+        If rays have never met, they are confused, or belong to another rig.
         """
         if not self._has_met or self.blocks_apart < KNOCKED_BLOCKS:
             return 0.0
         return float(self._blocks[-1].is_apart.mean())
 
     def _median(self, number: int, columns: list[np.ndarray]) -> _Rays:
-        """Return the median residual of each marker in a block: false matches do not count."""
+        """Return the median residual per marker in a block, which is robust to false matches."""
         target_id, uv_a, uv_b, residual, noise, systematic, is_apart = columns
         order = np.lexsort((residual, target_id))
         _, first, count = np.unique(target_id[order], return_index=True, return_counts=True)
@@ -148,12 +149,12 @@ class RigChange:
         )
 
     def addition(self, blocks: int) -> Addition | None:
-        """Return what so many of the newest blocks tell, at most WINDOW; None without any."""
+        """Return the addition from this many newest blocks, at most WINDOW; None without any."""
         newest = list(self._blocks)[-max(blocks, 1) :]
         if not newest:
             return None
         rays = _joined(newest)
-        # The systematic error of a marker that stands still does not average out.
+        # The systematic error of a stationary marker does not average out.
         variance = rays.noise + len(newest) * rays.systematic
         broad = np.sqrt(np.sum([sd**2 for sd in self._hypotheses], axis=0)) * SIZES[-1]
         design = rays.by_rig * broad
@@ -179,7 +180,7 @@ class RigChange:
 
 
 def _cap(residual: NDArray[np.float64]) -> float:
-    """Square of a residual beyond which it counts as false in a mean."""
+    """Return the square of a residual above which it counts as false in a mean."""
     return float(9 * np.median(residual**2) / NORMAL_MEDIAN**2)
 
 
@@ -193,9 +194,9 @@ def _joined(parts: Sequence[_Rays]) -> _Rays:
 
 
 def _hypotheses(orientation: RigOrientation) -> list[NDArray[np.float64]]:
-    """Standard deviations (9F,) of a knock, and of source against detector, by fluoroscope.
+    """Return standard deviations (9F,) of a knock, and of source against detector, by view.
 
-    Of two views, only the orientation of one against the other can be seen.
+    With two views, only the orientation of one relative to the other is observable.
     """
     views = len(orientation.fluoroscopes)
     out = []
@@ -211,8 +212,8 @@ def _weights(
 ) -> tuple[float, NDArray[np.float64]]:
     """Return the factor of the variance, at least 1, and the weights (n,) of residuals (n,).
 
-    design (n, K): derivatives by unknowns of variance one. Weights are those of a t distribution
-    (Lange, Little and Taylor, JASA 84, 1989).
+    design (n, K): derivatives with respect to unknowns of unit variance. Weights are those of a t
+    distribution (Lange, Little and Taylor, JASA 84, 1989).
     """
     weight = 1 / variance
     factor = 1.0

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The drift watch of an oriented rig: turns corrected views into its observations.
+"""The drift watch of an oriented rig: convert corrected views into its observations.
 
-It separates the noise of an image point from the error of its correction: the one is new in every
-frame, the other stays the same at a place and does not average out.
+It separates the noise of an image point from the error of its correction: noise is independent in
+every frame, while the error is constant at a place and does not average out.
 """
 
 from __future__ import annotations
@@ -37,16 +37,16 @@ from .drift_evidence import EPIPOLAR
 from .drift_watch import DriftWatch
 from .rig_change import Addition, RigChange
 
-# A residual above CERTAIN standard deviations and so many pixels more is that of a false
-# match. Up to there it may be that of a drift, even if the intersection rejects it.
+# A residual above CERTAIN standard deviations plus this many pixels is a false match. Up to this
+# limit it may be due to a drift, even if the intersection rejects it.
 FALSE_MATCH_PX = 3.0
 
 
 class RigDriftWatch:
-    """Drift watch of one RigOrientation; a new orientation needs a new one.
+    """Drift watch of one RigOrientation; a new orientation requires a new watch.
 
-    image_sizes: width and height of the images by fluoroscope [px]. rate_hz: largest number of
-    exposures to examine per second. Raises ValueError as DriftWatch. Raises DataError for a rig
+    image_sizes: width and height of the images by fluoroscope [px]. rate_hz: maximum number of
+    exposures to examine per second. Raises ValueError as DriftWatch does, and DataError for a rig
     with two sources in one place.
     """
 
@@ -66,17 +66,17 @@ class RigDriftWatch:
         ]
         sizes = {name: image_sizes[name] for name in names}
         self._watch = DriftWatch(sizes, options, bodies, orientation)
-        # Stamps jitter: a stream at this very rate must not lose any exposure.
+        # Stamps jitter: a stream at exactly this rate must not lose any exposure.
         self._min_interval_ns = round(0.9e9 / rate_hz)
         self._last_ns: int | None = None
         self._has_bodies = bool(bodies)
         self._orientation = orientation
         self._change = RigChange(orientation, self._pairs)
-        self._of_charts = self._watch.state  # of the last block
+        self._of_charts = self._watch.state  # state of the last block
         self._state = self._of_charts
         self._addition: Addition | None = None
-        self._wide: tuple[Intersector, Intersector] | None = None  # as given, and widened
-        #: what an alarm adds to standard deviations, None without one
+        self._wide: tuple[Intersector, Intersector] | None = None  # given and widened
+        #: addition of an alarm to standard deviations; None without an alarm
         self.widening: Finding | None = None
 
     @property
@@ -95,14 +95,14 @@ class RigDriftWatch:
         return self._watch.watched_s
 
     def is_due(self, stamp_ns: int) -> bool:
-        """Whether an exposure with this stamp is to be examined."""
+        """Return whether an exposure with this stamp is to be examined."""
         last = self._last_ns
         return last is None or not 0 <= stamp_ns - last < self._min_interval_ns
 
     def widened(self, intersector: Intersector) -> tuple[Intersector, float]:
-        """Return the intersector of the next exposure, and what is added to sigma [px].
+        """Return the intersector of the next exposure, and the addition to sigma [px].
 
-        While there is an alarm, its covariance of the rig contains what the alarm shows.
+        During an alarm, its covariance of the rig includes the change that the alarm shows.
         """
         added = self._addition
         if added is None:
@@ -116,7 +116,7 @@ class RigDriftWatch:
     def add_exposure(self, stamp_ns: int, exposure: IntersectedViews) -> DriftState:
         """Add an exposure of the fluoroscopes of the orientation, and return the state.
 
-        The exposure was intersected with what `widened` has returned.
+        The exposure must have been intersected with the results of `widened`.
         """
         self._last_ns = stamp_ns
         exposure = self._as_calibrated(exposure)
@@ -152,7 +152,7 @@ class RigDriftWatch:
         return self.state
 
     def _as_calibrated(self, exposure: IntersectedViews) -> IntersectedViews:
-        """Return an exposure without what an alarm has added to its image points."""
+        """Return an exposure without the addition of an alarm to its image points."""
         if self._addition is None or not self._addition.image_sd:
             return exposure
         views = exposure.views
@@ -163,7 +163,7 @@ class RigDriftWatch:
         return replace(exposure, views=replace(views, sigma=sigma, correction_sd=correction_sd))
 
     def _present_state(self) -> DriftState:
-        """State by the charts, or of a knock, whose rays are too far apart for them."""
+        """Return the state of the charts, or of a knock, whose rays are too far apart for them."""
         share = self._change.share_apart
         if not share:
             return self._of_charts
@@ -176,7 +176,7 @@ class RigDriftWatch:
         )
 
     def _widen(self, exposure: IntersectedViews) -> None:
-        """Find out what an alarm adds, from its newest rays. exposure: the last one."""
+        """Compute the addition of an alarm from its newest rays. exposure: the last one."""
         state = self._state
         self._wide = None
         self._addition = self.widening = None
@@ -191,7 +191,7 @@ class RigDriftWatch:
         self.widening = self._widening(exposure, added)
 
     def _with_shift(self, added: Addition, state: DriftState) -> Addition:
-        """Add a drift along epipolar lines, which only bodies show: a shift of the image."""
+        """Add a drift along epipolar lines, shown only by bodies, as a shift of the image."""
         covariance = added.covariance.copy()
         for f, name in enumerate(self._names):
             if name in state.fluoroscopes:
@@ -200,7 +200,7 @@ class RigDriftWatch:
         return replace(added, covariance=covariance)
 
     def _widening(self, exposure: IntersectedViews, added: Addition) -> Finding | None:
-        """Say by how much standard deviations of the points of an exposure grow."""
+        """Return the increase of the standard deviations of the points of an exposure."""
         views = exposure.views
         given = Intersector(self._orientation, None)
         wide, image_sd = self.widened(given)
@@ -220,7 +220,7 @@ class RigDriftWatch:
 
 
 def widened(sd_before_mm: float, sd_mm: float, miss_px: float, image_sd_px: float) -> Finding:
-    """Return the finding that an alarm adds to standard deviations."""
+    """Return the finding that an alarm increases standard deviations."""
     return Finding(
         Kind.WIDENED_BY_ALARM,
         f'rays miss each other by {miss_px:.2f} px (RMS): until the rig is healed, the standard '
@@ -239,33 +239,33 @@ def widened(sd_before_mm: float, sd_mm: float, miss_px: float, image_sd_px: floa
 class DriftVerdict:
     """Verdict of the drift watch on a recording."""
 
-    finding: Finding  #: what the watch says of the recording
-    #: where there was a drift: the state with the largest evidence
+    finding: Finding  #: result of the watch for the recording
+    #: state with the largest evidence, if there was a drift
     state: DriftState | None = None
     #: stamp of the exposure at which the highest level was first reached [ns]
     found_ns: int | None = None
-    began_ns: int | None = None  #: begin of the drift by the last estimate [ns]
+    began_ns: int | None = None  #: start of the drift by the last estimate [ns]
     level_at_end: str | None = None  #: 'ok', 'warn' or 'error'
     watched_s: float = 0.0  #: time in which a drift could have been detected [s]
-    widening: Finding | None = None  #: the most that an alarm has added to standard deviations
+    widening: Finding | None = None  #: largest addition of an alarm to standard deviations
 
     @property
     def level(self) -> str:
-        """The highest level that was reached: 'ok', 'warn' or 'error'.
+        """Highest level that was reached: 'ok', 'warn' or 'error'.
 
-        'learning' where the recording is too short, 'unknown' where it lacks what is needed.
+        'learning' if the recording is too short, 'unknown' if it does not contain what is needed.
         """
         undecided = {Kind.SHORT_RECORDING: 'learning', Kind.NOT_WATCHED: 'unknown'}
         return undecided.get(self.finding.kind, LEVEL_NAMES[self.finding.severity])
 
     @property
     def message(self) -> str:
-        """The finding in a sentence."""
+        """Finding as a sentence."""
         return self.finding.sentence
 
 
 class RecordingDriftWatch(RigDriftWatch):
-    """A RigDriftWatch that remembers its alarms, as one in the middle of a recording may end.
+    """RigDriftWatch that stores its alarms, as one in the middle of a recording may end.
 
     The parameters are those of a RigDriftWatch.
     """
@@ -305,7 +305,7 @@ class RecordingDriftWatch(RigDriftWatch):
         return state
 
     def verdict(self) -> DriftVerdict:
-        """Verdict on the exposures so far."""
+        """Return the verdict on the exposures so far."""
         worst = self._worst
         watched = self.watched_s
         level_at_end = LEVEL_NAMES[self.state.level]
@@ -341,7 +341,7 @@ class RecordingDriftWatch(RigDriftWatch):
         return DriftVerdict(found, watched_s=watched)
 
     def _drift(self, worst: DriftState) -> Finding:
-        """Return the drift of the worst state as a finding on the recording."""
+        """Return the finding on the recording for the drift of the worst state."""
         found_s = (self._found_ns - (self._first_ns or 0)) / 1e9
         ended = '; it was gone at the end' if self.state.level == OK else ''
         verb = 'no longer holds' if worst.level == ERROR else 'may no longer hold'

@@ -1,18 +1,18 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Check 'shape': the phantom as a whole has the shape that its survey says.
+"""Check 'shape': the phantom as a whole has the shape stated by its survey.
 
 A phantom that has shrunk along one axis, or is sheared, displaces every bead by less than the
-standard deviation of its survey, and all of them together by far more than chance does. The
-survey is taken to be S = X + D t + noise with five strains t besides the beads X (a common scale
-has to be taken on trust: the images do not show it). The test of t = 0 against this alternative is
-the score test (Rao, Proceedings of the Cambridge Philosophical Society 44, 1948): one step from
-the adjustment, with exterior orientations, interior orientations and a cubic change of each
-correction among the unknowns. What t does to the adjusted beads, over their claimed standard
-deviations, decides whether it matters, and the smallest t that the test would find says whether
-the exposures can tell (Baarda, "A testing procedure for use in geodetic networks", Netherlands
-Geodetic Commission 1968).
+standard deviation of its survey, but all of them together by far more than chance does. The survey
+is modelled as S = X + D t + noise with the beads X and five strains t (a common scale has to be
+taken on trust, as the images do not show it). The test of t = 0 against this alternative is the
+score test (Rao, Proceedings of the Cambridge Philosophical Society 44, 1948): one step from the
+adjustment, with exterior orientations, interior orientations and a cubic change of each correction
+among the unknowns. The effect of t on the adjusted beads, over their claimed standard deviations,
+decides whether it matters. The smallest t that the test would detect decides whether the exposures
+can show it (Baarda, "A testing procedure for use in geodetic networks", Netherlands Geodetic
+Commission 1968).
 """
 
 from __future__ import annotations
@@ -39,37 +39,37 @@ from .beads import MIN_BEADS, SD_FACTOR
 from .calibration_evidence import Evidence, Subject
 from .check import Check
 
-STRAINS = 5  # symmetric, without the common scale
-# Increase of the NSE of the points by a strain that is no fault: up to 1.25 it is honest.
+STRAINS = 5  # symmetric tensors, without the common scale
+# Harmless increase of the NSE of the points by a strain: up to 1.25 it is acceptable.
 HARMLESS_NSE = 0.25
-# Increase of the NSE by a strain that would not be found from which it is taken on trust.
+# Increase of the NSE by an undetectable strain above which the shape is taken on trust.
 TRUSTED_NSE = 1.0
 TINY = 1e-12
-HIDDEN = ('hidden_x', 'hidden_y', 'hidden_z')  # direction of the strain that is hidden
-# Square of the displacements by a strain, relative to the largest, from which it is one: those of
-# a flat phantom along its normal turn or enlarge it, which no image shows.
+HIDDEN = ('hidden_x', 'hidden_y', 'hidden_z')  # direction of the undetectable strain
+# Minimum square of the displacements by a strain, relative to the largest. Along the normal of a
+# flat phantom, strains only rotate or enlarge it, which no image shows.
 MIN_DISPLACEMENT = 1e-4
 
 
 @dataclass(frozen=True)
 class Strain:
-    """Strain of the survey against the images."""
+    """Strain of the survey relative to the images."""
 
     #: (3, 3) surveyed - true coordinates over the distance from the centre, without common scale
     tensor: NDArray[np.float64]
-    rms_mm: float  #: RMS displacement of the beads by it [mm]
-    #: statistic, and what chance exceeds with FALSE_ALARM
+    rms_mm: float  #: RMS displacement of the beads by the strain [mm]
+    #: test statistic, and the value that chance exceeds with probability FALSE_ALARM
     test: float
     critical: float
-    nse: float  #: increase of the NSE of the adjusted beads by it
-    hidden_nse: float  #: the largest increase by a strain whose statistic would be critical
-    hidden: NDArray[np.float64]  #: (3, 3) the tensor of that strain
+    nse: float  #: increase of the NSE of the adjusted beads by the strain
+    hidden_nse: float  #: largest increase by a strain whose test statistic equals critical
+    hidden: NDArray[np.float64]  #: (3, 3) tensor of that strain
 
 
 def strain_of_survey(evidence: Evidence) -> Strain | None:
-    """Return the strain of the survey that the exposures show; None with too few beads.
+    """Return the strain of the survey that the exposures show, or None with too few beads.
 
-    Raises numpy.linalg.LinAlgError where the exposures do not determine the beads.
+    Raises numpy.linalg.LinAlgError if the exposures do not determine the beads.
     """
     (solved,) = evidence.result.solved.values()
     survey = solved.measured.network.survey_mm
@@ -99,9 +99,9 @@ def strain_of_survey(evidence: Evidence) -> Strain | None:
 
 @dataclass(frozen=True)
 class _Score:
-    """Normal equations of strains, all other unknowns eliminated.
+    """Normal equations of strains, with all other unknowns eliminated.
 
-    information (5, 5), pull (5,): their right side; followed (n, 3, 5): displacements of the
+    information (5, 5); pull (5,): right-hand side; followed (n, 3, 5): displacements of the
     adjusted beads by unit strains [mm].
     """
 
@@ -111,7 +111,7 @@ class _Score:
 
 
 def _score(evidence: Evidence, solved: SolvedNetwork, displacement: NDArray[np.float64]) -> _Score:
-    """Normal equations of strains with displacements (n, 3, 5), linearised at an adjustment."""
+    """Return normal equations of strains with displacements (n, 3, 5), at an adjustment."""
     network = solved.measured.network
     adjustment = solved.adjustment
     names = solved.measured.fluoroscopes
@@ -136,17 +136,17 @@ def _score(evidence: Evidence, solved: SolvedNetwork, displacement: NDArray[np.f
 
 
 def _dispersion(evidence: Evidence) -> float:
-    """Factor by which low-order terms of the exposures vary more than noise makes them.
+    """Return the factor by which low-order terms of the exposures vary more than noise explains.
 
-    A strain shows in such terms, and so does a distortion that differs between exposures, by which
-    the statistic grows (McCullagh and Nelder, "Generalized Linear Models", 1989, 4.5).
+    A strain shows in such terms, as does a distortion that differs between exposures, which
+    inflates the statistic (McCullagh and Nelder, "Generalized Linear Models", 1989, 4.5).
     """
     found = [one.chi2_per_dof / VARYING for one in evidence.variations.values() if one is not None]
     return max((1.0, *found))
 
 
 def _change(evidence: Evidence, network: Network, f: int, name: str) -> AdditionalParameters:
-    """Cubic change of the correction of fluoroscope f by about what it claims."""
+    """Return a cubic change of the correction of fluoroscope f, of about its claimed sd."""
     calibration = evidence.calibrations[name]
     rows = network.rows(f)
     functions = exposure_functions(network.uv[rows], calibration.image_size, calibration.interior)
@@ -155,7 +155,7 @@ def _change(evidence: Evidence, network: Network, f: int, name: str) -> Addition
 
 
 def _strains(survey_mm: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Tensors (5, 3, 3) of unit strains, and displacements (n, 3, 5) [mm] of beads by them."""
+    """Return tensors (5, 3, 3) of unit strains, and displacements (n, 3, 5) [mm] of beads."""
     tensors = np.zeros((STRAINS, 3, 3))
     tensors[0] = np.diag([1.0, -1.0, 0.0]) / np.sqrt(2)
     tensors[1] = np.diag([1.0, 1.0, -2.0]) / np.sqrt(6)
@@ -168,7 +168,7 @@ def _strains(survey_mm: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArr
 def _without_similarity(
     displacement: NDArray[np.float64], survey_mm: NDArray[np.float64], sd_mm: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Displacements (n, 3, 5) less their shift, rotation and scale, which the poses take up."""
+    """Return displacements (n, 3, 5) without shift, rotation, scale, which the poses absorb."""
     similarity = similarity_directions(survey_mm, survey_mm.mean(axis=0))
     weight = 1 / sd_mm[:, None, None]
     rows = 3 * len(survey_mm)
@@ -178,17 +178,17 @@ def _without_similarity(
 
 
 def _strains_that_show(displacement: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Strains (5, k) that displace beads (n, 3, 5), as columns of unit length."""
+    """Return the strains (5, k) that displace beads (n, 3, 5), as columns of unit length."""
     of_beads = displacement.reshape(-1, STRAINS)
     values, vectors = np.linalg.eigh(of_beads.T @ of_beads)
     return vectors[:, values > MIN_DISPLACEMENT * values[-1]]
 
 
 def check_shape(evidence: Evidence, names: Sequence[str]) -> list[Check]:
-    """Test the survey of all beads for a strain that they have in common."""
+    """Test the survey for a strain that all beads have in common."""
     found = strain_of_survey(evidence)
     if found is None:
-        return []  # check 'beads' says that there are too few
+        return []  # reported by check 'beads'
     value = found.rms_mm
     significant = value * np.sqrt(found.critical / max(found.test, TINY))
     matters = value * np.sqrt(HARMLESS_NSE / max(found.nse, TINY))
@@ -217,7 +217,7 @@ def check_shape(evidence: Evidence, names: Sequence[str]) -> list[Check]:
 
 
 def trusted_shape(checks: Sequence[Check]) -> list[Finding]:
-    """Return a finding where the exposures cannot tell a strain of the survey that matters."""
+    """Return a finding if the exposures cannot show a strain of the survey that matters."""
     out = []
     for check in checks:
         hidden_nse = check.numbers.get('hidden_nse', 0.0)
@@ -240,7 +240,7 @@ def trusted_shape(checks: Sequence[Check]) -> list[Finding]:
 
 
 def _principal(tensor: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Direction (3,) of the largest strain, its largest coordinate positive, and that strain."""
+    """Return direction (3,) of the largest strain, its largest coordinate positive, and size."""
     values, vectors = np.linalg.eigh(tensor)
     largest = int(np.argmax(np.abs(values)))
     direction = vectors[:, largest]

@@ -20,18 +20,18 @@ from .beads import MIN_BEADS
 from .check import Check
 
 # Errors along two rays are cot(angle / 2) times those across: 6 times at 20 degrees. A single sd
-# for all axes would then be wrong by more than half for the worst of them.
+# for all axes would then be wrong by more than half for the worst axis.
 MIN_ANGLE_RAD = np.deg2rad(20.0)
-# Mean square of the normalised differences of two halves: docs/how_good.md. It is 1.41 at most in
-# simulated surveys whose sds are right, and was 1.64 in one with an NSE of 1.6 (8 exposures, seed
-# 7 of benchmarks.survey).
+# Limit of the mean square of the normalised differences of two halves: docs/how_good.md. It is at
+# most 1.41 in simulated surveys with correct sds, and was 1.64 in one with an NSE of 1.6 (8
+# exposures, seed 7 of benchmarks.survey).
 HALVES_LIMIT = 1.5
-OFF_SD = 1.5  # times what the sd of rough coordinates says, as an RMS of many beads
-UNKNOWN = 1e6  # variance of a datum that is not known, over that of the beads
+OFF_SD = 1.5  # maximum RMS over many beads, in sds of rough coordinates
+UNKNOWN = 1e6  # variance of an unknown datum, over that of the beads
 
 
 def unsurveyed(beads: SurveyedBeads) -> list[Finding]:
-    """Return a finding for beads of too few rays, and for beads whose rays meet too acutely."""
+    """Return findings for beads with too few rays, and for beads with too acute intersections."""
     few = beads.rays < MIN_RAYS
     acute = ~few & (beads.angle_rad < MIN_ANGLE_RAD)
     out = []
@@ -63,7 +63,7 @@ def unsurveyed(beads: SurveyedBeads) -> list[Finding]:
 
 
 def displaced(beads: SurveyedBeads) -> Finding | None:
-    """Return a finding for beads that are not where the given coordinates say."""
+    """Return a finding for beads that are not at their given coordinates."""
     variance = beads.covariance + beads.given_sd_mm[:, None, None] ** 2 * np.eye(3)
     off = beads.xyz_mm - beads.given_mm
     square = np.einsum('na,nab,nb->n', off, np.linalg.inv(variance), off)
@@ -94,9 +94,9 @@ def check_survey(beads: SurveyedBeads) -> list[Check]:
 
 
 def check_survey_halves(one: SurveyedBeads, other: SurveyedBeads) -> Check:
-    """Compare surveys from two halves of the exposures, up to shift, turn and scale.
+    """Compare surveys from two halves of the exposures, up to shift, rotation and scale.
 
-    Neither has a datum of its own: each is fitted to the given coordinates of its own beads.
+    Neither has a datum of its own: each is fitted to the given coordinates of its beads.
     """
     common = np.intersect1d(one.target_id, other.target_id)
     if len(common) < MIN_BEADS:
@@ -129,7 +129,7 @@ def check_survey_halves(one: SurveyedBeads, other: SurveyedBeads) -> Check:
 
 
 def halves_not_compared(reason: str) -> Check:
-    """Return the check 'halves' that could not be made for a reason."""
+    """Return the check 'halves' that could not be made, with a reason."""
     return Check(
         Kind.HALVES,
         f'check halves could not be made, {reason}',
@@ -140,10 +140,10 @@ def halves_not_compared(reason: str) -> Check:
 def _weighted_by(
     one: SurveyedBeads, other: SurveyedBeads, datum: NDArray[np.float64]
 ) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
-    """Return what multiplies values (3n, k) by the information of the difference of two surveys.
+    """Return the product with the information of the difference of two surveys, as a function.
 
-    Few beads have the errors of interior orientation and correction in common; the datum (3n, 7),
-    unit columns, is not known to either survey.
+    It multiplies values (3n, k). A few beads share the errors of interior orientation and
+    correction; the datum (3n, 7), with unit columns, is not known to either survey.
     """
     if one.joint_covariance is not None and other.joint_covariance is not None:
         joint = one.joint_covariance + other.joint_covariance
@@ -189,7 +189,7 @@ def _check_distances(beads: SurveyedBeads) -> Check:
     ratio = np.abs(beads.scaled.normalised)
     worst = int(np.argmax(ratio))
     off = float(beads.scaled.error_mm[worst])
-    # Of two distances either may be wrong.
+    # With two distances, either may be wrong.
     named = beads.distances if len(ratio) == 2 else beads.distances[worst : worst + 1]
     names = ' or '.join(one.name for one in named)
     return Check(
@@ -206,7 +206,7 @@ def _check_distances(beads: SurveyedBeads) -> Check:
 
 
 def _check_layout(beads: SurveyedBeads) -> Check:
-    """Beads that lie further off than half a spacing may be others, unless their sd allows it."""
+    """Check for beads further off than half a spacing, which may be others unless sds allow it."""
     nearest = float(np.median(KDTree(beads.given_mm).query(beads.given_mm, k=2)[0][:, 1]))
     off = float(np.sqrt(np.mean(beads.off_mm**2)))
     allowed = OFF_SD * np.sqrt(3) * float(np.sqrt(np.mean(beads.given_sd_mm**2)))

@@ -3,19 +3,20 @@
 
 """The verdict on a calibration from the exposures it was made from: pass, fail or cannot tell.
 
-Whether a given interior orientation is why a calibration fails. An interior orientation that is
-given with a small standard deviation holds the adjustment where the exposures contradict it: their
-lack of fit looks like a trend of the residuals, or like a distortion that differs between
-exposures. Where checks fail, the fluoroscope is calibrated again without what was given. If the
-residuals are then clearly smaller, and the interior orientation is clearly another one, that is
-the cause, and a check of its own says so.
+A given interior orientation may be why a calibration fails. If it is given with a small standard
+deviation, it fixes the adjustment where the exposures contradict it: the lack of fit looks like a
+trend of the residuals, or like a distortion that differs between exposures. If checks fail, the
+fluoroscope is calibrated again without the given values. If the residuals are then clearly
+smaller, and the interior orientation is clearly different, the given values are the cause, which a
+separate check reports.
 
-The interior orientation of an image with distortion depends on what is called distortion, so that
-a given one which the exposures move away from, with good residuals, is no fault.
+The interior orientation of an image with distortion depends on the definition of distortion. A
+given one which the exposures move away from, with good residuals, is therefore no fault.
 
-Every check is a number with a limit. How the limits were found, how often good calibrations exceed
-them and how large a fault must be to be found is in docs/verdict.md. `validate` recalibrates two
-halves and four folds of the exposures, which takes about twice as long as the calibration.
+Every check is a number with a limit. docs/verdict.md describes how the limits were found, how
+often good calibrations exceed them and how large a fault must be to be detected. `validate`
+recalibrates two halves and four folds of the exposures, in about twice the time of the
+calibration.
 """
 
 from __future__ import annotations
@@ -44,18 +45,18 @@ from .rig import RigFindings, check_rig, rig_findings
 from .shape import SHAPE, trusted_shape
 
 REPAIR_FIRST = 'check this again when the given interior orientation fits the exposures'
-# RMSE with what was given over that without, from which it is the cause; without a correction
-# model, the distortion is a better one.
+# Minimum ratio of the RMSE with and without the given values to accept them as the cause. Without
+# a correction model, distortion is the more likely cause.
 MIN_GAIN = 1.05
 MIN_GAIN_UNCORRECTED = 2.0
 LABELS = ('xp', 'yp', 'c')
 
 
 def with_given_interior(evidence: Evidence, checks: Sequence[Check]) -> list[Check]:
-    """Return the checks, with one more for every given interior orientation that is contradicted.
+    """Return the checks, plus one for every given interior orientation that is contradicted.
 
-    The estimated noise can take the misfit up, so that no other check fails. The advice of those
-    that fail is then to repair that first.
+    The estimated noise can absorb the misfit, so that no other check fails. Checks that do fail
+    then get the advice to repair the interior orientation first.
     """
     request = evidence.request
     distance = request.principal_distance
@@ -79,7 +80,7 @@ def with_given_interior(evidence: Evidence, checks: Sequence[Check]) -> list[Che
 
 
 def _contradictions(evidence: Evidence, names: Sequence[str], distance: float) -> list[Check]:
-    """Return a failed check for every fluoroscope whose exposures contradict what was given."""
+    """Return a failed check for every fluoroscope whose exposures contradict the given values."""
     evidence.report_step(f'{"+".join(names)}: interior orientation without what was given')
     try:
         free = evidence.calibrate_free(names)
@@ -124,7 +125,7 @@ def _given_interior_check(
 
 Progress = Callable[[str, int, int], None]
 
-# A new check is a module with a Subject, and its entry here; docs/verdict.md describes it.
+# A new check is a module with a Subject and an entry here; docs/verdict.md describes it.
 SUBJECTS = (BEADS, SHAPE, HALVES, TRENDS, VARIATION, HELD_OUT, PRECISION)
 
 
@@ -134,18 +135,18 @@ def validate(
     progress: Progress | None = None,
     rig: RigFindings | None = None,
 ) -> Validation:
-    """Validate calibrations with the exposures that they were made from.
+    """Validate calibrations with the exposures they were made from.
 
     Parameters
     ----------
     request : CalibrationRequest
-        What the calibrations were made from.
+        Data and options of the calibrations.
     calibrations : mapping of str to FluoroscopeCalibration
-        By fluoroscope.
+        Calibrations by fluoroscope.
     progress : callable, optional
         Called with the name of a step, the number of steps done and their total before each step.
     rig : RigFindings, optional
-        What is known of the orientation of the rig; by default it is determined.
+        Orientation of the rig and doubts about it; by default they are determined.
 
     Raises
     ------
@@ -190,8 +191,8 @@ def validate(
     )
 
 
-# Of the NSE of a correction at an angle: errors that are drawn from its covariance exceed it in so
-# many of a hundred calibrations (docs/how_good.md, a C-arm that turns).
+# NSE of a correction at an angle that errors drawn from its covariance exceed in MANY_PERCENT of a
+# hundred calibrations (docs/how_good.md, a C-arm that turns).
 MANY_NSE = 2.0
 MANY_PERCENT = 7
 
@@ -215,10 +216,10 @@ def trusted_angles(calibrations: Calibrations) -> list[Finding]:
 
 
 def _achieved_sd(evidence: Evidence, name: str, checks: Sequence[Check]) -> float:
-    """Standard deviation of a coordinate of the correction of a fluoroscope [px].
+    """Return the standard deviation of a coordinate of a fluoroscope's correction [px].
 
-    It is what the calibration claims, times the ratio of the difference of its halves to their
-    claims where that is above 1, together with the trend and the variation in the residuals.
+    It is the claimed one, times the ratio of difference and prediction of its halves if this is
+    above 1, combined with the trend and the variation in the residuals.
     """
     values = {
         check.kind: check.value
@@ -237,7 +238,7 @@ def validate_or_report(
     progress: Progress | None = None,
     rig: RigFindings | None = None,
 ) -> Validation:
-    """Validate; where that raises DataError, the verdict is 'cannot tell' with its message."""
+    """Validate; on DataError the verdict is 'cannot tell' with its message."""
     try:
         return validate(request, calibrations, progress, rig)
     except DataError as error:
@@ -254,7 +255,7 @@ class _StepCounter:
         self._done = 0
 
     def report(self, step: str) -> None:
-        """Report the step that begins."""
+        """Report a step that begins."""
         if self._progress is not None:
             self._progress(step, self._done, self._total)
         self._done += 1

@@ -3,12 +3,12 @@
 
 """Distortion that changes with the angle of a C-arm.
 
-The magnetic field along the axis of an image intensifier is that of the earth, turned with the
-C-arm: its components are cosines and sines of the angle; what the arm itself magnetises adds the
-second harmonic (Fahrig et al., "Three-dimensional computed tomographic reconstruction using a
-C-arm mounted XRII: correction of image intensifier distortion", Medical Physics 24, 1997).
-The correction is that of a calibration plus a sum of these harmonics, less their mean over the
-exposures, each with a field of its own (see `exposure_terms`).
+The magnetic field along the axis of an image intensifier is the field of the earth as seen by the
+rotating C-arm: its components are cosines and sines of the angle. The magnetisation of the arm
+itself adds the second harmonic (Fahrig et al., "Three-dimensional computed tomographic
+reconstruction using a C-arm mounted XRII: correction of image intensifier distortion", Medical
+Physics 24, 1997). The correction is that of a calibration plus a sum of these harmonics, reduced
+by their mean over the exposures, each with a field of its own (see `exposure_terms`).
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from .series import Functions, Series, sd_grid_pixels
 from .terms import CUBIC
 
 PAIRS = [(j, k) for j in range(HARMONICS) for k in range(j, HARMONICS)]
-MAX_DISTANCE = np.deg2rad(15)  # of an angle from the next one that was calibrated
+MAX_DISTANCE = np.deg2rad(15)  # maximum angle to the nearest calibrated angle [rad]
 
 
 def harmonics(angle: ArrayLike) -> NDArray[np.float64]:
-    """Cosines and sines (..., 4) of angles (...) [rad], by order."""
+    """Return cosines and sines (..., 4) of angles (...) [rad], ordered by harmonic."""
     multiple = np.asarray(angle, dtype=float)[..., None] * np.arange(1, ORDERS + 1)
     both = np.stack([np.cos(multiple), np.sin(multiple)], axis=-1)
     return both.reshape(*both.shape[:-2], HARMONICS)
@@ -38,29 +38,29 @@ def harmonics(angle: ArrayLike) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class _Change:
-    """What an angle adds to a correction."""
+    """Change of a correction at an angle."""
 
-    #: (4, k, 2, 4) of x^i y^j, in the order i, field, u or v, j: the change, then fields of what
-    #: is unknown
+    #: (4, k, 2, 4) coefficients of x^i y^j, indexed by i, field, u or v, j: first the change, then
+    #: the fields of its uncertainty
     coefficients: NDArray[np.float64]
     variance: NDArray[np.float64]  #: (33, 33) on the grid of the standard deviation [px^2]
-    scatters: bool  #: whether there are fields of what is unknown
+    scatters: bool  #: whether there are fields of uncertainty
 
 
 @dataclass(frozen=True)
 class AngleField:
     """Change of a correction with the angle, relative to its mean over the exposures.
 
-    Raises ValueError for arrays of other shapes, or values that are not finite.
+    Raises ValueError for arrays of unexpected shape and for values that are not finite.
     """
 
     image_size: tuple[int, int]  #: width and height [px]
     angles: NDArray[np.float64]  #: (e,) angles of the exposures [rad]
-    #: (4, 2, 10) of each harmonic less its mean: those of cubic polynomials of the pixel for u and
-    #: v, in the order and coordinates of `series.Functions` [px]
+    #: (4, 2, 10) fields of the harmonics less their means: coefficients of cubic polynomials of
+    #: the pixel for u and v, in the order and coordinates of `series.Functions` [px]
     coefficients: NDArray[np.float64]
     #: (14, 33, 33) on the grid of the standard deviation of a series [px^2]: covariances of the
-    #: correction without angle and each harmonic, then those of pairs of harmonics
+    #: angle-independent correction with each harmonic, then covariances of the pairs of harmonics
     variances: NDArray[np.float64]
 
     def __post_init__(self) -> None:
@@ -87,18 +87,18 @@ class AngleField:
 
     @cached_property
     def _spread(self) -> NDArray[np.float64]:
-        """Mean products (4, 4) of the harmonics over the exposures, less their mean."""
+        """Mean products (4, 4) over the exposures of the harmonics less their means."""
         h = harmonics(self.angles) - self._mean
         return h.T @ h / len(h)
 
     @property
     def range(self) -> tuple[float, float]:
-        """Least and largest angle of the exposures [rad]."""
+        """Smallest and largest angle of the exposures [rad]."""
         return float(self.angles.min()), float(self.angles.max())
 
     @property
     def size_px(self) -> float:
-        """RMS of a coordinate of the change, over the image and the exposures [px]."""
+        """RMS of a coordinate of the change over the image and the exposures [px]."""
         fields = self._functions(sd_grid_pixels(self.image_size)) @ self.coefficients.transpose(
             0, 2, 1
         )
@@ -106,25 +106,25 @@ class AngleField:
         return float(np.sqrt(square / (2 * fields.shape[1])))
 
     def covers(self, angle: ArrayLike) -> np.ndarray:
-        """Whether angles (...) [rad] are near a calibrated one; True where unknown (NaN)."""
+        """Return whether angles (...) [rad] are near a calibrated one; True for unknown (NaN)."""
         angle = np.asarray(angle, dtype=float)
         distance = np.abs(np.angle(np.exp(1j * (angle[..., None] - self.angles))))
         return ~(distance.min(axis=-1) > MAX_DISTANCE)
 
     def nearest_common(self, other: AngleField) -> float:
-        """Angle [rad] of these exposures that is nearest to one of another field."""
+        """Return the angle [rad] of these exposures that is nearest to one of another field."""
         turn = np.exp(1j * self.angles)[:, None] / np.exp(1j * other.angles)
         return float(self.angles[np.argmin(np.abs(np.angle(turn)).min(axis=1))])
 
     def change(
         self, uv: ArrayLike, angle: ArrayLike
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return what an angle adds to a correction and to its variance.
+        """Return the change of a correction and of its variance at an angle.
 
-        uv: (n, 2) observed pixels. angle: one or (n,) [rad]; NaN: it is unknown, the correction is
-        the mean over the exposures, and its variance holds what the angle changes. Returns (n, 2)
-        to be added to the correction [px] and (n,) to be added to the variance of each coordinate
-        [px^2]; it can be negative.
+        uv: (n, 2) observed pixels. angle: one or (n,) [rad]; NaN where it is unknown: the
+        correction is then the mean over the exposures, and its variance includes the effect of the
+        angle. Returns (n, 2) to be added to the correction [px] and (n,) to be added to the
+        variance of each coordinate [px^2]; it can be negative.
         """
         uv = np.asarray(uv, dtype=float).reshape(-1, 2)
         angles = np.asarray(angle, dtype=float)
@@ -140,11 +140,11 @@ class AngleField:
         return duv, variance
 
     def duv(self, uv: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
-        """Return what a known angle [rad] adds to a correction (n, 2) at pixels uv (n, 2) [px]."""
+        """Return the change (n, 2) [px] of a correction at a known angle [rad], at uv (n, 2)."""
         return self._values(uv, self._known(angle).coefficients)[:, 0]
 
     def added_to(self, series: Series, angle: float) -> Series:
-        """Return a series at an angle [rad], with its standard deviations there."""
+        """Return a series with the change at an angle [rad] added, and its standard deviations."""
         weights = harmonics(angle) - self._mean
         change = np.tensordot(weights, self.coefficients, axes=1)
         functions = series.functions
@@ -167,18 +167,18 @@ class AngleField:
         return values[:, 0], variance
 
     def _known(self, angle: float) -> _Change:
-        """Return the change at an angle; that of the last one is kept: arms stand still."""
+        """Return the change at an angle; cache the last one, as arms stand still."""
         last = self.__dict__.get('_last')
         if last is None or last[0] != angle:
             weights = harmonics(angle) - self._mean
             last = angle, self._change(weights, np.outer(weights, weights), weights[None])
-            self.__dict__['_last'] = last  # as a whole, for other threads
+            self.__dict__['_last'] = last  # one assignment, safe for other threads
         found: _Change = last[1]
         return found
 
     @cached_property
     def _unknown(self) -> _Change:
-        """The change at an unknown angle: none, and the scatter over all exposures."""
+        """The change at an unknown angle: zero, with the scatter over all exposures."""
         size, axes = np.linalg.eigh(self._spread)
         roots = axes.T * np.sqrt(np.maximum(size, 0))[:, None]
         weights = np.zeros(HARMONICS)
@@ -190,7 +190,7 @@ class AngleField:
         products: NDArray[np.float64],
         fields: NDArray[np.float64],
     ) -> _Change:
-        """Return a change from weights of the harmonics, their products, and those of fields."""
+        """Return a change from weights of the harmonics, their products, and weights of fields."""
         j, k = np.transpose(PAIRS)
         factors = np.concatenate([2 * weights, products[j, k] * np.where(j == k, 1, 2)])
         coefficients = np.tensordot(fields, self.coefficients, axes=1)
@@ -203,7 +203,7 @@ class AngleField:
     def _values(
         self, uv: NDArray[np.float64], coefficients: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Values (n, k, 2) of k fields, from the coefficients of a `_Change`."""
+        """Return values (n, k, 2) of k fields from the coefficients of a `_Change`."""
         side = max(self.image_size) / 2
         powers = np.empty((CUBIC + 1, len(uv), 2))
         powers[0] = 1
@@ -215,7 +215,7 @@ class AngleField:
         return np.einsum('nkay,yn->nka', by_y, powers[:, :, 1])
 
     def _at(self, uv: NDArray[np.float64], grid: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Values (n,) of a grid (33, 33) over the image at pixels uv (n, 2), interpolated."""
+        """Interpolate a grid (33, 33) over the image at pixels uv (n, 2); returns (n,)."""
         place = (uv + 0.5) / np.asarray(self.image_size) * (SD_GRID - 1)
         return map_coordinates(grid, place[:, ::-1].T, order=1, mode='nearest')
 
@@ -223,9 +223,9 @@ class AngleField:
 def packed_angles(
     field: AngleField | None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return angles (e,), coefficients (4, 2, 10) and variances (14, 33, 33), as they are saved.
+    """Return angles (e,), coefficients (4, 2, 10) and variances (14, 33, 33) for files, messages.
 
-    No field gives empty arrays.
+    Returns empty arrays for None.
     """
     if field is None:
         return np.zeros(0), np.zeros((0, 2, 0)), np.zeros((0, 0, 0))
@@ -238,9 +238,9 @@ def unpacked_angles(
     coefficients: NDArray[np.float64],
     variances: NDArray[np.float64],
 ) -> AngleField | None:
-    """Return the AngleField, or None, from which `packed_angles` made the arguments.
+    """Return the AngleField, or None, that `packed_angles` turned into the arguments.
 
-    Raises ValueError if the parts do not belong together.
+    Raises ValueError if the arguments do not match.
     """
     if not (np.size(angles) or np.size(coefficients) or np.size(variances)):
         return None
@@ -254,7 +254,7 @@ def note_on_angles(
     items: str = 'frames',
     consequence: str = 'they get the mean over the angles, with its larger standard deviation',
 ) -> str:
-    """Return what follows from angles of a fluoroscope that are unknown (None), '' if nothing."""
+    """Return a note on unknown (None) angles of a fluoroscope and their consequence, or ''."""
     unknown = sum(angle is None for angle in angles)
     if field is None or not unknown:
         return ''

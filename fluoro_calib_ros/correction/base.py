@@ -3,10 +3,10 @@
 
 """The interface of the correction models.
 
-A model is a subclass of `CorrectionModel` and one line in `registry`. It says how it predicts
-(`predict` and `standard_deviation`), and what a user and the lookup grid need to know
-(`description`, `smoothness`, `min_k`). How a self-calibration obtains it is not its business but
-that of `estimation.self_calibration`, which a program that only corrects does not load.
+A model is a subclass of `CorrectionModel` and one line in `registry`. It defines its predictions
+(`predict` and `standard_deviation`) and the properties that users and the lookup grid need
+(`description`, `smoothness`, `min_k`). How a self-calibration obtains a model is defined in
+`estimation.self_calibration`, which a program that only corrects does not load.
 
 docs/models.md shows how to add one.
 """
@@ -26,29 +26,27 @@ from ..limits import MAX_CORNERS
 from .calibration_record import SD_GRID
 from .series import Series, packed
 
-# Status of a corrected image point.
-
 
 class CorrectionStatus(IntEnum):
-    """Status of a corrected image point, as it is sent in messages and written to files."""
+    """Status of a corrected image point, as sent in messages and written to files."""
 
     OK = 0
     OUTSIDE = 1  # beyond the calibrated area
-    INVALID = 2  # off the image, or not a number
+    INVALID = 2  # off the image, or not finite
 
 
-# Radius of an empty disc that is a hole, in mean spacings of the training points: where these fell
-# at random, a disc would be empty with the chance exp(-9 pi) (Poisson), and with exp(-pi) where
-# they are nine times less dense.
+# Radius of an empty disc that counts as a hole, in mean spacings of the training points. Among
+# points scattered at random (Poisson) a disc is empty with probability exp(-9 pi); where they are
+# nine times less dense, with probability exp(-pi).
 HOLE_SPACINGS = 3.0
-BULK_CHUNK = 2048  # pixels evaluated in one call of `evaluate_in_bulk`: some milliseconds
+BULK_CHUNK = 2048  # pixels evaluated per chunk by `evaluate_in_bulk`: some milliseconds
 
 
 class Smoothness(Enum):
-    """How a correction varies over the image, which decides the cell size of its lookup grid."""
+    """Variation of a correction over the image, which decides the cell size of its lookup grid."""
 
     SMOOTH = 'smooth'  # differentiable
-    KINKED = 'kinked'  # continuous, its slope jumps
+    KINKED = 'kinked'  # continuous, with jumps of the slope
     STEPPED = 'stepped'  # piecewise constant
 
 
@@ -65,28 +63,28 @@ class Correction:
 class CorrectionModel(ABC):
     """Distortion (du, dv) as a function of the observed pixel.
 
-    The fields are the whole content of a model: calibration files and messages carry them and
-    nothing else, so a subclass derives everything it needs from them in `_prepare`.
+    The fields are the complete content of a model: calibration files and messages carry nothing
+    else. A subclass derives everything it needs from them in `_prepare`.
 
     Raises ValueError if the arrays differ in length or are not finite, if a series is missing or
-    not expected, or if the training points do not allow k.
+    unexpected, or if there are too few training points for k.
     """
 
     kind: ClassVar[str]
     description: ClassVar[str]
     smoothness: ClassVar[Smoothness] = Smoothness.SMOOTH
-    min_k: ClassVar[int | None] = None  # smallest number of neighbours; None: it has no neighbours
+    min_k: ClassVar[int | None] = None  # smallest number of neighbours; None for models without
     has_series: ClassVar[bool] = False
-    selectable: ClassVar[bool] = True  # False: a user cannot ask for it by name
-    corrects: ClassVar[bool] = True  # False: it leaves every pixel as it is
-    keeps_training_points: ClassVar[bool] = True  # train_uv are image points of exposures
+    selectable: ClassVar[bool] = True  # False: not available to users by name
+    corrects: ClassVar[bool] = True  # False: the model leaves every pixel unchanged
+    keeps_training_points: ClassVar[bool] = True  # whether train_uv are image points of exposures
 
-    k: int  #: number of neighbours; 0 for a model without
+    k: int  #: number of neighbours; 0 for a model without neighbours
     train_uv: NDArray[np.float64]  #: (N, 2) observed training pixels
     train_duv: NDArray[np.float64]  #: (N, 2) corrections at the training pixels [px]
     noise_px: float = 0.0  #: standard deviation of one training correction
     bias_px: float = 0.0  #: systematic error of a prediction, as a standard deviation
-    series: Series | None = None  #: terms that were estimated in the adjustment
+    series: Series | None = None  #: terms estimated in the adjustment
     _hull: NDArray[np.float64] = field(init=False, repr=False, compare=False)
     _holes: Holes | None = field(init=False, repr=False, compare=False)
 
@@ -115,27 +113,27 @@ class CorrectionModel(ABC):
         self._prepare()
 
     def _set(self, **values: Any) -> None:
-        """Set attributes of the frozen instance while it is made."""
+        """Set attributes of the frozen instance during construction."""
         for name, value in values.items():
             object.__setattr__(self, name, value)
 
     def _prepare(self) -> None:  # noqa: B027
-        """Derive from the content what predictions need; called once, by the constructor."""
+        """Derive from the fields what predictions need; called once, by the constructor."""
 
     def _calibrated_points(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Points whose convex hull bounds the calibrated area."""
+        """Return the points whose convex hull bounds the calibrated area."""
         return uv
 
     @abstractmethod
     def predict(self, uv: ArrayLike) -> NDArray[np.float64]:
-        """Corrections (n, 2) [px] at pixels uv (n, 2)."""
+        """Return corrections (n, 2) [px] at pixels uv (n, 2)."""
 
     def standard_deviation(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Standard deviations (n,) [px] of the predictions at pixels uv (n, 2)."""
+        """Return standard deviations (n,) [px] of the predictions at pixels uv (n, 2)."""
         return self._sd(np.zeros(len(uv)), uv)
 
     def _sd(self, norm2: NDArray[np.float64], uv: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Standard deviations (n,) [px] from the squared norms (n,) of the prediction weights."""
+        """Return standard deviations (n,) [px] from squared norms (n,) of prediction weights."""
         variance = self.noise_px**2 * norm2 + self.bias_px**2
         return np.sqrt(variance if self.series is None else variance + self.series.sd_at(uv) ** 2)
 
@@ -147,8 +145,8 @@ class CorrectionModel(ABC):
     def evaluate_in_bulk(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return du, dv and standard deviation (3, n) [px] at many pixels uv (n, 2).
 
-        The lookup grid is built with it. A subclass overrides it where there is a faster way than
-        `predict` in chunks.
+        The lookup grid is built with this method. Override it in a subclass that has a faster way
+        than calling `predict` in chunks.
         """
         out = np.empty((3, len(uv)))
         for start in range(0, len(uv), BULK_CHUNK):
@@ -158,27 +156,27 @@ class CorrectionModel(ABC):
         return out
 
     def bulk_work(self, uv: NDArray[np.float64], limit: float) -> float:
-        """Return the work of `evaluate_in_bulk` at pixels uv (n, 2), in some 50 ns.
+        """Return the work of `evaluate_in_bulk` at pixels uv (n, 2), in units of some 50 ns.
 
-        By default the values of functions that are added up. A result above the limit may be too
-        small.
+        By default it is the number of function values that are summed. A result above the limit
+        may be too small.
         """
         return float(len(uv)) * (1 if self.series is None else len(self.series.functions))
 
     def outside(self, uv: ArrayLike) -> NDArray[np.bool_]:
-        """True (n,) where a pixel uv (n, 2) is beyond the calibrated area.
+        """Return True (n,) where a pixel uv (n, 2) is beyond the calibrated area.
 
-        It is beyond the convex hull of the training points, or in a hole between them: what a
-        correction does where no target was seen nobody has measured.
+        Such a pixel is beyond the convex hull of the training points, or in a hole between them:
+        where no target was seen, the correction has not been measured.
         """
         uv = np.asarray(uv, dtype=float)
         out = _beyond(self._hull, uv)
         return out if self._holes is None else out | self._holes.contain(uv)
 
     def to_values(self) -> dict[str, Any]:
-        """Values of the fields of a calibration's record that hold the model.
+        """Return the values of those fields of a calibration's record that define the model.
 
-        `registry.model_from_values` makes an equal model of them.
+        `registry.model_from_values` creates an equal model from them.
         """
         degree, modes, coefficients, sd = packed(self.series)
         return {
@@ -203,27 +201,27 @@ class Holes:
     radius: float
 
     def contain(self, uv: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """True (n,) where a pixel uv (n, 2) is in one of the discs."""
+        """Return True (n,) where a pixel uv (n, 2) is in one of the discs."""
         distance, _ = self.centres.query(uv, distance_upper_bound=self.radius)
         return np.isfinite(distance)
 
 
 def _holes_of(uv: NDArray[np.float64], hull: NDArray[np.float64]) -> Holes | None:
-    """Holes between training points uv (N, 2) within their hull; None: there are none.
+    """Return the holes between training points uv (N, 2) within their hull, or None without holes.
 
-    Their union is what an alpha shape excludes (Edelsbrunner, Kirkpatrick and Seidel, "On the
-    shape of a set of points in the plane", IEEE Transactions on Information Theory 29, 1983). A
-    hole is no smaller than the distance of the nodes at which a standard deviation is stated.
+    The union of the holes is what an alpha shape excludes (Edelsbrunner, Kirkpatrick and Seidel,
+    "On the shape of a set of points in the plane", IEEE Transactions on Information Theory 29,
+    1983). The radius of a hole is at least the spacing of the nodes of the standard deviation.
     """
     try:
-        area = ConvexHull(uv).volume  # in the plane, the area
+        area = ConvexHull(uv).volume  # in the plane, `volume` is the area
     except (QhullError, ValueError):
         return None
     low, high = uv.min(axis=0), uv.max(axis=0)
     radius = max(
         HOLE_SPACINGS * float(np.sqrt(area / len(uv))), float(np.max(high - low)) / (SD_GRID - 1)
     )
-    u, v = (np.arange(a, b, radius / 3) for a, b in zip(low, high))  # centres that are tried
+    u, v = (np.arange(a, b, radius / 3) for a, b in zip(low, high))  # candidate centres
     tried = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
     tried = tried[~_beyond(hull, tried)]
     distance, _ = cKDTree(uv).query(tried, distance_upper_bound=radius)
@@ -232,12 +230,12 @@ def _holes_of(uv: NDArray[np.float64], hull: NDArray[np.float64]) -> Holes | Non
 
 
 def _beyond(hull: NDArray[np.float64], uv: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """True (n,) where a pixel uv (n, 2) is beyond half-planes (h, 3)."""
+    """Return True (n,) where a pixel uv (n, 2) is beyond half-planes (h, 3)."""
     return (uv @ hull[:, :2].T + hull[:, 2] > 0).any(axis=1)
 
 
 def _half_planes(uv: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Half-planes (h, 3) whose intersection is the convex hull of uv (N, 2).
+    """Return half-planes (h, 3) whose intersection is the convex hull of uv (N, 2).
 
     A pixel (u, v) is inside where a u + b v + c <= 0 for every row (a, b, c).
     """

@@ -1,14 +1,14 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The record of a calibration: every value that its file, its message and its id hold.
+"""The record of a calibration: every value that its file, its message and its id contain.
 
-Fields of records: what files, messages, identifiers and documentation have in common. A value is
-declared once, by a `Field`. The arrays of a file and their limits, what earlier versions did not
-have, the fields of a message and the table in the documentation follow from it.
+Each value is declared once, by a `Field`. The arrays of a file and their limits, the defaults for
+files of earlier versions, the fields of a message and the table in the documentation follow from
+this declaration.
 
-A new value is one line here and an attribute of `FluoroscopeCalibration`. Those that determine a
-correction come first, in the order in which the id depends on them.
+To add a value, add one line here and an attribute to `FluoroscopeCalibration`. Values that
+determine a correction come first, in the order in which they enter the id.
 """
 
 from __future__ import annotations
@@ -32,55 +32,55 @@ class Field:
     name: str
     dtype: str  #: {'text', 'int', 'float', 'bool'}
     shape: tuple[int | str, ...] = ()  #: a letter stands for any length
-    #: for the documentation
+    #: unit and meaning, for the documentation
     unit: str = '-'
     meaning: str = ''
     minimum: float | None = None
-    maximum: float | None = None  #: of the absolute value, where it is finite
-    longest: int | None = None  #: of the lengths that are letters
-    #: the only length but 0 that a letter of the shape can stand for
+    maximum: float | None = None  #: maximum of the absolute value of finite numbers
+    longest: int | None = None  #: maximum length that a letter can stand for
+    #: the only length other than 0 that a letter of the shape can stand for
     lengths: Mapping[str, int] = field(default_factory=dict)
     allowed: str = ''  #: value that a float can have besides finite ones: {'', 'inf', 'nan'}
     since: int = 1  #: first version of the file that has the field
-    before: Any = None  #: value of a record of an earlier version
-    #: fields of the message; several hold the parts along the axis of their number; empty: one of
-    #: the same name
+    before: Any = None  #: value assumed for a record of an earlier version
+    #: fields of the message; several contain the parts along the axis of that length; empty: the
+    #: field of the same name
     message: tuple[str, ...] = ()
-    #: whether the identifier of the record depends on it: as what determines a correction, or as
-    #: what does not: {'', 'correction', 'detail'}
+    #: dependence of the record's identifier on the field: {'', 'correction', 'detail'};
+    #: 'correction' if the field determines a correction, 'detail' if it does not
     identity: str = ''
 
 
-VERSION = 4  # of the file
-MAX_DEGREE = 15  # of a series that is read
-MAX_MODES = 100  # of a series that is read
+VERSION = 4  # version of the file format
+MAX_DEGREE = 15  # maximum degree of a series on reading
+MAX_MODES = 100  # maximum number of modes of a series on reading
 SD_GRID = 33  # nodes of the standard deviation along each side of the image
-ORDERS = 2  # harmonics of the angle
+ORDERS = 2  # number of harmonics of the angle
 HARMONICS = 2 * ORDERS
-TERMS = (CUBIC + 1) * (CUBIC + 2) // 2  # of a polynomial of two variables
-VARIANCES = HARMONICS + HARMONICS * (HARMONICS + 1) // 2  # with the series and of each pair
+TERMS = (CUBIC + 1) * (CUBIC + 2) // 2  # number of terms of a cubic polynomial of two variables
+VARIANCES = HARMONICS + HARMONICS * (HARMONICS + 1) // 2  # with the series, and of each pair
 
 _correction = partial(Field, identity='correction')
 _detail = partial(Field, identity='detail')
 
 
 def _pixels(name: str, meaning: str, shape: tuple[int | str, ...] = (), **more: Any) -> Field:
-    """Declare lengths in an image that determine a correction."""
+    """Declare lengths in the image that determine a correction."""
     return _correction(name, 'float', shape, 'px', meaning, maximum=MAX_PX, **more)
 
 
 def _count(name: str, meaning: str, shape: tuple[int | str, ...] = (), **more: Any) -> Field:
-    """Declare numbers of something, which do not change a correction."""
+    """Declare counts, which do not affect a correction."""
     return _detail(name, 'int', shape, '1', meaning, minimum=0, **more)
 
 
 def _fit(name: str, meaning: str, allowed: str, **more: Any) -> Field:
-    """Declare a number that tells how well an adjustment fits, without a dimension."""
+    """Declare a dimensionless measure of how well an adjustment fits."""
     return _detail(name, 'float', (), '1', meaning, allowed=allowed, **more)
 
 
 FIELDS = (
-    # What determines a correction.
+    # Values that determine a correction.
     _correction(
         'fluoroscope',
         'text',
@@ -248,7 +248,7 @@ FIELDS = (
         'text',
         meaning='SHA-256 of the observations and the phantom',
     ),
-    # What does not change a correction.
+    # Values that do not affect a correction.
     _detail(
         'interior_covariance',
         'float',
@@ -299,8 +299,8 @@ FIELDS = (
     _count('inliers', 'number of image points that the adjustment classified as inliers'),
     _count('iterations', 'number of rounds of adjustment and regression'),
     _detail('converged', 'bool', meaning='false: stopped at the maximum number of rounds'),
-    # What the id does not depend on: files of observations have neither stamps nor frames, and a
-    # calibration from files has the id of the same one by the node.
+    # Values that do not enter the id. Files of observations contain neither stamps nor frame ids,
+    # so a calibration from files has the same id as the equal calibration by the node.
     Field(
         'calibration_id',
         'text',

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Calibration of one fluoroscope: what is published, saved and used for the correction.
+"""Calibration of one fluoroscope: published, saved, and used to correct image points.
 
-Noise of image coordinates that differs between the middle of the image and its border. The
+The noise of image coordinates may differ between the middle of the image and its border. The
 logarithm of the variance is a linear function of the squared distance from the middle:
 multiplicative heteroscedasticity (Harvey, Econometrica 44, 1976).
 """
@@ -31,19 +31,19 @@ from .grid import CorrectionGrid
 from .registry import MODEL_FIELDS, model_from_values
 from .series import Functions, Series
 
-MAX_FACTOR = 10.0  # of the border over the middle, or the inverse
+MAX_FACTOR = 10.0  # maximum estimated ratio of the factors of border and middle, or of its inverse
 
 
 @dataclass(frozen=True)
 class NoiseProfile:
-    """Factors of the standard deviation of image coordinates over an image."""
+    """Factors of the standard deviation of image coordinates as a function of the position."""
 
     #: factors in the middle of the image, and at the border and beyond; the mean of their squares
-    #: over the image points is one
+    #: over the image points is 1
     middle: float
     rim: float
-    #: distance of the border from the middle, in halves of the longer side: no image points are
-    #: known beyond
+    #: distance of the border from the middle, in units of half the longer side; there were no
+    #: image points beyond it
     reach: float
 
     def factors(
@@ -56,16 +56,16 @@ class NoiseProfile:
 
 
 def packed_profile(profile: NoiseProfile | None) -> NDArray[np.float64]:
-    """Return middle, border and reach (3,) of a profile for files and messages, (0,) for None."""
+    """Return middle, border and reach (3,) of a profile for files and messages; (0,) for None."""
     if profile is None:
         return np.zeros(0)
     return np.array([profile.middle, profile.rim, profile.reach])
 
 
 def unpacked_profile(values: np.ndarray) -> NoiseProfile | None:
-    """Return the profile that `packed_profile` made an array of.
+    """Return the profile that `packed_profile` turned into an array.
 
-    Raises ValueError for arrays of another length, and for factors that no image has.
+    Raises ValueError for arrays of another length and for implausible factors.
     """
     if not len(values):
         return None
@@ -81,12 +81,12 @@ def unpacked_profile(values: np.ndarray) -> NoiseProfile | None:
 def square_distance(
     u: NDArray[np.float64], v: NDArray[np.float64], image_size: tuple[int, int]
 ) -> NDArray[np.float64]:
-    """Squares (n,) of distances from the middle of an image, in halves of its longer side."""
+    """Return squared distances (n,) from the image centre, in units of half the longer side."""
     width, height = image_size
     half = max(width, height) / 2
     x = (u - (width - 1) / 2) / half
     y = (v - (height - 1) / 2) / half
-    with np.errstate(over='ignore'):  # no image has such pixels
+    with np.errstate(over='ignore'):  # such pixels are off every image
         x *= x
         y *= y
         x += y
@@ -116,18 +116,18 @@ class CorrectedPoints:
 class FluoroscopeCalibration:
     """Interior orientation and correction model of one fluoroscope, and their quality.
 
-    `calibration_record` says what the attributes mean and their units; those that are no fields of
-    the record follow.
+    The meaning and unit of most attributes are in `calibration_record`. The following attributes
+    are not fields of the record.
 
     Attributes
     ----------
     model : CorrectionModel
     angle_field : AngleField or None
-        Change of the correction with the angle of the C-arm; None: there is none.
+        Change of the correction with the angle of the C-arm; None if it does not change.
     noise_profile : NoiseProfile or None
-        Factors of image_sd over the image; None: it is the same everywhere.
+        Factors of image_sd over the image; None if it is the same everywhere.
     seconds : float
-        Time the calibration took; NaN where it was read from a file.
+        Duration of the calibration; NaN for a calibration read from a file.
     """
 
     __repr__ = brief_repr
@@ -167,7 +167,7 @@ class FluoroscopeCalibration:
 
     @property
     def earlier_id(self) -> str:
-        """Id of this calibration in earlier versions: of what determines a correction only."""
+        """Id of this calibration in earlier versions, from the fields of the correction only."""
         digest = hashlib.sha256()
         self._add_to(digest, 'correction')
         return self._identity(digest)
@@ -176,10 +176,10 @@ class FluoroscopeCalibration:
         return f'{self.fluoroscope}-{digest.hexdigest()[:16]}'
 
     def _add_to(self, digest: hashlib._Hash, identity: str) -> None:
-        """Add the fields with this identity to a digest: numbers, then words.
+        """Add the fields with this identity to a digest: arrays of numbers, then words.
 
-        The words of a correction are texts, those of its details numbers without a dimension that
-        are whole.
+        The words of a correction are its text fields; the words of its details are its scalar
+        integers and booleans.
         """
         fields = [field for field in FIELDS if field.identity == identity]
         values = self.to_values(fields)
@@ -198,11 +198,11 @@ class FluoroscopeCalibration:
         digest.update('/'.join(words).encode())
 
     def to_values(self, fields: Sequence[Field] = FIELDS) -> dict[str, Any]:
-        """Return the values of the fields of its record, for files and messages."""
+        """Return the values of fields of the record, for files and messages."""
         values = self.model.to_values()
         values |= zip(_ANGLES, packed_angles(self.angle_field))
         values['noise_profile'] = packed_profile(self.noise_profile)
-        # An empty list would be one of floats.
+        # An empty list would become an array of floats.
         values['train_exposure'] = np.asarray(
             self.train_exposure, dtype=None if len(self.train_exposure) else np.int64
         )
@@ -215,9 +215,9 @@ class FluoroscopeCalibration:
     def from_values(
         cls, values: Mapping[str, Any], seconds: float = np.nan
     ) -> FluoroscopeCalibration:
-        """Return the calibration from which `to_values` made the values, with an id of its own.
+        """Return the calibration from which `to_values` made the values; its id is computed anew.
 
-        Raises ValueError for values that do not belong together.
+        Raises ValueError for values that do not match.
         """
         width, height = (int(side) for side in values['image_size'])
         size = (width, height)
@@ -249,17 +249,17 @@ class FluoroscopeCalibration:
 
     @cached_property
     def grid(self) -> CorrectionGrid:
-        """Lookup grid of the model, built at its first use."""
+        """Lookup grid of the model, built on first use."""
         return CorrectionGrid(self.model, self.image_size)
 
     def prepare(self) -> None:
-        """Build what the first correction needs, so that no frame waits for it."""
+        """Build what the first correction needs, so that no frame has to wait for it."""
         _ = self.grid
 
     def correction(self, uv: ArrayLike, angle: ArrayLike | None = None) -> Correction:
         """Return the Correction of the model at pixels uv (n, 2).
 
-        angle: of the C-arm [rad], a number or (n,); None or NaN where it is unknown.
+        angle: angle of the C-arm [rad], a number or (n,); None or NaN where it is unknown.
         """
         found = self.model.evaluate(uv)
         if self.angle_field is None:
@@ -273,10 +273,10 @@ class FluoroscopeCalibration:
         )
 
     def at_angle(self, angle: float | None) -> FluoroscopeCalibration:
-        """Return the calibration at an angle [rad] of the C-arm, which does not change with it.
+        """Return the calibration at a fixed angle [rad] of the C-arm.
 
-        None, or a calibration that does not depend on the angle: the calibration as it is. Raises
-        DataError for an angle that is not calibrated.
+        Returns self if the angle is None or the calibration does not depend on it. Raises
+        DataError for an angle outside the calibrated range.
         """
         field = self.angle_field
         series = self.model.series
@@ -309,17 +309,17 @@ class FluoroscopeCalibration:
         uv : (n, 2) array_like
             Observed pixels.
         sigma : (n,) array_like, optional
-            Their standard deviations [px]; by default that of the calibration.
+            Their standard deviations [px]; by default those of the calibration.
         exact : bool
-            True for the model itself instead of its grid, which differs by grid.error_px and is
-            OUTSIDE up to a cell before the calibrated area ends.
+            True to evaluate the model itself instead of its grid. The grid differs from it by up
+            to grid.error_px and reports OUTSIDE up to a cell before the calibrated area ends.
         angle : float or (n,) array_like, optional
-            Of the C-arm [rad], for a correction that changes with it; None or NaN: it is unknown.
+            Angle of the C-arm [rad], if the correction changes with it; None or NaN if unknown.
 
         Returns
         -------
         CorrectedPoints
-            With standard deviations of observation and correction together.
+            Their standard deviations combine those of observation and correction.
         """
         uv = np.asarray(uv, dtype=float).reshape(-1, 2)
         sigma = None if sigma is None else np.asarray(sigma, dtype=float)
@@ -343,11 +343,11 @@ class FluoroscopeCalibration:
         NDArray[np.float64],
         NDArray[np.uint8],
     ]:
-        """Correct arrays u, v and sigma (n,) of floats, with the least overhead.
+        """Correct arrays u, v and sigma (n,) of floats with the least overhead.
 
-        angle: of the C-arm [rad], a number or (n,); None or NaN where it is unknown. Returns
-        corrected u and v, their standard deviation, that of the correction alone [px], and status,
-        each (n,). The numbers are those of `correct`.
+        angle: angle of the C-arm [rad], a number or (n,); None or NaN where it is unknown. Returns
+        corrected u and v, their standard deviation, the standard deviation of the correction alone
+        [px], and status, each (n,). The values are equal to those of `correct`.
         """
         (du, dv, sd), status = self.grid.look_up(u, v)
         if self.angle_field is not None:
@@ -373,7 +373,7 @@ class FluoroscopeCalibration:
         status: NDArray[np.uint8],
         angle: ArrayLike | None,
     ) -> None:
-        """Add to a correction and its status, in place, what an angle changes."""
+        """Add the change with the angle to a correction and its status, in place."""
         valid = status != int(CorrectionStatus.INVALID)
         on = slice(None) if valid.all() else np.flatnonzero(valid)
         angle = np.asarray(np.nan if angle is None else angle, dtype=float)
@@ -390,7 +390,7 @@ class FluoroscopeCalibration:
     def _correct_exactly(
         self, uv: NDArray[np.float64], sigma: NDArray[np.float64] | float, angle: ArrayLike | None
     ) -> CorrectedPoints:
-        """Correct by the model itself."""
+        """Correct points with the model itself."""
         good = points_on_image(uv, self.image_size)
         out = CorrectedPoints(
             np.full(uv.shape, np.nan),
@@ -414,11 +414,11 @@ def with_drift(
     coefficients: NDArray[np.float64],
     sd: NDArray[np.float64],
 ) -> FluoroscopeCalibration:
-    """Return a calibration with a change of its correction.
+    """Return a calibration with a change added to its correction.
 
-    drift, coefficients (2, n) [px]: of the change; sd (33, 33): its standard deviation, on the
-    grid of `Series`. Raises DataError for a model without a series, which cannot tell how well the
-    change is known.
+    drift, coefficients (2, n) [px]: functions of the change and their coefficients. sd (33, 33):
+    standard deviation of the change, on the grid of `Series`. Raises DataError for a model without
+    a series, which has no field of standard deviations.
     """
     model = calibration.model
     if model.series is None:
@@ -438,10 +438,10 @@ def with_drift(
 def with_larger_sd(
     calibration: FluoroscopeCalibration, sd: NDArray[np.float64]
 ) -> FluoroscopeCalibration:
-    """Return a calibration whose correction claims a standard deviation of sd (33, 33) at least.
+    """Return a calibration whose correction has a standard deviation of at least sd (33, 33).
 
-    sd is on the grid of `Series` [px]. A model without a series is returned as it is: it has no
-    field of standard deviations.
+    sd is on the grid of `Series` [px]. A model without a series is returned unchanged, as it has
+    no field of standard deviations.
     """
     series = calibration.model.series
     if series is None or (sd <= series.sd).all():
@@ -453,10 +453,10 @@ def with_larger_sd(
 def at_common_angle(
     uv: ArrayLike, one: FluoroscopeCalibration, other: FluoroscopeCalibration
 ) -> tuple[Correction, Correction]:
-    """Return two corrections at pixels uv (n, 2), which can be compared.
+    """Return the corrections of two calibrations at pixels uv (n, 2), for comparison.
 
-    Corrections that change with the angle of a C-arm are those at the same angle, the one of the
-    exposures of one that the other has come nearest to.
+    If both change with the angle of the C-arm, they are evaluated at the same angle: the exposure
+    angle of the first that is nearest to an angle of the second.
     """
     fields = (one.angle_field, other.angle_field)
     angle = None
@@ -466,7 +466,7 @@ def at_common_angle(
 
 
 def digest_of_sources(frames: Iterable[Frame], phantom: Phantom) -> str:
-    """SHA-256 (hex) of the frames of one fluoroscope and of the phantom."""
+    """Return the SHA-256 (hex) of the frames of one fluoroscope and of the phantom."""
     digest = hashlib.sha256()
     for frame in sorted(frames, key=lambda f: f.number):
         frame = frame.sorted()
@@ -482,7 +482,7 @@ def digest_of_sources(frames: Iterable[Frame], phantom: Phantom) -> str:
     return digest.hexdigest()
 
 
-Calibrations = Mapping[str, FluoroscopeCalibration]  # by fluoroscope
+Calibrations = Mapping[str, FluoroscopeCalibration]  # by name of the fluoroscope
 
 
 def ids_of(calibrations: Calibrations) -> dict[str, str]:

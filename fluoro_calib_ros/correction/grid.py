@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The correction at the rate of a stream: a lookup grid that is made of a model once.
+"""Correction at the rate of a stream, by a lookup grid that is computed once from a model.
 
-A frame of 30 points leaves no time for neighbour searches or series of sines, and millions of
-points even less. So the image is divided into cells, and in each the correction and its standard
-deviation are bilinear between their exact values at the corners. A cell is one row of a table,
-with everything that a point in it needs: a random access to memory for each point, and the calls
-of numpy for a small frame, are what a lookup costs.
+Neighbour searches and series of sines take too long for a frame of 30 points, and even more so for
+millions of points. The image is therefore divided into cells. In each cell the correction and its
+standard deviation are interpolated bilinearly between exact values at the corners. A cell is one
+row of a table, with all the data of a point in it: the cost of a lookup is one random memory
+access per point, plus the numpy calls for a small frame.
 """
 
 from __future__ import annotations
@@ -29,17 +29,16 @@ from .grid_cells import (
     write_coefficients,
 )
 
-# The arrays in which the points of a frame are looked up, kept from frame to frame.
-
-# Part of a cell by which the image ends later, so that rounding leaves its edge on it.
+# Fraction of a cell by which the image is extended, so that rounding leaves its edge on it.
 EDGE = 1e-11
 
 
 class LookupWorkspace:
     """Arrays, and views of them, for the lookup of up to n points in a table of cells.
 
-    One thread uses it at a time. All calls of numpy are between whole arrays of one shape that
-    exist already: the number of calls is what a frame of 30 points costs.
+    Only one thread may use a workspace at a time. It is kept from frame to frame. All numpy calls
+    operate on whole, preallocated arrays of the same shape: the number of calls determines the
+    time of a frame of 30 points.
 
     n: largest number of points. shape: numbers of rows and columns of cells on the image.
     image_size: width and height of the image [px].
@@ -98,7 +97,7 @@ class LookupWorkspace:
         self.status = np.empty(n, dtype=np.uint8)  #: (n,) status of their cells
 
     def locate(self, u: NDArray[np.float64], v: NDArray[np.float64]) -> None:
-        """Find the cells of points u, v (m,) with m <= n: sets `uv`, `place` and `row`."""
+        """Find the cells of points u, v (m,) with m <= n; sets `uv`, `place` and `row`."""
         place = self.place
         row = self.row
         count = len(u)
@@ -106,41 +105,40 @@ class LookupWorkspace:
         self._v[:, :count] = v
         np.multiply(self.uv, self._cells_per_px, place)
         np.add(place, self._shift, place)
-        np.fmax(place, self._lowest, place)  # replaces NaN, too
+        np.fmax(place, self._lowest, place)  # also replaces NaN
         np.fmin(place, self._highest, place)
-        self._cell[...] = place  # rounds down: it is positive
+        self._cell[...] = place  # rounds down, as it is positive
         np.multiply(row, self._columns_of_table, row)
         np.add(row, self._column, row)
 
     def interpolate(self, table: NDArray[np.float64], status: NDArray[np.uint8]) -> None:
-        """Evaluate the cells of the located points: sets `result` and `status`.
+        """Evaluate the cells of the located points; sets `result` and `status`.
 
         table (cells, COEFFICIENTS) and status (cells,) have a row for each cell.
         """
         linear = self._linear
         result = self.result
-        # The rows are in range; other modes than 'clip' copy once more.
+        # The rows are in range; modes other than 'clip' make an additional copy.
         table.take(self.row, 0, self._coefficients, 'clip')
         status.take(self.row, 0, self.status, 'clip')
         self._found[...] = self._coefficients.T
-        np.multiply(self._slopes, self._v, linear)  # constant + slopes v, of 1 and of u
+        np.multiply(self._slopes, self._v, linear)  # constant + slopes * v, of 1 and of u
         np.add(linear, self._constant, linear)
         np.multiply(self._of_u, self._u, result)
         np.add(result, self._of_one, result)
 
 
 DIVIDED = 4  # added to the status of a cell that is divided
-CHUNK = 8192  # points that are looked up at once, so that their workspace fits the cache
-# Numbers of points for which workspaces are made: steps of 32 for frames, then powers of two.
+CHUNK = 8192  # points per lookup, so that their workspace fits the cache
+# Capacities of workspaces: steps of 32 for frames, then powers of two.
 WORKSPACE_SIZES = (*range(0, 512, 32), 512, 1024, 2048, 4096, CHUNK)
 
 
 class CorrectionGrid:
     """Correction, standard deviation and status of the pixels of an image, from a table.
 
-    A grid is not changed by its use: any number of threads may share it. A piecewise constant
-    model (knn) has the smallest cells; its lookups are between the values at the corners of the
-    cell.
+    Use does not change a grid, so any number of threads may share it. A piecewise constant model
+    (knn) gets the smallest cells; lookups interpolate between the values at their corners.
 
     image_size: width and height [px].
     """
@@ -162,9 +160,9 @@ class CorrectionGrid:
                 self._set_divided(divided)
                 errors[:, divided.row, divided.column] = self._errors_of_divided(model, divided)
         #: largest difference of a coordinate from the exact model in the calibrated area, measured
-        #: at the centres of cells and of their edges; a kink between them may do half more
+        #: at the centres of cells and of their edges; a kink between these may add half as much
         self.error_px = float(np.nanmax(errors[0][~cells.outside], initial=0.0))
-        #: the same in the other cells
+        #: the same for cells outside the calibrated area
         self.error_outside_px = float(np.nanmax(errors[0][cells.outside], initial=0.0))
         #: largest difference of the standard deviation, everywhere
         self.sd_error_px = float(np.nanmax(errors[1]))
@@ -173,7 +171,7 @@ class CorrectionGrid:
         """Make the tables of coefficients and status, one row for each cell."""
         rows, columns = cells.outside.shape
         self._shape = (rows, columns)
-        # A frame of cells around the image answers for what is off it, with NaN and INVALID.
+        # A border of cells around the image covers points off the image, with NaN and INVALID.
         table = aligned_array((rows + 2, columns + 2, COEFFICIENTS))
         table[:] = np.nan
         write_coefficients(cells.nodes, cells.values, table[1:-1, 1:-1])
@@ -184,7 +182,7 @@ class CorrectionGrid:
         ).ravel()
 
     def _set_divided(self, divided: DividedCells) -> None:
-        """Let lookups in divided cells use the table of their parts."""
+        """Make lookups in divided cells use the table of their parts."""
         self._first = divided.first
         self._parts = divided.parts
         self._parts_table = divided.table
@@ -196,8 +194,8 @@ class CorrectionGrid:
     def _errors_of_divided(
         self, model: CorrectionModel, divided: DividedCells
     ) -> NDArray[np.float64]:
-        """Errors (2, d) [px] of correction and standard deviation left in divided cells."""
-        place = np.random.default_rng(0).random((2, 20, self.divided))  # 20 places in each
+        """Return the errors (2, d) [px] of correction and standard deviation in divided cells."""
+        place = np.random.default_rng(0).random((2, 20, self.divided))  # 20 places per cell
         u, v = (
             axis[k] + part * (axis[k + 1] - axis[k])
             for axis, k, part in zip(self.nodes, (divided.column, divided.row), place)
@@ -208,7 +206,7 @@ class CorrectionGrid:
         return np.stack([error[:2].max(axis=0), error[2]])
 
     def __getstate__(self) -> dict[str, Any]:
-        # Copies of views would be arrays of their own.
+        # Copied views would no longer share memory, so workspaces are not pickled.
         return {**self.__dict__, '_workspaces': _no_workspaces()}
 
     def look_up(
@@ -220,10 +218,10 @@ class CorrectionGrid:
     ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
         """Return correction, standard deviation and status at pixels.
 
-        u, v: (n,) columns and rows [px]. values, status: (3, n) arrays for the results, both or
-        none. Returns values: (3, n) du, dv and standard deviation [px]; NaN where the status is
-        INVALID; status: (n,) `CorrectionStatus`; INVALID off the image and for what is not a
-        number.
+        u, v: (n,) columns and rows [px]. values, status: (3, n) and (n,) arrays for the results,
+        both or neither. Returns values: (3, n) du, dv and standard deviation [px], NaN where the
+        status is INVALID; status: (n,) `CorrectionStatus`, INVALID off the image and for
+        coordinates that are not a number.
         """
         n = len(u)
         if n <= CHUNK:
@@ -248,7 +246,7 @@ class CorrectionGrid:
         number = bisect_left(WORKSPACE_SIZES, n)
         workspaces = self._workspaces[number]
         try:
-            workspace = workspaces.pop()  # a thread that pops one has it alone, and puts it back
+            workspace = workspaces.pop()  # exclusive to this thread until it is appended
         except IndexError:
             workspace = LookupWorkspace(WORKSPACE_SIZES[number], self._shape, self.image_size)
         workspace.locate(u, v)
@@ -281,5 +279,5 @@ class CorrectionGrid:
 
 
 def _no_workspaces() -> list[list[LookupWorkspace]]:
-    """Empty lists of free workspaces, by WORKSPACE_SIZES."""
+    """Return empty lists of free workspaces, by WORKSPACE_SIZES."""
     return [[] for _ in WORKSPACE_SIZES]

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The cells of a lookup grid: their size, the exact values at their corners, their coefficients.
+"""Cells of a lookup grid: their size, exact values at their corners, and coefficients.
 
-The cells are as large as LIMIT_PX of `grid_errors` allows. The few in which that is not accurate
-enough, as neighbour models have kinks, are divided once more and have rows in a second table. What
-the values cost is counted beforehand: where it is too much, the cells are larger.
+The cells are as large as LIMIT_PX allows. Where a few of them are not accurate enough, such as at
+the kinks of neighbour models, they are divided once more into rows of a second table. The cost of
+the exact values is estimated beforehand; if it is too high, the cells are larger.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from .base import BULK_CHUNK, CorrectionModel, Smoothness
 
 # Errors of bilinear interpolation between the corners of the cells of a lookup grid.
 
-LIMIT_PX = 0.01  # largest difference of a looked-up correction from that of the exact model
-# The difference is measured at centres of cells and of their edges; a kink between centre and
+LIMIT_PX = 0.01  # largest difference of a looked-up correction from the exact model
+# The difference is measured at the centres of cells and of their edges; a kink between centre and
 # corner has its largest error elsewhere.
 TARGET_PX = 0.6 * LIMIT_PX
-# Cells of the smallest size in which the difference is measured: those with the largest second
-# differences.
+# The difference in cells of the smallest size is measured in those with the largest second
+# differences: minimum and maximum number of such cells, which bounds the time.
 MIN_MEASURED = 500
-MAX_MEASURED = 25_000  # centres of cells, which bounds the time
-PLACES = ((0.5, 0.5), (0.5, 0.0), (0.0, 0.5), (0.5, 1.0), (1.0, 0.5))  # in a cell, where it is
+MAX_MEASURED = 25_000
+PLACES = ((0.5, 0.5), (0.5, 0.0), (0.0, 0.5), (0.5, 1.0), (1.0, 0.5))  # positions within a cell
 
 
 def errors_of_finer_grid(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Errors (2, h, w) [px] of correction and standard deviation in cells.
+    """Return the errors (2, h, w) [px] of correction and standard deviation in cells.
 
     values (3, 2h + 1, 2w + 1): du, dv and standard deviation at the corners of the cells, the
     middles of their edges, and their centres.
@@ -54,16 +54,16 @@ def errors_where_curved(
     values: NDArray[np.float64],
     affordable: int,
 ) -> NDArray[np.float64]:
-    """Errors of cells, measured where second differences suggest that they may be too large.
+    """Measure the errors of cells where second differences suggest that they may be too large.
 
     nodes: (w,) columns and rows [px] of the corners of the cells. values: (3, h, w) du, dv and
-    standard deviation there. affordable: number of exact values that do not take too long.
-    Returns (2, h - 1, w - 1) errors of correction and standard deviation [px]; NaN in cells that
-    are not measured; at least MIN_MEASURED cells are, if that is affordable.
+    standard deviation there. affordable: number of exact values that can be computed in time.
+    Returns (2, h - 1, w - 1) errors of correction and standard deviation [px], NaN in cells that
+    are not measured. At least MIN_MEASURED cells are measured if that is affordable.
     """
     columns, rows = nodes
     curvature = _second_differences(values)
-    # At a kink the error is at most half the second difference, on a smooth bend an eighth.
+    # The error is at most half the second difference at a kink, and an eighth on a smooth bend.
     count = MIN_MEASURED
     if model.smoothness is not Smoothness.STEPPED:
         curved = np.count_nonzero(curvature > 1.5 * TARGET_PX)
@@ -84,7 +84,7 @@ def errors_where_curved(
 
 
 def _second_differences(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Largest second difference (h - 1, w - 1) [px] of the correction at the corners of a cell."""
+    """Return the largest second difference (h - 1, w - 1) [px] at the corners of each cell."""
     at_node = np.zeros(values.shape[1:])
     at_node[:, 1:-1] = np.abs(np.diff(values[:2], 2, axis=2)).max(axis=0)
     at_node[1:-1] += np.abs(np.diff(values[:2], 2, axis=1)).max(axis=0)
@@ -92,16 +92,16 @@ def _second_differences(values: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.maximum(of_cell[:, :-1], of_cell[:, 1:])
 
 
-CELL_PX = (8, 4, 2)  # sizes of cells that are tried; those of a saved lookup grid are the largest
-MAX_SHARE_DIVIDED = 0.01  # of cells, so that not all of them have to be smaller
-MAX_DIVIDED = 2500  # cells, the worst ones
-MAX_PARTS = 16  # of a divided cell along a side
-MAX_TABLE_BYTES = 128_000_000  # up to 5 megapixels all sizes of cells are tried
-MAX_CELL_PX = 64  # larger ones would not resemble the model
-# Work of the values at the corners of cells (`CorrectionModel.bulk_work`): some six seconds. That
-# of the errors may be a quarter of it, that of the divided cells half.
+CELL_PX = (8, 4, 2)  # sizes of cells to try; those of a saved lookup grid are the largest
+MAX_SHARE_DIVIDED = 0.01  # maximum fraction of cells to divide; beyond it all cells get smaller
+MAX_DIVIDED = 2500  # maximum number of cells to divide, the worst ones first
+MAX_PARTS = 16  # maximum number of parts of a divided cell along a side
+MAX_TABLE_BYTES = 128_000_000  # up to 5 megapixels, all sizes of cells are tried
+MAX_CELL_PX = 64  # larger ones would not represent the model
+# Limit of the work for the values at the corners of cells (`CorrectionModel.bulk_work`): some six
+# seconds. Measuring the errors may take a quarter of it, dividing cells half of it.
 MAX_WORK = 1.2e8
-COEFFICIENTS = 12  # of a cell: 1, u, v, u v, each for du, dv and the standard deviation
+COEFFICIENTS = 12  # per cell: 1, u, v, u v, each for du, dv and the standard deviation
 
 Nodes = tuple[
     NDArray[np.float64], NDArray[np.float64]
@@ -115,18 +115,18 @@ class Cells:
     nodes: Nodes  #: (w,) columns and rows [px] of their corners
     values: NDArray[np.float64]  #: (3, h, w) du, dv and standard deviation [px] there
     #: (2, h - 1, w - 1) errors [px] of correction and standard deviation in the cells; NaN where
-    #: not measured
+    #: they were not measured
     errors: NDArray[np.float64]
     #: (h - 1, w - 1) True for cells with a corner beyond the calibrated area
     outside: NDArray[np.bool_]
-    work: float  #: of a value, on average
+    work: float  #: average work per value
 
 
 @dataclass(frozen=True)
 class DividedCells:
-    """Cells that are divided further, as they are not accurate enough."""
+    """Cells that are divided further because they are not accurate enough."""
 
-    #: (d,) their place among the cells
+    #: (d,) indices of the divided cells in the grid
     row: NDArray[np.int64]
     column: NDArray[np.int64]
     parts: NDArray[np.int64]  #: (d,) number of parts along a side
@@ -135,9 +135,9 @@ class DividedCells:
 
 
 def build_cells(model: CorrectionModel, image_size: tuple[int, int]) -> Cells:
-    """Return the cells of an image (width, height) [px] for a model.
+    """Compute the cells of an image (width, height) [px] for a model.
 
-    Raises DataError for a model whose values take too long, even at the corners of large cells.
+    Raises DataError if the values take too long to compute, even at the corners of large cells.
     """
     sizes, work = _affordable_sizes(model, image_size)
     nodes, values, errors = _nodes_and_values(model, image_size, sizes, work)
@@ -145,7 +145,7 @@ def build_cells(model: CorrectionModel, image_size: tuple[int, int]) -> Cells:
 
 
 def divide_cells(model: CorrectionModel, cells: Cells) -> DividedCells | None:
-    """Divide the cells with the largest errors; None where all are accurate enough."""
+    """Divide the cells with the largest errors; return None if all are accurate enough."""
     error = cells.errors[0]
     inaccurate = np.flatnonzero(error > TARGET_PX)
     worst_first = np.argsort(-error.ravel()[inaccurate], kind='stable')
@@ -154,8 +154,8 @@ def divide_cells(model: CorrectionModel, cells: Cells) -> DividedCells | None:
         return None
     j, i = np.unravel_index(inaccurate, error.shape)
     columns, rows = cells.nodes
-    # At a kink the error is proportional to the side of a cell; one more halving for what the
-    # measured points do not show.
+    # At a kink the error is proportional to the side of a cell. One more halving allows for errors
+    # between the measured points.
     halvings = 1 + np.ceil(np.log2(error[j, i] / TARGET_PX))
     parts = np.minimum(2 ** halvings.astype(np.intp), MAX_PARTS)
     kept = _affordable_cells(error[j, i], parts, cells.work)
@@ -187,7 +187,7 @@ def divide_cells(model: CorrectionModel, cells: Cells) -> DividedCells | None:
 def _affordable_cells(
     error: NDArray[np.float64], parts: NDArray[np.int64], work: float
 ) -> NDArray[np.int64]:
-    """Places, ascending, of the cells with the largest errors whose parts do not take too long."""
+    """Return sorted indices of the cells with the largest errors whose parts are affordable."""
     worst_first = np.argsort(-error, kind='stable')
     values = np.cumsum((parts[worst_first] + 1) ** 2)
     return np.sort(worst_first[: np.searchsorted(values * work, MAX_WORK / 2, side='right')])
@@ -222,7 +222,7 @@ def write_coefficients(
 
 
 def aligned_array(shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Uninitialised floats that begin with a cache line, so that a row is in few of them."""
+    """Return uninitialised floats aligned to cache lines, so that a row spans few of them."""
     size = int(np.prod(shape))
     memory = np.empty(size + 8)
     start = -memory.ctypes.data % 64 // 8
@@ -232,7 +232,7 @@ def aligned_array(shape: tuple[int, ...]) -> NDArray[np.float64]:
 def _nodes_and_values(
     model: CorrectionModel, image_size: tuple[int, int], sizes: list[float], work: float
 ) -> tuple[Nodes, NDArray[np.float64], NDArray[np.float64]]:
-    """Nodes of the cell size that is chosen, values (3, h, w) there, and errors of the cells."""
+    """Choose the cell size; return its nodes, values (3, h, w) there, and errors of the cells."""
     nodes = _nodes(image_size, sizes[0], 1)
     values = None
     for number in range(len(sizes) - 1):
@@ -253,9 +253,9 @@ def _nodes_and_values(
 def _affordable_sizes(
     model: CorrectionModel, image_size: tuple[int, int]
 ) -> tuple[list[float], float]:
-    """Sizes of cells to try whose values do not take too long, and the mean work of a value.
+    """Return the sizes of cells to try that are affordable, and the mean work per value.
 
-    Raises DataError where there are none.
+    Raises DataError if there are none.
     """
     sizes = _cell_sizes(model.smoothness, image_size)
     while True:
@@ -272,7 +272,7 @@ def _affordable_sizes(
 
 
 def _cell_sizes(smoothness: Smoothness, image_size: tuple[int, int]) -> list[float]:
-    """Sizes of cells [px] to try, each half the one before."""
+    """Return the sizes of cells [px] to try, each half the previous one."""
     area = image_size[0] * image_size[1]
     bytes_of_cell = COEFFICIENTS * 8
     sizes: list[float] = [
@@ -288,7 +288,7 @@ def _cell_sizes(smoothness: Smoothness, image_size: tuple[int, int]) -> list[flo
 
 
 def _nodes(image_size: tuple[int, int], size: float, parts: int) -> Nodes:
-    """Corners of cells from edge to edge of an image: 1/parts of cells of at most size [px]."""
+    """Return the corners of cells of at most size / parts [px], from edge to edge of an image."""
     width, height = image_size
     return _axis_nodes(width, size, parts), _axis_nodes(height, size, parts)
 
@@ -298,21 +298,21 @@ def _axis_nodes(length: int, size: float, parts: int) -> NDArray[np.float64]:
 
 
 def _pixels(nodes: Nodes) -> NDArray[np.float64]:
-    """Pixels (h * w, 2) of nodes, row by row."""
+    """Return the pixels (h * w, 2) of nodes, row by row."""
     columns, rows = nodes
     return np.stack([np.tile(columns, len(rows)), np.repeat(rows, len(columns))], axis=1)
 
 
 def _exact_values(model: CorrectionModel, nodes: Nodes) -> NDArray[np.float64]:
-    """du, dv and standard deviation (3, h, w) [px] of the model at nodes."""
+    """Return du, dv and standard deviation (3, h, w) [px] of the model at nodes."""
     columns, rows = nodes
     return model.evaluate_in_bulk(_pixels(nodes)).reshape(3, len(rows), len(columns))
 
 
 def _outside(model: CorrectionModel, nodes: Nodes) -> NDArray[np.bool_]:
-    """True (h - 1, w - 1) for cells with a corner beyond the calibrated area.
+    """Return True (h - 1, w - 1) for cells with a corner beyond the calibrated area.
 
-    All other cells are inside, but for less than a cell at the border of a hole.
+    All other cells are inside, except for less than a cell at the border of a hole.
     """
     columns, rows = nodes
     step = max(1, BULK_CHUNK // len(columns))

@@ -17,17 +17,17 @@ from .base import BULK_CHUNK, Correction, CorrectionModel, Smoothness
 
 # Nearest training points of very many pixels, block by block.
 #
-# All pixels of a block have their k nearest training points among those within r + 2e of its
-# centre, where r is the distance of the k-th nearest from the centre and e half the diagonal
-# (triangle inequality). So one search serves some 200 pixels, and every call of numpy takes some
-# ten microseconds: a stream in the same process is not delayed.
+# Let r be the distance of the k-th nearest training point from the centre of a block, and e half
+# the diagonal of the block. By the triangle inequality, the k nearest training points of all its
+# pixels are within r + 2e of the centre. One search therefore serves some 200 pixels. Every numpy
+# call takes only some ten microseconds, so a stream in the same process is not delayed.
 
-BLOCK = 200  # pixels of a block
-MIN_BLOCK = 9  # where training points are dense
-MAX_BLOCK_PX = 64.0  # its largest side, for pixels that are far apart
-BLOCKS_PER_QUERY = 32  # that one call of scipy searches
-MAX_AT_ONCE = 2_000_000  # candidates of a query, and weights, to bound the memory
-# In candidates of a pixel: what a block costs, and each neighbour in the search from its centre.
+BLOCK = 200  # pixels per block
+MIN_BLOCK = 9  # minimum number of pixels per block, where training points are dense
+MAX_BLOCK_PX = 64.0  # longest side of a block, for pixels that are far apart
+BLOCKS_PER_QUERY = 32  # blocks per call of scipy
+MAX_AT_ONCE = 2_000_000  # maximum number of candidates per query, and of weights, to bound memory
+# Work in candidates of a pixel: per block, and per neighbour in the search from its centre.
 WORK_OF_BLOCK = 5000
 WORK_OF_NEIGHBOUR = 10
 
@@ -35,10 +35,10 @@ WORK_OF_NEIGHBOUR = 10
 def blocks_with_candidates(
     tree: cKDTree, uv: NDArray[np.float64], k: int, most: int
 ) -> Iterator[tuple[NDArray[np.int64], list[int] | None]]:
-    """Blocks of pixels uv (n, 2), and the training points among which their k nearest are.
+    """Yield blocks of pixels uv (n, 2) and the training points that contain their k nearest.
 
-    tree holds the training points. Yields the rows of the pixels and of the training points; None
-    in place of more than most points, as where many coincide.
+    tree contains the training points. Each block is given as rows of pixels and rows of training
+    points; the latter are None if there are more than most, such as where many coincide.
     """
     per_query = int(np.clip(MAX_AT_ONCE // min(tree.n, most), 1, BLOCKS_PER_QUERY))
     for some, centre, radius in _circles(tree, uv, k, per_query):
@@ -52,9 +52,9 @@ def blocks_with_candidates(
 
 
 def work_of_blocks(tree: cKDTree, uv: NDArray[np.float64], k: int, limit: float) -> int:
-    """Sum of the numbers of candidates over pixels uv (n, 2), and the work on blocks as such.
+    """Return the number of candidates summed over pixels uv (n, 2), plus the work per block.
 
-    Counting ends above a limit.
+    Counting stops above the limit.
     """
     total = 0
     for some, centre, radius in _circles(tree, uv, k, BLOCKS_PER_QUERY):
@@ -69,8 +69,8 @@ def work_of_blocks(tree: cKDTree, uv: NDArray[np.float64], k: int, limit: float)
 def _circles(
     tree: cKDTree, uv: NDArray[np.float64], k: int, per_query: int
 ) -> Iterator[tuple[list[NDArray[np.int64]], NDArray[np.float64], NDArray[np.float64]]]:
-    """Yield per_query blocks at a time, with centres and radii of the circles of candidates."""
-    reach = np.median(tree.query(uv[:: len(uv) // 32 + 1], k=[k])[0])  # of some pixels
+    """Yield per_query blocks at a time, with centres and radii of their circles of candidates."""
+    reach = np.median(tree.query(uv[:: len(uv) // 32 + 1], k=[k])[0])  # for a sample of pixels
     blocks = _blocks(uv, reach)
     for start in range(0, len(blocks), per_query):
         some = blocks[start : start + per_query]
@@ -83,10 +83,10 @@ def _circles(
 
 
 def _blocks(uv: NDArray[np.float64], reach: float) -> list[NDArray[np.int64]]:
-    """Rows of pixels uv (n, 2) that are close together, about BLOCK of them each.
+    """Return rows of pixels uv (n, 2) that are close together, about BLOCK of them each.
 
-    reach: distance of the k-th nearest training point [px]. Larger blocks would have many more
-    candidates than k, and are divided.
+    reach: distance of the k-th nearest training point [px]. Blocks that are larger than this would
+    have many more candidates than k, and are divided.
     """
     low = uv.min(axis=0)
     high = uv.max(axis=0)
@@ -109,11 +109,11 @@ def _blocks(uv: NDArray[np.float64], reach: float) -> list[NDArray[np.int64]]:
 
 # Nearest neighbours of image points, and the weights of linear smoothers over them.
 
-RIDGE = 1e-6  # of the slopes, relative to the kernel weights: collinear neighbours stay harmless
+RIDGE = 1e-6  # on the slopes, relative to the kernel weights; handles collinear neighbours
 
 
 class Neighbourhoods:
-    """Offsets from n query points to their K nearest training points, ascending in distance.
+    """Offsets from n query points to their K nearest training points, sorted by distance.
 
     neighbours (n, K, 2) and queries (n, 2) [px].
     """
@@ -129,16 +129,16 @@ class Neighbourhoods:
 
 
 def tricube_plane_weights(near: Neighbourhoods, k: int) -> NDArray[np.float64]:
-    """Weights (n, k) of a plane fitted to the k nearest values with tricube weights.
+    """Return weights (n, k) of a plane fitted to the k nearest values with tricube weights.
 
     The plane is evaluated at the query point (Cleveland, "Robust locally weighted regression",
     Journal of the American Statistical Association 74, 1979).
     """
-    # The k-th neighbour sets the bandwidth; among coincident points it stays positive.
+    # The k-th neighbour sets the bandwidth; the minimum keeps it positive for coincident points.
     bandwidth3 = np.maximum(near.cubed_distance[:, k - 1 : k], 1e-18)
     kernel = 1 - near.cubed_distance[:, :k] / bandwidth3
     kernel *= kernel * kernel
-    equidistant = np.einsum('nk->n', kernel) <= 1e-9  # then all neighbours have the same weight
+    equidistant = np.einsum('nk->n', kernel) <= 1e-9  # then all neighbours get the same weight
     if equidistant.any():
         kernel[equidistant] = 1.0
     return plane_weights(near.dx[:, :k], near.dy[:, :k], kernel, bandwidth3[:, 0] ** (2 / 3))
@@ -150,9 +150,9 @@ def plane_weights(
     kernel: NDArray[np.float64],
     bandwidth2: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Weights that evaluate at the origin the plane fitted to values at (dx, dy).
+    """Return the weights that evaluate, at the origin, the plane fitted to values at (dx, dy).
 
-    The weights of a query sum to one and reproduce planes exactly but for the ridge.
+    The weights of a query sum to one and reproduce planes exactly, except for the ridge.
 
     dx, dy: (n, k) offsets of the values from the origin. kernel: (n, k) weights of the values in
     the fit; overwritten. bandwidth2: (n,) squared bandwidth, to which the ridge is relative.
@@ -180,13 +180,12 @@ def plane_weights(
 
 
 class NeighbourTable:
-    """The nearest neighbours of points (N, 2) among themselves, in order of distance.
+    """Nearest neighbours of points (N, 2) among themselves, sorted by distance.
 
-    It is built once and then answers for changing subsets of the points.
+    The table is built once and can then be queried for varying subsets of the points.
 
-    uv: (N, 2). count: number of neighbours that will be asked for; some more are looked up, so
-    that excluded points can be skipped. rows: (T,) points whose neighbours will be asked for; by
-    default all.
+    uv: (N, 2) points. count: maximum number of neighbours per query; some more are stored, so that
+    excluded points can be skipped. rows: (T,) points to be queried; by default all.
     """
 
     def __init__(
@@ -215,7 +214,7 @@ class NeighbourTable:
         full = rank[:, -1] >= count
         out[full] = near[full][selected[full]].reshape(-1, count)
         if not full.all():
-            # Near a border of the image, or where a whole exposure is held out: search again.
+            # Near the image border, or where a whole exposure is excluded: search again.
             points = np.flatnonzero(allowed)
             _, found = cKDTree(self._uv[points]).query(
                 self._uv[rows[~full]], k=np.arange(1, count + 1)
@@ -224,7 +223,7 @@ class NeighbourTable:
         return out
 
     def restricted(self, selected: NDArray[np.bool_]) -> NeighbourTable:
-        """Return the table of the selected points (N, bool) alone, renumbered."""
+        """Return the table of the selected points (N, bool) only, renumbered."""
         other = NeighbourTable.__new__(NeighbourTable)
         other._uv = self._uv[selected]
         number = np.cumsum(selected) - 1
@@ -239,7 +238,7 @@ class NeighbourTable:
 class Trend:
     """Polynomials in two variables, centred and scaled by the training pixels.
 
-    degree: the highest, None: there are no polynomials; uv (N, 2): training pixels.
+    degree: highest degree, or None for no polynomials. uv (N, 2): training pixels.
     """
 
     def __init__(self, degree: int | None, uv: NDArray[np.float64]) -> None:
@@ -255,11 +254,11 @@ class Trend:
         return len(self._powers)
 
     def basis(self, uv: ArrayLike) -> NDArray[np.float64]:
-        """Values (n, p) of the polynomials at pixels uv (n, 2)."""
+        """Return values (n, p) of the polynomials at pixels uv (n, 2)."""
         x, y = ((np.asarray(uv) - self._centre) / self._scale).T
         out = np.empty((len(x), len(self._powers)))
         for column, (i, j) in enumerate(self._powers):
-            # Each polynomial is an earlier one times x or y.
+            # Each polynomial is a previous one times x or y.
             if i:
                 np.multiply(out[:, self._powers.index((i - 1, j))], x, out=out[:, column])
             elif j:
@@ -270,27 +269,27 @@ class Trend:
 
 
 def least_squares_map(basis: np.ndarray) -> NDArray[np.float64]:
-    """Matrix (p, N) from values at N points to the least-squares coefficients of basis (N, p)."""
+    """Return the matrix (p, N) from N values to least-squares coefficients of a basis (N, p)."""
     return np.linalg.pinv(basis) if basis.shape[1] else np.zeros((0, len(basis)))
 
 
 # Models that predict a weighted sum of the k nearest training corrections.
 
-MAX_CANDIDATES = 50  # for each neighbour; more are never found among distinct points
+MAX_CANDIDATES = 50  # candidates per neighbour; distinct points never have more
 
 
 class NeighbourModel(CorrectionModel):
-    """A linear smoother: a global part plus weights times the k nearest values.
+    """Linear smoother: a global part plus a weighted sum of the k nearest values.
 
-    The global part is a polynomial trend fitted here, or a series that was estimated in the
-    adjustment; the neighbours smooth what it leaves of the training corrections. A subclass gives
-    the `weights`. Cross-validation, standard deviations and the lookup grid follow from them.
+    The global part is a polynomial trend fitted here, or a series estimated in the adjustment. The
+    neighbours smooth its residuals at the training points. A subclass defines the `weights`;
+    cross-validation, standard deviations and the lookup grid follow from them.
     """
 
     smoothness = Smoothness.KINKED
     min_k: ClassVar[int]
-    trend_degree: ClassVar[int | None] = None  # of the polynomial trend; None: there is none
-    equal_weights: ClassVar[bool] = False  # weights are 1/k: a running mean gives all k at once
+    trend_degree: ClassVar[int | None] = None  # degree of the polynomial trend, or None
+    equal_weights: ClassVar[bool] = False  # all weights are 1/k; running means yield all k
     gauge_passes: ClassVar[int] = 3  # a smoother reproduces the gauge only approximately
 
     tree: cKDTree
@@ -316,15 +315,15 @@ class NeighbourModel(CorrectionModel):
     @classmethod
     @abstractmethod
     def weights(cls, near: Neighbourhoods, k: int) -> NDArray[np.float64]:
-        """Weights (n, k) of the k nearest training values in the predictions."""
+        """Return weights (n, k) of the k nearest training values in the predictions."""
 
     @classmethod
     def weights_of_candidates(
         cls, candidates: NDArray[np.float64], uv: NDArray[np.float64], k: int
     ) -> NDArray[np.float64]:
-        """Weights (n, c) of candidates (c, 2) at pixels uv (n, 2); zero but for the k nearest.
+        """Return weights (n, c) of candidates (c, 2) at uv (n, 2); zero except for the k nearest.
 
-        The lookup grid is built with it. A subclass overrides it where it need not sort.
+        The lookup grid is built with this method. Override it in a subclass that need not sort.
         """
         distance2 = np.sum((candidates - uv[:, None]) ** 2, axis=2)
         index = np.argsort(distance2, axis=1, kind='stable')[:, :k]
@@ -335,14 +334,14 @@ class NeighbourModel(CorrectionModel):
 
     @classmethod
     def candidate_k(cls, count: int) -> NDArray[np.int64]:
-        """Values of k that are tried for count training points, in steps of a quarter."""
+        """Return the values of k to try for count training points, in steps of a quarter."""
         largest = max(cls.min_k, min(int(count * 0.4), 400))
         steps = np.round(10 * 1.25 ** np.arange(17)).astype(int)
         steps = steps[steps <= largest]
         return steps if len(steps) else np.array([largest])
 
     def predict(self, uv: ArrayLike) -> NDArray[np.float64]:
-        """Corrections (n, 2) [px] at pixels uv (n, 2)."""
+        """Return corrections (n, 2) [px] at pixels uv (n, 2)."""
         return self._predict_with_norm(uv)[0]
 
     def evaluate(self, uv: ArrayLike) -> Correction:
@@ -352,7 +351,7 @@ class NeighbourModel(CorrectionModel):
         return Correction(duv, self._sd(norm2, uv), self.outside(uv))
 
     def standard_deviation(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Standard deviations (n,) [px] of the predictions at pixels uv (n, 2)."""
+        """Return standard deviations (n,) [px] of the predictions at pixels uv (n, 2)."""
         return self.evaluate(uv).sd
 
     def evaluate_in_bulk(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -383,13 +382,13 @@ class NeighbourModel(CorrectionModel):
         return super().bulk_work(uv, limit) + work_of_blocks(self.tree, uv, self.k, limit)
 
     def _global_part(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Trend or series (n, 2) [px] at pixels uv (n, 2)."""
+        """Return the trend or series (n, 2) [px] at pixels uv (n, 2)."""
         if self.series is None:
             return self.trend.basis(uv) @ self.trend_coefficients
         return self.series.predict_in_chunks(uv)
 
     def _predict_with_norm(self, uv: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Corrections (n, 2) [px] and the squared norms (n,) of their weights."""
+        """Return corrections (n, 2) [px] and the squared norms (n,) of their weights."""
         uv = np.asarray(uv, dtype=float).reshape(-1, 2)
         duv, norm2 = self._local_part(uv)
         return duv + self._global_part(uv), norm2
@@ -397,7 +396,7 @@ class NeighbourModel(CorrectionModel):
     def _local_part(
         self, uv: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """What the neighbours add to the global part (n, 2) [px], and the norms as above."""
+        """Return the contribution of the neighbours (n, 2) [px] and squared weight norms (n,)."""
         duv = np.zeros_like(uv)
         norm2 = np.zeros(len(uv))
         size = max(1, MAX_AT_ONCE // self.k)
@@ -410,19 +409,19 @@ class NeighbourModel(CorrectionModel):
         return duv, norm2
 
 
-# The model `local_linear`: a cubic trend, and local planes fitted to what it leaves.
+# The model `local_linear`: a cubic trend, and local planes fitted to its residuals.
 #
-# A local plane has no bias where all neighbours are on one side, as at the border of an image,
-# where the mean of them has. It flattens what bends within its reach, though, and in the
-# alternation with the adjustment the flattened part is lost: orientations and object points absorb
-# it. Pincushion, S-shape and spiral bend over the whole image and are cubic polynomials to first
-# order (Gronenschild, Medical Physics 24, 1997), so that polynomial is fitted first.
+# Where all neighbours are on one side, as at the border of an image, a local plane has no bias,
+# but the mean of the neighbours has. However, a plane flattens curvature within its neighbourhood.
+# In the alternation with the adjustment the flattened part is lost: orientations and object points
+# absorb it. Pincushion, S-shape and spiral distortion bend over the whole image and are cubic
+# polynomials to first order (Gronenschild, Medical Physics 24, 1997), so a cubic is fitted first.
 
 
 def _distances(
     candidates: NDArray[np.float64], uv: NDArray[np.float64], k: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Differences (n, c) in u and v of candidates, squared distances, and those of the k-th."""
+    """Return offsets (n, c) in u and v, squared distances, and the k-th smallest of these (n,)."""
     dx = candidates[:, 0] - uv[:, :1]
     dy = candidates[:, 1] - uv[:, 1:]
     distance2 = dx * dx
@@ -431,7 +430,7 @@ def _distances(
 
 
 class LocalLinearModel(NeighbourModel):
-    """Cubic trend plus a plane fitted to the k nearest remainders with tricube weights."""
+    """Cubic trend plus a plane fitted to the k nearest residuals with tricube weights."""
 
     kind = 'local_linear'
     description = 'cubic trend, and planes fitted to the k nearest residuals'
@@ -441,14 +440,14 @@ class LocalLinearModel(NeighbourModel):
 
     @classmethod
     def weights(cls, near: Neighbourhoods, k: int) -> NDArray[np.float64]:
-        """Weights (n, k) of the plane fitted with tricube weights."""
+        """Return weights (n, k) of the plane fitted with tricube weights."""
         return tricube_plane_weights(near, k)
 
     @classmethod
     def weights_of_candidates(
         cls, candidates: NDArray[np.float64], uv: NDArray[np.float64], k: int
     ) -> NDArray[np.float64]:
-        """Weights (n, c); a candidate as far as the k-th nearest or farther has the weight 0."""
+        """Return weights (n, c); 0 for candidates as far as the k-th nearest or farther."""
         dx, dy, distance2, kth = _distances(candidates, uv, k)
         ratio = distance2 / np.maximum(kth, 1e-12)[:, None]
         np.minimum(ratio, 1, out=ratio)
@@ -456,17 +455,17 @@ class LocalLinearModel(NeighbourModel):
         kernel *= ratio
         np.subtract(1, kernel, out=kernel)
         kernel *= kernel * kernel
-        equidistant = np.einsum('nk->n', kernel) <= 1e-9  # then all have the same weight
+        equidistant = np.einsum('nk->n', kernel) <= 1e-9  # then all neighbours get the same weight
         if equidistant.any():
             kernel[equidistant] = distance2[equidistant] <= kth[equidistant, None]
         return plane_weights(dx, dy, kernel, kth)
 
 
-# The model `hybrid`: a cubic trend in the adjustment, local planes on what it leaves.
+# The model `hybrid`: a cubic trend in the adjustment, and local planes fitted to its residuals.
 
 
 class HybridModel(LocalLinearModel):
-    """Series of polynomials from the adjustment plus local planes."""
+    """Polynomial series from the adjustment plus local planes."""
 
     kind = 'hybrid'
     description = 'cubic trend in the adjustment, and planes fitted to the k nearest residuals'
@@ -476,7 +475,7 @@ class HybridModel(LocalLinearModel):
 
 
 class KnnModel(NeighbourModel):
-    """Mean of the k nearest training corrections, as scikit-learn's KNeighborsRegressor."""
+    """Mean of the k nearest training corrections, like scikit-learn's KNeighborsRegressor."""
 
     kind = 'knn'
     description = 'mean of the k nearest residuals'
@@ -486,14 +485,14 @@ class KnnModel(NeighbourModel):
 
     @classmethod
     def weights(cls, near: Neighbourhoods, k: int) -> NDArray[np.float64]:
-        """Weights (n, k): 1/k each."""
+        """Return weights (n, k), all equal to 1/k."""
         return np.full((len(near), k), 1.0 / k)
 
     @classmethod
     def weights_of_candidates(
         cls, candidates: NDArray[np.float64], uv: NDArray[np.float64], k: int
     ) -> NDArray[np.float64]:
-        """Weights (n, c); candidates at the distance of the k-th nearest share its weight."""
+        """Return weights (n, c), equal for candidates at most as far as the k-th nearest."""
         *_, distance2, kth = _distances(candidates, uv, k)
         nearest = (distance2 <= kth[:, None]).astype(float)
         return nearest / nearest.sum(axis=1, keepdims=True)

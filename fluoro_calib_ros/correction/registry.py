@@ -1,15 +1,15 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The registry of the correction models: the only place that lists them; the model `lookup`.
+"""Registry of the correction models, the only place that lists them, and the model `lookup`.
 
-The model `lookup`: corrections at the nodes of a regular grid, bilinear between them. The
-calibration of a user's own regressor is saved as this model, so that neither files nor messages
-hold anything that is executed.
+The model `lookup` interpolates corrections bilinearly between the nodes of a regular grid. The
+calibration of a user-defined regressor is saved as this model, so that neither files nor messages
+contain executable code.
 
 A new model is a subclass of `CorrectionModel` and one line here; `estimation.self_calibration`
-says how a self-calibration obtains it. The options of a calibration, the command line, the node's
-parameters, calibration files and messages take the names from this module.
+defines how a self-calibration obtains it. The options of a calibration, the command line, the
+node's parameters, calibration files and messages take the names from this module.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from .series import Series, series_from_values
 
 
 class NoCorrection(CorrectionModel):
-    """The model that corrects nothing: zero everywhere, and nothing is outside."""
+    """Model without any correction: zero everywhere, and no pixel is outside."""
 
     kind = 'none'
     description = 'no correction'
@@ -39,11 +39,11 @@ class NoCorrection(CorrectionModel):
     keeps_training_points = False
 
     def predict(self, uv: ArrayLike) -> NDArray[np.float64]:
-        """Zeros (n, 2)."""
+        """Return zeros (n, 2)."""
         return np.zeros_like(np.asarray(uv, dtype=float).reshape(-1, 2))
 
     def outside(self, uv: ArrayLike) -> NDArray[np.bool_]:
-        """False (n,): there is no calibrated area to leave."""
+        """Return False (n,): there is no calibrated area."""
         return np.zeros(len(np.asarray(uv)), dtype=bool)
 
 
@@ -52,17 +52,17 @@ def no_correction() -> NoCorrection:
     return NoCorrection(0, np.zeros((0, 2)), np.zeros((0, 2)))
 
 
-# Models that are a series alone, estimated as a whole in the adjustment.
+# Models that consist of a series alone, estimated as a whole in the adjustment.
 
 
 class SeriesModel(CorrectionModel):
-    """A series of functions; the training points only bound the calibrated area."""
+    """Series of functions; the training points only bound the calibrated area."""
 
     has_series = True
     series: Series
 
     def predict(self, uv: ArrayLike) -> NDArray[np.float64]:
-        """Corrections (n, 2) [px] at pixels uv (n, 2)."""
+        """Return corrections (n, 2) [px] at pixels uv (n, 2)."""
         return self.series.predict_in_chunks(np.asarray(uv, dtype=float).reshape(-1, 2))
 
 
@@ -80,11 +80,11 @@ class CollocationModel(SeriesModel):
     description = 'cubic trend and random field in the adjustment'
 
 
-MAX_CELLS = 128  # along a side of the image, to bound the size of files and messages
+MAX_CELLS = 128  # maximum number along an image side, to bound the size of files and messages
 
 
 class LookupModel(CorrectionModel):
-    """Corrections at grid nodes, bilinear between them.
+    """Bilinear interpolation of corrections at grid nodes.
 
     The training points are the nodes, row by row from edge to edge of the image, followed by the
     corners of the convex hull of the calibrated area with the corrections there.
@@ -111,7 +111,7 @@ class LookupModel(CorrectionModel):
         return uv[columns * rows :]
 
     def predict(self, uv: ArrayLike) -> NDArray[np.float64]:
-        """Corrections (n, 2) [px] at pixels uv (n, 2); off the image those at its edge."""
+        """Return corrections (n, 2) [px] at uv (n, 2); off the image, those at its edge."""
         uv = np.asarray(uv, dtype=float).reshape(-1, 2)
         place = ((uv - self._low) * self._per_px)[:, ::-1].T
         values = [
@@ -126,7 +126,7 @@ class LookupModel(CorrectionModel):
 
 
 def grid_nodes(image_size: tuple[int, int]) -> NDArray[np.float64]:
-    """Nodes (n, 2) [px] of the lookup grid of an image (width, height), row by row."""
+    """Return the nodes (n, 2) [px] of the lookup grid of an image (width, height), by rows."""
     size = max(*CELL_PX, max(image_size) / MAX_CELLS)
     u, v = (
         np.linspace(-0.5, length - 0.5, max(2, int(np.ceil(length / size)) + 1))
@@ -136,7 +136,7 @@ def grid_nodes(image_size: tuple[int, int]) -> NDArray[np.float64]:
 
 
 def hull_corners(uv: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Corners (h, 2) of the convex hull of uv (N, 2); all points where they enclose no area."""
+    """Return the convex hull corners (h, 2) of uv (N, 2); all points if they span no area."""
     try:
         return uv[ConvexHull(uv).vertices]
     except (QhullError, ValueError):
@@ -144,9 +144,9 @@ def hull_corners(uv: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _grid_shape(uv: NDArray[np.float64]) -> tuple[int, int]:
-    """Numbers of columns and rows of the grid with which uv (N, 2) begins.
+    """Return the number of columns and rows of the grid at the beginning of uv (N, 2).
 
-    Raises ValueError where it does not begin with a grid.
+    Raises ValueError if uv does not begin with a grid.
     """
     in_first_row = np.cumprod(uv[:, 1] == uv[:1, 1])
     columns = int(in_first_row.sum())
@@ -162,7 +162,7 @@ def _grid_shape(uv: NDArray[np.float64]) -> tuple[int, int]:
     return columns, rows
 
 
-# The order is that of messages and help texts.
+# The order is used in messages and help texts.
 MODELS: dict[str, type[CorrectionModel]] = {
     model.kind: model
     for model in (
@@ -177,12 +177,12 @@ MODELS: dict[str, type[CorrectionModel]] = {
 }
 
 
-# Fields of a calibration's record that hold a model.
+# Fields of a calibration's record that define a model.
 MODEL_FIELDS = tuple(no_correction().to_values())
 
 
 def model_type(kind: str) -> type[CorrectionModel]:
-    """Return the class of the models of a kind. Raises ValueError for an unknown kind."""
+    """Return the model class of a kind. Raises ValueError for an unknown kind."""
     try:
         return MODELS[kind]
     except KeyError:
@@ -190,12 +190,12 @@ def model_type(kind: str) -> type[CorrectionModel]:
 
 
 def selectable_models() -> tuple[str, ...]:
-    """Names of the models that a user can ask for."""
+    """Return the names of the models that a user can select."""
     return tuple(name for name, model in MODELS.items() if model.selectable)
 
 
 def neighbour_models() -> tuple[str, ...]:
-    """Names of the models that have a number of neighbours k."""
+    """Return the names of the models that have a number of neighbours k."""
     return tuple(name for name, model in MODELS.items() if model.min_k is not None)
 
 
@@ -208,9 +208,9 @@ def create_model(
     bias_px: float = 0.0,
     series: Series | None = None,
 ) -> CorrectionModel:
-    """Return the model of a kind with this content; see `CorrectionModel` for the arguments.
+    """Create a model of a kind; see `CorrectionModel` for the arguments.
 
-    Raises ValueError for an unknown kind, and for a content that the model does not accept.
+    Raises ValueError for an unknown kind, and for arguments that the model does not accept.
     """
     return model_type(kind)(
         k, train_uv, train_duv, noise_px=noise_px, bias_px=bias_px, series=series
@@ -218,9 +218,9 @@ def create_model(
 
 
 def model_from_values(values: Mapping[str, Any], image_size: tuple[int, int]) -> CorrectionModel:
-    """Return the model whose `CorrectionModel.to_values` gave the values.
+    """Return the model from which `CorrectionModel.to_values` made the values.
 
-    image_size: width and height [px], which the functions of a series need. Raises ValueError.
+    image_size: width and height [px], needed for the functions of a series. Raises ValueError.
     """
     return create_model(
         values['model_kind'],

@@ -3,11 +3,11 @@
 
 """Corrections as a series of functions of the observed pixel: polynomials and products of sines.
 
-Polynomials describe what bends over the whole image. What they leave is a signal with a covariance
-function. On a rectangle somewhat larger than the image such a signal is a series of sines with
-independent coefficients, whose variance is the spectral density of the covariance function (Solin
-and Saerkkae, "Hilbert space methods for reduced-rank Gaussian process regression", Statistics and
-Computing 30, 2020).
+Polynomials describe distortion that bends over the whole image. Their residual is a signal with a
+covariance function. On a rectangle somewhat larger than the image such a signal is a series of
+sines with independent coefficients, whose variance is the spectral density of the covariance
+function (Solin and Saerkkae, "Hilbert space methods for reduced-rank Gaussian process regression",
+Statistics and Computing 30, 2020).
 """
 
 from __future__ import annotations
@@ -25,26 +25,26 @@ from scipy.ndimage import map_coordinates
 from .calibration_record import MAX_DEGREE, MAX_MODES, SD_GRID
 from .terms import CUBIC, ring_coefficients
 
-MARGIN = 1.3  # size of the rectangle of the sines, which vanish at its border, over the image
-RING_DEGREE = CUBIC + 2  # of the first radial polynomial beyond a cubic trend
-PREDICTION_CHUNK = 20_000  # pixels for which a series is evaluated at once
+MARGIN = 1.3  # size of the rectangle at whose border the sines vanish, relative to the image
+RING_DEGREE = CUBIC + 2  # degree of the first radial polynomial beyond a cubic trend
+PREDICTION_CHUNK = 20_000  # pixels per evaluation of a series
 
 
 @dataclass(frozen=True)
 class Functions:
-    """The functions of a series for an image.
+    """Basis functions of a series for an image.
 
-    Their coordinates are relative to the centre of the image, in units of half its longer side.
+    Their coordinates are relative to the image centre, in units of half the longer side.
     """
 
     image_size: tuple[int, int]  #: width and height [px]
-    degree: int  #: highest degree of the polynomials; -1: there are none
-    modes: int = 0  #: number of sines along the longer side of the image; 0: there are none
-    #: number of radial polynomials R of the degrees 5, 7, ... (see `terms.ring_coefficients`),
-    #: each with the functions x R(r) / r and y R(r) / r; r is 1 at the corners of the image
+    degree: int  #: highest degree of the polynomials; -1: none
+    modes: int = 0  #: number of sines along the longer side of the image; 0: none
+    #: number of radial polynomials R of degrees 5, 7, ... (see `terms.ring_coefficients`), each
+    #: with the functions x R(r) / r and y R(r) / r; r is 1 at the corners of the image
     rings: int = 0
-    #: bands whose sines are left out; the band of a sine is its frequency over that of one half
-    #: wave along the longer side, rounded
+    #: bands whose sines are excluded; the band of a sine is its frequency, rounded to a multiple
+    #: of the frequency of one half wave along the longer side
     absent: tuple[int, ...] = ()
 
     @cached_property
@@ -54,7 +54,7 @@ class Functions:
 
     @cached_property
     def _sines(self) -> NDArray[np.int64]:
-        """Numbers (s, 2) of the half waves along u and v."""
+        """Numbers (s, 2) of half waves along u and v."""
         extent = MARGIN * np.asarray(self.image_size) / max(self.image_size)
         i, j = np.meshgrid(
             np.arange(1, self.modes + 1), np.arange(1, self.modes + 1), indexing='ij'
@@ -82,12 +82,12 @@ class Functions:
 
     @property
     def complete(self) -> int:
-        """Number of the bands below the first that is left out."""
+        """Number of bands below the first excluded one."""
         return min((self.modes, *(band - 1 for band in self.absent)))
 
     @property
     def highest(self) -> float:
-        """Angular frequency [1/px] up to which no sine is left out."""
+        """Angular frequency [1/px] up to which no sine is excluded."""
         return (self.complete + 0.5) * self.frequency_of_mode
 
     def __len__(self) -> int:
@@ -95,12 +95,12 @@ class Functions:
 
     @property
     def trend(self) -> int:
-        """Number of functions of the trend: all but the sines."""
+        """Number of functions of the trend: all except the sines."""
         return len(self.powers) + 2 * self.rings
 
     @property
     def _ring_polynomials(self) -> NDArray[np.float64]:
-        """Coefficients (rings, k) of r^0, r^2, r^4, ... in R(r) / r, coordinates as elsewhere."""
+        """Coefficients (rings, k) of r^0, r^2, r^4, ... in R(r) / r, in the common coordinates."""
         corner = np.hypot(*self.image_size) / max(self.image_size)
         out = np.zeros((self.rings, RING_DEGREE // 2 + self.rings))
         for row, values in enumerate(out):
@@ -111,9 +111,9 @@ class Functions:
     def as_polynomials(
         self, coefficients: NDArray[np.float64]
     ) -> tuple[Functions, NDArray[np.float64]]:
-        """Functions without rings, and their coefficients (2, m) for the same series.
+        """Return functions without rings, and their coefficients (2, m) for the same series.
 
-        The rings are written as polynomials of their degree.
+        The rings are expressed as polynomials of their degree.
         """
         if not self.rings:
             return self, coefficients
@@ -133,9 +133,9 @@ class Functions:
     def converted(
         self, other: Functions, coefficients: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Coefficients (2m,) for these functions from those for others.
+        """Return coefficients (2m,) for these functions from those for other functions.
 
-        A function that the others lack gets the coefficient 0.
+        A function that is not among the other functions gets the coefficient 0.
         """
         number = {key: column for column, key in enumerate(other._keys())}
         mine = np.asarray([number.get(key, -1) for key in self._keys()])
@@ -144,10 +144,10 @@ class Functions:
     def as_rings(
         self, coefficients: NDArray[np.float64], degree: int, rings: int
     ) -> tuple[Functions, NDArray[np.float64]]:
-        """Functions with rings, and their coefficients (2, m) for the same series.
+        """Return functions with rings, and their coefficients (2, m) for the same series.
 
-        It is the inverse of `as_polynomials`, and the nearest series where these functions cannot
-        express it. coefficients (2, n): for these functions, which have no rings.
+        This is the inverse of `as_polynomials`, or the nearest series (least squares) if there is
+        none. coefficients (2, n): for these functions, which have no rings.
         """
         out = Functions(self.image_size, degree, self.modes, rings)
         matrix = out.converted(self, coefficients.ravel()).reshape(2, -1)
@@ -164,7 +164,7 @@ class Functions:
         return out, matrix
 
     def _keys(self) -> list[tuple[Any, ...]]:
-        """What tells each function from the others, in their order."""
+        """Return unique keys of the functions, in their order."""
         rings = [('ring', k, axis) for k in range(self.rings) for axis in 'xy']
         return [*self.powers, *rings, *(('sine', int(i), int(j)) for i, j in self._sines)]
 
@@ -175,7 +175,7 @@ class Functions:
         ).T
 
     def __call__(self, uv: ArrayLike) -> NDArray[np.float64]:
-        """Values (n, m) at pixels uv (n, 2): the polynomials, the rings, then the sines."""
+        """Return values (n, m) at pixels uv (n, 2) of the polynomials, the rings, the sines."""
         x, y = self._coordinates(uv)
         out = np.empty((len(x), len(self)))
         of_x, of_y = (np.vander(a, self.degree + 1, increasing=True) for a in (x, y))
@@ -195,9 +195,10 @@ class Functions:
     def sums_of_sines(
         self, uv: ArrayLike, values: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Sums (s, k) of values (n, k) at pixels uv (n, 2) times the sines; (s,) of their squares.
+        """Return sums (s, k) of values (n, k) times sines at uv (n, 2), and sums of their squares.
 
-        A sine is a product of one along u and one along v: it takes no value at every pixel.
+        The sums of squares of the sines are (s,). Each sine is a product of one along u and one
+        along v, so the sines need not be evaluated at every pixel.
         """
         of_x, of_y = self._waves_of_both(*self._coordinates(uv))
         i, j = self._sines.T - 1
@@ -207,12 +208,12 @@ class Functions:
     def _waves_of_both(
         self, x: NDArray[np.float64], y: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Sines (n, modes) along u and along v."""
+        """Return sines (n, modes) along u and along v."""
         extent = MARGIN * np.asarray(self.image_size) / 2
         return self._waves(x, extent[0]), self._waves(y, extent[1])
 
     def _waves(self, coordinate: NDArray[np.float64], extent: float) -> NDArray[np.float64]:
-        """Sines (n, modes) along one axis; extent: half the side of their rectangle [px]."""
+        """Return sines (n, modes) along an axis; extent: half the side of their rectangle [px]."""
         place = coordinate[:, None] * max(self.image_size) / 2 + extent
         return np.sin(np.arange(1, self.modes + 1) * (np.pi / 2 / extent * place)) / np.sqrt(
             extent
@@ -221,10 +222,10 @@ class Functions:
 
 @dataclass(frozen=True)
 class Series:
-    """A correction that is a sum of functions.
+    """Correction expressed as a sum of functions.
 
-    functions; coefficients (2, m) [px] for u and v; sd (33, 33): standard deviation of the
-    correction [px], on a regular grid from edge to edge of the image.
+    functions: basis functions. coefficients (2, m) [px]: for u and v. sd (33, 33): standard
+    deviation of the correction [px], on a regular grid from edge to edge of the image.
     """
 
     functions: Functions
@@ -232,7 +233,7 @@ class Series:
     sd: NDArray[np.float64]
 
     def plus(self, other: Series) -> Series:
-        """Return the sum with another series, whose errors are independent."""
+        """Return the sum of this series and another one with independent errors."""
         mine, own = self.functions.as_polynomials(self.coefficients)
         both = Functions(
             mine.image_size,
@@ -244,9 +245,9 @@ class Series:
         return Series(both, total.reshape(2, -1), np.hypot(self.sd, other.sd))
 
     def predict(self, uv: ArrayLike) -> NDArray[np.float64]:
-        """Corrections (n, 2) [px] at pixels uv (n, 2).
+        """Return corrections (n, 2) [px] at pixels uv (n, 2).
 
-        All functions are products of one along u and one along v: few of them are evaluated.
+        Each function is a product of one along u and one along v, so only a few are evaluated.
         """
         x, y = self.functions._coordinates(uv)
         out = np.zeros((len(x), 2))
@@ -262,7 +263,7 @@ class Series:
 
     @cached_property
     def _by_axes(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Coefficients (2, i, j) of powers, and of sines, along u times those along v."""
+        """Coefficients (2, i, j) of the products along u and v, for powers and for sines."""
         functions, coefficients = self.functions.as_polynomials(self.coefficients)
         powers = np.zeros((2, functions.degree + 1, functions.degree + 1))
         for (i, j), column in zip(functions.powers, coefficients.T):
@@ -273,12 +274,12 @@ class Series:
         return powers, sines
 
     def predict_in_chunks(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Corrections (n, 2) [px] at many pixels uv (n, 2), with bounded memory."""
+        """Return corrections (n, 2) [px] at many pixels uv (n, 2), with bounded memory."""
         starts = range(0, max(1, len(uv)), PREDICTION_CHUNK)
         return np.concatenate([self.predict(uv[i : i + PREDICTION_CHUNK]) for i in starts])
 
     def sd_at(self, uv: ArrayLike) -> NDArray[np.float64]:
-        """Standard deviations (n,) [px] of the corrections at pixels uv (n, 2), interpolated."""
+        """Return interpolated standard deviations (n,) [px] of the corrections at uv (n, 2)."""
         place = (
             (np.asarray(uv, dtype=float) + 0.5)
             / np.asarray(self.functions.image_size)
@@ -290,9 +291,9 @@ class Series:
 def without_absent_bands(
     functions: Functions, coefficients: NDArray[np.float64]
 ) -> tuple[Functions, NDArray[np.float64]]:
-    """Leave out the bands of sines whose coefficients are all zero.
+    """Exclude the bands of sines whose coefficients are all zero.
 
-    Returns the functions that remain, and their coefficients (2, m).
+    Returns the remaining functions and their coefficients (2, m).
     """
     sizes = np.abs(coefficients[:, functions.trend :]).sum(axis=0)
     present = np.unique(functions.band[sizes > 0])
@@ -304,9 +305,9 @@ def without_absent_bands(
 
 
 def packed(series: Series | None) -> tuple[int, int, NDArray[np.float64], NDArray[np.float64]]:
-    """Return degree, modes, coefficients (2, m) and sd (33, 33), as they are sent and saved.
+    """Return degree, modes, coefficients (2, m) and sd (33, 33) for messages and files.
 
-    No series gives -1, 0 and empty arrays.
+    Without a series, returns -1, 0 and empty arrays.
     """
     if series is None:
         return -1, 0, np.zeros((2, 0)), np.zeros((0, 0))
@@ -320,9 +321,9 @@ def unpacked(
     coefficients: ArrayLike,
     sd: ArrayLike,
 ) -> Series | None:
-    """Return the Series, or None, from which `packed` made the arguments.
+    """Return the Series, or None, that `packed` turned into the arguments.
 
-    Raises ValueError if the parts do not belong together.
+    Raises ValueError if the arguments do not match.
     """
     coefficients = np.ascontiguousarray(coefficients, dtype=float)
     sd = np.ascontiguousarray(sd, dtype=float)
@@ -355,15 +356,15 @@ def series_from_values(image_size: tuple[int, int], content: Mapping[str, Any]) 
 
 
 def sd_grid_pixels(image_size: tuple[int, int]) -> NDArray[np.float64]:
-    """Pixels (33 * 33, 2) of the standard deviations of a series, row by row, edge to edge."""
+    """Return pixels (33 * 33, 2) of the standard deviations of a series, by rows, edge to edge."""
     u, v = (np.linspace(-0.5, size - 0.5, SD_GRID) for size in image_size)
     return np.stack([a.ravel() for a in np.meshgrid(u, v)], axis=1)
 
 
 def sd_over_image(functions: Functions, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Standard deviations (33, 33) [px] of a series.
+    """Return standard deviations (33, 33) [px] of a series.
 
-    covariance (2m, 2m) of its coefficients, those of u first.
+    covariance (2m, 2m): of its coefficients, those of u first.
     """
     values = functions(sd_grid_pixels(functions.image_size))
     m = len(functions)

@@ -20,21 +20,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 HIGHEST = 7  # degree of the highest term
-CUBIC = 3  # degree of the trend
-# Variance [px^2] of a term that does not exist: its amplitude of 1e-4 px shows nowhere, and 1e-12
-# makes normal matrices singular.
+CUBIC = 3  # degree of the cubic trend
+# Variance [px^2] of a term that is absent. Its amplitude of 1e-4 px is negligible; 1e-12 makes
+# normal matrices singular.
 ABSENT_VARIANCE = 1e-8
 
 Part = tuple[int, int, int, float]  # (axis, i, j, factor): factor x^i y^j in u (axis 0) or v (1)
 
 
 def polynomial_powers(degree: int) -> list[tuple[int, int]]:
-    """Exponents (i, j) of the polynomials x^i y^j."""
+    """Return exponents (i, j) of the polynomials x^i y^j."""
     return [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
 
 
 def polynomial_coefficients(degree: int, parts: Iterable[Part]) -> NDArray[np.float64]:
-    """Coefficients (2, m) of a term as polynomials of a degree."""
+    """Return coefficients (2, m) of a term as polynomials up to a degree."""
     number = {power: k for k, power in enumerate(polynomial_powers(degree))}
     out = np.zeros((2, len(number)))
     for axis, i, j, factor in parts:
@@ -78,7 +78,7 @@ DECENTRING: dict[str, list[Part]] = {
     'decentring u': [(0, 2, 0, 3.0), (0, 0, 2, 1.0), (1, 1, 1, 2.0)],
     'decentring v': [(1, 0, 2, 3.0), (1, 2, 0, 1.0), (0, 1, 1, 2.0)],
 }
-# The plain terms of a degree that complete it, with gauge, decentring, radial and spiral terms.
+# Plain terms that complete a degree together with gauge, decentring, radial and spiral terms.
 SQUARES: dict[str, list[Part]] = {'u: x0y2': [(0, 0, 2, 1.0)], 'v: x2y0': [(1, 2, 0, 1.0)]}
 CUBES: dict[str, list[Part]] = {
     'S-shape u': [(0, 0, 3, 1.0)],
@@ -89,8 +89,8 @@ CUBES: dict[str, list[Part]] = {
         if name in ('u: x3y0', 'u: x1y2', 'u: x2y1', 'v: x2y1')
     },
 }
-# The 31 terms of the expert: radial 1 to 3, spiral 1 and 2, decentring, affinity and shear, then
-# degrees two to five.
+# The 31 terms of the expert model: radial 1 to 3, spiral 1 and 2, decentring, affinity and shear,
+# then terms of degree two to five.
 EXPERT: dict[str, list[Part]] = {
     'radial 1': _radial(1),
     'radial 2': _radial(2),
@@ -111,9 +111,9 @@ EXPERT: dict[str, list[Part]] = {
 
 
 def expert_terms(with_gauge: bool = False) -> tuple[list[str], NDArray[np.float64]]:
-    """Names of the 31 terms, and their coefficients (31, 2, m) as polynomials of degree 7.
+    """Return names of the 31 terms, and coefficients (31, 2, m) as polynomials of degree 7.
 
-    with_gauge: whether the six terms of the gauge follow, for orientations that are known.
+    with_gauge: append the six terms of the gauge, for orientations that are known.
     """
     terms = {**EXPERT, **GAUGE} if with_gauge else EXPERT
     return list(terms), np.stack(
@@ -134,11 +134,11 @@ def cubic_terms() -> dict[str, list[Part]]:
 
 
 def ring_coefficients(degree: int) -> NDArray[np.float64]:
-    """Coefficients (k,) of r^0, r^2, r^4, ... in R(r) / r, R the radial polynomial of a degree.
+    """Return coefficients (k,) of r^0, r^2, r^4, ... in R(r) / r for a radial polynomial R.
 
-    R is Zernike's of azimuthal order one, so that R(r) / r (x, y) is orthogonal over the unit disc
-    to the same terms of lower degree (Born and Wolf, "Principles of Optics", 7th ed., 9.2.1).
-    degree: odd.
+    R is Zernike's of azimuthal order one and odd degree, so that R(r) / r (x, y) is orthogonal
+    over the unit disc to the same terms of lower degree (Born and Wolf, "Principles of Optics",
+    7th ed., 9.2.1).
     """
     half = (degree - 1) // 2
     out = np.zeros(half + 1)
@@ -150,11 +150,11 @@ def ring_coefficients(degree: int) -> NDArray[np.float64]:
 
 @cache
 def trend_transformation(degree: int, rings: int = 0) -> tuple[NDArray[np.float64], int]:
-    """Matrix (2t, 2t) from coefficients of the trend's functions to those of terms; their number.
+    """Return the matrix (2t, 2t) from coefficients of the trend to terms, and their number.
 
-    The functions are those of `series.Functions` for u, then for v. The terms that are not gauge
-    come first, and only they are counted: 14 of the polynomials, then of each ring the radial one,
-    the spiral, and two like affinity and shear. degree: 3, or -1 without a trend.
+    The coefficients are those of `series.Functions` for u, then for v. The terms that are not
+    gauge come first, and only they are counted: 14 of the polynomials, then for each ring the
+    radial one, the spiral, and two like affinity and shear. degree: 3, or -1 without a trend.
     """
     if degree < 0:
         return np.zeros((0, 0)), 0
@@ -167,7 +167,7 @@ def trend_transformation(degree: int, rings: int = 0) -> tuple[NDArray[np.float6
     columns[:first, :, :m] = cubic[:first]
     columns[last:, :, :m] = cubic[first:]
     for k in range(rings):
-        # Factors of x R / r and y R / r in u, and in v.
+        # Factors of x R / r and y R / r in u and in v.
         pairs = [[(1, 0), (0, 1)], [(0, -1), (1, 0)], [(1, 0), (0, -1)], [(0, 1), (1, 0)]]
         at = m + 2 * k
         columns[first + 4 * k : first + 4 * k + 4, :, at : at + 2] = pairs

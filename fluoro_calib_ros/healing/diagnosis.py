@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What has changed in a rig since it was calibrated, by the bodies that it sees.
+"""Diagnose what has changed in a rig since its calibration, from the bodies that it sees.
 
-Bodies whose shapes were learned while the rig was healthy give scale and rigidity. Every cause
-widens the prior of some unknowns by what such a change may be. Causes are added one by one, the
-one with the largest evidence first, as long as the evidence grows (MacKay 2003, ch. 28).
+Bodies whose shapes were learned while the rig was healthy provide scale and rigidity. Each cause
+widens the prior of some unknowns by the usual size of such a change. Causes are added one by one,
+the one with the largest evidence first, as long as it increases (MacKay 2003, ch. 28).
 """
 
 from __future__ import annotations
@@ -30,36 +30,36 @@ from .rig_adjustment import (
 from .sizes import Sizes, Told, parts_of_drift, parts_of_interior, parts_of_knock
 
 MAX_CAUSES = 3
-# Probability that nothing more has changed, from 1 - SURE on no further cause is looked for.
+# The search for causes ends if the probability of no further change exceeds 1 - SURE.
 SURE = 0.95
-# Probability below which a cause is not believed: another one explains the data, too. The evidence
-# of two causes depends on the units of four sizes, each of which is known to a factor of eight.
+# Probability of a cause below which it is not accepted, as another one also explains the data. The
+# evidence of two causes depends on the units of four sizes, each known to a factor of eight.
 SURE_OF_CAUSE = 1 - 8.0**-4
-# Share of inliers of a pose below which it does not fit: most of its image points are false.
+# Share of inliers below which a pose does not fit: most of its image points are false.
 FITS = 0.5
-# Markers that are tried in full, of those that their derivatives make most likely.
+# Number of markers solved in full, those that their derivatives make most likely.
 TRIED = 3
 
 
 class Cause(str, Enum):
-    """What may have changed; the values are written to files."""
+    """Possible causes of a change; the values are written to files."""
 
     ORIENTATION = 'orientation'  # a fluoroscope was moved
-    INTERIOR = 'interior'  # source and detector have moved against each other
-    DISTORTION = 'distortion'  # the image bends differently
-    MIGRATED = 'migrated'  # a marker is elsewhere in its body
-    EXCHANGED = 'exchanged'  # two markers of a body have each other's ids
-    LOOSE = 'loose'  # a marker moves against its body
-    SOFT = 'soft'  # the markers of a body move against each other
+    INTERIOR = 'interior'  # source and detector have moved relative to each other
+    DISTORTION = 'distortion'  # the distortion of the image has changed
+    MIGRATED = 'migrated'  # a marker is at a different place in its body
+    EXCHANGED = 'exchanged'  # two markers of a body have exchanged ids
+    LOOSE = 'loose'  # a marker moves relative to its body
+    SOFT = 'soft'  # the markers of a body move relative to each other
 
 
-# Of the rig; the others are of bodies, and leave its calibration as it is.
+# Causes of the rig; the others are of bodies, and leave the calibration of the rig unchanged.
 OF_RIG = (Cause.ORIENTATION, Cause.INTERIOR, Cause.DISTORTION)
 
 
 @dataclass(frozen=True)
 class Change:
-    """A cause and its place: a fluoroscope, or body and markers, by their numbers."""
+    """Cause and place: indices of a fluoroscope, or of a body and its markers."""
 
     cause: Cause
     fluoroscope: int = -1
@@ -69,25 +69,25 @@ class Change:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What has changed."""
+    """Result of a diagnosis."""
 
-    changes: tuple[Change, ...]  #: in the order of their evidence; none where nothing has changed
-    probability: tuple[float, ...]  #: of each against the causes that might stand in its place
-    rivals: tuple[Change | None, ...]  #: the most likely of these, None where there is none
-    observed: ObservedBodies  #: with the exchanged ids put right
+    changes: tuple[Change, ...]  #: ordered by evidence; empty if nothing has changed
+    probability: tuple[float, ...]  #: probability of each change against its rivals
+    rivals: tuple[Change | None, ...]  #: the most likely rival of each change, or None
+    observed: ObservedBodies  #: observations with exchanged ids corrected
     prior: Prior
     solution: RigSolution
     noise: float  #: factor by which image points scatter more than claimed, at least 1
-    rest: float  #: probability that nothing else has changed; 0 where more causes were not tried
+    rest: float  #: probability of no other change; 0 if more causes were not tried
 
     @property
     def complete(self) -> bool:
-        """Whether nothing else has to be looked for."""
+        """Whether no other cause has to be searched for."""
         return self.rest > 1 - SURE
 
     @property
     def sure(self) -> bool:
-        """Whether the causes explain the data, and no other cause nearly as well."""
+        """Whether the causes explain the data, and no other cause does nearly as well."""
         return self.complete and all(one > SURE_OF_CAUSE for one in self.probability)
 
 
@@ -97,17 +97,17 @@ class _Tried:
     observed: ObservedBodies
     prior: Prior
     solution: RigSolution
-    # Evidence of the last change with any size, less that of the prior; of the others, theirs.
+    # Log evidence of each change over all sizes minus that of the size in its prior, summed.
     by_size: float
 
     @property
     def evidence(self) -> float:
-        """Logarithm, of changes of any size."""
+        """Log evidence, integrated over the sizes of changes."""
         return self.solution.evidence + self.by_size
 
 
 class Diagnostician:
-    """Decides what has changed.
+    """Determines what has changed.
 
     shape_scale: standard deviation of the scale of the shapes.
     """
@@ -117,7 +117,7 @@ class Diagnostician:
         bodies = adjustment.bodies
         self._shape_scale = shape_scale
         views = len(adjustment.orientation.fluoroscopes)
-        # Of two views, only the orientation of one against the other can be seen.
+        # With two views, only the orientation of one relative to the other is observable.
         self._moved = [views - 1] if views == 2 else list(range(views))
         self._markers = [
             (row, marker) for row, body in enumerate(bodies) for marker in range(len(body.sd_mm))
@@ -128,9 +128,9 @@ class Diagnostician:
     def diagnose(
         self, observed: ObservedBodies, poses: Poses, until: Sequence[Cause] = ()
     ) -> Diagnosis:
-        """Say what has changed, from first poses of the bodies.
+        """Diagnose what has changed, from initial poses of the bodies.
 
-        until: causes after one of which no further one is looked for.
+        until: causes after which the search for further causes ends.
         """
         adjustment = self.adjustment
         zero = np.zeros(adjustment.size)
@@ -167,11 +167,11 @@ class Diagnostician:
     # -- hypotheses
 
     def _tried(self, best: _Tried, first: Poses) -> list[_Tried]:
-        """Solve for the causes that may be added, of those that the derivatives make likely."""
+        """Solve for the additional causes that the derivatives make likely."""
         changes = [*self._changes_of_unknowns(best), *self._scattering(best)]
         changes += self._exchanges(best)
         start = np.zeros(self.adjustment.size), first
-        if best.changes:  # else a rig that is wrong may have led values and poses astray
+        if best.changes:  # otherwise values and poses may be wrong due to the wrong rig
             found = best.solution
             start = found.values, found.poses.or_else(first, found.inliers_of_pose > FITS)
         leader = best
@@ -184,10 +184,10 @@ class Diagnostician:
         return out
 
     def _is_hopeless(self, change: Change, best: _Tried, leader: _Tried) -> bool:
-        """Whether a change of a body has no chance beside a leader, if all of its points fitted.
+        """Return whether a change of a body cannot compete with a leader even if all points fit.
 
-        What other bodies show stays as unlikely as it was. All hopeless causes together leave the
-        leader as sure as it is.
+        The evidence of other bodies does not change. All hopeless causes together do not reduce
+        the certainty of the leader.
         """
         if change.cause in OF_RIG:
             return False
@@ -197,7 +197,7 @@ class Diagnostician:
         return bool(behind > np.log(self._causes / (1 - SURE_OF_CAUSE)))
 
     def knocks(self) -> list[Change]:
-        """Return the changes of the orientation that can be seen."""
+        """Return the observable changes of the orientation."""
         return [Change(Cause.ORIENTATION, f) for f in self._moved]
 
     def _of_rig(self) -> list[Change]:
@@ -208,13 +208,13 @@ class Diagnostician:
     def _changes_of_unknowns(self, best: _Tried) -> list[Change]:
         """Return the changes of rig and shapes that may have evidence.
 
-        If one is expected to have some, they are all changes of the rig, which may be far from
-        where the derivatives hold, and the likeliest ones of markers. So they are where the
+        If any of them is expected to have some, return all changes of the rig, which may be beyond
+        the validity of the derivatives, and the most likely ones of markers. Do the same if the
         solution takes most image points of a pose for false matches: these have no weight in the
         derivatives.
         """
         told = self.adjustment.told(best.observed, best.prior, best.solution)
-        lost = (best.solution.inliers_of_pose < FITS).any()  # by a change, hardly by chance
+        lost = (best.solution.inliers_of_pose < FITS).any()  # due to a change, hardly by chance
         places = self._of_rig()
         places += [Change(Cause.MIGRATED, body=b, markers=(m,)) for b, m in self._markers]
         gains = [
@@ -230,9 +230,9 @@ class Diagnostician:
         return of_rig + [change for gain, change in of_markers if gain > 0]
 
     def _scattering(self, best: _Tried) -> list[Change]:
-        """Return the marker and the body that scatter most, where that is worth an unknown.
+        """Return the marker and the body that scatter most, if this is worth an unknown.
 
-        With a variance s^2 of its own instead of 1, the likelihood of n squares grows by
+        With its own variance s^2 instead of 1, the log likelihood of n squares increases by
         n (s^2 - 1 - log s^2) / 2.
         """
         squares = best.solution.squares
@@ -251,7 +251,7 @@ class Diagnostician:
         return [change for _, change in out.values()]
 
     def _exchanges(self, best: _Tried) -> list[Change]:
-        """Return the exchanges of markers that do not fit in a body where most others do."""
+        """Return exchanges of markers that do not fit, in bodies where most others do."""
         inliers = best.solution.inliers
         lost = [
             (b, m)
@@ -276,7 +276,7 @@ class Diagnostician:
         prior = best.prior
         if change.cause in (Cause.LOOSE, Cause.SOFT):
             prior = replace(prior, inflation=self._inflation(best, change))
-        # With a usual size first; the solution tells which size it has.
+        # Start with the usual size; the solution then determines the size.
         solution = self._solve(observed, prior.widened(self.sd_of(change)), start)
         tried = _Tried((*best.changes, change), observed, prior, solution, best.by_size)
         rows = self.rows_of(change)
@@ -298,7 +298,7 @@ class Diagnostician:
         return with_best_modes(self.adjustment, observed, prior, found)
 
     def rows_of(self, change: Change) -> NDArray[np.int64]:
-        """Return the unknowns (k,) that a change changes."""
+        """Return the unknowns (k,) that a change affects."""
         return np.flatnonzero(self.sd_of(change))
 
     def _sizes(self, told: Told, change: Change) -> Sizes:
@@ -306,11 +306,11 @@ class Diagnostician:
         return told.only(rows).sizes(self.parts_of(change)[:, rows])
 
     def sd_of(self, change: Change) -> NDArray[np.float64]:
-        """Standard deviations (K,) of the unknowns by a change of the usual size."""
+        """Return standard deviations (K,) of the unknowns for a change of the usual size."""
         return np.asarray(np.linalg.norm(self.parts_of(change), axis=0))
 
     def parts_of(self, change: Change) -> NDArray[np.float64]:
-        """Standard deviations (p, K) of the unknowns by the parts of a change, of usual sizes."""
+        """Return standard deviations (p, K) of unknowns for parts of a change of usual size."""
         adjustment = self.adjustment
         number = np.arange(adjustment.size)
         of_rig = number[adjustment.rig]
@@ -330,14 +330,14 @@ class Diagnostician:
             ]
         elif change.cause is Cause.MIGRATED:
             shape = number[adjustment.shape].reshape(adjustment.xyz.shape)
-            parts = [(shape[change.body, change.markers[0]], 1.0)]  # [mm], unit of its size
+            parts = [(shape[change.body, change.markers[0]], 1.0)]  # [mm], the unit of its size
         out = np.zeros((len(parts), adjustment.size))
         for row, (columns, sd) in zip(out, parts):
             row[columns] = sd
         return out
 
     def _inflation(self, best: _Tried, change: Change) -> NDArray[np.float64]:
-        """Return how much more the image points of a loose marker or a soft body scatter."""
+        """Return the factors by which points of a loose marker or a soft body scatter more."""
         solution = best.solution
         rows = np.zeros(solution.squares.shape, dtype=bool)
         rows[change.body, change.markers[0] if change.markers else slice(None)] = True
@@ -350,7 +350,7 @@ class Diagnostician:
 
 
 def _is_told(change: Change, changes: Sequence[Change]) -> bool:
-    """Whether a change of a marker is part of another one: its body is soft, or it is loose."""
+    """Return whether a change of a marker is part of another one: soft body or loose marker."""
     return change.body >= 0 and any(
         one.body == change.body
         and (
@@ -361,16 +361,16 @@ def _is_told(change: Change, changes: Sequence[Change]) -> bool:
 
 
 def _noise(solution: RigSolution) -> float:
-    """Factor by which image points scatter more than claimed; that of most bodies."""
+    """Return the factor by which image points scatter more than claimed, median over bodies."""
     by_body = solution.squares.sum(axis=1) / np.maximum(solution.freedom.sum(axis=1), 1)
     return float(np.sqrt(max(1.0, np.median(by_body[by_body > 0])))) if by_body.any() else 1.0
 
 
 def _probabilities(tried: Sequence[_Tried], causes: int) -> NDArray[np.float64]:
-    """Probabilities of hypotheses, the first of which has a cause less.
+    """Return probabilities of hypotheses, the first of which has one cause less.
 
-    Where image points scatter more than claimed, the evidence counts less. A loose marker or a
-    soft body has one more unknown, its scatter, known to 1/sqrt(2 n) of n squares.
+    If image points scatter more than claimed, the evidence is scaled down. A loose marker or a
+    soft body has one more unknown, its scatter, known to 1/sqrt(2 n) from n squares.
     """
     found = np.array([one.evidence for one in tried])
     noise = _noise(tried[int(np.argmax(found))].solution)
@@ -382,8 +382,8 @@ def _probabilities(tried: Sequence[_Tried], causes: int) -> NDArray[np.float64]:
             count = of_body[change.markers[0]] if change.markers else of_body.sum()
             log[row] -= 0.5 * np.log(max(float(count), 1.0))
     log = log - log.max()
-    # That nothing more has changed is as likely as that something has, any cause as any other:
-    # also of those that were not tried.
+    # No further change and some further change are equally likely, and so are all causes,
+    # including those that were not tried.
     prior = np.array([0.5, *([0.5 / causes] * (len(tried) - 1))])
     chance = prior * np.exp(log)
     return chance / chance.sum()

@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The rig as it is after a diagnosis, and what of its changes the bodies do not show.
+"""The rig after a diagnosis, including the part of its changes that the bodies do not show.
 
-What the data do not identify keeps the covariance that it had, or that of the change.
+Directions that the data do not determine keep their prior covariance, or that of the change.
 
-How large a drift of the distortion is far from the bodies follows from what they show of it. Three
-parts have a size each (see `sizes`): polynomials up to degree 1, those beyond, which grow towards
-the edges, and the waves.
+How large a drift of the distortion is far from the bodies is inferred from the part that they
+show. Three parts have separate sizes (see `sizes`): polynomials up to degree 1, higher ones, which
+increase towards the edges, and the waves.
 """
 
 from __future__ import annotations
@@ -28,32 +28,32 @@ from .rig_errors import drift_errors
 
 @dataclass(frozen=True)
 class HealedRig:
-    """The orientation of a rig as it is now, and the drifts of its images."""
+    """Present orientation of a rig, and the drifts of its images."""
 
-    orientation: RigOrientation  #: with the ids of the calibrations as they were
-    #: by fluoroscope; to be added to its correction
+    orientation: RigOrientation  #: contains the ids of the previous calibrations
+    #: by fluoroscope: drift to be added to its correction
     drift: Mapping[int, tuple[Functions, NDArray[np.float64], NDArray[np.float64]]]
     #: by fluoroscope without such a drift: functions, and second moments (2n, 2n) of the
-    #: coefficients of the one that it may have had
+    #: coefficients of a drift that may have occurred
     unseen: Mapping[int, tuple[Functions, NDArray[np.float64]]]
     changes: NDArray[np.float64]  #: (F, 9) of T [mm], w [rad], xp, yp, c [px]
     sd: NDArray[np.float64]  #: (F, 9) their standard deviations
-    #: standard deviation of the direction of the changes that is known worst, over that of a large
-    #: change as it may be: 1 where the data tell nothing of it
+    #: standard deviation of the least known direction of the changes, over that of a large change:
+    #: 1 if the data do not determine it
     weakest: float
 
 
 def healed_rig(
     diagnostician: Diagnostician, diagnosis: Diagnosis, stamp_ns: int, exposures: int
 ) -> HealedRig:
-    """Estimate what has changed, with the rest of the rig held as it was calibrated.
+    """Estimate what has changed, with the rest of the rig fixed as it was calibrated.
 
-    A change of orientation or interior may be as large as any. The size with the largest evidence
-    is that of the directions that are known well; it would pull the others towards no change.
+    A change of orientation or interior may have any size. The size with the largest evidence is
+    that of the directions that are known well; it would pull the others towards no change.
 
-    Where nothing of the rig has changed, it stays as it was, with the second moments of the knock
-    that it may have had (see `_of_unseen_knocks`): bodies do not show all of a knock. Nor do they
-    show all of a drift of the distortion (see `_unseen_drift`).
+    If nothing has changed in the rig, its values do not change. Its covariance includes the second
+    moments of a knock that may have occurred (see `_of_unseen_knocks`), since bodies do not show
+    all of a knock. Nor do they show all of a drift of the distortion (see `_unseen_drift`).
     """
     adjustment = diagnostician.adjustment
     largest = np.zeros(adjustment.size)
@@ -105,11 +105,11 @@ def healed_rig(
 
 
 def _of_unseen_knocks(diagnostician: Diagnostician, diagnosis: Diagnosis) -> NDArray[np.float64]:
-    """Second moments (9F, 9F) of what a rig has changed by that is taken for unchanged.
+    """Return second moments (9F, 9F) of the possible change of a rig considered unchanged.
 
-    The mean over sizes of a knock, of its shift and turn together: the moments of one size alone
-    would be those of a rig that has certainly been knocked as hard. Bodies tell of a knock only:
-    their shapes were learned with the errors of the calibration, which are added as they were.
+    They are the mean over sizes of a knock, of its shift and rotation together: the moments of one
+    size alone would be those of a rig that has certainly been knocked this hard. Bodies only show
+    a knock: their shapes were learned with calibration errors, which are added unchanged.
     """
     adjustment = diagnostician.adjustment
     calibrated = diagnosis.prior.orientation
@@ -124,7 +124,7 @@ def _of_unseen_knocks(diagnostician: Diagnostician, diagnosis: Diagnosis) -> NDA
 
 
 def _coefficients(adjustment: RigAdjustment, fluoroscope: int) -> NDArray[np.int64]:
-    """Return the numbers (2n,) of the unknowns that are the drift of a fluoroscope."""
+    """Return indices (2n,) of the unknowns that are the drift of a fluoroscope."""
     views = len(adjustment.functions)
     return np.arange(adjustment.size)[adjustment.drift].reshape(views, -1)[fluoroscope]
 
@@ -132,17 +132,16 @@ def _coefficients(adjustment: RigAdjustment, fluoroscope: int) -> NDArray[np.int
 def _unseen_drift(
     diagnostician: Diagnostician, diagnosis: Diagnosis, fluoroscope: int, held: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Second moments (2n, 2n) of the drift of an image that is not corrected.
+    """Return second moments (2n, 2n) of the drift of an image that is not corrected.
 
-    held (9F,): the changes of the rig, which are certain. Without the affine map that is nearest
-    to the drift where the markers were: orientation and interior take that up, and their
-    covariance contains it.
+    held (9F,): changes of the rig, taken as certain. The affine map nearest to the drift at the
+    markers is removed: orientation and interior absorb it, and their covariance includes it.
     """
     adjustment = diagnostician.adjustment
     observed = diagnosis.observed
     own = _coefficients(adjustment, fluoroscope)
     sd = diagnosis.prior.sd.copy()
-    smooth = sd[own]  # by the error of the correction
+    smooth = sd[own]  # due to the error of the correction
     sd[adjustment.rig] = 0.0
     sd[own] = 0.0
     certain = np.zeros_like(diagnosis.prior.orientation)
@@ -159,7 +158,7 @@ def _unseen_drift(
 
 
 def _without_affine(functions: Functions, pixel: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Matrix (n, n) that takes the nearest affine map at pixels (m, 2) from coefficients (n,)."""
+    """Return the matrix (n, n) that removes the best affine fit at pixels (m, 2)."""
     values = functions(pixel)
     affine = np.flatnonzero([i + j <= 1 for i, j in functions.powers])
     rest = np.eye(len(functions))
@@ -168,10 +167,10 @@ def _without_affine(functions: Functions, pixel: NDArray[np.float64]) -> NDArray
 
 
 def unseen_distortion(diagnostician: Diagnostician, diagnosis: Diagnosis) -> tuple[float, float]:
-    """Return how far changes of the distortion may move points that the data do not show [mm].
+    """Return how far unobserved changes of the distortion may move points [mm].
 
-    RMS distances relative to each other where the markers were: by changes that may be as large as
-    any, and by the noise of a single point.
+    The values are RMS distances relative to each other at the markers: due to changes of any size,
+    and due to the noise of a single point.
     """
     adjustment = diagnostician.adjustment
     prior = diagnosis.prior
@@ -187,9 +186,9 @@ def unseen_distortion(diagnostician: Diagnostician, diagnosis: Diagnosis) -> tup
 def _weakest(
     adjustment: RigAdjustment, covariance: NDArray[np.float64], sd: NDArray[np.float64]
 ) -> float:
-    """Return the largest standard deviation of a direction over that before the data.
+    """Return the largest ratio of posterior to prior standard deviation of a direction.
 
-    covariance (9F, 9F) of the rig; sd (K,) by which the changed unknowns may have changed.
+    covariance (9F, 9F): of the rig. sd (K,): prior standard deviations of the changed unknowns.
     """
     rows = np.flatnonzero(sd[adjustment.rig])
     if not len(rows):

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Poses of exposures with several false matches, of which an iteration may take the wrong ones.
+"""Poses of exposures with several false matches, where an iteration may accept the wrong ones.
 
-The likelihood of a pose has a mode for each choice of the false matches. The iteration ends in the
-one that is next to its start. A pose that ends in another mode with one hypothesis than with
-the others decides between them: an image point that is lost costs some ten in logarithms.
+The likelihood of a pose has a mode for each choice of false matches. The iteration ends in the
+mode next to its start. A pose that ends in another mode for one hypothesis than for the others
+decides between them: a lost image point costs some ten in log likelihood.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ from .rig_adjustment import (
     moved_poses,
 )
 
-MAX_TRIED = 200  # choices of false matches; of many image points, two do not lead a pose astray
-# Share of the poses that have several false matches by chance; above it, the rig is another one.
+MAX_TRIED = 200  # choices of false matches; with many image points, two do not mislead a pose
+# Maximum share of poses with several false matches by chance; above it, the rig is different.
 BY_CHANCE = 0.1
-STEPS = 4  # of a pose by the trusted image points, and as many by all
+STEPS = 4  # iterations with the trusted image points, and as many with all
 
 
 def with_best_modes(
     adjustment: RigAdjustment, observed: ObservedBodies, prior: Prior, found: RigSolution
 ) -> RigSolution:
-    """Return a solution, of whose poses those with several false matches are the likeliest.
+    """Return a solution with the likeliest poses in exposures with several false matches.
 
-    From the pose of the nearest exposure without, each image point and each pair of them (of
-    bodies with few) is left out once, and the pose with the largest likelihood is taken.
+    From the pose of the nearest exposure without these, each image point and, for bodies with few,
+    each pair of them is excluded once, and the pose with the largest likelihood is taken.
     """
     lost = observed.seen.sum(axis=(2, 3)) * (1 - found.inliers_of_pose) > 1.5
     exposures = np.flatnonzero(lost.any(axis=1))
@@ -67,7 +67,7 @@ def with_best_modes(
 
 
 def _choices(shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Return which (n, M, F) of the image points of a body are left out, none first."""
+    """Return which (n, M, F) of the image points of a body are excluded; none in the first."""
     points = range(int(np.prod(shape)))
     choices: list[tuple[int, ...]] = [()]
     for count in (1, 2):
@@ -80,7 +80,7 @@ def _choices(shape: tuple[int, ...]) -> NDArray[np.bool_]:
 
 
 def _from_neighbours(poses: Poses, lost: NDArray[np.bool_]) -> Poses:
-    """Return the poses of the nearest exposures that are not lost where others (T, B) are."""
+    """Return poses with lost (T, B) ones replaced by those of the nearest exposures not lost."""
     rotation, centre = poses.rotation.copy(), poses.centre_mm.copy()
     for t, b in np.argwhere(lost):
         good = np.flatnonzero(poses.known[:, b] & ~lost[:, b])
@@ -97,9 +97,9 @@ def _posed(
     start: tuple[NDArray[np.float64], Poses],
     trusted: NDArray[np.bool_],
 ) -> Poses:
-    """Return poses by their trusted image points (T, B, M, F) alone, and then by all.
+    """Return poses from their trusted image points (T, B, M, F) alone, then from all.
 
-    start: values (K,) of the unknowns, which are certain, and first poses.
+    start: values (K,) of the unknowns, taken as certain, and initial poses.
     """
     values, poses = start
     certain = np.zeros(adjustment.size, dtype=bool)
@@ -120,9 +120,9 @@ def _loss(
     prior: Prior,
     found: tuple[NDArray[np.float64], Poses],
 ) -> NDArray[np.float64]:
-    """Return minus twice the logarithms (T, B) of the likelihood of poses.
+    """Return minus twice the log likelihood (T, B) of poses.
 
-    Image points of markers behind a source are false.
+    Image points of markers behind a source count as false.
     """
     terms = Mixture.of(adjustment, LinearPoints.of(adjustment, observed, *found), observed, prior)
     losses = np.where(terms.good, terms.losses, -2 * np.log(terms.false))

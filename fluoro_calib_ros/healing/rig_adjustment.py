@@ -3,24 +3,23 @@
 
 """Adjustment of a rig by the bodies that it sees: orientation, interior, distortion and shapes.
 
-The unknowns have a normal prior: what is known of the rig and of the shapes, widened where a
-hypothesis says that something has changed. With L L' the covariance of the prior, the unknowns are
-L z, and poses are eliminated exposure by exposure (Foerstner and Wrobel, "Photogrammetric Computer
-Vision", Springer 2016, 4.2.6 and 15.3.3). With the reduced normal equations H, h, a step is
+The unknowns have a normal prior: the knowledge of the rig and of the shapes, widened for the
+changes of a hypothesis. With L L' the covariance of the prior, the unknowns are L z, and poses are
+eliminated exposure by exposure (Foerstner and Wrobel, "Photogrammetric Computer Vision", Springer
+2016, 4.2.6 and 15.3.3). With the reduced normal equations H, h, a step is
 
     (I + L'HL) dz = L'h - z.
 
-An image point is an inlier with its own standard deviation, or a false match anywhere in the
-image (Hogg, Bovy and Lang, "Data analysis recipes: fitting a model to data", 2010, section 3). The
-evidence of a hypothesis is Laplace's approximation at the solution (MacKay, "Information Theory,
-Inference, and Learning Algorithms", Cambridge 2003, ch. 28):
+An image point is either an inlier with its own standard deviation, or a false match anywhere in
+the image (Hogg, Bovy and Lang, "Data analysis recipes: fitting a model to data", 2010, section 3).
+The evidence of a hypothesis is Laplace's approximation at the solution (MacKay, "Information
+Theory, Inference, and Learning Algorithms", Cambridge 2003, ch. 28):
 
     log Z = -1/2 (loss + z'z) - 1/2 log det(I + L'HL).
 
-The correction of an image point has an error that stays while a marker stands still, and that
-markers near each other have in common (see `correction_errors`). The mean over the exposures is an
-unknown of each marker and view, what differs from exposure to exposure a smooth field over the
-image.
+The correction of an image point has an error that is constant while a marker stands still, and
+that neighbouring markers share (see `correction_errors`). Its mean over the exposures is an
+unknown of each marker and view; its variation between exposures is a smooth field over the image.
 """
 
 from __future__ import annotations
@@ -42,18 +41,18 @@ from ..photogrammetry.rotations import cross_matrix, matrix_from_vector
 from ..photogrammetry.unknowns import POSE_SIZE
 from .sizes import Told
 
-FALSE_SHARE = 0.01  # of image points that are expected to be false matches
+FALSE_SHARE = 0.01  # expected share of false matches among the image points
 MAX_STEPS = 20
 MAX_REPEATS = 3
-LAST_GAIN = 0.1  # of the logarithm of the evidence, which decides by differences of about 3
-# Square of a step in standard deviations after which the iteration ends.
+LAST_GAIN = 0.1  # gain of log evidence that ends repeats; differences of about 3 decide
+# Square of a step in standard deviations below which the iteration ends.
 LAST_STEP = 1e-2
-# Half waves along the longer side, of a drift of the distortion beside a cubic trend.
+# Half waves along the longer side of a drift of the distortion, in addition to a cubic trend.
 DRIFT_MODES = 4
-FITTING = 0.8  # share of the image points of a body that are no false matches, at least
-MAX_NOISE_PX = 10.0  # of image points that are no false matches
-LOOSEST = 1e-6  # weight of a pose [1/mm^2, 1/rad^2] that keeps an unseen one where it is
-ROUNDING = POSE_SIZE * np.finfo(float).eps  # of the normal matrix of a pose, over its trace
+FITTING = 0.8  # minimum share of the image points of a body that are not false matches
+MAX_NOISE_PX = 10.0  # maximum noise of image points that are not false matches
+LOOSEST = 1e-6  # weight of a pose [1/mm^2, 1/rad^2] that keeps an unseen one in place
+ROUNDING = POSE_SIZE * np.finfo(float).eps  # of a pose's normal matrix, relative to its trace
 
 
 _BY_EXPOSURE = ('uv', 'pixel', 'variance', 'seen')
@@ -65,24 +64,24 @@ class ObservedBodies:
 
     uv: NDArray[np.float64]  #: (T, B, M, F, 2) corrected [px]
     pixel: NDArray[np.float64]  #: (T, B, M, F, 2) as observed [px]
-    variance: NDArray[np.float64]  #: (T, B, M, F) of the noise [px^2]
-    correction: NDArray[np.float64]  #: (B, M, F) of the errors of the correction that stay [px^2]
+    variance: NDArray[np.float64]  #: (T, B, M, F) variance of the noise [px^2]
+    correction: NDArray[np.float64]  #: (B, M, F) constant errors of the correction [px^2]
     seen: NDArray[np.bool_]  #: (T, B, M, F)
 
     def exposures(self, chosen: NDArray[np.int64]) -> ObservedBodies:
-        """Return some exposures."""
+        """Return a subset of the exposures."""
         return replace(self, **{name: getattr(self, name)[chosen] for name in _BY_EXPOSURE})
 
     def changed(self, change: NDArray[np.float64]) -> ObservedBodies:
-        """Return the same with other corrected image points: change (T, B, M, F, 2) is added."""
+        """Return a copy with change (T, B, M, F, 2) added to the corrected image points."""
         return replace(self, uv=self.uv + change)
 
     def without(self, rows: NDArray[np.bool_]) -> ObservedBodies:
-        """Return the same without the image points of some markers (B, M)."""
+        """Return a copy without the image points of some markers (B, M)."""
         return replace(self, seen=self.seen & ~rows[..., None])
 
     def exchanged(self, body: int, first: int, second: int) -> ObservedBodies:
-        """Return the same with two markers of a body exchanged."""
+        """Return a copy with two markers of a body exchanged."""
         order = np.arange(self.uv.shape[2])
         order[[first, second]] = second, first
         arrays = {}
@@ -95,18 +94,18 @@ class ObservedBodies:
 
 @dataclass(frozen=True)
 class Poses:
-    """Rotations (T, B, 3, 3) and centres (T, B, 3) of bodies, known (T, B) where there are any."""
+    """Rotations (T, B, 3, 3), centres (T, B, 3) of bodies, and whether (T, B) they are known."""
 
     rotation: NDArray[np.float64]
     centre_mm: NDArray[np.float64]
     known: NDArray[np.bool_]
 
     def exposures(self, chosen: NDArray[np.int64]) -> Poses:
-        """Return some exposures."""
+        """Return a subset of the exposures."""
         return Poses(self.rotation[chosen], self.centre_mm[chosen], self.known[chosen])
 
     def or_else(self, other: Poses, fits: NDArray[np.bool_]) -> Poses:
-        """Return other poses where these (T, B) do not fit."""
+        """Return these poses where they fit (T, B), and the other ones elsewhere."""
         chosen = fits[..., None]
         return Poses(
             np.where(chosen[..., None], self.rotation, other.rotation),
@@ -121,16 +120,16 @@ class Prior:
 
     #: (9F, 9F) covariance of the orientation, as it was calibrated
     orientation: NDArray[np.float64]
-    #: (K,) standard deviations of changes in addition to what was known of rig and shapes, and of
+    #: (K,) standard deviations of changes in addition to the knowledge of rig and shapes, and of
     #: the other unknowns
     sd: NDArray[np.float64]
-    #: (F, B M, B M) covariance of the mean errors of the correction, of each coordinate [px^2]
+    #: (F, B M, B M) covariance of the mean errors of the correction, per coordinate [px^2]
     correction: NDArray[np.float64]
     #: (B, M) factor of the standard deviations of the image points of a marker
     inflation: NDArray[np.float64]
 
     def widened(self, sd: NDArray[np.float64]) -> Prior:
-        """Return the prior with further changes of the unknowns (K,)."""
+        """Return the prior widened by further changes of the unknowns (K,)."""
         return replace(self, sd=np.hypot(self.sd, sd))
 
 
@@ -141,22 +140,21 @@ class RigSolution:
     values: NDArray[np.float64]  #: (K,) changes of the unknowns
     covariance: NDArray[np.float64]  #: (K, K)
     poses: Poses
-    evidence: float  #: logarithm, up to a constant that all hypotheses share
-    #: (B, M) minus twice the logarithm of the likelihood of the image points of each marker
+    evidence: float  #: log evidence, up to a constant that all hypotheses share
+    #: (B, M) minus twice the log likelihood of the image points of each marker
     losses: NDArray[np.float64]
-    #: (B, M) weighted squares of the residuals of the inliers of each marker, and their
-    #: expectation
+    #: (B, M) weighted squared residuals of the inliers of each marker, and their expectation
     squares: NDArray[np.float64]
     freedom: NDArray[np.float64]
-    #: (B, M) mean probability of the image points of a marker to be inliers; NaN for an unseen one
+    #: (B, M) mean inlier probability of the image points of a marker; NaN if unseen
     inliers: NDArray[np.float64]
-    #: (T, B) the same of the image points of a body in an exposure
+    #: (T, B) the same for the image points of a body in an exposure
     inliers_of_pose: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class _Normal:
-    """Reduced normal equations H (K, K), h (K,), and what gives the poses back by body."""
+    """Reduced normal equations H (K, K), h (K,), and back-substitution of the poses by body."""
 
     matrix: NDArray[np.float64]
     right: NDArray[np.float64]
@@ -164,14 +162,14 @@ class _Normal:
 
 
 class _Back(NamedTuple):
-    """What gives back the poses of a body: N = C C' of its poses, and their mixed matrix."""
+    """Back-substitution of the poses of a body: N = C C' of its poses, and their mixed matrix."""
 
     columns: NDArray[np.int64]  # (L,) unknowns
     inverse: NDArray[np.float64]  # (T, 6, 6) C^-1
     half: NDArray[np.float64]  # (T, 6, L + 1) C^-1 (D'J, D'r)
 
     def poses(self, step: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return by how much the poses (T, 6) change with a step (K,) of the other unknowns."""
+        """Return the changes of the poses (T, 6) for a step (K,) of the other unknowns."""
         half = self.half[..., -1] - self.half[..., :-1] @ step[self.columns]
         return np.asarray((np.swapaxes(self.inverse, 1, 2) @ half[..., None])[..., 0])
 
@@ -179,7 +177,7 @@ class _Back(NamedTuple):
 class RigAdjustment:
     """Adjustment of one recording for any hypothesis.
 
-    orientation: as it was calibrated. bodies: with known places of all markers. image_size: of
+    orientation: calibrated orientation. bodies: with known places of all markers. image_size: of
     each fluoroscope [px].
     """
 
@@ -220,7 +218,7 @@ class RigAdjustment:
     def healthy_prior(self, observed: ObservedBodies, shape_scale: float) -> Prior:
         """Return the prior of a rig that has not changed.
 
-        shape_scale: standard deviation of the scale that all shapes have in common.
+        shape_scale: standard deviation of the common scale of all shapes.
         """
         sd = np.zeros(self.size)
         sd[self.scale] = shape_scale
@@ -236,7 +234,7 @@ class RigAdjustment:
             seen = observed.seen[..., f]
             one_px = self.sd_of_drift(f)
             values = self.functions[f](observed.pixel[..., f, :][seen])
-            # A drift of 1 px at the edges has another variance than 1 px^2 at the markers.
+            # A drift of 1 px at the edges does not have a variance of 1 px^2 at the markers.
             variance = np.sum((values * one_px[: values.shape[1]]) ** 2)
             if variance > 0:
                 smooth = max(0.0, differs[..., f][seen].sum())
@@ -244,11 +242,11 @@ class RigAdjustment:
         return Prior(self.orientation.covariance, sd, means, np.ones(self.target_id.shape))
 
     def sd_of_drift(self, fluoroscope: int) -> NDArray[np.float64]:
-        """Return the standard deviations (2n,) of the coefficients of a drift of 1 px."""
+        """Return standard deviations (2n,) of the coefficients of a drift of 1 px."""
         return np.tile(_share_of_functions(self.functions[fluoroscope]), 2)
 
     def root(self, prior: Prior) -> NDArray[np.float64]:
-        """Return L (K, k) of a prior; unknowns that are certain have no columns."""
+        """Return L (K, k) of a prior; unknowns without uncertainty have no columns."""
         sd = prior.sd
         root = np.diag(sd)
         covariance = prior.orientation + np.diag(sd[self.rig] ** 2)
@@ -268,7 +266,7 @@ class RigAdjustment:
         return root[:, (root != 0).any(axis=0)]
 
     def rig_at(self, values: NDArray[np.float64]) -> RigOrientation:
-        """Return the orientation, with the changes of the unknowns."""
+        """Return the orientation including the changes of the unknowns."""
         change = values[self.rig].reshape(self._views, ORIENTATION_SIZE)
         return replace(
             self.orientation,
@@ -293,7 +291,7 @@ class RigAdjustment:
         return values[self.drift].reshape(self._views, 2, -1)
 
     def shapes_at(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the coordinates (B, M, 3) of the markers about their centres."""
+        """Return the coordinates (B, M, 3) of the markers relative to their centres."""
         return (self.xyz + values[self.shape].reshape(self.xyz.shape)) * (
             1 + values[self.scale][0]
         )
@@ -314,9 +312,9 @@ class RigAdjustment:
         solution: RigSolution,
         known: NDArray[np.float64] | float = 0.0,
     ) -> Told:
-        """Return what the data tell of changes of the unknowns (K,) in addition to a prior.
+        """Return the information of the data on changes of the unknowns (K,) beyond a prior.
 
-        At a solution, which may be that of another prior. known (K,): changes that are certain.
+        The solution may be that of another prior. known (K,): changes that are certain.
         """
         normal, right = self.normal_at(observed, prior, solution)
         both = np.column_stack([normal, right + normal @ (solution.values - known)])
@@ -328,14 +326,14 @@ class RigAdjustment:
     def covariance_at(
         self, observed: ObservedBodies, prior: Prior, solution: RigSolution
     ) -> NDArray[np.float64]:
-        """Return the covariance (K, K) of the unknowns with another prior, at a solution."""
+        """Return the covariance (K, K) of the unknowns with a different prior, at a solution."""
         root = self.root(prior)
         normal, _ = self.normal_at(observed, prior, solution)
         whitened = np.eye(root.shape[1]) + root.T @ normal @ root
         return np.asarray(root @ np.linalg.solve(whitened, root.T))
 
     def places_at(self, solution: RigSolution) -> NDArray[np.float64]:
-        """Return the places (n, 3) of all markers in the exposures that show their bodies [mm]."""
+        """Return places (n, 3) [mm] of all markers in the exposures that show their bodies."""
         poses = solution.poses
         xyz = self.shapes_at(solution.values) @ np.swapaxes(poses.rotation, 2, 3)
         known = poses.known[..., None] & (self.target_id >= 0)
@@ -346,13 +344,13 @@ class RigAdjustment:
     def with_fixed(
         self, observed: ObservedBodies, prior: Prior, solution: RigSolution, free: np.ndarray
     ) -> RigSolution:
-        """Return the solution where unknowns of the rig change only if they are free (K,).
+        """Return the solution in which unknowns of the rig change only if they are free (K,).
 
         The others stay as they were calibrated, with their covariance C. The free ones are
-        estimated with these fixed, and get their errors, too: with the derivatives G of the free
-        unknowns by the fixed ones, G C G' is added, and G C is the covariance of both (consider
-        covariance analysis; Tapley, Schutz and Born, "Statistical Orbit Determination", 2004,
-        6.2).
+        estimated with the others fixed, but also get their errors: with the derivatives G of the
+        free unknowns by the fixed ones, G C G' is added to the covariance, and G C is the
+        covariance of both (consider covariance analysis; Tapley, Schutz and Born, "Statistical
+        Orbit Determination", 2004, 6.2).
         """
         fixed = np.zeros(self.size, dtype=bool)
         fixed[self.rig] = ~free[self.rig]
@@ -378,8 +376,8 @@ class RigAdjustment:
     ) -> RigSolution:
         """Solve for a hypothesis, from values (K,) of the unknowns and poses.
 
-        It is repeated from its result while that helps: a pose that false matches have led astray
-        finds back once the rig is right.
+        The solution is repeated from its result while this helps: a pose misled by false matches
+        recovers once the rig is right.
         """
         found = self._converge(observed, prior, start, np.inf)
         for _ in range(MAX_REPEATS):
@@ -393,7 +391,7 @@ class RigAdjustment:
     def refine(
         self, observed: ObservedBodies, prior: Prior, start: tuple[NDArray[np.float64], Poses]
     ) -> RigSolution:
-        """Solve for a hypothesis from values (K,) and poses that tell which points are false."""
+        """Solve for a hypothesis from values (K,) and poses that identify the false points."""
         return self._converge(observed, prior, start, 1.0)
 
     def _converge(
@@ -403,7 +401,7 @@ class RigAdjustment:
         start: tuple[NDArray[np.float64], Poses],
         widest: float,
     ) -> RigSolution:
-        """Iterate; standard deviations are larger by up to a factor, halved with each step."""
+        """Iterate; standard deviations start larger, by up to widest, halved with each step."""
         root = self.root(prior)
         unsure = (root != 0).any(axis=1)
         values, poses = start
@@ -436,14 +434,14 @@ class RigAdjustment:
         )
 
     def _is_impossible(self, values: NDArray[np.float64]) -> bool:
-        """Whether a principal distance is less than half of what it was: a wrong hypothesis."""
+        """Return whether a principal distance is below half of the original: wrong hypothesis."""
         c = self.orientation.interior[:, 2]
         return bool((c + values[self.rig].reshape(self._views, -1)[:, 8] < c / 2).any())
 
     def normal_of(
         self, linear: LinearPoints, weight: NDArray[np.float64], unsure: NDArray[np.bool_]
     ) -> _Normal:
-        """Sum up the image points with weights (T, B, M, F); poses are eliminated.
+        """Sum the image points with weights (T, B, M, F); poses are eliminated.
 
         unsure (K,): unknowns that may change.
         """
@@ -466,7 +464,7 @@ class RigAdjustment:
         return _Normal(matrix, right, back)
 
     def of_body(self, row: int) -> _Unknowns:
-        """Return the numbers of the unknowns that a body tells of."""
+        """Return the indices of the unknowns on which the points of a body depend."""
         number = np.arange(self.size)
         return _Unknowns(
             number[self.rig].reshape(self._views, ORIENTATION_SIZE),
@@ -478,7 +476,7 @@ class RigAdjustment:
 
 
 class _Unknowns(NamedTuple):
-    """Numbers of the unknowns of the rig and of a body."""
+    """Indices of the unknowns of the rig and of a body."""
 
     rig: NDArray[np.int64]  # (F, 9)
     drift: NDArray[np.int64]  # (F, 2, n)
@@ -487,7 +485,7 @@ class _Unknowns(NamedTuple):
     bias: NDArray[np.int64]  # (M, F, 2)
 
     def of_coordinate(self, view: int, axis: int) -> NDArray[np.int64]:
-        """Return those on which a coordinate of a view depends, in the order of `_design`."""
+        """Return the indices for a coordinate of a view, in the order of `_design`."""
         own = self.rig[view], self.drift[view, axis], self.shape, self.scale
         return np.concatenate([*own, self.bias[:, view, axis]])
 
@@ -499,11 +497,11 @@ def _summed(
     weight: NDArray[np.float64],
     unsure: NDArray[np.bool_],
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Sum up the image points of a body with weights (T, M, F).
+    """Sum the image points of a body with weights (T, M, F).
 
-    Returns the unknowns (L,) that it tells of, their normal matrix with the right side in the last
-    row and column, the same mixed with poses (T, 6, L + 1), and that of poses (T, 6, 6). A
-    coordinate of a view depends on few of the unknowns, so each is summed up on its own.
+    Returns the unknowns (L,) on which it depends, their normal matrix with the right-hand side in
+    the last row and column, the mixed matrix with poses (T, 6, L + 1), and that of poses
+    (T, 6, 6). A coordinate of a view depends on few of the unknowns, so each is summed separately.
     """
     unknowns = adjustment.of_body(row)
     columns = np.concatenate([part.ravel() for part in unknowns])
@@ -529,10 +527,10 @@ def _summed(
 
 
 def _design(linear: LinearPoints, row: int, view: int, axis: int) -> NDArray[np.float64]:
-    """Derivatives (T, M, 9 + n + 3 M + 1 + M) of a coordinate of a body in a view, and residuals.
+    """Return derivatives (T, M, 9 + n + 3 M + 1 + M) of a coordinate in a view, and residuals.
 
-    By the orientation of the view, the drift along the axis, shape, scale and the mean errors of
-    the correction.
+    The derivatives are by the orientation of the view, the drift along the axis, shape, scale and
+    the mean errors of the correction.
     """
     by_place = linear.by_place[:, row, :, view, axis]  # (T, M, 3)
     turned = by_place @ linear.poses.rotation[:, row]
@@ -560,7 +558,7 @@ class LinearPoints:
     residual: NDArray[np.float64]  # (..., 2)
     by_place: NDArray[np.float64]  # (..., 2, 3)
     by_orientation: NDArray[np.float64]  # (..., 2, 9)
-    functions: NDArray[np.float64]  # (..., n), of a drift
+    functions: NDArray[np.float64]  # (..., n), functions of a drift
     place_by_pose: NDArray[np.float64]  # (T, B, M, 3, 6)
     good: NDArray[np.bool_]
     shape: NDArray[np.float64]  # (B, M, 3)
@@ -595,8 +593,9 @@ class LinearPoints:
         predicted = linear.uv.reshape(*grid, 2)
         residual = linear.residual.reshape(*grid, 2)
         coefficients = adjustment.drift_at(values)
-        # The drift where the model has the image point: at the observed pixel, which has noise, a
-        # drift that shrinks the image would shrink the noise, too, and be preferred for it.
+        # Evaluate the drift at the image point predicted by the model. At the observed pixel,
+        # which has noise, a drift that shrinks the image would also shrink the noise, and be
+        # preferred for it.
         pixel = np.where(good[..., None], observed.pixel, 0.0)
         drift = _drift(adjustment.functions_at(pixel), coefficients)
         noise = np.clip(residual - drift, -MAX_NOISE_PX, MAX_NOISE_PX)
@@ -614,25 +613,25 @@ class LinearPoints:
         )
 
     def by_pose(self, row: int) -> NDArray[np.float64]:
-        """Derivatives (T, M, F, 2, 6) of the image points of a body by its pose."""
+        """Return derivatives (T, M, F, 2, 6) of the image points of a body by its pose."""
         return self.by_place[:, row] @ self.place_by_pose[:, row, :, None]
 
 
 def _drift(
     functions: NDArray[np.float64], coefficients: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Drift (T, B, M, F, 2) of functions (T, B, M, F, n) with coefficients (F, 2, n)."""
+    """Return the drift (T, B, M, F, 2), from functions (T, B, M, F, n), coefficients (F, 2, n)."""
     return np.asarray((coefficients @ functions[..., None])[..., 0])
 
 
 @dataclass(frozen=True)
 class Mixture:
-    """Squares of standardised residuals (T, B, M, F), and the density of false matches there."""
+    """Squared standardised residuals (T, B, M, F), and the density of false matches there."""
 
     squares: NDArray[np.float64]
     variance: NDArray[np.float64]
     inflation: NDArray[np.float64]
-    false: NDArray[np.float64]  # density over that of a residual of 0
+    false: NDArray[np.float64]  # density relative to that of a residual of 0
     good: NDArray[np.bool_]
 
     @classmethod
@@ -654,36 +653,36 @@ class Mixture:
 
     @property
     def scale(self) -> NDArray[np.float64]:
-        """Scales (T, B, 1, 1) of the standardised residuals of bodies, by a quantile of them.
+        """Scales (T, B, 1, 1) of the standardised residuals of bodies, from a quantile.
 
-        A median would be small where one of two views fits, and the other one not at all.
+        A median would be small if one of two views fits, and the other one not at all.
         """
         squares = np.where(self.good, self.squares, np.nan).reshape(*self.good.shape[:2], -1)
         seen = np.isfinite(squares).any(axis=2)
         scale = np.ones(seen.shape)
-        # Chi-square with two degrees of freedom is below -2 log(1 - q) with the probability q.
+        # Chi-square with two degrees of freedom is below -2 log(1 - q) with probability q.
         scale[seen] = _quantile(squares[seen], FITTING) / (-2 * np.log(1 - FITTING))
         return np.sqrt(scale)[..., None, None]
 
     def inlier(self, widening: NDArray[np.float64] | float = 1.0) -> NDArray[np.float64]:
-        """Probability to be an inlier, where standard deviations are larger by a factor."""
+        """Return inlier probabilities, with standard deviations larger by a factor."""
         density = np.exp(-0.5 * self.squares / widening**2) / self.inflation
         return np.where(self.good, density / (density + self.false), 0.0)
 
     def weight(self, widening: NDArray[np.float64] | float) -> NDArray[np.float64]:
-        """Weights of the image points, where standard deviations are larger by a factor."""
+        """Return weights of the image points, with standard deviations larger by a factor."""
         return self.inlier(widening) / (self.variance * widening**2)
 
     @property
     def losses(self) -> NDArray[np.float64]:
-        """Minus twice the logarithms of the likelihoods."""
+        """Minus twice the log likelihoods."""
         density = np.exp(-0.5 * self.squares) / self.inflation + self.false
         return np.where(self.good, -2 * np.log(density), 0.0)
 
     def shares(self) -> dict[str, NDArray[np.float64]]:
-        """Losses, squares and their expectation by marker, and shares of inliers."""
+        """Return losses, squares and their expectation by marker, and shares of inliers."""
         inlier = self.inlier()
-        # A pose takes up six of the residuals of its body, in proportion to their number.
+        # A pose absorbs six of the residuals of its body, in proportion to their number.
         count = 2 * inlier.sum(axis=(2, 3))
         share = np.where(count > 2 * POSE_SIZE, 1 - POSE_SIZE / np.maximum(count, 1), 0.0)
         weighted = inlier * (share > 0)[..., None, None]
@@ -700,10 +699,10 @@ class Mixture:
 
 
 def _quantile(values: NDArray[np.float64], share: float) -> NDArray[np.float64]:
-    """Quantile (n,) of each row (n, k) without its NaN, by a sort: np.nanquantile loops over rows.
+    """Return the quantile (n,) of each row (n, k) without NaN; np.nanquantile loops over rows.
 
-    Linear between two values, as there (Hyndman and Fan, "Sample Quantiles in Statistical
-    Packages", 1996, definition 7).
+    It is linear between two values, as in np.nanquantile (Hyndman and Fan, "Sample Quantiles in
+    Statistical Packages", 1996, definition 7).
     """
     ordered = np.sort(values, axis=1)  # NaN last
     at = share * (np.count_nonzero(np.isfinite(ordered), axis=1) - 1)
@@ -714,7 +713,7 @@ def _quantile(values: NDArray[np.float64], share: float) -> NDArray[np.float64]:
 
 
 def _shape_covariance(body: Body, count: int) -> NDArray[np.float64]:
-    """Covariance (3 count, 3 count) of the shape of a body, 0 where it has no markers."""
+    """Return the covariance (3 count, 3 count) of the shape of a body; 0 for padding."""
     out = np.zeros((3 * count, 3 * count))
     own = slice(3 * len(body.sd_mm))
     known = body.covariance_mm2
@@ -723,14 +722,14 @@ def _shape_covariance(body: Body, count: int) -> NDArray[np.float64]:
 
 
 def root_of(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Root L of a covariance L L' that may be singular: of a motion of a whole body nothing."""
+    """Return the root L of a covariance L L', which may be singular, as for free motions."""
     variance, axes = np.linalg.eigh(covariance)
     rounding = len(variance) * np.finfo(float).eps * variance[-1]
     return np.asarray(axes * np.sqrt(np.where(variance > rounding, variance, 0.0)))
 
 
 def _share_of_functions(functions: Functions) -> NDArray[np.float64]:
-    """Standard deviations (n,) of coefficients that give a field of variance one.
+    """Return standard deviations (n,) of coefficients that yield a field of unit variance.
 
     The mean square of a product of two sines over their rectangle is 1 / (4 extent_u extent_v).
     Polynomials have 1 px at the edges.
@@ -743,7 +742,7 @@ def _share_of_functions(functions: Functions) -> NDArray[np.float64]:
 
 
 def _by_vector(w: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Derivatives (F, 3, 3) of a further small rotation by the vectors (F, 3) of rotations.
+    """Return derivatives (F, 3, 3) of a further small rotation by rotation vectors (F, 3).
 
     exp([w + dw]x) = exp([J dw]x) exp([w]x) with J = sum [w]x^n / (n + 1)! (Chirikjian, "Stochastic
     Models, Information Theory, and Lie Groups", vol. 2, 2012, 10.6); changes are small.
@@ -753,7 +752,7 @@ def _by_vector(w: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def moved_poses(poses: Poses, normal: _Normal, step: NDArray[np.float64]) -> Poses:
-    """Move the poses by what they gain from a step (K,) of the other unknowns."""
+    """Move the poses according to a step (K,) of the other unknowns."""
     rotation = poses.rotation.copy()
     centre = poses.centre_mm.copy()
     for row, back in enumerate(normal.back):

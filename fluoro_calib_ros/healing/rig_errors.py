@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Errors of points in space by those of a rig and of the drifts of its distortion."""
+"""Errors of points in space due to errors of a rig and drifts of its distortion."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from .rig_adjustment import RigAdjustment, root_of
 
 @dataclass(frozen=True)
 class RigErrors:
-    """Errors of points by those of a rig: relative to each other, and of all together."""
+    """Errors of points due to those of a rig: relative to each other, and common to all."""
 
     scale: float  #: standard deviation of the scale
-    place_mm: float  #: of a coordinate, where all points move together freely
-    #: RMS distance by which points move together, as a rigid body
+    place_mm: float  #: sd of a coordinate, after removing the common rigid motion
+    #: RMS distance of the common motion of the points as a rigid body
     common_mm: float
 
 
 def rig_errors(orientation: RigOrientation, points_mm: NDArray[np.float64]) -> RigErrors:
-    """Return the errors of points (n, 3) by the errors of an orientation.
+    """Return the errors of points (n, 3) due to the errors of an orientation.
 
-    The points move by -(A'A)^-1 A'B do (see `intersection`). Their scale is what they have in
-    common with a similarity about their centre, the rest what a rigid motion leaves.
+    The points move by -(A'A)^-1 A'B do (see `intersection`). The scale error is that of the
+    best-fit similarity about the centre; the place error is what a rigid motion does not explain.
     """
     image = _Intersected.of(orientation, points_mm)
     return _errors(points_mm, image.moved(image.by_rig) @ orientation.covariance_root())
@@ -40,7 +40,7 @@ def rig_errors(orientation: RigOrientation, points_mm: NDArray[np.float64]) -> R
 def drift_errors(
     adjustment: RigAdjustment, covariance: NDArray[np.float64], points_mm: NDArray[np.float64]
 ) -> tuple[RigErrors, float]:
-    """Return the errors of points (n, 3) by those of rig and drifts, with a covariance (K, K).
+    """Return the errors of points (n, 3) due to rig and drifts with a covariance (K, K).
 
     Also returns the RMS distance [mm] by which noise of 1 px moves a point.
     """
@@ -61,10 +61,10 @@ def drift_errors(
 
 @dataclass(frozen=True)
 class _Intersected:
-    """Image points uv (n, F, 2) of points (n, 3), and how the points follow from them.
+    """Image points uv (n, F, 2) of points (n, 3), and the dependence of the points on them.
 
     by_rig (n, F, 2, 9F): derivatives of the image points by the orientation. by_uv (n, 3, 2F):
-    of the points by the image points.
+    derivatives of the points by the image points.
     """
 
     uv: NDArray[np.float64]
@@ -90,13 +90,13 @@ class _Intersected:
         return cls(linear.uv[0], by_rig.reshape(*by_rig.shape[:3], -1), by_uv)
 
     def moved(self, derivatives: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return by how much points move (3n, k), from derivatives (n, F, 2, k) of their views."""
+        """Return the motion of points (3n, k), from derivatives (n, F, 2, k) of their views."""
         flat = derivatives.reshape(len(self.uv), -1, derivatives.shape[-1])
         return np.asarray(-(self.by_uv @ flat).reshape(-1, flat.shape[2]))
 
 
 def _errors(points_mm: NDArray[np.float64], moved: NDArray[np.float64]) -> RigErrors:
-    """Errors of points (n, 3) that move by moved (3n, k), times unknowns of variance one."""
+    """Return errors of points (n, 3) with motions moved (3n, k) by unknowns of unit variance."""
     similar = similarity_directions(points_mm, points_mm.mean(axis=0)).reshape(-1, DATUM_DEFECT)
     rigid = similar[:, :POSE_SIZE].copy()
     scale = np.linalg.pinv(similar)[-1] @ moved

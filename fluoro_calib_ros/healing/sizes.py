@@ -1,14 +1,14 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""How large a change is, by what the data tell of it.
+"""Estimate the size of a change from the information of the data.
 
-The parts of a change (the shift and the turn of a knock) have a size each, in units of what such
-a change may usually be. A size has a half-Cauchy prior: flat where it is small, so that it does
-not matter which size is the smallest that is tried, and with a heavy tail (Gelman, "Prior
-distributions for variance parameters in hierarchical models", Bayesian Analysis 1, 2006). The
-evidence of a change is the mean over its sizes: with the likeliest one alone, a change of few
-unknowns would be preferred to one of many wherever the sizes that are tried are wrong.
+The parts of a change (the shift and the rotation of a knock) have one size each, in units of the
+usual size of such a change. A size has a half-Cauchy prior: flat for small sizes, so that the
+smallest size tried does not matter, and with a heavy tail (Gelman, "Prior distributions for
+variance parameters in hierarchical models", Bayesian Analysis 1, 2006). The evidence of a change
+is the mean over its sizes. With the likeliest size alone, a change of few unknowns would be
+preferred to one of many wherever the sizes tried are wrong.
 """
 
 from __future__ import annotations
@@ -29,31 +29,31 @@ KNOCK_RAD = 0.02
 SHIFT_PX = 10.0
 FOCUS = 0.01
 SIZES = np.geomspace(2.0**-7, 8.0, 11)
-MANY = 3  # parts of a change, from which on every second size is tried
+MANY = 3  # number of parts of a change from which on only every second size is tried
 
 
 @dataclass(frozen=True)
 class Told:
-    """What the data tell of the unknowns of a change, with all other unknowns eliminated.
+    """Information of the data on the unknowns of a change, all other unknowns being eliminated.
 
-    Normal equations M (k, k), m (k,) about no change. With the covariance V of the change, the
-    logarithm of its evidence is 1/2 m'(M + V^-1)^-1 m - 1/2 log det(I + MV) (MacKay, "Information
-    Theory, Inference, and Learning Algorithms", Cambridge 2003, ch. 28).
+    Normal equations M (k, k), m (k,) about no change. With the covariance V of the change, its log
+    evidence is 1/2 m'(M + V^-1)^-1 m - 1/2 log det(I + MV) (MacKay, "Information Theory,
+    Inference, and Learning Algorithms", Cambridge 2003, ch. 28).
     """
 
     matrix: NDArray[np.float64]
     right: NDArray[np.float64]
 
     def only(self, rows: NDArray[np.int64]) -> Told:
-        """Return the same of some of the unknowns (k,), where the others have not changed."""
+        """Return the information on some of the unknowns (k,), with no change of the others."""
         return Told(self.matrix[np.ix_(rows, rows)], self.right[rows])
 
     def with_noise(self, factor: float) -> Told:
-        """Return what the data tell if they scatter more than claimed, by a factor."""
+        """Return the information if the data scatter more than claimed, by a factor."""
         return Told(self.matrix / factor**2, self.right / factor**2)
 
     def evidence(self, sd: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the logarithms (...,) of the evidence of standard deviations (..., k)."""
+        """Return the log evidence (...,) of standard deviations (..., k)."""
         whitened, gradient = self._whitened(sd)
         solved = np.linalg.solve(whitened, gradient[..., None])[..., 0]
         log_z = np.sum(gradient * solved, axis=-1) - np.linalg.slogdet(whitened)[1]
@@ -70,22 +70,22 @@ class Told:
     def mean_moments(
         self, parts: NDArray[np.float64], least: NDArray[np.float64] | float = 0.0
     ) -> NDArray[np.float64]:
-        """Return the mean (k, k) of second moments over the sizes of a change, see `sizes`."""
+        """Return the mean (k, k) of second moments over the sizes of a change; see `sizes`."""
         sizes = self.sizes(parts, least)
         return np.asarray(np.tensordot(sizes.share, self.moments(sizes.sd), axes=1))
 
     def _whitened(
         self, sd: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Normal equations of unknowns in units of their standard deviations (..., k)."""
+        """Return normal equations of unknowns in units of their standard deviations (..., k)."""
         matrix = np.eye(len(self.right)) + sd[..., :, None] * self.matrix * sd[..., None, :]
         return matrix, sd * self.right
 
     def sizes(self, parts: NDArray[np.float64], least: NDArray[np.float64] | float = 0.0) -> Sizes:
-        """Return what the data tell of the sizes of a change.
+        """Return the sizes of a change with their probabilities.
 
-        parts (p, k): standard deviations of the unknowns by each part of the usual size; least
-        (k,): those that they have anyway.
+        parts (p, k): standard deviations of the unknowns for each part of the usual size. least
+        (k,): standard deviations without the change.
         """
         some = SIZES if len(parts) < MANY else SIZES[::2]
         size = np.array(list(product(some, repeat=len(parts))))
@@ -99,9 +99,9 @@ class Told:
 
 @dataclass(frozen=True)
 class Sizes:
-    """Sizes of a change, and what the data tell of them."""
+    """Sizes of a change with their probabilities."""
 
-    evidence: float  #: logarithm, of the change with any size, against no change
+    evidence: float  #: log evidence of the change with any size, against no change
     sd: NDArray[np.float64]  #: (S, k) standard deviations of the unknowns
     share: NDArray[np.float64]  #: (S,) probabilities
 
@@ -112,7 +112,7 @@ class Sizes:
 
 
 def parts_of_knock(orientation: RigOrientation, fluoroscope: int) -> NDArray[np.float64]:
-    """Standard deviations (2, 9F) of the orientation by the shift and the turn of a knock."""
+    """Return standard deviations (2, 9F) of the orientation for shift and rotation of a knock."""
     out = np.zeros((2, len(orientation.fluoroscopes), ORIENTATION_SIZE))
     out[0, fluoroscope, :3] = KNOCK_MM
     out[1, fluoroscope, 3:6] = KNOCK_RAD
@@ -120,7 +120,7 @@ def parts_of_knock(orientation: RigOrientation, fluoroscope: int) -> NDArray[np.
 
 
 def parts_of_interior(orientation: RigOrientation, fluoroscope: int) -> NDArray[np.float64]:
-    """Standard deviations (2, 9F) of principal point and principal distance by their change."""
+    """Return standard deviations (2, 9F) for changes of principal point and distance."""
     out = np.zeros((2, len(orientation.fluoroscopes), ORIENTATION_SIZE))
     out[0, fluoroscope, 6:8] = SHIFT_PX
     out[1, fluoroscope, 8] = FOCUS * orientation.interior[fluoroscope, 2]
@@ -128,7 +128,7 @@ def parts_of_interior(orientation: RigOrientation, fluoroscope: int) -> NDArray[
 
 
 def parts_of_drift(functions: Functions) -> NDArray[np.bool_]:
-    """Which coefficients (3, 2n) are of polynomials up to degree 1, of those beyond, of waves."""
+    """Return which coefficients (3, 2n) are of degrees up to 1, of higher degrees, of waves."""
     waves = np.arange(len(functions)) >= functions.trend
     affine = np.zeros(len(functions), dtype=bool)
     affine[: len(functions.powers)] = [i + j <= 1 for i, j in functions.powers]

@@ -66,7 +66,7 @@ RADIUS_SD = 0.01  # of the radius of a shadow: what profile and distortion leave
 # The same where the surrounding light is clipped, except for a small share of it. Only the dark
 # inside of a shadow is visible then, which hardly separates radius, attenuation and scattered
 # light. In 12 images of a cube at 1.65 times the light that a pixel holds, estimated radii were 13
-# to 25 % smaller than in the same exposures without clipping.
+# to 25 % too small.
 CLIPPED_RADIUS_SD = 0.17
 SEEN_LIGHT = 0.05
 SETTLED = 0.1 * RADIUS_SD  # change of a radius at which a profile is kept

@@ -1,18 +1,18 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Do rays meet? The epipolar check of two image points, and why those of a recording do not.
+"""Epipolar check of two image points, and causes of recordings whose rays do not meet.
 
-Epipolar check: do two image points belong to one point in space? x_b^T E x_a = 0 with E = [s]x Q,
-Q = R_b R_a^T and s = R_b (T_a - T_b) [mm], where the image points are directions x in the sensor
-frames (Hartley and Zisserman, "Multiple View Geometry", 2nd ed., 2004, 9.6). The residual is the
-first-order geometric (Sampson) distance (11.4.3 there), with its sign, and its standard deviation
-follows by propagation of covariance.
+The epipolar check tests whether two image points belong to one point in space: x_b^T E x_a = 0
+with E = [s]x Q, Q = R_b R_a^T and s = R_b (T_a - T_b) [mm], where the image points are directions
+x in the sensor frames (Hartley and Zisserman, "Multiple View Geometry", 2nd ed., 2004, 9.6). The
+residual is the signed first-order geometric (Sampson) distance (11.4.3 there); its standard
+deviation follows by propagation of covariance.
 
-Recordings whose rays do not meet: most points are rejected, and why is found by trial. A share of
-false matches is borne. Where most rays miss each other, the frames, ids, fluoroscopes or
-coordinates are confused, or the orientation does not hold, and what meets does so by chance. Where
-they miss each other by a little, the same trials may tell why.
+If the rays of a recording do not meet, most points are rejected, and the cause is found by trial.
+A share of false matches is acceptable. If most rays miss each other, the frames, ids, fluoroscopes
+or coordinates are confused, or the orientation does not hold, and rays that meet do so by chance.
+If they miss each other by a little, the same trials may find the cause.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from .intersection import (
 )
 from .reconstruct import ReconstructedFrame, reconstruct_recording
 
-MIN_BASE = 1e-6  # distance of the sources over their distance from the origin of the rig
+MIN_BASE = 1e-6  # minimum distance of the sources over their distance from the origin of the rig
 
 
 @dataclass(frozen=True)
@@ -56,11 +56,11 @@ class EpipolarResiduals:
     """
 
     residual: NDArray[np.float64]  #: (n,) signed [px]
-    #: (n,) standard deviation of the residual by the image points alone (sigma) [px]
+    #: (n,) standard deviation of the residual due to the image points alone (sigma) [px]
     sd: NDArray[np.float64]
-    sd_total: NDArray[np.float64]  #: (n,) the same with the orientation of the rig [px]
+    sd_total: NDArray[np.float64]  #: (n,) the same including the orientation of the rig [px]
     #: (n, 2) unit normals of the epipolar lines in both images, in the direction in which the
-    #: residual grows
+    #: residual increases
     normal_a: NDArray[np.float64]
     normal_b: NDArray[np.float64]
     #: (n,) change of the residual when an image point is shifted by one pixel along that normal;
@@ -73,7 +73,7 @@ class EpipolarGeometry:
     """Epipolar geometry of two fluoroscopes of a rig, built once for all frames.
 
     a, b: names of the fluoroscopes. Raises DataError for an unknown fluoroscope, and for two
-    sources in one place.
+    sources at the same place.
     """
 
     def __init__(self, orientation: RigOrientation, a: str, b: str) -> None:
@@ -100,7 +100,7 @@ class EpipolarGeometry:
     def residuals(
         self, uv_a: ArrayLike, uv_b: ArrayLike, sigma_a: ArrayLike, sigma_b: ArrayLike
     ) -> EpipolarResiduals:
-        """Residuals of corrected image points uv_a and uv_b (n, 2) [px].
+        """Return the residuals of corrected image points uv_a and uv_b (n, 2) [px].
 
         sigma_a and sigma_b (n,), or a number for all: standard deviations of their coordinates
         [px].
@@ -133,7 +133,7 @@ class EpipolarGeometry:
         )
 
     def by_orientation(self, uv_a: ArrayLike, uv_b: ArrayLike) -> NDArray[np.float64]:
-        """Derivatives (n, 18) of the residuals by T, w, xp, yp, c of a and of b."""
+        """Return derivatives (n, 18) of the residuals by T, w, xp, yp, c of a and of b."""
         x_a = _directions(uv_a, self._interior[0])
         x_b = _directions(uv_b, self._interior[1])
         c_a, c_b = self._interior[:, 2]
@@ -145,7 +145,7 @@ class EpipolarGeometry:
 
 
 def _directions(uv: ArrayLike, interior: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Directions (n, 3) in the sensor frame, z = 1, of image points (n, 2) [px]."""
+    """Return directions (n, 3) in the sensor frame, z = 1, of image points (n, 2) [px]."""
     uv = np.asarray(uv, dtype=float).reshape(-1, 2)
     out = np.ones((len(uv), 3))
     out[:, :2] = (uv - interior[:2]) / interior[2]
@@ -158,16 +158,16 @@ def _essential_jacobian(
     r_b: NDArray[np.float64],
     c: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Derivatives (9, 18) of the elements of E, row by row, by T, w, xp, yp, c of a and of b.
+    """Return derivatives (9, 18) of the elements of E, by rows, by T, w, xp, yp, c of a and b.
 
-    Those by the interior orientation hold for E as it acts on the present directions. A changed
-    interior orientation maps a direction x to M x, where to first order
-    M = 1 - (dc, 0, dxp; 0, dc, dyp; 0, 0, 0)/c.
+    The derivatives by the interior orientation are those of E acting on the present directions. A
+    changed interior orientation maps a direction x to M x, to first order with M = 1 - (dc, 0,
+    dxp; 0, dc, dyp; 0, 0, 0)/c.
     """
     cross = cross_matrix(shift)
     units = cross_matrix(np.eye(3))
     essential = cross @ relative_rotation
-    # By T_a; by T_b it is the negative.
+    # Derivative by T_a; the derivative by T_b is its negative.
     by_position = np.stack([cross_matrix(column) @ relative_rotation for column in r_b.T])
     by_rotation_a = -essential @ units
     by_rotation_b = cross_matrix(units @ shift) @ relative_rotation
@@ -183,10 +183,10 @@ def _essential_jacobian(
     return np.concatenate(rows).reshape(2 * ORIENTATION_SIZE, 9).T
 
 
-MIN_POINTS = 20  # of two views, by which a recording is judged
-MAX_REJECTED = 0.5  # share of the points of two views
+MIN_POINTS = 20  # minimum number of points in two views for judging a recording
+MAX_REJECTED = 0.5  # maximum share of rejected points in two views
 CORRECTED = Finding(Kind.CORRECTED_ALREADY, 'the image points are corrected already')
-MAX_TRIED = 10  # exposures
+MAX_TRIED = 10  # maximum number of exposures to try
 UNKNOWN = Finding(
     Kind.RAYS_DO_NOT_MEET,
     'the frames, target ids or image coordinates do not belong together, the fluoroscopes are '
@@ -198,9 +198,9 @@ UNMATCHED = Finding(
     advice='the target ids of the fluoroscopes, or the numbers of their frames, do not belong '
     'together',
 )
-RECENT = 100  # exposures of a stream
-# Share of rejected points of a trial, and median miss of one, over those of the recording, from
-# which the trial tells the cause.
+RECENT = 100  # number of recent exposures of a stream
+# Maximum ratios of a trial to the recording, for the share of rejected points and the median miss,
+# to accept the cause of the trial.
 BETTER = 0.3
 CLOSER = 0.6
 
@@ -208,7 +208,7 @@ Trial = tuple[Finding, dict[str, list[Frame]]]
 
 
 class RecentMisses:
-    """Share of the rays of recent exposures of a stream that miss each other."""
+    """Share of the rays in recent exposures of a stream that miss each other."""
 
     def __init__(self) -> None:
         self._recent: deque[tuple[int, int, int]] = deque(maxlen=RECENT)
@@ -218,7 +218,7 @@ class RecentMisses:
         self._recent.append(_counts(points.status))
 
     def finding(self) -> Finding | None:
-        """Return what is wrong where points of the recent exposures cannot be right."""
+        """Return what is wrong if the points of the recent exposures are implausible, or None."""
         bad, total, single = (sum(column) for column in zip(*list(self._recent) or [(0, 0, 0)]))
         if not total and single >= MIN_POINTS:
             return UNMATCHED
@@ -228,20 +228,20 @@ class RecentMisses:
 
 
 def missing_rays(share: float, why: Finding) -> Finding:
-    """Return the finding that a share of the rays miss each other for a reason."""
+    """Return the finding that a share of the rays miss each other, with the cause."""
     cause = f'{100 * share:.0f} % of the rays miss each other: {why.cause}'
     return replace(why, cause=cause, numbers={**why.numbers, 'share': share})
 
 
 def share_rejected(found: Sequence[ReconstructedFrame]) -> tuple[float, int]:
-    """Return the share of rejected points, and the number of points of two views."""
+    """Return the share of rejected points, and the number of points in two views."""
     status = np.concatenate([frame.points.status for frame in found] or [np.empty(0, int)])
     bad, total, _ = _counts(status)
     return bad / max(total, 1), total
 
 
 def _counts(status: NDArray[np.integer]) -> tuple[int, int, int]:
-    """Number of rejected points, of points of two views, and of points of a single one."""
+    """Return the numbers of rejected points, of points in two views, and in a single one."""
     counts = np.bincount(status, minlength=len(STATUS_NAMES))
     bad = int(counts[REJECTED] + counts[FAILED])
     return bad, bad + int(counts[OK] + counts[OUTSIDE]), int(counts[SINGLE_VIEW])
@@ -254,7 +254,7 @@ def mismatch(
     intersector: Intersector,
     pairing: RecordedPairing,
 ) -> Finding | None:
-    """Return why a reconstruction cannot be right, None where nothing is wrong with it."""
+    """Return why a reconstruction is implausible, or None if nothing is wrong with it."""
     share, total = share_rejected(found)
     seen = sum(len(frame.target_id) for frame in found)
     if not total and seen >= MIN_POINTS:
@@ -277,9 +277,9 @@ def cause_of_misses(
     intersector: Intersector,
     pairing: RecordedPairing,
 ) -> Finding | None:
-    """Return why rays miss each other by more than they should, None where no trial tells it.
+    """Return why rays miss each other by more than expected, or None if no trial shows it.
 
-    The trials are those of `mismatch`, and image points that are corrected already.
+    The trials are those of `mismatch`, and image points that are already corrected.
     """
     names = intersector.orientation.fluoroscopes
     numbers = _largest(found)
@@ -300,13 +300,13 @@ def cause_of_misses(
 
 
 def _largest(found: Sequence[ReconstructedFrame]) -> set[int]:
-    """Numbers of the frames with the most targets, on which causes are tried."""
+    """Return the numbers of the frames with the most targets, for trials of causes."""
     largest = sorted(found, key=lambda frame: -len(frame.target_id))[:MAX_TRIED]
     return {frame.number for frame in largest}
 
 
 def _miss(found: Sequence[ReconstructedFrame]) -> float:
-    """Median miss of the rays over its standard deviation, infinite where there are few."""
+    """Return the median miss of the rays over its standard deviation; infinite for few rays."""
     points = [frame.points for frame in found]
     size = np.concatenate([p.standardised[p.status != SINGLE_VIEW] for p in points] or [[]])
     if len(size) < MIN_POINTS:
@@ -315,9 +315,9 @@ def _miss(found: Sequence[ReconstructedFrame]) -> float:
 
 
 def _trials(frames: Frames, names: Sequence[str], numbers: set[int]) -> list[Trial]:
-    """Return findings on what may be confused, each with the frames put right.
+    """Return findings on possible confusions, each with the frames put right.
 
-    numbers are those of the frames to try.
+    numbers: numbers of the frames to try.
     """
     tried = {name: [f for f in frames[name] if f.number in numbers] for name in names}
     out = []
@@ -347,7 +347,7 @@ def _trials(frames: Frames, names: Sequence[str], numbers: set[int]) -> list[Tri
 
 
 def _other_axes(frames: Mapping[str, list[Frame]]) -> list[Trial]:
-    """Return trials of other directions of u and v, in all fluoroscopes or one."""
+    """Return trials of other directions of u and v, in all fluoroscopes or in one."""
     out = []
     for kind, cause, change in (
         (Kind.IMAGE_TRANSPOSED, 'u and v are interchanged', _transposed),

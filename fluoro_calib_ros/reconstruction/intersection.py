@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Intersection of rays: points in space from their image points in two or more corrected views.
+"""Intersection of rays: points in space from image points in two or more corrected views.
 
-Maximum likelihood (Hartley and Zisserman, "Multiple View Geometry", 2nd ed., 2004, ch. 12):
-weighted least squares of the image residuals by Gauss-Newton, started from the linear solution
-(12.2, inhomogeneous). The covariance is propagated from the image points and the orientation o of
-the rig together,
+The points are maximum likelihood estimates (Hartley and Zisserman, "Multiple View Geometry", 2nd
+ed., 2004, ch. 12): weighted least squares of the image residuals by Gauss-Newton, started from the
+linear solution (12.2, inhomogeneous). The covariance is propagated jointly from the image points
+and the orientation o of the rig,
 
     P = X + dP/do do,  dP/do = -(A^T W A)^-1 A^T W B,
 
@@ -48,14 +48,14 @@ FAILED = int(PointStatus.FAILED)
 SINGLE_VIEW = int(PointStatus.SINGLE_VIEW)
 STATUS_NAMES = tuple(status.name for status in PointStatus)
 MAX_STEPS = 10
-# Square of a step, in standard deviations, after which the iteration ends. A step reduces the
+# Square of a step, in standard deviations, below which the iteration ends. A step reduces the
 # error by the residual over the principal distance, a thousandth, so 1e-4 standard deviations
 # remain.
 MAX_LAST_STEP = 1e-2
-# Determinant of a normal matrix over the cube of its mean diagonal: rays that meet at less than
-# 1e-4 rad count as parallel.
+# Minimum determinant of a normal matrix over the cube of its mean diagonal: rays that meet at less
+# than 1e-4 rad count as parallel.
 MIN_DETERMINANT = 1e-8
-# The derivatives of an image point by T, w, xp, yp, c are combinations of so many functions of
+# The derivatives of an image point by T, w, xp, yp, c are combinations of this many functions of
 # x, y and 1/Z.
 _FUNCTIONS = 9
 _COFACTORS = np.array(
@@ -70,24 +70,24 @@ _COFACTORS = np.array(
 
 @dataclass(frozen=True)
 class IntersectedPoints:
-    """Points in the rig frame.
+    """Intersected points in the rig frame.
 
     Coordinates and covariances are NaN unless the status is OK or OUTSIDE.
     """
 
     xyz_mm: NDArray[np.float64]  #: (n, 3)
-    #: (n, 3, 3) by the image points and the orientation of the rig [mm^2]
+    #: (n, 3, 3) from the image points and the orientation of the rig [mm^2]
     covariance: NDArray[np.float64]
-    #: (n, 3, 3) by the image points alone, that is by noise and correction [mm^2]; it is the one
-    #: for positions of points relative to each other
+    #: (n, 3, 3) from the image points alone, that is from noise and correction [mm^2]; use it for
+    #: positions of points relative to each other
     covariance_noise: NDArray[np.float64]
     residual: NDArray[np.float64]  #: (n,) RMS of the image residuals [px]
     rays: NDArray[np.int64]  #: (n,) number of rays used
-    #: (n,) root of the weighted square sum of the residuals over its expectation; for two rays
-    #: the epipolar distance over its standard deviation (sd_total)
+    #: (n,) root of the weighted sum of squared residuals over its expectation; for two rays, the
+    #: epipolar distance over its standard deviation (sd_total)
     standardised: NDArray[np.float64]
     status: NDArray[np.uint8]  #: (n,) PointStatus as uint8
-    #: (n,) number of the fluoroscope whose ray was dropped as false, else -1
+    #: (n,) index of the fluoroscope whose ray was dropped as false, else -1
     dropped_view: NDArray[np.int64]
 
     @property
@@ -100,8 +100,8 @@ class IntersectedPoints:
 class _Solution:
     """Least-squares solution of n points.
 
-    failed (n,): the rays have no intersection; by_rig (n,): part of the expected square of the
-    lack of fit that is by the orientation of the rig.
+    failed (n,): whether the rays have no intersection. by_rig (n,): part of the expected squared
+    lack of fit that is due to the orientation of the rig.
     """
 
     xyz: NDArray[np.float64]
@@ -117,10 +117,10 @@ class Intersector:
     """Intersection of rays for one RigOrientation, built once for all frames.
 
     orientation: of two or more fluoroscopes. reject: standardised epipolar distance above which
-    two rays do not belong together; None: accept all; with more rays the limit is the quantile of
-    chi-square of the same probability, and a ray is dropped if the others agree without it; where
-    the points of a recording are seen to scatter more than stated, it is wider. Raises DataError
-    for a rig of one fluoroscope, ValueError if reject is not above 0.
+    two rays do not belong together; None accepts all. With more rays, the limit is the chi-square
+    quantile of the same probability, and a ray is dropped if the others agree without it. If the
+    points of a recording scatter more than stated, the limit is wider. Raises DataError for a rig
+    of one fluoroscope, and ValueError if reject is not above 0.
     """
 
     def __init__(self, orientation: RigOrientation, reject: float | None = 4.0) -> None:
@@ -167,19 +167,19 @@ class Intersector:
         Parameters
         ----------
         uv : array_like
-            (F, n, 2), corrected pixels in the order of the orientation's fluoroscopes, NaN where
-            a fluoroscope does not see a point.
+            (F, n, 2), corrected pixels in the order of the orientation's fluoroscopes, NaN where a
+            fluoroscope does not see a point.
         sigma : array_like
-            (F, n), standard deviations of their coordinates [px].
+            (F, n), standard deviations of the coordinates [px].
         outside : array_like, optional
             (F, n), True for image points beyond the calibrated area.
         scatter : ObservedScatter, optional
-            Scatter of the recording, which these points add to. It widens the limit.
+            Scatter of the recording, which is updated with these points. It widens the limit.
 
         Raises
         ------
         ValueError
-            For arrays of other shapes. Values of the points never raise; see PointStatus.
+            For arrays of unexpected shape. Values of the points never raise; see PointStatus.
         """
         uv = np.asarray(uv, dtype=float)
         sigma = np.asarray(sigma, dtype=float)
@@ -203,10 +203,10 @@ class Intersector:
     def _intersect(
         self, uv: NDArray[np.float64], weight: NDArray[np.float64], scatter: ObservedScatter | None
     ) -> IntersectedPoints:
-        """Intersect image points uv (n, F, 2) of weights (n, F) [1/px^2], NaN where unseen."""
+        """Intersect image points uv (n, F, 2), weights (n, F) [1/px^2], both NaN where unseen."""
         seen = np.isfinite(uv.sum(axis=2) + weight)
         rays = seen.sum(axis=1)
-        if rays.min(initial=self._count) == self._count:  # the usual frame: nothing to mask
+        if rays.min(initial=self._count) == self._count:  # the usual frame needs no masks
             return self._classified(uv, weight, rays, self._solve(uv, weight, rays), scatter)
         uv = np.where(seen[:, :, None], uv, 0.0)
         weight = np.where(seen, weight, 0.0)
@@ -225,7 +225,7 @@ class Intersector:
     ) -> _Solution:
         """Solve for the points of image points uv (n, F, 2).
 
-        Weights (n, F) [1/px^2] are 0 where a point is unseen; rays (n,) is their number.
+        weight (n, F) [1/px^2]: 0 where a point is unseen. rays (n,): number of rays.
         """
         n, count = weight.shape
         flat = np.repeat(weight, 2, axis=1)[:, :, None]
@@ -244,7 +244,7 @@ class Intersector:
             inverse, determinant = _inverse(weighted @ a)
             step = inverse @ right
             xyz = xyz + step[:, :, 0]
-            # NaN, of rays that do not meet, does not keep the iteration going.
+            # NaN, for rays that do not meet, does not prolong the iteration.
             if not ((right * step).sum(axis=1) > MAX_LAST_STEP).any():
                 break
         r = r - a @ step
@@ -267,10 +267,10 @@ class Intersector:
         )
 
     def _start(self, uv: NDArray[np.float64], flat: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Linear solution (n, 3) for image points uv (n, F, 2).
+        """Return the linear solution (n, 3) for image points uv (n, F, 2).
 
-        flat (n, 2F, 1): weights of the coordinates. It solves (P_1 - u P_3) (X, 1) = 0, and the
-        same for v, with the projection matrices scaled so that a point where the axes meet has
+        flat (n, 2F, 1): weights of the coordinates. It solves (P_1 - u P_3) (X, 1) = 0, and
+        likewise for v, with the projection matrices scaled so that a point where the axes meet has
         depth one.
         """
         rows, shift = self._start_rows
@@ -282,10 +282,10 @@ class Intersector:
     def _image_jacobian(
         self, predicted: NDArray[np.float64], depth: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Derivatives (n, 2F, 9F) of the image points by the orientation.
+        """Return derivatives (n, 2F, 9F) of the image points by the orientation.
 
-        Its unknowns are expressed by independent ones of variance one. predicted (n, F, 2) [px],
-        depth (n, F) [mm].
+        The orientation is expressed by independent unknowns of unit variance. predicted (n, F, 2)
+        [px], depth (n, F) [mm].
         """
         n, count = depth.shape
         functions = np.empty((count, n, _FUNCTIONS))
@@ -311,7 +311,7 @@ class Intersector:
         solution: _Solution,
         scatter: ObservedScatter | None,
     ) -> IntersectedPoints:
-        """Give the points of a solution their status; drop false rays where the others agree."""
+        """Assign the status to the points of a solution; drop false rays if the others agree."""
         limit = self._limit
         if scatter is not None and self.reject is not None:
             size = np.where(solution.failed, np.nan, solution.standardised) / self._median[rays]
@@ -354,12 +354,12 @@ class Intersector:
         solution: _Solution,
         limit: NDArray[np.float64],
     ) -> tuple[_Solution, NDArray[np.int64]]:
-        """Replace points of a solution by those without their false ray.
+        """Replace points of a solution by those without their false rays.
 
         Each ray of the image points uv (m, F, 2) of the points in rows (m,) is dropped in turn. If
-        the remaining rays agree in exactly one case, that is the solution. Otherwise the false ray
-        cannot be identified. limit (F + 1,): largest lack of fit by the number of rays. Returns
-        the solution and the number (m,) of the dropped fluoroscope, -1 where there is none.
+        the remaining rays agree in exactly one case, that case is the solution. Otherwise the
+        false ray cannot be identified. limit (F + 1,): maximum lack of fit by the number of rays.
+        Returns the solution and the index (m,) of the dropped fluoroscope, -1 if there is none.
         """
         m, count = weight.shape
         remaining = (weight[:, None, :] * (1 - np.eye(count))).reshape(m * count, count)
@@ -380,7 +380,7 @@ class Intersector:
 
 
 def _without_points(solution: _Solution, wrong: NDArray[np.bool_]) -> _Solution:
-    """Set coordinates and covariances of the points that are wrong (n,) to NaN."""
+    """Set coordinates and covariances of wrong points (n,) to NaN."""
     xyz = solution.xyz.copy()
     covariance = solution.covariance.copy()
     noise = solution.noise.copy()
@@ -392,7 +392,7 @@ def _without_points(solution: _Solution, wrong: NDArray[np.bool_]) -> _Solution:
 def _expanded(
     found: IntersectedPoints, enough: NDArray[np.bool_], rays: NDArray[np.int64]
 ) -> IntersectedPoints:
-    """Points of all n targets, given those that enough (n,) fluoroscopes see."""
+    """Return the points of all n targets, given those that enough (n,) fluoroscopes see."""
     n = len(enough)
     out = IntersectedPoints(
         xyz_mm=np.full((n, 3), np.nan),
@@ -410,10 +410,10 @@ def _expanded(
 
 
 def _inverse(normal: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Inverse of symmetric matrices (n, 3, 3) by cofactors.
+    """Return the inverses of symmetric matrices (n, 3, 3), computed by cofactors.
 
     Also returns their determinants (n,) over the cube of the mean of their diagonals. A singular
-    matrix gives infinite numbers, not an exception.
+    matrix yields non-finite numbers, not an exception.
     """
     flat = normal.reshape(-1, 9)
     first, second, third, fourth = (flat[:, index] for index in _COFACTORS)
@@ -424,26 +424,26 @@ def _inverse(normal: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[
 
 
 def largest_lack_of_fit(reject: float, count: int) -> NDArray[np.float64]:
-    """Largest standardised lack of fit (count + 1,) of points of 0, 1, ... rays that agree.
+    """Return the maximum standardised lack of fit (count + 1,) of points of 0, 1, ... rays.
 
     Q = r^T W r is chi-square with 2 rays - 3 degrees of freedom, and the lack of fit is the root
-    of Q over that number. Two rays have one degree of freedom, and reject is their limit.
+    of Q over this number. Two rays have one degree of freedom, and reject is their limit.
     """
     freedom = np.maximum(2.0 * np.arange(count + 1) - 3, 1)
     tail = erfc(reject / np.sqrt(2))
-    # Where the probability underflows, the degrees of freedom make no difference.
+    # If the probability underflows, the degrees of freedom make no difference.
     quantile = chdtri(freedom, tail) if tail > 1e-200 else reject**2
     return np.sqrt(quantile / freedom)
 
 
 def _medians(count: int) -> NDArray[np.float64]:
-    """Median standardised lack of fit (count + 1,) of points of 0, 1, ... rays that agree."""
+    """Return the median standardised lack of fit (count + 1,) of points of 0, 1, ... rays."""
     freedom = np.maximum(2.0 * np.arange(count + 1) - 3, 1)
     return np.sqrt(chdtri(freedom, 0.5) / freedom)
 
 
 def _depth_of_axes(orientation: RigOrientation) -> NDArray[np.float64]:
-    """Depths (F,) [mm] of the point that is nearest to the axes of all fluoroscopes."""
+    """Return the depths (F,) [mm] of the point nearest to the axes of all fluoroscopes."""
     axis = orientation.rotation[:, 2]
     across = np.eye(3) - axis[:, :, None] * axis[:, None, :]
     right = (across @ orientation.position_mm[:, :, None]).sum(axis=0)[:, 0]
@@ -453,10 +453,10 @@ def _depth_of_axes(orientation: RigOrientation) -> NDArray[np.float64]:
 
 
 def _derivative_functions(orientation: RigOrientation) -> NDArray[np.float64]:
-    """Coefficients (F, 9, 2, 9) of nine functions in the derivatives of u, v by T, w, xp, yp, c.
+    """Return coefficients (F, 9, 2, 9) of nine functions in derivatives by T, w, xp, yp, c.
 
-    The functions are 1, x, y, x^2, y^2, xy, 1/Z, x/Z and y/Z with x = X/Z and y = Y/Z, and the
-    derivatives those of the collinearity equations, multiplied out.
+    The derivatives of u and v are those of the collinearity equations, expanded. The functions are
+    1, x, y, x^2, y^2, xy, 1/Z, x/Z and y/Z with x = X/Z and y = Y/Z.
     """
     out = np.zeros((len(orientation.fluoroscopes), _FUNCTIONS, 2, ORIENTATION_SIZE))
     for k, r, c in zip(out, orientation.rotation, orientation.interior[:, 2]):
@@ -482,10 +482,10 @@ def _derivative_functions(orientation: RigOrientation) -> NDArray[np.float64]:
 def _by_independent_unknowns(
     functions: NDArray[np.float64], root: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Coefficients (F, 9, 18F) of the derivatives by independent unknowns of variance one.
+    """Return coefficients (F, 9, 18F) of derivatives by independent unknowns of unit variance.
 
-    functions (F, 9, 2, 9): coefficients by the unknowns of the orientation; root (9F, 9F): root
-    of their covariance.
+    functions (F, 9, 2, 9): coefficients by the unknowns of the orientation. root (9F, 9F): root of
+    their covariance.
     """
     count = len(functions)
     out = functions.reshape(count, 2 * _FUNCTIONS, ORIENTATION_SIZE) @ root.reshape(

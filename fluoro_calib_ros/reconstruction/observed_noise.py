@@ -1,16 +1,16 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The noise of image points without sigma, as the rays of a recording show it.
+"""Noise of image points without sigma, estimated from the rays of a recording.
 
-Where an image point has no sigma, that of the calibration is taken: of beads, as they were
-measured. Markers that another program has measured may scatter several times as much, so that true
+If image points have no sigma, that of the calibration is used, which applies to beads as they were
+measured. Markers measured by another program may scatter several times as much, so that true
 points are rejected and standard deviations are too small. Epipolar residuals of one target in
-consecutive exposures, between which it hardly moves, have the errors of the rig and of the
-correction in common, and differ by the noise alone (von Neumann, "Distribution of the ratio of the
-mean square successive difference to the variance", Annals of Mathematical Statistics 12, 1941). It
-is taken only if it also explains the residuals themselves. Noise below that of the calibration is
-not: tracks may be smoothed, and then have their errors in common.
+consecutive exposures, between which it hardly moves, share the errors of the rig and of the
+correction, and differ by the noise alone (von Neumann, "Distribution of the ratio of the mean
+square successive difference to the variance", Annals of Mathematical Statistics 12, 1941). The
+estimated noise is used only if it also explains the residuals themselves. Noise below that of the
+calibration is not used: tracks may be smoothed, and then share their errors.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ from ..photogrammetry.rig_orientation import RigOrientation
 from .epipolar import EpipolarGeometry
 from .reconstruct import corrected_view, match_views, pair_recording
 
-MAX_PAIRS = 200  # of consecutive exposures, evenly spread over a recording
+MAX_PAIRS = 200  # pairs of consecutive exposures, evenly spread over a recording
 MIN_DIFFERENCES = 30
-NEAR = 1 / 32  # of the width of an image: errors of the correction are the same at such a distance
-# Noise over that of the calibration from which it is taken: less does no harm.
+NEAR = 1 / 32  # distance within which correction errors are equal, over the image width
+# Minimum ratio to the noise of the calibration to use the estimate: less does no harm.
 MIN_FACTOR = 1.25
-# Residuals over what the noise explains, up to which nothing else need be wrong.
+# Maximum ratio of residuals to explained ones for which no other error is assumed.
 MAX_UNEXPLAINED = 1.5
 
 
@@ -45,10 +45,10 @@ class _Residuals(NamedTuple):
     """Epipolar residuals of an exposure by pair of views and target."""
 
     key: NDArray[np.int64]  # (n, 2) pair of views, target id
-    place: NDArray[np.float64]  # (n, 4) image points in both views over the widths of the images
+    place: NDArray[np.float64]  # (n, 4) image points in both views, over the image widths
     value: NDArray[np.float64]  # (n,) [px]
-    noise_sd: NDArray[np.float64]  # (n,) by the noise of the calibration [px]
-    other_sd: NDArray[np.float64]  # (n,) by correction and rig [px]
+    noise_sd: NDArray[np.float64]  # (n,) due to the noise of the calibration [px]
+    other_sd: NDArray[np.float64]  # (n,) due to correction and rig [px]
 
 
 def with_observed_noise(
@@ -58,12 +58,12 @@ def with_observed_noise(
     pairing: RecordedPairing | None = None,
     must_explain: bool = True,
 ) -> tuple[Frames, Finding | None]:
-    """Give the image points of a recording the noise that they show.
+    """Assign to the image points of a recording the noise that their rays show.
 
-    must_explain: False where rays may miss each other for another reason, too, such as a rig that
-    has changed. Returns the frames with sigma and a finding on it; or those that were given, and
-    None, where any have sigma, where they scatter as the calibration says, and where it cannot be
-    told. Raises DataError for frames that cannot be corrected.
+    must_explain: False if rays may also miss each other for another reason, such as a change of
+    the rig. Returns the frames with sigma, and a finding on it. Returns the given frames and None
+    if any have sigma, if they scatter as the calibration says, or if the noise cannot be
+    determined. Raises DataError for frames that cannot be corrected.
     """
     names = orientation.fluoroscopes
     given = [frame for name in names for frame in frames.get(name, ())]
@@ -103,24 +103,24 @@ def _finding(factor: float, calibrations: Sequence[FluoroscopeCalibration]) -> F
 
 
 def _factor(pairs: Sequence[tuple[_Residuals, _Residuals]]) -> float:
-    """Return the noise in consecutive exposures over that of the calibration, 1 where unknown."""
+    """Return the noise in consecutive exposures over the calibration's; 1 if unknown."""
     differences = np.concatenate([_differences(*pair) for pair in pairs])
     factor, count = trimmed_scale(differences / NORMAL_MEDIAN, CERTAIN / NORMAL_MEDIAN)
     if count < MIN_DIFFERENCES:
         return 1.0
-    # A residual is in two differences.
+    # Each residual enters two differences.
     chance = 1 + SURE * MEDIAN_SD / np.sqrt(count / 2)
     return factor if factor > chance else 1.0
 
 
 def _explains(factor: float, found: Sequence[_Residuals]) -> bool:
-    """Whether residuals are what noise by a factor above that of the calibration makes them."""
+    """Return whether residuals agree with noise larger by a factor than the calibration's."""
     size = [np.abs(one.value) / np.hypot(factor * one.noise_sd, one.other_sd) for one in found]
     return bool(np.median(np.concatenate(size)) <= MAX_UNEXPLAINED * NORMAL_MEDIAN)
 
 
 def _differences(one: _Residuals, other: _Residuals) -> NDArray[np.float64]:
-    """Differences (m,) of the residuals of targets that hardly move, over those of noise."""
+    """Return differences (m,) of residuals of targets that hardly move, over expected noise."""
     keys = {tuple(key): row for row, key in enumerate(other.key.tolist())}
     rows = [(i, keys[tuple(key)]) for i, key in enumerate(one.key.tolist()) if tuple(key) in keys]
     i, j = np.array(rows, dtype=int).reshape(-1, 2).T

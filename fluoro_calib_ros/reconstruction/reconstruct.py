@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""From observed image points to points in space, for single exposures and whole recordings.
+"""Reconstruct points in space from observed image points of exposures and whole recordings.
 
 A recording is processed exposure by exposure, with the functions that the live node calls, so that
-both give the same numbers.
+both yield the same numbers.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from ..photogrammetry.noise import ObservedScatter
 from ..photogrammetry.rig_orientation import RigOrientation
 from .intersection import IntersectedPoints, Intersector
 
-# Matching of the image points of one exposure that have the same target id in several views.
+# Matching of the image points of an exposure that have the same target id in several views.
 
 
 @dataclass(frozen=True)
 class CorrectedView:
     """Corrected image points of one view of an exposure."""
 
-    target_id: NDArray[np.integer]  #: (n,) each once
+    target_id: NDArray[np.integer]  #: (n,) unique
     uv: NDArray[np.float64]  #: (n, 2) corrected pixels
     #: (n,) standard deviations of the coordinates, and of the correction alone [px]
     sigma: NDArray[np.float64]
@@ -44,10 +44,10 @@ class CorrectedView:
 class MatchedViews:
     """Corrected image points of F views of an exposure, by target.
 
-    Values are NaN, and `outside` False, where a view does not see a target.
+    If a view does not see a target, values are NaN, and `outside` is False.
     """
 
-    #: (n,) ascending; or, where all views have the same ids in the same order, in that order
+    #: (n,) ascending; in the common order if all views have the same ids in the same order
     target_id: NDArray[np.integer]
     uv: NDArray[np.float64]  #: (F, n, 2) corrected pixels
     #: (F, n) standard deviations of the coordinates, and of the correction alone [px]
@@ -57,9 +57,9 @@ class MatchedViews:
 
 
 def match_views(views: Sequence[CorrectedView | None]) -> MatchedViews:
-    """Match the views of an exposure by target id; None stands for a view that is missing.
+    """Match the views of an exposure by target id; None represents a missing view.
 
-    At least one view must be there.
+    At least one view is required.
     """
     present = [view for view in views if view is not None]
     first = present[0].target_id
@@ -92,13 +92,13 @@ def match_views(views: Sequence[CorrectedView | None]) -> MatchedViews:
 
 
 def _equal(one: NDArray[np.integer], other: NDArray[np.integer]) -> bool:
-    """Whether two views have the same ids in the same order."""
+    """Return whether two views have the same ids in the same order."""
     return len(one) == len(other) and bool((one == other).all())
 
 
 @dataclass(frozen=True)
 class IntersectedViews:
-    """The matched views of an exposure and their intersected points."""
+    """Matched views of an exposure and their intersected points."""
 
     views: MatchedViews
     points: IntersectedPoints
@@ -110,28 +110,28 @@ class IntersectedViews:
 
 
 class ExposureWatch(Protocol):
-    """What examines the exposures of a reconstruction, such as a RigDriftWatch."""
+    """Protocol of an object that examines exposures, such as a RigDriftWatch."""
 
     def is_due(self, stamp_ns: int) -> bool:
-        """Whether the exposure with this stamp is to be examined."""
+        """Return whether the exposure with this stamp is to be examined."""
 
     def add_exposure(self, stamp_ns: int, exposure: IntersectedViews) -> Any:
         """Examine an exposure."""
 
     def widened(self, intersector: Intersector) -> tuple[Intersector, float]:
-        """Return the intersector of the next exposure, and what is added to sigma [px]."""
+        """Return the intersector of the next exposure, and the addition to sigma [px]."""
 
 
 @dataclass(frozen=True)
 class ReconstructedFrame:
     """Points of one exposure."""
 
-    #: those of the frame of its first fluoroscope
+    #: number and stamp of the frame of its first fluoroscope
     number: int
     stamp_ns: int
     target_id: NDArray[np.int64]  #: (n,)
     points: IntersectedPoints
-    fluoroscopes: tuple[str, ...]  #: those that have a frame of the exposure
+    fluoroscopes: tuple[str, ...]  #: fluoroscopes with a frame of the exposure
 
 
 def intersect_exposure(
@@ -142,9 +142,9 @@ def intersect_exposure(
 ) -> IntersectedViews:
     """Match and intersect the views of an exposure.
 
-    They are in the order of the orientation's fluoroscopes, None for one that is missing. scatter:
-    that of the recording, by which the limit of false matches is widened. image_sd: standard
-    deviation that is added to that of the corrections [px].
+    views: in the order of the orientation's fluoroscopes, None if missing. scatter: scatter of the
+    recording, which widens the limit of false matches. image_sd: standard deviation that is added
+    to that of the corrections [px].
     """
     matched = match_views(views)
     if image_sd:
@@ -158,7 +158,7 @@ def intersect_exposure(
 
 
 def watch_exposure(watch: ExposureWatch, stamp_ns: int, exposure: IntersectedViews) -> None:
-    """Hand an exposure to a watch, if it is due.
+    """Pass an exposure to a watch, if it is due.
 
     Image points beyond the calibrated area are omitted: the correction is extrapolated there, and
     markers that move to other places would look like a drift.
@@ -180,7 +180,7 @@ def reconstruct_exposure(
 
     exposure: frames by fluoroscope, of two or more fluoroscopes of the orientation. watch:
     examines the exposure. scatter: scatter of the recording so far. Raises DataError for an image
-    whose size is not that of the calibration, and for a repeated target.
+    whose size differs from that of the calibration, and for a repeated target.
     """
     found, present = intersect_frames(exposure, calibrations, intersector, scatter, watch)
     return ReconstructedFrame(
@@ -199,9 +199,9 @@ def intersect_frames(
     scatter: ObservedScatter | None = None,
     watch: ExposureWatch | None = None,
 ) -> tuple[IntersectedViews, list[Frame]]:
-    """Correct, match and intersect the frames of an exposure, see `reconstruct_exposure`.
+    """Correct, match and intersect the frames of an exposure; see `reconstruct_exposure`.
 
-    Also returns the frames that are there, in the order of the orientation.
+    Also returns the available frames, in the order of the orientation.
     """
     frames = [exposure.get(name) for name in intersector.orientation.fluoroscopes]
     views = [
@@ -218,7 +218,7 @@ def intersect_frames(
 
 
 def corrected_view(frame: Frame, calibration: FluoroscopeCalibration) -> CorrectedView:
-    """Correct a frame. Raises DataError for another image size, and for a repeated target."""
+    """Correct a frame. Raises DataError for a wrong image size, and for a repeated target."""
     where = f'fluoroscope {frame.fluoroscope}, frame {frame.number}'
     error = image_size_error(frame.image_size, calibration.image_size)
     error = error or repeated_target_error(frame.target_id)
@@ -250,28 +250,28 @@ def reconstruct_recording(
         Observed frames by fluoroscope.
     calibrations : mapping of str to FluoroscopeCalibration
     intersector : Intersector
-        With three or more fluoroscopes, views of an exposure may be missing.
+        With three or more fluoroscopes, some views of an exposure may be missing.
     pairing : RecordedPairing, optional
-        What the frames of an exposure have in common; by default their number.
+        Criterion by which frames belong to an exposure; by default their number.
     watch : ExposureWatch, optional
         Examines the exposures.
     scatter : ObservedScatter, optional
-        Learns the scatter of the recording, and widens the limit of false matches by it. Without
-        it there is one all the same.
+        Learns the scatter of the recording, and widens the limit of false matches accordingly. By
+        default a new one is created.
     progress : callable, optional
-        Called with the number of exposures that are reconstructed, and of all.
+        Called with the number of reconstructed exposures, and their total number.
 
     Returns
     -------
     frames : list of ReconstructedFrame
-        In the order of time.
+        In temporal order.
     unpaired : dict of str to int
-        Frames whose partners are missing, by fluoroscope.
+        Number of frames without partners, by fluoroscope.
 
     Raises
     ------
     DataError
-        As reconstruct_exposure, and where a fluoroscope of the rig has no frames.
+        As reconstruct_exposure, and if a fluoroscope of the rig has no frames.
     """
     names = intersector.orientation.fluoroscopes
     exposures, unpaired = pair_recording(frames, names, pairing or RecordedPairing())
@@ -285,7 +285,7 @@ def reconstruct_recording(
 
 
 def orientation_of_recorded(frames: Frames, orientation: RigOrientation) -> RigOrientation:
-    """Return the orientation of the recorded fluoroscopes. Raises DataError for less than two."""
+    """Return the orientation of the recorded fluoroscopes. Raises DataError for fewer than two."""
     names = [name for name in orientation.fluoroscopes if name in frames]
     if len(names) < 2:
         raise DataError(
@@ -298,9 +298,9 @@ def orientation_of_recorded(frames: Frames, orientation: RigOrientation) -> RigO
 def pair_recording(
     frames: Frames, names: Sequence[str], pairing: RecordedPairing
 ) -> tuple[list[dict[str, Frame]], dict[str, int]]:
-    """Pair the frames of a recording to exposures, in the order of time.
+    """Pair the frames of a recording into exposures, in temporal order.
 
-    Also returns the number of frames without partners by fluoroscope. Raises DataError where a
+    Also returns the number of frames without partners by fluoroscope. Raises DataError if a
     fluoroscope has no frames.
     """
     for name in names:

@@ -45,7 +45,7 @@ def set_fields(message: Any, fields: Iterable[Field], values: Mapping[str, Any])
 def values_of_fields(where: str, message: Any, fields: Iterable[Field]) -> dict[str, Any]:
     """Return the values of a record from a message.
 
-    Raises DataError, beginning with where, for sequences of impossible length.
+    Raises DataError, starting with the text `where`, for sequences of impossible length.
     """
     return {field.name: _value(where, message, field) for field in fields}
 

@@ -65,8 +65,7 @@ class ImageConverter:
     def decoded(self, message: Image | CompressedImage) -> tuple[np.ndarray, str]:
         """Return the grey image (h, w) uint8 or uint16 of a message, and its encoding.
 
-        The array shares the memory of an Image where byte order and row step allow. Raises
-        Refused.
+        The array shares the memory of an Image if byte order and row step allow. Raises Refused.
         """
         if isinstance(message, CompressedImage):
             image = self._decompress(message)

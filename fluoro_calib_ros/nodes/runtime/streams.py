@@ -321,8 +321,7 @@ class StreamReader:
         for _ in range(most):
             if self._stopping.is_set():
                 return
-            # Take bytes: when taking a message, a damaged one could not be distinguished from
-            # none.
+            # Take bytes: with messages, a damaged one could not be distinguished from none.
             received = route.handle.take_message(route.subscription.msg_type, True)
             if received is None:
                 return

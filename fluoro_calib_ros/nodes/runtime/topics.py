@@ -37,7 +37,7 @@ from ...io.bags.metadata import Definition, fields_of, known_definition, with_de
 
 # Discovery of topics, and waiting for readers.
 
-# Time for readers to discover a publisher that has discovered them: several times as measured.
+# Time for readers to discover a publisher that discovered them: several times the measured one.
 SETTLING_S = 0.3
 DISCOVERY_S = 0.1  # period of the search for new topics
 
@@ -129,8 +129,7 @@ ACKNOWLEDGED_S = 10.0  # time limit for readers to acknowledge the last messages
 def wait_until_acknowledged(publishers: Iterable[Publisher], stop: threading.Event) -> bool:
     """Wait until all messages have been acknowledged; return whether they have.
 
-    Messages that are not acknowledged are lost when the process ends. Setting `stop` ends the
-    wait.
+    Unacknowledged messages are lost when the process ends. Setting `stop` ends the wait.
     """
     end = time.monotonic() + ACKNOWLEDGED_S
     for publisher in publishers:

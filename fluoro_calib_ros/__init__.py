@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def __getattr__(name: str) -> Any:
-    """Import the public interface when it is first used: a node needs only a part of it."""
+    """Import the public interface when it is first used, as a node needs only a part of it."""
     if name == '__all__' or not name.startswith('_'):
         api = import_module('.api', __name__)
         if name == '__all__':

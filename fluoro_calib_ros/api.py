@@ -155,21 +155,21 @@ def calibrate(
     Parameters
     ----------
     frames : mapping of str to sequence of Frame, or path-like
-        Exposures of the phantom by fluoroscope; or a bag or file of them, or a folder with a
-        folder of images for each fluoroscope.
+        Exposures of the phantom by fluoroscope; or a bag or file with them, or a folder with one
+        folder of images per fluoroscope.
     phantom : Phantom or path-like
-        Its survey, or the file of it.
+        The surveyed phantom, or the file of the survey.
     options : CalibrationOptions, optional
     joint : bool
-        Whether all fluoroscopes are adjusted together; else one after the other.
+        Whether all fluoroscopes are adjusted together; otherwise one after the other.
     principal_distance : float, optional
-        Start value, or with interior 'fixed' the value [px].
+        Initial value [px], or the fixed value if interior is 'fixed'.
     validated : bool
-        Whether the calibration is validated with its own exposures, which takes some six times as
+        Whether the calibration is validated with its own exposures, which takes about six times as
         long.
     progress : callable, optional
         Called after every image and round, and before every step of the validation, with a text,
-        how many of these are done and the total, which is 0 for rounds; may raise to stop.
+        the number completed and the total, which is 0 for rounds; may raise to stop.
 
     Returns
     -------
@@ -179,8 +179,8 @@ def calibrate(
     Raises
     ------
     DataError
-        For observations that do not suffice or cannot be right: place and cause in a sentence.
-        `run_calibration` calibrates these, too.
+        For observations that do not suffice or cannot be right; the message states place and
+        cause. `run_calibration` can calibrate from these, too.
     ValueError
         For options that contradict each other.
     """
@@ -213,7 +213,7 @@ def calibrate_with_known_orientations(
     frames : mapping of str to sequence of Frame
         Exposures by fluoroscope.
     phantom : Phantom
-        Targets in the frame of the lab; `MovingPoints.as_phantom` makes one of points in motion.
+        Targets in the laboratory frame; `MovingPoints.as_phantom` creates one from moving points.
     known : mapping of str to KnownOrientation
         By fluoroscope; fixed, or weighted by its standard deviations.
     options : CalibrationOptions, optional
@@ -229,7 +229,8 @@ def calibrate_with_known_orientations(
     Raises
     ------
     DataError
-        For observations that do not suffice or cannot be right: place and cause in a sentence.
+        For observations that do not suffice or cannot be right; the message states place and
+        cause.
     """
     request = CalibrationRequest(
         frames, phantom, options or CalibrationOptions(), known_orientations=known
@@ -243,7 +244,7 @@ def _frames_in(
     principal_distance: float | None,
     progress: Callable[[str, int, int], None] | None,
 ) -> Mapping[str, Sequence[Frame]]:
-    """Read the exposures of a bag or file, or find the beads of images. Raises DataError."""
+    """Read the exposures of a bag or file, or extract the beads of images. Raises DataError."""
     if not contains_images(source):
         return read_source(source, collect='auto').frames
     told = None if progress is None else partial(progress, 'image')
@@ -257,7 +258,7 @@ def _calibrated(
     validated: bool,
     progress: Callable[[str, int, int], None] | None,
 ) -> CalibrationOutcome:
-    """Run a calibration that tells its rounds as it does the steps of its validation."""
+    """Run a calibration that reports its rounds in the same way as the steps of its validation."""
 
     def tell(names: str, this: Round) -> None:
         if progress is not None:
@@ -275,8 +276,7 @@ def correct(
     """Remove the distortion from observed image points.
 
     uv (n, 2) are observed pixels, sigma (n,) their standard deviations [px], by default that of
-    the calibration. angle: of the C-arm [rad], a number or (n,), where the correction changes with
-    it.
+    the calibration. angle: of the C-arm [rad], a number or (n,), if the correction depends on it.
     """
     return calibration.correct(
         np.asarray(uv, dtype=float),

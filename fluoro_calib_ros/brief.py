@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Short representations of results, whose arrays would fill a console."""
+"""Short representations of results whose arrays would fill a console."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-MAX_ITEMS = 4  # of an array or a collection, that are shown
-MAX_TEXT = 60  # characters of a text
+MAX_ITEMS = 4  # maximum number of shown items of an array or collection
+MAX_TEXT = 60  # maximum number of shown characters of a text
 
 
 def brief_repr(result: Any) -> str:
-    """Return the representation of a dataclass: its scalars, and the sizes of what is larger."""
+    """Return the representation of a dataclass: scalars in full, larger values by their size."""
     shown = (f'{field.name}={_brief(getattr(result, field.name))}' for field in fields(result))
     return f'<{type(result).__name__} {", ".join(shown)}>'
 

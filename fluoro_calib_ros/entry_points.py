@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Console scripts of the nodes: one sentence where what they need is not installed."""
+"""Console scripts of the nodes, which print one sentence if a dependency is not installed."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from importlib import import_module
 from importlib.util import find_spec
 
 _MESSAGES = 'fluoro_calib_msgs'
-# Where the installation of a missing module is described, by its top-level name.
+# How to install a missing module, by its top-level name.
 _REMEDIES = {
     _MESSAGES: (
         'the message package is not built or not sourced: link msg_defs into the workspace '
@@ -28,12 +28,12 @@ _REMEDIES = {
     'tornado': 'the page of the dashboard needs it: pip install tornado',
 }
 
-# Modules that a user knows as a command.
+# Modules that users know by the name of a command.
 COMMANDS = {'watch': 'fluoro-calib watch'}
 
 
 def missing_module_message(program: str, module: str) -> str:
-    """Return what a user does about a missing module, in one sentence."""
+    """Return what a user can do about a missing module, in one sentence."""
     package = module.partition('.')[0]
     remedy = _REMEDIES.get(package, f'install it, for example by `pip install {package}`')
     return f'{program}: the Python module {package} is missing: {remedy}.'
@@ -42,11 +42,11 @@ def missing_module_message(program: str, module: str) -> str:
 def _run(module: str) -> None:
     """Import a module and call its main(). An interrupt during the import ends the process.
 
-    A node then ends with status 0, as it does later: launch calls anything else a node that died.
+    A node then exits with status 0, as it does later; for any other, launch reports that it died.
     """
     program = module.rpartition('.')[2]
     program = COMMANDS.get(program, program)
-    # The import takes a second: no traceback.
+    # The import takes a second; an interrupt must not print a traceback.
     if program.endswith('_node'):
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: os._exit(0))

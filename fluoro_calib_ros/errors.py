@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The exception for faults in the data, and how text of others is shown."""
+"""The exception for faults in the data, and safe display of text from files and messages."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from typing import Any
 
 from .findings import Finding, Kind, sentences
 
-MAX_MESSAGE = 800  # characters
+MAX_MESSAGE = 800  # maximum length in characters
 _ELLIPSIS = ' ... '
-_KEPT_END = 250  # characters; the cause is at the end
+_KEPT_END = 250  # characters kept at the end, where the cause is
 
 
 def printable(text: str) -> str:
-    """Return a text as one line without control characters, which are shown as escapes.
+    """Return a text as one line, with control characters shown as escapes.
 
-    Names in files and messages may hold line ends, or sequences that a terminal obeys: printed as
-    they are, they could pretend to be lines of a log.
+    Names in files and messages may contain line ends, or sequences that a terminal interprets;
+    printed unchanged, they could pretend to be lines of a log.
     """
     if text.isprintable():
         return text
@@ -28,7 +28,7 @@ def printable(text: str) -> str:
 
 
 def shortened(text: str, limit: int = MAX_MESSAGE) -> str:
-    """Return a text without its middle where it has more characters than the limit."""
+    """Return a text without its middle if it is longer than the limit in characters."""
     if len(text) <= limit:
         return text
     end = min(_KEPT_END, limit // 3)
@@ -36,7 +36,7 @@ def shortened(text: str, limit: int = MAX_MESSAGE) -> str:
 
 
 def quoted(text: str) -> str:
-    """Return what a file holds in quotation marks, as a message repeats it."""
+    """Return text from a file in quotation marks, shortened, for use in a message."""
     return repr(shortened(text, 100))
 
 
@@ -48,11 +48,11 @@ class DataError(ValueError):
     *found : Finding or object
         Anything but a Finding is the text of one: a sentence that names place and cause.
     at : object, optional
-        Where it was found, such as a path; it is put in front of the places.
+        Where it was found, such as a path; put in front of the places.
     kind : Kind
-        Of a text.
+        Kind of the Finding for a text.
     **more
-        Further fields of the Finding of a text.
+        Further fields of the Finding for a text.
 
     Attributes
     ----------
@@ -61,7 +61,7 @@ class DataError(ValueError):
 
     Notes
     -----
-    A text may quote the data: control characters are escaped, and a long message is cut.
+    A text may quote the data: control characters are escaped, and a long message is shortened.
     """
 
     def __init__(
@@ -80,12 +80,12 @@ class DataError(ValueError):
         return self.findings[0]
 
     def at(self, where: object) -> DataError:
-        """Return the error with its findings at another place, such as a path."""
+        """Return the error with a place, such as a path, in front of those of its findings."""
         return DataError(*self.findings, at=where)
 
 
 class ErrorsAt:
-    """Context in which a DataError is put at a place, such as a path."""
+    """Context manager that adds a place, such as a path, to a DataError."""
 
     def __init__(self, where: object) -> None:
         self._where = where
@@ -99,6 +99,6 @@ class ErrorsAt:
 
 
 def _shown(text: str) -> str:
-    if len(text) > MAX_MESSAGE:  # before megabytes are examined
+    if len(text) > MAX_MESSAGE:  # avoid examining megabytes
         text = shortened(text)
     return shortened(printable(text))

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the program finds, as data: kind, place, cause, advice, severity and numbers.
+"""Findings of the program as data: kind, place, cause, advice, severity and numbers.
 
-A Finding travels from where it is made to the edge (command, report, file, message), which prints
-its sentence. Whatever decides by a finding reads its kind and numbers, never the sentence.
+A Finding is passed from its origin to the output (command, report, file, message), which prints
+its sentence. Decisions based on a finding use its kind and numbers, never the sentence.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum, IntEnum
 
-MAX_LISTED = 5  # names in a sentence
+MAX_LISTED = 5  # maximum number of names in a sentence
 
 
 class Severity(IntEnum):
-    """How much a finding matters; the values are the levels of diagnostics and of DriftStatus."""
+    """Importance of a finding; the values are the levels of diagnostics and of DriftStatus."""
 
     NOTE = 0
     WARNING = 1
@@ -27,7 +27,7 @@ class Severity(IntEnum):
 class Kind(str, Enum):
     """Kind of a finding; the values are written to files and stay the same between versions."""
 
-    # Data that cannot be read or used, of no other kind.
+    # Data that cannot be read or used, if no other kind applies.
     DATA = 'data'
 
     # Checks of a verdict; the values are the names of the checks in validation.json.
@@ -90,7 +90,7 @@ class Kind(str, Enum):
     PRINCIPAL_POINT_OFF = 'principal_point_off'
     WRONG_PRINCIPAL_DISTANCE = 'wrong_principal_distance'
 
-    # A fixed calibration and other exposures.
+    # A fixed calibration applied to other exposures.
     CORRECTED_ALREADY = 'corrected_already'
     POOR_CALIBRATION_FIT = 'poor_calibration_fit'
 
@@ -102,7 +102,7 @@ class Kind(str, Enum):
     RAYS_DO_NOT_MEET = 'rays_do_not_meet'
     RIG_DEPENDS_ON_ANGLE = 'rig_depends_on_angle'
     RIG_MOVED = 'rig_moved'
-    RIG_NOTE = 'rig_note'  # one or more of these, as a file tells them
+    RIG_NOTE = 'rig_note'  # one or more of these, read from a file
     RIG_NOT_ORIENTED = 'rig_not_oriented'
 
     # Images of the phantom.
@@ -143,7 +143,7 @@ class Kind(str, Enum):
     MARKER_MIGRATED = 'marker_migrated'
     MARKERS_EXCHANGED = 'markers_exchanged'
 
-    # What has changed in a rig, and whether that is known.
+    # Changes of a rig, and how well they are identified.
     CAUSE_SURE = 'cause_sure'
     CHANGE_IDENTIFIED = 'change_identified'
     COMMON_MOTION = 'common_motion'
@@ -171,14 +171,13 @@ class Kind(str, Enum):
 
 @dataclass(frozen=True)
 class Place:
-    """What a finding is about."""
+    """Place to which a finding refers."""
 
     fluoroscopes: tuple[str, ...] = ()
-    exposures: tuple[int, ...] = ()  #: their numbers
+    exposures: tuple[int, ...] = ()  #: exposure numbers
     target_id: tuple[int, ...] = ()
     pixel: tuple[float, float] | None = None  #: (u, v)
-    #: what the place is called in a sentence; None: fluoroscopes and exposures; '': the cause
-    #: names it
+    #: name of the place in a sentence; None: fluoroscopes and exposures; '': named by the cause
     name: str | None = None
 
     @classmethod
@@ -189,7 +188,7 @@ class Place:
 
     @property
     def fluoroscope(self) -> str:
-        """The only or first fluoroscope, '' for none."""
+        """The only or first fluoroscope, '' if there is none."""
         return self.fluoroscopes[0] if self.fluoroscopes else ''
 
     def __str__(self) -> str:
@@ -199,7 +198,7 @@ class Place:
 
 @dataclass(frozen=True)
 class Finding:
-    """What was found.
+    """Result of a check or of reading data, as kind, cause and numbers.
 
     Attributes
     ----------
@@ -208,10 +207,10 @@ class Finding:
         What was found, in words.
     place : Place
     advice : str
-        What to do; '' for nothing.
+        What to do; '' if there is no advice.
     severity : Severity
     numbers : mapping of str to float
-        What was measured, by name, with the unit at the end of the name.
+        Measured values by name; the unit is at the end of the name.
     """
 
     kind: Kind
@@ -223,20 +222,20 @@ class Finding:
 
     @property
     def sentence(self) -> str:
-        """Place, cause and advice in a sentence for people."""
+        """Place, cause and advice as a sentence for people."""
         return sentence_of(self.place, self.cause, self.advice)
 
     def __str__(self) -> str:
         return self.sentence
 
     def at(self, where: object) -> Finding:
-        """Return the finding with what names its place put in front, such as a path."""
+        """Return the finding with a location, such as a path, in front of its place."""
         if not str(where):
             return self
         return replace(self, place=replace(self.place, name=sentence_of(where, self.place)))
 
     def explained_by(self, why: Finding | None) -> Finding:
-        """Return the finding at its place with the kind, cause and numbers of why, if known."""
+        """Return the finding with kind and advice of `why`, if any, both causes and numbers."""
         if why is None:
             return self
         numbers = {**self.numbers, **why.numbers}
@@ -250,12 +249,12 @@ def sentences(findings: Iterable[Finding], severity: Severity | None = None) -> 
 
 
 def sentence_of(*parts: object) -> str:
-    """Return place, cause and advice as a sentence, without those that are empty."""
+    """Return place, cause and advice as a sentence, without empty parts."""
     return ': '.join(filter(None, map(str, parts)))
 
 
 def first_few(names: Iterable[object], separator: str = ', ') -> str:
-    """Return the first of some names as text, and how many there are further."""
+    """Return the first few names as text, and how many more there are."""
     texts = list(map(str, names))
     first = separator.join(texts[:MAX_LISTED])
     further = len(texts) - MAX_LISTED
@@ -263,7 +262,7 @@ def first_few(names: Iterable[object], separator: str = ', ') -> str:
 
 
 def _named(noun: str, things: tuple[object, ...]) -> str:
-    """Return things with their noun, '' for none."""
+    """Return things with their noun, '' if there are none."""
     *others, last = map(str, things) if things else ('',)
     both = f'{", ".join(others)} and {last}' if others else last
     return f'{noun}{"s" * bool(others)} {both}' if things else ''

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Options: each declared once, with its default, choices, range, unit and description.
+"""Options, each declared once with its default, choices, range, unit and description.
 
 A frozen dataclass declares its fields by `option`. The command line, the parameters of the nodes,
-config/ and docs/ are made from `declared`, or tested against it.
+config/ and docs/ are generated from `declared`, or tested against it.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ class Option:
     description : str
         One phrase, without unit, range and choices.
     choices : tuple of str
-        Empty where any value in the range is allowed.
+        Empty if any value in the range is allowed.
     minimum, maximum : float or None
-        Range, both ends included.
+        Range, including both ends.
     unit : str
-        Such as 's' or 'px'; empty for a number without one.
+        Such as 's' or 'px'; empty for a number without a unit.
     length : int or None
         Number of components of a tuple.
     """
@@ -53,7 +53,7 @@ class Option:
         return f'{self.description}{unit}{choices}'
 
     def validate(self, value: Any) -> None:
-        """Raise ValueError, beginning with the name of the option, for a value it cannot have."""
+        """Raise ValueError, starting with the name of the option, for an invalid value."""
         if self.choices:
             if value not in self.choices:
                 raise ValueError(f'{self.name} is one of {", ".join(self.choices)}, not {value!r}')
@@ -65,7 +65,7 @@ class Option:
     def _in_range(self, value: float) -> bool:
         above = self.minimum is None or value >= self.minimum
         below = self.maximum is None or value <= self.maximum
-        return bool(above and below)  # NaN is neither
+        return bool(above and below)  # False for NaN
 
     def _range(self) -> str:
         if self.minimum is None:
@@ -87,8 +87,8 @@ def option(
 ) -> Any:
     """Declare a field of an options dataclass; see `Option` for the arguments.
 
-    choices may be a function, which is called whenever the options are declared: a registry that
-    grows is then always up to date.
+    choices may be a function, which is called whenever the options are declared, so that a growing
+    registry is always up to date.
     """
     declaration = {
         'description': description,
@@ -114,7 +114,7 @@ def declared(options: type | object) -> dict[str, Option]:
 
 
 def validate_options(options: object, except_for: Collection[str] = ()) -> None:
-    """Raise ValueError for the first option of an instance with a value it cannot have.
+    """Raise ValueError for the first option of an instance with an invalid value.
 
     except_for: names of options that are validated elsewhere.
     """

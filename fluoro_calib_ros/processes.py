@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Work in processes of their own: started, watched, limited and ended in one way.
+"""Work in separate processes, which are started, watched, limited and ended in a uniform way.
 
-A `WorkerProcess` calls a function in another process, call after call; `LentArrays` gives it large
-arrays without pickling them; `run_module` runs a module as a program. Either process ends with the
-one that has started it, however that ends. `Programs` run beside it, and are interrupted at its
-end.
+A `WorkerProcess` calls a function in another process, call after call; `LentArrays` passes large
+arrays to it without pickling them; `run_module` runs a module as a program. Both processes end
+with the one that started them, however that ends. `Programs` run alongside, and are interrupted
+when their context ends.
 """
 
 from __future__ import annotations
@@ -40,36 +40,36 @@ from .limits import ReadLimits, read_limits, use_read_limits
 
 Started = TypeVar('Started', bound='Programs')
 
-PARENT_POLL_S = 0.5  # interval at which a process looks whether its caller is alive
-CANCEL_POLL_S = 0.05  # interval at which a call may be cancelled
-END_S = 1.0  # in which a process that has closed its connection ends
-PROGRAM_END_S = 5  # in which a program ends that was interrupted
+PARENT_POLL_S = 0.5  # interval at which a process checks whether its caller is alive
+CANCEL_POLL_S = 0.05  # interval at which a call can be cancelled
+END_S = 1.0  # time limit for a process to end after closing its connection
+PROGRAM_END_S = 5  # time limit for a program to end after an interrupt
 
 
 @dataclass(frozen=True)
 class Resources:
-    """What a process may use of the machine."""
+    """Resources of the machine that a process may use."""
 
-    nice: int = 0  #: by how much its priority is lowered
+    nice: int = 0  #: decrease of its priority
     one_core: bool = True  #: whether its libraries use a single thread each
 
 
 OF_STREAM = Resources(nice=5)  # lower priority than the nodes, which must not wait for images
-OF_JOB = Resources(nice=10, one_core=False)  # lower than all that is live
+OF_JOB = Resources(nice=10, one_core=False)  # lower priority than all live processing
 
 
 class ProcessEnded(RuntimeError):
-    """A process has ended during a call."""
+    """Raised when a process has ended during a call."""
 
 
 class WorkerProcess:
     """Calls a function in another process, call after call.
 
-    One thread calls it, any may close it. After its process has ended, the next call starts a new
-    one. Interrupts from the keyboard do not reach the process.
+    One thread calls it; any thread may close it. After its process has ended, the next call starts
+    a new one. Keyboard interrupts do not reach the process.
 
-    make: returns the function, in the process; it can be pickled. what: what it is, for errors:
-    'the process of ...'.
+    make: picklable; returns the function, in the process. what: description of the process for
+    error messages: 'the process of ...'.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class WorkerProcess:
                 return
             context = multiprocessing.get_context('spawn')  # a fork would copy locks of threads
             self._connection, other = context.Pipe()
-            # Arguments arrive in their order: the watch before those that import modules.
+            # Arguments are unpickled in order: the watch before those that import modules.
             arguments = (_ParentWatch(), read_limits(), self._resources, other, self._make)
             self._process = context.Process(target=_serve, daemon=True, args=arguments)
             with interrupts_blocked():
@@ -108,16 +108,16 @@ class WorkerProcess:
     ) -> Any:
         """Return the result of a call.
 
-        The arguments can be pickled. progress is given to the function as such: what is called
-        there is called here. raise_if_cancelled is called again and again; where it raises, the
-        process is ended. Raises ValueError and OSError where the function does, which a user can
-        cause, RuntimeError where it fails otherwise, and ProcessEnded where the process ends.
+        The arguments must be picklable. If progress is given, the function receives a progress
+        argument whose calls are forwarded to it. raise_if_cancelled is called repeatedly; if it
+        raises, the process is ended. Raises ValueError and OSError, which users can cause, if the
+        function does; RuntimeError if it fails otherwise; and ProcessEnded if the process ends.
         """
         self.send(*arguments, progress=progress is not None)
         return self.receive(progress, raise_if_cancelled)
 
     def send(self, *arguments: Any, progress: bool = False) -> None:
-        """Begin a call; its result is received before the next one. Raises ProcessEnded."""
+        """Start a call, whose result must be received before the next one. Raises ProcessEnded."""
         self.start()
         pickled = _Pieces()
         ForkingPickler(pickled, pickle.HIGHEST_PROTOCOL).dump((arguments, progress))
@@ -131,7 +131,7 @@ class WorkerProcess:
         progress: Callable[..., None] | None = None,
         raise_if_cancelled: Callable[[], None] | None = None,
     ) -> Any:
-        """Return the result of the call that was begun; errors are those of a call."""
+        """Return the result of the call that was started; errors are those of a call."""
         connection = self._open_connection()
         try:
             while True:
@@ -144,7 +144,7 @@ class WorkerProcess:
                     break
                 if progress is not None:
                     progress(*message.arguments)
-        except BaseException:  # cancelled, or interrupted: the process is still at work
+        except BaseException:  # cancelled or interrupted: the process is still working
             self._end(0)
             raise
         if not isinstance(message, _Failure):
@@ -162,7 +162,7 @@ class WorkerProcess:
             self._raise_ended()
 
     def close(self) -> None:
-        """End the process, also during a call, which then raises RuntimeError."""
+        """End the process, even during a call, which then raises RuntimeError."""
         self._closed = True
         self._end(0)
 
@@ -173,12 +173,12 @@ class WorkerProcess:
         return connection
 
     def _raise_ended(self) -> NoReturn:
-        """Clear up after a process that has ended by itself."""
+        """Clean up after a process that has ended by itself, and raise ProcessEnded."""
         status = self._end(END_S)
         raise ProcessEnded(f'{self._what} ended with status {status}') from None
 
     def _end(self, patience_s: float) -> int | None:
-        """End the process, by force where it does not end itself; returns its exit status."""
+        """End the process, by force if it does not end by itself; return its exit status."""
         with self._lock:
             process = self._process
             self._process = None
@@ -192,9 +192,9 @@ class WorkerProcess:
 
 
 class _Pieces:
-    """File of a pickler, which hands over pieces of 64 kB; other threads run in between.
+    """File for a pickler, which writes pieces of 64 kB, so that other threads run in between.
 
-    Thousands of frames take 0.15 s, for which an input that waits in another thread loses frames.
+    Pickling thousands of frames takes 0.15 s, in which an input in another thread loses frames.
     """
 
     def __init__(self) -> None:
@@ -212,8 +212,8 @@ def in_worker_process(
 ) -> Any:
     """Return the result of one call of a function in a process with the resources of a job.
 
-    The function is one of a module, or 'module:function' of this package, which only the process
-    imports. Errors are those of a call of a WorkerProcess.
+    The function belongs to a module, or is given as 'module:function' of this package, which only
+    the process imports. Errors are those of a call of a WorkerProcess.
     """
     process = WorkerProcess(partial(_given, function), 'the worker process', OF_JOB)
     try:
@@ -233,15 +233,15 @@ def _given(function: Callable[..., Any] | str) -> Callable[..., Any]:
 class LentArrays:
     """Shared memory for arrays that are arguments of a WorkerProcess.
 
-    Each slot holds one array, which is read-only in the process, until the slot is filled again:
-    after the call that has used it.
+    Each slot contains one array, which is read-only in the process. A slot may only be filled
+    again after the call that used it.
     """
 
     def __init__(self) -> None:
         self._blocks: dict[str, SharedMemory] = {}
 
     def lend(self, slot: str, array: np.ndarray) -> Any:
-        """Copy an array into a slot; returns what arrives in a process as that array."""
+        """Copy an array into a slot; return the argument that a process receives as this array."""
         block = self._blocks.get(slot)
         if block is None or block.size < array.nbytes:
             self._release(slot)
@@ -250,7 +250,7 @@ class LentArrays:
         return _Lent(block.name, array.shape, array.dtype.str)
 
     def close(self) -> None:
-        """Give the memory back; the process keeps its own until it ends."""
+        """Free the memory; the process keeps its mapping until it ends."""
         for slot in tuple(self._blocks):
             self._release(slot)
 
@@ -263,7 +263,7 @@ class LentArrays:
 
 @dataclass(frozen=True)
 class _Lent:
-    """An array in shared memory, as it is sent."""
+    """Array in shared memory, in the form that is sent."""
 
     name: str
     shape: tuple[int, ...]
@@ -273,11 +273,11 @@ class _Lent:
         return _borrowed, (self.name, self.shape, self.dtype)
 
 
-_borrowed_blocks: dict[str, SharedMemory] = {}  # of this process, by name
+_borrowed_blocks: dict[str, SharedMemory] = {}  # blocks in use by this process, by name
 
 
 def _borrowed(name: str, shape: tuple[int, ...], dtype: str) -> np.ndarray:
-    """Return an array that the caller of this process has lent."""
+    """Return an array lent by the caller of this process."""
     if name not in _borrowed_blocks:
         _borrowed_blocks[name] = SharedMemory(name)
     array: np.ndarray = np.ndarray(shape, dtype, _borrowed_blocks[name].buf)
@@ -294,7 +294,7 @@ class _Progress:
 
 @dataclass(frozen=True)
 class _Failure:
-    """What a function has raised, and where."""
+    """Exception raised by a function, and its traceback."""
 
     error: ValueError | OSError | None  #: to be raised again; None for a bug
     text: str
@@ -308,7 +308,7 @@ def _serve(
     connection: Connection,
     make: Callable[[], Callable[..., Any]],
 ) -> None:
-    """Answer calls until the caller has closed the connection or has died."""
+    """Answer calls until the caller has closed the connection or died."""
     use_read_limits(limits)
     os.nice(resources.nice)
     with ExitStack() as stack:
@@ -325,7 +325,7 @@ def _serve(
 def _answer(
     function: Callable[..., Any], arguments: tuple[Any, ...], keywords: dict[str, Any]
 ) -> Any:
-    """Return the result of a function, or its _Failure: this call is lost, the next one is not."""
+    """Return the result of a function, or a _Failure, so that later calls are still answered."""
     try:
         return function(*arguments, **keywords)
     except BrokenPipeError:
@@ -336,9 +336,9 @@ def _answer(
 
 
 def _portable(error: Exception) -> ValueError | OSError | None:
-    """Return an error that survives the way to the caller, None for one that means a bug.
+    """Return an error that can be sent to the caller, or None for an error that indicates a bug.
 
-    Errors of other packages may have arguments of their own, by which they cannot be made anew.
+    Errors of other packages may have special arguments, so that they cannot be recreated.
     """
     if isinstance(error, DataError):
         return error
@@ -351,7 +351,7 @@ def _portable(error: Exception) -> ValueError | OSError | None:
 
 @contextmanager
 def one_core() -> Iterator[None]:
-    """Let the libraries of this process use a single thread each: others work beside it."""
+    """Restrict the libraries of this process to one thread each, as others work in parallel."""
     import cv2
     from threadpoolctl import threadpool_limits
 
@@ -362,12 +362,12 @@ def one_core() -> Iterator[None]:
 
 @contextmanager
 def interrupts_blocked() -> Iterator[None]:
-    """Keep interrupts from the keyboard from the processes that are started meanwhile.
+    """Block keyboard interrupts in the processes that are started in this context.
 
-    They inherit the mask of the calling thread: an interrupt only reaches the caller, which ends
-    them.
+    They inherit the signal mask of the calling thread: an interrupt only reaches the caller, which
+    ends them.
     """
-    resource_tracker.ensure_running()  # unblocks interrupts when it is started
+    resource_tracker.ensure_running()  # starting it unblocks interrupts
     masked = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     try:
         yield
@@ -376,9 +376,9 @@ def interrupts_blocked() -> Iterator[None]:
 
 
 class _ParentWatch:
-    """Argument of a process that begins to watch the parent where it arrives.
+    """Argument of a process that starts to watch the parent when it is unpickled.
 
-    That is before the process imports the modules of the arguments behind it, which takes seconds
+    That happens before the process imports the modules of the later arguments, which takes seconds
     on a busy machine.
     """
 
@@ -387,7 +387,7 @@ class _ParentWatch:
 
 
 def watch_parent(parent: int) -> None:
-    """End this process with its parent, from a thread of its own."""
+    """End this process with its parent, from a dedicated thread."""
 
     def watch() -> None:
         while os.getppid() == parent:
@@ -398,9 +398,9 @@ def watch_parent(parent: int) -> None:
 
 
 class Programs:
-    """Modules that run as programs, and end together: a context manager.
+    """Context manager for modules that run as programs and end together.
 
-    Each has a session of its own: an interrupt from the keyboard reaches it from here, in order.
+    Each has its own session, so that keyboard interrupts reach it only from here, in order.
     """
 
     def __init__(self) -> None:
@@ -409,7 +409,7 @@ class Programs:
     def run(
         self, name: str, *arguments: str, log: Path, out: Path | None = None
     ) -> subprocess.Popen[Any]:
-        """Start a module, whose output is added to a file; returns its process.
+        """Start a module and append its output to a file; return its process.
 
         out: file of its standard output, by default the log.
         """
@@ -442,14 +442,14 @@ class Programs:
 
 
 def run_module(name: str, *arguments: str, timeout_s: float) -> subprocess.CompletedProcess[bytes]:
-    """Run a module of the package as a program, which does not import that of its caller.
+    """Run a module of the package as a program, without importing the caller's main module.
 
-    The program calls watch_parent(). Raises TimeoutError.
+    The program must call watch_parent(). Raises TimeoutError.
     """
     root = str(Path(__file__).resolve().parents[1])
     environment = {
         **os.environ,
-        'OPENBLAS_NUM_THREADS': '1',  # each takes address space
+        'OPENBLAS_NUM_THREADS': '1',  # each thread takes address space
         'PYTHONPATH': os.pathsep.join(filter(None, [root, os.environ.get('PYTHONPATH')])),
     }
     try:

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The job of the bodies: shapes, poses and joints from a recording of markers, and films."""
+"""The bodies job: shapes, poses and joints from a recording of markers, and films."""
 
 from __future__ import annotations
 
@@ -52,17 +52,17 @@ from ..reconstruction.reconstruct import (
 )
 from .image_sources import fluoroscope_folders, is_image_bag, open_sources
 
-FILM_HZ = 25.0  # slow motion: players show no 250 images a second
+FILM_HZ = 25.0  # slow motion, because players cannot show 250 images per second
 
 
 @dataclass(frozen=True)
 class Film:
-    """What films are made of."""
+    """Input data of films."""
 
-    source: Path  #: bag of images, or folder with a folder for each fluoroscope
+    source: Path  #: bag of images, or folder with one folder per fluoroscope
     calibrations: Calibrations
-    orientation: RigOrientation  #: of the fluoroscopes of the recording
-    #: called after each image with the number of those read of a fluoroscope, and their total
+    orientation: RigOrientation  #: orientation of the fluoroscopes of the recording
+    #: called after each image of a fluoroscope with the numbers of images read and in total
     progress: Callable[[int, int], None] | None = None
 
 
@@ -71,7 +71,7 @@ def write_films(
 ) -> None:
     """Write folder/film_<fluoroscope>.mp4 of the exposures that have an image.
 
-    Raises DataError for images that cannot be read, or are of other exposures.
+    Raises DataError for images that cannot be read, or belong to other exposures.
     """
     folders = fluoroscope_folders(film.source)
     if not folders and not is_image_bag(film.source):
@@ -94,7 +94,7 @@ def write_films(
 def _frames(
     source: Path, film: Film, name: str, bodies: Sequence[Body], poses: Sequence[BodyPoses]
 ) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield the pictures of a fluoroscope. Raises DataError for an image that cannot be read."""
+    """Yield the film pictures of a fluoroscope. Raises DataError for an unreadable image."""
     rows = {number: row for row, number in enumerate(poses[0].number.tolist())}
     for image in open_sources([source], name).counted(film.progress):
         if isinstance(image.image, DataError):
@@ -112,7 +112,7 @@ def _frames(
 def _view(
     body: Body, pose: BodyPoses, orientation: RigOrientation, calibration: FluoroscopeCalibration
 ) -> BodyView:
-    """Return a body where it is in the observed image of a fluoroscope."""
+    """Return a body at its position in the observed image of a fluoroscope."""
     row = orientation.fluoroscopes.index(calibration.fluoroscope)
     ends = body.centre + np.vstack([np.zeros(3), AXIS_MM * np.eye(3)])
     points = np.vstack([body.xyz_mm, ends]) @ pose.rotation[0].T + pose.position_mm[0]
@@ -133,15 +133,15 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SMOOTH = ('auto', 'none', 'lag', 'butterworth')
-SHAPE_EXPOSURES = 600  # of a recording that shapes are estimated from, evenly spread
+SHAPE_EXPOSURES = 600  # maximum number, evenly spread over a recording, used to estimate shapes
 
 
 @dataclass(frozen=True)
 class BodiesOptions(RecordedPairing):
-    """Options of poses and joints. Raises ValueError for a value that an option cannot have.
+    """Options of poses and joints. Raises ValueError for an invalid value.
 
-    neutral: frames by fluoroscope of another recording with all joints in neutral position, in
-    place of the exposures that the joints name.
+    neutral: frames by fluoroscope of another recording with all joints in neutral position, which
+    replaces the exposures named by the joints.
     """
 
     smooth: str = option(
@@ -176,15 +176,15 @@ class BodiesOutcome:
     ----------
     shapes : tuple of EstimatedShape
     exposures : list of TrackedExposure
-        In the order of time, of the centres of the markers.
+        Tracked poses of the marker centres, ordered by time.
     poses : list of BodyPoses
-        A body each.
+        One entry per body.
     joints : list of JointMotion
     unpaired : mapping of str to int
-        Frames without partner, by fluoroscope.
+        Number of frames without partner, by fluoroscope.
     findings : tuple of Finding
     noise : Finding or None
-        Set where image points have no sigma, and their rays show more noise than the calibration.
+        Set if image points have no sigma and their rays show more noise than the calibration.
     """
 
     __repr__ = brief_repr
@@ -199,11 +199,11 @@ class BodiesOutcome:
 
     @property
     def bodies(self) -> tuple[Body, ...]:
-        """The bodies with their estimated shapes."""
+        """Bodies with their estimated shapes."""
         return tuple(shape.body for shape in self.shapes)
 
     def tables(self) -> dict[str, Table]:
-        """Return poses, motion, shapes and joints, by the names of their files."""
+        """Return tables of poses, motion, shapes and joints, by file name."""
         start_ns = int(self.exposures[0].stamp_ns)
         tables = {
             POSES: pose_table(self.poses, start_ns),
@@ -215,14 +215,14 @@ class BodiesOutcome:
     def to_dataframe(self, name: str = 'poses') -> pandas.DataFrame:
         """Return poses, motion, joints or shapes as a pandas DataFrame, as in their CSV files.
 
-        Raises DataError for another name, and where pandas is not installed.
+        Raises DataError for another name, and if pandas is not installed.
         """
         return dataframe_of(self.tables(), name)
 
     def plot(self, name: str | None = None) -> Figure:
-        """Return a matplotlib figure of a joint or a body, or else of all paths in space.
+        """Return a matplotlib figure of a joint or body; without a name, of all paths in space.
 
-        Raises DataError for a name that is none of them.
+        Raises DataError for an unknown name.
         """
         from ..report.motion import body_figure, joint_figure, paths_figure
 
@@ -238,7 +238,7 @@ class BodiesOutcome:
         raise DataError(f'no joint or body is named {name!r}, but {", ".join(names)}')
 
     def summary(self) -> dict[str, Any]:
-        """How well bodies and joints are known: medians of standard deviations."""
+        """Return the quality of bodies and joints, with median standard deviations."""
         bodies: dict[str, Any] = {}
         for poses, shape in zip(self.poses, self.shapes):
             known = poses.known
@@ -281,12 +281,12 @@ def track_bodies(
         By fluoroscope.
     calibrations : mapping of str to FluoroscopeCalibration
     orientation : RigOrientation
-        That they belong to.
+        Orientation to which the calibrations belong.
     bodies : sequence of Body
     joints : sequence of JointEntry
     options : BodiesOptions, optional
     progress : callable, optional
-        Called with the number of steps that are done, and of all: two for each exposure.
+        Called with the number of completed steps and their total, which is two per exposure.
 
     Raises
     ------
@@ -338,23 +338,23 @@ def track_bodies(
 
 @dataclass(frozen=True)
 class IntersectedExposure:
-    """An exposure of a recording, and its points in space."""
+    """Exposure of a recording with its points in space."""
 
     number: int
     stamp_ns: int
     views: IntersectedViews
-    orientation: RigOrientation  #: with what an alarm of the drift watch adds to its covariance
+    orientation: RigOrientation  #: with the covariance widened after a drift alarm
 
 
 @dataclass(frozen=True)
 class IntersectedRecording:
-    """The exposures of a recording, and what is known of it."""
+    """Intersected exposures of a recording, and related results."""
 
     exposures: list[IntersectedExposure]
     sides: NDArray[np.float64]  #: (F,) longer sides of the images [px]
-    unpaired: Mapping[str, int]  #: frames without partner, by fluoroscope
-    drift: DriftVerdict  #: what the drift watch says
-    noise: Finding | None  #: on image points without sigma, where they are not as precise as beads
+    unpaired: Mapping[str, int]  #: number of frames without partner, by fluoroscope
+    drift: DriftVerdict  #: verdict of the drift watch
+    noise: Finding | None  #: set if image points without sigma are less precise than beads
 
 
 def intersected(
@@ -396,7 +396,7 @@ def intersected(
 def estimated_shapes(
     bodies: Sequence[Body], recording: IntersectedRecording
 ) -> list[EstimatedShape]:
-    """Estimate the shapes of bodies from exposures that are spread over the recording."""
+    """Estimate the shapes of bodies from exposures spread evenly over the recording."""
     exposures = recording.exposures
     rows = np.unique(np.linspace(0, len(exposures) - 1, SHAPE_EXPOSURES).astype(int))
     chosen = [exposures[row].views for row in rows]
@@ -408,7 +408,7 @@ def estimated_shapes(
 def _split(
     exposure: IntersectedViews, sides: NDArray[np.float64]
 ) -> dict[str, NDArray[np.float64]]:
-    """Points of an exposure with the covariances of noise, and of the corrections.
+    """Return the points of an exposure with separate covariances of noise and corrections.
 
     sides (F,): longer sides of the images [px].
     """
@@ -430,7 +430,7 @@ def _split(
 def _poses(
     bodies: Sequence[Body], tracked: Sequence[TrackedExposure], options: BodiesOptions
 ) -> list[BodyPoses]:
-    """Poses of the frames of the bodies, smoothed as the options say."""
+    """Return the poses of the frames of the bodies, smoothed according to the options."""
     if options.smooth in ('auto', 'lag'):
         return poses_of(bodies, tracked)
     alone = poses_alone(bodies, tracked)
@@ -446,7 +446,7 @@ def _poses_alone(
     bodies: Sequence[Body],
     options: BodiesOptions,
 ) -> list[BodyPoses]:
-    """Poses that the exposures of another recording give alone. Raises DataError."""
+    """Return the unsmoothed poses in another recording. Raises DataError."""
     exposures = intersected(frames, calibrations, orientation, options).exposures
     tracker = BodyTracker(orientation, bodies, options.reject)
     tracked = [tracker.add(one.views, one.number, one.stamp_ns) for one in exposures]
@@ -456,7 +456,7 @@ def _poses_alone(
 def _joints(
     requests: Sequence[JointEntry], poses: Sequence[BodyPoses], at_rest: Sequence[BodyPoses]
 ) -> list[JointMotion]:
-    """Motion of joints, with their neutral position by the poses at rest. Raises DataError."""
+    """Return the motion of joints; poses at rest give neutral positions. Raises DataError."""
     by_name = {one.body: one for one in poses}
     neutral = {one.body: one for one in at_rest}
     out = []
@@ -483,7 +483,7 @@ def _unseen(poses: BodyPoses) -> Finding:
     )
 
 
-# The folder with the bodies of a recording.
+# Result folder of the bodies of a recording.
 
 POSES = 'poses.csv'
 MOTION = 'motion.csv'
@@ -501,7 +501,7 @@ BODIES_FOLDER = FolderKind(
 def save_bodies(
     directory: PathLike, outcome: BodiesOutcome, report: bool = False, film: Film | None = None
 ) -> None:
-    """Write poses, motion, shapes and joints, all or nothing; with report and films on request.
+    """Write poses, motion, shapes and joints, all or nothing; report and films on request.
 
     Raises DataError.
     """
@@ -528,6 +528,6 @@ def save_bodies(
 
 
 def _some_exposure_has_all(joints: Sequence[JointMotion]) -> bool:
-    """Return whether the motion of all joints is known in an exposure, as OpenSim needs it."""
+    """Return whether some exposure has the motion of all joints, as OpenSim requires."""
     known = [np.isfinite(motion.angles).all(axis=1) for motion in joints]
     return bool(known) and bool(np.all(known, axis=0).any())

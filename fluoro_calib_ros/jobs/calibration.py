@@ -4,7 +4,7 @@
 """The calibration job: self-calibrate, orient the rig, validate.
 
 The command line, the calibration node, its worker process and Python users all call
-`run_calibration`; `result_folder.save_outcome` writes what it returns.
+`run_calibration`; `result_folder.save_outcome` writes its outcome.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ if TYPE_CHECKING:
     import pandas
     from matplotlib.figure import Figure
 
-# The adjustment job: adjust exposures with calibrations fixed, an out-of-sample test.
+# The adjustment job: adjust exposures with fixed calibrations, as an out-of-sample test.
 
 
 def adjust(
@@ -63,7 +63,7 @@ def adjust(
 ) -> CalibrationResult:
     """Adjust exposures of the phantom with interior orientations and corrections fixed.
 
-    A few image points that are off the image, or not of the phantom, are excluded.
+    A few image points that are off the image, or do not belong to the phantom, are excluded.
 
     Parameters
     ----------
@@ -77,13 +77,13 @@ def adjust(
     Returns
     -------
     CalibrationResult
-        Its findings of severity ERROR say where the exposures do not fit the calibrations.
+        Its findings of severity ERROR state where the exposures do not fit the calibrations.
 
     Raises
     ------
     DataError
         For a missing calibration, and for frames that do not suffice, cannot be of the phantom, or
-        are corrected already.
+        are already corrected.
     """
     used = select_calibrations(calibrations, frames)
     cleaned, strays = frames_without_strays(frames, phantom)
@@ -98,7 +98,7 @@ def adjust(
     return replace(result, findings=findings)
 
 
-MAX_SHARED = 1 / 3  # of the exposures of a fluoroscope that another one has as well
+MAX_SHARED = 1 / 3  # maximum share of the exposures of a fluoroscope that another also has
 
 Progress = Callable[[str, Round], None]
 
@@ -107,17 +107,17 @@ Progress = Callable[[str, Round], None]
 class Rig:
     """Fluoroscopes that belong to the rig but are not calibrated by this job."""
 
-    #: names of all fluoroscopes of the rig in their order; empty: those of the request
+    #: names of all fluoroscopes of the rig, in order; empty: those of the request
     fluoroscopes: Sequence[str] = ()
     #: exposures of the other fluoroscopes
     frames: Frames = field(default_factory=dict)
-    #: present calibrations of the other fluoroscopes
+    #: current calibrations of the other fluoroscopes
     calibrations: Calibrations = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class CalibrationOutcome:
-    """Everything that a calibration job found.
+    """Complete outcome of a calibration job.
 
     Attributes
     ----------
@@ -126,9 +126,9 @@ class CalibrationOutcome:
     rig : Rig
         The fluoroscopes that were not calibrated.
     orientation : RigOrientation or None
-        None where the exposures give none; the findings of the result say why.
+        None if the exposures do not give one; the findings of the result say why.
     validation : Validation or None
-        None where no validation was requested.
+        None if no validation was requested.
     """
 
     request: CalibrationRequest
@@ -153,9 +153,9 @@ class CalibrationOutcome:
         return '\n'.join([summary_table(self.result).rstrip(), *verdict])
 
     def plot(self, name: str) -> Figure:
-        """Return a matplotlib figure of the distortion of a fluoroscope, and of its sd.
+        """Return a matplotlib figure of the distortion of a fluoroscope, with its uncertainty.
 
-        Raises DataError for a fluoroscope that is not calibrated, or without correction.
+        Raises DataError for a fluoroscope that is not calibrated, or has no correction.
         """
         from ..report.figures import distortion_figure
 
@@ -166,14 +166,14 @@ class CalibrationOutcome:
 
     @property
     def calibrations(self) -> dict[str, FluoroscopeCalibration]:
-        """Calibrations of all fluoroscopes of the rig, the new ones among them."""
+        """Calibrations of all fluoroscopes of the rig, including the new ones."""
         return {**self.rig.calibrations, **self.result.calibrations}
 
     def to_dataframe(self, name: str = 'residuals') -> pandas.DataFrame:
         """Return residuals, exposures, targets or interior as a pandas DataFrame.
 
-        The columns are those of the CSV file in the folder of the result. Raises DataError for
-        another name, and where pandas is not installed.
+        The columns are those of the CSV file in the result folder. Raises DataError for another
+        name, and if pandas is not installed.
         """
         return dataframe_of(result_tables(self.result), name)
 
@@ -189,17 +189,17 @@ def run_calibration(
 ) -> CalibrationOutcome:
     """Self-calibrate the fluoroscopes of a request, and orient the rig.
 
-    Exposures that repeat an earlier one are excluded, those of a phantom that stands still are
-    joined, and a few image points off the image or of targets that the phantom does not have are
-    excluded.
+    Exposures that repeat an earlier one are excluded, and exposures of a phantom that stands still
+    are joined. A few image points that are off the image, or of targets that the phantom does not
+    have, are excluded.
 
     Parameters
     ----------
     request : CalibrationRequest
     validate : bool
-        Whether the calibration is validated with its own exposures.
+        Whether to validate the calibration with its own exposures.
     force : bool
-        Whether to calibrate input that cannot be right, and return a result that is impossible;
+        Whether to calibrate from input that cannot be right, and to return an impossible result;
         the findings of the result then say so.
     rig : Rig, optional
         Further fluoroscopes of the rig.
@@ -207,7 +207,7 @@ def run_calibration(
         Called after every round with the names of the fluoroscopes and the Round; may raise to
         stop.
     report_step : callable, optional
-        Called as the progress of `checks.verdict.validate`.
+        Called like the progress of `checks.verdict.validate`.
 
     Raises
     ------
@@ -239,8 +239,8 @@ def run_calibration(
 
 
 def _wrong_input(request: CalibrationRequest) -> list[Finding]:
-    """Return a finding for everything in phantom and exposures that cannot be right."""
-    frames = valid_frames(request.frames)  # the calibration reports the others
+    """Return findings on everything in phantom and exposures that cannot be right."""
+    frames = valid_frames(request.frames)  # the calibration reports invalid frames
     known = request.known_orientations
     absent = [name for name in known if name not in request.frames]
     if absent:
@@ -249,7 +249,7 @@ def _wrong_input(request: CalibrationRequest) -> list[Finding]:
             f'there are only those of {", ".join(request.frames)}'
         )
     unknown = {name: exposures for name, exposures in frames.items() if name not in known}
-    # Points in motion may rest, and may come from far away.
+    # With known orientations the points are in motion: they may rest, or come from far away.
     found = [
         *([] if known else find_wrong_phantom(frames, request.phantom)),
         *find_wrong_input(unknown, request.phantom),
@@ -265,7 +265,7 @@ def _calibrated(
     request: CalibrationRequest,
     progress: Progress | None,
 ) -> CalibrationResult:
-    """Calibrate; a normal matrix that breaks down is a fault in the data. Raises DataError."""
+    """Calibrate; raise DataError if the normal matrix breaks down because of the data."""
     try:
         return calibrate_request(request, progress)
     except np.linalg.LinAlgError as error:
@@ -277,7 +277,7 @@ def _calibrated(
 
 
 def _with_causes(request: CalibrationRequest, result: CalibrationResult) -> list[Finding]:
-    """Return what was excluded, with the causes of exposures that do not fit, where known."""
+    """Return findings on excluded data, with the causes of misfitting exposures if known."""
     causes: dict[Place, Finding | None] = {}
     for name, figures in result.fluoroscopes.items():
         used = {exposure.exposure for exposure in figures.exposures}
@@ -290,16 +290,16 @@ def _with_causes(request: CalibrationRequest, result: CalibrationResult) -> list
 
 
 def without_unusable(request: CalibrationRequest) -> tuple[CalibrationRequest, list[Finding]]:
-    """Return the request without stray points and repeated exposures, and what was excluded.
+    """Return the request without stray points and repeated exposures, and findings on them.
 
-    Raises DataError where copies are many.
+    Raises DataError if there are many copies.
     """
     frames, strays = frames_without_strays(request.frames, request.phantom)
     frames, copies = _without_copies(frames, request.known_orientations)
     frames, shared = _without_shared(frames)
     joined, repeats = without_repeats(frames, request.known_orientations)
     if any(len(of_one) < MIN_EXPOSURES for of_one in joined.values()):
-        joined, repeats = frames, []  # too few poses, which is said as such
+        joined, repeats = frames, []  # too few poses, which is reported elsewhere
     return replace(request, frames=joined), [*strays, *copies, *shared, *repeats]
 
 
@@ -308,8 +308,8 @@ def _without_copies(
 ) -> tuple[dict[str, list[Frame]], list[Finding]]:
     """Return the frames without repeated exposures, and a finding for each of these.
 
-    Of a fixed fluoroscope, whose orientation is known, the same points may be seen again. Raises
-    DataError where too few are left.
+    A fluoroscope with known orientation is fixed, so it may see the same points again. Raises
+    DataError if too few exposures are left.
     """
     out = {}
     findings = []
@@ -338,10 +338,9 @@ def _without_copies(
 
 
 def _without_shared(frames: Frames) -> tuple[dict[str, list[Frame]], list[Finding]]:
-    """Return the frames without exposures that two fluoroscopes have in common.
+    """Return the frames without exposures that two fluoroscopes share, and a finding for each.
 
-    Which of both they are of is not known. Returns a finding for each, too. Raises DataError
-    where they are many.
+    It is unknown to which of the two they belong. Raises DataError if they are many.
     """
     out = {name: list(exposures) for name, exposures in frames.items()}
     findings = []
@@ -372,7 +371,7 @@ def _without_shared(frames: Frames) -> tuple[dict[str, list[Frame]], list[Findin
 
 
 def _interchanged(result: CalibrationResult) -> list[Finding]:
-    """Return a finding for every two fluoroscopes whose frames are interchanged somewhere."""
+    """Return a finding for each fluoroscope with frames interchanged with those of the first."""
     first, *others = result.fluoroscopes
     figures = result.fluoroscopes
     found = [interchanged((first, name), figures[first], figures[name]) for name in others]
@@ -382,7 +381,7 @@ def _interchanged(result: CalibrationResult) -> list[Finding]:
 def _findings_of_rig(
     request: CalibrationRequest, result: CalibrationResult, rig: Rig
 ) -> RigFindings:
-    """Return what the exposures say about the orientation of the rig."""
+    """Return findings of the exposures on the orientation of the rig."""
     frames = {**rig.frames, **request.frames}
     calibrations = {**rig.calibrations, **result.calibrations}
     names = [name for name in rig.fluoroscopes or calibrations if name in calibrations]
@@ -394,7 +393,7 @@ def _findings_of_rig(
     )
 
 
-# Run a calibration job in another process, so that it does not delay its caller.
+# Running a calibration job in another process, so that it does not block its caller.
 
 
 def run_in_worker_process(
@@ -434,9 +433,9 @@ def _outcome(
     rig: Rig | None,
     progress: Callable[..., None] | None = None,
 ) -> CalibrationOutcome:
-    """Run the job in the worker process; progress is that of rounds and that of steps."""
+    """Run the job in the worker process; progress receives both rounds and steps."""
     outcome = run_calibration(
         request, validate=validate, rig=rig, progress=progress, report_step=progress
     )
-    # Only the figures need the networks behind it.
+    # Do not transfer the networks: only figures need them.
     return replace(outcome, result=replace(outcome.result, runs={}, solved={}))

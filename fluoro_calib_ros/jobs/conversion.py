@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The conversion job: a bag, a result folder or a file of any format into another format."""
+"""The conversion job: convert a bag, a result folder or a file of any format to another format."""
 
 from __future__ import annotations
 
@@ -60,37 +60,37 @@ PHANTOM_BODY = 'phantom'  # name of the phantom as a rigid body
 
 @dataclass(frozen=True)
 class ConversionRequest:
-    """What to convert.
+    """Source, target and options of a conversion.
 
     Attributes
     ----------
     source : path-like
-        Bag, result folder, file of any format, or folder with a file of one format a camera.
+        Bag, result folder, file of any format, or folder with one file per camera.
     kind : str
-        Format to write, of `kinds_written`.
+        Format to write, one of `kinds_written`.
     out : path-like
-        File, or for formats with one file a fluoroscope folder, to write.
+        File to write; for formats with one file per fluoroscope, folder to write.
     source_kind : str or None
-        Format of the source; None: as it is recognised.
+        Format of the source; if None, it is recognised.
     exposure : int or None
         Exposure of a result folder whose exterior orientations the cameras have, in the frame of
-        the phantom; None: the orientation of the rig.
+        the phantom; if None, the orientation of the rig is used.
     calibration : path-like or None
-        Result folder whose image size and names hold for the source.
+        Result folder whose image size and names apply to the source.
     corrected : bool
         Whether image points are corrected by this calibration.
     fluoroscopes : sequence of str
         Those to convert, in this order; empty: all.
     settings : FileSettings
-        What files do not say. Its unit holds for the source and what is written, pixels from 1 and
-        rows upwards for the source if it is of another program, else for what is written.
+        Conventions that files do not state. The unit applies to source and output. Pixels from 1
+        and rows upwards apply to the source if it is of another program, else to the output.
     out_units : {'mm', 'cm', 'm'} or None
-        Unit of what is written.
+        Unit of the output.
     angle : float or None
-        Angle of the C-arm [rad] of corrections that are written, and of corrected points without
-        an angle of their own; None: the mean over the exposures.
+        Angle of the C-arm [rad] for corrections that are written, and for corrected points without
+        their own angle; None: the mean over the exposures.
     angles : AngleOptions
-        Which joint gives the angles of the frames of a bag.
+        Joints that give the angles of the frames of a bag.
     """
 
     source: PathLike
@@ -113,15 +113,15 @@ def kinds_written() -> tuple[str, ...]:
 
 
 def kinds_read() -> tuple[str, ...]:
-    """Return the formats that a file can have."""
+    """Return the formats that can be read from files."""
     return registry.kinds(lambda format_: format_.read)
 
 
 def convert(request: ConversionRequest) -> Written:
     """Convert a source into another format.
 
-    Raises DataError for a source that cannot be read or does not contain what the format needs,
-    and where it cannot be written.
+    Raises DataError if the source cannot be read or lacks what the format needs, or if the output
+    cannot be written.
     """
     known = request.settings
     calibrations: Calibrations = {}
@@ -150,7 +150,7 @@ def convert(request: ConversionRequest) -> Written:
 
 
 def _read(request: ConversionRequest, settings: FileSettings) -> tuple[Content, bool]:
-    """Return the content of the source, and whether it is in the conventions of this package."""
+    """Return the content of the source, and whether it uses the conventions of this package."""
     source = Path(request.source)
     from_bag = not is_result_folder(source) and request.source_kind is None and is_bag(source)
     if request.angles.angle_joint and not request.angles.of_rig and not from_bag:
@@ -170,14 +170,14 @@ def _read(request: ConversionRequest, settings: FileSettings) -> tuple[Content, 
 
 
 def _bag_content(source: Path, angles: AngleOptions) -> Content:
-    """Return the frames of a bag, with the angles of the C-arm. Raises DataError."""
+    """Return the frames of a bag with the angles of the C-arm. Raises DataError."""
     contents = read_frames(source)
     frames, notes = with_angles(source, contents.frames, angles)
     return Content(observations=frames, notes=(*contents.notes, *notes))
 
 
 def _lost_angles(request: ConversionRequest, observations: Frames) -> tuple[str, ...]:
-    """Return a note where angles of the C-arm are not in what was written."""
+    """Return a note if angles of the C-arm are lost in the output."""
     has_angle = any(frame.angle is not None for each in observations.values() for frame in each)
     own = request.kind == 'observations'
     if own or not has_angle or 'observations' not in _parts_written(request.kind):
@@ -197,7 +197,7 @@ def is_result_folder(path: Path) -> bool:
 
 
 def _selected(content: Content, request: ConversionRequest) -> Content:
-    """Return the content of the fluoroscopes that were asked for. Raises DataError."""
+    """Return the content of the requested fluoroscopes. Raises DataError."""
     wanted = list(request.fluoroscopes)
     if not wanted:
         return content
@@ -241,7 +241,7 @@ def _write(request: ConversionRequest, content: Content, is_own: bool) -> Writte
 def _corrected(
     content: Content, calibrations: Calibrations, request: ConversionRequest
 ) -> tuple[dict[str, list[Frame]], tuple[str, ...]]:
-    """Return the frames of a content with the image points that could be corrected, and notes."""
+    """Return frames with the image points that could be corrected, and notes."""
     out: dict[str, list[Frame]] = {}
     notes: list[str] = []
     for name, frames in (content.observations or {}).items():
@@ -272,9 +272,9 @@ def result_content(
     exposure: int | None = None,
     angle: float | None = None,
 ) -> Content:
-    """Return the wanted parts of a result folder, of the fluoroscopes that settings name.
+    """Return the wanted parts of a result folder, for the fluoroscopes named in settings.
 
-    exposure: that whose exterior orientations the cameras have; angle: that of the C-arm [rad] for
+    exposure: the one whose exterior orientations the cameras have; angle: of the C-arm [rad], for
     corrections that depend on it. Raises DataError.
     """
     directory = Path(directory)
@@ -309,7 +309,7 @@ def result_content(
 
 
 def _orientation(directory: Path, calibrations: Calibrations) -> RigOrientation | None:
-    """Return the orientation of the rig if it is there. Raises DataError for a foreign one."""
+    """Return the orientation of the rig, or None. Raises DataError if it does not belong here."""
     path = Path(orientation_path(directory))
     if not path.exists():
         return None
@@ -346,7 +346,7 @@ def _poses(
     orientation: RigOrientation | None,
     exposure: int | None,
 ) -> Poses:
-    """Return rotation and position of every fluoroscope that has one. Raises DataError."""
+    """Return rotation and position of each fluoroscope with known ones. Raises DataError."""
     if exposure is None:
         if orientation is None:
             return {}
@@ -371,7 +371,7 @@ def _camera(calibration: FluoroscopeCalibration, poses: Poses) -> Camera:
 
 
 def _lookup(calibration: FluoroscopeCalibration) -> NDArray[np.float32]:
-    """Return the observed pixel (2, h, w) of every corrected one, NaN outside the support."""
+    """Return the observed pixel (2, h, w) of each corrected pixel, NaN outside the support."""
     corrector = ImageCorrector(calibration)
     return np.where(corrector.status == CorrectionStatus.OK, corrector.source, np.float32(np.nan))
 
@@ -379,9 +379,9 @@ def _lookup(calibration: FluoroscopeCalibration) -> NDArray[np.float32]:
 def _phantom_poses(
     directory: Path, stations: Sequence[Station], orientation: RigOrientation | None
 ) -> Bodies:
-    """Return the poses of the phantom in the rig frame, as the first fluoroscope saw it.
+    """Return the poses of the phantom in the rig frame, as seen by the first fluoroscope.
 
-    Without orientation of the rig they are in the optical frame of the fluoroscope.
+    Without an orientation of the rig, they are in the optical frame of that fluoroscope.
     """
     first = stations[0].fluoroscope if orientation is None else orientation.fluoroscopes[0]
     own = sorted((s for s in stations if s.fluoroscope == first), key=lambda s: s.exposure)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The extraction job: images of a fluoroscope to observations, on all cores."""
+"""The extraction job: observations from images of a fluoroscope, on all cores."""
 
 from __future__ import annotations
 
@@ -43,13 +43,13 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class ImageResult(Observations):
-    """What was found in one image of a recording."""
+    """Result of the extraction from one image of a recording."""
 
     exposure: int = 0
     place: str = ''  #: file, page or message
-    frame: Frame | None = None  #: None where the image gives no observations; the finding says why
-    png: bytes | None = None  #: overlay, if it was asked for
-    #: the image of full contrast, reduced, if it was asked for and gives observations
+    frame: Frame | None = None  #: None if there are no observations; see the finding
+    png: bytes | None = None  #: overlay, if requested
+    #: reduced image of full contrast, if requested and if the image gives observations
     jpeg: bytes = b''
 
 
@@ -64,16 +64,16 @@ class ExtractionRequest:
     phantom : Phantom
     fluoroscope : str
     principal_distance_px : float or None
-        None: not known.
+        None if unknown.
     overlay : Path or None
-        Folder for pictures of what was found.
+        Folder for overlay pictures of the results.
     workers : int
-        Processes; 0: as many as there are cores.
+        Number of processes; 0: one per core.
     scheduler : Cluster or str or None
-        A Dask cluster, or the address of its scheduler, whose workers extract, in place of
+        A Dask cluster, or the address of its scheduler, whose workers extract instead of local
         processes.
     regular_grid : bool
-        The phantom is a regular flat grid. Its place and turn are arbitrary by whole steps.
+        The phantom is a regular flat grid. Its position and rotation are arbitrary by whole steps.
     angles : ImageAngles
         Angles of the C-arm.
     radiographs : bool
@@ -96,7 +96,7 @@ class ExtractionRequest:
 
 @dataclass(frozen=True)
 class ExtractionOutcome:
-    """Results of all images of a fluoroscope, in the order of their exposures, and notes."""
+    """Results of all images of a fluoroscope, ordered by exposure, and notes."""
 
     __repr__ = brief_repr
 
@@ -106,7 +106,7 @@ class ExtractionOutcome:
 
     @property
     def frames(self) -> list[Frame]:
-        """Observations of the images that have some."""
+        """Observations of the images that have any."""
         return [result.frame for result in self.results if result.frame is not None]
 
     @property
@@ -117,7 +117,7 @@ class ExtractionOutcome:
 
 @dataclass(frozen=True)
 class _Task:
-    """Images for a worker: one, or some of a video."""
+    """Images for a worker: a single one, or several successive ones of a video."""
 
     images: tuple[SourceImage, ...]
     settings: PhantomSettings
@@ -126,7 +126,7 @@ class _Task:
 
 
 def _extract(task: _Task) -> list[ImageResult]:
-    """Extract the images of a task, each from the pose of the one before, where that leads."""
+    """Extract the images of a task, each starting from the previous pose where possible."""
     follower = task.settings()
     name = task.settings.fluoroscope
     results = []
@@ -147,7 +147,7 @@ def _extract(task: _Task) -> list[ImageResult]:
 
 
 def _result(found: Observations, source: SourceImage, settings: PhantomSettings) -> ImageResult:
-    """Return what was found as the result of an image."""
+    """Return the observations found in an image as an ImageResult."""
     frame: Frame | None = None
     if found.finding is None and settings.lens is not None:
         frame = Frame(
@@ -173,11 +173,11 @@ def run_extraction(
 ) -> ExtractionOutcome:
     """Extract the beads of all images of a fluoroscope.
 
-    A damaged image, or one without the phantom, is passed over, and its result says why. Images
-    whose pose is not found are tried again with the distortion that the others have.
+    An image that is damaged or does not show the phantom is skipped, and its result says why.
+    Images whose pose is not found are tried again with the distortion found in the others.
 
-    progress: called after every image with the number of images that are done, and their total.
-    Raises DataError for sources that cannot be read, and where no image gives observations.
+    progress: called after every image with the number of finished images and their total. Raises
+    DataError for sources that cannot be read, and if no image gives observations.
     """
     sources = open_sources(request.sources, request.fluoroscope, request.angles)
     if request.regular_grid and FlatGrid.of(request.phantom.xyz_mm) is None:
@@ -201,17 +201,17 @@ def run_extraction(
     return ExtractionOutcome(request.fluoroscope, tuple(results), notes)
 
 
-# What the polynomials of the exposures leave of the shifts of shadows, as a share of them: 0.46,
-# 0.57 and 0.63 with shadows of 17 px (`benchmarks.calibrated_renderings`, large beads).
+# Share of the shifts of shadows that remains after the polynomials of the exposures: 0.46, 0.57
+# and 0.63 with shadows of 17 px (`benchmarks.calibrated_renderings`, large beads).
 BENT_LEFT = 0.55
-# Independent errors of a correction in a coordinate: the median of `benchmarks.pathologies`.
+# Independent errors of a correction per coordinate: the median of `benchmarks.pathologies`.
 FREE_ERRORS = 42
 
 
 def bent_shadows(fluoroscope: str, results: Sequence[ImageResult]) -> Finding | None:
-    """Return a warning where the distortion within shadows shifts a correction beyond its noise.
+    """Return a warning if distortion within shadows shifts a correction beyond its noise.
 
-    The exposures share that shift, and no standard deviation contains it.
+    The exposures share that shift, and no standard deviation includes it.
     """
     used = [result for result in results if result.frame is not None]
     sigma = np.concatenate([result.sigma for result in used])
@@ -236,7 +236,7 @@ def _first_pass(
     workers: Workers,
     progress: Progress | None,
 ) -> list[ImageResult]:
-    """Extract all images, those of a video from the pose of the one before."""
+    """Extract all images, those of a video starting from the pose of the previous one."""
     lens: Lens | None = None
 
     def tasks() -> Iterator[_Task]:
@@ -261,7 +261,7 @@ def _second_pass(
     workers: Workers,
     results: list[ImageResult],
 ) -> None:
-    """Extract refused images with the distortion of the others; replaces the results."""
+    """Extract refused images again with the distortion of the others; update results in place."""
     again = {number for number, result in enumerate(results) if may_be_found(result.finding)}
     views = [result.view for result in results if result.view is not None]
     lens = shared_lens(views[0].lens, views) if views else None
@@ -276,7 +276,7 @@ def _second_pass(
 
 
 def _groups(images: Iterable[SourceImage]) -> Iterator[tuple[SourceImage, ...]]:
-    """Yield images that one worker extracts: one alone, or some of a video."""
+    """Yield images for one worker: a single one, or several successive ones of a video."""
     for _, group in groupby(enumerate(images), lambda item: _group(*item)):
         yield tuple(image for _, image in group)
 
@@ -292,7 +292,7 @@ def _task(request: ExtractionRequest, images: tuple[SourceImage, ...], lens: Len
     settings = PhantomSettings(
         request.fluoroscope,
         request.phantom,
-        # Without a lens none of the images can be read, so that it is not used.
+        # Without a lens none of the images can be read, so this one is not used.
         lens=lens or Lens((1, 1), 1.0),
         regular_grid=request.regular_grid,
     )
@@ -300,7 +300,7 @@ def _task(request: ExtractionRequest, images: tuple[SourceImage, ...], lens: Len
 
 
 def _with_picture_written(request: ExtractionRequest, result: ImageResult) -> ImageResult:
-    """Write the picture of a result; return the result without it."""
+    """Write the picture of a result; return the result without the picture."""
     if result.png is None or request.overlay is None:
         return result
     write_bytes(request.overlay / f'{request.fluoroscope}_{result.exposure:04d}.png', result.png)
@@ -321,14 +321,14 @@ def recording_of_images(
     Parameters
     ----------
     source : Path
-        A folder with a folder of images for each fluoroscope, a bag with images, or the images of
-        a single fluoroscope.
+        A folder with one folder of images per fluoroscope, a bag with images, or the images of a
+        single fluoroscope.
     survey : Survey
     fluoroscopes : sequence of str, optional
-        Names of those to read; needed for the images of a single one.
+        Names of those to read; required for the images of a single fluoroscope.
     principal_distance_px : float, optional
     scheduler : Cluster or str, optional
-        A Dask cluster, or the address of the scheduler of one.
+        A Dask cluster, or the address of its scheduler.
     progress : callable, optional
     angles : ImageAngles, optional
         Angles of the C-arms.
@@ -336,7 +336,7 @@ def recording_of_images(
     Raises
     ------
     DataError
-        Where a fluoroscope has no image with observations.
+        If a fluoroscope has no image with observations.
     """
     folders = fluoroscope_folders(source)
     known = list(folders) or (list(image_topics(source)) if is_image_bag(source) else [])
@@ -373,7 +373,7 @@ def recording_of_images(
 
 
 def _first_lens(request: ExtractionRequest, image: np.ndarray | DataError) -> Lens | None:
-    """Return what is assumed of the fluoroscope of an image, None for one that cannot be read."""
+    """Return the lens assumed for the fluoroscope of an image, None for an unreadable image."""
     if isinstance(image, DataError):
         return None
     return assumed_lens((image.shape[1], image.shape[0]), request.principal_distance_px)
@@ -382,9 +382,9 @@ def _first_lens(request: ExtractionRequest, image: np.ndarray | DataError) -> Le
 def _mirrored(
     request: ExtractionRequest, sources: ImageSources, results: Sequence[ImageResult]
 ) -> Finding | None:
-    """Return a finding where the phantom is found in a mirrored image, None where it is not.
+    """Return a finding if the phantom is found in a mirrored image, else None.
 
-    Two images are tried, none of which gives observations as it is.
+    Two of the images are tried, none of which gives observations as it is.
     """
     found = [result.exposure for result in results if may_be_found(result.finding)]
     tried = set(found[:2])
@@ -406,7 +406,7 @@ def _mirrored(
 
 
 def _first_of(results: Sequence[ImageResult], found: Finding | None) -> Finding:
-    """Return why no image gives observations, from the finding on one of them."""
+    """Return why no image gives observations, based on the finding on one of them."""
     assert found is not None
     if len(results) == 1:
         return found

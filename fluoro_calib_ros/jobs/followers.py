@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Following of radiographs and of markers in motion, live and offline, image after image.
+"""Tracking of phantoms and of moving markers from image to image, live and offline.
 
-Each image is helped by those before. A recording is a stream that ends: the jobs give its images
-to the same followers as the extraction node those of a camera.
+Each image uses the results of earlier images. A recording is treated as a stream that ends: jobs
+pass its images to the same followers that the extraction node uses for those of a camera.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from ..processes import OF_STREAM, WorkerProcess
 
 @dataclass(frozen=True)
 class Observations:
-    """What was found in one image."""
+    """Observations in one image."""
 
     #: (n,)
     target_id: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
@@ -47,44 +47,44 @@ class Observations:
     #: (n,), standard deviation of a coordinate [px]
     sigma: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     overlapped: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))  #: (n,)
-    finding: Finding | None = None  #: why there are no observations; None where there are
-    #: what should be known of the observations, such as ids that may have been exchanged
+    finding: Finding | None = None  #: why there are no observations; None if there are
+    #: remark on the observations, such as ids that may have been exchanged
     note: str = ''
-    expected: int = 0  #: targets that should be visible
-    #: shares of the expected targets that are found, and of what is found that is expected
+    expected: int = 0  #: number of targets that should be visible
+    #: fraction of the expected targets that were found, and of found targets that were expected
     found: float = 0.0
     explained: float = 0.0
-    view: View | None = None  #: of the phantom
-    followed: bool = False  #: whether the image before gave the start
+    view: View | None = None  #: view of the phantom
+    followed: bool = False  #: whether tracking started from the previous image
     bent_px: float = 0.0  #: see Extraction
-    doubtful: int = 0  #: targets whose id may be wrong
-    #: ids of earlier images of the fluoroscope that turned out to be wrong with this one
+    doubtful: int = 0  #: number of targets whose id may be wrong
+    #: ids in earlier images of the fluoroscope that this image has shown to be wrong
     retracted: tuple[Retraction, ...] = ()
-    #: (h, w, 3), overlay of uint8, blue, green, red, if it was asked for
+    #: (h, w, 3), overlay of uint8 in BGR order, if requested
     picture: NDArray[np.uint8] | None = None
     seconds: float = 0.0
 
     @property
     def reason(self) -> str:
-        """Why there are no observations, without the place; '' where there are."""
+        """Why there are no observations, without the place; '' if there are."""
         return '' if self.finding is None else self.finding.cause
 
 
 @dataclass(frozen=True)
 class PhantomSettings:
-    """What a PhantomFollower is made of."""
+    """Settings from which a PhantomFollower is created."""
 
     fluoroscope: str
     phantom: Phantom
-    principal_distance_px: float | None = None  #: None: not known
-    #: what is known of the fluoroscope in a recording, all of whose images come; None: a stream,
-    #: whose images may be shed, and whose distortion helps where a pose is not found
+    principal_distance_px: float | None = None  #: None if unknown
+    #: assumed lens for a recording, whose images all arrive; None for a stream, whose images may
+    #: be shed, and whose distortion is used if a pose is not found
     lens: Lens | None = None
     regular_grid: bool = False  #: the phantom is a regular flat grid
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The fluoroscope."""
+        """Name of the fluoroscope, as a tuple."""
         return (self.fluoroscope,)
 
     def __call__(self) -> PhantomFollower:
@@ -93,7 +93,7 @@ class PhantomSettings:
 
 
 class PhantomFollower:
-    """Extracts the beads of a phantom: from the pose of the image before, else from nothing."""
+    """Extracts the beads of a phantom, starting from the previous pose if there is one."""
 
     def __init__(self, settings: PhantomSettings) -> None:
         phantom = settings.phantom
@@ -101,10 +101,10 @@ class PhantomFollower:
         self._settings = settings
         self._model = _model_of(phantom.xyz_mm.tobytes(), diameters, settings.regular_grid)
         self._lens = settings.lens
-        # Solved images whose distortion helps where a pose is not found.
+        # Views of solved images whose distortion is used if a pose is not found.
         self._views: deque[View] = deque(maxlen=30)
         self._near: Nearby | None = None
-        # Numbers and views of the last two exposures that were solved.
+        # Numbers and views of the last two solved exposures.
         self._track: deque[tuple[int, View]] = deque(maxlen=2)
 
     def extract(
@@ -114,18 +114,18 @@ class PhantomFollower:
         overlays: Collection[str] = (),
         angles: Mapping[str, float | None] | None = None,
     ) -> dict[str, Observations]:
-        """Return what is found in the images of an exposure; never raises DataError.
+        """Return the observations in the images of an exposure; never raises DataError.
 
         Parameters
         ----------
         images : mapping of str to (h, w) ndarray of uint8 or uint16
             By fluoroscope.
         number : int
-            Of the exposure: it grows, and tells how many are left out.
+            Exposure number; it increases, and gaps show how many exposures were skipped.
         overlays : collection of str
-            Fluoroscopes whose pictures are wanted.
+            Fluoroscopes for which overlays are wanted.
         angles : mapping of str to float or None
-            Of the C-arms [rad], None where they are unknown.
+            Angles of the C-arms [rad], None if unknown.
         """
         name = self._settings.fluoroscope
         return {name: self._observations(images[name], number, name in overlays)}
@@ -145,7 +145,7 @@ class PhantomFollower:
         return replace(result, picture=picture, seconds=time.perf_counter() - start)
 
     def _extraction(self, image: np.ndarray, number: int) -> Extraction:
-        """Extract the beads, in a stream if need be with the distortion of the images before.
+        """Extract the beads; in a stream, retry with the distortion of earlier images if needed.
 
         Raises DataError.
         """
@@ -160,7 +160,7 @@ class PhantomFollower:
             return extract_beads(image, self._model, shared)
 
     def _lens_of(self, size: tuple[int, int]) -> Lens:
-        """Return what is assumed of the fluoroscope. Raises DataError for another image size."""
+        """Return the assumed lens. Raises DataError if the image size of a recording changes."""
         known = self._settings.lens
         if known is not None and known.image_size != size:
             expected = known.image_size
@@ -176,7 +176,7 @@ class PhantomFollower:
         return self._lens
 
     def _nearby(self, number: int) -> Nearby | None:
-        """Return the exposure before, and where the phantom may be after those left out."""
+        """Return the previous exposure, and the predicted view after skipped exposures."""
         if self._near is None or self._settings.lens is not None:
             return self._near
         last, view = self._track[-1]
@@ -206,13 +206,13 @@ class PhantomFollower:
 
 @lru_cache(maxsize=4)
 def _model_of(beads: bytes, diameters: bytes | None, regular: bool) -> PhantomModel:
-    """Return a phantom, prepared for matching; a worker keeps it from follower to follower."""
+    """Return a phantom prepared for matching, cached so that a worker reuses it."""
     diameter_mm = None if diameters is None else np.frombuffer(diameters)
     return PhantomModel.of(np.frombuffer(beads).reshape(-1, 3), diameter_mm, regular)
 
 
-MIN_STARTED = 0.5  # of the given markers, in the first image
-REVISED = 300  # images, in which late decisions take ids back
+MIN_STARTED = 0.5  # minimum fraction of the given markers found in the first image
+REVISED = 300  # number of last images in which late decisions can retract ids
 DECIDED = {
     'exchanged': 'were exchanged, which is undone from now on',
     'dropped': 'is not what was followed, and is searched for',
@@ -221,35 +221,35 @@ DECIDED = {
 
 @dataclass(frozen=True)
 class MarkerSettings:
-    """What a MarkerFollower is made of."""
+    """Settings from which a MarkerFollower is created."""
 
-    #: ids and places in the first images by fluoroscope, None for one that does not see them yet;
-    #: empty: the shapes of the bodies tell them
+    #: ids and positions in the first images by fluoroscope, None for one that does not see them
+    #: yet; if empty, the shapes of the bodies identify the markers
     first: Mapping[str, FirstMarkers | None]
     options: MarkerOptions = field(default_factory=MarkerOptions)
     #: of several fluoroscopes
     calibrations: Calibrations = field(default_factory=dict)
     orientation: RigOrientation | None = None  #: of several fluoroscopes
-    bodies: tuple[Body, ...] = ()  #: markers that are rigid together, of several fluoroscopes
-    later: tuple[int, ...] = ()  #: ids of markers whose places are given later
+    bodies: tuple[Body, ...] = ()  #: rigid groups of markers, if several fluoroscopes
+    later: tuple[int, ...] = ()  #: ids of markers whose positions are given later
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The fluoroscopes."""
+        """Names of the fluoroscopes."""
         if self.first or self.orientation is None:
             return tuple(self.first)
         return self.orientation.fluoroscopes
 
     def __call__(self) -> MarkerFollower:
-        """Return a new MarkerFollower. Raises DataError for what does not fit together."""
+        """Return a new MarkerFollower. Raises DataError for inconsistent settings."""
         return MarkerFollower(self)
 
 
 class MarkerFollower:
-    """Follows markers in one view, or in several that help each other.
+    """Follows markers in one view, or in several views jointly.
 
-    update() follows them from the first call on; extract() waits for images in which they are
-    where they are said to be.
+    update() follows them from the first call on; extract() waits for images that show the markers
+    at their given first positions.
     """
 
     def __init__(self, settings: MarkerSettings) -> None:
@@ -265,13 +265,13 @@ class MarkerFollower:
             )
 
     def _renew(self) -> None:
-        """Begin again. Raises DataError."""
+        """Start again. Raises DataError."""
         self._views: MarkerViews | None = None
         if self._settings.first:
             self._follow(self._settings.first)
 
     def _follow(self, first: Mapping[str, FirstMarkers | None]) -> None:
-        """Follow markers from their first places on. Raises DataError."""
+        """Follow markers from their first positions. Raises DataError."""
         settings = self._settings
         self._views = MarkerViews(
             settings.calibrations,
@@ -283,7 +283,7 @@ class MarkerFollower:
         )
 
     def place(self, fluoroscope: str, given: FirstMarkers) -> None:
-        """Follow markers of a view from where a person sees them in the next image."""
+        """Follow markers of a view from the positions that a person gives in the next image."""
         self._begun_views.trackers[fluoroscope].place(given)
 
     def update(
@@ -310,7 +310,7 @@ class MarkerFollower:
         overlays: Collection[str] = (),
         angles: Mapping[str, float | None] | None = None,
     ) -> dict[str, Observations]:
-        """Return the markers that are seen in the images of an exposure; see PhantomFollower."""
+        """Return the observed markers in the images of an exposure; see PhantomFollower."""
         start = time.perf_counter()
         results = self._results(images, number, overlays, angles)
         seconds = (time.perf_counter() - start) / max(len(results), 1)
@@ -359,7 +359,7 @@ class MarkerFollower:
     def _identify(
         self, images: Mapping[str, np.ndarray], angles: Mapping[str, float | None] | None
     ) -> None:
-        """Begin with the bodies that are found by their shapes. Raises DataError."""
+        """Start with the bodies that are identified by their shapes. Raises DataError."""
         settings = self._settings
         assert settings.orientation is not None
         found = identify_markers(
@@ -368,7 +368,7 @@ class MarkerFollower:
         self._follow({name: found.get(name) for name in settings.names})
 
     def _check_start(self, exposure: ViewsFrame) -> None:
-        """Begin, or wait for another exposure. Raises DataError."""
+        """Accept the first exposure, or raise DataError to wait for another."""
         for name, view in exposure.views.items():
             given = self._begun_views.trackers[name].first
             problem = None if given is None else _wrong_start(view, len(given.target_id))
@@ -380,14 +380,14 @@ class MarkerFollower:
 
 
 def _missing_views(names: Sequence[str]) -> Finding:
-    """Return the finding that the first exposure lacks views."""
+    """Return the finding that views are missing in the first exposure."""
     several = f'views of {", ".join(names)} are' if len(names) > 1 else f'view of {names[0]} is'
     place = Place(tuple(names), name='')
     return Finding(Kind.OTHER_VIEW_MISSING, f'the {several} missing', place)
 
 
 def _wrong_start(found: MarkerFrame, expected: int) -> Finding | None:
-    """Return why the first image is not that of the given markers, None where it may be."""
+    """Return why the first image does not show the given markers, None if it may do so."""
     count = len(found.target_id)
     if found.finding is not None or count >= MIN_STARTED * expected:
         return found.finding
@@ -399,7 +399,7 @@ def _wrong_start(found: MarkerFrame, expected: int) -> Finding | None:
 
 
 def _decision_text(decision: Decision) -> str:
-    """Return what was decided, in words."""
+    """Return a decision in words."""
     several = len(decision.target_id) > 1
     markers = ' and '.join(map(str, decision.target_id))
     return (
@@ -409,7 +409,7 @@ def _decision_text(decision: Decision) -> str:
 
 
 def _observed(found: MarkerFrame, expected: int) -> Observations:
-    """Return the observations of an image."""
+    """Return a MarkerFrame as Observations."""
     finding = found.finding
     if finding is None and not len(found.target_id):
         finding = Finding(Kind.NO_MARKERS, 'no marker is seen')
@@ -429,17 +429,17 @@ def _observed(found: MarkerFrame, expected: int) -> Observations:
 
 
 def _doubt_text(doubt: Finding) -> str:
-    """Return what may be wrong, in words."""
+    """Return a doubt in words."""
     markers = ' and '.join(map(str, doubt.place.target_id))
     what = 'may have been exchanged' if len(doubt.place.target_id) > 1 else 'may be something else'
     return f'markers {markers} {what}: {doubt.cause}'
 
 
-FollowerSettings = PhantomSettings | MarkerSettings  # they can be pickled, and make a follower
+FollowerSettings = PhantomSettings | MarkerSettings  # picklable; calling one returns a follower
 
 
 def follower_process(make: FollowerSettings) -> WorkerProcess:
-    """Return a process with a follower; it is called as `extract`."""
+    """Return a process with a follower; calling it calls `extract`."""
     return WorkerProcess(partial(_extract_of, make), 'the process of the extraction', OF_STREAM)
 
 

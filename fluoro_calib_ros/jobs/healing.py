@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The job of healing: what has changed in a rig, from a recording of bodies, and the rig as it is.
+"""The healing job: diagnose from a recording of bodies what has changed in a rig, and heal it.
 
-Blocks of the recording are used in turn for the diagnosis and for its verdict. The healed rig
-passes where no block that was not used tells of a further change.
+Alternating blocks of the recording are used for the diagnosis and for its verdict. The healed rig
+passes if no unused block shows a further change.
 """
 
 from __future__ import annotations
@@ -55,11 +55,11 @@ from ..reconstruction.intersection import OK, OUTSIDE, Intersector
 from ..reconstruction.observed_noise import with_observed_noise
 from ..reconstruction.reconstruct import orientation_of_recorded, pair_recording
 
-BLOCKS = 10  # of a recording, used in turn for the diagnosis and for its verdict
-MAX_EXPOSURES = 100  # of a recording that are used for each, evenly spread
+BLOCKS = 10  # blocks of a recording, alternately used for the diagnosis and for its verdict
+MAX_EXPOSURES = 100  # maximum number used for each of these, evenly spread
 MIN_EXPOSURES = BLOCKS
-# Standard deviation of a direction of a change, relative to that of a change as it may be, above
-# which the data do not identify it: they have told less than half of it.
+# Largest relative standard deviation (posterior over prior) of a direction of a change that the
+# data identify: beyond it, they have determined less than half of the change.
 IDENTIFIED = 0.5
 CHANGED_MEANWHILE = 'the rig changed during the recording'
 
@@ -68,36 +68,36 @@ _Exposure: TypeAlias = Mapping[str, Frame]
 
 @dataclass(frozen=True)
 class HealingOptions(RecordedPairing):
-    """Options of healing. Raises ValueError for a value that an option cannot have."""
+    """Options of healing. Raises ValueError for an invalid value."""
 
 
 @dataclass(frozen=True)
 class HealingOutcome:
-    """What has changed in a rig, and the rig as it is now.
+    """Changes of a rig, and the rig as it is now.
 
     Attributes
     ----------
     diagnosis : Diagnosis
     healed : HealedRig or None
-        None where nothing of the rig has changed and its claims hold. Where they are less than a
-        knock or a drift that bodies do not show, it is the rig as it was calibrated, with larger
-        ones.
+        None if nothing in the rig has changed and its claimed errors hold. If nothing has changed,
+        but the claimed errors are smaller than those from a knock or drift that bodies do not
+        show, it is the calibrated rig with larger ones.
     calibrations : mapping of str to FluoroscopeCalibration
         Of the healed rig.
     orientation : RigOrientation
         Of the healed rig.
     before, after : RigErrors
-        Errors of points where the bodies were.
+        Errors of points at the positions of the bodies.
     common_motion : Finding
-        How far all points together may have moved, which no body shows.
+        Possible common motion of all points, which no body shows.
     verdict : {'pass', 'fail', 'cannot tell'}
     checks : tuple of Check
     findings : tuple of Finding
-        What has changed.
+        The changes.
     exposures : int
-        That were used for the diagnosis.
+        Number of exposures used for the diagnosis.
     noise : Finding or None
-        Set where image points have no sigma, and their rays show more noise than the calibration.
+        Set if image points have no sigma and their rays show more noise than the calibration.
     """
 
     __repr__ = brief_repr
@@ -117,12 +117,12 @@ class HealingOutcome:
 
     @property
     def unseen_distortion(self) -> Check:
-        """How far changes of the distortion that bodies do not show may have moved points."""
+        """Check of how far points may have moved by changes of distortion that no body shows."""
         return next(check for check in self.checks if check.kind is Kind.UNSEEN_DISTORTION)
 
     @property
     def changed_meanwhile(self) -> bool:
-        """Whether exposures that were not used contradict: the rig changed as it was recorded."""
+        """Whether unused exposures contradict the diagnosis: the rig changed during recording."""
         return any(
             check.kind is Kind.UNUSED_EXPOSURES and check.passed is False for check in self.checks
         )
@@ -136,20 +136,21 @@ def heal_rig(
     options: HealingOptions | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> HealingOutcome:
-    """Find out what has changed in a rig since it was calibrated, and estimate it.
+    """Find out what has changed in a rig since it was calibrated, and estimate the change.
 
     Parameters
     ----------
     frames : mapping of str to sequence of Frame
         Observed image points of the markers of bodies, by fluoroscope.
     calibrations : mapping of str to FluoroscopeCalibration
+        Calibrations before the change.
     orientation : RigOrientation
-        As they were before.
+        Orientation before the change.
     bodies : sequence of Body
-        With their shapes as they were learned while the rig was healthy.
+        With the shapes that were learned while the rig was healthy.
     options : HealingOptions, optional
     progress : callable, optional
-        Called with the number of the steps that are done, and of all.
+        Called with the number of completed steps and their total.
 
     Raises
     ------
@@ -177,7 +178,7 @@ def heal_rig(
     stamp_ns = max(frame.stamp_ns for frame in used[-1].values())
     healed = healed_rig(diagnostician, diagnosis, stamp_ns, len(used))
     after = rig_errors(healed.orientation, places)
-    # Where nothing has changed, the rig is another one only if it may err by more than it claims.
+    # If nothing has changed, the rig is replaced only if it may err by more than it claims.
     claims_more = after.common_mm > before.common_mm
     now = rig if fixed else rig.healed(healed, is_other=bool(changed) or claims_more)
     is_other = now is not rig
@@ -185,7 +186,7 @@ def heal_rig(
     known = _correctable(fixed) if fixed else _identified(healed.weakest, bool(changed))
     unseen = _unseen_distortion(*unseen_distortion(diagnostician, diagnosis))
     checks = [known, _sure(diagnosis, rig), unseen]
-    if not fixed:  # else they tell of the same change
+    if not fixed:  # otherwise they would show the same change
         checks += _unused_exposures(now if changed else rig, unused, diagnosis, before.scale)
     step(4, 4)
     return HealingOutcome(
@@ -211,7 +212,7 @@ def _exposures_of(
     bodies: Sequence[Body],
     options: HealingOptions,
 ) -> tuple[list[dict[str, Frame]], Finding | None]:
-    """Return the exposures of bodies, and a finding on their noise. Raises DataError."""
+    """Return the exposures that show bodies, and a finding on their noise. Raises DataError."""
     markers = np.concatenate([body.target_id for body in bodies])
     given = frames_of_targets(frames, markers)
     seen, noise = with_observed_noise(
@@ -222,7 +223,7 @@ def _exposures_of(
 
 
 def _check_seen(poses: Poses) -> None:
-    """Raise DataError for too few exposures with a pose of a body."""
+    """Raise DataError if too few exposures give a pose of a body."""
     seen = int(poses.known.any(axis=1).sum())
     if seen < MIN_EXPOSURES:
         raise DataError(
@@ -232,9 +233,9 @@ def _check_seen(poses: Poses) -> None:
 
 
 def _chosen(paired: Sequence[_Exposure]) -> tuple[list[_Exposure], list[_Exposure]]:
-    """Exposures for the diagnosis and for its verdict, from alternating blocks.
+    """Return exposures for the diagnosis and for its verdict, from alternating blocks.
 
-    Raises DataError for too few.
+    Raises DataError if there are too few.
     """
     count = len(paired)
     if count < MIN_EXPOSURES:
@@ -250,7 +251,7 @@ def _chosen(paired: Sequence[_Exposure]) -> tuple[list[_Exposure], list[_Exposur
 
 @dataclass(frozen=True)
 class _Rig:
-    """A rig at a time, and the bodies that it sees."""
+    """State of a rig, and the bodies that it sees."""
 
     calibrations: Calibrations
     orientation: RigOrientation
@@ -262,10 +263,10 @@ class _Rig:
         return RigAdjustment(self.orientation, self.bodies, sizes)
 
     def observe(self, exposures: Sequence[_Exposure]) -> tuple[ObservedBodies, Poses]:
-        """Correct the image points of exposures, and return first poses of the bodies."""
+        """Return the corrected image points of exposures, and initial poses of the bodies."""
         target_id = self.adjustment().target_id
         names = self.orientation.fluoroscopes
-        # u, v as observed and corrected, standard deviations in all and of the correction
+        # observed u, v; corrected u, v; standard deviations in total and of the correction
         values = np.full((len(exposures), *target_id.shape, len(names), 6), np.nan)
         flat = values.reshape(len(exposures), target_id.size, len(names), 6)
         for f, name in enumerate(names):
@@ -284,7 +285,7 @@ class _Rig:
         return observed, self._first_poses(uv, sigma)
 
     def _first_poses(self, uv: NDArray[np.float64], sigma: NDArray[np.float64]) -> Poses:
-        """Return poses that take the bodies to their markers in space, which may be false."""
+        """Return initial poses that fit the bodies to their markers in space, some maybe wrong."""
         shape = uv.shape[:3]
         views = uv.shape[3]
         points = Intersector(self.orientation, None).intersect(
@@ -302,15 +303,15 @@ class _Rig:
         return Poses(rotation, centre, known)
 
     def with_fixed_correction(self, changes: Iterable[Change]) -> list[str]:
-        """Fluoroscopes whose distortion has changed and whose model takes no change."""
+        """Return fluoroscopes whose distortion has changed, but whose model allows no change."""
         names = self.orientation.fluoroscopes
         distorted = [names[one.fluoroscope] for one in changes if one.cause is Cause.DISTORTION]
         return [name for name in distorted if self.calibrations[name].model.series is None]
 
     def healed(self, healed: HealedRig, is_other: bool) -> _Rig:
-        """Return the rig with what was healed.
+        """Return the rig with the healed changes.
 
-        is_other: False where only a correction may differ; it is this rig where none does.
+        is_other: if False, only corrections may differ; returns this rig if none does.
         """
         calibrations = dict(self.calibrations)
         names = self.orientation.fluoroscopes
@@ -341,7 +342,7 @@ class _Rig:
     def diagnose(
         self, exposures: Sequence[_Exposure], known: Diagnosis, shape_scale: float
     ) -> Diagnosis | None:
-        """Say what has changed beside what is known of the bodies, up to a change of the rig.
+        """Diagnose changes in addition to the known changes of bodies, up to a change of the rig.
 
         Returns None for too few exposures.
         """
@@ -361,9 +362,9 @@ class _Rig:
 
 
 def _left_out(changes: Sequence[Change], target_id: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return the markers (B, M) that have changed, or whose bodies have.
+    """Return which markers (B, M) have changed, themselves or with their body.
 
-    Where no body would remain, they are kept: a rig that changes during the recording makes all
+    If no body would remain, none is excluded: a rig that changes during the recording makes all
     bodies look soft.
     """
     out = np.zeros(target_id.shape, dtype=bool)
@@ -374,16 +375,16 @@ def _left_out(changes: Sequence[Change], target_id: NDArray[np.int64]) -> NDArra
 
 
 def _solvable(target_id: NDArray[np.int64], left_out: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return which bodies (B,) have three markers that are not left out (B, M)."""
+    """Return which bodies (B,) have at least three markers that are not excluded (B, M)."""
     return np.asarray(((target_id >= 0) & ~left_out).sum(axis=1) >= 3)
 
 
 def _corrected(
     target_id: NDArray[np.int64], frame: Frame, calibration: FluoroscopeCalibration
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Rows (n,) of the markers of a frame in target_id, and their values (n, 6).
+    """Return rows (n,) of the markers of a frame in target_id, and their values (n, 6).
 
-    Image points beyond the calibrated area are left out.
+    Image points beyond the calibrated area are excluded.
     """
     _, own, given = np.intersect1d(target_id.ravel(), frame.target_id, return_indices=True)
     observed = frame.uv[given]
@@ -395,7 +396,7 @@ def _corrected(
     return own[inside], np.column_stack([observed, u, v, total, sd])[inside]
 
 
-# What is said of it.
+# Findings and checks of a healing.
 
 _KINDS = {
     Cause.ORIENTATION: Kind.FLUOROSCOPE_MOVED,
@@ -417,7 +418,7 @@ def _place_of(change: Change, rig: _Rig) -> Place:
 
 
 def _finding(change: Change, rig: _Rig, diagnosis: Diagnosis) -> Finding:
-    """Return what a change is, in a sentence."""
+    """Return a finding that describes a change."""
     return Finding(
         _KINDS[change.cause],
         _cause_text(change, rig),
@@ -444,7 +445,7 @@ def _cause_text(change: Change, rig: _Rig) -> str:
 
 
 def common_motion(distance_mm: float) -> Finding:
-    """Return how far all points together may have moved [mm]."""
+    """Return a finding on the possible common motion of all points [mm]."""
     return Finding(
         Kind.COMMON_MOTION,
         f'all points together may have moved by {distance_mm:.2f} mm (RMS) in the rig frame, '
@@ -455,7 +456,7 @@ def common_motion(distance_mm: float) -> Finding:
 
 
 def _unseen_distortion(distance_mm: float, noise_mm: float) -> Check:
-    """Check that changes of the distortion which bodies do not show are below the noise."""
+    """Check that changes of distortion that bodies do not show are below the noise."""
     return Check(
         Kind.UNSEEN_DISTORTION,
         'a change of the distortion that no body shows may have moved points by '
@@ -469,7 +470,7 @@ def _unseen_distortion(distance_mm: float, noise_mm: float) -> Check:
 
 
 def _identified(weakest: float, is_healed: bool) -> Check:
-    """Check that the bodies tell all of the change, or would tell that of a knock."""
+    """Check that the bodies identify the whole change, or would identify a knock."""
     change = 'the change' if is_healed else 'a knock'
     return Check(
         Kind.CHANGE_IDENTIFIED,
@@ -482,7 +483,7 @@ def _identified(weakest: float, is_healed: bool) -> Check:
 
 
 def _correctable(fixed: Sequence[str]) -> Check:
-    """Return the failed check of a change of the distortion that models do not take."""
+    """Return the failed check for a change of distortion that the models do not allow."""
     return Check(
         Kind.CHANGE_IDENTIFIED,
         'its model of the distortion has no field of standard deviations, and takes no change',
@@ -521,7 +522,7 @@ def _sure(diagnosis: Diagnosis, rig: _Rig) -> Check:
 def _unused_exposures(
     now: _Rig, exposures: Sequence[_Exposure], known: Diagnosis, shape_scale: float
 ) -> list[Check]:
-    """Check both halves of the exposures that were not used: a rig that creeps changes between."""
+    """Check both halves of the unused exposures, as a creeping rig changes between them."""
     middle = len(exposures) // 2
     halves = exposures[:middle], exposures[middle:]
     return [
@@ -531,7 +532,7 @@ def _unused_exposures(
 
 
 def _unused(rest: Diagnosis | None, half: int, rig: _Rig) -> Check:
-    """Check that exposures that were not used tell of no further change of the rig."""
+    """Check that unused exposures show no further change of the rig."""
     part = f'the {("first", "second")[half - 1]} half of the exposures that were not used'
     if rest is None:
         return Check(
@@ -555,9 +556,9 @@ def _unused(rest: Diagnosis | None, half: int, rig: _Rig) -> Check:
     )
 
 
-# The folder with a healed rig: calibrations, orientation, and what was changed and why.
+# Folder of a healed rig: calibrations, orientation, and what was changed and why.
 
-VERSION = 1  # of healing.json
+VERSION = 1  # format version of healing.json
 
 
 HEALING_FOLDER = FolderKind(
@@ -573,9 +574,9 @@ def save_healing(
     parent: RigOrientation,
     learned: LearnedShapes | None = None,
 ) -> None:
-    """Write a healed rig, all or nothing, and the shapes that have healed it.
+    """Write a healed rig, all or nothing, and the shapes by which it was healed.
 
-    parent: its orientation before. Raises DataError.
+    parent: its orientation before healing. Raises DataError.
     """
     with replaced_folder(directory, HEALING_FOLDER) as folder:
         for calibration in outcome.calibrations.values():
@@ -587,7 +588,7 @@ def save_healing(
 
 
 def healing_document(outcome: HealingOutcome, parent: RigOrientation) -> dict[str, Any]:
-    """Return what healing.json contains; docs/bodies.md describes it."""
+    """Return the content of healing.json, which docs/bodies.md describes."""
     return {
         'version': VERSION,
         'orientation_id': outcome.orientation.orientation_id,
@@ -633,7 +634,7 @@ def _errors(errors: RigErrors) -> dict[str, float]:
 
 
 def _changes(outcome: HealingOutcome) -> dict[str, Any]:
-    """Return the changes of the fluoroscopes that have changed, with their sd."""
+    """Return the changes of the changed fluoroscopes, with standard deviations."""
     healed = outcome.healed
     if healed is None:
         return {}

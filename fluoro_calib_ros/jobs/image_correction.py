@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The image correction job: a file, or all files of a folder, on all cores or a cluster."""
+"""The image correction job: correct a file, or a folder on all cores or a cluster."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from ..io.image_writing import (
 )
 from .scheduling import Cluster, open_workers
 
-PER_PROCESS = 50  # images that are worth the start of a process
+PER_PROCESS = 50  # number of images that justifies starting a process
 
 
 @dataclass(frozen=True)
@@ -38,22 +38,22 @@ class ImageCorrectionRequest:
     out: Path
     calibration: FluoroscopeCalibration
     interpolation: str = 'linear'  #: {'linear', 'cubic'}
-    #: processes for the files of a folder; 0: as many as there are cores, and as are worth it
+    #: processes for the files of a folder; 0: as many as are worthwhile, at most one per core
     workers: int = 0
-    #: a Dask cluster, or the address of its scheduler, in place of processes; its workers read and
-    #: write the same folders under the same names
+    #: a Dask cluster, or the address of its scheduler, used instead of processes; its workers
+    #: access the same folders by the same paths
     scheduler: Cluster | str | None = None
-    recursive: bool = False  #: whether the folders in a folder belong to it
-    #: whether the other files of a folder are corrected where some cannot be
+    recursive: bool = False  #: whether subfolders are included
+    #: whether to correct the other files of a folder if some cannot be corrected
     keep_going: bool = False
-    #: angle of the C-arm [rad] in an image of a file, by the number of the image, from 1; others
-    #: get the mean correction, as all do where it is None
+    #: angle of the C-arm [rad] for images of a file, by image number from 1; images without an
+    #: angle get the mean correction, as do all if this is None
     angles: Mapping[int, float] | None = None
 
 
 @dataclass(frozen=True)
 class _Task:
-    """A file of a folder."""
+    """File of a folder to correct."""
 
     source: Path
     out: Path
@@ -61,7 +61,7 @@ class _Task:
 
 @dataclass(frozen=True)
 class _Done:
-    """What became of a file: a number of images, or what is wrong with it."""
+    """Result of a file: its number of images, or its problem."""
 
     images: int
     problem: str = ''
@@ -70,12 +70,12 @@ class _Done:
 def run_image_correction(
     request: ImageCorrectionRequest, progress: Progress | None = None
 ) -> CorrectedImages:
-    """Correct an image file, a stack, a video, or all of them in a folder.
+    """Correct an image file, a stack, a video, or all of these in a folder.
 
-    progress is called with what is done, and the total: images of a file, files of a folder.
-    Raises DataError if a source cannot be read, is damaged, or is no grey image of the size of the
-    calibration; if `out` cannot be written, or its format cannot hold the images; for workers that
-    are lost, and angles of a folder. `out` is left as it was.
+    progress is called with the completed number and the total: images of a file, files of a
+    folder. Raises DataError if a source cannot be read, is damaged, or is no grey image of the
+    size of the calibration; if `out` cannot be written, or its format cannot hold the images; if
+    workers are lost; and for angles of a folder. `out` is then left unchanged.
     """
     if not request.source.is_dir():
         if request.angles is not None:
@@ -109,8 +109,8 @@ def _correct_by_angle(
 def _corrected_files(
     request: ImageCorrectionRequest, folder: ImageFolder, out: Path, progress: Progress | None
 ) -> Iterator[_Done]:
-    """Correct the files of a folder into another one. Raises DataError unless to keep going."""
-    # Paths that are the same for workers in other folders.
+    """Correct the files of a folder into another. Raises DataError, unless keep_going is set."""
+    # Absolute paths, valid for workers with another working directory.
     source = Path(os.path.abspath(folder.path))
     tasks = [_Task(source / one, out / new) for one, new in zip(folder.files, folder.written)]
     correct = partial(_correct_file, request.calibration, request.interpolation)
@@ -127,7 +127,7 @@ def _corrected_files(
 
 
 def _count(request: ImageCorrectionRequest, folder: ImageFolder) -> int:
-    """Return how many processes a folder is worth."""
+    """Return the number of processes that is worthwhile for a folder."""
     if request.workers:
         return request.workers
     videos = sum(suffix_of(path) in VIDEO_SUFFIXES for path in folder.files)
@@ -135,11 +135,11 @@ def _count(request: ImageCorrectionRequest, folder: ImageFolder) -> int:
     return min(max(worth, 1), os.cpu_count() or 1)
 
 
-_correctors: dict[tuple[str, str], ImageCorrector] = {}  # the last one of this process
+_correctors: dict[tuple[str, str], ImageCorrector] = {}  # the last corrector of this process
 
 
 def _correct_file(calibration: FluoroscopeCalibration, interpolation: str, task: _Task) -> _Done:
-    """Correct a file, in a worker."""
+    """Correct a file in a worker."""
     key = (calibration.calibration_id, interpolation)
     if key not in _correctors:
         _correctors.clear()

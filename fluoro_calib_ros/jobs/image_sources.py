@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Images of files, folders, stacks, videos and bags, one after the other, with their exposures."""
+"""Iteration over images of files, folders, stacks, videos and bags, with exposure numbers."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ from ..io.recordings import read_dicom_header
 
 @dataclass(frozen=True)
 class SourceImage:
-    """An image of a source."""
+    """Image of a source."""
 
     exposure: int
     place: str  #: file, page or message, in words
-    image: np.ndarray | DataError  #: (h, w), the error says why it cannot be read
-    frame: int | None = None  #: place in its video; None for an image that is of no video
-    angle: float | None = None  #: of the C-arm [rad], None where it is unknown
+    image: np.ndarray | DataError  #: (h, w), or the reason why it cannot be read
+    frame: int | None = None  #: index in its video; None if it is not of a video
+    angle: float | None = None  #: of the C-arm [rad], None if unknown
 
 
 @dataclass(frozen=True)
@@ -47,10 +47,10 @@ class ImageAngles:
 
     #: joints whose states in a bag give the angle of its images
     joints: AngleOptions = field(default_factory=AngleOptions)
-    angle: float | None = None  #: that of images without a joint [rad]
+    angle: float | None = None  #: angle of images without a joint [rad]
 
     def check(self, sources: Sequence[Path], fluoroscopes: Iterable[str]) -> None:
-        """Raise DataError for a joint of another fluoroscope, or without a bag."""
+        """Raise DataError for a joint of an unknown fluoroscope, or a joint without a bag."""
         try:
             joints = self.joints.joints(fluoroscopes)
         except ValueError as error:
@@ -61,13 +61,13 @@ class ImageAngles:
             )
 
     def track(self, bag: Path, fluoroscope: str) -> JointAngles:
-        """Return the angles of a fluoroscope in a bag. Raises DataError for a missing joint."""
+        """Return the angles of a fluoroscope in a bag. Raises DataError if a joint is missing."""
         joints = self.joints.joints((fluoroscope,), others=True)
         joint = joints.get(fluoroscope, '')
         return angles_in(bag, (fluoroscope,), replace(self.joints, angle_joint=joint))
 
     def note(self, fluoroscope: str, angles: Sequence[float | None]) -> tuple[str, ...]:
-        """Return a sentence where some images of a fluoroscope have no angle, but others do."""
+        """Return a note if images of a fluoroscope with a joint have no angle, else nothing."""
         count = sum(angle is None for angle in angles)
         joint = self.joints.joints((fluoroscope,), others=True).get(fluoroscope)
         if not joint or not count:
@@ -80,13 +80,13 @@ class ImageAngles:
 
 @dataclass(frozen=True)
 class ImageSources:
-    """Images of one fluoroscope: how many, 0 where it is not known, and the images."""
+    """Images of one fluoroscope, and their number (0 if unknown)."""
 
     count: int
     images: Callable[[], Iterator[SourceImage]]
 
     def counted(self, progress: Callable[[int, int], None] | None) -> Iterator[SourceImage]:
-        """Yield the images; progress is called after each with their number and the total."""
+        """Yield the images; after each, call progress with its number and the total."""
         for number, image in enumerate(self.images(), 1):
             yield image
             if progress is not None:
@@ -98,9 +98,9 @@ def open_sources(
 ) -> ImageSources:
     """Open images of one fluoroscope.
 
-    An exposure has the number in the name of its file if all files have a different one, else its
-    place in the order of the sources. fluoroscope selects the topic of a bag with several. Raises
-    DataError for a source that cannot contain images.
+    If all file names contain a number and these differ, they are the exposure numbers; otherwise
+    exposures are numbered in the order of the sources. fluoroscope selects the topic of a bag with
+    several. Raises DataError for a source that cannot contain images.
     """
     files: list[Path] = []
     topics: dict[Path, str] = {}
@@ -149,9 +149,9 @@ def fluoroscope_folders(source: Path) -> dict[str, Path]:
 
 
 def dose_texts(source: Path) -> dict[str, str]:
-    """Return what DICOM files say of the dose, by fluoroscope; '' for the images of a single one.
+    """Return the dose stated in DICOM files, by fluoroscope; '' for images of a single one.
 
-    Empty where none says anything. Files that cannot be read are passed over.
+    Empty if no file states a dose. Files that cannot be read are skipped.
     """
     texts = {}
     for name, folder in (fluoroscope_folders(source) or {'': source}).items():
@@ -173,12 +173,12 @@ def dose_texts(source: Path) -> dict[str, str]:
     return texts
 
 
-@lru_cache(maxsize=10_000)  # a live page asks again and again
+@lru_cache(maxsize=10_000)  # a live page requests this repeatedly
 def _dose(path: Path, changed_ns: int) -> tuple[float | None, float | None]:
     """Return tube load and dose area product of a DICOM file, None where unknown."""
     try:
         header = read_dicom_header(path)
-    except DataError:  # its reader says what is wrong
+    except DataError:  # the image reader reports the reason
         return None, None
     return header.tube_load, header.area_dose
 
@@ -195,11 +195,11 @@ def contains_images(source: Path) -> bool:
         known = [info.type for info in topics_of(source).values()]
         return TARGET_OBSERVATIONS not in known and bool(image_topics(source))
     except DataError:
-        return False  # the reader of bags says what is wrong
+        return False  # the reader of bags reports the reason
 
 
 def _images_in(folder: Path) -> list[Path]:
-    """Return the images of a folder in the order of their names. Raises DataError for none."""
+    """Return the images of a folder, ordered by number and name. Raises DataError if none."""
     found = [path for path in folder.iterdir() if image_suffix_of(path) in EXPOSURE_SUFFIXES]
     if not found:
         raise DataError(
@@ -209,7 +209,7 @@ def _images_in(folder: Path) -> list[Path]:
 
 
 def _number(path: Path) -> int | None:
-    """Return the last number in the name of a file, None for none."""
+    """Return the last number in a file name, or None."""
     numbers = re.findall(r'\d+', path.name if path.suffix[1:].isdigit() else path.stem)
     return int(numbers[-1][-9:]) if numbers else None
 
@@ -261,7 +261,7 @@ def _bag_reader(
 
 
 def _read(path: Path, angle: float | None) -> Iterator[_Placed]:
-    """Yield the images of a file; an error in place of what cannot be read ends it."""
+    """Yield the images of a file; if one cannot be read, yield the error and stop."""
     try:
         for place, image in open_images(path).images:
             yield place, image.copy(), angle

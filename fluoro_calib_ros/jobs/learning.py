@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The job of learning: shapes of bodies by a healthy rig, with which it is healed later."""
+"""The learning job: shapes of bodies seen by a healthy rig, used to heal it later."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from ..reconstruction.reconstruct import orientation_of_recorded
 from .bodies import BodiesOptions, estimated_shapes, intersected
 from .healing import MIN_EXPOSURES
 
-# What is wrong with a body whose shape is not used; what CT says of it does not matter.
+# Findings for which the shape of a body is not used; deviations from CT do not matter.
 REFUSED = (
     Kind.BODY_MIRRORED,
     Kind.BODY_NOT_RIGID,
@@ -31,7 +31,7 @@ REFUSED = (
     Kind.MARKER_LOOSE,
     Kind.WRONG_UNIT,
 )
-# What the drift watch says in an alarm.
+# Findings of the drift watch in an alarm.
 DRIFTED = (Kind.CLUSTER_CHANGE, Kind.IMAGE_DRIFT, Kind.RAYS_DO_NOT_MEET)
 
 
@@ -52,22 +52,22 @@ def learn_shapes(
     calibrations : mapping of str to FluoroscopeCalibration
     orientation : RigOrientation
     bodies : sequence of Body
-        Places of their markers may be unknown.
+        Positions of their markers may be unknown.
     options : BodiesOptions, optional
         How frames are paired.
     progress : callable, optional
-        Called with the number of exposures that are intersected, and of all.
+        Called with the number of intersected exposures and their total.
 
     Returns
     -------
     LearnedShapes
-        Without bodies that are loose, soft or not seen, which its findings name.
+        Without bodies that are loose, soft or not seen; its findings name them.
 
     Raises
     ------
     DataError
         For a healed rig, for a recording with an alarm of the drift watch, for frames that cannot
-        be paired or corrected, and where no shape can be learned.
+        be paired or corrected, and if no shape can be learned.
     """
     if orientation.source == 'healing':
         raise DataError(
@@ -103,9 +103,9 @@ def learn_shapes(
 
 
 def learned_for(directory: PathLike, orientation: RigOrientation) -> LearnedShapes:
-    """Return the learned shapes in a folder of calibrations, for an orientation of theirs.
+    """Return the learned shapes in a folder of calibrations for one of its orientations.
 
-    Raises DataError where there are none, or those of another calibration.
+    Raises DataError if there are none, or if they belong to another calibration.
     """
     if not has_learned_shapes(directory):
         raise DataError(
@@ -119,11 +119,11 @@ def learned_for(directory: PathLike, orientation: RigOrientation) -> LearnedShap
 
 
 def _is_good(shape: EstimatedShape) -> bool:
-    """Whether a shape may be compared with what a rig sees later."""
+    """Return whether a shape may be compared with later observations of a rig."""
     enough = shape.exposures >= MIN_EXPOSURES and int(shape.body.known.sum()) >= 3
     return enough and not any(one.kind in REFUSED for one in shape.findings)
 
 
 def _known(body: Body) -> Body:
-    """Return a body with the markers that were seen."""
+    """Return a body with only the markers that were seen."""
     return body.rows(body.known & np.isfinite(body.sd_mm))

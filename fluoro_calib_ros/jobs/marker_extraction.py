@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The marker job: image sequences of fluoroscopes to observations of markers.
+"""The marker job: observations of markers from image sequences of fluoroscopes.
 
-Images are read ahead in threads, since decoding takes as long as following. Calibrated views are
-followed together, image by image, because each predicts and checks the others; what they decide
-later on an earlier doubt is written into the earlier images.
+Threads read images ahead, because decoding takes as long as tracking. Calibrated views are tracked
+jointly, image by image, because each view predicts and checks the others. Their later decisions on
+an earlier doubt are applied to the earlier images.
 """
 
 from __future__ import annotations
@@ -46,33 +46,33 @@ from .image_sources import (
     open_sources,
 )
 
-MAX_TRIES = 30  # exposures in which markers are identified by their shapes
+MAX_TRIES = 30  # maximum number of exposures tried for identifying markers by their shapes
 
 
 @dataclass(frozen=True)
 class MarkerRequest:
-    """Image sequences of one fluoroscope or several, and their markers."""
+    """Image sequences of one or more fluoroscopes, and their markers."""
 
     sources: Mapping[str, Sequence[Path]]  #: images by fluoroscope
-    #: markers of one or more exposures, by fluoroscope; following begins with the first exposure
-    #: that every fluoroscope has some of; those of later ones enter there, or are found again
+    #: markers given in one or more exposures, by fluoroscope; tracking starts at the first
+    #: exposure for which all fluoroscopes have some; markers given later enter or are re-found
+    #: there
     first: Frames
     options: MarkerOptions = field(default_factory=MarkerOptions)
     #: of several fluoroscopes
     calibrations: Calibrations = field(default_factory=dict)
     orientation: RigOrientation | None = None  #: of several fluoroscopes
-    #: markers that are rigid together, of several fluoroscopes; known shapes give the ids where
-    #: no markers are given
+    #: rigid groups of markers, if several fluoroscopes; their shapes give ids if none are given
     bodies: tuple[Body, ...] = ()
-    overlay: Path | None = None  #: folder for pictures
-    #: names of markers, for pictures
+    overlay: Path | None = None  #: folder for overlay pictures
+    #: names of markers, for overlay pictures
     target_names: Mapping[int, str] = field(default_factory=dict)
     angles: ImageAngles = field(default_factory=ImageAngles)  #: angles of the C-arms
 
 
 @dataclass(frozen=True)
 class MarkerImageResult:
-    """Markers of one image, where it comes from, and the angle of its C-arm [rad]."""
+    """Markers of one image, its source, and the angle of its C-arm [rad]."""
 
     exposure: int
     place: str
@@ -82,33 +82,33 @@ class MarkerImageResult:
 
 @dataclass(frozen=True)
 class DoubtfulSpan:
-    """An id that may be wrong in some exposures."""
+    """Range of exposures in which an id may be wrong."""
 
     fluoroscope: str
     target_id: int
     first: int  #: exposures
     last: int  #: exposures
     images: int
-    #: markers that it may be exchanged with; none where it may be something else
+    #: markers with which it may be exchanged; empty if it may be something else
     others: tuple[int, ...]
     reason: str
 
 
 @dataclass(frozen=True)
 class MarkerOutcome:
-    """Followed markers."""
+    """Tracked markers."""
 
-    #: by fluoroscope, in the order of the exposures
+    #: by fluoroscope, ordered by exposure
     results: Mapping[str, tuple[MarkerImageResult, ...]]
-    #: what the views decided on doubtful ids; the results obey them
+    #: decisions of the views on doubtful ids, which are applied in the results
     decisions: tuple[Decision, ...]
     image_size: Mapping[str, tuple[int, int]]
-    #: images before the first one with given markers, which were not used
+    #: number of unused images before the first with given markers
     before: Mapping[str, int]
-    notes: tuple[str, ...] = ()  #: what a user has to know about the angles
+    notes: tuple[str, ...] = ()  #: notes for the user about the angles
 
     def frames(self) -> list[tuple[Frame, NDArray[np.bool_], NDArray[np.bool_]]]:
-        """Observations, with flags (n,) of overlapped markers and of doubtful ids."""
+        """Return observations, with flags (n,) of overlapped markers and of doubtful ids."""
         out = []
         for name, results in self.results.items():
             for result in results:
@@ -128,7 +128,7 @@ class MarkerOutcome:
         return out
 
     def spans(self) -> list[DoubtfulSpan]:
-        """Return what is still doubtful, by fluoroscope, marker and run of exposures."""
+        """Return the remaining doubts, by fluoroscope, marker and run of exposures."""
         out = []
         for name, results in self.results.items():
             open_spans: dict[int, DoubtfulSpan] = {}
@@ -165,7 +165,7 @@ class MarkerOutcome:
 
 
 def doubtful_ids(outcome: MarkerOutcome) -> list[Doubtful]:
-    """Return what is still doubtful, for the table in which a person decides."""
+    """Return the remaining doubts, for the table in which a person decides on them."""
     return [
         Doubtful(s.fluoroscope, s.first, s.last, s.target_id, s.reason, others=s.others)
         for s in outcome.spans()
@@ -177,7 +177,7 @@ def sequences(
 ) -> tuple[dict[str, list[Path]], tuple[int, int]]:
     """Return the sources of each fluoroscope, and the size of the first image [px].
 
-    Several fluoroscopes have one source each, or share a folder with a folder for each, or a bag.
+    Several fluoroscopes have one source each, or share a bag or a folder with one folder each.
     Raises DataError.
     """
     if len(fluoroscopes) == 1:
@@ -208,7 +208,7 @@ def sequences(
 
 
 def shaped(bodies: Sequence[Body], phantom: Phantom, path: Path) -> tuple[Body, ...]:
-    """Return bodies with coordinates of their markers. Raises DataError."""
+    """Return bodies with the surveyed coordinates of their markers. Raises DataError."""
     out = []
     for body in bodies:
         absent = np.setdiff1d(body.target_id, phantom.target_id)
@@ -223,11 +223,11 @@ def shaped(bodies: Sequence[Body], phantom: Phantom, path: Path) -> tuple[Body, 
 def run_marker_extraction(
     request: MarkerRequest, progress: Progress | None = None
 ) -> MarkerOutcome:
-    """Follow markers through the images of one fluoroscope or several.
+    """Track markers through the images of one or more fluoroscopes.
 
-    A damaged image, or one of another size, is passed over, and its result says why. progress is
-    called after every exposure with the number of those that are done, and their total, and again
-    while pictures of them are written. Raises DataError for sources that cannot be read, markers
+    An image that is damaged or of another size is skipped, and its result says why. progress is
+    called after every exposure with the number of finished exposures and their total, and again
+    while their pictures are written. Raises DataError for sources that cannot be read, markers
     that are not in the images, and fluoroscopes without calibration.
     """
     names = list(request.sources)
@@ -249,7 +249,7 @@ def run_marker_extraction(
 
 
 class _Recording:
-    """Gives exposures to a follower from the first with markers on, and revises its results."""
+    """Passes exposures to a follower, starting at the first with markers; revises its results."""
 
     def __init__(self, request: MarkerRequest) -> None:
         self._request = request
@@ -273,7 +273,7 @@ class _Recording:
         self._start = None if by_shape else self._first_exposure()
 
     def _first_exposure(self) -> int:
-        """First exposure of which markers of all fluoroscopes are given. Raises DataError."""
+        """Return the first exposure with given markers of all fluoroscopes. Raises DataError."""
         common = set.intersection(*(set(of_view) for of_view in self._given.values()))
         if not common:
             raise DataError(
@@ -282,7 +282,7 @@ class _Recording:
         return min(common)
 
     def add(self, images: Mapping[str, SourceImage]) -> None:
-        """Follow the markers through the images of one exposure, by fluoroscope."""
+        """Track the markers through the images of one exposure, by fluoroscope."""
         exposure = next(iter(images.values())).exposure
         if self._follower is None:
             first = self._first_markers(images, exposure)
@@ -313,7 +313,7 @@ class _Recording:
     def _first_markers(
         self, images: Mapping[str, SourceImage], exposure: int
     ) -> Mapping[str, FirstMarkers | None]:
-        """Return the markers of an exposure, none where they are not known. Raises DataError."""
+        """Return the markers of an exposure, empty if they are unknown. Raises DataError."""
         if len(images) < len(self._names) or (self._start or exposure) != exposure:
             return {}
         if self._start is None:
@@ -329,7 +329,7 @@ class _Recording:
             raise DataError(f'fluoroscope {name}, exposure {exposure}: {error}') from None
 
     def _given_later(self) -> tuple[int, ...]:
-        """Ids of markers that are given for exposures after the first one."""
+        """Return ids of markers that are given for exposures after the first."""
         if self._start is None:
             return ()
         frames = [f for of_view in self._given.values() for f in of_view.values()]
@@ -365,7 +365,7 @@ class _Recording:
     def _begin(
         self, images: Mapping[str, SourceImage], first: Mapping[str, FirstMarkers | None]
     ) -> MarkerFollower:
-        """Return the follower from the first images on. Raises DataError for a damaged one."""
+        """Return a follower starting at the first images. Raises DataError for a damaged image."""
         for name in self._names:
             image = images[name].image
             if isinstance(image, DataError):
@@ -384,7 +384,7 @@ class _Recording:
         )
 
     def outcome(self) -> MarkerOutcome:
-        """Return all results. Raises DataError where following did not begin."""
+        """Return all results. Raises DataError if tracking has not started."""
         if self._follower is None and self._start is None:
             raise DataError(f'the markers are in no exposure: {self._reason or "no images"}')
         if self._follower is None:
@@ -407,7 +407,7 @@ class _Recording:
         )
 
     def _notes(self) -> Iterator[str]:
-        """Yield what a user has to know about the angles."""
+        """Yield notes for the user about the angles."""
         request = self._request
         for name, results in self._results.items():
             angles = [result.angle for result in results]
@@ -422,12 +422,12 @@ class _Recording:
 
 
 def _angles_of(images: Mapping[str, SourceImage]) -> dict[str, float | None]:
-    """Angles of the C-arms in the images of an exposure [rad], by fluoroscope."""
+    """Return the angles of the C-arms in the images of an exposure [rad], by fluoroscope."""
     return {name: image.angle for name, image in images.items()}
 
 
 def _exposures(sources: Mapping[str, ImageSources]) -> Iterator[dict[str, SourceImage]]:
-    """Yield the images of each exposure, by fluoroscope, in the order of the exposures."""
+    """Yield the images of each exposure, by fluoroscope, ordered by exposure."""
     readers = {name: _ahead(source.images()) for name, source in sources.items()}
     waiting = {name: next(reader, None) for name, reader in readers.items()}
     while True:
@@ -442,11 +442,11 @@ def _exposures(sources: Mapping[str, ImageSources]) -> Iterator[dict[str, Source
 
 
 def _ahead(images: Iterator[SourceImage]) -> Iterator[SourceImage]:
-    """Yield images that a thread reads before they are wanted."""
+    """Yield images that a thread reads ahead."""
     waiting: deque[Future[SourceImage | None]] = deque()
     with ThreadPoolExecutor(1) as pool:
         while True:
-            while len(waiting) < 3:  # images are read before they are wanted
+            while len(waiting) < 3:  # number of images read ahead
                 waiting.append(pool.submit(next, images, None))
             image = waiting.popleft().result()
             if image is None:
@@ -460,7 +460,7 @@ def _write_pictures(
     outcome: MarkerOutcome,
     progress: Progress | None,
 ) -> None:
-    """Write a picture of every image that can be read, with the final ids."""
+    """Write a picture of every readable image with the final ids."""
     assert request.overlay is not None
     for name, source in sources.items():
         found = {result.exposure: result.markers for result in outcome.results[name]}

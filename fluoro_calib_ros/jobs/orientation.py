@@ -24,28 +24,28 @@ from ..photogrammetry.rotations import rotation_angle
 from ..reconstruction.intersection import Intersector
 from ..reconstruction.reconstruct import ReconstructedFrame, reconstruct_exposure
 
-MIN_MET = 0.5  # share of the targets of two views whose rays meet
-MIN_MET_SURELY = 0.9  # less is doubtful
-MIN_MATCHED = 10  # targets of two views by which a capture is judged
-MAX_SD = 2.0  # median distance of a target from its survey over the expectation
-# Changes of the relative orientation since the one before that are mentioned.
-MAX_SHIFT = 0.002  # over the distance of the sources
+MIN_MET = 0.5  # minimum share of targets in two views whose rays meet
+MIN_MET_SURELY = 0.9  # below this share the orientation is doubtful
+MIN_MATCHED = 10  # minimum number of targets in two views for judging a capture
+MAX_SD = 2.0  # maximum median distance of targets from their survey, relative to its expectation
+# Changes of the relative orientation since the previous one above which they are reported.
+MAX_SHIFT = 0.002  # relative to the distance of the sources
 MAX_TURN_RAD = np.deg2rad(0.2)
 
 
 @dataclass(frozen=True)
 class OrientationOutcome:
-    """Orientation of the rig, and a check of it for people.
+    """Orientation of the rig, and a check of it.
 
     Attributes
     ----------
     orientation : RigOrientation
     targets : int
-        Number of targets of the capture that were intersected again.
+        Number of targets of the capture that were intersected as a check.
     rms_mm : float
         Root mean square of their distances from the survey, NaN without targets.
     findings : tuple of Finding
-        What is doubtful about it, and what has changed.
+        Doubts about the orientation, and what has changed.
     """
 
     __repr__ = brief_repr
@@ -74,13 +74,13 @@ def orient(
     frame_id : str
         Name of the rig frame.
     present : RigOrientation, optional
-        The orientation so far, with which the new one is compared.
+        The previous orientation, with which the new one is compared.
 
     Raises
     ------
     DataError
         For fewer than two fluoroscopes, missing calibrations, frames that do not suffice, cannot
-        be of the phantom or are corrected already, and where most rays do not meet.
+        be of the phantom or are already corrected, and if most rays do not meet.
     """
     require_phantom(frames, phantom)
     orientation = orientation_of_capture(frames, phantom, calibrations, frame_id)
@@ -102,10 +102,10 @@ def orient(
 
 @dataclass(frozen=True)
 class _Met:
-    """How well the targets of a capture in two views are intersected again.
+    """Quality of the intersection of the targets that a capture shows in two views.
 
-    matched: their number; met: that of those whose rays meet; ratio: of their distances from the
-    survey to the expected ones, NaN for none.
+    matched: number of targets; met: number of those whose rays meet; ratio: of their distances
+    from the survey to the expected distances, NaN if there are none.
     """
 
     matched: int
@@ -114,7 +114,7 @@ class _Met:
 
     @property
     def is_good(self) -> bool:
-        """Whether nothing is doubtful, or too few targets are seen to tell."""
+        """Whether nothing is doubtful, or too few targets are seen to decide."""
         if self.matched < MIN_MATCHED:
             return True
         return self.met >= MIN_MET_SURELY * self.matched and self.ratio <= MAX_SD
@@ -123,13 +123,13 @@ class _Met:
 def _intersected(
     frames: Frames, calibrations: Calibrations, orientation: RigOrientation
 ) -> ReconstructedFrame:
-    """Return the targets of a capture, intersected again."""
+    """Return the targets of a capture, intersected with its orientation."""
     standing = standing_frames(frames, calibrations)
     return reconstruct_exposure(standing, calibrations, Intersector(orientation))
 
 
 def _met(found: ReconstructedFrame, phantom: Phantom) -> _Met:
-    """Return how well targets that are intersected again fit the phantom."""
+    """Return how well intersected targets fit the phantom."""
     points = found.points
     matched = int(np.sum(points.rays > 1))
     rows = phantom.index(found.target_id)
@@ -147,7 +147,7 @@ def _met(found: ReconstructedFrame, phantom: Phantom) -> _Met:
 def _fits_uncorrected(
     frames: Frames, phantom: Phantom, calibrations: Calibrations, frame_id: str
 ) -> bool:
-    """Whether a capture fits the calibrations without their corrections."""
+    """Return whether a capture fits the calibrations without their corrections."""
     if not any(calibrations[name].model.corrects for name in frames):
         return False
     plain = uncorrected(calibrations)
@@ -159,9 +159,9 @@ def _fits_uncorrected(
 
 
 def _doubt(met: _Met) -> Finding | None:
-    """Return why an orientation is doubtful, None where it is not.
+    """Return why an orientation is doubtful, None if it is not.
 
-    Raises DataError where most rays do not meet.
+    Raises DataError if most rays do not meet.
     """
     if met.is_good:
         return None
@@ -182,7 +182,7 @@ def _doubt(met: _Met) -> Finding | None:
 
 
 def _change(present: RigOrientation | None, new: RigOrientation) -> Finding | None:
-    """Return how the fluoroscopes stand to each other otherwise than before, None as before."""
+    """Return a finding if the relative orientation of fluoroscopes has changed, else None."""
     if present is None or present.fluoroscopes != new.fluoroscopes:
         return None
     first, *others = range(len(new.fluoroscopes))

@@ -42,9 +42,9 @@ if TYPE_CHECKING:
 class ReconstructionOptions(RecordedPairing):
     """Options of a reconstruction.
 
-    The drift watch also monitors the shapes of rigid bodies. A recording without
-    time stamps (has_stamps False) can only be paired by frame number, and cannot show a drift.
-    Raises ValueError for a value that an option cannot have.
+    The drift watch also monitors the shapes of rigid bodies. A recording without time stamps
+    (has_stamps False) can only be paired by frame number, and cannot show a drift. Raises
+    ValueError for an invalid value.
     """
 
     reject: float = option(
@@ -66,22 +66,22 @@ class ReconstructionOutcome:
     Attributes
     ----------
     frames : list of ReconstructedFrame
-        In the order of time.
+        Ordered by time.
     unpaired : mapping of str to int
-        Frames without partner, by fluoroscope.
+        Number of frames without partner, by fluoroscope.
     orientation : RigOrientation
         Of the fluoroscopes that were used.
     drift : DriftVerdict or None
-        None where the drift watch is switched off.
+        None if the drift watch is switched off.
     disagreement : str
-        Set where frames that were paired by number are far apart in time.
+        Set if frames that were paired by number are far apart in time.
     widening : float
-        Factor of the limit of false matches at the end: above 1 where the rays miss each other by
+        Factor of the limit of false matches at the end; above 1 if the rays miss each other by
         more than their standard deviations allow.
     cause : Finding or None
-        Why, where the factor is the largest and a trial tells it.
+        Cause of the widening, if the factor is at its maximum and a trial identifies the cause.
     noise : Finding or None
-        Set where image points have no sigma, and their rays show more noise than the calibration.
+        Set if image points have no sigma and their rays show more noise than the calibration.
     """
 
     __repr__ = brief_repr
@@ -96,21 +96,21 @@ class ReconstructionOutcome:
     noise: Finding | None = None
 
     def to_dataframe(self, names: Names | None = None) -> pandas.DataFrame:
-        """Return the points as a pandas DataFrame, with a column name where targets have names.
+        """Return the points as a pandas DataFrame, with a column name if targets have names.
 
-        Raises DataError where pandas is not installed.
+        Raises DataError if pandas is not installed.
         """
         return point_table(self.frames, names).to_dataframe()
 
     def plot(self, names: Names | None = None) -> Figure:
-        """Return a matplotlib figure of the paths in space, the gaps and the sd of the targets."""
+        """Return a matplotlib figure of the paths, gaps and standard deviations of targets."""
         from ..report.motion import points_figure
 
         return points_figure(self.frames, (names or Names()).target_names())
 
     @property
     def incomplete(self) -> int:
-        """Number of frames that some fluoroscope did not see."""
+        """Number of frames that were not seen by all fluoroscopes."""
         count = len(self.orientation.fluoroscopes)
         return sum(len(frame.fluoroscopes) < count for frame in self.frames)
 
@@ -138,13 +138,13 @@ def reconstruct(
     orientation : RigOrientation
     options : ReconstructionOptions, optional
     progress : callable, optional
-        Called with the number of exposures that are reconstructed, and of all.
+        Called with the number of reconstructed exposures and their total.
 
     Raises
     ------
     DataError
-        For calibrations that the orientation does not belong to, for frames that cannot be paired
-        or corrected, and where most rays do not meet.
+        For calibrations to which the orientation does not belong, for frames that cannot be paired
+        or corrected, and if most rays do not meet.
     """
     options = options or ReconstructionOptions()
     if options.pair_by == 'stamp' and not options.has_stamps:
@@ -198,7 +198,7 @@ def check_orientation(orientation: RigOrientation, calibrations: Calibrations) -
 def _drift_watch(
     orientation: RigOrientation, calibrations: Calibrations, options: ReconstructionOptions
 ) -> tuple[RecordingDriftWatch | None, DriftVerdict | None]:
-    """Return the drift watch of a recording, or the verdict that explains why there is none."""
+    """Return the drift watch of a recording, or a verdict that explains why there is none."""
     if not options.drift_watch:
         return None, None
     if not options.has_stamps:

@@ -49,10 +49,10 @@ from .result_folder import REPORT, belongs_to, saved_orientation, saved_rig_note
 
 @dataclass(frozen=True)
 class ComparedFolders:
-    """Comparisons by fluoroscope, the scale at the phantom, and what could not be compared."""
+    """Comparisons by fluoroscope, image scales at the phantom, and findings on missing ones."""
 
     comparisons: dict[str, Comparison]
-    #: at the median distance of the phantom; without an entry where result.json is missing
+    #: at the median distance of the phantom; no entry if result.json is missing
     mm_per_px: dict[str, float]
     findings: tuple[Finding, ...]
 
@@ -60,7 +60,7 @@ class ComparedFolders:
 def compare_folders(first: PathLike, second: PathLike) -> ComparedFolders:
     """Compare the calibrations of the fluoroscopes that two result folders have in common.
 
-    Raises DataError where there are none, and for calibrations that cannot be compared.
+    Raises DataError if there are none, and for calibrations that cannot be compared.
     """
     one = load_calibrations(first)
     other = load_calibrations(second)
@@ -88,7 +88,7 @@ def compare_folders(first: PathLike, second: PathLike) -> ComparedFolders:
 
 
 def _distances(directory: Path) -> dict[str, float]:
-    """Return the median distance of the phantom from the source by fluoroscope [mm]."""
+    """Return the median distance of the phantom from the source, by fluoroscope [mm]."""
     if not (directory / RESULT).exists():
         return {}
     found: dict[str, list[float]] = {}
@@ -99,7 +99,7 @@ def _distances(directory: Path) -> dict[str, float]:
     return {name: float(np.median(values)) for name, values in found.items()}
 
 
-# What reading a damaged result raises.
+# Exceptions raised by reading a damaged result.
 NOT_A_RESULT = (
     ArithmeticError,
     AttributeError,
@@ -122,14 +122,13 @@ def _not_a_result(directory: PathLike, error: Exception) -> DataError:
 def write_report(directory: PathLike, progress: Callable[[int, int], object] | None = None) -> str:
     """Write DIR/report.html from the result folder of a calibration, and return its path.
 
-    progress is called with the number of pictures that are drawn and that of all.
-    Raises DataError for a folder that is not the result of a calibration, and where the file
-    cannot be written.
+    progress is called with the number of finished pictures and their total. Raises DataError for a
+    folder that is not the result of a calibration, and if the file cannot be written.
     """
     path = Path(directory) / REPORT
     given = read_report_input(directory)
     try:
-        with np.errstate(all='ignore'):  # giant numbers of a damaged result
+        with np.errstate(all='ignore'):  # a damaged result may contain huge numbers
             text = report_html(given, progress)
     except NOT_A_RESULT as error:
         raise _not_a_result(directory, error) from None
@@ -138,10 +137,10 @@ def write_report(directory: PathLike, progress: Callable[[int, int], object] | N
 
 
 def residual_vectors(directory: PathLike) -> dict[str, Any]:
-    """Return the residuals of a result folder, by fluoroscope and number of the exposure.
+    """Return the residuals of a result folder, by fluoroscope and exposure number.
 
-    Of a fluoroscope: size, width and height [px], and exposures, with rows u, v, du, dv [px] and
-    whether the point was used. Empty for too many. Raises DataError.
+    For each fluoroscope: size, width and height [px], and exposures, with rows u, v, du, dv [px]
+    and whether the point was used. Empty if there are too many. Raises DataError.
     """
     try:
         return residual_rows(read_report_input(directory))
@@ -150,7 +149,7 @@ def residual_vectors(directory: PathLike) -> dict[str, Any]:
 
 
 def read_report_input(directory: PathLike) -> ReportInput:
-    """Read what the report of a result folder needs. Raises DataError."""
+    """Read the input of the report of a result folder. Raises DataError."""
     directory = Path(directory)
     calibrations = load_calibrations(directory)
     result = read_json(directory / RESULT)
@@ -194,26 +193,26 @@ def read_report_input(directory: PathLike) -> ReportInput:
 def _accuracy_in_space(
     request: CalibrationRequest, calibrations: Calibrations, orientation: RigOrientation | None
 ) -> SpaceAccuracy | None:
-    """Return how well the beads of the exposures are known in space, None where they are not."""
+    """Return the accuracy of the beads in space, or None if it cannot be determined."""
     if orientation is None or not set(orientation.fluoroscopes) <= set(calibrations):
         return None
     options = ReconstructionOptions(drift_watch=False)
     try:
         found = reconstruct(request.frames, calibrations, orientation, options)
-    except DataError:  # such as exposures without partner: the verdict says what is wrong
+    except DataError:  # such as exposures without partner: the verdict reports the reason
         return None
     return accuracy_in_space(found.frames, request.phantom)
 
 
-# Print a report as PDF, by a browser of this machine.
+# Printing a report as PDF with a browser of this machine.
 #
-# The report draws rig, radiographs and residuals by script, which only a browser runs.
+# Scripts in the report draw rig, radiographs and residuals, and only a browser runs these.
 
 BROWSERS = (
     *('chromium', 'chromium-browser', 'google-chrome', 'google-chrome-stable', 'chrome'),
     *('microsoft-edge', 'microsoft-edge-stable', 'msedge'),
 )
-# Where Windows and macOS have them, which is on no path.
+# Locations on Windows and macOS that are not on the search path.
 PLACES = (
     r'%ProgramFiles(x86)%\Microsoft\Edge\Application\msedge.exe',
     r'%ProgramFiles%\Google\Chrome\Application\chrome.exe',
@@ -224,13 +223,13 @@ PDF_START = b'%PDF-'
 
 
 def find_browser() -> str | None:
-    """Return a browser that prints without a window, None where there is none."""
+    """Return a browser that can print without a window, or None."""
     known = (os.path.expandvars(place) for place in PLACES)
     return next(filter(None, map(shutil.which, (*BROWSERS, *known))), None)
 
 
 def print_page(page: PathLike, out: PathLike) -> None:
-    """Write a page of this machine as PDF. Raises DataError without a browser."""
+    """Print a local page to PDF. Raises DataError if there is no browser or it fails."""
     browser = find_browser()
     if browser is None:
         raise DataError(
@@ -247,7 +246,7 @@ def print_page(page: PathLike, out: PathLike) -> None:
         if hasattr(os, 'geteuid') and os.geteuid() == 0:
             words.insert(
                 1, '--no-sandbox'
-            )  # with which it refuses to run as root, as in containers
+            )  # browsers refuse to run sandboxed as root, as in containers
         try:
             done = subprocess.run(words, capture_output=True, timeout=300, check=False)
             content = printed.read_bytes() if printed.exists() else b''

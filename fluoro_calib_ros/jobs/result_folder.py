@@ -50,7 +50,7 @@ from .healing import HealingOutcome, save_healing
 
 REPORT = 'report.html'
 REPORT_PDF = 'report.pdf'
-# Calibrations of other fluoroscopes stay in the folder.
+# Calibrations are not listed as parts, so those of other fluoroscopes stay in the folder.
 RESULT_FOLDER = FolderKind(
     'a result folder',
     parts=(
@@ -71,17 +71,17 @@ def save_outcome(
     """Write the outcome of a calibration job as a result folder, which replaces an earlier one.
 
     Writes the calibrations, result.json and its tables, the sources (observations, phantom,
-    options), the orientation of the rig and, where there is one, the validation. The folder is
-    exchanged as a whole, and the earlier one is kept as DIRECTORY.previous.
+    options), the orientation of the rig and the validation, if there is one. The folder is
+    replaced as a whole, and the earlier one is kept as DIRECTORY.previous.
 
     Parameters
     ----------
     directory : path-like
     outcome : CalibrationOutcome
     present : RigOrientation, optional
-        Orientation in use; by default that in the folder.
+        Orientation in use; by default the one in the folder.
     write_more : callable, optional
-        Called with the new folder to write files of other names, such as figures.
+        Called with the new folder, to write further files, such as figures.
 
     Returns
     -------
@@ -91,7 +91,7 @@ def save_outcome(
     Raises
     ------
     DataError
-        Where the folder cannot be written, or is not a result folder; it is then unchanged.
+        If the folder cannot be written, or is not a result folder; it is then unchanged.
     """
     orientation = kept_orientation(
         present or saved_orientation(directory), outcome.orientation, outcome.calibrations
@@ -116,7 +116,7 @@ def save_result(
 ) -> None:
     """Write calibrations and result.json of a calibration or adjustment as a result folder.
 
-    covariance: whether to write the covariance matrix of all unknowns, too. An earlier folder is
+    covariance: whether to also write the covariance matrix of all unknowns. An earlier folder is
     replaced as a whole and kept as DIRECTORY.previous. Raises DataError.
     """
     with replaced_folder(directory, RESULT_FOLDER) as folder:
@@ -126,7 +126,7 @@ def save_result(
 
 
 def write_covariances(folder: Path, result: CalibrationResult) -> None:
-    """Write the covariance matrix of all unknowns of every adjustment of a result into a folder.
+    """Write the covariance matrix of all unknowns of each adjustment of a result into a folder.
 
     Raises DataError.
     """
@@ -139,8 +139,8 @@ def save_calibrations(
 ) -> None:
     """Write calibrations and the orientation of the rig as a result folder.
 
-    Where these are the calibrations in the folder, only the orientation is written. Else the
-    folder is replaced as a whole and kept as DIRECTORY.previous. Raises DataError.
+    If the folder already contains these calibrations, only the orientation is written. Otherwise
+    the folder is replaced as a whole and kept as DIRECTORY.previous. Raises DataError.
     """
     check_output_folder(directory, RESULT_FOLDER)
     if _saved_ids(directory, calibrations) == [c.calibration_id for c in calibrations.values()]:
@@ -161,11 +161,11 @@ def save_healed_version(
     parent: RigOrientation,
     learned: LearnedShapes,
 ) -> None:
-    """Save a healed rig as a version beside its parent, and as the rig to be used.
+    """Save a healed rig as a version next to its parent, and as the rig to be used.
 
-    The parent comes first and the rig to be used last, so that a failure in between leaves the
-    parent in use. calibrations, parent: the rig as it was before. learned: the shapes that have
-    healed it. Raises DataError.
+    The parent is written first and the rig to be used last, so that a failure in between leaves
+    the parent in use. calibrations, parent: the rig before healing. learned: the shapes by which
+    it was healed. Raises DataError.
     """
     healed_id = outcome.orientation.orientation_id
     save_calibrations(version_folder(directory, parent.orientation_id), calibrations, parent)
@@ -191,12 +191,12 @@ def _write_result(
 
 
 def written_document(result: CalibrationResult) -> dict[str, Any]:
-    """Return the whole content of result.json."""
+    """Return the complete content of result.json."""
     return with_digest(result_document(result))
 
 
 def _saved_ids(directory: PathLike, calibrations: Calibrations) -> list[str]:
-    """Return the ids of the calibrations of these fluoroscopes in a folder, none for a fault."""
+    """Return the ids of the saved calibrations of these fluoroscopes, none if unreadable."""
     try:
         saved = load_calibrations(directory)
     except DataError:
@@ -205,7 +205,7 @@ def _saved_ids(directory: PathLike, calibrations: Calibrations) -> list[str]:
 
 
 def saved_orientation(directory: PathLike) -> RigOrientation | None:
-    """Return the orientation in a folder, None where there is no valid one."""
+    """Return the orientation in a folder, None if there is no valid one."""
     try:
         return load_orientation(orientation_path(directory))
     except DataError:
@@ -213,10 +213,10 @@ def saved_orientation(directory: PathLike) -> RigOrientation | None:
 
 
 def saved_rig_note(directory: PathLike) -> Finding | None:
-    """Return what result.json says about the orientation of the rig from its exposures.
+    """Return the finding in result.json on the orientation of the rig from the exposures.
 
-    None for nothing, and where the folder has a captured orientation, which the exposures do not
-    concern. Raises DataError for a file that cannot be read.
+    None if there is no finding, or if the orientation in the folder was captured, to which the
+    exposures do not contribute. Raises DataError for a file that cannot be read.
     """
     note = read_result(directory).get('rig_note', '')
     orientation = saved_orientation(directory)
@@ -237,10 +237,10 @@ def belongs_to(orientation: RigOrientation, calibrations: Calibrations) -> bool:
 def kept_orientation(
     present: RigOrientation | None, new: RigOrientation | None, calibrations: Calibrations
 ) -> RigOrientation | None:
-    """Choose between the present orientation of a rig and that of new calibrations.
+    """Choose between the current orientation of a rig and that of new calibrations.
 
-    The present one is kept if it belongs to the calibrations, and if there is no new one or it was
-    captured in the frame of the lab, which the exposures of a calibration do not determine.
+    The current one is kept if it belongs to the calibrations, and if there is no new one or it was
+    captured in the laboratory frame, which the exposures of a calibration do not determine.
     """
     is_valid = present is not None and belongs_to(present, calibrations)
     if present is not None and is_valid and (new is None or present.source == 'capture'):

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Where the parts of a job run: in processes of this machine, or on a Dask cluster."""
+"""Execution of the tasks of a job in processes of this machine or on a Dask cluster."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from ..processes import ProcessEnded, WorkerProcess, one_core
 Task = TypeVar('Task')
 Result = TypeVar('Result')
 
-QUEUED = 3  # tasks that wait for each worker
-CONNECT_S = 10  # to wait for a scheduler and its first worker
+QUEUED = 3  # maximum number of queued tasks per worker
+CONNECT_S = 10  # time limit for reaching a scheduler and its first worker
 
 
 class Workers(Protocol):
@@ -39,11 +39,11 @@ class Workers(Protocol):
 def open_workers(
     count: int = 0, scheduler: Cluster | str | None = None, tasks: int = 0
 ) -> AbstractContextManager[Workers]:
-    """Return workers, as a context that ends them: processes, or those of a Dask cluster.
+    """Return workers as a context that ends them: local processes or those of a Dask cluster.
 
-    count: of the processes, 0 for as many as there are cores. tasks: how many there will be, 0
-    where it is not known; for a single one, no process is started. Raises DataError where the
-    scheduler cannot be reached or is not trusted, or the package `distributed` is missing.
+    count: number of processes, 0 for one per core. tasks: number of tasks, 0 if unknown; for a
+    single task, no process is started. Raises DataError if the scheduler cannot be reached or is
+    not trusted, or if the package `distributed` is missing.
     """
     if scheduler is not None:
         return DaskWorkers(Cluster(scheduler) if isinstance(scheduler, str) else scheduler)
@@ -51,7 +51,7 @@ def open_workers(
 
 
 class LocalWorkers:
-    """Processes of this machine, each called by a thread; for a single one, the caller's own."""
+    """Processes of this machine, each called from a thread; a single one is the caller's own."""
 
     def __init__(self, count: int) -> None:
         self._count = count
@@ -69,7 +69,7 @@ class LocalWorkers:
             process.close()
 
     def map(self, function: Callable[[Task], Result], tasks: Iterable[Task]) -> Iterator[Result]:
-        """Yield the results of tasks in their order. Raises DataError for a worker that died."""
+        """Yield the results of tasks in their order. Raises DataError if a worker died."""
         threads = self._threads
         if threads is None:
             for task in tasks:
@@ -88,7 +88,7 @@ class LocalWorkers:
             ) from None
 
     def _call(self, function: Callable[[Task], Result], task: Task) -> Result:
-        """Return the result of a task, from the process of this thread."""
+        """Return the result of a task, computed in the process of this thread."""
         process: WorkerProcess | None = getattr(self._of_thread, 'process', None)
         if process is None:
             process = self._of_thread.process = WorkerProcess(_caller, 'a worker process')
@@ -97,7 +97,7 @@ class LocalWorkers:
 
 
 def _caller() -> Callable[[Callable[[Task], Result], Task], Result]:
-    """Return what a worker process does with a function and a task."""
+    """Return the function that a worker process applies to a function and a task."""
     return _applied
 
 
@@ -107,24 +107,24 @@ def _applied(function: Callable[[Task], Result], task: Task) -> Result:
 
 @dataclass(frozen=True)
 class Cluster:
-    """A Dask cluster: who it is, and why it is trusted.
+    """Address and security of a Dask cluster.
 
-    Functions, tasks and results travel as pickles: scheduler and workers can run code here, and
-    whoever reaches them can run code there.
+    Functions, tasks and results are exchanged as pickles: scheduler and workers can run code here,
+    and whoever reaches them can run code there.
     """
 
     #: address: tls://host:port, or tcp://host:port on this machine or in a trusted network
     scheduler: str
-    #: files (PEM) of the authority that has signed the certificates of the cluster, and of the
-    #: certificate of this process and its key; '' for none
+    #: PEM files: certificate of the authority that signed the certificates of the cluster, and
+    #: certificate and key of this process; '' for none
     tls_ca: str = ''
     tls_cert: str = ''
     tls_key: str = ''
-    #: whether all who reach the network of a tcp:// scheduler are trusted
+    #: whether everyone with access to the network of a tcp:// scheduler is trusted
     trusted_network: bool = False
 
     def security(self) -> Any:
-        """Return what the client proves and demands, None for plain TCP. Raises DataError."""
+        """Return the security settings of the client, None for plain TCP. Raises DataError."""
         from distributed.security import Security
 
         files = (self.tls_ca, self.tls_cert, self.tls_key)
@@ -155,7 +155,7 @@ class Cluster:
 
 
 def _is_of_this_machine(address: str) -> bool:
-    """Return whether an address is a loopback one, in numbers; a name may be that of another."""
+    """Return whether an address is localhost or a numeric loopback; names may be of others."""
     host = urlsplit(address if '//' in address else f'//{address}').hostname or ''
     try:
         return host == 'localhost' or ip_address(host).is_loopback
@@ -164,7 +164,7 @@ def _is_of_this_machine(address: str) -> bool:
 
 
 def _connected(cluster: Cluster) -> Any | str:
-    """Return a client of a scheduler, or why there is none."""
+    """Return a client of a scheduler, or the reason why there is none."""
     try:
         from distributed import Client
     except ImportError:
@@ -181,14 +181,14 @@ def _connected(cluster: Cluster) -> Any | str:
 
 
 class DaskWorkers:
-    """Workers of a Dask cluster. A task whose worker dies runs again on another one."""
+    """Workers of a Dask cluster. If a worker dies, its task runs again on another."""
 
     def __init__(self, cluster: Cluster) -> None:
         address = cluster.scheduler
         client = _connected(cluster)
         if isinstance(client, str):
-            # A client that could not connect is closed when it is collected. That must not happen
-            # while another one starts: both would wait for one lock.
+            # A client that failed to connect is closed when it is collected. This must not happen
+            # while another one starts, because both would wait for one lock.
             gc.collect()
             raise DataError(f'there is no Dask scheduler at {address}: {client}')
         self._client = client
@@ -205,7 +205,7 @@ class DaskWorkers:
         self._client.close()
 
     def map(self, function: Callable[[Task], Result], tasks: Iterable[Task]) -> Iterator[Result]:
-        """Yield the results of tasks in their order. Raises DataError for a lost cluster."""
+        """Yield the results of tasks in their order. Raises DataError if the cluster is lost."""
         from distributed import CancelledError, KilledWorker
 
         limits = read_limits()
@@ -223,7 +223,7 @@ class DaskWorkers:
 
 
 def _alone(function: Callable[[Task], Result], task: Task, limits: ReadLimits) -> Result:
-    """Run a task on one core, as its worker has others beside it, with the caller's limits."""
+    """Run a task on one core with the caller's limits, as other tasks run in parallel."""
     use_read_limits(limits)
     with one_core():
         return function(task)
@@ -232,7 +232,7 @@ def _alone(function: Callable[[Task], Result], task: Task, limits: ReadLimits) -
 def _in_order(
     submit: Callable[[Task], Future[Result]], tasks: Iterable[Task], queued: int
 ) -> Iterator[Result]:
-    """Yield the results of submitted tasks in their order, with so many in flight at most."""
+    """Yield the results of submitted tasks in their order, at most `queued` at a time."""
     waiting: deque[Future[Result]] = deque()
     for task in tasks:
         waiting.append(submit(task))

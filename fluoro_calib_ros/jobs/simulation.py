@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The simulation job: a data set of the virtual rig on disk."""
+"""The simulation job: write a data set of the virtual rig to disk."""
 
 from __future__ import annotations
 
@@ -67,19 +67,19 @@ from ..simulation.rig import (
     virtual_rig,
 )
 
-# A data set of the virtual rig on disk: bags, CSV files, phantom and truth.
+# Data set of the virtual rig on disk: bags, CSV files, phantom and truth.
 
-IMAGES = 'images'  # folder of radiographs, a folder for each fluoroscope
-MARKER_IMAGES = 'marker_images'  # the same of moving markers
-FIRST_MARKERS = 'first_markers.csv'  # where they are in the first image, to some pixel
+IMAGES = 'images'  # folder of radiographs, with one folder per fluoroscope
+MARKER_IMAGES = 'marker_images'  # the same for moving markers
+FIRST_MARKERS = 'first_markers.csv'  # their positions in the first image, to the nearest pixel
 BODIES = 'bodies.csv'
 JOINTS = 'joints.toml'
-CLUSTERS = 'clusters.txt'  # markers that are rigid together, a line for each cluster
-TRUTH = 'truth'  # folder of what a data set was made with
+CLUSTERS = 'clusters.txt'  # rigid groups of markers, one line per cluster
+TRUTH = 'truth'  # folder of the true values of a data set
 
 
 def write_bag(path: PathLike, frames: Frames) -> None:
-    """Write frames as a bag folder, in the order of their stamps. Raises DataError."""
+    """Write frames as a bag folder, ordered by stamp. Raises DataError."""
     recorded = [frame for of_fluoroscope in frames.values() for frame in of_fluoroscope]
     with BagWriter(path, overwrite=True) as bag:
         for frame in sorted(recorded, key=lambda f: f.stamp_ns):
@@ -92,7 +92,7 @@ def _rows(
     values: Iterable[NDArray[np.float64]],
     digits: int,
 ) -> Iterator[list[object]]:
-    """Yield rows that begin alike, with an id and numbers of so many digits."""
+    """Yield rows that start with the same values, followed by an id and formatted numbers."""
     for identity, numbers in zip(ids, values):
         yield [*begin, identity, *(f'{x:.{digits}f}' for x in numbers)]
 
@@ -136,7 +136,7 @@ def write_radiographs(
     """Write a radiograph of every exposure as images/FLUOROSCOPE/NUMBER.png, with its truth.
 
     truth/images.csv contains the centres of all beads in the field of view. progress is called
-    after every image with the number of images that are done, and their total. Raises DataError.
+    after every image with the number of finished images and their total. Raises DataError.
     """
     directory = Path(directory)
     rows: list[list[object]] = []
@@ -166,10 +166,10 @@ def write_marker_radiographs(
 ) -> None:
     """Write radiographs of moving markers as marker_images/FLUOROSCOPE/NUMBER.png.
 
-    first_markers.csv contains the markers of the first images, to the nearest pixel, as a person
-    would point at them; clusters.txt the rigid clusters, truth/marker_images.csv the true centres
-    of all markers with 1 for those that are seen, truth/marker_images_points.csv their points in
-    space [mm]. progress is called as by `write_radiographs`. Raises DataError.
+    first_markers.csv contains the markers in the first images, to the nearest pixel, as a person
+    would point at them; clusters.txt the rigid clusters; truth/marker_images.csv the true centres
+    of all markers, with 1 for visible ones; truth/marker_images_points.csv their points in space
+    [mm]. progress is called as by `write_radiographs`. Raises DataError.
     """
     directory = Path(directory)
     markers = sequence.markers
@@ -205,7 +205,7 @@ def write_marker_radiographs(
 def _first_markers(
     views: Mapping[str, MarkerImage], markers: MovingMarkers
 ) -> dict[str, list[Frame]]:
-    """Return the markers that are seen in the images of an exposure, to the nearest pixel."""
+    """Return the markers visible in the images of an exposure, to the nearest pixel."""
     return {
         name: [
             Frame(
@@ -267,7 +267,7 @@ def write_knee_recording(directory: PathLike, name: str, recording: SimulatedKne
 def write_rig(directory: PathLike, rig: VirtualRig, options: Mapping[str, Any]) -> None:
     """Write phantom.csv (the survey), truth/phantom.csv (true coordinates) and truth/rig.json.
 
-    options are those of the simulation. Raises DataError.
+    options: those of the simulation. Raises DataError.
     """
     directory = Path(directory)
     make_folder(directory / TRUTH)
@@ -302,7 +302,7 @@ def _fluoroscope(fluoroscope: VirtualFluoroscope) -> dict[str, Any]:
     }
 
 
-# Radiographs of a virtual rig, rendered in processes of their own.
+# Radiographs of a virtual rig, rendered in separate processes.
 
 SETTINGS = {'clean': CLEAN, 'hard': HARD}
 MARKER_MM = 1.0  # diameter of a marker
@@ -310,17 +310,17 @@ MARKER_MM = 1.0  # diameter of a marker
 
 @dataclass(frozen=True)
 class RenderedScene:
-    """What a radiograph is taken of."""
+    """Scene of which radiographs are rendered."""
 
     points_mm: NDArray[np.float64]  #: (n, 3), centres of beads or markers
-    pose: Pose  #: that takes them into the rig frame
-    seed: int = 0  #: of noise and clutter
-    diameter_mm: NDArray[np.float64] | None = None  #: (n,), None: the usual one of beads
-    plates: bool = True  #: whether there are the faces of the phantom
+    pose: Pose  #: transforms them into the rig frame
+    seed: int = 0  #: seed of noise and clutter
+    diameter_mm: NDArray[np.float64] | None = None  #: (n,), None: the usual diameter of beads
+    plates: bool = True  #: whether the faces of the phantom are present
 
 
 class Renderers:
-    """Takes radiographs with the fluoroscopes of a virtual rig, each in a process of its own."""
+    """Renders radiographs of the fluoroscopes of a virtual rig, each in its own process."""
 
     def __init__(
         self, fluoroscopes: Sequence[VirtualFluoroscope], settings: RadiographSettings
@@ -338,13 +338,13 @@ class Renderers:
             process.start()
 
     def images(self, scene: RenderedScene) -> Mapping[str, np.ndarray]:
-        """Return the radiographs (h, w) of a scene. Raises RuntimeError where it was closed."""
+        """Return the radiographs (h, w) of a scene. Raises RuntimeError after close()."""
         for process in self._processes.values():
             process.send(scene)
         return {name: process.receive() for name, process in self._processes.items()}
 
     def close(self) -> None:
-        """End the processes, also while they render."""
+        """End the processes, even while they render."""
         for process in self._processes.values():
             process.close()
 
@@ -358,8 +358,8 @@ def _camera(
     )
 
 
-HOUR_NS = 3600 * 10**9  # from one recording to the next
-NAMES = 'abcdefgh'  # of fluoroscopes
+HOUR_NS = 3600 * 10**9  # time from one recording to the next
+NAMES = 'abcdefgh'  # names of fluoroscopes
 DATA_SET = FolderKind(
     'a data set of the virtual rig',
     parts=(
@@ -372,7 +372,7 @@ DATA_SET = FolderKind(
 
 @dataclasses.dataclass(frozen=True)
 class SimulationOptions:
-    """Options of a data set. Raises ValueError for a value that an option cannot have."""
+    """Options of a data set. Raises ValueError for an invalid value."""
 
     seed: int = option(
         1, 'seed of the random numbers, which determines the rig', minimum=0, maximum=2**31
@@ -428,8 +428,8 @@ def simulate(
     """Write bags, CSV files, phantom and truth of a virtual rig into a folder.
 
     An earlier data set is replaced as a whole and kept as DIRECTORY.previous. progress is called
-    after every radiograph with their number and total. Raises DataError where the folder cannot
-    be written, or is no data set.
+    after every radiograph with its number and the total. Raises DataError if the folder cannot be
+    written, or is not a data set.
     """
     options = options or SimulationOptions()
     with replaced_folder(directory, DATA_SET) as folder:
@@ -457,7 +457,7 @@ def _write(
         taken = MARKER_SETTINGS if options.images != 'hard' else HARD_MARKER_SETTINGS
         sequence = MarkerSequence(rig, moving, taken, options.marker_images, options.seed)
         write_marker_radiographs(directory, sequence, progress)
-    # Each part has its own seed, so that its size does not change the others.
+    # Each part has its own seed, so that its size does not affect the others.
     if options.test_exposures:
         test = simulate_exposures(
             rig,

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Read the input of jobs: frames and phantoms from bags and files of any format, calibrations."""
+"""Reading of job input: frames and phantoms from bags and files of any format, calibrations."""
 
 from __future__ import annotations
 
@@ -55,13 +55,13 @@ class Recording:
     frames : dict of str to list of Frame
         By fluoroscope.
     unpaired : mapping of str to int
-        Numbers of frames without partner that were excluded.
+        Number of excluded frames without partner, by fluoroscope.
     names : Names
-        The known names and those of the source.
+        Known names, merged with those of the source.
     notes : tuple of str
-        What a user has to know about the source.
+        Notes for the user about the source.
     radiographs : mapping of str to mapping of int to bytes
-        By fluoroscope and exposure a small JPEG; of a source of images.
+        Small JPEGs by fluoroscope and exposure, if the source has images.
     """
 
     frames: dict[str, list[Frame]]
@@ -82,19 +82,19 @@ class Recording:
 
 @dataclass(frozen=True)
 class BagSelection:
-    """What is used of a bag, and how its frames are paired."""
+    """Selection of the frames of a bag, and how they are paired."""
 
-    #: time window from the stamp of the first frame [s]; None: not limited
+    #: time window relative to the stamp of the first frame [s]; None: unlimited
     start_s: float | None = None
     end_s: float | None = None
     pair_by: str = 'frame_number'  #: {'frame_number', 'stamp'}
     #: largest difference between the stamps of an exposure [s]
     tolerance_s: float = PairingOptions.tolerance_s
-    #: which joint gives the angle of the C-arm
+    #: joint that gives the angle of the C-arm
     angles: AngleOptions = field(default_factory=AngleOptions)
 
     def check_file(self, path: object) -> None:
-        """Raise DataError where a file without times is to be selected from by time."""
+        """Raise DataError if the selection needs the times that a file does not have."""
         if self.start_s is not None or self.end_s is not None or self.pair_by == 'stamp':
             raise DataError(
                 f'{path}: a time window and the pairing by stamp need a bag, this file does not '
@@ -107,7 +107,7 @@ class BagSelection:
             )
 
     def frames(self, path: object, found: Frames) -> dict[str, list[Frame]]:
-        """Return the frames in the time window. Raises DataError where there are none."""
+        """Return the frames in the time window. Raises DataError if a fluoroscope has none."""
         origin = min(frame.stamp_ns for each in found.values() for frame in each)
         low = -math.inf if self.start_s is None else self.start_s
         high = math.inf if self.end_s is None else self.end_s
@@ -127,7 +127,7 @@ class BagSelection:
 
 @dataclass(frozen=True)
 class Survey:
-    """A phantom, the names of its beads, and what a user has to know about them."""
+    """A phantom, the names of its beads, and notes for the user about them."""
 
     __repr__ = brief_repr
 
@@ -139,7 +139,7 @@ class Survey:
 def read_content(path: PathLike, settings: FileSettings, part: str, default: str) -> Content:
     """Read a part of a file of any format.
 
-    default is the kind of a CSV file that is not recognised, whose reader says what is wrong.
+    default: kind of a CSV file that is not recognised, whose reader then reports what is wrong.
     Raises DataError for a format without this part.
     """
     found = registry.recognised(path)
@@ -168,10 +168,10 @@ def read_survey(path: PathLike, settings: FileSettings | None = None) -> Survey:
 def read_orientations(
     paths: Iterable[PathLike], settings: FileSettings | None = None
 ) -> dict[str, KnownOrientation]:
-    """Read known orientations of fluoroscopes by name.
+    """Read known orientations of fluoroscopes, by name.
 
-    paths: YAML files of docs/special_rigs.md, or files of cameras of any format, such as
-    MayaCam 2. Raises DataError, also for a fluoroscope that occurs in two files.
+    paths: YAML files of docs/special_rigs.md, or camera files of any format, such as MayaCam 2.
+    Raises DataError, also for a fluoroscope that occurs in two files.
     """
     out: dict[str, KnownOrientation] = {}
     for path in paths:
@@ -189,7 +189,7 @@ def read_orientations(
 def _orientations_of_cameras(
     path: PathLike, settings: FileSettings
 ) -> dict[str, KnownOrientation]:
-    """Read the cameras of a file. Raises DataError for one without position and attitude."""
+    """Read the cameras of a file. Raises DataError for a camera without position and attitude."""
     content = read_content(path, settings, 'cameras', 'camera')
     out = {}
     for camera in content.cameras:
@@ -216,19 +216,19 @@ def read_source(
         A bag (file or folder), a CSV file `fluoroscope,exposure,target_id,u,v[,sigma]`, or a file
         of another program (docs/formats.md).
     image_size : (int, int), optional
-        Width and height [px]; needed for a file that does not contain it.
+        Width and height [px]; required for a file that does not contain it.
     fluoroscopes : sequence of str, optional
-        Names of those to read, in this order; by default all. As many names as there are cameras,
-        none of them in the file, name those that the file only numbers.
+        Names of those to read, in this order; by default all. If there are as many names as
+        cameras and none occurs in the file, they name the cameras that the file only numbers.
     collect : {'auto', 'all', 'still'}, optional
-        How exposures are collected from a bag; by default all frames are returned, unpaired ones
-        too. A CSV file already consists of exposures.
+        How exposures are collected from a bag; by default all frames are returned, including
+        unpaired ones. A CSV file already consists of exposures.
     validate : bool
-        Whether every frame of a bag is validated; else only the lengths of its arrays.
+        Whether every frame of a bag is validated; otherwise only the lengths of its arrays are.
     settings : exchange.content.FileSettings, optional
-        What the file does not say, and known names.
+        Conventions that the file does not state, and known names.
     selection : BagSelection, optional
-        Time window and pairing; pairing by stamp also numbers the frames anew, by exposure.
+        Time window and pairing; pairing by stamp also renumbers the frames by exposure.
 
     Raises
     ------
@@ -237,7 +237,7 @@ def read_source(
     """
     settings = settings or FileSettings()
     selection = selection or BagSelection()
-    bag = Path(path).is_dir() or is_bag(path)  # a folder that is none: its reader says so
+    bag = Path(path).is_dir() or is_bag(path)  # the reader refuses a folder that is no bag
     if bag:
         contents = read_frames(path, validate)
         found = selection.frames(path, contents.frames)
@@ -266,7 +266,7 @@ def read_source(
 
 
 def with_decisions(recording: Recording, path: PathLike | None) -> Recording:
-    """Return a recording after the decisions in a table, if any. Raises DataError."""
+    """Return a recording with the decisions in a table applied, if any. Raises DataError."""
     if path is None:
         return recording
     decisions = read_decisions(path, recording.names)
@@ -279,7 +279,7 @@ def with_decisions(recording: Recording, path: PathLike | None) -> Recording:
 
 
 def _observed(path: PathLike, settings: FileSettings) -> tuple[dict[str, list[Frame]], Content]:
-    """Read the frames of a file, and all else that it says. Raises DataError."""
+    """Read the frames of a file, and its other content. Raises DataError."""
     content = read_content(path, settings, 'observations', 'observations')
     require_observed(path, content.corrected_by)
     found = {name: list(frames) for name, frames in (content.observations or {}).items()}
@@ -293,7 +293,7 @@ def select_calibrations(
 ) -> dict[str, FluoroscopeCalibration]:
     """Return the calibrations of some fluoroscopes.
 
-    where begins the message of the DataError that is raised for a missing calibration.
+    where: start of the message of the DataError that is raised for a missing calibration.
     """
     place = f'{where}: ' if where else ''
     if not calibrations:
@@ -308,7 +308,7 @@ def select_calibrations(
 
 
 def _numbered_hint(name: str, calibrations: Calibrations) -> str:
-    """Return what to do about a camera that its file only numbers."""
+    """Return advice for a camera that its file only numbers."""
     if not re.fullmatch(r'cam\d+', name):
         return ''
     return f'; name the cameras of the file with --fluoroscopes {",".join(calibrations)}'
@@ -319,7 +319,7 @@ def read_calibrations(
 ) -> dict[str, FluoroscopeCalibration]:
     """Read the calibrations in a result folder, by default all.
 
-    Raises DataError for a folder without calibrations, a missing one, and a damaged file.
+    Raises DataError for a folder without calibrations, a missing calibration, and a damaged file.
     """
     found = load_calibrations(directory)
     if not found:
@@ -328,7 +328,7 @@ def read_calibrations(
 
 
 def require_observed(path: object, corrected_by: Mapping[str, str]) -> None:
-    """Raise DataError for image points that a calibration has corrected already."""
+    """Raise DataError for image points that are already corrected by a calibration."""
     for name, identity in corrected_by.items():
         raise DataError(
             f'{path}: the image points of fluoroscope {name} are corrected already, by the '
@@ -356,7 +356,7 @@ def read_calibrated_source(
     directory : path-like
         The result folder with the calibrations, whose names are known.
     image_size : (int, int), optional
-        Of a file; by default that of the calibration.
+        Image size of a file; by default that of the calibration.
     fluoroscopes, validate, settings, selection
         As in `read_source`.
 
@@ -391,7 +391,7 @@ def read_calibrated_source(
 def _unknown_angles(
     path: PathLike, frames: Frames, calibrations: Calibrations, selection: BagSelection | None
 ) -> Iterable[str]:
-    """Yield a sentence for each fluoroscope whose correction needs angles that are unknown."""
+    """Yield a note for each fluoroscope whose correction needs angles that are unknown."""
     for name, each in frames.items():
         angles = [frame.angle for frame in each]
         note = note_on_angles(name, calibrations[name].angle_field, angles)
@@ -410,8 +410,8 @@ def read_point_table(
 ) -> tuple[PointsFile, tuple[str, ...]]:
     """Read image points to be corrected with the calibrations in a folder, and notes about them.
 
-    A CSV file with columns u and v keeps its rows and other columns; a file of another program
-    becomes a row a point. Raises DataError.
+    A CSV file with columns u and v keeps its rows and other columns; a file of another program is
+    converted to one row per point. Raises DataError.
     """
     names = read_names(directory)
     found = registry.recognised(path)

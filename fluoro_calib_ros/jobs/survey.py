@@ -3,8 +3,8 @@
 
 """The survey job: coordinates of a phantom from its own exposures.
 
-Given coordinates need only be good enough to tell where each exposure was taken from: to some
-centimetres for a phantom of some decimetres. The self-calibration does the rest.
+The given coordinates only need to be good enough to find the position of each exposure: to some
+centimetres for a phantom of some decimetres. The self-calibration improves them.
 """
 
 from __future__ import annotations
@@ -46,15 +46,15 @@ class SurveyRequest:
     frames : mapping of str to sequence of Frame
         By fluoroscope; all are adjusted together.
     given : Phantom
-        Its coordinates as far as they are known, by a drawing or a ruler, and their sd.
+        Coordinates and standard deviations as far as known, from a drawing or a ruler.
     distances : sequence of MeasuredDistance
         Two or more, for scale and check.
     options : CalibrationOptions
         Of the self-calibration; the datum is that of a free network.
     principal_distance : float or None
-        Start value [px]; None: from the observations.
+        Initial value [px]; None: derived from the observations.
     keep_given : bool
-        Whether beads that cannot be surveyed keep their given coordinates; else they are left out.
+        Whether beads that cannot be surveyed keep their given coordinates; else they are omitted.
     """
 
     __repr__ = brief_repr
@@ -67,7 +67,7 @@ class SurveyRequest:
     keep_given: bool = False
 
     def calibration_of(self, frames: Frames, phantom: Phantom) -> CalibrationRequest:
-        """Return the request of the free network of some exposures."""
+        """Return the request for the free network of some exposures."""
         return CalibrationRequest(
             frames,
             phantom,
@@ -79,19 +79,19 @@ class SurveyRequest:
 
 @dataclass(frozen=True)
 class SurveyOutcome:
-    """A surveyed phantom.
+    """Surveyed phantom.
 
     Attributes
     ----------
     phantom : Phantom
     beads : SurveyedBeads
-        Those that were surveyed.
+        The beads that were surveyed.
     validation : Validation
         Verdict on the survey.
     findings : tuple of Finding
         What was excluded, and where the given coordinates are wrong.
     result : CalibrationResult
-        The self-calibration behind it.
+        The underlying self-calibration.
     """
 
     __repr__ = brief_repr
@@ -168,7 +168,7 @@ def _free_network(
     request: SurveyRequest,
     progress: Callable[[str, Round], None] | None,
 ) -> CalibrationResult:
-    """Self-calibrate with inner constraints; rough coordinates are replaced and tried again.
+    """Self-calibrate with inner constraints; if needed, improve rough coordinates and retry.
 
     Raises DataError.
     """
@@ -183,7 +183,7 @@ def _free_network(
     try:
         return adjusted(request.given, force=False)
     except DataError as error:
-        # What does not fit the given coordinates may fit those that the images give.
+        # Exposures that do not fit the given coordinates may fit those found from the images.
         if any(found.kind is not Kind.OTHER_PHANTOM for found in error.findings):
             raise
         refused = error
@@ -195,7 +195,7 @@ def _free_network(
 
 
 def _with_found(given: Phantom, result: CalibrationResult) -> Phantom:
-    """Return given coordinates with those that an adjustment found in their place."""
+    """Return the given coordinates, replaced where an adjustment found others."""
     xyz = given.xyz_mm.copy()
     xyz[given.index(result.targets.target_id)] = result.targets.xyz_mm
     return replace(given, xyz_mm=xyz)
@@ -205,15 +205,15 @@ def _halves(
     request: SurveyRequest,
     result: CalibrationResult,
 ) -> Check:
-    """Compare surveys of every other exposure."""
+    """Compare two surveys, each from every second exposure."""
     numbers = sorted({e.exposure for one in result.fluoroscopes.values() for e in one.exposures})
     fewest = min(len(one.exposures) for one in result.fluoroscopes.values())
     if fewest < 2 * MIN_EXPOSURES:
         return halves_not_compared(
             f'{fewest} exposures are too few for two halves of {MIN_EXPOSURES} or more'
         )
-    # The coordinates found so far are the better start values. The scale is not compared, so that
-    # its uncertainty does not count.
+    # Start from the better coordinates found so far. The scale is not compared, so exclude its
+    # uncertainty.
     start = replace(
         _with_found(request.given, result), sd_mm=np.full(len(request.given.sd_mm), EXACT_SD_MM)
     )
@@ -234,7 +234,7 @@ def _halves(
 
 
 def _phantom(request: SurveyRequest, beads: SurveyedBeads) -> Phantom:
-    """Return the phantom with the coordinates that were found."""
+    """Return the phantom with the surveyed coordinates."""
     given = request.given
     row = given.index(beads.target_id)
     found_mm = np.round(beads.xyz_mm, 6)
@@ -242,7 +242,7 @@ def _phantom(request: SurveyRequest, beads: SurveyedBeads) -> Phantom:
     if not request.keep_given:
         diameter = None if given.diameter_mm is None else given.diameter_mm[row]
         return Phantom(beads.target_id, found_mm, found_sd, diameter)
-    # They are as far off as those that were surveyed, if not further by their sd.
+    # Assume given coordinates as far off as those of surveyed beads were, if not more by their sd.
     off = float(np.sqrt(np.mean(beads.off_mm**2) / 3))
     xyz = given.xyz_mm.copy()
     sd = np.maximum(given.sd_mm, off)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""ROS 2 nodes: parameters, topics and message conversion around the other rooms.
+"""ROS 2 nodes: parameters, topics and message conversion for the other subpackages.
 
-Only this room imports rclpy and message packages.
+Only this subpackage imports rclpy and message packages.
 """

@@ -25,18 +25,18 @@ TOPIC = 'joint_states'
 
 
 class Asked(NamedTuple):
-    """An exposure whose angle was asked for: its stamp [ns], and the angle [rad] or None."""
+    """Last angle request of a fluoroscope: stamp of the exposure [ns] and angle [rad] or None."""
 
     stamp_ns: int
     angle: float | None
 
 
 class AngleInput:
-    """Receives the states of joints, in the thread of the streams, and gives angles to frames.
+    """Receives joint states in the stream thread and gives each frame the angle of its C-arm.
 
     Without a joint it subscribes to nothing, and all angles are unknown.
 
-    names: fluoroscopes. Raises StartError for a joint of a fluoroscope that there is not.
+    names: fluoroscopes. Raises StartError if a joint is configured for an unknown fluoroscope.
     """
 
     def __init__(
@@ -50,14 +50,14 @@ class AngleInput:
         self._received = 0
         self._refused = 0
         self._asked: dict[str, Asked] = {}
-        self._unknown = dict.fromkeys(names, 0)  # exposures
-        self._seen = dict.fromkeys(names, 0)  # of them, when the status was asked for last
+        self._unknown = dict.fromkeys(names, 0)  # exposures without an angle
+        self._seen = dict.fromkeys(names, 0)  # value at the last health()
         self._doubted: set[str] = set()
 
     def create_reader(self, node: StreamNode, faults: FaultHandlers) -> StreamReader:
-        """Return a new reader of a node that also receives the states.
+        """Return a new stream reader of a node that also receives the joint states.
 
-        faults: of its other topics.
+        faults: handlers of the node's other topics.
         """
         reader = node.create_reader(faults)
         if self._angles.joints:
@@ -69,12 +69,12 @@ class AngleInput:
                 decode=decode_joint_state,
                 max_bytes=MEGABYTE,
             )
-            # An exposure that waits among others must not get the angle of the first of them.
+            # Joint states first, so that a queued frame does not get the angle of an earlier one.
             reader.take_first(TOPIC, self._faults(faults))
         return reader
 
     def _faults(self, faults: FaultHandlers) -> FaultHandlers:
-        """Return the handlers of the states of joints; faults: of the other topics."""
+        """Return the fault handlers of the joint states; faults: those of the other topics."""
         on = f'a message on {TOPIC}'
         return FaultHandlers(
             lambda _: self._refuse(f'{on} cannot be decoded'),
@@ -84,9 +84,10 @@ class AngleInput:
         )
 
     def of_frame(self, name: str, stamp_ns: int, needed: bool) -> float | None:
-        """Return the angle of an exposure [rad], None where it is unknown.
+        """Return the angle of an exposure [rad], or None if it is unknown.
 
-        needed: whether something depends on it, so that an unknown one is counted and logged.
+        needed: whether a result depends on the angle, so that an unknown angle is counted and
+        logged.
         """
         angle = self._angles.at(name, stamp_ns)
         self._asked[name] = Asked(stamp_ns, angle)
@@ -100,7 +101,7 @@ class AngleInput:
         return angle
 
     def values(self, name: str) -> dict[str, object]:
-        """Return the values of a fluoroscope for the diagnostics, none where it has no joint."""
+        """Return the diagnostic values of a fluoroscope; empty if it has no joint."""
         if name not in self._angles.joints and not self._unknown[name]:
             return {}
         asked = self._asked.get(name)
@@ -114,9 +115,9 @@ class AngleInput:
         }
 
     def health(self, name: str, incompatible: Mapping[str, str]) -> Health | None:
-        """Return the state of a fluoroscope some of whose new frames had no angle, else None.
+        """Return a warning if new frames of a fluoroscope had no angle, else None.
 
-        incompatible: messages about publishers that are not received, by topic.
+        incompatible: messages about publishers that cannot be received, by topic.
         """
         before, self._seen[name] = self._seen[name], self._unknown[name]
         if self._unknown[name] == before:
@@ -124,7 +125,7 @@ class AngleInput:
         return Health(WARN, incompatible.get(TOPIC) or self._doubt(name))
 
     def _doubt(self, name: str) -> str:
-        """Return why the angle of the last exposure is unknown, or of some before it."""
+        """Return why the angle of the last exposure, or of an earlier one, is unknown."""
         asked = self._asked[name]
         reason = self._angles.doubt(name, asked.stamp_ns) or 'some exposures had none'
         return f'the angle of the C-arm is unknown: {reason}'
@@ -139,7 +140,7 @@ class AngleInput:
 
 
 def beyond_text(angle: float, calibrated: NDArray[np.float64]) -> str:
-    """Return a sentence about an angle [rad] that is far from all calibrated ones."""
+    """Return a sentence about an angle [rad] that is far from all calibrated angles."""
     nearest = calibrated[np.abs(np.angle(np.exp(1j * (calibrated - angle)))).argmin()]
     return (
         f'the angle of the C-arm, {math.degrees(angle):.1f} degrees, is far from all calibrated '

@@ -3,13 +3,13 @@
 
 """Node that shows the topics of a rig to Foxglove, also on machines without ROS.
 
-The door of the bridge: lets those who know its token through to the server of foxglove-sdk. The
-server of the SDK asks nobody anything: a web page that is open on this machine could read it. So
-it listens on an address of this machine that nobody can guess, and the gate in front of it looks
-at the request of each client (RFC 6455, 4.1): token and Origin.
+The server of foxglove-sdk does not authenticate its clients: any web page open on this machine
+could read from it. It therefore listens on a random loopback address that nobody can guess. A gate
+in front of it checks token and Origin in the request of each client (RFC 6455, 4.1), and forwards
+only admitted clients to the server.
 
-Messages are passed on as they are (CDR), with their definitions, by a WebSocket of foxglove-sdk. A
-topic is subscribed only while somebody looks at it.
+The WebSocket server of foxglove-sdk passes messages on unchanged (CDR), with their definitions. A
+topic is subscribed to only while a client reads it.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ from .runtime.topics import (
     installed_type,
 )
 
-HEAD_S = 5.0  # in which the head of a request has to come
-MAX_CLIENTS = 32  # connections at a time
+HEAD_S = 5.0  # time limit for receiving the head of a request
+MAX_CLIENTS = 32  # simultaneous connections
 CLIENT_ERRORS = (
     OSError,
     asyncio.TimeoutError,
@@ -55,21 +55,21 @@ REFUSED = b'HTTP/1.1 403 Forbidden\r\nConnection: close\r\nContent-Length: 0\r\n
 
 
 def hidden_address() -> str:
-    """Return a random address of this machine, 127.0.0.0/8 (RFC 1122, 3.2.1.3)."""
+    """Return a random loopback address of this machine, in 127.0.0.0/8 (RFC 1122, 3.2.1.3)."""
     return '127.' + '.'.join(str(secrets.randbelow(254) + 1) for _ in range(3))
 
 
 @dataclass(frozen=True)
 class Admission:
-    """Who is let through."""
+    """Decides which clients are let through."""
 
-    token: str  #: what the address has to end with: ?token=...
-    #: web pages that may connect, such as https://app.foxglove.dev; programs that are no web page
-    #: send no Origin, or none of http
+    token: str  #: that the address of a client has to end with: ?token=...
+    #: web pages that may connect, such as https://app.foxglove.dev; other programs send no Origin,
+    #: or none of http(s)
     origins: Sequence[str]
 
     def refusal(self, head: bytes) -> str:
-        """Return why a client is not let through, '' where it is; head: of its request."""
+        """Return why a client is refused, '' if it is admitted; head: of its request."""
         request, *lines = head.decode('latin-1').split('\r\n')
         words = request.split(' ')
         fields = (line.partition(':') for line in lines)
@@ -88,11 +88,11 @@ class Admission:
 
 
 class Gate:
-    """A TCP server that passes the connections of admitted clients on, in a thread of its own.
+    """TCP server, in its own thread, that forwards the connections of admitted clients.
 
     host, port: where it listens; port 0 is any free one. inner: host and port of the server behind
-    it. on_refused: called with the address of a client and the reason, in the thread. Raises
-    OSError where it cannot listen.
+    it. on_refused: called in that thread with the address and the reason of a refused client.
+    Raises OSError if it cannot listen.
     """
 
     def __init__(
@@ -113,11 +113,11 @@ class Gate:
         threading.Thread(target=self._loop.run_forever, name='gate', daemon=True).start()
 
     def close(self) -> None:
-        """Let nobody through any more."""
+        """Stop letting clients through."""
         self._loop.call_soon_threadsafe(self._loop.stop)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Look at the request of a client, and pass on what both sides send."""
+        """Check the request of a client, then forward data in both directions."""
         task = asyncio.current_task()
         assert task is not None
         self._clients.add(task)
@@ -152,7 +152,7 @@ class Gate:
 
 
 async def _pass_on(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-    """Pass on what comes until one side ends; a slow reader is waited for."""
+    """Forward data until one side ends; wait for a slow receiver."""
     with suppress(OSError):
         while data := await reader.read(65_536):
             writer.write(data)
@@ -183,17 +183,17 @@ PARAMETERS = (_NODE,)
 
 @dataclass
 class _Shown:
-    """A topic that is offered."""
+    """Topic that is offered to clients."""
 
     topic: str
     kind: type
     channel: Any
     subscription: Subscription | None = None
-    last: bytes = b''  # of a latched topic
+    last: bytes = b''  # last message of a latched topic, else empty
 
 
 class BridgeNode(ParameterNode):
-    """Offers topics on a WebSocket, and passes messages on to those who subscribe."""
+    """Offers topics on a WebSocket and passes messages on to clients that subscribe."""
 
     def __init__(self) -> None:
         super().__init__('bridge_node')
@@ -202,7 +202,7 @@ class BridgeNode(ParameterNode):
         self._topics_of_graph = TopicDiscovery(self, filter(None, settings.topics))
         self._shown: dict[str, _Shown] = {}
         self._lock = threading.Lock()
-        self._readers: Counter[str] = Counter()  # by topic; changed by the server's threads
+        self._readers: Counter[str] = Counter()  # by topic; changed by server threads
         self._newcomers: set[str] = set()  # topics with a reader who missed the latched message
         self._limited_logger = RateLimitedLogger(self.get_logger())
         self._token = settings.token or secrets.token_urlsafe(16)
@@ -232,7 +232,7 @@ class BridgeNode(ParameterNode):
         )
 
     def _open_gate(self, settings: BridgeParameters) -> Gate:
-        """Let clients through to the server. Raises StartError."""
+        """Open the gate that lets clients through to the server. Raises StartError."""
 
         def on_refused(client: str, reason: str) -> None:
             self._limited_logger.warning(f'client {client} refused: {reason}')
@@ -258,7 +258,7 @@ class BridgeNode(ParameterNode):
                 self._newcomers.add(topic)
 
     def _update(self) -> None:
-        """Offer new topics; subscribe to those with readers, and to no others."""
+        """Offer new topics, subscribe to those with readers, and unsubscribe from the others."""
         self._discover()
         with self._lock:
             read = {topic for topic, count in self._readers.items() if count > 0}
@@ -307,7 +307,7 @@ class BridgeNode(ParameterNode):
 
 
 def _foxglove() -> Any:
-    """Import the SDK. Raises StartError where it is not installed."""
+    """Import foxglove-sdk. Raises StartError if it is not installed."""
     try:
         import foxglove
     except ImportError:

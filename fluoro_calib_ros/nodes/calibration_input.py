@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Calibrations that arrive at a node, each prepared in a thread in parallel to the stream."""
+"""Calibrations received by a node, each prepared in a thread in parallel to the stream."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ from .runtime.diagnostics import one_line
 from .runtime.streams import DECODING_ERRORS
 from .runtime.topics import latched_qos, publisher_conflict
 
-# Calls of release() after which an undisputed calibration is used, in case a second node that is
-# seen has died.
+# Number of release() calls after which an undisputed calibration is used although a second node is
+# seen, which may have died.
 HOLD_TICKS = 3
-# Held while a calibration is prepared: one at a time, also of inputs that were closed meanwhile.
+# Locked while a calibration is prepared: one at a time, also of inputs closed meanwhile.
 _PREPARING = threading.Lock()
 
 
 class CalibrationInput:
     """Subscribes to the calibrations of fluoroscopes and prepares them for use.
 
-    The calibration in use stays until the next one is prepared: a frame sees one or the other. Of
-    calibrations that come while one is being prepared, the newest one is next; those of several
-    fluoroscopes are used together, as views with calibrations of two rigs give no points. While
-    two calibration nodes serve the same fluoroscope, their calibrations are held back until
-    release() finds one node only.
+    The current calibration stays in use until the next one is prepared, so each frame sees exactly
+    one of them. If several calibrations arrive during a preparation, only the newest is prepared
+    next. Calibrations of several fluoroscopes that arrive together come into use together, because
+    views with calibrations of different rigs give no points. While two calibration nodes serve the
+    same fluoroscope, their calibrations are held back until release() finds only one node.
 
     Parameters
     ----------
@@ -46,12 +46,12 @@ class CalibrationInput:
     names : iterable of str
         Fluoroscopes.
     prepare : callable
-        Called with a calibration in the thread; returns what current() returns from then on. It
-        does not need the node, which may be destroyed meanwhile.
+        Called with a calibration in the thread; its result is what current() returns from then on.
+        It must not need the node, which may be destroyed meanwhile.
     on_ready : callable
-        Called with name and prepared calibration in the thread, once it is in use.
+        Called in the thread with name and prepared calibration, once it is in use.
     on_refused : callable
-        Called with name and reason where a calibration is refused.
+        Called with name and reason if a calibration is refused.
     """
 
     def __init__(
@@ -69,11 +69,11 @@ class CalibrationInput:
         names = tuple(names)
         self._current: dict[str, Any] = dict.fromkeys(names)
         self._next: dict[str, FluoroscopeCalibration] = {}
-        self._ready: dict[str, Any] = {}  # prepared, while those of others are not
+        self._ready: dict[str, Any] = {}  # prepared, but waiting for others
         self._threads: dict[str, threading.Thread] = {}
         self._held: dict[str, dict[str, FluoroscopeCalibration]] = {name: {} for name in names}
         self._patience = dict.fromkeys(names, 0)
-        # Of _next, _ready, _threads, _closed and the use of the node.
+        # Protects _next, _ready, _threads, _closed and the use of the node.
         self._lock = threading.Lock()
         self._closed = False
         self._subscriptions = [
@@ -88,11 +88,11 @@ class CalibrationInput:
         ]
 
     def current(self, name: str) -> Any:
-        """Return the prepared calibration of a fluoroscope, None before the first one."""
+        """Return the prepared calibration of a fluoroscope, or None before the first one."""
         return self._current[name]
 
     def close(self) -> None:
-        """Unsubscribe; a calibration in preparation, which may take long, is not used any more."""
+        """Unsubscribe, and discard a calibration still in preparation, which may take long."""
         for subscription in self._subscriptions:
             self._node.destroy_subscription(subscription)
         self._subscriptions = []
@@ -104,18 +104,19 @@ class CalibrationInput:
     def begin_with(
         self, name: str, calibration: calibration_result.FluoroscopeCalibration
     ) -> None:
-        """Use a calibration of a file until another one arrives."""
+        """Use a calibration loaded from a file until another one arrives."""
         self._start(name, message_from_calibration(calibration))
 
     def conflict(self, name: str) -> str:
-        """Return a message where several calibration nodes serve a fluoroscope, else ''."""
+        """Return a message if several calibration nodes serve a fluoroscope, else ''."""
         return publisher_conflict(self._node, f'{name}/calibration_status')
 
     def release(self) -> None:
-        """Use the newest calibration held back where only one calibration node is left.
+        """Use the newest held-back calibration of each fluoroscope that has one calibration node.
 
-        To be called once a second. A single calibration that nothing contradicts is also used
-        while a second node is there, which may be one that has died, if there is none yet.
+        To be called once a second. If a fluoroscope has no calibration yet and only one is held
+        back, it is used after HOLD_TICKS calls even while a second node is seen, which may have
+        died.
         """
         for name, held in self._held.items():
             if not held:
@@ -128,7 +129,7 @@ class CalibrationInput:
                 held.clear()
 
     def _on_data(self, name: str, data: bytes) -> None:
-        """Decode a message of limited size."""
+        """Decode a message, unless it is too large."""
         most = read_limits().max_calibration_bytes
         if len(data) > most:
             self._refuse(
@@ -164,7 +165,7 @@ class CalibrationInput:
         with self._lock:
             self._next[name] = message
             thread = self._threads.get(name)
-            # One thread for each fluoroscope, however many calibrations come.
+            # One thread per fluoroscope, however many calibrations come.
             if thread is None or not thread.is_alive():
                 self._threads[name] = threading.Thread(
                     target=self._work, args=(name,), daemon=True
@@ -182,14 +183,15 @@ class CalibrationInput:
                 self._use(name, message)
 
     def _use(self, name: str, message: FluoroscopeCalibration) -> None:
-        """Prepare a calibration, and use it with those that came together."""
+        """Prepare a calibration, and use it together with those that arrived with it."""
         prepared = self._prepared(name, message)
         with self._lock:
             if self._closed:
                 return
             if prepared is not None:
                 self._ready[name] = prepared
-            # Not for another one of a fluoroscope that has one: there may be no end of them.
+            # Wait for fluoroscopes with nothing prepared, but not for a newer calibration of the
+            # others: there may be no end of them.
             if self._next.keys() <= self._ready.keys():
                 ready, self._ready = self._ready, {}
                 self._current = {**self._current, **ready}
@@ -197,7 +199,7 @@ class CalibrationInput:
                     self._on_ready(one, ready[one])
 
     def _prepared(self, name: str, message: FluoroscopeCalibration) -> Any:
-        """Return the prepared calibration, None where it is refused."""
+        """Return the prepared calibration, or None if it is refused."""
         try:
             calibration = calibration_from_message(message)
             if calibration.fluoroscope != name:
@@ -209,7 +211,7 @@ class CalibrationInput:
                 f'fluoroscope {name}: calibration {calibration.calibration_id} is being prepared'
             )
             return self._prepare(calibration)
-        except Exception as error:  # a message may hold anything, and the stream has to go on
+        except Exception as error:  # a message may contain anything, and the stream must go on
             with self._lock:
                 if not self._closed:
                     self._refuse(name, one_line(error))

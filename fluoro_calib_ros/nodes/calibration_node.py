@@ -3,15 +3,15 @@
 
 """Node that collects exposures of the phantom and self-calibrates the fluoroscopes on request.
 
-A thread of its own receives the frames. Another one runs all other callbacks: those that take long
-(calibrate, capture) are coroutines that await what they need, and the calibration itself is a
-process of its own. rclpy's MultiThreadedExecutor is no alternative: it schedules a callback again
-and again until it has started, which on a busy machine costs so much time that frames are lost.
+A dedicated thread receives the frames. A second thread runs all other callbacks: long ones
+(calibrate, capture) are coroutines that await their results, and the calibration itself runs in a
+separate process. rclpy's MultiThreadedExecutor is no alternative: it schedules a callback
+repeatedly until it has started, which on a busy machine takes so long that frames are lost.
 
-The parts: parameters and rig (calibration_settings), exposures (exposure_input), what is published
-(calibration_output), and the services that collect (exposure_input), orient the rig and calibrate
-(calibration_services), heal (healing_services), save and load (calibration_settings); and shapes
-that are learned (shape_learning).
+The node is assembled from parameters and rig (calibration_settings), exposures (exposure_input),
+publishers (calibration_output), and services that collect (exposure_input), orient the rig and
+calibrate (calibration_services), heal (healing_services), and save and load
+(calibration_settings). shape_learning learns the shapes of bodies.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class CalibrationNode(StreamNode):
         follow_groups(self, lambda: self._settings, self._use)
 
     def reset(self) -> None:
-        """Forget exposures and angles, and start counting from zero."""
+        """Discard exposures and angles, and reset all counters."""
         names = self._rig.names
         self._angles = AngleInput(self._settings.angles, names, self.limited_logger)
         self._exposures = ExposureInput(
@@ -81,14 +81,14 @@ class CalibrationNode(StreamNode):
         )
 
     def _use(self, settings: CalibrationSettings) -> None:
-        """Use other settings from now on."""
+        """Apply new settings from now on."""
         self._settings = settings
         self._exposures.use(settings)
 
     # -- lifecycle
 
     def create_outputs(self) -> None:
-        """Make topics, services and action, and publish the saved calibrations."""
+        """Create topics, services and actions, and publish the saved calibrations."""
         rig = self._rig
         self._output = output = CalibrationOutput(self, rig.names, rig.directory)
         files = CalibrationFiles(rig, output, self.get_logger())
@@ -99,7 +99,7 @@ class CalibrationNode(StreamNode):
         self._calibrating = SelfCalibration(parts)
         self._healing = Healing(parts)
         self._learning = ShapeLearning(parts)
-        # Services that await must not keep others from being answered.
+        # Reentrant, so that a service that awaits something does not block the others.
         group = ReentrantCallbackGroup()
         groups = (
             self._calibrating,
@@ -142,7 +142,7 @@ class CalibrationNode(StreamNode):
             )
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Take everything down, but not while a request is being answered."""
+        """Clean up, unless a request is being answered."""
         if self._requests.waiting:
             self.get_logger().error(
                 'cleanup refused: a request is being answered; cancel it or wait for its end'
@@ -151,7 +151,7 @@ class CalibrationNode(StreamNode):
         return super().on_cleanup(state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """End a running job; what answers it goes with the process."""
+        """Cancel a running job and deactivate; requests still waiting end with the process."""
         if not self._requests.waiting:
             return super().on_shutdown(state)
         self._calibrating.stop()
@@ -178,7 +178,7 @@ class CalibrationNode(StreamNode):
     # -- diagnostics
 
     def diagnose(self) -> list[Status]:
-        """Return the status of every fluoroscope, and publish it."""
+        """Return the diagnostic status of every fluoroscope, and publish its CalibrationStatus."""
         incompatible = self.incompatible_publishers()
         statuses = [self._diagnose(name, incompatible) for name in self._rig.names]
         return [*statuses, *self._learning.diagnose()]

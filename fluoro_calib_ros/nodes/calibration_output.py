@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a calibration node publishes: results, status, coverage, and its diagnostics."""
+"""Outputs of a calibration node: results, status, coverage, and its diagnostics."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ from .runtime.topics import latched_qos
 
 
 class CalibrationOutput:
-    """Publishers of a calibration node, what is in use, and what went wrong with the rest."""
+    """Publishers of a calibration node, the results in use, and the faults of refused ones."""
 
     def __init__(self, node: StreamNode, names: Sequence[str], directory: Path) -> None:
-        self.orientation: rig_orientation.RigOrientation | None = None  #: the one in use
+        self.orientation: rig_orientation.RigOrientation | None = None  #: orientation in use
         self.refused: dict[str, str] = {}  #: why the last calibration of a fluoroscope was refused
-        #: why calibrations were not loaded at the start, or are not saved; '' where they are
+        #: why calibrations were not loaded at the start, or could not be saved; '' without a fault
         self.load_fault = ''
         self.save_fault = ''
         self._node = node
@@ -55,8 +55,8 @@ class CalibrationOutput:
         self._in_use: dict[str, calibration_result.FluoroscopeCalibration] = {}
         self._since: dict[str, float] = {}
         self._verdict: dict[str, Verdict] = {}
-        # The status first: by its publishers, receivers of calibrations recognise that two nodes
-        # serve the same fluoroscope.
+        # Create the status publishers first: receivers of calibrations count them to recognise
+        # that two nodes serve the same fluoroscope.
         self._status = self._publishers(CalibrationStatus, 'calibration_status', 10)
         self._calibration = self._publishers(FluoroscopeCalibration, 'calibration', latched_qos())
         self._coverage = self._publishers(Image, 'coverage', latched_qos())
@@ -69,7 +69,7 @@ class CalibrationOutput:
         return {name: self._publisher(kind, f'{name}/{topic}', qos) for name in self._names}
 
     def _publisher(self, kind: type, topic: str, qos: QoSProfile | int) -> Publisher:
-        """Return a publisher, also of the inactive node."""
+        """Return a publisher that also publishes while the node is inactive."""
         publisher = self._node.create_publisher(kind, topic, qos)
         return self._node.own(publisher, self._node.destroy_publisher, publisher)
 
@@ -86,10 +86,10 @@ class CalibrationOutput:
     ) -> None:
         """Use and publish calibrations, and the orientation that belongs to them, if any.
 
-        verdict: on some of them.
+        verdict: validation verdict on some of the calibrations.
         """
-        # The orientation first, so that it is there when the first points come that are corrected
-        # with the new calibrations.
+        # Publish the orientation first, so that it is there when the first points arrive that are
+        # corrected with the new calibrations.
         if orientation is not None:
             self.publish_orientation(orientation)
         for name, calibration in calibrations.items():
@@ -103,7 +103,7 @@ class CalibrationOutput:
             self._calibration[name].publish(message_from_calibration(calibration))
 
     def publish_orientation(self, orientation: rig_orientation.RigOrientation) -> None:
-        """Use and publish an orientation, and before it the one that it was healed from."""
+        """Use and publish an orientation, preceded by the calibrated one if it was healed."""
         self.orientation = orientation
         calibrated = calibrated_orientation(self._directory, orientation)
         if calibrated is not None:
@@ -115,11 +115,11 @@ class CalibrationOutput:
         return self._verdict.get(name, Verdict())
 
     def age_s(self, name: str) -> float:
-        """Return how long a calibration has been in use [s], NaN where there is none."""
+        """Return how long a calibration has been in use [s], NaN if there is none."""
         return time.monotonic() - self._since.get(name, float('nan'))
 
     def publish_status(self, progress: FluoroscopeProgress) -> None:
-        """Publish the progress of a fluoroscope, and a picture where somebody looks at it."""
+        """Publish the progress of a fluoroscope, and a coverage picture if it has subscribers."""
         stamp = self._node.get_clock().now().to_msg()
         name = progress.fluoroscope
         self._status[name].publish(message_from_progress(progress, stamp))
@@ -137,49 +137,49 @@ class CalibrationOutput:
 
 @dataclass(frozen=True)
 class FluoroscopeState(StreamState):
-    """What the diagnostics of a fluoroscope are decided by."""
+    """State from which the health of a fluoroscope is diagnosed."""
 
     progress: FluoroscopeProgress
     output: CalibrationOutput
-    disagreement: str  #: about frames with the same number that are far apart in time, else ''
-    angle: Health | None  #: where the angle of the C-arm is unknown
+    disagreement: str  #: message if frames of the same number are far apart in time, else ''
+    angle: Health | None  #: warning if the angle of the C-arm is unknown
 
 
 def nothing_loaded(state: FluoroscopeState) -> Health | None:
-    """The saved calibrations could not be loaded at the start."""
+    """Report that the saved calibrations could not be loaded at the start."""
     reason = state.output.load_fault
     return fault(reason and f'no calibration loaded: {reason}')
 
 
 def nothing_saved(state: FluoroscopeState) -> Health | None:
-    """The calibration in use could not be saved."""
+    """Report that the calibration in use could not be saved."""
     return fault(state.output.save_fault)
 
 
 def refused_calibration(state: FluoroscopeState) -> Health | None:
-    """The last self-calibration gave no calibration."""
+    """Report that the last self-calibration gave no calibration."""
     reason = state.output.refused.get(state.stream.name, '')
     in_use = state.progress.calibration_id or 'no calibration'
     return fault(reason and f'the last calibration was refused: {reason}; {in_use} is in use')
 
 
 def never_published(state: FluoroscopeState) -> Health | None:
-    """Nobody publishes frames, or has done so."""
+    """Report that nobody publishes frames, or has ever done so."""
     return None if state.stream.received else missing_publisher(state)
 
 
 def distant_stamps(state: FluoroscopeState) -> Health | None:
-    """Frames of the same number are far apart in time."""
+    """Warn if frames of the same number are far apart in time."""
     return warning(state.disagreement)
 
 
 def unknown_angle(state: FluoroscopeState) -> Health | None:
-    """The angle of the C-arm is unknown."""
+    """Warn if the angle of the C-arm is unknown."""
     return state.angle
 
 
 def failed_verdict(state: FluoroscopeState) -> Health | None:
-    """The calibration in use should not be used."""
+    """Warn if the calibration in use has failed its verdict."""
     verdict = state.output.verdict(state.stream.name)
     if verdict.verdict != 'fail':
         return None
@@ -189,7 +189,7 @@ def failed_verdict(state: FluoroscopeState) -> Health | None:
 
 
 def working(state: FluoroscopeState) -> Health:
-    """Nothing is wrong."""
+    """Report what the node is doing if nothing is wrong."""
     progress = state.progress
     if progress.is_calibrating:
         last = progress.last_round

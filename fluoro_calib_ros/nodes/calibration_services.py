@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Jobs of a calibration node: orient the rig, self-calibrate."""
+"""Jobs of a calibration node: orient the rig and self-calibrate."""
 
 from __future__ import annotations
 
@@ -44,16 +44,16 @@ from .runtime.services import ServiceEntry, in_thread, wake, within
 
 
 class _Capture:
-    """Collects frames of the phantom in the rig frame until there are enough, or too late."""
+    """Collects frames of the phantom in the rig frame until there are enough or time is up."""
 
     def __init__(self, names: Sequence[str], count: int) -> None:
         self.frames: dict[str, list[Frame]] = {name: [] for name in names}
-        self.done = Future()  # of whether there are enough
+        self.done = Future()  # result: whether there are enough
         self._count = count
         self._lock = threading.Lock()
 
     def add(self, pair: Mapping[str, Frame]) -> bool:
-        """Add a frame of every fluoroscope; returns whether there are enough."""
+        """Add a frame of every fluoroscope; return whether the capture has ended."""
         for name, frame in pair.items():
             self.frames[name].append(frame)
         if len(self.frames[frame.fluoroscope]) == self._count:
@@ -61,7 +61,7 @@ class _Capture:
         return self.done.done()
 
     def finish(self, is_complete: bool) -> None:
-        """End the capture, unless it has ended: frames and timeout come from two threads."""
+        """End the capture, once only: frames and timeout come from different threads."""
         with self._lock:
             if not self.done.done():
                 self.done.set_result(is_complete)
@@ -76,7 +76,7 @@ class OrientationService(RigServices):
         self.services = (ServiceEntry('orient', Orient, self._on_orient),)
 
     def add(self, pair: Mapping[str, Frame]) -> None:
-        """Give frames of the phantom to the capture that waits for them, if any.
+        """Give frames of the phantom to the waiting capture, if any.
 
         Called in the thread of the streams.
         """
@@ -140,7 +140,7 @@ class OrientationService(RigServices):
     async def _captured(
         self, names: Sequence[str], count: int, timeout_s: float
     ) -> dict[str, list[Frame]]:
-        """Return the next frames of all fluoroscopes. Raises DataError when the time is up."""
+        """Return the next frames of all fluoroscopes. Raises DataError if time runs out."""
         if self._capture is not None:
             raise DataError('another capture is waiting for its frames')
         capture = self._capture = _Capture(names, count)
@@ -154,15 +154,15 @@ class OrientationService(RigServices):
 
 
 class Cancelled(Exception):
-    """The running job has to stop."""
+    """Raised when the running job has to stop."""
 
 
 class Job(RigServices, ABC):
-    """Runs one job of an action at a time, in a process of its own."""
+    """Runs one job of an action at a time, in a separate process."""
 
     kind: Any  #: type of the action
-    action: str  #: its name
-    title: str  #: what is run
+    action: str  #: name of the action
+    title: str  #: kind of job, for messages
 
     def __init__(self, parts: NodeParts) -> None:
         super().__init__(parts)
@@ -183,18 +183,18 @@ class Job(RigServices, ABC):
         )
 
     def stop(self) -> None:
-        """Cancel the running job, and those that are still to come."""
+        """Cancel the running job and all later ones."""
         self._stopping.set()
 
     def end(self) -> None:
-        """Cancel the running job, and wait for its end."""
+        """Cancel the running job and wait for it to end."""
         self.stop()
         if self._thread is not None:
             self._thread.join()
 
     @abstractmethod
     async def _work(self, goal: Any, result: Any) -> None:
-        """Run the job of a goal and fill in the result. Raises DataError, Cancelled."""
+        """Run the job of a goal and fill in the result. Raises DataError and Cancelled."""
 
     def _on_cancel(self, _: Any) -> CancelResponse:
         return CancelResponse.ACCEPT
@@ -205,12 +205,12 @@ class Job(RigServices, ABC):
             goal.succeed()
         elif goal.is_cancel_requested:
             goal.canceled()
-        else:  # also where the node ends
+        else:  # also if the node ends
             goal.abort()
         return result
 
     async def _answer(self, result: Any, work: Coroutine[Any, Any, None]) -> bool:
-        """Let the work be done, or say in the result why it was not; returns whether it was.
+        """Await the work and return whether it succeeded; if not, state the reason in the result.
 
         Without success nothing is changed.
         """
@@ -240,7 +240,7 @@ class Job(RigServices, ABC):
         return False
 
     def _raise_if_cancelled(self, is_cancel_requested: bool) -> None:
-        """Raise Cancelled where the job has to stop."""
+        """Raise Cancelled if the job has to stop."""
         if is_cancel_requested or self._stopping.is_set():
             raise Cancelled
 
@@ -294,9 +294,9 @@ class SelfCalibration(Job):
         tell: Callable[[SelfCalibrate.Feedback], None],
         is_cancel_requested: Callable[[], bool],
     ) -> Future:
-        """Start a calibration in a worker process; returns the Future of its CalibrationOutcome.
+        """Start a calibration in a worker process; return the Future of its CalibrationOutcome.
 
-        Raises DataError and ValueError, also where the outcome could not be saved.
+        Raises DataError and ValueError, also if the outcome could not be saved.
         """
         check_output_folder(self._rig.directory, RESULT_FOLDER)
         job, rig = self._job_of(request)
@@ -322,7 +322,7 @@ class SelfCalibration(Job):
         return done
 
     async def _write_report(self) -> None:
-        """Write the report of the calibration that is saved, if that is possible."""
+        """Write the report of the saved calibration; a failure is only logged."""
         written, self._thread = in_thread(
             self._node,
             lambda: in_worker_process(
@@ -339,7 +339,7 @@ class SelfCalibration(Job):
             self._logger.warning(f'no report of the calibration: {error}')
 
     def _job_of(self, request: Request) -> tuple[CalibrationRequest, Rig]:
-        """Return the job of a request, and the fluoroscopes that it leaves as they are.
+        """Return the job of a request, and the rig of the fluoroscopes that it leaves unchanged.
 
         Raises DataError and ValueError.
         """
@@ -388,7 +388,7 @@ class SelfCalibration(Job):
 
 
 def _verdict_of(validation: Validation | None) -> Verdict | None:
-    """Return the verdict of a validation."""
+    """Return the verdict of a validation, None without one."""
     if validation is None:
         return None
     findings = tuple(found.sentence for found in validation.findings)

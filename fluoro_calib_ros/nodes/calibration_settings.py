@@ -58,7 +58,7 @@ COLLECT_MODES = ('still', 'request')
 
 @dataclass(frozen=True)
 class CalibrationParameters(ManagedParameters):
-    """Parameters that only the calibration node has."""
+    """Parameters specific to the calibration node."""
 
     phantom: str = option(
         '',
@@ -122,7 +122,7 @@ _OF_REQUESTS = ('model', 'interior', 'loss', 'max_iterations', 'relative_orienta
 
 @dataclass(frozen=True)
 class CalibrationSettings:
-    """Values of the parameters, by group."""
+    """Parameter values by group."""
 
     node: CalibrationParameters = group(
         CalibrationParameters,
@@ -156,13 +156,13 @@ class RigSetup:
     """The rig of a calibration node."""
 
     names: tuple[str, ...]  #: fluoroscopes
-    phantom: Phantom | None  #: without one, the node only serves saved calibrations
-    target_names: Names  #: of the beads
-    directory: Path  #: folder of its calibrations
-    settings: Callable[[], CalibrationSettings]  #: returns the present CalibrationSettings
+    phantom: Phantom | None  #: if None, the node only serves saved calibrations
+    target_names: Names  #: names of the beads
+    directory: Path  #: folder of the calibrations
+    settings: Callable[[], CalibrationSettings]  #: returns the current settings
 
     def required_phantom(self) -> Phantom:
-        """Return the phantom. Raises DataError where there is none."""
+        """Return the phantom. Raises DataError if there is none."""
         if self.phantom is None:
             raise DataError(
                 'parameter phantom is not set: the node only serves saved calibrations'
@@ -199,15 +199,15 @@ def read_rig(node: ParameterNode, settings: Callable[[], CalibrationSettings]) -
 def default_calibration_directory(namespace: str) -> Path:
     """Return the folder in which a calibration node of a namespace saves its calibrations.
 
-    It is fluoro_calib/<namespace> in $ROS_HOME, or in ~/.ros where that is not set. Raises
-    DataError where there is no home folder.
+    It is fluoro_calib/<namespace> in $ROS_HOME, or in ~/.ros if that is not set. Raises DataError
+    if there is no home folder.
     """
     home = os.environ.get('ROS_HOME') or '~/.ros'
     return expand_path(home) / 'fluoro_calib' / namespace.strip('/')
 
 
 class CalibrationFiles:
-    """The services save_calibration and load_calibration, and the folder behind them."""
+    """The services save_calibration and load_calibration, and the folder they use."""
 
     def __init__(self, rig: RigSetup, output: CalibrationOutput, logger: Logger) -> None:
         self._rig = rig
@@ -225,7 +225,7 @@ class CalibrationFiles:
         )
 
     def load_at_start(self) -> None:
-        """Use what the folder contains; a fault is logged and told by the diagnostics."""
+        """Use the calibrations in the folder; log a fault and report it in the diagnostics."""
         directory = self._rig.directory
         if not any(directory.glob('*' + SUFFIX)):
             return
@@ -243,12 +243,12 @@ class CalibrationFiles:
     def save_outcome(
         self, outcome: CalibrationOutcome, radiographs: Radiographs
     ) -> tuple[RigOrientation | None, str]:
-        """Save the outcome of a job with radiographs for its report.
+        """Save the outcome of a job, with radiographs for its report.
 
-        Returns the orientation to use, and why it is not saved.
+        Returns the orientation to use, and why saving failed ('' if it succeeded).
 
-        What a calibration has cost is not lost where its folder cannot be written any more: the
-        outcome is used and published all the same.
+        The outcome of a costly calibration is used and published even if its folder cannot be
+        written.
         """
         present = self._output.orientation
         try:
@@ -327,11 +327,11 @@ class CalibrationFiles:
         """Return the verdict on the calibrations of a folder."""
         try:
             return stored_verdict(directory)
-        except DataError:  # which is told as a disagreement
+        except DataError:  # already reported by disagreements()
             return Verdict()
 
     def _check_phantom(self) -> None:
-        """Raise DataError where the saved calibrations were made with another phantom."""
+        """Raise DataError if the saved calibrations were made with another phantom."""
         directory = self._rig.directory
         phantom = self._rig.phantom
         path = directory / PHANTOM_FILE
@@ -345,12 +345,12 @@ class CalibrationFiles:
 
 
 def check_folders(directory: Path, base: Path, limit: int) -> None:
-    """Raise DataError where a folder would be one too many below the base, which peers name."""
+    """Raise DataError if a folder named by a peer would exceed the limit of folders in base."""
     target = directory.resolve()
     if target.exists() or not target.is_relative_to(base.resolve()):
         return
     new = sum(not path.exists() for path in (target, *target.parents))
-    # The first one is the base itself.
+    # os.walk also yields the base, so subtract one.
     present = sum(1 for _ in itertools.islice(os.walk(base.resolve()), limit + 2)) - 1
     if max(present, 0) + new > limit:
         raise DataError(f'{directory}: {base} has as many folders as max_folders allows')

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the nodes that correct streams have in common."""
+"""Common parts of the nodes that correct streams."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ FILES = f'*{SUFFIX}'
 
 
 class CorrectedStream(Stream):
-    """Stream of a fluoroscope that is corrected."""
+    """Stream of a fluoroscope whose messages are corrected."""
 
     def __init__(self, name: str, refusals: RefusalLog) -> None:
         super().__init__(name, refusals)
-        self.corrected = 0  #: number of frames or images
-        self.waiting = 0  #: number of those that came before the first calibration
-        #: angle [rad] of a message since the last diagnostics that is far from all calibrated ones
+        self.corrected = 0  #: number of corrected frames or images
+        self.waiting = 0  #: number that came before the first calibration
+        #: angle [rad] since the last diagnostics that is far from all calibrated angles
         self.beyond: tuple[float, AngleField] | None = None
 
     def count_corrected(self, info: Mapping[str, int]) -> None:
@@ -63,24 +63,24 @@ class CorrectedStream(Stream):
 
 @dataclass(frozen=True)
 class CorrectingState(StreamState):
-    """What the diagnostics of a fluoroscope are decided by."""
+    """State from which the health of a corrected fluoroscope is diagnosed."""
 
     stream: CorrectedStream
-    item: str  #: what is corrected: frame or image
+    item: str  #: corrected item: frame or image
     beyond: str  #: what becomes of the items at an angle far from all calibrated ones
     calibrations: CalibrationInput
     angles: AngleInput
 
 
 def uncalibrated(state: CorrectingState) -> Health | None:
-    """There is no calibration yet."""
+    """Warn if there is no calibration yet."""
     if state.calibrations.current(state.stream.name) is not None:
         return None
     return warning(f'no calibration yet: {state.stream.waiting} {state.item}s were not corrected')
 
 
 def doubtful_angle(state: CorrectingState) -> Health | None:
-    """The angle of the C-arm is unknown, or was not calibrated."""
+    """Warn if the angle of the C-arm is unknown or far from all calibrated angles."""
     stream = state.stream
     unknown = state.angles.health(stream.name, state.incompatible)
     beyond, stream.beyond = stream.beyond, None
@@ -111,17 +111,17 @@ class CorrectingNode(StreamNode):
     """Node that corrects a stream of each fluoroscope with its newest calibration.
 
     Nothing is corrected before the first calibration. A correction that depends on the angle of a
-    C-arm is that at the angle of the stamp, or the mean over the angles where that is unknown.
+    C-arm is evaluated at the angle at the stamp, or averaged over the angles if that is unknown.
     Subclasses set the class attributes and override prepare(), on_calibration_ready(),
     make_stream(), make_angles() and extra_values().
     """
 
-    item: ClassVar[str] = ''  #: what is corrected: frame or image
-    subject: ClassVar[str] = ''  #: what is subscribed to, in words
+    item: ClassVar[str] = ''  #: corrected item: frame or image
+    subject: ClassVar[str] = ''  #: subscribed messages, in words
     refusal_kinds: ClassVar[tuple[str, ...]] = ()
     #: what becomes of the items at an angle far from all calibrated ones
     beyond: ClassVar[str] = ''
-    topics: tuple[str, ...] = ()  #: what is subscribed to, below each fluoroscope
+    topics: tuple[str, ...] = ()  #: subscribed topics, relative to each fluoroscope
 
     def __init__(self, name: str) -> None:
         super().__init__(name)
@@ -132,7 +132,7 @@ class CorrectingNode(StreamNode):
         self.angles: dict[str, AngleInput] = {}  #: angles of the C-arms, by fluoroscope
 
     def use_parameters(self, parameters: CalibratedParameters, angles: AngleOptions) -> None:
-        """Take the parameters that all these nodes have; subclasses call it in __init__."""
+        """Apply the parameters common to these nodes; subclasses call this in __init__."""
         self.angle_options = angles
         self.autostart = parameters.autostart
         self._directory = parameters.calibration_directory
@@ -140,22 +140,22 @@ class CorrectingNode(StreamNode):
         self.reset()
 
     def make_stream(self, name: str) -> CorrectedStream:
-        """Return the state of one fluoroscope before the first message."""
+        """Return the initial stream state of a fluoroscope."""
         return CorrectedStream(name, self.refusal_log())
 
     def refusal_log(self) -> RefusalLog:
-        """Return what counts the messages of a stream that are refused."""
+        """Return a log that counts the refused messages of a stream."""
         return RefusalLog(self.item, self.limited_logger)
 
     def make_angles(self) -> dict[str, AngleInput]:
-        """Return what gives the angles of each fluoroscope; threads must not share one."""
+        """Return the AngleInput of each fluoroscope; threads must not share one."""
         angles = AngleInput(self.angle_options, self.names, self.limited_logger)
         return dict.fromkeys(self.names, angles)
 
     def angle_of(self, name: str, stamp_ns: int, field: AngleField | None) -> float | None:
-        """Return the angle [rad] of a message at its stamp, None where it is unknown.
+        """Return the angle [rad] of a message at its stamp, None if it is unknown.
 
-        field: what the correction changes with the angle.
+        field: how the correction changes with the angle, None if it does not.
         """
         angle = self.angles[name].of_frame(name, stamp_ns, needed=field is not None)
         if field is not None and angle is not None and not field.covers(angle):
@@ -167,14 +167,14 @@ class CorrectingNode(StreamNode):
         return calibration
 
     def on_calibration_ready(self, name: str, prepared: Any) -> None:
-        """Log that a calibration is in use; called in a thread."""
+        """Do nothing; subclasses log that a calibration is in use. Called in a thread."""
 
     def extra_values(self, stream: Any, prepared: Any) -> dict[str, object]:
         """Return further values for the diagnostics of a fluoroscope."""
         return {}
 
     def reset(self) -> None:
-        """Start counting from zero."""
+        """Reset all counters."""
         self.streams = {name: self.make_stream(name) for name in self.names}
         self.angles = self.make_angles()
 
@@ -183,7 +183,7 @@ class CorrectingNode(StreamNode):
         return self._calibrations.current(name)
 
     def subscribe_calibrations(self) -> None:
-        """Subscribe to calibrations; the outputs that they need must exist."""
+        """Subscribe to calibrations; the outputs that they need must already exist."""
         self._calibrations = CalibrationInput(
             self, self.names, self.prepare, self.on_calibration_ready, self._on_refused_calibration
         )
@@ -192,7 +192,7 @@ class CorrectingNode(StreamNode):
             self._load_calibrations(self._directory)
 
     def _load_calibrations(self, text: str) -> None:
-        """Begin with the calibrations of a folder; there may be none before the first one."""
+        """Start with the calibrations of a folder, which may be empty or missing at first."""
         try:
             directory = expand_path(text)
             if not directory.exists() or (directory.is_dir() and not any(directory.glob(FILES))):
@@ -214,7 +214,7 @@ class CorrectingNode(StreamNode):
 
     @property
     def fault_handlers(self) -> FaultHandlers:
-        """What a stream reader calls when something goes wrong."""
+        """Handlers that a stream reader calls when something goes wrong."""
         return stream_faults(self.streams, self.fail)
 
     def diagnose(self) -> list[Status]:

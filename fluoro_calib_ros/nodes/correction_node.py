@@ -38,7 +38,7 @@ from .runtime.parameters import (
 )
 from .runtime.topics import latched_qos, observations_qos
 
-# An integer: comparing an array with an enum member takes longer than the rest of the node.
+# As int, because comparing an array with an enum member takes longer than all other work here.
 INVALID = int(CorrectionStatus.INVALID)
 _NODE = ParameterGroup(CalibratedParameters)
 _ANGLES = ParameterGroup(AngleOptions)
@@ -47,7 +47,7 @@ PARAMETERS = (_NODE, _ANGLES, _LIMITS, READ_LIMITS)
 
 
 class ObservationStream(CorrectedStream):
-    """Stream of image points that are corrected."""
+    """Stream of image points to correct."""
 
     def __init__(self, name: str, refusals: RefusalLog) -> None:
         super().__init__(name, refusals)
@@ -57,7 +57,7 @@ class ObservationStream(CorrectedStream):
 
 
 class CorrectionNode(CorrectingNode):
-    """Publishes corrected observations; nothing before the first calibration."""
+    """Publishes corrected observations, none before the first calibration."""
 
     item = 'frame'
     subject = 'target observations'
@@ -72,11 +72,11 @@ class CorrectionNode(CorrectingNode):
         self.use_parameters(_NODE.declare(self), _ANGLES.declare(self))
 
     def make_stream(self, name: str) -> ObservationStream:
-        """Return the state of one fluoroscope before the first frame."""
+        """Return the initial stream state of a fluoroscope."""
         return ObservationStream(name, self.refusal_log())
 
     def create_outputs(self) -> None:
-        """Make the outputs and subscribe to calibrations."""
+        """Create the outputs and subscribe to calibrations."""
         self._corrected = self.create_outputs_of(
             self.names, CorrectedObservations, 'corrected_observations', observations_qos
         )
@@ -88,7 +88,7 @@ class CorrectionNode(CorrectingNode):
 
     def create_readers(self) -> None:
         """Receive the observations of all fluoroscopes in one thread."""
-        angles = self.angles[self.names[0]]  # one for all fluoroscopes
+        angles = self.angles[self.names[0]]  # the same for all fluoroscopes
         reader = angles.create_reader(self, self.fault_handlers)
         for name in self.names:
             reader.subscribe(
@@ -101,12 +101,12 @@ class CorrectionNode(CorrectingNode):
             )
 
     def prepare(self, calibration: FluoroscopeCalibration) -> FluoroscopeCalibration:
-        """Return the calibration with its lookup grid."""
+        """Prepare the lookup grid of a calibration, and return the calibration."""
         calibration.prepare()
         return calibration
 
     def on_calibration_ready(self, name: str, prepared: FluoroscopeCalibration) -> None:
-        """Publish the CameraInfo and log that a calibration is in use."""
+        """Publish the CameraInfo of a new calibration, and log that it is in use."""
         self._publish_info(name)
         grid = prepared.grid
         self.get_logger().info(

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""ROS client of the demonstration: calls the action, and records what the graph publishes."""
+"""ROS client of the demonstration: calls the action, and records the published results."""
 
 from __future__ import annotations
 
@@ -48,13 +48,13 @@ class DemoError(RuntimeError):
 
 
 class DemoClient(Node):
-    """User of the graph."""
+    """Client that uses the graph as a user would."""
 
     def __init__(self, names: Sequence[str], namespace: str = '') -> None:
         super().__init__('demo_client', namespace=namespace)
         self.names = tuple(names)  #: fluoroscopes
         self.exposures: dict[str, int] = {}  #: number of collected exposures by fluoroscope
-        #: subscriptions to the corrected observations that the correction node knows
+        #: number of subscriptions to corrected observations, as reported by the correction node
         self.corrected_readers: dict[str, int] = {}
         #: frames and their source timestamps [ns] by (fluoroscope, frame number)
         self.sent: dict[tuple[str, int], tuple[ObservedFrame, int]] = {}
@@ -82,14 +82,14 @@ class DemoClient(Node):
 
     @property
     def calibrations(self) -> dict[str, calibration_result.FluoroscopeCalibration]:
-        """The published calibrations by fluoroscope."""
+        """Published calibrations by fluoroscope."""
         return {name: calibration_from_message(m) for name, m in self._calibrations.items()}
 
     @property
     def is_correcting(self) -> bool:
         """Whether the correction node uses calibrations of all fluoroscopes.
 
-        It publishes its first CameraInfo when it does.
+        It publishes the first CameraInfo of a fluoroscope when it does.
         """
         return len(self._camera_infos) == len(self.names)
 
@@ -122,7 +122,7 @@ class DemoClient(Node):
         return answer.result.message
 
     def wait(self, condition: Callable[[], Any], timeout_s: float, what: str) -> None:
-        """Spin until a condition is true. Raises DemoError when the time is up."""
+        """Spin until a condition is true. Raises DemoError if time runs out."""
         end = time.monotonic() + timeout_s
         while not condition():
             if time.monotonic() > end:
@@ -130,7 +130,7 @@ class DemoClient(Node):
             rclpy.spin_once(self, timeout_sec=0.1)
 
     def destroy_node(self) -> None:
-        """Stop the streams with the node."""
+        """Stop the streams and destroy the node."""
         self._streams.stop()
         super().destroy_node()
 
@@ -191,7 +191,7 @@ class DemoClient(Node):
                 )
 
     def _add_joints(self, message: JointAngles) -> None:
-        """Keep motion of joints whose bodies are there, until it is taken back."""
+        """Add joint angles, or remove those of an exposure that are reported as failed."""
         if message.status[0] != JointAngles.FAILED:
             self.joint_angles.append(message)
         else:
@@ -217,7 +217,7 @@ class DemoClient(Node):
 
 @contextmanager
 def demo_clients(names: Sequence[str], *namespaces: str) -> Iterator[list[DemoClient]]:
-    """Run a DemoClient for each namespace in a ROS context of their own."""
+    """Run a DemoClient for each namespace, in a ROS context of their own."""
     rclpy.init(args=[])
     try:
         clients = [DemoClient(names, namespace) for namespace in namespaces]

@@ -23,12 +23,12 @@ from ..photogrammetry.rig_orientation import RigOrientation
 from .messages.status import ALARM, message_from_drift_state
 from .runtime.diagnostics import ERROR, OK, WARN, Logger, Status
 
-LEVELS = (OK, WARN, ERROR)  # of the diagnostics, by the level of a DriftState
+LEVELS = (OK, WARN, ERROR)  # diagnostic levels, indexed by the level of a DriftState
 
 
 @dataclass(frozen=True)
 class DriftParameters:
-    """Parameters of the drift watch that belong to the node."""
+    """Parameters of the drift watch that the node handles."""
 
     drift_watch: bool = option(True, 'whether the stream is watched for drift of the calibration')
     drift_rate: float = option(
@@ -58,12 +58,12 @@ class DriftParameters:
             raise ValueError(f'clusters: {error}') from None
 
     def rigid_bodies(self) -> tuple[Body, ...]:
-        """Return the bodies. Raises ValueError for a text that declares none."""
+        """Return the declared bodies. Raises ValueError for a text that declares none."""
         return declared_bodies([text for text in self.clusters if text])
 
 
 class DriftMonitor:
-    """Makes the drift watches of orientations, and publishes the state of the newest one."""
+    """Creates the drift watch of each orientation, and publishes the state of the newest."""
 
     def __init__(
         self,
@@ -80,7 +80,7 @@ class DriftMonitor:
         self.reset()
 
     def use(self, parameters: DriftParameters) -> bool:
-        """Use other parameters; returns whether the watches have to be made anew."""
+        """Use new parameters; return whether the watches must be created anew."""
         old = self._parameters
         self._parameters = parameters
         self._bodies = parameters.rigid_bodies()
@@ -88,33 +88,33 @@ class DriftMonitor:
         return replace(old, **asked) != parameters
 
     def use_options(self, options: DriftOptions) -> None:
-        """Use other options for the watches that are made from now on."""
+        """Use new options for watches created from now on."""
         self._options = options
 
     def reset(self) -> None:
-        """Forget image sizes, exposures and alarms."""
+        """Discard image sizes, exposures and alarms."""
         self._sizes: dict[str, tuple[int, int]] = {}
-        #: watch, orientation and stamp [ns] of the newest exposure; the stream's thread sets it
+        #: watch, orientation and stamp [ns] of the newest exposure; set by the stream's thread
         self.newest: tuple[RigDriftWatch | None, RigOrientation, int] | None = None
         self._alarmed = False
 
     def connect(self, publisher: Publisher, collect_anew: Client, heal: ActionClient) -> None:
-        """Set where the state is published, and what an alarm may ask the calibration node for."""
+        """Set the publisher of the state, and the clients of the calibration node for alarms."""
         self._publisher = publisher
         self._collect_anew = collect_anew
         self._heal = heal
 
     def set_image_size(self, name: str, size: tuple[int, int]) -> bool:
-        """Set the image size of a fluoroscope; returns whether it has changed."""
+        """Set the image size of a fluoroscope; return whether it has changed."""
         if self._sizes.get(name) == size:
             return False
         self._sizes = {**self._sizes, name: size}
         return True
 
     def make_watch(self, orientation: RigOrientation) -> RigDriftWatch | None:
-        """Return the watch of an orientation, None without one or before all sizes are known.
+        """Return the watch of an orientation, None if it is disabled or image sizes are missing.
 
-        Raises ValueError, DataError among them, for an orientation that cannot be watched.
+        Raises ValueError (including DataError) for an orientation that cannot be watched.
         """
         if not self._parameters.drift_watch or self._missing_sizes():
             return None
@@ -127,7 +127,7 @@ class DriftMonitor:
         )
 
     def publish_state(self) -> list[Status]:
-        """Publish the state of the watch; returns its diagnostics, nothing without exposures."""
+        """Publish the state of the watch; return its diagnostics, empty without exposures."""
         newest = self.newest
         if not self._parameters.drift_watch or newest is None:
             return []

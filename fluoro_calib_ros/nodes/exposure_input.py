@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Exposures of the phantom, collected from the streams of a calibration node, and its services."""
+"""Exposures of the phantom collected from the streams of a calibration node, and its services."""
 
 from __future__ import annotations
 
@@ -41,16 +41,16 @@ from .runtime.services import Requests, ServiceEntry, within
 
 
 def _no_angle() -> None:
-    """Return that an angle is unknown."""
+    """Return None: the angle is unknown."""
 
 
 class PhantomStream(Stream):
-    """Stream of a fluoroscope in which the phantom is looked for."""
+    """Stream of a fluoroscope that is searched for the phantom."""
 
     def __init__(self, name: str, refusals: RefusalLog) -> None:
         super().__init__(name, refusals)
         self.image_size: tuple[int, int] | None = None
-        self.other_targets: bytes | None = None  # ids of the last frame without the phantom
+        self.other_targets: bytes | None = None  # ids in the last frame without the phantom
         self.is_other_object_logged = False
 
 
@@ -58,24 +58,24 @@ RADIOGRAPH = 'radiograph'
 
 
 class ExposureInput:
-    """Validates frames, pairs them, and collects the pairs that are wanted.
+    """Validates frames, pairs them, and collects the required pairs.
 
-    The thread of the streams adds frames, and the executor's thread asks for what is collected; a
-    lock keeps them apart. Frames that show nothing of the phantom, such as those of markers, are
-    dropped first of all: a stream shows the same targets frame after frame, so it takes a
-    comparison of their ids.
+    The thread of the streams adds frames, and the executor's thread reads the collected data; a
+    lock protects them. Frames without any target of the phantom, such as those of markers, are
+    dropped first. This is cheap: a stream shows the same targets frame after frame, so comparing
+    their ids suffices.
 
     Parameters
     ----------
     names : sequence of str
         Fluoroscopes.
     phantom : Phantom or None
-        Without one, frames are only counted.
+        If None, frames are only counted.
     settings : CalibrationSettings
     on_pair : callable
         Called with every pair of frames of the phantom, in the thread of the streams.
     on_captured : callable
-        Called in that thread after the Future of a capture has got its result.
+        Called in that thread after the Future of a capture has received its result.
     logger : Logger
         Logger of the node.
     """
@@ -100,7 +100,7 @@ class ExposureInput:
             name: PhantomStream(name, RefusalLog('frame', self._limited_logger))
             for name in self._names
         }
-        self._captures: deque[Future] = deque()  # one for every capture that waits for its pair
+        self._captures: deque[Future] = deque()  # one per capture that waits for its pair
         self.capture_refusal = ''  # why the last pair was not captured
         self._lock = threading.Lock()
         self._start()
@@ -113,14 +113,14 @@ class ExposureInput:
     # -- the executor's thread
 
     def use(self, settings: CalibrationSettings) -> None:
-        """Use other settings from now on; what is collected stays."""
+        """Apply new settings from now on; collected exposures are kept."""
         with self._lock:
             self._settings = settings
             self._pairer.use(settings.pairing)
             self._collector.still = settings.still
 
     def reset(self) -> int:
-        """Discard all exposures; returns their number. The counts of frames stay."""
+        """Discard all exposures and return their number. The counts of frames are kept."""
         with self._lock:
             count = len(self._collector.exposures)
             self._start()
@@ -139,7 +139,7 @@ class ExposureInput:
             return self._radiographs.of(frames)
 
     def collected(self, name: str) -> Collected:
-        """Return what is collected of a fluoroscope."""
+        """Return a summary of the data collected for a fluoroscope."""
         stream = self.streams[name]
         with self._lock:
             exposures = self._collector.exposures
@@ -157,15 +157,15 @@ class ExposureInput:
             )
 
     def disagreement(self) -> str:
-        """Return a sentence where frames with the same number are far apart in time, else ''."""
+        """Return a message if frames with the same number are far apart in time, else ''."""
         with self._lock:
             return self._pairer.stamps.disagreement()
 
     def capture(self) -> Future:
-        """Collect the next pair in whatever mode.
+        """Collect the next pair, whatever the mode.
 
-        Returns the Future of its frame number and of the number of exposures with it; the result
-        is None where the wait was given up.
+        Returns a Future of the pair's frame number and the resulting number of exposures; its
+        result is None if the wait was given up.
         """
         captured = Future()
         with self._lock:
@@ -174,7 +174,7 @@ class ExposureInput:
         return captured
 
     def give_up(self, captured: Future) -> None:
-        """End the wait of a capture."""
+        """Stop waiting for a capture."""
         with self._lock:
             if not captured.done():
                 self._captures.remove(captured)
@@ -185,10 +185,9 @@ class ExposureInput:
     def add(
         self, name: str, observed: ObservedFrame, angle: Callable[[], float | None] = _no_angle
     ) -> None:
-        """Take a frame: drop it, refuse it, or validate, pair and perhaps collect it.
+        """Process a frame: ignore it, refuse it, or validate, pair and possibly collect it.
 
-        angle: called for that of the C-arm [rad], None where it is unknown, of a frame that shows
-        the phantom.
+        angle: returns the angle of the C-arm [rad] or None; called if a frame shows the phantom.
         """
         stream = self.streams[name]
         stream.received += 1
@@ -204,7 +203,7 @@ class ExposureInput:
             stream.refusals.refuse(error)
 
     def add_radiograph(self, name: str, message: CompressedImage) -> None:
-        """Take a small radiograph; what is none is refused."""
+        """Add a small radiograph; refuse data that is too large or no JPEG."""
         jpeg = bytes(message.data)
         if len(jpeg) > MEGABYTE or not jpeg.startswith(JPEG_START):
             error = DataError(f'{name}/{RADIOGRAPH}: this is no small JPEG')
@@ -220,7 +219,7 @@ class ExposureInput:
         phantom: Phantom,
         angle: Callable[[], float | None],
     ) -> Frame | None:
-        """Return a valid frame, None where it does not show the phantom. Raises DataError."""
+        """Return a valid frame, None if it does not show the phantom. Raises DataError."""
         ids = np.frombuffer(observed.target_id, np.uint32)
         if len(ids) and (phantom.index(ids) < 0).all():
             stream.other_targets = observed.target_id
@@ -270,7 +269,7 @@ class ExposureInput:
             self._log_collected(pair)
 
     def _refuse_full(self, exposures: int) -> None:
-        """Refuse further exposures: each new one is compared with all."""
+        """Refuse further exposures, because each new one is compared with all others."""
         self.capture_refusal = (
             f'{exposures} exposures are collected, as many as max_exposures allows: reset first'
         )
@@ -293,7 +292,7 @@ class ExposureInput:
 
 @dataclass(frozen=True)
 class NodeParts:
-    """What the services of a calibration node work on."""
+    """Parts of a calibration node that its services use."""
 
     node: StreamNode
     rig: RigSetup
@@ -304,7 +303,7 @@ class NodeParts:
 
 
 class RigServices:
-    """Services of a calibration node, in the table `services`."""
+    """Services of a calibration node, listed in `services`."""
 
     services: tuple[ServiceEntry, ...]
 
@@ -335,7 +334,7 @@ class CollectServices(RigServices):
         timeout = request.timeout_sec or self._rig.settings().node.capture_timeout
         try:
             self._check(timeout)
-        except ValueError as error:  # DataError among them
+        except ValueError as error:  # including DataError
             response.message = str(error)
             return response
         captured = self._exposures.capture()
@@ -359,7 +358,7 @@ class CollectServices(RigServices):
         return response
 
     def _check(self, timeout_s: float) -> None:
-        """Raise ValueError, DataError among them, where nothing can be captured."""
+        """Raise ValueError (including DataError) if nothing can be captured."""
         self._rig.required_phantom()
         check_timeout(timeout_s)
         if not self._node.readers:

@@ -3,8 +3,8 @@
 
 """Node that finds the beads of the phantom, or markers, in the images of the fluoroscopes, live.
 
-One thread receives the images and numbers them; each fluoroscope has a thread and a process of its
-own that extracts. Where images come faster than they are extracted, whole exposures are shed.
+One thread receives the images and numbers them. Each fluoroscope has its own thread and process
+for extraction. If images arrive faster than they can be extracted, whole exposures are shed.
 """
 
 from __future__ import annotations
@@ -133,13 +133,13 @@ class ExtractionParameters(ManagedParameters):
             raise ValueError('bodies: the file names the markers of each body, as clusters do')
 
     def rigid_bodies(self) -> tuple[Body, ...]:
-        """Return the bodies. Raises ValueError for a text that declares none."""
+        """Return the declared bodies. Raises ValueError for a text that declares none."""
         return declared_bodies([text for text in self.clusters if text])
 
 
 @dataclass(frozen=True)
 class ExtractionSettings:
-    """Values of the parameters, by group."""
+    """Parameter values by group."""
 
     node: ExtractionParameters = group(ExtractionParameters)
     pairing: PairingOptions = group(PairingOptions, {'tolerance_s': 'pair_tolerance'})
@@ -153,7 +153,7 @@ PARAMETERS = (*groups_of(ExtractionSettings).values(), READ_LIMITS)
 
 
 def read_followers(settings: ExtractionSettings, logger: Logger) -> Sequence[FollowerSettings]:
-    """Return what makes the followers: one for each view, or one for all. Raises StartError."""
+    """Return the settings of the followers: one per view, or one for all. Raises StartError."""
     mode = settings.node.mode
     path = settings.node.phantom if mode == 'phantom' else settings.node.markers
     by_shape = mode == 'markers' and settings.node.bodies and settings.node.calibration_directory
@@ -176,7 +176,7 @@ def read_followers(settings: ExtractionSettings, logger: Logger) -> Sequence[Fol
 def _of_phantom(
     path: Path, parameters: ExtractionParameters, logger: Logger
 ) -> Sequence[FollowerSettings]:
-    """Return what makes the follower of each fluoroscope. Raises DataError."""
+    """Return the follower settings of each fluoroscope. Raises DataError."""
     survey = read_survey(path)
     for note in survey.notes:
         logger.warning(note)
@@ -185,8 +185,8 @@ def _of_phantom(
 
 
 def _first_markers(path: Path, names: Sequence[str]) -> dict[str, FirstMarkers]:
-    """Return ids and first places of the markers of each fluoroscope. Raises DataError."""
-    size = (MAX_IMAGE_SIDE, MAX_IMAGE_SIDE)  # their image is not known yet
+    """Return ids and initial positions of the markers of each fluoroscope. Raises DataError."""
+    size = (MAX_IMAGE_SIDE, MAX_IMAGE_SIDE)  # the image size is not known yet
     recording = read_source(path, image_size=size, fluoroscopes=names)
     out = {}
     for name, frames in recording.frames.items():
@@ -196,7 +196,7 @@ def _first_markers(path: Path, names: Sequence[str]) -> dict[str, FirstMarkers]:
 
 
 def _joined(settings: ExtractionSettings, first: Mapping[str, FirstMarkers]) -> MarkerSettings:
-    """Read what views need to be followed together. Raises DataError."""
+    """Read what is needed to follow the views jointly. Raises DataError."""
     names = settings.node.fluoroscopes
     folder = expand_path(settings.node.calibration_directory)
     if len(names) < 2:
@@ -211,7 +211,7 @@ def _joined(settings: ExtractionSettings, first: Mapping[str, FirstMarkers]) -> 
         bodies = read_bodies(expand_path(settings.node.bodies))
     joined = MarkerSettings(first, settings.following, calibrations, orientation, bodies=bodies)
     check_orientation(orientation, calibrations)
-    joined()  # refuses what does not belong together before the node starts
+    joined()  # refuses inconsistent settings before the node starts
     return joined
 
 
@@ -224,7 +224,7 @@ RADIOGRAPH = 'radiograph'
 
 
 class ExtractionNode(StreamNode):
-    """Publishes the targets that it finds in images."""
+    """Publishes the targets found in images."""
 
     def __init__(self) -> None:
         super().__init__('extraction_node')
@@ -235,7 +235,7 @@ class ExtractionNode(StreamNode):
         self._inputs = INPUTS[settings.node.inputs]
         AngleInput(settings.angles, self.names, self.limited_logger)  # refuses unknown joints
         self._followers = read_followers(settings, self.get_logger())
-        # By which the images of several views are predicted: only for them, angles are needed.
+        # Used to predict marker positions when views are followed jointly; only these need angles.
         self._calibrations = {
             name: calibration
             for follower in self._followers
@@ -247,7 +247,7 @@ class ExtractionNode(StreamNode):
         self.reset()
 
     def reset(self) -> None:
-        """Start counting from zero."""
+        """Reset all counters."""
         self.streams = {
             name: ImageStream(
                 name,
@@ -262,14 +262,14 @@ class ExtractionNode(StreamNode):
 
     def _make_workers(self) -> ExtractionWorkers:
         size = self._settings.node.queue_size
-        # One view waits for the others.
+        # Leave room for images that wait for the other views.
         size = max(size, LATE + 1) if self._calibrations else size
         return ExtractionWorkers(self.streams, size, self._is_overlay_wanted, self._finish)
 
     # -- lifecycle
 
     def create_outputs(self) -> None:
-        """Make the outputs."""
+        """Create the outputs."""
         outputs = partial(self.create_outputs_of, self.names)
         self._observations = outputs(TargetObservations, OBSERVATIONS, observations_qos)
         self._overlays = outputs(Image, OVERLAY, images_qos)
@@ -286,13 +286,13 @@ class ExtractionNode(StreamNode):
                 )
 
     def activate(self) -> None:
-        """Start the processes that extract, then the stream reader."""
+        """Start the extracting processes, then the stream reader."""
         self._workers = self._make_workers()
         self._workers.start(self._followers)
         super().activate()
 
     def deactivate(self) -> None:
-        """Stop receiving and extracting; what is waiting is lost."""
+        """Stop receiving and extracting; waiting images are lost."""
         super().deactivate()
         self._workers.close()
 
@@ -301,7 +301,7 @@ class ExtractionNode(StreamNode):
     def _on_image(
         self, name: str, message: Image | CompressedImage, info: Mapping[str, int]
     ) -> None:
-        """Number an image and let it wait for the thread of its fluoroscope."""
+        """Number an image and queue it for the thread of its fluoroscope."""
         self.streams[name].received += 1
         stamp_ns = nanoseconds_from_stamp(message.header.stamp)
         number = self._numbers.number(name, stamp_ns)
@@ -321,7 +321,7 @@ class ExtractionNode(StreamNode):
     def _finish(
         self, stream: ImageStream, task: Task, image: np.ndarray, found: Observations
     ) -> None:
-        """Publish what was found in an image, and count it."""
+        """Publish the targets found in an image, and count it."""
         header = task.message.header
         if not found.reason:
             self._publish_radiograph(stream.name, header, image)
@@ -345,14 +345,14 @@ class ExtractionNode(StreamNode):
             )
 
     def _publish_radiograph(self, name: str, header: Header, image: np.ndarray) -> None:
-        """Publish a small picture of an image in which the phantom was found, where wanted."""
+        """Publish a small copy of an image that shows the phantom, if there are subscribers."""
         publisher = self._radiographs[name]
         if self._settings.node.mode == 'phantom' and publisher.get_subscription_count():
             jpeg = array('B', small_jpeg(image, RADIOGRAPH_PX))
             publisher.publish(CompressedImage(header=header, format='jpeg', data=jpeg))
 
     def _retract(self, stream: ImageStream, task: Task, found: Observations) -> None:
-        """Publish which ids of earlier images are taken back."""
+        """Publish which ids of earlier images are retracted."""
         headers = stream.headers
         remember(headers, task.number, task.message.header, REVISED)
         for one in found.retracted:

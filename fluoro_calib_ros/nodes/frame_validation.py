@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Validation of frames on the live path, in microseconds."""
+"""Validation of frames on the live path, within microseconds."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ Decoded = TypeVar('Decoded', ObservedFrame, CorrectedFrame)
 
 
 def with_limit(decode: Callable[[bytes], Decoded], most: int) -> Callable[[bytes], Decoded]:
-    """Return a function that decodes frames and raises TooLarge for more than so many points.
+    """Return a decoder of frames that raises TooLarge for more than `most` points.
 
-    The same at every node: bytes tell it only for a message with all its columns.
+    The limit is then the same at every node: the size in bytes depends on the columns present.
     """
 
     def decode_limited(data: bytes) -> Decoded:
@@ -52,12 +52,12 @@ def with_limit(decode: Callable[[bytes], Decoded], most: int) -> Callable[[bytes
 class FrameValidator:
     """Validates the frames of one fluoroscope before they are corrected.
 
-    A stream shows the same targets frame after frame: their ids are examined when they change.
+    A stream shows the same targets frame after frame, so ids are checked only when they change.
     """
 
     def __init__(self, fluoroscope: str) -> None:
         self._fluoroscope = fluoroscope
-        self._unique: bytes | None = None  # target ids that were examined last
+        self._unique: bytes | None = None  # last target ids that were checked
 
     def validated_arrays(
         self, frame: ObservedFrame, calibration: FluoroscopeCalibration
@@ -103,7 +103,7 @@ def _target_ids(frame: ObservedFrame) -> NDArray[np.uint32]:
 
 
 def _length_error(frame: ObservedFrame) -> str:
-    """Return the error of the first array with another length than the target ids."""
+    """Return the error of the first array whose length differs from that of the target ids."""
     arrays = {'u': frame.u, 'v': frame.v}
     if len(frame.sigma):
         arrays['sigma'] = frame.sigma
@@ -113,7 +113,7 @@ def _length_error(frame: ObservedFrame) -> str:
 def validate_corrected(fluoroscope: str, frame: CorrectedFrame) -> None:
     """Raise Refused for arrays of different lengths, repeated targets and invalid deviations.
 
-    Standard deviations may be NaN: those of points that are INVALID are.
+    Standard deviations may be NaN, as they are for points with the status INVALID.
     """
     count = len(frame.target_id)
     where = f'fluoroscope {fluoroscope}, frame {frame.frame_number}'

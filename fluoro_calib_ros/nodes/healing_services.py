@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The action heal of a calibration node, and the services that accept or take back what it finds.
+"""The action heal of a calibration node, and the services that accept or roll back its outcome.
 
-The calibration node has all that is needed: the image points as they were observed, before any
-correction that may have become wrong, the calibrations and the orientation in use.
+The calibration node has everything that healing needs: the observed image points before any
+correction (which may have become wrong), and the calibrations and the orientation in use.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ from .messages.observations import ObservedFrame, frame_from_observed
 from .messages.self_calibration import fill_healing
 from .runtime.services import in_thread, telling_service, wake, within
 
-MAX_FRAMES = 20_000  # of a fluoroscope that are collected, whatever its rate
-MAX_SECONDS = 60.0  # of collecting: what has changed shows in a few
-PAUSE_S = 1.0  # between frames that show markers; a longer one is no time in which they are seen
+MAX_FRAMES = 20_000  # maximum number collected per fluoroscope, whatever its rate
+MAX_SECONDS = 60.0  # maximum collection time: changes show within a few seconds
+PAUSE_S = 1.0  # longest interval between frames that counts as time in which markers are seen
 CHANGED = 'the rig in use has changed meanwhile, heal it again'
 
 
 class _Rig(NamedTuple):
-    """What is healed."""
+    """Rig that is to be healed."""
 
     learned: LearnedShapes
     calibrations: dict[str, FluoroscopeCalibration]
@@ -53,9 +53,9 @@ class _Rig(NamedTuple):
 
 
 class MarkerCollection:
-    """Frames that show markers of bodies, collected in the thread of the streams until finish().
+    """Frames with markers of bodies, collected in the thread of the streams until finish().
 
-    seconds: of the stream in which a fluoroscope has seen markers, after which it has enough.
+    seconds: stream time with visible markers after which a fluoroscope has enough frames.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class MarkerCollection:
         seconds: float = np.inf,
     ) -> None:
         self.frames: dict[str, list[Frame]] = {}
-        self.refused: deque[str] = deque(maxlen=1)  # why the last invalid frame was left out
+        self.refused: deque[str] = deque(maxlen=1)  # why the last invalid frame was excluded
         self.done = Future()
         self._calibrations = calibrations
         self._markers = np.concatenate([body.target_id for body in bodies])
@@ -75,24 +75,24 @@ class MarkerCollection:
 
     @property
     def count(self) -> int:
-        """Number of the frames of all fluoroscopes."""
+        """Number of frames of all fluoroscopes."""
         return sum(map(len, list(self.frames.values())))
 
     @property
     def seen_s(self) -> float:
-        """How long all fluoroscopes have seen markers [s]."""
+        """Time for which every fluoroscope has seen markers [s]."""
         return min(self._seen_s.values())
 
     @property
     def is_complete(self) -> bool:
-        """Whether all fluoroscopes have enough."""
+        """Whether all fluoroscopes have enough frames."""
         return all(map(self._is_full, self._calibrations))
 
     def _is_full(self, name: str) -> bool:
         return self._seen_s[name] >= self._seconds or len(self.frames.get(name, ())) >= MAX_FRAMES
 
     def add(self, name: str, observed: ObservedFrame, angle: float | None) -> None:
-        """Keep a valid frame that shows markers, without what is no marker of the bodies."""
+        """Add a valid frame that shows markers of the bodies, without its other targets."""
         calibration = self._calibrations.get(name)
         if calibration is None or self._is_full(name):
             return
@@ -114,14 +114,14 @@ class MarkerCollection:
             of_one.append(frame.rows(seen))
 
     def finish(self) -> None:
-        """End the collection: time, a cancellation and the end of the node may all do so."""
+        """End the collection once: after its time, a cancellation, or the end of the node."""
         with self._lock:
             if not self.done.done():
                 self.done.set_result(None)
 
 
 class Healing(Job):
-    """The action heal, which keeps its outcome until it is accepted."""
+    """The action heal; keeps its outcome until it is accepted."""
 
     kind = Heal
     action = 'heal'
@@ -130,7 +130,7 @@ class Healing(Job):
     def __init__(self, parts: NodeParts) -> None:
         super().__init__(parts)
         self._collection: MarkerCollection | None = None
-        self._healed: tuple[HealingOutcome, _Rig] | None = None  # to be accepted
+        self._healed: tuple[HealingOutcome, _Rig] | None = None  # waits to be accepted
         self.services = (
             telling_service(
                 'accept_healing', Reset, 'not accepted', lambda _: self._accept(), self._logger
@@ -147,7 +147,7 @@ class Healing(Job):
             collection.add(name, observed, angle())
 
     def stop(self) -> None:
-        """Cancel the running job, and those that are still to come."""
+        """Cancel the running job and all later ones."""
         super().stop()
         if self._collection is not None:
             self._collection.finish()
@@ -155,13 +155,13 @@ class Healing(Job):
     # -- the action
 
     def _on_cancel(self, goal: Any) -> CancelResponse:
-        """Cancel a goal; while frames are collected, that ends at once."""
+        """Accept a cancellation, and end a running collection of frames at once."""
         if self._collection is not None:
             self._collection.finish()
         return CancelResponse.ACCEPT
 
     async def _work(self, goal: Any, result: Any) -> None:
-        """Collect frames, find out what has changed, and keep it."""
+        """Collect frames, diagnose what has changed, and keep the outcome."""
         seconds = goal.request.seconds or self._rig.settings().node.heal_time
         if not 0 < seconds <= MAX_SECONDS:
             raise DataError(f'seconds is above 0 and at most {MAX_SECONDS:g}, not {seconds:g}')
@@ -203,7 +203,7 @@ class Healing(Job):
                 result.message += f'; {self._accept()}'
 
     async def _collected(self, goal: Any, rig: _Rig, seconds: float) -> dict[str, list[Frame]]:
-        """Return the frames of the next seconds, or fewer where the goal is cancelled."""
+        """Return the frames of the next seconds, fewer if the goal is cancelled."""
         collection = MarkerCollection(rig.learned.bodies, rig.calibrations)
 
         def tell() -> None:
@@ -224,7 +224,7 @@ class Healing(Job):
         return collection.frames
 
     def _present_rig(self) -> _Rig:
-        """Return what is to be healed. Raises DataError where something is missing."""
+        """Return the rig to be healed. Raises DataError if something is missing."""
         if not self._node.readers:
             raise DataError(NOT_ACTIVE)
         calibrations = self._output.calibrations
@@ -237,7 +237,7 @@ class Healing(Job):
         return _Rig(learned, calibrations, self._output.orientation)
 
     def _check_unchanged(self, rig: _Rig) -> None:
-        """Raise DataError where another rig is in use than the one that was healed."""
+        """Raise DataError if the rig in use is no longer the one that was healed."""
         if rig.orientation is not self._output.orientation or ids_of(rig.calibrations) != ids_of(
             self._output.calibrations
         ):
@@ -246,7 +246,7 @@ class Healing(Job):
     # -- versions
 
     def _accept(self) -> str:
-        """Save, use and publish the healed rig; returns what was done. Raises DataError."""
+        """Save, use and publish the healed rig; return a message. Raises DataError."""
         if self._healed is None:
             raise DataError('there is no healed rig to accept')
         outcome, rig = self._healed
@@ -270,7 +270,7 @@ class Healing(Job):
         )
 
     def _roll_back(self, _: Reset.Request) -> str:
-        """Return to the parent of the healed rig in use. Raises DataError."""
+        """Return to the parent of the healed rig in use; return a message. Raises DataError."""
         directory = self._rig.directory
         healed = self._output.orientation
         folder = parent_folder(directory, healed)
@@ -284,7 +284,7 @@ class Healing(Job):
     def _use(
         self, calibrations: Mapping[str, FluoroscopeCalibration], orientation: RigOrientation
     ) -> None:
-        """Publish the orientation, and the calibrations that are not in use already."""
+        """Publish the orientation, and those calibrations that are not in use yet."""
         self._healed = None
         present = ids_of(self._output.calibrations)
         others = {n: c for n, c in calibrations.items() if c.calibration_id != present.get(n)}

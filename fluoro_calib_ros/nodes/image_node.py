@@ -3,9 +3,9 @@
 
 """Node that removes the distortion from the images of the fluoroscopes, live.
 
-A thread of its own receives and corrects the images of each fluoroscope. What takes time, the
-remap and the copies in and out of DDS, runs in parallel as far as Python's lock allows. The thread
-also receives the joint states that give the angle of its C-arm.
+Each fluoroscope has its own thread, which receives and corrects its images. The slow steps (the
+remap and the copies into and out of DDS) run in parallel as far as Python's lock allows. The
+thread also receives the joint states that give the angle of the C-arm.
 """
 
 from __future__ import annotations
@@ -77,18 +77,18 @@ PARAMETERS = (_NODE, _ANGLES, READ_LIMITS)
 
 
 class _PreparedCalibration:
-    """A calibration with its maps of pixels."""
+    """Calibration with its pixel maps."""
 
     def __init__(self, calibration: FluoroscopeCalibration, interpolation: str) -> None:
         calibration.prepare()
         self.calibration = calibration
         self.maps = AngleMaps(calibration, interpolation)
-        # Its header is replaced by that of each image.
+        # The header is replaced by that of each image.
         self.info = message_of_corrected_stream(calibration, Time())
 
 
 class CorrectedImages(CorrectedStream):
-    """Stream of images that are corrected."""
+    """Stream of images to correct."""
 
     def __init__(self, name: str, refusals: RefusalLog) -> None:
         super().__init__(name, refusals)
@@ -97,7 +97,7 @@ class CorrectedImages(CorrectedStream):
 
 
 class ImageNode(CorrectingNode):
-    """Publishes corrected images and their CameraInfo; nothing before the first calibration."""
+    """Publishes corrected images and their CameraInfo, none before the first calibration."""
 
     item = 'image'
     subject = 'images'
@@ -118,30 +118,30 @@ class ImageNode(CorrectingNode):
         self._settings = settings
 
     def make_stream(self, name: str) -> CorrectedImages:
-        """Return the state of one fluoroscope before the first image."""
+        """Return the initial stream state of a fluoroscope."""
         return CorrectedImages(name, self.refusal_log())
 
     def make_angles(self) -> dict[str, AngleInput]:
-        """Return what gives the angles of each fluoroscope, in its own thread."""
+        """Return an AngleInput for each fluoroscope, as each has its own thread."""
         return {
             name: AngleInput(self.angle_options, self.names, self.limited_logger)
             for name in self.names
         }
 
     def create_outputs(self) -> None:
-        """Make the outputs and subscribe to calibrations."""
+        """Create the outputs and subscribe to calibrations."""
         outputs = partial(self.create_outputs_of, self.names)
         self._images = outputs(Image, CORRECTED, images_qos)
         self._compressed = outputs(CompressedImage, f'{CORRECTED}/compressed', images_qos)
         # image_transport looks for the CameraInfo in the namespace of the image. The correction
-        # node publishes there, too, latched, and subscribers ask for that.
+        # node publishes there, too, with latched QoS, and subscribers request that.
         beside = outputs(CameraInfo, 'camera_info', latched_qos)
         below = outputs(CameraInfo, f'{CORRECTED}/camera_info', images_qos)
         self._infos = {name: (beside[name], below[name]) for name in self.names}
         self.subscribe_calibrations()
 
     def create_readers(self) -> None:
-        """Receive images, those of each fluoroscope in a thread of its own."""
+        """Receive the images of each fluoroscope in its own thread."""
         for name, angles in self.angles.items():
             reader = angles.create_reader(self, self.fault_handlers)
             for kind, topic in self._inputs:
@@ -153,7 +153,7 @@ class ImageNode(CorrectingNode):
                 )
 
     def prepare(self, calibration: FluoroscopeCalibration) -> _PreparedCalibration:
-        """Return the calibration with its maps of pixels."""
+        """Return the calibration with its pixel maps."""
         return _PreparedCalibration(calibration, self._settings.interpolation)
 
     def on_calibration_ready(self, name: str, prepared: _PreparedCalibration) -> None:

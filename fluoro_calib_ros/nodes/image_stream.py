@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Streams of images: their diagnostics, the queue of exposures, and workers that extract them."""
+"""Streams of images: their diagnostics, the queue of exposures, and the extracting workers."""
 
 from __future__ import annotations
 
@@ -36,31 +36,31 @@ from .runtime.streams import REMEMBERED
 
 
 class ImageStream(Stream):
-    """Stream of images that are extracted."""
+    """Stream of images from which targets are extracted."""
 
     def __init__(self, name: str, refusals: RefusalLog, topic: str) -> None:
         super().__init__(name, refusals)
-        self.topic = topic  #: one on which images come, for messages
-        #: number of images with observations, of those that the image before gave the start of, of
-        #: those without observations, and of those that were never looked at
+        self.topic = topic  #: one of the topics of the images, for messages
+        #: number of images with observations, of those among them followed from the previous
+        #: image, of images without observations, and of images that were shed unprocessed
         self.extracted = 0
         self.followed = 0
         self.without = 0
         self.shed = 0
         self.headers: OrderedDict[int, Header] = OrderedDict()  #: of the last images, by number
-        self.retracted = 0  #: ids that were published and taken back
-        self.last: Observations | None = None  #: of the last image
+        self.retracted = 0  #: number of published ids that were retracted
+        self.last: Observations | None = None  #: observations in the last image
         self.converter = ImageConverter(name)
-        self.seconds = 0.0  #: that images took
-        #: between the last two calls of measure(), and shed_now: images shed in this time
+        self.seconds = 0.0  #: total processing time of the images
+        #: rate, and number of images shed, between the last two calls of measure()
         self.rate_hz = 0.0
         self.shed_now = 0
         self._first: tuple[tuple[int, int], str] | None = None  # image size and frame id
-        # At the last measurement: time, images that were processed, images that were shed.
+        # At the last measurement: time, number of processed images, number of shed images.
         self._before = (time.monotonic(), 0, 0)
 
     def measure(self) -> None:
-        """Determine the rate, and what was shed, since the last call."""
+        """Update the rate and the number of shed images since the last call."""
         now = time.monotonic()
         then, processed, shed = self._before
         count = self.extracted + self.without
@@ -69,7 +69,7 @@ class ImageStream(Stream):
         self._before = (now, count, self.shed)
 
     def decoded(self, message: Image | CompressedImage) -> np.ndarray:
-        """Return the image (h, w) of a message. Raises Refused where the stream has changed."""
+        """Return the image (h, w) of a message. Raises Refused if frame id or size has changed."""
         frame_id = message.header.frame_id
         if self._first is not None and frame_id != self._first[1]:
             raise self.converter.refusal(
@@ -92,7 +92,7 @@ class ImageStream(Stream):
         return image
 
     def count(self, message: Image | CompressedImage, found: Observations) -> None:
-        """Count an image that was extracted, and log what is wrong with it."""
+        """Count a processed image, and log what is wrong with it."""
         if not found.reason:
             self.extracted += 1
             self.followed += found.followed
@@ -108,7 +108,7 @@ class ImageStream(Stream):
         self.refusals.note(str(self.converter.refusal('', message, text)))
 
     def values(self, waiting: int) -> dict[str, object]:
-        """Return the values for the diagnostics; waiting: images that wait."""
+        """Return the values for the diagnostics; waiting: number of waiting images."""
         last = self.last or Observations()
         processed = self.extracted + self.without
         return {
@@ -135,26 +135,26 @@ class ImageStream(Stream):
 
 @dataclass(frozen=True)
 class ImageState(StreamState):
-    """What the diagnostics of a fluoroscope are decided by."""
+    """State from which the health of an image stream is diagnosed."""
 
     stream: ImageStream
     angles: AngleInput
 
 
 def shed_images(state: ImageState) -> Health | None:
-    """Images came faster than they were extracted."""
+    """Warn if images came faster than they were extracted."""
     shed = f'images come faster than they are extracted: {state.stream.shed} were shed'
     return warning(shed if state.stream.shed_now else '')
 
 
 def empty_image(state: ImageState) -> Health | None:
-    """The last image gave no observations."""
+    """Warn if the last image gave no observations."""
     reason = state.stream.last.reason if state.stream.last is not None else ''
     return warning(reason and f'no observations in the last image: {reason}')
 
 
 def unknown_angle(state: ImageState) -> Health | None:
-    """The angle of the C-arm is unknown, but needed."""
+    """Warn if the angle of the C-arm is needed but unknown."""
     unknown = state.angles.health(state.stream.name, state.incompatible)
     return unknown and unknown.with_consequence(
         'markers are predicted by the mean correction over all angles'
@@ -178,14 +178,14 @@ CONDITIONS = (
 
 T = TypeVar('T')
 
-LATE = 3  # exposures that one view may come after the other
+LATE = 3  # maximum delay of a view behind the others, in exposures
 
 
 class ExposureQueue(Generic[T]):
     """Items of each fluoroscope that wait for its thread, at most `size` of them.
 
-    Where more would wait, the oldest exposure that no thread has begun is shed with the items of
-    all fluoroscopes: views of different exposures are of no use to a reconstruction.
+    If more would wait, the oldest exposure that no thread has begun is shed for all fluoroscopes:
+    a reconstruction cannot use views of different exposures.
     """
 
     def __init__(self, fluoroscopes: Iterable[str], size: int) -> None:
@@ -193,18 +193,18 @@ class ExposureQueue(Generic[T]):
         self._waiting: dict[str, OrderedDict[int, T]] = {n: OrderedDict() for n in fluoroscopes}
         self._begun: deque[int] = deque(maxlen=REMEMBERED)
         self._shed: deque[int] = deque(maxlen=REMEMBERED)
-        # Last exposure that was given out to several fluoroscopes together, by each of them.
+        # Last exposure that get() returned for several fluoroscopes together, by fluoroscope.
         self._given: dict[str, int] = {}
         self._changed = threading.Condition()
         self._closed = False
 
     def put(self, fluoroscope: str, number: int, item: T) -> list[str]:
-        """Add an item; returns the fluoroscopes that have lost one."""
+        """Add an item; return the fluoroscopes that have lost one."""
         with self._changed:
             waiting = self._waiting[fluoroscope]
             if number in self._shed or number <= self._given.get(fluoroscope, -1):
                 return [fluoroscope]
-            lost = [fluoroscope] if number in waiting else []  # a number that is used again
+            lost = [fluoroscope] if number in waiting else []  # the number is reused
             waiting[number] = item
             if len(waiting) > self._size:
                 lost += self._shed_one(waiting)
@@ -214,9 +214,9 @@ class ExposureQueue(Generic[T]):
     def get(
         self, fluoroscopes: Collection[str], patience_s: float = 0.0
     ) -> tuple[int, dict[str, T]] | None:
-        """Wait for the items of an exposure, the lowest number that waits; None once it is closed.
+        """Wait for the lowest waiting exposure and return its number and items; None once closed.
 
-        Items of the other fluoroscopes are waited for while they may still come, at most so long.
+        Waits for items of the other fluoroscopes while they may still come, at most patience_s.
         """
         views = {name: self._waiting[name] for name in fluoroscopes}
         with self._changed:
@@ -236,17 +236,17 @@ class ExposureQueue(Generic[T]):
         return self._closed
 
     def waiting(self, fluoroscope: str) -> int:
-        """Return how many items of a fluoroscope wait."""
+        """Return the number of waiting items of a fluoroscope."""
         return len(self._waiting[fluoroscope])
 
     def close(self) -> None:
-        """End all waits; what is waiting is lost."""
+        """End all waits; waiting items are lost."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
 
     def _shed_one(self, full: OrderedDict[int, T]) -> list[str]:
-        """Remove an exposure; returns the fluoroscopes that have lost an item."""
+        """Remove an exposure; return the fluoroscopes that have lost an item."""
         fresh = [number for number in full if number not in self._begun]
         if not fresh:
             full.popitem(last=False)
@@ -259,27 +259,27 @@ class ExposureQueue(Generic[T]):
 
 
 def _lowest(views: Mapping[str, Mapping[int, object]]) -> int:
-    """Return the lowest number that waits."""
+    """Return the lowest waiting exposure number."""
     return min(number for items in views.values() for number in items)
 
 
 def _is_complete(views: Mapping[str, Mapping[int, object]]) -> bool:
-    """Return whether the lowest exposure that waits has all items that it will have."""
+    """Return whether the lowest waiting exposure has all items that can be expected."""
     number = _lowest(views)
-    # A fluoroscope with a later exposure has lost this one, and one that is several exposures late
-    # is not waited for.
+    # A fluoroscope with a later exposure has lost this one. Do not wait for a fluoroscope that is
+    # several exposures late.
     overdue = any(number in items and len(items) > LATE for items in views.values())
     return overdue or all(number in items or items for items in views.values())
 
 
-PATIENCE_S = 5.0  # with the other views of an exposure, unless LATE exposures come before
+PATIENCE_S = 5.0  # longest wait for the other views of an exposure, unless LATE exposures arrive
 
 
 @dataclass(frozen=True)
 class Task:
-    """An image that waits.
+    """Image that waits for extraction.
 
-    Its number, message, when it has arrived [ns, system clock], and the angle of the C-arm [rad].
+    Its number, message, time of arrival [ns, system clock], and angle of the C-arm [rad].
     """
 
     number: int
@@ -289,11 +289,11 @@ class Task:
 
 
 class ExtractionWorkers:
-    """A process for each follower, and the thread that gives it images.
+    """One process per follower, and the threads that pass images to the processes.
 
-    queue_size: images of a fluoroscope that may wait. wanted: called with a fluoroscope; returns
-    whether its overlay is wanted. finish: called with stream, task, image and what was found in
-    it, in the threads.
+    queue_size: maximum number of waiting images of a fluoroscope. wanted: called with a
+    fluoroscope; returns whether its overlay is wanted. finish: called in the threads with stream,
+    task, image and the observations found in it.
     """
 
     def __init__(
@@ -311,7 +311,7 @@ class ExtractionWorkers:
         self._processes: list[WorkerProcess] = []
 
     def start(self, followers: Sequence[FollowerSettings]) -> None:
-        """Start the processes, and the threads."""
+        """Start the processes and threads."""
         for make in followers:
             process = follower_process(make)
             process.start()
@@ -323,16 +323,16 @@ class ExtractionWorkers:
             self._threads.append(thread)
 
     def put(self, name: str, task: Task) -> None:
-        """Let an image wait; the oldest exposure is shed where too many do."""
+        """Queue an image; if too many wait, the oldest exposure is shed."""
         for loser in self._queue.put(name, task.number, task):
             self._streams[loser].shed += 1
 
     def waiting(self, name: str) -> int:
-        """Return how many images of a fluoroscope wait."""
+        """Return the number of waiting images of a fluoroscope."""
         return self._queue.waiting(name)
 
     def close(self) -> None:
-        """End threads and processes; what is waiting is lost."""
+        """End threads and processes; waiting images are lost."""
         self._queue.close()
         for process in self._processes:
             process.close()
@@ -340,7 +340,7 @@ class ExtractionWorkers:
             thread.join()
 
     def _serve(self, names: Collection[str], process: WorkerProcess) -> None:
-        """Extract the images of some fluoroscopes, exposure by exposure."""
+        """Extract the images of the given fluoroscopes, exposure by exposure."""
         lent = LentArrays()
         try:
             self._serve_exposures(names, process, lent)
@@ -364,7 +364,7 @@ class ExtractionWorkers:
     def _extract(
         self, number: int, tasks: Mapping[str, Task], process: WorkerProcess, lent: LentArrays
     ) -> None:
-        """Extract the images of an exposure in a process."""
+        """Extract the images of an exposure in the process."""
         images = {}
         for name, task in tasks.items():
             try:

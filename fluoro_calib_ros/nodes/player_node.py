@@ -36,13 +36,13 @@ from .runtime.topics import (
     wait_until_acknowledged,
 )
 
-WAIT_S = 0.02  # after which a change of the speed, a pause and its end, or a step is noticed
+WAIT_S = 0.02  # longest delay until a change of speed, a pause, its end or a step takes effect
 
 
 class Pace:
-    """Moments at which positions of a recording are due.
+    """Times at which positions of a recording are due.
 
-    rate: speed relative to the recording. paused: whether to begin with a pause.
+    rate: speed relative to the recording. paused: whether to start paused.
     """
 
     def __init__(self, rate: float, paused: bool = False) -> None:
@@ -54,42 +54,42 @@ class Pace:
         self.start()
 
     def start(self) -> None:
-        """Be at position 0 now."""
-        # Replaced as a whole: another thread may change it.
+        """Set the current position to 0."""
+        # Replace the tuple as a whole, because another thread may read or change it.
         self._anchor = (time.monotonic(), 0.0, 0.0 if self.paused else self._rate)
 
     @property
     def paused(self) -> bool:
-        """Whether there is a pause."""
+        """Whether playing is paused."""
         return self._paused.is_set()
 
     @property
     def position_s(self) -> float:
-        """The present position [s]."""
+        """Current position [s]."""
         then, position, rate = self._anchor
         return position + (time.monotonic() - then) * rate
 
     def pause(self) -> None:
-        """Stay where it is."""
+        """Stop at the current position."""
         self._anchor = (time.monotonic(), self.position_s, 0.0)
         self._paused.set()
 
     def resume(self) -> None:
-        """Go on from there."""
+        """Continue from the current position."""
         self._anchor = (time.monotonic(), self.position_s, self._rate)
         self._paused.clear()
 
     def step(self) -> None:
-        """Let one wait end during a pause."""
+        """End one wait during a pause."""
         self._steps.release()
 
     def change(self, rate: float) -> None:
-        """Go on from the present position at another speed."""
+        """Continue from the current position at another speed."""
         self._rate = rate
         self._anchor = (time.monotonic(), self.position_s, 0.0 if self.paused else rate)
 
     def wait(self, position_s: float, stop: threading.Event) -> bool:
-        """Wait until a position [s] is due; returns whether `stop` has ended the wait."""
+        """Wait until a position [s] is due; return whether `stop` ended the wait."""
         while True:
             if self.paused:
                 if self._steps.acquire(blocking=False):
@@ -109,7 +109,7 @@ class Pace:
 
 
 OBSERVATIONS = 'TargetObservations'
-# Message types of the other streams that the nodes process, each with one reader at least.
+# Message types of the other streams that the nodes process, each with at least one reader.
 OTHER_STREAMS = ('CorrectedObservations', 'Image', 'CompressedImage')
 
 
@@ -134,7 +134,7 @@ PARAMETERS = (_NODE, READ_LIMITS)
 
 
 class PlayerNode(ParameterNode):
-    """Plays a bag once, or over and over; stamps are those of the recording."""
+    """Plays a bag once or in a loop; stamps are those of the recording."""
 
     def __init__(self) -> None:
         super().__init__('player_node')
@@ -144,7 +144,7 @@ class PlayerNode(ParameterNode):
             raise StartError('parameter bag is not set: it names the bag to play')
         self._outputs = self._create_outputs(self._settings.bag)
         self._pace = Pace(self._settings.rate, self._settings.start_paused)
-        self._start_ns: int | None = None  # of the recording, where playing begins
+        self._start_ns: int | None = None  # time of the recording at which playing begins
         _NODE.follow(self, self._use)
         services = (
             ServiceEntry('~/pause', SetBool, self._on_pause),
@@ -158,12 +158,12 @@ class PlayerNode(ParameterNode):
         self._worker.start()
 
     def _use(self, settings: PlayerParameters) -> None:
-        """Use other settings from now on."""
+        """Apply new settings from now on."""
         self._settings = settings
         self._pace.change(settings.rate)
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        """Pause, or go on."""
+        """Pause or continue."""
         response.success = self._pace.paused != request.data
         if request.data:
             self._pace.pause()
@@ -217,9 +217,9 @@ class PlayerNode(ParameterNode):
         return outputs
 
     def _create_output(self, topic: str, info: TopicInfo) -> Publisher | None:
-        """Return the publisher of a topic, relative so that it can be remapped.
+        """Return the publisher of a topic, with a relative name so that it can be remapped.
 
-        Returns None for a type that is not installed. Raises StartError.
+        Returns None if the type is not installed. Raises StartError.
         """
         message_type = installed_type(info.type)
         if message_type is None:
@@ -241,7 +241,7 @@ class PlayerNode(ParameterNode):
             ) from None
 
     def _wait_for_readers(self) -> None:
-        """Wait for the readers of streams: /rosout of a bag has none, and others may have none."""
+        """Wait for the readers of streams only: other topics, such as /rosout, may have none."""
         kinds = {output: output.msg_type.__name__ for output in self._outputs.values()}
         count = self._settings.wait_for_readers
         awaited = [output for output, kind in kinds.items() if kind == OBSERVATIONS]
@@ -267,7 +267,7 @@ class PlayerNode(ParameterNode):
             self.get_logger().fatal(str(error))
             self.failed = True
         except Exception:
-            if rclpy.ok():  # else the node has been ended between two messages
+            if rclpy.ok():  # else the node was ended between two messages
                 self.get_logger().fatal(Trace(traceback.format_exc()))
                 self.failed = True
         finally:
@@ -275,7 +275,7 @@ class PlayerNode(ParameterNode):
                 rclpy.shutdown()
 
     def _play_once(self) -> None:
-        """Publish every message at its time."""
+        """Publish every message at its time; before the start offset, only latched ones."""
         start = time.monotonic()
         start_ns = None
         count = 0
@@ -308,7 +308,7 @@ class PlayerNode(ParameterNode):
 
 
 def is_latched(info: TopicInfo) -> bool:
-    """Return whether late subscribers received the messages of a recorded topic, too."""
+    """Return whether a recorded topic was latched, so that late subscribers received it."""
     return any(profile.get('durability') == 'transient_local' for profile in info.offered_qos)
 
 

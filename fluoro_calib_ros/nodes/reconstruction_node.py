@@ -116,7 +116,7 @@ PARAMETERS = (_NODE, _PAIRING, _BODIES, _DRIFT, _DRIFT_OPTIONS, _LIMITS, READ_LI
 
 @dataclass(frozen=True)
 class _View:
-    """A corrected frame that waits for its partners."""
+    """Corrected frame that waits for its partners."""
 
     fluoroscope: str
     number: int
@@ -146,7 +146,7 @@ class ReconstructionNode(StreamNode):
         _DRIFT_OPTIONS.follow(self, self._use_drift_options)
 
     def reset(self) -> None:
-        """Forget the orientations and start counting from zero."""
+        """Discard the orientations and reset all counters."""
         self._drift.reset()
         self._refusals = RefusalLog('frame', self.limited_logger)
         self._streams = {name: Stream(name, self._refusals) for name in self._names}
@@ -187,7 +187,7 @@ class ReconstructionNode(StreamNode):
     # -- lifecycle
 
     def create_outputs(self) -> None:
-        """Make the outputs and subscribe to orientations."""
+        """Create the outputs and subscribe to orientations."""
         self._output = PointsOutput(self)
         self._retractions = PointRetractions(self)
         self._create_bodies()
@@ -207,7 +207,7 @@ class ReconstructionNode(StreamNode):
             self._on_orientation(saved)
 
     def _create_bodies(self) -> None:
-        """Read the files of bodies and joints, and make their outputs. Raises DataError."""
+        """Read the files of bodies and joints, and create their outputs. Raises DataError."""
         bodies, joints = read_body_files(self._body_parameters)
         if bodies:
             self._follower = BodyFollower(bodies, joints, self._body_parameters.body_lag)
@@ -253,7 +253,7 @@ class ReconstructionNode(StreamNode):
             self._publish_transforms(message)
 
     def _on_calibrated(self, message: RigOrientation) -> None:
-        """Take the orientation from before the rig was healed, which may come after it."""
+        """Store the orientation before healing, which may arrive after the healed orientation."""
         self._rigs.use_calibrated(message)
         if self._rigs.newest is not None and self._rigs.calibrated is not None:
             self._publish_transforms(message_from_orientation(self._rigs.newest.orientation))
@@ -264,7 +264,7 @@ class ReconstructionNode(StreamNode):
         )
 
     def _on_camera_info(self, name: str, message: CameraInfo) -> None:
-        """Take the image size of a fluoroscope, which the drift watch needs."""
+        """Store the image size of a fluoroscope, which the drift watch needs."""
         try:
             size = image_size_of(message, f'{name}/camera_info', *self._rigs.camera_of(name))
         except DataError as error:
@@ -276,7 +276,7 @@ class ReconstructionNode(StreamNode):
     # -- corrected observations, in the thread of the streams
 
     def _on_view(self, name: str, frame: CorrectedFrame, info: Mapping[str, int]) -> None:
-        """Pair a corrected frame, and reconstruct the exposures that are complete by it."""
+        """Pair a corrected frame, and reconstruct the exposures that it completes."""
         self._streams[name].received += 1
         try:
             validate_corrected(name, frame)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Points, bodies and joints, published in all their forms, and diagnostics, the gravest first."""
+"""Publishers of points, bodies and joints in all their forms, and their diagnostics."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ COUNTED_STATUSES = {
     'failed': FAILED,
     'in a single view': SINGLE_VIEW,
 }
-POINT_FORMS = ('points', 'markers', 'mocap_markers')  # beside the points with covariance
+POINT_FORMS = ('points', 'markers', 'mocap_markers')  # in addition to the points with covariance
 
 
 class PointsCounter:
@@ -85,7 +85,7 @@ class PointsCounter:
         self._counts: Counter[str] = Counter()
 
     def add(self, points: IntersectedPoints) -> None:
-        """Count points."""
+        """Add points to the counts."""
         self._counts['points'] += len(points.status)
         if points.status.any():
             for name, status in COUNTED_STATUSES.items():
@@ -121,7 +121,7 @@ class PointsOutput:
         self._outputs['points_with_covariance'].publish(encode_reconstructed_points(content))
 
     def publish_forms(self, content: PointsContent, sigmas: float, rate_hz: float) -> None:
-        """Publish the other forms that have subscribers: ellipsoids of so many sigmas."""
+        """Publish the other forms that have subscribers; sigmas: half axes of the ellipsoids."""
         wanted = [
             name
             for name in POINT_FORMS
@@ -169,7 +169,7 @@ class BodiesOutput:
         )
 
     def publish(self, content: BodiesContent) -> None:
-        """Publish an exposure; standard types only while they have subscribers."""
+        """Publish an exposure; standard message types only while they have subscribers."""
         message = self.publish_own(content)
         if self._transforms.get_subscription_count():
             transforms = transforms_of_bodies(content, message, self._rig_frame)
@@ -186,7 +186,7 @@ class BodiesOutput:
             self._joint_states.publish(joint_state(content))
 
     def publish_own(self, content: BodiesContent) -> BodyPoses:
-        """Publish the messages that have a status; returns that of the poses."""
+        """Publish the messages that have a status field; return that of the poses."""
         message = message_from_bodies(content)
         self._bodies.publish(message)
         if self._joints is not None and content.joints:
@@ -202,7 +202,7 @@ NO_ORIENTATION = (
 
 @dataclass(frozen=True)
 class ReconstructionState(InputState):
-    """What the diagnostics of the reconstruction are decided by."""
+    """State from which the health of the reconstruction is diagnosed."""
 
     streams: Mapping[str, Stream]  #: by fluoroscope
     rigs: RigInput
@@ -211,14 +211,14 @@ class ReconstructionState(InputState):
 
 
 def no_orientation(state: ReconstructionState) -> Health | None:
-    """The orientation of the rig is not known yet."""
+    """Warn if the orientation of the rig is not known yet."""
     if state.rigs.newest is not None:
         return None
     return warning(state.refusals.last_fault or NO_ORIENTATION)
 
 
 def stalled_streams(state: ReconstructionState) -> Health | None:
-    """Streams have stopped; what else is wrong with the streams follows."""
+    """Warn if streams have stopped, and append other faults of the streams."""
     found = {name: stream.stalled() for name, stream in state.streams.items()}
     stalled = [f'{name}: {message}' for name, message in found.items() if message]
     if not stalled:
@@ -229,14 +229,14 @@ def stalled_streams(state: ReconstructionState) -> Health | None:
 
 
 def missing_publishers(state: ReconstructionState) -> Health | None:
-    """Nobody publishes the frames of a fluoroscope."""
+    """Warn if nobody publishes the frames of a fluoroscope."""
     published = map(state.node.has_publisher, state.topics)
     missing = ', '.join(name for name, there in zip(state.streams, published) if not there)
     return warning(missing and f'no publisher of corrected observations of {missing}')
 
 
 def missed_rays(state: ReconstructionState) -> Health | None:
-    """The rays of the views do not meet."""
+    """Report that the rays of the views do not intersect."""
     finding = state.misses.finding()
     misses = '' if finding is None else finding.sentence
     disagreement = state.pairer.stamps.disagreement()
@@ -244,14 +244,14 @@ def missed_rays(state: ReconstructionState) -> Health | None:
 
 
 def silent_fluoroscopes(state: ReconstructionState) -> Health | None:
-    """Fluoroscopes have stopped, and are not waited for any more."""
+    """Warn if fluoroscopes have stopped, so that exposures no longer wait for them."""
     silent = ', '.join(sorted(state.pairer.silent))
     return warning(
         silent and f'no frames of {silent}, points are reconstructed from the other fluoroscopes'
     )
 
 
-# Views were corrected with calibrations of no known orientation.
+# Views were corrected with calibrations that match no known orientation.
 foreign_calibrations = counted(
     'without_orientation',
     '{count} exposures in the last minute were corrected with calibrations to which no '
@@ -260,11 +260,11 @@ foreign_calibrations = counted(
 
 
 def distant_stamps(state: ReconstructionState) -> Health | None:
-    """Frames of the same number are far apart in time."""
+    """Warn if frames of the same number are far apart in time."""
     return warning(state.pairer.stamps.disagreement())
 
 
-# Exposures have some of the views only.
+# Exposures lacked some of the views.
 incomplete_exposures = counted(
     'incomplete', '{count} exposures without all fluoroscopes in the last minute'
 )
@@ -292,7 +292,7 @@ CONDITIONS = (
 
 @dataclass(frozen=True)
 class BodyState:
-    """What the diagnostics of a body are decided by: its row in the state of all bodies."""
+    """State from which the health of a body is diagnosed: its row in the state of all bodies."""
 
     body: Body
     state: BodiesState
@@ -302,42 +302,42 @@ class BodyState:
 
     @property
     def status(self) -> PoseStatus:
-        """How its last pose was obtained."""
+        """How the last pose of the body was obtained."""
         return PoseStatus(self.state.status[self.row])
 
     @property
     def unseen_s(self) -> float | None:
-        """Time of the stream since an exposure showed a marker of it [s], None before."""
+        """Stream time since a marker of the body was last seen [s], None if never."""
         seen = int(self.state.seen_ns[self.row])
         return None if seen < 0 else (self.state.stamp_ns - seen) * 1e-9
 
 
 def exposures_without_time(state: BodyState) -> Health | None:
-    """Exposures have the stamp of the one before."""
+    """Warn if exposures have the same stamp as the one before."""
     count = state.untimed_recently
     text = f'{count} exposures in the last minute have the stamp of the one before'
     return warning(text if count else '')
 
 
 def unseen_body(state: BodyState) -> Health | None:
-    """No exposure has shown the body."""
+    """Warn if no exposure has shown the body yet."""
     return warning('' if state.unseen_s is not None else 'not seen yet')
 
 
 def lost_body(state: BodyState) -> Health | None:
-    """The body is lost."""
+    """Warn if the body is lost."""
     text = f'lost, its markers were last seen {state.unseen_s or 0:.1f} s ago'
     return warning(text if state.status == PoseStatus.FAILED else '')
 
 
 def predicted_body(state: BodyState) -> Health | None:
-    """No marker is seen, but the body is not lost yet."""
+    """Warn if no marker is seen, so that the pose is predicted; the body is not lost yet."""
     text = f'no marker is seen for {state.unseen_s or 0:.2f} s: the pose is predicted'
     return warning(text if state.status == PoseStatus.FILLED else '')
 
 
 def ambiguous_body(state: BodyState) -> Health | None:
-    """Its markers fit in a second pose."""
+    """Warn if the markers fit a second pose."""
     text = 'its markers fit in a second pose, too'
     return warning(text if state.status == PoseStatus.AMBIGUOUS else '')
 
@@ -353,12 +353,12 @@ BODY_CONDITIONS = (
 
 
 def failed_neutral(joint: JointTracker) -> Health | None:
-    """The neutral trial has passed without a neutral position."""
+    """Warn if the neutral trial has ended without a neutral position."""
     return warning('' if joint.error is None else f'no angles: {joint.error}')
 
 
 def awaited_neutral(joint: JointTracker) -> Health | None:
-    """The neutral trial has not passed."""
+    """Warn if the neutral trial has not ended."""
     return warning('no angles before the end of the neutral trial' if joint.needs_neutral else '')
 
 
@@ -366,7 +366,7 @@ JOINT_CONDITIONS = (failed_neutral, awaited_neutral, healthy('followed'))
 
 
 def statuses_of(follower: BodyFollower, counts: RecentCounts) -> list[Status]:
-    """Return a status for each body and each joint, nothing before the first exposure."""
+    """Return a status for each body and each joint, none before the first exposure."""
     state = follower.state
     if state is None:
         return []

@@ -43,7 +43,7 @@ from .runtime.topics import (
 )
 
 JOINT_STATES = 'joint_states'
-DEPTH = 1000  # messages that wait for the reading thread, of one topic
+DEPTH = 1000  # queue length of each topic for the reading thread
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ PARAMETERS = (_NODE, _RECORDING)
 
 
 class RecorderState(NamedTuple):
-    """Why nothing is written, what was dropped, and what never arrived; '' for nothing."""
+    """Why writing failed, what was dropped, and what never arrived; '' means none."""
 
     fault: str
     loss: str
@@ -73,17 +73,17 @@ class RecorderState(NamedTuple):
 
 
 def failed_recording(state: RecorderState) -> Health | None:
-    """Nothing can be written any more."""
+    """Report that nothing can be written any more."""
     return fault(state.fault and (state.loss or state.fault))
 
 
 def dropped_messages(state: RecorderState) -> Health | None:
-    """Messages are dropped."""
+    """Warn if messages were dropped."""
     return warning(state.loss)
 
 
 def overrun_input(state: RecorderState) -> Health | None:
-    """Messages were lost before they were taken: the recording has gaps."""
+    """Warn if messages were lost at the input, so that the recording has gaps."""
     return warning(state.overrun)
 
 
@@ -91,9 +91,9 @@ CONDITIONS = (failed_recording, dropped_messages, overrun_input, healthy('record
 
 
 class RecorderNode(ParameterNode):
-    """Records the messages of topics as they are, from their first publisher on."""
+    """Records the messages of topics unchanged, from the discovery of their first publisher."""
 
-    end_s = 60.0  # to write what was received, see runtime.main
+    end_s = 60.0  # time for writing what was received, see runtime.main
 
     def __init__(self) -> None:
         super().__init__('recorder_node')
@@ -111,7 +111,7 @@ class RecorderNode(ParameterNode):
         if topics and self._settings.angle_joint:
             topics.append(JOINT_STATES)
         self._topics_of_graph = TopicDiscovery(self, topics)
-        self._topics: dict[str, str] = {}  # type by topic
+        self._topics: dict[str, str] = {}  # types by topic
         self._overrun: Counter[str] = Counter()  # messages lost at the input by topic
         self._limited_logger = RateLimitedLogger(self.get_logger())
         self._reader = StreamReader(
@@ -131,14 +131,14 @@ class RecorderNode(ParameterNode):
         self.get_logger().info(f'recording to {self._recording.path}')
 
     def _discover(self) -> None:
-        """Subscribe to topics that have been published since the last time."""
+        """Subscribe to topics that have appeared since the last call."""
         for topic, types, publishers in self._topics_of_graph.new():
             self._subscribe(topic, types, publishers)
 
     def _subscribe(
         self, topic: str, types: Sequence[str], publishers: Sequence[TopicEndpointInfo]
     ) -> None:
-        """Record a topic, or say why that is not possible."""
+        """Record a topic, or log why it cannot be recorded."""
         kind = installed_type(types[0]) if len(types) == 1 else None
         if kind is None:
             reason = (
@@ -171,7 +171,7 @@ class RecorderNode(ParameterNode):
         self.get_logger().info(f'recording {topic} [{types[0]}]')
 
     def _loss(self) -> str:
-        """Return what was dropped, and why."""
+        """Return a message about dropped messages and the cause, '' if none was dropped."""
         dropped = lost_text(self._recording.dropped)
         cause = self._recording.fault or 'the disk is too slow'
         return f'messages are dropped, {cause}: {dropped}' if dropped else ''
@@ -180,7 +180,7 @@ class RecorderNode(ParameterNode):
         self._overrun[topic] += count
 
     def _lost_at_input(self) -> str:
-        """Return what was lost before it was taken."""
+        """Return a message about messages lost at the input, '' if none was lost."""
         lost = lost_text(self._overrun)
         return f'messages are lost at the input, they come too fast: {lost}' if lost else ''
 
@@ -205,7 +205,7 @@ class RecorderNode(ParameterNode):
         self._diagnostics.publish([Status('recorder', *health_of(state, CONDITIONS), counts)])
 
     def stop(self) -> None:
-        """Write what was received, and close the bag."""
+        """Write all received messages, and close the bag."""
         self._reader.stop(take_pending=True)
         self._recording.stop()
         loss = self._loss()
@@ -225,7 +225,7 @@ class RecorderNode(ParameterNode):
 
 
 def qos_document(profile: QoSProfile) -> dict[str, Any]:
-    """Return an offered QoS profile as bags contain it."""
+    """Return an offered QoS profile in the form that bags contain."""
     return {
         'history': profile.history.name.lower(),
         'depth': profile.depth,
@@ -245,7 +245,7 @@ def _duration(duration: Duration) -> dict[str, int]:
 
 
 def type_hash_text(publisher: TopicEndpointInfo) -> str:
-    """Return the hash of the type of a publisher, '' where the middleware does not tell it."""
+    """Return the type hash of a publisher, '' if the middleware does not provide it."""
     found = publisher.topic_type_hash
     if found is None or found.version != 1 or not any(found.value):
         return ''

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Points and poses of earlier exposures whose image points were taken back."""
+"""Retraction of points and poses of earlier exposures whose image points were withdrawn."""
 
 from __future__ import annotations
 
@@ -26,34 +26,34 @@ from .runtime.streams import remember
 from .runtime.topics import observations_qos
 
 TOPIC = 'retractions'
-MAX_IDS = 10_000  # of a retraction
+MAX_IDS = 10_000  # maximum number of ids in a retraction that is stored
 
 
 @dataclass
 class _Published:
-    """Bodies of an exposure, and which of them were taken back."""
+    """Bodies of an exposure, and the names of those whose poses were retracted."""
 
     content: BodiesContent
     taken: set[str] = field(default_factory=set)
 
 
 class BodyRetractions:
-    """Takes back poses, and the motion of joints between them.
+    """Retracts poses of bodies and the motion of the joints between them.
 
-    publish: called with what replaces a part of an exposure: the bodies and joints whose motion is
-    not known any more.
+    publish: called with the replacement for a part of an exposure: the bodies and joints whose
+    motion is no longer known.
     """
 
     def __init__(self, publish: Callable[[BodiesContent], None]) -> None:
         self._publish = publish
-        # By stamp of the exposure [ns].
+        # By stamp of the exposure [ns]; _early: marker ids retracted before the exposure is noted.
         self._published: OrderedDict[int, _Published] = OrderedDict()
         self._early: OrderedDict[int, set[int]] = OrderedDict()
-        self._lock = threading.Lock()  # exposures and retractions come in two threads
-        self.count = 0  #: poses that were taken back
+        self._lock = threading.Lock()  # exposures and retractions come from different threads
+        self.count = 0  #: number of retracted poses
 
     def note(self, content: BodiesContent) -> None:
-        """Remember an exposure that was published."""
+        """Store a published exposure."""
         with self._lock:
             remember(self._published, content.stamp_ns, _Published(content))
             wrong = self._early.pop(content.stamp_ns, None)
@@ -61,7 +61,7 @@ class BodyRetractions:
                 self._take_back(self._published[content.stamp_ns], wrong)
 
     def take_back(self, stamp_ns: int, target_id: Collection[int]) -> None:
-        """Take back the poses of an exposure by some markers; it may still be to come."""
+        """Retract the poses of an exposure, possibly a future one, that use some markers."""
         with self._lock:
             published = self._published.get(stamp_ns)
             if published is not None:
@@ -98,7 +98,7 @@ class BodyRetractions:
 
 
 def _unknown_pose(poses: BodyPoses) -> BodyPoses:
-    """The same exposures without poses."""
+    """Return the same exposures with unknown poses."""
     return replace(
         poses,
         rotation=np.full_like(poses.rotation, np.nan),
@@ -112,28 +112,28 @@ def _unknown_pose(poses: BodyPoses) -> BodyPoses:
 
 
 class PointRetractions:
-    """Publishes which points of an exposure are by image points that were taken back."""
+    """Retracts the points of exposures that rely on withdrawn image points."""
 
     def __init__(self, node: StreamNode) -> None:
         self._node = node
         self._output = node.create_output(
             Retraction, f'reconstruction/{TOPIC}', observations_qos()
         )
-        # By fluoroscope and stamp of a view.
+        # By fluoroscope and stamp of a view [ns].
         self._exposures: OrderedDict[tuple[str, int], PointsContent] = OrderedDict()
         self._early: OrderedDict[tuple[str, int], Retraction] = OrderedDict()
-        self._lock = threading.Lock()  # views and retractions come in two threads
-        self.bodies = BodyRetractions(_nowhere)  #: whose poses are by these points
-        self._count = 0  # points that were taken back
+        self._lock = threading.Lock()  # views and retractions come from different threads
+        self.bodies = BodyRetractions(_nowhere)  #: retracts poses determined from these points
+        self._count = 0  # retracted points
 
     def listen(self, name: str, refusals: RefusalLog) -> None:
-        """Receive what is taken back of a fluoroscope."""
+        """Subscribe to the retractions of a fluoroscope."""
         on_retraction = partial(self.on_retraction, name)
         topic = f'{name}/{TOPIC}'
         self._node.create_input(Retraction, topic, on_retraction, observations_qos(), refusals)
 
     def note(self, stamps_ns: Mapping[str, int], content: PointsContent) -> None:
-        """Remember an exposure that was reconstructed, by the stamps of its views."""
+        """Store a reconstructed exposure by the stamps of its views."""
         with self._lock:
             for key in stamps_ns.items():
                 remember(self._exposures, key, content)
@@ -141,7 +141,7 @@ class PointRetractions:
                     self._publish(content, self._early.pop(key))
 
     def on_retraction(self, name: str, message: Retraction) -> None:
-        """Take back points of an exposure, or of one that is still to come."""
+        """Retract points of an exposure, or store the retraction until the exposure arrives."""
         key = name, nanoseconds_from_stamp(message.header.stamp)
         with self._lock:
             if key in self._exposures:
@@ -166,4 +166,4 @@ class PointRetractions:
 
 
 def _nowhere(content: BodiesContent) -> None:
-    """Publish no bodies."""
+    """Do not publish bodies."""

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Orientations of the rig that arrive, and bodies and joints that are followed in it."""
+"""Received orientations of the rig, and the tracking of bodies and joints in it."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ from .messages.rig_orientation import (
 from .runtime.diagnostics import Logger, RefusalLog
 from .runtime.parameters import expand_path
 
-MAX_ORIENTATIONS = 4  # frames of the previous calibrations may still come
+MAX_ORIENTATIONS = 4  # as frames of the previous calibrations may still arrive
 
 
 class Rig(NamedTuple):
-    """An orientation that has arrived, its intersector, scatter, and drift watch if any."""
+    """Received orientation, its intersector, observed scatter, and drift watch, if any."""
 
     orientation_id: str
     orientation: rig_orientation.RigOrientation
@@ -51,7 +51,7 @@ class Rig(NamedTuple):
     watch: RigDriftWatch | None
 
     def widened(self) -> tuple[Intersector, float]:
-        """Return the intersector with what an alarm adds, and the addition to sigma [px]."""
+        """Return the intersector and the increase of sigma [px], widened after a drift alarm."""
         watch = self.watch
         return (self.intersector, 0.0) if watch is None else watch.widened(self.intersector)
 
@@ -79,13 +79,13 @@ class RigInput:
         self._drift = drift
         self._refusals = refusals
         self._logger = logger
-        # By calibration ids, the oldest first; replaced as a whole.
+        # By calibration ids, oldest first; replaced as a whole.
         self._rigs: dict[tuple[str | None, ...], Rig] = {}
-        self._calibrated: rig_orientation.RigOrientation | None = None  # before it was healed
+        self._calibrated: rig_orientation.RigOrientation | None = None  # before healing
 
     @property
     def calibrated(self) -> rig_orientation.RigOrientation | None:
-        """The orientation before the newest one was healed, None where that was not."""
+        """Orientation from which the newest one was healed, None if the newest is not healed."""
         rig, known = self.newest, self._calibrated
         if rig is None or known is None or rig.orientation.source != 'healing':
             return None
@@ -93,17 +93,17 @@ class RigInput:
 
     @property
     def correction(self) -> str:
-        """By how much the newest one differs from the one before it was healed."""
+        """How far the newest orientation differs from the one before healing, as text."""
         rig, known = self.newest, self.calibrated
         return '' if rig is None or known is None else jump_text(known, rig.orientation)
 
     @property
     def newest(self) -> Rig | None:
-        """The last one that has arrived."""
+        """The rig of the last received orientation."""
         return next(reversed(self._rigs.values()), None)
 
     def camera_of(self, name: str) -> tuple[str, NDArray[np.float64] | None]:
-        """Return optical frame and interior orientation (3,) of the newest one, or '' and None."""
+        """Return optical frame and interior orientation (3,) in the newest rig, or '' and None."""
         rig = self.newest
         if rig is None:
             return '', None
@@ -111,7 +111,7 @@ class RigInput:
         return rig.orientation.optical_frame_ids[index], rig.orientation.interior[index]
 
     def rig_of(self, calibration_ids: Mapping[str, str]) -> Rig | None:
-        """Return the newest rig with the calibrations of some views, by fluoroscope."""
+        """Return the newest rig that matches the calibration ids of some views, by fluoroscope."""
         rigs = self._rigs
         ids = tuple(calibration_ids.get(name) for name in self._names)
         if len(calibration_ids) == len(ids):
@@ -122,7 +122,7 @@ class RigInput:
         return None
 
     def add(self, message: RigOrientation) -> bool:
-        """Use an orientation from now on; returns whether it is not refused."""
+        """Use an orientation from now on; return False if it is refused."""
         try:
             orientation = orientation_from_message(message).subset(self._names)
             rig = Rig(
@@ -144,14 +144,14 @@ class RigInput:
         return True
 
     def use_calibrated(self, message: RigOrientation) -> None:
-        """Take the orientation that the newest one was healed from, unless it is refused."""
+        """Store the orientation from which the newest one was healed, unless it is refused."""
         try:
             self._calibrated = orientation_from_message(message).subset(self._names)
         except ValueError as error:  # DataError among them
             self._logger.error(f'orientation as calibrated refused: {error}')
 
     def _tell_jump(self, orientation: rig_orientation.RigOrientation) -> None:
-        """Log how far the transforms of the rig jump by another orientation."""
+        """Log how far the transforms of the rig jump with a new orientation."""
         if self.newest is None:
             return
         jump = jump_text(self.newest.orientation, orientation)
@@ -159,7 +159,7 @@ class RigInput:
             self._logger.warning(f'the transforms of the rig jump: {jump}')
 
     def saved(self, file: str, folder: str) -> RigOrientation | None:
-        """Return the orientation of a file, or else of a folder, None where there is none."""
+        """Return the orientation of a file, else of a folder, or None if there is none."""
         try:
             path = file
             if not path and folder:
@@ -177,7 +177,7 @@ class RigInput:
             return None
 
     def use_reject(self, reject: float) -> None:
-        """Use another limit from now on."""
+        """Use another rejection limit from now on."""
         self._reject = reject
         self._rigs = {
             ids: rig._replace(intersector=Intersector(rig.orientation, reject))
@@ -185,7 +185,7 @@ class RigInput:
         }
 
     def renew_watches(self) -> None:
-        """Watch for drift from the beginning."""
+        """Restart all drift watches."""
         try:
             self._rigs = {
                 ids: rig._replace(watch=self._drift.make_watch(rig.orientation))
@@ -196,9 +196,9 @@ class RigInput:
             self._logger.error(self._refusals.last_fault)
 
 
-# A body's name is part of topics, and the name of a TF frame.
+# A body's name is part of topic names, and the name of a TF frame.
 BODY_NAME = re.compile('[A-Za-z][A-Za-z0-9_]*')
-FORGETTING = 0.01  # share of the newest exposure in the mean misfit
+FORGETTING = 0.01  # weight of the newest exposure in the mean misfit
 
 
 @dataclass(frozen=True)
@@ -250,15 +250,15 @@ def read_body_files(parameters: BodyParameters) -> tuple[tuple[Body, ...], tuple
 
 
 class BodiesState(NamedTuple):
-    """What the last published exposure tells of B bodies."""
+    """State of B bodies in the last published exposure."""
 
     stamp_ns: int
     #: (B,)
     status: NDArray[np.uint8]
     markers: NDArray[np.int64]
-    #: (B,) stamps of the last exposures that show each body; -1 for none
+    #: (B,) stamp of the last exposure that shows each body [ns]; -1 if none does
     seen_ns: NDArray[np.int64]
-    #: (B,) mean of chi-squared over its expectation, of the last 100 exposures or so; NaN for none
+    #: (B,) mean of chi-squared over its expectation, of about the last 100 exposures; NaN if none
     misfit: NDArray[np.float64]
 
 
@@ -274,7 +274,7 @@ class BodyFollower:
         self._lag = lag
         self.joints = self._new_joints()
         self.state: BodiesState | None = None  #: None before the first exposure
-        self.untimed = 0  #: exposures that were not later than the one before, and were not taken
+        self.untimed = 0  #: number of skipped exposures with the stamp of the one before
         self._rig: Rig | None = None
         self._tracker: BodyTracker | None = None
         self._last_ns = -1
@@ -283,10 +283,10 @@ class BodyFollower:
     def add(
         self, exposure: IntersectedViews, rig: Rig, number: int, stamp_ns: int
     ) -> list[BodiesContent]:
-        """Take an exposure; return what is known of those whose turn it is.
+        """Add an exposure; return the contents of the exposures that are now ready for output.
 
-        An orientation, or another limit of false markers, starts a new tracker. So does a stamp
-        that is earlier than the last one: a recording begins anew.
+        A new tracker is started if the orientation or the rejection limit changes. So it is if a
+        stamp is earlier than the last one, because a recording has started again.
         """
         begins_anew = stamp_ns < self._last_ns
         out = []
@@ -305,7 +305,7 @@ class BodyFollower:
         return out if found is None else [*out, self._content(found)]
 
     def _is_same(self, rig: Rig) -> bool:
-        """Whether the tracker fits a rig."""
+        """Return whether the tracker matches a rig."""
         known = self._rig
         return known is not None and (known.orientation_id, known.intersector.reject) == (
             rig.orientation_id,
@@ -316,13 +316,13 @@ class BodyFollower:
         return [JointTracker(entry.joint, entry.neutral) for entry in self._entries]
 
     def _flushed(self) -> list[BodiesContent]:
-        """What is known of exposures that wait for later ones, which do not come."""
+        """Return the contents of exposures that wait for later ones, which will not come."""
         if self._tracker is None:
             return []
         return [self._content(one) for one in self._tracker.flush()]
 
     def _content(self, found: TrackedExposure) -> BodiesContent:
-        """Return poses and joints of an exposure, and note its state."""
+        """Return poses and joints of an exposure, and update the state."""
         assert self._rig is not None
         poses = poses_of(self.bodies, [found])
         by_name = {one.body: one for one in poses}
@@ -348,7 +348,7 @@ class BodyFollower:
         )
 
     def _note(self, found: TrackedExposure) -> None:
-        """Update the state by an exposure."""
+        """Update the state with an exposure."""
         frame = found.frame
         known = frame.alone & (frame.freedom > 0)
         newest = np.where(known, [frame.chi2, frame.freedom], 0.0)

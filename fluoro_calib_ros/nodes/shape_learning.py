@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A calibration node learns the shapes of bodies while the rig is healthy, for the action heal.
+"""Learning of body shapes by a calibration node while the rig is healthy, for the action heal.
 
-Once a second it looks how far it is: frames of markers are collected in the thread of the streams,
-and shapes are estimated from them in a process of their own.
+Once a second the next step is taken: frames of markers are collected in the thread of the streams,
+and shapes are estimated from them in a separate process.
 """
 
 from __future__ import annotations
@@ -37,49 +37,49 @@ DRIFT = 'the drift watch has given an alarm: no shapes are learned before the ne
 
 
 class ShapeLearning(RigServices):
-    """Learns shapes once for each orientation that is not healed, before any alarm."""
+    """Learns shapes once for each orientation that is not healed, before any drift alarm."""
 
     services = ()
 
     def __init__(self, parts: NodeParts) -> None:
         super().__init__(parts)
         self._bodies = _declared(self._rig.settings().node.learn_bodies)
-        self._orientation: RigOrientation | None = None  # that is learned with
+        self._orientation: RigOrientation | None = None  # orientation in use while learning
         self._window: MarkerCollection | None = None
         self._job: tuple[Future, threading.Thread] | None = None
         self._stopping = threading.Event()
-        self._alarmed = False  # whether the drift watch has given an alarm of this orientation
+        self._alarmed = False  # whether the drift watch has raised an alarm for this orientation
         self._learned: LearnedShapes | None = None
         self._refusal = ''  # why the last shapes were not learned
 
     def add(self, name: str, observed: ObservedFrame, angle: Callable[[], float | None]) -> None:
-        """Give a frame to the window, if any. Called in the thread of the streams."""
+        """Add a frame to the collection window, if any. Called in the thread of the streams."""
         window = self._window
         if window is not None:
             window.add(name, observed, angle())
 
     def on_drift(self, message: DriftStatus) -> None:
-        """Learn nothing any more where the drift watch has given an alarm."""
-        # A message that comes right after a new orientation may be about the one before.
+        """Stop learning if the drift watch has raised an alarm."""
+        # A message received right after a new orientation may refer to the previous one.
         orientation = self._orientation
         if message.level == DriftStatus.OK or orientation is not self._output.orientation:
             return
         self._window = None
         if orientation is not None and not self._alarmed:
             self._alarmed = True
-            try:  # to be known after a restart, too
+            try:  # keep the alarm for the time after a restart
                 write_drift_alarm(self._rig.directory, orientation.orientation_id, message.message)
             except (DataError, OSError) as error:
                 self._logger.error(f'the alarm of the drift watch is not saved: {error}')
 
     def end(self) -> None:
-        """Cancel a running job, and wait for its end."""
+        """Cancel a running job and wait for it to end."""
         self._stopping.set()
         if self._job is not None:
             self._job[1].join()
 
     def diagnose(self) -> list[Status]:
-        """Take the next step; return how far the shapes are, nothing where none are learned."""
+        """Take the next step; return the progress of learning, empty without bodies to learn."""
         if not self._bodies:
             return []
         if self._orientation is not self._output.orientation:
@@ -89,7 +89,7 @@ class ShapeLearning(RigServices):
         return [Status('shapes', *self._step())]
 
     def _begin_anew(self) -> None:
-        """Begin with the orientation in use; what is learned with it already, is kept."""
+        """Start with the orientation in use; shapes already learned with it are kept."""
         self._orientation = orientation = self._output.orientation
         self._window = self._learned = None
         self._alarmed = False
@@ -106,7 +106,7 @@ class ShapeLearning(RigServices):
                 self._logger.info(f'shapes of bodies are learned: {error}')
 
     def _step(self) -> Health:
-        """Collect or estimate, whichever is next; returns level and message."""
+        """Collect frames or start the estimation; return level and message."""
         orientation = self._orientation
         learned = self._learned
         if learned is not None:
@@ -151,7 +151,7 @@ class ShapeLearning(RigServices):
         )
 
     def _finish(self, done: Future) -> None:
-        """Save what was learned, unless there was an alarm meanwhile."""
+        """Save the learned shapes, unless there has been an alarm meanwhile."""
         self._job = None
         orientation = self._orientation
         try:
@@ -174,6 +174,6 @@ class ShapeLearning(RigServices):
 
 
 def _declared(path: str) -> tuple[Body, ...]:
-    """Return the bodies of a file, none without one. Raises DataError."""
+    """Return the bodies of a file, none if the path is empty. Raises DataError."""
     with ErrorsAt('learn_bodies'):
         return read_bodies(expand_path(path)) if path else ()

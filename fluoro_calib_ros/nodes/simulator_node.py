@@ -48,7 +48,7 @@ from .runtime.topics import (
 )
 
 SCENES = ('phantom', 'standing', 'markers', 'grid')
-LOOP_S = 10.0  # length of a scene that is computed in advance and repeated
+LOOP_S = 10.0  # duration of a precomputed scene, which is repeated
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ PARAMETERS = (_NODE,)
 
 
 class SimulatorNode(ParameterNode):
-    """Publishes target observations, or radiographs, of every fluoroscope with present stamps."""
+    """Publishes target observations or radiographs of every fluoroscope, with current stamps."""
 
     def __init__(self) -> None:
         super().__init__('simulator_node')
@@ -136,7 +136,7 @@ class SimulatorNode(ParameterNode):
             )
             for name in parameters.fluoroscopes
         }
-        self._moving_mm = np.zeros((0, 0, 3))  # markers in radiographs
+        self._moving_mm = np.zeros((0, 0, 3))  # positions of the markers for radiographs
         self._precomputed = self._precompute()
         self._renderers: Renderers | None = None
         self._stopping = threading.Event()
@@ -145,7 +145,7 @@ class SimulatorNode(ParameterNode):
         self._worker.start()
 
     def _precompute(self) -> dict[str, list[TargetObservations]]:
-        """Return the messages of a scene that is repeated; nothing for one that is drawn live."""
+        """Return the messages of a repeated scene; empty for a scene that is generated live."""
         parameters = self._settings
         if parameters.scene == 'markers':
             tracking = simulate_tracking(
@@ -169,7 +169,7 @@ class SimulatorNode(ParameterNode):
         }
 
     def _run(self) -> None:
-        """Publish frame after frame, from a thread: a timer of rclpy costs more than a frame."""
+        """Publish frame after frame from a thread: a timer of rclpy costs more than a frame."""
         parameters = self._settings
         outputs = self._outputs.values()
         try:
@@ -186,14 +186,14 @@ class SimulatorNode(ParameterNode):
                 if not self._with_images:
                     self._publish(number)
                     continue
-                # As a camera does that is too slow: what is missed is left out.
+                # Skip missed frames, like a camera that is too slow.
                 late = math.floor((time.monotonic() - start) * parameters.rate)
                 number = max(number, min(late, parameters.frames or late))
                 self._publish_images(number)
             wait_until_acknowledged(outputs, self._stopping)
             rclpy.try_shutdown()
         except Exception:
-            if not self._stopping.is_set():  # else the node has been ended between two messages
+            if not self._stopping.is_set():  # else the node was ended between two messages
                 self.get_logger().fatal(Trace(traceback.format_exc()))
                 self.failed = True
                 rclpy.try_shutdown()
@@ -202,16 +202,16 @@ class SimulatorNode(ParameterNode):
                 self._renderers.close()
 
     def _start_rendering(self) -> None:
-        """Start the processes that render, and wait until they are ready."""
+        """Start the rendering processes, and wait until they are ready."""
         settings = SETTINGS[self._settings.images]
         if self._settings.scene == 'markers':
             settings = replace(settings, bead_attenuation=MarkerScene.attenuation)
         self._renderers = Renderers(self._rig.fluoroscopes, settings)
         self._renderers.start()
-        self._renderers.images(self._rendered_scene(1))  # so that the first one is not late
+        self._renderers.images(self._rendered_scene(1))  # so that the first one is in time
 
     def _publish_images(self, number: int) -> None:
-        """Render and publish the radiographs of an exposure, with the stamp of its beginning."""
+        """Render and publish the radiographs of an exposure, stamped with its start."""
         assert self._renderers is not None
         stamp = stamp_from_nanoseconds(self.get_clock().now().nanoseconds)
         scene = self._rendered_scene(number)
@@ -220,7 +220,7 @@ class SimulatorNode(ParameterNode):
             self._outputs[name].publish(message_from_image(header, image))
 
     def _rendered_scene(self, number: int) -> RenderedScene:
-        """Return what the fluoroscopes see in an exposure."""
+        """Return the scene that the fluoroscopes see in an exposure."""
         standing = np.eye(3), np.zeros(3)
         if self._settings.scene == 'markers':
             points = self._moving_mm[(number - 1) % len(self._moving_mm)]
@@ -247,7 +247,7 @@ class SimulatorNode(ParameterNode):
             self._outputs[name].publish(message)
 
     def _phantom_frames(self, number: int) -> Iterator[Frame]:
-        """Return the frames of the phantom in its present pose."""
+        """Yield the frames of the phantom in its current pose."""
         parameters = self._settings
         rotation, shift = (
             self._pose(number) if parameters.scene == 'phantom' else (np.eye(3), np.zeros(3))
@@ -271,7 +271,7 @@ class SimulatorNode(ParameterNode):
             )
 
     def _pose(self, number: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the present pose: standing, or on the way to the next one."""
+        """Return the current pose: standing, or moving to the next pose."""
         stand_s = self._settings.stand_time
         move_s = self._settings.move_time
         cycle_s = stand_s + move_s

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The long requests of a dashboard: actions self_calibrate and heal of the calibration node."""
+"""Long-running requests of a dashboard: the calibration node's actions self_calibrate and heal."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ NO_ANSWER = 'no answer yet; it may be lost: look at the state of the rig before 
 
 
 class _Kind(NamedTuple):
-    """One of the actions, and what the dashboard says of it."""
+    """An action and its texts in the dashboard."""
 
-    name: str  #: of the request
+    name: str  #: name of the request
     client: ActionClient
-    job: str  #: what runs
+    job: str  #: text for the running job
     feedback: Callable[[Any], str]
 
 
 class Actions:
-    """Starts the actions, one at a time, and tells what becomes of them.
+    """Starts the actions, one at a time, and reports their progress and result.
 
-    say takes a line of the log, set what has changed in the session. They are called in the
-    executor's thread; request() and cancel() in that of the view.
+    say appends a line to the log; set_ changes fields of the session state. Both are called in the
+    executor's thread as well as in that of the view, which calls request() and cancel().
     """
 
     def __init__(self, node: Node, say: Callable[[str], None], set_: Callable[..., None]) -> None:
@@ -63,7 +63,7 @@ class Actions:
         self._start(self._calibrate, SelfCalibrate.Goal(validate=validate), text)
 
     def cancel(self) -> None:
-        """Cancel what was started here."""
+        """Cancel the running action, if it was started here."""
         if self._goal is None:
             self._say('cancel: nothing runs that was started here')
             return
@@ -91,7 +91,7 @@ class Actions:
     # -- the executor's thread
 
     def check(self, before: float) -> None:
-        """Give up what nobody carries out: a goal sent earlier and not accepted, or no server."""
+        """Give up if the server is gone, or if a goal sent before that time was not accepted."""
         with self._lock:
             kind = self._running
             if kind is None or not self._job:
@@ -114,7 +114,7 @@ class Actions:
             return
         with self._lock:
             self._goal = handle
-            self._job = kind.job  # also where it was given up before
+            self._job = kind.job  # also if check() gave it up before
         handle.get_result_async().add_done_callback(partial(self._on_result, kind))
 
     def _on_result(self, kind: _Kind, future: Future) -> None:

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a rig sees at the moment: radiographs with image points, coverage, points in space."""
+"""Current view of a rig: radiographs with image points, coverage, and points in space."""
 
 from __future__ import annotations
 
@@ -31,20 +31,20 @@ from ..runtime.diagnostics import Refused
 from ..runtime.streams import remember
 from ..runtime.topics import OBSERVATION_DEPTH, adapted_qos
 
-IDLE_S = 10.0  # after which a topic that nobody looks at is no longer subscribed
-LARGEST_PX = 768  # of a radiograph that is shown
-KEPT = 16  # radiographs that wait for their image points, which come later
+IDLE_S = 10.0  # idle time after which a topic is unsubscribed
+LARGEST_PX = 768  # maximum size of a displayed radiograph
+KEPT = 16  # radiographs kept until their image points arrive
 
 
 @dataclass
 class _Film:
-    """The last radiographs of a fluoroscope, and image points by stamp [ns]."""
+    """Last radiographs and image points of a fluoroscope, by stamp [ns]."""
 
     converter: ImageConverter
-    #: JPEG, and width and height [px]
+    #: JPEG data, and width and height of the original image [px]
     images: OrderedDict[int, tuple[bytes, int, int]] = field(default_factory=OrderedDict)
     points: OrderedDict[int, TargetObservations] = field(default_factory=OrderedDict)
-    found_at: float = -math.inf  #: when the last image points were taken
+    found_at: float = -math.inf  #: time at which the last image points were taken [s]
 
 
 @dataclass
@@ -56,10 +56,10 @@ class _Reader:
 
 
 class Scene:
-    """Takes the newest messages of a rig when somebody looks; for one thread.
+    """Takes the newest messages of a rig on request; to be used from one thread.
 
-    Its node is not spun: DDS keeps the last messages of a topic, and none of the others costs
-    Python any time. What nobody has looked at for a while is not subscribed.
+    Its node is not spun: DDS keeps the last messages of a topic, and the others cost Python no
+    time. Topics that have not been requested for IDLE_S are unsubscribed.
     """
 
     def __init__(self, namespace: str, context: Context | None = None) -> None:
@@ -75,19 +75,19 @@ class Scene:
         self._latched: dict[str, Any] = {}
 
     def close(self) -> None:
-        """End the node."""
+        """Destroy the node."""
         self._node.destroy_node()
 
     def radiograph(self, name: str) -> dict[str, Any]:
-        """Return the newest image that was searched, and the image points of the same exposure.
+        """Return the newest analysed image, and the image points of the same exposure.
 
-        Keys: stamp [ns]; age [s], by how much it is older than the newest image; width, height
-        [px] of the image; jpeg, its picture as a data URL, '' for a stream without images; points,
-        rows (id, u, v) [px]. Empty before there is anything.
+        Keys: stamp [ns]; age [s], how much older it is than the newest image; width, height [px]
+        of the image; jpeg, the image as a data URL, '' for a stream without images; points, rows
+        (id, u, v) [px]. Empty before any data has arrived.
         """
         film = self._films.setdefault(name, _Film(ImageConverter(name)))
         has_images = self._take_image(name, film)
-        depth = OBSERVATION_DEPTH if has_images else 1  # three seconds at 30 Hz
+        depth = OBSERVATION_DEPTH if has_images else 1  # 3 s at 30 Hz
         for message in self._taken(f'{name}/target_observations', TargetObservations, depth):
             stamp_ns = nanoseconds_from_stamp(message.header.stamp)
             remember(film.points, stamp_ns, message, OBSERVATION_DEPTH)
@@ -103,7 +103,7 @@ class Scene:
         else:
             return {}
         return {
-            'stamp': str(stamp),  # JavaScript has 53 bits
+            'stamp': str(stamp),  # numbers of JavaScript have 53 bits
             'age': (max(film.images, default=stamp) - stamp) * 1e-9,
             'width': width,
             'height': height,
@@ -112,14 +112,14 @@ class Scene:
         }
 
     def _take_image(self, name: str, film: _Film) -> bool:
-        """Take the newest image of a fluoroscope; returns whether somebody publishes images."""
+        """Take the newest image of a fluoroscope; return whether images are published."""
         for topic, kind in (('image_raw', Image), ('image_raw/compressed', CompressedImage)):
             if not self._node.count_publishers(f'{name}/{topic}'):
                 continue
             for message in self._taken(f'{name}/{topic}', kind):
                 try:
                     image, _ = film.converter.decoded(message)
-                except Refused:  # the extraction node says what is wrong with it
+                except Refused:  # the extraction node reports the reason
                     continue
                 height, width = image.shape
                 remember(
@@ -132,7 +132,7 @@ class Scene:
         return False
 
     def coverage(self, name: str) -> bytes:
-        """Return the picture of the coverage of a fluoroscope as PNG, b'' before there is one."""
+        """Return the coverage picture of a fluoroscope as PNG, or b'' if there is none."""
         message = self._last(f'{name}/coverage', Image)
         if message is None or message.encoding != 'rgb8':
             return b''
@@ -151,7 +151,7 @@ class Scene:
         out: dict[str, Any] = {'points': [], 'sources': []}
         orientation = self._last('rig_orientation', RigOrientation)
         if orientation is not None:
-            with suppress(ValueError):  # the reconstruction node says what is wrong with it
+            with suppress(ValueError):  # the reconstruction node reports the reason
                 out['sources'] = _sources(orientation_from_message(orientation))
         points = self._last('reconstruction/points_with_covariance', ReconstructedPoints)
         if points is not None:
@@ -163,7 +163,7 @@ class Scene:
         return out
 
     def _last(self, topic: str, kind: type) -> Any:
-        """Return the newest message of a topic, also one that was taken before; None for none."""
+        """Return the newest message of a topic, possibly taken earlier; None if there is none."""
         for message in self._taken(topic, kind):
             self._latched[topic] = message
         if not self._node.count_publishers(topic):
@@ -171,7 +171,7 @@ class Scene:
         return self._latched.get(topic)
 
     def _taken(self, topic: str, kind: type, depth: int = 1) -> list[Any]:
-        """Return the messages of a topic that have come since, at most the last ones."""
+        """Return the new messages of a topic, at most the last `depth`."""
         now = time.monotonic()
         for name, known in list(self._readers.items()):
             if now - known.used_at > IDLE_S or (name == topic and known.depth != depth):
@@ -191,7 +191,7 @@ class Scene:
         return out
 
     def _open(self, topic: str, kind: type, depth: int) -> _Reader | None:
-        """Subscribe to a topic, None where nobody publishes it."""
+        """Subscribe to a topic; return None if nobody publishes it."""
         publishers = self._node.get_publishers_info_by_topic(self._node.resolve_topic_name(topic))
         if not publishers:
             return None
@@ -207,9 +207,9 @@ def _sources(rig: rig_orientation.RigOrientation) -> list[dict[str, Any]]:
 
 
 def _shown(film: _Film) -> int:
-    """Return the stamp of the image to show: the newest one that was searched.
+    """Return the stamp of the image to show: the newest that was analysed.
 
-    That is the newest one of all where nothing was found for a while.
+    If no image points have arrived for IDLE_S, it is the newest image of all.
     """
     newest = next(reversed(film.images))
     if time.monotonic() - film.found_at > IDLE_S:
@@ -219,7 +219,7 @@ def _shown(film: _Film) -> int:
 
 
 def _rows(message: TargetObservations | None) -> list[list[float]]:
-    """Return id, u and v of the image points of a message that are numbers."""
+    """Return id, u and v of the image points with finite coordinates."""
     if message is None:
         return []
     rows = np.column_stack([message.target_id, message.u, message.v])

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a dashboard shows of a session, whichever way; it knows neither ROS nor a screen."""
+"""Session state that every dashboard view shows; independent of ROS and of the display."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Protocol
 
-LEVELS = ('ok', 'warn', 'error', 'silent')  # of a node or a function; silent: nothing is heard
-# Keys by which a user asks for something, and what the dashboard then calls.
+LEVELS = ('ok', 'warn', 'error', 'silent')  # of a node or a function; silent: no reports
+# Names of the requests that a user can make.
 CAPTURE = 'capture'
 CALIBRATE = 'calibrate'
 CALIBRATE_FAST = 'calibrate_fast'
@@ -27,38 +27,38 @@ REQUESTS = (
     *(HEAL, ACCEPT, ROLL_BACK),
 )
 
-RATE_WINDOW_S = 5.0  # over which rates are counted
+RATE_WINDOW_S = 5.0  # time window in which rates are counted
 
 
 @dataclass(frozen=True)
 class FluoroscopeState:
-    """One fluoroscope. NaN and '' stand for what is not known yet."""
+    """State of one fluoroscope; NaN and '' mean not known yet."""
 
     name: str
     state: str = ''  #: 'collecting', 'calibrating', 'calibrated'
-    #: frames that arrive, and frames that are corrected, a second
+    #: frames received and frames corrected per second
     frames_hz: float = math.nan
     corrected_hz: float = math.nan
-    #: from the arrival of a frame to its correction
+    #: delay from the arrival of a frame to its correction
     latency_p50_ms: float = math.nan
     latency_p99_ms: float = math.nan
-    rejected: int = 0  #: frames refused because their content was wrong
-    frames: int = 0  #: frames that arrived since the calibration node was started
+    rejected: int = 0  #: frames refused because of their content
+    frames: int = 0  #: frames received since the calibration node was started
     exposures: int = 0
     coverage: float = 0.0  #: covered part of the image, 0 to 1
     next_pose: str = ''  #: what the next exposure should show
-    ready: bool = False  #: whether the exposures suffice
+    ready: bool = False  #: whether the exposures suffice to calibrate
     iteration: int = 0  #: round of the running or last calibration
-    rmse_px: tuple[float, float] = (math.nan, math.nan)  #: of that round, in u and v
+    rmse_px: tuple[float, float] = (math.nan, math.nan)  #: residuals of that round, in u and v
     calibration_id: str = ''
     age_s: float = math.nan  #: of the calibration
     verdict: str = ''  #: on the calibration
-    findings: tuple[str, ...] = ()  #: why it is no pass
+    findings: tuple[str, ...] = ()  #: why the verdict is not pass
 
 
 @dataclass(frozen=True)
 class NodeState:
-    """One node: its worst level and the message that belongs to it."""
+    """State of one node: its worst level and the corresponding message."""
 
     name: str
     level: str
@@ -67,46 +67,46 @@ class NodeState:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What the action heal has found, until it is accepted or rolled back."""
+    """Result of the action heal, until it is accepted or rolled back."""
 
-    verdict: str = ''  #: on the healed rig, '' without a diagnosis
-    findings: tuple[str, ...] = ()  #: what has changed, and what speaks against the healed rig
-    orientation_id: str = ''  #: of the healed rig, '' where nothing of the rig has changed
+    verdict: str = ''  #: on the healed rig, '' if there is no diagnosis
+    findings: tuple[str, ...] = ()  #: what has changed, and objections to the healed rig
+    orientation_id: str = ''  #: of the healed rig, '' if the rig has not changed
 
 
 @dataclass(frozen=True)
 class SessionState:
-    """The whole session."""
+    """State of the whole session."""
 
     namespace: str = '/'
     fluoroscopes: tuple[FluoroscopeState, ...] = ()
     nodes: tuple[NodeState, ...] = ()
-    points_hz: float = math.nan  #: exposures reconstructed a second
+    points_hz: float = math.nan  #: exposures reconstructed per second
     points_latency_ms: tuple[float, float] = (math.nan, math.nan)  #: median and 99th percentile
     orientation: str = ''  #: source of the orientation of the rig, '' without one
-    orientation_id: str = ''  #: of the one in use
+    orientation_id: str = ''  #: id of the orientation in use
     diagnosis: Diagnosis = field(default_factory=Diagnosis)
-    #: of the drift watch
+    #: level and message of the drift watch
     drift_level: str = ''
     drift: str = ''
-    verdict: str = ''  #: the worst one on the calibrations in use
+    verdict: str = ''  #: worst verdict on the calibrations in use
     findings: tuple[str, ...] = ()
-    results: str = ''  #: folder into which the calibration node writes its results
-    job: str = ''  #: what runs at the moment, '' if nothing does
-    log: tuple[str, ...] = ()  #: what was asked for, and the answers; the newest last
+    results: str = ''  #: result folder of the calibration node
+    job: str = ''  #: running job, '' if there is none
+    log: tuple[str, ...] = ()  #: requests and their answers, the newest last
 
     @property
     def acceptable(self) -> bool:
-        """Whether a healed rig waits to be accepted."""
+        """Whether a healed rig can be accepted."""
         healed = self.diagnosis
         return healed.verdict == 'pass' and healed.orientation_id not in ('', self.orientation_id)
 
 
-VERDICTS = ('fail', 'cannot tell', 'pass', '')  # the worst one first
+VERDICTS = ('fail', 'cannot tell', 'pass', '')  # the worst first
 
 
 def worst_verdict(fluoroscopes: Iterable[FluoroscopeState]) -> tuple[str, tuple[str, ...]]:
-    """Return the worst verdict on the calibrations in use, and all findings."""
+    """Return the worst verdict on the calibrations in use, and the findings on all of them."""
     of_all = tuple(fluoroscopes)
     known = [one.verdict for one in of_all if one.verdict in VERDICTS]
     verdict = min(known, key=VERDICTS.index, default='')
@@ -114,25 +114,25 @@ def worst_verdict(fluoroscopes: Iterable[FluoroscopeState]) -> tuple[str, tuple[
 
 
 class Session(Protocol):
-    """What the view needs: the present state, and somebody who carries out requests."""
+    """Interface that a view needs: the current state, and a way to make requests."""
 
     def state(self) -> SessionState:
-        """Return the present state."""
+        """Return the current state."""
         ...
 
     def request(self, action: str) -> None:
-        """Start one of REQUESTS; the answer comes into the log."""
+        """Start one of REQUESTS; the answer is added to the log."""
         ...
 
 
 @dataclass
 class RateMeter:
-    """Events a second, from a counter that is read now and then."""
+    """Event rate, from occasional readings of a counter."""
 
     _readings: deque[tuple[float, int]] = field(default_factory=lambda: deque(maxlen=100))
 
     def add(self, seconds: float, count: int) -> None:
-        """Add a reading; a counter that was reset begins anew."""
+        """Add a reading; if the counter was reset, start again."""
         if self._readings and count < self._readings[-1][1]:
             self._readings.clear()
         self._readings.append((seconds, count))
@@ -141,7 +141,7 @@ class RateMeter:
 
     @property
     def hz(self) -> float:
-        """The mean rate of the last seconds, NaN before two readings."""
+        """Mean rate over the last RATE_WINDOW_S [Hz], NaN before two readings."""
         if len(self._readings) < 2:
             return math.nan
         (first_s, first), (last_s, last) = self._readings[0], self._readings[-1]
@@ -150,7 +150,7 @@ class RateMeter:
 
 @dataclass(frozen=True)
 class Light:
-    """The session in one colour, one word and one sentence, for whoever stands at the phantom."""
+    """Summary of a session for the operator at the phantom: a colour, a word and a sentence."""
 
     level: str  #: 'ok', 'warn', 'error' or 'busy'
     word: str
@@ -158,7 +158,7 @@ class Light:
 
 
 def light(state: SessionState) -> Light:
-    """Return the light of a session: what is worst, else what is to be done next."""
+    """Return the summary of a session: its worst problem, else what to do next."""
     bad = [node for node in state.nodes if node.level in ('error', 'silent')]
     if not state.nodes:
         return Light('error', 'No signal', 'no node of the rig has reported yet')

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The dashboard in a terminal; it knows the state, not ROS."""
+"""The dashboard in a terminal; it depends on the session state only, not on ROS."""
 
 from __future__ import annotations
 
@@ -30,27 +30,27 @@ COLOURS = {
     'calibrated': 'green',
     'calibrating': 'cyan',
 }
-CONFIRM_S = 5.0  # in which a second key confirms
+CONFIRM_S = 5.0  # time in which a second key press confirms
 CONFIRMATIONS = {
     'reset': 'press r again to discard the exposures; the calibration stays',
     'roll_back_healing': 'press b again to return to the rig before it was healed',
 }
-BAR = 20  # characters of the coverage bar
+BAR = 20  # width of the coverage bar in characters
 
 
 def session_text(state: SessionState) -> Group:
-    """Return the whole session as a renderable of rich."""
+    """Return the whole session as a rich renderable."""
     parts = [_fluoroscopes(state), Text(), _nodes(state), Text(), _results(state)]
     return Group(*_title(state), *parts)
 
 
 def plain(text: str) -> str:
-    """Return a text without control characters: a message of any peer must not rule a terminal."""
+    """Return a text without control characters: messages of peers must not control a terminal."""
     return ''.join(c if c.isprintable() else ' ' for c in text)
 
 
 def _cell(text: str | Text) -> Text:
-    """Return a cell of a table, in which brackets are no markup."""
+    """Return a table cell in which brackets are not interpreted as markup."""
     return text if isinstance(text, Text) else Text(plain(text))
 
 
@@ -173,7 +173,7 @@ def _duration(seconds: float) -> str:
 
 
 class Dashboard(App[None]):
-    """Shows a session, and asks it for what the keys stand for."""
+    """Shows a session, and passes the requests made by key to it."""
 
     CSS = """
     #session { height: auto; padding: 0 1; }
@@ -197,23 +197,23 @@ class Dashboard(App[None]):
         super().__init__()
         self._session = session
         self._confirm_until = 0.0
-        self._confirmed = ''  # what a second key asks for
+        self._confirmed = ''  # request that a second key press confirms
         self._note = ''
 
     def compose(self) -> ComposeResult:
-        """Make the widgets."""
+        """Create the widgets."""
         with VerticalScroll():
             yield Static(id='session')
         yield Static(id='log')
         yield Footer()
 
     def on_mount(self) -> None:
-        """Show the state from now on."""
+        """Show the state now and twice a second."""
         self.show()
         self.set_interval(0.5, self.show)
 
     def show(self) -> None:
-        """Show the present state."""
+        """Show the current state."""
         state = self._session.state()
         self._update('#session', session_text(state))
         if self._note and time.monotonic() > self._confirm_until:
@@ -222,19 +222,19 @@ class Dashboard(App[None]):
         self._update('#log', Text('\n'.join(map(plain, lines[-6:]))))
 
     def _update(self, selector: str, content: RenderableType) -> None:
-        """Update a widget; while the application ends, it may be gone before the timer is."""
+        """Update a widget, if it exists: as the application ends, it may go before the timer."""
         for widget in self.query(selector).results(Static):
             widget.update(content)
 
     def action_ask(self, request: str) -> None:
-        """Ask the session for something."""
+        """Make a request to the session."""
         self._confirm_until = 0.0
         self._note = ''
         self._session.request(request)
         self.show()
 
     def action_confirm(self, request: str) -> None:
-        """Ask for something that loses data, once the key is pressed again."""
+        """Make a request that loses data, once the key is pressed a second time."""
         if request == self._confirmed and time.monotonic() < self._confirm_until:
             self.action_ask(request)
             return

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The dashboard as a program, fluoro-calib watch: listens to nodes and calls their services."""
+"""The program fluoro-calib watch: a dashboard that listens to nodes and calls their services."""
 
 from __future__ import annotations
 
@@ -69,8 +69,8 @@ STATES = {
 class SessionClient(Node):
     """Listens to the nodes of a namespace; implements the Session of the view.
 
-    Callbacks run in the executor's thread, state() and request() in that of the view: a lock keeps
-    them apart.
+    Callbacks run in the executor's thread, state() and request() in that of the view; a lock
+    protects the shared data.
     """
 
     def __init__(self, namespace: str | None = None, context: Context | None = None) -> None:
@@ -83,7 +83,7 @@ class SessionClient(Node):
         self._meters: dict[tuple[str, str], RateMeter] = {}
         self._log: deque[str] = deque(maxlen=50)
         self._session = SessionState(self.get_namespace())
-        self._points_at: tuple[int, float] | None = None  # exposures reconstructed, and since when
+        self._points_at: tuple[int, float] | None = None  # reconstructed exposures, last change
         self._settings = AsyncParameterClient(self, 'calibration_node')
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 50)
         self._callers = {
@@ -92,14 +92,14 @@ class SessionClient(Node):
             **{name: self.create_client(Reset, name) for name in (RESET, ACCEPT, ROLL_BACK)},
         }
         self._actions = Actions(self, self._say, self._set)
-        self._asked: dict[Future, tuple[str, float]] = {}  # what waits for an answer, since when
+        self._asked: dict[Future, tuple[str, float]] = {}  # request, time it was made
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(1.0, self._check_answers, clock=steady)
 
     # -- the view's thread
 
     def state(self) -> SessionState:
-        """Return the present state."""
+        """Return the current state."""
         with self._lock:
             level, drift = self._drift_now()
             verdict, findings = worst_verdict(self._fluoroscopes.values())
@@ -115,7 +115,7 @@ class SessionClient(Node):
             )
 
     def _drift_now(self) -> tuple[str, str]:
-        """Return level and text of the drift: of a stream that has ended, nothing is known now."""
+        """Return level and text of the drift; if the stream has ended, the drift is unknown."""
         level = self._session.drift_level
         drift = self._session.drift
         idle_s = 0.0 if self._points_at is None else time.monotonic() - self._points_at[1]
@@ -124,7 +124,7 @@ class SessionClient(Node):
         return '', f'not watched: no exposure for {idle_s:.0f} s (before: {drift})'
 
     def request(self, action: str) -> None:
-        """Start one of REQUESTS; the answer comes into the log."""
+        """Start one of REQUESTS; the answer is added to the log."""
         with self._lock:
             if action in (CALIBRATE, CALIBRATE_FAST, HEAL):
                 self._actions.request(action)
@@ -150,7 +150,7 @@ class SessionClient(Node):
     # -- the executor's thread
 
     def _check_answers(self) -> None:
-        """Tell what was asked in vain: answers are lost where a node ends or has just begun."""
+        """Report unanswered requests: answers get lost when a node ends or has just started."""
         before = time.monotonic() - ANSWER_S
         with self._lock:
             for future, (action, since) in list(self._asked.items()):
@@ -208,7 +208,7 @@ class SessionClient(Node):
         stamp_s: float,
         status: DiagnosticStatus,
     ) -> None:
-        """Take over the values of a status."""
+        """Copy the values of a diagnostic status into the session state."""
         if node == 'calibration_node':
             self._follow(function)
             self._update(
@@ -243,7 +243,7 @@ class SessionClient(Node):
             self._set(drift_level=level, drift=status.message)
 
     def _note_points(self, count: str | None) -> None:
-        """Remember when the number of reconstructed exposures changed last."""
+        """Record when the number of reconstructed exposures last changed."""
         if count is not None and (self._points_at is None or self._points_at[0] != int(count)):
             self._points_at = int(count), time.monotonic()
 
@@ -281,7 +281,7 @@ class SessionClient(Node):
             self._log.append(f'{time.strftime("%H:%M:%S")}  {text}')
 
     def _node_states(self) -> Iterator[NodeState]:
-        """Yield the worst level of every node, and its message."""
+        """Yield the worst level of every node, with its message."""
         now = time.monotonic()
         for node, functions in sorted(self._functions.items()):
             silent_s = now - self._heard_at[node]
@@ -302,7 +302,7 @@ def _number(text: str | None) -> float:
 
 @contextmanager
 def session_client(arguments: list[str]) -> Iterator[SessionClient]:
-    """Run a SessionClient in a thread. arguments: of ROS, such as a namespace."""
+    """Run a SessionClient in a thread. arguments: ROS arguments, such as a namespace."""
     rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     client = SessionClient()
     executor = SingleThreadedExecutor()
@@ -327,7 +327,7 @@ def _until_shutdown(spin: Callable[[], None]) -> Callable[[], None]:
 
 
 def main(args: Sequence[str] | None = None) -> None:
-    """Show the session in the terminal or a browser until it is ended; with --once, print it."""
+    """Show the session in the terminal or a browser until the user quits; --once prints it."""
     parser = argparse.ArgumentParser('fluoro-calib watch')
     parser.add_argument('--once', action='store_true')
     parser.add_argument('--web', action='store_true')
@@ -356,7 +356,7 @@ def main(args: Sequence[str] | None = None) -> None:
 
 
 def _print(client: SessionClient) -> None:
-    """Print the state once, after the first reports."""
+    """Print the state once, after waiting for the first reports."""
     from rich.console import Console
 
     from .terminal import session_text

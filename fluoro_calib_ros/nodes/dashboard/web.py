@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The dashboard in a browser: a page beside the X-ray machine.
+"""The dashboard in a browser: a page for use next to the X-ray machine.
 
-The page asks for everything by HTTP; nothing is loaded from elsewhere. Who opens the address with
-the token gets a cookie, without which nothing is answered. What acts on the rig is accepted from
-this page only (same origin).
+The page requests everything by HTTP and loads nothing from elsewhere. Opening the address with the
+token sets a cookie, without which no request is answered. Requests that act on the rig are
+accepted from this page only (same origin).
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src data: blob:; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
-# The report has its styles and scripts inside, and must not act in the name of this page.
+# The report contains its styles and scripts, and must not act on behalf of this page.
 REPORT_POLICY = (
     "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline'; "
     "style-src 'unsafe-inline'; img-src data:"
@@ -54,10 +54,10 @@ REFUSAL = 'open the address that fluoro-calib watch has printed, with its token'
 
 @dataclass(frozen=True)
 class WebOptions:
-    """Where the page is offered, and what a rig.toml says.
+    """Where the page is served, and settings of a rig.toml.
 
-    port 0: any free one. token: empty for a new one. mas: tube load of a frame [mAs], 0 where it
-    is unknown. dicom: folder of DICOM files that tell the dose, None without.
+    port 0: any free one. token: empty for a new one. mas: tube load of a frame [mAs], 0 if
+    unknown. dicom: folder of DICOM files from which the dose is read, or None.
     """
 
     host: str = '127.0.0.1'
@@ -69,19 +69,19 @@ class WebOptions:
 
 @dataclass(frozen=True)
 class Desk:
-    """What the handlers of the page share."""
+    """Objects shared by the handlers of the page."""
 
     session: Session
     scene: Scene
     options: WebOptions
-    residuals: dict[str, Any]  #: residual vectors, by the id of their calibrations
+    residuals: dict[str, Any]  #: residual vectors, by calibration ids
 
 
 class Handler(RequestHandler):
-    """Answers who has the token."""
+    """Answers clients that have the token."""
 
     def initialize(self, desk: Desk) -> None:
-        """Take over what the handlers share."""
+        """Store the shared objects."""
         self._desk = desk
 
     def set_default_headers(self) -> None:
@@ -92,12 +92,12 @@ class Handler(RequestHandler):
         self.set_header('Cache-Control', 'no-store')
 
     def prepare(self) -> None:
-        """Refuse a request without token, and one of another page that acts."""
+        """Refuse requests without the token, and requests of other pages that act on the rig."""
         given = self.get_query_argument('token', '')
         cookie = f'fluoro_calib_{self._desk.options.port}'
         if self._is_token(given):
             self.set_cookie(cookie, given, httponly=True, samesite='Strict')
-            self.redirect(self.request.path)  # without the token, which a picture would show
+            self.redirect(self.request.path)  # drops the token, which a screenshot would show
         elif not self._is_token(self.get_cookie(cookie) or ''):
             raise HTTPError(403, reason='Forbidden', log_message=REFUSAL)
         elif self.request.method != 'GET':
@@ -119,7 +119,7 @@ class Handler(RequestHandler):
 
 
 class FileHandler(Handler):
-    """A file of the page."""
+    """Serves a file of the page."""
 
     def get(self) -> None:
         """Answer with the file."""
@@ -129,10 +129,10 @@ class FileHandler(Handler):
 
 
 class StateHandler(Handler):
-    """The state of the session."""
+    """Serves the state of the session."""
 
     async def get(self) -> None:
-        """Answer with the state, its light, and what is known of the dose."""
+        """Answer with the state, its summary light, and the known doses."""
         state = self._desk.session.state()
         folder = self._desk.options.dicom
         doses = await asyncio.to_thread(dose_texts, folder) if folder else {}
@@ -148,7 +148,7 @@ class StateHandler(Handler):
 
 
 class RadiographHandler(Handler):
-    """What a fluoroscope sees."""
+    """Serves the current view of a fluoroscope."""
 
     def get(self, name: str) -> None:
         """Answer with the newest image and its image points."""
@@ -156,10 +156,10 @@ class RadiographHandler(Handler):
 
 
 class CoverageHandler(Handler):
-    """What the exposures cover, and the next pose."""
+    """Serves the coverage by the exposures, and the next pose."""
 
     def get(self, name: str) -> None:
-        """Answer with the picture, 204 before there is one."""
+        """Answer with the picture, or 204 before there is one."""
         picture = self._desk.scene.coverage(_known(self._desk, name))
         if not picture:
             self.set_status(204)
@@ -169,15 +169,15 @@ class CoverageHandler(Handler):
 
 
 class SpaceHandler(Handler):
-    """Points in space."""
+    """Serves points in space."""
 
     def get(self) -> None:
-        """Answer with the newest points, and the sources."""
+        """Answer with the newest points and the sources."""
         self._finish_json(self._desk.scene.space())
 
 
 class ResidualHandler(Handler):
-    """Residual vectors of the calibration in use."""
+    """Serves residual vectors of the calibration in use."""
 
     async def get(self) -> None:
         """Answer with the vectors, or with the reason why there are none."""
@@ -191,10 +191,10 @@ class ResidualHandler(Handler):
 
 
 class ReportHandler(Handler):
-    """The report of the calibration in use."""
+    """Serves the report of the calibration in use."""
 
     async def get(self) -> None:
-        """Answer with the report, which is written where it is missing or older."""
+        """Answer with the report; write it first if it is missing or outdated."""
         folder = _results(self._desk)
         report = folder / REPORT
         result = folder / RESULT_NAME
@@ -205,10 +205,10 @@ class ReportHandler(Handler):
 
 
 class RequestHandlerOfSession(Handler):
-    """Requests to the rig."""
+    """Passes requests to the rig on."""
 
     def post(self, action: str) -> None:
-        """Ask the session; the answer comes into its log."""
+        """Pass a request to the session; the answer is added to its log."""
         if action not in REQUESTS:
             raise HTTPError(404, log_message='there is no such request')
         self._desk.session.request(action)
@@ -216,7 +216,7 @@ class RequestHandlerOfSession(Handler):
 
 
 def _known(desk: Desk, name: str) -> str:
-    """Return the name of a fluoroscope of the session. Raises HTTPError."""
+    """Return the name if the session has this fluoroscope. Raises HTTPError."""
     if name not in {f.name for f in desk.session.state().fluoroscopes}:
         raise HTTPError(404, log_message='there is no such fluoroscope')
     return name
@@ -233,7 +233,7 @@ def _results(desk: Desk) -> Path:
 
 
 def _vectors_of(folder: Path) -> dict[str, Any]:
-    from ...jobs.report import residual_vectors  # with matplotlib
+    from ...jobs.report import residual_vectors  # imports matplotlib
 
     try:
         return {'fluoroscopes': residual_vectors(folder)}
@@ -242,7 +242,7 @@ def _vectors_of(folder: Path) -> dict[str, Any]:
 
 
 async def _write_report(folder: Path) -> None:
-    """Write the report in a process of its own: it takes seconds. Raises HTTPError."""
+    """Write the report in a separate process, as this takes seconds. Raises HTTPError."""
     process = await asyncio.create_subprocess_exec(
         *(sys.executable, '-m', 'fluoro_calib_ros.cli', 'report', str(folder)),
         stdout=asyncio.subprocess.DEVNULL,
@@ -254,7 +254,7 @@ async def _write_report(folder: Path) -> None:
 
 
 def application(desk: Desk) -> Application:
-    """Return the application that answers the page."""
+    """Return the application that serves the page."""
     name = '([A-Za-z0-9_-]+)'
     routes: list[tuple[str, type[Handler]]] = [
         *((path, FileHandler) for path in FILES),
@@ -272,11 +272,11 @@ def application(desk: Desk) -> Application:
 async def run_server(
     session: Session, scene: Scene, options: WebOptions, started: Callable[[str], None]
 ) -> None:
-    """Answer the page until the task is cancelled; started is called with its address.
+    """Serve the page until the task is cancelled; started is called with its address.
 
-    Raises DataError where nothing can listen there.
+    Raises DataError if the address cannot be bound.
     """
-    logging.getLogger('tornado.access').setLevel(logging.CRITICAL)  # refusals are told to who asks
+    logging.getLogger('tornado.access').setLevel(logging.CRITICAL)  # clients are told of refusals
     try:
         sockets = bind_sockets(options.port, options.host)
     except OSError as error:
@@ -303,7 +303,7 @@ async def run_server(
 
 
 def serve(session: Session, scene: Scene, options: WebOptions) -> None:
-    """Answer the page until an interrupt. Exits with a sentence where nothing can listen."""
+    """Serve the page until an interrupt. Exits with a message if the address cannot be bound."""
 
     def started(address: str) -> None:
         print(f'fluoro-calib watch: open {address} in a browser; Ctrl-C ends it', flush=True)

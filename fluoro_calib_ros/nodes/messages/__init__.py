@@ -3,6 +3,6 @@
 
 """Conversion of ROS messages, one module for each message or group of services.
 
-No other module of the nodes knows the fields of these messages. Arrays are copied as a whole,
-never element by element.
+No other module in nodes accesses the fields of these messages. Arrays are copied as a whole, never
+element by element.
 """

@@ -3,8 +3,8 @@
 
 """Poses of bodies and motion of joints in one exposure, in metres.
 
-Covariances of poses are about the fixed axes of the frame of the header, as REP 103 asks and
-robot_localization reads them: those of BodyPoses are.
+Covariances of poses refer to the fixed axes of the header's frame, as REP 103 requires and
+robot_localization expects; those of BodyPoses already do.
 """
 
 from __future__ import annotations
@@ -39,19 +39,19 @@ try:
 except ImportError:
     vision = None
 
-# Types without a status have measured poses only: nobody could tell a predicted one from them.
+# Types without a status contain measured poses only: predicted ones would not be recognisable.
 MEASURED = (PoseStatus.OK, PoseStatus.WEAK)
 _TO_METRES = np.repeat([1e-3, 1.0], 3)  # position, then rotation
 _SCALE = _TO_METRES[:, None] * _TO_METRES
 _OF_JOINT = _SCALE[::-1, ::-1]  # angles, then translations
-AXES = [ColorRGBA(r=r, g=g, b=b, a=1.0) for r, g, b in np.eye(3).tolist()]  # as RViz draws them
-MARKER_MM = 2.0  # diameter of a bead as it is drawn
+AXES = [ColorRGBA(r=r, g=g, b=b, a=1.0) for r, g, b in np.eye(3).tolist()]  # colours of RViz
+MARKER_MM = 2.0  # diameter of a bead in the display
 
 
 class BodiesContent(NamedTuple):
     """Poses of B bodies and motion of joints in one exposure."""
 
-    #: those of the exposure
+    #: of the exposure
     stamp_ns: int
     frame_number: int
     orientation_id: str
@@ -62,10 +62,10 @@ class BodiesContent(NamedTuple):
     twist: NDArray[np.float64]
     twist_covariance: NDArray[np.float64]
     joints: Sequence[JointMotion]  #: of this exposure
-    used: Sequence[NDArray[np.int64]]  #: ids of the markers that each pose is by
+    used: Sequence[NDArray[np.int64]]  #: ids of the markers used for each pose
 
     def header(self, frame_id: str = '') -> Header:
-        """Return the header, by default with the frame of the orientation."""
+        """Return the header; by default, its frame is that of the orientation."""
         return Header(
             stamp=stamp_from_nanoseconds(self.stamp_ns),
             frame_id=frame_id or self.orientation.frame_id,
@@ -73,7 +73,7 @@ class BodiesContent(NamedTuple):
 
     @property
     def measured(self) -> list[int]:
-        """Rows of the bodies that the exposure shows."""
+        """Rows of the bodies whose poses were measured in this exposure."""
         return [row for row, one in enumerate(self.poses) if one.status[0] in MEASURED]
 
 
@@ -97,7 +97,7 @@ def message_from_bodies(content: BodiesContent) -> BodyPoses:
 
 
 def pose_of(message: BodyPoses, row: int) -> Pose:
-    """Return the pose of a body of a message."""
+    """Return the pose of a body from a message."""
     pose = Pose()
     for name in 'xyz':
         setattr(pose.position, name, getattr(message, name)[row])
@@ -107,7 +107,7 @@ def pose_of(message: BodyPoses, row: int) -> Pose:
 
 
 def pose_with_covariance(message: BodyPoses, row: int) -> PoseWithCovarianceStamped:
-    """Return the pose of a body of a message with its covariance."""
+    """Return the pose of a body from a message, with its covariance."""
     out = PoseWithCovarianceStamped(header=message.header)
     out.pose.pose = pose_of(message, row)
     out.pose.covariance = np.array(message.covariance[36 * row : 36 * row + 36])
@@ -115,7 +115,7 @@ def pose_with_covariance(message: BodyPoses, row: int) -> PoseWithCovarianceStam
 
 
 def odometry(content: BodiesContent, message: BodyPoses, row: int) -> Odometry:
-    """Return pose and velocities of a body; velocities are along its own axes."""
+    """Return pose and velocities of a body; the velocities are along the body's own axes."""
     out = Odometry(header=message.header, child_frame_id=message.body[row])
     out.pose = pose_with_covariance(message, row).pose
     twist = (content.twist[row] * _TO_METRES).tolist()
@@ -126,7 +126,7 @@ def odometry(content: BodiesContent, message: BodyPoses, row: int) -> Odometry:
 
 
 def transforms_of_bodies(content: BodiesContent, message: BodyPoses, parent: str) -> TFMessage:
-    """Return the frames of the bodies that the exposure shows, as children of the rig frame."""
+    """Return the frames of the measured bodies, as children of the rig frame."""
     out = TFMessage()
     for row in content.measured:
         name = message.body[row]
@@ -145,9 +145,9 @@ def _point(xyz_mm: NDArray[np.float64]) -> Point:
 
 
 def body_markers(content: BodiesContent, message: BodyPoses) -> MarkerArray:
-    """Return markers and axes of the bodies that the exposure shows, for RViz.
+    """Return markers and axes of the measured bodies, for RViz.
 
-    Axes are those of the body, from the centre of its markers on.
+    The axes of each body start at the centre of its markers.
     """
     out = MarkerArray()
     for row in content.measured:
@@ -169,7 +169,7 @@ def body_markers(content: BodiesContent, message: BodyPoses) -> MarkerArray:
 
 
 def detections(content: BodiesContent, message: BodyPoses) -> vision.Detection3DArray:
-    """Return the bodies that the exposure shows; the boxes are those of their markers."""
+    """Return the measured bodies as detections; each box encloses the markers of a body."""
     out = vision.Detection3DArray(header=message.header)
     for row in content.measured:
         body = content.bodies[row]
@@ -190,7 +190,7 @@ def detections(content: BodiesContent, message: BodyPoses) -> vision.Detection3D
 
 
 def rigid_bodies(content: BodiesContent, message: BodyPoses) -> mocap.RigidBodies:
-    """Return the bodies that the exposure shows, with their markers in the rig frame."""
+    """Return the measured bodies, with their markers in the rig frame."""
     out = mocap.RigidBodies(header=message.header, frame_number=message.frame_number)
     for row in content.measured:
         body, poses = content.bodies[row], content.poses[row]
@@ -206,7 +206,7 @@ def rigid_bodies(content: BodiesContent, message: BodyPoses) -> mocap.RigidBodie
     return out
 
 
-# Forms of all bodies of an exposure that are published while they have subscribers.
+# Further message types for all bodies of an exposure, published while they have subscribers.
 FORMS = {'body_markers': (MarkerArray, body_markers)}
 if vision is not None:
     FORMS['body_detections'] = (vision.Detection3DArray, detections)
@@ -232,7 +232,7 @@ def message_from_joints(content: BodiesContent) -> JointAngles:
 
 
 def joint_state(content: BodiesContent) -> JointState:
-    """Return the angles of joints whose bodies the exposure shows, as <joint>_<angle>."""
+    """Return the angles of measured joints, named <joint>_<angle>."""
     out = JointState(header=content.header())
     for one in content.joints:
         if one.status[0] in (JointStatus.OK, JointStatus.WEAK):

@@ -1,9 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""FluoroscopeCalibration: interior orientation and correction model, to the last bit. Also the
-CameraInfo of a corrected stream.
-"""
+"""Lossless conversion of FluoroscopeCalibration, and the CameraInfo of a corrected stream."""
 
 from __future__ import annotations
 
@@ -47,18 +45,18 @@ def set_fields(message: Any, fields: Iterable[Field], values: Mapping[str, Any])
 def values_of_fields(where: str, message: Any, fields: Iterable[Field]) -> dict[str, Any]:
     """Return the values of a record from a message.
 
-    Raises DataError, beginning with where, for sequences of a length that they cannot have.
+    Raises DataError, starting with the text `where`, for sequences of impossible length.
     """
     return {field.name: _value(where, message, field) for field in fields}
 
 
 def _axis(field: Field) -> int:
-    """Axis of the value whose parts have a field of the message each."""
+    """Return the axis along which a value is split into several fields of the message."""
     return field.shape.index(len(field.message))
 
 
 def _to_wire(field: Field, value: Any) -> Any:
-    """Return a value, or a part of it, as rclpy takes it."""
+    """Return a value, or a part of it, in the form that rclpy accepts."""
     value = np.asarray(value)
     if not value.ndim:
         return value.item()
@@ -91,12 +89,12 @@ def _shaped(where: str, field: Field, flat: np.ndarray) -> np.ndarray:
     return flat.reshape(shape)
 
 
-# The header holds the others.
+# The header contains the excluded fields.
 MESSAGE_FIELDS = [field for field in FIELDS if field.name not in ('stamp_ns', 'frame_id')]
 
 
 def decode_fluoroscope_calibration(data: bytes) -> FluoroscopeCalibration:
-    """Read a message from its bytes, also one of an earlier definition.
+    """Read a message, possibly of an earlier definition, from its bytes.
 
     Raises one of DECODING_ERRORS for damaged bytes.
     """
@@ -125,7 +123,7 @@ def calibration_from_message(
 ) -> calibration_result.FluoroscopeCalibration:
     """Return the calibration of a message, identical to the one that was sent.
 
-    Raises DataError where the message holds no valid calibration, or not the one its id says.
+    Raises DataError if the message contains no valid calibration, or if its id does not match.
     """
     calibration = content_of_calibration(message)
     if calibration.calibration_id != message.calibration_id:
@@ -139,7 +137,7 @@ def calibration_from_message(
 def content_of_calibration(
     message: FluoroscopeCalibration,
 ) -> calibration_result.FluoroscopeCalibration:
-    """Return the calibration of a message, whatever its id says. Raises DataError."""
+    """Return the calibration of a message without comparing its id. Raises DataError."""
     where = f'calibration of fluoroscope {message.fluoroscope}'
     values = values_of_fields(where, message, MESSAGE_FIELDS)
     values['stamp_ns'] = nanoseconds_from_stamp(message.header.stamp)
@@ -154,7 +152,7 @@ def content_of_calibration(
 def message_of_corrected_stream(
     calibration: calibration_result.FluoroscopeCalibration, stamp: Time
 ) -> CameraInfo:
-    """Return the CameraInfo without distortion, K from the interior orientation."""
+    """Return the CameraInfo without distortion; K follows from the interior orientation."""
     xp, yp, c = (float(x) for x in calibration.interior)
     info = CameraInfo(
         width=calibration.image_size[0],
@@ -173,10 +171,10 @@ def message_of_corrected_stream(
 def image_size_of(
     message: CameraInfo, topic: str, frame_id: str = '', interior: ArrayLike | None = None
 ) -> tuple[int, int]:
-    """Return width and height [px] of the CameraInfo of a corrected stream.
+    """Return width and height [px] from the CameraInfo of a corrected stream.
 
-    Raises DataError where the message has none, and where it is of another camera than that of an
-    optical frame and an interior orientation xp, yp, c [px]; None and '' for unknown ones.
+    Raises DataError if the message has no size, or if it does not match an optical frame and an
+    interior orientation xp, yp, c [px]; '' and None skip these comparisons.
     """
     if not message.width or not message.height:
         raise DataError(

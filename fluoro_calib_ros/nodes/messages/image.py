@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Image and CompressedImage, without avoidable copies of a megabyte."""
+"""Conversion of Image and CompressedImage without avoidable copies of the pixels."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ...findings import Kind
 from ...images.codec import decode, encode
 from ..runtime.diagnostics import TOO_LARGE, Refused
 
-# Pixel type of each encoding; 8UC1 and 16UC1 are the same without saying that they are grey.
+# Pixel type of each encoding; 8UC1 and 16UC1 are the same, but do not state that they are grey.
 PIXEL_TYPES = {'mono8': np.uint8, '8UC1': np.uint8, 'mono16': np.uint16, '16UC1': np.uint16}
 ENCODINGS = {np.dtype(np.uint8): 'mono8', np.dtype(np.uint16): 'mono16'}
 COMPRESSIONS = {'png': '.png', 'jpeg': '.jpg'}
@@ -30,20 +30,20 @@ IMAGE_REFUSALS = ('undecodable', TOO_LARGE, 'encoding', 'image size', 'frame id'
 
 
 class ImageConverter:
-    """Converts the images of one fluoroscope: messages to arrays, and back in reused memory."""
+    """Converts the images of one fluoroscope: messages to arrays, and back into reused memory."""
 
     def __init__(self, fluoroscope: str) -> None:
         self._fluoroscope = fluoroscope
-        # Of one (encoding, shape): message, and its data as an array.
+        # By (encoding, shape), a single entry: message, and its data as an array.
         self._output: dict[tuple[Any, ...], tuple[Image, np.ndarray]] = {}
 
     def to_array(
         self, message: Image | CompressedImage, calibration: FluoroscopeCalibration
     ) -> tuple[np.ndarray, str]:
-        """Return the grey image (h, w) uint8 or uint16, and the encoding of the corrected one.
+        """Return the grey image (h, w) uint8 or uint16, and the encoding for the corrected image.
 
-        The array is the memory of an Image where its byte order allows. Raises Refused for an
-        image that does not fit the calibration.
+        The array shares the memory of an Image where byte order and row step allow. Raises Refused
+        for an image that does not match the calibration.
         """
         frame_id = message.header.frame_id
         if frame_id != calibration.frame_id and frame_id and calibration.frame_id:
@@ -65,7 +65,7 @@ class ImageConverter:
     def decoded(self, message: Image | CompressedImage) -> tuple[np.ndarray, str]:
         """Return the grey image (h, w) uint8 or uint16 of a message, and its encoding.
 
-        The array is the memory of an Image where its byte order allows. Raises Refused.
+        The array shares the memory of an Image if byte order and row step allow. Raises Refused.
         """
         if isinstance(message, CompressedImage):
             image = self._decompress(message)
@@ -85,7 +85,7 @@ class ImageConverter:
             message = Image(
                 height=shape[0], width=shape[1], encoding=encoding, step=shape[1] * dtype.itemsize
             )
-            # The assignment may copy: the view is of what the message has.
+            # The assignment may copy, so view the data that the message owns.
             message.data = array('B', bytes(shape[0] * message.step))
             prepared = message, np.frombuffer(message.data, dtype).reshape(shape)
             self._output = {(encoding, shape): prepared}  # a stream has one encoding
@@ -114,7 +114,7 @@ class ImageConverter:
         image = np.ndarray((height, width), dtype, message.data, strides=(step, dtype.itemsize))
         if dtype == np.uint16 and message.is_bigendian:
             return image.byteswap()
-        # OpenCV accepts no row that begins within a pixel.
+        # OpenCV does not accept rows that begin within a pixel.
         return image if step % dtype.itemsize == 0 else image.copy()
 
     def _decompress(self, message: CompressedImage) -> np.ndarray:
@@ -128,7 +128,7 @@ class ImageConverter:
             ) from None
 
     def refusal(self, kind: str, message: Image | CompressedImage, reason: str) -> Refused:
-        """Return the error that names an image and says why it is refused."""
+        """Return an error that identifies an image and says why it is refused."""
         stamp = message.header.stamp
         return Refused(
             kind,
@@ -138,7 +138,7 @@ class ImageConverter:
 
 
 def colour_message(image: NDArray[np.uint8], stamp: Time, frame_id: str) -> Image:
-    """Return the Image of a colour picture (h, w, 3) of uint8, RGB."""
+    """Return the Image of a colour picture (h, w, 3) of uint8 in RGB order."""
     message = Image(
         height=image.shape[0],
         width=image.shape[1],
@@ -152,7 +152,7 @@ def colour_message(image: NDArray[np.uint8], stamp: Time, frame_id: str) -> Imag
 
 
 def message_from_image(header: Header, image: np.ndarray) -> Image:
-    """Return the Image of a grey image (h, w), or of a picture (h, w, 3): blue, green, red."""
+    """Return the Image of a grey image (h, w) or a colour picture (h, w, 3) in BGR order."""
     colour = image.ndim == 3
     message = Image(
         header=header,
@@ -175,11 +175,11 @@ def compressed_message(
     message : Image
         Source of header and encoding.
     image : np.ndarray
-        Its pixels (h, w).
+        Pixels (h, w) of the Image.
     kind : {'png', 'jpeg'}
-        JPEG has 8 bits: images of 16 bits become png all the same.
+        JPEG has 8 bits, so images of 16 bits always become png.
     quality : int
-        Of JPEG, 1 to 100.
+        JPEG quality, 1 to 100.
     """
     kind = 'png' if image.dtype == np.uint16 else kind
     out = CompressedImage(

@@ -3,16 +3,16 @@
 
 """Image points of identified targets in one frame, as messages and as bytes (CDR).
 
-Primitives of CDR, the byte format of messages, for streams without message objects. Between two
-frames of a stream the caches of the processor go cold. What a frame costs then is the code and
-memory that is touched once: making an object of a message of 30 points takes 0.02 ms in a loop and
-0.2 ms in a stream. So the frames of a stream are read from bytes and written as bytes.
-docs/how_good/speed.md compares this with rclpy and with the typestore of rosbags.
+The frames of a stream are read from and written to bytes in CDR, the wire format of messages,
+without message objects. Between two frames of a stream the processor caches go cold, and the cost
+of a frame is then that of the code and memory touched once: creating the object of a message of 30
+points takes 0.02 ms in a loop but 0.2 ms in a stream. docs/how_good/speed.md compares this with
+rclpy and with the typestore of rosbags.
 
 The bytes are CDR, version 1, little-endian (OMG DDSI-RTPS 2.5, section 10; OMG CORBA 3.4, part 2,
-section 9.3): 4 bytes that say so, then the fields one after the other. Numbers are aligned to
-their size, counted from behind these 4 bytes; strings and sequences begin with their length. rclpy
-converts messages in any other encoding first.
+section 9.3): 4 bytes that identify the encoding, then the fields one after the other. Numbers are
+aligned to their size, counted from the end of these 4 bytes; strings and sequences begin with
+their length. Messages in any other encoding are first converted by rclpy.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ TRUNCATED = 'the message is shorter than it says'
 
 
 def as_little_endian(data: bytes, kind: type) -> bytes:
-    """Return the bytes of a message of a type in the encoding that is read here.
+    """Return the bytes of a message in the encoding that this module reads.
 
-    Raises ValueError where they are no message of that type.
+    Raises ValueError if they are not a message of that type.
     """
     if data[:2] == LITTLE_ENDIAN:
         return data
@@ -62,13 +62,13 @@ def read_header(data: bytes) -> tuple[int, int, str, int]:
 
 
 def read_string(data: bytes, start: int, length: int) -> tuple[str, int]:
-    """Read a string of a length, up to its first zero; returns the next aligned offset."""
+    """Read a string of given length, up to its first zero; return it and the next offset."""
     end = start + length
     return data[start:end].partition(b'\0')[0].decode(errors='replace'), end + -end % 4
 
 
 def read_float64_sequence(data: bytes, start: int) -> tuple[NDArray[np.float64], int]:
-    """Read a sequence of float64 and return the offset behind it. Raises ValueError."""
+    """Read a sequence of float64; return it and the offset after it. Raises ValueError."""
     (count,) = UINT32.unpack_from(data, start)
     start += 4
     if not count:
@@ -77,7 +77,7 @@ def read_float64_sequence(data: bytes, start: int) -> tuple[NDArray[np.float64],
     end = start + 8 * count
     if end > len(data):
         raise ValueError(TRUNCATED)
-    # A copy: the numbers are not aligned in the memory of the message.
+    # Copy, because the numbers are not aligned in the memory of the message.
     return np.frombuffer(data[start:end]), end
 
 
@@ -112,15 +112,15 @@ def columns_bytes(
     octets : sequence of np.ndarray
         Fields of uint8, (n,) each.
     end : bytes
-        Fields behind, which begin aligned to 4 bytes.
+        Fields after the columns, which begin aligned to 4 bytes.
     """
     number = len(target_id) // 4
     count = UINT32.pack(number)
     if not number:
         return start + count * (1 + len(columns) + len(octets)) + end
     parts: list[Any] = [start, count, target_id]
-    # The first float64 is aligned behind its count; the counts of the others are then followed by
-    # four bytes of padding.
+    # The first float64 is aligned after its count; the counts of the other columns are therefore
+    # followed by four bytes of padding.
     before = count + b'\0' * (-(len(start) + 4 + len(target_id)) % 8)
     for column in columns:
         parts += before, column
@@ -132,11 +132,11 @@ def columns_bytes(
     return b''.join(parts)
 
 
-# Fields that many messages have: stamps, and arrays of primitive numbers.
+# Fields common to many messages: stamps, and arrays of primitive numbers.
 
 
 def stamp_from_nanoseconds(nanoseconds: int) -> Time:
-    """Return a Time message of a time in nanoseconds."""
+    """Return the Time message for a time in nanoseconds."""
     return Time(sec=int(nanoseconds // NS_PER_S), nanosec=int(nanoseconds % NS_PER_S))
 
 
@@ -159,7 +159,7 @@ _IMAGE = Struct('<IIII')  # frame number, width, height, number of target ids
 
 
 class ObservedFrame(NamedTuple):
-    """A TargetObservations message, read from its bytes; nothing is validated."""
+    """A TargetObservations message read from its bytes, without validation."""
 
     #: stamp
     sec: int
@@ -172,12 +172,12 @@ class ObservedFrame(NamedTuple):
     u: NDArray[np.float64]
     v: NDArray[np.float64]
     sigma: NDArray[np.float64]
-    #: the message up to the frame number: so a CorrectedObservations message begins, too
+    #: the message up to the frame number, which is also the start of a CorrectedObservations
     start: bytes
 
 
 def decode_target_observations(data: bytes) -> ObservedFrame:
-    """Read a TargetObservations message from its bytes. Raises ValueError for damaged ones."""
+    """Read a TargetObservations message from its bytes. Raises ValueError for damaged bytes."""
     data = as_little_endian(data, TargetObservations)
     try:
         sec, nanosec, frame_id, at = read_header(data)
@@ -205,7 +205,7 @@ def decode_target_observations(data: bytes) -> ObservedFrame:
 def frame_from_observed(
     observed: ObservedFrame, fluoroscope: str, angle: float | None = None
 ) -> Frame:
-    """Return the Frame of a message; angle: of the C-arm [rad], None where it is unknown.
+    """Return the Frame of a message; angle: of the C-arm [rad], None if unknown.
 
     Raises DataError for arrays of different lengths.
     """
@@ -245,16 +245,16 @@ def message_from_frame(frame: Frame) -> TargetObservations:
 
 
 def set_number_and_stamp(message: TargetObservations, number: int, stamp_ns: int) -> None:
-    """Change frame number and stamp of a message that is published again."""
+    """Set frame number and stamp of a message, so that it can be published again."""
     message.frame_number = number
     message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, NS_PER_S)
 
 
-# CorrectedObservations: image points of one frame without distortion.
+# CorrectedObservations: image points of one frame with the distortion removed.
 
 
 class CorrectedFrame(NamedTuple):
-    """A CorrectedObservations message, read from its bytes; nothing is validated."""
+    """A CorrectedObservations message read from its bytes, without validation."""
 
     #: stamp
     sec: int
@@ -272,7 +272,7 @@ class CorrectedFrame(NamedTuple):
 
 
 def decode_corrected_observations(data: bytes) -> CorrectedFrame:
-    """Read a CorrectedObservations message from its bytes. Raises ValueError for damaged ones."""
+    """Read a CorrectedObservations message from its bytes. Raises ValueError if damaged."""
     data = as_little_endian(data, CorrectedObservations)
     try:
         sec, nanosec, frame_id, at = read_header(data)
@@ -320,7 +320,7 @@ def encode_corrected_observations(
     )
 
 
-# JointState: positions of joints, of which one is the angle of a C-arm.
+# JointState: positions of joints, including the angles of C-arms.
 
 
 class JointStates(NamedTuple):

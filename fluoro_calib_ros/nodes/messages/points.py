@@ -29,7 +29,7 @@ from .observations import (
     uint8_field,
 )
 
-_TERMS = [0, 1, 2, 4, 5, 8]  # of a flattened covariance: xx, xy, xz, yy, yz, zz
+_TERMS = [0, 1, 2, 4, 5, 8]  # indices into a flattened covariance: xx, xy, xz, yy, yz, zz
 _SYMMETRIC = (
     'cov_xx',
     'cov_xy',
@@ -46,7 +46,7 @@ _SYMMETRIC = (
 class PointsContent(NamedTuple):
     """Content of a ReconstructedPoints message."""
 
-    #: those of the exposure
+    #: of the exposure
     stamp_ns: int
     frame_number: int
     orientation_id: str
@@ -56,7 +56,7 @@ class PointsContent(NamedTuple):
 
 
 def encode_reconstructed_points(content: PointsContent) -> bytes:
-    """Return the bytes of the message of reconstructed points."""
+    """Return the bytes of a ReconstructedPoints message."""
     orientation = content.orientation
     points = content.points
     sec, nanosec = divmod(content.stamp_ns, NS_PER_S)
@@ -87,17 +87,17 @@ def covariance_of(message: ReconstructedPoints) -> NDArray[np.float64]:
 
 
 class GoodPoints(NamedTuple):
-    """The intersected points of a ReconstructedPoints message."""
+    """Intersected points of a ReconstructedPoints message."""
 
     frame_number: int
-    total: int  #: number of all points of the message, the ones that failed among them
+    total: int  #: number of all points of the message, including failed ones
     target_id: NDArray[np.uint32]  #: (n,)
     xyz_mm: NDArray[np.float64]  #: (n, 3)
     covariance: NDArray[np.float64]  #: (n, 3, 3) [mm^2]
 
 
 def good_points_of(message: ReconstructedPoints) -> GoodPoints:
-    """Return the points of a message that are OK or OUTSIDE."""
+    """Return the points of a message with the status OK or OUTSIDE."""
     good = np.array(message.status) <= message.OUTSIDE
     xyz = np.stack([message.x, message.y, message.z], axis=1)
     return GoodPoints(
@@ -113,18 +113,18 @@ def good_points_of(message: ReconstructedPoints) -> GoodPoints:
 
 GREEN = ColorRGBA(r=0.2, g=0.9, b=0.3, a=0.8)
 YELLOW = ColorRGBA(r=1.0, g=0.8, b=0.1, a=0.8)
-LIFETIME_NS = 500_000_000  # after which RViz removes a marker that is no longer seen
+LIFETIME_NS = 500_000_000  # time after which RViz removes a marker that is no longer published
 
 
 def ellipsoid_markers(
     message: ReconstructedPoints, good: NDArray[np.int64], sigmas: float
 ) -> MarkerArray:
-    """Return the ellipsoids of the good points (indices) of a message.
+    """Return covariance ellipsoids of the good points (indices) of a message.
 
     sigmas: half axes in standard deviations.
     """
     values, axes = np.linalg.eigh(covariance_of(message)[good])
-    axes[:, :, 0] *= np.linalg.det(axes)[:, None]  # a rotation, not a reflection
+    axes[:, :, 0] *= np.linalg.det(axes)[:, None]  # make it a rotation, not a reflection
     attitudes = quaternion_from_matrix(axes).tolist()
     scales = (2 * sigmas * np.sqrt(np.maximum(values, 0))).tolist()
     out = MarkerArray()
@@ -145,7 +145,7 @@ def ellipsoid_markers(
     return out
 
 
-# mocap4r2 Markers of reconstructed points, where mocap4r2_msgs is installed.
+# mocap4r2 Markers of reconstructed points, if mocap4r2_msgs is installed.
 
 try:
     from mocap4r2_msgs import msg as mocap
@@ -155,7 +155,7 @@ MOCAP_MARKERS = None if mocap is None else mocap.Markers
 
 
 def mocap_markers(message: ReconstructedPoints, good: NDArray[np.int64]) -> mocap.Markers:
-    """Return the good points (indices) of a message; the index of each is its target id."""
+    """Return the good points (indices) of a message; each marker index is the target id."""
     out = mocap.Markers(header=message.header, frame_number=message.frame_number)
     for k in good.tolist():
         out.markers.append(

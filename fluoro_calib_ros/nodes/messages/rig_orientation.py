@@ -26,7 +26,7 @@ from .observations import float64_field, stamp_from_nanoseconds
 # Static transforms of the optical frames of a rig.
 
 
-AS_CALIBRATED = '_as_calibrated'  # ending of an optical frame that healing leaves where it is
+AS_CALIBRATED = '_as_calibrated'  # suffix of the frame at the calibrated pose of a healed camera
 
 
 def transforms_of_orientation(
@@ -34,12 +34,12 @@ def transforms_of_orientation(
 ) -> TFMessage:
     """Return the optical frames as children of the rig frame.
 
-    An orientation from the calibration is given in the optical frame of its first fluoroscope;
-    the rig frame then coincides with it. So every optical frame has the same parent whatever the
-    source of the orientation is, and no transform of an earlier one stays valid.
+    An orientation from the calibration is given in the optical frame of its first fluoroscope, and
+    the rig frame then coincides with that frame. Every optical frame thus has the same parent
+    whatever the source of the orientation, and no earlier transform stays valid.
 
-    calibrated: the orientation before it was healed. Between the rig frame and an optical frame
-    that has moved since there is another one, which stays where it was (REP 105: as odom does
+    calibrated: the orientation before it was healed. For each optical frame that has moved since,
+    a frame at its calibrated pose is inserted between it and the rig frame (REP 105: like odom
     between map and robot).
     """
     if calibrated is not None:
@@ -63,7 +63,7 @@ def transforms_of_orientation(
 def _with_corrections(
     message: RigOrientation, rig_frame: str, calibrated: rig.RigOrientation
 ) -> TFMessage:
-    """Return the transforms of a healed orientation, with frames that stay as calibrated."""
+    """Return the transforms of a healed orientation, with frames at the calibrated poses."""
     out = transforms_of_orientation(message, rig_frame)
     before = message_from_orientation(calibrated)
     earlier = {
@@ -83,7 +83,7 @@ def _with_corrections(
 
 
 def rig_change(before: rig.RigOrientation, after: rig.RigOrientation) -> dict[str, str]:
-    """Return by how much optical frames have moved between orientations, by their names."""
+    """Return how far optical frames have moved between orientations, as text by frame name."""
     return {
         after.optical_frame_ids[f]: text
         for f, name in enumerate(after.fluoroscopes)
@@ -108,7 +108,7 @@ def _set_pose(
 
 
 def _transform(message: RigOrientation, parent: str, child: str) -> TransformStamped:
-    """Return the identity with the stamp of a message."""
+    """Return an identity transform with the stamp of a message."""
     stamped = TransformStamped(child_frame_id=child)
     stamped.header.stamp = message.header.stamp
     stamped.header.frame_id = parent
@@ -146,9 +146,9 @@ def message_from_orientation(orientation: rig.RigOrientation) -> RigOrientation:
 
 
 def orientation_from_message(message: RigOrientation) -> rig.RigOrientation:
-    """Return the orientation of a message, equal to the one that was sent after rounding.
+    """Return the orientation of a message, equal to the sent one after rounding.
 
-    Raises DataError where the message holds no valid orientation, or not the one its id says.
+    Raises DataError if the message contains no valid orientation, or if its id does not match.
     """
     orientation = content_of_orientation(message)
     if orientation.orientation_id != message.orientation_id:
@@ -159,7 +159,7 @@ def orientation_from_message(message: RigOrientation) -> rig.RigOrientation:
 
 
 def content_of_orientation(message: RigOrientation) -> rig.RigOrientation:
-    """Return the orientation of a message, whatever its id says. Raises DataError."""
+    """Return the orientation of a message without comparing its id. Raises DataError."""
     count = len(message.fluoroscope)
     most = read_limits().max_fluoroscopes
     if count > most:
@@ -212,7 +212,7 @@ def description_of(message: RigOrientation) -> str:
 
 
 def jump_text(before: rig.RigOrientation, after: rig.RigOrientation) -> str:
-    """Return how far fluoroscopes are displaced between orientations, '' where none is."""
+    """Return how far fluoroscopes have moved between orientations, '' if none has."""
     if before.frame_id != after.frame_id:
         return f'the rig frame is {after.frame_id} instead of {before.frame_id}'
     texts = ((name, _moved_by(before, after, name)) for name in after.fluoroscopes)
@@ -220,17 +220,17 @@ def jump_text(before: rig.RigOrientation, after: rig.RigOrientation) -> str:
 
 
 def _moved_by(before: rig.RigOrientation, after: rig.RigOrientation, name: str) -> str:
-    """Return how far a fluoroscope is displaced between orientations, '' where it is not."""
+    """Return how far a fluoroscope has moved between orientations, '' if it has not."""
     if name not in before.fluoroscopes:
         return ''
     old, f = before.index(name), after.index(name)
     shift = np.linalg.norm(after.position_mm[f] - before.position_mm[old])
     turn = np.linalg.norm(vector_from_matrix(after.rotation[f] @ before.rotation[old].T))
-    if shift < 1e-6 and turn < 1e-7:  # what a message and back leaves of an orientation
+    if shift < 1e-6 and turn < 1e-7:  # rounding by the conversion to a message and back
         return ''
     return f'{shift:.2f} mm and {np.degrees(turn):.3f} degrees'
 
 
 def _metre_scale(count: int) -> NDArray[np.float64]:
-    """Return the factors (9 count,) that turn the unknowns of an orientation from mm into m."""
+    """Return the factors (9 count,) that convert the unknowns of an orientation from mm to m."""
     return np.tile(np.repeat([1e-3, 1.0], [3, 6]), count)

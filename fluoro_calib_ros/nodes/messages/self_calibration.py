@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Calibrate.srv and SelfCalibrate.action: the same request and the same result."""
+"""Calibrate.srv, SelfCalibrate.action (which share request and result) and Heal.action."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ _REQUESTED = ('model', 'interior', 'loss', 'max_iterations')
 def options_of_request(
     request: Request, defaults: CalibrationOptions, joint: bool
 ) -> CalibrationOptions:
-    """Return the options of a request, with defaults where it leaves them open.
+    """Return the options of a request, with defaults for those that it leaves open.
 
-    Raises ValueError for options that are invalid.
+    Raises ValueError for invalid options.
     """
     if request.principal_distance < 0 or not np.isfinite(request.principal_distance):
         raise ValueError(
@@ -44,7 +44,7 @@ def options_of_request(
 
 
 def feedback_of_round(label: str, last: Round) -> SelfCalibrate.Feedback:
-    """Return the feedback of a round of the fluoroscopes named by the label."""
+    """Return the feedback of a round for the fluoroscopes named by the label."""
     mean_square = np.mean([np.square(rmse) for rmse in last.rmse.values()], axis=0)
     rmse_u, rmse_v = (float(x) for x in np.sqrt(mean_square))
     return SelfCalibrate.Feedback(
@@ -59,7 +59,7 @@ def feedback_of_round(label: str, last: Round) -> SelfCalibrate.Feedback:
 
 
 def feedback_text(feedback: SelfCalibrate.Feedback) -> str:
-    """Return the feedback of a round or step in one line, for people."""
+    """Return the feedback of a round or step as a line of text."""
     if feedback.stage:
         return f'verdict: {100 * feedback.step // feedback.steps} %, {feedback.stage}'
     neighbours = f'k {feedback.k:3d}  ' if feedback.k else ''
@@ -70,7 +70,7 @@ def feedback_text(feedback: SelfCalibrate.Feedback) -> str:
 
 
 def fill_result(result: Result, job: CalibrationResult, calibrations: Calibrations) -> None:
-    """Fill in the result of a calibration that succeeded."""
+    """Fill in the result of a successful calibration."""
     result.success = True
     result.seconds = job.seconds
     for name, calibration in calibrations.items():
@@ -101,17 +101,17 @@ def fill_result(result: Result, job: CalibrationResult, calibrations: Calibratio
 
 
 def fill_verdict(result: Result, validation: Validation) -> None:
-    """Fill in the verdict on a calibration that succeeded."""
+    """Fill in the verdict on a successful calibration."""
     result.verdict = validation.verdict
     result.findings = sentences(validation.findings)
     result.message += f'; verdict: {validation.verdict}'
 
 
-# Heal.action: what has changed in a rig.
+# Heal.action: changes of a rig.
 
 
 def fill_healing(result: Heal.Result, outcome: HealingOutcome, parent: RigOrientation) -> None:
-    """Fill in the result of a diagnosis. parent: the orientation before."""
+    """Fill in the result of a diagnosis. parent: the orientation before healing."""
     result.success = True
     result.verdict = outcome.verdict
     result.parent_orientation_id = parent.orientation_id
@@ -136,14 +136,14 @@ def fill_healing(result: Heal.Result, outcome: HealingOutcome, parent: RigOrient
 
 
 def healing_text(feedback: Heal.Feedback) -> str:
-    """Return the feedback of a healing in one line, for people."""
+    """Return the feedback of a healing as a line of text."""
     if feedback.stage == 'collecting':
         return f'healing: {feedback.frames} frames of markers'
     return f'healing: diagnosis, step {feedback.step} of {feedback.steps}'
 
 
 def _fill_changes(result: Heal.Result, outcome: HealingOutcome) -> None:
-    """Fill in the changes of the fluoroscopes that have changed."""
+    """Fill in the changes, for the changed fluoroscopes only."""
     healed = outcome.healed
     if healed is None:
         return

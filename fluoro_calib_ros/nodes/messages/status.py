@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""CalibrationStatus: progress of collecting and calibrating, in plain scalars."""
+"""CalibrationStatus (progress of collecting and calibrating, in plain scalars) and DriftStatus."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ...correction.fluoroscope_calibration import FluoroscopeCalibration
 from ...photogrammetry.rig_orientation import RigOrientation
 from .observations import stamp_from_nanoseconds
 
-if TYPE_CHECKING:  # the reconstruction node has neither
+if TYPE_CHECKING:  # not imported by the reconstruction node
     from ...estimation.rounds import Round
     from ...exposures.collector import Readiness
 
@@ -53,13 +53,13 @@ def message_from_drift_state(
 
 @dataclass(frozen=True)
 class Collected:
-    """What is collected of one fluoroscope."""
+    """Summary of the data collected for one fluoroscope."""
 
-    #: number of frames
+    #: numbers of frames
     received: int
     rejected: int
     unpaired: int
-    #: collected exposures, and the image points in them
+    #: numbers of collected exposures and of image points in them
     exposures: int
     observations: int
     coverage: float  #: covered part of the image, 0 to 1
@@ -83,7 +83,7 @@ class Collected:
 
 @dataclass(frozen=True)
 class FluoroscopeProgress:
-    """What the calibration node knows of one fluoroscope."""
+    """State of one fluoroscope in the calibration node."""
 
     fluoroscope: str
     collected: Collected
@@ -94,7 +94,7 @@ class FluoroscopeProgress:
 
     @property
     def calibration_id(self) -> str:
-        """Id of the calibration, empty without one."""
+        """Id of the calibration, '' if there is none."""
         return self.calibration.calibration_id if self.calibration else ''
 
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""State of a node: /diagnostics, and logs that cannot flood and whose lines cannot be forged."""
+"""Diagnostics of a node on /diagnostics, and logs that cannot be flooded or forged."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ class StartError(RuntimeError):
     """Reason why a node cannot start, in one sentence."""
 
 
-# Errors that a user can cause, as opposed to bugs: raised for invalid names,
-# parameters and QoS overrides; rclpy's RCLError is a RuntimeError.
+# Errors that a user can cause, as opposed to bugs: raised for invalid names, parameters and QoS
+# overrides; rclpy's RCLError is a RuntimeError.
 USER_ERRORS = (ParameterException, NameValidationException, RuntimeError, DataError)
 
 
 def one_line(error: BaseException) -> str:
-    """Return the message of an exception in one line, or its type where it has none."""
+    """Return the message of an exception as one line, or its type if it has no message."""
     return printable(' '.join(str(error).split())[:MAX_LINE]) or type(error).__name__
 
 
-# rclpy keeps state for each place that logs: that is the caller of this module.
+# rclpy keeps state per logging call site, which shall be the caller of this module.
 rcutils_logger._internal_callers.append(os.path.realpath(__file__))
 
 
@@ -49,9 +49,9 @@ _LEVELS = ('debug', 'info', 'warning', 'error', 'fatal')  # methods of a logger
 
 
 class PrintableLogger:
-    """Logger of a node: what names and texts of others contain stays in its line.
+    """Logger of a node that keeps names and texts of peers within their line.
 
-    A line end is written as an escape, and so is everything that a terminal would obey.
+    Line ends are escaped, and so is everything that a terminal would interpret.
     """
 
     def __init__(self, logger: RcutilsLogger) -> None:
@@ -65,11 +65,11 @@ class PrintableLogger:
 
 
 class Trace(str):
-    """A text with a traceback, which keeps its lines."""
+    """Text with a traceback, which keeps its lines."""
 
 
 def log_line(text: str) -> str:
-    """Return a text as a line of the log; the further lines of a traceback are marked as such."""
+    """Return a text as a line of the log; further lines of a traceback are marked as such."""
     if isinstance(text, Trace):
         return '\n  | '.join(map(printable, shortened(text, MAX_TRACE).splitlines()))
     return printable(shortened(str(text), MAX_LINE))
@@ -78,11 +78,11 @@ def log_line(text: str) -> str:
 Logger: TypeAlias = 'RcutilsLogger | PrintableLogger'
 
 
-BURST = 20.0  # messages that are logged at once
+BURST = 20.0  # number of messages that may be logged at once
 
 
 class RateLimitedLogger:
-    """Logs a burst of messages, then one a second; the next one says how many were suppressed."""
+    """Logs a burst of messages, then one per second with the number of suppressed ones."""
 
     def __init__(self, logger: Logger) -> None:
         self._logger = logger
@@ -119,12 +119,12 @@ class RateLimitedLogger:
 # Messages that a node refuses: counted by kind, logged, and shown in the diagnostics.
 
 TOO_LARGE = 'too large'
-# Parameters that limit the bytes of a message, by the item in it.
+# Parameter that limits the size of a message, by item.
 _LIMITS = {'frame': 'max_points', 'image': 'max_image_megapixels'}
 
 
 class Refused(DataError):
-    """Reason why a message is refused, and its kind, by which refusals are counted."""
+    """Reason why a message is refused; refusals are counted by its kind."""
 
     def __init__(self, kind: str, message: str) -> None:
         super().__init__(message)
@@ -138,8 +138,8 @@ class RefusalLog:
         self._item = item
         self._logger = logger
         self.counts: Counter[str] = Counter()  #: refused messages by kind
-        self.failures = 0  #: messages lost by an unexpected exception, that is, by a bug
-        self.last_fault = ''  #: the last reason; empty before the first
+        self.failures = 0  #: messages lost by an unexpected exception, that is, a bug
+        self.last_fault = ''  #: last reason; empty before the first
         self._last_failure = ''
 
     @property
@@ -164,7 +164,7 @@ class RefusalLog:
         )
 
     def refuse_too_large(self, topic: str, size: int) -> None:
-        """Count a message of so many bytes, more than are read, on <fluoroscope>/<...>."""
+        """Count a message of too many bytes (size) on the topic <fluoroscope>/<...>."""
         fluoroscope = topic.partition('/')[0]
         self.refuse(
             Refused(
@@ -180,7 +180,7 @@ class RefusalLog:
         self._logger.warning(text)
 
     def fail(self, topic: str, error: Exception) -> None:
-        """Count a message on a topic that was lost by an unexpected exception, and log it."""
+        """Count and log a message on a topic that was lost by an unexpected exception."""
         self.failures += 1
         self._last_failure = f'topic {topic}: {type(error).__name__}: {one_line(error)}'
         self.last_fault = self._last_failure
@@ -198,31 +198,31 @@ class RefusalLog:
         }
 
     def failure(self) -> str:
-        """Return a message where messages were lost by internal errors, else ''."""
+        """Return a message if messages were lost by internal errors, else ''."""
         count = self.failures
         lost = f'{count} {self._item}s lost by internal errors: {self._last_failure}'
         return lost if count else ''
 
     def refusal(self, recent: int) -> str:
-        """Return a message where so many messages were refused recently, else '' for none."""
+        """Return a message about the number of recently refused messages, '' if it is 0."""
         refused = f'{recent} {self._item}s refused in the last minute: {self.last_fault}'
         return refused if recent else ''
 
 
-# Counts that tell what is wrong now: a fault that is over must not stay a warning for ever.
+# Counts over a recent period: a fault that is over must not remain a warning for ever.
 
-RECENT_S = 60.0  # a warning stays so long: an operator looks up that often
+RECENT_S = 60.0  # duration of a warning: an operator looks up about that often
 
 
 class RecentCounts:
-    """By how much counts have grown within the last minute.
+    """Growth of counts within the last minute.
 
     now: returns the time [s], by default of the monotonic clock.
     """
 
     def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
         self._now = now
-        # Times and counts; the first one is the newest that is not recent.
+        # Times and counts; the first entry is the newest that is no longer recent.
         self._history: dict[tuple[str, str], deque[tuple[float, int]]] = {}
 
     def growth(self, subject: str, **counts: int) -> dict[str, int]:
@@ -240,12 +240,12 @@ class RecentCounts:
 
 # Detection of a stream that has stopped.
 
-MIN_RATE_HZ = 5.0  # of a stream; exposures that are taken one by one are slower
-MAX_SILENCE_S = 0.9  # diagnostics ask every second, so a stop is told within two
+MIN_RATE_HZ = 5.0  # minimum rate of a stream; exposures taken one by one are slower
+MAX_SILENCE_S = 0.9  # checked every second, so a stop is reported within two
 
 
 class StallDetector:
-    """Tells from the count of received frames that a stream has stopped.
+    """Detects that a stream has stopped from its count of received frames.
 
     now: returns the time [s], by default of the monotonic clock.
     """
@@ -257,9 +257,9 @@ class StallDetector:
         self._rate_hz = 0.0
 
     def message(self, count: int) -> str:
-        """Return a message where the stream has stopped, else ''; to be called periodically.
+        """Return a message if the stream has stopped, else ''; to be called periodically.
 
-        count: frames received up to now.
+        count: number of frames received so far.
         """
         now = self._now()
         elapsed = now - self._changed_at
@@ -287,49 +287,49 @@ class Health(NamedTuple):
     message: str
 
     def with_consequence(self, text: str) -> Health:
-        """Return the same with what follows from it."""
+        """Return a copy with a consequence appended to the message."""
         return self._replace(message=f'{self.message}; {text}')
 
 
 def warning(message: str) -> Health | None:
-    """Return a WARN, None for an empty message."""
+    """Return a WARN, or None for an empty message."""
     return Health(WARN, message) if message else None
 
 
 def fault(message: str) -> Health | None:
-    """Return an ERROR, None for an empty message."""
+    """Return an ERROR, or None for an empty message."""
     return Health(ERROR, message) if message else None
 
 
 def healthy(message: str) -> Callable[[Any], Health]:
-    """Return the condition that nothing is wrong, which holds always."""
+    """Return the condition that nothing is wrong, which always holds."""
     return lambda state: Health(OK, message)
 
 
 def counted(name: str, text: str) -> Callable[[Any], Health | None]:
-    """Return the condition that something was counted within the last minute, told by {count}."""
+    """Return a condition that warns of events within the last minute; text contains {count}."""
     return lambda state: warning(
         text.format(count=state.recent[name]) if state.recent[name] else ''
     )
 
 
-# Returns what is to be said about a state, None where the condition does not hold.
+# Returns the health of a state, None if the condition does not hold.
 Condition: TypeAlias = Callable[[State], Health | None]
 
 
 def health_of(state: State, conditions: Iterable[Condition[State]]) -> Health:
-    """Return what the first condition that holds says: the gravest comes first, OK last.
+    """Return the health from the first condition that holds: most severe first, OK last.
 
-    Those behind it are not evaluated.
+    Later conditions are not evaluated.
     """
     return next(health for condition in conditions if (health := condition(state)) is not None)
 
 
 @dataclass(frozen=True)
 class Status:
-    """One entry of the diagnostics of a node."""
+    """Entry of the diagnostics of a node."""
 
-    name: str  #: fluoroscope or function that the status is about
+    name: str  #: fluoroscope or function to which the status refers
     level: bytes  #: OK, WARN or ERROR
     message: str
     values: Mapping[str, object] = field(default_factory=dict)
@@ -339,7 +339,7 @@ NO_CLOCK = 'use_sim_time is set, but nobody publishes /clock: what this node sta
 
 
 class DiagnosticsPublisher:
-    """Publishes the statuses of a node on /diagnostics, and that its clock stands at 0."""
+    """Publishes the statuses of a node on /diagnostics, with a warning if its clock is 0."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
@@ -371,7 +371,7 @@ class DiagnosticsPublisher:
 
 
 class LatencyWindow:
-    """The last latencies; one thread writes them and another one reads them."""
+    """Window of the last latencies; one thread writes it and another reads it."""
 
     def __init__(self) -> None:
         self._ring = np.zeros(2000, dtype=np.int64)
@@ -383,7 +383,7 @@ class LatencyWindow:
         self._count += 1
 
     def values(self) -> dict[str, str]:
-        """Return median and 99th percentile for the diagnostics; nothing before the first one."""
+        """Return median and 99th percentile for the diagnostics, nothing before the first one."""
         if not self._count:
             return {}
         p50, p99 = np.percentile(self._ring[: self._count], [50, 99]) * 1e-6

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Managed nodes, their services, and what the nodes that work on streams have in common."""
+"""Managed nodes and the common parts of nodes that process streams."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ T = TypeVar('T')
 class ManagedNode(ParameterNode, LifecycleNode):
     """Lifecycle node that configures and activates itself, unless autostart is false.
 
-    Subclasses override configure(), activate(), deactivate() and cleanup(). The last two have to
-    work in every state. A transition that raises is undone and logged; rclpy would keep silent.
+    Subclasses override configure(), activate(), deactivate() and cleanup(). The last two must work
+    in every state. A transition that raises is undone and logged; rclpy itself would not log it.
     """
 
     def __init__(self, name: str) -> None:
@@ -57,19 +57,19 @@ class ManagedNode(ParameterNode, LifecycleNode):
         self._fault = ''
 
     def configure(self) -> None:
-        """Make outputs and slow inputs."""
+        """Create outputs and slow inputs."""
 
     def activate(self) -> None:
-        """Begin to process streams."""
+        """Start to process streams."""
 
     def deactivate(self) -> None:
         """Stop processing streams."""
 
     def cleanup(self) -> None:
-        """Destroy what configure() made."""
+        """Destroy everything that configure() created."""
 
     def bring_up(self) -> None:
-        """Configure and activate the node where it does so itself. Raises StartError."""
+        """Configure and activate the node if autostart is set. Raises StartError."""
         if not self.autostart:
             return
         self._starting = True
@@ -79,26 +79,26 @@ class ManagedNode(ParameterNode, LifecycleNode):
         self._starting = False
 
     def fail(self, text: str) -> None:
-        """Log a fatal fault of the node itself and end it with exit status 1."""
+        """Log a fatal fault of the node itself, and end it with exit status 1."""
         self.get_logger().fatal(Trace(text))
         self.failed = True
         rclpy.try_shutdown()
 
     def stop(self) -> None:
-        """Take everything down before the node is destroyed."""
+        """Deactivate and clean up before the node is destroyed."""
         self.deactivate()
         self.cleanup()
 
     def destroy_publisher(self, publisher: Publisher) -> bool:
-        """Destroy a publisher, also one that the lifecycle switches on and off."""
+        """Destroy a publisher, possibly a lifecycle publisher."""
         return self.destroy_lifecycle_publisher(publisher)
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Run configure(); undo it where it fails."""
+        """Run configure(); undo it if it fails."""
         return self._try(self.configure, self.cleanup)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Run activate(); undo it where it fails."""
+        """Run activate(); undo it if it fails."""
         super().on_activate(state)
         result = self._try(self.activate, self.deactivate)
         if result != TransitionCallbackReturn.SUCCESS:
@@ -116,7 +116,7 @@ class ManagedNode(ParameterNode, LifecycleNode):
         return TransitionCallbackReturn.SUCCESS
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Take everything down."""
+        """Deactivate and clean up."""
         self.stop()
         return TransitionCallbackReturn.SUCCESS
 
@@ -128,7 +128,7 @@ class ManagedNode(ParameterNode, LifecycleNode):
         except Exception as error:
             is_user_error = isinstance(error, USER_ERRORS)
             self._fault = one_line(error) if is_user_error else Trace(traceback.format_exc())
-            if not self._starting:  # else it is logged by the main loop
+            if not self._starting:  # otherwise the main loop logs it
                 self.get_logger().error(self._fault)
             undo()
             return TransitionCallbackReturn.FAILURE
@@ -136,7 +136,7 @@ class ManagedNode(ParameterNode, LifecycleNode):
 
 
 class StreamNode(ManagedNode):
-    """Managed node with outputs, stream readers, and its diagnostics once a second.
+    """Managed node with outputs and stream readers, which publishes diagnostics once a second.
 
     Subclasses override create_outputs(), create_readers(), diagnose() and reset().
     """
@@ -146,29 +146,29 @@ class StreamNode(ManagedNode):
         self.limited_logger = RateLimitedLogger(self.get_logger())
         self.readers: list[StreamReader] = []
         self._resources = ExitStack()
-        self._readiness = ''  # what was logged last
+        self._readiness = ''  # last logged state
         self.recent = RecentCounts()
 
     def create_outputs(self) -> None:
-        """Make what exists while the node is configured, by create_output() and own()."""
+        """Create what exists while the node is configured, by create_output() and own()."""
 
     def create_readers(self) -> None:
-        """Make the stream readers of the active node by create_reader()."""
+        """Create the stream readers of the active node by create_reader()."""
 
     def diagnose(self) -> list[Status]:
-        """Return the state of the node."""
+        """Return the diagnostic statuses of the node."""
         return []
 
     def reset(self) -> None:
-        """Forget everything that was received."""
+        """Discard everything that was received."""
 
     def own(self, resource: T, destroy: Callable[..., Any], *arguments: Any) -> T:
-        """Call destroy(*arguments) at cleanup, in reverse order; returns the resource."""
+        """Call destroy(*arguments) at cleanup, in reverse order; return the resource."""
         self._resources.callback(destroy, *arguments)
         return resource
 
     def create_output(self, kind: type, topic: str, qos: QoSProfile) -> Publisher:
-        """Make the publisher of a stream: silent while the node is inactive, QoS overridable."""
+        """Create the publisher of a stream: silent while the node is inactive, QoS overridable."""
         publisher = self.create_lifecycle_publisher(
             kind, topic, qos, qos_overriding_options=qos_overrides()
         )
@@ -177,7 +177,7 @@ class StreamNode(ManagedNode):
     def create_outputs_of(
         self, names: Iterable[str], kind: type, topic: str, qos: Callable[[], QoSProfile]
     ) -> dict[str, Publisher]:
-        """Make the publishers <name>/<topic> of several fluoroscopes, by name."""
+        """Create the publishers <name>/<topic> of several fluoroscopes, by name."""
         return {name: self.create_output(kind, f'{name}/{topic}', qos()) for name in names}
 
     def create_input(
@@ -188,28 +188,28 @@ class StreamNode(ManagedNode):
         qos: QoSProfile,
         refusals: RefusalLog,
     ) -> None:
-        """Subscribe to a slow topic, while configured; an exception in the callback is logged.
+        """Subscribe to a slow topic while configured; log an exception in the callback.
 
-        kind: message type. callback: called with every message. refusals: counts the messages at
+        kind: message type. callback: called with every message. refusals: counts the messages for
         which the callback raises.
         """
 
         def guarded(message: Any) -> None:
             try:
                 callback(message)
-            except Exception as error:  # a message may hold anything and must not end the node
+            except Exception as error:  # a message may contain anything and must not end the node
                 refusals.fail(topic, error)
 
         subscription = self.create_subscription(kind, topic, guarded, qos)
         self.own(subscription, self.destroy_subscription, subscription)
 
     def create_reader(self, faults: FaultHandlers) -> StreamReader:
-        """Make a StreamReader that runs while the node is active."""
+        """Create a StreamReader that runs while the node is active."""
         self.readers.append(StreamReader(self, faults))
         return self.readers[-1]
 
     def has_publisher(self, topic: str) -> bool:
-        """Return whether a topic, as this node calls it, has a publisher; remaps are applied."""
+        """Return whether a topic, named as in this node, has a publisher; remaps are applied."""
         return bool(self.count_publishers(self.resolve_topic_name(topic)))
 
     def incompatible_publishers(self) -> dict[str, str]:
@@ -224,7 +224,7 @@ class StreamNode(ManagedNode):
         return found
 
     def configure(self) -> None:
-        """Make outputs, slow inputs and the diagnostics."""
+        """Create outputs, slow inputs and the diagnostics."""
         self.create_outputs()
         diagnostics = DiagnosticsPublisher(self)
         self.own(diagnostics, diagnostics.close)
@@ -244,7 +244,7 @@ class StreamNode(ManagedNode):
         self._readiness = ''
 
     def _log_readiness(self) -> None:
-        """Log that the node is ready and for whom it waits, whenever that has changed."""
+        """Log that the node is ready and which publishers it waits for, whenever that changes."""
         found: dict[str, bool] = {}
         for reader in self.readers:
             for topic, published in reader.topics().items():
@@ -268,26 +268,26 @@ class StreamNode(ManagedNode):
         self.readers = []
 
     def cleanup(self) -> None:
-        """Destroy outputs and inputs, and forget what was received."""
+        """Destroy outputs and inputs, and discard what was received."""
         self._resources.close()
         self.recent = RecentCounts()
         self.reset()
 
 
-# What a node counts of the stream of one fluoroscope, and the conditions of its diagnostics.
+# Counts of the stream of one fluoroscope, and the conditions of its diagnostics.
 
 
 class Stream:
-    """Counts of the messages of one fluoroscope; nodes add what only they count."""
+    """Counts of the messages of one fluoroscope; nodes add their own counts."""
 
     def __init__(self, name: str, refusals: RefusalLog) -> None:
         self.name = name  #: fluoroscope
         self.received = 0  #: number of messages
-        #: number of messages that were lost at the input, because the queue was full
+        #: number of messages lost at the input, because the queue was full
         self.overrun = 0
-        self.refusals = refusals  #: streams whose messages are counted together share it
+        self.refusals = refusals  #: shared by streams whose messages are counted together
         self.stall = StallDetector()
-        #: from the arrival of a message to the publication of what is made of it
+        #: delays from the arrival of a message to the publication of its result
         self.latencies = LatencyWindow()
 
     def add_latency(self, received_ns: int) -> None:
@@ -295,14 +295,14 @@ class Stream:
         self.latencies.add(time.time_ns() - received_ns)
 
     def stalled(self) -> str:
-        """Return a message where the stream has stopped, else ''; see StallDetector."""
+        """Return a message if the stream has stopped, else ''; see StallDetector."""
         return self.stall.message(self.received)
 
 
 def stream_faults(
     streams: Mapping[str, Stream], reader_error: Callable[[str], None]
 ) -> FaultHandlers:
-    """Return what counts the faults of messages on <fluoroscope>/<...> in their streams."""
+    """Return handlers that count faults of messages on <fluoroscope>/<...> in their streams."""
 
     def stream_of(topic: str) -> Stream:
         return streams[topic.partition('/')[0]]
@@ -328,18 +328,18 @@ def stream_faults(
 
 @dataclass(frozen=True)
 class InputState:
-    """What the diagnostics of an input are decided by."""
+    """State from which the health of an input is diagnosed."""
 
     node: StreamNode
-    topics: tuple[str, ...]  #: what the node subscribes to
+    topics: tuple[str, ...]  #: topics that the node subscribes to
     refusals: RefusalLog
-    incompatible: Mapping[str, str]  #: messages about publishers that are not received, by topic
-    recent: Mapping[str, int]  #: what was counted within the last minute; see RecentCounts
+    incompatible: Mapping[str, str]  #: messages about publishers that cannot be received, by topic
+    recent: Mapping[str, int]  #: counts within the last minute; see RecentCounts
 
 
 @dataclass(frozen=True)
 class StreamState(InputState):
-    """What the diagnostics of a stream are decided by; one of its topics suffices.
+    """State from which the health of a stream is diagnosed; one of its topics suffices.
 
     subject: what is published there, in words.
     """
@@ -349,23 +349,23 @@ class StreamState(InputState):
 
 
 def lost_messages(state: InputState) -> Health | None:
-    """Messages were lost by internal errors."""
+    """Report that messages were lost by internal errors."""
     return fault(state.refusals.failure())
 
 
 def incompatible_publisher(state: InputState) -> Health | None:
-    """A publisher offers less than is requested."""
+    """Warn if a publisher offers less than is requested."""
     found = [state.incompatible[topic] for topic in state.topics if topic in state.incompatible]
     return warning(found[0] if found else '')
 
 
 def inactive_node(state: InputState) -> Health | None:
-    """The node does not receive anything."""
+    """Warn if the node is not active and receives nothing."""
     return warning('' if state.node.readers else 'the node is not active')
 
 
 def refused_messages(state: InputState) -> Health | None:
-    """Messages were refused."""
+    """Warn if messages were refused."""
     return warning(state.refusals.refusal(state.recent['refused']))
 
 
@@ -382,16 +382,16 @@ unpaired_frames = counted(
 
 
 def several_nodes(state: StreamState) -> Health | None:
-    """Several calibration nodes serve the fluoroscope."""
+    """Report that several calibration nodes serve the fluoroscope."""
     return fault(publisher_conflict(state.node, f'{state.stream.name}/calibration_status'))
 
 
 def missing_publisher(state: StreamState) -> Health | None:
-    """Nobody publishes the stream."""
+    """Warn if nobody publishes the stream."""
     found = any(map(state.node.has_publisher, state.topics))
     return warning('' if found else f'no publisher of {state.subject}')
 
 
 def stalled_stream(state: StreamState) -> Health | None:
-    """The stream has stopped."""
+    """Warn if the stream has stopped."""
     return warning(state.stream.stalled())

@@ -36,23 +36,23 @@ from .diagnostics import USER_ERRORS, StartError, log_line, one_line
 from .parameters import parameters_of, settable_parameters, unknown_parameters
 from .services import guard_services
 
-MAX_FAILURES = 100  # of callbacks within a second: nothing else works
-# Time in which further signals belong to the first one: launch and service managers signal a group
-# of processes and each of them, with SIGINT and SIGTERM.
+MAX_FAILURES = 100  # limit of failed callbacks within a second, at which nothing else works
+# Time in which further signals count as part of the first: launch and service managers signal a
+# group of processes and each of them, with SIGINT and SIGTERM.
 ONE_INTERRUPT_S = 1.0
-# Time in which a node ends after a signal; launch sends the next one, SIGTERM, after 5 s. A node
-# that has something to write has an attribute end_s.
+# Time within which a node must end after a signal: launch sends the next one, SIGTERM, after 5 s.
+# A node that has data to write has an attribute end_s instead.
 END_S = 4.0
 
 
 def run(make_node: Callable[[], Node], args: Sequence[str] | None = None) -> None:
     """Run a node until it is interrupted or the context is shut down, then exit.
 
-    The exit status is 1, after one sentence, where the node cannot start, and where its flag
-    `failed` is set; else 0. A node may have a method bring_up(), called before the loop, and a
-    method stop(), which ends everything that its callbacks wait for. The callbacks end before the
-    context does: rclpy's own signal handlers would shut it down while they run. A node that has
-    not ended within its time (END_S) after a signal ends with exit status 1 and a sentence.
+    The exit status is 1 if the node cannot start (after one sentence) or if its flag `failed` is
+    set; else 0. A node may have a method bring_up(), called before the loop, and a method stop(),
+    which ends everything that its callbacks wait for. The callbacks end before the context does,
+    whereas rclpy's own signal handlers would shut it down while they run. A node that has not
+    ended within its time (END_S) after a signal is ended with exit status 1 and a sentence.
     """
     if asks_for_help(sys.argv[1:] if args is None else args):
         print(help_text(sys.modules[make_node.__module__]))
@@ -68,8 +68,8 @@ def run(make_node: Callable[[], Node], args: Sequence[str] | None = None) -> Non
 
         def end() -> None:
             ended.set()
-            with suppress(InvalidHandle):  # the executor has been shut down
-                executor.create_task(lambda: None)  # something to do, so that spin_once returns
+            with suppress(InvalidHandle):  # the executor is already shut down
+                executor.create_task(lambda: None)  # makes spin_once return
             woken.set()
 
         _call_on_interrupt(end, lambda: getattr(node, 'end_s', END_S))
@@ -88,8 +88,8 @@ def run(make_node: Callable[[], Node], args: Sequence[str] | None = None) -> Non
         rclpy.logging.get_logger('fluoro_calib').fatal(log_line(str(error)))
         code = 1
     finally:
-        # What is left to the end of the interpreter is destroyed in any order, beside the threads
-        # of the middleware: the process may end with a segmentation fault.
+        # Objects left to the end of the interpreter are destroyed in any order, while threads of
+        # the middleware run: the process may end with a segmentation fault.
         if ended.is_set():
             woken.wait(ONE_INTERRUPT_S)  # for the thread that wakes the executor
         if executor is not None:
@@ -102,10 +102,10 @@ def run(make_node: Callable[[], Node], args: Sequence[str] | None = None) -> Non
 
 
 def _exit(code: int) -> NoReturn:
-    """End the process without the end of its interpreter.
+    """End the process without shutting down its interpreter.
 
-    That takes long on a busy machine, does not handle signals, and waits for threads that still
-    compute what nobody needs any more.
+    That shutdown takes long on a busy machine, does not handle signals, and waits for threads
+    whose results are no longer needed.
     """
     sys.stdout.flush()
     sys.stderr.flush()
@@ -115,8 +115,8 @@ def _exit(code: int) -> NoReturn:
 def _spin(executor: SingleThreadedExecutor, node: Node, ended: threading.Event) -> None:
     """Run the callbacks of a node until it is to end.
 
-    What a callback raises is logged, and the node goes on: a message or request of any peer must
-    not end it. Where callbacks do nothing but raise, the last exception is raised.
+    An exception in a callback is logged, and the node continues: a message or request of a peer
+    must not end it. If callbacks do nothing but raise, the last exception is raised.
     """
     failures: deque[float] = deque(maxlen=MAX_FAILURES)
     while rclpy.ok() and not ended.is_set():
@@ -142,7 +142,7 @@ def _init(args: Sequence[str] | None) -> None:
     try:
         for option, path in pairwise(words):
             if option == '--params-file':
-                check_regular_file(path)  # rcl would wait for a pipe, deaf to interrupts
+                check_regular_file(path)  # rcl would block on a pipe and ignore interrupts
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     except RCLError as error:  # invalid arguments after --ros-args
         raise StartError(str(error).partition(', at /')[0]) from None
@@ -153,15 +153,15 @@ def _init(args: Sequence[str] | None) -> None:
 
 
 def _make(make_node: Callable[[], Node]) -> Node:
-    """Make the node. Raises StartError where its arguments are invalid."""
+    """Create the node. Raises StartError if its arguments are invalid."""
     try:
         return make_node()
     except BaseException as error:
-        # Half a node has joined the graph, too; the frame of its constructor still knows it.
+        # A partly constructed node has joined the graph, too; find it in its constructor's frame.
         for frame, _ in traceback.walk_tb(error.__traceback__):
             half = frame.f_locals.get('self')
             if isinstance(half, Node):
-                with suppress(Exception):  # what it does not have yet
+                with suppress(Exception):  # parts that it does not have yet
                     half.destroy_node()
                 break
         if isinstance(error, USER_ERRORS):
@@ -172,8 +172,8 @@ def _make(make_node: Callable[[], Node]) -> Node:
 def _call_on_interrupt(end: Callable[[], None], patience_s: Callable[[], float]) -> None:
     """Call end() from a thread at SIGINT or SIGTERM, whatever the main thread waits for.
 
-    A second one, more than a second later, ends the process at once, and so does the end of the
-    time that patience_s() returns.
+    The process ends at once on a further signal more than a second later, or when the time
+    returned by patience_s() has passed.
     """
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
@@ -190,7 +190,7 @@ def _call_on_interrupt(end: Callable[[], None], patience_s: Callable[[], float])
             os.read(reading, 1000)
         patience = patience_s()
         if select.select([reading], [], [], patience - ONE_INTERRUPT_S)[0]:
-            os._exit(128 + signal.SIGINT)  # as shells tell what ended by a signal
+            os._exit(128 + signal.SIGINT)  # exit status of shells for this signal
         rclpy.logging.get_logger('fluoro_calib').fatal(
             f'ended by force: the work in hand takes longer than {patience:g} s'
         )
@@ -199,11 +199,11 @@ def _call_on_interrupt(end: Callable[[], None], patience_s: Callable[[], float])
     threading.Thread(target=watch, daemon=True).start()
 
 
-# What a node prints with --help: its task, how to start it, and its parameters.
+# Output of a node for --help: its task, how to start it, and its parameters.
 
 
 def asks_for_help(arguments: Sequence[str]) -> bool:
-    """Return whether -h or --help is among the arguments in front of those of ROS."""
+    """Return whether -h or --help is among the arguments before those of ROS."""
     words = list(arguments)
     if '--ros-args' in words:
         words = words[: words.index('--ros-args')]
@@ -211,7 +211,7 @@ def asks_for_help(arguments: Sequence[str]) -> bool:
 
 
 def help_text(module: ModuleType) -> str:
-    """Return the help of the node of a module: its docstring, usage and PARAMETERS."""
+    """Return the help text of a node's module: its docstring, usage and PARAMETERS."""
     name = module.__name__.rpartition('.')[2]
     if name == '__main__' and module.__spec__ is not None:
         name = module.__spec__.name.rpartition('.')[2]

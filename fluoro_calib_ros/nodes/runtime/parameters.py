@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Parameters of the nodes, made from the options that dataclasses declare."""
+"""Parameters of the nodes, created from options that dataclasses declare."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ from ...options import Option, declared, option
 from .diagnostics import PrintableLogger, StartError
 
 MAX_TIMEOUT_S = 86400.0  # longest time that a request may ask a node to wait
-MAX_INTEGER = 2**63 - 1  # of a parameter of ROS
+MAX_INTEGER = 2**63 - 1  # largest integer parameter in ROS
 # A fluoroscope's name is part of file names and topics.
 FLUOROSCOPE_NAME = re.compile('[A-Za-z_][A-Za-z0-9_]{0,99}')
 
-# Names that ROS declares itself, in part only when they are needed.
+# Parameters that ROS itself declares, some only when they are needed.
 SIM_TIME = 'use_sim_time'
 _OF_ROS = ('qos_overrides.', SIM_TIME, 'start_type_description_service')
 
 T = TypeVar('T')
-_GROUP = 'group'  # key of the metadata of a field of settings
+_GROUP = 'group'  # key in the metadata of a field of settings
 
 
 @dataclass(frozen=True)
@@ -80,14 +80,14 @@ class CalibratedParameters(ManagedParameters):
 
 
 class ParameterNode(Node):
-    """Node that says what to do where one tries to set a parameter that is read-only.
+    """Node that explains how to change a read-only parameter when one tries to set it.
 
-    Texts of its peers stay in their lines of its log. Its timers follow a steady clock: /clock may
-    stop, and whoever sets use_sim_time must not silence diagnostics.
+    Texts of peers stay within their line of the log. Timers use a steady clock: /clock may stop,
+    and setting use_sim_time must not silence the diagnostics.
     """
 
     def get_logger(self) -> Any:
-        """Return the logger, for any text."""
+        """Return a logger that is safe for any text."""
         return PrintableLogger(super().get_logger())
 
     def create_timer(
@@ -98,14 +98,14 @@ class ParameterNode(Node):
         clock: Clock | None = None,
         autostart: bool = True,
     ) -> Timer:
-        """Make a timer of the steady clock, unless another one is given."""
+        """Create a timer of the steady clock, unless another clock is given."""
         clock = clock or Clock(clock_type=ClockType.STEADY_TIME)
         return super().create_timer(timer_period_sec, callback, callback_group, clock, autostart)
 
     def set_parameters_atomically(
         self, parameter_list: Sequence[Parameter]
     ) -> SetParametersResult:
-        """Set parameters, all or none; an integer stands for a number, too."""
+        """Set all parameters or none; integers are accepted for floating-point parameters."""
         parameter_list = [self._as_declared(parameter) for parameter in parameter_list]
         for parameter in parameter_list:
             name = parameter.name
@@ -126,7 +126,7 @@ class ParameterNode(Node):
         return super().set_parameters_atomically(parameter_list)
 
     def _as_declared(self, parameter: Parameter) -> Parameter:
-        """Return a parameter as a number where it is an integer and a number was declared."""
+        """Convert an integer to a float if the parameter was declared as one."""
         name = parameter.name
         is_number = (
             parameter.type_ == Parameter.Type.INTEGER
@@ -138,12 +138,12 @@ class ParameterNode(Node):
 
 @dataclass(frozen=True)
 class ParameterGroup(Generic[T]):
-    """Options of a dataclass that are parameters of a node."""
+    """Options of a dataclass as parameters of a node."""
 
     options: type[T]  #: frozen dataclass that declares them
     #: parameter names by option name; empty: all options under their own names
     names: Mapping[str, str] = field(default_factory=dict)
-    #: names of the parameters that may change while the node runs; see follow(); all others are
+    #: names of the parameters that may change while the node runs, see follow(); all others are
     #: read-only
     settable: Sequence[str] = ()
 
@@ -162,7 +162,7 @@ class ParameterGroup(Generic[T]):
         }
 
     def declare(self, node: Node) -> T:
-        """Declare the parameters of a node. Raises StartError for an invalid value."""
+        """Declare the parameters on a node, return their values. Raises StartError if invalid."""
         values = {
             parameter: declare_parameter(node, declaration, parameter not in self.settable)
             for parameter, declaration in self.declarations.items()
@@ -175,7 +175,7 @@ class ParameterGroup(Generic[T]):
     def follow(self, node: Node, use: Callable[[T], None]) -> None:
         """Call use() with the new options whenever parameters of the group have been set.
 
-        A value that is not allowed is refused in one sentence, and nothing changes.
+        An invalid value is refused with one sentence, and nothing changes.
         """
         declarations = self.declarations
 
@@ -205,7 +205,7 @@ class ParameterGroup(Generic[T]):
         node.add_post_set_parameters_callback(apply)
 
     def _options_of(self, values: Mapping[str, Any]) -> T:
-        """Return the options of parameter values. Raises ValueError."""
+        """Return the options for parameter values. Raises ValueError."""
         for parameter, declaration in self.declarations.items():
             declaration.validate(values[parameter])
         return self.options(**{name: values[parameter] for name, parameter in self._names.items()})
@@ -224,12 +224,12 @@ def groups_of(settings: type[Any]) -> dict[str, ParameterGroup[Any]]:
 
 
 def declare_groups(node: Node, settings: type[T]) -> T:
-    """Declare the parameters of a settings dataclass; returns their values. Raises StartError."""
+    """Declare the parameters of a settings dataclass; return their values. Raises StartError."""
     return settings(**{name: each.declare(node) for name, each in groups_of(settings).items()})
 
 
 def follow_groups(node: Node, present: Callable[[], T], use: Callable[[T], None]) -> None:
-    """Call use() with new settings whenever parameters have been set."""
+    """Call use() with the new settings whenever parameters have been set."""
 
     def follow(name: str, each: ParameterGroup[Any]) -> None:
         each.follow(node, lambda new: use(replace(present(), **{name: new})))  # type: ignore[type-var]
@@ -239,7 +239,7 @@ def follow_groups(node: Node, present: Callable[[], T], use: Callable[[T], None]
             follow(name, each)
 
 
-READ_LIMITS = ParameterGroup(ReadLimits)  # of every node that reads files or images
+READ_LIMITS = ParameterGroup(ReadLimits)  # for every node that reads files or images
 
 
 def declare_read_limits(node: Node) -> None:
@@ -250,7 +250,7 @@ def declare_read_limits(node: Node) -> None:
 def declare_parameter(node: Node, declaration: Option, read_only: bool = True) -> Any:
     """Declare a parameter and return its value. Raises StartError.
 
-    An integer is taken for a number.
+    Integers are accepted for floating-point parameters.
     """
     default = declaration.default
     given = node._parameter_overrides.get(declaration.name)  # rclpy has no public access to them
@@ -270,7 +270,7 @@ def declare_parameter(node: Node, declaration: Option, read_only: bool = True) -
     return _tuple_or_value(declaration, value)
 
 
-# What a value is called that has the type of a default.
+# Name of a value in messages, by the type of the default.
 _WORDS = {
     bool: 'true or false',
     int: 'a whole number',
@@ -281,7 +281,7 @@ _WORDS = {
 
 
 def _check_given(declaration: Option, given: Parameter) -> None:
-    """Raise StartError for a value that a parameter cannot have, in the words of its option."""
+    """Raise StartError for a value that is invalid for a parameter, in the words of its option."""
     default = declaration.default
     listed = list(default) if isinstance(default, tuple) else default
     empty = given.type_ == Parameter.Type.NOT_SET or given.value == []  # of any type
@@ -295,7 +295,7 @@ def _check_given(declaration: Option, given: Parameter) -> None:
 
 
 def _tuple_or_value(declaration: Option, value: Any) -> Any:
-    """Return the value of a parameter as its option has it, a list as a tuple."""
+    """Return the value of a parameter in the type of its option: a list as a tuple."""
     if isinstance(declaration.default, tuple):
         return tuple(value or ())  # an empty list has no type and counts as not set
     return value
@@ -344,8 +344,8 @@ def settable_parameters(groups: Iterable[ParameterGroup[Any]]) -> frozenset[str]
 def unknown_parameters(node: Node) -> list[str]:
     """Return a sentence for every given parameter that a node does not have.
 
-    ROS ignores them: a mistyped name would change nothing, and nobody would be told. Those of the
-    other nodes of a rig have none: a file may give them to all nodes (/**).
+    ROS ignores such parameters: a mistyped name would silently have no effect. Parameters of other
+    nodes of a rig are not reported, because a file may set them for all nodes (/**).
     """
     sentences = []
     others: frozenset[str] | None = None
@@ -362,7 +362,7 @@ def unknown_parameters(node: Node) -> list[str]:
 
 
 def _parameters_of_rig() -> frozenset[str]:
-    """Return the names of the parameters in the installed configuration, none without one."""
+    """Return the parameter names in the installed configuration, none if it is not installed."""
     try:
         share = get_package_share_directory(__name__.partition('.')[0])
         document = read_yaml(os.path.join(share, 'config', 'fluoro_calib.yaml'))

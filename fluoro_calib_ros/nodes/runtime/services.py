@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Services of the nodes, and requests whose answers wait for something."""
+"""Services of the nodes, and requests whose answers have to wait."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from .topics import services_qos
 
 # Services that answer a request that cannot be handled, instead of ending the node.
 #
-# rclpy raises from its own services where a transition does not fit the state of a managed node,
-# and where a parameter has an unknown type. Without a guard one such request of any peer ends the
-# node. rcl logs the texts of a request as they are, such as the label of a transition.
+# rclpy's own services raise if a transition does not fit the state of a managed node, or if a
+# parameter has an unknown type. Without a guard, one such request of any peer ends the node. rcl
+# logs texts in a request unchanged, such as the label of a transition.
 
 Callback = Callable[[Any, Any], Any]
 
 
 def guard_services(node: Node, services: Iterable[Service]) -> None:
-    """Let services of a node refuse the requests at which their callbacks raise."""
+    """Make services of a node refuse the requests for which their callbacks raise."""
     for service in services:
         service.callback = _guarded(node, service.srv_name, service.callback)
 
@@ -63,7 +63,7 @@ def _guarded(node: Node, name: str, callback: Callback) -> Callback:
 
 
 def _check_texts(value: Any, where: str = 'request') -> None:
-    """Raise ValueError unless all texts in a request, or a field of it, are lines of a log."""
+    """Raise ValueError unless all texts in a request or field are printable and short enough."""
     if isinstance(value, str):
         if len(value) > MAX_TEXT or not value.isprintable():
             raise ValueError(f'{where} is printable text of at most {MAX_TEXT} characters')
@@ -76,7 +76,7 @@ def _check_texts(value: Any, where: str = 'request') -> None:
 
 
 def _refusal_of(request: Any, response: Any, reason: str) -> Any:
-    """Return the response that says that nothing was done; its flags are false by default."""
+    """Return the response that nothing was done; its flags are false by default."""
     refusal = SetParametersResult(successful=False, reason=reason)
     if isinstance(request, SetParameters.Request):
         response.results = [refusal] * len(request.parameters)
@@ -88,7 +88,7 @@ def _refusal_of(request: Any, response: Any, reason: str) -> Any:
 
 
 class ServiceEntry(NamedTuple):
-    """A service: name, type, and a handler (request, response) -> response, also a coroutine."""
+    """Service: name, type, and handler (request, response) -> response, possibly a coroutine."""
 
     name: str
     kind: type
@@ -98,9 +98,9 @@ class ServiceEntry(NamedTuple):
 def telling_service(
     name: str, kind: type, refused: str, act: Callable[[Any], str], logger: Logger
 ) -> ServiceEntry:
-    """Return a service that does what is asked, and answers what was done or why it was not.
+    """Return a service that carries out a request, and answers what was done or why not.
 
-    act may raise DataError and OSError; refused is what is said before the reason.
+    act may raise DataError and OSError; refused is the text before the reason.
     """
 
     def answer(request: Any, response: Any) -> Any:
@@ -120,9 +120,9 @@ def telling_service(
 def create_services(
     node: Node, table: Iterable[ServiceEntry], group: CallbackGroup | None = None
 ) -> list[Service]:
-    """Make the services of a table; one whose handler raises says so in its answer.
+    """Create the services of a table; if a handler raises, the answer says so.
 
-    Handlers that are coroutines need a reentrant group, or they keep others from being answered.
+    Handlers that are coroutines need a reentrant group, or they block the other services.
     """
     services = [
         node.create_service(
@@ -139,7 +139,7 @@ def create_services(
 
 
 class Requests:
-    """Counts the requests whose answers wait for something."""
+    """Counts the requests that are waiting for their answers."""
 
     def __init__(self) -> None:
         self.waiting = 0
@@ -157,7 +157,7 @@ class Requests:
 async def within(
     node: ParameterNode, timeout_s: float, future: Future, give_up: Callable[[], object]
 ) -> Any:
-    """Return the result of a Future; give_up() is called when the time is up and has to set it."""
+    """Return the result of a Future; call give_up(), which must set it, after the timeout."""
     timer = node.create_timer(timeout_s, give_up)
     result = await future
     node.destroy_timer(timer)
@@ -165,13 +165,13 @@ async def within(
 
 
 def in_thread(node: Node, function: Callable[[], Any]) -> tuple[Future, threading.Thread]:
-    """Run a function in a thread of its own; returns the Future of its result, and the thread."""
+    """Run a function in a new thread; return the Future of its result, and the thread."""
     done = Future()
 
     def work() -> None:
         try:
             done.set_result(function())
-        except Exception as error:  # for the one who awaits it
+        except Exception as error:  # raised where the Future is awaited
             done.set_exception(error)
         wake(node)
 
@@ -181,6 +181,6 @@ def in_thread(node: Node, function: Callable[[], Any]) -> tuple[Future, threadin
 
 
 def wake(node: Node) -> None:
-    """Make the executor of a node continue what awaits a result of another thread."""
+    """Make the executor of a node resume coroutines that await a result of another thread."""
     if node.executor is not None:
         node.executor.wake()

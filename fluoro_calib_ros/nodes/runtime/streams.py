@@ -1,17 +1,17 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Receiving the messages of streams at lab rates.
+"""Reception of the messages of streams at laboratory frame rates.
 
 rclpy's executors rebuild their wait set for every message, from all entities of a node. With the
-services of parameters and lifecycle this costs some 0.2 ms, twice the time of handling a frame. So
-a dedicated thread waits for the subscriptions of streams only and receives all pending messages;
-services and timers stay with the executor. Data that both threads use is replaced as a whole,
-never changed in place.
+services of parameters and lifecycle this costs some 0.2 ms, twice the time for handling a frame.
+Therefore a dedicated thread waits for the subscriptions of streams only and receives all pending
+messages; services and timers stay with the executor. Data used by both threads is replaced as a
+whole, never changed in place.
 
-Events of these subscriptions are not requested: an event in a wait set wakes the executor at every
-message. Instead, incompatible_publishers() compares offered and requested quality of service once
-a second.
+Events of these subscriptions are not requested, because an event in a wait set wakes the executor
+at every message. Instead, incompatible_publishers() compares offered and requested quality of
+service once a second.
 """
 
 from __future__ import annotations
@@ -48,28 +48,27 @@ from .topics import (
     qos_overrides,
 )
 
-WAIT_NS = 50_000_000  # after which the thread checks whether it has to end
-# Messages of a topic that are handled before the next topic has its turn: views wait for each
-# other.
+WAIT_NS = 50_000_000  # interval at which the thread checks whether it has to end
+# Messages of a topic that are handled before the next topic's turn: views wait for each other.
 MAX_BATCH = 8
-# What decoding a damaged message raises, in our decoders and in those of the middleware.
+# Exceptions for a damaged message, raised by our decoders and those of the middleware.
 DECODING_ERRORS = (ValueError, RCLError, RuntimeError, MemoryError)
 
 
-REMEMBERED = 1000  # exposures, by what may come later of them
+REMEMBERED = 1000  # exposures that are kept for messages about them that arrive later
 
 
 def remember(
     table: OrderedDict[Any, Any], key: object, value: object, most: int = REMEMBERED
 ) -> None:
-    """Keep a value by its key; of more than that many, the oldest is forgotten."""
+    """Store a value by its key; beyond `most` entries, drop the oldest."""
     table[key] = value
     if len(table) > most:
         table.popitem(last=False)
 
 
 class TooLarge(ValueError):
-    """A message holds more than a limit allows; raised by what decodes it."""
+    """Raised by a decoder for a message whose content exceeds a limit."""
 
 
 class _ReaderGroup(CallbackGroup):
@@ -86,7 +85,7 @@ class _ReaderGroup(CallbackGroup):
 
 
 class _Route(NamedTuple):
-    """A subscription, what makes a message from its bytes, and what is called with it."""
+    """A subscription, the decoder of its messages, and their callback."""
 
     topic: str
     subscription: Subscription
@@ -110,33 +109,33 @@ class _Route(NamedTuple):
 
 @dataclass(frozen=True)
 class FaultHandlers:
-    """What a StreamReader calls when something goes wrong."""
+    """Functions that a StreamReader calls when something goes wrong."""
 
     #: called with the topic of a message that cannot be decoded
     undecodable: Callable[[str], None]
-    #: called with topic and exception where a callback raises: that message is lost
+    #: called with topic and exception if a callback raises: that message is lost
     callback_error: Callable[[str, Exception], None]
-    #: called with a traceback where the thread itself fails and ends
+    #: called with a traceback if the thread itself fails and ends
     reader_error: Callable[[str], None]
-    #: called with the topic of a message that is too large, and its size [bytes]; None:
+    #: called with the topic of a message that is too large, and its size [bytes]; if None,
     #: undecodable is called
     too_large: Callable[[str, int], None] | None = None
-    #: called with a topic and the number of its messages that were lost before they were taken: by
-    #: their sequence numbers, where the topic has one publisher and is not latched
+    #: called with a topic and the number of its messages lost before they were taken, according to
+    #: their sequence numbers; only for topics with one publisher that are not latched
     overrun: Callable[[str, int], None] | None = None
 
 
 class StreamReader:
-    """Subscriptions of a node that a thread of their own serves between start() and stop()."""
+    """Subscriptions of a node, served by a dedicated thread between start() and stop()."""
 
     def __init__(self, node: Node, faults: FaultHandlers) -> None:
         self._node = node
         self._faults = faults
-        self._faults_of: dict[str, FaultHandlers] = {}  # of topics that have their own
+        self._faults_of: dict[str, FaultHandlers] = {}  # of topics with their own handlers
         self._group = _ReaderGroup()
         self._routes: list[_Route] = []
         self._max_bytes: dict[str, int] = {}  # by topic
-        self._first: set[str] = set()  # topics
+        self._first: set[str] = set()  # topics of take_first()
         self._sequence: dict[str, int] = {}  # number of the last message by topic
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
@@ -162,11 +161,10 @@ class StreamReader:
             source_timestamp [ns, system clock].
         qos : QoSProfile
         decode : callable, optional
-            Makes the message from its bytes, or raises ValueError, TooLarge for one that is
-            dropped and counted as such; by default that of ROS.
+            Converts bytes to a message. Raises ValueError or TooLarge for a message that is then
+            dropped and counted as such. By default, the deserialisation of ROS.
         max_bytes : int, optional
-            Larger messages are dropped before they are decoded; by default those that are larger
-            than an image may be.
+            Larger messages are dropped before they are decoded; by default the limit for images.
         """
         subscription = self._subscription(kind, topic, qos, qos_overrides())
         self._max_bytes[topic] = max_bytes or read_limits().max_image_bytes
@@ -192,9 +190,9 @@ class StreamReader:
         )
 
     def take_first(self, topic: str, faults: FaultHandlers) -> None:
-        """Handle what is pending of a subscribed topic before each message of the others.
+        """Handle pending messages of a subscribed topic before each message of the others.
 
-        faults: of this topic.
+        faults: handlers of this topic.
         """
         self._first.add(topic)
         self._faults_of[topic] = faults
@@ -203,17 +201,17 @@ class StreamReader:
         return self._faults_of.get(topic, self._faults)
 
     def topics(self) -> dict[str, bool]:
-        """Return the subscribed topics by relative name, and whether each has a publisher."""
+        """Return whether each subscribed topic (relative name) has a publisher."""
         return {
             route.topic: bool(self._node.count_publishers(route.subscription.topic_name))
             for route in self._routes
         }
 
     def accept_best_effort(self) -> list[str]:
-        """Subscribe best effort to topics that are only published so; returns them.
+        """Use best effort for topics that are only published so; return these topics.
 
-        Drivers of cameras often publish so, and a reliable subscription receives nothing from
-        them. To be called from the thread that made the subscriptions.
+        Camera drivers often publish so, and a reliable subscription receives nothing from them. To
+        be called from the thread that created the subscriptions.
         """
         lowered = [
             number
@@ -236,7 +234,7 @@ class StreamReader:
     def incompatible_publishers(self) -> dict[str, str]:
         """Return a message for every topic with a publisher that offers less than is requested.
 
-        Keys are the topics as they were subscribed to, without namespace and remapping.
+        Keys are the topics as passed to subscribe(), without namespace and remapping.
         """
         found = {}
         for topic, subscription, *_ in self._routes:
@@ -250,7 +248,7 @@ class StreamReader:
         return found
 
     def start(self) -> None:
-        """Start to receive; to be called from the thread that made the subscriptions."""
+        """Start receiving; to be called from the thread that created the subscriptions."""
         self._stopping.clear()
         self._thread = threading.Thread(target=self._run, name='streams', daemon=True)
         self._thread.start()
@@ -258,7 +256,7 @@ class StreamReader:
     def stop(self, take_pending: bool = False) -> None:
         """Stop after the message that is being handled, and destroy the subscriptions.
 
-        take_pending: whether the messages that have arrived before are handled, too.
+        take_pending: whether messages that have already arrived are handled, too.
         """
         self._halt()
         if take_pending:
@@ -308,7 +306,7 @@ class StreamReader:
                 self._drain(routes[pointer], first, MAX_BATCH)
 
     def _drop(self, topic: str, size: int) -> None:
-        """Count a message that is too large."""
+        """Report a message that is too large."""
         faults = self._of(topic)
         if faults.too_large is None:
             faults.undecodable(topic)
@@ -316,31 +314,31 @@ class StreamReader:
             faults.too_large(topic, size)
 
     def _drain(self, route: _Route, first: list[_Route], most: int) -> None:
-        """Handle the pending messages of a subscription, at most so many of them.
+        """Handle at most `most` pending messages of a subscription.
 
         first: routes whose pending messages are handled before each of these.
         """
         for _ in range(most):
             if self._stopping.is_set():
                 return
-            # As bytes: taking the message itself would not tell a damaged one from none.
+            # Take bytes: with messages, a damaged one could not be distinguished from none.
             received = route.handle.take_message(route.subscription.msg_type, True)
             if received is None:
                 return
             for other in first:
                 if other is not route:
-                    self._drain(other, [], OBSERVATION_DEPTH)  # all that can wait
+                    self._drain(other, [], OBSERVATION_DEPTH)  # the whole queue
             self._count_overrun(route, received[1]['publication_sequence_number'])
             self._handle(route, *received)
 
     def _count_overrun(self, route: _Route, number: int | None) -> None:
-        """Count the messages before one with that number that did not arrive."""
+        """Count the missing messages before the one with the given sequence number."""
         faults = self._of(route.topic)
         if faults.overrun is None or number is None or route.is_latched:
             return
         lost = number - self._sequence.get(route.topic, number - 1) - 1
         self._sequence[route.topic] = number
-        # Each of several publishers has numbers of its own; so has one that was started again.
+        # Several publishers number their messages separately; so does a restarted one.
         if lost > 0 and self._node.count_publishers(route.subscription.topic_name) == 1:
             faults.overrun(route.topic, lost)
 
@@ -358,6 +356,6 @@ class StreamReader:
             return
         try:
             route.callback(message, info)
-        except Exception as error:  # this message is lost, the next ones are not
+        except Exception as error:  # only this message is lost
             if not self._stopping.is_set() and self._node.context.ok():
                 self._of(route.topic).callback_error(route.topic, error)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Topics of the graph: finding them, their types, and their quality of service."""
+"""Topics of the ROS graph: their discovery, types, and quality of service."""
 
 from __future__ import annotations
 
@@ -35,22 +35,21 @@ from ...errors import DataError
 from ...io.access import read_text
 from ...io.bags.metadata import Definition, fields_of, known_definition, with_dependencies
 
-# Finding topics, and waiting for their other end.
+# Discovery of topics, and waiting for readers.
 
-# Time in which readers discover a publisher that has discovered them, several times the measured
-# one.
+# Time for readers to discover a publisher that discovered them: several times the measured one.
 SETTLING_S = 0.3
-DISCOVERY_S = 0.1  # period in which new topics are looked for
+DISCOVERY_S = 0.1  # period of the search for new topics
 
 
 def wait_for_readers(
     node: Node, publishers: Iterable[Publisher], count: int, stop: threading.Event
 ) -> None:
-    """Wait until each publisher of a node has `count` readers, and these know it.
+    """Wait until each publisher of a node has `count` readers that have discovered it.
 
-    A publisher discovers a reader and the reader the publisher independently of each other. What
-    is published between these moments is lost, reliable or not, and nothing signals the second
-    one. Setting `stop` ends the wait.
+    A publisher and a reader discover each other independently. Messages published between the two
+    discoveries are lost, reliable or not, and nothing signals the second one. Setting `stop` ends
+    the wait.
     """
     while missing := [p.topic_name for p in publishers if p.get_subscription_count() < count]:
         node.get_logger().info(
@@ -73,7 +72,7 @@ def needs_best_effort(node: Node, subscription: Subscription) -> bool:
 
 
 def best_effort_message(topic: str) -> str:
-    """Return the message about a topic that is subscribed best effort from now on."""
+    """Return the message about a topic that is from now on subscribed to as best effort."""
     return (
         f'topic {topic}: its publishers offer best effort only; it is subscribed best effort now, '
         'so lost messages are not sent again'
@@ -83,8 +82,8 @@ def best_effort_message(topic: str) -> str:
 class TopicDiscovery:
     """Finds the topics of the graph that have a publisher, each once.
 
-    wanted: names as the node calls them; none: all but those that are hidden, whose names have a
-    part that begins with an underscore.
+    wanted: topic names as the node uses them; if empty, all topics except hidden ones (with a name
+    part that begins with an underscore).
     """
 
     def __init__(self, node: Node, wanted: Iterable[str]) -> None:
@@ -106,9 +105,9 @@ class TopicDiscovery:
 
 
 def publisher_conflict(node: Node, topic: str) -> str:
-    """Return a message where several nodes publish a topic that belongs to one, else ''.
+    """Return a message if several nodes publish a topic that only one should, else ''.
 
-    A node that was killed counts until DDS notices, within half a minute.
+    A killed node counts until DDS notices, within half a minute.
     """
     publishers = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
     if len(publishers) < 2:
@@ -124,13 +123,13 @@ def publisher_conflict(node: Node, topic: str) -> str:
     )
 
 
-ACKNOWLEDGED_S = 10.0  # in which readers have to confirm what was published last
+ACKNOWLEDGED_S = 10.0  # time limit for readers to acknowledge the last messages
 
 
 def wait_until_acknowledged(publishers: Iterable[Publisher], stop: threading.Event) -> bool:
-    """Wait until all messages have arrived, and return whether they have.
+    """Wait until all messages have been acknowledged; return whether they have.
 
-    What is not acknowledged is lost when the process ends. Setting `stop` ends the wait.
+    Unacknowledged messages are lost when the process ends. Setting `stop` ends the wait.
     """
     end = time.monotonic() + ACKNOWLEDGED_S
     for publisher in publishers:
@@ -140,13 +139,13 @@ def wait_until_acknowledged(publishers: Iterable[Publisher], stop: threading.Eve
     return True
 
 
-# Message types that are installed: their classes and their definitions.
+# Installed message types: their classes and definitions.
 
 
 def installed_type(name: str) -> type[Any] | None:
-    """Return the class of a message type, None where it is not installed.
+    """Return the class of a message type, or None if it is not installed.
 
-    Only packages in the ament index are imported: a bag or a peer must not name any module.
+    Only packages in the ament index are imported: a bag or a peer must not name any other module.
     """
     package, _, kind = name.partition('/msg/')
     try:
@@ -159,10 +158,10 @@ def installed_type(name: str) -> type[Any] | None:
 
 
 def definition_of(name: str, type_hash: str) -> Definition:
-    """Return the definition of a message type as a bag contains it.
+    """Return the definition of a message type in the form that a bag contains.
 
-    It is that of this package if it has the hash that publishers offer, '' for an unknown one;
-    else the installed .msg files. The text is empty where there are none.
+    It is the definition in this package if that has the hash that publishers offer ('' if
+    unknown), else that of the installed .msg files. The text is empty if there is none.
     """
     try:
         known = known_definition(name)
@@ -185,53 +184,53 @@ def _installed(name: str) -> tuple[str, Iterable[Any]]:
 
 # Quality of service of the topics.
 #
-# Every function returns a new profile: rclpy writes the overrides of one topic into the profile
-# object that it was given, so a shared one would carry them over to other topics.
+# Every function returns a new profile: rclpy writes the overrides of a topic into the profile
+# object that it was given, so a shared object would carry them over to other topics.
 
-# A fluoroscope at 1000 frames a second and a reader that is busy for a tenth of a second.
+# Queue for a fluoroscope at 1000 frames per second while the reader is busy for 0.1 s.
 OBSERVATION_DEPTH = 100
-# Images take a megabyte or more, so few are queued, a twelfth of a second at 120 Hz. A slower
+# Images take a megabyte or more, so few are queued: a twelfth of a second at 120 Hz. A slower
 # reader gets the newest ones.
 IMAGE_DEPTH = 10
-RECORDED_LATCHED_DEPTH = 100  # messages of as many publishers
-# Requests that come at once and are all answered; ROS's default is 10.
+RECORDED_LATCHED_DEPTH = 100  # one message each of as many publishers
+# Simultaneous requests that are all answered; the default of ROS is 10.
 REQUEST_DEPTH = 200
 
 
 def observations_qos() -> QoSProfile:
-    """Profile of image points and reconstructed points."""
+    """Return the profile of image points and reconstructed points."""
     return _reliable(OBSERVATION_DEPTH)
 
 
 def images_qos() -> QoSProfile:
-    """Profile of images."""
+    """Return the profile of images."""
     return _reliable(IMAGE_DEPTH)
 
 
 def latched_qos() -> QoSProfile:
-    """Profile of topics whose last message late subscribers receive, too."""
+    """Return the profile of topics whose last message late subscribers also receive."""
     return _reliable(1, DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def recorded_latched_qos() -> QoSProfile:
-    """Profile for playing latched topics: one player replays what many publishers have latched."""
+    """Return the profile for playing latched topics: one player replays many publishers."""
     return _reliable(RECORDED_LATCHED_DEPTH, DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def clock_qos() -> QoSProfile:
-    """Profile of /clock, as rosbag2 has it."""
+    """Return the profile of /clock, as in rosbag2."""
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.BEST_EFFORT
     )
 
 
 def services_qos() -> QoSProfile:
-    """Profile of services: a burst of requests is queued, and every one of them is answered."""
+    """Return the profile of services: a burst of requests is queued, and all are answered."""
     return _reliable(REQUEST_DEPTH)
 
 
 def adapted_qos(publishers: Sequence[TopicEndpointInfo], depth: int) -> QoSProfile:
-    """Return the profile with which the messages of all publishers are received."""
+    """Return the profile for receiving the messages of all given publishers."""
     profiles = [publisher.qos_profile for publisher in publishers]
     reliable = all(p.reliability == ReliabilityPolicy.RELIABLE for p in profiles)
     latched = all(p.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in profiles)
@@ -244,7 +243,7 @@ def adapted_qos(publishers: Sequence[TopicEndpointInfo], depth: int) -> QoSProfi
 
 
 def qos_overrides() -> QoSOverridingOptions:
-    """Let a user override history, depth and reliability of a topic by parameters."""
+    """Return options by which users may override history, depth and reliability of a topic."""
     return QoSOverridingOptions.with_default_policies()
 
 

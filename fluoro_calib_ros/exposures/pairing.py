@@ -24,8 +24,7 @@ from .stamps import StampAgreement, StampedFrame
 PAIR_BY = ('frame_number', 'stamp')
 MIN_VIEWS = 2  # minimum number of views for an intersection
 PATIENCE = 32  # in frames: a stall of 32 ms at 1000 Hz
-# A stamp that is earlier than the last one by more than this starts a new stream; otherwise the
-# frame is out of order.
+# A stamp earlier than the last one by more than this starts a new stream; else it is out of order.
 RESTART_NS = 1_000_000_000
 UNLIMITED = 10**9  # frames
 
@@ -242,9 +241,8 @@ class CompletePairer(_Counts):
     def _is_late(self, fluoroscope: str, key: int) -> bool:
         """Return whether a partner of the frame with this key was already displaced.
 
-        This holds for a key that is not after the last displaced one of another fluoroscope,
-        within a limit, and has no waiting partner. The keys of a restarted fluoroscope lie beyond
-        the limit.
+        This holds for a key without a waiting partner, not after the last displaced one of another
+        fluoroscope, within a limit. The keys of a restarted fluoroscope lie beyond the limit.
         """
         for name in self.fluoroscopes:
             displaced = self._displaced[name]

@@ -172,9 +172,8 @@ def write_table(path: PathLike, header: Iterable[str], rows: Iterable[Iterable[A
     Table(tuple(header), rows).write(path)
 
 
-# A spreadsheet evaluates a cell that begins with one of these characters as a formula. Therefore
-# such a name is written with a leading apostrophe, which marks it as text; the apostrophe is
-# removed on reading.
+# A spreadsheet evaluates a cell that begins with one of these characters as a formula. A leading
+# apostrophe marks such a name as text; it is added on writing and removed on reading.
 _FORMULA = frozenset('=+-@')
 _SUSPICIOUS = _FORMULA | {"'"}
 

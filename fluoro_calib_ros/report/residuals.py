@@ -221,8 +221,7 @@ def position_figure(
 ) -> Figure:
     """Return the residuals of a fluoroscope over the image, before and after the calibration.
 
-    Residuals after it are shown both at the scale of those before, and at their own. uv (n, 2):
-    pixels.
+    Those after it are shown at the scale of those before, and at their own. uv (n, 2): pixels.
     """
     figure = new_figure(15, 8.4, title)
     grid = figure.subplots(2, 3)

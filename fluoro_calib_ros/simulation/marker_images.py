@@ -248,8 +248,7 @@ class MarkerRadiography(Radiography):
             row = (np.arange((v1 - v0) * FINE) + 0.5) / FINE - 0.5 + v0
             grid = np.meshgrid(column.astype(np.float32), row.astype(np.float32))
             plane = cv2.remap(self._plane, *grid, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
-            # Differences of squares of metres and squares of millimetres need more than single
-            # precision.
+            # Squares of metres minus squares of millimetres: single precision is not enough.
             detector = np.dstack([plane, np.full(grid[0].shape, self.settings.detector_mm)])
             total = np.zeros_like(grid[0])
             for number, of_moment in enumerate(sensor):

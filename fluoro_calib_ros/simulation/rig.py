@@ -195,8 +195,7 @@ class DistortionField:
 def random_field(rng: np.random.Generator, strength: float = 1.0) -> DistortionField:
     """Draw a field at random.
 
-    At strength 1 the correction is some 15 px along the border of the image and 26 to 35 px in its
-    corners.
+    At strength 1 it is some 15 px along the border of the image and 26 to 35 px in its corners.
     """
     sign = rng.choice([-1.0, 1.0], size=4)
     centre = np.asarray(IMAGE_SIZE) / 2 - 0.5 + rng.uniform(-20, 20, 2)

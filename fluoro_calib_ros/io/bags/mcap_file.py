@@ -256,8 +256,7 @@ NO_METADATA = 'this is not the metadata of a bag, or it is damaged'
 def is_bag(source: PathLike) -> bool:
     """Return whether a source is a bag, judged by its files, its name, or its first bytes.
 
-    A path that does not exist counts as a bag if its name has no suffix. Raises DataError for a
-    pipe.
+    A missing path counts as a bag if its name has no suffix. Raises DataError for a pipe.
     """
     path = Path(source)
     if path.is_dir():

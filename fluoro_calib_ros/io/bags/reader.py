@@ -76,8 +76,7 @@ def read_frames(source: PathLike, validate: bool = True) -> BagContents:
     _check_definitions(source, fluoroscopes)
     frames: dict[str, list[Frame]] = {name: [] for name in sorted(fluoroscopes.values())}
     notes: list[str] = []
-    # number of the message in which a frame first occurred
-    first: dict[tuple[str, int, int], int] = {}
+    first: dict[tuple[str, int, int], int] = {}  # message in which a frame first occurred
     restarts = dict.fromkeys(frames, 0)
     segments: dict[str, list[int]] = {name: [] for name in frames}
     for message in iterate_messages(source, fluoroscopes):

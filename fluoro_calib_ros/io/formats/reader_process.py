@@ -3,12 +3,11 @@
 
 """Read a C3D or HDF5 file in a separate process: `python -m ...reader_process KIND PATH`.
 
-ezc3d and HDF5 trust the sizes stated in a file: a damaged file can make them crash or exhaust the
-memory. The process writes an .npz of arrays to standard output. For C3D: labels, unit, rate,
-first, xyz (m, n, 3), residual (m, n), and rotation_labels, rotation_unit, rotation_rate, rotations
-(m, b, 4, 4). For an analysis file of SLEAP: uv (m, t, n, 2) and score (m, t, n) by frame, track
-and node, and the names nodes and tracks. For a file of DeepLabCut: columns (n, levels), index (m,)
-and values (m, n).
+ezc3d and HDF5 trust what a file states about itself: damage can make them crash or exhaust the
+memory. Standard output is an .npz of arrays. For C3D: labels, unit, rate, first, xyz (m, n, 3),
+residual (m, n), and rotation_labels, rotation_unit, rotation_rate, rotations (m, b, 4, 4). For an
+analysis file of SLEAP: uv (m, t, n, 2) and score (m, t, n) by frame, track and node, and the names
+nodes and tracks. For a file of DeepLabCut: columns (n, levels), index (m,) and values (m, n).
 """
 
 from __future__ import annotations

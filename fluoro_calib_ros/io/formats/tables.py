@@ -116,10 +116,9 @@ class Row:
 def read_table(path: PathLike, separator: str | None = None) -> list[Row]:
     """Return the rows of a text file that are not blank.
 
-    separator: ' ' for any whitespace. By default it is found from the first row: a semicolon if it
-    has one (then with decimal commas, as spreadsheets write them in many countries), otherwise a
-    tabulator or a comma. Raises DataError for a file that cannot be read, is not text or has no
-    rows.
+    separator: ' ' for any whitespace; by default a semicolon if the first row has one (then with
+    decimal commas, as spreadsheets write them in many countries), otherwise a tabulator or a
+    comma. Raises DataError for a file that cannot be read, is not text or has no rows.
     """
     return table_of(path, read_text(path), separator)
 
@@ -162,8 +161,7 @@ def _separated(path: PathLike, text: str, separator: str) -> list[Row]:
 def read_frames(path: PathLike) -> tuple[Row, list[Row], int]:
     """Return header and rows of a table with one row a frame, and 1 if its first column is Frame.
 
-    The third value is 0 without a column Frame. Raises DataError as `read_table` does, and for a
-    header without rows.
+    The third value is otherwise 0. Raises DataError as `read_table`, and for missing rows.
     """
     header, *rows = read_table(path)
     if not rows:

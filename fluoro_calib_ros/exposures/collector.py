@@ -298,7 +298,7 @@ MAX_AREAS = 2  # maximum number of areas named at once
 
 @dataclass(frozen=True)
 class Readiness:
-    """Requirements that a calibration still lacks."""
+    """Whether a calibration is worthwhile, and what is still missing."""
 
     ready: bool  #: whether the number of exposures and the coverage suffice
     advice: str  #: advice on the next pose, or that it is time to calibrate

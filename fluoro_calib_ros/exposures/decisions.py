@@ -109,7 +109,7 @@ def _rows(frame: Frame, decision: PointDecision) -> NDArray[np.bool_]:
 
 
 def _missing(frames: Frames, decision: PointDecision) -> str:
-    """Return a clause about what a decision refers to and does not exist."""
+    """Return a clause that names the missing object of a decision."""
     name = decision.fluoroscope
     if name not in frames:
         return f'there is no fluoroscope {name!r}, only {", ".join(frames)}'

@@ -94,7 +94,7 @@ class RecordedPairing:
         validate_options(self)
 
     def unlimited(self) -> PairingOptions:
-        """Options of a pairer without limits: all frames exist, so none has to be given up."""
+        """Return options without limits: all frames exist, so none has to be given up."""
         return PairingOptions(
             self.pair_by, self.pair_tolerance, waiting=UNLIMITED, patience=UNLIMITED
         )
@@ -106,7 +106,7 @@ class Pairer(Protocol):
     fluoroscopes: tuple[str, ...]
     unpaired: dict[str, int]  #: number of frames that belong to no exposure, by fluoroscope
     late: dict[str, int]  #: number of those frames that arrived too late for their exposure
-    incomplete: int  #: number of exposures that lack a frame of some fluoroscope
+    incomplete: int  #: number of exposures without a frame of every fluoroscope
     silent: frozenset[str]  #: fluoroscopes that are no longer waited for
     stamps: StampAgreement  #: comparison of stamps of frames that were paired by number
 

@@ -132,7 +132,7 @@ class ExposureNumbers:
             if apart > self._tolerance or fluoroscope in exposure[2]:
                 continue
             if nearest is None or apart <= abs(nearest[0] - stamp_ns):
-                nearest = exposure  # of equally near ones the newest: a repeated recording
+                nearest = exposure  # the newest of equally near ones, for repeated recordings
         if nearest is None:
             self._last += 1
             nearest = (stamp_ns, self._last, set())

@@ -48,7 +48,7 @@ def os_error_reason(error: OSError) -> str:
 
 @contextmanager
 def os_errors(path: object, what: str) -> Iterator[None]:
-    """Turn an OSError into a DataError; what says what failed, such as 'cannot be read'."""
+    """Turn an OSError into a DataError; what: the failure, such as 'cannot be read'."""
     try:
         yield
     except OSError as error:

@@ -367,7 +367,7 @@ def stored_verdict(directory: PathLike) -> Verdict:
 
 
 def _digest_of_file(path: Path) -> str:
-    """SHA-256 (hex) of a file, or of the values of a JSON document; '' if there is no file."""
+    """Return SHA-256 (hex) of a file, or of the values of a JSON document; '' without a file."""
     if not path.exists():
         return ''
     if path.suffix == '.json':
@@ -426,7 +426,7 @@ def _edited(directory: PathLike, name: str, consequence: str) -> Finding:
 
 
 def _digest(content: Mapping[str, Any]) -> str:
-    """SHA-256 (hex) of the values of a document, independent of its layout as text."""
+    """Return SHA-256 (hex) of the values of a document, independent of its layout as text."""
     text = json.dumps(_plain(to_json_values(content)), sort_keys=True, separators=(',', ':'))
     return hashlib.sha256(text.encode()).hexdigest()
 

@@ -112,7 +112,7 @@ def _names_text(names: Sequence[str]) -> str:
     return f'Fluoroscopes {" and ".join(names)}, adjusted together'
 
 
-ARROW_SHARE = 0.03  # of the image size, for the 99 % quantile of the residuals
+ARROW_SHARE = 0.03  # arrow of the 99 % quantile of residuals, over the image size
 
 
 def residual_map(residuals: Residuals, name: str, image_size: tuple[int, int]) -> Figure:

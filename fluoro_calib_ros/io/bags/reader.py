@@ -45,7 +45,7 @@ class TopicInfo(NamedTuple):
     """A topic of a bag: type, number of messages, and offered QoS profiles [{policy: value}]."""
 
     type: str
-    count: int  # tuples have a method count
+    count: int  # type: ignore[assignment]  # a tuple has a method count
     offered_qos: list[dict[str, Any]]
 
 

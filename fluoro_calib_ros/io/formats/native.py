@@ -256,7 +256,7 @@ KNOWN_ORIENTATION = Format(
 
 # Known orientations of fluoroscopes as YAML; docs/special_rigs.md describes the file.
 
-VERSION = 1  # of known_orientation.yaml
+VERSION = 1  # version of known_orientation.yaml
 KEYS = ('K', 'R', 't_mm', 'interior_sd_px', 'exterior_sd')
 
 

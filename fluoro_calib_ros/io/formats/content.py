@@ -180,7 +180,7 @@ class Content:
     points: Points | None = None
     bodies: Bodies | None = None
     #: by fluoroscope, the observed column and row of every pixel of the corrected image [px], NaN
-    #: outside the observed image
+    #: without support
     lookups: Mapping[str, np.ndarray] = field(default_factory=dict)
     #: by fluoroscope, the observed u, v and the reference u, v of points of a distortion grid
     grids: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)

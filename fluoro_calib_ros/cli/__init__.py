@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The command fluoro-calib, one module for each command; no ROS is needed."""
+"""The command fluoro-calib, one module for each subcommand; ROS is not needed."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ if TYPE_CHECKING:
     from ..io.rig_file import RigFile
 
 NOT_PASSED = 3  # exit status
-# A command is a module with NAME, HELP, EXAMPLE, add_arguments(parser), run(arguments) and, where
-# arguments depend on each other, check(arguments, error). One that gives a verdict has
-# --exit-zero, and its run returns whether it is pass.
+# A command is a module with NAME, HELP, EXAMPLE, add_arguments(parser), run(arguments) and, if its
+# arguments depend on each other, check(arguments, error). A command that gives a verdict has
+# --exit-zero, and its run returns whether the verdict is pass.
 COMMANDS = (
     simulate,
     phantom,
@@ -72,7 +72,7 @@ COMMANDS = (
 READ_NOTHING = (simulate, phantom, process, watch, bridge)
 
 
-# Groups of options that few need: --help names them, --help-all shows them.
+# Groups of rarely used options: --help names them, --help-all shows them.
 RARE = (
     'bags',
     'files of other programs',
@@ -137,7 +137,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 class _WholeHelp(argparse.Action):
-    """Prints the help with all options, and ends."""
+    """Prints the help with all options, and exits."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: Any, **__: Any) -> None:
         print(argparse.ArgumentParser.format_help(parser), end='')
@@ -145,7 +145,7 @@ class _WholeHelp(argparse.Action):
 
 
 class _Version(argparse.Action):
-    """Prints the versions, which are looked up only then."""
+    """Prints the versions, which are looked up only on demand."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: Any, **__: Any) -> None:
         from ..report.html import versions
@@ -158,7 +158,7 @@ class _Version(argparse.Action):
 
 
 class _Completion(argparse.Action):
-    """Prints the script for a shell, and ends."""
+    """Prints the completion script for a shell, and exits."""
 
     def __call__(
         self,
@@ -177,8 +177,8 @@ def make_parser(
     """Return the parser of the command line.
 
     Only the arguments of `command` are added, by default those of all commands: each command
-    imports the modules that declare its options. rig: gives defaults of the arguments. kind: its
-    class.
+    imports the modules that declare its options. rig: provides defaults of arguments. kind: class
+    of the parser.
     """
     parser = kind(prog='fluoro-calib', description='Self-calibration of X-ray fluoroscopes.')
     parser.add_argument('--version', action=_Version, nargs=0, help='print versions and exit')
@@ -214,10 +214,10 @@ def make_parser(
 def parse_words(
     words: Sequence[str], error: Callable[[str], NoReturn] | None = None
 ) -> argparse.Namespace:
-    """Return the arguments of a command line, checked.
+    """Parse and check the arguments of a command line.
 
-    error is called with a sentence for a wrong one; by default it is printed, and the process
-    exits with 2. Raises DataError for a rig.toml that is wrong.
+    error is called with a sentence for an invalid argument; by default it is printed, and the
+    process exits with 2. Raises DataError for an invalid rig.toml.
     """
 
     class Parser(_Parser):
@@ -242,18 +242,18 @@ def _command_of(words: Sequence[str]) -> str:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line.
 
-    Exit status 0: done, 1: failed for a reason in the data, 2: wrong usage, 3: done, but the
-    verdict is not pass; 130 and 143 after SIGINT and SIGTERM, which leave no unfinished output and
-    no process behind.
+    Exit status 0: success, 1: failure caused by the data, 2: wrong usage, 3: success, but the
+    verdict is not pass; 130 and 143 after SIGINT and SIGTERM, which leave neither unfinished
+    output nor processes behind.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
-    # Without arguments, this process is the command.
+    # Without arguments, this process is the command itself.
     with terminated_by_signals() if arguments is None else contextlib.nullcontext():
         _run(words)
 
 
 def _run(words: list[str]) -> None:
-    """Run the command of these words, and exit with its status if it fails."""
+    """Run the command given by words; exit with its status if that is not 0."""
     command = _command_of(words)
     try:
         options = parse_words(words)
@@ -272,13 +272,13 @@ def _run(words: list[str]) -> None:
         sys.exit(NOT_PASSED)
 
 
-# Completion of the command line in shells, by shtab.
+# Shell completion of the command line, by shtab.
 
 SHELLS = ('bash', 'zsh', 'tcsh')
 
 
 def completion_script(parser: argparse.ArgumentParser, shell: str) -> str:
-    """Return the script that completes a command line. Raises DataError without shtab."""
+    """Return the completion script of a command line. Raises DataError without shtab."""
     try:
         import shtab
     except ImportError:
@@ -291,7 +291,7 @@ def completion_script(parser: argparse.ArgumentParser, shell: str) -> str:
 
 
 def _complete_paths(parser: argparse.ArgumentParser, complete: object) -> None:
-    """Let every argument that is a path be completed as one, in all subcommands."""
+    """Enable path completion for every argument that is a path, in all subcommands."""
     for action in parser._actions:
         if action.type is Path:
             action.complete = complete  # type: ignore[attr-defined]

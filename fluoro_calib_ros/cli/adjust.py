@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> bool:
-    """Adjust and write the result folder; return whether the calibration holds.
+    """Adjust exposures and write the result folder; return whether the calibration holds.
 
     Raises DataError.
     """

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Argument types, and arguments that several commands have in common."""
+"""Argument types, and arguments shared by several commands."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 Parser = argparse.ArgumentParser | argparse._ArgumentGroup
 T = TypeVar('T')
 UNITS = ('mm', 'cm', 'm')
-READ_LIMITS = ('max_file_mb', 'max_image_megapixels', 'max_training_points')  # that are options
+READ_LIMITS = ('max_file_mb', 'max_image_megapixels', 'max_training_points')  # with options
 
 
 def image_size(text: str) -> tuple[int, int]:
@@ -60,7 +60,7 @@ def number_in(low: float, high: float, kind: type = float) -> Callable[[str], An
 
 
 def numbers_of(count: int) -> Callable[[str], tuple[float, ...]]:
-    """Return an argument type: count numbers above 0, separated by commas."""
+    """Return an argument type: `count` positive numbers, separated by commas."""
 
     def convert(text: str) -> tuple[float, ...]:
         try:
@@ -84,7 +84,8 @@ def names(text: str) -> list[str]:
 def add_option(parser: Parser, option: Option, **changes: Any) -> None:
     """Add the argument of a declared option: --name with its choices, default and description.
 
-    One that is False by default is a flag. changes replace keyword arguments of `add_argument`.
+    An option that is False by default becomes a flag. changes replace keyword arguments of
+    `add_argument`.
     """
     settings: dict[str, Any] = {'default': option.default}
     unit = f' [{option.unit}]' if option.unit else ''
@@ -107,7 +108,7 @@ def add_option(parser: Parser, option: Option, **changes: Any) -> None:
 def add_options(
     parser: Parser, kind: type, only: Iterable[str] = (), **changes: dict[str, Any]
 ) -> None:
-    """Add the arguments of the options that a dataclass declares, by default of all of them.
+    """Add the arguments of the options that a dataclass declares: all of them, or `only` some.
 
     changes: keyword arguments of `add_argument`, by option.
     """
@@ -117,7 +118,7 @@ def add_options(
 
 
 def add_address(parser: argparse.ArgumentParser, what: str, port: int) -> None:
-    """Add --host and --port of what a command offers, with a default port."""
+    """Add --host and --port of a server, with a default port; what: name of the server."""
     parser.add_argument(
         '--host',
         default='127.0.0.1',
@@ -142,7 +143,7 @@ def add_orientation(parser: Parser) -> None:
 
 
 def add_oriented_source(parser: argparse.ArgumentParser, options: type, **metavars: str) -> None:
-    """Add what `read_oriented_source` reads, and options with those of `RecordedPairing`."""
+    """Add the inputs of `read_oriented_source`, and options that include `RecordedPairing`."""
     add_source(parser, 'image size of a file [px] (default: that of the calibration)')
     add_bag_options(parser, pairing=False)
     add_calibration(parser)
@@ -154,9 +155,9 @@ def add_oriented_source(parser: argparse.ArgumentParser, options: type, **metava
 def read_oriented_source(
     arguments: argparse.Namespace, path: PathLike
 ) -> tuple[Recording, dict[str, FluoroscopeCalibration], RigOrientation]:
-    """Read a recording, its calibrations and the orientation of the rig in path.
+    """Read a recording, its calibrations, and the orientation of the rig from path.
 
-    Raises DataError, also where the orientation belongs to other calibrations.
+    Raises DataError, also if the orientation belongs to other calibrations.
     """
     from ..io.calibration import load_orientation
     from ..jobs.reconstruction import check_orientation
@@ -180,7 +181,7 @@ def read_oriented_source(
 
 
 def add_out(parser: Parser, text: str, metavar: str = 'DIR') -> None:
-    """Add --out, what is written."""
+    """Add --out, the output."""
     parser.add_argument('--out', required=True, type=Path, metavar=metavar, help=text)
 
 
@@ -204,7 +205,7 @@ def add_clusters(parser: Parser, text: str) -> None:
 def rigid_clusters(
     arguments: argparse.Namespace, error: Callable[[str], NoReturn]
 ) -> tuple[Body, ...]:
-    """Return the bodies of `add_clusters`; call error with a sentence for one that is wrong."""
+    """Return the bodies of `add_clusters`; call error with a sentence for an invalid one."""
     from ..bodies.body import declared_bodies
 
     try:
@@ -223,16 +224,16 @@ def add_exit_zero(parser: Parser) -> None:
 
 
 def options_of(kind: type[T], arguments: argparse.Namespace, **values: Any) -> T:
-    """Return an options dataclass with the values of its arguments, and with other values.
+    """Return an options dataclass from its arguments; values replace them.
 
-    An option without argument has its default. Raises ValueError.
+    An option without an argument keeps its default. Raises ValueError.
     """
     given = {n: getattr(arguments, n) for n in declared(kind) if hasattr(arguments, n)}
     return kind(**{**given, **values})
 
 
 def add_read_limits(parser: argparse.ArgumentParser) -> None:
-    """Add the limits of what a command reads."""
+    """Add the limits for input files."""
     group = parser.add_argument_group('limits of what is read')
     metavar = {'metavar': 'N'}
     add_options(group, ReadLimits, READ_LIMITS, **dict.fromkeys(READ_LIMITS, metavar))
@@ -251,9 +252,9 @@ def _text(default: Any) -> str:
 def add_source(
     parser: argparse.ArgumentParser, image_size_help: str, more: str = ''
 ) -> argparse._ArgumentGroup:
-    """Add SOURCE, --image-size and --fluoroscopes; more: what else SOURCE may be.
+    """Add SOURCE, --image-size and --fluoroscopes; more: further kinds of SOURCE, for the help.
 
-    Returns the group of what is read.
+    Returns the group of the inputs.
     """
     parser.add_argument(
         'source',
@@ -278,7 +279,7 @@ def add_source(
 
 
 def add_bag_options(parser: argparse.ArgumentParser, pairing: bool = True) -> None:
-    """Add what is used of a bag: time window and, where they are not options already, pairing."""
+    """Add the options for bags: time window, angle of the C-arm and, if wanted, pairing."""
     from ..exposures.pairing import RecordedPairing
 
     group = parser.add_argument_group('bags')
@@ -295,7 +296,7 @@ def add_bag_options(parser: argparse.ArgumentParser, pairing: bool = True) -> No
 
 
 def add_angle_options(parser: Parser) -> None:
-    """Add where the angle of the C-arm in the exposures of a bag comes from."""
+    """Add the options for the source of the angle of the C-arm in the exposures of a bag."""
     from ..exposures.angles import AngleOptions
 
     joint = {
@@ -309,7 +310,7 @@ def add_angle_options(parser: Parser) -> None:
 
 
 def angle_options(arguments: argparse.Namespace) -> AngleOptions:
-    """Return the options of `add_angle_options`."""
+    """Return the options added by `add_angle_options`."""
     from ..exposures.angles import AngleOptions
 
     joint = arguments.angle_joint
@@ -319,7 +320,7 @@ def angle_options(arguments: argparse.Namespace) -> AngleOptions:
 
 
 def _angle_joint(text: str) -> str:
-    """Return the option angle_joint as it is, if it is valid."""
+    """Return the option angle_joint unchanged if it is valid."""
     from ..exposures.angles import joints_by_fluoroscope
 
     try:
@@ -330,7 +331,7 @@ def _angle_joint(text: str) -> str:
 
 
 def bag_selection(arguments: argparse.Namespace, pairing: bool = True) -> BagSelection:
-    """Return the selection of `add_bag_options`."""
+    """Return the selection added by `add_bag_options`."""
     from ..jobs.sources import BagSelection
 
     return BagSelection(
@@ -343,7 +344,7 @@ def bag_selection(arguments: argparse.Namespace, pairing: bool = True) -> BagSel
 
 
 def add_file_options(parser: argparse.ArgumentParser) -> None:
-    """Add what files of other programs do not say."""
+    """Add settings for facts that files of other programs do not contain."""
     group = parser.add_argument_group('files of other programs')
     group.add_argument(
         '--units', choices=UNITS, help='unit of lengths, where the format does not say it'
@@ -366,7 +367,7 @@ def add_file_options(parser: argparse.ArgumentParser) -> None:
 
 
 def file_settings(arguments: argparse.Namespace, **changes: Any) -> FileSettings:
-    """Return the settings of `add_file_options`; changes replace some."""
+    """Return the settings added by `add_file_options`; changes replace some of them."""
     from ..io.formats.content import FileSettings
 
     settings: dict[str, Any] = {
@@ -429,7 +430,7 @@ def add_scheduler(parser: argparse.ArgumentParser, task: str = 'extract the imag
 
 
 def cluster_of(arguments: argparse.Namespace) -> Cluster | None:
-    """Return the cluster of the arguments of `add_scheduler`, None without one."""
+    """Return the cluster given by the arguments of `add_scheduler`, None without one."""
     from ..jobs.scheduling import Cluster
 
     if arguments.scheduler is None:
@@ -464,7 +465,7 @@ def add_calibration(parser: Parser) -> None:
 def add_angle(
     parser: Parser, use: str, default: str = 'unknown, the mean correction of its exposures'
 ) -> None:
-    """Add --angle-deg; use: what has this angle."""
+    """Add --angle-deg; use: what the angle applies to, for the help."""
     parser.add_argument(
         '--angle-deg',
         type=number_in(-720, 720),
@@ -475,7 +476,7 @@ def add_angle(
 
 
 def angle_of(arguments: argparse.Namespace) -> float | None:
-    """Angle of the C-arm [rad] that --angle-deg gives, None without it."""
+    """Return the angle of the C-arm [rad] from --angle-deg, None without it."""
     return None if arguments.angle_deg is None else math.radians(arguments.angle_deg)
 
 
@@ -489,7 +490,7 @@ def add_covariance(parser: Parser) -> None:
 
 
 def add_result_folder(parser: argparse.ArgumentParser) -> None:
-    """Add DIR, which --calibration and a rig.toml give as well; see `result_folder`."""
+    """Add DIR, which can also be given as --calibration and by a rig.toml; see `result_folder`."""
     parser.add_argument(
         'directory',
         type=Path,
@@ -503,7 +504,7 @@ def add_result_folder(parser: argparse.ArgumentParser) -> None:
 
 
 def result_folder(arguments: argparse.Namespace, error: Callable[[str], NoReturn]) -> Path:
-    """Return the folder of `add_result_folder`; call error with a sentence where there is none."""
+    """Return the folder of `add_result_folder`; call error with a sentence if there is none."""
     if arguments.directory is None and arguments.calibration is None:
         error('the following arguments are required: DIR')
     folder: Path = arguments.directory or arguments.calibration

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""fluoro-calib bag: record, look into and recover bags."""
+"""fluoro-calib bag: record, play, inspect and recover bags."""
 
 from __future__ import annotations
 
@@ -141,11 +141,11 @@ def _play(arguments: argparse.Namespace) -> None:
 
 
 def become_node(node: str, parameters: Mapping[str, Any]) -> NoReturn:
-    """Replace this process by a node, which gets the signals and gives the exit status."""
+    """Replace this process by a node, which gets its signals and determines the exit status."""
     code = f'from fluoro_calib_ros.entry_points import {node}; {node}()'
     words = ['--ros-args']
     for name, value in parameters.items():
-        words += ['-p', f'{name}:={json.dumps(value)}']  # JSON is YAML
+        words += ['-p', f'{name}:={json.dumps(value)}']  # JSON is valid YAML
     os.execv(sys.executable, [sys.executable, '-c', code, *words])
 
 
@@ -181,7 +181,7 @@ def _topic_document(topic: TopicReport) -> dict[str, Any]:
 
 
 def _damage_text(damage: Damage) -> str:
-    """Return what is gone: the time range, and the topics where they are known."""
+    """Return the lost time range, and the topics if known, as text."""
     if damage.start_ns is None and damage.end_ns is None:
         when = 'all of the file'
     elif damage.end_ns is None:

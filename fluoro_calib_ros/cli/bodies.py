@@ -80,7 +80,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Write poses and joints of a recording. Raises DataError."""
+    """Track the bodies of a recording; write poses and joints. Raises DataError."""
     from ..io.bags.mcap_file import is_bag
     from ..io.bodies import read_bodies, read_joints
     from ..io.calibration import orientation_path
@@ -151,7 +151,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _print(arguments: argparse.Namespace, outcome: BodiesOutcome) -> None:
-    """Print how well poses and joints are known."""
+    """Print a summary of the accuracy of poses and joints."""
     from ..io.result_document import finding_document
 
     summary = outcome.summary()

@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Become the bridge."""
+    """Replace this process by the bridge node."""
     parameters = {'host': arguments.host, 'port': arguments.port}
     if arguments.token:
         parameters['token'] = arguments.token

@@ -178,9 +178,9 @@ def check(arguments: argparse.Namespace, error: Callable[[str], NoReturn]) -> No
 
 
 def run(arguments: argparse.Namespace) -> bool:
-    """Self-calibrate and write the result folder; return whether nothing speaks against it.
+    """Self-calibrate and write the result folder.
 
-    Raises DataError.
+    Returns False if the verdict is not pass, otherwise True. Raises DataError.
     """
     from ..io.calibration_request import write_radiographs
     from ..io.folder import check_output_folder
@@ -214,7 +214,7 @@ def run(arguments: argparse.Namespace) -> bool:
 
 
 def _request(arguments: argparse.Namespace) -> tuple[CalibrationRequest, Radiographs]:
-    """Read what the arguments name, with radiographs of images. Raises DataError."""
+    """Read the inputs named by the arguments, with radiographs of images. Raises DataError."""
     from ..estimation.options import CalibrationOptions, CalibrationRequest
     from ..exposures.names import Names
     from ..io.phantom import has_exposures, read_moving_points
@@ -227,7 +227,7 @@ def _request(arguments: argparse.Namespace) -> tuple[CalibrationRequest, Radiogr
     print_notes((*(() if survey is None else survey.notes), *recording.notes))
     print_unpaired(arguments.source, recording.unpaired)
     if survey is None:
-        # Its targets have an id in every exposure.
+        # Its targets have an id of their own in every exposure.
         frames, phantom = read_moving_points(arguments.phantom).as_phantom(recording.frames)
         names = Names()
     else:
@@ -254,7 +254,7 @@ def _request(arguments: argparse.Namespace) -> tuple[CalibrationRequest, Radiogr
 
 
 def _doses(source: Path) -> dict[str, str]:
-    """Return what DICOM files say of the dose, for the report."""
+    """Return dose information of DICOM files, for the report."""
     from ..jobs.image_sources import contains_images, dose_texts
 
     texts = dose_texts(source) if contains_images(source) else {}
@@ -299,20 +299,20 @@ def _print(arguments: argparse.Namespace, outcome: CalibrationOutcome) -> None:
 
 
 def _next_step(arguments: argparse.Namespace, outcome: CalibrationOutcome) -> tuple[object, ...]:
-    """Return the command that follows: it uses the calibration, or says what is wrong with it."""
+    """Return the next command: it uses the calibration, or validates it."""
     if outcome.validation is None:
         return 'validate', arguments.out
     if outcome.validation.verdict != 'pass':
-        return ()  # the verdict says what to do
+        return ()  # the verdict contains the advice
     if outcome.orientation is None:
         return 'correct', 'POINTS.csv', '--calibration', arguments.out, '--out', 'corrected.csv'
     return 'reconstruct', 'MEASURED', '--calibration', arguments.out, '--out', 'points.csv'
 
 
 def _report(directory: Path) -> str | None:
-    """Write the report and return its path; None where it cannot be written, which is no failure.
+    """Write the report and return its path; None, with a note, if it cannot be written.
 
-    A regressor of the user is not named by files, and the report reads files.
+    This happens with a regressor of the user: the report reads files, which do not name it.
     """
     from ..jobs.report import write_report
 
@@ -325,7 +325,7 @@ def _report(directory: Path) -> str | None:
 
 
 def _extracted(arguments: argparse.Namespace, survey: Survey | None) -> Recording:
-    """Return the observations of images. Raises DataError."""
+    """Return observations extracted from images. Raises DataError."""
     from ..jobs.extraction import recording_of_images
     from ..jobs.image_sources import ImageAngles
 

@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Compare, and draw the figure. Raises DataError."""
+    """Compare two calibrations, and draw the figure if asked for. Raises DataError."""
     from ..io.access import write_bytes
     from ..io.folder import check_output_file
     from ..jobs.report import compare_folders

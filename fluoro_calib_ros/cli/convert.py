@@ -29,11 +29,11 @@ from .output import print_notes, print_result
 NAME = 'convert'
 HELP = 'Convert between this program and others: XMALab, Autoscoper, Anipose, OpenCV, C3D, TRC ...'
 EXAMPLE = 'fluoro-calib convert result --to mayacam2 --out mayacam'
-MAX_RATE = 1e6  # [Hz] no camera is faster
+MAX_RATE = 1e6  # [Hz], above the rate of any camera
 
 
 def _with_meaning(kind: str) -> str:
-    """Return a kind of format and what it is, for the help."""
+    """Return the kind of a format with its title, for the help."""
     from ..io.formats.registry import FORMATS
 
     if kind not in FORMATS:
@@ -87,7 +87,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_selection(parser: argparse.ArgumentParser) -> None:
-    """Add what is converted, and with which calibration."""
+    """Add the arguments that select the content and the calibration."""
     add_image_size(parser, 'where SOURCE does not contain it [px]')
     add_fluoroscopes(parser, 'convert')
     parser.add_argument(
@@ -121,14 +121,14 @@ def check(arguments: argparse.Namespace, error: Callable[[str], NoReturn]) -> No
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Convert. Raises DataError."""
+    """Convert a file or folder. Raises DataError."""
     from ..io.folder import check_output_file
     from ..jobs.conversion import ConversionRequest, convert
 
     inputs = [path for path in (arguments.source, arguments.calibration) if path is not None]
     if arguments.out.resolve() in [path.resolve() for path in inputs]:
         raise DataError(f'{arguments.out}: the input would be overwritten, choose another output')
-    if not arguments.out.is_dir():  # bags and formats of several files make or fill a folder
+    if not arguments.out.is_dir():  # bags and formats with several files create or fill a folder
         check_output_file(arguments.out, inputs)
     written = convert(
         ConversionRequest(

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 NAME = 'correct'
 HELP = 'Correct image points (CSV file) or images (image, TIFF stack, folder or video).'
 EXAMPLE = 'fluoro-calib correct points.csv --calibration result --out corrected.csv'
-POINTS_SUFFIXES = ('.csv', '.txt', '.xma', '.pho', '')  # of files with image points
+POINTS_SUFFIXES = ('.csv', '.txt', '.xma', '.pho', '')  # suffixes of files with image points
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -103,7 +103,7 @@ def run(arguments: argparse.Namespace) -> None:
     if is_image_source(arguments.source):
         _correct_images(arguments, calibrations)
     elif suffix_of(arguments.source) in POINTS_SUFFIXES or not arguments.source.exists():
-        _correct_points(arguments, calibrations)  # reports a missing file
+        _correct_points(arguments, calibrations)  # reports a missing file, too
     else:
         known = listed(('.csv', *READ_SUFFIXES))
         raise DataError(
@@ -183,7 +183,7 @@ def _correct_images(arguments: argparse.Namespace, calibrations: Calibrations) -
 def _print_images(
     arguments: argparse.Namespace, calibration: FluoroscopeCalibration, done: CorrectedImages
 ) -> None:
-    """Print what was corrected."""
+    """Print the summary of a correction of images."""
     from ..images.corrector import ImageCorrector
 
     if done.passed_over:
@@ -221,7 +221,7 @@ def _print_images(
 def _angles_of_images(
     arguments: argparse.Namespace, calibration: FluoroscopeCalibration
 ) -> dict[int, float] | None:
-    """Angles [rad] of the images by number, None where --angles is not given. Raises DataError."""
+    """Return the angles [rad] of images by number, None without --angles. Raises DataError."""
     from ..io.image_reading import read_image_angles
 
     if arguments.angles is None:

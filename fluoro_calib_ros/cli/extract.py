@@ -98,7 +98,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_markers(group: argparse._ArgumentGroup) -> None:
-    """Add what is known of markers that are followed."""
+    """Add the arguments for the extraction of moving markers."""
     from ..images.markers import MarkerOptions
 
     group.add_argument(
@@ -216,7 +216,7 @@ def _run_phantom(arguments: argparse.Namespace) -> None:
 
 
 def _document(out: Path, outcome: ExtractionOutcome) -> dict[str, Any]:
-    """Return the summary that --json prints."""
+    """Return the summary for --json."""
     return {
         'out': str(out),
         'fluoroscope': outcome.fluoroscope,
@@ -241,7 +241,7 @@ def _document(out: Path, outcome: ExtractionOutcome) -> dict[str, Any]:
 
 
 def _text(out: Path, outcome: ExtractionOutcome) -> str:
-    """Return the summary for people."""
+    """Return the summary as text."""
     frames = outcome.frames
     beads = sum(len(frame.target_id) for frame in frames)
     return (
@@ -251,7 +251,7 @@ def _text(out: Path, outcome: ExtractionOutcome) -> str:
 
 
 def _run_markers(arguments: argparse.Namespace) -> None:
-    """Follow markers through images. Raises DataError."""
+    """Track markers through images. Raises DataError."""
     from ..exposures.names import Names
     from ..io.access import check_safe_name
     from ..io.decisions import DOUBTFUL, doubtful_table
@@ -299,7 +299,7 @@ def _run_markers(arguments: argparse.Namespace) -> None:
 
 
 def _marker_request(arguments: argparse.Namespace) -> MarkerRequest:
-    """Read what is known of the markers and the fluoroscopes. Raises DataError."""
+    """Read the inputs of the extraction of markers. Raises DataError."""
     from ..images.markers import MarkerOptions
     from ..io.bodies import read_bodies
     from ..io.calibration import load_orientation, orientation_path
@@ -367,7 +367,7 @@ def _doubt_texts(spans: list[DoubtfulSpan], request: MarkerRequest) -> list[str]
 
 
 def _marker_document(out: Path, outcome: MarkerOutcome) -> dict[str, Any]:
-    """Return the summary that --json prints."""
+    """Return the summary for --json."""
     return {
         'out': str(out),
         'fluoroscopes': {
@@ -398,7 +398,7 @@ def _marker_document(out: Path, outcome: MarkerOutcome) -> dict[str, Any]:
 
 
 def _marker_text(out: Path, outcome: MarkerOutcome) -> str:
-    """Return the summary for people."""
+    """Return the summary as text."""
     lines = []
     for name, results in outcome.results.items():
         found = sum(len(r.markers.target_id) for r in results)

@@ -89,7 +89,7 @@ def run(arguments: argparse.Namespace) -> bool:
 
 
 def _lines(arguments: argparse.Namespace, outcome: HealingOutcome) -> list[str]:
-    """Return what has changed by how much, and what that is good for."""
+    """Return lines about the changes, the resulting accuracy and the verdict."""
     from ..healing.diagnosis import OF_RIG
     from ..jobs.healing import CHANGED_MEANWHILE
 
@@ -117,7 +117,7 @@ def _lines(arguments: argparse.Namespace, outcome: HealingOutcome) -> list[str]:
         lines.append(f'points relative to each other: sd {after} (as calibrated {before})')
         lines.append(f'written to {arguments.out}')
     lines.append(outcome.common_motion.sentence)
-    if outcome.unseen_distortion.passed:  # else it is one of the checks that follow
+    if outcome.unseen_distortion.passed:  # otherwise it is one of the checks that follow
         lines.append(outcome.unseen_distortion.sentence)
     lines += [check.sentence for check in outcome.checks if not check.passed]
     lines.append(styled_verdict(f'Verdict: {outcome.verdict}', outcome.verdict))
@@ -125,7 +125,7 @@ def _lines(arguments: argparse.Namespace, outcome: HealingOutcome) -> list[str]:
 
 
 def _change(value: NDArray[np.float64], sd: NDArray[np.float64]) -> str:
-    """Return changes of an orientation with their standard deviations."""
+    """Return the changes of an orientation with their standard deviations, as text."""
     parts = []
     if value[:6].any():
         shift = ', '.join(f'{v:.2f} (sd {s:.2f})' for v, s in zip(value[:3], sd[:3]))

@@ -26,7 +26,7 @@ MAX_EXPOSURES = 10**6
 
 
 def exposure_numbers(text: str) -> set[int]:
-    """Parse 1,4-6 as a set of numbers."""
+    """Parse 1,4-6 as a set of exposure numbers."""
     out: set[int] = set()
     try:
         for part in text.split(','):
@@ -63,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Write DIR/rig_orientation.npz. Raises DataError."""
+    """Orient the rig and write DIR/rig_orientation.npz. Raises DataError."""
     from ..io.calibration import save_orientation
     from ..io.csv_table import read_names
     from ..io.result_document import orientation_document

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the commands print, and how they end at SIGINT and SIGTERM."""
+"""Output of the commands, and their termination by SIGINT and SIGTERM."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ VERDICTS = {'pass': 'green', 'fail': 'red', 'cannot tell': 'yellow'}
 
 
 def styled(text: str, style: str, stream: TextIO) -> str:
-    """Return a text in a style, on a terminal; as it is elsewhere, and with NO_COLOR.
+    """Return a styled text on a terminal; the plain text elsewhere, and with NO_COLOR.
 
-    https://no-color.org: NO_COLOR counts if it is not empty.
+    https://no-color.org: NO_COLOR applies if it is not empty.
     """
     plain = os.environ.get('NO_COLOR') or os.environ.get('TERM') == 'dumb'
     if not style or plain or not stream.isatty():
@@ -50,7 +50,7 @@ def print_result(
     text: str,
     next_step: Sequence[object] = (),
 ) -> None:
-    """Print a result: as JSON with --json, else as text for people, with the next command."""
+    """Print a result: as JSON with --json, otherwise as text, followed by the next command."""
     if arguments.json:
         from ..io.documents import json_text
 
@@ -68,25 +68,25 @@ def print_note(note: object) -> None:
 
 
 def print_status(text: str) -> None:
-    """Print what a long command is doing on standard error."""
+    """Print the progress of a long command on standard error."""
     print(styled(printable(text), 'dim', sys.stderr), file=sys.stderr)
 
 
 def print_notes(notes: Iterable[object]) -> None:
-    """Print texts and findings on standard error, each once."""
+    """Print texts and findings on standard error, without repetitions."""
     for text in dict.fromkeys(map(str, notes)):
         print_note(text)
 
 
 def print_findings(findings: Iterable[Finding], error: str) -> None:
-    """Print what was found of a calibration on standard error; error begins what is wrong."""
+    """Print the findings on a calibration on standard error; error: prefix of errors."""
     begin = {Severity.NOTE: 'not used: ', Severity.WARNING: '', Severity.ERROR: error}
     for found in sorted(findings, key=lambda one: (1, 0, 2)[one.severity]):
         print_note(f'{begin[found.severity]}{found}')
 
 
 def print_unpaired(source: Path, unpaired: Mapping[str, int]) -> None:
-    """Print the numbers of frames without partner, if there are any."""
+    """Print the numbers of frames without a partner, if there are any."""
     lost = {name: count for name, count in unpaired.items() if count}
     if lost:
         counts = ', '.join(f'{name} {count}' for name, count in lost.items())
@@ -110,7 +110,7 @@ def print_step(step: str, done: int, total: int) -> None:
 class ProgressBar:
     """A progress bar on a terminal, 'name: image 3 of 16'; a context manager.
 
-    Elsewhere it shows nothing. unit is what is counted.
+    It shows nothing elsewhere. unit: name of the counted items.
     """
 
     def __init__(self, name: str, unit: str = 'image') -> None:
@@ -119,7 +119,7 @@ class ProgressBar:
         self._bar: Any = None
 
     def __call__(self, done: int, total: int) -> None:
-        """Show that `done` images of `total` are done, 0 where the total is unknown."""
+        """Show that `done` of `total` items are done; 0 if the total is unknown."""
         if self._bar is None:
             from tqdm import tqdm
 
@@ -144,7 +144,7 @@ class ProgressBar:
             self._bar.close()
 
 
-AGAIN_S = 1.0  # after which an exception that nothing handles is raised again
+AGAIN_S = 1.0  # interval at which an unhandled exception is raised again
 
 
 @contextlib.contextmanager
@@ -152,8 +152,8 @@ def terminated_by_signals() -> Iterator[None]:
     """Raise KeyboardInterrupt at SIGINT, SystemExit at SIGTERM, until the block ends.
 
     Python drops an exception that a signal handler raises in a destructor or in a callback of the
-    garbage collector, and C code may clear it. It is raised again each second, unless it is being
-    handled: what cleans up is not interrupted.
+    garbage collector, and C code may clear it. Therefore it is raised again every second, unless
+    it is being handled: cleanup is not interrupted.
     """
     raised: list[BaseException] = []
 
@@ -178,7 +178,7 @@ def terminated_by_signals() -> Iterator[None]:
 
 
 def _is_handled(raised: list[BaseException]) -> bool:
-    """Return whether the code that runs handles one of these exceptions, or one raised then."""
+    """Return whether the running code handles one of these exceptions, or one raised meanwhile."""
     error = sys.exc_info()[1]
     while error is not None:
         if error in raised:

@@ -17,12 +17,12 @@ from .output import print_result
 NAME = 'phantom'
 HELP = 'Write the phantom file of a regular sheet or block from its drawing, with a picture.'
 EXAMPLE = 'fluoro-calib phantom --hex 45x45 --pitch 7 --diameter 3 --blocked 10,12 sheet.csv'
-MAX_COUNT = 1000  # of places along an axis
+MAX_COUNT = 1000  # maximum number of places along an axis
 PICTURES = ('.svg', '.png')
 
 
 def counts(length: int) -> Callable[[str], tuple[int, ...]]:
-    """Return an argument type: length whole numbers with an x between them."""
+    """Return an argument type: `length` integers separated by x."""
 
     def convert(text: str) -> tuple[int, ...]:
         parts = text.lower().split('x')
@@ -45,7 +45,7 @@ def place(text: str) -> tuple[int, ...]:
 
 
 def pitches(text: str) -> tuple[float, float, float]:
-    """Parse one pitch, or those along x, y and z [mm]."""
+    """Parse one pitch, or the pitches along x, y and z [mm]."""
     try:
         values = [number_in(1e-3, 1e4)(part) for part in text.split(',')]
         x, y, z = values * 3 if len(values) == 1 else values
@@ -113,7 +113,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def check(arguments: argparse.Namespace, error: Callable[[str], NoReturn]) -> None:
-    """Call error with a sentence unless there is one file to write."""
+    """Call error with a sentence unless exactly one output file is given."""
     if (arguments.file is None) == (arguments.out is None):
         error('one file to write is needed: OUT.csv')
     arguments.out = arguments.out or arguments.file

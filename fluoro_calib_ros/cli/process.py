@@ -4,8 +4,8 @@
 """fluoro-calib process: calibrate, and process all trials of a study.
 
 Each step is a command of fluoro-calib as it could be typed in the folder of the study. A step is
-done again only where its options, its inputs or the program have changed. The trials run in
-processes of their own, and a trial that fails does not stop the others.
+repeated only if its options, its inputs or the program have changed. Trials run in separate
+processes, and a failed trial does not stop the others.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ if TYPE_CHECKING:
 NAME = 'process'
 HELP = 'Calibrate, and process all trials of a study: one file in, one table out.'
 EXAMPLE = 'fluoro-calib process knee_study'
-STATE = 'study.json'  # which steps are done, with the digest of what they were done with
+STATE = 'study.json'  # completed steps, with digests of their inputs
 TABLE = 'trials.csv'
 LOG = 'log.txt'
-POLL_S = 0.05  # between looks at the commands that run
+POLL_S = 0.05  # interval between polls of the running commands
 NOT_PASSED = 3  # exit status of a step whose verdict is not pass
 SOURCE = 'source'
 OF_PROCESS = ('out', 'calibration', 'json', 'help', 'help_all', SOURCE)
@@ -71,40 +71,40 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 class Step:
     """A command of a study."""
 
-    trial: str  #: '' for the calibration
-    words: tuple[str, ...]  #: as typed in the folder of the study
-    inputs: tuple[Path, ...]  #: what it reads
+    trial: str  #: name of the trial, '' for the calibration
+    words: tuple[str, ...]  #: command line in the folder of the study, without the program
+    inputs: tuple[Path, ...]  #: files and folders that it reads
     out: Path
 
     @property
     def command(self) -> str:
-        """The name of the command."""
+        """Name of the command."""
         return self.words[0]
 
     @property
     def name(self) -> str:
-        """The name of the step in its trial: of several conversions, with the format."""
+        """Name of the step in its trial; for conversions with the format."""
         suffix = self.out.suffix if self.command == 'convert' else ''
         return f'{self.command}{suffix.replace(".", " ")}'
 
     @property
     def key(self) -> str:
-        """The name of the step in the study."""
+        """Name of the step in the study."""
         return f'{self.trial}: {self.name}'.removeprefix(': ')
 
     @property
     def document(self) -> Path:
-        """Where what it prints with --json is written."""
+        """File for the output of the step with --json."""
         return self.out.parent / f'{self.name.replace(" ", "_")}.json'
 
 
 @dataclass(frozen=True)
 class Done:
-    """What a step has given."""
+    """Result of a step."""
 
     status: int  #: exit status
-    document: Mapping[str, Any]  #: what it prints with --json
-    message: str = ''  #: why it failed, '' where it has not
+    document: Mapping[str, Any]  #: output with --json
+    message: str = ''  #: cause of the failure, '' if there is none
 
     @property
     def ok(self) -> bool:
@@ -116,7 +116,7 @@ Parse = Callable[[Sequence[str], Callable[[str], NoReturn]], argparse.Namespace]
 
 
 def run(arguments: argparse.Namespace) -> bool:
-    """Process a study; return whether all its verdicts are pass. Raises DataError."""
+    """Process a study; return whether all of its verdicts are pass. Raises DataError."""
     from ..io.rig_file import read_study
 
     study = read_study(arguments.study)
@@ -147,7 +147,7 @@ def _process(
     calibration: Sequence[Step],
     trials: Mapping[str, Sequence[Step]],
 ) -> bool:
-    """Do all steps in the working directory, write the table and print it. Raises DataError."""
+    """Run all steps in the working directory, write the table and print it. Raises DataError."""
     from ..io.calibration import stored_verdict
     from ..processes import Programs
 
@@ -190,9 +190,9 @@ def _process(
 
 
 def study_steps(study: StudyFile, parse: Parse) -> tuple[list[Step], dict[str, list[Step]]]:
-    """Return the steps of the calibration, and those of each trial; the options are checked.
+    """Return the steps of the calibration, and those of each trial, with checked options.
 
-    The working directory is the folder of the study. Raises DataError for an option that is wrong.
+    The working directory must be the folder of the study. Raises DataError for an invalid option.
     """
     make = _StepMaker(study, parse)
     first = []
@@ -224,7 +224,7 @@ def _trial_steps(study: StudyFile, trial: Trial, make: _StepMaker) -> Iterator[S
 
 
 class _StepMaker:
-    """Makes steps of the options of a study, and checks them by the parser of the command."""
+    """Creates steps from the options of a study, checked by the parser of the command."""
 
     def __init__(self, study: StudyFile, parse: Parse) -> None:
         self._study = study
@@ -233,7 +233,7 @@ class _StepMaker:
     def __call__(
         self, trial: str, command: str, options: Options, words: Sequence[str], out: Path
     ) -> Step:
-        """Return a step; words: those that the options do not give. Raises DataError."""
+        """Return a step; words: arguments that do not come from the options. Raises DataError."""
         where = f'{self._study.path}, table {command}'
 
         def error(message: str) -> NoReturn:
@@ -258,7 +258,7 @@ class _StepMaker:
 
 
 def _option_words(key: str, value: Any, error: Callable[[str], NoReturn]) -> list[str]:
-    """Return the words of an option on the command line."""
+    """Return an option as words of the command line."""
     word = '--' + key.replace('_', '-')
     if isinstance(value, bool):
         return [word] if value else []
@@ -271,15 +271,15 @@ def _option_words(key: str, value: Any, error: Callable[[str], NoReturn]) -> lis
 
 @dataclass(frozen=True)
 class _Started:
-    """A step that runs."""
+    """A running step."""
 
     step: Step
-    digest: str  #: of what it was started with
+    digest: str  #: digest of its inputs when it was started
     process: subprocess.Popen[Any]
 
 
 class _Work:
-    """Runs steps as programs, and knows those that were done earlier."""
+    """Runs steps as programs, and skips those that were completed earlier."""
 
     def __init__(self, out: Path, programs: Programs, again: bool) -> None:
         from ..io.access import make_folder
@@ -293,7 +293,7 @@ class _Work:
         self._state: dict[str, Any] = read_json(path) if path.exists() and not again else {}
 
     def run(self, chains: Iterable[Sequence[Step]], workers: int) -> None:
-        """Do chains of steps, some at a time; a chain ends at a step that fails."""
+        """Run chains of steps, at most `workers` at a time; a chain stops at a failed step."""
         waiting = deque((place, deque(chain)) for place, chain in enumerate(chains, 1))
         total = len(waiting)
         running: list[tuple[tuple[int, deque[Step]], _Started]] = []
@@ -313,7 +313,7 @@ class _Work:
             time.sleep(POLL_S if running else 0)
 
     def _next(self, chain: deque[Step], place: str) -> _Started | None:
-        """Start the first step of a chain that is not done yet; None where there is none."""
+        """Start the first incomplete step of a chain; return None if there is none."""
         from ..io.access import make_folder
 
         while chain:
@@ -339,7 +339,7 @@ class _Work:
         return None
 
     def _kept(self, step: Step, digest: str) -> Done | None:
-        """Return what a step gave earlier, with the same options, inputs and program."""
+        """Return the earlier result of a step with the same options, inputs and program."""
         from ..io.documents import read_json
 
         entry = self._state.get(step.key)
@@ -350,7 +350,7 @@ class _Work:
         return Done(int(entry['status']), read_json(step.document))
 
     def _ended(self, started: _Started) -> Done:
-        """Note that a step has ended; return what it gave."""
+        """Record the end of a step; return its result."""
         from ..io.documents import read_json, write_json
 
         step = started.step
@@ -369,15 +369,15 @@ class _Work:
 
 
 def _last_line(path: Path) -> str:
-    """Return the last line of a log: what a command says at its end."""
+    """Return the last line of a log, which is the final message of a command."""
     lines = path.read_text(errors='replace').strip().splitlines()
     return shortened(lines[-1]) if lines else 'it ended without a message'
 
 
 def digest_of(step: Step) -> str:
-    """Return a digest of what a step is done with: version, words, and the state of its inputs.
+    """Return a digest of a step: version of the program, words, and state of its inputs.
 
-    The state of a file is its size and the time of its last change, as for make.
+    The state of a file is its size and modification time, as in make.
     """
     program = version('fluoro_calib_ros')
     digest = hashlib.sha256('\0'.join((program, *step.words)).encode())
@@ -393,10 +393,11 @@ def digest_of(step: Step) -> str:
 def trial_row(
     name: str, calibration: str, steps: Iterable[tuple[Step, Done | None]]
 ) -> dict[str, Any]:
-    """Return the row of a trial in the table; calibration: the verdict that holds for it.
+    """Return the row of a trial in the table; calibration: verdict on the calibration.
 
-    The verdict is 'refused' where a command failed, 'fail' where the trial contradicts its
-    calibration, else that of the calibration.
+    The verdict is 'refused' if a command failed, 'fail' if the trial contradicts its calibration,
+    and 'cannot tell' instead of pass if its bodies are doubtful; otherwise that of the
+    calibration.
     """
     row: dict[str, Any] = {'trial': name, 'verdict': calibration, 'cause': ''}
     for step, done in steps:
@@ -412,7 +413,7 @@ def trial_row(
 
 
 def _reconstruction_cells(row: Mapping[str, Any], document: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what a reconstruction adds to the row of a trial."""
+    """Return the cells that a reconstruction adds to the row of a trial."""
     drift = document.get('drift') or {}
     cells = {
         'frames': document['frames'],
@@ -432,7 +433,7 @@ def _reconstruction_cells(row: Mapping[str, Any], document: Mapping[str, Any]) -
 
 
 def _bodies_cells(row: Mapping[str, Any], document: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what poses and joints add to the row of a trial."""
+    """Return the cells that poses and joints add to the row of a trial."""
     cells: dict[str, Any] = {}
     for name, body in document['bodies'].items():
         cells |= {f'{name}_{key}': body[key] for key in ('poses', 'sd_mm', 'sd_deg')}

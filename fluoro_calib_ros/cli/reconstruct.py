@@ -68,7 +68,7 @@ def check(arguments: argparse.Namespace, error: Callable[[str], NoReturn]) -> No
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Write the points of a recording. Raises DataError."""
+    """Reconstruct the points of a recording and write them. Raises DataError."""
     from ..io.access import write_bytes
     from ..io.bags.mcap_file import is_bag
     from ..io.bodies import write_reconstruction
@@ -119,7 +119,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _print(arguments: argparse.Namespace, outcome: ReconstructionOutcome) -> None:
-    """Print what was reconstructed."""
+    """Print the summary of a reconstruction."""
     from ..io.result_document import drift_document, finding_document, orientation_document
 
     counts = outcome.status_counts

@@ -28,14 +28,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def check(arguments: argparse.Namespace, error: Callable[[str], NoReturn]) -> None:
-    """Find the result folder; call error with a sentence where none is given."""
+    """Find the result folder; call error with a sentence if none is given."""
     arguments.directory = result_folder(arguments, error)
     if arguments.pdf and arguments.directory.suffix == '.pdf':
         error(f'--pdf writes DIR/report.pdf; it takes no name, such as {arguments.directory}')
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Write DIR/report.html, and print it. Raises DataError."""
+    """Write DIR/report.html, with --pdf also DIR/report.pdf. Raises DataError."""
     from ..jobs.report import print_page, write_report
     from ..jobs.result_folder import REPORT_PDF
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ..io.rig_file import NAME, RigFile, read_rig_file
 
-# Arguments whose default a rig.toml gives, by command; `out` is the key calibration.
+# Arguments with a default from rig.toml, by command; `out` has the key calibration.
 _ANGLE = ('angle_joint', 'angle_max_age')
 _IMAGES = ('fluoroscopes', 'image_size', *_ANGLE)
 _SOURCE = (*_IMAGES, 'units', 'phantom_sd')
@@ -20,24 +20,24 @@ USED = {
     'calibrate': (*_SOURCE, 'phantom', 'out'),
     'adjust': (*_SOURCE, 'phantom', 'calibration'),
     'correct': ('calibration',),
-    'survey': _SOURCE,  # its --phantom is a rough one, and its --out is not the rig's folder
+    'survey': _SOURCE,  # its --phantom is a rough one, and its --out is not the folder of the rig
     'validate': ('calibration', *_ANGLE),
     'report': ('calibration',),
     'orient': (*_SOURCE, 'phantom', 'calibration'),
     'reconstruct': (*_SOURCE, 'calibration'),
-    'convert': _IMAGES,  # --units is that of its output, too
-    'watch': (),  # what it says about the rig
+    'convert': _IMAGES,  # --units also applies to its output
+    'watch': (),  # only the table [about]
 }
 
 
 class JointOfRig(str):
-    """Value of angle_joint that nobody has typed: not every source has these joints."""
+    """Value of angle_joint that the user has not typed: not every source has these joints."""
 
 
 def find_rig(words: Sequence[str], command: str) -> RigFile | None:
     """Return the file of --rig, else the rig.toml of the working directory, else None.
 
-    Raises DataError for a file that is wrong.
+    Raises DataError for an invalid file.
     """
     if command not in USED:
         return None
@@ -45,7 +45,7 @@ def find_rig(words: Sequence[str], command: str) -> RigFile | None:
     parser.add_argument('--rig', type=Path)
     try:
         given = parser.parse_known_args(list(words))[0].rig
-    except argparse.ArgumentError:  # the parser of the command says what is wrong
+    except argparse.ArgumentError:  # the parser of the command reports the error
         return None
     if given is None and Path(NAME).is_file():
         given = Path(NAME)
@@ -53,7 +53,7 @@ def find_rig(words: Sequence[str], command: str) -> RigFile | None:
 
 
 def add_rig(parser: argparse.ArgumentParser, command: str, rig: RigFile | None) -> None:
-    """Add --rig to the parser of a command, and make the values of the rig its defaults."""
+    """Add --rig to the parser of a command, and use the values of the rig as defaults."""
     if command not in USED:
         return
     parser.add_argument(

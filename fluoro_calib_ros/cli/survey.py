@@ -38,7 +38,7 @@ OPTIONS = ('model', 'loss', 'max_iterations', 'interior_sd')
 
 
 def distance(text: str) -> tuple[str, str, float, float]:
-    """Parse A,B,MM,SD as two beads and numbers."""
+    """Parse A,B,MM,SD as two beads, a length and its standard deviation."""
     parts = [part.strip() for part in text.split(',')]
     try:
         first, second, length, sd = parts
@@ -86,7 +86,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Write the surveyed phantom. Raises DataError, also for the verdict 'fail'."""
+    """Survey a phantom and write it. Raises DataError, also for the verdict 'fail'."""
     from ..estimation.options import CalibrationOptions
     from ..io.phantom import write_phantom
     from ..jobs.sources import read_source, read_survey
@@ -131,7 +131,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _distances(arguments: argparse.Namespace, names: Names) -> list[MeasuredDistance]:
-    """Return the distances of the arguments by target ids. Raises DataError."""
+    """Return the distances of the arguments, with target ids. Raises DataError."""
     from ..estimation.survey import MeasuredDistance
 
     def target(bead: str) -> int:

@@ -59,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def check(arguments: argparse.Namespace, error: Callable[[str], NoReturn]) -> None:
-    """Find the result folder; call error with a sentence where none is given."""
+    """Find the result folder; call error with a sentence if none is given."""
     arguments.directory = result_folder(arguments, error)
 
 
@@ -106,7 +106,7 @@ def run(arguments: argparse.Namespace) -> bool:
 
 
 def _request(arguments: argparse.Namespace, calibrations: Calibrations) -> CalibrationRequest:
-    """Read what the calibrations were made from, in the folder or where it is given."""
+    """Read the inputs of the calibrations, from the folder or the given files."""
     from ..estimation.options import CalibrationRequest
     from ..io.calibration import PHANTOM
     from ..io.calibration_request import read_request
@@ -137,5 +137,5 @@ def _request(arguments: argparse.Namespace, calibrations: Calibrations) -> Calib
     saved = arguments.directory / PHANTOM
     if frames is not None and (phantom is not None or saved.exists()):
         given = CalibrationRequest(frames, phantom or read_phantom(saved))
-        frames = without_unusable(given)[0].frames  # as `calibrate` has taken them
+        frames = without_unusable(given)[0].frames  # excluded as in `calibrate`
     return read_request(arguments.directory, calibrations, frames, phantom)

@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Replace this process by the dashboard, which has the terminal to itself."""
+    """Replace this process by the dashboard, which then owns the terminal."""
     words = ['--once'] if arguments.once else []
     if arguments.web:
         about = (arguments.rig_file and arguments.rig_file.about) or {}
@@ -56,7 +56,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def tube_load(about: Mapping[str, str]) -> float:
-    """Return the tube load of a frame by a rig.toml: mAs, or mA and ms; 0 where it is unknown."""
+    """Return the tube load of a frame from a rig.toml: mAs, or mA and ms; 0 if unknown."""
     try:
         if 'mAs' in about:
             return float(about['mAs'])

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Processes of the demonstration, and how good its live results are against the true rig."""
+"""Processes of the demonstration, and the accuracy of its live results against the true rig."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ FIRST_PARTICIPANT = 10  # offset of the unicast ports of a domain
 class NodeProcesses(Programs):
     """Node processes that end together; a context manager.
 
-    log_directory: the output of each node goes to NAME.log in it. namespace: of the nodes; with
-    one, the log is NAMESPACE_NAME.log.
+    log_directory: folder for the output of each node, NAME.log. namespace: namespace of the nodes;
+    if given, the log is NAMESPACE_NAME.log.
     """
 
     def __init__(self, log_directory: Path, namespace: str = '') -> None:
@@ -44,7 +44,7 @@ class NodeProcesses(Programs):
     def start(
         self, name: str, parameters: Mapping[str, object] | None = None
     ) -> subprocess.Popen[Any]:
-        """Start the node fluoro_calib_ros.nodes.NAME with parameters; returns the process."""
+        """Start the node fluoro_calib_ros.nodes.NAME with parameters; return the process."""
         arguments = ['--ros-args']
         for key, value in (parameters or {}).items():
             arguments += ['-p', f'{key}:={value}']
@@ -59,9 +59,9 @@ class NodeProcesses(Programs):
 
 
 def isolate_ros_graph() -> None:
-    """Keep this process and its children on this machine and in a free ROS domain.
+    """Restrict this process and its children to this machine and a free ROS domain.
 
-    Environment variables that are set already are left as they are.
+    Environment variables that are already set remain unchanged.
     """
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     if 'ROS_DOMAIN_ID' not in os.environ:
@@ -71,7 +71,7 @@ def isolate_ros_graph() -> None:
 
 
 def _is_free(domain: int) -> bool:
-    """Return whether nobody on this machine uses a ROS domain."""
+    """Return whether no process on this machine uses a ROS domain."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as port:
         try:
             port.bind(('', DISCOVERY_PORT + PORTS_PER_DOMAIN * domain + FIRST_PARTICIPANT))
@@ -82,26 +82,26 @@ def _is_free(domain: int) -> bool:
 
 # Frames and source timestamps [ns] by (fluoroscope, frame number); frames have target_id, u and v.
 Frames = Mapping[tuple[str, int], tuple[Any, int]]
-IMAGE_CENTRE = 511.5  # [px] of the images of the virtual rig
+IMAGE_CENTRE = 511.5  # [px], for images of the virtual rig
 IMAGE_SCALE = 512.0
 
 
 @dataclass(frozen=True)
 class SpaceFigures:
-    """Accuracy and latency of the points in space."""
+    """Accuracy and latency of reconstructed points."""
 
-    rmse_mm: float  #: against the true markers, after the rotation and shift that fit best
-    normalised: float  #: mean square of a coordinate's error over its variance
-    good_fraction: float  #: part of the points that were intersected
+    rmse_mm: float  #: against the true markers, after the best-fitting rotation and shift
+    normalised: float  #: mean ratio of the squared error of a coordinate to its variance
+    good_fraction: float  #: fraction of points that were intersected
     exposures: int
-    #: median, from the publication of the frames by the player to that of the points
+    #: median, from publication of the frames by the player to publication of the points
     latency_ms: float
 
 
 def latencies_ms(sent: Frames, corrected: Frames) -> NDArray[np.float64]:
     """Return the latency of every corrected frame [ms].
 
-    It runs from the publication of the frame by the player to that of its correction.
+    It is the time from publication of the frame by the player to publication of its correction.
     """
     return np.array([(corrected[key][1] - sent[key][1]) * 1e-6 for key in corrected])
 
@@ -111,9 +111,9 @@ def image_errors(
 ) -> dict[str, tuple[float, float]]:
     """Return the RMSE of the observed and of the corrected markers by fluoroscope [px].
 
-    A calibration is known up to a rotation of the sensor and what corresponds to it in the
-    interior orientation. So a projective map of the image to the truth is fitted first, for the
-    observed markers as for the corrected ones.
+    A calibration is determined up to a rotation of the sensor and the corresponding change of the
+    interior orientation. Therefore a projective map from the image to the truth is fitted first,
+    for both observed and corrected markers.
     """
     rig = json.loads((bags / 'truth' / 'rig.json').read_text())['fluoroscopes']
     truth = _true_markers(bags)
@@ -139,7 +139,7 @@ def image_errors(
 def calibration_errors(bags: Path, calibrations: Calibrations) -> dict[str, float]:
     """Return the RMSE of the true markers, observed without noise and corrected [px].
 
-    By fluoroscope, after the best projective map, as for image_errors().
+    By fluoroscope, after the best projective map as in image_errors().
     """
     rig = json.loads((bags / 'truth' / 'rig.json').read_text())['fluoroscopes']
     points = np.array(list(_true_markers(bags).values()))
@@ -163,7 +163,7 @@ def calibration_errors(bags: Path, calibrations: Calibrations) -> dict[str, floa
 def space_figures(
     bags: Path, points: Sequence[tuple[Any, int]], sent: Frames, first: str
 ) -> SpaceFigures:
-    """Return the figures of the points in space.
+    """Return the accuracy and latency of reconstructed points.
 
     Parameters
     ----------
@@ -172,7 +172,7 @@ def space_figures(
     points : sequence of (GoodPoints, int)
         Points and their source timestamps [ns].
     sent : mapping
-        Frames that the player has published.
+        Frames published by the player.
     first : str
         First fluoroscope, whose frame numbers the points have.
     """

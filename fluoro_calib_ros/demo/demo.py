@@ -39,13 +39,13 @@ from .image_twin import (
     comparison_table,
 )
 
-QUIET_S = 3.0  # after which no more messages are expected
+QUIET_S = 3.0  # time without messages after which a stream has ended
 
 
 def run_graph(bags: Path, out: Path, client: DemoClient, knee: LiveKnee) -> int:
     """Run the graph from the first exposure to the last corrected frame.
 
-    Returns the number of corrected frames that were lost. Raises DemoError.
+    Returns the number of lost corrected frames. Raises DemoError.
     """
     _clear(out)
     recorded = _frame_counts(bags / 'calibration')
@@ -96,7 +96,7 @@ def wait_for_stream(
     nodes: NodeProcesses,
     tracked: Mapping[str, int],
 ) -> None:
-    """Wait until all frames have come out, or the player has ended and nothing comes any more.
+    """Wait until all frames have arrived, or the player has ended and no more messages arrive.
 
     tracked: number of frames by fluoroscope. Raises DemoError.
     """
@@ -117,28 +117,28 @@ def wait_for_stream(
         return complete or bool(nodes.failed()) or time.monotonic() > quiet_since + QUIET_S
 
     client.wait(is_over, 120, 'the end of the stream')
-    for key in client.corrected.keys() - client.sent.keys():  # without its source, no latency
+    for key in client.corrected.keys() - client.sent.keys():  # no latency without the source frame
         del client.corrected[key]
 
 
 def report(
     bags: Path, out: Path, client: DemoClient, lost: int, start: float, texts: Sequence[str]
 ) -> bool:
-    """Write and print the table; returns whether live and offline calibration are identical.
+    """Write and print the table; return whether live and offline calibration are identical.
 
-    The figures need the residuals, so the bag is calibrated once more without ROS.
+    The figures need the residuals, so the bag is calibrated again without ROS.
 
     Parameters
     ----------
     bags, out : Path
     client : DemoClient
-        With what it has recorded.
+        With the messages that it has recorded.
     lost : int
         Number of corrected frames that did not arrive.
     start : float
         Monotonic time of the start of the demonstration [s].
     texts : sequence of str
-        Line of the knee, and table of the calibrations from coordinates and from images.
+        Line on the knee, and table of the calibrations from coordinates and from images.
     """
     print('6  the same bag without ROS, figures and table')
     frames, _ = collect_recorded(read_frames(bags / 'calibration').frames)
@@ -200,7 +200,7 @@ def _image_lines(bags: Path, client: DemoClient, job: CalibrationResult) -> list
 
 
 def _space_line(bags: Path, client: DemoClient) -> str:
-    """Return the figures of the points in space in one line."""
+    """Return the accuracy of reconstructed points in one line."""
     space = space_figures(bags, client.good_points(), client.sent, client.names[0])
     return (
         f'In space: {space.exposures} exposures, {100 * space.good_fraction:.1f} % of the points; '
@@ -210,7 +210,7 @@ def _space_line(bags: Path, client: DemoClient) -> str:
 
 
 def _clear(out: Path) -> None:
-    """Make the folder of the results, and delete the logs and calibrations of an earlier run."""
+    """Create the folder of the results; delete logs and calibrations of an earlier run."""
     out.mkdir(parents=True, exist_ok=True)
     for old in (*out.glob('*.log'), *(out / 'calibration').glob('*.calibration.npz')):
         old.unlink()
@@ -242,7 +242,7 @@ def _raise_if_failed(nodes: NodeProcesses, out: Path) -> None:
 
 
 def default_bags() -> Path:
-    """Return the folder bags of the working directory, or the one installed in a workspace."""
+    """Return the folder bags in the working directory, or the one installed in a workspace."""
     here = Path('bags')
     prefixes = filter(None, os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep))
     installed = [Path(prefix) / 'share' / 'fluoro_calib_ros' / 'bags' for prefix in prefixes]
@@ -250,7 +250,7 @@ def default_bags() -> Path:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the demonstration; exit status 0 when all of it worked."""
+    """Run the demonstration; exit with status 0 if all of it worked."""
     parser = argparse.ArgumentParser(prog='fluoro_calib_demo', description=__doc__)
     parser.add_argument(
         '--bags',

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Twins of the recorded rig: its radiographs are extracted, and a virtual knee lands in it."""
+"""Radiographs of the recorded virtual rig for extraction, and a virtual knee that lands in it."""
 
 from __future__ import annotations
 
@@ -40,23 +40,23 @@ from ..simulation.rig import VirtualRig, simulate_exposures, virtual_rig
 from .assessment import NodeProcesses, calibration_errors
 
 NAMESPACE = 'images'
-EXPOSURES = 6  # of those of the bag
+EXPOSURES = 6  # number of exposures of the bag that are rendered
 START_NS = 1_700_000_000_000_000_000
 INTERVAL_NS = 500_000_000
 
 
 @dataclass(frozen=True)
 class RecordedRig:
-    """The virtual rig that the bags were made with."""
+    """The virtual rig with which the bags were made."""
 
     rig: VirtualRig
     seed: int
-    noise_px: float  #: of an image coordinate
+    noise_px: float  #: standard deviation of an image coordinate
     exposures: int
 
     @classmethod
     def of(cls, bags: Path, names: Sequence[str]) -> RecordedRig:
-        """Return the rig of fluoroscopes that the truth in a folder of bags names."""
+        """Return the rig of fluoroscopes described by the truth in a folder of bags."""
         made_with = json.loads((bags / 'truth' / 'rig.json').read_text())['made_with']
         return cls(
             virtual_rig(made_with['seed'], made_with['strength'], names),
@@ -67,7 +67,7 @@ class RecordedRig:
 
 
 class ImageTwin:
-    """Renders a twin of the calibration bag that is made of images, in a thread.
+    """Renders radiographs for a copy of the calibration bag, in a thread.
 
     recorded: the virtual rig of the bags. out: bag to write.
     """
@@ -78,7 +78,7 @@ class ImageTwin:
         exposures = recorded.exposures
         self._poses = simulate_exposures(self._rig, exposures, recorded.seed).poses
         self.numbers = np.unique(np.linspace(0, exposures - 1, EXPOSURES).astype(int))
-        # A point source is rendered in half the time.
+        # A point source takes half the time to render.
         settings = replace(SETTINGS['clean'], bits=8, focal_spot_mm=0.0)
         self._renderers = Renderers(self._rig.fluoroscopes, settings)
         self._error: BaseException | None = None
@@ -101,7 +101,7 @@ class ImageTwin:
     def _run(self) -> None:
         try:
             _write_images(self.bag, self._rig, self._scenes(), self._renderers)
-        except Exception as error:  # told by wait()
+        except Exception as error:  # raised by wait()
             self._error = error
         finally:
             self._renderers.close()
@@ -141,7 +141,7 @@ def _write_images(
 def calibrate_from_images(
     twin: ImageTwin, bags: Path, out: Path, client: DemoClient
 ) -> Calibrations:
-    """Play the twin through the extraction node into another calibration node, and calibrate.
+    """Play the rendered bag through the extraction node into another calibration node; calibrate.
 
     client: in the namespace of the images. Raises DemoError.
     """
@@ -172,7 +172,7 @@ def calibrate_from_images(
 
 
 def comparison_table(bags: Path, names: Sequence[str], ways: Mapping[str, Calibrations]) -> str:
-    """Return a table of the calibrations by coordinates and by images, with the truth."""
+    """Return a table of the calibrations from coordinates and from images, against the truth."""
     head = [
         'fluoroscope',
         'from',
@@ -201,7 +201,7 @@ def comparison_table(bags: Path, names: Sequence[str], ways: Mapping[str, Calibr
     return markdown_table(head, sorted(rows))
 
 
-PLAYED = 0.2  # of the speed of the recording, for a machine with two cores
+PLAYED = 0.2  # speed relative to the recording, for a machine with two cores
 
 
 class LiveKnee:
@@ -223,7 +223,7 @@ class LiveKnee:
         write_bag(self.bag, frames)
 
     def assess(self, messages: Sequence[Any], picture: Path) -> str:
-        """Draw the live angles of JointAngles, and return how good they are in one line."""
+        """Draw the live angles of JointAngles messages; return their accuracy as one line."""
         number = np.array([message.frame_number for message in messages])
         metres = np.repeat([1.0, 1e3], 3)
         covariance = np.array([message.covariance for message in messages]).reshape(-1, 6, 6)

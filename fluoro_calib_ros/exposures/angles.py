@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Angle of the C-arm in an exposure: where a joint was when it was taken.
+"""Angle of the C-arm in an exposure, from the position of a joint.
 
-The rule is the same live and for a bag. The angle of an exposure is the position of the joint in
-its last state at or before the stamp of the exposure, if that state is no older than
-`angle_max_age`; else it is unknown. Stamps decide, not the order in which messages arrive. There
-is no interpolation: the state after an exposure comes later than the exposure itself, and no
-frame waits for it.
+The same rule applies to live streams and bags. The angle of an exposure is the position of the
+joint in its last state at or before the stamp of the exposure, if that state is no older than
+`angle_max_age`; otherwise it is unknown. Stamps decide, not the order in which messages arrive.
+There is no interpolation: the state after an exposure arrives later than the exposure itself, and
+no frame waits for it.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ import numpy as np
 from ..options import option, validate_options
 from .frame import MAX_ANGLE, angle_in_degrees
 
-CAPACITY = 10_000  # states of a joint that a live track keeps
+CAPACITY = 10_000  # maximum number of states of a joint in a live track
 
 
 @dataclass(frozen=True)
 class AngleOptions:
-    """Where the angle of the C-arm comes from. Raises ValueError for what cannot be.
+    """Source of the angle of the C-arm. Raises ValueError for an invalid value.
 
-    of_rig: the joints are those of a whole rig (rig.toml), of which a recording may have some
-    fluoroscopes only, or no times.
+    of_rig: the joints are those of a whole rig (rig.toml); a recording may contain only some of
+    its fluoroscopes, or no times.
     """
 
     angle_joint: str = option(
@@ -56,8 +56,8 @@ class AngleOptions:
     def joints(self, fluoroscopes: Iterable[str], others: bool = False) -> dict[str, str]:
         """Return the joint of each fluoroscope that has one.
 
-        Raises ValueError where a joint is given for another fluoroscope, unless there may be
-        others.
+        Raises ValueError if a joint is given for another fluoroscope, unless of_rig or others is
+        set.
         """
         names = tuple(fluoroscopes)
         given = joints_by_fluoroscope(self.angle_joint)
@@ -73,14 +73,14 @@ class AngleOptions:
         return given
 
     def tracks(self, fluoroscopes: Iterable[str], capacity: int | None = CAPACITY) -> JointAngles:
-        """Return what follows the joints of fluoroscopes. Raises ValueError."""
+        """Return the joint angles of fluoroscopes, without states yet. Raises ValueError."""
         return JointAngles(self.joints(fluoroscopes), self.angle_max_age, capacity)
 
 
 def joints_by_fluoroscope(text: str) -> str | dict[str, str]:
-    """Return the joint of all fluoroscopes, or one for each, from an option.
+    """Parse an option: return the joint of all fluoroscopes, or one for each.
 
-    'carm' is of all, 'a:frontal,b:lateral' of each. Raises ValueError.
+    'carm' applies to all, 'a:frontal,b:lateral' to each. Raises ValueError.
     """
     if ':' not in text:
         if ',' in text:
@@ -98,11 +98,11 @@ def joints_by_fluoroscope(text: str) -> str | dict[str, str]:
 class AngleTrack:
     """Positions of a joint by stamp.
 
-    A position that is not finite, or is no angle in radians, counts as unknown. A state older than
-    max_age_s gives no angle. The newest `capacity` states are kept, all for None; a state before
-    all that are kept means that the clock was set back, and the track begins again. late counts
-    the states that were added after an angle at or after their stamp had been asked for: it would
-    have been another one.
+    A position that is not finite, or not an angle in radians, counts as unknown. A state older
+    than max_age_s gives no angle. The newest `capacity` states are kept, all for None. A state
+    earlier than all kept ones means that the clock was set back; the track then starts anew. late
+    counts the states that were added after the angle at or after their stamp had been requested:
+    the answer would have been different.
     """
 
     def __init__(self, max_age_s: float, capacity: int | None = CAPACITY) -> None:
@@ -115,9 +115,9 @@ class AngleTrack:
         self.late = 0
 
     def add(self, stamp_ns: int, angle: float) -> None:
-        """Add a state: angle [rad], rounded as that of a `Frame`.
+        """Add a state: angle [rad], rounded like that of a `Frame`.
 
-        A second one with the same stamp replaces the first.
+        A second state with the same stamp replaces the first.
         """
         angle = float(np.radians(angle_in_degrees(angle)))
         if not abs(angle) <= MAX_ANGLE:
@@ -140,7 +140,7 @@ class AngleTrack:
             self._is_cut = True
 
     def at(self, stamp_ns: int) -> float | None:
-        """Return the angle at a time [rad], None where it is unknown."""
+        """Return the angle at a time [rad], None if unknown."""
         self._asked = stamp_ns
         place = bisect_right(self._stamps, stamp_ns) - 1
         if place < 0 or stamp_ns - self._stamps[place] > self._max_age_ns:
@@ -149,7 +149,7 @@ class AngleTrack:
         return None if math.isnan(angle) else angle
 
     def doubt(self, stamp_ns: int) -> str:
-        """Return why the angle at a time is unknown, '' where it is known."""
+        """Return why the angle at a time is unknown, '' if it is known."""
         if not self._stamps:
             return 'it has no state yet'
         place = bisect_right(self._stamps, stamp_ns) - 1
@@ -175,8 +175,7 @@ class AngleTrack:
 class JointAngles:
     """Angles of the C-arms of fluoroscopes, from the states of their joints.
 
-    joints by fluoroscope; several may have the same one. max_age_s and capacity as in
-    `AngleTrack`.
+    joints by fluoroscope; several may share a joint. max_age_s and capacity as in `AngleTrack`.
     """
 
     def __init__(
@@ -186,7 +185,7 @@ class JointAngles:
         self._tracks = {joint: AngleTrack(max_age_s, capacity) for joint in joints.values()}
 
     def add(self, stamp_ns: int, names: Sequence[str], positions: Sequence[float]) -> None:
-        """Add the states of joints: positions [rad], empty where they are not told.
+        """Add the states of joints: positions [rad], empty if unknown.
 
         Other joints are ignored.
         """
@@ -198,17 +197,17 @@ class JointAngles:
                 track.add(stamp_ns, float(position))
 
     def at(self, fluoroscope: str, stamp_ns: int) -> float | None:
-        """Return the angle of a fluoroscope at a time [rad], None where it is unknown."""
+        """Return the angle of a fluoroscope at a time [rad], None if unknown."""
         joint = self.joints.get(fluoroscope)
         return None if joint is None else self._tracks[joint].at(stamp_ns)
 
     def late(self, fluoroscope: str) -> int:
-        """Return the number of states that came after an exposure that needed them."""
+        """Return the number of states that arrived after an exposure that needed them."""
         joint = self.joints.get(fluoroscope)
         return 0 if joint is None else self._tracks[joint].late
 
     def doubt(self, fluoroscope: str, stamp_ns: int) -> str:
-        """Return a clause that says why an angle is unknown, '' where it is known."""
+        """Return a clause that says why an angle is unknown, '' if it is known."""
         joint = self.joints.get(fluoroscope)
         if joint is None:
             return 'parameter angle_joint names no joint'

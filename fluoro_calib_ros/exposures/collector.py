@@ -3,10 +3,10 @@
 
 """Collect exposures from streams of frames: pair them, wait until the phantom stands still.
 
-Exposures of a phantom that stands still count as one (`without_repeats`). The frames of a film of
-a standing phantom differ by a part of their noise only: their errors of extraction, which depend
-on what is round a bead, are the same. Taken as so many exposures they would be believed more than
-they know, and take their time. Their mean is one exposure.
+Exposures of a phantom that stands still count as one (`without_repeats`). Frames of a film of a
+standing phantom differ only by part of their noise: extraction errors caused by the surroundings
+of a bead are the same in all of them. Taken as separate exposures they would get too much weight,
+and cost computing time. Therefore they are replaced by their median, one exposure.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from ..options import option
 from .frame import Frame, Frames, cells_of
 from .pairing import CompletePairer, PairingOptions, RecordedPairing
 
-MIN_COMMON_TARGETS = 8  # with fewer targets in common two frames cannot be compared
-MAX_RECENT = 1000  # pairs that are remembered
-MAX_RECENT_RADIOGRAPHS = 32  # of a fluoroscope, whose frames may come later
-MAX_GAP = 10  # a gap in a stream is at most this many times the still time
+MIN_COMMON_TARGETS = 8  # two frames with fewer common targets cannot be compared
+MAX_RECENT = 1000  # maximum number of remembered pairs
+MAX_RECENT_RADIOGRAPHS = 32  # maximum per fluoroscope, while their frames are pending
+MAX_GAP = 10  # longest gap in a stream, as a multiple of the still time
 
-COLLECT_MODES = ('auto', 'all', 'still')  # of recordings
+COLLECT_MODES = ('auto', 'all', 'still')  # modes for recordings
 
 Pair = Mapping[str, Frame]
 
@@ -38,7 +38,7 @@ Pair = Mapping[str, Frame]
 def displacement(one: Frame, other: Frame) -> float:
     """Return the median displacement [px] of the targets that two frames have in common.
 
-    Infinite for fewer than MIN_COMMON_TARGETS common targets.
+    It is infinite for fewer than MIN_COMMON_TARGETS common targets.
     """
     _, in_one, in_other = np.intersect1d(
         one.target_id, other.target_id, assume_unique=True, return_indices=True
@@ -50,10 +50,10 @@ def displacement(one: Frame, other: Frame) -> float:
 
 @dataclass(frozen=True)
 class StillOptions:
-    """When the phantom counts as standing still in a new pose.
+    """Criteria for a phantom that stands still in a new pose.
 
-    Frames further apart than still_time_s are single shots, each of which counts; but not after a
-    gap in a stream, up to ten times as long.
+    Frames further apart than still_time_s are single shots, each of which counts; except after a
+    gap in a stream of up to ten times still_time_s.
     """
 
     still_time_s: float = option(
@@ -82,8 +82,8 @@ class StillOptions:
 class ExposureCollector:
     """Exposures collected from paired frames.
 
-    exposures are the collected pairs, coverage that of the image by fluoroscope, which grows with
-    them.
+    exposures: the collected pairs; coverage: covered part of the image by fluoroscope, which grows
+    with them.
     """
 
     def __init__(self, fluoroscopes: Iterable[str], still: StillOptions | None = None) -> None:
@@ -93,14 +93,13 @@ class ExposureCollector:
         self.coverage: dict[str, Coverage] = {}
         self._recent: deque[Pair] = deque(maxlen=MAX_RECENT)
         self._streaming = False
-        self._single: Pair | None = None  # collected as a single shot, may begin a stream
+        self._single: Pair | None = None  # collected as a single shot, but may begin a stream
 
     def offer(self, pair: Pair) -> str:
         """Collect a pair if the phantom stands still in a new pose.
 
-        Returns '' if the pair was collected, else the reason why not. The first frame of a stream
-        is collected like a single shot, and discarded once the next ones show that the phantom
-        moves.
+        Returns '' if the pair was collected, otherwise the reason. The first frame of a stream is
+        collected like a single shot, and discarded if the next ones show that the phantom moves.
         """
         first = self.fluoroscopes[0]
         now = pair[first].stamp_ns
@@ -123,7 +122,7 @@ class ExposureCollector:
         return refusal
 
     def _confirm_single(self, pair: Pair, still_ns: float) -> None:
-        """Discard the single shot where the next frames show that the phantom moved."""
+        """Discard the single shot if the next frames show that the phantom moved."""
         single = self._single
         if single is None:
             return
@@ -142,13 +141,14 @@ class ExposureCollector:
             self._cover(known)
 
     def _displacement(self, one: Pair, other: Pair) -> float:
-        """Return the largest displacement [px] that a fluoroscope sees between two pairs."""
+        """Return the largest displacement [px] of all fluoroscopes between two pairs."""
         return max(displacement(one[name], other[name]) for name in self.fluoroscopes)
 
     def _update_streaming(self, now: int, follows: bool, still_ns: float) -> None:
         """Update whether frames arrive as a stream.
 
-        They do from the first frame that follows another one, until a long gap.
+        A stream begins with the first frame that follows another one in time, and ends with a long
+        gap.
         """
         before = self._recent[-1][self.fluoroscopes[0]].stamp_ns if self._recent else None
         if follows:
@@ -157,9 +157,9 @@ class ExposureCollector:
             self._streaming = False
 
     def add(self, pair: Pair) -> str:
-        """Collect a pair as it is, unless one of its frame numbers is already collected.
+        """Collect a pair unconditionally, unless one of its frame numbers is already collected.
 
-        Returns '' if the pair was collected, else the reason why not.
+        Returns '' if the pair was collected, otherwise the reason.
         """
         numbers = {pair[name].number for name in self.fluoroscopes}
         for known in self.exposures:
@@ -186,8 +186,8 @@ class ExposureCollector:
     def frames(self, fluoroscopes: Iterable[str] | None = None) -> dict[str, list[Frame]]:
         """Return the collected frames by fluoroscope.
 
-        fluoroscopes are the names of those to return, by default all. Raises DataError for an
-        unknown name.
+        fluoroscopes: names of those to return, by default all. Raises DataError for an unknown
+        name.
         """
         wanted = tuple(fluoroscopes or ())
         for name in wanted:
@@ -203,9 +203,9 @@ class ExposureCollector:
 
 
 class RadiographCollector:
-    """Small radiographs of the exposures that are collected, for their report.
+    """Small radiographs of the collected exposures, for their report.
 
-    They come as messages of their own, before or after the frames with the same stamps.
+    They arrive as separate messages, before or after the frames with the same stamps.
     """
 
     def __init__(self, names: Iterable[str]) -> None:
@@ -213,7 +213,7 @@ class RadiographCollector:
         self._wanted: dict[str, dict[int, bytes]] = {name: {} for name in self._recent}
 
     def add(self, name: str, stamp_ns: int, jpeg: bytes) -> None:
-        """Keep a radiograph: of a collected frame, or as one of the last."""
+        """Store a radiograph: for its collected frame, or among the last ones."""
         if stamp_ns in self._wanted[name]:
             self._wanted[name][stamp_ns] = jpeg
         else:
@@ -223,7 +223,7 @@ class RadiographCollector:
                 recent.popitem(last=False)
 
     def want(self, exposures: Iterable[Pair]) -> None:
-        """Keep the radiographs of the frames of all collected exposures, once they come."""
+        """Keep the radiographs of the frames of all collected exposures when they arrive."""
         pairs = tuple(exposures)
         for name, recent in self._recent.items():
             kept = self._wanted[name]
@@ -231,7 +231,7 @@ class RadiographCollector:
             self._wanted[name] = {t: kept.get(t) or recent.pop(t, b'') for t in stamps}
 
     def of(self, frames: Frames) -> dict[str, dict[int, bytes]]:
-        """Return the radiographs that came of frames, by fluoroscope and exposure."""
+        """Return the available radiographs of frames, by fluoroscope and exposure."""
         return {
             name: {
                 frame.number: jpeg
@@ -248,7 +248,7 @@ def collect_recorded(
     pair_by: str = 'frame_number',
     tolerance_s: float = PairingOptions.tolerance_s,
 ) -> tuple[dict[str, list[Frame]], dict[str, int]]:
-    """Collect the exposures of a recording, as the calibration node would.
+    """Collect the exposures of a recording in the same way as the calibration node.
 
     Parameters
     ----------
@@ -266,7 +266,7 @@ def collect_recorded(
     frames : dict of str to list of Frame
         Collected frames by fluoroscope.
     unpaired : dict of str to int
-        Number of frames without partner by fluoroscope.
+        Number of frames without a partner, by fluoroscope.
     """
     still = StillOptions()
     pairer = CompletePairer(frames, RecordedPairing(pair_by, tolerance_s).unlimited())
@@ -283,30 +283,30 @@ def collect_recorded(
 
 
 def _is_stream(frames: Sequence[Frame], still: StillOptions) -> bool:
-    """Return whether frames follow each other within the still time."""
+    """Return whether successive frames are within the still time."""
     if len(frames) < 2:
         return False
     gaps = np.diff(sorted(f.stamp_ns for f in frames))
     return bool(0 < np.median(gaps) <= still.still_time_s * 1e9)
 
 
-MIN_EXPOSURES = 3  # of a calibration, or that tell by their scatter
+MIN_EXPOSURES = 3  # for a calibration, or for a meaningful scatter
 RECOMMENDED_EXPOSURES = 15  # docs/usage.md; accuracy by number: docs/how_good/accuracy.md
-RECOMMENDED_COVERAGE = 0.9  # share of the image
-MAX_AREAS = 2  # named at once
+RECOMMENDED_COVERAGE = 0.9  # share of the field of view
+MAX_AREAS = 2  # maximum number of areas named at once
 
 
 @dataclass(frozen=True)
 class Readiness:
-    """What is still missing before a calibration is worthwhile."""
+    """Whether a calibration is worthwhile, and what is still missing."""
 
-    ready: bool  #: whether there are enough exposures and enough of the image is covered
-    advice: str  #: what the next pose should show, or that it is time to calibrate
-    areas: tuple[int, ...] = ()  #: areas of the image, indices of AREAS, that it should show
+    ready: bool  #: whether the number of exposures and the coverage suffice
+    advice: str  #: advice on the next pose, or that it is time to calibrate
+    areas: tuple[int, ...] = ()  #: areas to show next, indices of AREAS
 
 
 def readiness(exposures: int, coverage: Coverage | None) -> Readiness:
-    """Return what is missing to a calibration of one fluoroscope.
+    """Return what is missing for a calibration of one fluoroscope.
 
     exposures: number of collected ones; coverage: None before the first one.
     """
@@ -327,7 +327,8 @@ def readiness(exposures: int, coverage: Coverage | None) -> Readiness:
 
 # Coverage of the image by the collected image points.
 
-# Across the image: at 1024 px a cell is 32 px, about the spacing of the points of 15 exposures.
+# Cells across the image: at 1024 px a cell is 32 px, about the spacing of the points of 15
+# exposures.
 CELLS = 32
 # Areas of the image, in rows of three from the top left.
 AREAS = (
@@ -341,10 +342,10 @@ AREAS = (
     'at the lower edge',
     'in the lower right corner',
 )
-# Covered part of the inscribed ellipse from which empty corners are taken for those of a round
-# field. It decides the advice only, which tells so.
+# Covered fraction of the inscribed ellipse above which empty corners are attributed to a round
+# field of view. It affects only the advice, which mentions it.
 ROUND_FROM = 0.6
-SUFFICIENT_OF_AREA = 0.85  # covered fraction above which an area is not named as missing
+SUFFICIENT_OF_AREA = 0.85  # an area with a larger covered fraction is not named as missing
 
 
 class Coverage:
@@ -374,9 +375,9 @@ class Coverage:
 
     @property
     def is_round(self) -> bool:
-        """Whether the points may fill a round field of view, as image intensifiers have it.
+        """Whether the points may fill a round field of view, as of image intensifiers.
 
-        So it is where most of the inscribed ellipse is covered, and no point lies outside.
+        This is assumed if most of the inscribed ellipse is covered, and no point lies outside.
         """
         inside = _ellipse()
         within = float(np.mean(self.covered[inside]))
@@ -401,30 +402,30 @@ class Coverage:
 
 
 def _sums_of_areas(cells: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the number of cells (rows, columns) of bool in each of the 3 x 3 areas."""
+    """Return the number of True cells (rows, columns) in each of the 3 x 3 areas."""
     thirds = np.linspace(0, CELLS, 4).astype(int)[:-1]
     return np.add.reduceat(np.add.reduceat(cells.astype(float), thirds, 0), thirds, 1)
 
 
 def _ellipse() -> NDArray[np.bool_]:
-    """Return whether cells (rows, columns) touch the ellipse that is inscribed into the image."""
-    nearest = np.abs(np.arange(CELLS) + 0.5 - CELLS / 2) - 0.5  # edge towards the centre
+    """Return whether cells (rows, columns) touch the inscribed ellipse of the image."""
+    nearest = np.abs(np.arange(CELLS) + 0.5 - CELLS / 2) - 0.5  # nearest edge to the centre
     return np.hypot(nearest[:, None], nearest[None]) <= CELLS / 2
 
 
-STILL_PX = StillOptions().still_px  # median displacement of the targets
-SHARE = 0.5  # of the targets of a frame that another one of the same pose has
-SAME_ANGLE_RAD = 1e-3  # of the C-arm
+STILL_PX = StillOptions().still_px  # maximum median displacement of targets in the same pose [px]
+SHARE = 0.5  # minimum share of the targets of a frame that another one of the same pose has
+SAME_ANGLE_RAD = 1e-3  # maximum difference of the angle of the C-arm in the same pose [rad]
 
 
 def without_repeats(
     frames: Frames, known: Container[str] = ()
 ) -> tuple[dict[str, list[Frame]], list[Finding]]:
-    """Return the frames with those of one pose joined, and a finding for each fluoroscope.
+    """Join the frames of the same pose; return the frames, and a finding for each fluoroscope.
 
-    Fluoroscopes of one rig see the same phantom: exposures are of one pose where they are so in
-    the images of all fluoroscopes that have both. known: fluoroscopes of which a repeated pose is
-    no repeated exposure, as their orientation is given.
+    Fluoroscopes of one rig see the same phantom: exposures have the same pose if they have it in
+    the images of all fluoroscopes that have both. known: fluoroscopes with a given orientation,
+    for which a repeated pose is not a repeated exposure.
     """
     images = {
         name: {frame.number: frame for frame in of_one}
@@ -461,7 +462,7 @@ def without_repeats(
 
 
 def _groups(images: Mapping[str, Mapping[int, Frame]]) -> list[list[int]]:
-    """Numbers of the exposures of each pose, in order."""
+    """Return the numbers of the exposures of each pose, in order."""
     numbers = sorted({number for of_one in images.values() for number in of_one})
     tables = [_Table(list(of_one.values())) for of_one in images.values() if of_one]
     groups: list[list[int]] = []
@@ -495,7 +496,7 @@ class _Table:
     def compare(
         self, number: int, others: NDArray[np.int64]
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Return whether exposures (k,) have the pose of one, and whether they have another."""
+        """Return whether exposures (k,) have the pose of `number`, and whether another one."""
         same = np.zeros(len(others), dtype=bool)
         has = np.array([other in self._row for other in others.tolist()], dtype=bool)
         if number not in self._row or not has.any():
@@ -516,7 +517,7 @@ class _Table:
 
 
 def _joined(frames: Sequence[Frame], number: int) -> Frame:
-    """Frame of a number with the medians of the image points of frames, of two their mean."""
+    """Return a frame with the median image points of frames, which is the mean for two."""
     first = frames[0]
     if len(frames) == 1:
         return first if first.number == number else replace(first, number=number)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Doubtful image points and exposures, and what a person decides on them."""
+"""Doubtful image points and exposures, and decisions of a person on them."""
 
 from __future__ import annotations
 
@@ -18,39 +18,40 @@ from .phantom import first_repeated
 
 @dataclass(frozen=True)
 class Doubtful:
-    """An image point whose id may be wrong, or an exposure that may not be usable."""
+    """An image point whose id may be wrong, or an exposure that may be unusable."""
 
     fluoroscope: str
-    #: exposures
+    #: first and last exposure
     first: int
     last: int
-    target_id: int | None  #: None: the exposure as a whole
+    target_id: int | None  #: None: the whole exposure
     reason: str
-    others: tuple[int, ...] = ()  #: targets that it may be, the likeliest first
-    uv: tuple[float, float] | None = None  #: [px], of a single image point
+    others: tuple[int, ...] = ()  #: ids that the target may have, likeliest first
+    uv: tuple[float, float] | None = None  #: position of a single image point [px]
     residual_px: float = np.nan
 
 
 @dataclass(frozen=True)
 class PointDecision:
-    """What a person decides: an image point or an exposure is left out, or gets another id."""
+    """Decision of a person: exclude an image point or an exposure, or change the id of a point."""
 
     where: str  #: file and row
     fluoroscope: str
-    #: exposures that it holds for
+    #: first and last exposure to which it applies
     first: int
     last: int
-    target_id: int | None  #: as it is in the source; None: all of the exposure
-    new_id: int | None = None  #: None: it is left out
+    target_id: int | None  #: id in the source; None: the whole exposure
+    new_id: int | None = None  #: None: exclude
 
 
 def decided(
     frames: Frames, decisions: Sequence[PointDecision]
 ) -> tuple[dict[str, list[Frame]], tuple[int, int, int]]:
-    """Return the frames after decisions; how many exposures and points are left out, and renamed.
+    """Apply decisions to frames; return them, and counts of exclusions and changes.
 
-    Frames without points are left out. Raises DataError, which names the row, for a decision on
-    what is not there, and for one that gives an id twice in an exposure.
+    The counts are those of excluded exposures, excluded points and changed ids. Frames without
+    points are excluded. Raises DataError that names the row, for a decision on something that does
+    not exist, and for one that gives an id twice in an exposure.
     """
     out: dict[str, list[Frame]] = {}
     counts = np.zeros(3, dtype=int)
@@ -73,7 +74,7 @@ def decided(
 
 
 def _decided(frame: Frame, decisions: Sequence[PointDecision]) -> tuple[Frame | None, int, int]:
-    """Return a frame after decisions on it, and how many points are left out, and renamed."""
+    """Apply decisions to a frame; return it, and counts of excluded points and changed ids."""
     if not decisions:
         return frame, 0, 0
     keep = np.ones(len(frame.target_id), dtype=bool)
@@ -101,14 +102,14 @@ def _decided(frame: Frame, decisions: Sequence[PointDecision]) -> tuple[Frame | 
 
 
 def _rows(frame: Frame, decision: PointDecision) -> NDArray[np.bool_]:
-    """Return which image points (n,) of a frame a decision is on."""
+    """Return the image points (n,) of a frame to which a decision applies, as a mask."""
     if decision.target_id is None:
         return np.ones(len(frame.target_id), dtype=bool)
     return np.asarray(frame.target_id) == decision.target_id
 
 
 def _missing(frames: Frames, decision: PointDecision) -> str:
-    """Return what is not there of a decision, in words."""
+    """Return a clause that names the missing object of a decision."""
     name = decision.fluoroscope
     if name not in frames:
         return f'there is no fluoroscope {name!r}, only {", ".join(frames)}'

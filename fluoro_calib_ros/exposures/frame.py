@@ -1,18 +1,17 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Frames of image points, the rules that every frame must meet, and what is excluded.
+"""Frames of image points, rules for valid frames, and exclusion of stray image points.
 
-All inputs apply the same rules: the CSV and bag readers, the nodes and the calculations. The
-functions `..._error` state one rule each. They return '' where it is met, else the sentence that
-says what is wrong, so that a caller puts its own place in front: a row of a file, a message of a
-bag, a frame of a stream.
+All inputs apply the same rules: the CSV and bag readers, the nodes and the calculations. Each of
+the functions `..._error` checks one rule. It returns '' if the rule is met, otherwise a sentence
+about the error, to which the caller prepends the place: a row of a file, a message of a bag, a
+frame of a stream.
 
-Single image points that cannot be used: off the image, or of a target that is unknown. A few of
-them are excluded and reported. Many are a fault of the whole input, such as a wrong image size or
-another phantom, and are left to `validate_frame`, which refuses the frame. Many targets at the
-same image point are a fill value of some program for targets that are not seen, such as (0, 0),
-and always excluded.
+Image points off the image, or of an unknown target, cannot be used. A few of them are excluded and
+reported. Many are a fault of the whole input, such as a wrong image size or another phantom, and
+are left to `validate_frame`, which refuses the frame. Many targets at the same image point are a
+fill value for targets that are not seen, such as (0, 0), and always excluded.
 """
 
 from __future__ import annotations
@@ -28,8 +27,8 @@ from ..errors import DataError
 from ..findings import Finding, Kind, Place, Severity, first_few
 from .phantom import Phantom, first_repeated, is_positive
 
-DECIMALS = 4  # of a pixel, and of its standard deviation, in files
-MAX_ANGLE = 4 * np.pi  # two turns either way: more is no angle in radians
+DECIMALS = 4  # decimals of a pixel, and of its standard deviation, in files
+MAX_ANGLE = 4 * np.pi  # two turns either way: a larger value is not an angle in radians
 
 
 @dataclass(frozen=True)
@@ -40,21 +39,21 @@ class Frame:
     ----------
     fluoroscope : str
     number : int
-        Frame number; frames of one exposure have the same.
+        Frame number; frames of one exposure have the same number.
     target_id : (n,) ndarray of int
     uv : (n, 2) ndarray
         Observed column and row [px].
     image_size : (int, int)
         Width and height [px].
     sigma : (n,) ndarray or None
-        Standard deviation of a coordinate [px], None where it is unknown.
+        Standard deviation of a coordinate [px], None if unknown.
     stamp_ns : int
         Time of the exposure [ns].
     frame_id : str
         Name of the optical frame.
     angle : float or None
-        Angle of the C-arm [rad], None where it is unknown. It is rounded to a microdegree, so that
-        files in degrees give the same numbers.
+        Angle of the C-arm [rad], None if unknown. It is rounded to a microdegree, so that files in
+        degrees give the same numbers.
     """
 
     __repr__ = brief_repr
@@ -79,7 +78,7 @@ class Frame:
             object.__setattr__(self, 'angle', float(np.radians(angle_in_degrees(self.angle))))
 
     def rows(self, chosen: NDArray[np.bool_]) -> Frame:
-        """Return the frame with some of its targets (n,)."""
+        """Return the frame restricted to some of its targets (n,)."""
         sigma = None if self.sigma is None else np.asarray(self.sigma)[chosen]
         return replace(self, target_id=self.target_id[chosen], uv=self.uv[chosen], sigma=sigma)
 
@@ -104,7 +103,7 @@ class Frame:
 
 
 def frames_of_targets(frames: Frames, target_id: NDArray[np.int64]) -> dict[str, list[Frame]]:
-    """Return the frames that show some of these targets, without others."""
+    """Return the frames restricted to these targets; frames that show none are excluded."""
     return {
         name: [
             frame.rows(seen)
@@ -120,8 +119,8 @@ def validate_frame(
 ) -> None:
     """Validate a frame before it is used in a calculation.
 
-    Of a phantom, the frame may only contain its targets; image_size [px] is that of the
-    calibration, which the frame must have.
+    If a phantom is given, all targets must belong to it; if image_size [px], that of the
+    calibration, is given, the frame must have it.
 
     Raises DataError that names the fluoroscope, the frame and the first wrong target: for an empty
     frame, arrays of different lengths, values that are not finite, a sigma that is not positive, a
@@ -133,7 +132,7 @@ def validate_frame(
 
 
 def _frame_error(frame: Frame, phantom: Phantom | None, image_size: tuple[int, int] | None) -> str:
-    """Return the first rule that a frame breaks, '' for a valid frame."""
+    """Return the first error of a frame, '' for a valid frame."""
     ids = np.asarray(frame.target_id)
     uv = np.asarray(frame.uv)
     width, height = frame.image_size
@@ -160,19 +159,19 @@ def _frame_error(frame: Frame, phantom: Phantom | None, image_size: tuple[int, i
 
 
 def angle_in_degrees(angle: float) -> float:
-    """Return an angle [rad] in degrees, to a microdegree."""
+    """Convert an angle [rad] to degrees, rounded to a microdegree."""
     return float(np.round(np.degrees(angle), 6))
 
 
 def angle_error(angle: float | None) -> str:
-    """Return what is wrong with an angle of the C-arm [rad], '' for a valid or unknown one."""
+    """Return the error of an angle of the C-arm [rad], '' for a valid or unknown one."""
     if angle is None or abs(angle) <= MAX_ANGLE:
         return ''
     return f'the angle of the C-arm is {np.degrees(angle):g} degrees'
 
 
 def angles_of(frames: Iterable[Frame]) -> NDArray[np.float64]:
-    """Return the angles (e,) of the C-arm [rad], NaN where they are unknown."""
+    """Return the angles (e,) of the C-arm [rad], NaN if unknown."""
     return np.array([np.nan if f.angle is None else f.angle for f in frames], dtype=float)
 
 
@@ -187,7 +186,7 @@ def points_on_image(uv: ArrayLike, image_size: tuple[int, int]) -> NDArray[np.bo
 
 
 def length_error(target_id: Sized, **arrays: Sized) -> str:
-    """Return the error of the first array, by name, that is not as long as target_id."""
+    """Return the error of the first array, by name, whose length differs from target_id."""
     for name, values in arrays.items():
         if len(values) != len(target_id):
             return f'{len(target_id)} target ids, but {len(values)} values of {name}'
@@ -195,7 +194,7 @@ def length_error(target_id: Sized, **arrays: Sized) -> str:
 
 
 def image_size_error(image_size: tuple[int, int], expected: tuple[int, int]) -> str:
-    """Return the error of an image size (width, height) that is not that of the calibration."""
+    """Return the error of an image size (width, height) that differs from the calibration's."""
     if tuple(image_size) == tuple(expected):
         return ''
     return (
@@ -227,7 +226,7 @@ def stack_image_points(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64] | None]:
     """Return ids (n,), uv (n, 2) and sigma (n,) of a Frame from the flat arrays of a message.
 
-    An empty sigma is unknown, None. Raises DataError for arrays of different lengths.
+    An empty sigma becomes None, unknown. Raises DataError for arrays of different lengths.
     """
     ids = np.array(target_id)
     columns = {'u': np.array(u), 'v': np.array(v)}
@@ -271,7 +270,7 @@ def cells_of(uv: ArrayLike, image_size: ArrayLike, count: int) -> NDArray[np.int
     return np.clip(np.floor(place), 0, count - 1).astype(np.int64)
 
 
-# Targets whose coordinates are known in every exposure, such as markers of a motion capture.
+# Targets whose coordinates are known in every exposure, such as motion capture markers.
 
 
 @dataclass(frozen=True)
@@ -305,21 +304,21 @@ class MovingPoints:
 
     @property
     def base(self) -> int:
-        """The power of ten by which the ids of two exposures are apart."""
+        """Power of ten that separates the ids of successive exposures."""
         return int(10 ** len(str(int(self.target_id.max(initial=0)))))
 
     def ids(self, exposure: ArrayLike, target_id: ArrayLike) -> NDArray[np.int64]:
-        """Return an id (n,) of its own for each target of each exposure.
+        """Return a unique id (n,) for each target of each exposure.
 
-        Target 7 of exposure 12 is 1207 where all ids have two digits at most.
+        Target 7 of exposure 12 is 1207 if all ids have at most two digits.
         """
         return np.asarray(exposure, dtype=np.int64) * self.base + np.asarray(target_id)
 
     def as_phantom(self, frames: Frames) -> tuple[dict[str, list[Frame]], Phantom]:
-        """Return frames and phantom in which each target of each exposure has an id of its own.
+        """Return frames and phantom in which each target of each exposure has a unique id.
 
         Raises DataError for a target whose coordinates in an exposure are missing, and for
-        coordinates of which no phantom can be made.
+        coordinates that do not make a valid phantom.
         """
         phantom = Phantom(self.ids(self.exposure, self.target_id), self.xyz_mm, self.sd_mm)
         out: dict[str, list[Frame]] = {}
@@ -337,21 +336,21 @@ class MovingPoints:
         return out, phantom
 
 
-MIN_TOGETHER = 4  # targets at the same image point that are fill values
-MIN_SHARE_TOGETHER = 0.02  # the same, of the targets of the frame; the larger of both holds
-MAX_SHARE = 0.05  # of the image points of a frame that are excluded; one always is
+MIN_TOGETHER = 4  # minimum number of targets at the same image point to be fill values
+MIN_SHARE_TOGETHER = 0.02  # as a share of the targets of the frame; the larger one applies
+MAX_SHARE = 0.05  # maximum share of image points of a frame to exclude; one may always be
 
 
 def few(count: int, of: int) -> bool:
-    """Return whether so many image points of a frame or file can be excluded."""
+    """Return whether `count` of `of` image points of a frame or file may be excluded."""
     return 0 < count <= max(1, MAX_SHARE * of) and count < of
 
 
 def without_strays(frame: Frame, phantom: Phantom | None = None) -> tuple[Frame, Finding | None]:
-    """Return the frame without its few stray points, and a finding about them, None without any.
+    """Exclude a few stray points of a frame; return the frame, and a finding or None.
 
-    phantom: its targets are known, by default all. A frame with many of them, or whose arrays do
-    not belong together, is returned as it is.
+    phantom: its targets are known; by default all targets are. A frame with many stray points, or
+    with arrays of different lengths, is returned unchanged.
     """
     ids = np.asarray(frame.target_id)
     uv = np.asarray(frame.uv)
@@ -403,7 +402,7 @@ def without_strays(frame: Frame, phantom: Phantom | None = None) -> tuple[Frame,
 def frames_without_strays(
     frames: Frames, phantom: Phantom
 ) -> tuple[dict[str, list[Frame]], list[Finding]]:
-    """Return the frames by fluoroscope without their few stray points, and findings on these."""
+    """Exclude a few stray points of the frames; return the frames by fluoroscope and findings."""
     findings = []
     out: dict[str, list[Frame]] = {}
     for name, exposures in frames.items():
@@ -414,7 +413,7 @@ def frames_without_strays(
 
 
 def _together(uv: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which (n,) of image points (n, 2) are at the place of so many others that none is there."""
+    """Return (n,) which image points (n, 2) coincide with enough others to be fill values."""
     if len(uv) < MIN_TOGETHER:
         return np.zeros(len(uv), dtype=bool)
     _, place, count = np.unique(uv, axis=0, return_inverse=True, return_counts=True)

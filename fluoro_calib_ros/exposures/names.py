@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Names that targets, exposures and fluoroscopes have in files, and the ids they have inside.
+"""Names of targets, exposures and fluoroscopes in files, and their ids in this package.
 
-Messages and calculations know ids: whole numbers, and words that are safe in file names and
-topics. Files of a lab know `bead01`, `trial 3.tif` and `cam 1`.
+Messages and calculations use ids: integers, and words that are safe in file names and topics.
+Files of a lab use names such as `bead01`, `trial 3.tif` and `cam 1`.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from ..errors import DataError
 MAX_ID = 2**32 - 1  # ids are uint32 in the messages
 _NUMBERED = re.compile(r'(?P<before>.*?)(?P<number>\d+)(?P<after>\D*)')
 _UNSAFE = re.compile(r'[^A-Za-z0-9_-]')
-_MAX_NAME = 100  # characters of the id of a fluoroscope
+_MAX_NAME = 100  # maximum length of a fluoroscope id, in characters
 
 
 @dataclass(frozen=True)
 class Names:
-    """Ids by name; a name that is its own id is not listed.
+    """Ids by name; a name that equals its id is not listed.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class Names:
         return bool(self.targets or self.exposures or self.fluoroscopes)
 
     def merged(self, other: Names) -> Names:
-        """Return the names of both. Raises DataError for one name with two ids."""
+        """Return the names of both. Raises DataError for a name with two ids."""
         return Names(
             _merged('target', self.targets, other.targets),
             _merged('exposure', self.exposures, other.exposures),
@@ -70,9 +70,9 @@ def _merged(what: str, one: Mapping[str, object], other: Mapping[str, object]) -
 def number_names(names: Iterable[str], known: Mapping[str, int] | None = None) -> dict[str, int]:
     """Return an id for every name of targets or exposures.
 
-    A known name keeps its id. If all others are numbered alike, such as bead01, bead02 or 3.tif,
-    7.tif, the number is the id, so that two files agree that do not know of each other. Otherwise
-    they are counted in their order, from the first number that is free.
+    A known name keeps its id. If all others contain a number and differ in nothing else, such as
+    bead01, bead02 or 3.tif, 7.tif, the number becomes the id, so that independent files agree.
+    Otherwise they are counted in their order, from the first free number.
     """
     known = known or {}
     new = [name for name in dict.fromkeys(names) if name not in known]
@@ -85,7 +85,7 @@ def number_names(names: Iterable[str], known: Mapping[str, int] | None = None) -
 
 
 def _common_numbers(names: Sequence[str]) -> list[int] | None:
-    """Return the numbers in names that differ by nothing else, None for other names."""
+    """Return the numbers in names that differ in nothing else, None for other names."""
     parts = [_NUMBERED.fullmatch(name) for name in names]
     found = [part for part in parts if part is not None]
     if len(found) < len(names):
@@ -98,7 +98,7 @@ def _common_numbers(names: Sequence[str]) -> list[int] | None:
 
 
 def safe_names(names: Iterable[str], known: Mapping[str, str] | None = None) -> dict[str, str]:
-    """Return an id for every name of a fluoroscope: letters, digits, _ and -, each once."""
+    """Return a unique id of letters, digits, _ and - for every name of a fluoroscope."""
     out = dict(known or {})
     for name in dict.fromkeys(names):
         if name in out:
@@ -115,5 +115,5 @@ def safe_names(names: Iterable[str], known: Mapping[str, str] | None = None) -> 
 
 
 def without_trivial(ids: Mapping[str, int]) -> dict[str, int]:
-    """Return the ids of the names that are not just the number itself."""
+    """Return the ids of names that are not the id itself as text."""
     return {name: number for name, number in ids.items() if name != str(number)}

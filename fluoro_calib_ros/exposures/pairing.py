@@ -6,8 +6,8 @@
 A calibration needs all views of an exposure (CompletePairer). For a reconstruction, two views of
 three or more suffice (PartialPairer).
 
-Streams arrive in order. So a fluoroscope that has delivered a later frame has lost the one
-before, and nothing has to wait for it. Only a silent fluoroscope makes the others wait, for a
+Streams arrive in order. Therefore a fluoroscope that has delivered a later frame has lost the
+earlier one, which is no longer waited for. Only a silent fluoroscope makes the others wait, for a
 limited time.
 """
 
@@ -22,18 +22,18 @@ from ..options import option, validate_options
 from .stamps import StampAgreement, StampedFrame
 
 PAIR_BY = ('frame_number', 'stamp')
-MIN_VIEWS = 2  # views of an exposure that can be intersected
-PATIENCE = 32  # frames: a stall of 32 ms at 1000 Hz
-# A stamp that much before the last one starts a new stream; it is no frame out of order.
+MIN_VIEWS = 2  # minimum number of views for an intersection
+PATIENCE = 32  # in frames: a stall of 32 ms at 1000 Hz
+# A stamp earlier than the last one by more than this starts a new stream; else it is out of order.
 RESTART_NS = 1_000_000_000
 UNLIMITED = 10**9  # frames
 
-# Frames by fluoroscope. They are dataclasses with the fields of PairableFrame.
+# Frames by fluoroscope: dataclasses with the fields of PairableFrame.
 Exposure = dict[str, Any]
 
 
 class PairableFrame(StampedFrame, Protocol):
-    """What the pairing needs to know of a frame; it must be a dataclass, too."""
+    """Interface of a frame for pairing; the class must be a dataclass, too."""
 
     @property
     def fluoroscope(self) -> str:
@@ -42,7 +42,7 @@ class PairableFrame(StampedFrame, Protocol):
 
 @dataclass(frozen=True)
 class PairingOptions:
-    """How frames of several fluoroscopes are paired."""
+    """Options for pairing the frames of several fluoroscopes."""
 
     pair_by: str = option('frame_number', 'how frames are paired', choices=PAIR_BY)
     tolerance_s: float = option(
@@ -64,7 +64,7 @@ class PairingOptions:
 
     @property
     def tolerance_ns(self) -> int:
-        """The tolerance in nanoseconds."""
+        """Tolerance [ns]."""
         return round(1e9 * self.tolerance_s)
 
     @property
@@ -77,7 +77,7 @@ class PairingOptions:
 
 @dataclass(frozen=True)
 class RecordedPairing:
-    """How a recording is paired. Raises ValueError for a value that an option cannot have."""
+    """Options for pairing a recording. Raises ValueError for an invalid value."""
 
     pair_by: str = option(
         'frame_number', 'what the frames of one exposure have in common', choices=PAIR_BY
@@ -94,37 +94,37 @@ class RecordedPairing:
         validate_options(self)
 
     def unlimited(self) -> PairingOptions:
-        """Options of a pairer: all frames are there, so none has to be given up."""
+        """Return options without limits: all frames exist, so none has to be given up."""
         return PairingOptions(
             self.pair_by, self.pair_tolerance, waiting=UNLIMITED, patience=UNLIMITED
         )
 
 
 class Pairer(Protocol):
-    """Combines frames into exposures."""
+    """Interface of pairers, which combine frames into exposures."""
 
     fluoroscopes: tuple[str, ...]
-    unpaired: dict[str, int]  #: number of frames that are in no exposure, by fluoroscope
-    late: dict[str, int]  #: number of those that arrived too late for their exposure
+    unpaired: dict[str, int]  #: number of frames that belong to no exposure, by fluoroscope
+    late: dict[str, int]  #: number of those frames that arrived too late for their exposure
     incomplete: int  #: number of exposures without a frame of every fluoroscope
     silent: frozenset[str]  #: fluoroscopes that are no longer waited for
-    stamps: StampAgreement  #: times of the frames that were paired by number
+    stamps: StampAgreement  #: comparison of stamps of frames that were paired by number
 
     def add(self, frame: PairableFrame) -> Sequence[Exposure]:
-        """Add a frame; returns the exposures that are ready now."""
+        """Add a frame; return the exposures that are now ready."""
 
     def use(self, options: PairingOptions) -> None:
-        """Use other limits from now on. Raises ValueError where pair_by is another one."""
+        """Change the limits from now on. Raises ValueError if pair_by differs."""
 
     def flush(self) -> Sequence[Exposure]:
-        """Stop waiting; returns the exposures that were still waiting for a frame."""
+        """Stop waiting; return the exposures that were still waiting for a frame."""
 
 
 def exposure_pairer(fluoroscopes: Iterable[str], options: PairingOptions | None = None) -> Pairer:
-    """Pairer for a reconstruction with these fluoroscopes.
+    """Return a pairer for a reconstruction with these fluoroscopes.
 
-    Of two fluoroscopes no view can be missing, so they are paired as for a calibration. Raises
-    ValueError for an unknown pair_by.
+    Two fluoroscopes are paired as for a calibration, as no view may be missing. Raises ValueError
+    for an unknown pair_by.
     """
     names = tuple(fluoroscopes)
     if len(names) <= MIN_VIEWS:
@@ -133,9 +133,9 @@ def exposure_pairer(fluoroscopes: Iterable[str], options: PairingOptions | None 
 
 
 def disagreement_of_recording(frames: Mapping[str, Iterable[PairableFrame]]) -> str:
-    """Return a sentence where recorded frames with the same number are far apart in time.
+    """Return a sentence if recorded frames with the same number are far apart in time.
 
-    frames: by fluoroscope. '' where they agree; see StampAgreement.
+    frames: by fluoroscope. Returns '' if they agree; see StampAgreement.
     """
     if len(frames) < MIN_VIEWS:
         return ''
@@ -148,7 +148,7 @@ def disagreement_of_recording(frames: Mapping[str, Iterable[PairableFrame]]) -> 
 
 
 class _Counts:
-    """What a pairer pairs, and what it counts; see Pairer."""
+    """Common options and counters of the pairers; see Pairer."""
 
     def __init__(self, fluoroscopes: Iterable[str], options: PairingOptions | None = None) -> None:
         options = options or PairingOptions()
@@ -163,7 +163,7 @@ class _Counts:
         self.use(options)
 
     def use(self, options: PairingOptions) -> None:
-        """Use other limits from now on. Raises ValueError where pair_by is another one."""
+        """Change the limits from now on. Raises ValueError if pair_by differs."""
         if options.by_number != self._by_number:
             raise ValueError('pair_by cannot change while frames are being paired')
         self._tolerance = options.tolerance_ns
@@ -174,10 +174,10 @@ class _Counts:
         self.unpaired[name] += 1
 
     def _counted(self, exposure: Exposure) -> Exposure:
-        """Count an exposure, and return it.
+        """Count an exposure and return it.
 
-        Frames that are paired by stamp may be numbered differently, or not at all: they get the
-        number of the exposure.
+        Frames that are paired by stamp may be numbered differently, or not at all: their number is
+        replaced by that of the exposure.
         """
         self._exposures += 1
         if self._by_number:
@@ -189,11 +189,11 @@ class _Counts:
 class CompletePairer(_Counts):
     """Pairer of exposures with a frame of every fluoroscope.
 
-    Frames belong together by number, or by stamp within the tolerance. Of each fluoroscope the
-    last `waiting` frames wait for their partners; a frame that is displaced counts as unpaired. A
-    frame that arrives after one of its partners was displaced is late: it counts as late and as
-    unpaired. Exposures may be ready in another order than that of their frames. Raises ValueError
-    for an unknown pair_by.
+    Frames are matched by number, or by stamp within the tolerance. The last `waiting` frames of
+    each fluoroscope wait for their partners; a frame that is displaced from this queue counts as
+    unpaired. A frame that arrives after one of its partners was displaced counts as late and as
+    unpaired. Exposures may become ready in another order than that of their frames. Raises
+    ValueError for an unknown pair_by.
     """
 
     def __init__(self, fluoroscopes: Iterable[str], options: PairingOptions | None = None) -> None:
@@ -205,7 +205,7 @@ class CompletePairer(_Counts):
         self._displaced: dict[str, int | None] = dict.fromkeys(self.fluoroscopes)
 
     def add(self, frame: PairableFrame) -> Sequence[Exposure]:
-        """Add a frame; returns the exposure that it completes, or none."""
+        """Add a frame; return the exposure that it completes, if any."""
         name = frame.fluoroscope
         waiting = self._waiting[name]
         key = frame.number if self._by_number else frame.stamp_ns
@@ -213,7 +213,7 @@ class CompletePairer(_Counts):
             self._count_late(name)
             return ()
         if key in waiting:
-            self.unpaired[name] += 1  # the frame with the same key that is replaced
+            self.unpaired[name] += 1  # the previous frame with the same key, which is replaced
         waiting[key] = frame
         exposure = self._complete(key)
         if exposure is not None:
@@ -224,7 +224,7 @@ class CompletePairer(_Counts):
         return ()
 
     def _complete(self, key: int) -> Exposure | None:
-        """Remove and return the exposure with that key if all its frames are waiting."""
+        """Remove and return the exposure with this key if all its frames are waiting."""
         partners = {name: self._partner(name, key) for name in self.fluoroscopes}
         exposure = {
             name: self._waiting[name][partner]
@@ -239,10 +239,10 @@ class CompletePairer(_Counts):
         return self._counted(exposure)
 
     def _is_late(self, fluoroscope: str, key: int) -> bool:
-        """Whether a partner of the frame with that key was displaced already.
+        """Return whether a partner of the frame with this key was already displaced.
 
-        This is so for keys before all that are waiting and not after the last displaced one. The
-        keys of a fluoroscope that was restarted are further back.
+        This holds for a key without a waiting partner, not after the last displaced one of another
+        fluoroscope, within a limit. The keys of a restarted fluoroscope lie beyond the limit.
         """
         for name in self.fluoroscopes:
             displaced = self._displaced[name]
@@ -254,7 +254,7 @@ class CompletePairer(_Counts):
         return False
 
     def _partner(self, name: str, key: int) -> int | None:
-        """Key of the waiting frame of a fluoroscope that belongs to a key, or None."""
+        """Return the key of the waiting frame of a fluoroscope that matches a key, or None."""
         waiting = self._waiting[name]
         if self._by_number:
             return key if key in waiting else None
@@ -264,7 +264,7 @@ class CompletePairer(_Counts):
         return nearest
 
     def flush(self) -> Sequence[Exposure]:
-        """Discard all waiting frames, which count as unpaired; returns no exposures."""
+        """Discard all waiting frames, which count as unpaired; return no exposures."""
         for name, waiting in self._waiting.items():
             self.unpaired[name] += len(waiting)
             waiting.clear()
@@ -272,15 +272,15 @@ class CompletePairer(_Counts):
 
 
 class PartialPairer(_Counts):
-    """Pairer of exposures with frames of two or more of three or more fluoroscopes.
+    """Pairer of exposures with frames of at least two of three or more fluoroscopes.
 
-    Exposures are ready in the order of time, each once. Frames belong together by number, or by
+    Each exposure is returned once, in the order of time. Frames are matched by number, or by
     stamp: all within the tolerance of the earliest frame. An exposure is ready once every
     fluoroscope has a frame in it or has delivered a later one. A fluoroscope that has delivered
-    nothing while two others went on by `patience` frames is silent: it is not waited for until it
-    delivers again. Of each fluoroscope at most `waiting` frames wait. A frame alone in its
+    nothing while two others advanced by `patience` frames is silent: it is not waited for until it
+    delivers again. At most `waiting` frames of each fluoroscope wait. A frame alone in its
     exposure counts as unpaired. One that arrives after its exposure, or after a later one of its
-    own stream, counts as late, too. A stream that starts again releases all waiting frames. Raises
+    own stream, also counts as late. A stream that restarts releases all waiting frames. Raises
     ValueError for an unknown pair_by.
     """
 
@@ -290,27 +290,27 @@ class PartialPairer(_Counts):
         self._start()
 
     def _start(self) -> None:
-        """Forget the streams, but not the counts."""
-        # Keys, ascending, and frames.
+        """Reset the streams, but not the counters."""
+        # Keys in ascending order, with frames.
         self._queues: dict[str, deque[tuple[int, Any]]] = {
             name: deque() for name in self.fluoroscopes
         }
         # Key and stamp of the last frame.
         self._last: dict[str, tuple[int, int] | None] = dict.fromkeys(self.fluoroscopes)
-        # Key up to which exposures went out without the fluoroscope.
+        # Largest key of the exposures that were released without the fluoroscope.
         self._passed: dict[str, float] = dict.fromkeys(self.fluoroscopes, float('-inf'))
         self._recent.clear()
         self.silent = frozenset()
 
     def use(self, options: PairingOptions) -> None:
-        """Use other limits from now on. Raises ValueError where pair_by is another one."""
+        """Change the limits from now on. Raises ValueError if pair_by differs."""
         super().use(options)
         self._tolerance = 0 if self._by_number else options.tolerance_ns
         self._patience = options.patience
         self._recent = deque(self._recent.copy(), maxlen=self._patience)
 
     def add(self, frame: PairableFrame) -> list[Exposure]:
-        """Add a frame; returns the exposures that are ready now."""
+        """Add a frame; return the exposures that are now ready."""
         name = frame.fluoroscope
         ready: list[Exposure] = []
         key = frame.number if self._by_number else frame.stamp_ns
@@ -323,7 +323,7 @@ class PartialPairer(_Counts):
         self._last[name] = key, frame.stamp_ns
         if key <= self._passed[name]:
             self._count_late(name)
-            # It lags by no more than can be waited for, so from now on it is waited for.
+            # Its lag is within the patience, so it is waited for from now on.
             if name in self.silent and key >= self._recent[0]:
                 self.silent -= {name}
             return ready
@@ -338,9 +338,9 @@ class PartialPairer(_Counts):
         return ready
 
     def _is_restart(self, key: int, stamp_ns: int, last: int, last_ns: int) -> bool:
-        """Whether a frame that is not after the last one of its stream starts a new stream.
+        """Return whether a frame that is not later than the last one of its stream restarts it.
 
-        Its number falls back while time goes on, or by more than frames can be out of order.
+        Its number decreases while time increases, or by more than frames can be out of order.
         """
         if not self._by_number:
             return last - key > RESTART_NS
@@ -349,7 +349,7 @@ class PartialPairer(_Counts):
         )
 
     def _release(self) -> list[Exposure]:
-        """Remove the exposures for which there is nothing to wait any more."""
+        """Remove and return the exposures that no longer have to wait."""
         ready: list[Exposure] = []
         queues = self._queues
         while True:
@@ -364,10 +364,10 @@ class PartialPairer(_Counts):
             ready += self._pop_exposure(names, end)
 
     def _gives_up(self, heads: dict[str, int], names: list[str]) -> bool:
-        """Whether the fluoroscopes without a waiting frame were waited for long enough.
+        """Return whether the fluoroscopes without a waiting frame were waited for long enough.
 
-        They are silent then. heads: key of the first waiting frame by fluoroscope; names: those
-        of the next exposure.
+        If so, they become silent. heads: key of the first waiting frame by fluoroscope; names:
+        fluoroscopes of the next exposure.
         """
         lengths = sorted(len(queue) for queue in self._queues.values())
         is_full = any(len(self._queues[name]) > self._max_waiting for name in names)
@@ -378,9 +378,9 @@ class PartialPairer(_Counts):
         return True
 
     def _pop_exposure(self, names: list[str], end: int) -> list[Exposure]:
-        """Remove the first frames of these fluoroscopes; returns the exposure, or none.
+        """Remove the first frames of these fluoroscopes; return their exposure, or none.
 
-        end: largest key that belongs to it.
+        end: largest key that belongs to the exposure.
         """
         exposure = {name: self._queues[name].popleft()[1] for name in names}
         if len(exposure) < MIN_VIEWS:
@@ -395,7 +395,7 @@ class PartialPairer(_Counts):
         return [self._counted(exposure)]
 
     def flush(self) -> list[Exposure]:
-        """Stop waiting and start anew; returns the exposures that were waiting."""
+        """Stop waiting and start anew; return the exposures that were waiting."""
         ready: list[Exposure] = []
         while any(self._queues.values()):
             first = min(queue[0][0] for queue in self._queues.values() if queue)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The phantom: surveyed coordinates of its beads."""
+"""Phantoms: surveyed coordinates of beads, and drawings of regular phantoms."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from ..errors import DataError
 from ..findings import Kind
 
 MIN_TARGETS = 4
-# Largest side of what a fluoroscope can see: from a grid before the detector of a specimen scanner
-# to a frame around a treadmill, with a factor of five in hand. A wrong unit is a factor of ten.
+# Possible extent of what a fluoroscope sees: from a grid before the detector of a specimen scanner
+# to a frame around a treadmill, with a fivefold margin. A wrong unit is a factor of ten.
 EXTENT_MM = (2.0, 10_000.0)
 UNITS_MM = {'m': 1000.0, 'cm': 10.0, 'micrometres': 1e-3}
-MISTAKEN_UNITS = {10.0: 'cm', 25.4: 'inches', 1000.0: 'm'}  # that mm are mistaken for
-EXACT_SD_MM = 1e-6  # of coordinates that count as known; files have six decimals
+MISTAKEN_UNITS = {10.0: 'cm', 25.4: 'inches', 1000.0: 'm'}  # mistaken for mm; keys in mm
+EXACT_SD_MM = 1e-6  # coordinates with a smaller sd count as known; files have six decimals
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Phantom:
     sd_mm : (n,) ndarray
         Standard deviation of each coordinate [mm].
     diameter_mm : (n,) ndarray, optional
-        Of the beads [mm], where it is known.
+        Diameters of the beads [mm], if known.
     """
 
     __repr__ = brief_repr
@@ -76,7 +76,7 @@ class Phantom:
         )
 
     def index(self, target_id: ArrayLike) -> NDArray[np.intp]:
-        """Return the rows (n,) of target ids (n,), -1 for an id that the phantom does not have."""
+        """Return the rows (n,) of target ids (n,), -1 for an id that is not on the phantom."""
         target_id = np.asarray(target_id, dtype=np.int64)
         row = np.minimum(np.searchsorted(self.target_id, target_id), len(self.target_id) - 1)
         return np.where(self.target_id[row] == target_id, row, -1)
@@ -105,9 +105,9 @@ def _validate(ids: NDArray[np.int64], xyz: NDArray[np.float64], sd: NDArray[np.f
 
 
 def require_size(phantom: Phantom) -> None:
-    """Raise DataError for a phantom of a size that none has: its unit is another one.
+    """Raise DataError for a phantom of an impossible size: its unit must be a different one.
 
-    Targets that are all in one place have no size, and are left to others.
+    Targets that all coincide have no size; they are not checked here.
     """
     extent = float(np.ptp(phantom.xyz_mm, axis=0).max())
     low, high = EXTENT_MM
@@ -126,32 +126,33 @@ def require_size(phantom: Phantom) -> None:
     )
 
 
-# Phantoms as they are drawn: regular sheets of holes or beads, and blocks of layers of beads.
+# Regular phantoms as drawings: sheets of holes or beads, and blocks of layers of beads.
 #
-# x runs along a row, y from row to row, z from layer to layer, from the first hole at (0, 0, 0); a
-# sheet is seen with x to the right, y down and z away from the viewer. Ids count all places from
-# 1, row by row and layer by layer, those without a hole too, so that a blocked hole changes no id.
+# x runs along a row, y from row to row, z from layer to layer, starting at the first hole at (0,
+# 0, 0); a sheet is seen with x to the right, y down and z away from the viewer. Ids count all
+# places from 1, row by row and layer by layer, including those without a hole, so that a blocked
+# hole does not change the ids.
 
-HEX_ROW = np.sqrt(3) / 2  # distance of rows over the pitch
+HEX_ROW = np.sqrt(3) / 2  # distance of rows as a fraction of the pitch
 
 
 @dataclass(frozen=True)
 class Drawing:
     """A regular phantom.
 
-    Raises DataError for what cannot be drawn.
+    Raises DataError for an impossible drawing.
     """
 
     columns: int
     rows: int
     layers: int = 1
-    #: along x, y and z; hexagonal: along x, from which that along y follows
+    #: pitch along x, y and z; hexagonal: that along y follows from that along x
     pitch_mm: tuple[float, float, float] = (10.0, 10.0, 10.0)
     hexagonal: bool = False  #: whether every second row is shifted by half a pitch
-    #: places without hole or bead: row and column, or row, column and layer, from 1
+    #: places without a hole or bead: row and column, or row, column and layer, from 1
     blocked: Sequence[tuple[int, ...]] = ()
-    diameter_mm: float | None = None  #: of holes or beads
-    sd_mm: float = 0.1  #: tolerance of the manufacture
+    diameter_mm: float | None = None  #: diameter of holes or beads
+    sd_mm: float = 0.1  #: manufacturing tolerance, as standard deviation
 
     def __post_init__(self) -> None:
         if min(self.columns, self.rows, self.layers) < 1:
@@ -169,7 +170,7 @@ class Drawing:
 
     @property
     def blocked_id(self) -> NDArray[np.int64]:
-        """Ids (b,) of the blocked places. Raises DataError for one that is not on the drawing."""
+        """Ids (b,) of the blocked places. Raises DataError for one outside the drawing."""
         out = []
         for place in self.blocked:
             row, column, layer = (*place, 1)[:3] if len(place) in (2, 3) else (0, 0, 0)
@@ -185,7 +186,7 @@ class Drawing:
 
     @property
     def places_mm(self) -> NDArray[np.float64]:
-        """Coordinates (n, 3) of all places in the order of their ids, blocked ones too."""
+        """Coordinates (n, 3) of all places, including blocked ones, in the order of their ids."""
         layer, row, column = (
             index.ravel() for index in np.indices((self.layers, self.rows, self.columns))
         )
@@ -196,7 +197,7 @@ class Drawing:
         return np.round(np.column_stack([x * (column + shift), y * row, z * layer]), 6)
 
     def phantom(self) -> Phantom:
-        """Return the phantom without the blocked places. Raises DataError where few are left."""
+        """Return the phantom without the blocked places. Raises DataError if too few remain."""
         places = self.places_mm
         ids = np.arange(1, len(places) + 1)
         kept = ~np.isin(ids, self.blocked_id)
@@ -205,7 +206,7 @@ class Drawing:
         return Phantom(ids[kept], places[kept], np.full(count, self.sd_mm), diameter)
 
 
-# Rules for columns of numbers that phantoms and frames share.
+# Checks of columns of numbers, shared by phantoms and frames.
 
 
 def is_positive(sigma: ArrayLike) -> NDArray[np.bool_]:

@@ -1,12 +1,11 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Stamps and numbers of frames: whether they agree, and numbers for images that have none.
+"""Time stamps and numbers of frames: check their agreement, and number images that have none.
 
-Whether frames that are paired by number agree in time. Frames with the same number are of one
-exposure only if the cameras count alike. Cameras that were started at different times, or one that
-has dropped a frame, count differently. The stamps show it: frames with the same number are then a
-frame interval or more apart.
+Frames with the same number belong to one exposure only if the cameras count in step. Cameras that
+were started at different times, or one that has dropped a frame, do not. The stamps reveal this:
+frames with the same number are then a frame interval or more apart.
 """
 
 from __future__ import annotations
@@ -19,19 +18,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 NS_PER_S = 1_000_000_000
-RECENT = 200  # exposures that are compared
+RECENT = 200  # number of exposures that are compared
 MIN_EXPOSURES = 5
-# Part of the frame interval from which the frame with another number is nearer in time.
+# Difference of stamps, as a fraction of the frame interval, from which another frame is nearer.
 MAX_PART = 0.5
 
 
 def nanoseconds_from_stamp(stamp: Any) -> int:
-    """Return the time [ns] of what has the fields sec and nanosec, as a Time message."""
+    """Return the time [ns] of an object with fields sec and nanosec, such as a Time message."""
     return int(stamp.sec * NS_PER_S + stamp.nanosec)
 
 
 class StampedFrame(Protocol):
-    """What is needed of a frame."""
+    """Interface of a frame with number and stamp."""
 
     @property
     def number(self) -> int:
@@ -39,14 +38,14 @@ class StampedFrame(Protocol):
 
     @property
     def stamp_ns(self) -> int:
-        """Time of the exposure [ns], 0 where it is not known."""
+        """Time of the exposure [ns], 0 if unknown."""
 
 
 class StampAgreement:
-    """Compares the stamps of the frames of recent exposures.
+    """Comparison of the stamps of the frames of recent exposures.
 
     fluoroscopes: names; recent: number of exposures, None for all. Frames without a stamp (0) are
-    not compared.
+    ignored.
     """
 
     def __init__(self, fluoroscopes: tuple[str, ...], recent: int | None = RECENT) -> None:
@@ -61,9 +60,9 @@ class StampAgreement:
             self._recent.append((frames[0].number, stamps))
 
     def disagreement(self) -> str:
-        """Return a sentence where the frames of an exposure are far apart in time, else ''.
+        """Return a sentence if the frames of an exposure are far apart in time, otherwise ''.
 
-        A constant difference of the clocks looks the same; the sentence says so.
+        A constant offset between the clocks has the same effect; the sentence says so.
         """
         first, *others = self._fluoroscopes
         for other in others:
@@ -95,7 +94,7 @@ class StampAgreement:
 
 
 def _frame_interval(number: NDArray[np.int64], stamp_ns: NDArray[np.int64]) -> float:
-    """Return the time [ns] between frames of consecutive numbers; 0 where it is not known."""
+    """Return the time between frames of consecutive numbers [ns], 0 if unknown."""
     numbers = np.diff(number)
     times = np.diff(stamp_ns)
     forward = (numbers > 0) & (times > 0)
@@ -104,20 +103,20 @@ def _frame_interval(number: NDArray[np.int64], stamp_ns: NDArray[np.int64]) -> f
     return float(np.median(times[forward] / numbers[forward]))
 
 
-RECENT_IMAGES = 512  # exposures whose images may still come
+RECENT_IMAGES = 512  # number of exposures to which further images may be added
 
 
 class ExposureNumbers:
-    """Gives images of several fluoroscopes the same number where they are of one exposure.
+    """Assigns the same number to images of several fluoroscopes that belong to one exposure.
 
-    Images belong together by stamp, within the tolerance [ns]. Exposures are counted from 1 in the
-    order of their first image, so an image that is lost, of any fluoroscope, shifts no number.
-    Images without a stamp (0) are counted by fluoroscope.
+    Images are matched by stamp, within the tolerance [ns]. Exposures are counted from 1 in the
+    order of their first image, so a lost image of any fluoroscope does not shift the numbers.
+    Images without a stamp (0) are counted for each fluoroscope separately.
     """
 
     def __init__(self, fluoroscopes: Iterable[str], tolerance_ns: int) -> None:
         self._tolerance = tolerance_ns
-        # Stamp, number, and the fluoroscopes that have delivered their image.
+        # Stamp, number, and fluoroscopes whose image has arrived.
         self._recent: deque[tuple[int, int, set[str]]] = deque(maxlen=RECENT_IMAGES)
         self._last = 0
         self._without_stamp = dict.fromkeys(fluoroscopes, 0)
@@ -133,7 +132,7 @@ class ExposureNumbers:
             if apart > self._tolerance or fluoroscope in exposure[2]:
                 continue
             if nearest is None or apart <= abs(nearest[0] - stamp_ns):
-                nearest = exposure  # the newest one, where a recording is repeated
+                nearest = exposure  # the newest of equally near ones, for repeated recordings
         if nearest is None:
             self._last += 1
             nearest = (stamp_ns, self._last, set())

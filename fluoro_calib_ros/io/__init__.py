@@ -1,4 +1,4 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Files: what is read and written, with care and whole."""
+"""Read and write files: input within limits, output atomically."""

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Reading of whole files, folders, and names that are safe as file names."""
+"""Read and write whole files and folders; check names that become part of file names."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from ..errors import DataError
 from ..limits import read_limits
 
 UTF_16 = (b'\xff\xfe', b'\xfe\xff')  # byte order marks
-# How files begin that hold tables, but are no text.
+# Beginnings of text files with tables in layouts that are not read.
 _QTM = 'a TSV export of Qualisys Track Manager; export the trial as C3D, which is read'
 _NEXUS = 'an ASCII export of Vicon Nexus; take the C3D file of the trial, which is read'
-# How files begin that are not read, and what to do about them.
+# Beginnings of files that are not read, with advice to the user.
 _NOT_READ = (
     (b'PK\x03\x04', 'an xlsx spreadsheet or another zip archive; save the table as CSV'),
     (b'\xd0\xcf\x11\xe0', 'an xls spreadsheet; save the table as CSV'),
@@ -48,7 +48,7 @@ def os_error_reason(error: OSError) -> str:
 
 @contextmanager
 def os_errors(path: object, what: str) -> Iterator[None]:
-    """Raise DataError for an OSError; what: what cannot be done with the path, in words."""
+    """Turn an OSError into a DataError; what: the failure, such as 'cannot be read'."""
     try:
         yield
     except OSError as error:
@@ -58,7 +58,7 @@ def os_errors(path: object, what: str) -> Iterator[None]:
 def check_regular_file(path: PathLike) -> None:
     """Raise DataError for a pipe, device or socket: reading one may never end.
 
-    What does not exist, or cannot be looked at, is left to the reader.
+    A path that does not exist or cannot be accessed passes: the reader will report it.
     """
     try:
         mode = os.stat(path).st_mode
@@ -70,10 +70,7 @@ def check_regular_file(path: PathLike) -> None:
 
 @contextmanager
 def opened(path: PathLike) -> Iterator[BinaryIO]:
-    """Open a file to read it.
-
-    Raises DataError for a file that does not exist or cannot be read, and for a folder.
-    """
+    """Open a file for reading. Raises DataError for a folder or if the file cannot be read."""
     check_regular_file(path)
     try:
         with open(path, 'rb') as file:
@@ -90,7 +87,7 @@ def opened(path: PathLike) -> Iterator[BinaryIO]:
 
 
 def read_bytes(path: PathLike) -> bytes:
-    """Return the content of a file. Raises DataError as `opened`, and for an empty file."""
+    """Return the content of a file. Raises DataError, also for an empty or too large file."""
     with opened(path) as file:
         size = os.fstat(file.fileno()).st_size
         limits = read_limits()
@@ -107,9 +104,9 @@ def read_bytes(path: PathLike) -> bytes:
 
 
 def read_text(path: PathLike) -> str:
-    """Return the text of a file in UTF-8, or in UTF-16 with its byte order mark, without the mark.
+    """Return the text of a file in UTF-8, or in UTF-16 with a byte order mark, without the mark.
 
-    Raises DataError as `read_bytes` does, and for a file in neither.
+    Raises DataError as `read_bytes`, for a kind that is not read, and for another encoding.
     """
     content = read_bytes(path)
     kind = kind_not_read(content)
@@ -127,18 +124,18 @@ def read_text(path: PathLike) -> str:
 
 
 def encoding_of(content: bytes) -> str:
-    """Return the encoding of a text by how it begins."""
+    """Return the encoding of a text, judged by its first bytes."""
     return 'utf-16' if content.startswith(UTF_16) else 'utf-8-sig'
 
 
 def kind_not_read(content: bytes) -> str:
-    """Return what a table is whose kind is not read, and what to do; '' for any other file."""
+    """Return the kind of a file that is not read, with advice to the user; otherwise ''."""
     begin = content.lstrip()
     return next((kind for start, kind in _NOT_READ if begin.startswith(start)), '')
 
 
 def check_rows(text: str, most: int, where: object) -> None:
-    """Raise DataError for a text of more rows than that; where begins its message."""
+    """Raise DataError for a text of more than `most` rows; the message begins with where."""
     rows = text.count('\n')
     if rows > most:
         raise DataError(f'{where}: {rows} rows, more than {most} are not read')
@@ -147,7 +144,7 @@ def check_rows(text: str, most: int, where: object) -> None:
 def check_safe_name(name: str, where: object) -> None:
     """Raise DataError unless the name of a fluoroscope can be part of a file name.
 
-    It may contain letters, digits, _ and -; where begins the message.
+    It may contain letters, digits, _ and -. The message begins with where.
     """
     longest = read_limits().max_name_length
     if len(str(name)) > longest or not _SAFE_NAME.fullmatch(str(name)):
@@ -159,7 +156,7 @@ def check_safe_name(name: str, where: object) -> None:
 
 
 def make_folder(path: PathLike) -> None:
-    """Create a folder, and those above it, unless it exists. Raises DataError."""
+    """Create a folder and its parents unless it exists. Raises DataError."""
     try:
         os.makedirs(path, exist_ok=True)
     except FileExistsError:
@@ -170,17 +167,17 @@ def make_folder(path: PathLike) -> None:
         ) from None
 
 
-# Writing that leaves either the complete new file or the old one.
+# Atomic writing: afterwards either the complete new file or the old one exists.
 
 
 @contextmanager
 def atomic_file(path: PathLike, mode: str = 'wb') -> Iterator[IO[Any]]:
-    """Open a file for writing that gets its name when the block ends without an error.
+    """Open a temporary file for writing; rename it to path when the block ends without an error.
 
-    mode is 'wb', or 'w' for UTF-8 text without conversion of line ends. Raises DataError where the
+    mode is 'wb', or 'w' for UTF-8 text without conversion of line ends. Raises DataError if the
     file cannot be written. After any exception an earlier file is unchanged.
     """
-    target = os.path.realpath(path)  # a symbolic link remains one
+    target = os.path.realpath(path)  # write through a symbolic link, do not replace it
     folder, name = os.path.split(target)
     if os.path.lexists(target) and not os.path.isfile(target):
         what = 'a directory' if os.path.isdir(target) else 'a device or pipe'
@@ -203,24 +200,24 @@ def atomic_file(path: PathLike, mode: str = 'wb') -> Iterator[IO[Any]]:
 
 
 def delete_file(path: Path) -> None:
-    """Delete a file, if it exists. Raises DataError where that is not possible."""
+    """Delete a file if it exists. Raises DataError if it cannot be deleted."""
     with os_errors(path, 'cannot be deleted'):
         path.unlink(missing_ok=True)
 
 
 def write_bytes(path: PathLike, content: bytes) -> None:
-    """Write a file of bytes as a whole. Raises DataError where it cannot be written."""
+    """Write a binary file atomically. Raises DataError if it cannot be written."""
     with atomic_file(path) as file:
         file.write(content)
 
 
 def write_text(path: PathLike, text: str) -> None:
-    """Write a file of UTF-8 text as a whole. Raises DataError where it cannot be written."""
+    """Write a UTF-8 text file atomically. Raises DataError if it cannot be written."""
     write_bytes(path, text.encode())
 
 
 def sync_folder(folder: PathLike) -> None:
-    """Make the names in a folder survive a power failure, where the system supports it."""
+    """Flush a folder to disk, where supported: its names then survive a power failure."""
     with suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
         try:

@@ -3,9 +3,9 @@
 
 """Files of named arrays: .npz archives as numpy.savez writes them, but validated and repeatable.
 
-Nothing is unpickled. Data type, shape, finiteness and range of every array are validated when it
-is written and when it is read, and so is the CRC of every member. The same arrays give the same
-bytes.
+Nothing is unpickled. Data type, shape, finiteness and range of every array and the CRC of every
+member are validated on reading; the arrays are also validated on writing. The same arrays give the
+same bytes.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from ..errors import DataError
 from ..limits import read_limits
 from .access import PathLike, atomic_file, read_bytes
 
-# The beginning of an .npy file, versions 1 to 3, of plain numbers or text (numpy.lib.format).
-# numpy evaluates it as Python, which raises almost anything for a crafted one.
+# Beginning of an .npy file, versions 1 to 3, of plain numbers or text (numpy.lib.format). numpy
+# evaluates the header as Python, which raises almost anything for a crafted one.
 _HEADER = re.compile(
     rb'\x93NUMPY[\x01\x02\x03]\0(.{2}|.{4})\{'
     rb"'descr': '([<>|=]?(?:b1|[iu][1248]|f[248]|U[0-9]{1,6}))', "
@@ -44,7 +44,7 @@ _DTYPES = {'int': np.dtype('<i8'), 'float': np.dtype('<f8'), 'bool': np.dtype('?
 class Layout:
     """Layout of a file."""
 
-    content: str  #: what the file holds, with its article, such as 'a calibration'
+    content: str  #: content of the file, with an article, such as 'a calibration'
     fields: Sequence[Field]  #: its arrays
     version: int  #: version that is written; all earlier ones can be read
 
@@ -52,21 +52,20 @@ class Layout:
 def to_arrays(where: object, layout: Layout, values: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """Return values as the arrays that a file of this layout contains.
 
-    where begins the message of the DataError that is raised for a value that could not be read
-    again.
+    Raises DataError, whose message begins with where, for a value that could not be read again.
     """
     return {field.name: _to_array(where, values[field.name], field) for field in layout.fields}
 
 
 def to_values(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Return arrays with Python numbers and text in place of arrays without dimensions."""
+    """Return arrays with zero-dimensional ones converted to Python numbers and text."""
     return {name: array.item() if array.ndim == 0 else array for name, array in arrays.items()}
 
 
 def write_arrays(path: PathLike, layout: Layout, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write the arrays that `to_arrays` returned.
+    """Write arrays returned by `to_arrays`.
 
-    Raises DataError where the file cannot be written; an earlier file is then unchanged.
+    Raises DataError if the file cannot be written; an earlier file is then unchanged.
     """
     version = np.array(layout.version, dtype=_DTYPES['int'])
     with atomic_file(path) as file, zipfile.ZipFile(file, 'w', zipfile.ZIP_STORED) as archive:
@@ -78,8 +77,8 @@ def write_arrays(path: PathLike, layout: Layout, arrays: Mapping[str, np.ndarray
 def read_arrays(path: PathLike, layout: Layout) -> dict[str, np.ndarray]:
     """Read the arrays of a file.
 
-    Raises DataError for a file of another kind, a damaged one, a version of the layout that is
-    not known, and an array that does not meet its requirements.
+    Raises DataError for a file of another kind, a damaged file, an unknown version of the layout,
+    and an array that does not meet its requirements.
     """
     content = read_bytes(path)
     try:
@@ -116,7 +115,7 @@ def _to_array(where: object, value: Any, spec: Field) -> np.ndarray:
 
 
 def _write_member(archive: zipfile.ZipFile, name: str, array: np.ndarray) -> None:
-    info = zipfile.ZipInfo(f'{name}.npy')  # of 1980: the same arrays give the same bytes
+    info = zipfile.ZipInfo(f'{name}.npy')  # dated 1980: the same arrays give the same bytes
     info.create_system = 3  # Unix, on every system
     info.external_attr = 0o644 << 16
     buffer = io.BytesIO()
@@ -127,7 +126,7 @@ def _write_member(archive: zipfile.ZipFile, name: str, array: np.ndarray) -> Non
 def _read_members(
     path: PathLike, archive: zipfile.ZipFile, layout: Layout
 ) -> dict[str, np.ndarray]:
-    """Return the arrays of an archive; its version is checked first."""
+    """Return the arrays of an archive, after checking its version."""
     members = archive.namelist()
     total = sum(info.file_size for info in archive.infolist())
     limits = read_limits()
@@ -150,7 +149,7 @@ def _read_members(
 
 
 def _read_version(path: PathLike, archive: zipfile.ZipFile, layout: Layout) -> int:
-    """Return the version of the layout. Raises DataError for one that is not known."""
+    """Return the version of the layout. Raises DataError for an unknown version."""
     if 'format_version.npy' not in archive.namelist():
         raise DataError(
             f'{path}: this is not {layout.content} file, it has no array format_version'
@@ -170,9 +169,9 @@ def _read_version(path: PathLike, archive: zipfile.ZipFile, layout: Layout) -> i
 
 
 def _read_member(path: PathLike, archive: zipfile.ZipFile, name: str) -> np.ndarray:
-    """Return an array of an archive. Raises DataError unless it is one of plain numbers or text.
+    """Return an array of an archive. Raises DataError unless it contains plain numbers or text.
 
-    The header is compared with the size of the member before anything is made of it.
+    The header is compared with the size of the member before an array is created.
     """
     info = archive.getinfo(f'{name}.npy')
     if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
@@ -196,9 +195,9 @@ def _read_member(path: PathLike, archive: zipfile.ZipFile, name: str) -> np.ndar
     if dtype.kind == 'U':
         codes = np.frombuffer(content, np.dtype('u4').newbyteorder(dtype.byteorder), offset=offset)
         is_surrogate = (codes >> 11) == 0xD800 >> 11
-        if ((codes > sys.maxunicode) | is_surrogate).any():  # no characters
+        if ((codes > sys.maxunicode) | is_surrogate).any():  # not valid characters
             raise _no_plain_array(path, name)
-    return array.astype(dtype.newbyteorder('='))  # a copy that can be written to
+    return array.astype(dtype.newbyteorder('='))  # a writable copy
 
 
 def _no_plain_array(path: PathLike, name: str) -> DataError:
@@ -209,7 +208,7 @@ def _no_plain_array(path: PathLike, name: str) -> DataError:
 
 
 def _validate(where: object, array: np.ndarray, spec: Field) -> None:
-    """Raise DataError, beginning with where, for an array that does not meet its requirements."""
+    """Raise DataError, whose message begins with where, for an array that is not as required."""
     name = spec.name
     if spec.dtype == 'text':
         is_expected = array.dtype.kind == 'U'

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Bodies as CSV, joints as TOML, and poses, motion and points in space as CSV.
+"""Bodies as CSV, joints as TOML, and poses, motion and 3-D points as CSV.
 
-Bodies as CSV `body,marker,x,y,z,sd`, in millimetres; marker is the id of a target. A marker whose
-place is unknown has empty x, y, z and sd, one without a standard deviation an empty sd.
+Bodies are CSV `body,marker,x,y,z,sd`, in millimetres; marker is the id of a target. A marker with
+an unknown position has empty x, y, z and sd; one with an unknown standard deviation an empty sd.
 
-Joints: joints.toml, which defines them, and joints.csv, their motion.
+joints.toml defines joints, joints.csv contains their motion.
 
     [[joint]]
     name = "knee"
@@ -62,7 +62,7 @@ BODY_COLUMNS = ('body', 'marker', 'x', 'y', 'z', 'sd')
 
 
 def read_bodies(path: PathLike) -> tuple[Body, ...]:
-    """Read bodies from a CSV file, in their order there. Raises DataError that names the row."""
+    """Read bodies from a CSV file, in file order. Raises DataError that names the row."""
     rows: dict[str, list[tuple[int, list[float]]]] = {}
     first_rows: dict[int, tuple[int, str]] = {}
     most = read_limits().max_targets
@@ -94,7 +94,7 @@ def read_bodies(path: PathLike) -> tuple[Body, ...]:
 
 
 def _numbers(block: Block) -> NDArray[np.float64]:
-    """Return x, y, z, sd (n, 4), NaN and an infinite sd where unknown. Raises DataError."""
+    """Return x, y, z, sd (n, 4); unknown ones are NaN, sd infinite. Raises DataError."""
     columns = []
     for name in BODY_COLUMNS[2:]:
         values = block.floats_or_nan(name)
@@ -121,7 +121,7 @@ def _fail_repeated(block: Block, index: int, name: str, row: int, owner: str) ->
 
 
 def write_bodies(path: PathLike, bodies: Sequence[Body]) -> None:
-    """Write bodies to a CSV file, from which the same values are read again. Raises DataError."""
+    """Write bodies to a CSV file; reading it restores the same values. Raises DataError."""
     shape_table(bodies).write(path)
 
 
@@ -169,7 +169,7 @@ class JointEntry:
 
 
 def read_joints(path: PathLike, bodies: Iterable[Body | str]) -> tuple[JointEntry, ...]:
-    """Read a joints.toml with joints between these bodies, or bodies of these names.
+    """Read a joints.toml with joints between the given bodies, or bodies of the given names.
 
     Raises DataError that names file and joint.
     """
@@ -253,7 +253,7 @@ def _frame(of: Convention, end: str, table: Any, side: str) -> AnatomicalFrame:
 
 
 def _frame_of(of: Convention, end: str, table: Mapping[str, Any], side: str) -> AnatomicalFrame:
-    """Return the frame that a table describes in one of four ways. Raises DataError."""
+    """Return the frame given by landmarks, axes, quaternion or matrix. Raises DataError."""
     has_origin = 'matrix' not in table and 'landmarks' not in table
     if has_origin != ('origin' in table):
         raise DataError(f'the key origin is {"missing" if has_origin else "given twice"}')
@@ -316,7 +316,7 @@ def joint_definition(
 
 
 def joint_table(motions: Sequence[JointMotion], start_ns: int) -> Table:
-    """Return joints.csv: a row for each joint and exposure, with times since start_ns."""
+    """Return joints.csv: one row a joint and exposure, times relative to start_ns."""
     rows = (row for motion in motions for row in _motion_rows(motion, start_ns))
     return Table(JOINT_COLUMNS, rows)
 
@@ -334,9 +334,9 @@ def _motion_rows(motion: JointMotion, start_ns: int) -> Iterator[list[object]]:
 
 # Results in space as CSV: poses and motion of bodies, and reconstructed points.
 #
-# Poses and motion have a row for each body and exposure, in mm, s and rad. A pose takes points of
-# the body to the frame of the reconstructed points; errors of a rotation are about the axes of
-# that frame. The motion is that of the centre of the markers of a body.
+# Poses and motion have one row a body and exposure, in mm, s and rad. A pose maps points of the
+# body to the frame of the reconstructed points; rotation errors are about the axes of that frame.
+# The motion is that of the centre of the markers of a body.
 
 COLUMNS = (
     *('body', 'exposure', 'time_s', 'x_mm', 'y_mm', 'z_mm', 'qx', 'qy', 'qz', 'qw'),
@@ -350,7 +350,7 @@ MOTION_COLUMNS = ('body', 'exposure', 'time_s', *_VALUES, *(f'sd_{name}' for nam
 
 
 def pose_table(poses: Sequence[BodyPoses], start_ns: int) -> Table:
-    """Return poses.csv, with times since start_ns."""
+    """Return poses.csv, times relative to start_ns."""
     return Table(COLUMNS, (row for one in poses for row in _rows(one, start_ns)))
 
 
@@ -382,28 +382,28 @@ def _motion(body: Body, row: int, one: TrackedExposure, start_ns: int) -> list[o
     return [body.name, one.number, time_s, *values.tolist()]
 
 
-# Reconstructed points as CSV: one row for a point of a frame, lengths in mm, residuals in px.
+# Reconstructed points as CSV: one row a point and frame, lengths in mm, residuals in px.
 
 POINT_COLUMNS = (
     *('frame', 'stamp_ns', 'target_id', 'x', 'y', 'z'),
     *('sd_x', 'sd_y', 'sd_z', 'residual', 'rays', 'status'),
 )
-NAME_COLUMN = 'name'  # the last one, of targets that have names
+NAME_COLUMN = 'name'  # last column, if targets have names
 
 
 def write_reconstruction(
     path: PathLike, frames: Iterable[ReconstructedFrame], names: Names | None = None
 ) -> None:
-    """Write reconstructed frames to a CSV file, with a column name where targets have names.
+    """Write reconstructed frames to a CSV file, with a column name if targets have names.
 
-    What is unknown, such as the coordinates of a point that only one fluoroscope sees, is an empty
-    cell. Raises DataError where the file cannot be written.
+    Unknown values, such as the coordinates of a point seen by a single fluoroscope, are empty
+    cells. Raises DataError if the file cannot be written.
     """
     point_table(frames, names).write(path)
 
 
 def point_table(frames: Iterable[ReconstructedFrame], names: Names | None = None) -> Table:
-    """Return reconstructed frames as a table, with a column name where targets have names."""
+    """Return reconstructed frames as a table, with a column name if targets have names."""
     labels = (names or Names()).target_names()
     rows = (
         [*row, labels.get(row[2], '')] if labels else row

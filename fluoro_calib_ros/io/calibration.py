@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The calibration file DIR/<fluoroscope>.calibration.npz, and whether a result folder is whole.
+"""Calibration files DIR/<fluoroscope>.calibration.npz and the consistency of a result folder.
 
-Whether the files in a result folder belong together. result.json names the calibrations that it is
-about by their ids, which are digests of their content, and has a digest of its own content.
-validation.json, the verdict, has digests of all files that it is about, and one of these and
-itself: one over the folder. Those of earlier versions have none, and agree with everything.
+The files in a result folder must belong together. result.json names its calibrations by their ids,
+which are digests of their content, and contains a digest of its own content. validation.json, the
+verdict, contains digests of all files that it is about, and a digest of its own content, hence of
+the whole folder. Documents of earlier versions have no digests and are accepted.
 """
 
 from __future__ import annotations
@@ -46,11 +46,11 @@ def calibration_path(directory: PathLike, fluoroscope: str) -> str:
 
 
 def save_calibration(directory: PathLike, calibration: FluoroscopeCalibration) -> str:
-    """Write a calibration into a folder, which is created where it is missing.
+    """Write a calibration into a folder, which is created if it does not exist.
 
     Returns the path. The same calibration gives the same bytes; its `seconds` are not saved.
-    Raises DataError where the file cannot be written, or could not be read again; an earlier file
-    is then unchanged.
+    Raises DataError if the file cannot be written, or could not be read again; an earlier file is
+    then unchanged.
     """
     path = calibration_path(directory, calibration.fluoroscope)
     arrays = validated_arrays(path, calibration.to_values())
@@ -62,8 +62,8 @@ def save_calibration(directory: PathLike, calibration: FluoroscopeCalibration) -
 def validated_arrays(where: object, values: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """Return the values of a calibration as the arrays that its file contains.
 
-    values: as `FluoroscopeCalibration.to_values` returns them; where begins the message of the
-    DataError that is raised for a value that a calibration cannot have, such as NaN.
+    values: as returned by `FluoroscopeCalibration.to_values`. Raises DataError for a value that a
+    calibration cannot have, such as NaN; the message begins with where.
     """
     arrays = to_arrays(where, LAYOUT, values)
     _check_content(where, arrays)
@@ -71,17 +71,17 @@ def validated_arrays(where: object, values: Mapping[str, Any]) -> dict[str, np.n
 
 
 def load_calibration(path: PathLike) -> FluoroscopeCalibration:
-    """Read a calibration, which is equal to the saved one to the last bit; its seconds are NaN.
+    """Read a calibration: equal to the saved one to the last bit, except that its seconds are NaN.
 
-    The file of an earlier version may have the id that it gave; the calibration has that of this
-    version. Raises DataError for a file that is not a calibration, is damaged, or has a version of
-    the layout that is not known.
+    A file of an earlier version may contain the id that this version computed; the calibration
+    gets the id of the current version. Raises DataError for a file that is not a calibration, is
+    damaged, or has an unknown layout version.
     """
     return read_with_id(path)[0]
 
 
 def read_with_id(path: PathLike) -> tuple[FluoroscopeCalibration, str]:
-    """Read a calibration as `load_calibration` does, and the id that its file has."""
+    """Read a calibration as `load_calibration` does; also return the id that its file contains."""
     arrays = read_arrays(path, LAYOUT)
     _check_content(path, arrays)
     values = to_values(arrays)
@@ -102,7 +102,7 @@ def read_with_id(path: PathLike) -> tuple[FluoroscopeCalibration, str]:
 def load_calibrations(directory: PathLike) -> dict[str, FluoroscopeCalibration]:
     """Read all calibrations in a folder, sorted by fluoroscope.
 
-    Raises DataError, also for a folder without calibrations.
+    Raises DataError if one cannot be read, or if the folder contains none.
     """
     try:
         names = sorted(
@@ -131,7 +131,7 @@ def load_calibrations(directory: PathLike) -> dict[str, FluoroscopeCalibration]:
 
 
 def _check_content(where: object, arrays: Mapping[str, Any]) -> None:
-    """Raise DataError for training arrays of different lengths, and for impossible sizes."""
+    """Raise DataError for training arrays of different lengths, and for values out of range."""
     lengths = {name: len(arrays[name]) for name in ('train_uv', 'train_duv', 'train_exposure')}
     if len(set(lengths.values())) > 1:
         listed = ', '.join(f'{name} {length}' for name, length in lengths.items())
@@ -142,7 +142,7 @@ def _check_content(where: object, arrays: Mapping[str, Any]) -> None:
             f'{where}: {lengths["train_uv"]} training points, more than '
             f'{limits.max_training_points} are not read'
         )
-    # Points of one place in single precision: no search tree can divide them.
+    # Points that coincide in single precision: a search tree cannot separate them.
     heaps = np.unique(arrays['train_uv'].astype(np.float32), axis=0, return_counts=True)[1]
     if heaps.max(initial=0) > MAX_COINCIDENT:
         raise DataError(
@@ -177,7 +177,7 @@ ORIENTATION_FIELDS = (
     Field('exposures', 'int', minimum=0),
     Field('orientation_id', 'text'),
 )
-# Array of the file: attribute of the RigOrientation, where it has another name.
+# Array of the file -> attribute of RigOrientation, if their names differ.
 _ATTRIBUTES = {
     'fluoroscope': 'fluoroscopes',
     'calibration_id': 'calibration_ids',
@@ -187,14 +187,14 @@ ORIENTATION_LAYOUT = Layout('a rig orientation', ORIENTATION_FIELDS, version=1)
 
 
 def orientation_path(directory: PathLike) -> str:
-    """Return the path of the orientation of the rig in a folder."""
+    """Return the path of the rig orientation in a folder."""
     return os.path.join(directory, ORIENTATION_NAME)
 
 
 def save_orientation(directory: PathLike, orientation: RigOrientation) -> str:
-    """Write an orientation into a folder, which is created where it is missing.
+    """Write an orientation into a folder, which is created if it does not exist.
 
-    Returns the path. The same orientation gives the same bytes. Raises DataError where the file
+    Returns the path. The same orientation gives the same bytes. Raises DataError if the file
     cannot be written; an earlier file is then unchanged.
     """
     path = orientation_path(directory)
@@ -212,10 +212,9 @@ def save_orientation(directory: PathLike, orientation: RigOrientation) -> str:
 def load_orientation(path: PathLike) -> RigOrientation:
     """Read an orientation, which is equal to the saved one to the last bit.
 
-    Where the calibrations beside it are of an earlier version, it refers to them by the ids of
-    this version, and so has an id of its own. Raises DataError for a file that is not the
-    orientation of a rig, is damaged or was changed, or has a version of the layout that is not
-    known.
+    If the calibrations next to it were written by an earlier version, the orientation refers to
+    them by their current ids, and its own id changes accordingly. Raises DataError for a file that
+    is not a rig orientation, is damaged or was changed, or has an unknown layout version.
     """
     values = to_values(read_arrays(path, ORIENTATION_LAYOUT))
     identity = values.pop('orientation_id')
@@ -243,14 +242,14 @@ def load_orientation(path: PathLike) -> RigOrientation:
 
 
 def _present_ids(path: PathLike, orientation: RigOrientation) -> tuple[str, ...]:
-    """Ids of the calibrations of an orientation, in place of those that earlier versions gave."""
+    """Return the calibration ids of an orientation; replace those computed by earlier versions."""
     folder = os.path.dirname(os.path.abspath(path))
     out = []
     for name, identity in zip(orientation.fluoroscopes, orientation.calibration_ids):
         present = identity
         beside = calibration_path(folder, name)
         if os.path.isfile(beside):
-            with suppress(DataError):  # told where the calibration is needed
+            with suppress(DataError):  # reported where the calibration is used
                 calibration, stored = read_with_id(beside)
                 present = calibration.calibration_id if stored == identity else identity
         out.append(present)
@@ -262,10 +261,10 @@ VALIDATION_NAME = 'validation.json'  # the verdict
 OBSERVATIONS = 'observations.csv'
 PHANTOM = 'phantom.csv'
 OPTIONS = 'options.json'
-KNOWN_ORIENTATION = 'known_orientation.yaml'  # only where there are any
+KNOWN_ORIENTATION = 'known_orientation.yaml'  # only present if orientations were known
 DIGEST = 'digest'
 FILES = 'files'
-# What a verdict is about, beside the calibrations.
+# Files that a verdict is about, in addition to the calibrations.
 _JUDGED = (RESULT_NAME, OBSERVATIONS, PHANTOM, OPTIONS, KNOWN_ORIENTATION, NAMES_FILE)
 
 
@@ -275,9 +274,9 @@ def with_digest(document: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def disagreements(directory: PathLike, calibrations: Calibrations) -> list[Finding]:
-    """Return a finding for everything in result.json and the verdict that contradicts the files.
+    """Return a finding for each contradiction between result.json, the verdict and the files.
 
-    There are none without result.json. A file that cannot be read is one.
+    There are none without result.json. A file that cannot be read gives a finding.
     """
     try:
         document = read_result(directory)
@@ -293,7 +292,7 @@ def disagreements(directory: PathLike, calibrations: Calibrations) -> list[Findi
 
 
 def read_result(directory: PathLike, name: str = RESULT_NAME) -> dict[str, Any]:
-    """Read a document of a folder, {} where there is none. Raises DataError."""
+    """Read a JSON document of a folder, {} if there is none. Raises DataError."""
     path = Path(directory) / name
     return read_json(path) if path.exists() else {}
 
@@ -301,7 +300,8 @@ def read_result(directory: PathLike, name: str = RESULT_NAME) -> dict[str, Any]:
 def used_exposures(document: Mapping[str, Any], frames: Frames) -> dict[str, set[int]]:
     """Return the numbers of the exposures that were used, by fluoroscope.
 
-    document is the content of result.json. Where it does not tell, all frames were used.
+    document is the content of result.json. If it does not list exposures of a fluoroscope, all its
+    frames count as used.
     """
     entries = document.get('fluoroscopes')
     out = {name: {int(frame.number) for frame in of_one} for name, of_one in frames.items()}
@@ -317,7 +317,7 @@ def used_exposures(document: Mapping[str, Any], frames: Frames) -> dict[str, set
 def with_digests(
     directory: PathLike, document: Mapping[str, Any], fluoroscopes: Iterable[str]
 ) -> dict[str, Any]:
-    """Return a verdict with the digests of the files that it is about, and one of all.
+    """Return a verdict with the digests of the files that it is about, and its own digest.
 
     Raises DataError for a file that cannot be read.
     """
@@ -327,7 +327,7 @@ def with_digests(
 
 
 def changed_since_verdict(directory: PathLike, verdict: Mapping[str, Any]) -> Finding | None:
-    """Return a finding where a verdict, or a file that it is about, was changed afterwards."""
+    """Return a finding if a verdict, or a file that it is about, was changed afterwards."""
     found = edited(directory, verdict, VALIDATION_NAME)
     files = verdict.get(FILES)
     if found is not None or not isinstance(files, Mapping):
@@ -341,15 +341,15 @@ def changed_since_verdict(directory: PathLike, verdict: Mapping[str, Any]) -> Fi
 
 @dataclass(frozen=True)
 class Verdict:
-    """Verdict on calibrations: pass, fail or cannot tell, '' where none was made."""
+    """Verdict on calibrations: pass, fail or cannot tell; '' if none was made."""
 
     verdict: str = ''
-    findings: tuple[str, ...] = ()  #: why it is no pass
+    findings: tuple[str, ...] = ()  #: reasons for a verdict other than pass
     calibration_id: Mapping[str, str] = field(default_factory=dict)  #: by fluoroscope
 
 
 def stored_verdict(directory: PathLike) -> Verdict:
-    """Return the verdict of a result folder, 'cannot tell' where it is not about its files.
+    """Return the verdict of a result folder; 'cannot tell' if its files were changed since.
 
     Raises DataError for a damaged file.
     """
@@ -367,7 +367,7 @@ def stored_verdict(directory: PathLike) -> Verdict:
 
 
 def _digest_of_file(path: Path) -> str:
-    """SHA-256 (hex) of a file, of the values of a JSON document; '' where there is none."""
+    """Return SHA-256 (hex) of a file, or of the values of a JSON document; '' without a file."""
     if not path.exists():
         return ''
     if path.suffix == '.json':
@@ -378,9 +378,9 @@ def _digest_of_file(path: Path) -> str:
 def exchanged(
     directory: PathLike, document: Mapping[str, Any], calibrations: Calibrations
 ) -> Finding | None:
-    """Return a finding where calibrations of a folder are not those of its result.json.
+    """Return a finding if calibrations of a folder are not those named by its result.json.
 
-    document is the content of result.json. Fluoroscopes that it does not have are not compared.
+    document is the content of result.json. Fluoroscopes that it does not list are not compared.
     """
     entries = document.get('fluoroscopes')
     if not isinstance(entries, Mapping):
@@ -406,7 +406,7 @@ def exchanged(
 def edited(
     directory: PathLike, document: Mapping[str, Any], name: str = RESULT_NAME
 ) -> Finding | None:
-    """Return a finding where a document with a digest was changed after it was written."""
+    """Return a finding if a document with a digest was changed after it was written."""
     if DIGEST not in document:
         return None
     content = {key: value for key, value in document.items() if key != DIGEST}
@@ -426,13 +426,13 @@ def _edited(directory: PathLike, name: str, consequence: str) -> Finding:
 
 
 def _digest(content: Mapping[str, Any]) -> str:
-    """SHA-256 (hex) of the values of a document, however they are laid out as text."""
+    """Return SHA-256 (hex) of the values of a document, independent of its layout as text."""
     text = json.dumps(_plain(to_json_values(content)), sort_keys=True, separators=(',', ':'))
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _plain(value: Any) -> Any:
-    """Return a value with floats for whole numbers, which some programs do not tell apart."""
+    """Return a value with floats for integers: some programs do not distinguish them."""
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, list):

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a calibration was made from: observations.csv, phantom.csv and options.json in its folder.
+"""Inputs of a calibration: observations.csv, phantom.csv and options.json in its folder.
 
 A validation reads them; see docs/verdict.md.
 """
@@ -31,13 +31,13 @@ from .observations import read_observations_csv, write_observations_csv
 from .phantom import read_phantom, write_phantom
 from .result_document import delete_validation
 
-VERSION = 1  # of options.json
+VERSION = 1  # version of options.json
 
 
 def write_request(directory: PathLike, request: CalibrationRequest) -> None:
-    """Write what a calibration was made from, and delete the verdict on an earlier one.
+    """Write the inputs of a calibration, and delete the verdict on an earlier one.
 
-    Raises DataError where a file cannot be written.
+    Raises DataError if a file cannot be written.
     """
     directory = Path(directory)
     delete_validation(directory)
@@ -64,7 +64,7 @@ def read_request(
     frames: Frames | None = None,
     phantom: Phantom | None = None,
 ) -> CalibrationRequest:
-    """Read the request that the calibrations in a folder were made from.
+    """Read the request from which the calibrations in a folder were made.
 
     Parameters
     ----------
@@ -79,8 +79,8 @@ def read_request(
     Raises
     ------
     DataError
-        For a file that is missing or damaged, and for frames or a phantom that the calibrations
-        were not made from.
+        For a missing or damaged file, and for frames or a phantom from which the calibrations
+        were not made.
     """
     directory = Path(directory)
     options, joint, distance = read_options(directory / OPTIONS)
@@ -116,9 +116,9 @@ def read_request(
 
 
 def _require_file(path: Path, option: str = '') -> Path:
-    """Return the path of a file that exists, else raise DataError.
+    """Return the path if the file exists, otherwise raise DataError.
 
-    option is the one of the command line that can be given instead.
+    option: command-line option that can be given instead.
     """
     if not path.exists():
         instead = f'give {option}, or calibrate again' if option else 'calibrate again'
@@ -129,7 +129,7 @@ def _require_file(path: Path, option: str = '') -> Path:
 
 
 def read_calibrated_frames(directory: Path, calibrations: Calibrations) -> dict[str, list[Frame]]:
-    """Read the frames that the calibrations in a folder were made from. Raises DataError."""
+    """Read the frames from which the calibrations in a folder were made. Raises DataError."""
     path = directory / OBSERVATIONS
     widths, heights = zip(*(c.image_size for c in calibrations.values()))
     found = read_observations_csv(_require_file(path, '--source'), (max(widths), max(heights)))
@@ -168,13 +168,13 @@ def read_options(path: Path) -> tuple[CalibrationOptions, bool, float | None]:
     return options, joint, distance
 
 
-# The folder DIR/radiographs: small JPEGs of the exposures that were found in images.
+# The folder DIR/radiographs: small JPEGs of exposures that were extracted from images.
 #
 # A file is named <fluoroscope>_<exposure>.jpg.
 
 RADIOGRAPHS = 'radiographs'
 
-Radiographs = Mapping[str, Mapping[int, bytes]]  # JPEG by fluoroscope and exposure
+Radiographs = Mapping[str, Mapping[int, bytes]]  # JPEG content by fluoroscope and exposure
 
 
 def write_radiographs(directory: PathLike, radiographs: Radiographs) -> None:
@@ -190,16 +190,16 @@ def write_radiographs(directory: PathLike, radiographs: Radiographs) -> None:
 def read_radiographs(
     directory: PathLike, wanted: Iterable[tuple[str, int]]
 ) -> dict[str, dict[int, bytes]]:
-    """Return the radiographs that are there, of the wanted fluoroscopes and exposures.
+    """Return the existing radiographs of the wanted fluoroscopes and exposures.
 
-    Raises DataError for a file that is too large or no JPEG.
+    Raises DataError for a file that is too large or not a JPEG.
     """
     found: dict[str, dict[int, bytes]] = {}
     for name, exposure in wanted:
         path = _path(directory, name, exposure)
         if not path.is_file():
             continue
-        if path.stat().st_size > MEGABYTE:  # grey pixels of 512 x 512 px have a quarter of it
+        if path.stat().st_size > MEGABYTE:  # 512 x 512 px without compression: a quarter of it
             raise DataError(f'{path}: this is no small radiograph, it has over {MEGABYTE} bytes')
         content = read_bytes(path)
         if not content.startswith(JPEG_START):

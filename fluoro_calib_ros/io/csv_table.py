@@ -3,8 +3,8 @@
 
 """CSV tables: columns by name, and errors that name the row.
 
-A header with semicolons announces a table with semicolons between the cells and decimal commas, as
-spreadsheets write it in many countries.
+If the header contains semicolons and no comma, cells are separated by semicolons and numbers have
+decimal commas, as spreadsheets write them in many countries.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from .access import PathLike, atomic_file, check_rows, check_safe_name, delete_f
 if TYPE_CHECKING:
     import pandas
 
-BLOCK = 10_000  # rows converted at a time, to bound the memory
+BLOCK = 10_000  # rows converted at a time, which bounds the memory
 
 
 @dataclass(frozen=True)
 class Block:
-    """Some rows of a table."""
+    """A block of rows of a table."""
 
-    path: PathLike  #: file, for messages
+    path: PathLike  #: file name, for messages
     header: list[str]  #: names of the columns
     rows: list[list[str]]
     lines: NDArray[np.int64]  #: (n,), number of each row in the file; the header is row 1
@@ -94,10 +94,10 @@ class Block:
 def read_blocks(path: PathLike, required: Sequence[str]) -> Iterator[Block]:
     """Yield the rows of a CSV file as blocks of at most BLOCK rows.
 
-    The first row is the header. Columns may have any order, and there may be others besides the
-    required ones. Blank lines and lines that begin with # are skipped. Raises DataError for a file
-    that cannot be read, is empty, is not UTF-8 or has no rows, for missing or repeated columns,
-    and for a row with too few or too many cells.
+    The first row is the header. Columns may be in any order and include others than the required
+    ones. Blank lines and lines that begin with # are skipped. Raises DataError for a file that
+    cannot be read, is empty, is not UTF-8 or UTF-16 text or has no rows, for missing or repeated
+    columns, and for a row with too few or too many cells.
     """
     text = read_text(path)
     check_rows(text, MAX_ROWS_CSV, path)
@@ -118,14 +118,14 @@ def read_blocks(path: PathLike, required: Sequence[str]) -> Iterator[Block]:
 
 
 def read_all(path: PathLike, required: Sequence[str]) -> Block:
-    """Return all rows of a CSV file as one block. Raises DataError as `read_blocks`."""
+    """Return all rows of a CSV file as one block. Raises DataError as `read_blocks` does."""
     blocks = list(read_blocks(path, required))
     rows = [row for block in blocks for row in block.rows]
     return Block(path, blocks[0].header, rows, np.concatenate([block.lines for block in blocks]))
 
 
 def decimal_point(cell: str) -> str:
-    """Return a number with a decimal comma as one with a point, any other cell as it is."""
+    """Replace the decimal comma of a number by a point; return any other cell unchanged."""
     if cell.count(',') != 1 or '.' in cell:
         return cell
     changed = cell.replace(',', '.')
@@ -134,22 +134,22 @@ def decimal_point(cell: str) -> str:
 
 @dataclass(frozen=True)
 class Table:
-    """A table of results, for a CSV file or for pandas: names of columns, and rows of cells.
+    """A table of results for a CSV file or pandas: column names and rows of cells.
 
-    A float that is unknown is NaN, which is an empty cell in a file.
+    An unknown float is NaN, which is an empty cell in a file.
     """
 
     columns: tuple[str, ...]
     rows: Iterable[Iterable[Any]]
 
     def write(self, path: PathLike) -> None:
-        """Write a CSV file with line feeds. Raises DataError where it cannot be written."""
+        """Write a CSV file with line feeds. Raises DataError if it cannot be written."""
         with atomic_file(path, 'w') as file:
             writer = csv.writer(file, lineterminator='\n')
             writer.writerows(map(_as_texts, chain([self.columns], self.rows)))
 
     def to_dataframe(self) -> pandas.DataFrame:
-        """Return the table as a DataFrame. Raises DataError where pandas is not installed."""
+        """Return the table as a DataFrame. Raises DataError if pandas is not installed."""
         try:
             import pandas
         except ImportError:
@@ -160,7 +160,7 @@ class Table:
 
 
 def dataframe_of(tables: Mapping[str, Table], name: str) -> pandas.DataFrame:
-    """Return the table <name>.csv as a DataFrame. Raises DataError for a name of none."""
+    """Return the table <name>.csv as a DataFrame. Raises DataError for an unknown name."""
     if f'{name}.csv' not in tables:
         names = ', '.join(file.removesuffix('.csv') for file in tables)
         raise DataError(f'no table is named {name!r}, but {names}')
@@ -168,18 +168,18 @@ def dataframe_of(tables: Mapping[str, Table], name: str) -> pandas.DataFrame:
 
 
 def write_table(path: PathLike, header: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
-    """Write a CSV file of a header and rows of cells. Raises DataError."""
+    """Write a CSV file from a header and rows of cells. Raises DataError."""
     Table(tuple(header), rows).write(path)
 
 
-# A spreadsheet runs a cell that begins so. In a file of ours such a name begins with an
-# apostrophe, by which a spreadsheet takes it for text, and which is not read as a part of it.
+# A spreadsheet evaluates a cell that begins with one of these characters as a formula. A leading
+# apostrophe marks such a name as text; it is added on writing and removed on reading.
 _FORMULA = frozenset('=+-@')
 _SUSPICIOUS = _FORMULA | {"'"}
 
 
 def as_text(cell: str) -> str:
-    """Return a cell, with an apostrophe before one that a spreadsheet would run."""
+    """Return a cell, with a leading apostrophe if a spreadsheet would evaluate it as a formula."""
     bare = cell.lstrip("'")
     return f"'{cell}" if bare[:1] in _FORMULA and not is_number(bare) else cell
 
@@ -200,15 +200,15 @@ def _from_text(cell: str) -> str:
 
 
 def format_float(value: float) -> str:
-    """Return a float as text from which the same value is read again, '' for NaN."""
+    """Return a float as text that reads back to the same value, '' for NaN."""
     return '' if np.isnan(value) else repr(float(value))
 
 
 def _numbered_rows(path: PathLike, text: str) -> Iterator[tuple[int, list[str]]]:
-    """Yield the rows of a table that are not blank, with their numbers in it. Raises DataError."""
+    """Yield the rows of a table that are not blank, with their row numbers. Raises DataError."""
     separator = _separator(text)
     lines: Iterable[str] = io.StringIO(text, newline='')
-    if '#' in text:  # a comment becomes a blank line, so that the numbers of the rows remain
+    if '#' in text:  # replace comments by blank lines, to keep the row numbers
         lines = ('\n' if line.lstrip().startswith('#') else line for line in lines)
     reader = csv.reader(lines, delimiter=separator, strict=True)
     has_commas = separator == ';'
@@ -223,14 +223,14 @@ def _numbered_rows(path: PathLike, text: str) -> Iterator[tuple[int, list[str]]]
 
 
 def _separator(text: str) -> str:
-    """Return the separator of a table: a semicolon where its header has one and no comma."""
+    """Return the separator of a table: a semicolon if its header has one and no comma."""
     lines = (line for line in io.StringIO(text) if not line.lstrip().startswith('#'))
     header = next((line for line in lines if line.strip()), '')
     return ';' if ';' in header and ',' not in header else ','
 
 
 def _check_header(where: str, header: Sequence[str], required: Sequence[str]) -> None:
-    """Raise DataError for missing and repeated columns; where begins its message."""
+    """Raise DataError for missing and repeated columns; the message begins with where."""
     missing = [name for name in required if name not in header]
     if missing:
         raise DataError(
@@ -255,7 +255,7 @@ def _check_widths(
 
 
 def is_number(cell: str, kind: Callable[[str], Any] = float) -> bool:
-    """Return whether a cell is a number of a kind, as programs write it."""
+    """Return whether a cell is a number of this kind; Python's 1_0 is not."""
     try:
         kind(cell)
     except ValueError:
@@ -263,14 +263,14 @@ def is_number(cell: str, kind: Callable[[str], Any] = float) -> bool:
     return '_' not in cell
 
 
-# A column of ids in a CSV file, in which a lab may have written names.
+# Columns of ids in CSV files that may contain names instead.
 
 
 class NamedColumn:
-    """The ids of a column, read block by block.
+    """A column of ids or names, read block by block.
 
-    known: names with known ids, None where the column may only have whole numbers. A column has
-    names if none of its first cells is a number.
+    known: ids of known names; None if the column may contain integers only. The column contains
+    names if no cell of its first block is a number.
     """
 
     def __init__(self, column: str, known: Mapping[str, int] | None) -> None:
@@ -302,13 +302,13 @@ class NamedColumn:
         return {name: ids[name] for name in self._codes}
 
     def numbers(self, values: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the ids of what `read` returned, after all blocks were read."""
+        """Convert values returned by `read` to ids, after all blocks have been read."""
         ids = self.ids()
         return np.array(list(ids.values()), dtype=np.int64)[values] if ids else values
 
 
 def _are_names(cells: Sequence[str]) -> bool:
-    """Return whether no cell is a number."""
+    """Return whether no cell is a number; an empty cell counts as a number."""
     for cell in cells:
         try:
             float(cell or 'nan')
@@ -320,7 +320,7 @@ def _are_names(cells: Sequence[str]) -> bool:
 
 # The file DIR/names.csv: names of targets, exposures and fluoroscopes, `kind,id,name`.
 #
-# It is there only where the files that a calibration was made from have names.
+# It exists only if the input files of a calibration contain names.
 
 NAMES_FILE = 'names.csv'
 COLUMNS = ('kind', 'id', 'name')
@@ -328,9 +328,9 @@ _KINDS = {'target': 'targets', 'exposure': 'exposures', 'fluoroscope': 'fluorosc
 
 
 def write_names(directory: PathLike, names: Names) -> None:
-    """Write the names into a folder; delete the file there where no names are given.
+    """Write the names into a folder; delete the file if there are no names.
 
-    Raises DataError where that is not possible.
+    Raises DataError if that fails.
     """
     path = Path(directory) / NAMES_FILE
     if not names:
@@ -345,7 +345,7 @@ def write_names(directory: PathLike, names: Names) -> None:
 
 
 def read_names(directory: PathLike) -> Names:
-    """Read the names in a folder, none where there is no such file. Raises DataError."""
+    """Read the names in a folder; there are none without the file. Raises DataError."""
     path = Path(directory) / NAMES_FILE
     if not path.exists():
         return Names()

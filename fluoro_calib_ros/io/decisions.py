@@ -13,7 +13,7 @@ from ..exposures.names import MAX_ID, Names
 from .access import PathLike
 from .csv_table import Block, Table, read_blocks
 
-DOUBTFUL = 'doubtful.csv'  # of a result folder
+DOUBTFUL = 'doubtful.csv'  # in a result folder
 LEAVE_OUT = 'leave out'
 COLUMNS = (
     *('fluoroscope', 'exposure', 'last_exposure', 'target_id', 'u_px', 'v_px', 'residual_px'),
@@ -23,7 +23,7 @@ REQUIRED = ('fluoroscope', 'exposure', 'target_id', 'decision')
 
 
 def doubtful_table(doubtful: Iterable[Doubtful], names: Names | None = None) -> Table:
-    """Return the table of what is doubtful, with the names of targets and exposures."""
+    """Return the table of doubtful points and exposures, with names of targets and exposures."""
     names = names or Names()
     targets = names.target_names()
     exposures = names.exposure_names()
@@ -50,10 +50,10 @@ def doubtful_table(doubtful: Iterable[Doubtful], names: Names | None = None) -> 
 
 
 def read_decisions(path: PathLike, names: Names) -> list[PointDecision]:
-    """Read the decisions in a table; rows without one are passed over.
+    """Read the decisions in a table; rows without a decision are skipped.
 
-    names: of fluoroscopes, exposures and targets, by which the table may call them. Raises
-    DataError, which names the row, for a decision that is neither 'leave out' nor a target.
+    names: names of fluoroscopes, exposures and targets that the table may contain. Raises
+    DataError that names the row, for a decision that is neither 'leave out' nor a target.
     """
     out = []
     for block in read_blocks(path, REQUIRED):
@@ -89,7 +89,7 @@ def read_decisions(path: PathLike, names: Names) -> list[PointDecision]:
 
 
 def _new_id(block: Block, index: int, row: Mapping[str, str], names: Names) -> int:
-    """Return the id that an image point gets. Raises DataError."""
+    """Return the new id of an image point. Raises DataError."""
     text = row['decision']
     if not row['target_id']:
         block.fail(
@@ -105,7 +105,7 @@ def _new_id(block: Block, index: int, row: Mapping[str, str], names: Names) -> i
 def _number(
     block: Block, index: int, row: Mapping[str, str], column: str, known: Mapping[str, int]
 ) -> int:
-    """Return the number of a cell, which may be a known name. Raises DataError."""
+    """Return the number in a cell, which may contain a known name. Raises DataError."""
     text = row[column]
     if text in known:
         return known[text]

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""TOML, YAML, JSON and XML of others: parsed within a budget of time and memory.
+"""Read TOML, YAML, JSON and XML files of any origin within a budget of time and memory.
 
-A parser is given no more bytes than `limits.DOCUMENT_BYTES` and no structure for which its time or
-memory grows faster than the text: deep nesting, keys of many parts, aliases. Whole numbers have 64
-bits. Everything else is left to the parser of the library, whose time and memory then are a
-multiple of the bytes of the text.
+A parser gets at most `limits.DOCUMENT_BYTES` of text. Structures for which its time or memory
+grows faster than the text are refused: deep nesting, keys of many parts, aliases. Integers are
+limited to 64 bits. Everything else is left to the parser of the library, whose time and memory are
+then a multiple of the size of the text.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-MAX_DIGITS = 400  # of a number of YAML
+MAX_DIGITS = 400  # maximum length of a YAML number, in characters
 _NUMBERS = ('tag:yaml.org,2002:int', 'tag:yaml.org,2002:float')
-# Brackets of nested lists and tables; those in texts count, too.
+# Brackets of nested lists and tables; brackets inside strings count, too.
 _BRACKETS = re.compile(r'[\[\]{}]')
-# Nested lists of YAML in one line, without brackets.
+# Nested YAML lists on one line, without brackets.
 _CHAIN = re.compile(rf'(?:[-?:][ \t]+){{{MAX_DEPTH}}}')
-# What TOML may contain that is neither key nor bracket: texts and comments, also without an end.
+# Parts of TOML that are neither key nor bracket: strings and comments, also unterminated ones.
 _TOML_TEXT = re.compile(
     r'"""(?:\\.|[^\\])*?(?:"""|\Z)'
     r"|'''.*?(?:'''|\Z)"
@@ -55,22 +55,22 @@ def read_toml(path: PathLike) -> dict[str, Any]:
 
 
 def parse_toml(text: str, where: object) -> dict[str, Any]:
-    """Return the value of a TOML text. Raises DataError; where begins its message."""
+    """Parse a TOML text. Raises DataError whose message begins with where."""
     _check_size('TOML', text, where)
     structure = _TOML_TEXT.sub('x', text)
     _check_depth('TOML', structure, where)
-    if _TOML_KEY.search(structure):  # the parser keeps a copy of each part of a key for the others
+    if _TOML_KEY.search(structure):  # for each part of a key, the parser copies the others
         _fail_nested('TOML', where)
     return _parsed('TOML', where, lambda: tomllib.loads(text))
 
 
 class _Loader(getattr(yaml, 'CSafeLoader', yaml.SafeLoader)):  # type: ignore[misc]
-    """Plain values only, each once: with aliases a small text becomes a large value."""
+    """Load plain values only, and each once: with aliases a small text becomes a large value."""
 
     def construct_object(self, node: Any, deep: bool = False) -> Any:
         if node in self.constructed_objects or node in self.recursive_objects:
             self._refuse('aliases', node)
-        if node.tag in _NUMBERS and len(node.value) > MAX_DIGITS:  # of base 60: quadratic time
+        if node.tag in _NUMBERS and len(node.value) > MAX_DIGITS:  # base 60: quadratic time
             self._refuse(f'numbers of more than {MAX_DIGITS} characters', node)
         return super().construct_object(node, deep)
 
@@ -90,7 +90,7 @@ def read_yaml(path: PathLike) -> Any:
 
 
 def parse_yaml(text: str, where: object) -> Any:
-    """Return the value of a YAML text. Raises DataError; where begins its message."""
+    """Parse a YAML text. Raises DataError whose message begins with where."""
     check_budget('YAML', text, where)
     if _CHAIN.search(text):
         _fail_nested('YAML', where)
@@ -98,12 +98,12 @@ def parse_yaml(text: str, where: object) -> Any:
 
 
 def read_json(path: PathLike) -> dict[str, Any]:
-    """Read a JSON file of an object. Raises DataError that names the row of a fault."""
+    """Read a JSON file of one object. Raises DataError that names the row of the error."""
     return parse_json(read_text(path), path)
 
 
 def parse_json(text: str, where: object) -> dict[str, Any]:
-    """Return the object of a JSON text. Raises DataError; where begins its message."""
+    """Parse a JSON text; return its object. Raises DataError whose message begins with where."""
     _check_size('JSON', text, where)
     document = _parsed(
         'JSON', where, lambda: json.loads(text, parse_int=_whole, parse_constant=_not_finite)
@@ -116,15 +116,15 @@ def parse_json(text: str, where: object) -> dict[str, Any]:
 
 
 def parse_xml(text: str, where: object) -> ElementTree.Element:
-    """Return the root of an XML text. Raises DataError; where begins its message."""
+    """Parse an XML text; return its root. Raises DataError whose message begins with where."""
     _check_size('XML', text, where)
-    if '<!' in text.replace('<!--', ''):  # entities make a small text a large one
+    if '<!' in text.replace('<!--', ''):  # entities can expand a small text to a large one
         raise DataError(f'{where}: a document type, entities and CDATA are not read')
     return _parsed('XML', where, lambda: ElementTree.fromstring(text))
 
 
 def check_budget(kind: str, text: str, where: object) -> None:
-    """Raise DataError for a text of a format that is too large or nested too deeply."""
+    """Raise DataError if a text is too large for its format, or nested too deeply."""
     _check_size(kind, text, where)
     _check_depth(kind, text, where)
 
@@ -151,7 +151,7 @@ def _fail_nested(kind: str, where: object) -> NoReturn:
 
 
 def _parsed(kind: str, where: object, parse: Callable[[], Any]) -> Any:
-    """Return what a parser returns; whatever it raises becomes a DataError with the row."""
+    """Return the result of a parser; turn its exceptions into a DataError that names the row."""
     try:
         value = parse()
         if kind in ('TOML', 'YAML'):
@@ -166,7 +166,7 @@ def _parsed(kind: str, where: object, parse: Callable[[], Any]) -> Any:
 
 
 def _row_of(error: Exception) -> str:
-    """Return the place of a fault in words, '' where the parser does not tell it as a number."""
+    """Return the row of a syntax error in words, '' if the parser does not report it."""
     mark = getattr(error, 'problem_mark', None)
     row = mark.line + 1 if mark is not None else getattr(error, 'lineno', None)
     if isinstance(error, ElementTree.ParseError):
@@ -175,7 +175,7 @@ def _row_of(error: Exception) -> str:
 
 
 def _check_whole(value: Any) -> None:
-    """Raise ValueError for whole numbers beyond 64 bits in a value."""
+    """Raise ValueError for an integer beyond 64 bits anywhere in a value."""
     if isinstance(value, int):
         _whole(value)
     elif isinstance(value, dict):
@@ -188,7 +188,7 @@ def _check_whole(value: Any) -> None:
 
 
 def _whole(value: str | int) -> int:
-    # Numbers of 64 bits have up to 19 digits; those of many take quadratic time.
+    # 64-bit integers have up to 19 digits; converting many more takes quadratic time.
     if (isinstance(value, str) and len(value) > 19) or abs(int(value)) > 2**63:
         raise ValueError('a whole number is too large')
     return int(value)
@@ -202,19 +202,19 @@ def _not_finite(word: str) -> NoReturn:
 
 
 def write_json(path: PathLike, document: Mapping[str, Any]) -> None:
-    """Write a document; numbers that are not finite become null. Raises DataError."""
+    """Write a document as JSON; numbers that are not finite become null. Raises DataError."""
     write_text(path, json_text(document))
 
 
 def json_text(document: Mapping[str, Any]) -> str:
-    """Return a document as JSON, with an indentation of two blanks and the keys in order."""
+    """Return a document as JSON text, indented by two spaces, keys in their given order."""
     return (
         json.dumps(to_json_values(document), indent=2, allow_nan=False, ensure_ascii=False) + '\n'
     )
 
 
 def to_json_values(value: Any) -> Any:
-    """Return a value with lists for arrays, Python numbers, and None for what is not finite."""
+    """Return a value of lists, Python numbers and texts; None for floats that are not finite."""
     if isinstance(value, Mapping):
         return {str(key): to_json_values(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

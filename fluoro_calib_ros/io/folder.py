@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Folders that are replaced as a whole, and outputs that must not destroy anything.
+"""Atomic replacement of folders, and checks that outputs do not destroy anything.
 
-A new folder is written beside the old one and both are exchanged in one step of the file system.
-The old one is kept as NAME.previous. What a killed run leaves behind is hidden, and is cleaned up
-by the next one. Its names are .NAME.<random>.tmp while a folder is being written,
-.NAME.<inode>.swap when it is complete, and .NAME.<random>.old for a folder on its way to
-NAME.previous or to deletion.
+A new folder is written next to the old one, and both are exchanged in one step of the file system.
+The old one is kept as NAME.previous. Hidden folders left behind by a killed run are cleaned up by
+the next run. They are named .NAME.<random>.tmp while a folder is being written, .NAME.<inode>.swap
+when it is complete, and .NAME.<random>.old for a folder on its way to NAME.previous or to
+deletion.
 """
 
 from __future__ import annotations
@@ -29,33 +29,33 @@ from ..errors import DataError
 from .access import PathLike, make_folder, os_error_reason, os_errors, sync_folder
 
 PREVIOUS = '.previous'
-# Ends of the names of files that are read from a folder: of a bag, or a result.
+# Suffixes of the files of a bag or a result folder that are read as inputs.
 _INPUT_NAMES = (
     *('.mcap', '.db3', '.zstd', '.npz', '.yaml', '.json'),
     *('observations.csv', 'phantom.csv', 'names.csv'),
 )
 _AT_FDCWD = -100  # linux/fcntl.h: paths are relative to the working directory
 _RENAME_EXCHANGE = 2  # linux/fs.h
-# What a file system or an old kernel without exchange answers.
+# Errors of file systems and old kernels that do not support the exchange.
 _NO_EXCHANGE = (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EXDEV)
 
 
 @dataclass(frozen=True)
 class FolderKind:
-    """What a folder of one kind consists of."""
+    """Description of a kind of folder."""
 
-    title: str  #: what it is called in messages, such as 'a result folder'
-    #: patterns of the names of entries that are replaced with such a folder; all others belong to
-    #: the user and are carried over
+    title: str  #: name in messages, such as 'a result folder'
+    #: patterns of names of entries that are replaced with the folder; all others belong to the
+    #: user and are carried over
     parts: tuple[str, ...]
-    marks: tuple[str, ...]  #: patterns of names that show that a folder is of this kind
+    marks: tuple[str, ...]  #: patterns of names that identify a folder of this kind
 
     def owns(self, name: str) -> bool:
-        """Return whether an entry is a part of the folder, or what a killed run left of one."""
+        """Return whether an entry belongs to the folder, or was left behind by a killed run."""
         return _matches(name, (*self.parts, '.*.tmp'))
 
     def is_marked_by(self, name: str) -> bool:
-        """Return whether an entry of this name shows that a folder is of this kind."""
+        """Return whether an entry of this name identifies a folder of this kind."""
         return _matches(name, self.marks)
 
 
@@ -66,8 +66,8 @@ def _matches(name: str, patterns: Iterable[str]) -> bool:
 def check_output_folder(path: PathLike, kind: FolderKind, inputs: Iterable[PathLike] = ()) -> None:
     """Raise DataError unless a folder of this kind may be written at a path.
 
-    There must be nothing, an empty folder or one of this kind, which can be written. None of the
-    inputs may be replaced: neither that folder, nor a file or folder in it or above it.
+    The path must not exist, or be an empty folder or one of this kind, and must be writable. It
+    must neither contain an input, nor be an input or lie in one.
     """
     target = os.path.realpath(path)
     if os.path.lexists(target) and not os.path.isdir(target):
@@ -90,7 +90,7 @@ def check_output_folder(path: PathLike, kind: FolderKind, inputs: Iterable[PathL
 def check_output_file(path: PathLike, inputs: Iterable[PathLike] = ()) -> None:
     """Raise DataError unless a file may be written at a path.
 
-    There must be nothing or a regular file, which is neither an input nor part of one.
+    The path must not exist, or be a regular file that is neither an input nor part of one.
     """
     target = os.path.realpath(path)
     if os.path.lexists(target) and not os.path.isfile(target):
@@ -107,10 +107,10 @@ def check_output_file(path: PathLike, inputs: Iterable[PathLike] = ()) -> None:
 
 @contextmanager
 def replaced_folder(path: PathLike, kind: FolderKind) -> Iterator[Path]:
-    """Yield a new folder to write into, which gets its name when the block ends without an error.
+    """Yield a new folder to write to; give it its name if the block ends without an error.
 
-    Entries of an earlier folder that are not of this kind are carried over; a part of it that is
-    to be kept is to be written again. Raises DataError where the folder cannot be written. After
+    Entries of an earlier folder that do not belong to this kind are carried over; entries that do
+    are lost unless they are written again. Raises DataError if the folder cannot be written. After
     any exception the earlier folder is unchanged.
     """
     check_output_folder(path, kind)
@@ -119,7 +119,7 @@ def replaced_folder(path: PathLike, kind: FolderKind) -> Iterator[Path]:
     make_folder(parent)
     clean_up(target)
     in_place = _is_fixed(target, kind)
-    # Known before the folder is made: a signal may end the program right after that.
+    # Set before the folder is created: a signal may end the program right after that.
     staging = _hidden(
         os.path.join(target, os.path.basename(target)) if in_place else target, 'tmp'
     )
@@ -150,10 +150,10 @@ def replaced_folder(path: PathLike, kind: FolderKind) -> Iterator[Path]:
 
 @contextmanager
 def temporary_folder(path: PathLike) -> Iterator[Path]:
-    """Yield a hidden folder beside a path, for files on their way there; it is deleted at the end.
+    """Yield a hidden folder next to a path for files on their way there; delete it at the end.
 
-    So are those that killed runs have left. Raises DataError, which names the path, where it
-    cannot be made, and for an OSError in the block.
+    Folders left behind by killed runs are deleted, too. Raises DataError that names the path if
+    the folder cannot be created, and for an OSError in the block.
     """
     parent, name = os.path.split(os.path.abspath(path))
     folder = _hidden(os.path.join(parent, name), 'tmp')
@@ -172,9 +172,9 @@ def temporary_folder(path: PathLike) -> Iterator[Path]:
 
 
 def clean_up(path: PathLike) -> None:
-    """Finish or delete what killed runs left beside a folder; running ones are left alone.
+    """Finish or delete folders that killed runs left behind; skip those of active runs.
 
-    Raises DataError where that is not possible.
+    Raises DataError if that fails.
     """
     target = os.path.realpath(path)
     parent = os.path.dirname(target)
@@ -186,7 +186,7 @@ def clean_up(path: PathLike) -> None:
 
 
 def _settle(leftover: str, target: str) -> None:
-    """Keep a leftover that is an old folder, delete it otherwise."""
+    """Keep a leftover if it is an old folder, delete it otherwise."""
     mark, suffix = leftover.rsplit('.', 2)[1:]
     is_old = suffix == 'old' or (suffix == 'swap' and mark != str(os.stat(leftover).st_ino))
     if is_old and not os.path.lexists(target):
@@ -200,7 +200,7 @@ def _settle(leftover: str, target: str) -> None:
 
 
 def _put_in_place(staging: str, target: str) -> None:
-    """Give a complete folder its name, and the old one the name of the previous."""
+    """Rename a complete folder to the target; keep the old one as the previous."""
     parent, name = os.path.split(target)
     complete = os.path.join(parent, f'.{name[:100]}.{os.stat(staging).st_ino}.swap')
     os.rename(staging, complete)
@@ -227,7 +227,7 @@ def _put_in_place(staging: str, target: str) -> None:
 
 
 def _keep_as_previous(folder: str, target: str) -> None:
-    """Keep a folder as NAME.previous; the one of that name is deleted."""
+    """Keep a folder as NAME.previous; delete the one that had this name."""
     previous = target + PREVIOUS
     if os.path.lexists(previous):
         outdated = _hidden(target, 'old')
@@ -250,7 +250,7 @@ def _exchange(first: str, second: str) -> None:
 
 
 def _move_entries(staging: str, target: str, kind: FolderKind) -> None:
-    """Move new entries into a folder that must stay where it is, one after the other."""
+    """Move new entries one by one into a folder that must stay in place."""
     new = set(os.listdir(staging))
     for name in os.listdir(target):
         path = os.path.join(target, name)
@@ -263,7 +263,7 @@ def _move_entries(staging: str, target: str, kind: FolderKind) -> None:
 
 
 def _carry_over(old: str, new: str, kind: FolderKind) -> None:
-    """Link what a user has put into a folder into the new one, or copy it."""
+    """Link, or copy, the user's entries of a folder into the new one."""
 
     def link(source: str, copy: str) -> None:
         try:
@@ -282,11 +282,11 @@ def _carry_over(old: str, new: str, kind: FolderKind) -> None:
 
 
 def _make_locked(path: str) -> int:
-    """Make a folder that is locked as long as this process lives, and return its lock."""
+    """Create a folder that is locked as long as this process lives; return its lock."""
     while True:
         os.mkdir(path)
         lock = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
-        with suppress(OSError):  # a file system without locks; or another run cleans up just now
+        with suppress(OSError):  # no locks in this file system, or another run cleans up now
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         if os.path.isdir(path):
             return lock
@@ -294,7 +294,7 @@ def _make_locked(path: str) -> int:
 
 
 def _is_locked(path: str) -> bool:
-    """Return whether a run is still writing a folder."""
+    """Return whether a run is still writing to a folder."""
     lock = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -306,7 +306,7 @@ def _is_locked(path: str) -> bool:
 
 
 def _leftovers(folder: str, name: str) -> list[str]:
-    """Return the paths of hidden folders that replacing the folder `name` made in a folder."""
+    """Return the paths of hidden folders that were created to replace the folder `name`."""
     if not os.path.isdir(folder):
         return []
     start = f'.{name[:100]}.'
@@ -326,10 +326,11 @@ def _hidden(target: str, suffix: str) -> str:
 
 
 def _is_fixed(target: str, kind: FolderKind) -> bool:
-    """Return whether a folder must stay where it is.
+    """Return whether a folder must stay in place.
 
-    That is a mount point, the working folder (a shell in it would stay with the old one), and one
-    with folders of the same kind, into which others may be writing.
+    This applies to a mount point, a folder whose parent is not writable, the working folder (a
+    shell in it would stay with the old one), and a folder that contains folders of the same kind,
+    to which others may be writing.
     """
     if not os.path.isdir(target):
         return False
@@ -346,7 +347,7 @@ def _is_of_kind(path: str, kind: FolderKind) -> bool:
 
 
 def _check_kind(folder: str, kind: FolderKind) -> None:
-    """Raise DataError for a folder that holds something, but is not of this kind."""
+    """Raise DataError for a folder that is neither empty nor of this kind."""
     if not os.path.lexists(folder):
         return
     with os_errors(folder, 'cannot be read'):
@@ -362,7 +363,7 @@ def _check_kind(folder: str, kind: FolderKind) -> None:
 
 
 def _check_writable(path: PathLike, target: str) -> None:
-    """Raise DataError unless files can be made in a folder, or in the one that it will be in."""
+    """Raise DataError unless files can be created in a folder or its nearest existing parent."""
     folder = target
     while not os.path.lexists(folder):
         folder = os.path.dirname(folder)
@@ -378,7 +379,7 @@ def _check_writable(path: PathLike, target: str) -> None:
 
 
 def _what(path: str) -> str:
-    """Return what a path that is no folder, or no file, is."""
+    """Return what a path is, if it is not the expected file or folder."""
     mode = os.stat(path).st_mode if os.path.exists(path) else 0
     for test, name in (
         (stat.S_ISREG, 'a file'),

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Reading image files, stacks and videos, image by image."""
+"""Read image files, stacks and videos, image by image."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from .recordings import read_cine_header, read_cine_images, read_dicom_header, r
 
 # Angles of a C-arm in the images of a stack or video, as CSV: `image,angle_deg`.
 #
-# The first image has number 1. Rows may have any order; an image without an angle, or without a
+# The first image has number 1. Rows may be in any order. An image without an angle, or without a
 # row, gets the mean correction.
 
 COLUMNS = ('image', 'angle_deg')
 
 
 def read_image_angles(path: PathLike) -> dict[int, float]:
-    """Return the angle [rad] of each image by its number, the first one being 1.
+    """Return the angle [rad] of each image by its number; the first image has number 1.
 
-    Raises DataError for a file that cannot be read, an image that is named twice or has no
-    possible number, and a value that is no angle. Images with an empty cell are left out.
+    Raises DataError for a file that cannot be read, an image that is given twice or has an
+    impossible number, and a value that is not an angle. Images with an empty cell are omitted.
     """
     angles: dict[int, float] = {}
     rows: dict[int, int] = {}
@@ -55,31 +55,31 @@ def read_image_angles(path: PathLike) -> dict[int, float]:
     return angles
 
 
-# The formats of images, stacks and videos, by the suffix of a file name.
+# Formats of images, stacks and videos, by file name suffix.
 
 STACK_SUFFIXES = ('.tif', '.tiff')
 IMAGE_SUFFIXES = ('.png', *STACK_SUFFIXES, '.jpg', '.jpeg', '.bmp', '.pgm')
-# Read, but not written: recordings of Phantom cameras, and DICOM.
+# Formats that are read only: recordings of Phantom cameras, and DICOM.
 CINE_SUFFIXES = ('.cine',)
 DICOM_SUFFIXES = ('.dcm', '.dicom', '.ima')
 LOSSLESS_CODEC = 'FFV1'
 SUPPORTS_16_BIT_VIDEOS = tuple(map(int, cv2.__version__.split('.')[:2])) >= (4, 7)
-# Codec by which videos are written. Players know MP4 with lossy codecs only.
+# Codecs for writing videos. Players support MP4 with lossy codecs only.
 VIDEO_CODECS = {'.avi': LOSSLESS_CODEC, '.mkv': LOSSLESS_CODEC, '.mp4': 'mp4v'}
 
-# Files whose images follow each other in time.
+# Formats whose images are a time series.
 VIDEO_SUFFIXES = (*VIDEO_CODECS, *CINE_SUFFIXES, *DICOM_SUFFIXES)
-# Files with one image or more of which a folder may hold one for each exposure.
+# Formats with one or more images; a folder may contain one file for each exposure.
 EXPOSURE_SUFFIXES = (*IMAGE_SUFFIXES, *DICOM_SUFFIXES)
 READ_SUFFIXES = (*IMAGE_SUFFIXES, *VIDEO_CODECS, *CINE_SUFFIXES, *DICOM_SUFFIXES)
 
 
 def suffix_of(path: PathLike) -> str:
-    """Suffix of a path in lower case, with its dot."""
+    """Return the suffix of a path in lower case, with its dot."""
     return Path(path).suffix.lower()
 
 
-# How files begin: PNG, TIFF, JPEG, BMP and PGM; DICOM has a preamble (PS3.10, 7.1).
+# First bytes of files: PNG, TIFF, JPEG, BMP and PGM; DICOM has a preamble (PS3.10, 7.1).
 _BEGINNINGS = (
     (0, b'\x89PNG\r\n\x1a\n', '.png'),
     (0, b'II*\0', '.tif'),
@@ -93,10 +93,10 @@ _DIRECTORY = 'DICOMDIR'  # a DICOM file that lists others
 
 
 def image_suffix_of(path: PathLike) -> str:
-    """Suffix of a file that is read as images, '' for another file.
+    """Return the suffix of the image format of a file, '' if it has none that is read.
 
-    That of its name, or, where the name has none or one that means nothing, that of its content:
-    scanners call a file IM000001, or 1.2.840 and so on.
+    It is the suffix of the name. If the name has none, or a number, the content decides: scanners
+    name files IM000001, or 1.2.840 and so on.
     """
     suffix = suffix_of(path)
     if suffix in READ_SUFFIXES:
@@ -113,28 +113,28 @@ def image_suffix_of(path: PathLike) -> str:
 
 
 def is_image_source(path: PathLike) -> bool:
-    """Whether a path is a folder, or a file with images or a video."""
+    """Return whether a path is a folder, or a file with images or a video."""
     return os.path.isdir(path) or bool(image_suffix_of(path))
 
 
 def listed(suffixes: Iterable[str]) -> str:
-    """Suffixes as a text, without their dots."""
+    """Return suffixes as text, without their dots."""
     return ', '.join(suffix[1:] for suffix in suffixes)
 
 
 # Stacks of grey images in TIFF files are checked before they are read.
 #
-# tifffile lists the pages. If a file is cut off, it only logs it and goes on with the remaining
-# pages: `count_pages` refuses such a file.
+# If a file is cut off, tifffile only logs that and continues with the remaining pages;
+# `count_pages` refuses such a file.
 
-# tifffile logs what count_pages says in its one sentence.
+# Silence the log messages of tifffile: count_pages raises one error instead.
 logging.getLogger('tifffile').addHandler(logging.NullHandler())
 
 
 def count_pages(path: PathLike) -> int:
-    """Number of pages of a TIFF file.
+    """Return the number of pages of a TIFF file.
 
-    Raises DataError for a file that cannot be read, is no TIFF file, is cut off or is damaged, and
+    Raises DataError for a file that cannot be read, is not a TIFF file, is cut off or damaged, and
     for pages that are too large.
     """
     try:
@@ -159,9 +159,9 @@ def count_pages(path: PathLike) -> int:
 
 
 def _ends_with_last_page(file: TiffFile) -> bool:
-    """Whether the last page that tifffile found is the last one by the file itself.
+    """Return whether the last page that tifffile found is the last page of the file.
 
-    Its link to the next page is 0 then.
+    The link of the last page to the next one is 0.
     """
     position = file.pages.next_page_offset
     if position is None:
@@ -172,13 +172,12 @@ def _ends_with_last_page(file: TiffFile) -> bool:
 
 
 VIDEO_SIZE = (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
-MAX_BATCH_BYTES = 64_000_000  # of pages that are read at once
-# Fraction of the frames by which the frame count of a video may be wrong; some containers only
-# hold an estimate.
+MAX_BATCH_BYTES = 64_000_000  # maximum size of pages that are read at once
+# Tolerated relative error of the frame count of a video; some containers only state an estimate.
 FRAME_COUNT_TOLERANCE = 0.01
-GREY_16 = b'Y1\0\x10'  # OpenCV's name of the pixel format of a video of 16 bits
+GREY_16 = b'Y1\0\x10'  # OpenCV's name of the pixel format of a 16-bit grey video
 
-# Silence FFmpeg: errors are reported here, in one sentence.
+# Silence FFmpeg: errors are raised as DataError.
 os.environ.setdefault('OPENCV_FFMPEG_LOGLEVEL', '-8')
 
 
@@ -187,11 +186,11 @@ class ImageSource:
     """Images of one file."""
 
     kind: str  #: {'image', 'stack', 'video'}
-    count: int  #: number of images; of a video as its header states it
-    #: place in words, for error messages, and image (h, w) of uint8 or uint16; it raises DataError
-    #: for an image that cannot be read
+    count: int  #: number of images; for a video, as stated by its header
+    #: pairs of a place in words, for error messages, and an image (h, w) of uint8 or uint16;
+    #: raises DataError for an image that cannot be read
     images: Iterator[tuple[str, np.ndarray]]
-    frame_rate: float | None = None  #: of a video [Hz]
+    frame_rate: float | None = None  #: frame rate of a video [Hz]
 
 
 def open_images(path: Path) -> ImageSource:
@@ -228,7 +227,7 @@ def _open_dicom(path: Path) -> ImageSource:
 
 
 def check_name(path: Path) -> None:
-    """Raise DataError for a name that is no UTF-8 text: OpenCV would end the process."""
+    """Raise DataError for a name that is not valid UTF-8: OpenCV would abort the process."""
     try:
         str(path).encode()
     except UnicodeEncodeError:
@@ -243,7 +242,7 @@ def _read_image(path: Path) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def _read_pages(path: Path, pages: int) -> Iterator[tuple[str, np.ndarray]]:
-    """Read the pages of a stack in batches: OpenCV goes through the file anew for each."""
+    """Read the pages of a stack in batches: OpenCV scans the file from its start for each call."""
     done = 0
     batch = 1
     while done < pages:
@@ -267,7 +266,7 @@ def _read_pages(path: Path, pages: int) -> Iterator[tuple[str, np.ndarray]]:
 
 def _open_video(path: Path) -> ImageSource:
     if not os.path.isfile(path):
-        read_bytes(path)  # raises DataError with the reason
+        read_bytes(path)  # raises DataError with the cause
     check_name(path)
     video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     if not video.isOpened():
@@ -278,7 +277,7 @@ def _open_video(path: Path) -> ImageSource:
     count = max(0, round(video.get(cv2.CAP_PROP_FRAME_COUNT)))
     if not 0 < frame_rate < 1e6:
         raise DataError('the video does not state its frame rate', at=path)
-    # A damaged video may have none, which is -1.
+    # A damaged video may have no pixel format, which is -1.
     code = int(video.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT)) % 2**32
     pixel_format = code.to_bytes(4, 'little')
     if pixel_format == GREY_16:
@@ -300,8 +299,7 @@ def _read_frames(
             if not ok:
                 break
             number += 1
-            # The colours of a grey video are equal except for rounding. Others are converted to
-            # grey by their luminance.
+            # The channels of a grey video are equal except for rounding. Colours become luminance.
             grey = frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
             yield f'{path}, frame {number}', grey
     finally:

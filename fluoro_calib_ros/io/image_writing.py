@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Writing image files, stacks and videos, image by image.
+"""Write image files, stacks and videos, image by image.
 
 A file appears under its name only once it is complete.
 """
@@ -41,15 +41,15 @@ from .image_reading import (
     suffix_of,
 )
 
-# Called with the number of images that are done, and their total.
+# Called with the number of completed images and the total number.
 Progress = Callable[[int, int], None]
 
 
 def write_images(out: Path, source: ImageSource, progress: Progress) -> int:
-    """Write the images of a source to one file; returns their number.
+    """Write the images of a source to one file; return their number.
 
     progress is called after every image. Raises DataError if the file cannot be written, if its
-    format cannot hold the images, and as the source.
+    format cannot represent the images, and if the source raises it.
     """
     suffix = suffix_of(out)
     if suffix in VIDEO_CODECS and source.kind == 'video':
@@ -77,13 +77,13 @@ def write_images(out: Path, source: ImageSource, progress: Progress) -> int:
     return 1
 
 
-CLASSIC_BYTES = 4 * 10**9  # size from which a file needs 64-bit offsets, with some reserve
+CLASSIC_BYTES = 4 * 10**9  # larger files need 64-bit offsets; includes a reserve
 
 
 def _write_stack(out: Path, source: ImageSource, progress: Progress) -> int:
-    """Write an uncompressed TIFF file, page by page; returns the number of pages."""
+    """Write an uncompressed TIFF file, page by page; return the number of pages."""
     _, image = next(source.images)
-    large = max(source.count, 1) * (image.nbytes + 1024) > CLASSIC_BYTES  # with heads of pages
+    large = max(source.count, 1) * (image.nbytes + 1024) > CLASSIC_BYTES  # 1024: page header
     with (
         atomic_file(out) as file,
         TiffWriter(file, bigtiff=large, byteorder='<') as writer,
@@ -96,7 +96,7 @@ def _write_stack(out: Path, source: ImageSource, progress: Progress) -> int:
 def _write_each(
     source: ImageSource, image: np.ndarray, write: Callable[[np.ndarray], None], progress: Progress
 ) -> int:
-    """Write the first image and those that follow; returns their number."""
+    """Write the given first image and the following ones; return their number."""
     number = 1
     write(image)
     progress(number, source.count)
@@ -107,7 +107,7 @@ def _write_each(
 
 
 def write_video(out: Path, source: ImageSource, progress: Progress) -> int:
-    """Write a video; returns the number of frames. Raises as write_images."""
+    """Write a video; return the number of frames. Raises as write_images does."""
     _, image = next(source.images)
     with temporary_folder(out) as folder:
         temporary = folder / out.name
@@ -125,7 +125,7 @@ def write_video(out: Path, source: ImageSource, progress: Progress) -> int:
 def _open_video(
     out: Path, temporary: Path, image: np.ndarray, frame_rate: float
 ) -> cv2.VideoWriter:
-    """Open a writer for images like this one."""
+    """Open a writer for images of the same size and type as `image`."""
     height, width = image.shape[:2]
     is_16_bit = image.dtype == np.uint16
     codec = VIDEO_CODECS[suffix_of(out)]
@@ -139,7 +139,7 @@ def _open_video(
             'use avi or mkv'
         )
     check_name(out.absolute())
-    # OpenCV 4.6 knows no depth: it writes 8 bits.
+    # OpenCV 4.6 does not know the property depth: it writes 8 bits.
     depth = [cv2.VIDEOWRITER_PROP_DEPTH, cv2.CV_16U] if is_16_bit else []
     video = cv2.VideoWriter(
         str(temporary),
@@ -172,23 +172,23 @@ def _check_written(out: Path, path: Path, count: int) -> None:
 
 # Correction of image files, stacks and videos.
 #
-# Images are grey and keep their 8 or 16 bits; if the new file cannot hold them, an error is
-# raised and nothing is written. Videos are written without loss (FFV1), except for MP4.
+# Images are grey and keep their 8 or 16 bits. If the output format cannot represent them, an error
+# is raised and nothing is written. Videos are written losslessly (FFV1), except for MP4.
 
 
 @dataclass(frozen=True)
 class CorrectedImages:
-    """What was corrected."""
+    """Result of a correction of images."""
 
     kind: str  #: {'image', 'stack', 'video', 'folder'}
     images: int  #: number of images, pages and frames
     files: int = 1
-    passed_over: tuple[str, ...] = ()  #: names of the files of a folder that are no images
-    #: what is wrong with the files of a folder that could not be corrected
+    passed_over: tuple[str, ...] = ()  #: names of files in a folder that are not images
+    #: errors of files in a folder that could not be corrected
     failed: tuple[str, ...] = ()
 
 
-# Gives the corrector of an image from its number, the first being 1.
+# Returns the corrector of an image from its number; the first image has number 1.
 Correctors = Callable[[int], ImageCorrector]
 
 
@@ -200,11 +200,11 @@ def correct_images(
 ) -> CorrectedImages:
     """Correct an image file, a stack or a video.
 
-    corrector: of all images, or that gives the one of each image from its number, the first being
-    1. progress: called after every image with the number of images that are done, and their total.
-    Raises DataError if the source cannot be read, is damaged, or is no grey image of the size of
-    the calibration; if `out` cannot be written, or its format cannot hold the images. `out` is
-    left as it was.
+    corrector: applies to all images, or is a function that returns the corrector of an image from
+    its number, starting at 1. progress: called after every image with the number of completed
+    images and the total number. Raises DataError if the source cannot be read, is damaged, or does
+    not contain grey images of the size of the calibration; if `out` cannot be written, or its
+    format cannot represent the images. `out` is then unchanged.
     """
     source = Path(source)
     out = Path(out)
@@ -219,7 +219,7 @@ def correct_images(
 
 
 def check_apart(source: Path, out: Path) -> None:
-    """Raise DataError where the output is the source, or has no folder to be in."""
+    """Raise DataError if the output is the source, or its parent folder does not exist."""
     if source.exists() and out.exists() and os.path.samefile(source, out):
         raise DataError('this is the source itself, corrected images need another name', at=out)
     if not out.absolute().parent.is_dir():
@@ -229,7 +229,7 @@ def check_apart(source: Path, out: Path) -> None:
 def _corrected_images(
     source: ImageSource, correctors: Correctors
 ) -> Iterator[tuple[str, np.ndarray]]:
-    """Corrected images, all in the same array."""
+    """Yield the corrected images; all of them share one array."""
     out = None
     for number, (where, image) in enumerate(source.images, 1):
         corrector = correctors(number)
@@ -240,25 +240,25 @@ def _corrected_images(
         yield where, corrector.correct(image, out)
 
 
-# Folders of images and videos, and new folders like them that appear as a whole.
+# Folders of images and videos, and output folders with the same structure.
 
-# Suffixes that images get where their own format is read but not written.
+# Suffixes for images whose own format can be read but not written.
 _WRITTEN_AS = dict.fromkeys(CINE_SUFFIXES, '.avi') | dict.fromkeys(DICOM_SUFFIXES, '.tif')
 
 
 @dataclass(frozen=True)
 class ImageFolder:
-    """Files with images in a folder."""
+    """Image files in a folder."""
 
     path: Path
-    #: images and videos, relative to the folder, in the order of their names
+    #: images and videos, relative to the folder, sorted by name
     files: tuple[Path, ...]
     passed_over: tuple[str, ...]  #: other files
-    recursive: bool  #: whether the folders in the folder belong to it
+    recursive: bool  #: whether subfolders are included
 
     @property
     def written(self) -> tuple[Path, ...]:
-        """Names of new files for `files`."""
+        """Names of the output files for `files`."""
         return tuple(self._written(path) for path in self.files)
 
     def _written(self, path: Path) -> Path:
@@ -266,13 +266,13 @@ class ImageFolder:
         new = _WRITTEN_AS.get(suffix, suffix)
         if suffix_of(path) == suffix:
             return path.with_suffix(new if suffix in _WRITTEN_AS else path.suffix)
-        return path.with_name(path.name + new)  # recognised by its content
+        return path.with_name(path.name + new)  # its format was recognised by content
 
 
 def list_images(folder: Path, recursive: bool = False) -> ImageFolder:
-    """Return the files with images in a folder, and in the folders in it if asked for.
+    """Return the image files in a folder; recursive: in its subfolders, too.
 
-    Raises DataError where there are none, or two would be written under one name.
+    Raises DataError if there are none, or if two would be written under the same name.
     """
     found = (path for path in folder.rglob('*')) if recursive else folder.iterdir()
     files = sorted(path.relative_to(folder) for path in found if path.is_file())
@@ -296,11 +296,11 @@ def list_images(folder: Path, recursive: bool = False) -> ImageFolder:
 
 @contextmanager
 def folder_like(out: Path, source: ImageFolder) -> Iterator[Path]:
-    """A temporary folder with the folders of another one; at the end its files move to `out`.
+    """Yield a temporary folder with the subfolders of source; finally move its files to `out`.
 
-    Files of the same names in `out` are replaced, other ones stay. After an error, `out` is as it
-    was. Raises DataError where `out` is a file, the source itself, or inside of it and would be
-    read as a part of it, and where a file would replace a folder.
+    Files of the same names in `out` are replaced, others stay. After an error, `out` is unchanged.
+    Raises DataError if `out` is a file, the source itself, or inside the source and would be read
+    as part of it, and if a file would replace a folder.
     """
     check_apart(source.path, out)
     if out.exists() and not out.is_dir():
@@ -316,10 +316,10 @@ def folder_like(out: Path, source: ImageFolder) -> Iterator[Path]:
 
 
 def _move(temporary: Path, out: Path, folders: Sequence[Path], names: Sequence[Path]) -> None:
-    """Move the files that were written to their place, where all of them can be."""
+    """Move the written files to their places, or none if one of them cannot be moved."""
     names = [name for name in names if (temporary / name).exists()]
     make_folder(out)
-    for name in names:  # before any file is moved: all or nothing
+    for name in names:  # check before any file is moved
         if (out / name).is_dir():
             raise DataError(f'{out / name}: cannot be written, this is a folder')
     for folder in folders:

@@ -3,10 +3,10 @@
 
 """Observations as CSV: `fluoroscope,exposure,target_id,u,v[,sigma][,angle_deg]`.
 
-u, v and sigma are in pixels; angle_deg is the angle of the C-arm in degrees, the same in all rows
-of an exposure of a fluoroscope, or empty.
+u, v and sigma are in pixels. angle_deg is the angle of the C-arm in degrees. It is the same in all
+rows of a frame (one fluoroscope, one exposure), or empty.
 
-Files of a lab may have names instead of ids in the first three columns.
+The first three columns may contain names instead of ids.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from .access import PathLike, check_safe_name
 from .csv_table import Block, NamedColumn, Table, read_all, read_blocks, write_table
 
 ANGLE = 'angle_deg'
-CORRECTED_BY = 'corrected_by'  # id of the calibration, of image points that are corrected already
+CORRECTED_BY = 'corrected_by'  # id of the calibration that corrected the image points
 COLUMNS = ('fluoroscope', 'exposure', 'target_id', 'u', 'v')
 
 
@@ -54,7 +54,7 @@ class _Rows:
     target_id: NDArray[np.int64]  #: (n,)
     uv: NDArray[np.float64]  #: (n, 2) [px]
     sigma: NDArray[np.float64]  #: (n,) [px], NaN where unknown
-    angle: NDArray[np.float64]  #: (n,), of the C-arm [degrees], NaN where unknown
+    angle: NDArray[np.float64]  #: (n,), angle of the C-arm [degrees], NaN where unknown
     line: NDArray[np.int64]  #: (n,), number of the row in the file
 
     def __getitem__(self, rows: np.ndarray) -> _Rows:
@@ -64,10 +64,10 @@ class _Rows:
 def read_observations_csv(
     path: PathLike, image_size: tuple[int, int] | None = None
 ) -> dict[str, list[Frame]]:
-    """Read the frames of a CSV file, fluoroscopes by name and exposures by number.
+    """Read the frames of a CSV file, by name of the fluoroscope.
 
     The rows of a frame may be anywhere in the file. sigma is given for all targets of a frame or
-    for none. image_size is that of all fluoroscopes [px]; it is required, as the file does not
+    for none. image_size [px] applies to all fluoroscopes; it is required, as the file does not
     contain it.
 
     Raises DataError that names the row for text that is not a number, a point off the image, and a
@@ -81,9 +81,9 @@ def read_named_observations(
 ) -> tuple[dict[str, list[Frame]], Names, str]:
     """Read the frames of a CSV file in which fluoroscopes, exposures and targets may have names.
 
-    known are names whose ids are given. Returns the frames by id of the fluoroscope, the names of
-    the file, and a sentence about the few points that are off the image and left out, or ''.
-    Raises DataError as `read_observations_csv` does.
+    known: names whose ids are already known. Returns the frames by fluoroscope id, the names of
+    the file, and a sentence about excluded points off the image ('' if there are none). Raises
+    DataError as `read_observations_csv` does, and if more than a few points are off the image.
     """
     columns = _Columns(known)
     frames, stray = _read(path, image_size, columns)
@@ -91,7 +91,7 @@ def read_named_observations(
 
 
 class _Columns:
-    """What was read of the columns with names; without known names they are ids."""
+    """State of the columns that may contain names; if known is None, they contain ids only."""
 
     def __init__(self, known: Names | None) -> None:
         self.codes: dict[str, int] = {}
@@ -107,7 +107,7 @@ class _Columns:
         return [ids[name] for name in self.codes]
 
     def names(self) -> Names:
-        """Return the names that are not ids themselves."""
+        """Return the names that differ from their ids."""
         pairs = zip(self.codes, self.fluoroscopes())
         return Names(
             without_trivial(self.target.ids()),
@@ -144,9 +144,10 @@ def _read(
 def _on_image(
     path: PathLike, rows: _Rows, image_size: tuple[int, int], leave_out: bool
 ) -> tuple[_Rows, str]:
-    """Return the rows without a few that are off the image, and a sentence about these.
+    """Exclude a few points that are off the image; return the remaining rows and a sentence.
 
-    Raises DataError where they are many, or are not to be left out.
+    The sentence names the first excluded point and counts the others. Raises DataError if
+    leave_out is false or too many points are off the image.
     """
     off = ~points_on_image(rows.uv, image_size)
     if not off.any():
@@ -171,10 +172,10 @@ def write_observations_csv(
 ) -> None:
     """Write frames, by fluoroscope or as a sequence, to a CSV file.
 
-    The file has a column sigma if any frame has sigma, and angle_deg if any has an angle. Names
-    are written instead of ids in a column whose ids all have one. corrected_by are the ids of the
-    calibrations that corrected the image points, a further column. Raises DataError where the file
-    cannot be written.
+    The file has a column sigma if any frame has sigma, and angle_deg if any frame has an angle.
+    A fluoroscope is written by name if it has one; exposures and targets if all of them have one.
+    corrected_by, ids of the calibrations that corrected the image points by fluoroscope, adds a
+    column. Raises DataError if the file cannot be written.
     """
     if isinstance(frames, Mapping):
         frames = [frame for of_fluoroscope in frames.values() for frame in of_fluoroscope]
@@ -189,7 +190,7 @@ def observation_table(
     names: Names | None = None,
     corrected_by: Mapping[str, str] | None = None,
 ) -> Table:
-    """Return frames as a table: see write_observations_csv."""
+    """Return frames as a table; see write_observations_csv."""
     with_sigma = any(frame.sigma is not None for frame in frames)
     with_angle = any(frame.angle is not None for frame in frames)
     labels = _labels(frames, names or Names())
@@ -203,9 +204,9 @@ def observation_table(
 
 
 def corrections_of(path: PathLike) -> dict[str, str]:
-    """Return by fluoroscope the ids of calibrations that corrected the points of a CSV file.
+    """Return the ids of the calibrations that corrected the points of a CSV file, by fluoroscope.
 
-    {} for points as they were observed. Raises DataError.
+    Returns {} for observed, uncorrected points. Raises DataError.
     """
     found: dict[str, str] = {}
     for block in read_blocks(path, COLUMNS):
@@ -217,7 +218,7 @@ def corrections_of(path: PathLike) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class _Labels:
-    """Names to write instead of ids, empty for a column that is written as ids."""
+    """Names to write instead of ids; a mapping is empty if its column contains ids."""
 
     fluoroscopes: Mapping[str, str]
     exposures: Mapping[int, str]
@@ -225,7 +226,7 @@ class _Labels:
 
 
 def _labels(frames: Sequence[Frame], names: Names) -> _Labels:
-    """Return the names of the columns whose ids all have one."""
+    """Return the names to write; exposures and targets need a name for each of their ids."""
     exposures = names.exposure_names()
     targets = names.target_names()
     if not all(frame.number in exposures for frame in frames):
@@ -236,7 +237,7 @@ def _labels(frames: Sequence[Frame], names: Names) -> _Labels:
 
 
 def _parse(block: Block, columns: _Columns) -> _Rows:
-    """Return a block of the file as arrays; new names are added to columns."""
+    """Return a block of the file as arrays; add new names to columns."""
     names = block.strings('fluoroscope')
     codes = columns.codes
     for name in dict.fromkeys(names):
@@ -276,9 +277,9 @@ def _concatenate(parts: Sequence[_Rows]) -> _Rows:
 
 
 def _by_frame(rows: _Rows, names: Sequence[str]) -> Iterator[_Rows]:
-    """Yield the rows of each frame, by name of the fluoroscope and number of the exposure.
+    """Yield the rows of each frame, sorted by fluoroscope name and exposure number.
 
-    Within a frame the order of the file is kept.
+    Rows within a frame keep the order of the file.
     """
     rank = np.argsort(np.argsort(names))[rows.code]
     order = np.lexsort((rows.exposure, rank))
@@ -291,7 +292,7 @@ def _by_frame(rows: _Rows, names: Sequence[str]) -> Iterator[_Rows]:
 
 
 def _frame(path: PathLike, name: str, rows: _Rows, image_size: tuple[int, int]) -> Frame:
-    """Return the frame of its rows. Raises DataError."""
+    """Return the frame with these rows. Raises DataError."""
     where = f'of fluoroscope {name}, exposure {rows.exposure[0]}'
     repeated = first_repeated(rows.target_id)
     if repeated is not None:
@@ -321,7 +322,7 @@ def _frame(path: PathLike, name: str, rows: _Rows, image_size: tuple[int, int]) 
 
 
 def _angle(path: PathLike, where: str, rows: _Rows) -> float | None:
-    """Return the angle [rad] of the rows of a frame, None without one. Raises DataError."""
+    """Return the angle of the C-arm in a frame [rad], None if not given. Raises DataError."""
     differs = ~((rows.angle == rows.angle[0]) | np.isnan(rows.angle) & np.isnan(rows.angle[0]))
     if differs.any():
         row = np.argmax(differs)
@@ -349,10 +350,10 @@ def _csv_rows(
     return ([fluoroscope, exposure, *cells] for cells in zip(*columns))
 
 
-# Observations of images as CSV: `fluoroscope,exposure,target_id,u,v,sigma,overlapped`.
+# Observations extracted from images: `fluoroscope,exposure,target_id,u,v,sigma,overlapped`.
 #
-# Markers that were followed have a further column `doubtful`, and images with the angle of a
-# C-arm have `angle_deg` as the last one.
+# The columns after sigma are flags: files of tracked markers also have `doubtful`. If images have
+# the angle of a C-arm, the last column is `angle_deg`.
 
 
 FLAGS = ('overlapped', 'doubtful')
@@ -364,9 +365,10 @@ def write_extracted(
     target_names: Mapping[int, str],
     flags: tuple[str, ...] = FLAGS,
 ) -> None:
-    """Write frames, each with its flags (n,), to a CSV file, and the angle if any frame has one.
+    """Write frames, each with its flags (n,), to a CSV file.
 
-    Targets with a name are written by it. Raises DataError where the file cannot be written.
+    The angle is written if any frame has one, and the name of a target instead of its id if it has
+    one. Raises DataError if the file cannot be written.
     """
     with_angle = any(frame.angle is not None for frame, _ in frames)
     rows = (
@@ -396,7 +398,7 @@ def _rows(
         yield [frame.fluoroscope, frame.number, target_names.get(target, target), *row, *flag]
 
 
-# Image points in a CSV file, which are corrected and written with all their other columns.
+# Image points of a CSV file, to be corrected and written with all other columns unchanged.
 
 STATUS = tuple(status.name for status in CorrectionStatus)
 ADDED_COLUMNS = ('u_corrected', 'v_corrected', 'sigma', 'status')
@@ -411,10 +413,10 @@ class PointsFile:
     rows: list[list[str]]  #: all cells as text
     lines: NDArray[np.int64]  #: (n,), number of each row in the file
     uv: NDArray[np.float64]  #: (n, 2) [px], NaN where a cell is empty or nan
-    #: (n,) [px], NaN where a cell is empty; None without such a column
+    #: (n,) [px], NaN where the cell is empty; None if there is no such column
     sigma: NDArray[np.float64] | None
-    fluoroscope: NDArray[np.str_] | None  #: (n,), None without such a column
-    #: (n,), of the C-arm [rad], NaN where a cell is empty; None without such a column
+    fluoroscope: NDArray[np.str_] | None  #: (n,), None if there is no such column
+    #: (n,), angle of the C-arm [rad], NaN where the cell is empty; None if there is no such column
     angle: NDArray[np.float64] | None = None
 
     @property
@@ -427,9 +429,9 @@ class PointsFile:
 
 
 def points_of_frames(path: PathLike, frames: Frames, names: Names) -> PointsFile:
-    """Return the image points of frames as the rows of a CSV file; path is for messages.
+    """Return the image points of frames as rows of a CSV file; path is for messages.
 
-    Targets and exposures have their names where they have some.
+    Targets and exposures are written by name if they have one.
     """
     exposures = names.exposure_names()
     targets = names.target_names()
@@ -459,11 +461,11 @@ def points_of_frames(path: PathLike, frames: Frames, names: Names) -> PointsFile
 
 
 def read_points(path: PathLike, known: Mapping[str, str] | None = None) -> PointsFile:
-    """Read a CSV file with the columns u, v [px], optionally fluoroscope and sigma, and others.
+    """Read a CSV file with the columns u, v [px], optionally fluoroscope, sigma and angle_deg.
 
-    A column angle_deg has the angle of the C-arm in degrees. u and v may be empty; such a point
-    will have the status INVALID. known are the ids of
-    fluoroscopes that have names. Raises DataError that names row and cause.
+    Other columns are kept as text. angle_deg is the angle of the C-arm in degrees. u and v may be
+    empty; such a point will have the status INVALID. known maps names of fluoroscopes to ids.
+    Raises DataError that names row and cause.
     """
     table = read_all(path, ('u', 'v'))
     header = table.header
@@ -511,10 +513,9 @@ def correct_points(
 ) -> CorrectedPoints:
     """Correct image points with the calibrations of their fluoroscopes.
 
-    A point without sigma has that of the calibration, one without an angle that of angle [rad].
-    Raises DataError for a fluoroscope without
-    calibration, and for a file without the column fluoroscope where there are several
-    calibrations.
+    A point without sigma gets that of its calibration; a point without an angle gets angle [rad].
+    Raises DataError for a fluoroscope without a calibration, and for a file without the column
+    fluoroscope if there are several calibrations.
     """
     names = points.fluoroscope
     if names is None:
@@ -555,11 +556,11 @@ def correct_points(
 
 
 def write_points(path: PathLike, points: PointsFile, corrected: CorrectedPoints) -> None:
-    """Write the rows of a PointsFile with further columns.
+    """Write the rows of a PointsFile with additional columns.
 
-    These are u_corrected, v_corrected [px], sigma [px] (sigma_corrected where the file has a
-    sigma) and status. The cells of a point that is INVALID are empty. Raises DataError where the
-    file cannot be written.
+    These are u_corrected, v_corrected [px], sigma [px] (sigma_corrected if the file already has a
+    column sigma) and status. The additional numbers of an INVALID point are empty. Raises
+    DataError if the file cannot be written.
     """
     numbers = np.column_stack([corrected.uv, corrected.sigma]).tolist()
     rows = (

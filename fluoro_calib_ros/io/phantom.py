@@ -1,10 +1,9 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The file of the phantom: CSV `target_id,x,y,z,sd[,diameter]`, in millimetres.
+"""Phantom files: CSV `target_id,x,y,z,sd[,diameter]`, in millimetres.
 
-Files of a lab may have names of beads instead of ids. Points in motion have a further column
-`exposure`.
+Beads may have names instead of ids. Files of moving points have a further column `exposure`.
 """
 
 from __future__ import annotations
@@ -20,20 +19,20 @@ from .access import PathLike
 from .csv_table import Block, NamedColumn, read_all, read_blocks, write_table
 
 COLUMNS = ('target_id', 'x', 'y', 'z', 'sd')
-DIAMETER = 'diameter'  # of the beads, optional
+DIAMETER = 'diameter'  # diameter of the beads, optional
 EXPOSURE = 'exposure'
 
 
 def read_phantom(path: PathLike) -> Phantom:
     """Read a Phantom from a CSV file with the columns target_id and x, y, z, sd [mm].
 
-    The columns may have any order. Raises DataError that names row and cause.
+    The columns may be in any order. Raises DataError that names row and cause.
     """
     return _read(path, NamedColumn('target_id', None))
 
 
 def read_named_phantom(path: PathLike, known: Names) -> tuple[Phantom, Names]:
-    """Read a Phantom whose targets may have names, and the names. Raises DataError."""
+    """Read a Phantom whose targets may have names; return the names, too. Raises DataError."""
     column = NamedColumn('target_id', known.targets)
     phantom = _read(path, column)
     return phantom, Names(without_trivial(column.ids()))
@@ -66,7 +65,7 @@ def _numbers(rows: Block) -> np.ndarray:
 
 
 def has_exposures(path: PathLike) -> bool:
-    """Return whether a file holds coordinates by exposure; False for files of other programs."""
+    """Return whether a file contains coordinates by exposure; False for other formats."""
     try:
         return any(EXPOSURE in block for block in read_blocks(path, COLUMNS))
     except DataError:
@@ -95,10 +94,10 @@ def read_moving_points(path: PathLike) -> MovingPoints:
 
 
 def write_phantom(path: PathLike, phantom: Phantom, names: Names | None = None) -> None:
-    """Write a Phantom to a CSV file, from which the same values are read again.
+    """Write a Phantom to a CSV file; reading the file restores the same values.
 
-    Names are written instead of ids where all targets have one. Raises DataError where the file
-    cannot be written.
+    Names are written instead of ids if all targets have one. Raises DataError if the file cannot
+    be written.
     """
     labels = (names or Names()).target_names()
     if not all(target in labels for target in phantom.target_id.tolist()):

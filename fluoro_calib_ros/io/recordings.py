@@ -3,18 +3,18 @@
 
 """Recordings of other devices: radiographs in DICOM files, cine files of Phantom cameras.
 
-Radiographs and cine loops in DICOM files: grey, uncompressed or with run lengths (RLE). pydicom
-(extra dicom) reads and decodes them frame by frame; sizes are checked by the header first. Grey
-values rise with brightness: MONOCHROME1, in which they fall, is inverted (PS3.3, C.7.6.3.1.2).
-Signed values are shifted to begin at zero.
+DICOM files contain radiographs or cine loops: grey, uncompressed or run-length encoded (RLE).
+pydicom (extra dicom) reads and decodes them frame by frame; sizes in the header are checked first.
+Grey values increase with brightness: MONOCHROME1, in which they decrease, is inverted (PS3.3,
+C.7.6.3.1.2). Signed values are shifted to start at zero.
 
-Recordings of Phantom high-speed cameras: cine files, uncompressed and grey. The layout is that of
-the manufacturer's description "Cine file format" (Vision Research), little endian throughout: a
+Cine files are recordings of Phantom high-speed cameras, uncompressed and grey. The layout is that
+of the manufacturer's description "Cine file format" (Vision Research), little endian throughout: a
 file header (44 bytes), a BITMAPINFOHEADER (40 bytes), a SETUP with the frame rate, and a table of
-64-bit offsets, one an image. In front of the pixels of an image are an annotation, whose size
-includes its own eight bytes, and the size of the pixels. Rows of 8 and 16 bits are stored from the
-bottom, as in a BMP file, unless the height is negative; packed rows of 10 bits from the top. Grey
-values are returned as they are stored: packed ones are on the camera's curve, not linear.
+64-bit offsets, one an image. The pixels of an image are preceded by an annotation, whose size
+includes its own eight bytes, and by the size of the pixels. Rows of 8 and 16 bits are stored from
+the bottom, as in a BMP file, unless the height is negative; packed rows of 10 bits from the top.
+Grey values are returned as stored: packed ones follow the camera's curve and are not linear.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ from ..images.codec import check_size
 from ..limits import MAX_FRAMES
 from .access import check_regular_file, opened, os_errors
 
-# Transfer syntaxes (PS3.5, annex A) that are read: implicit and explicit little endian, explicit
-# big endian, RLE. A deflated file could be of any size when it is decompressed.
+# Supported transfer syntaxes (PS3.5, annex A): implicit and explicit little endian, explicit big
+# endian, RLE. Deflated files are refused, as their decompressed size is unbounded.
 NATIVE = ('1.2.840.10008.1.2', '1.2.840.10008.1.2.1', '1.2.840.10008.1.2.2')
 RUN_LENGTHS = '1.2.840.10008.1.2.5'
 DICOM_GREY = ('MONOCHROME1', 'MONOCHROME2')
@@ -45,16 +45,16 @@ DICOM_GREY = ('MONOCHROME1', 'MONOCHROME2')
 
 @dataclass(frozen=True)
 class DicomHeader:
-    """What the header of a DICOM file says of its images."""
+    """Content of the header of a DICOM file."""
 
     count: int  #: number of frames
-    bits: int  #: used of a pixel
-    #: whether grey values can be negative, and whether they fall with brightness
+    bits: int  #: bits used of a pixel
+    #: whether grey values can be negative, and whether they decrease with brightness
     signed: bool
     inverted: bool
     shape: tuple[int, int]  #: rows and columns
     frame_rate: float | None  #: [Hz]
-    #: of the file: tube load [mAs], and dose area product [dGy cm^2]; None where it is not told
+    #: tube load [mAs] and dose area product [dGy cm^2] of the file; None if not stated
     tube_load: float | None = None
     area_dose: float | None = None
 
@@ -62,8 +62,8 @@ class DicomHeader:
 def read_dicom_header(path: Path) -> DicomHeader:
     """Read the header of a DICOM file.
 
-    Raises DataError for a file that cannot be read, is no DICOM file, is cut off, or holds what is
-    no grey image of 8 or 16 bits without compression or with run lengths.
+    Raises DataError for a file that cannot be read, is not DICOM, is cut off, or contains anything
+    but grey images of 8 or 16 bits, uncompressed or run-length encoded.
     """
     pydicom = _pydicom()
     check_regular_file(path)
@@ -78,17 +78,17 @@ def read_dicom_header(path: Path) -> DicomHeader:
         raise error.at(path) from None
     except OSError as error:
         raise DataError(f'cannot be read ({error.strerror or error})', at=path) from None
-    except Exception:  # pydicom raises what its parsing stumbles over
+    except Exception:  # pydicom raises various exceptions for damaged files
         raise DataError('this is no DICOM file, or it is damaged', at=path) from None
     return header
 
 
-# Tags of the tube load and their units in mAs, the finest first (PS3.3, X-Ray Acquisition).
+# Tags of the tube load with their units in mAs, finest first (PS3.3, X-Ray Acquisition).
 _TUBE_LOADS = (('ExposureInmAs', 1.0), ('ExposureInuAs', 1e-3), ('Exposure', 1.0))
 
 
 def _tube_load(dataset: Any) -> float | None:
-    """Return the tube load [mAs] of a data set, None where it is not told."""
+    """Return the tube load [mAs] of a data set, None if not stated."""
     for tag, unit in _TUBE_LOADS:
         value = _amount(dataset, tag)
         if value is not None:
@@ -98,7 +98,7 @@ def _tube_load(dataset: Any) -> float | None:
 
 
 def _amount(dataset: Any, tag: str) -> float | None:
-    """Return a number above 0 of a data set, None for anything else."""
+    """Return a positive number of a data set, None for anything else."""
     try:
         value = float(dataset.get(tag))
     except (TypeError, ValueError):
@@ -107,7 +107,7 @@ def _amount(dataset: Any, tag: str) -> float | None:
 
 
 def read_dicom_images(path: Path, header: DicomHeader) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield place and image (h, w) of uint8 or uint16, one after the other. Raises DataError."""
+    """Yield place and image (h, w) of uint8 or uint16 of each frame. Raises DataError."""
     frames = _pydicom().pixels.iter_pixels(path, raw=True)
     for number in range(1, header.count + 1):
         where = f'{path}, frame {number}' if header.count > 1 else str(path)
@@ -116,13 +116,13 @@ def read_dicom_images(path: Path, header: DicomHeader) -> Iterator[tuple[str, np
                 warnings.simplefilter('ignore')
                 frame = next(frames)
             image = _grey(np.asarray(frame), header)
-        except Exception:  # StopIteration, and what the decoders raise
+        except Exception:  # StopIteration, and exceptions of the decoders
             raise DataError('the frame is damaged or cut off', at=where) from None
         yield where, image
 
 
 def _pydicom() -> Any:
-    """Import pydicom. Raises DataError where it is not installed."""
+    """Import pydicom. Raises DataError if it is not installed."""
     try:
         import pydicom
         import pydicom.pixels
@@ -171,7 +171,7 @@ def _dicom_header(dataset: Any, file_size: int) -> DicomHeader:
 
 
 def _dicom_rate(dataset: Any) -> float | None:
-    """Return the frame rate [Hz], None where it is not stated."""
+    """Return the frame rate [Hz], None if not stated."""
     interval_ms = float(dataset.get('FrameTime') or 0)
     rate = 1e3 / interval_ms if interval_ms > 0 else float(dataset.get('CineRate') or 0)
     rate = rate or float(dataset.get('RecommendedDisplayFrameRate') or 0)
@@ -179,14 +179,14 @@ def _dicom_rate(dataset: Any) -> float | None:
 
 
 def _grey(frame: np.ndarray, header: DicomHeader) -> np.ndarray:
-    """Return grey values that begin at 0 and rise with brightness."""
+    """Convert to grey values that start at 0 and increase with brightness."""
     if frame.shape != header.shape:
         raise ValueError
     full = 2**header.bits - 1
     values = frame.astype(np.int32)
     if header.signed:
         values += (full + 1) // 2
-    values &= full  # unused bits may hold an overlay
+    values &= full  # unused bits may contain an overlay
     if header.inverted:
         values = full - values
     return values.astype(np.uint8 if header.bits <= 8 else np.uint16)
@@ -195,40 +195,40 @@ def _grey(frame: np.ndarray, header: DicomHeader) -> np.ndarray:
 SIGNATURE = b'CI'
 FILE_HEADER = struct.Struct('<2sHHHiIiIIIIQ')
 BITMAP_HEADER = struct.Struct('<IiiHHIIiiII')
-SETUP_MARK = 140  # offset in SETUP of the letters ST, which newer files have, and of its length
-FRAME_RATE = 768  # offset in SETUP, 32 bits; SETUP begins with a frame rate of 16 bits
-ANNOTATION = 8  # bytes at least
+SETUP_MARK = 140  # offset in SETUP of the mark ST, present in newer files, and of its length
+FRAME_RATE = 768  # offset in SETUP of the 32-bit rate; SETUP begins with a 16-bit rate
+ANNOTATION = 8  # minimum size [bytes]
 
 
 @dataclass(frozen=True)
 class CineHeader:
-    """What the headers of a cine file say."""
+    """Content of the headers of a cine file."""
 
-    width: int  #: of the images [px]
-    height: int  #: of the images [px]
-    bits: int  #: of a pixel as it is stored: 8, 10 (packed) or 16
-    from_bottom: bool  #: whether the last row comes first
+    width: int  #: width of the images [px]
+    height: int  #: height of the images [px]
+    bits: int  #: bits of a stored pixel: 8, 10 (packed) or 16
+    from_bottom: bool  #: whether the last row is stored first
     offsets: NDArray[np.int64]  #: (n,), positions of the images in the file
     frame_rate: float  #: [Hz]
 
     @property
     def image_bytes(self) -> int:
-        """Bytes of the pixels of an image, without padding."""
+        """Size of the pixels of an image without padding [bytes]."""
         return self.height * ((self.width * self.bits + 7) // 8)
 
 
 def read_cine_header(path: Path) -> CineHeader:
     """Read the headers of a cine file.
 
-    Raises DataError for a file that cannot be read, is no cine file, is cut off, is damaged, or
-    holds colours or compressed images.
+    Raises DataError for a file that cannot be read, is not a cine file, is cut off, is damaged, or
+    contains colours or compressed images.
     """
     with opened(path) as file, ErrorsAt(path):
         return _cine_header(file, os.fstat(file.fileno()).st_size)
 
 
 def read_cine_images(path: Path, header: CineHeader) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield place and image (h, w) of uint8 or uint16, one after the other. Raises DataError."""
+    """Yield place and image (h, w) of uint8 or uint16 of each frame. Raises DataError."""
     with os_errors(path, 'cannot be read'), open(path, 'rb') as file:
         for number, offset in enumerate(header.offsets.tolist(), 1):
             where = f'{path}, frame {number}'
@@ -238,7 +238,7 @@ def read_cine_images(path: Path, header: CineHeader) -> Iterator[tuple[str, np.n
 
 
 def _cine_header(file: BinaryIO, size: int) -> CineHeader:
-    """Return the header of a file of a size [bytes]. Raises DataError."""
+    """Return the header of a file of this size [bytes]. Raises DataError."""
     fields = _unpack(file, 0, FILE_HEADER)
     signature, _, compression, _, _, _, _, count, at_bitmap, at_setup, at_offsets, _ = fields
     if signature != SIGNATURE:
@@ -332,7 +332,7 @@ def _image(file: BinaryIO, offset: int, header: CineHeader) -> np.ndarray:
 
 
 def _unpacked_10(rows: NDArray[np.uint8], width: int) -> np.ndarray:
-    """Return pixels (h, w) of rows in which four pixels take five bytes, highest bits first."""
+    """Unpack rows with four pixels in five bytes, highest bits first, to pixels (h, w)."""
     bits = np.unpackbits(rows, axis=1)[:, : 10 * width].reshape(len(rows), width, 10)
     padded = np.zeros((len(rows), width, 16), np.uint8)
     padded[..., 6:] = bits

@@ -28,7 +28,7 @@ from .calibration import VALIDATION_NAME, with_digests
 from .csv_table import Table
 from .documents import write_json
 
-# 1 had neither version, date, units nor adjustments; 2 no ids, no note on the rig and no digest.
+# Version 1 had no version, date, units or adjustments; version 2 no ids, rig note or digest.
 FORMAT_VERSION = 3
 UNITS = {'lengths': 'mm', 'image': 'px', 'angles': 'rad', 'seconds': 's'}
 
@@ -36,7 +36,7 @@ UNITS = {'lengths': 'mm', 'image': 'px', 'angles': 'rad', 'seconds': 's'}
 def result_document(job: CalibrationResult) -> dict[str, Any]:
     """Return a CalibrationResult as the dict of result.json.
 
-    Lengths are in mm, pixels in px and angles in rad, each with the unit in its name.
+    Lengths are in mm, image coordinates in px and angles in rad, as the entry `units` states.
     """
     return {
         'format_version': FORMAT_VERSION,
@@ -76,7 +76,7 @@ def result_document(job: CalibrationResult) -> dict[str, Any]:
 
 
 def finding_document(found: Finding) -> dict[str, Any]:
-    """Return a finding for programs that decide by it."""
+    """Return a finding as a dict, for programs that act on it."""
     return {
         'kind': found.kind.value,
         'severity': found.severity.name.lower(),
@@ -119,7 +119,7 @@ def _statistics(statistics: AdjustmentStatistics) -> dict[str, Any]:
 
 
 def _relative(orientations: Sequence[RelativeOrientation]) -> Any:
-    """Return the relative orientation of two fluoroscopes, a list for more, None without any."""
+    """Return the relative orientation of two fluoroscopes, a list for more, None for none."""
     out = [
         {
             'fluoroscopes': list(o.fluoroscopes),
@@ -162,7 +162,7 @@ def _fluoroscope(figures: FluoroscopeResult) -> dict[str, Any]:
 
 
 def _noise(calibration: FluoroscopeCalibration) -> dict[str, float]:
-    """Return the standard deviation of an image coordinate [px], also by place if it differs."""
+    """Return the noise of an image coordinate [px], with middle and rim if it depends on place."""
     profile = calibration.noise_profile
     out = {'sd': calibration.image_sd}
     if profile is not None:
@@ -172,7 +172,7 @@ def _noise(calibration: FluoroscopeCalibration) -> dict[str, float]:
 
 
 def _angle(calibration: FluoroscopeCalibration) -> dict[str, Any]:
-    """Return the change of a correction with the angle of the C-arm, {} where there is none."""
+    """Return the change of a correction with the angle of the C-arm, {} if there is none."""
     field = calibration.angle_field
     if field is None:
         return {}
@@ -180,7 +180,7 @@ def _angle(calibration: FluoroscopeCalibration) -> dict[str, Any]:
 
 
 def _history(history: Mapping[str, Sequence[Round]]) -> list[dict[str, Any]]:
-    """Return all rounds in order, one calibration after the other."""
+    """Return the rounds of all calibrations, one calibration after the other."""
     return [
         {
             'fluoroscopes': label.split('+'),
@@ -224,7 +224,7 @@ def orientation_document(orientation: RigOrientation) -> dict[str, Any]:
 
 
 def drift_document(verdict: DriftVerdict | None, begin_ns: int) -> dict[str, Any] | None:
-    """Return a DriftVerdict as a dict; times [s] count from the exposure at begin_ns."""
+    """Return a DriftVerdict as a dict; times [s] are relative to the exposure at begin_ns."""
     if verdict is None:
         return None
     out = {
@@ -273,7 +273,7 @@ def _check_document(check: Check) -> dict[str, Any]:
 
 
 def write_validation(directory: PathLike, validation: Validation) -> dict[str, Any]:
-    """Write validation.json into a folder, as its last file; return it. Raises DataError."""
+    """Write validation.json as the last file of a folder; return its content. Raises DataError."""
     document = validation_document(validation)
     document = with_digests(directory, document, validation.calibration_id)
     write_json(Path(directory) / VALIDATION_NAME, document)
@@ -281,7 +281,7 @@ def write_validation(directory: PathLike, validation: Validation) -> dict[str, A
 
 
 def delete_validation(directory: PathLike) -> None:
-    """Delete validation.json from a folder, if it exists. Raises DataError."""
+    """Delete validation.json from a folder if it exists. Raises DataError."""
     delete_file(Path(directory) / VALIDATION_NAME)
 
 
@@ -309,7 +309,7 @@ _INTERIOR_HEADER = (
 
 
 def result_tables(result: CalibrationResult) -> dict[str, Table]:
-    """Return the tables of a result by the names of their files."""
+    """Return the tables of a result by file name."""
     tables = {
         EXPOSURES: (_EXPOSURES_HEADER, _exposures(result)),
         TARGETS: (_TARGETS_HEADER, _targets(result)),
@@ -343,7 +343,7 @@ def _exposures(result: CalibrationResult) -> Iterator[Sequence[Any]]:
 
 
 def _fit_of_exposure(table: ResidualTable | None, name: str, exposure: int) -> list[Any]:
-    """Image points, outliers and RMSE [px] of the inliers of an exposure; blanks without table."""
+    """Return image points, outliers and RMSE [px] of the inliers; blanks without a table."""
     if table is None:
         return ['', '', '', '']
     own = (table.fluoroscope == name) & (table.exposure == exposure)
@@ -380,7 +380,7 @@ def _interior(result: CalibrationResult) -> Iterator[Sequence[Any]]:
         ]
 
 
-# Files <adjustment>.covariance.npz: the covariance matrix of all unknowns.
+# Files <adjustment>.covariance.npz: covariance matrix of all unknowns.
 
 SUFFIX = '.covariance.npz'
 _LAYOUT = Layout(

@@ -1,20 +1,20 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a lab writes about its rig and its studies, as TOML.
+"""Files in which a lab describes its rig and its studies, as TOML.
 
-rig.toml: what does not change from command to command, so that flags are unnecessary.
+rig.toml contains settings that are the same for all commands, which makes flags unnecessary.
 
     fluoroscopes = ["a", "b"]
     image_size = [1024, 1024]     # width, height [px]
     phantom = "phantom.csv"
-    units = "cm"                  # of files that do not say theirs, such as the phantom
-    phantom_sd = 0.05             # of the coordinates of beads, where the file has none [mm]
+    units = "cm"                  # of files that do not state theirs, such as the phantom
+    phantom_sd = 0.05             # sd of bead coordinates, if the file has none [mm]
     calibration = "result"        # result folder of calibrate
     angle_joint = "carm"          # joint of the C-arm; or {a = "frontal", b = "lateral"}
     angle_max_age = 0.5           # longest time from its last state to an exposure [s]
 
-    [about]                       # shown in the report of a calibration, used by nothing
+    [about]                       # shown in the report of a calibration, otherwise unused
     site = "gait laboratory"
     kV = 80
 
@@ -32,26 +32,26 @@ from ..errors import DataError
 from .documents import read_toml
 
 NAME = 'rig.toml'
-MAX_ABOUT_TEXT = 1000  # characters of an entry
+MAX_ABOUT_TEXT = 1000  # maximum length of a key with its text, in characters
 
 
 @dataclass(frozen=True)
 class RigFile:
-    """Content of a rig.toml; None for what it does not say."""
+    """Content of a rig.toml; None for missing keys."""
 
     path: Path
     fluoroscopes: list[str] | None = None
     image_size: tuple[int, int] | None = None  #: width and height [px]
-    #: file with the phantom, and result folder
+    #: phantom file, and result folder
     phantom: Path | None = None
     calibration: Path | None = None
-    units: str | None = None  #: of files that do not say theirs
-    phantom_sd: float | None = None  #: of the coordinates of beads, where the file has none [mm]
-    #: joint of the C-arm, or one for each fluoroscope, as the option of this name
+    units: str | None = None  #: unit of files that do not state theirs
+    phantom_sd: float | None = None  #: sd of bead coordinates [mm], if the file has none
+    #: joint of the C-arm, or one for each fluoroscope, in the form of the option of this name
     angle_joint: str | None = None
     #: longest time from the last state of the joint to an exposure [s]
     angle_max_age: float | None = None
-    #: what the report says of the rig, such as site, operator, kV and mA
+    #: information for the report about the rig, such as site, operator, kV and mA
     about: dict[str, str] | None = None
 
 
@@ -110,8 +110,8 @@ def _phantom_sd(path: Path, value: Any) -> float | None:
 
 
 def _joint(path: Path, value: Any, names: list[str] | None) -> str | None:
-    """Return the option angle_joint; names: the fluoroscopes of the rig, None for any."""
-    from ..exposures.angles import joints_by_fluoroscope  # every command reads this module
+    """Return the option angle_joint; names: fluoroscopes of the rig, None for any."""
+    from ..exposures.angles import joints_by_fluoroscope  # every command loads this module
 
     if value is None:
         return None
@@ -138,7 +138,7 @@ def _joint(path: Path, value: Any, names: list[str] | None) -> str | None:
 
 def _max_age(path: Path, value: Any) -> float | None:
     """Return the option angle_max_age [s]."""
-    from ..exposures.angles import AngleOptions  # every command reads this module
+    from ..exposures.angles import AngleOptions  # every command loads this module
 
     if value is None:
         return None
@@ -151,7 +151,7 @@ def _max_age(path: Path, value: Any) -> float | None:
 
 
 def _about(path: Path, value: Any) -> dict[str, str] | None:
-    """Return texts that the report shows, by name."""
+    """Return texts for the report, by key."""
     if value is None:
         return None
     if not isinstance(value, dict):
@@ -176,13 +176,13 @@ def _checked_path(path: Path, key: str, value: Any, example: str) -> Path:
 
 
 def _check_keys(path: Path, document: Mapping[str, Any], keys: Sequence[str]) -> None:
-    """Raise DataError for a key that a file cannot have."""
+    """Raise DataError for an unknown key."""
     for key in document:
         if key not in keys:
             raise DataError(f'{path}, key {key}: unknown, there are {", ".join(keys)}')
 
 
-# study.toml: a calibration and the trials that it serves, for `fluoro-calib process`.
+# study.toml: a calibration and the trials that use it, for `fluoro-calib process`.
 #
 #     trials = ["trials/*"]         # recordings: bags, files of image points, or radiographs
 #     out = "results"               # folder of all results
@@ -200,13 +200,13 @@ def _check_keys(path: Path, document: Mapping[str, Any], keys: Sequence[str]) ->
 #     [convert.c3d]                 # options of fluoro-calib convert, for the points of each trial
 #     rate = 250
 #
-# `calibration = "DIR"`, a result folder of calibrate, may stand in place of [calibrate]; a table
-# [extract] is for trials that are radiographs. All paths are relative to the folder of the file.
+# `calibration = "DIR"`, a result folder of calibrate, may replace [calibrate]. A table [extract]
+# is for trials that are radiographs. All paths are relative to the folder of the file.
 
 STUDY = 'study.toml'
 OUT = 'results'
-OF_TRIALS = ('extract', 'reconstruct', 'bodies')  # commands, in their order
-CONVERT = 'convert'  # a table of tables: one for each format
+OF_TRIALS = ('extract', 'reconstruct', 'bodies')  # commands, in order of execution
+CONVERT = 'convert'  # a table of tables, one a format
 CALIBRATE = 'calibrate'
 SOURCE = 'source'
 Options = Mapping[str, Any]
@@ -216,7 +216,7 @@ Options = Mapping[str, Any]
 class Trial:
     """A recording of a study."""
 
-    name: str  #: its path in the study, without the ending of a file
+    name: str  #: path in the study, without the suffix of a file
     path: Path  #: relative to the folder of the study
 
 
@@ -225,17 +225,17 @@ class StudyFile:
     """Content of a study.toml."""
 
     path: Path
-    folder: Path  #: of the file, to which all paths are relative
+    folder: Path  #: folder of the file, to which all paths are relative
     out: Path
     calibration: Path  #: result folder
     trials: tuple[Trial, ...]
-    calibrate: Options | None  #: None: the calibration exists
+    calibrate: Options | None  #: None if the calibration exists
     commands: Mapping[str, Options]  #: options by command, in the order of OF_TRIALS
     convert: Mapping[str, Options]  #: options by format
 
 
 def read_study(path: Path) -> StudyFile:
-    """Read a study.toml, or that of a folder. Raises DataError that names file and key."""
+    """Read a study.toml, given by path or folder. Raises DataError that names file and key."""
     path = path / STUDY if path.is_dir() else path
     document = read_toml(path)
     keys = ('trials', 'out', 'calibration', CALIBRATE, *OF_TRIALS, CONVERT)
@@ -278,7 +278,7 @@ def _table(path: Path, key: str, value: Any) -> Options:
 
 
 def _trials(path: Path, patterns: Any, out: Path) -> tuple[Trial, ...]:
-    """Return the recordings of all patterns, in order. Raises DataError."""
+    """Return the recordings that match any pattern, in order. Raises DataError."""
     valid = isinstance(patterns, list) and all(isinstance(p, str) and p for p in patterns)
     if not valid or not patterns:
         raise DataError(f'{path}, key trials: paths or patterns, such as ["trials/*"]')
@@ -295,7 +295,7 @@ def _trials(path: Path, patterns: Any, out: Path) -> tuple[Trial, ...]:
 
 
 def _matching(path: Path, pattern: str, out: Path) -> Sequence[Trial]:
-    """Return the recordings of a pattern; results are none, and hidden files neither."""
+    """Return the recordings that match a pattern, excluding results and hidden files."""
     folder = path.parent
     if Path(pattern).is_absolute():
         raise DataError(f'{path}, key trials: {pattern!r} is not relative to the study')

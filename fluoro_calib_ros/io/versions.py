@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What is kept of a rig beside its calibrations: versions, drift alarm, learned shapes.
+"""Files of a rig next to its calibrations: versions, drift alarm, learned shapes.
 
-A version is a folder with calibrations and orientation, named by the orientation. Those that were
-healed contain healing.json, which names their parent.
+A version is a folder with calibrations and orientation, named after the orientation id. A healed
+version contains healing.json, which names its parent.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from .access import PathLike
 from .calibration import edited, load_orientation, orientation_path, with_digest
 from .documents import read_json, write_json
 
-VERSIONS = 'versions'  # folder below that of the calibrations
+VERSIONS = 'versions'  # folder in the folder of the calibrations
 HEALING = 'healing.json'
 
 
@@ -33,7 +33,7 @@ def version_folder(directory: Path, orientation_id: str) -> Path:
 
 
 def parent_folder(directory: Path, orientation: RigOrientation | None) -> Path:
-    """Return the folder with the parent of a healed rig. Raises DataError where there is none."""
+    """Return the folder with the parent of a healed rig. Raises DataError if there is none."""
     if orientation is None or orientation.source != 'healing':
         raise DataError('the rig in use was not healed, there is nothing to roll back')
     document = read_json(version_folder(directory, orientation.orientation_id) / HEALING)
@@ -44,14 +44,14 @@ def parent_folder(directory: Path, orientation: RigOrientation | None) -> Path:
 
 
 def calibrated_orientation(directory: Path, orientation: RigOrientation) -> RigOrientation | None:
-    """Return the orientation that a rig had before it was healed, None where that is not known.
+    """Return the orientation that a rig had before it was healed, None if unknown.
 
-    An orientation that was not healed is returned as it is.
+    An orientation that was not healed is returned unchanged.
     """
     known = orientation
     ids: set[str] = set()
     while known.source == 'healing':
-        if known.orientation_id in ids:  # edited files may go round in circles
+        if known.orientation_id in ids:  # edited files may form a cycle
             return None
         ids.add(known.orientation_id)
         try:
@@ -61,31 +61,31 @@ def calibrated_orientation(directory: Path, orientation: RigOrientation) -> RigO
     return known
 
 
-# An alarm of the drift watch: drift_alarm.json beside the calibrations that it is about.
+# Alarm of the drift watch: drift_alarm.json next to the calibrations concerned.
 
 DRIFT_ALARM = 'drift_alarm.json'
 
 
 def write_drift_alarm(directory: PathLike, orientation_id: str, cause: str) -> None:
-    """Write that the drift watch has given an alarm of an orientation. Raises DataError."""
+    """Record that the drift watch has raised an alarm on an orientation. Raises DataError."""
     document = {'version': 1, 'orientation_id': orientation_id, 'cause': cause}
     write_json(Path(directory) / DRIFT_ALARM, document)
 
 
 def has_drift_alarm(directory: PathLike, orientation_id: str) -> bool:
-    """Return whether there was an alarm of an orientation. Raises DataError."""
+    """Return whether an alarm was raised on an orientation. Raises DataError."""
     path = Path(directory) / DRIFT_ALARM
     return os.path.exists(path) and read_json(path).get('orientation_id') == orientation_id
 
 
-# Shapes of bodies that a healthy rig has learned: learned_shapes.json beside its calibrations.
+# Shapes of bodies learned by a healthy rig: learned_shapes.json next to its calibrations.
 
 LEARNED_SHAPES = 'learned_shapes.json'
-VERSION = 1  # of learned_shapes.json
+VERSION = 1  # version of learned_shapes.json
 
 
 def write_learned_shapes(directory: PathLike, learned: LearnedShapes) -> None:
-    """Write learned shapes into a folder, to be read with the same values. Raises DataError."""
+    """Write learned shapes into a folder; reading restores the same values. Raises DataError."""
     bodies = [
         {
             'body': body.name,
@@ -114,7 +114,7 @@ def has_learned_shapes(directory: PathLike) -> bool:
 
 
 def read_learned_shapes(directory: PathLike) -> LearnedShapes:
-    """Read the learned shapes of a folder. Raises DataError, also for a file that was edited."""
+    """Read the learned shapes of a folder. Raises DataError, also for an edited file."""
     path = Path(directory) / LEARNED_SHAPES
     document = read_json(path)
     if document.get('version') != VERSION:
@@ -135,7 +135,7 @@ def read_learned_shapes(directory: PathLike) -> LearnedShapes:
                 end_ns=int(document['end_ns']),
                 exposures=int(document['exposures']),
             )
-        except (KeyError, TypeError, ValueError) as error:  # DataError among them
+        except (KeyError, TypeError, ValueError) as error:  # includes DataError
             raise (
                 error
                 if isinstance(error, DataError)

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The look of all figures, and the figures of a drawn phantom and of an estimated distortion.
+"""Style of all figures; figures of a drawn phantom, of a distortion, and of a comparison.
 
-The look of all figures: colours, fonts and size. Figures need no display and no pyplot. The
-colours are those of Okabe and Ito, which colour-blind people can tell apart.
+The style consists of colours, fonts and sizes. Figures need no display and no pyplot. The colours
+are those of Okabe and Ito, which colour-blind people can distinguish.
 """
 
 from __future__ import annotations
@@ -50,26 +50,26 @@ AFTER = BLUE
 
 
 def new_figure(width: float, height: float, title: str, layout: Any = 'constrained') -> Figure:
-    """An empty figure; width and height in inches."""
+    """Return an empty figure; width and height in inches."""
     figure = Figure(figsize=(width, height), dpi=120, layout=layout)
     figure.suptitle(title)
     return figure
 
 
 def png_bytes(figure: Figure) -> bytes:
-    """Bytes of a figure as PNG, the same for the same figure."""
+    """Return a figure as PNG; the same figure gives the same bytes."""
     buffer = io.BytesIO()
     FigureCanvasAgg(figure).print_png(buffer, metadata={'Software': None})
     return buffer.getvalue()
 
 
-# Marks of an artist that are vectors in an SVG: each takes some 100 bytes, pixels in their place
-# some 30 kB.
+# Largest number of marks of an artist that are drawn as vectors in an SVG: each takes some 100
+# bytes, a raster image instead some 30 kB.
 MAX_VECTORS = 300
 
 
 def svg_bytes(figure: Figure, text: str = 'path') -> bytes:
-    """Bytes of a figure as SVG, the same for the same figure; many marks are pixels in it.
+    """Return a figure as SVG with reproducible bytes; artists with many marks are rasterised.
 
     text: 'path', or 'none' for characters, which a reader can search.
     """
@@ -84,23 +84,23 @@ def svg_bytes(figure: Figure, text: str = 'path') -> bytes:
 
 
 def _marks(artist: Artist) -> int:
-    """Return how many marks an artist draws."""
+    """Return the number of marks of an artist."""
     if isinstance(artist, Line2D):
         return len(np.atleast_1d(artist.get_xdata()))
-    if isinstance(artist, QuadMesh):  # its paths would be made for this
+    if isinstance(artist, QuadMesh):  # without creating its paths
         return int(np.size(artist.get_array()))
     if isinstance(artist, Collection):
         return max(len(artist.get_offsets()), len(artist.get_paths()))
     return 1
 
 
-INCH = 0.33  # of a place, so that an id of four digits can be read
-MAX_INCH = 60.0  # of the longer side, however many places a sheet has
-EDGE = 0.8  # of a pitch around the places
+INCH = 0.33  # size of a place; an id of four digits stays legible
+MAX_INCH = 60.0  # maximum length of the longer side
+EDGE = 0.8  # margin around the places, as a fraction of the pitch
 
 
 def phantom_figure(drawing: Drawing) -> Figure:
-    """Draw every layer as it is seen along z, with ids; blocked places are crossed out."""
+    """Draw every layer as seen along z, with ids; blocked places are crossed out."""
     places = drawing.places_mm
     phantom = drawing.phantom()
     pitch = drawing.pitch_mm[0]
@@ -154,30 +154,30 @@ def _draw_layer(axes: matplotlib.axes.Axes, drawing: Drawing, layer: int, radius
 
 
 def picture_bytes(figure: Figure, suffix: str) -> bytes:
-    """Bytes of a figure as .png, or as .svg; the same for the same figure."""
+    """Return a figure as .png or .svg; the same figure gives the same bytes."""
     return png_bytes(figure) if suffix == '.png' else svg_bytes(figure, 'none')
 
 
-# Along the longer side of the image.
+# Number of cells along the longer side of the image.
 FIELD_CELLS = 160
-FIELD_ARROWS = 17  # across the longer side of the image
-SCALE_CELLS = 48  # across it, for the largest correction
-# Of the longer side, around the image for the arrows at its border, and twice that below it.
+FIELD_ARROWS = 17  # arrows along the longer side of the image
+SCALE_CELLS = 48  # cells along it to find the largest correction
+# Margin for arrows at the border, as a fraction of the longer side; twice as wide at the bottom.
 MARGIN = 0.09
-MIN_ARROW_PX = 1e-6  # where there is no correction
+MIN_ARROW_PX = 1e-6  # lower limit of the scale, for a field without correction
 ROUND_NUMBERS = (1, 1.5, 2, 3, 5, 7)
 
 
 @dataclass(frozen=True)
 class Scale:
-    """Largest magnitude and largest standard deviation [px] of figures that are compared."""
+    """Largest magnitude and largest standard deviation [px] of figures to be compared."""
 
     magnitude_px: float
     sd_px: float
 
 
 def common_scale(fields: Iterable[tuple[CorrectionModel, tuple[int, int]]]) -> Scale:
-    """Return the scale of the figures of several fluoroscopes: models with their image sizes."""
+    """Return the common scale of several fluoroscopes; fields: models with their image sizes."""
     magnitude = sd = MIN_ARROW_PX
     for model, image_size in fields:
         field = _field_on_grid(model, image_size, SCALE_CELLS)[1]
@@ -194,7 +194,7 @@ def distortion_figure(
     interior_estimated: bool,
     scale: Scale | None = None,
 ) -> Figure:
-    """Learned distortion as arrows over its magnitude, and its standard deviation.
+    """Return the estimated distortion as arrows over its magnitude, and its standard deviation.
 
     Parameters
     ----------
@@ -207,7 +207,7 @@ def distortion_figure(
     interior_estimated : bool
         Whether the interior orientation was estimated with the model.
     scale : Scale, optional
-        That of the figures of all fluoroscopes; by default that of the model.
+        Common scale of all fluoroscopes; by default that of the model.
     """
     scale = scale or common_scale([(model, image_size)])
     width, height = np.asarray(image_size) + np.array([2, 3]) * MARGIN * max(image_size)
@@ -251,13 +251,13 @@ def distortion_figure(
 def _field_on_grid(
     model: CorrectionModel, image_size: Sequence[int], cells: int
 ) -> tuple[list[NDArray[np.float64]], Correction]:
-    """Columns and rows of a regular grid over the image [px], and the Correction at its points."""
+    """Return columns and rows of a regular grid over the image [px], and the Correction there."""
     axes, centres = cell_centres(image_size, cells)
     return axes, model.evaluate(centres)
 
 
 def _draw_image_frame(axes: Axes, image_size: Sequence[int]) -> None:
-    """Draw the image as a hatched area with a frame, v pointing down."""
+    """Draw the image as a hatched area with a frame, v downwards."""
     width, height = image_size
     margin = MARGIN * max(image_size)
     image: dict[str, Any] = {'xy': (-0.5, -0.5), 'width': width, 'height': height}
@@ -278,14 +278,14 @@ def _draw_image_frame(axes: Axes, image_size: Sequence[int]) -> None:
 def _draw_arrows(
     axes: Axes, model: CorrectionModel, image_size: Sequence[int], largest: float
 ) -> float:
-    """Draw arrows of the field and a reference arrow below the image; return their enlargement.
+    """Draw arrows of the field and a reference arrow below the image; return their magnification.
 
-    largest: length of the longest arrow [px]. Arrows begin in the calibrated area only.
+    largest: length of the longest arrow [px]. Arrows start only in the calibrated area.
     """
     centres, field = _field_on_grid(model, image_size, FIELD_ARROWS)
     u, v = (grid.ravel()[~field.outside] for grid in np.meshgrid(*centres))
     duv = field.duv[~field.outside]
-    # At most two cells long: arrows hardly overlap, and small ones can be seen.
+    # At most two cells long, so that arrows hardly overlap, but small ones are visible.
     factor = _round_down(2 * max(image_size) / FIELD_ARROWS / largest)
     reference = _round_down(largest)
     below = image_size[1] + 0.13 * max(image_size)
@@ -308,15 +308,15 @@ def _draw_arrows(
 
 
 def _round_down(value: float) -> float:
-    """The largest of 1, 1.5, 2, 3, 5, 7, 10, ... and their decimal fractions up to a value."""
+    """Return the largest of 1, 1.5, 2, 3, 5, 7 times a power of ten that is at most a value."""
     power = 10.0 ** np.floor(np.log10(value))
     digits = [digit for digit in ROUND_NUMBERS if digit * power <= value * (1 + 1e-9)]
     return float(power * max(digits))
 
 
-# What changed between two calibrations.
+# Differences between two calibrations.
 
-ARROWS = 16  # along the longer side of the image
+ARROWS = 16  # number of arrows along the longer side of the image
 
 
 def comparison_document(comparison: Comparison, mm_per_px: float | None) -> dict[str, Any]:
@@ -338,7 +338,7 @@ def comparison_document(comparison: Comparison, mm_per_px: float | None) -> dict
 
 
 def comparison_text(comparison: Comparison, mm_per_px: float | None) -> str:
-    """Return what changed in a few lines."""
+    """Return the differences as text of a few lines."""
     largest, (u, v) = comparison.largest
 
     def with_mm(pixels: float) -> str:
@@ -364,13 +364,13 @@ def comparison_text(comparison: Comparison, mm_per_px: float | None) -> str:
 
 
 def comparison_png(comparisons: Mapping[str, Comparison]) -> bytes:
-    """Return the differences of the fields of all fluoroscopes as a PNG file."""
+    """Return the differences of the corrections of all fluoroscopes as a PNG file."""
     with style.context(['default', STYLE]):
         return png_bytes(_figure(list(comparisons.values())))
 
 
 def _figure(comparisons: Sequence[Comparison]) -> Figure:
-    """Arrows over the size of the difference; dots where it is significant."""
+    """Return arrows over the size of the difference, with dots where it is significant."""
     figure = new_figure(7.5 * len(comparisons), 7, 'Difference of the corrections, without gauge')
     panels = figure.subplots(1, len(comparisons), squeeze=False)[0]
     for axes, comparison in zip(panels, comparisons):
@@ -384,7 +384,7 @@ def _figure(comparisons: Sequence[Comparison]) -> Figure:
         axes.plot(*marked.T, '.', color=BLACK, markersize=2)
         keys = np.floor(comparison.uv / step).astype(int)
         _, first = np.unique(keys, axis=0, return_index=True)
-        # A difference far below its standard deviation is shown as small as it is.
+        # A difference far below its standard deviation must not be magnified to look large.
         longest = max(float(comparison.size.max()), float(np.median(comparison.sd)))
         factor = 0.8 * step / longest
         factor = float(f'{factor:.1g}')

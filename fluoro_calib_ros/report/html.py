@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The report of a calibration as one HTML file that needs nothing else."""
+"""The report of a calibration as one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -46,14 +46,14 @@ VERDICTS = {
     'cannot tell': 'It cannot be told whether this calibration can be used.',
     None: 'This calibration has not been validated.',
 }
-MAX_ROWS = 40  # of the lists of outliers and correlations
-MAX_ARROWS = 30_000  # residuals of all exposures: a megabyte
-MAX_RADIOGRAPHS_BYTES = 3_000_000  # of all exposures together, 4 MB in the report
+MAX_ROWS = 40  # maximum rows in the lists of outliers and correlations
+MAX_ARROWS = 30_000  # maximum number of residuals in all exposures; they take a megabyte
+MAX_RADIOGRAPHS_BYTES = 3_000_000  # of all exposures together; 4 MB in the report
 
 
 @dataclass(frozen=True)
 class ReportInput:
-    """What a result folder contains."""
+    """Content of a result folder."""
 
     title: str
     result: Mapping[str, Any]  #: content of result.json
@@ -65,19 +65,19 @@ class ReportInput:
     orientation: RigOrientation | None = None
     names: Names = field(default_factory=Names)
     written: str = ''  #: date of result.json, as text
-    #: why the rig has no orientation, or what is doubtful about it
+    #: why the rig has no orientation, or why it is doubtful
     rig_note: Finding | None = None
-    edited: Finding | None = None  #: what is wrong with result.json itself
-    #: how well the beads of the exposures are known in space, None for a single fluoroscope
+    edited: Finding | None = None  #: inconsistency of result.json itself, such as an edit
+    #: accuracy of the beads in space, None for a single fluoroscope
     space: SpaceAccuracy | None = None
-    #: JPEG by fluoroscope and exposure, where the exposures come from images
+    #: JPEG by fluoroscope and exposure, if the exposures come from images
     radiographs: Mapping[str, Mapping[int, bytes]] = field(default_factory=dict)
 
 
 def report_html(given: ReportInput, progress: Callable[[int, int], object] | None = None) -> str:
-    """Return the report as HTML: pictures inside, no reference to anything outside.
+    """Return the report as HTML with embedded figures and no external references.
 
-    progress is called with the number of pictures that are drawn and that of all.
+    progress is called with the number of figures drawn so far and the total number.
     """
     residuals = {name: _residuals(given, name) for name in given.calibrations}
     with style.context(['default', STYLE]):
@@ -112,7 +112,7 @@ def report_html(given: ReportInput, progress: Callable[[int, int], object] | Non
 
 
 def page(template: str, **values: Any) -> str:
-    """Return a page of a template, with values, numbers for people (`text`) and `versions`."""
+    """Render a template with values, the formatter of numbers `text`, and `versions`."""
     environment = Environment(
         loader=FileSystemLoader(TEMPLATES),
         autoescape=True,
@@ -124,7 +124,7 @@ def page(template: str, **values: Any) -> str:
 
 
 def _verdict(given: ReportInput) -> dict[str, Any]:
-    """Return verdict, its sentence, and what to do."""
+    """Return verdict, its sentence, findings with advice, and checks."""
     verdict = None if given.validation is None else given.validation.get('verdict')
     findings = sentences(filter(None, [given.edited]))
     findings += given.validation.get('findings', []) if given.validation else []
@@ -149,7 +149,7 @@ def _verdict(given: ReportInput) -> dict[str, Any]:
 
 
 def _check_mm(given: ReportInput, check: Mapping[str, Any]) -> float | None:
-    """Return what a check found, in mm at the phantom; None where it is no length."""
+    """Return the value of a check in mm at the phantom; None if it is not a length."""
     if check.get('value') is None:
         return None
     if check.get('unit') == 'mm':
@@ -213,14 +213,14 @@ def _outliers(given: ReportInput, residuals: Mapping[str, Residuals]) -> dict[st
 
 
 def residual_rows(given: ReportInput) -> dict[str, Any]:
-    """Return the residuals of every exposure as the report has them, see `_arrows`."""
+    """Return the residuals of every exposure as in the report, see `_arrows`."""
     return _arrows(given, {name: _residuals(given, name) for name in given.calibrations})
 
 
 def _arrows(given: ReportInput, residuals: Mapping[str, Residuals]) -> dict[str, Any]:
-    """Return the residuals of every exposure, to be looked at one by one; {} for too many.
+    """Return the residuals of every exposure for interactive display; {} if there are too many.
 
-    Rows u, v, du, dv and whether the point was used, by fluoroscope and number of the exposure.
+    The rows u, v, du, dv and inlier flag are grouped by fluoroscope and exposure number.
     """
     if sum(len(r.uv) for r in residuals.values()) > MAX_ARROWS:
         return {}
@@ -240,7 +240,7 @@ def _radiographs(
 ) -> dict[str, dict[int, str]]:
     """Return the radiographs in base64, by fluoroscope and exposure.
 
-    Of too many, those with the largest residuals.
+    If their total size is limited, those with the largest residuals are included first.
     """
     by_rms = sorted(
         (-np.nan_to_num(after, nan=np.inf), name, number)
@@ -259,7 +259,7 @@ def _radiographs(
 
 
 def _fluoroscope(given: ReportInput, name: str, residuals: Residuals) -> dict[str, Any]:
-    """Return the numbers of a fluoroscope."""
+    """Return the numbers of a fluoroscope in the report."""
     calibration = given.calibrations[name]
     covered = covered_cells(residuals.uv, calibration.image_size)
     exposures = given.names.exposure_names()
@@ -306,7 +306,7 @@ def _correlation(covariance: NDArray[np.float64]) -> list[list[float]]:
 def _figures(
     given: ReportInput, name: str, residuals: Residuals, scale: Scale
 ) -> list[tuple[str, Figure]]:
-    """Return titles and pictures of a fluoroscope."""
+    """Return titles and figures of a fluoroscope."""
     calibration = given.calibrations[name]
     size = calibration.image_size
     figures: list[tuple[str, Figure]] = []
@@ -331,7 +331,7 @@ def svg_text(figure: Figure) -> str:
 
 
 def _bead_picture(given: ReportInput) -> dict[str, Any] | None:
-    """Return the shifts of the beads against the survey, None without beads."""
+    """Return the shifts of the beads from the survey, None without beads."""
     targets = given.result['targets']
     ids = np.array([t['target_id'] for t in targets], dtype=np.int64)
     row = given.phantom.index(ids) if len(ids) else np.zeros(0, dtype=int)
@@ -354,7 +354,7 @@ def _bead_picture(given: ReportInput) -> dict[str, Any] | None:
 
 
 def _text(value: Any, digits: int = 3) -> str:
-    """Return a number for people, a dash for none."""
+    """Format a number for people; a missing one is a dash."""
     if value is None or (isinstance(value, float) and not np.isfinite(value)):
         return '–'
     return f'{float(value):.{digits}f}'

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Pictures and the report of motion: joints and bodies over time, points in space."""
+"""Figures and report of motion: joints and bodies over time, reconstructed points."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from ..reconstruction.reconstruct import ReconstructedFrame
 from .figures import BLUE, GREY, RED, STYLE, new_figure
 from .html import page, svg_text
 
-BAND = 2.0  # standard deviations, 95 %
-FILLED = 0.15  # opacity of the times without a marker
+BAND = 2.0  # half width of the band in standard deviations, 95 %
+FILLED = 0.15  # opacity of the background of times without a marker
 
 
 def joint_figure(motion: JointMotion) -> Figure:
-    """Angles and translations of a joint."""
+    """Return a figure of the angles and translations of a joint."""
     names = [
         *(f'{name.replace("_", " ")} [°]' for name in motion.angle_names),
         *(f'{name.replace("_", " ")} [mm]' for name in motion.translation_names),
@@ -38,7 +38,7 @@ def joint_figure(motion: JointMotion) -> Figure:
 
 
 def body_figure(poses: BodyPoses) -> Figure:
-    """Position of a body, and its rotation from the first pose."""
+    """Return a figure of the position of a body, and its rotation relative to the first pose."""
     known = np.flatnonzero(poses.known)
     names = [
         *(f'{axis} [mm]' for axis in 'xyz'),
@@ -59,7 +59,7 @@ def _series(
     source: JointMotion | BodyPoses,
     series: tuple[NDArray[np.float64], NDArray[np.float64]],
 ) -> Figure:
-    """Six time series (T, 6) with their standard deviations."""
+    """Return a figure of six time series (T, 6) with their standard deviations."""
     values, sd = series
     time_s = (source.stamp_ns - source.stamp_ns[0]) / 1e9
     filled = ~np.isin(source.status, (PoseStatus.OK, PoseStatus.WEAK))
@@ -100,7 +100,7 @@ def _draw(
 
 
 def paths_figure(poses: Sequence[BodyPoses]) -> Figure:
-    """Paths of the origins of bodies in space, and their axes at ten times."""
+    """Return a figure of the paths of the origins of bodies, with their axes at ten times."""
     with matplotlib.rc_context(STYLE):
         figure = new_figure(7, 6, 'Paths of the origins of the bodies')
         axes = figure.add_subplot(projection='3d')
@@ -124,11 +124,11 @@ def paths_figure(poses: Sequence[BodyPoses]) -> Figure:
     return figure
 
 
-MAX_NAMED = 30  # targets that are named beside their rows
+MAX_NAMED = 30  # up to so many targets the rows are labelled with names
 
 
 def points_figure(frames: Sequence[ReconstructedFrame], names: Mapping[int, str]) -> Figure:
-    """Paths of reconstructed points in space, when each was found, and how well it is known."""
+    """Return a figure of paths of reconstructed points, times of detection, and accuracy."""
     ids = np.unique(np.concatenate([frame.target_id for frame in frames]))
     xyz = np.full((len(frames), len(ids), 3), np.nan)
     sd = np.full(xyz.shape, np.nan)
@@ -175,7 +175,7 @@ def _draw_paths(axes: Axes, xyz: NDArray[np.float64]) -> None:
 def _draw_gaps(
     axes: Axes, when: np.ndarray, found: NDArray[np.bool_], labels: Sequence[str]
 ) -> None:
-    """Draw when targets (T, n) were found, a row each, with the share of the frames."""
+    """Draw when targets (T, n) were found, one row a target, with the share of frames."""
     for row, of_target in enumerate(found.T):
         edges = np.flatnonzero(np.diff(np.concatenate([[0], of_target.astype(int), [0]])))
         step = float(np.median(np.diff(when))) if len(when) > 1 else 1.0
@@ -198,9 +198,9 @@ def bodies_html(
     summary: Mapping[str, Any],
     findings: Sequence[str],
 ) -> str:
-    """Return the report as HTML: pictures inside, no reference to anything outside.
+    """Return the report as HTML with embedded figures and no external references.
 
-    summary: as BodiesOutcome gives it.
+    summary: as in BodiesOutcome.
     """
     figures = [(f'joint {one.joint.name}', joint_figure(one)) for one in joints]
     figures.append(('paths in space', paths_figure(poses)))

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The figures of the report: cost, and residuals and coverage over the image and by exposure."""
+"""Figures of the report: cost, and residuals and coverage over the image and by exposure."""
 
 from __future__ import annotations
 
@@ -43,13 +43,13 @@ from .tables import model_text
 def relative_costs(
     run: SelfCalibration,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """F (n+1,), G (n,) and recorded G (n,) of the n rounds, in percent of their first values.
+    """Return F (n+1,), G (n,) and recorded G (n,) of n rounds, in percent of their first values.
 
-    F[i] is the weighted square sum of the residuals of adjustment i, 0 being the one without
-    correction; G[i] the cross-validation of the model that is fitted to them. G is recorded in
-    units of the noise as adjustment i estimates it. The noise decreases with the distortion, which
-    alone makes recorded G grow. The estimated variance follows F, so G times F is in the same unit
-    in all rounds.
+    F[i] is the weighted square sum of the residuals of adjustment i, where adjustment 0 has no
+    correction; G[i] is the cross-validation of the model that is fitted to these residuals. G is
+    recorded in units of the noise estimated by adjustment i. The noise decreases with the
+    distortion, which alone makes the recorded G grow. The estimated variance follows F, so G times
+    F has the same unit in all rounds.
     """
     before = run.before
     first = float(np.sum(before.noise.weight(before.q)[:, None] * before.residuals**2))
@@ -60,7 +60,7 @@ def relative_costs(
 
 
 def cost_figure(run: SelfCalibration) -> Figure:
-    """Costs of adjustment and regression, their mean, and what a round still changes."""
+    """Return the costs of adjustment and regression, their mean, and the change in each round."""
     kinds = ', '.join(sorted({model.kind for model in run.models.values()}))
     end = 'converged' if run.converged else 'NOT converged'
     figure = new_figure(
@@ -101,7 +101,7 @@ def cost_figure(run: SelfCalibration) -> Figure:
 
 
 def _curve(axes: Axes, values: Sequence[float], colour: str, label: str, first: int = 0) -> None:
-    """Draw a value for each iteration from the first one on."""
+    """Draw a value for each iteration, starting with number `first`."""
     iterations = range(first, first + len(values))
     axes.plot(iterations, values, '-', color=colour, label=label, marker='o', markersize=4)
 
@@ -112,11 +112,11 @@ def _names_text(names: Sequence[str]) -> str:
     return f'Fluoroscopes {" and ".join(names)}, adjusted together'
 
 
-ARROW_SHARE = 0.03  # of the image, of the largest of most residuals
+ARROW_SHARE = 0.03  # arrow of the 99 % quantile of residuals, over the image size
 
 
 def residual_map(residuals: Residuals, name: str, image_size: tuple[int, int]) -> Figure:
-    """Residuals after the calibration as arrows over the image; grey: not covered."""
+    """Return the residuals after the calibration as arrows over the image; grey: not covered."""
     width, height = image_size
     figure = new_figure(7.5, 7.5 * height / width + 0.6, f'{name}: residuals and coverage')
     axes = figure.subplots()
@@ -150,14 +150,14 @@ def residual_map(residuals: Residuals, name: str, image_size: tuple[int, int]) -
 
 
 def covered_cells(uv: NDArray[np.float64], image_size: tuple[int, int]) -> NDArray[np.bool_]:
-    """Return (CELLS, CELLS) whether a part of the image is near an image point."""
+    """Return (CELLS, CELLS) whether a cell of the image is near an image point."""
     coverage = Coverage(image_size)
     coverage.add(uv)
     return coverage.covered
 
 
 def missing_sides(uv: NDArray[np.float64], image_size: tuple[int, int]) -> list[str]:
-    """Return the parts of the image, in words, of which less than half is covered."""
+    """Return the names of the parts of the image of which less than half is covered."""
     covered = covered_cells(uv, image_size)
     third = CELLS // 3
     rows = {'upper': slice(0, third), 'middle': slice(third, -third), 'lower': slice(-third, None)}
@@ -171,7 +171,7 @@ def missing_sides(uv: NDArray[np.float64], image_size: tuple[int, int]) -> list[
 
 
 def exposure_bars(residuals: Residuals, name: str) -> Figure:
-    """RMS and number of beads by exposure."""
+    """Return the RMS of the residuals and the number of beads by exposure."""
     numbers, counts, _, after = zip(*residuals.of_exposures())
     figure = new_figure(7.5, 4.6, f'{name}: by exposure')
     upper, lower = figure.subplots(2, 1, sharex=True)
@@ -187,7 +187,7 @@ def exposure_bars(residuals: Residuals, name: str) -> Figure:
 
 
 def distribution(residuals: Residuals, name: str) -> Figure:
-    """Histogram of the residuals of the inliers in px, and their quantiles against a normal."""
+    """Return the histogram of the inlier residuals [px], and their quantiles against a normal."""
     values = residuals.after[residuals.inlier].ravel()
     figure = new_figure(7.5, 3.8, f'{name}: residuals in px')
     left, right = figure.subplots(1, 2)
@@ -206,7 +206,7 @@ def distribution(residuals: Residuals, name: str) -> Figure:
 
 
 def bead_shifts(shift_mm: NDArray[np.float64], sd_mm: NDArray[np.float64]) -> Figure:
-    """Shifts of the beads against their survey (n, 3), and relative to its standard deviation."""
+    """Return the shifts of the beads from the survey (n, 3) [mm], also relative to its sd."""
     figure = new_figure(7.5, 3.6, 'Beads: adjusted minus survey')
     left, right = figure.subplots(1, 2)
     left.hist(shift_mm, 30, histtype='step', label=['x', 'y', 'z'], linewidth=1.5)
@@ -218,19 +218,18 @@ def bead_shifts(shift_mm: NDArray[np.float64], sd_mm: NDArray[np.float64]) -> Fi
     return figure
 
 
-# The figures of a self-calibration as PNG files.
-#
-# They are Figures 1 to 10 of Chow et al., and the distortion field.
+# Figures of a self-calibration as PNG files: Figures 1 to 10 of Chow et al., and the distortion
+# field.
 
 
 def write_figures(result: CalibrationResult, directory: str | os.PathLike[str]) -> list[str]:
-    """Write the figures of a calibration into a folder, which is made if necessary.
+    """Write the figures of a calibration into a folder, which is created if necessary.
 
     For every run there is cost_<label>.png, for every fluoroscope residuals_histogram_<name>.png,
     residuals_position_<name>.png and distortion_<name>.png. Without a correction model there is
-    neither a cost nor a distortion to show, and a result without runs has no figures. Each file
-    appears only once it is complete. Sets matplotlib's style while it draws, so it must not run in
-    two threads at once.
+    neither a cost nor a distortion figure, and a result without runs has no figures. Each file
+    appears only once it is complete. This function sets matplotlib's style while drawing, so it
+    must not run in two threads at once.
 
     Returns the paths. Raises DataError if a file cannot be written.
     """
@@ -257,7 +256,7 @@ def write_figures(result: CalibrationResult, directory: str | os.PathLike[str]) 
 def _figures_of_run(
     label: str, run: SelfCalibration, scale: Scale
 ) -> Iterator[tuple[str, Figure]]:
-    """File names and figures of one run; scale: of the distortions."""
+    """Yield file names and figures of one run; scale: common scale of the distortions."""
     network = run.measured.network
     if any(model.corrects for model in run.models.values()):
         yield f'cost_{label}.png', cost_figure(run)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Residuals of a calibration, computed again from its result folder, and their figures."""
+"""Residuals of a calibration, recomputed from its result folder, and their figures."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ class Residuals:
     exposure: NDArray[np.int64]  #: (n,)
     target_id: NDArray[np.int64]  #: (n,)
     uv: NDArray[np.float64]  #: (n, 2), observed pixels
-    #: (n, 2), observed and corrected minus computed [px]
+    #: (n, 2), residuals of the observed and of the corrected pixels, minus computed [px]
     before: NDArray[np.float64]
     after: NDArray[np.float64]
-    inlier: NDArray[np.bool_]  #: (n,), False for image points that fail their test
-    #: (n,), of the C-arm [rad], NaN where it is unknown; None: it is nowhere known
+    inlier: NDArray[np.bool_]  #: (n,), False for image points that failed their outlier test
+    #: (n,), angle of the C-arm [rad], NaN if unknown; None if always unknown
     angle: NDArray[np.float64] | None = None
 
     def of_exposures(self) -> list[tuple[int, int, float, float]]:
-        """Return number, inliers, and RMS before and after [px] of every exposure."""
+        """Return number, inliers, and RMS before and after [px] for each exposure."""
         out = []
         for number in np.unique(self.exposure):
             rows = (self.exposure == number) & self.inlier
@@ -68,7 +68,7 @@ def residuals_of(
     """Return the residuals of the frames of a fluoroscope.
 
     poses: exterior orientation by exposure; frames of other exposures were not used. points_mm:
-    (3,) adjusted object points by target.
+    adjusted object points (3,) by target.
     """
     exposure = []
     target_id = []
@@ -114,29 +114,29 @@ def residuals_of(
     )
 
 
-MIN_HISTOGRAM_SD = 5.0  # standard deviations to either side
+MIN_HISTOGRAM_SD = 5.0  # range of the histogram, in standard deviations to either side
 MAX_HISTOGRAM_SD = 15.0
-BIN_SD = 0.25  # width of a bar, in standard deviations
-STRIPES = 16  # of the image, for the running median
+BIN_SD = 0.25  # width of a bin, in standard deviations
+STRIPES = 16  # number of stripes across the image, for the running median
 COORDINATES = ('u', 'v')
 
 
 def normalised_residuals(
     run: SelfCalibration, rows: NDArray[np.int64], redundancy: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Inlier residuals in units of their standard deviation, before (n, 2) and after (m, 2).
+    """Return inlier residuals in units of their standard deviation, before (n, 2), after (m, 2).
 
-    rows (k,) are image points, redundancy (k,) their redundancy numbers. The standard deviation of
-    a residual is s0 sigma sqrt(redundancy number): it is smaller than that of the image noise by
-    what the unknowns absorb. s0 is estimated from the inliers after the calibration and used for
-    both, so that remaining distortion shows as width. The root of diag C_r would not do: it
-    contains the robust weight of each point, which depends on that very residual, and every tail
-    would vanish.
+    rows (k,): indices of image points; redundancy (k,): their redundancy numbers. The standard
+    deviation of a residual is s0 sigma sqrt(redundancy number): it is smaller than that of the
+    image noise, as the unknowns absorb part of the error. s0 is estimated from the inliers after
+    the calibration and used for both, so that remaining distortion shows as width. The root of
+    diag C_r is not suitable: it contains the robust weight of each point, which depends on that
+    very residual, and every tail would vanish.
     """
     sd = run.measured.network.sigma[rows] * np.sqrt(redundancy)
     inliers = run.after.inliers[rows]
     after = run.after.residuals[rows][inliers] / sd[inliers, None]
-    # A residual of low redundancy says little about the noise and counts accordingly.
+    # A residual with low redundancy says little about the noise, so it has a small weight.
     s0 = np.sqrt(np.average(np.mean(after**2, axis=1), weights=redundancy[inliers]))
     inliers_before = run.before.inliers[rows]
     before = run.before.residuals[rows][inliers_before] / sd[inliers_before, None]
@@ -146,7 +146,7 @@ def normalised_residuals(
 def histogram_figure(
     run: SelfCalibration, name: str, rows: NDArray[np.int64], redundancy: np.ndarray
 ) -> Figure:
-    """Histograms of the normalised residuals of one fluoroscope, with the standard normal.
+    """Return histograms of the normalised residuals of a fluoroscope, with the standard normal.
 
     rows (k,): its image points; redundancy (k,): their redundancy numbers.
     """
@@ -185,7 +185,7 @@ def histogram_figure(
 
 
 def _plot_histogram(axes: Axes, values: NDArray[np.float64], limit: float, when: str) -> None:
-    """Histogram of values (n,) from -limit to limit; when: 'before' or 'after'."""
+    """Draw a histogram of values (n,) from -limit to limit; when: 'before' or 'after'."""
     colour, alpha = (BEFORE, 0.45) if when == 'before' else (AFTER, 0.5)
     edges = np.linspace(-limit, limit, 2 * round(limit / BIN_SD) + 1)
     beyond = 100 - _percent_within(values, limit)
@@ -209,7 +209,7 @@ def _percent_within(values: NDArray[np.float64], limit: float) -> float:
     return 100 * np.mean(np.abs(values) <= limit)
 
 
-Residual = tuple[NDArray[np.float64], NDArray[np.bool_]]  # (n, 2) [px], and (n,) inliers
+Residual = tuple[NDArray[np.float64], NDArray[np.bool_]]  # (n, 2) [px], and inlier mask (n,)
 
 
 def position_figure(
@@ -219,9 +219,9 @@ def position_figure(
     after: Residual,
     image_size: tuple[int, int],
 ) -> Figure:
-    """Residuals of one fluoroscope over the image, before and after the calibration.
+    """Return the residuals of a fluoroscope over the image, before and after the calibration.
 
-    Those after it are shown to the scale of those before, and to their own. uv (n, 2): pixels.
+    Those after it are shown at the scale of those before, and at their own. uv (n, 2): pixels.
     """
     figure = new_figure(15, 8.4, title)
     grid = figure.subplots(2, 3)
@@ -262,7 +262,7 @@ def position_figure(
 
 
 def _residual_limit(residuals: Residual, axis: int) -> float:
-    """Limit of a panel in which nearly all inlier residuals lie [px]."""
+    """Return the limit of a panel that contains nearly all inlier residuals [px]."""
     values, inliers = residuals
     return float(1.1 * np.quantile(np.abs(values[inliers, axis]), 0.999)) or 1.0
 
@@ -275,7 +275,7 @@ def _plot_residuals(
     limit: float,
     colour: str,
 ) -> None:
-    """Residuals (n,) over positions (n,): dots, and crosses for outliers.
+    """Draw residuals (n,) over positions (n,): dots for inliers, crosses for outliers.
 
     Outliers beyond the limit are drawn at the border of the panel.
     """
@@ -287,7 +287,7 @@ def _plot_residuals(
 def _plot_running_median(
     axes: Axes, position: NDArray[np.float64], residual: NDArray[np.float64], size: int
 ) -> None:
-    """Running median of residuals (n,) over positions (n,) in an image of this size."""
+    """Draw the running median of residuals (n,) over positions (n,) in an image of this size."""
     edges = np.linspace(-0.5, size - 0.5, STRIPES + 1)
     stripe = np.digitize(position, edges) - 1
     medians = [

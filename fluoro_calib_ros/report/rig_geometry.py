@@ -1,9 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The rig of a calibration in mm: where sources, images and phantom are, and how well points are
-known in space.
-"""
+"""Geometry of the rig of a calibration [mm], and the accuracy of 3-D points."""
 
 from __future__ import annotations
 
@@ -23,31 +21,31 @@ from ..photogrammetry.rotations import matrix_from_quaternion
 from ..reconstruction.intersection import OK
 from ..reconstruction.reconstruct import ReconstructedFrame
 
-BEHIND = 1.3  # of the distance of the phantom: where the images are drawn
-GRID = 64  # places in each direction of an image
+BEHIND = 1.3  # position of the image plane in the drawing, as a multiple of the phantom distance
+GRID = 64  # number of sample points in each direction of an image
 
 
 @dataclass(frozen=True)
 class SpaceAccuracy:
-    """How well points in space are known that two or more fluoroscopes see."""
+    """Accuracy of 3-D points that at least two fluoroscopes see."""
 
-    points: int  #: beads that were intersected, in all exposures
+    points: int  #: number of intersected beads in all exposures
     sd_mm: NDArray[
         np.float64
     ]  #: (3,) median standard deviations of x, y, z in the frame of the rig
-    sd_point_mm: float  #: median root of the sum of their squares
-    distances: int  #: between beads of one exposure
+    sd_point_mm: float  #: median of the root of the sum of their squares
+    distances: int  #: number of distances between beads of the same exposure
     distance_mm: float  #: mean distance
-    distance_rms_mm: float  #: RMS of their differences from the survey
-    distance_sd_mm: float  #: RMS of what is expected for these
+    distance_rms_mm: float  #: RMS of the differences from the survey
+    distance_sd_mm: float  #: expected RMS of these differences
 
 
 def accuracy_in_space(
     frames: Sequence[ReconstructedFrame], phantom: Phantom
 ) -> SpaceAccuracy | None:
-    """Return how well the beads of exposures are known, None without two in an exposure.
+    """Return the accuracy of beads in exposures, None if no exposure has two of them.
 
-    In each exposure, the distances are those between the first and the second half of its beads.
+    In each exposure, distances are measured between beads of the first and of the second half.
     """
     sd = []
     measured = []
@@ -88,7 +86,7 @@ def accuracy_in_space(
 
 
 def beams(orientation: RigOrientation) -> list[tuple[str, float, float]]:
-    """Return pairs of fluoroscopes: names, angle of their beams [degrees], and mm between sources.
+    """Return for each pair of fluoroscopes: names, angle of beams [deg], source distance [mm].
 
     A beam is the ray through the principal point.
     """
@@ -102,20 +100,20 @@ def beams(orientation: RigOrientation) -> list[tuple[str, float, float]]:
 
 
 def phantom_in_sensor(entry: Mapping[str, Any]) -> NDArray[np.float64]:
-    """Return the origin of the phantom in the sensor frame of an exposure of result.json [mm]."""
+    """Return the origin of the phantom in the sensor frame for an exposure of result.json [mm]."""
     rotation = matrix_from_quaternion(np.array(entry['quaternion_wxyz'], dtype=float))
     return -rotation @ np.array(entry['position_mm'], dtype=float)
 
 
 def phantom_distance(exposures: Sequence[Mapping[str, Any]]) -> float:
-    """Return the median distance of the phantom from the source [mm], NaN without exposures."""
+    """Return the median depth of the phantom from the source [mm], NaN without exposures."""
     if not exposures:
         return float('nan')
     return float(np.median([phantom_in_sensor(entry)[2] for entry in exposures]))
 
 
 def uncalibrated_share(calibration: FluoroscopeCalibration) -> float:
-    """Return the share of the pixels beyond the calibrated area, 0 to 1."""
+    """Return the fraction of pixels outside the calibrated area, 0 to 1."""
     ticks = ((np.arange(GRID) + 0.5) / GRID * side - 0.5 for side in calibration.image_size)
     uv = np.stack(np.meshgrid(*ticks), axis=-1).reshape(-1, 2)
     return float(np.mean(calibration.correct(uv).status != CorrectionStatus.OK))
@@ -124,9 +122,10 @@ def uncalibrated_share(calibration: FluoroscopeCalibration) -> float:
 def drawing(
     result: Mapping[str, Any], calibrations: Calibrations, orientation: RigOrientation | None
 ) -> dict[str, Any]:
-    """Return what the drawing of the rig shows, in mm: in the frame of the rig, else per exposure.
+    """Return the data of the drawing of the rig [mm], in the rig frame if there is an orientation.
 
-    Sources, corners of the images on a plane behind the phantom, and the places of the phantom.
+    Otherwise the frame is that of the sensor of the first fluoroscope. The data are sources,
+    corners of the images on a plane behind the phantom, and positions of the phantom.
     """
     entries = result['fluoroscopes']
     fluoroscopes = []

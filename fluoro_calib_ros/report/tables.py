@@ -21,13 +21,13 @@ from ..estimation.result import CalibrationResult, FluoroscopeResult
 from ..findings import Severity, sentences
 from ..photogrammetry.rig_orientation import RigOrientation
 
-# Widths of the columns of quantities and of fluoroscopes.
+# Widths of columns, in characters.
 LABEL_WIDTH = 36
-COLUMN_WIDTH = 20  # of the values of a fluoroscope, in characters
+COLUMN_WIDTH = 20  # for the values of a fluoroscope
 
 
 def summary_table(result: CalibrationResult, latency_ms: Mapping[str, float] | None = None) -> str:
-    """Summarise a calibration in at most 100 columns of text, one column per fluoroscope.
+    """Summarise a calibration in at most 100 columns of text, one table column a fluoroscope.
 
     latency_ms: latency of the correction, p50, p99 and max [ms], and the number of frames.
     """
@@ -60,14 +60,14 @@ def summary_table(result: CalibrationResult, latency_ms: Mapping[str, float] | N
 
 
 def _column(result: CalibrationResult, name: str) -> dict[str, str]:
-    """Quantities and values of one fluoroscope, as text."""
+    """Return quantities and values of one fluoroscope, as text."""
     figures = result.fluoroscopes[name]
     calibration = result.calibrations[name]
     run = next((r for r in result.runs.values() if name in r.measured.fluoroscopes), None)
     converged = result.converged if run is None else run.converged
     inlier_percent = 100 * figures.inliers / max(figures.observations, 1)
     model = calibration.model
-    # An adjustment with calibrations has no rounds.
+    # An adjustment with given calibrations has no rounds.
     estimated = calibration.interior_estimated and bool(result.history)
     return {
         'Fluoroscope': name if len(name) < COLUMN_WIDTH else name[: COLUMN_WIDTH - 4] + '...',
@@ -89,7 +89,7 @@ def _column(result: CalibrationResult, name: str) -> dict[str, str]:
 
 
 def _median_sd(calibration: FluoroscopeCalibration) -> float:
-    """Median standard deviation of a correction [px], at all angles of the exposures."""
+    """Return the median sd of a correction [px], over all angles of the exposures."""
     uv = calibration.model.train_uv
     if not len(uv):
         return float('nan')
@@ -102,7 +102,7 @@ def _median_sd(calibration: FluoroscopeCalibration) -> float:
 
 
 def _noise_text(calibration: FluoroscopeCalibration) -> str:
-    """Standard deviation of an image coordinate [px]; in the middle and at the border."""
+    """Return the sd of an image coordinate [px], in the middle and at the border."""
     profile = calibration.noise_profile
     if profile is None:
         return number_text(calibration.image_sd)
@@ -138,9 +138,9 @@ def _interior_rows(figures: FluoroscopeResult) -> dict[str, str]:
 
 
 def markdown_table(header: Sequence[Any], rows: Sequence[Sequence[Any]]) -> str:
-    """Format a table for GitHub, with columns of numbers aligned to the right.
+    """Format a table for GitHub; columns of numbers are aligned to the right.
 
-    Raises ValueError for a row that is not as long as the header.
+    Raises ValueError for a row whose length differs from that of the header.
     """
     titles = [_cell(cell) for cell in header]
     cells = [[_cell(cell) for cell in row] for row in rows]
@@ -162,12 +162,12 @@ def markdown_table(header: Sequence[Any], rows: Sequence[Sequence[Any]]) -> str:
 
 
 def _cell(value: Any) -> str:
-    """Text of a cell: on one line, with the bars that would end it escaped."""
+    """Return the text of a cell on one line, with escaped bars."""
     return ' '.join(str(value).split()).replace('|', '\\|')
 
 
 def _is_number(cell: str) -> bool:
-    """Whether a cell is a number, with or without a percent sign, or a dash for none."""
+    """Return whether a cell is a number, with or without a percent sign, or a dash."""
     try:
         float(cell.rstrip(' %'))
     except ValueError:
@@ -179,19 +179,19 @@ TERMINAL_WIDTH = 100  # columns
 
 
 def model_text(model: CorrectionModel) -> str:
-    """A correction model in words."""
+    """Return a correction model in words."""
     if not model.corrects:
         return 'no correction model'
     return f'{model.kind}, k = {model.k}' if model.k else model.kind
 
 
 def number_text(value: float, digits: int = 3) -> str:
-    """A number with so many decimals, or a dash if it is not finite."""
+    """Return a number with this many decimals, or a dash if it is not finite."""
     return f'{value:.{digits}f}' if math.isfinite(value) else '-'
 
 
 def orientation_text(orientation: RigOrientation) -> str:
-    """Return a RigOrientation as text: a line, then a line a fluoroscope."""
+    """Return a RigOrientation as text: a title line, then one line a fluoroscope."""
     lines = [
         f'orientation of the rig {orientation.orientation_id} in frame {orientation.frame_id}, '
         f'from a {orientation.source} (exposures: {orientation.exposures})'
@@ -215,11 +215,11 @@ def _numbers(values: NDArray[np.float64]) -> str:
 
 HEADER = ('check', 'fluoroscope', 'value', 'limit', 'unit', '')
 PASSED_TEXT = {True: 'passed', False: 'FAILED', None: 'not made'}
-MAX_NAME = 20  # characters
+MAX_NAME = 20  # maximum length of a name in characters
 
 
 def verdict_text(validation: Validation) -> str:
-    """Format a Validation in at most 100 columns: the checks, the verdict, and what to do."""
+    """Format a Validation in at most 100 columns: checks, verdict, and advice."""
     rows = [HEADER]
     for check in validation.checks:
         rows.append(
@@ -253,7 +253,7 @@ def verdict_text(validation: Validation) -> str:
 
 
 def verdict_line(validation: Validation) -> str:
-    """Format the verdict in one line, with the accuracy achieved or the first thing to do."""
+    """Format the verdict in one line, with the achieved accuracy or the first advice."""
     text = f'Verdict: {validation.verdict}'
     if validation.verdict == 'pass':
         achieved = [

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A virtual right knee with markers in femur and tibia, walking and landing, with its truth.
+"""A virtual right knee with markers in femur and tibia, walking or landing, with ground truth.
 
 Frames of the bones are those of Grood and Suntay: x right, y anterior, z proximal. The person
-faces along y of the rig. Coordinates of bodies are those of a CT, which lies anywhere.
+faces along y of the rig. Coordinates of bodies are those of a CT with an arbitrary pose.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from ..exposures.frame import Frame
 from ..photogrammetry.rotations import matrix_from_vector
 from .rig import StreamStart, VirtualRig, image_frames
 
-CT_SD_MM = 0.1  # of a coordinate of a marker
+CT_SD_MM = 0.1  # standard deviation of a coordinate of a marker in the CT
 SIDE = 'right'
 JOINT = 'knee'
 CONVENTION = 'grood_suntay_knee'
-# Markers [mm] in the frames of the bones, and their first ids.
+# Markers [mm] in the frames of the bones, and the first id of each bone.
 FIRST_ID = {'femur': 3001, 'tibia': 3011}
 MARKERS_MM = {
     'femur': [[-31, -6, 16], [29, -14, 21], [6, 13, 46], [-9, -8, 66]],
@@ -48,23 +48,23 @@ LANDMARKS_MM = {
     },
 }
 
-# Flexion [deg] over a gait cycle from initial contact on: coefficients of cosines and sines, from
-# the harmonic 0 and 1 on. Fitted to the means of free walking, every 2 % of the cycle, of Schwartz
-# et al., J. Biomech. 41 (2008) 1639; the largest residual is 0.44 degrees.
+# Flexion [deg] over a gait cycle that starts at initial contact: coefficients of cosines and
+# sines, from harmonics 0 and 1 on. Fitted to the means of free walking, every 2 % of the cycle, of
+# Schwartz et al., J. Biomech. 41 (2008) 1639; the largest residual is 0.44 degrees.
 GAIT_COS_DEG = (23.338, -1.981, -14.122, -0.619, -0.895, -0.598)
 GAIT_SIN_DEG = (-18.904, 6.962, 4.516, 0.641, 0.742)
-CYCLE_S = 1.1  # of a step of walking
+CYCLE_S = 1.1  # duration of a gait cycle
 THIGH_MM = 425.0  # length
 SHANK_MM = 375.0  # length
 GRAVITY = 9810.0  # mm/s^2
 
-# Landing from 0.2 m on one leg. The pulse of the tibia, t exp(-t/RISE_S), takes up its speed and
-# peaks after RISE_S at speed / (e RISE_S) = 25 g.
+# Landing from 0.2 m on one leg. The pulse of the tibia, t exp(-t/RISE_S), absorbs its speed and
+# has its maximum after RISE_S, speed / (e RISE_S) = 25 g.
 DROP_MM = 200.0
 RISE_S = 0.003
-FLEX_S = 0.05  # time to the largest angular velocity of the knee, 370 degrees a second
-FALL_S = 0.06  # recorded before the contact
-LANDING_S = 0.4  # recorded
+FLEX_S = 0.05  # time to the maximum angular velocity of the knee, 370 degrees/s
+FALL_S = 0.06  # recorded time before the contact
+LANDING_S = 0.4  # recorded time
 LANDING_HZ = 500.0  # frame rate
 
 
@@ -73,17 +73,17 @@ class VirtualKnee:
     """The bones of a knee in the coordinates of their CT."""
 
     bodies: tuple[Body, ...]  #: femur and tibia with their true markers; sd 0
-    surveyed: tuple[Body, ...]  #: the same with the errors of CT
-    landmarks: Mapping[str, Mapping[str, NDArray[np.float64]]]  #: (3,) by body [mm]
+    surveyed: tuple[Body, ...]  #: the same bodies with the errors of CT
+    landmarks: Mapping[str, Mapping[str, NDArray[np.float64]]]  #: landmarks (3,) by body [mm]
     joint: Joint
 
 
 @dataclass(frozen=True)
 class KneeMotion:
-    """True motion at times (T,) [s]: poses of bodies -> rig by name, and the joint.
+    """True motion at times (T,) [s]: poses body -> rig by name, and joint coordinates.
 
-    rotation (T, 3, 3), position_mm (T, 3); angles (T, 3) [rad] and translations (T, 3) [mm] with
-    the names of the convention.
+    rotation (T, 3, 3), position_mm (T, 3); angles (T, 3) [rad] and translations (T, 3) [mm] as
+    named by the convention.
     """
 
     times_s: NDArray[np.float64]
@@ -132,7 +132,7 @@ def virtual_knee(seed: int = 0) -> VirtualKnee:
 
 
 def walking(knee: VirtualKnee, times_s: NDArray[np.float64]) -> KneeMotion:
-    """Motion of a knee on a treadmill; the thigh swings by 20 degrees to both sides."""
+    """Return the motion of a knee on a treadmill; the thigh swings by 20 degrees to both sides."""
     phase = 2 * np.pi * times_s / CYCLE_S
     order = np.arange(len(GAIT_COS_DEG))
     waves = np.cos(np.outer(phase, order)) @ GAIT_COS_DEG
@@ -154,9 +154,9 @@ def walking(knee: VirtualKnee, times_s: NDArray[np.float64]) -> KneeMotion:
 
 
 def landing(knee: VirtualKnee, times_s: NDArray[np.float64]) -> KneeMotion:
-    """Motion of a knee that falls and lands FALL_S after the time 0.
+    """Return the motion of a knee that falls and lands at the time FALL_S.
 
-    The tibia decelerates by a pulse, then tilts forward while the knee bends, both by
+    The tibia is decelerated by a pulse, then tilts forward while the knee bends, both by
     1 - (1 + t/FLEX_S) exp(-t/FLEX_S).
     """
     speed = np.sqrt(2 * GRAVITY * DROP_MM)
@@ -185,10 +185,10 @@ def landing(knee: VirtualKnee, times_s: NDArray[np.float64]) -> KneeMotion:
 def _coupled(
     flexion: NDArray[np.float64], phase: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return angles and translations (T, 3): what goes with flexion (T,) [rad].
+    """Return angles and translations (T, 3) that accompany flexion (T,) [rad].
 
-    A few degrees and millimetres, as pins in the bones showed (Lafortune et al., J. Biomech. 25,
-    1992).
+    The coupled motions are a few degrees and millimetres, as measured with pins in the bones
+    (Lafortune et al., J. Biomech. 25, 1992).
     """
     adduction = 0.03 * np.sin(phase) - 0.04 * np.sin(flexion)
     internal = 0.02 + 0.1 * np.sin(flexion) + 0.03 * np.cos(phase)
@@ -209,14 +209,14 @@ def _motion(
     translations: NDArray[np.float64],
     of_tibia: bool = False,
 ) -> KneeMotion:
-    """Return the motion of both bones; driven: pose of the femur, or the tibia, in the rig."""
+    """Return the motion of both bones; driven: pose of the femur, or of the tibia, in the rig."""
     unit = np.eye(3)
     by_flexion, by_adduction, by_turn = (
         matrix_from_vector(sign * angles[:, n : n + 1] * unit[n])
         for n, sign in enumerate((-1, 1, 1))
     )
     turn = by_flexion @ by_adduction @ by_turn
-    # The shifts along the three axes; distraction is against the last one.
+    # Shifts along the three axes; distraction is opposite to the last one.
     axes = np.stack(
         [np.broadcast_to(unit[0], angles.shape), by_flexion[:, :, 1], turn[:, :, 2]], axis=1
     )
@@ -245,7 +245,7 @@ def _motion(
 def _of_body(
     rotation: NDArray[np.float64], origin: NDArray[np.float64], frame: AnatomicalFrame
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the pose of a body whose anatomical frame has this pose."""
+    """Return the pose of a body from the pose of its anatomical frame."""
     of_body = rotation @ frame.rotation.T
     return of_body, origin - of_body @ frame.origin_mm
 
@@ -260,8 +260,8 @@ def simulate_knee(
 ) -> SimulatedKnee:
     """Simulate a recording of a knee: image points of the markers that are on the image.
 
-    motion: such as walking(knee, times) returns it. noise_px: standard deviation of an image
-    coordinate. seed: the same seed gives the same noise.
+    motion: for example walking(knee, times). noise_px: standard deviation of an image coordinate.
+    seed: the same seed gives the same noise.
     """
     ids = np.concatenate([body.target_id for body in knee.bodies])
     points = np.concatenate(

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Radiographs of moving markers: beads in bones that move while the light is on.
+"""Radiographs of moving markers: beads in bones that move during the exposure.
 
 Rays from several points of the focal spot, at several moments of the exposure, are traced through
-the beads, as in `radiographs`. Bones are hollow ellipsoids that move with their cluster of beads;
-discs of metal hide beads for a while, and cables, screws and specks lie in the way where it is
-asked. Only the surroundings of the beads are traced finely.
+the beads, as in `radiographs`. Bones are hollow ellipsoids that move with their cluster of beads.
+Metal discs hide beads for a while; cables, screws and specks are optional. Only the surroundings
+of the beads are traced at full resolution.
 """
 
 from __future__ import annotations
@@ -33,34 +33,34 @@ from .radiographs import (
 )
 from .rig import VirtualFluoroscope, VirtualRig
 
-FINE = 4  # rays across a pixel
-MOMENTS = 5  # of an exposure
-SPOT_POINTS = 3  # of the focal spot at each moment, others at the next
+FINE = 4  # number of rays across a pixel
+MOMENTS = 5  # number of moments of an exposure
+SPOT_POINTS = 3  # number of focal spot points at each moment; they alternate between moments
 BONE_STEP = 2  # pixels between rays through bones
-BONE_ATTENUATION = 0.028  # of compact bone less that of soft tissue [1/mm]
-HIDING = 0.02  # light that passes a disc of metal
-HIDING_PX = (7.0, 11.0)  # radius of such a disc
-HIDDEN_FRAMES = (3, 25)  # how long a bead is hidden
-FIRST_ID = 1001  # of the markers
+BONE_ATTENUATION = 0.028  # attenuation of compact bone minus that of soft tissue [1/mm]
+HIDING = 0.02  # fraction of light that passes a metal disc
+HIDING_PX = (7.0, 11.0)  # range of the radius of such a disc
+HIDDEN_FRAMES = (3, 25)  # range of the number of images in which a bead is hidden
+FIRST_ID = 1001  # first marker id
 
 
 @dataclass(frozen=True)
 class MarkerScene:
-    """What moves in front of the fluoroscopes."""
+    """Content of a scene in front of the fluoroscopes."""
 
-    #: number of rigid clusters, and of markers of each
+    #: number of rigid clusters, and number of markers in each
     clusters: int = 5
     markers: int = 6
-    diameters_mm: tuple[float, ...] = (0.8, 1.0)  #: of markers, drawn at random
+    diameters_mm: tuple[float, ...] = (0.8, 1.0)  #: diameters of markers, drawn at random
     #: linear attenuation coefficient of a marker [1/mm]; 7 is tantalum at 55 keV (NIST XCOM)
     attenuation: float = 7.0
     spread_mm: float = 20.0  #: half the size of a cluster
-    #: half the size of the volume in which the middles of the clusters move
+    #: half the size of the volume in which the centres of the clusters move
     apart_mm: float = 110.0
-    speed_mm: float = 0.6  #: typical way of a cluster from one image to the next
+    speed_mm: float = 0.6  #: typical motion of a cluster between successive images
     hidden: float = 0.05  #: share of images in which a marker is hidden
-    bones: bool = True  #: whether each cluster is in a bone
-    shutter: float = 0.4  #: share of the time between two images during which the light is on
+    bones: bool = True  #: whether each cluster is inside a bone
+    shutter: float = 0.4  #: exposure time, as a fraction of the time between two images
 
 
 MARKER_SETTINGS = RadiographSettings(photons=1500.0, bits=16, glare=0.08)
@@ -71,24 +71,24 @@ HARD_MARKER_SETTINGS = RadiographSettings(
 
 @dataclass(frozen=True)
 class MarkerImage:
-    """A radiograph of moving markers, with its truth."""
+    """A radiograph of moving markers, with ground truth."""
 
     image: np.ndarray  #: (h, w)
-    uv: NDArray[np.float64]  #: (n, 2) True centres in the middle of the exposure [px]
-    seen: NDArray[np.bool_]  #: (n,) False for markers that are hidden or out of the field
+    uv: NDArray[np.float64]  #: (n, 2) true centres in the middle of the exposure [px]
+    seen: NDArray[np.bool_]  #: (n,) False for markers that are hidden or outside the field
     mean_uv: NDArray[np.float64]  #: (n, 2) mean of the true centres over the exposure [px]
 
 
 @dataclass(frozen=True)
 class _Disc:
-    """A disc of metal that hides a marker of a fluoroscope for some images."""
+    """A metal disc that hides a marker from a fluoroscope in some images."""
 
     fluoroscope: str
     marker: int
     first: float
     last: float
     radius_px: float
-    drift: NDArray[np.float64]  # [px] from its middle to its end
+    drift: NDArray[np.float64]  # motion from its middle to its end [px]
 
 
 class MovingMarkers:
@@ -102,25 +102,25 @@ class MovingMarkers:
         rng = np.random.default_rng([seed, 21])
         n = scene.clusters * scene.markers
         self.target_id = np.arange(FIRST_ID, FIRST_ID + n)  #: (n,)
-        #: (n,) number of the cluster of a marker
+        #: (n,) cluster number of each marker
         self.cluster = np.repeat(np.arange(scene.clusters), scene.markers)
-        self.local_mm = _spread(rng, scene)  #: (n, 3) Markers in the frame of their cluster
+        self.local_mm = _spread(rng, scene)  #: (n, 3) markers in the frame of their cluster
         self.diameter_mm = rng.choice(scene.diameters_mm, n)
-        # Sums of three sinusoids for each coordinate and angle: (cluster, 6, 3).
+        # Sum of three sinusoids for each coordinate and angle: (cluster, 6, 3).
         shape = (scene.clusters, 6, 3)
         self._amplitude = rng.uniform(0.3, 1.0, shape)
         self._amplitude[:, :3] *= scene.apart_mm / 1.8
         self._amplitude[:, 3:] *= 0.35
         frequency = rng.uniform(0.5, 1.5, shape)
         self._phase = rng.uniform(0, 2 * np.pi, shape)
-        # Scaled so that the clusters have the speed that is asked for.
+        # Scaled such that the clusters have the given speed.
         speed = np.sqrt(0.5 * ((self._amplitude * frequency)[:, :3] ** 2).sum(axis=(1, 2)))
         self._frequency = frequency * scene.speed_mm / np.median(speed)
         angle = rng.uniform(-1.0, 1.0, (scene.clusters, 3))
         self._turn = np.array([matrix_from_vector(vector) for vector in angle])
 
     def poses(self, frame: float) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-        """Rotations (3, 3) and shifts (3,) [mm] of all clusters at an image number."""
+        """Return rotations (3, 3) and shifts (3,) [mm] of all clusters at an image number."""
         angle = 2 * self._frequency * frame / 2 + self._phase
         values = (self._amplitude * np.sin(angle)).sum(axis=2)
         return [
@@ -129,7 +129,7 @@ class MovingMarkers:
         ]
 
     def points_mm(self, frame: float) -> NDArray[np.float64]:
-        """Markers (n, 3) in the rig frame at an image number."""
+        """Return markers (n, 3) in the rig frame at an image number."""
         out = np.empty_like(self.local_mm)
         for number, (rotation, shift) in enumerate(self.poses(frame)):
             rows = self.cluster == number
@@ -138,7 +138,7 @@ class MovingMarkers:
 
 
 def _spread(rng: np.random.Generator, scene: MarkerScene) -> NDArray[np.float64]:
-    """Markers (n, 3) of all clusters [mm], no two of a cluster close to each other."""
+    """Return markers (n, 3) of all clusters [mm], none of them close to another of its cluster."""
     out = []
     for _ in range(scene.clusters):
         chosen: list[NDArray[np.float64]] = []
@@ -153,7 +153,7 @@ def _spread(rng: np.random.Generator, scene: MarkerScene) -> NDArray[np.float64]
 class MarkerRadiography(Radiography):
     """Takes radiographs of moving markers with one fluoroscope.
 
-    frames: length of the sequence, over which markers are hidden.
+    frames: length of the sequence over which markers are hidden.
     """
 
     def __init__(
@@ -181,7 +181,7 @@ class MarkerRadiography(Radiography):
         self._coarse = np.ascontiguousarray(coarse.T, dtype=np.float32)
 
     def take(self, frame: int) -> MarkerImage:
-        """Take the radiograph of an image number; the same number gives the same image."""
+        """Take the radiograph with an image number; the same number gives the same image."""
         rng = np.random.default_rng([self.seed, 23, frame])
         light, uv, hidden = self._light(frame, np.arange(len(self.markers.target_id)))
         image = self._grey(detected(light, self.settings), rng)
@@ -194,9 +194,9 @@ class MarkerRadiography(Radiography):
         rows: NDArray[np.int64],
         shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> NDArray[np.float32]:
-        """Return the light (h, w) that is expected, 1 in the open beam, of markers in rows (k,).
+        """Return the expected light (h, w) of markers in rows (k,), 1 in the open beam.
 
-        They are moved by shift_mm in the rig frame.
+        The markers are shifted by shift_mm in the rig frame.
         """
         light, _, _ = self._light(frame, rows, shift_mm)
         return detected(light, self.settings)
@@ -207,7 +207,7 @@ class MarkerRadiography(Radiography):
         rows: NDArray[np.int64],
         shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_]]:
-        """Light (h, w) before the detector, centres (moments, n, 2), which are hidden (n,)."""
+        """Return light (h, w) before the detector, centres (moments, n, 2), hidden mask (n,)."""
         scene = self.markers.scene
         moments = frame + scene.shutter * ((np.arange(MOMENTS) + 0.5) / MOMENTS - 0.5)
         points = np.array([self.markers.points_mm(moment) for moment in moments])
@@ -223,7 +223,7 @@ class MarkerRadiography(Radiography):
     def _true(
         self, frame: int, shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
     ) -> NDArray[np.float64]:
-        """True centres (n, 2) in the middle of an exposure, of markers that are moved."""
+        """Return true centres (n, 2) in the middle of an exposure, for shifted markers."""
         points = self.markers.points_mm(frame) + np.asarray(shift_mm)
         return self.centres(points, (np.eye(3), np.zeros(3)))
 
@@ -248,14 +248,14 @@ class MarkerRadiography(Radiography):
             row = (np.arange((v1 - v0) * FINE) + 0.5) / FINE - 0.5 + v0
             grid = np.meshgrid(column.astype(np.float32), row.astype(np.float32))
             plane = cv2.remap(self._plane, *grid, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
-            # Squares of metres less squares of millimetres: single precision is not enough.
+            # Squares of metres minus squares of millimetres: single precision is not enough.
             detector = np.dstack([plane, np.full(grid[0].shape, self.settings.detector_mm)])
             total = np.zeros_like(grid[0])
             for number, of_moment in enumerate(sensor):
                 for spot in spots[1 + number % 2 :: 2][:SPOT_POINTS]:
                     passed = np.ones_like(total)
                     for one in rows:
-                        # Only where the bead is: regions of several beads are wide.
+                        # Only around the bead: regions of several beads are large.
                         part = tuple(
                             slice((a - b) * FINE, (c - b) * FINE)
                             for a, b, c in zip(low[one][::-1], (v0, u0), high[one][::-1])
@@ -269,7 +269,7 @@ class MarkerRadiography(Radiography):
     def _bones(
         self, poses: list[tuple[NDArray[np.float64], NDArray[np.float64]]]
     ) -> NDArray[np.float32]:
-        """Transmission (h, w) of the bones around the clusters."""
+        """Return transmission (h, w) of the bones around the clusters."""
         fluoroscope = self.fluoroscope
         size = self.markers.scene.spread_mm
         path = np.zeros(self._coarse.shape[1], dtype=np.float32)
@@ -283,7 +283,7 @@ class MarkerRadiography(Radiography):
         shape = self._plane[::BONE_STEP, ::BONE_STEP].shape[:2]
         passed = np.exp(-BONE_ATTENUATION * path).astype(np.float32).reshape(shape)
         height, width = self._plane.shape[:2]
-        # The coarse pixels are those at multiples of the step, so they are no area means.
+        # The coarse pixels are samples at multiples of the step, not area means.
         place = np.meshgrid(
             np.arange(width, dtype=np.float32) / BONE_STEP,
             np.arange(height, dtype=np.float32) / BONE_STEP,
@@ -293,7 +293,7 @@ class MarkerRadiography(Radiography):
     def _hide(
         self, light: NDArray[np.float32], frame: int, true: NDArray[np.float64]
     ) -> NDArray[np.bool_]:
-        """Draw the discs of metal of an image; returns (n,) which markers they hide."""
+        """Draw the metal discs of an image; return a mask (n,) of the markers that they hide."""
         hidden = np.zeros(len(true), dtype=bool)
         for disc in self._discs:
             if not disc.first <= frame <= disc.last:
@@ -309,7 +309,7 @@ class MarkerRadiography(Radiography):
         return hidden
 
     def _grey(self, light: NDArray[np.float32], rng: np.random.Generator) -> np.ndarray:
-        """Grey values (h, w) of light from 0 to 1; so many photons have Gaussian noise."""
+        """Return grey values (h, w) of light from 0 to 1; many photons have Gaussian noise."""
         settings = self.settings
         expected = np.maximum(light, 0).astype(np.float32) * np.float32(settings.photons)
         noise = rng.standard_normal(expected.shape, dtype=np.float32) * np.sqrt(expected)
@@ -327,7 +327,7 @@ class MarkerRadiography(Radiography):
 def _regions(
     low: NDArray[np.int64], high: NDArray[np.int64]
 ) -> Iterator[tuple[list[int], tuple[int, int], tuple[int, int]]]:
-    """Yield rows and corners of boxes low (n, 2) to high (n, 2), those that touch as one."""
+    """Yield rows and corners of boxes low (n, 2) to high (n, 2); touching boxes are merged."""
     boxes = [
         ([number], a.copy(), b.copy())
         for number, (a, b) in enumerate(zip(low, high))
@@ -355,7 +355,7 @@ def _regions(
 def _ellipsoid_path(
     source: NDArray[np.float64], direction: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Lengths (n,) of rays in an ellipsoid, scaled to the unit sphere; directions (3, n)."""
+    """Return lengths (n,) of rays in an ellipsoid scaled to the unit sphere; directions (3, n)."""
     x, y, z = direction
     a = x * x + y * y + z * z
     b = source.astype(np.float32) @ direction
@@ -366,7 +366,7 @@ def _ellipsoid_path(
 def _discs(
     rng: np.random.Generator, fluoroscope: str, markers: MovingMarkers, frames: int
 ) -> list[_Disc]:
-    """Draw when markers are hidden, after the first images."""
+    """Draw when markers are hidden, excluding the first images."""
     out = []
     mean = 0.5 * sum(HIDDEN_FRAMES)
     count = rng.poisson(markers.scene.hidden * frames * len(markers.target_id) / mean)

@@ -4,10 +4,10 @@
 """Radiographs of a virtual fluoroscope: X-rays traced through beads and plates of the phantom.
 
 Every grey value is the mean over rays from several points of the focal spot to several points of
-the pixel, each attenuated by its path through the spheres (Beer and Lambert). The distortion is
-that of the observed pixel, so shadows are stretched as the image is. Blur and glare of the
-detector, quantum noise and digitisation follow (Rowlands and Yorkston, "Flat panel detectors for
-digital radiography", Handbook of Medical Imaging 1, 2000, section 4.3).
+the pixel, each attenuated by its path through the spheres (Beer and Lambert). Rays belong to
+observed pixels, so the distortion stretches shadows, too. Blur and glare of the detector, quantum
+noise and digitisation follow (Rowlands and Yorkston, "Flat panel detectors for digital
+radiography", Handbook of Medical Imaging 1, 2000, section 4.3).
 """
 
 from __future__ import annotations
@@ -20,38 +20,38 @@ from numpy.typing import NDArray
 
 from .rig import CUBE_MM, Pose, VirtualFluoroscope
 
-OVERSAMPLING = 3  # rays across a pixel
-FOCAL_POINTS = 7  # one in the middle, the others around
-FIELD_RADIUS = 0.485  # of a round field, as a fraction of the width of the image
-FIELD_MARGIN = 0.03  # of a rectangular field
+OVERSAMPLING = 3  # number of rays across a pixel
+FOCAL_POINTS = 7  # number of points of the focal spot: one in the middle, the others on a ring
+FIELD_RADIUS = 0.485  # radius of a round field, as a fraction of the smaller side of the image
+FIELD_MARGIN = 0.03  # margin of a rectangular field, as a fraction of the image size
 FIELD_EDGE_PX = 1.5  # softness of the edge of the field
-LEAKAGE = 0.004  # light outside of the field, as a fraction of that in it
+LEAKAGE = 0.004  # light outside the field, as a fraction of the light inside
 GLARE_PX = 60.0  # width of the veiling glare
-OPEN_BEAM = 0.85  # grey value of the open beam, as a fraction of the largest one
+OPEN_BEAM = 0.85  # grey value of the open beam, as a fraction of the maximum
 DARK = 0.02  # grey value without light
-MARGIN_PX = 3  # around the shadow of a bead
+MARGIN_PX = 3  # margin around the shadow of a bead
 
 
 @dataclass(frozen=True)
 class RadiographSettings:
-    """How radiographs are taken."""
+    """Settings of radiographs."""
 
     photons: float = 1500.0  #: photons that a pixel of the open beam counts
-    bits: int = 16  #: 8 or 16, of a grey value
-    bead_mm: float = 2.0  #: diameter of the beads [mm], where the phantom gives none
+    bits: int = 16  #: bits of a grey value, 8 or 16
+    bead_mm: float = 2.0  #: diameter of the beads [mm], if the phantom gives none
     #: linear attenuation coefficient of a bead [1/mm]; 1.5 is steel at 50 keV (NIST XCOM)
     bead_attenuation: float = 1.5
-    #: thickness of the plates that hold the beads [mm] and their coefficient [1/mm]
+    #: thickness of the plates that hold the beads [mm], and their attenuation coefficient [1/mm]
     plate_mm: float = 3.0
     plate_attenuation: float = 0.006
     focal_spot_mm: float = 0.6  #: diameter of the focal spot [mm]; 0 for a point, which is faster
     detector_mm: float = 2000.0  #: distance from the source to the detector [mm]
     blur_px: float = 0.8  #: standard deviation of the detector's blur [px]
-    glare: float = 0.08  #: fraction of the light that is scattered widely
-    round_field: bool = True  #: round field of an image intensifier, else a rectangle
-    clutter: int = 0  #: number of things in the image that are not the phantom
-    inverted: bool = False  #: beads are brighter than their surroundings
-    #: standard deviation of a blur of the quantum noise [px], which correlates it
+    glare: float = 0.08  #: fraction of the light that is scattered over long distances
+    round_field: bool = True  #: round field of an image intensifier, otherwise rectangular
+    clutter: int = 0  #: number of objects in the image that do not belong to the phantom
+    inverted: bool = False  #: whether beads are brighter than their surroundings
+    #: standard deviation of the blur of the quantum noise [px], which correlates it
     noise_blur_px: float = 0.0
 
 
@@ -75,14 +75,14 @@ class Radiography:
         self._directions = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
     def centres(self, points_mm: NDArray[np.float64], pose: Pose) -> NDArray[np.float64]:
-        """Observed pixels (n, 2) of points of the phantom (n, 3) [mm]."""
+        """Return observed pixels (n, 2) of points of the phantom (n, 3) [mm]."""
         rotation, shift = pose
         return self.fluoroscope.distortion.distort(
             self.fluoroscope.ideal(points_mm @ rotation.T + shift)
         )
 
     def in_field(self, uv: NDArray[np.float64], margin_px: float = 0.0) -> NDArray[np.bool_]:
-        """Return (n,) whether pixels (n, 2) lie in the field, a margin from its edge."""
+        """Return (n,) whether pixels (n, 2) lie in the field, at least margin_px from its edge."""
         return _depth_in_field(uv, self.fluoroscope.image_size, self.settings) > margin_px
 
     def image(
@@ -100,13 +100,13 @@ class Radiography:
         points_mm : ndarray
             (n, 3), centres of the beads in the frame of the phantom.
         pose : Pose
-            Of the phantom in the rig frame.
+            Pose of the phantom in the rig frame.
         seed : int
             The same seed gives the same noise and clutter.
         diameter_mm : ndarray, optional
-            (n,), of the beads; by default that of the settings.
+            (n,), diameters of the beads; by default that of the settings.
         plates : bool
-            Whether there are the four side faces of the cube.
+            Whether to include the four side faces of the cube.
 
         Returns
         -------
@@ -146,7 +146,7 @@ class Radiography:
         return detected(light, settings)
 
     def _detector_mm(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Points of the detector (n, 3) in the sensor frame [mm] of observed pixels (n, 2)."""
+        """Return detector points (n, 3) in the sensor frame [mm] for observed pixels (n, 2)."""
         xp, yp, c = self.fluoroscope.interior
         ideal = uv - self.fluoroscope.distortion(uv)
         scaled = (ideal - (xp, yp)) * (self.settings.detector_mm / c)
@@ -158,13 +158,13 @@ class Radiography:
         uv: NDArray[np.float64],
         radius_mm: NDArray[np.float64],
     ) -> np.ndarray:
-        """Transmission (h, w) of beads: sensor frame (n, 3) [mm], pixels (n, 2), radii (n,)."""
+        """Return transmission (h, w) of beads: sensor frame (n, 3) [mm], pixels (n, 2), radii."""
         width, height = self.fluoroscope.image_size
         fine = OVERSAMPLING
         reach = radius_mm * self.fluoroscope.interior[2] / sensor_mm[:, 2] * 1.15 + MARGIN_PX
         low = np.floor(uv - reach[:, None]).astype(int)
         count = 2 * int(np.ceil(reach.max(initial=1.0))) + 2
-        # Shadows that do not touch the image are left out; the others are cut at its edge.
+        # Exclude shadows that do not touch the image; cut the others at its edge.
         seen = np.flatnonzero(((low < (width, height)) & (low + count > 0)).all(axis=1))
         detector = self._patches_mm(low[seen], count)
         total = np.zeros((height, width), dtype=np.float32)
@@ -183,10 +183,10 @@ class Radiography:
         return total / len(spots)
 
     def _patches_mm(self, low: NDArray[np.int64], count: int) -> NDArray[np.float64]:
-        """Points (n, k, 3) of the detector [mm] where rays meet patches of `count` pixels.
+        """Return points (n, k, 3) of the detector [mm] where rays meet patches of `count` pixels.
 
-        low (n, 2) are their first pixels. The points are interpolated linearly between pixels:
-        the distortion bends by less than 1e-4 px from one pixel to the next.
+        low (n, 2) are the first pixels of the patches. The points are interpolated linearly
+        between pixels: the distortion bends by less than 1e-4 px from one pixel to the next.
         """
         fine = OVERSAMPLING
         around = np.arange(-1, count + 1)
@@ -202,9 +202,9 @@ class Radiography:
     def _plates(
         self, rotation: NDArray[np.float64], origin: NDArray[np.float64]
     ) -> NDArray[np.float32]:
-        """Transmission (h, w) of the four plates of the cube.
+        """Return transmission (h, w) of the four plates of the cube.
 
-        rotation (3, 3) and origin (3,) [mm] take points of the phantom to the sensor frame.
+        rotation (3, 3) and origin (3,) [mm] transform points of the phantom to the sensor frame.
         """
         source = -origin @ rotation
         source = source.astype(np.float32)
@@ -223,7 +223,7 @@ class Radiography:
 
 
 def focal_spot(diameter_mm: float) -> NDArray[np.float64]:
-    """Points (k, 3) of a uniform disc: its middle, and a ring that gives its second moment."""
+    """Return points (k, 3) of a uniform disc: centre, and a ring that gives its second moment."""
     if not diameter_mm:
         return np.zeros((1, 3))
     angle = np.arange(FOCAL_POINTS - 1) * 2 * np.pi / (FOCAL_POINTS - 1)
@@ -235,7 +235,7 @@ def focal_spot(diameter_mm: float) -> NDArray[np.float64]:
 def chords(
     centre: NDArray[np.float64], ray: NDArray[np.float64], radius: np.ndarray
 ) -> NDArray[np.float64]:
-    """Lengths of rays from the origin inside spheres; all arguments broadcast, the last axis 3."""
+    """Return lengths of rays from the origin inside spheres; arguments broadcast, last axis 3."""
     x, y, z = np.moveaxis(ray, -1, 0)
     a, b, c = np.moveaxis(centre, -1, 0)
     along = (a * x + b * y + c * z) ** 2 / (x * x + y * y + z * z)
@@ -248,7 +248,7 @@ def _path_in_box(
     low: NDArray[np.float32],
     high: NDArray[np.float32],
 ) -> NDArray[np.float32]:
-    """Lengths (h, w) of rays (h, w, 3) of unit length inside a box, by the slab method."""
+    """Return lengths (h, w) of rays (h, w, 3) of unit length inside a box, by the slab method."""
     direction = np.where(np.abs(rays) < 1e-12, rays.dtype.type(1e-12), rays)
     first = (low - source) / direction
     second = (high - source) / direction
@@ -262,7 +262,7 @@ def _path_in_box(
 def _depth_in_field(
     uv: np.ndarray, image_size: tuple[int, int], settings: RadiographSettings
 ) -> NDArray[np.float64]:
-    """Distances [px] of pixels (..., 2) from the edge of the field, negative outside."""
+    """Return distances [px] of pixels (..., 2) from the edge of the field, negative outside."""
     size = np.asarray(image_size)
     from_centre = uv - (size - 1) / 2
     if settings.round_field:
@@ -273,7 +273,7 @@ def _depth_in_field(
 def illumination(
     uv: NDArray[np.int64], image_size: tuple[int, int], settings: RadiographSettings
 ) -> NDArray[np.float32]:
-    """Open beam (h, w) from 0 to 1 at pixels (h, w, 2): darker to the border and to the anode."""
+    """Return the open beam (h, w), 0 to 1, at pixels (h, w, 2); darker at the border and anode."""
     x = (uv - (np.asarray(image_size) - 1) / 2) / (max(image_size) / 2)
     light = 1 - 0.16 * np.sum(x * x, axis=-1) + 0.06 * x[..., 0] - 0.05 * x[..., 1] ** 3
     depth = _depth_in_field(uv, image_size, settings)
@@ -282,7 +282,7 @@ def illumination(
 
 
 def clutter(rng: np.random.Generator, shape: tuple[int, ...], count: int) -> NDArray[np.float32]:
-    """Transmission (h, w) of cables, bone-like shadows, screws and specks."""
+    """Return transmission (h, w) of cables, bone-like shadows, screws and specks."""
     height, width = shape
     size = np.array([width, height])
     out = np.ones(shape, dtype=np.float32)
@@ -323,7 +323,7 @@ def clutter(rng: np.random.Generator, shape: tuple[int, ...], count: int) -> NDA
 
 
 def detected(light: NDArray[np.float32], settings: RadiographSettings) -> NDArray[np.float32]:
-    """Light (h, w) after blur and glare of the detector."""
+    """Return light (h, w) after blur and glare of the detector."""
     sharp = cv2.GaussianBlur(light, (0, 0), settings.blur_px) if settings.blur_px else light
     if not settings.glare:
         return sharp
@@ -336,7 +336,7 @@ def detected(light: NDArray[np.float32], settings: RadiographSettings) -> NDArra
 def _digitised(
     light: NDArray[np.float32], settings: RadiographSettings, rng: np.random.Generator
 ) -> np.ndarray:
-    """Grey values (h, w) of light from 0 to 1, with quantum noise."""
+    """Return grey values (h, w) of light from 0 to 1, with quantum noise."""
     expected = np.maximum(light, 0) * settings.photons
     counted = rng.poisson(expected).astype(np.float32)
     if settings.noise_blur_px:

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The virtual rig: phantom, fluoroscopes and where they stand, and its streams of frames.
+"""The virtual rig: phantom, fluoroscopes with positions and distortion, and streams of frames.
 
-Two fluoroscopes look across each other at the middle of the rig frame (z up, mm). Their sources
+Two fluoroscopes with crossing axes look at the origin of the rig frame (z up, mm). Their sources
 are about 1.5 m from it and about 2 m apart. The phantom is a cube of 260 mm with 503 beads on its
 four side faces.
 """
@@ -22,13 +22,13 @@ from ..photogrammetry.collinearity import project
 from ..photogrammetry.rotations import matrix_from_vector
 
 IMAGE_SIZE = (1024, 1024)
-CUBE_MM = 260.0  # edge of the phantom
-BEADS = 503  # of the phantom
-SURVEY_SD_MM = 0.1  # of a coordinate of a bead
+CUBE_MM = 260.0  # edge length of the phantom
+BEADS = 503  # number of beads on the phantom
+SURVEY_SD_MM = 0.1  # standard deviation of a coordinate of a bead
 BETWEEN_DEG = 84.0  # angle between the axes of neighbouring fluoroscopes
-BETWEEN_THREE_DEG = 60.0  # the same, of three
+BETWEEN_THREE_DEG = 60.0  # the same for three fluoroscopes
 
-# Rotation (3, 3) and shift (3,) [mm] that take points of the phantom into the rig frame.
+# Rotation (3, 3) and shift (3,) [mm] from the frame of the phantom to the rig frame.
 Pose = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
@@ -39,21 +39,21 @@ class VirtualFluoroscope:
     name: str
     interior: NDArray[np.float64]  #: (3,) xp, yp, c [px]
     rotation: NDArray[np.float64]  #: (3, 3) rig frame -> sensor frame
-    position_mm: NDArray[np.float64]  #: (3,) of the source in the rig frame
+    position_mm: NDArray[np.float64]  #: (3,) position of the source in the rig frame
     distortion: DistortionField
     image_size: tuple[int, int] = IMAGE_SIZE  #: width and height [px]
 
     def exterior(self, pose: Pose) -> Pose:
-        """Exterior orientation for a pose of the phantom.
+        """Return the exterior orientation for a pose of the phantom.
 
-        Returns the rotation (3, 3) phantom -> sensor frame and the source (3,) in the frame of the
-        phantom [mm].
+        It consists of the rotation (3, 3) phantom -> sensor frame and the source (3,) in the frame
+        of the phantom [mm].
         """
         rotation, shift = pose
         return self.rotation @ rotation, rotation.T @ (self.position_mm - shift)
 
     def ideal(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Undistorted image points (n, 2) [px] of points (n, 3) in the rig frame."""
+        """Return the undistorted image points (n, 2) [px] of points (n, 3) in the rig frame."""
         n = len(points_mm)
         return project(
             np.broadcast_to(self.rotation, (n, 3, 3)),
@@ -73,7 +73,7 @@ class VirtualRig:
 
 
 def bead_coordinates(rng: np.random.Generator) -> NDArray[np.float64]:
-    """Coordinates (503, 3) [mm] of beads on the side faces of the cube, in a disturbed grid."""
+    """Return coordinates (503, 3) [mm] of beads on the sides of the cube, in a perturbed grid."""
     across, up = np.meshgrid(
         (np.arange(11) - 5) * 23.0, (np.arange(12) - 5.5) * 21.0, indexing='ij'
     )
@@ -89,7 +89,7 @@ def bead_coordinates(rng: np.random.Generator) -> NDArray[np.float64]:
 
 
 def looking_at_origin(position_mm: ArrayLike) -> NDArray[np.float64]:
-    """Rotation (3, 3) rig -> sensor frame of a source at position_mm (3,) that faces the origin.
+    """Return the rotation (3, 3) rig -> sensor of a source at position_mm (3,), facing the origin.
 
     The y axis of the sensor points down.
     """
@@ -112,9 +112,9 @@ def virtual_rig(
     ----------
     seed : int
     strength : float
-        Factor on the distortion.
+        Scale factor of the distortion.
     names : sequence of str
-        Fluoroscopes, any number.
+        Names of any number of fluoroscopes.
     survey_sd_mm : float
         Standard deviation of the survey of the phantom.
     between_deg : float
@@ -144,16 +144,16 @@ def virtual_rig(
     return VirtualRig(tuple(fluoroscopes), true_mm, phantom)
 
 
-EDGE_PX = IMAGE_SIZE[0] / 2  # the parts of a field are given by their size there
-RIPPLES = 14  # parts of a random field
+EDGE_PX = IMAGE_SIZE[0] / 2  # the components of a field are given by their size there
+RIPPLES = 14  # number of ripples in a random field
 
 
 @dataclass(frozen=True)
 class DistortionField:
-    """Correction field: a function of pixels (n, 2) that returns corrections (n, 2) [px]."""
+    """Correction field: a function from pixels (n, 2) to corrections (n, 2) [px]."""
 
     centre: NDArray[np.float64]  #: (2,) [px]
-    #: size at the edge of the image [px]
+    #: size of the pincushion distortion at the edge of the image [px]
     pincushion: float
     s_shape: NDArray[np.float64]  #: (2,) size along u and v at the edge of the image [px]
     spiral: float
@@ -161,12 +161,12 @@ class DistortionField:
     ripples: NDArray[np.float64]
 
     def __call__(self, uv: ArrayLike) -> NDArray[np.float64]:
-        """Corrections (n, 2) [px] of observed pixels uv (n, 2)."""
+        """Return the corrections (n, 2) [px] of observed pixels uv (n, 2)."""
         uv = np.asarray(uv, dtype=float)
         x = (uv - self.centre) / EDGE_PX
         r2 = np.sum(x * x, axis=1, keepdims=True)
         turned = np.stack([-x[:, 1], x[:, 0]], axis=1)
-        # The S of each line: a cubic that leaves the centre and the point at two thirds in place.
+        # S shape of each line: a cubic that fixes the centre and the point at 0.63.
         s = x[:, ::-1] * (x[:, ::-1] ** 2 - 0.4) / 0.6
         out = r2 * (self.pincushion * x + self.spiral * turned) + self.s_shape * s
         along_u, along_v = np.ascontiguousarray(uv.T)  # sums over an axis of two are slow
@@ -177,9 +177,9 @@ class DistortionField:
         return out
 
     def distort(self, uv: ArrayLike) -> NDArray[np.float64]:
-        """Observed pixels (n, 2) of undistorted ones uv (n, 2), by fixed-point iteration.
+        """Return observed pixels (n, 2) of undistorted ones uv (n, 2), by fixed-point iteration.
 
-        Far beyond the image it may diverge; these are NaN or infinite.
+        Far beyond the image it may diverge; such pixels are NaN or infinite.
         """
         uv = np.asarray(uv, dtype=float)
         with np.errstate(over='ignore', invalid='ignore'):
@@ -187,7 +187,7 @@ class DistortionField:
             for _ in range(100):
                 last = observed
                 observed = uv + self(observed)
-                if np.max(np.abs(observed - last), initial=0.0) < 1e-11:  # rounding
+                if np.max(np.abs(observed - last), initial=0.0) < 1e-11:  # below rounding errors
                     break
         return observed
 
@@ -232,7 +232,7 @@ class StreamStart:
         target_id: NDArray[np.int64],
         observed: NDArray[np.float64],
     ) -> Frame:
-        """Frame number `index`, counted from 0, at a time after the first one [s].
+        """Return the frame with this index, counted from 0, at a time after the first one [s].
 
         target_id (n,) and observed (n, 2) [px] are its image points.
         """
@@ -248,16 +248,16 @@ class StreamStart:
         )
 
 
-# Simulated exposures of the phantom, of moving markers and of a grid, with their truth.
+# Simulated exposures of the phantom, of moving markers and of a grid, with ground truth.
 
 
 @dataclass(frozen=True)
 class Detection:
-    """How beads are detected in an exposure."""
+    """Properties of the detection of beads in an exposure."""
 
     noise_px: float = 0.25  #: standard deviation of an image coordinate
-    false_matches: float = 0.01  #: fraction of the detected beads that get the id of a bead nearby
-    beads: tuple[int, int] = (130, 160)  #: smallest and largest number of detected beads
+    false_matches: float = 0.01  #: fraction of detected beads with the id of a nearby bead
+    beads: tuple[int, int] = (130, 160)  #: minimum and maximum number of detected beads
 
 
 @dataclass(frozen=True)
@@ -266,13 +266,13 @@ class SimulatedExposures:
 
     frames: Mapping[str, list[Frame]]  #: by fluoroscope
     poses: Sequence[Pose]  #: rotation and shift [mm] of the phantom in the rig frame
-    #: by fluoroscope the undistorted image points (n, 2) of each frame, with noise and false
-    #: matches [px]
+    #: by fluoroscope, the undistorted image points (n, 2) of each frame [px], with noise and false
+    #: matches
     undistorted: Mapping[str, list[NDArray[np.float64]]]
 
 
 def phantom_poses(rng: np.random.Generator, count: int) -> list[Pose]:
-    """Poses of the phantom on a turntable, tilted and shifted at random."""
+    """Return poses of the phantom on a turntable, tilted and shifted at random."""
     turns = 2 * np.pi * (np.arange(count) + rng.uniform(0, 1, count)) / count
     poses = []
     for turn in turns:
@@ -322,8 +322,8 @@ def detect_beads(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Simulate the detection of beads in one image.
 
-    points_mm: (k, 3), beads in the rig frame. target_id: (k,). Returns target_id: (n,), ids of the
-    detected beads; observed: (n, 2) [px].
+    points_mm: beads (k, 3) in the rig frame; target_id: (k,). Returns the ids (n,) of the detected
+    beads and their observed pixels (n, 2).
     """
     detection = detection or Detection()
     ideal = fluoroscope.ideal(points_mm)
@@ -341,8 +341,8 @@ def detect_beads(
     return target_id[found], seen
 
 
-CLUSTER_MARKERS = 6  # of a rigid body
-# Centres of the clusters [mm]; the first two are on the one bone.
+CLUSTER_MARKERS = 6  # number of markers in a rigid cluster
+# Centres of the clusters [mm]; the first two belong to one bone, the others to the other.
 CLUSTER_CENTRES = np.array(
     [
         [-8, 0, 85],
@@ -356,7 +356,7 @@ CLUSTER_CENTRES = np.array(
     ],
     dtype=float,
 )
-GRID = (52, 39)  # points of a calibration grid across and down
+GRID = (52, 39)  # number of points of a calibration grid across and down
 
 
 @dataclass(frozen=True)
@@ -365,8 +365,8 @@ class SimulatedTracking:
 
     frames: Mapping[str, list[Frame]]  #: by fluoroscope
     marker_id: NDArray[np.int64]  #: (k,)
-    points_mm: NDArray[np.float64]  #: (frames, k, 3) positions in the rig frame
-    #: by fluoroscope the ideal image points (frames, k, 2) without noise [px]
+    points_mm: NDArray[np.float64]  #: (frames, k, 3), positions in the rig frame
+    #: by fluoroscope, the ideal image points (frames, k, 2) without noise [px]
     ideal: Mapping[str, NDArray[np.float64]]
 
 
@@ -418,8 +418,8 @@ def image_frames(
 ) -> tuple[dict[str, list[Frame]], dict[str, NDArray[np.float64]]]:
     """Return frames of moving points and their ideal image points (T, k, 2), by fluoroscope.
 
-    points_mm (T, k, 3) are those of the targets (k,) at times (T,). A frame has the points that
-    are on the image.
+    points_mm (T, k, 3) are the positions of the targets (k,) at times (T,). A frame contains the
+    points that are on the image.
     """
     frames: dict[str, list[Frame]] = {}
     ideal: dict[str, NDArray[np.float64]] = {}
@@ -438,7 +438,7 @@ def image_frames(
 
 
 def _markers_at(time_s: float, shapes: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Positions (k, 3) [mm] of all markers at a time [s]; shapes: clusters (6, 3) [mm]."""
+    """Return positions (k, 3) [mm] of all markers at a time [s]; shapes: clusters (6, 3) [mm]."""
     t = time_s
     bend = np.deg2rad(25) * np.sin(2 * np.pi * 0.5 * t)
     sway = 70 * np.array(
@@ -458,9 +458,9 @@ def simulate_grid(
     seed: int = 0,
     noise_px: float = 0.25,
 ) -> dict[str, list[Frame]]:
-    """Simulate count frames of a grid of 2,028 points in front of the detector, at 30 Hz.
+    """Simulate `count` frames of a grid of 2,028 points in front of the detector, at 30 Hz.
 
-    seed: the same one gives the same frames. noise_px: standard deviation of an image coordinate.
+    seed: the same seed gives the same frames. noise_px: standard deviation of an image coordinate.
     """
     start = StreamStart()
     rng = np.random.default_rng([seed, 5])

@@ -1,4 +1,4 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Bags: MCAP as rosbag2 writes it, without ROS."""
+"""Bags: MCAP in the layout of rosbag2, read and written without ROS."""

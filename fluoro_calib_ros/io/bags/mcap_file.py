@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Read one .mcap file, with every damage reported as DataError."""
+"""Read the files of a bag; all damage is reported as DataError."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from rosbags.rosbag2 import Reader
 
 MAGIC = b'\x89MCAP0\r\n'
-SQLITE = b'SQLite format 3\0'  # how a bag of that storage begins
+SQLITE = b'SQLite format 3\0'  # signature of a bag with the storage sqlite3
 FOOTER = struct.Struct('<BQQQI')  # opcode, length, two offsets, checksum
 RECORD = struct.Struct('<BQ')  # opcode and length
 
@@ -43,13 +43,13 @@ class BagMessage(NamedTuple):
 
     topic: str
     type: str
-    log_time_ns: int  #: time at which it was received [ns]
+    log_time_ns: int  #: time of reception [ns]
     data: bytes  #: CDR
 
 
 @dataclass(frozen=True)
 class ChannelInfo:
-    """A channel of a file, its schema (None where the file has none) and number of messages."""
+    """A channel of a file, its schema (None if unknown) and its number of messages."""
 
     channel: Channel
     schema: Schema | None
@@ -57,12 +57,12 @@ class ChannelInfo:
 
     @property
     def msg_type(self) -> str:
-        """Type of the messages, '' where it is not known."""
+        """Type of the messages, '' if unknown."""
         return self.schema.name if self.schema else ''
 
     @property
     def definition(self) -> Definition:
-        """Definition of the type as it was recorded."""
+        """Recorded definition of the type."""
         type_hash = self.channel.metadata.get('topic_type_hash', '')
         if self.schema is None:
             return Definition('', '', type_hash)
@@ -71,18 +71,18 @@ class ChannelInfo:
 
     @property
     def offered_qos(self) -> list[dict[str, Any]]:
-        """QoS profiles {policy: value} of the publishers, none where they are not known."""
+        """QoS profiles {policy: value} of the publishers; empty if unknown."""
         return parse_profiles(self.channel.metadata.get('offered_qos_profiles', ''))
 
 
 @dataclass
 class _Scan:
-    """What a pass over all records of a file found, by id."""
+    """Result of a pass over all records of a file, by id."""
 
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     counts: dict[int, int] = field(default_factory=dict)
-    ordered: bool = True  # by log time
+    ordered: bool = True  # whether messages are in the order of log time
 
 
 def channels_of_file(path: str) -> list[ChannelInfo]:
@@ -113,7 +113,7 @@ def channels_of_file(path: str) -> list[ChannelInfo]:
 def messages_of_file(path: str, topics: Collection[str] | None) -> Iterator[BagMessage]:
     """Yield the messages of a file in the order of log time.
 
-    topics are the names of those to read, None for all. Raises DataError for a damaged file.
+    topics: names of the topics to read, None for all. Raises DataError for a damaged file.
     """
     with _open_checked(path) as file:
         _check_chunks(file)
@@ -130,7 +130,7 @@ def messages_of_file(path: str, topics: Collection[str] | None) -> Iterator[BagM
 
 @contextmanager
 def _open_checked(path: str) -> Iterator[BinaryIO]:
-    """Open a file and check both of its ends; errors of the MCAP reader become DataError."""
+    """Open a file and check its beginning and end; turn errors of the reader into DataError."""
     try:
         check_regular_file(path)
         with os_errors(path, 'the bag cannot be read'), open(path, 'rb') as file:
@@ -145,7 +145,7 @@ def _open_checked(path: str) -> Iterator[BinaryIO]:
 
 
 def _check_ends(path: str, file: BinaryIO) -> None:
-    """Check the magic at both ends and the CRC of the summary, which the MCAP reader does not."""
+    """Check the magic at both ends and the CRC of the summary, which the MCAP reader ignores."""
     size = file.seek(0, os.SEEK_END)
     file.seek(0)
     if size == 0:
@@ -167,12 +167,12 @@ def _check_ends(path: str, file: BinaryIO) -> None:
 
 
 def _check_chunks(file: BinaryIO) -> None:
-    """Raise DataError for a chunk that would take too much memory; none is decompressed."""
+    """Raise DataError for a chunk that would need too much memory, without decompressing it."""
     position = len(MAGIC)
     size = file.seek(0, os.SEEK_END)
     while position + RECORD.size <= size:
         file.seek(position)
-        head = file.read(100)  # with sizes and compression, where it is that of a chunk
+        head = file.read(100)  # of a chunk: includes its sizes and compression
         opcode, length = RECORD.unpack_from(head)
         if opcode == Opcode.CHUNK:
             (held,) = struct.unpack_from('<Q', head, RECORD.size + 16)
@@ -193,7 +193,7 @@ def _check_chunks(file: BinaryIO) -> None:
 
 
 def _complete_summary(file: BinaryIO) -> Summary | None:
-    """Return the summary of a file, None unless it lists all channels and their schemas."""
+    """Return the summary of a file, None if it does not list all channels and their schemas."""
     summary = SeekingReader(file).get_summary()
     if summary is None:
         return None
@@ -204,9 +204,9 @@ def _complete_summary(file: BinaryIO) -> Summary | None:
 
 
 def _unindexed_messages(file: BinaryIO, topics: Collection[str] | None) -> Iterator[BagMessage]:
-    """Yield the messages of a file without chunk index in the order of log time.
+    """Yield the messages of a file without a chunk index in the order of log time.
 
-    They are read one after the other if that is their order, else sorted in memory.
+    They are read sequentially if they are in this order, otherwise sorted in memory.
     """
     scan = _scan(file)
     types = {number: schema.name for number, schema in scan.schemas.items()}
@@ -221,7 +221,7 @@ def _unindexed_messages(file: BinaryIO, topics: Collection[str] | None) -> Itera
 
 
 def _scan(file: BinaryIO) -> _Scan:
-    """Read all records of a file for its channels and counts."""
+    """Read all records of a file to collect its channels and message counts."""
     scan = _Scan()
     last = 0
     for record in _records(file):
@@ -242,11 +242,11 @@ def _records(file: BinaryIO) -> Iterator[McapRecord]:
 
 
 def _cause(error: Exception) -> str:
-    """Return the text of an error in one line, or its type."""
+    """Return the text of an exception on one line, or its type."""
     return ' '.join(str(error).split()) or type(error).__name__
 
 
-# Storage files of a bag: an .mcap file, or those in the folder of a rosbag2 bag.
+# Storage files of a bag: a single .mcap file, or the files in the folder of a rosbag2 bag.
 
 METADATA = 'metadata.yaml'
 SUFFIXES = ('.mcap', '.db3')
@@ -254,9 +254,9 @@ NO_METADATA = 'this is not the metadata of a bag, or it is damaged'
 
 
 def is_bag(source: PathLike) -> bool:
-    """Return whether a source is a bag: by its files, its name, or its first bytes.
+    """Return whether a source is a bag, judged by its files, its name, or its first bytes.
 
-    What is not there counts as a bag where its name has no ending. Raises DataError for a pipe.
+    A missing path counts as a bag if its name has no suffix. Raises DataError for a pipe.
     """
     path = Path(source)
     if path.is_dir():
@@ -269,7 +269,7 @@ def is_bag(source: PathLike) -> bool:
 
 
 def _beginning(path: PathLike) -> bytes:
-    """Return the first bytes of a file, none of one that cannot be read."""
+    """Return the first bytes of a file, b'' if it cannot be read."""
     with suppress(OSError), open(path, 'rb') as file:
         return file.read(len(SQLITE))
     return b''
@@ -278,8 +278,8 @@ def _beginning(path: PathLike) -> bytes:
 def storage_files(source: PathLike) -> list[str]:
     """Return the paths of the .mcap files of a bag, in order.
 
-    A bag folder has those that its metadata.yaml lists; without metadata.yaml all of them count,
-    in the order of their numbers. Raises DataError for a source that is not a bag.
+    For a folder these are the files listed in metadata.yaml; without metadata.yaml all .mcap
+    files, in the order of their numbers. Raises DataError for a source that is not a bag.
     """
     if not os.path.lexists(source):
         raise DataError(f'{source}: there is no such bag')
@@ -291,7 +291,7 @@ def storage_files(source: PathLike) -> list[str]:
 
 
 def candidate_files(source: PathLike) -> list[str]:
-    """Return the paths of the .mcap files of a damaged bag, whatever its metadata.yaml says.
+    """Return the paths of the .mcap files of a damaged bag; its metadata.yaml is ignored.
 
     Raises DataError for a source that is not a bag.
     """
@@ -312,14 +312,14 @@ def _files_in(source: PathLike) -> list[str]:
 
 
 def _natural_order(name: str) -> list[tuple[int, str]]:
-    """Return a sort key by which bag_10 follows bag_9."""
+    """Return a sort key that orders bag_9 before bag_10."""
     return [
         (int(part), '') if part.isdigit() else (-1, part) for part in re.split(r'([0-9]+)', name)
     ]
 
 
 def bag_information(folder: PathLike) -> dict[str, Any]:
-    """Return what metadata.yaml says of a bag. Raises DataError."""
+    """Return the information in metadata.yaml of a bag. Raises DataError."""
     path = os.path.join(folder, METADATA)
     document = read_yaml(path)
     found = document.get('rosbag2_bagfile_information') if isinstance(document, dict) else None
@@ -329,7 +329,7 @@ def bag_information(folder: PathLike) -> dict[str, Any]:
 
 
 def _listed_files(source: PathLike) -> list[str]:
-    """Return the files that metadata.yaml lists. Raises DataError."""
+    """Return the paths of the files listed in metadata.yaml. Raises DataError."""
     path = os.path.join(source, METADATA)
     information = bag_information(source)
     try:
@@ -353,15 +353,15 @@ def _listed_files(source: PathLike) -> list[str]:
     return paths
 
 
-# Bags of other storages, read by the library rosbags: sqlite3, and compressed ones.
+# Bags of other storages, read by the library rosbags: sqlite3 and compressed bags.
 #
-# A bag is compressed by rosbag2 file by file (`file`) or message by message (`message`).
+# rosbag2 compresses a bag file by file (`file`) or message by message (`message`).
 
 
 def is_foreign(source: PathLike) -> bool:
-    """Return whether a bag is not stored in plain .mcap files."""
+    """Return whether a bag is stored in another form than uncompressed .mcap files."""
     if os.path.isdir(source):
-        with suppress(DataError, KeyError):  # the reader of MCAP bags says what is wrong
+        with suppress(DataError, KeyError):  # the reader of MCAP bags reports the error
             information = bag_information(source)
             mode = str(information.get('compression_mode') or 'none').lower()
             return str(information['storage_identifier']) == 'sqlite3' or mode != 'none'
@@ -370,7 +370,7 @@ def is_foreign(source: PathLike) -> bool:
 
 
 def channels_of_bag(source: PathLike) -> list[ChannelInfo]:
-    """Return all channels of a bag. Raises DataError for one that cannot be read."""
+    """Return all channels of a bag. Raises DataError for a bag that cannot be read."""
     out = []
     with _opened(source) as bag:
         for number, connection in enumerate(bag.connections, 1):
@@ -399,7 +399,7 @@ def messages_of_bag(source: PathLike, topics: Collection[str] | None) -> Iterato
 
 
 def _plain(profiles: object) -> list[object]:
-    """Return QoS profiles, of which rosbags makes objects, as YAML contains them; or none."""
+    """Return QoS profiles as in YAML, [] if rosbags has converted them to objects."""
     if isinstance(profiles, list) and all(isinstance(item, dict) for item in profiles):
         return profiles
     return []
@@ -407,8 +407,8 @@ def _plain(profiles: object) -> list[object]:
 
 @contextmanager
 def _opened(source: PathLike) -> Iterator[Reader]:
-    """Open a bag; every error of the library becomes a DataError."""
-    from rosbags.rosbag2 import Reader  # with SQLite, which a recorder does not need
+    """Open a bag; turn every error of the library into a DataError."""
+    from rosbags.rosbag2 import Reader  # loads SQLite, which a recorder does not need
 
     check_regular_file(source)
     for name in os.listdir(source) if os.path.isdir(source) else ():

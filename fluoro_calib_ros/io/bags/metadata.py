@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Message definitions without ROS, and the metadata of a bag as rosbag2 writes it."""
+"""Message definitions without ROS, and metadata of a bag in the layout of rosbag2."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ from ..documents import parse_yaml
 PACKAGE = 'fluoro_calib_msgs'
 TARGET_OBSERVATIONS = f'{PACKAGE}/msg/TargetObservations'
 FLUOROSCOPE_CALIBRATION = f'{PACKAGE}/msg/FluoroscopeCalibration'
-# Fields that were added at the end of a message, one change after the other: those of an earlier
-# definition do not have them, or only the first of them. Series came before there were bags.
+# Fields appended to a message by each change of its definition: earlier messages have none or only
+# the first of them. Series did not exist before bags did.
 ADDED = {
     FLUOROSCOPE_CALIBRATION: tuple(
         tuple(field.name for field in FIELDS if field.since == version)
         for version in range(3, VERSION + 1)
     )
 }
-SEPARATOR = '=' * 80  # between the definitions of a schema
+SEPARATOR = '=' * 80  # separates the definitions in a schema
 
 
 @dataclasses.dataclass(frozen=True)
 class Definition:
-    """Definition of a message type in a bag: text, its encoding, and hash, '' where unknown."""
+    """Definition of a message type in a bag: text, encoding and hash; '' if unknown."""
 
     text: str
     encoding: str = 'ros2msg'
@@ -48,7 +48,7 @@ class Definition:
 
 
 def known_definition(msg_type: str) -> Definition:
-    """Return the definition of a type in the typestore. Raises DataError for an unknown one."""
+    """Return the definition of a type in the typestore. Raises DataError for an unknown type."""
     return Definition(full_text(msg_type), 'ros2msg', type_hash(msg_type))
 
 
@@ -81,17 +81,17 @@ def type_hash(msg_type: str) -> str:
 
 @cache
 def full_text(msg_type: str) -> str:
-    """Return the definition of a message type as the schema of a bag contains it.
+    """Return the definition of a message type in the form of a bag schema.
 
-    The definitions of all types it depends on follow, each after a line of 80 '=' and a line
-    'MSG: package/Type', in the order in which rosbag2 finds them.
+    The definitions of all types it depends on follow, each after a line of 80 '=' and a line 'MSG:
+    package/Type', in the order of rosbag2.
     """
     message_class(msg_type)
     return with_dependencies(msg_type, _own_definition, set())
 
 
 def to_cdr(message: Any, msg_type: str) -> bytes:
-    """Return a message dataclass as CDR. Raises DataError for a value that a field cannot have."""
+    """Serialise a message dataclass to CDR. Raises DataError for an invalid value of a field."""
     message_class(msg_type)
     try:
         return bytes(typestore().serialize_cdr(message, msg_type, little_endian=True))
@@ -100,12 +100,12 @@ def to_cdr(message: Any, msg_type: str) -> bytes:
 
 
 def from_cdr(data: bytes, msg_type: str) -> Any:
-    """Return CDR as a message dataclass. Raises DataError for other bytes.
+    """Deserialise CDR to a message dataclass. Raises DataError for invalid bytes.
 
-    Fields that a message of an earlier definition does not have are empty.
+    Fields that an earlier definition of the message lacks are empty.
 
     Fast DDS reserves four bytes for the alignment of each empty sequence of float64, such as a
-    sigma that is not given, and leaves them at the end. rosbags takes that for another message.
+    missing sigma, and leaves them at the end. rosbags rejects such messages.
     """
     kind = message_class(msg_type)
     try:
@@ -125,28 +125,28 @@ def from_cdr(data: bytes, msg_type: str) -> Any:
 
 
 def present_cdr(data: bytes, msg_type: str) -> bytes:
-    """Return a message, also one of an earlier definition, as CDR of the present definition.
+    """Convert a message of any definition to CDR of the current definition.
 
-    Raises DataError for other bytes.
+    Raises DataError for invalid bytes.
     """
     return to_cdr(from_cdr(data, msg_type), msg_type)
 
 
 def earlier_text(msg_type: str, changes: int = 0) -> str:
-    """Return the definition of a type after so many of the changes that added fields."""
+    """Return the definition of a type after the first `changes` changes that added fields."""
     lines = _package_texts()[msg_type].splitlines(keepends=True)
     added = _added(msg_type, changes)
     return ''.join(line for line in lines if (line.split() + ['', ''])[1] not in added)
 
 
 def _added(msg_type: str, changes: int) -> list[str]:
-    """Return the fields of a type that were added after so many changes."""
+    """Return the fields of a type that were added after the first `changes` changes."""
     return [name for names in ADDED[msg_type][changes:] for name in names]
 
 
 @cache
 def _earlier_typestore(changes: int) -> Typestore:
-    """Return the typestore with the types in ADDED after so many changes."""
+    """Return the typestore with the types in ADDED after the first `changes` changes."""
     store = get_typestore(Stores.ROS2_JAZZY)
     for name, text in _package_texts().items():
         earlier = name in ADDED and changes < len(ADDED[name])
@@ -156,11 +156,11 @@ def _earlier_typestore(changes: int) -> Typestore:
 
 
 def _read_cdr(store: Typestore, data: bytes, msg_type: str) -> Any:
-    """Return CDR as a message dataclass of a typestore. Raises DataError for other bytes."""
+    """Deserialise CDR with a typestore. Raises DataError for invalid bytes."""
     try:
         return store.deserialize_cdr(data, msg_type)
     except Exception as error:  # generated code raises almost anything for damaged bytes
-        # Fast DDS reserves four bytes at the end for an empty float64[]; a message has ten at most
+        # Ignore the bytes of up to ten empty sequences, see from_cdr; no message has more
         for empty in range(1, 11):
             with suppress(Exception):
                 message = store.deserialize_cdr(data[: -4 * empty], msg_type)
@@ -170,13 +170,13 @@ def _read_cdr(store: Typestore, data: bytes, msg_type: str) -> Any:
 
 
 def _count_empty(message: Any) -> int:
-    """Return the number of empty sequences of float64 among the fields of a message."""
+    """Return the number of empty float64 sequences among the fields of a message."""
     values = (getattr(message, field.name) for field in dataclasses.fields(message))
     return sum(isinstance(v, np.ndarray) and v.dtype == np.float64 and not len(v) for v in values)
 
 
 def fields_of(msg_type: str, text: str, encoding: str) -> dict[str, Any]:
-    """Return the fields of a message type and of those it depends on, by type.
+    """Return the fields of a message type and its dependencies, by type.
 
     text is the definition in the schema of a bag, encoding 'ros2msg' or 'ros2idl'. Raises
     DataError for a definition that cannot be read.
@@ -219,7 +219,7 @@ Definitions = Callable[[str], tuple[str, Iterable[Any]]]  # text and fields of a
 
 
 def with_dependencies(name: str, definitions: Definitions, seen: set[str]) -> str:
-    """Return the definition of a type and of those it depends on, unless they were seen."""
+    """Return the definition of a type and its dependencies that are not in seen."""
     text, fields = definitions(name)
     for nested in sorted(_nested_types(fields)):
         if nested not in seen:
@@ -240,7 +240,7 @@ def _nested_types(fields: Iterable[Any]) -> set[str]:
     return names
 
 
-# Frames and TargetObservations messages, as dataclasses of the rosbags typestore.
+# Conversion between frames and TargetObservations messages, dataclasses of the rosbags typestore.
 
 TOPIC_NAME = 'target_observations'
 RETRACTION = f'{PACKAGE}/msg/Retraction'
@@ -287,16 +287,16 @@ def message_from_frame(frame: Frame) -> Any:
 def observations_topic(fluoroscope: str, namespace: str = '') -> str:
     """Return the absolute topic of the observations of a fluoroscope.
 
-    namespace is that of the rig, such as '/rig'.
+    namespace: namespace of the rig, such as '/rig'.
     """
     parts = [*namespace.strip('/').split('/'), fluoroscope, TOPIC_NAME]
     return '/' + '/'.join(parts).lstrip('/')
 
 
 def fluoroscope_of_topic(topic: str) -> str:
-    """Return the fluoroscope of a topic, which is the part of its name before the last.
+    """Return the fluoroscope of a topic, the last but one part of its name.
 
-    Raises DataError for a name of one part.
+    Raises DataError for a name of a single part.
     """
     parts = [part for part in topic.split('/') if part]
     if len(parts) < 2:
@@ -306,10 +306,10 @@ def fluoroscope_of_topic(topic: str) -> str:
     return parts[-2]
 
 
-# QoS profiles as bags contain them: YAML in a channel's metadata and in metadata.yaml.
+# QoS profiles in bags: YAML in the metadata of a channel and in metadata.yaml.
 
 _INFINITE = {'sec': 9223372036, 'nsec': 854775807}  # RMW_DURATION_INFINITE
-# Bags from before Jazzy number the policies (rmw/types.h).
+# Bags older than Jazzy contain numbers instead of policy names (rmw/types.h).
 _POLICY_NAMES = {
     'history': ('system_default', 'keep_last', 'keep_all', 'unknown'),
     'reliability': ('system_default', 'reliable', 'best_effort', 'unknown', 'best_available'),
@@ -326,7 +326,7 @@ _POLICY_NAMES = {
 
 
 def profile(durability: str = 'volatile', depth: int = 10) -> dict[str, Any]:
-    """Return a reliable QoS profile {policy: value} as rosbag2 writes it.
+    """Return a reliable QoS profile {policy: value} in the form of rosbag2.
 
     Keep last, without deadline and lifespan.
     """
@@ -347,7 +347,7 @@ PROFILES = {'observations': profile(), 'latched': profile(durability='transient_
 
 
 def to_yaml(value: Any) -> str:
-    """Return a value as YAML as rosbag2 does: block style, keys in order, no final newline."""
+    """Return a value as YAML like rosbag2: block style, keys in order, no final newline."""
     return yaml.dump(
         value, Dumper=_Dumper, sort_keys=False, default_flow_style=False, width=10**6
     ).rstrip('\n')
@@ -356,7 +356,7 @@ def to_yaml(value: Any) -> str:
 def parse_profiles(value: Any) -> list[dict[str, Any]]:
     """Return QoS profiles from the YAML text, or the list, in a bag; policies by name.
 
-    A text that cannot be parsed gives no profiles: a bag can be read without them.
+    A text that cannot be parsed gives []: a bag can be read without profiles.
     """
     try:
         items = parse_yaml(value, 'QoS profiles') if isinstance(value, str) else value
@@ -377,7 +377,7 @@ def _with_policy_names(item: dict[str, Any]) -> dict[str, Any]:
 
 
 class _Dumper(yaml.SafeDumper):
-    """Block style as yaml-cpp writes it."""
+    """Writes block style like yaml-cpp."""
 
     def increase_indent(self, flow: bool = False, indentless: bool = False) -> None:
         return super().increase_indent(flow, False)
@@ -396,7 +396,7 @@ NO_MESSAGE_NS = 2**63 - 1  # starting time of a bag without messages [ns]
 
 @dataclass
 class FileSpan:
-    """Number of the messages in a file, or in the whole bag, and the time they span [ns]."""
+    """Number of messages in a file, or in the whole bag, and the time they span [ns]."""
 
     path: str = ''
     count: int = 0
@@ -429,23 +429,23 @@ class BagTopic:
     qos: list[dict[str, Any]]  #: offered QoS profiles
     definition: Definition
     count: int = 0  #: number of messages
-    #: its channel in the file that is being written
+    #: channel id in the file that is being written
     channel: int = field(default=0, compare=False)
 
 
 def bag_metadata(
     topics: Iterable[BagTopic], files: Sequence[FileSpan], total: FileSpan
 ) -> dict[str, Any]:
-    """Return the content of rosbag2_bagfile_information; the order of the keys counts."""
+    """Return the content of rosbag2_bagfile_information; the order of the keys matters."""
     return {
-        'version': 9,  # as rosbag2 of Jazzy writes it
+        'version': 9,  # version of rosbag2 in Jazzy
         'storage_identifier': 'mcap',
         'duration': total.duration,
         'starting_time': total.starting_time,
         'message_count': total.count,
         'topics_with_message_count': [_topic_metadata(topic) for topic in topics],
         'compression_format': '',
-        'compression_mode': '',  # of whole files; the chunks have their own
+        'compression_mode': '',  # applies to whole files; chunks are compressed separately
         'relative_file_paths': [file.path for file in files],
         'files': [
             {

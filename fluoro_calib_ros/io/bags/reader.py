@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Read bags: an .mcap file, or a rosbag2 folder with one or more of them."""
+"""Read bags: a single .mcap file, or a rosbag2 folder."""
 
 from __future__ import annotations
 
@@ -51,9 +51,9 @@ class TopicInfo(NamedTuple):
 
 @dataclass(frozen=True)
 class BagContents:
-    """Frames of a bag in the order of time, and the topics they were read from, by fluoroscope.
+    """Frames of a bag in the order of time, and their topics, by fluoroscope.
 
-    notes are sentences about image points that were left out.
+    notes are sentences about excluded image points and renumbered frames.
     """
 
     frames: dict[str, list[Frame]]
@@ -62,11 +62,11 @@ class BagContents:
 
 
 def read_frames(source: PathLike, validate: bool = True) -> BagContents:
-    """Read all frames of a bag: those of every topic of type TargetObservations.
+    """Read all frames of a bag, from every topic of type TargetObservations.
 
-    The fluoroscope is the part of the topic's name before the last. Where the frame numbers of a
-    stream begin again, a power of ten is added to those that follow, so that they differ. Without
-    validate only the lengths of the arrays of a frame are checked.
+    The fluoroscope is the last but one part of the topic's name. If the frame numbers of a stream
+    restart, a multiple of a power of ten is added to the following numbers to make them unique.
+    Without validate only the lengths of the arrays of a frame are checked.
 
     Raises DataError that names bag, topic and message: for a source that is not a bag, a damaged
     or truncated one, one without observations, a different definition of the message, and an
@@ -76,7 +76,7 @@ def read_frames(source: PathLike, validate: bool = True) -> BagContents:
     _check_definitions(source, fluoroscopes)
     frames: dict[str, list[Frame]] = {name: [] for name in sorted(fluoroscopes.values())}
     notes: list[str] = []
-    first: dict[tuple[str, int, int], int] = {}  # message in which a frame occurred first
+    first: dict[tuple[str, int, int], int] = {}  # message in which a frame first occurred
     restarts = dict.fromkeys(frames, 0)
     segments: dict[str, list[int]] = {name: [] for name in frames}
     for message in iterate_messages(source, fluoroscopes):
@@ -125,9 +125,9 @@ def read_frames(source: PathLike, validate: bool = True) -> BagContents:
 
 
 def _without_retracted(source: PathLike, frames: Frames) -> tuple[dict[str, list[Frame]], int]:
-    """Return frames without image points whose ids were taken back later, and their number.
+    """Exclude image points whose ids were retracted later; return the frames and their number.
 
-    Raises DataError.
+    The number is that of the excluded points. Raises DataError.
     """
     topics = {
         topic: fluoroscope_of_topic(topic)
@@ -154,14 +154,14 @@ def _without_retracted(source: PathLike, frames: Frames) -> tuple[dict[str, list
 
 
 def _is_restart(last: Frame, frame: Frame) -> bool:
-    """Return whether the numbers of a stream begin again while time goes on."""
+    """Return whether the frame numbers of a stream restart while time increases."""
     return frame.number < last.number and frame.stamp_ns > last.stamp_ns
 
 
 def _renumbered(
     frames: Frames, segments: Mapping[str, Sequence[int]]
 ) -> tuple[dict[str, list[Frame]], int]:
-    """Return frames with numbers that differ between segments of their streams, and the step."""
+    """Make frame numbers of different segments of a stream unique; return frames and step."""
     largest = max(frame.number for each in frames.values() for frame in each)
     step = 10 ** len(str(largest))
     renumbered = {
@@ -177,9 +177,9 @@ def _renumbered(
 def iterate_messages(
     source: PathLike, topics: Iterable[str] | None = None
 ) -> Iterator[BagMessage]:
-    """Yield the messages of a bag in the order of log time; only a few chunks are in memory.
+    """Yield the messages of a bag in the order of log time, with only a few chunks in memory.
 
-    topics are the names of those to read, by default all. Raises DataError, also while iterating,
+    topics: names of the topics to read, by default all. Raises DataError, also during iteration,
     for a damaged or truncated bag.
     """
     wanted = None if topics is None else set(topics)
@@ -208,7 +208,7 @@ def topics_of(source: PathLike) -> dict[str, TopicInfo]:
 
 
 def _channels(source: PathLike) -> Iterator[tuple[PathLike, list[ChannelInfo]]]:
-    """Yield every file of a bag and its channels. Raises DataError."""
+    """Yield each file of a bag and its channels. Raises DataError."""
     if is_foreign(source):
         yield source, channels_of_bag(source)
         return
@@ -237,7 +237,7 @@ def _observation_topics(source: PathLike) -> dict[str, str]:
 
 
 def _check_definitions(source: PathLike, topics: Collection[str]) -> None:
-    """Raise DataError unless a bag defines TargetObservations as this program does."""
+    """Raise DataError unless a bag and this program define TargetObservations equally."""
     for path, channels in _channels(source):
         for info in channels:
             if info.channel.topic not in topics:
@@ -255,7 +255,7 @@ def _check_definition(info: ChannelInfo) -> None:
 
 
 def _is_same_definition(recorded: Definition) -> bool:
-    """Return whether a definition in a bag has the fields that this program knows.
+    """Return whether a definition in a bag has the same fields as the one of this program.
 
     Without a text the recorded hash decides; without either the definition is accepted.
     """
@@ -274,9 +274,9 @@ PIXEL_TYPES = {'mono8': 'u1', '8UC1': 'u1', 'mono16': 'u2', '16UC1': 'u2'}
 
 
 class BagImage(NamedTuple):
-    """An image (h, w) of a bag, its place in words, and its stamp [ns], None where it is damaged.
+    """An image (h, w) of a bag, its place in words, and its stamp [ns], None if unreadable.
 
-    In place of an image that cannot be read there is the DataError that says why.
+    If the image cannot be read, image is the DataError with the cause.
     """
 
     place: str
@@ -285,10 +285,10 @@ class BagImage(NamedTuple):
 
 
 def image_topics(source: PathLike) -> dict[str, str]:
-    """Return the topics of a bag with images by fluoroscope, the part of the name before the last.
+    """Return the image topics of a bag by fluoroscope, the last but one part of the topic's name.
 
-    The suffix /compressed of image_transport does not count. Where a fluoroscope has both, the
-    images that are not compressed are taken. Raises DataError.
+    The suffix /compressed of image_transport is ignored. If a fluoroscope has both, the
+    uncompressed images are used. Raises DataError.
     """
     out: dict[str, str] = {}
     for kind in (COMPRESSED_IMAGE, IMAGE):
@@ -302,7 +302,7 @@ def image_topics(source: PathLike) -> dict[str, str]:
 
 def images_of_topic(source: PathLike, topic: str) -> Iterator[BagImage]:
     """Yield the images of a topic. Raises DataError for a damaged bag."""
-    from ...images.codec import decode  # with OpenCV, which a player does not need
+    from ...images.codec import decode  # loads OpenCV, which a player does not need
 
     kind = topics_of(source)[topic].type
     for number, message in enumerate(iterate_messages(source, [topic]), 1):
@@ -319,7 +319,7 @@ def images_of_topic(source: PathLike, topic: str) -> Iterator[BagImage]:
 
 
 def _pixels(message: Any) -> np.ndarray:
-    """Grey values (h, w) of an Image. Raises DataError."""
+    """Return the grey values (h, w) of an Image. Raises DataError."""
     if message.encoding not in PIXEL_TYPES:
         raise DataError(f'the encoding {message.encoding} is none of {", ".join(PIXEL_TYPES)}')
     order = '>' if message.is_bigendian else '<'
@@ -340,7 +340,7 @@ JOINT_STATE = 'sensor_msgs/msg/JointState'
 
 
 def joint_topics(source: PathLike) -> list[str]:
-    """Return the topics of a bag that hold states of joints. Raises DataError."""
+    """Return the topics of a bag with joint states. Raises DataError."""
     return [
         name for name, info in topics_of(source).items() if info.type == JOINT_STATE and info.count
     ]
@@ -349,11 +349,11 @@ def joint_topics(source: PathLike) -> list[str]:
 def with_angles(
     source: PathLike, frames: Frames, options: AngleOptions
 ) -> tuple[dict[str, list[Frame]], tuple[str, ...]]:
-    """Return frames of a bag with the angles that the nodes give them, and notes about them.
+    """Return frames of a bag with the same angles as the nodes assign, and notes about them.
 
-    options say which joint is the C-arm, in any topic of joint states. Raises DataError for a bag
-    without this joint, with states of it on several topics or damaged ones, and for a joint of
-    another fluoroscope.
+    options name the joint of the C-arm, which may be in any topic of joint states. Raises
+    DataError for a bag without this joint, with its states on several topics or damaged states,
+    and for a joint of another fluoroscope.
     """
     angles = angles_in(source, frames, options)
     if not angles.joints:
@@ -366,9 +366,9 @@ def with_angles(
 
 
 def angles_in(source: PathLike, fluoroscopes: Iterable[str], options: AngleOptions) -> JointAngles:
-    """Return the angles of fluoroscopes by all joint states of a bag.
+    """Return the joint angles of fluoroscopes from all joint states of a bag.
 
-    Raises DataError as with_angles.
+    Raises DataError as `with_angles` does.
     """
     try:
         angles = options.tracks(fluoroscopes, capacity=None)
@@ -384,7 +384,7 @@ def angles_in(source: PathLike, fluoroscopes: Iterable[str], options: AngleOptio
 
 
 def _read_states(source: PathLike, angles: JointAngles) -> None:
-    """Add all states of joints in a bag to their tracks. Raises DataError."""
+    """Add all joint states in a bag to their tracks. Raises DataError."""
     topics = joint_topics(source)
     wanted = set(angles.joints.values())
     if not topics:
@@ -412,7 +412,7 @@ def _read_states(source: PathLike, angles: JointAngles) -> None:
 
 
 def _notes(source: PathLike, frames: Frames, angles: JointAngles) -> Iterable[str]:
-    """Yield a sentence for each fluoroscope with frames whose angle is unknown."""
+    """Yield a sentence for each fluoroscope that has frames with an unknown angle."""
     for name, each in frames.items():
         unknown = [frame for frame in each if frame.angle is None]
         if name in angles.joints and unknown:

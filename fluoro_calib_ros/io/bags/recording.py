@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Record messages as they come: queued, written by a thread, and flushed to disk regularly.
+"""Record messages as they arrive: a thread writes them from a queue and flushes them to disk.
 
-Also the options of playing them.
+Also contains the options for playing bags.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from ..access import PathLike
 from .metadata import Definition
 from .writer import BagWriter
 
-SMALL_BYTES = 65536  # of a message that is no image
-LARGE_SHARE = 0.9  # of the queue that large messages may fill: images must not displace frames
+SMALL_BYTES = 65536  # larger messages are taken for images
+LARGE_SHARE = 0.9  # share of the queue for large messages, so that images do not displace frames
 
 
 @dataclass(frozen=True)
 class RecordingOptions:
-    """Options of a recording. Raises ValueError for a value that an option cannot have."""
+    """Options of a recording. Raises ValueError for an invalid value."""
 
     split_size: float = option(
         0.0, 'size after which a new file is begun; 0: never', minimum=0.0, maximum=1e7, unit='MB'
@@ -56,7 +56,7 @@ class RecordingOptions:
 
 @dataclass(frozen=True)
 class PlayingOptions:
-    """Options of playing a bag."""
+    """Options for playing a bag."""
 
     rate: float = option(1.0, 'speed relative to the recording', minimum=0.001, maximum=1e6)
     loop: bool = option(False, 'whether the bag is played over and over')
@@ -81,9 +81,9 @@ class PlayingOptions:
 
 
 class TopicToRecord(NamedTuple):
-    """A topic, its type, the QoS profiles offered, and the definition of the type.
+    """A topic, its type, the offered QoS profiles, and the definition of the type.
 
-    latched: how many of its last messages are written again at the start of each file.
+    latched: number of its last messages that are repeated at the start of each file.
     """
 
     name: str
@@ -103,10 +103,10 @@ class _Message(NamedTuple):
 class Recording:
     """A bag that is being recorded, from start() to stop().
 
-    put() never waits: where the disk is slower than the messages, they wait in a queue of limited
-    size, and what does not fit is dropped and counted, large messages first. Every flush_period
-    the open chunk is closed and flushed to disk, so that a crash or a power failure costs no
-    more. Where the disk is full, what was not flushed counts as dropped.
+    put() never waits. If the disk is slower than the messages, they wait in a queue of limited
+    size; messages that do not fit are dropped and counted, large ones first. Every flush_period
+    the open chunk is closed and flushed to disk, so that a crash or a power failure loses no more
+    than that. If the disk is full, messages that were not flushed count as dropped.
     """
 
     def __init__(self, path: PathLike, options: RecordingOptions | None = None) -> None:
@@ -114,8 +114,8 @@ class Recording:
         self.options = options or RecordingOptions()
         self.counts: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
-        self._unflushed: Counter[str] = Counter()  # written, but perhaps not yet on disk
-        self.fault = ''  # why nothing is written any more
+        self._unflushed: Counter[str] = Counter()  # written, but possibly not yet on disk
+        self.fault = ''  # reason why nothing is written any more
         self.waiting_bytes = 0
         self.most_waiting_bytes = 0
         self._writer = BagWriter(path, live=True)
@@ -133,19 +133,19 @@ class Recording:
         return self._writer.file_count
 
     def start(self) -> None:
-        """Make the bag and begin. Raises DataError where that is not possible."""
+        """Create the bag and begin to record. Raises DataError if that fails."""
         self._writer.__enter__()
         self._file_start = time.monotonic()
         self._thread.start()
 
     def add_topic(self, topic: TopicToRecord) -> None:
-        """Add a topic, before its first message."""
+        """Add a topic; must precede its first message."""
         with self._condition:
             self._queue.append(topic)
             self._condition.notify()
 
     def put(self, topic: str, data: bytes, received_ns: int, sent_ns: int) -> bool:
-        """Queue a message; returns False where it had to be dropped."""
+        """Queue a message; return False if it had to be dropped."""
         with self._condition:
             share = 1.0 if len(data) <= SMALL_BYTES else LARGE_SHARE
             full = self.waiting_bytes + len(data) > share * self.options.queue_size * 1e6
@@ -159,7 +159,7 @@ class Recording:
         return True
 
     def stop(self) -> None:
-        """Write what waits, close the file and write metadata.yaml; `fault` says what failed."""
+        """Write queued messages, close the file, write metadata.yaml; `fault` reports errors."""
         with self._condition:
             self._stopping = True
             self._condition.notify()
@@ -195,11 +195,11 @@ class Recording:
 
     @property
     def _period_s(self) -> float:
-        """Time between two flushes: a part of each period is left for the flush itself."""
+        """Time between two flushes [s]: half a period, which leaves time for the flush itself."""
         return 0.5 * self.options.flush_period
 
     def _flush_if_due(self, flushed: float) -> float:
-        """Flush what is written to disk once in a period; returns when this was last done."""
+        """Flush written data to disk if due; return the time of the last flush."""
         if time.monotonic() - flushed <= self._period_s:
             return flushed
         self._writer.flush(to_disk=True)
@@ -207,10 +207,10 @@ class Recording:
         return time.monotonic()
 
     def _fail(self, fault: str, items: list[_Message | TopicToRecord]) -> None:
-        """Count what can no longer be written as dropped."""
+        """Stop writing; count all messages that are not on disk as dropped."""
         with self._condition:
             self.fault = fault
-            self.counts -= self._unflushed  # what an open chunk holds
+            self.counts -= self._unflushed  # messages of the open chunk
             self.dropped += self._unflushed
             self._unflushed.clear()
             for item in (*items, *self._queue):
@@ -250,7 +250,7 @@ class Recording:
         )
 
     def _is_full(self) -> bool:
-        """Return whether a new file is to be begun."""
+        """Return whether a new file is due."""
         size = self.options.split_size * 1e6
         duration = self.options.split_duration
         return bool(
@@ -260,5 +260,5 @@ class Recording:
 
 
 def lost_text(dropped: Mapping[str, int]) -> str:
-    """Return the numbers of dropped messages by topic, for people."""
+    """Return the numbers of dropped messages by topic, as text."""
     return ', '.join(f'{topic} {count}' for topic, count in sorted(dropped.items()))

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Read what is left of a damaged or cut-off .mcap file.
+"""Read the intact parts of a damaged or cut-off .mcap file.
 
-The file is read from its beginning, without its index. A chunk counts if its checksum is right.
-Behind damaged bytes, reading goes on at the next chunk. The layout of the records is that of the
+The file is read from its beginning, without its index. A chunk is used if its checksum is correct.
+After damaged bytes, reading continues at the next chunk. The layout of the records is that of the
 MCAP specification (https://mcap.dev/spec).
 """
 
@@ -42,15 +42,15 @@ from .metadata import (
 )
 from .writer import BagWriter
 
-_CHUNK = struct.Struct('<QQQI')  # of a chunk: first and last time, size, checksum
-_MESSAGE = struct.Struct('<HIQQ')  # of a message: channel, sequence, log and publish time
-# Where a chunk may begin: a short record with its opcode, or the name of its compression.
+_CHUNK = struct.Struct('<QQQI')  # chunk: first and last time, size, checksum
+_MESSAGE = struct.Struct('<HIQQ')  # message: channel, sequence, log and publish time
+# Possible beginnings of a chunk: a short record with its opcode, or the name of its compression.
 _CANDIDATE = re.compile(rb'\x06[\x00-\xff]{4}\x00{4}|\x04\x00{3}zstd|\x03\x00{3}lz4')
-_TO_COMPRESSION = RECORD.size + _CHUNK.size  # bytes
+_TO_COMPRESSION = RECORD.size + _CHUNK.size  # offset in a chunk record [bytes]
 
 
 class SalvagedMessage(NamedTuple):
-    """A message that is intact, with the times at which it was received and sent [ns]."""
+    """An intact message, with its times of reception and publication [ns]."""
 
     topic: str
     log_time_ns: int
@@ -61,31 +61,31 @@ class SalvagedMessage(NamedTuple):
 
 @dataclass(frozen=True)
 class Damage:
-    """Bytes of a file that cannot be used."""
+    """Damaged bytes of a file."""
 
     path: str
     cause: str
-    #: messages between these times may be missing [ns]; None: from the beginning, to the end
+    #: messages between these times may be missing [ns]; None: since the beginning, until the end
     start_ns: int | None
     end_ns: int | None
-    #: number of lost messages by topic, empty where it is not known
+    #: number of lost messages by topic; empty if unknown
     lost: dict[str, int] = field(default_factory=dict)
 
 
 class _Chunk(NamedTuple):
     content: bytes | memoryview
-    end: int  # position behind it
+    end: int  # position after the chunk
 
 
 class FileSalvage:
-    """The intact messages of an .mcap file; damages are known after messages() has ended."""
+    """The intact messages of an .mcap file; damages are complete after messages() has ended."""
 
     def __init__(self, path: str) -> None:
         self.path = path
         self.topics: dict[str, ChannelInfo] = {}
         self.damages: list[Damage] = []
         self.counts: Counter[str] = Counter()
-        self.expected: Counter[str] = Counter()  # number of messages, where the end is intact
+        self.expected: Counter[str] = Counter()  # if the end of the file is intact
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         self._last_ns: int | None = None
@@ -129,7 +129,7 @@ class FileSalvage:
                 position = self._next_chunk(data, position + 1)
                 continue
             is_end = data[position] == Opcode.DATA_END
-            # A damaged length may reach over chunks.
+            # A damaged length may span several chunks.
             chunk_at = self._next_chunk(data, position + 1, size if is_end else end)
             if chunk_at < size:
                 self._note('these bytes are damaged')
@@ -140,7 +140,7 @@ class FileSalvage:
             position = end
 
     def _end_of_record(self, data: mmap.mmap, position: int) -> int | None:
-        """Return the position behind a record, None where there is no complete record."""
+        """Return the position after a record, None if there is no complete record."""
         if position + RECORD.size > len(data):
             return None
         opcode, length = RECORD.unpack_from(data, position)
@@ -148,9 +148,9 @@ class FileSalvage:
         return end if 0 < opcode <= Opcode.DATA_END and end <= len(data) else None
 
     def _next_chunk(self, data: mmap.mmap, position: int, limit: int = sys.maxsize) -> int:
-        """Return the position of the next intact chunk, or the end of the file.
+        """Return the position of the next intact chunk, the end of the file if there is none.
 
-        It is looked for as far as a limit.
+        The search ends at limit.
         """
         for match in _CANDIDATE.finditer(data, position, limit):
             is_head = data[match.start()] == Opcode.CHUNK
@@ -160,7 +160,7 @@ class FileSalvage:
         return len(data)
 
     def _record(self, opcode: int, content: bytes) -> Iterator[SalvagedMessage]:
-        """Yield the message of a record, if it is one; remember schemas and channels."""
+        """Yield the message if the record is one; store schemas and channels."""
         if opcode == Opcode.MESSAGE and len(content) >= _MESSAGE.size:
             number, sequence, received, sent = _MESSAGE.unpack_from(content)
             topic = self._topic(number)
@@ -175,7 +175,7 @@ class FileSalvage:
             self._define(opcode, content)
 
     def _define(self, opcode: int, content: bytes) -> None:
-        """Remember a schema or channel; one that cannot be read is a damage."""
+        """Store a schema or channel; count an unreadable one as damage."""
         try:
             if opcode == Opcode.SCHEMA:
                 schema = Schema.read(ReadDataStream(BytesIO(content)))
@@ -187,7 +187,7 @@ class FileSalvage:
             self._note('the definition of a topic is damaged')
 
     def _topic(self, number: int) -> str | None:
-        """Return the topic of a channel, None where it is not known."""
+        """Return the topic of a channel, None if unknown."""
         channel = self._channels.get(number)
         if channel is None:
             return None
@@ -197,7 +197,7 @@ class FileSalvage:
         return channel.topic
 
     def _read_summary(self, data: mmap.mmap) -> None:
-        """Read topics and counts of an intact end: their first chunk may be damaged."""
+        """Read topics and counts from an intact end; the first chunk may be damaged."""
         size = len(data)
         footer = size - len(MAGIC) - FOOTER.size
         if footer < len(MAGIC) or data[-len(MAGIC) :] != MAGIC:
@@ -219,7 +219,7 @@ class FileSalvage:
                         self.expected[topic] += count
 
     def _note_lost_chunk(self, data: mmap.mmap, position: int, end: int | None) -> None:
-        """Note a damaged chunk, with what its message index says about it."""
+        """Record a damaged chunk, with the message counts in the index that follows it."""
         if end is None:
             is_cut = position + RECORD.size > len(data) or data[position] in range(1, 16)
             self._note(
@@ -242,7 +242,7 @@ class FileSalvage:
         self._note('a chunk is damaged', lost)
 
     def _note(self, cause: str, lost: dict[str, int] | None = None) -> None:
-        """Begin a damage, or extend the one that has begun."""
+        """Begin a damage, or extend the current one."""
         if self._open_damage is None:
             self._open_damage = (cause, self._last_ns, {})
         for topic, count in (lost or {}).items():
@@ -250,7 +250,7 @@ class FileSalvage:
             known[topic] = known.get(topic, 0) + count
 
     def _close_damage(self, next_ns: int | None) -> None:
-        """End a damage at the time of the next message, None at the end of the file."""
+        """End the current damage at the time of the next message, None at the end of the file."""
         if self._open_damage is not None:
             cause, start_ns, lost = self._open_damage
             self.damages.append(Damage(self.path, cause, start_ns, next_ns, lost))
@@ -260,7 +260,7 @@ class FileSalvage:
 def _records_of(
     content: bytes | memoryview | mmap.mmap, position: int = 0, end: int | None = None
 ) -> Iterator[tuple[int, int, int]]:
-    """Yield opcode, beginning and end of the records between two positions."""
+    """Yield opcode, begin and end of the content of each record between two positions."""
     while position + RECORD.size <= (len(content) if end is None else end):
         opcode, length = RECORD.unpack_from(content, position)
         position += RECORD.size + length
@@ -268,7 +268,7 @@ def _records_of(
 
 
 def _looks_like_chunk(data: mmap.mmap, position: int) -> bool:
-    """Return whether a record names a compression where a chunk does."""
+    """Return whether a record has the name of a compression at the position of a chunk's."""
     start = position + _TO_COMPRESSION
     return data[start : start + 8].startswith((b'\x04\0\0\0zstd', b'\x03\0\0\0lz4'))
 
@@ -302,11 +302,11 @@ def _chunk_at(data: mmap.mmap, position: int) -> _Chunk | None:
 
 
 def _decompressed(compression: bytes, data: memoryview, size: int) -> bytes | None:
-    """Return the content of a chunk, None where it cannot be decompressed."""
+    """Return the content of a chunk, None if it cannot be decompressed."""
     try:
         if compression == b'zstd':
             held = zstandard.frame_content_size(data)
-            limit = size if held < 0 else held  # the frame need not tell its size
+            limit = size if held < 0 else held  # a frame need not state its size
             if not 0 < limit <= MAX_CHUNK:
                 return None
             return zstandard.ZstdDecompressor().decompress(data, max_output_size=limit)
@@ -320,7 +320,7 @@ def _decompressed(compression: bytes, data: memoryview, size: int) -> bytes | No
 
 
 def _is_whole(content: bytes) -> bool:
-    """Return whether a chunk without checksum consists of whole records."""
+    """Return whether a chunk without checksum consists of complete records."""
     known = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
     records = list(_records_of(content))
     if not records or any(opcode not in known for opcode, *_ in records):
@@ -328,18 +328,18 @@ def _is_whole(content: bytes) -> bool:
     return records[-1][-1] == len(content)
 
 
-# Recover a bag: all intact messages of a damaged or cut-off one, written as a valid bag.
+# Recovery of a bag: all intact messages of a damaged or cut-off bag are written as a valid bag.
 
 
 @dataclass(frozen=True)
 class Recovery:
-    """What was recovered from a bag."""
+    """Result of the recovery of a bag."""
 
     counts: dict[str, int]  #: number of recovered messages by topic
-    #: number of messages that the bag had, as far as it says so, by topic
+    #: original number of messages by topic, as far as the bag states it
     expected: dict[str, int]
     damages: tuple[Damage, ...]
-    skipped: dict[str, str]  #: why topics were left out
+    skipped: dict[str, str]  #: reason for each topic that was skipped
 
     @property
     def lost(self) -> dict[str, int]:
@@ -348,7 +348,7 @@ class Recovery:
 
 
 class Salvage:
-    """The intact messages of a bag, file by file; topics and damages as far as it was read."""
+    """The intact messages of a bag, file by file; topics and damages of the parts read so far."""
 
     def __init__(self, source: PathLike) -> None:
         self.files = [FileSalvage(path) for path in candidate_files(source)]
@@ -367,7 +367,7 @@ class Salvage:
 
     @property
     def expected(self) -> dict[str, int]:
-        """Number of messages that the bag had, as far as it says so, by topic."""
+        """Original number of messages by topic, as far as the bag states it."""
         total: Counter[str] = Counter()
         for file in self.files:
             total += file.expected
@@ -377,7 +377,7 @@ class Salvage:
 def recover_bag(source: PathLike, out: PathLike) -> Recovery:
     """Write the intact messages of a bag to a new one, which must not exist.
 
-    Raises DataError for a source without any intact message, and where the bag cannot be written.
+    Raises DataError for a source without any intact message, and if the bag cannot be written.
     """
     salvage = Salvage(source)
     if os.path.realpath(out).startswith(os.path.join(os.path.realpath(source), '')):
@@ -410,7 +410,7 @@ def recover_bag(source: PathLike, out: PathLike) -> Recovery:
 
 
 def _added(bag: BagWriter, topic: ChannelInfo) -> str:
-    """Add a topic to a bag; returns why that is not possible, or ''."""
+    """Add a topic to a bag; return the reason if that is not possible, otherwise ''."""
     encoding = topic.channel.message_encoding
     if encoding != 'cdr':
         return f'the messages are encoded as {encoding!r}'
@@ -423,7 +423,7 @@ def _added(bag: BagWriter, topic: ChannelInfo) -> str:
 
 
 def _expected_of_metadata(source: PathLike) -> dict[str, int]:
-    """Return the numbers of messages by topic in metadata.yaml, if there is one."""
+    """Return the message counts by topic in metadata.yaml, {} if unavailable."""
     try:
         return {
             str(entry['topic_metadata']['name']): int(entry['message_count'])
@@ -433,34 +433,34 @@ def _expected_of_metadata(source: PathLike) -> dict[str, int]:
         return {}
 
 
-# What is in a bag, and what is wrong with it; damaged bags, too.
+# Report on the content of a bag and its faults, also for damaged bags.
 
-JUMP_NS = 1_000_000  # a time that much before the last one runs backwards
-STREAM_NS = 100_000_000  # messages of a stream follow each other in less than that
-GAP = 10  # times the usual interval of a stream is a gap
+JUMP_NS = 1_000_000  # a decrease of time by more than this is a clock that runs backwards
+STREAM_NS = 100_000_000  # maximum usual interval between messages of a stream
+GAP = 10  # a gap is longer than this multiple of the usual interval
 _NUMBERED = (TARGET_OBSERVATIONS, f'{PACKAGE}/msg/CorrectedObservations')
 
 
 @dataclass
 class TopicReport:
-    """What a topic holds."""
+    """Content of a topic."""
 
     type: str
-    #: times at which the messages were received, and those of their headers, if any [ns]
+    #: times of reception, and times of the headers, if any [ns]
     log_ns: list[int] = field(default_factory=list)
     stamp_ns: list[int] = field(default_factory=list)
-    numbers: list[int] = field(default_factory=list)  #: frame numbers, of observations only
-    undecodable: int = 0  #: messages whose header cannot be read
+    numbers: list[int] = field(default_factory=list)  #: frame numbers, for observations only
+    undecodable: int = 0  #: number of messages whose header cannot be read
 
     @property
     def interval_ns(self) -> float:
-        """Usual time between two messages, by their stamps if they have some; NaN for one."""
+        """Median time between messages [ns], from stamps if available; NaN for a single one."""
         times = self.stamp_ns if len(self.stamp_ns) > 1 else self.log_ns
         return float(np.median(np.diff(times))) if len(times) > 1 else float('nan')
 
     @property
     def longest_gap_s(self) -> float:
-        """Longest time between two messages, by stamps or when they were received."""
+        """Longest time between two messages [s], by stamps or by reception."""
         steps = [np.diff(t).max() for t in (self.stamp_ns, self.log_ns) if len(t) > 1]
         return float(max(steps, default=0)) * 1e-9
 
@@ -483,35 +483,35 @@ class TopicReport:
 
     @property
     def restarts(self) -> int:
-        """Number of times that the frame numbers began again."""
+        """Number of times that the frame numbers restarted."""
         return int((np.diff(self.numbers) < 0).sum())
 
     @property
     def repeated_frames(self) -> int:
-        """Number of frames with the number of the one before."""
+        """Number of frames that repeat the number of the previous frame."""
         return int((np.diff(self.numbers) == 0).sum())
 
     @property
     def missing_frames(self) -> int:
-        """Number of frame numbers that were passed over."""
+        """Number of frame numbers that were skipped."""
         steps = np.diff(self.numbers)
         return int((steps[steps > 1] - 1).sum())
 
 
 @dataclass(frozen=True)
 class BagReport:
-    """What a bag holds, and its damages."""
+    """Content of a bag, and its damages."""
 
     files: list[str]
     topics: dict[str, TopicReport]
-    #: frames of every fluoroscope whose number another one does not have
+    #: by fluoroscope, number of frames whose number is missing for another fluoroscope
     without_partner: dict[str, int]
     damages: tuple[Damage, ...]
     lost: dict[str, int]  #: number of messages that are known to be lost, by topic
 
     @property
     def faults(self) -> list[str]:
-        """What is wrong, in sentences."""
+        """Sentences about everything that is wrong."""
         found = [f'{d.path}: {d.cause}' for d in self.damages]
         found += [f'{topic}: {count} messages are lost' for topic, count in self.lost.items()]
         for topic, report in self.topics.items():
@@ -550,7 +550,7 @@ def inspect_bag(source: PathLike) -> BagReport:
 
 
 def _read_header(report: TopicReport, data: bytes) -> None:
-    """Read stamp and frame number of a message that has them."""
+    """Read stamp and frame number of a message if its type has them."""
     fields = typestore().fielddefs.get(report.type)
     if fields is None or not fields[1] or 'std_msgs/msg/Header' not in str(fields[1][0]):
         return
@@ -567,7 +567,7 @@ def _read_header(report: TopicReport, data: bytes) -> None:
 
 
 def _without_partner(topics: Mapping[str, TopicReport]) -> dict[str, int]:
-    """Return the number of frames without partner by fluoroscope, of two or more."""
+    """Return the number of frames without partner by fluoroscope; {} for a single fluoroscope."""
     numbers: dict[str, Counter[int]] = {}
     for topic, report in topics.items():
         if report.type == TARGET_OBSERVATIONS and topic.count('/') > 1:

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Write a bag as rosbag2 (Jazzy) does: a folder NAME with NAME_0.mcap and metadata.yaml.
+"""Write a bag in the layout of rosbag2 (Jazzy): a folder NAME, NAME_0.mcap and metadata.yaml.
 
 The layout follows rosbag2's sources (sequential_writer.cpp, mcap_storage.cpp, yaml.hpp of the
 branch jazzy).
@@ -39,33 +39,33 @@ from .metadata import (
 
 LIBRARY = 'fluoro_calib_ros'
 NOT_WRITTEN = 'the bag cannot be written'
-CHUNK_SIZE = 768 * 1024  # that of rosbag2 [bytes]
+CHUNK_SIZE = 768 * 1024  # chunk size of rosbag2 [bytes]
 _TOPIC_NAME = re.compile(r'(/[A-Za-z_][A-Za-z0-9_]*)+')
 
-Qos = str | list[dict[str, Any]]  # a name in PROFILES, or QoS profiles
+Qos = str | list[dict[str, Any]]  # key of PROFILES, or QoS profiles
 
 
 class BagWriter:
     """A new bag, as a context manager; the same messages give the same bytes.
 
-    The bag is written under a temporary name and renamed when the block ends without an error. An
-    exception leaves nothing behind, and a bag that is to be replaced as it was.
+    The bag is written under a temporary name and renamed when the block ends without an error.
+    After an exception nothing is left behind, and a bag that was to be replaced is unchanged.
 
     Parameters
     ----------
     path : path-like
         Folder of the bag.
     overwrite : bool
-        Whether a bag of that name is replaced.
+        Whether to replace an existing bag.
     live : bool
-        For recording: the bag is written under its own name, and what was written before an
-        exception is kept.
+        For recording: the bag is written under its final name, and messages written before an
+        exception are kept.
 
     Raises
     ------
     DataError
-        For a folder or file that must not be replaced, where the bag cannot be written, and for
-        an invalid topic, type or message.
+        If a folder or file must not be replaced, if the bag cannot be written, and for an invalid
+        topic, type or message.
     """
 
     def __init__(self, path: PathLike, overwrite: bool = False, live: bool = False) -> None:
@@ -80,7 +80,7 @@ class BagWriter:
         self._topics: dict[str, BagTopic] = {}
         self._files: list[FileSpan] = []
         self._total = FileSpan()
-        self._schemas: dict[str, int] = {}  # schema of a message type in the file being written
+        self._schemas: dict[str, int] = {}  # schema id by message type, in the file being written
         self._file: BinaryIO
         self._mcap: Writer
 
@@ -131,11 +131,11 @@ class BagWriter:
         message : object
             A dataclass of the typestore, or CDR as bytes.
         log_time_ns : int
-            Time at which the message was received [ns].
+            Time of reception [ns].
         publish_time_ns : int, optional
-            Time at which it was sent [ns]; by default log_time_ns.
+            Time of publication [ns]; by default log_time_ns.
         qos : str or list of dict
-            A name in PROFILES or QoS profiles; those of the first message of a topic count.
+            A key of PROFILES or QoS profiles; only used with the first message of a topic.
 
         Raises
         ------
@@ -187,7 +187,7 @@ class BagWriter:
     ) -> BagTopic:
         """Add a topic, which may remain without messages.
 
-        Without definition the type is one that this program knows. Raises DataError for an
+        Without a definition the type must be known to this program. Raises DataError for an
         invalid name and an unknown type.
         """
         if not _TOPIC_NAME.fullmatch(topic):
@@ -199,9 +199,9 @@ class BagWriter:
         return self._topics[topic]
 
     def flush(self, to_disk: bool = False) -> None:
-        """Close the open chunk: its messages survive the end of the process.
+        """Close the open chunk, so that its messages survive the end of the process.
 
-        to_disk: they survive a power failure, too.
+        to_disk: also survive a power failure.
         """
         with os_errors(self.path, NOT_WRITTEN):
             self._mcap.flush()
@@ -237,13 +237,13 @@ class BagWriter:
             enable_data_crcs=True,
         )
         self._mcap.start(profile='ros2', library=LIBRARY)
-        self._write_metadata([])  # as rosbag2 does: a recording that was killed has metadata
+        self._write_metadata([])  # like rosbag2: even a recording that was killed has metadata
         self._schemas = {}
         for topic in self._topics.values():
             self._register(topic)
 
     def _register(self, topic: BagTopic) -> None:
-        """Write schema and channel of a topic into the file."""
+        """Write schema and channel of a topic to the file."""
         if topic.msg_type not in self._schemas:
             self._schemas[topic.msg_type] = self._mcap.register_schema(
                 topic.msg_type, topic.definition.encoding, topic.definition.text.encode()
@@ -259,7 +259,7 @@ class BagWriter:
         )
 
     def _close_file(self) -> None:
-        self._mcap.flush()  # the last chunk comes before the metadata
+        self._mcap.flush()  # the last chunk precedes the metadata
         self._write_metadata(self._topics.values())
         self._mcap.finish()
         self._file.flush()
@@ -279,9 +279,9 @@ class BagWriter:
 
 
 def check_replaceable(path: str, overwrite: bool) -> None:
-    """Raise DataError unless a new bag may have this path.
+    """Raise DataError unless a new bag may be written to this path.
 
-    There must be nothing, or with overwrite a folder with nothing but a bag.
+    The path must not exist; with overwrite it may be a folder that contains nothing but a bag.
     """
     if not os.path.lexists(path):
         return
@@ -298,7 +298,7 @@ def check_replaceable(path: str, overwrite: bool) -> None:
 
 
 def _put_in_place(folder: str, path: str, overwrite: bool) -> None:
-    """Rename a finished folder; with overwrite the bag of that name is deleted last."""
+    """Rename a finished folder; with overwrite, delete the replaced bag afterwards."""
     sync_folder(folder)
     old = f'{folder}.old'
     replaced = overwrite and os.path.isdir(path)

@@ -1,4 +1,4 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Formats of other programs, one file a format, one registry."""
+"""File formats of this and other programs, and their registry."""

@@ -3,18 +3,18 @@
 
 """Poses of rigid bodies: files of XMALab, Autoscoper and OpenSim, and poses.csv.
 
-XMALab: 16 columns a body, one row a frame, NaN without pose. The layout is that of
-`Trial::saveRigidBodyTransformations` of XMALab 2.2.7: the 4 x 4 matrix that takes points of the
-body (a bone's model) to the world, column after column (r11, r21, r31, 0, r12, and so on, t1, t2,
-t3, 1), which Maya reads as rows. XMALab calls its columns R11, R12, R13, 01, R21, and so on, TX,
-TY, TZ, 1; the column Frame need not be there. The unit is that of the calibration object, and the
-file does not say it.
+XMALab: 16 columns a body, one row a frame, NaN without a pose. The layout is that of
+`Trial::saveRigidBodyTransformations` of XMALab 2.2.7: the 4 x 4 matrix from the body (a bone's
+model) to the world, column by column (r11, r21, r31, 0, r12, and so on, t1, t2, t3, 1), which Maya
+reads as rows. XMALab names its columns R11, R12, R13, 01, R21, and so on, TX, TY, TZ, 1; the
+column Frame is optional. Lengths have the unit of the calibration object, which the file does not
+state.
 
 Tables of OpenSim: orientations and positions of bodies (.sto), and joint motion (.mot). A header
-of key=value up to endheader, then a row of labels and a row a frame, between tabulators. OpenSim
-reads elements by DataType: quaternions w,x,y,z body -> world, and vectors in metres, as its models
-are; NaN where there is no pose. Angles are in degrees where inDegrees=yes. Programs read a .mot as
-TimeSeriesTable or as Storage, which silently reads other numbers for NaN.
+of key=value up to endheader is followed by a row of labels and one row a frame, separated by
+tabulators. OpenSim reads elements by DataType: quaternions w,x,y,z body -> world, and vectors in
+metres, as in its models; NaN where there is no pose. Angles are in degrees if inDegrees=yes.
+Programs read a .mot as TimeSeriesTable or as Storage, which silently replaces NaN by numbers.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def _read_xmalab(path: Path, settings: FileSettings) -> Content:
 
 
 def _bodies(row: Row, first: int) -> list[str]:
-    """Return the names of the bodies of a header. Raises DataError."""
+    """Return the names of the bodies in a header. Raises DataError."""
     cells = row.cells[first:]
     if len(cells) % len(COLUMNS):
         row.fail(f'{len(cells)} columns, but a rigid body has {len(COLUMNS)}')
@@ -119,7 +119,7 @@ def _check(row: Row, matrices: NDArray[np.float64], names: list[str]) -> None:
 
 
 def _write_xmalab(path: Path, content: Content, settings: FileSettings) -> Written:
-    """Write the poses of rigid bodies, with header and column Frame."""
+    """Write the poses of rigid bodies, with a header and the column Frame."""
     bodies = content.bodies
     assert bodies is not None
     mm, notes = settings.unit_or('mm', str(path))
@@ -140,16 +140,17 @@ RIGIDBODY = Format(
 )
 
 
-# Tracking files (.tra) of Autoscoper: a row a frame, 16 columns a body, NaN without pose.
+# Tracking files (.tra) of Autoscoper: one row a frame, 16 columns a body, NaN without a pose.
 #
-# The layout is that of `save_tracking_results` of Autoscoper with its default options: matrices by
-# rows (r11, r12, r13, t1, r21, and so on, 0, 0, 0, 1), with commas, in mm, without header. Row 1
-# is the first frame. A matrix takes a volume to the world. Autoscoper places a volume by its first
-# voxel and its own axes, which are not those of the CT from which the markers of a body are.
+# The layout is that of `save_tracking_results` of Autoscoper with its default options: matrices
+# row by row (r11, r12, r13, t1, r21, and so on, 0, 0, 0, 1), separated by commas, in mm, without a
+# header. Row 1 is the first frame. A matrix maps a volume to the world. The origin of a volume of
+# Autoscoper is its first voxel, with its own axes; they differ from those of the CT in which the
+# markers of a body were located.
 
 
 def _write_autoscoper(path: Path, content: Content, settings: FileSettings) -> Written:
-    """Write the poses of bodies, in all frames from the first to the last. Raises DataError."""
+    """Write the poses of bodies in all frames from the first to the last. Raises DataError."""
     assert content.bodies is not None
     mm, notes = settings.unit_or('mm', str(path))
     frames = frames_of(path, [content.bodies], settings, needs_rate=False)
@@ -171,9 +172,9 @@ AUTOSCOPER = Format(
 )
 
 
-# poses.csv of the command bodies, so that its poses go into the files of other programs.
+# poses.csv of the command bodies is read, to convert its poses to formats of other programs.
 
-_POSES = POSE_COLUMNS[:10]  # the poses without standard deviations, as the truth has them
+_POSES = POSE_COLUMNS[:10]  # without standard deviations: files of true poses have none
 
 
 def _read_poses(path: Path, settings: FileSettings) -> Content:
@@ -224,7 +225,7 @@ END = 'endheader'
 
 
 def write(path: Path, content: Content, settings: FileSettings) -> Written:
-    """Write the orientations of bodies, and beside them NAME_positions.sto. Raises DataError."""
+    """Write the orientations of bodies, and NAME_positions.sto next to it. Raises DataError."""
     assert content.bodies is not None
     frames = frames_of(path, [content.bodies], settings)
     bodies = bodies_of(content.bodies, frames)
@@ -243,9 +244,9 @@ def write(path: Path, content: Content, settings: FileSettings) -> Written:
 def write_joint_motion(path: PathLike, motions: Sequence[JointMotion], start_ns: int) -> None:
     """Write the motion of joints as coordinates: angles [deg] and translations [m].
 
-    Their labels are JOINT_NAME with the names of the convention, such as knee_flexion; times are
-    since start_ns. Exposures in which the motion of a joint is unknown are left out. Raises
-    DataError for no joints, for motion of other exposures, where nothing is known, and where the
+    Labels are JOINT_NAME with the names of the convention, such as knee_flexion; times are
+    relative to start_ns. Exposures in which the motion of any joint is unknown are omitted. Raises
+    DataError if there are no joints, if their exposures differ, if no exposure remains, and if the
     file cannot be written.
     """
     if not motions or any(not np.array_equal(m.number, motions[0].number) for m in motions):
@@ -283,7 +284,7 @@ def _write(
     times_s: NDArray[np.float64],
     cells: Iterable[Sequence[str]],
 ) -> None:
-    """Write a table. Raises DataError for a label that would be two, or no column."""
+    """Write a table. Raises DataError for a label that contains a tabulator or a line end."""
     for label in labels:
         if any(mark in label for mark in '\t\r\n'):
             raise DataError(f'{path}: the name {label!r} contains a tabulator or a line end')

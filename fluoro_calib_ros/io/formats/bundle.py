@@ -1,15 +1,15 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The files of the program of Chow et al.: NAME.pho, NAME.iop, NAME.eop and NAME.xyz.
+"""Files of the program of Chow et al.: NAME.pho, NAME.iop, NAME.eop and NAME.xyz.
 
-The layout is that of the program's README (github.com/jckchow/BundleAdjustment), numbers between
-blanks: .pho target, station, x, y, their noise, corrections to be added; .iop camera, direction of
-the y axis, x min, y min, x max, y max, xp, yp, c, seven coefficients of Brown's model and nine
-empirical ones; .eop station, camera, X, Y, Z, omega, phi, kappa [degrees]; .xyz target, X, Y, Z
-and their standard deviations. Its camera looks along -z with y upwards: x = u, y = -v. The
-stations of camera 2 are numbered 2000 + exposure where there are several cameras (20 + exposure
-for fewer than ten exposures, and so on). The files do not say the unit of lengths.
+The layout is that of the program's README (github.com/jckchow/BundleAdjustment), numbers separated
+by blanks. .pho: target, station, x, y, their noise, corrections to be added. .iop: camera,
+direction of the y axis, x min, y min, x max, y max, xp, yp, c, seven coefficients of Brown's model
+and nine empirical ones. .eop: station, camera, X, Y, Z, omega, phi, kappa [degrees]. .xyz: target,
+X, Y, Z and their standard deviations. Its camera looks along -z with y upwards: x = u, y = -v. If
+there are several cameras, the stations of camera 2 are numbered 2000 + exposure (20 + exposure for
+fewer than ten exposures, and so on). The files do not state the unit of lengths.
 """
 
 from __future__ import annotations
@@ -43,13 +43,13 @@ from .content import (
 from .tables import Row, joined, read_table, require_width
 from .xmalab_points import camera_order
 
-NAME = 'bundle'  # of the files written
+NAME = 'bundle'  # name of the files written
 WIDTHS = {'.pho': 8, '.iop': 25, '.eop': 8, '.xyz': 7}
 
 
 @dataclass(frozen=True)
 class _Cameras:
-    """Names of the cameras by id, the camera of every station, and the exposures of stations."""
+    """Names of the cameras by id; camera and exposure of every station."""
 
     names: Mapping[int, str]
     of_station: Mapping[int, int]
@@ -61,7 +61,7 @@ class _Cameras:
 
 
 def read(path: Path, settings: FileSettings) -> Content:
-    """Read the wanted parts from the file and those beside it. Raises DataError."""
+    """Read the wanted parts from the file and those next to it. Raises DataError."""
     files = {ending: path.with_suffix(ending) for ending in WIDTHS}
     rows = {
         ending: _rows(file, WIDTHS[ending])
@@ -91,7 +91,7 @@ def _rows(path: Path, width: int) -> list[Row]:
 
 
 def _cameras(rows: Mapping[str, Sequence[Row]], settings: FileSettings) -> _Cameras:
-    """Return the cameras: those of .eop, else those of .iop, else one."""
+    """Return the cameras listed in .eop and .iop, or a single one if neither exists."""
     of_station = {
         row.whole(0, 'the station'): row.whole(1, 'the camera') for row in rows.get('.eop', ())
     }
@@ -111,7 +111,7 @@ def _cameras(rows: Mapping[str, Sequence[Row]], settings: FileSettings) -> _Came
 
 
 def _exposures(of_station: Mapping[int, int]) -> dict[int, int]:
-    """Return the exposure of every station, see the module."""
+    """Return the exposure of every station; for the numbering see the module docstring."""
     cameras = set(of_station.values())
     base = 10
     while len(cameras) > 1 and base <= max(of_station, default=0):
@@ -215,7 +215,7 @@ def _survey(path: Path, rows: Sequence[Row], mm: float) -> Phantom:
 
 
 def write(path: Path, content: Content, settings: FileSettings) -> Written:
-    """Write the parts that there are as bundle.pho, .iop, .eop and .xyz into the folder path."""
+    """Write the existing parts as bundle.pho, .iop, .eop and .xyz into the folder path."""
     mm, notes = settings.unit_or('mm', str(path))
     observations = content.observations or {}
     names = camera_order(

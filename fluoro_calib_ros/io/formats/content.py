@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What files of other programs contain, in the conventions of this package."""
+"""Contents of files of other programs, in the conventions of this package."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from ...exposures.phantom import Phantom
 from ...photogrammetry.rotations import TAKEN_TOLERANCE, is_rotation
 from ..access import PathLike, check_safe_name, make_folder, write_text
 
-# Camera axes x right, y up, z backwards -> x right, y down, z forwards.
+# Converts camera axes from x right, y up, z backwards to x right, y down, z forwards.
 Y_UP_TO_DOWN = np.diag([1.0, -1.0, -1.0])
 UNITS_MM = {'mm': 1.0, 'cm': 10.0, 'm': 1000.0}
-# Attributes of a Content, as messages call them.
+# Attributes of a Content, as named in messages.
 PARTS = {
     'observations': 'image points',
     'survey': 'a phantom',
@@ -40,12 +40,12 @@ PARTS = {
 
 
 def from_units(values: NDArray[np.float64], mm: float) -> NDArray[np.float64]:
-    """Return lengths in mm of lengths in units of mm, with the same decimal digits."""
+    """Convert lengths in a unit of `mm` millimetres to mm; decimal digits are kept."""
     return _shifted(values, mm, 1)
 
 
 def in_units(values_mm: NDArray[np.float64], mm: float) -> NDArray[np.float64]:
-    """Return lengths in units of mm of lengths in mm, with the same decimal digits."""
+    """Convert lengths from mm to a unit of `mm` millimetres; decimal digits are kept."""
     return _shifted(values_mm, mm, -1)
 
 
@@ -61,16 +61,16 @@ def _shifted(values: NDArray[np.float64], mm: float, sign: int) -> NDArray[np.fl
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera: what a fluoroscope is once its images are corrected."""
+    """A pinhole camera: the model of a fluoroscope after correction of its images."""
 
     name: str
     #: (3, 3), camera matrix [px]; for a fluoroscope [[c, 0, xp], [0, c, yp], [0, 0, 1]]
     matrix: NDArray[np.float64]
     image_size: tuple[int, int] | None = None  #: width and height [px]
-    #: (3, 3), world -> sensor; None where the format has no exterior orientation
+    #: (3, 3), world -> sensor; None if the format has no exterior orientation
     rotation: NDArray[np.float64] | None = None
     translation_mm: NDArray[np.float64] | None = None  #: (3,), t of X_sensor = rotation P + t
-    #: coefficients of OpenCV's model (k1, k2, p1, p2, k3, ...), empty without
+    #: coefficients of OpenCV's model (k1, k2, p1, p2, k3, ...); empty without distortion
     distortion: tuple[float, ...] = ()
 
     @property
@@ -85,7 +85,7 @@ class Camera:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height [px]. Raises DataError where they are unknown."""
+        """Width and height [px]. Raises DataError if unknown."""
         if self.image_size is None:
             raise DataError(
                 f'camera {self.name}: the source does not contain the image size, --image-size '
@@ -95,7 +95,7 @@ class Camera:
 
     @property
     def is_distorted(self) -> bool:
-        """Whether a coefficient of the distortion is not zero."""
+        """Whether any coefficient of the distortion is nonzero."""
         return any(self.distortion)
 
 
@@ -106,13 +106,13 @@ def camera_at(
     rotation: NDArray[np.float64],
     position_mm: np.ndarray,
 ) -> Camera:
-    """Return the Camera whose source is at position_mm (3,)."""
+    """Return the Camera with its source at position_mm (3,)."""
     return Camera(name, matrix, image_size, rotation, -rotation @ position_mm)
 
 
 @dataclass(frozen=True)
 class Station:
-    """Exterior orientation of one fluoroscope in one exposure: X = rotation (P - position_mm)."""
+    """Exterior orientation of a fluoroscope in an exposure: X = rotation (P - position_mm)."""
 
     fluoroscope: str
     exposure: int
@@ -122,17 +122,17 @@ class Station:
 
 @dataclass(frozen=True)
 class Points:
-    """Points in space over time; NaN where a point was not seen."""
+    """3-D points over time; NaN where a point was not seen."""
 
     frame: NDArray[np.int64]  #: (m,), numbers of the frames, ascending
     target_id: NDArray[np.int64]  #: (n,)
     xyz_mm: NDArray[np.float64]  #: (m, n, 3)
-    #: (m, n), standard deviation of the position, the root of the sum of its three variances; NaN
-    #: where it is unknown
+    #: (m, n), standard deviation of the position: root of the sum of its three variances; NaN if
+    #: unknown
     sd_mm: NDArray[np.float64]
-    #: (m, n), RMS of the image residuals; NaN where it is unknown
+    #: (m, n), RMS of the image residuals; NaN if unknown
     residual_px: NDArray[np.float64]
-    rate_hz: float | None = None  #: frames per second; None where it is unknown
+    rate_hz: float | None = None  #: frames per second; None if unknown
 
 
 def points_without_precision(
@@ -141,7 +141,7 @@ def points_without_precision(
     xyz_mm: NDArray[np.float64],
     rate_hz: float | None = None,
 ) -> Points:
-    """Return Points of which only the coordinates are known."""
+    """Return Points whose standard deviations and residuals are unknown."""
     unknown = np.full(xyz_mm.shape[:2], np.nan)
     return Points(
         frame, target_id, xyz_mm=xyz_mm, sd_mm=unknown, residual_px=unknown, rate_hz=rate_hz
@@ -150,17 +150,17 @@ def points_without_precision(
 
 @dataclass(frozen=True)
 class Bodies:
-    """Poses of rigid bodies over time, P_world = R P_body + t; NaN where there is none."""
+    """Poses of rigid bodies over time, P_world = R P_body + t; NaN where unknown."""
 
     names: tuple[str, ...]
     frame: NDArray[np.int64]  #: (m,)
     rotation: NDArray[np.float64]  #: (m, b, 3, 3)
     translation_mm: NDArray[np.float64]  #: (m, b, 3)
-    rate_hz: float | None = None  #: frames per second; None where it is unknown
+    rate_hz: float | None = None  #: frames per second; None if unknown
 
 
 def homogeneous(bodies: Bodies, mm: float = 1.0) -> NDArray[np.float64]:
-    """Return the poses of bodies as matrices (m, b, 4, 4) with lengths in units of mm."""
+    """Return the poses of bodies as matrices (m, b, 4, 4), lengths in units of mm."""
     matrices = np.zeros((*bodies.rotation.shape[:2], 4, 4))
     matrices[..., :3, :3] = bodies.rotation
     matrices[..., :3, 3] = in_units(bodies.translation_mm, mm)
@@ -171,7 +171,7 @@ def homogeneous(bodies: Bodies, mm: float = 1.0) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class Content:
-    """What a file contains; a part that it does not have is None or empty."""
+    """Content of a file; missing parts are None or empty."""
 
     observations: Frames | None = None  #: image points by fluoroscope
     survey: Phantom | None = None
@@ -179,15 +179,15 @@ class Content:
     stations: tuple[Station, ...] = ()
     points: Points | None = None
     bodies: Bodies | None = None
-    #: by fluoroscope the observed column and row of every pixel of the corrected image [px], NaN
+    #: by fluoroscope, the observed column and row of every pixel of the corrected image [px], NaN
     #: without support
     lookups: Mapping[str, np.ndarray] = field(default_factory=dict)
-    #: by fluoroscope the observed u, v and the reference u, v of points of a distortion grid
+    #: by fluoroscope, the observed u, v and the reference u, v of points of a distortion grid
     grids: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     names: Names = field(default_factory=Names)  #: the names in the file
-    notes: tuple[str, ...] = ()  #: what a user has to know about the conversion
-    #: by fluoroscope the id of the calibration that corrected the observations; empty: they are as
-    #: observed
+    notes: tuple[str, ...] = ()  #: notes to the user about the conversion
+    #: by fluoroscope, the id of the calibration that corrected the observations; empty if they are
+    #: uncorrected
     corrected_by: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -197,26 +197,26 @@ class Content:
 
 
 def has_content(part: Any) -> bool:
-    """Return whether a part of a Content is there."""
+    """Return whether a part of a Content is present."""
     return part is not None and (not isinstance(part, (tuple, Mapping)) or len(part) > 0)
 
 
 @dataclass(frozen=True)
 class FileSettings:
-    """What a file does not say and a user does.
+    """Settings by the user for facts that a file does not contain.
 
     Attributes
     ----------
     image_size : (int, int) or None
         Width and height [px].
     units : {'mm', 'cm', 'm'} or None
-        Unit of lengths in the file; None: what the format says.
+        Unit of lengths in the file; None: the unit stated by the file or its format.
     one_based : bool
-        Whether the file counts pixels from 1.
+        Whether pixel coordinates in the file start at 1.
     y_up : bool
-        Whether rows of the image are counted upwards in the file.
+        Whether image rows are counted upwards in the file.
     phantom_sd_mm : float or None
-        Standard deviation of the coordinates of beads, where the file has none.
+        Standard deviation of the bead coordinates if the file has none.
     trial : str or None
         Trial of an XMALab project.
     rate_hz : float or None
@@ -226,9 +226,9 @@ class FileSettings:
     fluoroscopes : tuple of str
         Names for cameras that a file only numbers.
     wanted : tuple of str
-        Parts to read from a format of several, names of PARTS.
+        Parts to read from a file with several parts, names of PARTS.
     decisions : path-like or None
-        Table of what a person decided on doubtful image points and exposures of the file.
+        Table of a person's decisions on doubtful image points and exposures of the file.
     """
 
     image_size: tuple[int, int] | None = None
@@ -244,7 +244,7 @@ class FileSettings:
     decisions: PathLike | None = None
 
     def fluoroscope_of(self, name: str, where: object) -> str:
-        """Return the fluoroscope of a file of one camera that names it. Raises DataError."""
+        """Return the fluoroscope of a file that names its only camera. Raises DataError."""
         if len(self.fluoroscopes) == 1:
             return self.fluoroscopes[0]
         fluoroscope = self.names.fluoroscopes.get(name, name)
@@ -252,7 +252,7 @@ class FileSettings:
         return fluoroscope
 
     def image_size_of(self, where: object) -> tuple[int, int]:
-        """Return the image size of a file that does not say it. Raises DataError without."""
+        """Return the image size for a file that has none. Raises DataError if it is not set."""
         if self.image_size is None:
             raise DataError(
                 f'{where}: this format does not contain the image size, --image-size WxH is needed'
@@ -260,7 +260,7 @@ class FileSettings:
         return self.image_size
 
     def unit_read(self, where: object) -> float:
-        """Return the mm of a unit of a file that does not say it. Raises DataError without."""
+        """Return the unit in mm for a file that does not state it. Raises DataError if not set."""
         if self.units is None:
             raise DataError(
                 f'{where}: this format does not say the unit of its lengths, --units '
@@ -269,7 +269,7 @@ class FileSettings:
         return UNITS_MM[self.units]
 
     def unit_or(self, default: str, what: str) -> tuple[float, tuple[str, ...]]:
-        """Return the mm of a unit, and a note where it is the default of the format."""
+        """Return the unit in mm, and a note if it is the default of the format."""
         if self.units is not None:
             return UNITS_MM[self.units], ()
         note = f'{what}: lengths in {default}, as the format does not say a unit; change it with '
@@ -278,13 +278,13 @@ class FileSettings:
 
 @dataclass(frozen=True)
 class Written:
-    """Files that were written, and what a user has to know about them."""
+    """Files that were written, and notes to the user about them."""
 
     paths: tuple[str, ...]
     notes: tuple[str, ...] = ()
 
 
-# What a format of another program is to the rest of the package.
+# Interface between the formats of other programs and the rest of the package.
 
 Reader = Callable[[Path, FileSettings], Content]
 Writer = Callable[[Path, Content, FileSettings], Written]
@@ -292,12 +292,11 @@ Writer = Callable[[Path, Content, FileSettings], Written]
 
 @dataclass(frozen=True)
 class Sample:
-    """The name of a file and how it begins, by which formats recognise it."""
+    """Name and beginning of a file, by which formats recognise it."""
 
     path: Path
-    head: bytes  #: the first bytes
-    #: the first lines that are not blank, without surrounding blanks; empty for a file that is not
-    #: text
+    head: bytes  #: first bytes of the file
+    #: first lines that are not blank, without surrounding blanks; empty for a binary file
     lines: list[str]
 
     @property
@@ -307,33 +306,33 @@ class Sample:
 
     @property
     def first(self) -> str:
-        """The first line that is not blank, '' for a file that is not text."""
+        """First line that is not blank, '' for a binary file."""
         return self.lines[0] if self.lines else ''
 
 
 @dataclass(frozen=True)
 class Format:
-    """A format."""
+    """A file format."""
 
     kind: str  #: name on the command line
     title: str  #: name in messages
-    parts: tuple[str, ...]  #: what it can contain, names of `content.PARTS`
-    recognise: Callable[[Sample], bool]  #: returns whether a file, by its Sample, has the format
-    #: reads a Content; None where the format is only written; raises DataError
+    parts: tuple[str, ...]  #: possible contents, names of `content.PARTS`
+    recognise: Callable[[Sample], bool]  #: returns whether a Sample has the format
+    #: reads a Content, raises DataError; None if the format is only written
     read: Reader | None
-    #: writes a part of a Content; None where the format is only read; raises DataError
+    #: writes a part of a Content, raises DataError; None if the format is only read
     write: Writer | None
-    says_units: bool = True  #: whether the format says the unit of its lengths, or has none
-    one_camera: bool = False  #: whether a file of image points is of one fluoroscope
+    says_units: bool = True  #: whether the format states the unit of its lengths, or has none
+    one_camera: bool = False  #: whether a file of image points contains a single fluoroscope
 
 
-# What the formats of cameras have in common: one file a fluoroscope, in a folder.
+# Helpers of the camera formats that have one file for each fluoroscope in a folder.
 
 
 def write_cameras(
     folder: Path, cameras: Sequence[Camera], ending: str, text_of: Callable[[Camera], str]
 ) -> tuple[str, ...]:
-    """Write a file <camera><ending> for each camera into a folder, after all texts are made.
+    """Write a file <camera><ending> for each camera into a folder, once all texts are complete.
 
     Returns the paths. Raises DataError.
     """
@@ -348,7 +347,7 @@ def write_cameras(
 
 
 def name_of_file(path: Path, ending: str) -> str:
-    """Return the name of the camera that a file is of: the file's without its ending."""
+    """Return the camera name of a file: the file name without its ending."""
     return path.name[: -len(ending)] if path.name.endswith(ending) else path.stem
 
 
@@ -369,7 +368,7 @@ def check_matrix(where: object, matrix: NDArray[np.float64]) -> None:
 
 
 def refuse_distortion(path: PathLike, camera: Camera, title: str) -> None:
-    """Raise DataError for a camera with distortion, for a format that cannot hold it."""
+    """Raise DataError for a camera with distortion, which the format cannot represent."""
     if camera.is_distorted:
         raise DataError(
             f'{path}: camera {camera.name} has a distortion, which {title} cannot contain'
@@ -377,7 +376,7 @@ def refuse_distortion(path: PathLike, camera: Camera, title: str) -> None:
 
 
 def common_focal_length(path: PathLike, camera: Camera, title: str) -> float:
-    """Return the principal distance of a camera with square pixels. Raises DataError."""
+    """Return the principal distance of a camera with square pixels. Raises DataError otherwise."""
     fx = float(camera.matrix[0, 0])
     fy = float(camera.matrix[1, 1])
     if camera.matrix[0, 1] or abs(fx - fy) > 1e-9 * fx:

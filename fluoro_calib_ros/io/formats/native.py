@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The files of this package as formats: observations, phantom, points, known orientations.
+"""Formats of this package: observations, phantom, points, distortion grid, known orientations.
 
-Targets, exposures and fluoroscopes may have names in them.
+Targets, exposures and fluoroscopes may have names instead of ids.
 
-Known orientations of this package: K, R and t_mm of every fluoroscope as YAML. A calibration takes
-the orientations from it. It has no image size.
+Known orientations are a YAML file with K, R and t_mm of every fluoroscope, an input of the
+calibration. The file does not contain the image size.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def _read_observations(path: Path, settings: FileSettings) -> Content:
 
 
 def _write_observations(path: Path, content: Content, settings: FileSettings) -> Written:
-    """Write the ids; names would not be read by programs that know this layout."""
+    """Write image points, with names instead of ids as `write_observations_csv` does."""
     assert content.observations is not None
     write_observations_csv(path, content.observations, content.names, content.corrected_by)
     return Written((str(path),))
@@ -128,7 +128,7 @@ def _read_points(path: Path, settings: FileSettings) -> Content:
 
 
 def _write_points(path: Path, content: Content, settings: FileSettings) -> Written:
-    """Write the points that were seen, with what is known about them."""
+    """Write the known points with their residuals, without standard deviations."""
     points = content.points
     assert points is not None
     rate = settings.rate_hz or points.rate_hz
@@ -212,7 +212,7 @@ TITLE = 'known orientations'
 
 
 def recognise(sample: Sample) -> bool:
-    """Return whether the file has the entry fluoroscopes and matrices K."""
+    """Return whether the file has an entry fluoroscopes and a matrix K."""
     keys = {line.split(':')[0] for line in sample.lines}
     return {'fluoroscopes', 'K'} <= keys
 
@@ -256,21 +256,21 @@ KNOWN_ORIENTATION = Format(
 
 # Known orientations of fluoroscopes as YAML; docs/special_rigs.md describes the file.
 
-VERSION = 1  # of known_orientation.yaml
+VERSION = 1  # version of known_orientation.yaml
 KEYS = ('K', 'R', 't_mm', 'interior_sd_px', 'exterior_sd')
 
 
 def holds_known_orientations(path: PathLike) -> bool:
-    """Return whether a file is a YAML file with an entry of fluoroscopes. Raises DataError."""
+    """Return whether a file is YAML with an entry fluoroscopes. Raises DataError."""
     if Path(path).suffix.lower() not in ('.yaml', '.yml'):
         return False
     return any(line.startswith('fluoroscopes:') for line in read_text(path).splitlines())
 
 
 def read_known_orientations(path: PathLike) -> dict[str, KnownOrientation]:
-    """Read the known orientations of a YAML file by fluoroscope.
+    """Read the known orientations of a YAML file, by fluoroscope.
 
-    Raises DataError with path and fluoroscope for a file that cannot be read or is wrong.
+    Raises DataError with path and fluoroscope for a file that cannot be read or is invalid.
     """
     document = read_yaml(path)
     if not isinstance(document, Mapping) or not isinstance(document.get('fluoroscopes'), Mapping):
@@ -287,7 +287,7 @@ def read_known_orientations(path: PathLike) -> dict[str, KnownOrientation]:
 
 
 def _orientation(entry: Any, where: str) -> KnownOrientation:
-    """Return one entry of the file. Raises DataError."""
+    """Return the orientation of one entry. Raises DataError."""
     if not isinstance(entry, Mapping):
         raise DataError(f'{where}: the entry has no K, R and t_mm')
     for key in entry:
@@ -308,7 +308,7 @@ def _orientation(entry: Any, where: str) -> KnownOrientation:
 
 
 def write_known_orientations(path: PathLike, known: Mapping[str, KnownOrientation]) -> None:
-    """Write known orientations, from which the same are read again. Raises DataError."""
+    """Write known orientations; reading the file restores them. Raises DataError."""
     entries: dict[str, Any] = {}
     for name, one in known.items():
         xp, yp, c = one.interior.tolist()

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Cameras with the distortion of OpenCV: OpenCV YAML, Anipose and ROS camera_info.
+"""Cameras with OpenCV's distortion model: OpenCV YAML, Anipose and ROS camera_info.
 
-OpenCV YAML is camera_matrix, distortion_coefficients, R and T of a camera. The names are those
-that OpenCV's calibration sample writes (image_width, image_height, camera_matrix,
-distortion_coefficients), with R and T of X = R P + t as its stereo sample calls them. Pixel
-centres are at integers from (0, 0), v downwards. The file does not say the unit of T.
+OpenCV YAML contains camera_matrix, distortion_coefficients, R and T of a camera. The names are
+those that OpenCV's calibration sample writes (image_width, image_height, camera_matrix,
+distortion_coefficients), with R and T of X = R P + t named as in its stereo sample. Pixel centres
+are at integers from (0, 0), v downwards. The file does not state the unit of T.
 """
 
 from __future__ import annotations
@@ -45,16 +45,16 @@ DISTORTION_NAMES = ('distortion_coefficients', 'Distortion_Coefficients', 'distC
 
 
 def _is_opencv(sample: Sample) -> bool:
-    """Return whether the file has the first line of OpenCV's file storage."""
+    """Return whether the file begins like OpenCV's file storage and has a camera matrix."""
     if not sample.first.startswith('%YAML'):
         return False
     return any(line.split(':')[0] in MATRIX_NAMES for line in sample.lines)
 
 
 def _read_opencv(path: Path, settings: FileSettings) -> Content:
-    """Read a camera, which is called like the file. Raises DataError."""
+    """Read a camera, named after the file. Raises DataError."""
     text = read_text(path)
-    check_budget('YAML', text, path)  # OpenCV crashes where it is nested deeply
+    check_budget('YAML', text, path)  # OpenCV crashes on deep nesting
     try:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
     except (cv2.error, SystemError):
@@ -105,7 +105,7 @@ def _opencv_camera(path: Path, storage: cv2.FileStorage, settings: FileSettings)
 def _node_matrix(
     path: Path, storage: cv2.FileStorage, names: tuple[str, ...]
 ) -> NDArray[np.float64] | None:
-    """Return the first of some matrices that is there. Raises DataError."""
+    """Return the first matrix with one of the names, None if there is none. Raises DataError."""
     for name in names:
         node = storage.getNode(name)
         if node.empty():
@@ -151,16 +151,16 @@ OPENCV = Format(
 )
 
 
-# Anipose calibration.toml: a table [cam_0], [cam_1], ... a camera, with rotation vectors.
+# Anipose calibration.toml: one table [cam_0], [cam_1], ... a camera, with rotation vectors.
 #
 # The layout is that of `CameraGroup.dump` of aniposelib: name, size (width, height), matrix,
 # distortions (OpenCV), rotation (Rodrigues vector) and translation of X = R P + t, metadata.
-# Pixels are those of OpenCV. The unit is that of the calibration board, and the file does not say
-# it.
+# Pixels are those of OpenCV. Lengths have the unit of the calibration board, which the file does
+# not state.
 
 
 def _is_anipose(sample: Sample) -> bool:
-    """Return whether the file is TOML with tables of cameras."""
+    """Return whether the file is TOML with tables."""
     if sample.suffix != '.toml':
         return False
     return any(line.startswith('[') for line in sample.lines)
@@ -259,7 +259,7 @@ ANIPOSE = Format(
 # ROS camera_info YAML, as camera_calibration writes it and camera_info_manager reads it.
 #
 # image_width, image_height, camera_name, camera_matrix {rows, cols, data}, distortion_model,
-# distortion_coefficients, rectification_matrix, projection_matrix. It is of the interior
+# distortion_coefficients, rectification_matrix, projection_matrix. It contains the interior
 # orientation only. Pixel centres are at integers from (0, 0), v downwards.
 
 _CAMERA_INFO = '_camera_info.yaml'
@@ -267,7 +267,7 @@ _MODELS = ('plumb_bob', 'rational_polynomial')
 
 
 def _is_camera_info(sample: Sample) -> bool:
-    """Return whether the file has the entries of camera_info, and no first line of OpenCV."""
+    """Return whether the file has the entries of camera_info, and not the first line of OpenCV."""
     if sample.first.startswith('%YAML'):
         return False
     keys = {line.split(':')[0] for line in sample.lines}

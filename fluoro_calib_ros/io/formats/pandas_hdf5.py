@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Tables that pandas has stored as HDF5, read without pandas.
+"""Read tables that pandas has stored as HDF5, without pandas.
 
-pandas stores the names of columns of a table pickled, by protocol 0. A pickle may run any code
-where it is loaded. Here its instructions are read one by one, and only those are known that make
+pandas pickles the column names of a table with protocol 0. Loading a pickle may run arbitrary
+code. Therefore its instructions are interpreted one by one, and only those are accepted that make
 lists and tuples of texts and numbers.
 """
 
@@ -17,26 +17,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-VALUES = 'values_block_0'  # of columns of one kind, as in a table of coordinates
+VALUES = 'values_block_0'  # block of columns of the same type, as in a table of coordinates
 _VALUES = ('UNICODE', 'STRING', 'INT', 'LONG')
 _MAKERS: dict[str, Callable[[list[Any]], Any]] = {'LIST': list, 'TUPLE': tuple}
 _MARK = object()
 
 
 def texts(values: Any) -> list[str]:
-    """Return texts of HDF5, which are bytes, and numbers as texts."""
+    """Return HDF5 values as texts: bytes decoded, numbers converted."""
     return [v.decode() if isinstance(v, bytes) else str(v) for v in values]
 
 
 def is_pandas(group: Any) -> bool:
-    """Return whether a group of an HDF5 file is a table of pandas."""
+    """Return whether a group of an HDF5 file is a pandas object."""
     return 'pandas_type' in group.attrs
 
 
 def table_arrays(group: Any) -> dict[str, Any]:
     """Return columns (n, levels), index (m,) and values (m, n) of a table in a group.
 
-    Raises ValueError for a table that is not one of numbers in columns with several headers.
+    Raises ValueError unless it is a table of numbers whose columns have several headers.
     """
     kind = texts([group.attrs['pandas_type']])[0]
     if kind == 'frame_table':
@@ -65,7 +65,7 @@ def _fixed(group: Any) -> tuple[NDArray[np.str_], NDArray[np.str_], NDArray[np.f
     if int(group.attrs['nblocks']) != 1:
         raise ValueError('its columns are not of one kind')
     columns = np.array(_levels(group, 'block0_items')).T
-    # The last level of an index with several is the name of an image.
+    # A multi-level index ends with the image name.
     index = _levels(group, 'axis1')[-1]
     stored = group['block0_values']
     values = stored[:].astype(float)
@@ -73,7 +73,7 @@ def _fixed(group: Any) -> tuple[NDArray[np.str_], NDArray[np.str_], NDArray[np.f
 
 
 def _levels(group: Any, axis: str) -> list[list[str]]:
-    """Return the texts of an axis, level by level."""
+    """Return the texts of each level of an axis."""
     if axis in group:
         return [texts(group[axis][:])]
     out = []
@@ -87,7 +87,7 @@ def _levels(group: Any, axis: str) -> list[list[str]]:
 
 
 def literal(pickled: bytes) -> Any:
-    """Return what a pickle of protocol 0 contains, without loading it.
+    """Return the value of a pickle of protocol 0, without loading it.
 
     Raises ValueError for anything but lists and tuples of texts and numbers.
     """

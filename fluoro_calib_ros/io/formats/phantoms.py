@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Phantoms: lists of bead coordinates as labs and makers share them, XMALab frame specification.
+"""Phantoms: lists of bead coordinates from labs and makers; XMALab frame specification.
 
-A list has a row a bead, separated by blanks, commas, tabs or semicolons. Without a header: x y z,
-and the beads are counted from 1; or id x y z; or x y z name. With a header: columns x, y, z in any
-order, id or name, sd and diameter, a unit after the name of a column (x_mm, "x [mm]", X (cm)).
-Rows that begin with # are comments.
+A list has one row a bead, separated by blanks, commas, tabs or semicolons. Without a header the
+columns are x y z (beads are then counted from 1), id x y z, or x y z name. With a header the
+columns x, y, z, id or name, sd and diameter may be in any order, with a unit after the name of a
+column (x_mm, "x [mm]", X (cm)). Rows that begin with # are comments.
 """
 
 from __future__ import annotations
@@ -29,28 +29,28 @@ from .content import UNITS_MM, Content, FileSettings, Format, Sample, Written, f
 from .tables import Row, joined, separator_of, table_of
 
 _COLUMN = re.compile(r'"?([a-z]+)(?:[ _]*[\[(]?(mm|cm|m)[\])]?)?"?')
-# Names of columns that mean the same.
+# Synonyms of column names.
 _SAME = {
     **dict.fromkeys(('bead', 'label', 'marker', 'name', 'no', 'nr', 'number', 'point'), 'id'),
     **dict.fromkeys(('sigma', 'std', 'accuracy', 'precision'), 'sd'),
     'd': 'diameter',
 }
-# Columns of other files of coordinates, whose own readers say what they lack.
+# Columns of other files with coordinates; their own readers report what is missing.
 _OTHERS = {'target_id', 'frame', 'exposure'}
 _KNOWN = ('id', 'x', 'y', 'z', 'sd', 'diameter')
-MOST_CELLS = 12  # of a header that may be one of beads
+MOST_CELLS = 12  # maximum number of columns in the header of a bead list
 
 
 @dataclass(frozen=True)
 class _Layout:
-    """Column of every part, by name, and the unit of the header, None where it says none."""
+    """Column numbers by name, and the unit in the header, None if it states none."""
 
     columns: dict[str, int]
     unit: str | None = None
 
 
 def _is_coordinates(sample: Sample) -> bool:
-    """Return whether the first rows are those of such a list."""
+    """Return whether the first rows look like a list of bead coordinates."""
     lines = [line for line in sample.lines if not line.startswith('#')]
     if len(lines) < 2:
         return False
@@ -97,7 +97,7 @@ def _read_coordinates(path: Path, settings: FileSettings) -> Content:
 
 
 def _separator(lines: Sequence[str]) -> str:
-    """Return the separator that the first bead has, ' ' for blanks."""
+    """Return the separator found in the second row, ' ' for blanks."""
     first = lines[1] if len(lines) > 1 else ''.join(lines)
     return next((mark for mark in ';\t,' if mark in first), ' ')
 
@@ -110,7 +110,7 @@ def _cells(line: str, separator: str) -> list[str]:
 
 
 def _header(cells: Sequence[str]) -> _Layout | None:
-    """Return the layout that the first row tells, None where it is no header."""
+    """Return the layout given by a header, None if the row is not a header."""
     columns: dict[str, int] = {}
     units = set()
     for number, cell in enumerate(cells):
@@ -130,7 +130,7 @@ def _header(cells: Sequence[str]) -> _Layout | None:
 
 
 def _without_header(cells: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of the columns of a row without header, none for no such row."""
+    """Return the column names of a row without a header, () if the row fits no such layout."""
     numbers = [is_number(cell) for cell in cells]
     if len(cells) == 3 and all(numbers):
         return 'x', 'y', 'z'
@@ -142,7 +142,7 @@ def _without_header(cells: Sequence[str]) -> tuple[str, ...]:
 
 
 def _of_numbers(rows: Sequence[Row]) -> _Layout:
-    """Return the layout of rows without header. Raises DataError for other columns."""
+    """Return the layout of rows without a header. Raises DataError for other columns."""
     names = _without_header(rows[0].cells)
     if not names:
         rows[0].fail(
@@ -153,7 +153,7 @@ def _of_numbers(rows: Sequence[Row]) -> _Layout:
 
 
 def _unit(path: Path, layout: _Layout, settings: FileSettings) -> float:
-    """Return the mm of the unit. Raises DataError where header and user contradict each other."""
+    """Return the unit in mm. Raises DataError if header and user contradict each other."""
     if layout.unit is None:
         return settings.unit_read(path)
     if settings.units not in (None, layout.unit):
@@ -182,7 +182,7 @@ def _positive(rows: Sequence[Row], layout: _Layout, name: str) -> NDArray[np.flo
 
 
 def _ids(rows: Sequence[Row], layout: _Layout) -> dict[str, int]:
-    """Return the ids by name, in the order of the rows. Raises DataError for one that is twice."""
+    """Return the ids by name, in the order of the rows. Raises DataError for a repeated name."""
     if 'id' not in layout.columns:
         return {str(number): number for number in range(1, len(rows) + 1)}
     cells = [row.cells[layout.columns['id']] for row in rows]
@@ -214,12 +214,12 @@ COORDINATES = Format(
 
 # XMALab frame specification: the beads of a calibration object, `x,y,z[,name]` in cm.
 #
-# The layout is that of `CalibrationObject::loadCoords` of XMALab 2.2.7: the first row is a header,
-# `x y z`, or `white` for bright beads, or `s10,s10,s10` for factors of the three coordinates; then
-# one row a bead. The number of the row, from 1, is the bead's id unless the bead has a name.
-# XMALab does not say a unit; its users give centimetres.
+# The layout is that of `CalibrationObject::loadCoords` of XMALab 2.2.7. The first row is a header:
+# `x y z`, or `white` for bright beads, or `s10,s10,s10` for factors of the three coordinates. Then
+# follows one row a bead. The id of a bead is the number of its row, from 1, unless it has a name.
+# XMALab does not state a unit; its users give centimetres.
 
-DEFAULT_SD_MM = 0.1  # of coordinates, where nobody says one
+DEFAULT_SD_MM = 0.1  # used if neither the file nor the user states a standard deviation
 _FIRST_ROW = re.compile(r'(white|x[\s,;]+y[\s,;]+z|s[\d.,]+([,;]\s*s[\d.,]+){2}).*', re.IGNORECASE)
 
 
@@ -237,7 +237,7 @@ def _read_framespec(path: Path, settings: FileSettings) -> Content:
 
 def content_of(path: Path, text: str, settings: FileSettings) -> Content:
     """Return the survey in a text; path is for messages. Raises DataError."""
-    # The header need not have the separator of the beads.
+    # The header may have another separator than the beads.
     rows = table_of(path, text, separator_of('\n'.join(text.splitlines()[1:])))
     scale = _factors(rows[0])
     beads = rows[1:]
@@ -262,7 +262,7 @@ def content_of(path: Path, text: str, settings: FileSettings) -> Content:
 def _sd_unsaid(
     path: Path, count: int, settings: FileSettings
 ) -> tuple[NDArray[np.float64], tuple[str, ...]]:
-    """Return standard deviations (n,) [mm] that a file does not say, and a note if nobody does."""
+    """Return standard deviations (n,) [mm] from the settings, else the default with a note."""
     if settings.phantom_sd_mm is not None:
         return np.full(count, settings.phantom_sd_mm), ()
     note = f'{path}: the file has no standard deviation, {DEFAULT_SD_MM:g} mm is used; change it '

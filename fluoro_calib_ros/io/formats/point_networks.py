@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Image points that networks find: DeepLabCut and SLEAP.
+"""Image points predicted by neural networks: DeepLabCut and SLEAP.
 
-DeepLabCut tables, one file a camera: predicted points, and points labelled by hand. They are CSV,
+DeepLabCut tables, one file a camera: predicted points, or points labelled by hand. They are CSV,
 or HDF5 of pandas.
 
-The header has a row each for scorer, body part and coordinate, with several animals one for the
-individual, too. Rows are frames from 0, or the paths of labelled images, in one cell or in three.
+The header has one row each for scorer, body part and coordinate, and for several animals one for
+the individual. Rows are frames from 0, or the paths of labelled images, in one cell or in three.
 Pixel centres are at integers from (0, 0), v downwards.
 """
 
@@ -41,7 +41,8 @@ from .tables import (
 
 HEADER = ('scorer', 'individuals', 'bodyparts', 'coords')
 SCORER = 'fluoro_calib_ros'
-# Points that DeepLabCut itself neither plots nor evaluates: the default of its setting pcutoff.
+# Least likelihood of a point that is read; default of the setting pcutoff of DeepLabCut, below
+# which it neither plots nor evaluates points.
 LIKELIHOOD = 0.6
 _NUMBER = re.compile(r'\d+')
 
@@ -92,10 +93,10 @@ def read_deeplabcut(path: Path, settings: FileSettings) -> Content:
 
 
 def _rows_of_hdf5(path: Path) -> list[Row]:
-    """Return the rows that a file has as CSV. Raises DataError."""
+    """Return the rows that the same table has as CSV. Raises DataError."""
     arrays = hdf5_arrays('deeplabcut', path)
     levels = arrays['columns'].T.tolist()
-    # A table of several animals has the headers of HEADER, that of a single one no individuals.
+    # A table of several animals has all headers of HEADER, one of a single animal no individuals.
     names = HEADER if len(levels) == len(HEADER) else (HEADER[0], *HEADER[2:])
     if len(levels) != len(names):
         raise DataError(f'{path}: the columns have {len(levels)} headers, not those of DeepLabCut')
@@ -106,7 +107,7 @@ def _rows_of_hdf5(path: Path) -> list[Row]:
 
 
 def _body_parts(header: dict[str, Row], first: int) -> list[str]:
-    """Return the names of the points, in the order of the columns. Raises DataError."""
+    """Return the names of the points in the order of the columns. Raises DataError."""
     coords = header['coords']
     axes = [cell.lower() for cell in coords.cells[first:]]
     group = ['x', 'y', 'likelihood'] if 'likelihood' in axes else ['x', 'y']
@@ -114,7 +115,7 @@ def _body_parts(header: dict[str, Row], first: int) -> list[str]:
         coords.fail(f'the columns are not {", ".join(group)} of one body part after the other')
     parts = header['bodyparts'].cells[first :: len(group)]
     if 'individuals' in header:
-        # 'single' are the points that belong to no animal
+        # 'single' marks points that belong to no animal
         animals = header['individuals'].cells[first :: len(group)]
         parts = [p if a == 'single' else f'{a} {p}' for a, p in zip(animals, parts)]
     for name in parts:
@@ -124,13 +125,13 @@ def _body_parts(header: dict[str, Row], first: int) -> list[str]:
 
 
 def _fluoroscope_of_table(path: Path, settings: FileSettings) -> str:
-    """Return the fluoroscope of a file: <name>DLC_<network>.csv, CollectedData_<name>.csv."""
+    """Return the fluoroscope of a file <name>DLC_<network>.csv or CollectedData_<name>.csv."""
     name = path.stem.removeprefix('CollectedData_').split('DLC_')[0].rstrip('_') or path.stem
     return settings.fluoroscope_of(name, path)
 
 
 def _frame_number(row: Row, first: int) -> int:
-    """Return the number of a frame, or of a labelled image. Raises DataError."""
+    """Return the number of a frame or of a labelled image. Raises DataError."""
     numbers = _NUMBER.findall(Path(row.cells[first - 1]).stem)
     if not numbers:
         row.fail(f'{row.cells[first - 1]!r} is neither a frame nor a numbered image')
@@ -138,7 +139,7 @@ def _frame_number(row: Row, first: int) -> int:
 
 
 def write_deeplabcut(path: Path, content: Content, settings: FileSettings) -> Written:
-    """Write a folder with a file <fluoroscope>.csv each, with likelihood 1. Raises DataError."""
+    """Write a folder with a file <fluoroscope>.csv each, likelihood 1. Raises DataError."""
     files = _files_of_cameras(path, content, '.csv')
     for file, frames in files.items():
         _write_camera(Path(file), frames, content.names.target_names())
@@ -146,7 +147,7 @@ def write_deeplabcut(path: Path, content: Content, settings: FileSettings) -> Wr
 
 
 def _files_of_cameras(path: Path, content: Content, ending: str) -> dict[str, Sequence[Frame]]:
-    """Make a folder; return the frames by the names of their files in it. Raises DataError."""
+    """Create a folder; return the frames by the paths of their files in it. Raises DataError."""
     observations = content.observations or {}
     for name in observations:
         check_safe_name(name, path)
@@ -191,9 +192,9 @@ DEEPLABCUT = Format(
 
 # Analysis files of SLEAP (HDF5), one file a camera: points of skeletons in frames of a video.
 #
-# Rows are frames from 0. Pixel centres are at integers from (0, 0), v downwards.
+# Frames count from 0. Pixel centres are at integers from (0, 0), v downwards.
 
-LEAST_SCORE = 1e-6  # below it a point weighs nothing beside the others
+LEAST_SCORE = 1e-6  # a point with a smaller score would have negligible weight
 _OF_VIDEO = re.compile(r'.*\.\d{3}_(?P<video>.+)')  # <project>.<number of the video>_<video>
 
 
@@ -207,7 +208,7 @@ def read_sleap(path: Path, settings: FileSettings) -> Content:
         raise DataError(f'{path}: tracks, point_scores and node_names are of different sizes')
     uv = uv.reshape(len(uv), len(targets), 2)
     score = score.reshape(len(uv), len(targets))
-    score = np.where(np.isnan(score), 1.0, score)  # labelled by hand
+    score = np.where(np.isnan(score), 1.0, score)  # NaN: labelled by hand
     size = settings.image_size_of(path)
     target_id, names = numbered_targets(targets, settings.names.targets)
     fluoroscope = _fluoroscope_of_video(path, settings)
@@ -231,7 +232,7 @@ def read_sleap(path: Path, settings: FileSettings) -> Content:
 
 
 def _nodes(path: Path, arrays: dict[str, np.ndarray]) -> list[str]:
-    """Return the names of the points: nodes, of several tracks with the name of each."""
+    """Return the names of the points: nodes, preceded by the track if there are several tracks."""
     nodes = arrays['nodes'].tolist()
     tracks = arrays['tracks'].tolist()
     count = arrays['uv'].shape[1]
@@ -244,7 +245,7 @@ def _nodes(path: Path, arrays: dict[str, np.ndarray]) -> list[str]:
 
 
 def _fluoroscope_of_video(path: Path, settings: FileSettings) -> str:
-    """Return the fluoroscope of a file, <project>.000_<video>.analysis.h5: its video."""
+    """Return the fluoroscope of a file <project>.000_<video>.analysis.h5: its video."""
     name = path.name.removesuffix(path.suffix).removesuffix('.analysis')
     found = _OF_VIDEO.fullmatch(name)
     return settings.fluoroscope_of(found['video'] if found else name, path)
@@ -260,7 +261,7 @@ def write_sleap(path: Path, content: Content, settings: FileSettings) -> Written
 
 
 def _content_of(frames: Sequence[Frame], named: dict[int, str]) -> bytes:
-    """Return an analysis file of one track, as SLEAP orders it, with scores of 1."""
+    """Return an analysis file of one track, axes in the order of SLEAP, with scores of 1."""
     import h5py
 
     ids = sorted({int(i) for frame in frames for i in frame.target_id})

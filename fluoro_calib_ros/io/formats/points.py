@@ -1,19 +1,19 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Points in space: files of XMALab, C3D (c3d.org) and TRC.
+"""3-D points: files of XMALab, C3D (c3d.org) and TRC.
 
 C3D is read and written with ezc3d: points in mm, rotations, rate and names. The residual of a C3D
-point is in the unit of the points, the low byte of its fourth word times POINT:SCALE, and the word
-is negative where there is no point (c3d.org, "The C3D File Format, User Guide"). It is written as
+point has the unit of the points: it is the low byte of its fourth word times POINT:SCALE, and the
+word is negative for a missing point (c3d.org, "The C3D File Format, User Guide"). It is written as
 the standard deviation of the position, the root of the sum of its variances in x, y and z [mm]; 0
-where that is unknown. C3D holds coordinates as float32, and residuals in 255 steps. Poses of
-bodies are the 4 x 4 matrices, body -> world, of the group ROTATION.
+if unknown. C3D stores coordinates as float32, and residuals in 255 steps. Poses of bodies are the
+4 x 4 matrices, body -> world, of the group ROTATION.
 
 XMALab: `[Frame,]name_X,name_Y,name_Z,...`, one row a frame, NaN where not seen. The layout is that
-of `Trial::save3dPoints` of XMALab 2.2.7. The unit is that of the calibration object, and the file
-does not say it. Without the column Frame the first row is frame 1. A filtered export appends the
-cut-off frequency to the names, which then belongs to them.
+of `Trial::save3dPoints` of XMALab 2.2.7. Coordinates have the unit of the calibration object,
+which the file does not state. Without the column Frame the first row is frame 1. A filtered export
+appends the cut-off frequency to the names; it is kept as part of them.
 """
 
 from __future__ import annotations
@@ -64,9 +64,9 @@ from .tables import (
     write_frames,
 )
 
-MAX_FRAME = 65535  # the header counts in uint16
-# Points, analog values, first and last frame, scale factor and first block of the data: from byte
-# 2 of the header on.
+MAX_FRAME = 65535  # the header stores frame numbers as uint16
+# Header from byte 2 on: points, analog values, first and last frame, scale factor, first block of
+# the data.
 _HEADER = struct.Struct('<4H2xfH')
 BLOCK = 512  # bytes
 
@@ -82,7 +82,7 @@ def _ezc3d() -> Any:
 
 
 def read_c3d(path: Path, settings: FileSettings) -> Content:
-    """Read points in space. Raises DataError."""
+    """Read 3-D points and poses of bodies. Raises DataError."""
     _check_size(path, read_bytes(path))
     _ezc3d()
     arrays = arrays_apart('c3d', path, 'C3D')
@@ -119,7 +119,7 @@ def _points(path: Path, arrays: dict[str, np.ndarray], settings: FileSettings) -
 
 
 def _bodies(path: Path, arrays: dict[str, np.ndarray], settings: FileSettings) -> Bodies:
-    """Return the rotations of a file, of the frames of its points. Raises DataError."""
+    """Return the rotations of a file as bodies. Raises DataError."""
     matrices = arrays['rotations']
     names = arrays['rotation_labels'].tolist()[: matrices.shape[1]]
     if len(set(names)) < matrices.shape[1]:
@@ -150,7 +150,7 @@ def _bodies(path: Path, arrays: dict[str, np.ndarray], settings: FileSettings) -
 
 
 def _unit(path: Path, unit: str, settings: FileSettings) -> float:
-    """Return the mm of the unit of a file. Raises DataError for an unknown one."""
+    """Return the unit of a file in mm. Raises DataError for an unknown one."""
     mm = UNITS_MM[settings.units] if settings.units else UNITS_MM.get(unit)
     if mm is None:
         raise DataError(f'{path}: the unit of the points is {unit!r}, give it with --units')
@@ -158,16 +158,16 @@ def _unit(path: Path, unit: str, settings: FileSettings) -> float:
 
 
 def _check_size(path: Path, content: bytes) -> None:
-    """Raise DataError for a file that is no C3D file or shorter than its header says.
+    """Raise DataError for a file that is not C3D or is shorter than its header states.
 
-    The header is that of c3d.org, of a file with the numbers of Intel processors.
+    The header is that of c3d.org; it is evaluated only for the number format of Intel processors.
     """
     if content[1:2] != b'P':
         raise DataError(f'{path}: this is not a C3D file')
     if len(content) < BLOCK:
         raise DataError(f'{path}: this C3D file is truncated')
     start = (content[0] - 1) * BLOCK
-    if content[start + 3 : start + 4] != bytes([84]):  # numbers of Intel processors
+    if content[start + 3 : start + 4] != bytes([84]):  # number format of Intel processors
         return
     points, analog, first, last, scale, data = _HEADER.unpack_from(content, 2)
     values = (last - first + 1) * (4 * points + analog)
@@ -176,7 +176,7 @@ def _check_size(path: Path, content: bytes) -> None:
 
 
 def write_c3d(path: Path, content: Content, settings: FileSettings) -> Written:
-    """Write points in space and poses of bodies. Raises DataError."""
+    """Write 3-D points and poses of bodies. Raises DataError."""
     frames = frames_of(path, [p for p in (content.points, content.bodies) if p], settings)
     last = frames.first + frames.count - 1
     if not 1 <= frames.first <= last <= MAX_FRAME:
@@ -204,7 +204,7 @@ def write_c3d(path: Path, content: Content, settings: FileSettings) -> Written:
 
 
 def _add_points(file: Any, points: Points, mm: float) -> None:
-    """Add points of all frames to a file, in units of mm, with their residuals."""
+    """Add points of all frames to a file, in a unit of `mm` millimetres, with their residuals."""
     missing = np.asarray(np.isnan(points.xyz_mm).any(axis=2))
     xyz = np.where(missing[..., None], 0.0, points.xyz_mm / mm)
     with_one = np.concatenate([xyz, np.ones((*xyz.shape[:2], 1))], axis=2)
@@ -216,7 +216,7 @@ def _add_points(file: Any, points: Points, mm: float) -> None:
 
 
 def _bytes_of(file: Any, path: Path) -> bytes:
-    """Return a C3D file as bytes; ezc3d writes only to files, and its errors have no type."""
+    """Return a C3D file as bytes; ezc3d writes only to files, and its exceptions have no type."""
     with TemporaryDirectory() as folder:
         temporary = Path(folder) / 'points.c3d'
         try:
@@ -224,9 +224,9 @@ def _bytes_of(file: Any, path: Path) -> bytes:
             content = bytearray(temporary.read_bytes())
         except Exception as error:
             raise DataError(f'{path}: cannot be written ({error})') from None
-    # ezc3d leaves -1 in the header, and readers such as py-c3d refuse a file where it is not that
-    # of the parameter. It writes residuals into the byte of the cameras, where large ones have the
-    # sign of a missing point.
+    # ezc3d writes a scale of -1 into the header; readers such as py-c3d refuse a file in which it
+    # differs from the parameter. ezc3d also writes residuals into the byte of the camera mask,
+    # where large values have the sign of a missing point.
     (scale,) = file['parameters']['POINT']['SCALE']['value']
     struct.pack_into('<f', content, 12, scale)
     *_, data = _HEADER.unpack_from(content, 2)
@@ -250,7 +250,7 @@ _COLUMN = re.compile(r'(?P<target>.+)_(?P<axis>[XYZ])', re.IGNORECASE)
 
 
 def _is_xmalab3d(sample: Sample) -> bool:
-    """Return whether the header has triples of columns of a marker."""
+    """Return whether the header begins with the three columns of a marker."""
     cells = re.split(r'[,;\t]', sample.first)
     cells = cells[cells[0].strip().lower() == 'frame' :]
     return len(cells) >= 3 and all(
@@ -259,7 +259,7 @@ def _is_xmalab3d(sample: Sample) -> bool:
 
 
 def _read_xmalab3d(path: Path, settings: FileSettings) -> Content:
-    """Read points in space. Raises DataError."""
+    """Read 3-D points. Raises DataError."""
     header, body, first = read_frames(path)
     targets = _targets(header, first)
     require_width(body, 3 * len(targets) + first, 'the header')
@@ -277,7 +277,7 @@ def _read_xmalab3d(path: Path, settings: FileSettings) -> Content:
 
 
 def _targets(row: Row, first: int) -> list[str]:
-    """Return the names of the targets of a header. Raises DataError."""
+    """Return the names of the targets in a header. Raises DataError."""
     found = []
     for cell, axis in zip(row.cells[first:], 'XYZ' * len(row.cells)):
         match = _COLUMN.fullmatch(cell)
@@ -294,7 +294,7 @@ def _targets(row: Row, first: int) -> list[str]:
 
 
 def _write_xmalab3d(path: Path, content: Content, settings: FileSettings) -> Written:
-    """Write points in space, with the column Frame."""
+    """Write 3-D points, with the column Frame."""
     points = content.points
     assert points is not None
     mm, notes = settings.unit_or('mm', str(path))
@@ -314,15 +314,15 @@ XMALAB3D = Format(
 )
 
 
-# TRC of Motion Analysis, as OpenSim reads it: points in space, at a constant rate.
+# TRC of Motion Analysis, as OpenSim reads it: 3-D points at a constant rate.
 #
-# Header of five rows: PathFileType, names and values of DataRate, CameraRate, NumFrames,
+# The header has five rows: PathFileType; names and values of DataRate, CameraRate, NumFrames,
 # NumMarkers, Units, OrigDataRate, OrigDataStartFrame, OrigNumFrames; names of the markers; X1 Y1
-# Z1 and so on. Then a row a frame: its number, time [s] and coordinates, between tabulators. Where
-# a marker is not seen, OpenSim writes and reads NaN; other programs leave the cell empty, which is
-# read, too. TRC has no residuals.
+# Z1 and so on. Then follows one row a frame: its number, time [s] and coordinates, separated by
+# tabulators. Where a marker is not seen, OpenSim writes and reads NaN; other programs leave the
+# cell empty, which is read, too. TRC has no residuals.
 
-_HEADER_ROWS = 5  # of a TRC file
+_HEADER_ROWS = 5  # header rows of a TRC file
 TAB = '\t'
 _NAMES = (
     *('DataRate', 'CameraRate', 'NumFrames', 'NumMarkers'),
@@ -331,7 +331,7 @@ _NAMES = (
 
 
 def _read_trc(path: Path, settings: FileSettings) -> Content:
-    """Read points in space. Raises DataError that names the row."""
+    """Read 3-D points. Raises DataError that names the row."""
     lines = read_text(path).splitlines()
     if len(lines) < _HEADER_ROWS or not lines[0].startswith('PathFileType'):
         raise DataError(f'{path}: this is not a TRC file, it does not begin with PathFileType')
@@ -379,7 +379,7 @@ def _coordinates(row: Row, count: int) -> NDArray[np.float64]:
 
 
 def _write_trc(path: Path, content: Content, settings: FileSettings) -> Written:
-    """Write points in space. Raises DataError."""
+    """Write 3-D points. Raises DataError."""
     assert content.points is not None
     points = points_of(content.points, frames_of(path, [content.points], settings))
     unit = settings.units or 'mm'

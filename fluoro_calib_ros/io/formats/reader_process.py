@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Read a C3D or HDF5 file in a process of its own: `python -m ...reader_process KIND PATH`.
+"""Read a C3D or HDF5 file in a separate process: `python -m ...reader_process KIND PATH`.
 
-ezc3d and HDF5 trust what a file says about itself: a damaged one can make them crash, or fill the
-memory. Standard output is an .npz of arrays. Of C3D: labels, unit, rate, first, xyz (m, n, 3),
-residual (m, n), and rotation_labels, rotation_unit, rotation_rate, rotations (m, b, 4, 4). Of an
-analysis file of SLEAP: uv (m, t, n, 2) and score (m, t, n) of frames, tracks and nodes, and the
-names nodes and tracks. Of a file of DeepLabCut: columns (n, levels), index (m,) and values (m, n).
+ezc3d and HDF5 trust what a file states about itself: damage can make them crash or exhaust the
+memory. Standard output is an .npz of arrays. For C3D: labels, unit, rate, first, xyz (m, n, 3),
+residual (m, n), and rotation_labels, rotation_unit, rotation_rate, rotations (m, b, 4, 4). For an
+analysis file of SLEAP: uv (m, t, n, 2) and score (m, t, n) by frame, track and node, and the names
+nodes and tracks. For a file of DeepLabCut: columns (n, levels), index (m,) and values (m, n).
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from ...errors import DataError
 from ...processes import run_module, watch_parent
 from .pandas_hdf5 import is_pandas, table_arrays, texts
 
-HDF5 = b'\x89HDF\r\n\x1a\n'  # with which a file begins
-# Bytes of address space: for the program, for each byte of the file, and at most.
+HDF5 = b'\x89HDF\r\n\x1a\n'  # signature of HDF5 files
+# Limit of the address space [bytes]: base, plus a multiple of the file size, at most the maximum.
 BASE_MEMORY = 3 * 2**30
 MEMORY_OF_BYTE = 100
 MAX_MEMORY = 8 * 2**30
 
 
 def labels_of(parameters: Any) -> list[str]:
-    """Return the names of all points: a parameter holds 255, the others follow in LABELS2, ..."""
+    """Return all point names: one parameter contains 255, the others follow in LABELS2, ..."""
     found = list(parameters['LABELS']['value'])
     number = 2
     while f'LABELS{number}' in parameters:
@@ -76,10 +76,10 @@ def c3d_arrays(path: str) -> dict[str, Any]:
 
 
 def _residuals(path: str, xyz: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
-    """Return the residuals (m, n) of the points of a C3D file, -1 where there is none.
+    """Return the residuals (m, n) of the points of a C3D file, -1 for missing points.
 
-    They are the low byte of the fourth word of a point. ezc3d 1.7.2 gives the high byte, which
-    tells the cameras.
+    The residual is the low byte of the fourth word of a point. ezc3d 1.7.2 returns the high byte,
+    which is the camera mask.
     """
     content = Path(path).read_bytes()
     analog, data = (int.from_bytes(content[place : place + 2], 'little') for place in (4, 16))
@@ -87,19 +87,19 @@ def _residuals(path: str, xyz: NDArray[np.float64], scale: float) -> NDArray[np.
     width = 4 * points + analog
     kind = '<f4' if scale < 0 else '<i2'
     values = np.frombuffer(content, kind, frames * width, (data - 1) * 512)
-    if scale < 0 and content[(content[0] - 1) * 512 + 3] == 85:  # numbers of DEC processors
+    if scale < 0 and content[(content[0] - 1) * 512 + 3] == 85:  # DEC floating-point format
         values = values.view('<u2').reshape(-1, 2)[:, ::-1].copy().view('<f4') / 4
     words = values.reshape(frames, width)[:, 3 : 4 * points : 4]
     steps = np.where(words >= 0, words, -1).astype(np.int64)
     return np.where(steps < 0, -1.0, (steps & 0xFF) * abs(scale))
 
 
-# Axes of `tracks` in a file that does not name them, as SLEAP itself writes.
+# Axes of `tracks` in a file that does not name them; the order that SLEAP itself writes.
 SLEAP_AXES = ('track', 'xy', 'node', 'frame')
 
 
 def sleap_arrays(path: str) -> dict[str, Any]:
-    """Return the arrays of an analysis file of SLEAP. Raises ValueError for any other file."""
+    """Return the arrays of an analysis file of SLEAP. Raises ValueError for another file."""
     import h5py
 
     with h5py.File(path, 'r') as file:
@@ -125,7 +125,7 @@ def sleap_arrays(path: str) -> dict[str, Any]:
 
 
 def deeplabcut_arrays(path: str) -> dict[str, Any]:
-    """Return the arrays of a table of DeepLabCut. Raises ValueError for any other file."""
+    """Return the arrays of a DeepLabCut table. Raises ValueError for another file."""
     import h5py
 
     with h5py.File(path, 'r') as file:
@@ -139,7 +139,7 @@ READERS = {'c3d': c3d_arrays, 'sleap': sleap_arrays, 'deeplabcut': deeplabcut_ar
 
 
 def main() -> None:
-    """Write the arrays to standard output, or the cause to standard error and exit with 1."""
+    """Write the arrays to standard output, or the error to standard error and exit with 1."""
     watch_parent(os.getppid())
     with suppress(ImportError, ValueError, OSError):  # Windows has no such limit
         import resource
@@ -149,7 +149,7 @@ def main() -> None:
         resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
     try:
         arrays = READERS[sys.argv[1]](sys.argv[2])
-    except Exception as error:  # the errors of ezc3d have no type
+    except Exception as error:  # the exceptions of ezc3d have no common type
         print(' '.join(str(error).split()), file=sys.stderr)
         sys.exit(1)
     buffer = io.BytesIO()
@@ -157,19 +157,19 @@ def main() -> None:
     sys.stdout.buffer.write(buffer.getvalue())
 
 
-# Of the process that reads: to start, and for each byte of the file.
+# Time limit of the process [s]: base for the start, plus seconds per byte of the file.
 BASE_SECONDS = 10
 SECONDS_OF_BYTE = 1e-6
 
 
 def hdf5_arrays(kind: str, path: Path) -> dict[str, np.ndarray]:
-    """Return the arrays of an HDF5 file. Raises DataError, also where h5py is not installed."""
+    """Return the arrays of an HDF5 file. Raises DataError, also if h5py is not installed."""
     require_h5py(path)
     return arrays_apart(kind, path, 'HDF5')
 
 
 def require_h5py(path: Path) -> None:
-    """Raise DataError where h5py is not installed."""
+    """Raise DataError if h5py is not installed."""
     if importlib.util.find_spec('h5py') is None:
         raise DataError(
             f'{path}: HDF5 files need the package h5py: pip install h5py, or '
@@ -178,7 +178,7 @@ def require_h5py(path: Path) -> None:
 
 
 def arrays_apart(kind: str, path: Path, title: str) -> dict[str, np.ndarray]:
-    """Return the arrays of a file, read by the process. Raises DataError where it cannot be."""
+    """Return the arrays of a file, read in a separate process. Raises DataError if that fails."""
     seconds = BASE_SECONDS + SECONDS_OF_BYTE * path.stat().st_size
     try:
         done = run_module(__name__, kind, os.fspath(path.resolve()), timeout_s=seconds)

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The registry of the formats: the only place that lists them.
+"""Registry of the formats: the only place that lists them.
 
-A new format is a `content.Format` and one line here. The command line takes the kinds
-from this module, and reads every source by it.
+A new format is a `content.Format` and one line here. The command line takes the kinds from this
+module, and reads every source through it.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from .point_networks import DEEPLABCUT, SLEAP
 from .points import C3D, TRC, XMALAB3D
 from .xmalab_cameras import DLT, LOOKUP, MAYACAM1, MAYACAM2
 
-HEAD = 65536  # bytes by which a format is recognised
-LINES = 20  # lines by which a format is recognised
+HEAD = 65536  # first bytes of a file, by which a format is recognised
+LINES = 20  # first lines of a file, by which a format is recognised
 
-# The order is that in which a file is compared with them, and that of help texts.
+# Order in which a file is compared with the formats; help texts have the same order.
 FORMATS: dict[str, Format] = {
     format_.kind: format_
     for format_ in (
@@ -66,7 +66,7 @@ def kinds(condition: Callable[[Format], object]) -> tuple[str, ...]:
 
 
 def sample_of(path: PathLike) -> Sample:
-    """Return how a file begins. Raises DataError for a file that cannot be read."""
+    """Return the beginning of a file. Raises DataError for a file that cannot be read."""
     path = Path(path)
     with opened(path) as file:
         head = file.read(HEAD)
@@ -81,7 +81,7 @@ def sample_of(path: PathLike) -> Sample:
 
 
 def recognised(path: PathLike) -> Format | None:
-    """Return the format of a file, None for an unknown one. Raises DataError where unreadable."""
+    """Return the format of a file, None if unknown. Raises DataError for an unreadable file."""
     sample = sample_of(path)
     return next((f for f in FORMATS.values() if f.recognise(sample)), None)
 
@@ -89,8 +89,8 @@ def recognised(path: PathLike) -> Format | None:
 def read(path: PathLike, settings: FileSettings, kind: str | None = None) -> Content:
     """Read a file of any format, or a folder with a file of one format for each camera.
 
-    kind is its format, by default the one it is recognised as. Raises DataError for a file that
-    is no such format, with what it looks like.
+    kind: the format; by default it is recognised. Raises DataError for a file that does not have
+    the format; the message names the recognised one.
     """
     path = Path(path)
     if path.is_dir():
@@ -127,7 +127,7 @@ def _read_folder(folder: Path, settings: FileSettings, kind: str | None) -> Cont
         if format_.parts not in (('cameras',), ('lookups',)) and not format_.one_camera:
             continue
         content = format_.read(path, settings)
-        # A target has the same id in all files.
+        # A target must have the same id in all files.
         settings = replace(settings, names=settings.names.merged(content.names))
         contents[path] = (format_.kind, content)
     found = dict.fromkeys(name for name, _ in contents.values())
@@ -162,9 +162,9 @@ def _read_folder(folder: Path, settings: FileSettings, kind: str | None) -> Cont
 
 
 def write(path: PathLike, kind: str, content: Content, settings: FileSettings) -> Written:
-    """Write a content as a format.
+    """Write a Content in a format.
 
-    Raises DataError for a format that is only read, and for a content without what it holds.
+    Raises DataError for a format that is only read, and for a Content without a suitable part.
     """
     format_ = FORMATS[kind]
     if format_.write is None:

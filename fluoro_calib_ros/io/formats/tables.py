@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What formats share: tables of numbers in text files; points and bodies in frames at one rate."""
+"""Shared by formats: number tables in text files; 3-D points and bodies at a constant rate."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ MISSING = ('', 'nan', 'none', 'null', 'na', 'n/a')
 def with_sigma_of_likelihood(
     frames: Sequence[Frame], likelihood: Sequence[NDArray[np.float64]]
 ) -> list[Frame]:
-    """Return frames of points of a network with standard deviations, 1 px where it is sure.
+    """Return frames whose points have standard deviations of 1 px / likelihood.
 
-    likelihood: (n,) of each frame. Where all are 1, as in files that are written here, nothing is
-    known, and the frames are as they were. Residuals are weighted by the likelihood, as by
-    Karashchuk et al., "Anipose: A toolkit for robust markerless 3D pose estimation", Cell Reports
-    36, 2021. The pixel is a convention: these programs do not tell the size of their errors, and
-    an adjustment estimates it.
+    likelihood: (n,) for each frame, as stated by a network. If all are 1, as in files that this
+    package writes, the frames are returned unchanged, as nothing is known. Residuals are weighted
+    by the likelihood, as by Karashchuk et al., "Anipose: A toolkit for robust markerless 3D pose
+    estimation", Cell Reports 36, 2021. The pixel is a convention: these programs do not state the
+    size of their errors; an adjustment estimates it.
     """
     if all((values == 1).all() for values in likelihood):
         return list(frames)
@@ -51,9 +51,9 @@ def frame_of(
     uv: NDArray[np.float64],
     image_size: tuple[int, int],
 ) -> Frame:
-    """Return the frame of image points of a file.
+    """Return a frame of image points of a file.
 
-    Raises DataError, beginning with where, for a point off the image.
+    Raises DataError, whose message begins with where, for a point off the image.
     """
     on_image = points_on_image(uv, image_size)
     if not on_image.all():
@@ -67,7 +67,7 @@ def frame_of(
 
 @dataclass(frozen=True)
 class Row:
-    """A row of a table: its number in the file, counted from 1, and its cells without blanks."""
+    """A row of a table: its number in the file, counted from 1, and its stripped cells."""
 
     path: PathLike
     line: int
@@ -83,7 +83,7 @@ class Row:
         return f'{self.path}, row {self.line}'
 
     def numbers(self, first: int = 0) -> list[float]:
-        """Return the cells from the given one on as finite numbers. Raises DataError."""
+        """Return the cells from column `first` on as finite numbers. Raises DataError."""
         values = self.numbers_or_nan(first)
         for column, value in enumerate(values, first):
             if math.isnan(value):
@@ -91,7 +91,7 @@ class Row:
         return values
 
     def numbers_or_nan(self, first: int = 0) -> list[float]:
-        """Return the cells from the given one on as numbers, NaN where one is missing."""
+        """Return the cells from column `first` on as numbers, NaN for missing ones."""
         out = []
         for column, cell in enumerate(self.cells[first:], first):
             try:
@@ -106,7 +106,7 @@ class Row:
         return out
 
     def whole(self, column: int, what: str) -> int:
-        """Return a cell as a whole number from 0. Raises DataError."""
+        """Return a cell as a non-negative integer. Raises DataError."""
         cell = self.cells[column]
         if not cell.isascii() or not cell.isdigit():
             self.fail(f'{what} is {quoted(cell)}, not a whole number')
@@ -116,15 +116,15 @@ class Row:
 def read_table(path: PathLike, separator: str | None = None) -> list[Row]:
     """Return the rows of a text file that are not blank.
 
-    separator: ' ' for any blanks; by default a semicolon where the first row has one, then with
-    decimal commas, as spreadsheets write it in many countries, else a tabulator or a comma. Raises
-    DataError for a file that cannot be read, is not text or has no rows.
+    separator: ' ' for any whitespace; by default a semicolon if the first row has one (then with
+    decimal commas, as spreadsheets write them in many countries), otherwise a tabulator or a
+    comma. Raises DataError for a file that cannot be read, is not text or has no rows.
     """
     return table_of(path, read_text(path), separator)
 
 
 def table_of(path: PathLike, text: str, separator: str | None = None) -> list[Row]:
-    """Return the rows of a text, as `read_table` does; path is for messages."""
+    """Return the rows of a text as `read_table` does; path is for messages."""
     if '\0' in text:
         raise DataError(f'{path}: this is not text, it contains a byte 0')
     check_rows(text, MAX_ROWS, path)
@@ -139,7 +139,7 @@ def table_of(path: PathLike, text: str, separator: str | None = None) -> list[Ro
 
 
 def separator_of(text: str) -> str:
-    """Return the separator of a table: that of its first row that is not blank."""
+    """Return the separator found in the first row that is not blank."""
     first = next((line for line in text.splitlines() if line.strip()), '')
     return next((mark for mark in ';\t' if mark in first), ',')
 
@@ -159,9 +159,9 @@ def _separated(path: PathLike, text: str, separator: str) -> list[Row]:
 
 
 def read_frames(path: PathLike) -> tuple[Row, list[Row], int]:
-    """Return header and rows of a table with a row a frame, and its number of columns Frame.
+    """Return header and rows of a table with one row a frame, and 1 if its first column is Frame.
 
-    Raises DataError as `read_table`, and for a header without rows.
+    The third value is otherwise 0. Raises DataError as `read_table`, and for missing rows.
     """
     header, *rows = read_table(path)
     if not rows:
@@ -170,7 +170,7 @@ def read_frames(path: PathLike) -> tuple[Row, list[Row], int]:
 
 
 def frame_numbers(rows: Sequence[Row], first: int) -> list[int]:
-    """Return the numbers of frames: those of the column Frame, without one from 1 on."""
+    """Return the frame numbers: the column Frame if first is 1, else 1, 2, 3, ..."""
     return [row.whole(0, 'Frame') if first else number for number, row in enumerate(rows, 1)]
 
 
@@ -182,7 +182,7 @@ def require_width(rows: Iterable[Row], width: int, what: str) -> None:
 
 
 def number_text(value: float) -> str:
-    """Return a number as text from which the same one is read again, NaN for a missing one."""
+    """Return a number as text that reads back to the same value, 'NaN' for a missing one."""
     return 'NaN' if math.isnan(value) else repr(float(value))
 
 
@@ -201,30 +201,30 @@ def write_frames(
             file.write(f'{number},{joined(numbers.ravel())}\n')
 
 
-# Names of targets in formats that need one.
+# Target names in formats that require them.
 
 
 def default_name(target_id: int) -> str:
-    """Return the name of a target without one, as XMALab calls its markers: marker001."""
+    """Return the name of a target without one, in the style of XMALab: marker001."""
     return f'marker{target_id:03d}'
 
 
 def named_targets(ids: Mapping[str, int]) -> dict[str, int]:
-    """Return the ids of the names that a person has given."""
+    """Return the ids of names that were given by a person."""
     return {name: i for name, i in without_trivial(ids).items() if name != default_name(i)}
 
 
 def numbered_targets(
     targets: Sequence[str], known: Mapping[str, int]
 ) -> tuple[NDArray[np.int64], Names]:
-    """Return the ids (n,) of targets that a file names, and the names that a person has given."""
+    """Return the ids (n,) of targets named in a file, and the names given by a person."""
     ids = number_names(targets, known)
     own = {name: ids[name] for name in targets}
     return np.array([own[name] for name in targets], dtype=np.int64), Names(named_targets(own))
 
 
 def are_numbers(lines: Sequence[str], rows: int, columns: int = 0) -> bool:
-    """Return whether a file has so many rows of as many numbers, of columns if it is not 0."""
+    """Return whether the lines are `rows` rows of equally many numbers; columns 0: any count."""
     try:
         widths = {len([float(cell) for cell in line.split(',')]) for line in lines}
     except ValueError:
@@ -234,7 +234,7 @@ def are_numbers(lines: Sequence[str], rows: int, columns: int = 0) -> bool:
 
 @dataclass(frozen=True)
 class Frames:
-    """All frames of a recording: the first, how many there are, and their rate, NaN if unknown."""
+    """All frames of a recording: the first, their count, and their rate, NaN if unknown."""
 
     first: int
     count: int
@@ -242,18 +242,18 @@ class Frames:
 
     @property
     def numbers(self) -> NDArray[np.int64]:
-        """Numbers (m,) of the frames."""
+        """Frame numbers, shape (m,)."""
         return np.arange(self.first, self.first + self.count)
 
     @property
     def times_s(self) -> NDArray[np.float64]:
-        """Times (m,) after the first frame [s]."""
+        """Times after the first frame [s], shape (m,)."""
         return np.arange(self.count) / self.rate_hz
 
     def expanded(
         self, frame: NDArray[np.int64], values: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return values (m, ...) of all frames, NaN for those that are not in frame (k,)."""
+        """Expand the values (k, ...) of frames (k,) to all frames (m, ...), NaN where missing."""
         out = np.full((self.count, *values.shape[1:]), np.nan)
         out[frame - self.first] = values
         return out
@@ -265,9 +265,9 @@ def frames_of(
     settings: FileSettings,
     needs_rate: bool = True,
 ) -> Frames:
-    """Return the frames from the first to the last one of points and bodies.
+    """Return all frames from the first to the last one of points and bodies.
 
-    Raises DataError where a rate is needed and unknown, and for too many frames.
+    Raises DataError if a rate is needed and unknown, and for too many frames.
     """
     rates = (settings.rate_hz, *(part.rate_hz for part in parts))
     rate = next((rate for rate in rates if rate), None if needs_rate else math.nan)
@@ -281,7 +281,7 @@ def frames_of(
 
 
 def points_of(points: Points, frames: Frames) -> Points:
-    """Return points with all frames."""
+    """Expand points to all frames."""
     return replace(
         points,
         frame=frames.numbers,
@@ -293,7 +293,7 @@ def points_of(points: Points, frames: Frames) -> Points:
 
 
 def bodies_of(bodies: Bodies, frames: Frames) -> Bodies:
-    """Return bodies with all frames."""
+    """Expand bodies to all frames."""
     return replace(
         bodies,
         frame=frames.numbers,
@@ -304,7 +304,7 @@ def bodies_of(bodies: Bodies, frames: Frames) -> Bodies:
 
 
 def rate_of(frame: NDArray[np.int64], stamp_ns: np.ndarray) -> float | None:
-    """Return the frames per second between the first and the last time stamp, None without."""
+    """Return the frame rate [Hz] between the first and the last time stamp, None if unknown."""
     first = int(np.argmin(frame))
     last = int(np.argmax(frame))
     seconds = (stamp_ns[last] - stamp_ns[first]) / 1e9
@@ -312,12 +312,12 @@ def rate_of(frame: NDArray[np.int64], stamp_ns: np.ndarray) -> float | None:
         return None
     rate = (frame[last] - frame[first]) / seconds
     whole = round(rate)
-    # Stamps are rounded to nanoseconds, clocks to some millionths.
+    # A clock is off by some millionths, and stamps are rounded to nanoseconds.
     return float(whole) if whole and abs(rate - whole) < 1e-5 * whole else float(rate)
 
 
 def labels(content: Content) -> list[str]:
-    """Return the names of the targets; those without a name are marker001, marker002, ..."""
+    """Return the names of the targets; a target without a name is marker001, marker002, ..."""
     assert content.points is not None
     named = content.names.target_names()
     return [named.get(i, default_name(i)) for i in content.points.target_id.tolist()]

@@ -1,21 +1,22 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Cameras of XMALab: MayaCam 2.0 and 1.0, DLT coefficients, and the undistortion lookup table.
+"""Cameras of XMALab: MayaCam 2.0 and 1.0, DLT coefficients, undistortion lookup table.
 
-MayaCam 2.0 is camera matrix, rotation and translation of one camera. The layout is that of
+MayaCam 2.0 contains camera matrix, rotation and translation of one camera. The layout is that of
 `Camera::saveMayaCamVersion2` of XMALab 2.2.7 and `Camera::loadMayaCam2` of Autoscoper, which reads
-values by the number of the line: 1 `image size`, 2 width,height, 5 to 7 the camera matrix, 10 to
-12 the rotation, 15 to 17 the translation; comments and other blank lines are not allowed. Pixel
-centres are at integers from (0, 0), v downwards; X = R P + t. The unit of the translation is that
-of the calibration object (often mm), and the file does not say it. The camera is that of corrected
+values by line number: 1 `image size`, 2 width,height, 5 to 7 the camera matrix, 10 to 12 the
+rotation, 15 to 17 the translation. Comments and other blank lines are not allowed. Pixel centres
+are at integers from (0, 0), v downwards; X = R P + t. The translation has the unit of the
+calibration object (often mm), which the file does not state. The camera applies to corrected
 images; XMALab may add a block `undistortion` with eight coefficients of OpenCV, which Autoscoper
 does not read.
 
-XMALab's undistortion lookup table: H rows of the map's columns, then H rows of its rows. The
-layout is that of `UndistortionObject::exportData` of XMALab 2.2.7: for every pixel of the
-corrected image the column, and then the row, of the observed image that is seen there, as float32;
-pixel centres at integers from (0, 0), v downwards, -1 without support. It is what cv2.remap takes.
+XMALab's undistortion lookup table has H rows of column coordinates, then H rows of row
+coordinates. The layout is that of `UndistortionObject::exportData` of XMALab 2.2.7: for every
+pixel of the corrected image the column, and then the row, of the corresponding pixel of the
+observed image, as float32; pixel centres at integers from (0, 0), v downwards, -1 without support.
+cv2.remap takes the same map.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ _TITLES = {1: 'image size', 4: 'camera matrix', 9: 'rotation', 14: 'translation'
 
 
 def _read_mayacam2(path: Path, settings: FileSettings) -> Content:
-    """Read a camera, which is called like the file. Raises DataError that names the line."""
+    """Read a camera, named after the file. Raises DataError that names the line."""
     lines = read_text(path).splitlines()
     for number, title in _TITLES.items():
         if _line(path, lines, number).strip() != title:
@@ -100,7 +101,7 @@ def _line(path: Path, lines: list[str], number: int) -> str:
 
 
 def _numbers(path: Path, lines: list[str], number: int, count: int) -> list[float]:
-    """Return the numbers of a line. Raises DataError for another count of them."""
+    """Return the numbers of a line. Raises DataError unless there are `count` of them."""
     cells = [cell.strip() for cell in _line(path, lines, number).split(',')]
     row = Row(path, number, cells)
     if len(cells) != count:
@@ -156,13 +157,13 @@ MAYACAM2 = Format(
 # Autoscoper: position of the source; angles x, y, z [degrees] of the camera's axes in the world,
 # turned about z, then y, then x; position of the film plane (derived, not read); principal point
 # u0, v0 and -c [px], counted from 1, v upwards; scale, width, height (0: 1024). The camera looks
-# along -z, y upwards. The unit is that of the calibration object, and the file does not say it.
+# along -z, y upwards. The file does not state the unit of lengths, that of the calibration object.
 
 _MAYACAM1 = '_MayaCam.csv'
 
 
 def _read_mayacam1(path: Path, settings: FileSettings) -> Content:
-    """Read a camera, which is called like the file. Raises DataError that names the row."""
+    """Read a camera, named after the file. Raises DataError that names the row."""
     rows = read_table(path)
     if len(rows) != 5:
         raise DataError(f'{path}: {len(rows)} rows, but MayaCam 1.0 has 5')
@@ -171,7 +172,7 @@ def _read_mayacam1(path: Path, settings: FileSettings) -> Content:
     size = (_pixels(rows[4], width), _pixels(rows[4], height))
     if not z:
         rows[3].fail('the principal distance is 0')
-    # x, y, z of the camera in the world as columns: extrinsic rotations about x, y and z.
+    # Columns: axes x, y, z of the camera in the world; extrinsic rotations about x, y and z.
     axes = Rotation.from_euler('xyz', angles, degrees=True).as_matrix()
     matrix = np.array([[abs(z), 0, u0 - 1], [0, abs(z), size[1] - 1 - (v0 - 1)], [0, 0, 1]])
     camera = camera_at(
@@ -205,14 +206,14 @@ MAYACAM1 = Format(
 #
 # The layout is that of `Project::exportDLT` of XMALab 2.2.7, as DLTdv and Argus read it: eleven
 # rows L1 to L11, x = (L1 X + L2 Y + L3 Z + L4) / (L9 X + L10 Y + L11 Z + 1), y with L5 to L8
-# (Abdel-Aziz and Karara, 1971). x and y count from 1, y upwards; the image height turns them into
-# ours. DLTdv8 and easyWand6 count y downwards: then the origin, where L12 is 1, lies behind every
-# camera, if y is taken as upwards. The unit is that of the calibration object, and the file does
-# not say it.
+# (Abdel-Aziz and Karara, 1971). x and y count from 1, y upwards; the image height converts them to
+# ours. DLTdv8 and easyWand6 count y downwards. Such a file is recognised: with y taken as upwards,
+# the origin, where L12 is 1, would lie behind every camera. Lengths have the unit of the
+# calibration object, which the file does not state.
 
 
 def _read_dlt(path: Path, settings: FileSettings) -> Content:
-    """Read the cameras, which are called cam1, cam2, ... unless settings name them.
+    """Read the cameras, which are named cam1, cam2, ... unless settings name them.
 
     Raises DataError, also without the image size.
     """
@@ -253,12 +254,12 @@ def _dlt_camera(
     """Return the camera of a matrix (3, 4) from homogeneous coordinates to our pixels.
 
     Source: Hartley and Zisserman, Multiple View Geometry, 2nd edition, section 6.2.4. Raises
-    ValueError for a matrix that is not of a camera.
+    ValueError if the matrix does not represent a camera.
     """
     if not np.linalg.det(projection[:, :3]):
         raise ValueError('the coefficients are not those of a camera with a finite position')
     position = -np.linalg.solve(projection[:, :3], projection[:, 3])
-    # Points before the camera have a positive depth where the determinant is positive.
+    # Points in front of the camera have a positive depth if the determinant is positive.
     upper, rotation = rq(projection[:, :3] * np.sign(np.linalg.det(projection[:, :3])))
     signs = np.diag(np.sign(np.diag(upper)))
     matrix = upper @ signs
@@ -299,18 +300,18 @@ DLT = Format(
 
 
 ENDING = '_LUT.csv'
-NOWHERE = -1.0  # no pixel: what XMALab writes
-_MIN_COLUMNS = 32  # narrower tables are something else
+NOWHERE = -1.0  # value of XMALab for pixels without support
+_MIN_COLUMNS = 32  # a table with fewer columns is not a lookup table
 
 
 def recognise(sample: Sample) -> bool:
-    """Return whether the first row has as many numbers as an image has columns."""
+    """Return whether the first row is long enough to be a row of an image."""
     cells = sample.first.split(',')[:_MIN_COLUMNS]
     return are_numbers([','.join(cells)], 1, _MIN_COLUMNS)
 
 
 def read(path: Path, settings: FileSettings) -> Content:
-    """Read a table, of a fluoroscope that is called like the file. Raises DataError."""
+    """Read a table; the fluoroscope is named after the file. Raises DataError."""
     text = read_text(path)
     check_rows(text, 2 * MAX_IMAGE_SIDE, path)
     lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip()]
@@ -363,7 +364,7 @@ def write(path: Path, content: Content, settings: FileSettings) -> Written:
         table = np.where(np.isnan(maps).any(axis=0), np.float32(NOWHERE), maps)
         with atomic_file(paths[-1], 'w') as file:
             for row in table.astype(np.float32).reshape(-1, table.shape[2]).tolist():
-                # Nine digits hold a float32.
+                # Nine significant digits represent a float32 exactly.
                 file.write(', '.join([f'{value:.9g}' for value in row]) + '\n')
     return Written(tuple(paths))
 

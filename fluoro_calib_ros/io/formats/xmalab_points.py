@@ -4,12 +4,12 @@
 """XMALab 2-D points: `name_cam1_X,name_cam1_Y,name_cam2_X,...`, one row a frame.
 
 The layout is that of `Trial::save2dPoints` and `load2dPoints` of XMALab 2.2.7: pixel centres at
-integers from (0, 0), v downwards, NaN where a marker is not seen. Variants, chosen in its dialogue
-and not visible in the file: pixels from 1 (one_based), rows counted upwards (y_up). DLTdv calls
-the points pt1, pt2, ... and counts from 1, before version 8 upwards; Argus, which writes
-`name_cam_1_x`, counts upwards. A further variant begins with the columns
-cam<n>_offset; XMALab writes their header without the separating commas. The row is the exposure,
-counted from 1, unless there is a column Frame.
+integers from (0, 0), v downwards, NaN where a marker is not seen. Variants are chosen in its
+dialogue and not visible in the file: pixels counted from 1 (one_based), rows counted upwards
+(y_up). DLTdv names the points pt1, pt2, ... and counts from 1, before version 8 upwards. Argus
+writes `name_cam_1_x` and counts upwards. A further variant begins with the columns cam<n>_offset;
+XMALab writes their header without the separating commas. The exposure is the row number, counted
+from 1, unless there is a column Frame.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def read(path: Path, settings: FileSettings) -> Content:
 
 
 def _origin_notes(path: Path, header: Row, settings: FileSettings) -> tuple[str, ...]:
-    """Return what to do about the origin of pixels of another program that names points so."""
+    """Return advice about the pixel origin if the column names suggest another program."""
     if settings.one_based or settings.y_up:
         return ()
     last = header.cells[-1]
@@ -83,11 +83,11 @@ def _origin_notes(path: Path, header: Row, settings: FileSettings) -> tuple[str,
 def _header(row: Row, first: int) -> tuple[list[tuple[str, int]], int]:
     """Return target and camera of every column of points, and the number of offset columns.
 
-    Raises DataError for columns that do not come in pairs of X and Y, or twice.
+    Raises DataError unless columns come in pairs of X and Y, each pair once.
     """
     cells = row.cells[first:]
     offsets = 0
-    while cells and _OFFSET.match(cells[0]):  # XMALab forgets the commas between them
+    while cells and _OFFSET.match(cells[0]):  # XMALab omits the commas between them
         offsets += 1
         rest = cells[0][_OFFSET.match(cells[0]).end() :]  # type: ignore[union-attr]
         cells = ([rest] if rest else []) + cells[1:]
@@ -107,7 +107,7 @@ def _header(row: Row, first: int) -> tuple[list[tuple[str, int]], int]:
 
 
 def _labels(cameras: Sequence[int], settings: FileSettings) -> dict[int, str]:
-    """Return the fluoroscopes of the numbered cameras."""
+    """Return the fluoroscope of each numbered camera."""
     given = settings.fluoroscopes
     plain = {camera: f'cam{camera}' for camera in cameras}
     if len(given) == len(cameras) and not set(given) & set(plain.values()):
@@ -117,7 +117,7 @@ def _labels(cameras: Sequence[int], settings: FileSettings) -> dict[int, str]:
 
 
 def _check_offsets(row: Row, first: int, offsets: int) -> None:
-    """Raise DataError for cameras that are not synchronous, as DLTdv allows them to be."""
+    """Raise DataError for cameras with a time offset, which DLTdv allows."""
     if offsets and any(Row(row.path, row.line, row.cells[first : first + offsets]).numbers()):
         row.fail('the cameras are offset against each other in time: write them without offset')
 
@@ -125,7 +125,7 @@ def _check_offsets(row: Row, first: int, offsets: int) -> None:
 def _pixels(
     values: Sequence[float], settings: FileSettings, size: tuple[int, int]
 ) -> NDArray[np.float64]:
-    """Return pixels (n, 2) in our convention, NaN where either coordinate is missing."""
+    """Convert to our pixels (n, 2), NaN where either coordinate is missing."""
     uv = np.array(values).reshape(-1, 2)
     if settings.one_based:
         uv = uv - 1.0
@@ -150,7 +150,7 @@ def _check_point(
 
 
 def write(path: Path, content: Content, settings: FileSettings) -> Written:
-    """Write image points, one column a target and camera, one row an exposure from 1 on."""
+    """Write image points: one column pair a target and camera, one row an exposure, from 1 on."""
     observations = content.observations or {}
     cameras = camera_order(list(observations))
     named = content.names.target_names()
@@ -188,7 +188,7 @@ def write(path: Path, content: Content, settings: FileSettings) -> Written:
 
 
 def _file_pixels(frame: Frame, settings: FileSettings) -> NDArray[np.float64]:
-    """Return pixels (n, 2) in the convention of the file."""
+    """Convert the image points of a frame to pixels (n, 2) in the convention of the file."""
     uv = np.array(frame.uv, dtype=float)
     if settings.y_up:
         uv[:, 1] = frame.image_size[1] - 1 - uv[:, 1]
@@ -196,7 +196,7 @@ def _file_pixels(frame: Frame, settings: FileSettings) -> NDArray[np.float64]:
 
 
 def camera_order(names: Sequence[str]) -> list[str]:
-    """Return fluoroscopes in the order of their numbers where they are numbered, else as given."""
+    """Return fluoroscopes sorted by the number in their names; unsorted if not all have one."""
     found = [re.fullmatch(r'\D*(\d+)', name) for name in names]
     numbers = [int(match[1]) for match in found if match is not None]
     if len(numbers) < len(names) or len(set(numbers)) < len(numbers):

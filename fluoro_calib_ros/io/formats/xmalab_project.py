@@ -1,14 +1,15 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""XMALab project (.xma), read only: a ZIP file of project.xml and the files it names.
+"""XMALab project (.xma), read only: a ZIP file with project.xml and the files that it names.
 
-The layout is that of `ProjectFileIO` of XMALab 2.2.7, project version 0.3. Read are the detected
-points of the calibration object (those that XMALab calls inliers), the markers of a trial, the
-frame specification, the cameras with their calibrated poses, and the points of the undistortion
-grids. Points are those of the observed, distorted image, pixel centres at integers from (0, 0), v
-downwards. A calibration image is the exposure of its number, counted from 1; a frame of a trial,
-too. The unit is that of the frame specification, which XMALab does not say: cm, as there.
+The layout is that of `ProjectFileIO` of XMALab 2.2.7, project version 0.3. The following is read:
+the detected points of the calibration object (those that XMALab marks as inliers), the markers of
+a trial, the frame specification, the cameras with their calibrated poses, and the points of the
+undistortion grids. Points are those of the observed, distorted image, pixel centres at integers
+from (0, 0), v downwards. The exposure is the number of the calibration image or of the frame of a
+trial, counted from 1. Lengths have the unit of the frame specification, which XMALab does not
+state: by default cm, as there.
 """
 
 from __future__ import annotations
@@ -82,7 +83,7 @@ def _is_set(element: ElementTree.Element, name: str = 'isCalibrated') -> bool:
 
 
 class _Project:
-    """Cameras, images and trials of an open project, with the names they have here."""
+    """Cameras, images and trials of an open project, with fluoroscope ids for the camera names."""
 
     def __init__(self, archive: ProjectArchive, settings: FileSettings) -> None:
         self.archive = archive
@@ -99,12 +100,12 @@ class _Project:
         self.ids = safe_names(self._names, known)
 
     def named(self) -> Iterator[tuple[ElementTree.Element, str]]:
-        """Yield the cameras with the names they have here."""
+        """Yield the cameras with their fluoroscope ids."""
         for camera, name in zip(self.cameras, self._names):
             yield camera, self.ids[name]
 
     def survey(self) -> Content:
-        """Return the frame specification, an empty Content for a checkerboard or without one."""
+        """Return the frame specification; an empty Content without one, as for a checkerboard."""
         element = self.archive.root.find('CalibrationObject')
         name = '' if element is None else element.get('FrameSpecifications', '')
         if not name:
@@ -114,12 +115,12 @@ class _Project:
         )
 
     def images(self, camera: ElementTree.Element) -> Iterator[tuple[int, ElementTree.Element]]:
-        """Yield the calibration images of a camera with their exposures."""
+        """Yield the calibration images of a camera with their exposure numbers."""
         for number, image in enumerate(camera.findall('CalibrationImage'), 1):
             yield (self.archive.whole(image, 'Frame') + 1 if image.get('Frame') else number), image
 
     def image_size(self, camera: ElementTree.Element) -> tuple[int, int]:
-        """Return the image size of a camera, of its sequence or its first image."""
+        """Return the image size of a camera from its sequence, images or the settings."""
         sequence = camera.find('CalibrationSequence')
         if sequence is not None:
             return self.archive.whole(sequence, 'Width'), self.archive.whole(sequence, 'Height')
@@ -152,7 +153,7 @@ class _Project:
 
 
 class _Part:
-    """A part of a project."""
+    """Base class of the readers of parts of a project."""
 
     def __init__(self, project: _Project) -> None:
         self._project = project
@@ -162,14 +163,14 @@ class _Part:
 
 
 class _Observations(_Part):
-    """Points of a project: those of its calibration object, or those of the markers of a trial."""
+    """Image points of a project, of the calibration object or the markers of a trial."""
 
     def __init__(self, project: _Project, survey: Content) -> None:
         super().__init__(project)
         self._survey = survey
 
     def of_phantom(self) -> tuple[dict[str, list[Frame]], dict[str, int]]:
-        """Return the frames of the calibration object, and the names of its exposures."""
+        """Return the frames of the calibration object, and the numbers of its named exposures."""
         frames: dict[str, list[Frame]] = {}
         exposures: dict[str, int] = {}
         for camera, name in self._project.named():
@@ -204,7 +205,7 @@ class _Observations(_Part):
                 f'{self._path}, {file}: {len(uv)} points and {len(inlier)} inliers, but the '
                 f'calibration object has {count} beads'
             )
-        used = (inlier[:, 0] == 1) & ~(uv == -1).all(axis=1)  # -1, -1 where it was not found
+        used = (inlier[:, 0] == 1) & ~(uv == -1).all(axis=1)  # -1, -1: not found
         points = (self._bead_ids(count)[used], uv[used])
         return frame_of(f'{self._path}, {file}', name, number, *points, size)
 
@@ -215,7 +216,7 @@ class _Observations(_Part):
         return np.arange(1, count + 1)
 
     def of_trial(self) -> tuple[dict[str, list[Frame]], dict[str, int]]:
-        """Return the frames of the markers of a trial, and the names of the markers."""
+        """Return the frames of the markers of a trial, and the ids of the markers by name."""
         trial = self._project.trial()
         markers = trial.findall('Marker')
         if not markers:
@@ -259,7 +260,7 @@ class _Observations(_Part):
 
 
 class _Calibration(_Part):
-    """Calibrated cameras, their poses and undistortion grids of a project."""
+    """Calibrated cameras of a project, their poses and undistortion grids."""
 
     def stations(self, mm: float) -> Iterator[Station]:
         """Yield the pose of every calibrated image."""
@@ -280,8 +281,8 @@ class _Calibration(_Part):
     def cameras(self, stations: tuple[Station, ...]) -> Iterator[Camera]:
         """Yield the calibrated cameras in the frame of the calibration object.
 
-        The pose is that of the reference image of the chosen trial, else of the first one that all
-        cameras are calibrated in.
+        The poses are those of the reference image of the chosen trial, otherwise of the first
+        image in which all cameras are calibrated.
         """
         calibrated = [(camera, name) for camera, name in self._project.named() if _is_set(camera)]
         reference = self._reference(stations, [name for _, name in calibrated])
@@ -315,7 +316,7 @@ class _Calibration(_Part):
                 yield Camera(name, matrix, size, distortion=distortion)
 
     def _reference(self, stations: tuple[Station, ...], names: list[str]) -> int | None:
-        """Return the exposure whose poses the cameras have."""
+        """Return the exposure from which the poses of the cameras are taken."""
         if self._settings.trial is not None:
             return self._files.whole(self._project.trial(), 'referenceCalibration') + 1
         by_exposure: dict[int, set[str]] = {}
@@ -324,7 +325,7 @@ class _Calibration(_Part):
         return min((e for e, of in by_exposure.items() if of >= set(names)), default=None)
 
     def grids(self) -> Iterator[tuple[str, NDArray[np.float64]]]:
-        """Yield the points of the undistortion grids that XMALab used, observed and reference."""
+        """Yield the grid points that XMALab used: observed u, v and reference u, v."""
         for camera, name in self._project.named():
             grid = camera.find('UndistortionGrid')
             if grid is None or not _is_set(grid, 'isComputed'):
@@ -353,16 +354,16 @@ FORMAT = Format(
 )
 
 
-# The files of an XMALab project: a ZIP file with project.xml and the tables it names.
+# Access to the ZIP file of an XMALab project.
 
 DOCUMENT = 'project.xml'
 
 
 class ProjectArchive:
-    """An open project; a context manager. root is the element of project.xml.
+    """An open project, as a context manager. root is the root element of project.xml.
 
-    Raises DataError where the file is no project; so do the methods, for whatever is missing or
-    damaged.
+    The constructor raises DataError if the file is not a project; the methods raise it for
+    anything missing or damaged.
     """
 
     def __init__(self, path: Path) -> None:
@@ -393,7 +394,7 @@ class ProjectArchive:
         return root
 
     def member(self, name: str, most: int = sys.maxsize) -> bytes:
-        """Return a file of the archive, of at most so many bytes."""
+        """Return a file of the archive; it may have at most `most` bytes."""
         info = self._members.get(posixpath.normpath(name.replace('\\', '/')))
         if info is None:
             raise DataError(f'{self.path}: the project does not contain {name}')
@@ -401,7 +402,7 @@ class ProjectArchive:
             raise DataError(f'{self.path}: {name} is too large, {info.file_size} bytes')
         try:
             return self._archive.read(info)
-        except Exception as error:  # whatever zipfile and its decompressors make of the damage
+        except Exception as error:  # zipfile and its decompressors raise various exceptions
             raise DataError(f'{self.path}: {name} is damaged ({error})') from None
 
     def member_text(self, name: str) -> str:
@@ -409,7 +410,7 @@ class ProjectArchive:
         return self.member(name, MAX_MEMBER).decode('utf-8', 'replace')
 
     def numbers(self, name: str) -> NDArray[np.float64]:
-        """Return a table of numbers; an error for rows of different lengths, too."""
+        """Return a table of numbers. Rows of different lengths are an error, too."""
         rows: list[Row] = table_of(f'{self.path}, {name}', self.member_text(name))
         values = [row.numbers_or_nan() for row in rows]
         for row, of_row in zip(rows, values):
@@ -418,14 +419,14 @@ class ProjectArchive:
         return np.array(values)
 
     def text(self, element: ElementTree.Element, name: str) -> str:
-        """Return an attribute."""
+        """Return an attribute of an element."""
         value = element.get(name)
         if value is None:
             raise DataError(f'{self.path}, {DOCUMENT}: a {element.tag} has no attribute {name}')
         return value
 
     def whole(self, element: ElementTree.Element, name: str) -> int:
-        """Return an attribute that is a whole number."""
+        """Return an attribute that is a non-negative integer."""
         text = self.text(element, name)
         if not text.isascii() or not text.isdigit():
             raise DataError(
@@ -435,7 +436,7 @@ class ProjectArchive:
         return int(text)
 
     def file_of(self, element: ElementTree.Element, tag: str) -> str:
-        """Return the name of the file of a child."""
+        """Return the file name of a child element."""
         child = element.find(tag)
         if child is None:
             raise DataError(f'{self.path}, {DOCUMENT}: a {element.tag} has no {tag}')

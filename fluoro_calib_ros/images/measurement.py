@@ -470,9 +470,8 @@ class _BeadFit(ShadowFit):
 
 # Imaging of beads: noise, the shadow of a typical bead, the sizes of all beads.
 #
-# A phantom of unspecified sizes may have beads of several sizes. An isolated bead has the size
-# with which its shadow fits best; if nearly all beads of a sample have the same size, all beads
-# have.
+# A phantom without specified sizes may have several. An isolated bead has the size with which its
+# shadow fits best; if nearly all beads of a sample have the same size, all beads have.
 
 STEP = 1.25  # ratio of consecutive sizes in the first comparison
 SIZES = STEP ** np.arange(-4, 5)

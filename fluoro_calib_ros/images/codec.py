@@ -149,7 +149,7 @@ def check_size(width: int, height: int) -> None:
 
 
 def declared_size(content: memoryview) -> tuple[int, int]:
-    """Return width and height that an image file declares [px], or (0, 0) if it declares none."""
+    """Return width and height that an image file declares [px], (0, 0) if they are not found."""
     start = bytes(content[:64])
     if start.startswith(PNG_SIGNATURE):
         return _number(start[16:20]), _number(start[20:24])

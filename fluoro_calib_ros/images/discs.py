@@ -23,7 +23,7 @@ MIN_RADIUS_PX = 3.0
 SIZES = (0.8, 1.25)  # least and largest radius of a disc, relative to the typical one
 APART = 0.5  # distance in radii below which two maxima are the same disc
 MIN_STRAIGHT = 3  # pairs of discs in a straight line from which a part of the mask is a bar
-SAME = 0.1  # distance in radii from a disc within which the place of a blob is kept: it is better
+SAME = 0.1  # distance in radii within which a blob is a disc; the place of the blob is better
 
 
 def set_apart(
@@ -77,7 +77,7 @@ def _in_bars(
     """Return (n,) whether discs (n, 2) lie in bars, such as screws, that are as wide as a bead.
 
     Halfway between two beads, the distance (h, w) to the border is less than the radius; in a bar
-    it is not. Three beads in a line are one such pair, so a bar needs at least MIN_STRAIGHT pairs.
+    it is not. Three beads in a line form one such pair; a bar has at least MIN_STRAIGHT pairs.
     """
     pair = cKDTree(discs).query_pairs(2 * radius, output_type='ndarray').reshape(-1, 2)
     away = np.linalg.norm(discs[pair[:, 0]] - discs[pair[:, 1]], axis=1)

@@ -30,7 +30,7 @@ WRONG_SHARE = 1e-3
 WRONG_SIGMAS = np.sqrt(-2 * np.log(WRONG_SHARE))
 SURE_SIGMA_PX = 0.5 / WRONG_SIGMAS
 MAX_SIGMAS = 2.9  # largest standard deviation over the usual one: an eighth of the weight
-MAX_MISFIT = 5.0
+MAX_MISFIT = 5.0  # largest lack of fit, relative to that of a typical bead
 DEPTH = (0.55, 1.7)  # depth of a shadow relative to the usual depth in such light
 RADII = (0.2, 5.0)  # radii of shadows of equal beads, relative to a typical one
 MIN_CONTRASTS = 20  # least number of beads from which the usual depth is estimated
@@ -259,7 +259,7 @@ class _Measured:
 
 
 def _away(measured: _Measured) -> NDArray[np.bool_]:
-    """Return (n,) whether well-measured beads are away from the prediction by their neighbours."""
+    """Return (n,) whether well-measured beads are off the places predicted by their neighbours."""
     good = np.array([reason is None for reason in measured.reasons], dtype=bool)
     sigma = measured.beads.sigma[good]
     scatter = np.maximum(measured.sd_px[good], MIN_SCATTER_PX)
@@ -277,7 +277,7 @@ def _checked(
     measured: _Measured,
     imaging: Imaging,
 ) -> Extraction:
-    """Exclude beads that are away from the prediction by their neighbours, or measured badly."""
+    """Exclude beads that are off the places predicted by their neighbours, or measured badly."""
     beads = measured.beads
     reasons = list(measured.reasons)
     for number in np.flatnonzero(_away(measured)):
@@ -314,12 +314,12 @@ def _checked(
 def _chances_of_wrong(
     residual: NDArray[np.float64], sigma: NDArray[np.float64], scatter: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return probabilities (n,) that centres are wrong, given the prediction by their neighbours.
+    """Return probabilities (n,) that centres are wrong, given the predictions of neighbours.
 
     residual: (n,) distances from the predictions; sigma, scatter: (n,) standard deviations of
     coordinates of centres and of predictions. Given the residual, the error of a centre is normal.
     Its mean is the share of the residual that is not due to the prediction. A centre is wrong if
-    it is off by half a pixel, and by more than all but one in a thousand of such centres.
+    it is off by half a pixel, and by more than one in a thousand of such centres.
     """
     wrong_px = WRONG_SIGMAS * np.maximum(sigma, SURE_SIGMA_PX)
     total = sigma**2 + scatter**2

@@ -27,8 +27,8 @@ FAR_TURN_RAD = np.deg2rad(35)
 FAR_SCALES = (0.8, 1.25)  # factors on the scale
 FAR_SEEDS = 6  # number of beads of the image from which the pose is searched for
 FAR_POSES = 3  # number of poses tried for each of these beads
-SCATTER_FACTOR = 1.5  # largest scatter of residuals: this factor on that of the nearby exposure,
-SCATTER_PX = 0.1  # plus this constant
+SCATTER_FACTOR = 1.5  # largest scatter of the residuals over that of the nearby exposure
+SCATTER_PX = 0.1  # is added to this limit
 
 
 @dataclass(frozen=True)
@@ -143,7 +143,7 @@ def _farther(seen: Seen, model: PhantomModel, near: View) -> Iterator[Match | No
 
 
 def _turned(pose: LocalPose, near: View, xyz: NDArray[np.float64]) -> View | None:
-    """Return the nearby view in the pose of a bead, None if it is turned too far."""
+    """Return the nearby view with the pose found at a bead, None if it is turned too far."""
     c = near.principal_distance_px
     start = start_view(pose, replace(near.lens, principal_distance_px=c), xyz)
     if rotation_angle(start.rotation @ near.rotation.T) > FAR_TURN_RAD:

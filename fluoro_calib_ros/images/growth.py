@@ -23,7 +23,7 @@ LAST_STEPS = 4
 LAST_TOLERANCE_PX = 2.5
 CELLS = 5  # regions along each side of the image
 MIN_CELL = 5  # least number of predicted beads in a region that is evaluated
-AMBIGUOUS_PX = 1.5  # least difference in distance between the two nearest predictions
+AMBIGUOUS_PX = 1.5  # least difference of a detection's distances from the two nearest predictions
 SUPPORT = 12  # neighbours in space, of which MIN_SHARE must be found as well
 # Correlation length of the residuals of a view, as a share of half the image: a polynomial of
 # degree 6 has five extrema across it.
@@ -94,7 +94,7 @@ def start_view(pose: LocalPose, lens: Lens, xyz: NDArray[np.float64]) -> View:
     c = lens.principal_distance_px
     ray = np.append((pose.uv - lens.centre) / c, 1.0)
     rotation = _turn_to(ray) @ pose.rotation
-    # The scale is that across the ray, at its length.
+    # The scale applies perpendicular to the ray, at the length of the ray.
     sensor = ray * (c / pose.scale)
     position = xyz[pose.bead] - rotation.T @ sensor
     view = View(
@@ -280,7 +280,7 @@ def _good_cells(
 # smooth, and errors of centres and survey add noise. The share of the noise, and the size of both,
 # are estimated from how well matched beads predict each other.
 
-NEIGHBOURS = 8  # neighbours, which screen a bead from those farther away
+NEIGHBOURS = 8  # number of neighbours; they screen a bead from those farther away
 NOISE_SHARES = (0.001, 0.01, 0.1, 1.0)  # variance of the noise over that of the smooth part
 SAMPLE = 100  # beads from which the share is estimated
 ROUNDS = 2  # iterations of the weights: the first also spoils those of an outlier's neighbours

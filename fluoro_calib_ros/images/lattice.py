@@ -171,8 +171,8 @@ def grid_poses(
 ) -> Iterator[GridPose]:
     """Yield poses of a flat grid, those with the fewest contradictions first.
 
-    Equal poses are in order of tilt, the least tilted first, then by how upright they are, then by
-    the distance of their middle from that of the image.
+    Poses with equally many are in order of tilt, the least tilted first, then by how upright they
+    are, then by the distance of their middle from that of the image.
     """
     found = number_lattice(seen.uv)
     if found is None:
@@ -240,7 +240,7 @@ def _shifts(
 ) -> list[tuple[NDArray[np.int64], int]]:
     """Return shifts (2,) of indices found (n, 2) onto a grid (m, 2), with their contradictions.
 
-    Equal shifts are in order of their distance from a wanted shift (2,).
+    Shifts with equally many are in order of their distance from a wanted shift (2,).
     """
     corner = found.min(axis=0)
     other = grid.min(axis=0)

@@ -31,8 +31,8 @@ LEVELS = 30  # levels of light at which the noise is estimated
 SURE_CORRELATION = 3.0  # significance limit of a correlation [standard deviations]
 LAGS = 4  # largest lag at which noise is correlated [px]
 SECOND = np.array([1.0, -2.0, 1.0])  # kernel of second differences
-MIN_SEEN = 0.1  # smallest variance that second differences retain, for noise blurred by a pixel
-MIN_CLIPPED = 10  # pixels at the outermost grey value that noise alone may have
+MIN_SEEN = 0.1  # least share of the variance in second differences: noise blurred by a pixel
+MIN_CLIPPED = 10  # largest number of outermost grey values that is no evidence of clipping
 MIN_PIXELS = 1000  # pixels that estimates of noise and correlation need
 MAX_SLOW = 0.9  # largest share of slow changes; beyond it the noise is not visible
 
@@ -83,10 +83,10 @@ class Noise:
 def estimate_noise(light: NDArray[np.float32], usable: NDArray[np.bool_]) -> Noise:
     """Estimate the noise of an image (h, w) from its deviations from a plane.
 
-    Robust estimates of second differences (Immerkaer, "Fast noise variance estimation", CVIU 64,
-    1996) are taken over usable pixels of about the same light. They underestimate correlated
-    noise by a factor that follows from the correlation. If hardly any pixel is usable, the noise
-    is that of rounding.
+    The variance is estimated robustly from second differences (Immerkaer, "Fast noise variance
+    estimation", CVIU 64, 1996) at usable pixels of about the same light. They underestimate
+    correlated noise; a factor from the correlation corrects this. If hardly any pixel is usable,
+    the noise is that of rounding.
     """
     correlation = _correlation(light, usable)
     kernel = np.outer(SECOND, SECOND) / float(np.sum(SECOND**2))

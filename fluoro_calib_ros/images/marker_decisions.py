@@ -198,10 +198,10 @@ class EarlierImages:
 
 
 DECIDED = 3  # exposures that agree before an id is confirmed, or disagree before it is dropped
-NEAR_PX = 1.0  # distance of a marker from the prediction of its body up to which it agrees, or
-NEAR_SIGMAS = 3.5  # the same in standard deviations
-FAR = 1.5  # factor on that distance from which the marker is another object
-DOUBT_SIGMAS = 4.5  # from which it may be: by chance one of 25,000 places exceeds it
+NEAR_PX = 1.0  # distance from the place that its body predicts, up to which a marker agrees
+NEAR_SIGMAS = 3.5  # the same in standard deviations; the larger one counts
+FAR = 1.5  # factor on that distance, beyond which the marker is another object
+DOUBT_SIGMAS = 4.5  # beyond them it may be one: chance exceeds them in one of 25,000 places
 
 
 class BodyDecisions:
@@ -304,7 +304,7 @@ MAX_COST = 50.0  # limit of a squared distance, and evidence from which a decisi
 
 
 class RayDecisions:
-    """Decides on pairs of ids of a view by the epipolar distances before and after an exchange."""
+    """Decides on the ids of a view by epipolar distances, as they are and after an exchange."""
 
     def __init__(self, view: DecidedView, rays: MarkerRays) -> None:
         self._view = view

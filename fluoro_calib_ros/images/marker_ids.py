@@ -6,8 +6,9 @@
 Rays of round shadows are intersected. Among these points in space, the members of a body are those
 with its distances: a search with backtracking, like the interpretation trees of Grimson and
 Lozano-Perez ("Localizing overlapping parts by searching the interpretation tree", IEEE PAMI 9,
-1987). The mirror image of a body has the same distances, but no rotation fits it. A body is
-refused if it fits in two ways, or if as many random points would probably contain it as well.
+1987). The mirror image of a body has the same distances, but no rotation fits it. If a body fits
+in several ways, only members on which they agree are kept. A body is refused if too few remain, or
+if it would be found as well among as many random points.
 """
 
 from __future__ import annotations
@@ -94,8 +95,8 @@ def identify_markers(
     Raises
     ------
     DataError
-        If none of the bodies is found, or all that are found fit in several ways, and if no two
-        fluoroscopes see those that are found.
+        If none of the bodies is found, or none fits in one way only, and if no two fluoroscopes
+        see those that are found.
     """
     names = list(orientation.fluoroscopes)
     bodies = identifiable(bodies)

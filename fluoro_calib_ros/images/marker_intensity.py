@@ -297,7 +297,7 @@ class _Typical:
 
     @property
     def merit(self) -> float:
-        """Prominence of its size; the response to noise is largest at small sizes, too."""
+        """Strength reduced by noise, to compare sizes: small sizes respond most to noise, too."""
         return self.strength**2 / max(self.strength + self.light.noise, 1e-9)
 
     @property

@@ -24,7 +24,7 @@ from .shadow_fit import DEPTH_SD
 FIRST_SPEED_PX = 6.0  # standard deviation of the unknown initial velocity [px/frame]
 FORGET = 0.9  # weight of the past in a running mean
 COMPARED = 5  # images after which it is known how alike two markers move
-UNSTEADY_PX = 0.5  # usual change in a frame, and difference, of velocities [px/frame]
+UNSTEADY_PX = 0.5  # usual change of a velocity in a frame, or difference of two [px/frame]
 LEADERS = 4  # number of markers whose motion an unseen marker follows
 LED = 0.5  # share of the acceleration that they do not explain
 MAX_SD_PX = 60.0  # largest standard deviation of a prediction
@@ -124,8 +124,8 @@ class Motion:
     ) -> NDArray[np.bool_]:
         """Let unseen markers follow markers that move alike; return (n,) which do.
 
-        seen (n,) were measured now, and had velocities before (n, 2). The likeness of motion is
-        updated from markers with certain ids, sure (n,).
+        seen (n,): measured now; before (n, 2): velocities before these measurements. Which markers
+        move alike is learned from those with certain ids, sure (n,).
         """
         rows = np.flatnonzero(seen & self.settled)
         led = np.zeros(len(seen), dtype=bool)
@@ -191,7 +191,7 @@ class Motion:
 
     @property
     def settled(self) -> NDArray[np.bool_]:
-        """Return (n,) whether the velocity of a marker is known."""
+        """Whether (n,) the velocity of a marker is known."""
         return np.asarray(self.covariance[:, 1, 1] < FIRST_SPEED_PX**2 / 4)
 
     def redirect(

@@ -31,7 +31,7 @@ SYSTEMATIC_PX = 0.1  # standard deviation of a corrected image point in addition
 
 @dataclass(frozen=True)
 class MarkerExposure:
-    """Markers of one exposure in all F views; columns are the rows of all ids."""
+    """Markers of one exposure, in arrays over F views and n ids."""
 
     observed: NDArray[np.float64]  #: (F, n, 2) [px], NaN if a view does not see a marker
     doubtful: NDArray[np.bool_]  #: (F, n), True if the id may be wrong in the view
@@ -117,7 +117,7 @@ class CalibratedRig:
     angles: Mapping[str, float | None]
 
     def project(self, view: int, xyz_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return observed pixels (k, 2) of points (k, 3) in the rig frame [mm]; NaN for NaN.
+        """Return observed pixels (k, 2) of points (k, 3) in the rig frame [mm]; NaN stays NaN.
 
         view is the row of the fluoroscope in the orientation. The correction is a function of the
         observed pixel, so it is found by fixed-point iteration; where it is not defined, it is 0.
@@ -192,7 +192,7 @@ class MarkerRays:
     def exchanged(
         self, exposure: MarkerExposure, view: int, rows: Sequence[int]
     ) -> NDArray[np.float64]:
-        """Return the standardised lack of fit (2,) of two markers if a view exchanged them."""
+        """Return the standardised lack of fit (2,) of two markers of a view after an exchange."""
         pair = list(rows)
         uv = exposure.corrected[:, pair].copy()
         sigma = exposure.sigma[:, pair].copy()

@@ -190,7 +190,7 @@ class JoinedViews:
         """Return the markers of the views after decisions by the other views."""
         exposure = self._rays.intersect(self._without_missed(found, frame), self._rig.angles)
         self._bodies.update(exposure, frame)
-        self._missed &= ~self._bodies.present.known  # their markers have places again
+        self._missed &= ~self._bodies.present.known  # their bodies have a pose again
         self._doubt_unsupported(exposure, frame)
         decisions = self._decide(exposure, frame)
         decided = [number for decision in decisions for number in decision.target_id]
@@ -237,7 +237,7 @@ class JoinedViews:
     def _doubt_unsupported(self, exposure: MarkerExposure, frame: int) -> None:
         """Doubt markers of bodies without a pose that no other view supports.
 
-        These are markers that a view sees anew, all markers of a body that was found in one
+        These are markers that a view newly sees, all markers of a body that was found in one
         exposure only and has no speed yet, and all of a body whose other markers are supported:
         another object is among them.
         """

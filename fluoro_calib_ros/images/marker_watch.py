@@ -178,7 +178,7 @@ class MarkerDoubts:
 
     @property
     def doubtful(self) -> NDArray[np.bool_]:
-        """Return (n,) whether each id may be wrong."""
+        """Whether (n,) an id may be wrong."""
         return np.array([bool(partners) for partners in self._partners], dtype=bool)
 
     def since(self, row: int) -> int | None:

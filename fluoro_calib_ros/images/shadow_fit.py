@@ -56,7 +56,7 @@ class Beads:
     sigma: NDArray[np.float64]  #: (n,), standard deviation of a coordinate [px]
     depth: NDArray[np.float64]  #: (n,), depth of the shadow, 1 for the profile
     light: NDArray[np.float64]  #: (n,), grey values at the centres without the beads
-    #: (n,), mean squared residual over the noise, 1 if the model is right
+    #: (n,), mean squared residual over the noise, relative to that of a typical bead
     misfit: NDArray[np.float64]
     #: (n,), True if the shadow of another bead reaches into that of the bead
     overlapped: NDArray[np.bool_]

@@ -5,8 +5,8 @@
 
 The polynomial models the distortion as a function of the undistorted pixel. It only has to predict
 the places of beads, so its coefficients have a prior: where observations do not determine them, a
-prediction falls back to the expected distortion, by default none. All unknowns
-are estimated at once by robust Gauss-Newton steps.
+prediction falls back to the expected distortion, by default none. All unknowns are estimated at
+once by robust Gauss-Newton steps.
 """
 
 from __future__ import annotations

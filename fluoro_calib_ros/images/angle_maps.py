@@ -3,14 +3,14 @@
 
 """Maps of corrected images for a correction that depends on the angle of a C-arm.
 
-While a C-arm turns, every image needs another map, and the iteration of a map for each pixel
-takes far longer than an image may. It is not repeated: with the mean correction d and the change e
-of an angle, the source S of pixel x is S = x + d(S) + e(S), which is the source of pixel x + e(S)
-by d alone. So the map of an angle is that of the mean, shifted by what it has at x + e(S) and not
-at x. This is smooth: it is computed at every eighth pixel, and interpolated between.
+While a C-arm turns, every image needs another map, and iterating a map for each pixel takes far
+longer than the time between images. The iteration is avoided: with the mean correction d and the
+change e at an angle, the source S of pixel x is S = x + d(S) + e(S), which is the source of pixel
+x + e(S) by d alone. The map at an angle is therefore that of the mean, shifted by its difference
+between x + e(S) and x. The shift is smooth: it is computed at every eighth pixel and interpolated.
 
-Angles are rounded to steps within which no pixel moves by more than LIMIT_PX, so that a map serves
-all images of an arm that stands still, and depends on the angle only, not on the images before.
+Angles are rounded to steps within which no pixel moves by more than LIMIT_PX. A map therefore
+serves all images of an arm that stands still, and depends only on the angle.
 """
 
 from __future__ import annotations
@@ -35,28 +35,28 @@ from .corrector import (
     steps,
 )
 
-NODE_PX = 8  # between nodes at which the change is iterated
-STEPS = 3  # of this iteration; each leaves the fraction by which the change differs per pixel
+NODE_PX = 8  # distance between nodes at which the change is iterated
+STEPS = 3  # iterations; each leaves the fraction by which the change differs per pixel
 TURN = np.deg2rad(np.arange(360.0))  # angles at which the rate of change is measured
-SIDE = 17  # of the grid of pixels at which it is measured
-MIN_RATE = 1e-3  # of change of a pixel [px/rad], below which one map serves all angles
+SIDE = 17  # side of the grid of pixels at which it is measured
+MIN_RATE = 1e-3  # rate of change of a pixel [px/rad] below which one map serves all angles
 
 
 class AngleMaps:
     """Correctors of the images of one fluoroscope at the angles of its C-arm.
 
-    The corrector of the last angle is kept. One thread may use it.
+    The corrector of the last angle is kept. Not thread-safe.
 
-    interpolation, border: see `ImageCorrector`. Raises DataError as ImageCorrector.
+    interpolation, border: see `ImageCorrector`. Raises the same DataError as ImageCorrector.
     """
 
     def __init__(
         self, calibration: FluoroscopeCalibration, interpolation: str = 'linear', border: int = 0
     ) -> None:
-        #: by the mean over the angles: where the angle is unknown, and where it changes nothing
+        #: corrector of the mean over the angles, for unknown angles or a constant correction
         self.mean = ImageCorrector(calibration, interpolation, border)
-        self.built = 0  #: number of maps that were made for angles
-        #: to which angles are rounded [rad]; infinite where the correction has no change
+        self.built = 0  #: number of maps built for angles
+        #: step to which angles are rounded [rad]; infinite if the correction does not change
         self.step = np.inf
         self._calibration = calibration
         self._last: tuple[float, ImageCorrector] | None = None
@@ -67,15 +67,15 @@ class AngleMaps:
             self._base = _Base(calibration, int(np.ceil(largest)) + NODE_PX)
 
     def rounded(self, angle: float | None) -> float | None:
-        """Return the angle [rad] of the map for an angle; None for the mean."""
+        """Return the angle [rad] of the map used for an angle; None for the mean."""
         if angle is None or np.isinf(self.step):
             return None
         return round(angle / self.step) * self.step
 
     def at(self, angle: float | None) -> ImageCorrector:
-        """Return the corrector for an angle [rad], None where it is unknown.
+        """Return the corrector for an angle [rad], None if unknown.
 
-        At an angle far from all calibrated ones, all pixels are OUTSIDE.
+        At an angle far from all calibrated angles, all pixels are OUTSIDE.
         """
         angle = self.rounded(angle)
         if angle is None or self._field is None:
@@ -90,9 +90,9 @@ class AngleMaps:
 
 
 class _Base:
-    """Map of the mean, also around the image.
+    """Map of the mean, extended around the image.
 
-    margin: of pixels around the image, for pixels whose source the change moves.
+    margin: width of the extension [px], for pixels whose source the change moves.
     """
 
     def __init__(self, calibration: FluoroscopeCalibration, margin: int) -> None:
@@ -108,7 +108,7 @@ class _Base:
             u = np.tile(np.arange(width), len(rows)) - margin
             v = np.repeat(rows, width) - margin
             ideal = np.stack([u, v]).astype(float)
-            # A bend at the border would not be interpolated well between nodes on both sides.
+            # A kink at the border would not be interpolated well between nodes on both sides.
             observed = iterated(self._grid, ideal, continued)
             error = np.abs(observed - continued(self._grid, observed) - ideal).max(axis=0)
             source[:, rows] = observed.reshape(2, -1, width)
@@ -131,7 +131,7 @@ class _Base:
         self._shift_of_nodes = self._shift_at(self._nodes)
 
     def _far_from_rim(self, start: int) -> slice:
-        """Columns in the stripe from a row whose sources are on the image at all angles."""
+        """Return the columns of a stripe whose sources are in the image at all angles."""
         own = self._source[:, start : start + STRIPE]
         near = (own < self.margin - 0.5) | (own >= self._high - self.margin)
         width = self._size[0]
@@ -142,9 +142,9 @@ class _Base:
     def of_stripe(
         self, start: int, shift: NDArray[np.float32], is_small: bool
     ) -> NDArray[np.float32]:
-        """Sources (2, r, w) of a stripe, shifted by values of nodes; NaN off the image.
+        """Return sources (2, r, w) of a stripe, shifted by values at nodes; NaN off the image.
 
-        is_small: no shift is larger than the margin.
+        is_small: True if no shift is larger than the margin.
         """
         mean = self._source[:, start : start + STRIPE]
         source = np.empty_like(mean)
@@ -157,9 +157,9 @@ class _Base:
         return source
 
     def _between(self, of_nodes: NDArray[np.float32], start: int) -> NDArray[np.float32]:
-        """Values (r, w) at the pixels of a stripe from those of nodes.
+        """Interpolate values (r, w) at the pixels of a stripe from those at nodes.
 
-        The first node is half a step before the image: resizing begins between two nodes.
+        The first node is half a step before the image: resizing starts between two nodes.
         """
         width, height = self._size
         count = min(STRIPE, height - start)
@@ -168,14 +168,14 @@ class _Base:
         return fine[NODE_PX : NODE_PX + count, NODE_PX : NODE_PX + width]
 
     def status(self, source: NDArray[np.float32]) -> NDArray[np.uint8]:
-        """Status (h, w) of the observed pixels at sources (2, h, w)."""
+        """Return the status (h, w) of the observed pixels at sources (2, h, w)."""
         found = [
             self._grid.look_up(*source[:, row].astype(float))[1] for row in range(source.shape[1])
         ]
         return np.stack(found)
 
     def may_fold(self, shift: NDArray[np.float32]) -> bool:
-        """Whether pixels may be seen mirrored by sources that are shifted (2, rows, columns)."""
+        """Return whether sources shifted by (2, rows, columns) may show pixels mirrored."""
         if self._bad is not None:
             return True
         # The determinant of the steps changes by no more than this.
@@ -185,7 +185,7 @@ class _Base:
     def folded(
         self, source: NDArray[np.float32], change: NDArray[np.float32]
     ) -> NDArray[np.bool_]:
-        """Whether (h, w) sources are folded, or those of a pixel that has none by the mean."""
+        """Return (h, w) whether sources are folded, or if their pixel has none by the mean."""
         folded = is_folded(source)
         if self._bad is None:
             return folded
@@ -200,7 +200,7 @@ class _Base:
     def at_nodes(
         self, field: AngleField, angle: float
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Change of the correction, and by what it moves the sources (2, rows, columns) [px]."""
+        """Return the change of the correction, and the shift of sources (2, rows, columns)."""
         shift = self._shift_of_nodes
         change = np.zeros_like(self._nodes)
         for _ in range(STEPS):
@@ -212,14 +212,14 @@ class _Base:
         return change, np.stack(cv2.split(change + shift - self._shift_of_nodes))
 
     def _shift_at(self, places: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Source less pixel (rows, columns, 2) of the mean, at places around the image [px]."""
+        """Return source minus pixel (rows, columns, 2) of the mean at places [px]."""
         return cv2.remap(
             self._shift, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         )
 
 
 class _AtAngle:
-    """The `corrector.Sources` at an angle [rad]; as a whole only where they are asked for."""
+    """`corrector.Sources` at an angle [rad]; the whole map is built only on demand."""
 
     def __init__(self, base: _Base, field: AngleField, angle: float) -> None:
         self._base = base
@@ -229,7 +229,7 @@ class _AtAngle:
         self._folded: NDArray[np.bool_] | None = None
         if base.may_fold(self._shift):
             self._folded = base.folded(self.source, change)
-            del self.source  # it is without them
+            del self.source  # built without the folds
 
     def of_stripe(self, start: int) -> NDArray[np.float32]:
         """See `corrector.Sources`."""
@@ -254,7 +254,7 @@ class _AtAngle:
 
 
 def _rate(field: AngleField) -> tuple[float, float]:
-    """Largest rate of change of a pixel [px/rad], and the largest change [px], at all angles."""
+    """Return the largest rate of change of a pixel [px/rad] and the largest change [px]."""
     width, height = field.image_size
     u, v = np.meshgrid(np.linspace(-0.5, width - 0.5, SIDE), np.linspace(-0.5, height - 0.5, SIDE))
     uv = np.column_stack([u.ravel(), v.ravel()])
@@ -264,5 +264,5 @@ def _rate(field: AngleField) -> tuple[float, float]:
 
 
 def _longest(vectors: NDArray[np.float64]) -> float:
-    """Length of the longest of vectors (..., 2)."""
+    """Return the length of the longest of vectors (..., 2)."""
     return float(np.hypot(vectors[..., 0], vectors[..., 1]).max())

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Grey images in the formats of image files, in memory. Damaged files are refused."""
+"""Encode and decode grey images in memory. Damaged image files are refused."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from ..errors import DataError
 from ..findings import Kind
 from ..limits import read_limits
 
-# Higher levels take several times as long and save a few per cent of an image with noise.
+# Higher levels take several times as long and reduce an image with noise by only a few per cent.
 PNG_COMPRESSION = 1
 EIGHT_BIT_SUFFIXES = ('.jpg', '.jpeg', '.bmp')
 
 LOG_LEVEL_SILENT = 0
 JPEG_START = b'\xff\xd8'
 JPEG_END = b'\xff\xd9'
-MAX_JPEG_TRAILER = 4096  # what some cameras append to an image [bytes]
+MAX_JPEG_TRAILER = 4096  # largest trailer that some cameras append to an image [bytes]
 
 
 def silence_opencv() -> None:
     """Keep OpenCV from printing: callers report errors in one sentence."""
     if hasattr(cv2.utils, 'logging'):
         cv2.utils.logging.setLogLevel(LOG_LEVEL_SILENT)
-    else:  # OpenCV 4.6, as Ubuntu 24.04 has it
+    else:  # OpenCV 4.6, as in Ubuntu 24.04
         cv2.setLogLevel(LOG_LEVEL_SILENT)
 
 
@@ -40,11 +40,11 @@ silence_opencv()
 
 
 def decode(content: bytes | bytearray | memoryview | NDArray[np.uint8]) -> np.ndarray:
-    """Grey image (h, w) of uint8 or uint16 from the bytes of an image file.
+    """Return the grey image (h, w) of uint8 or uint16 in the bytes of an image file.
 
     The formats are PNG, JPEG, TIFF (the first page), BMP and PGM. An image whose colours are all
-    equal is grey. Raises DataError if the content is no image, is too large, is damaged or is cut
-    off, as far as its format shows it: PNG has checksums, the others an end.
+    equal is grey. Raises DataError if the content is not an image, is too large, is damaged or is
+    truncated, as far as its format shows it: PNG has checksums, the other formats an end marker.
     """
     data = np.frombuffer(content, dtype=np.uint8)
     if not len(data):
@@ -52,8 +52,8 @@ def decode(content: bytes | bytearray | memoryview | NDArray[np.uint8]) -> np.nd
     is_png = data[: len(PNG_SIGNATURE)].tobytes() == PNG_SIGNATURE
     if declared_size(data.data) == (0, 0):
         if is_png:
-            _check_png(data.data)  # says what is damaged
-        # OpenCV knows more formats, but nothing tells their size before they are decoded.
+            _check_png(data.data)  # reports what is damaged
+        # OpenCV decodes more formats, but their size is unknown before they are decoded.
         raise DataError('this is no image that can be decoded, or it is damaged')
     check_declared_size(data.data)
     if is_png:
@@ -70,7 +70,7 @@ def decode(content: bytes | bytearray | memoryview | NDArray[np.uint8]) -> np.nd
 
 
 def as_grey(image: np.ndarray) -> np.ndarray:
-    """Grey image (h, w) from an image (h, w) or (h, w, channels) with equal colours.
+    """Return the grey image (h, w) of an image (h, w) or (h, w, channels) with equal colours.
 
     Raises DataError if the colours differ, or if the pixels are not uint8 or uint16.
     """
@@ -91,10 +91,10 @@ def as_grey(image: np.ndarray) -> np.ndarray:
 
 
 def encode(image: np.ndarray, suffix: str, quality: int = 95) -> bytes:
-    """Bytes of an image file of an image (h, w) of uint8 or uint16.
+    """Return the bytes of an image file for an image (h, w) of uint8 or uint16.
 
-    suffix, such as '.png', is the format; quality, from 1 to 100, is that of JPEG. Raises
-    DataError if the format cannot hold 16 bits.
+    suffix, such as '.png', selects the format; quality, from 1 to 100, applies to JPEG. Raises
+    DataError if the format does not support 16 bits.
     """
     if image.dtype == np.uint16 and suffix in EIGHT_BIT_SUFFIXES:
         raise DataError(f'an image of 16 bits cannot be written as {suffix[1:]}, use png or tif')
@@ -107,7 +107,7 @@ def encode(image: np.ndarray, suffix: str, quality: int = 95) -> bytes:
 
 
 def _check_png(content: memoryview) -> None:
-    """Raise DataError unless all chunks of a PNG are there, with their checksums."""
+    """Raise DataError unless all chunks of a PNG are present, with correct checksums."""
     position = len(PNG_SIGNATURE)
     kind = b''
     while kind != b'IEND':
@@ -130,16 +130,16 @@ PNM = re.compile(rb'P[1-6]\s(?:\s*#[^\n]*\n)*\s*(\d{1,9})\s(?:\s*#[^\n]*\n)*\s*(
 
 
 def check_declared_size(content: memoryview) -> None:
-    """Raise DataError for an image file that declares more pixels than are read.
+    """Raise DataError if an image file declares more pixels than the limit.
 
-    Files of other formats, and headers that are damaged, are left to the decoder.
+    Files of other formats and damaged headers are left to the decoder.
     """
     width, height = declared_size(content)
     check_size(width, height)
 
 
 def check_size(width: int, height: int) -> None:
-    """Raise DataError for an image of more pixels than are read."""
+    """Raise DataError if an image has more pixels than the limit."""
     limits = read_limits()
     if width * height > limits.max_pixels:
         raise DataError(
@@ -149,7 +149,7 @@ def check_size(width: int, height: int) -> None:
 
 
 def declared_size(content: memoryview) -> tuple[int, int]:
-    """Width and height that an image file declares [px]; (0, 0) where they are not found."""
+    """Return width and height that an image file declares [px], (0, 0) if they are not found."""
     start = bytes(content[:64])
     if start.startswith(PNG_SIGNATURE):
         return _number(start[16:20]), _number(start[20:24])
@@ -190,5 +190,5 @@ def _tiff_size(content: memoryview) -> tuple[int, int]:
         with tifffile.TiffFile(io.BytesIO(content)) as file:
             page = file.pages.first
             return int(page.imagewidth), int(page.imagelength)
-    except Exception:  # tifffile raises what its parsing stumbles over
+    except Exception:  # tifffile raises whatever its parser runs into
         return 0, 0

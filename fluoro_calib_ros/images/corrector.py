@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The corrected image: the observed picture with every pixel where it would be without distortion.
+"""Corrected images: every pixel is shown where it would be without distortion.
 
 The correction is a function of the observed pixel, whereas an image needs the inverse: for each of
 its own pixels, the place where it was observed. This inverse of undistorted = observed - (du, dv)
-has no formula. It is iterated once for every pixel, on the lookup grid that also corrects points,
-so that a bead in a corrected image lies where the corrected bead of the observed image lies. Each
-image then takes a single remap of OpenCV.
+has no closed form. It is iterated once for every pixel, on the lookup grid that also corrects
+points, so that a bead in a corrected image coincides with the corrected bead of the observed
+image. Each image then takes a single remap of OpenCV.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ from ..limits import MAX_IMAGE_SIDE
 
 INTERPOLATIONS = {'linear': cv2.INTER_LINEAR, 'cubic': cv2.INTER_CUBIC}
 LIMIT_PX = 0.01  # largest difference between a pixel and its corrected source
-STEP_PX = 0.001  # a source is no longer iterated below this step
-# Number of steps: full ones, then half ones where those do not converge.
+STEP_PX = 0.001  # step below which the iteration of a source ends
+# Number of steps: full steps, then half steps where full steps do not converge.
 FULL_STEPS = 12
 HALF_STEPS = 60
-# Rows that are iterated at once: they fit into the cache, and other threads do not wait for long.
+# Rows iterated at once: they fit into the cache, and other threads do not wait for long.
 ROWS = 16
 STRIPE = 256  # rows whose map is made at once; threads wait for each other after each step
-NOWHERE = -10_000.0  # source of a pixel without one: far off any image
-SHARPNESS = -0.75  # of OpenCV's cubic convolution
+NOWHERE = -10_000.0  # source of a pixel that has none: far off any image
+SHARPNESS = -0.75  # parameter of OpenCV's cubic convolution
 
 
 class Sources(Protocol):
-    """Where the pixels of a corrected image were seen, see `ImageCorrector`."""
+    """Sources of the pixels of a corrected image, see `ImageCorrector`."""
 
     @property
     def source(self) -> NDArray[np.float32]:
@@ -54,7 +54,7 @@ class Sources(Protocol):
         ...
 
     def of_stripe(self, start: int) -> NDArray[np.float32]:
-        """Return the source (2, r, w) of STRIPE rows, or those that are left, from a row on."""
+        """Return the source (2, r, w) of up to STRIPE rows from a row on."""
         ...
 
 
@@ -72,8 +72,8 @@ class _KnownSources:
 class ImageCorrector:
     """Corrects the images of one fluoroscope by a map that is built once.
 
-    The sources are exact to LIMIT_PX, and OpenCV rounds them to 1/32 px, so that an image is
-    within 1/64 px of where it should be (cubic: 1/45 px). Threads may share a corrector.
+    Sources are exact to LIMIT_PX, and OpenCV rounds them to 1/32 px, so that an image is within
+    1/64 px of its correct place (cubic: 1/45 px). Threads may share a corrector.
 
     Parameters
     ----------
@@ -82,13 +82,13 @@ class ImageCorrector:
     border : int
         Grey value where nothing was observed.
     sources : Sources, optional
-        Where they are known; by default they are those of the calibration, of a correction that
-        depends on an angle the mean (see `angle_maps`).
+        Sources if known; by default those of the calibration. For a correction that depends on an
+        angle, these are the sources of the mean (see `angle_maps`).
 
     Raises
     ------
     DataError
-        For an unknown interpolation, and for an image that is too large.
+        For an unknown interpolation, or an image that is too large.
     """
 
     def __init__(
@@ -132,18 +132,18 @@ class ImageCorrector:
     def source(self) -> NDArray[np.float32]:
         """Pixels (2, h, w) of the observed image that the corrected one shows, columns first [px].
 
-        NaN where there is none: off the image, or where the correction folds it.
+        NaN if there is none: off the image, or where the correction folds it.
         """
         return self._sources.source
 
     @property
     def status(self) -> NDArray[np.uint8]:
-        """Status (h, w) uint8: OK, OUTSIDE of the calibrated area, or INVALID without a source."""
+        """Status (h, w) uint8: OK, OUTSIDE the calibrated area, or INVALID without a source."""
         return self._sources.status
 
     @cached_property
     def mask(self) -> NDArray[np.bool_]:
-        """Whether there is a source (h, w)."""
+        """Whether a pixel has a source (h, w)."""
         return ~np.isnan(self.source[0])
 
     @cached_property
@@ -154,7 +154,7 @@ class ImageCorrector:
         """Correct an image (h, w) of uint8 or uint16; its rows need not be contiguous.
 
         out, if given, receives the corrected image; it must be contiguous, have the shape and
-        type of the image, and share no memory with it. Raises DataError for another image or out.
+        type of the image, and share no memory with it. Raises DataError if either is unsuitable.
         """
         self.check(image)
         if out is None:
@@ -193,7 +193,7 @@ class ImageCorrector:
             )
 
     def _remap_cubic(self, image: np.ndarray, out: np.ndarray) -> None:
-        """Remap with the two pixels needed beyond the border equal to the outermost ones."""
+        """Remap with the two pixels needed beyond the border equal to the outermost pixels."""
         narrow = image.dtype == np.uint8  # OpenCV is three times as fast with 16 bits
         wide = cv2.remap(
             image.astype(np.uint16) if narrow else image,
@@ -209,7 +209,7 @@ class ImageCorrector:
 
 
 def _sources(grid: CorrectionGrid, image_size: tuple[int, ...]) -> Sources:
-    """Sources of all pixels, by iteration."""
+    """Return the sources of all pixels, by iteration."""
     width, height = image_size
     source = np.empty((2, height, width), dtype=np.float32)
     status = np.empty((height, width), dtype=np.uint8)
@@ -228,7 +228,7 @@ def _sources(grid: CorrectionGrid, image_size: tuple[int, ...]) -> Sources:
 def _invert_correction(
     grid: CorrectionGrid, undistorted: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Observed pixels (2, n) of undistorted ones (2, n) [px], and their status (n,)."""
+    """Return observed pixels (2, n) of undistorted pixels (2, n) [px], and their status (n,)."""
     observed = iterated(grid, undistorted)
     (du, dv, _), status = grid.look_up(*observed)  # off the image it is INVALID
     error = np.abs(observed - (du, dv) - undistorted).max(axis=0)
@@ -241,13 +241,13 @@ def iterated(
     undistorted: NDArray[np.float64],
     look_up: Callable[[CorrectionGrid, NDArray[np.float64]], NDArray[np.float64]] | None = None,
 ) -> NDArray[np.float64]:
-    """Observed pixels (2, n) of undistorted ones (2, n) [px], also where they do not converge.
+    """Return observed pixels (2, n) of undistorted pixels (2, n) [px], converged or not.
 
     The iteration is observed = undistorted + (du, dv)(observed). Each step leaves the fraction of
     the error by which the correction changes per pixel, some hundredths. Off the image, the
-    correction continues as it is at the border, so that a step too far comes back. Where it
-    changes so much that full steps do not converge, half steps may. look_up gives corrections (2,
-    n) at pixels (2, n), by default these.
+    correction continues as it is at the border, so that too long a step is reversed. Where it
+    changes so much that full steps do not converge, half steps may. look_up returns corrections
+    (2, n) at pixels (2, n); by default it is `as_at_rim`.
     """
     look_up = look_up or as_at_rim
     observed = undistorted.copy()
@@ -263,12 +263,12 @@ def iterated(
 
 
 def as_at_rim(grid: CorrectionGrid, at: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Corrections (2, n) at pixels (2, n); off the image that of the nearest pixel."""
+    """Return corrections (2, n) at pixels (2, n); off the image, those of the nearest pixel."""
     return grid.look_up(*np.clip(at, -0.5, _end(grid)))[0][:2]
 
 
 def continued(grid: CorrectionGrid, at: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Corrections (2, n) at pixels (2, n), beyond the border as steep as before it."""
+    """Return corrections (2, n) at pixels (2, n), extrapolated with the slope at the border."""
     out = as_at_rim(grid, at)
     off = np.flatnonzero(((at < -0.5) | (at > _end(grid))).any(axis=0))
     mirrored = 2 * np.clip(at[:, off], -0.5, _end(grid)) - at[:, off]
@@ -277,27 +277,27 @@ def continued(grid: CorrectionGrid, at: NDArray[np.float64]) -> NDArray[np.float
 
 
 def _end(grid: CorrectionGrid) -> NDArray[np.float64]:
-    """Largest columns and rows (2, 1) on the image."""
+    """Return the largest column and row (2, 1) on the image."""
     return np.array(grid.image_size)[:, None] - 0.5 - 1e-6
 
 
 def is_folded(source: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Whether (h, w) the neighbours of a pixel are seen mirrored by the sources (2, h, w)."""
+    """Return (h, w) whether the neighbours of a pixel are mirrored by the sources (2, h, w)."""
     right, down = steps(source)
     folded = right[0] * down[1] - right[1] * down[0] <= 0
     return np.pad(folded, ((0, 1), (0, 1))) | np.pad(folded, ((1, 0), (1, 0)))
 
 
 def steps(source: NDArray[np.floating]) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-    """From the source of a pixel to those on its right and below it (2, h - 1, w - 1) [px]."""
+    """Return steps from each source to those right of and below it (2, h - 1, w - 1) [px]."""
     return np.diff(source, axis=2)[:, :-1], np.diff(source, axis=1)[:, :, :-1]
 
 
 def _cubic_coordinates(wanted: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Coordinates at which OpenCV's cubic convolution shows what is at other ones (h, w) [px].
+    """Return coordinates (h, w) at which OpenCV's cubic convolution shows the wanted ones [px].
 
-    With its sharpness, the first moment of the kernel is not the fraction of a pixel that it is
-    asked for: a straight ramp, and every blob, would be displaced by up to 0.05 px.
+    With its sharpness, the first moment of the kernel differs from the requested fraction of a
+    pixel: a straight ramp, and every blob, would be displaced by up to 0.05 px.
     """
     a = SHARPNESS
     x = np.linspace(0, 1, 1025)

@@ -6,8 +6,8 @@
 A bead is a blob: both eigenvalues of the Hessian of the blurred image have the same sign
 (Lindeberg, "Feature detection with automatic scale selection", IJCV 30, 1998). Edges of plates,
 cables and the edge of the field have one small eigenvalue, so the smaller one is the response.
-What counts is a response that the noise of the image does not explain; among these, beads are the
-strongest ones. Both hold for three beads as for thousands.
+Responses that the noise of the image explains are discarded; beads are the strongest of the
+others. Both criteria hold for three beads as well as for thousands.
 """
 
 from __future__ import annotations
@@ -26,61 +26,61 @@ from ..findings import Kind
 from .discs import set_apart
 from .light import Light, Noise, clipped_at, estimate_noise, vertex
 
-MIN_SIZE = 32  # of an image [px]
+MIN_SIZE = 32  # smallest side of an image [px]
 SCALES = (1.1, 1.5, 2.1, 3.0, 4.2, 6.0, 8.5, 12.0, 17.0)  # standard deviations of the blur [px]
-BLOB_RADIUS = 1.25  # radius of a blurred disc over the scale at which its response is largest
-FINE_SCALE = 2.9  # from which half the resolution tells scales apart as well
+BLOB_RADIUS = 1.25  # radius of a blurred disc over the scale of its largest response
+FINE_SCALE = 2.9  # scale from which half the resolution separates scales as well [px]
 # Factors on the scale: the noise of a response decreases with the scale, but beads merge.
 WIDER = (1.0, 1.4, 1.9)
-LARGER = (1.4, 2.0, 2.8)  # factors on the scale, at which large beads are told
-# Of a response, in standard deviations of the second derivative. Those of the mean of both
-# eigenvalues are 1.22 times smaller (Gaussian noise), so that less than one of the 200,000 places
-# of a megapixel exceeds it by chance.
+LARGER = (1.4, 2.0, 2.8)  # factors on the scale at which large beads are detected
+# Threshold of a response, in standard deviations of the second derivative. Those of the mean of
+# both eigenvalues are 1.22 times smaller (Gaussian noise), so that less than one of the 200,000
+# places of a megapixel exceeds the threshold by chance.
 MIN_SNR = 4.0
-MIN_SHARE = 0.3  # of the response of a typical bead
-MOST_TYPICAL = 40  # strongest blobs that choose polarity and scale, at most
-LEAST_TYPICAL = 2
-MAX_LIKELY = 3  # sizes and polarities that are tried
-MANY = 4 * MOST_TYPICAL  # beads, of which the middle quarter of an image shows enough
-SEEN_SHARE = 0.5  # of the beads of a phantom that every image is expected to show
+MIN_SHARE = 0.3  # threshold of a response, relative to that of a typical bead
+MOST_TYPICAL = 40  # largest number of strongest blobs that determine polarity and scale
+LEAST_TYPICAL = 2  # smallest number of them
+MAX_LIKELY = 3  # largest number of sizes and polarities that are tried
+MANY = 4 * MOST_TYPICAL  # number of beads from which the middle quarter of an image shows enough
+SEEN_SHARE = 0.5  # expected share of the beads of a phantom that every image shows
 BACKGROUND = 8.0  # blur of the light around a bead, over its scale
-PIXELS_AT_ONCE = 2**16  # that are filtered: four arrays of them fit a cache of 1 MiB
-COARSE_BLUR = 4.0  # at which a coarser image has the same blur within 1 %
-FIELD_BLUR_PX = 4.0
-FIELD_LEVEL = 0.18  # of the light in the field below which there is no field
-MAX_PARTS = 8  # of the field, that plates cut apart
-# Of what a part of the field adds to its convex hull. Lines of letters beside a round field add
-# less than a quarter; what lies beyond a plate adds nearly a half where the plate is widest.
+PIXELS_AT_ONCE = 2**16  # pixels filtered at once: four such arrays fit into a cache of 1 MiB
+COARSE_BLUR = 4.0  # blur from which a coarser image has the same blur within 1 %
+FIELD_BLUR_PX = 4.0  # least blur of the image from which the field is found
+FIELD_LEVEL = 0.18  # level below which there is no field, as a fraction of the light in the field
+MAX_PARTS = 8  # largest number of parts into which plates cut the field
+# Least lit share of the area that a part adds to the convex hull of the field. It is less than 1/4
+# for letters next to a round field, nearly 1/2 beyond a plate, where the plate is widest.
 MIN_LIT = 1 / 3
-MIN_CONTRAST = 0.05  # of a bead, as a fraction of the light around it
+MIN_CONTRAST = 0.05  # least contrast of a bead, as a fraction of the light around it
 
 
 @dataclass(frozen=True)
 class Look:
-    """How an image shows beads."""
+    """Appearance of beads in an image."""
 
-    radius_px: float  #: of a typical bead
-    inverted: bool  #: beads are bright
-    noise: Noise | None = None  #: of the image, None where it is to be estimated
-    alike: bool = False  #: no bead is much larger than a typical one
+    radius_px: float  #: radius of a typical bead
+    inverted: bool  #: True if beads are bright
+    noise: Noise | None = None  #: noise of the image; None if it is to be estimated
+    alike: bool = False  #: True if no bead is much larger than a typical bead
 
 
 @dataclass(frozen=True)
 class Detections:
-    """Blobs of an image, and what they were found with."""
+    """Blobs of an image, and the parameters with which they were detected."""
 
-    light: Light  #: grey values, turned round where beads are bright, so that beads are dark
-    noise: Noise  #: of the light
-    uv: NDArray[np.float64]  #: (n, 2), centres [px], to some 0.1 px
-    scale: float  #: of the blur with which they were found [px]
-    radius_px: float  #: radius of a typical bead with its blur [px]
-    inverted: bool  #: beads are bright in the image
+    light: Light  #: grey values, inverted if beads are bright, so that beads are dark
+    noise: Noise  #: noise of the light
+    uv: NDArray[np.float64]  #: (n, 2), centres [px], to about 0.1 px
+    scale: float  #: standard deviation of the blur of the detection [px]
+    radius_px: float  #: radius of a typical bead including its blur [px]
+    inverted: bool  #: True if beads are bright in the image
 
     @cached_property
     def strength(self) -> NDArray[np.float64]:
-        """Responses (n,) at a scale beyond that of most beads, 1 for a typical one.
+        """Relative responses (n,) at a scale larger than that of most beads; 1 is typical.
 
-        There they increase with the size of a bead; at its own scale they hardly do.
+        There they increase with the size of a bead; at the bead's own scale they hardly do.
         """
         column, row = np.rint(self.uv).astype(int).T
         (response,) = responses(self.light.grey, WIDER[-1] * self.scale, (False,))
@@ -93,9 +93,8 @@ def detect_beads(
 ) -> Detections:
     """Find the beads of an image (h, w) of uint8 or uint16.
 
-    beads is the number of beads of the phantom. Where it is not known how the image shows them,
-    the likeliest size and polarity are taken. Raises DataError, in one sentence, for an image
-    without beads.
+    beads is the number of beads of the phantom. If look is None, the likeliest size and polarity
+    are taken. Raises DataError, in one sentence, if the image shows no beads.
     """
     if look is None:
         return next(likely_detections(image, beads))
@@ -108,13 +107,13 @@ def detect_beads(
 
 
 def likely_detections(image: np.ndarray, beads: int) -> Iterator[Detections]:
-    """Yield what is found with the likeliest sizes and polarities of the beads, in this order.
+    """Yield detections with the likeliest sizes and polarities of the beads, likeliest first.
 
     Letters and screws may look more like beads than the beads do: the pose decides. Raises
-    DataError where nothing is found with any.
+    DataError if nothing is detected with any of them.
     """
     sight = _Sight.of(image, beads)
-    # Where an image shows fewer beads than expected, the strongest blob tells their size.
+    # If an image shows fewer beads than expected, the strongest blob determines their size.
     for part in (sight, replace(sight, typical=1)):
         number = 0
         for scale, inverted in part.looks(whole=beads < MANY):
@@ -131,7 +130,7 @@ def likely_detections(image: np.ndarray, beads: int) -> Iterator[Detections]:
 
 @dataclass(frozen=True)
 class _Sight:
-    """An image (h, w) with its noise, and the number of beads that choose their size."""
+    """An image (h, w) with its noise, and the number of blobs that determine the bead size."""
 
     grey: NDArray[np.float32]
     noise: Noise
@@ -139,7 +138,7 @@ class _Sight:
 
     @classmethod
     def of(cls, image: np.ndarray, beads: int, noise: Noise | None = None) -> _Sight:
-        """Return what is needed to find so many beads in an image. Raises DataError."""
+        """Prepare the detection of so many beads in an image. Raises DataError."""
         _check(image)
         grey = image.astype(np.float32)
         if noise is None:
@@ -148,12 +147,12 @@ class _Sight:
         return cls(grey, noise, typical)
 
     def middle(self) -> NDArray[np.float32]:
-        """Return the middle quarter of the image, which is a quarter of the work."""
+        """Return the middle quarter of the image, which takes a quarter of the time."""
         height, width = self.grey.shape
         return self.grey[height // 4 : height - height // 4, width // 4 : width - width // 4]
 
     def looks(self, whole: bool = True) -> list[tuple[float, bool]]:
-        """Return scales and polarities of the strongest blobs, the strongest first."""
+        """Return scales and polarities of the strongest blobs, strongest first."""
         looks = [] if whole else self.likely(self.middle())
         looks = sorted(looks or self.likely(self.grey), reverse=True)
         return [(scale, inverted) for _, scale, inverted in looks]
@@ -161,7 +160,7 @@ class _Sight:
     def likely(self, grey: NDArray[np.float32]) -> list[tuple[float, float, bool]]:
         """Return strength, scale and polarity of the strongest blobs of the image or a part.
 
-        For either polarity, those scales at which they are stronger than at the next ones.
+        For either polarity, return the scales at which the strength has a local maximum.
         """
         strengths = np.zeros((2, len(SCALES) + 2))
         fields: dict[int, tuple[NDArray[np.bool_], NDArray[np.bool_]]] = {}
@@ -186,9 +185,9 @@ class _Sight:
         return _blobs(self.grey, self.noise, scale, polarities=(inverted,))[0]
 
     def merged(self, blobs: _Blobs, scale: float, inverted: bool) -> NDArray[np.float64]:
-        """Return places (n, 2) of beads, several in one large bead as one.
+        """Return places (n, 2) of beads, with the blobs inside a large bead merged into one.
 
-        A large bead has several maxima at a small scale, and a larger response at its own one:
+        A large bead has several maxima at a small scale, and a larger response at its own scale:
         a blob is a maximum over places and scales (Lindeberg 1998).
         """
         uv = blobs.uv
@@ -228,17 +227,17 @@ class _Sight:
     def detections(
         self, scale: float, inverted: bool, radius_px: float | None = None
     ) -> Detections | None:
-        """Return what is found with a scale and a polarity, None for nothing.
+        """Return the detections at a scale and a polarity, None if there are none.
 
-        radius_px: that of all beads, where they were seen before. Where several are one blob, the
-        pose of before tells it.
+        radius_px: radius of all beads, if an earlier exposure gave it. Blobs are then neither
+        merged nor separated; the earlier pose resolves beads that share a blob.
         """
         grey = self.grey
         light = float(grey.max()) - grey if inverted else grey
         low, high = clipped_at(light)
         field = field_of_view(light, scale)
         if inverted:
-            # Holes of a sheet are bright, and there is no light beyond the field either.
+            # Holes of a sheet are bright, but there is no light outside the field either.
             field &= field_of_view(grey, scale)
         for wider in WIDER:
             blobs = _beads(self.blobs(wider * scale, inverted), field, self.typical)
@@ -261,9 +260,9 @@ class _Sight:
 
 
 def field_of_view(light: NDArray[np.float32], scale: float) -> NDArray[np.bool_]:
-    """Return the mask (h, w) of the field of view: where there is light, holes filled."""
+    """Return the mask (h, w) of the field of view: where there is light, with holes filled."""
     smooth = cv2.GaussianBlur(light, (0, 0), max(FIELD_BLUR_PX, 2 * scale))
-    apart = int(FIELD_BLUR_PX)  # pixels that the blur leaves different
+    apart = int(FIELD_BLUR_PX)  # pixels across which the blurred image hardly changes
     low, high = map(float, np.percentile(smooth[::apart, ::apart], [1, 95]))
     mask = (smooth > low + FIELD_LEVEL * (high - low)).astype(np.uint8)
     if mask.mean() > 0.98 or low > 0.35 * high:
@@ -276,10 +275,10 @@ def field_of_view(light: NDArray[np.float32], scale: float) -> NDArray[np.bool_]
 
 
 def _lit(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return the field (h, w) of a mask of what is bright: convex, for beads leave bays in it.
+    """Return the field (h, w) of a mask of bright pixels: convex, because beads leave bays in it.
 
-    A plate seen from its edge may cut off a part of the field. Letters beside the field are lit as
-    well; between them and the field it is dark.
+    A plate seen from its edge may cut off a part of the field. Letters next to the field are lit
+    as well, but it is dark between them and the field.
     """
     contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     contours = sorted(contours, key=cv2.contourArea, reverse=True)
@@ -296,26 +295,26 @@ def _lit(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 @dataclass(frozen=True)
 class _Blobs:
-    """Blobs that the noise does not explain."""
+    """Blobs that noise does not explain."""
 
     uv: NDArray[np.float64]  #: (n, 2) [px]
     response: NDArray[np.floating]  #: (n,)
-    relative: NDArray[np.floating]  #: (n,), the same as fractions of the light around
+    relative: NDArray[np.floating]  #: (n,), responses as fractions of the light around the blobs
 
     def chosen(self, mask: NDArray[np.bool_]) -> _Blobs:
-        """Return those of a mask (n,)."""
+        """Return the blobs selected by a mask (n,)."""
         return _Blobs(self.uv[mask], self.response[mask], self.relative[mask])
 
 
 def _typical(values: NDArray[np.floating], count: int) -> float:
-    """Median of so many of the largest values, 0 where there are fewer."""
+    """Return the median of the `count` largest values, 0 if there are fewer."""
     if len(values) < count:
         return 0.0
     return float(np.median(np.sort(values)[::-1][:count]))
 
 
 def _resolutions(grey: NDArray[np.float32]) -> Iterator[tuple[float, NDArray[np.float32], int]]:
-    """Yield scales, the image (h, w) in which they are tried, and how much smaller it is."""
+    """Yield scales, the image (h, w) in which each is tried, and its reduction factor."""
     factor = 1
     for scale in SCALES:
         while scale / factor >= FINE_SCALE and min(grey.shape) > 2 * MIN_SIZE:
@@ -380,7 +379,7 @@ def _blobs(
 ) -> list[_Blobs]:
     """Return the dark and the bright blobs of an image (h, w) that is reduced by a factor.
 
-    polarities: whether those wanted are bright.
+    polarities: True for bright blobs, False for dark blobs.
     """
     background = _background(grey, scale)
     per_sd = MIN_SNR * _noise_of_response(noise, scale * factor)
@@ -402,7 +401,7 @@ def _blobs(
 
 
 def _background(grey: NDArray[np.float32], scale: float) -> NDArray[np.float32]:
-    """Blur of an image (h, w) over many beads of a scale, from a coarser image."""
+    """Return the blur of an image (h, w) over many beads of a scale, from a coarser image."""
     blur = BACKGROUND * scale
     factor = max(1, int(blur / COARSE_BLUR))
     height, width = grey.shape
@@ -413,14 +412,14 @@ def _background(grey: NDArray[np.float32], scale: float) -> NDArray[np.float32]:
 
 
 def _light_around(light: np.ndarray, scale: float) -> np.ndarray:
-    """Light (h, w) around beads of a scale, positive."""
+    """Return the light (h, w) around beads of a scale; it is positive."""
     return np.maximum(_background(light, scale), 1e-3 * light.max())
 
 
 def _noise_of_response(noise: Noise, scale: float) -> float:
-    """Standard deviation of a second derivative at a scale, over that of a grey value.
+    """Return the standard deviation of a second derivative at a scale, over that of a grey value.
 
-    The sum of the correlation of the noise with that of the derivative of a Gaussian.
+    It is the sum over the correlation of the noise and that of the derivative of a Gaussian.
     """
     half = int(np.ceil(4 * scale)) + len(noise.correlation) // 2
     axis = np.arange(-half, half + 1)
@@ -432,7 +431,7 @@ def _noise_of_response(noise: Noise, scale: float) -> float:
         np.array([values @ np.roll(values, lag) for lag in range(-lags, lags + 1)])
         for values in (second, gauss)
     )
-    # A correlation with gaps in it need not be that of any noise.
+    # A correlation with lags set to zero need not be that of any noise.
     variance = np.sum(noise.correlation * np.outer(across, along))
     return float(np.sqrt(max(variance, along[lags] * across[lags])))
 
@@ -440,9 +439,9 @@ def _noise_of_response(noise: Noise, scale: float) -> float:
 def responses(
     grey: NDArray[np.float32], scale: float, polarities: Sequence[bool] = (False, True)
 ) -> list[NDArray[np.float32]]:
-    """Responses (h, w) to dark and to bright blobs: the smaller eigenvalue, or 0.
+    """Return responses (h, w) to dark and to bright blobs: the smaller eigenvalue, or 0.
 
-    polarities: whether the blobs are bright.
+    polarities: True for bright blobs.
     """
     out = [np.empty(grey.shape, dtype=np.float32) for _ in polarities]
     for rows, mean, spread in _curvatures(grey, scale):
@@ -455,10 +454,9 @@ def responses(
 def _curvatures(
     grey: NDArray[np.float32], scale: float
 ) -> Iterator[tuple[slice, NDArray[np.float32], NDArray[np.float32]]]:
-    """Yield rows of an image, the mean of both eigenvalues of the scaled Hessian there, and half
-    their difference.
+    """Yield rows, and the mean and half the difference of the eigenvalues of the scaled Hessian.
 
-    Of a few rows, what is computed on the way stays in the cache of a core.
+    A few rows are processed at a time, so that intermediate results stay in the cache of a core.
     """
     smooth = cv2.GaussianBlur(grey, (0, 0), scale)
     twice = np.array([1.0, -2.0, 1.0], dtype=np.float32)
@@ -487,7 +485,7 @@ def _curvatures(
 def _maxima(
     response: np.ndarray, scale: float, least: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows and columns (n,) of local maxima of a response (h, w), away from the border."""
+    """Return rows and columns (n,) of local maxima of a response (h, w) inside the border."""
     size = 2 * max(1, round(scale)) + 1
     mask = response >= cv2.dilate(response, np.ones((size, size), np.uint8))
     mask &= response > least
@@ -498,7 +496,7 @@ def _maxima(
 
 
 def _beads(blobs: _Blobs, field: NDArray[np.bool_], count: int) -> _Blobs:
-    """Blobs in the field that are beads, none where they are too weak."""
+    """Return the blobs in the field that are beads, none if they are too weak."""
     inside = _inside(blobs.uv, field)
     values = np.where(inside, blobs.relative, 0)
     typical = _typical(values[inside], min(count, max(int(inside.sum()), 1)))

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Tell beads apart whose shadows overlap: discs of one size in the mask of what is dark.
+"""Separate beads whose shadows overlap: find discs of one size in the mask of dark pixels.
 
-The distance from a pixel of the mask to its border is largest in the middles of the discs, and
-there it is their radius, whatever else overlaps them. A blob detector finds several of them as
-one, or one beside its middle.
+The distance from a pixel of the mask to the border of the mask has its maxima at the centres of
+the discs. There it equals the radius, whatever else overlaps the disc. A blob detector finds
+several overlapping discs as one blob, or one disc off its centre.
 """
 
 from __future__ import annotations
@@ -15,24 +15,24 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-SMOOTH_PX = 1.0  # blur of the light, for its noise
-BORDER_PX = 0.7  # blur of the distances, for the pixels of the border
-# Of smaller discs, those that overlap are one: two that are a radius apart leave a dip of 0.13
-# radii between their middles, which the blur takes away.
+SMOOTH_PX = 1.0  # standard deviation of the blur that reduces the noise of the light
+BORDER_PX = 0.7  # standard deviation of the blur that smooths the pixel steps of the distances
+# Smaller discs that overlap are not separated: two discs that are a radius apart leave a dip of
+# 0.13 radii between their centres, which the blur removes.
 MIN_RADIUS_PX = 3.0
-SIZES = (0.8, 1.25)  # of discs, over that of a typical one
-APART = 0.5  # radii between discs, below which they are one
-MIN_STRAIGHT = 3  # pairs of discs, that lie in a bar
-SAME = 0.1  # radii from a disc, within which a blob has the better place
+SIZES = (0.8, 1.25)  # least and largest radius of a disc, relative to the typical one
+APART = 0.5  # distance in radii below which two maxima are the same disc
+MIN_STRAIGHT = 3  # pairs of discs in a straight line from which a part of the mask is a bar
+SAME = 0.1  # distance in radii within which a blob is a disc; the place of the blob is better
 
 
 def set_apart(
     relative: NDArray[np.floating], uv: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], float | None]:
-    """Return places (n, 2) and radius of beads, from blobs (m, 2) that may be several beads each.
+    """Return places (n, 2) and radius of beads; each of the blobs (m, 2) may be several beads.
 
-    relative: (h, w) light over that around the beads. Blobs at which there is no disc stay; the
-    radius [px] is None where beads are too small for discs.
+    relative: (h, w) light as a fraction of that around the beads. Blobs with no disc near them are
+    kept. The radius [px] is None if beads are too small for discs, or if there are none.
     """
     column, row = np.rint(uv).astype(int).T
     half = 0.5 * (1 + float(np.median(relative[row, column])))
@@ -44,7 +44,7 @@ def set_apart(
     if radius < MIN_RADIUS_PX:
         return uv, None
     count, part = cv2.connectedComponents(mask)
-    # A part without a blob is noise or a border; one that is wider than a disc is a plate, a bone.
+    # A part without a blob is noise or a border; a part wider than a disc is a plate or bone.
     usable = np.isin(np.arange(count), part[row, column])
     usable[part[distance > SIZES[1] * radius]] = usable[0] = False
     discs = _discs(np.where(usable[part], distance, 0), radius)
@@ -58,7 +58,7 @@ def set_apart(
 
 
 def _discs(distance: NDArray[np.float32], radius: float) -> NDArray[np.float64]:
-    """Middles (n, 2) of discs of about a radius, by the distances (h, w) to the border."""
+    """Return centres (n, 2) of discs of about a radius, from distances (h, w) to the border."""
     size = 2 * int(APART * radius) + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
     v, u = np.nonzero((distance >= cv2.dilate(distance, kernel)) & (distance > SIZES[0] * radius))
@@ -76,8 +76,8 @@ def _in_bars(
 ) -> NDArray[np.bool_]:
     """Return (n,) whether discs (n, 2) lie in bars, such as screws, that are as wide as a bead.
 
-    Half way between two discs the distance (h, w) to the border is less, in a bar it is not. Three
-    beads in a line have one such pair, so a part of the mask with fewer than three is no bar.
+    Halfway between two beads, the distance (h, w) to the border is less than the radius; in a bar
+    it is not. Three beads in a line form one such pair; a bar has at least MIN_STRAIGHT pairs.
     """
     pair = cKDTree(discs).query_pairs(2 * radius, output_type='ndarray').reshape(-1, 2)
     away = np.linalg.norm(discs[pair[:, 0]] - discs[pair[:, 1]], axis=1)

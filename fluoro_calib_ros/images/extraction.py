@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""From a radiograph to observations: detect, match, measure all predicted beads, check."""
+"""Extract observations from a radiograph: detect, match, measure all predicted beads, check."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ from .measurement import FIRST_STEPS, STEPS, Expected, Imaging, first_imaging, m
 from .shadow_fit import MAX_SIGMA_PX, Beads
 from .view import Lens, View, fit_view
 
-# Of beads with the largest standard deviation, one in a thousand is wrong: half a pixel off
-# (Rayleigh's distribution).
+# Accepted share of wrong centres among those with the largest standard deviation. A centre is
+# wrong if it is off by half a pixel; distances have Rayleigh's distribution.
 WRONG_SHARE = 1e-3
 WRONG_SIGMAS = np.sqrt(-2 * np.log(WRONG_SHARE))
 SURE_SIGMA_PX = 0.5 / WRONG_SIGMAS
-MAX_SIGMAS = 2.9  # times that of a usual bead of the image: an eighth of its weight
-MAX_MISFIT = 5.0
-DEPTH = (0.55, 1.7)  # of the shadow of a bead, 1 for what is usual in such light
-RADII = (0.2, 5.0)  # of shadows of equal beads, over that of a typical one
-MIN_CONTRASTS = 20  # beads that tell what is usual
+MAX_SIGMAS = 2.9  # largest standard deviation over the usual one: an eighth of the weight
+MAX_MISFIT = 5.0  # largest lack of fit, relative to that of a typical bead
+DEPTH = (0.55, 1.7)  # depth of a shadow relative to the usual depth in such light
+RADII = (0.2, 5.0)  # radii of shadows of equal beads, relative to a typical one
+MIN_CONTRASTS = 20  # least number of beads from which the usual depth is estimated
 CONTRAST_STEPS = 8
 MIN_USUAL_DEPTH = 0.1
-RESIDUAL_SIGMAS = 4.5  # from the prediction by neighbours
+RESIDUAL_SIGMAS = 4.5  # largest residual from the prediction by neighbours [standard deviations]
 FIRST_RESIDUAL_PX = 2.5
-ALONE_RADII = 2.5  # distance of the next shadow from that of a bead alone
-MIN_ACCEPTED = 0.5  # of the matched beads that are measured well
+ALONE_RADII = 2.5  # least distance of an isolated bead from the next shadow [radii]
+MIN_ACCEPTED = 0.5  # least share of the matched beads that are measured well
 MIN_SCATTER_PX = 0.05
-# Why predicted beads are not observed, where no number belongs to it.
+# Reasons why predicted beads are not observed, without a number.
 LOST = Finding(Kind.BEAD_LOST, 'cut off, or lost while it was measured')
 DISTURBED = Finding(Kind.BEAD_DISTURBED, 'something else is beside it')
 HIDDEN = Finding(Kind.BEAD_HIDDEN, 'hidden by another bead')
@@ -51,7 +51,7 @@ ALONE = Finding(Kind.BEAD_ALONE, 'its neighbours are not found')
 
 @dataclass(frozen=True)
 class Refusal:
-    """A predicted bead without observation: its row, the prediction (2,) [px], and why."""
+    """Predicted bead without an observation: its row, the prediction (2,) [px], and the reason."""
 
     bead: int
     uv: NDArray[np.float64]
@@ -65,20 +65,20 @@ class Extraction:
     bead: NDArray[np.int64]  #: (n,), rows of the phantom
     uv: NDArray[np.float64]  #: (n, 2), centres [px]
     sigma: NDArray[np.float64]  #: (n,), standard deviation of a coordinate [px]
-    #: (n,), the shadow of another bead reaches into that of the bead
+    #: (n,), True if the shadow of another bead reaches into that of the bead
     overlapped: NDArray[np.bool_]
     refused: tuple[Refusal, ...]
     view: View
     detections: Detections
     match: Match
     imaging: Imaging
-    followed: bool = False  #: the pose comes from the exposure before, not from a search
-    #: RMS of the corrected shifts of centres by the distortion within their shadows [px]
+    followed: bool = False  #: True if the pose was tracked from a nearby exposure
+    #: RMS correction of centres for the distortion within their shadows [px]
     bent_px: float = 0.0
 
     @property
     def nearby(self) -> Nearby:
-        """What an exposure nearby begins with."""
+        """Initial values for a nearby exposure."""
         found = self.detections
         return Nearby(
             self.view,
@@ -91,19 +91,19 @@ class Extraction:
 
 @dataclass(frozen=True)
 class Nearby:
-    """What is taken over from an exposure nearby, such as the previous one of a video."""
+    """Initial values from a nearby exposure, such as the previous video frame."""
 
     view: View
-    scale_px: float  #: robust standard deviation of its residuals [px]
+    scale_px: float  #: robust standard deviation of the residuals [px]
     imaging: Imaging
-    radius_px: float  #: of a bead
-    inverted: bool  #: beads are bright
-    far: Far | None = None  #: for images that were left out since
+    radius_px: float  #: radius of a bead
+    inverted: bool  #: True if beads are bright
+    far: Far | None = None  #: set if images were skipped since
 
     @property
     def look(self) -> Look:
-        """How beads are expected to look."""
-        # The noise of the image where beads are bright is not that of the image turned round.
+        """Expected appearance of beads."""
+        # For bright beads the noise was estimated on the inverted image: estimate it again.
         noise = None if self.inverted else self.imaging.noise
         return Look(self.radius_px, self.inverted, noise, alike=self.imaging.sizes_are_alike)
 
@@ -113,11 +113,11 @@ def extract_beads(
 ) -> Extraction:
     """Extract the beads of a phantom from a radiograph.
 
-    image: (h, w). near: the exposure before; where the phantom has moved little since then, this
-    is several times faster; elsewhere its pose is searched for as without it. Raises DataError
-    where there is no phantom in the image, or its pose is not sure, with the reason.
+    image: (h, w). near: the previous exposure. If the phantom has moved little since then, this is
+    several times faster; otherwise the pose is searched for as without it. Raises DataError, with
+    the reason, if there is no phantom in the image, or its pose is not certain.
     """
-    # Small matrices take three times the time on several threads.
+    # Small matrices take three times as long on several threads.
     with _threads().limit(limits=1):
         followed = None if near is None else _followed(image, model, near)
         return followed or _searched(image, model, lens)
@@ -129,7 +129,7 @@ def _threads() -> ThreadpoolController:
 
 
 def _searched(image: np.ndarray, model: PhantomModel, lens: Lens) -> Extraction:
-    """Return the extraction by a search for the pose. Raises DataError."""
+    """Extract beads by a search for the pose. Raises DataError."""
     first: DataError | None = None
     for detections in likely_detections(image, len(model.xyz)):
         seen = _seen(detections, model)
@@ -145,7 +145,7 @@ def _searched(image: np.ndarray, model: PhantomModel, lens: Lens) -> Extraction:
 
 
 def _followed(image: np.ndarray, model: PhantomModel, near: Nearby) -> Extraction | None:
-    """Return the extraction from an exposure nearby, None where it does not lead to the pose."""
+    """Extract beads by tracking from a nearby exposure; return None if that finds no pose."""
     try:
         detections = detect_beads(image, len(model.xyz), near.look)
         if image.shape != near.view.lens.image_size[::-1]:
@@ -223,7 +223,7 @@ def _measured(
     measured = _Measured(rows, beads, reasons, predicted, nearby.sd_px[rows])
     away = _away(measured)
     if away.any():
-        # What is not where it should be has told its neighbours where they should be.
+        # Misplaced beads have biased the predictions of their neighbours: predict without them.
         kept = good & ~away
         nearby = nearby_residuals(view, model.xyz, rows[kept], beads.uv[kept])
         predicted = view.project(model.xyz) + nearby.value
@@ -231,7 +231,7 @@ def _measured(
     assert imaging is not None
     extraction = _checked(detections, found, view, measured, imaging)
     extraction = _with_support(extraction, model, rows)
-    # What was measured are shadows; observations are of the centres of beads.
+    # The fit measures the centres of shadows; observations are the projected centres of beads.
     radius_px = imaging.profile.border_px * (shadows.radius * size)
     of_bead = radius_px[np.searchsorted(rows, extraction.bead)]
     xyz = model.xyz[extraction.bead]
@@ -243,23 +243,23 @@ def _measured(
 
 @dataclass(frozen=True)
 class _Measured:
-    """Predicted beads (n,) that were measured."""
+    """Measurements of predicted beads (n,)."""
 
-    rows: NDArray[np.int64]  #: (n,), of the phantom
+    rows: NDArray[np.int64]  #: (n,), rows of the phantom
     beads: Beads
-    reasons: list[Finding | None]  #: (n,), against observations
-    predicted: NDArray[np.float64]  #: (m, 2), pixels of all beads of the phantom, by neighbours
-    #: (n,), of the difference of a coordinate from that; it contains what the survey leaves open
+    reasons: list[Finding | None]  #: (n,), reasons against an observation, or None
+    predicted: NDArray[np.float64]  #: (m, 2), predicted pixels of all beads of the phantom
+    #: (n,), standard deviation of a coordinate from its prediction, including survey errors
     sd_px: NDArray[np.float64]
 
     @property
     def residual(self) -> NDArray[np.float64]:
-        """Distances (n,) from where neighbours say [px]."""
+        """Distances (n,) from the predictions by neighbours [px]."""
         return np.linalg.norm(self.beads.uv - self.predicted[self.rows], axis=1)
 
 
 def _away(measured: _Measured) -> NDArray[np.bool_]:
-    """Whether (n,) beads that were measured well are not where their neighbours say."""
+    """Return (n,) whether well-measured beads are off the places predicted by their neighbours."""
     good = np.array([reason is None for reason in measured.reasons], dtype=bool)
     sigma = measured.beads.sigma[good]
     scatter = np.maximum(measured.sd_px[good], MIN_SCATTER_PX)
@@ -277,7 +277,7 @@ def _checked(
     measured: _Measured,
     imaging: Imaging,
 ) -> Extraction:
-    """Exclude beads that are not where their neighbours say, or measured badly."""
+    """Exclude beads that are off the places predicted by their neighbours, or measured badly."""
     beads = measured.beads
     reasons = list(measured.reasons)
     for number in np.flatnonzero(_away(measured)):
@@ -314,12 +314,12 @@ def _checked(
 def _chances_of_wrong(
     residual: NDArray[np.float64], sigma: NDArray[np.float64], scatter: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Chances (n,) that centres are wrong, given what their neighbours say.
+    """Return probabilities (n,) that centres are wrong, given the predictions of neighbours.
 
     residual: (n,) distances from the predictions; sigma, scatter: (n,) standard deviations of
-    coordinates of centres and of predictions. Given its residual, an error is normal about the
-    share of it that is not the prediction's. Wrong are errors by half a pixel, and by what one in
-    a thousand of such centres have.
+    coordinates of centres and of predictions. Given the residual, the error of a centre is normal.
+    Its mean is the share of the residual that is not due to the prediction. A centre is wrong if
+    it is off by half a pixel, and by more than one in a thousand of such centres.
     """
     wrong_px = WRONG_SIGMAS * np.maximum(sigma, SURE_SIGMA_PX)
     total = sigma**2 + scatter**2
@@ -333,7 +333,7 @@ def _with_support(
 ) -> Extraction:
     """Exclude beads of which most neighbours among the predicted ones (n,) are not found.
 
-    One that is found, but too vague to be observed, supports them as well.
+    A bead that is found, but too uncertain to be observed, also supports its neighbours.
     """
     observed = np.isin(rows, extraction.bead)
     vague = [one.bead for one in extraction.refused if one.finding.kind in VAGUE]
@@ -364,7 +364,7 @@ def _expected(
     seen: Seen,
     outlines: NDArray[np.float64],
 ) -> Expected:
-    """Shadows of predicted beads: where one alone was found, else where it is predicted."""
+    """Return expected shadows: at the detection of an isolated bead, else at the prediction."""
     start = predicted.copy()
     apart = np.full(len(predicted), np.inf)
     if len(rows) > 1:
@@ -379,18 +379,18 @@ def _expected(
 
 
 def _relative_sizes(model: PhantomModel) -> NDArray[np.float64]:
-    """Sizes (n,) of the beads of a phantom, 1 for a typical one, NaN where they are not told."""
+    """Return sizes (n,) of beads of a phantom, 1 for a typical bead, NaN if unspecified."""
     if model.diameter_mm is None:
         return np.full(len(model.xyz), np.nan)
     return np.asarray(model.diameter_mm / np.median(model.diameter_mm))
 
 
 def _usual_depth(beads: Beads) -> NDArray[np.float64]:
-    """Depths (n,) of shadows that are usual where beads lie.
+    """Return the usual depths (n,) of shadows at the places of the beads.
 
-    Beads take the same share of the direct light, and nothing of scattered light; a hole of a
-    sheet adds a share of the light behind the sheet. So a contrast is linear in the light beside
-    it, here by iteratively reweighted least squares (weights of Cauchy).
+    Beads absorb the same share of the direct light, and no scattered light; a hole of a sheet adds
+    a share of the light behind the sheet. A contrast is therefore linear in the light around the
+    bead. The line is fitted by iteratively reweighted least squares with Cauchy weights.
     """
     good = beads.measured & (beads.light > 0)
     usual = np.ones(len(beads.uv))
@@ -410,7 +410,7 @@ def _usual_depth(beads: Beads) -> NDArray[np.float64]:
 
 
 def _reasons(beads: Beads, predicted: NDArray[np.float64]) -> list[Finding | None]:
-    """Why beads are not observed, None for those that are."""
+    """Return the reasons why beads are not observed, None for observed beads."""
     away = np.linalg.norm(beads.uv - predicted, axis=1)
     usual_depth = _usual_depth(beads)
     out: list[Finding | None] = []

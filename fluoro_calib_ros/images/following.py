@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The pose of a phantom from that of an exposure nearby, such as the previous one of a video."""
+"""Track the pose of a phantom from a nearby exposure, such as the previous video frame."""
 
 from __future__ import annotations
 
@@ -20,32 +20,32 @@ from .matching import MIN_BEADS, NEIGHBOURS, PhantomModel, is_evident, seeds_of,
 from .pose_search import LocalPose, local_poses, nearby_map
 from .view import View
 
-REACH = 0.1  # of the image, by which a phantom may move between exposures
-# Of the exposures between which images were left out.
-FAR_REACH = 0.25  # of the image
+REACH = 0.1  # maximum motion between exposures, as a fraction of the image size
+# Limits of motion between exposures if images in between were skipped.
+FAR_REACH = 0.25  # fraction of the image size
 FAR_TURN_RAD = np.deg2rad(35)
-FAR_SCALES = (0.8, 1.25)  # factors
-FAR_SEEDS = 6  # beads of the image from which the pose is searched for
-FAR_POSES = 3  # of each
-SCATTER_FACTOR = 1.5  # on the residuals of the exposure before
-SCATTER_PX = 0.1
+FAR_SCALES = (0.8, 1.25)  # factors on the scale
+FAR_SEEDS = 6  # number of beads of the image from which the pose is searched for
+FAR_POSES = 3  # number of poses tried for each of these beads
+SCATTER_FACTOR = 1.5  # largest scatter of the residuals over that of the nearby exposure
+SCATTER_PX = 0.1  # is added to this limit
 
 
 @dataclass(frozen=True)
 class Far:
-    """Images were left out since the exposure nearby."""
+    """State of a track after images were skipped since the nearby exposure."""
 
-    ahead: View | None = None  #: the pose to which the phantom should have moved since
+    ahead: View | None = None  #: extrapolated pose of the phantom
 
 
 def follow(
     seen: Seen, model: PhantomModel, near: View, scale_px: float, far: Far | None = None
 ) -> Match | None:
-    """Match what was found in an image from a pose nearby.
+    """Match detections of an image, starting from a nearby pose.
 
-    scale_px: robust standard deviation of the residuals of the image nearby [px]. far: where
-    images were left out in between: the pose is searched for farther away. Returns None where the
-    pose is too far, or not sure.
+    scale_px: robust standard deviation of the residuals of the nearby image [px]. far: set if
+    images in between were skipped; the search then extends farther. Returns None if the pose is
+    too far away or not certain.
     """
     if len(seen.uv) < MIN_BEADS:
         return None
@@ -57,7 +57,7 @@ def follow(
         if found is None or not _fits(found, limit):
             continue
         try:
-            # A grid may have gone by a step of its pattern.
+            # A grid may have moved by a step of its pattern.
             found = unambiguous(found, seen, model, FAR_TURN_RAD)
         except DataError:
             return None
@@ -68,7 +68,7 @@ def follow(
 def _fits(found: Match | None, limit_px: float) -> bool:
     """Return whether a match is evident, with residuals as small as before.
 
-    A phantom that was turned by nearly a symmetry of its own would have larger ones.
+    If the phantom had turned by nearly one of its symmetries, residuals would be larger.
     """
     return (
         found is not None
@@ -81,10 +81,10 @@ def _fits(found: Match | None, limit_px: float) -> bool:
 def moved_on(
     before: View, last: View, centre_mm: NDArray[np.float64], factor: float
 ) -> View | None:
-    """Return the view after a further motion like that from one view to the next.
+    """Extrapolate the motion from one view to the next; return the view after it.
 
     centre_mm: (3,) of the phantom, which moves on a straight line while it turns about a fixed
-    axis. factor: on the motion. Returns None where the motion is not small.
+    axis. factor: on the motion. Returns None if the turn is not small.
     """
     turn = vector_from_matrix(last.rotation @ before.rotation.T)
     if factor * np.linalg.norm(turn) > FAR_TURN_RAD:
@@ -98,7 +98,7 @@ def moved_on(
 def _elsewhere(
     seen: Seen, model: PhantomModel, near: View, far: Far | None
 ) -> Iterator[Match | None]:
-    """Yield the matches from a pose that is moved on, shifted over the image, or searched for."""
+    """Yield matches from a pose that is extrapolated, shifted over the image, or searched for."""
     if far is not None and far.ahead is not None:
         yield settle(far.ahead, model.xyz, seen)
     yield _over_the_image(seen, model.xyz, near)
@@ -107,7 +107,7 @@ def _elsewhere(
 
 
 def _over_the_image(seen: Seen, xyz: NDArray[np.float64], near: View) -> Match | None:
-    """Return the match of a pose nearby that is shifted, None where there is none."""
+    """Return the match of a nearby pose after a shift in the image, None if there is none."""
     predicted = near.project(xyz)
     row = np.flatnonzero(seen.in_field(predicted))
     shift = _shift(predicted[row], seen) if len(row) >= MIN_BEADS else None
@@ -119,7 +119,7 @@ def _over_the_image(seen: Seen, xyz: NDArray[np.float64], near: View) -> Match |
 
 
 def _farther(seen: Seen, model: PhantomModel, near: View) -> Iterator[Match | None]:
-    """Yield the matches of poses that are some way off, by triples of beads seen nearby."""
+    """Yield matches of more distant poses, from triples of beads that are predicted nearby."""
     predicted = near.project(model.xyz)
     with np.errstate(invalid='ignore'):
         size = np.array(seen.field.shape[::-1])
@@ -143,25 +143,25 @@ def _farther(seen: Seen, model: PhantomModel, near: View) -> Iterator[Match | No
 
 
 def _turned(pose: LocalPose, near: View, xyz: NDArray[np.float64]) -> View | None:
-    """Return a view nearby in the pose of a bead, None where it is turned too far."""
+    """Return the nearby view with the pose found at a bead, None if it is turned too far."""
     c = near.principal_distance_px
     start = start_view(pose, replace(near.lens, principal_distance_px=c), xyz)
     if rotation_angle(start.rotation @ near.rotation.T) > FAR_TURN_RAD:
         return None
     view = replace(near, rotation=start.rotation, position=start.position)
     bead = xyz[[pose.bead]]
-    # The bead is seen with the distortion of the fluoroscope, which is known by now.
+    # The bead is distorted by the fluoroscope, whose distortion is known from the nearby view.
     return _shifted(view, pose.uv - view.project(bead)[0], float(view.depth(bead)[0]))
 
 
 def _shifted(view: View, shift: NDArray[np.float64], depth_mm: float) -> View:
-    """Return a view that sees points at a depth shifted by (2,) [px]."""
+    """Return a view in which points at a depth are shifted by (2,) [px]."""
     sensor = np.append(shift, 0) * depth_mm / view.principal_distance_px
     return replace(view, position=view.position - view.rotation.T @ sensor)
 
 
 def _shift(predicted: NDArray[np.float64], seen: Seen) -> NDArray[np.float64] | None:
-    """Shift (2,) [px] that takes most predictions (n, 2) to something that was found."""
+    """Return the shift (2,) [px] that moves most predictions (n, 2) to a detection."""
     reach = REACH * max(seen.field.shape)
     pairs = cKDTree(predicted).query_ball_tree(seen.tree, reach)
     steps = np.concatenate(
@@ -173,7 +173,7 @@ def _shift(predicted: NDArray[np.float64], seen: Seen) -> NDArray[np.float64] | 
     cell = np.rint(steps / seen.tolerance_px).astype(int) + cells
     size = 2 * cells + 1
     count = np.bincount(cell[:, 0] * size + cell[:, 1], minlength=size**2).reshape(size, size)
-    # A shift near the edge of two cells counts in both.
+    # A shift near the edge between two cells counts in both.
     smooth = cv2.boxFilter(count.astype(float), -1, (3, 3), normalize=False)
     place = np.unravel_index(np.argmax(smooth), smooth.shape)
     return (np.array(place) - cells) * seen.tolerance_px

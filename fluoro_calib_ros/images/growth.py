@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Grow a pose of a few beads to all beads of an image, and say what speaks for it."""
+"""Grow a pose from a few beads to all beads of an image, and evaluate its evidence."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from scipy.spatial import cKDTree
 from .pose_search import LocalPose
 from .view import TAIL, Lens, View, fit_view
 
-START_BEADS = 14  # within the first radius
-GROWTH = 1.25  # of the radius in a step
-MIN_SHARE = 0.5  # of the beads that are expected, below which a pose is given up
+START_BEADS = 14  # beads within the initial radius
+GROWTH = 1.25  # factor on the radius in each step
+MIN_SHARE = 0.5  # least share of expected beads; a pose with less is discarded
 DEGREE = 5
 LAST_DEGREE = 6
 LAST_STEPS = 4
 LAST_TOLERANCE_PX = 2.5
-CELLS = 5  # regions across the image
-MIN_CELL = 5  # predicted beads of a region that is judged
-AMBIGUOUS_PX = 1.5  # by which another prediction must be farther
+CELLS = 5  # regions along each side of the image
+MIN_CELL = 5  # least number of predicted beads in a region that is evaluated
+AMBIGUOUS_PX = 1.5  # least difference of a detection's distances from the two nearest predictions
 SUPPORT = 12  # neighbours in space, of which MIN_SHARE must be found as well
-# Of the residuals of a view, as a share of half the image: a polynomial of degree 6 has five
-# extrema across it.
+# Correlation length of the residuals of a view, as a share of half the image: a polynomial of
+# degree 6 has five extrema across it.
 LENGTH = 0.5
 
 
 @dataclass(frozen=True)
 class Seen:
-    """What was found in an image."""
+    """Detections in an image."""
 
     uv: NDArray[np.float64]  #: (n, 2), beads [px]
     tree: cKDTree  #: of uv
     field: NDArray[np.bool_]  #: (h, w), the field of view
-    radius_px: float  #: of a bead: two closer than this may be found as one
+    radius_px: float  #: radius of a bead: two beads closer than this may be detected as one
     #: largest distance from a prediction at which a bead is matched while the pose grows
     tolerance_px: float
     #: (n,), response to each bead, which increases with its size
@@ -51,7 +51,7 @@ class Seen:
         radius_px: float,
         strength: NDArray[np.float64] | None = None,
     ) -> Seen:
-        """Return what was found, with a tolerance from the distances between beads."""
+        """Return the detections, with a tolerance derived from the distances between beads."""
         tree = cKDTree(uv)
         distance = tree.query(uv, k=[min(4, len(uv))])[0][:, 0]
         tolerance = float(np.clip(0.2 * np.median(distance), 2.5, 6))
@@ -60,7 +60,7 @@ class Seen:
         )
 
     def in_field(self, uv: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return (n,) whether pixels (n, 2) lie in the field; NaN does not."""
+        """Return (n,) whether pixels (n, 2) lie in the field, False for NaN."""
         height, width = self.field.shape
         places = np.rint(np.where(np.isfinite(uv), uv, -1)).astype(int)
         inside = np.asarray(((places >= 0) & (places < (width, height))).all(axis=1))
@@ -73,19 +73,19 @@ class Match:
     """A pose with its matched beads and the evidence for it."""
 
     view: View
-    #: (n,), rows of the phantom and of the image that belong together
+    #: (n,), matched rows of the phantom and of the image
     bead: NDArray[np.int64]
     detection: NDArray[np.int64]
-    #: (m, 2), pixels of all beads of the phantom, with the residuals of neighbours
+    #: (m, 2), predicted pixels of all beads of the phantom, with interpolated residuals
     predicted: NDArray[np.float64]
     found: float  #: share of the beads predicted in the field that are found
-    explained: float  #: share of what was found in the image that is predicted
+    explained: float  #: share of the detections in the image that are predicted
     scale_px: float  #: robust standard deviation of the residuals
     expected: int  #: number of beads predicted in the field
 
     @property
     def score(self) -> float:
-        """Matched beads, less those that are predicted but not found."""
+        """Number of matched beads minus that of predicted beads that are not found."""
         return len(self.bead) - self.expected * (1 - self.found)
 
 
@@ -94,7 +94,7 @@ def start_view(pose: LocalPose, lens: Lens, xyz: NDArray[np.float64]) -> View:
     c = lens.principal_distance_px
     ray = np.append((pose.uv - lens.centre) / c, 1.0)
     rotation = _turn_to(ray) @ pose.rotation
-    # The scale holds across the ray, at its length.
+    # The scale applies perpendicular to the ray, at the length of the ray.
     sensor = ray * (c / pose.scale)
     position = xyz[pose.bead] - rotation.T @ sensor
     view = View(
@@ -106,7 +106,7 @@ def start_view(pose: LocalPose, lens: Lens, xyz: NDArray[np.float64]) -> View:
         degree=DEGREE,
     )
     expected = lens.expected(DEGREE)
-    # The expected distortion is in the image already, where the bead was found.
+    # The image of the bead already contains the expected distortion.
     return View(
         lens,
         view.rotation,
@@ -118,7 +118,7 @@ def start_view(pose: LocalPose, lens: Lens, xyz: NDArray[np.float64]) -> View:
 
 
 def _turn_to(ray: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Smallest rotation (3, 3) that takes the z axis to a direction (3,)."""
+    """Return the smallest rotation (3, 3) that takes the z axis to a direction (3,)."""
     z = ray / np.linalg.norm(ray)
     axis = np.array([-z[1], z[0], 0.0])
     k = np.array([[0, 0, axis[1]], [0, 0, -axis[0]], [-axis[1], axis[0], 0]])
@@ -126,11 +126,11 @@ def _turn_to(ray: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def grow(view: View, start: int, xyz: NDArray[np.float64], seen: Seen) -> Match | None:
-    """Grow a view from one bead over the phantom; None where it does not fit.
+    """Grow a view from one bead over the phantom; return None if it does not fit.
 
-    The radius around the bead grows, in space: what lies behind it in the image is predicted last,
-    when the pose is known better. Beads found near their predictions are matched. start is the row
-    of the bead in xyz (n, 3) [mm].
+    The radius around the bead grows in space, not in the image: beads behind it are predicted
+    last, when the pose is known better. Beads found near their predictions are matched. start is
+    the row of the bead in xyz (n, 3) [mm].
     """
     distance = np.linalg.norm(xyz - xyz[start], axis=1)
     radius = float(np.partition(distance, min(START_BEADS, len(xyz) - 1))[:START_BEADS].max())
@@ -154,7 +154,7 @@ def grow(view: View, start: int, xyz: NDArray[np.float64], seen: Seen) -> Match 
 
 
 def settle(view: View, xyz: NDArray[np.float64], seen: Seen) -> Match | None:
-    """Match all beads by a view that is near the right one, and refine it."""
+    """Match all beads with a view that is nearly right, and refine it."""
     view = view.with_degree(max(view.degree, LAST_DEGREE))
     tolerance = seen.tolerance_px
     scale = 0.0
@@ -172,7 +172,7 @@ def settle(view: View, xyz: NDArray[np.float64], seen: Seen) -> Match | None:
         bead = row[bead]
         if len(bead) < MIN_SHARE * len(row) and step:
             return None
-        # What is matched as before takes the steps that are left at once.
+        # If the matches do not change, take the remaining steps at once.
         is_last = all(map(np.array_equal, before, (bead, detection)))
         steps = 2 * (LAST_STEPS - step) if is_last else 2
         view, scale = fit_view(view, xyz[bead], seen.uv[detection], steps)
@@ -187,7 +187,7 @@ def settle(view: View, xyz: NDArray[np.float64], seen: Seen) -> Match | None:
 def pairs(
     predicted: NDArray[np.float64], seen: Seen, tolerance: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows of predictions (n, 2) and of what was found that are nearest to each other."""
+    """Return the rows of predictions (n, 2) and detections that are nearest to each other."""
     distance, detection = seen.tree.query(predicted, distance_upper_bound=tolerance)
     row = np.flatnonzero(np.isfinite(distance))
     order = row[np.argsort(distance[row], kind='stable')]
@@ -199,7 +199,7 @@ def pairs(
 def nearby_residuals(
     view: View, xyz: NDArray[np.float64], bead: NDArray[np.int64], uv: NDArray[np.float64]
 ) -> Interpolation:
-    """Residuals of all beads of a view, as their matched neighbours in the image have them.
+    """Interpolate the residuals of all beads of a view from their matched neighbours in the image.
 
     xyz (n, 3) are all beads, bead (m,) the matched rows with pixels uv (m, 2).
     """
@@ -210,7 +210,7 @@ def nearby_residuals(
 def _judged(
     view: View, xyz: NDArray[np.float64], seen: Seen, predicted: NDArray[np.float64], scale: float
 ) -> Match | None:
-    """Return the match of settled predictions (n, 2), without regions that ran away."""
+    """Return the match of settled predictions (n, 2), without regions that have diverged."""
     row = np.flatnonzero(seen.in_field(predicted))
     if len(row) < 4:
         return None
@@ -218,7 +218,7 @@ def _judged(
     bead, detection = pairs(predicted[row], seen, tolerance)
     is_found = np.zeros(len(row), dtype=bool)
     is_found[bead] = True
-    # Two beads that overlap are found as one, somewhere between them.
+    # Two beads that overlap are detected as one, somewhere between them.
     merged, _ = seen.tree.query(predicted[row], distance_upper_bound=1.2 * seen.radius_px)
     other = cKDTree(predicted[row]).query(predicted[row], k=[2])[0][:, 0]
     is_found |= np.isfinite(merged) & (other < 2 * seen.radius_px)
@@ -226,7 +226,7 @@ def _judged(
         seen.uv, distance_upper_bound=max(tolerance, 1.2 * seen.radius_px)
     )
     good = _good_cells(predicted[row], is_found, seen.field.shape)
-    # A detection between two predictions may be either.
+    # A detection between two predictions may belong to either.
     tree = cKDTree(predicted[row])
     distance, _ = tree.query(seen.uv[detection], k=2)
     sure = distance[:, 1] > distance[:, 0] + AMBIGUOUS_PX
@@ -249,7 +249,7 @@ def _judged(
 def supported(xyz: NDArray[np.float64], good: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return (n,) whether most neighbours in space of beads (n, 3) are good (n,).
 
-    Where a face is seen from its edge, a prediction that is off by one bead still finds something
+    If a face is seen from its edge, a prediction that is off by one bead still finds a detection
     now and then.
     """
     count = min(SUPPORT + 1, len(xyz))
@@ -276,23 +276,23 @@ def _good_cells(
 # Interpolation of the residuals of matched beads over an image.
 #
 # Simple kriging with the nearest neighbours and Matern's covariance of order 3/2 (Stein,
-# "Interpolation of Spatial Data", 1999): what the polynomial of a view leaves is smooth, and
-# centres and survey add noise. The share of the noise, and the size of both, follow from how well
-# matched beads predict each other.
+# "Interpolation of Spatial Data", 1999): the residual distortion after the polynomial of a view is
+# smooth, and errors of centres and survey add noise. The share of the noise, and the size of both,
+# are estimated from how well matched beads predict each other.
 
-NEIGHBOURS = 8  # which screen a bead from those farther away
+NEIGHBOURS = 8  # number of neighbours; they screen a bead from those farther away
 NOISE_SHARES = (0.001, 0.01, 0.1, 1.0)  # variance of the noise over that of the smooth part
-SAMPLE = 100  # beads that tell the share
-ROUNDS = 2  # of weights: the first one spoils those beside what is far off
-FAR = 1e9  # of a bead from others where it has no pixel
+SAMPLE = 100  # beads from which the share is estimated
+ROUNDS = 2  # iterations of the weights: the first also spoils those of an outlier's neighbours
+FAR = 1e9  # place of beads without a pixel, far from all others [px]
 
 
 @dataclass(frozen=True)
 class Interpolation:
-    """Residuals of all beads, as matched neighbours in the image have them."""
+    """Residuals of all beads, interpolated from matched neighbours in the image."""
 
     value: NDArray[np.float64]  #: (n, 2) [px]
-    sd_px: NDArray[np.float64]  #: (n,), of the difference of an observed coordinate from it
+    sd_px: NDArray[np.float64]  #: (n,), standard deviation of an observed coordinate from it
 
 
 def interpolated(
@@ -303,8 +303,8 @@ def interpolated(
 ) -> Interpolation:
     """Interpolate residuals (m, 2) of the matched rows bead (m,) of pixels place (n, 2).
 
-    A bead does not take part in its own value, and one that is far off its value counts less for
-    others. length_px: distance at which the covariance of the smooth part has fallen to a half.
+    A bead does not contribute to its own value, and an outlier has less weight for others.
+    length_px: distance at which the covariance of the smooth part has fallen to a half.
     """
     kriging = _Kriging.of(np.where(np.isfinite(place), place, FAR) / length_px, bead)
     matched = kriging.chosen(bead)
@@ -323,7 +323,7 @@ def interpolated(
 def _noise_share(
     kriging: _Kriging, residual: NDArray[np.float64], sample: NDArray[np.int64]
 ) -> float:
-    """Share of the noise with which a sample of matched beads is predicted best."""
+    """Return the share of the noise with which a sample of matched beads is predicted best."""
 
     def lack(share: float) -> float:
         value, _ = kriging.at(residual, np.full(len(residual), share))
@@ -333,41 +333,41 @@ def _noise_share(
 
 
 def _scale(squared: NDArray[np.float64]) -> float:
-    """Variance factor of squared lengths (m,) of residuals with two normal coordinates."""
+    """Return the variance factor of squared lengths (m,) of residuals, normal in u and v."""
     return max(float(np.median(squared)) / (2 * np.log(2)), np.finfo(float).tiny)
 
 
 @dataclass(frozen=True)
 class _Kriging:
-    """Places, and their nearest matched ones other than themselves."""
+    """Kriging system of places with their nearest matched neighbours."""
 
-    near: NDArray[np.int64]  #: (n, k), rows of the matched ones
-    covariance: NDArray[np.float64]  #: (n, k, k), of the smooth part at the neighbours
+    near: NDArray[np.int64]  #: (n, k), rows of the neighbours among the matched beads
+    covariance: NDArray[np.float64]  #: (n, k, k), covariance of the smooth part between neighbours
     known: NDArray[np.float64]  #: (n, k), covariance of a place with its neighbours, 0 for its own
 
     @classmethod
     def of(cls, place: NDArray[np.float64], bead: NDArray[np.int64]) -> _Kriging:
-        """Return that of places (n, 2), in units of the length of the covariance."""
+        """Return the system of places (n, 2) in units of the length of the covariance."""
         count = min(NEIGHBOURS + 1, len(bead))
         _, near = cKDTree(place[bead]).query(place, k=list(range(1, count + 1)))
         other = bead[near] != np.arange(len(place))[:, None]
         neighbour = place[bead[near]]
         known = _matern(neighbour - place[:, None]) * other
         covariance = _matern(neighbour[:, :, None] - neighbour[:, None])
-        # What a bead has itself is uncorrelated with all others.
+        # A bead's own residual is uncorrelated with all others, so that it gets no weight.
         covariance *= other[:, :, None] & other[:, None] | np.eye(count, dtype=bool)
         return cls(near, covariance, known)
 
     def chosen(self, rows: NDArray[np.int64]) -> _Kriging:
-        """Return that of some of the places."""
+        """Return the kriging system restricted to some places."""
         return _Kriging(self.near[rows], self.covariance[rows], self.known[rows])
 
     def at(
         self, residual: NDArray[np.float64], noise: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Values (n, 2), and their variances (n,) in units of that of the smooth part.
+        """Return values (n, 2), and their variances (n,) in units of that of the smooth part.
 
-        noise: (m,) variances of the residuals (m, 2). Variances contain the noise of one more.
+        noise: (m,) variances of the residuals (m, 2). Variances include an observation's noise.
         """
         covariance = self.covariance.copy()
         diagonal = np.arange(covariance.shape[1])
@@ -378,6 +378,6 @@ class _Kriging:
 
 
 def _matern(shift: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Matern's covariance of order 3/2 at shifts (..., 2) in units of its length."""
+    """Return Matern's covariance of order 3/2 at shifts (..., 2) in units of its length."""
     distance = np.sqrt(3) * np.hypot(shift[..., 0], shift[..., 1])
     return (1 + distance) * np.exp(-distance)

@@ -4,9 +4,9 @@
 """Poses of flat grids: beads are numbered along rows and columns in the image and in the phantom.
 
 Both numberings differ by a change of the basis of the lattice and a shift. All small changes of
-the basis are tried, with the shifts that least speaks against: beads found where the phantom has
-none, and beads of the phantom that are missing where all around them are found. So one blocked
-hole of a sheet tells where it is.
+the basis are tried, with the shifts that have the fewest contradictions: beads detected where the
+phantom has none, and missing beads whose surroundings are detected. Thus one blocked hole of a
+sheet determines its position.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from ..findings import Finding, Kind, Severity
 from .growth import MIN_SHARE, Match, Seen, settle
 from .view import Lens, View, fit_view
 
-FLAT = 0.02  # thickness over the extent of a phantom that counts as flat
-REACH = 0.3  # of the distance between neighbours, within which a bead lies at its place
-MIN_ANGLE = np.deg2rad(35.0)  # between the steps of a lattice, also in an oblique view
-CENTRAL = 8  # beads of the middle from which a search begins
+FLAT = 0.02  # largest thickness over the extent of a flat phantom
+REACH = 0.3  # largest distance of a bead from its place, over the distance between neighbours
+MIN_ANGLE = np.deg2rad(35.0)  # least angle between the steps of a lattice, also in an oblique view
+CENTRAL = 8  # number of beads in the middle from which a search starts
 MIN_NUMBERED = 0.6  # share of the beads that a numbering must reach
-GAP = 2  # missing beads side by side, twice
-SHIFTS = 6  # best shifts of each basis
-DEGREE = 3  # of the distortion while a candidate is refined
-STEPS = 3  # in which a candidate is refined
+GAP = 2  # half the width of the largest gap, in missing beads
+SHIFTS = 6  # number of best shifts for each basis
+DEGREE = 3  # degree of the distortion during the refinement of a candidate
+STEPS = 3  # number of steps of the refinement
 
-# What is said of images of a grid of which any place is taken.
+# Note on images of a grid of which any place is accepted.
 NOT_MARKED = Finding(
     Kind.GRID_NOT_MARKED,
     'the grid is taken as one without marks: ids count from the hole nearest to the middle of '
@@ -49,10 +49,10 @@ NOT_MARKED = Finding(
 
 @dataclass(frozen=True)
 class Lattice:
-    """Beads of a plane in rows and columns."""
+    """Beads of a plane, numbered in rows and columns."""
 
-    row: NDArray[np.int64]  #: (n,), rows of the beads that are numbered
-    index: NDArray[np.int64]  #: (n, 2), their places along both steps of the lattice
+    row: NDArray[np.int64]  #: (n,), rows of the numbered beads
+    index: NDArray[np.int64]  #: (n, 2), indices of the beads along both steps of the lattice
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class FlatGrid:
 
     @classmethod
     def of(cls, xyz: NDArray[np.float64]) -> FlatGrid | None:
-        """Return the grid of beads (n, 3) [mm]; None where they are not flat, or on no lattice."""
+        """Return the grid of beads (n, 3) [mm]; None if they are not flat, or form no lattice."""
         centre = xyz.mean(axis=0)
         _, extent, axes = np.linalg.svd(xyz - centre, full_matrices=False)
         if len(extent) < 3 or extent[2] > FLAT * extent[0]:
@@ -77,7 +77,7 @@ class FlatGrid:
 def number_lattice(points: NDArray[np.float64]) -> Lattice | None:
     """Number points (n, 2) of a plane along the steps of their lattice; None for no lattice.
 
-    The lattice may be bent: a step is compared with those beside it.
+    The lattice may be bent: a step is compared with neighbouring steps.
     """
     if len(points) < 9:
         return None
@@ -95,10 +95,10 @@ def number_lattice(points: NDArray[np.float64]) -> Lattice | None:
 
 
 def _shortest_steps(index: NDArray[np.int64], points: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return places (n, 2) of points (n, 2) along the two shortest steps of their lattice.
+    """Return indices (n, 2) of points (n, 2) along the two shortest steps of their lattice.
 
-    Where beads are missing around the first one, its steps are longer ones. Reduction of Gauss
-    (Cohen, A Course in Computational Algebraic Number Theory, 1993, algorithm 1.3.14).
+    If beads are missing around the first bead, its steps are too long. Gauss's reduction (Cohen, A
+    Course in Computational Algebraic Number Theory, 1993, algorithm 1.3.14).
     """
     short, long = _steps(index, points)
     change = np.eye(2, dtype=np.int64)
@@ -113,7 +113,7 @@ def _shortest_steps(index: NDArray[np.int64], points: NDArray[np.float64]) -> ND
 
 
 def _basis(points: NDArray[np.float64], tree: cKDTree, start: int) -> NDArray[np.float64] | None:
-    """Two steps (2, 2) of the lattice at a point: the shortest one, and the next across it."""
+    """Return two steps (2, 2) of the lattice at a point: the shortest, and the next across it."""
     _, near = tree.query(points[start], k=min(13, len(points)))
     steps = points[near[1:]] - points[start]
     first = steps[0]
@@ -128,7 +128,7 @@ def _basis(points: NDArray[np.float64], tree: cKDTree, start: int) -> NDArray[np
 def _numbered(
     points: NDArray[np.float64], tree: cKDTree, start: int, basis: NDArray[np.float64]
 ) -> dict[int, tuple[int, int]]:
-    """Return the places of points that are reached step by step from one of them."""
+    """Return the indices of points that can be reached step by step from a start."""
     number = {start: (0, 0)}
     taken = {(0, 0)}
     steps = {start: basis}
@@ -148,7 +148,7 @@ def _numbered(
                 continue
             taken.add(key)
             number[other] = key
-            # Half of the new step: one bead off its place does not turn the lattice.
+            # Average the new step with the old: one misplaced bead does not turn the lattice.
             bent = local.copy()
             bent[axis] = 0.5 * (local[axis] + sign * (points[other] - points[point]))
             steps[other] = bent
@@ -158,21 +158,21 @@ def _numbered(
 
 @dataclass(frozen=True)
 class GridPose:
-    """A way to lay what was found over a flat grid."""
+    """Placement of detections on a flat grid."""
 
-    #: beads found where the grid has none, and beads of the grid that are missing among others
+    #: number of beads detected where the grid has none, and of missing beads of the grid
     against: int
-    numbered: int  #: beads found in rows and columns
-    fit: Callable[[], Match | None]  #: its match, None where no pose fits
+    numbered: int  #: number of beads detected in rows and columns
+    fit: Callable[[], Match | None]  #: returns the match, None if no pose fits
 
 
 def grid_poses(
     grid: FlatGrid, xyz: NDArray[np.float64], seen: Seen, lens: Lens
 ) -> Iterator[GridPose]:
-    """Yield poses of a flat grid, those that least speaks against first.
+    """Yield poses of a flat grid, those with the fewest contradictions first.
 
-    Among equal ones the least tilted comes first, then the one most upright, then the one whose
-    middle is nearest to that of the image.
+    Poses with equally many are in order of tilt, the least tilted first, then by how upright they
+    are, then by the distance of their middle from that of the image.
     """
     found = number_lattice(seen.uv)
     if found is None:
@@ -210,13 +210,13 @@ def grid_poses(
 
 
 def _steps(index: NDArray[np.int64], points: NDArray[np.float64]) -> np.ndarray:
-    """Mean steps (2, k) of a lattice with places (n, 2) of points (n, k)."""
+    """Return mean steps (2, k) of a lattice with indices (n, 2) of points (n, k)."""
     centred = index - index.mean(axis=0)
     return np.linalg.lstsq(centred, points - points.mean(axis=0), rcond=None)[0]
 
 
 def _missing(index: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Places (k, 2) of a lattice where nothing is found, though it is all around them."""
+    """Return indices (k, 2) of a lattice without a detection but with detections all around."""
     corner = index.min(axis=0) - 2 * GAP
     there = np.pad(_raster(index - corner), ((0, 2 * GAP), (0, 2 * GAP))) > 0
     around = binary_closing(there, np.ones((3, 3)), iterations=GAP)
@@ -225,7 +225,7 @@ def _missing(index: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _changes() -> Iterator[NDArray[np.int64]]:
-    """Yield the changes (2, 2) of the basis of a lattice by at most one step."""
+    """Yield changes (2, 2) of the basis of a lattice by at most one step."""
     for entries in product((-1, 0, 1), repeat=4):
         change = np.array(entries).reshape(2, 2)
         if abs(round(float(np.linalg.det(change)))) == 1:
@@ -238,9 +238,9 @@ def _shifts(
     grid: NDArray[np.int64],
     wanted: np.ndarray,
 ) -> list[tuple[NDArray[np.int64], int]]:
-    """Shifts (2,) of places found (n, 2) onto a grid (m, 2), with what speaks against each.
+    """Return shifts (2,) of indices found (n, 2) onto a grid (m, 2), with their contradictions.
 
-    Those nearest to a wanted shift (2,) come first where as much speaks against several.
+    Shifts with equally many are in order of their distance from a wanted shift (2,).
     """
     corner = found.min(axis=0)
     other = grid.min(axis=0)
@@ -249,7 +249,7 @@ def _shifts(
     gone = np.zeros_like(here)
     gone[tuple((missing - corner).T)] = 1
     shape = tuple(np.array(there.shape) + here.shape - 1)
-    # A bead that is found speaks for a shift, one that is missing against it.
+    # A detected bead counts for a shift, a missing bead against it.
     both = np.fft.rfft2((here - gone)[::-1, ::-1], shape)
     overlap = np.rint(np.fft.irfft2(np.fft.rfft2(there, shape) * both, shape)).astype(int)
     start = other - corner - (np.array(here.shape) - 1)
@@ -272,7 +272,7 @@ def _raster(places: NDArray[np.int64]) -> NDArray[np.float64]:
 def _view(
     grid: FlatGrid, xyz: NDArray[np.float64], uv: NDArray[np.float64], lens: Lens
 ) -> View | None:
-    """Return the view of matched beads of a grid; None where no pose fits them.
+    """Return the view of matched beads of a grid; None if no pose fits them.
 
     Collins and Bartoli, "Infinitesimal plane-based pose estimation", IJCV 109, 2014.
     """

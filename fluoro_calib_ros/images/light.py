@@ -1,16 +1,16 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Light of an image: grey values, where they are clipped, their noise, the background of beads.
+"""Light of an image: grey values, clipping, noise, and the background of beads.
 
-Background of a window beyond a polynomial: edges of plates, bone, letters. It is a sum of cosines
-whose power decreases with the cube of their frequency, as that of radiographs of tissue does, and
-of any edge averaged over its directions (Burgess, Jacobson and Judy, "Human observer detection
-experiments with mammograms and power-law noise", Med. Phys. 28, 2001). There is one unknown, the
-strength, estimated by restricted maximum likelihood (Patterson and Thompson, Biometrika 58, 1971).
-Whether a window has such a background is decided with all windows of the image: the more have one,
-the less evidence is asked for. The cosines are eliminated from the normal equations, so a standard
-deviation contains what the background leaves open.
+The background of a window may exceed a polynomial: edges of plates, bone, letters. It is modelled
+as a sum of cosines whose power decreases with the cube of their frequency, like that of
+radiographs of tissue and of any edge averaged over its directions (Burgess, Jacobson and Judy,
+"Human observer detection experiments with mammograms and power-law noise", Med. Phys. 28, 2001).
+The only unknown is its strength, estimated by restricted maximum likelihood (Patterson and
+Thompson, Biometrika 58, 1971). All windows of the image decide together which of them have such a
+background: the more have one, the less evidence is required. The cosines are eliminated from the
+normal equations, so standard deviations include the uncertainty of the background.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 from scipy.special import expit, logit, logsumexp
 
-MIN_VARIANCE = 1 / 12  # of rounding
-SAMPLED = 100_000  # pixels that tell the noise: a median of each level to 2 %
-LEVELS = 30  # of light, at which it is estimated
-SURE_CORRELATION = 3.0  # standard deviations of one that is none
-LAGS = 4  # pixels over which noise is correlated
-SECOND = np.array([1.0, -2.0, 1.0])  # differences
-MIN_SEEN = 0.1  # of the variance: what second differences see of noise blurred by a pixel
-MIN_CLIPPED = 10  # pixels
-MIN_PIXELS = 1000  # whose correlation is computed
-MAX_SLOW = 0.9  # share of slow changes, beyond which the noise is not seen
+MIN_VARIANCE = 1 / 12  # variance of rounding to integers
+SAMPLED = 100_000  # pixels for the noise estimate: they give the median of each level to 2 %
+LEVELS = 30  # levels of light at which the noise is estimated
+SURE_CORRELATION = 3.0  # significance limit of a correlation [standard deviations]
+LAGS = 4  # largest lag at which noise is correlated [px]
+SECOND = np.array([1.0, -2.0, 1.0])  # kernel of second differences
+MIN_SEEN = 0.1  # least share of the variance in second differences: noise blurred by a pixel
+MIN_CLIPPED = 10  # largest number of outermost grey values that is no evidence of clipping
+MIN_PIXELS = 1000  # pixels that estimates of noise and correlation need
+MAX_SLOW = 0.9  # largest share of slow changes; beyond it the noise is not visible
 
 
 @dataclass(frozen=True)
@@ -43,15 +43,15 @@ class Light:
 
     grey: NDArray[np.float32]  #: (h, w)
     field: NDArray[np.bool_]  #: (h, w), the field of view
-    #: values at which grey values are clipped: there is no less, or more, light than they say
+    #: grey values at which the image is clipped: less, or more, light does not change them
     low: float = -np.inf
     high: float = np.inf
 
 
 def clipped_at(grey: NDArray[np.floating]) -> tuple[float, float]:
-    """Return the values at which an image (h, w) is clipped, infinite where it is not.
+    """Return the values at which an image (h, w) is clipped, infinite if it is not.
 
-    Noise alone makes the outermost value rarer than the next one.
+    With noise alone, the outermost value is rarer than its neighbour.
     """
     least = float(grey.min())
     most = float(grey.max())
@@ -61,32 +61,32 @@ def clipped_at(grey: NDArray[np.floating]) -> tuple[float, float]:
 
 
 def _is_clipped(grey: NDArray[np.floating], outermost: float, beside: float) -> bool:
-    """Return whether an outermost value is more frequent than the one beside it."""
+    """Return whether an outermost grey value is more frequent than its neighbour."""
     count = int(np.count_nonzero(grey == outermost))
     return count > max(int(np.count_nonzero(grey == beside)), MIN_CLIPPED)
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Variance of a grey value: constant + gain * grey value; and its correlation."""
+    """Variance of a grey value, constant + gain * grey value, and correlation of the noise."""
 
     constant: float
     gain: float
-    #: (2 LAGS + 1, 2 LAGS + 1), of the noise of pixels at lags (row, column), 1 in the middle
+    #: (2 LAGS + 1, 2 LAGS + 1), correlation of pixels at lags (row, column), 1 in the middle
     correlation: NDArray[np.float64]
 
     def variance(self, light: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Variance of grey values of an expected light."""
+        """Return the variance of grey values, given their expected light."""
         return np.maximum(self.constant + self.gain * np.maximum(light, 0), MIN_VARIANCE)
 
 
 def estimate_noise(light: NDArray[np.float32], usable: NDArray[np.bool_]) -> Noise:
-    """Estimate the noise of an image (h, w) from what a plane does not explain.
+    """Estimate the noise of an image (h, w) from its deviations from a plane.
 
-    The second differences of Immerkaer, "Fast noise variance estimation", CVIU 64, 1996, of
-    usable pixels of about the same light, robustly. They see less of a noise that is correlated,
-    by a factor that follows from the correlation. Where hardly a pixel is usable, there is the
-    noise of rounding.
+    The variance is estimated robustly from second differences (Immerkaer, "Fast noise variance
+    estimation", CVIU 64, 1996) at usable pixels of about the same light. They underestimate
+    correlated noise; a factor from the correlation corrects this. If hardly any pixel is usable,
+    the noise is that of rounding.
     """
     correlation = _correlation(light, usable)
     kernel = np.outer(SECOND, SECOND) / float(np.sum(SECOND**2))
@@ -111,7 +111,7 @@ def estimate_noise(light: NDArray[np.float32], usable: NDArray[np.bool_]) -> Noi
 
 
 def _seen_by(kernel: NDArray[np.float64], correlation: NDArray[np.float64]) -> float:
-    """Variance that a kernel in both directions leaves of correlated noise, over that of white."""
+    """Return the variance of noise after a kernel along both axes, over that of white noise."""
     lags = len(correlation) // 2
     padded = np.pad(kernel, lags)
     own = np.array([padded @ np.roll(padded, lag) for lag in range(-lags, lags + 1)])
@@ -120,7 +120,7 @@ def _seen_by(kernel: NDArray[np.float64], correlation: NDArray[np.float64]) -> f
 
 
 def _correlation(light: NDArray[np.float32], field: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Correlation of the noise, from the background less its blur, clipped at beads."""
+    """Return the correlation of the noise in the light minus its blur, without beads."""
     height, width = light.shape
     top, left = height // 4, width // 4
     # A blur mirrors the light at its border, where a slope would look like noise.
@@ -148,12 +148,12 @@ def _correlation(light: NDArray[np.float32], field: NDArray[np.bool_]) -> NDArra
 def correlation_of(
     residual: NDArray[np.floating], valid: NDArray[np.floating]
 ) -> NDArray[np.float64]:
-    """Correlation (2 LAGS + 1, 2 LAGS + 1) of residuals (k, h, w), 0 where they are not valid.
+    """Return the correlation (2 LAGS + 1, 2 LAGS + 1) of residuals (k, h, w), 0 if invalid.
 
-    At the largest lags the noise is not correlated: what is seen there are slow changes of the
-    light, or what a fit has taken from all lags.
+    At the largest lags noise is not correlated. A correlation there comes from slow changes of the
+    light, or from what a fit has removed at all lags.
     """
-    # With an edge of zeros, a lag in two directions is one in the order of the pixels.
+    # With an edge of zeros, a lag along both axes is a lag in the flattened pixels.
     edge_of_zeros = ((0, 0), (0, LAGS), (0, LAGS))
     value, seen = (np.pad(one, edge_of_zeros).reshape(-1) for one in (residual, valid))
     total = float(value @ value) / max(float(seen.sum()), 1.0)
@@ -168,7 +168,7 @@ def correlation_of(
             out[LAGS + row, LAGS + column] = out[LAGS - row, LAGS - column] = mean
     edge = float(np.median(np.concatenate([out[0], out[-1], out[:, 0], out[:, -1]])))
     out = np.clip((out - edge) / max(1 - edge, 1 - MAX_SLOW), 0, 1)
-    # Estimates of noise that is not correlated scatter by the root of the number of pixels.
+    # Correlations of white noise scatter by one over the root of the number of pixels.
     out[out < SURE_CORRELATION / np.sqrt(max(float(seen.sum()), 1.0))] = 0
     out[LAGS, LAGS] = 1
     return out
@@ -181,12 +181,12 @@ def less_common(
     valid: NDArray[np.bool_],
     usual: NDArray[np.bool_],
 ) -> np.ndarray:
-    """Return residuals (n, m) of windows, over the noise, without what usual ones have in common.
+    """Return standardised residuals (n, m) without the part that usual windows have in common.
 
-    Where the shadow is not quite that of a sphere, all windows show it, and more or less so by
-    the place (n, 2) and the size (n,) of the shadow: for each pixel polynomials of degree 2, a
-    priori as large as the noise. What is left is enlarged by what these take of the noise of usual
-    windows, and reduced by what they add to that of others. Residuals that are not valid are 0.
+    If a shadow is not exactly that of a sphere, all windows show it, depending on the place (n, 2)
+    and the size (n,) of the shadow. The common part of each pixel is a polynomial of degree 2 with
+    a prior as large as the noise. It absorbs noise of usual windows and adds noise to the others;
+    the result is scaled to compensate for both. Invalid residuals are 0.
     """
     differing = np.column_stack([place, np.log(size)])
     away = differing - differing.mean(axis=0)
@@ -207,22 +207,22 @@ def less_common(
     return (residual - common) * valid / noise[:, None]
 
 
-HIGHEST = 9  # half waves across a window
-# Principal components of the background beyond a polynomial that tell the strength: 0.9 of its
-# variance is in them.
+HIGHEST = 9  # highest number of half waves across a window
+# Principal components of the background beyond a polynomial that are used to estimate its
+# strength: they contain 0.9 of its variance.
 TELLING = 26
 EXPONENT = 3.0
 POLYNOMIAL = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # powers of x and y
-# Ratios of the variance of the background to that of the noise that are compared. A likelihood is
-# wider than their steps: of 20 waves, a strength is told to a factor of 1.4.
+# Ratios of the variance of the background to that of the noise that are compared. The likelihood
+# is wider than their steps: 20 cosines determine the strength to a factor of 1.4.
 STEP = 4.0
 RATIOS = STEP ** np.arange(-2, 7)
-ROUNDS = 3  # of the strengths and the factor on the noise
-EM_STEPS = 30  # which settle the share of windows to one in a hundred
+ROUNDS = 3  # iterations over the strengths and the factor on the noise
+EM_STEPS = 30  # iterations after which the share of windows has converged to 0.01
 
 
 def vertex(before: np.ndarray, at: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Places (n,) of the vertices of parabolas through three samples, relative to the middle."""
+    """Return vertices (n,) of parabolas through three samples, relative to the middle sample."""
     curvature = before - 2 * at + after
     shift = 0.5 * (before - after) / np.where(curvature < 0, curvature, -1.0)
     return np.clip(np.where(curvature < 0, shift, 0), -0.5, 0.5)
@@ -231,7 +231,7 @@ def vertex(before: np.ndarray, at: np.ndarray, after: np.ndarray) -> np.ndarray:
 class Cosines:
     """Cosines on the pixels of a window, and their variances.
 
-    offset (m, 2): pixels, from the middle of the window [px].
+    offset: (m, 2) pixels relative to the middle of the window.
     """
 
     def __init__(self, offset: NDArray[np.int64], dtype: type[np.floating]) -> None:
@@ -248,7 +248,7 @@ class Cosines:
             np.cos(np.outer(number[:, 0], x)) * np.cos(np.outer(number[:, 1], y))
         ).astype(dtype)
         power = np.sum(number**2, axis=1) ** (-EXPONENT / 2)
-        # Of one unit of strength a pixel has one unit of variance.
+        # Scaled so that a background of unit strength has unit variance at a pixel.
         self.variance = power / (power @ np.mean(self.waves**2, axis=1))
         polynomial, _ = np.linalg.qr(np.stack([x**i * y**j for i, j in POLYNOMIAL], axis=1))
         beyond = np.sqrt(self.variance)[:, None] * self.waves
@@ -263,11 +263,11 @@ class Cosines:
         weight: NDArray[np.floating],
         residual: NDArray[np.float64],
     ) -> Spectra:
-        """Project the residuals of windows on what tells the strength.
+        """Project the residuals of windows on the components that determine the strength.
 
         relative: (g, m) light behind the beads, as a fraction of that without them. jacobian: (g,
-        u, m) derivatives of the light by the unknowns that are estimated with it. weight,
-        residual: (g, m).
+        u, m) derivatives of the light with respect to the unknowns that are estimated with it.
+        weight, residual: (g, m).
         """
         unknowns = jacobian.shape[1]
         root = np.sqrt(weight)
@@ -299,7 +299,7 @@ class Cosines:
         weight: NDArray[np.floating],
         residual: NDArray[np.float32],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return what the backgrounds take from normal equations, right sides and squared sums.
+        """Return the terms to subtract from normal matrices, right sides and squared sums.
 
         strength (g,) is positive; the other arguments are those of `spectra`.
         """
@@ -316,27 +316,27 @@ class Cosines:
 
 @dataclass(frozen=True)
 class Spectra:
-    """Backgrounds of windows (g,) beyond the polynomial."""
+    """Residuals of windows (g,), projected on the components of the background."""
 
-    #: (g, k + 1, k + 1), normal matrix of k components in units of the noise, with their right
-    #: side and the squared sum of the residuals
+    #: (g, k + 1, k + 1), normal matrix of k components in units of the noise, bordered by the
+    #: right side and the squared sum of the residuals
     products: NDArray[np.float64]
-    freedom: NDArray[np.int64]  #: (g,), of the residuals
-    noise: NDArray[np.floating]  #: (g,), variance of a usual pixel
+    freedom: NDArray[np.int64]  #: (g,), degrees of freedom of the residuals
+    noise: NDArray[np.floating]  #: (g,), variance of a typical pixel
 
     @classmethod
     def joined(cls, parts: Sequence[Spectra]) -> Spectra:
-        """Return those of all windows of some groups."""
+        """Return the spectra of all windows of several groups."""
         names = [field.name for field in fields(cls)]
         return cls(
             **{name: np.concatenate([getattr(one, name) for one in parts]) for name in names}
         )
 
     def strengths(self, excess: float) -> NDArray[np.float64]:
-        """Variances (g,) of the backgrounds, 0 where there is more likely none.
+        """Return variances (g,) of the backgrounds, 0 for windows that more likely have none.
 
-        The share of windows that have one is estimated with the strengths, and so is a common
-        factor on the noise. excess: variance of slow waves of the noise over that of white noise.
+        The share of windows with a background and a common factor on the noise are estimated with
+        the strengths. excess: variance of slow waves of the noise over that of white noise.
         """
         log_det, taken = np.stack([self._marginal(ratio / excess) for ratio in RATIOS], axis=1)
         squared = self.products[:, -1, -1]
@@ -355,7 +355,7 @@ class Spectra:
         return np.where(likely, ratio * self.noise, 0.0)
 
     def _marginal(self, ratio: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return log-determinants (g,), and what a background takes from the squared residuals."""
+        """Return log-determinants (g,) and the squared residuals that a background explains."""
         matrix = ratio * self.products
         diagonal = np.arange(matrix.shape[1])
         matrix[:, diagonal, diagonal] += 1
@@ -365,10 +365,10 @@ class Spectra:
 
 
 def _likely(evidence: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return (g,) whether windows are of a kind, given logarithms of the evidence for it.
+    """Return (g,) whether windows are of a kind, given the log-evidence (g,) for it.
 
-    How many are is unknown: by expectation and maximisation (Dempster, Laird and Rubin, J. R.
-    Stat. Soc. B 39, 1977).
+    Their share is unknown and estimated by expectation-maximisation (Dempster, Laird and Rubin, J.
+    R. Stat. Soc. B 39, 1977).
     """
     least = 0.5 / len(evidence)
     odds = 0.0

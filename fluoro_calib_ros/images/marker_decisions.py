@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Decisions on doubtful ids of a view, and what they change in its images."""
+"""Decisions on doubtful ids of a view, and the changes that they make to its images."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from .markers import MarkerFrame, MarkerTracker
 
 @dataclass(frozen=True)
 class Decision:
-    """What other views, or its body, say of a doubtful id."""
+    """Decision on a doubtful id by other views, or by its body."""
 
     kind: str  #: {'confirmed', 'exchanged', 'dropped'}
     fluoroscope: str
-    #: the image of the decision, and the first one that it holds for
+    #: the image of the decision, and the first image to which it applies
     frame: int
     since: int
-    target_id: tuple[int, ...]  #: one id, or the two that were exchanged
+    target_id: tuple[int, ...]  #: one id, or the two ids that were exchanged
 
 
 class ViewCounts:
-    """Exposures, one after the other, that agree or disagree with the ids of count markers."""
+    """Counts of consecutive exposures that agree or disagree with the ids of `count` markers."""
 
     def __init__(self, count: int) -> None:
         self._agreed = np.zeros(count, dtype=int)
@@ -37,9 +37,9 @@ class ViewCounts:
         self._wrong = np.zeros(count, dtype=int)
 
     def agree(self, row: int, agrees: bool, frame: int, began: int | None = None) -> int:
-        """Count an exposure that agrees with an id or does not, and return how many agree.
+        """Count an exposure that agrees with an id or not; return the number of those that agree.
 
-        began: image since which the id is in doubt; exposures before it say nothing.
+        began: image since which the id is in doubt; earlier exposures are not counted.
         """
         if began is not None and self._agreed_since[row] < began:
             self._agreed[row] = 0
@@ -49,36 +49,36 @@ class ViewCounts:
         return int(self._agreed[row])
 
     def confirm(self, row: int) -> int:
-        """Return the first exposure that agreed, and count anew."""
+        """Return the first exposure that agreed, and restart the count."""
         self._agreed[row] = 0
         return int(self._agreed_since[row])
 
     def disagree(
         self, wrong: NDArray[np.bool_], rows: NDArray[np.int64] | slice = np.s_[:]
     ) -> None:
-        """Count an exposure in which some of the rows are wrong, and the others are not."""
+        """Count an exposure in which some rows are wrong; restart the count of the others."""
         self._wrong[rows] = np.where(wrong, self._wrong[rows] + 1, 0)
 
     @property
     def wrong(self) -> NDArray[np.int64]:
-        """Exposures (n,) that disagree."""
+        """Numbers (n,) of exposures that disagree."""
         return self._wrong
 
     def clear(self, rows: Sequence[int]) -> None:
-        """Count anew for some markers."""
+        """Restart the counts of some markers."""
         self._wrong[list(rows)] = 0
         self._agreed[list(rows)] = 0
 
 
 @dataclass(frozen=True)
 class DecidedView:
-    """One of several views, whose ids are decided on."""
+    """One of several views, for whose ids decisions are made."""
 
-    view: int  #: its row in an exposure
-    name: str  #: of the fluoroscope
+    view: int  #: row of the view in an exposure
+    name: str  #: name of the fluoroscope
     tracker: MarkerTracker
-    target_id: NDArray[np.int64]  #: (n,), of the markers of all views, ascending
-    counts: ViewCounts  #: by row of these
+    target_id: NDArray[np.int64]  #: (n,), ids of the markers of all views, ascending
+    counts: ViewCounts  #: counts by row of target_id
 
     def ids(self, *rows: int) -> tuple[int, ...]:
         """Return the ids of rows."""
@@ -90,23 +90,23 @@ class DecidedView:
             self.tracker.doubt(number, frame)
 
     def doubted_since(self, rows: Sequence[int], frame: int) -> int:
-        """Return the image since which one of the rows may be wrong, or the present one."""
+        """Return the image since which one of the rows may be wrong, or the current image."""
         return min(self.tracker.doubted_since(number) or frame for number in self.ids(*rows))
 
     def confirm(self, row: int, frame: int) -> Decision:
-        """Take back the doubt in an id that exposures agreed with."""
+        """Revoke the doubt in an id that exposures agreed with."""
         ids = self.ids(row)
         self.tracker.confirm(*ids)
         return Decision('confirmed', self.name, frame, self.counts.confirm(row), ids)
 
     def exchange(self, rows: Sequence[int], frame: int, since: int) -> Decision:
-        """Exchange two ids that were the wrong way round since an image."""
+        """Exchange two ids that have been swapped since an image."""
         one, other = self.ids(*rows)
         self.tracker.exchange(one, other)
         return Decision('exchanged', self.name, frame, since, (one, other))
 
     def drop(self, row: int, frame: int, since: int) -> Decision:
-        """Give up a marker that was something else since an image."""
+        """Drop a marker that has been another object since an image."""
         ids = self.ids(row)
         self.tracker.forget(*ids)
         self.counts.clear([row])
@@ -115,7 +115,7 @@ class DecidedView:
     def revised(
         self, found: MarkerFrame, decisions: Sequence[Decision], frame: int
     ) -> MarkerFrame:
-        """Return the markers of the view after decisions on all, with the doubts left."""
+        """Return the markers of the view after all decisions, with the remaining doubts."""
         for decision in decisions:
             if decision.fluoroscope == self.name and decision.since <= frame:
                 found = revise(found, decision)
@@ -123,12 +123,12 @@ class DecidedView:
 
 
 def revise(found: MarkerFrame, decision: Decision) -> MarkerFrame:
-    """Return the markers of an image after a decision that holds for it."""
+    """Return the markers of an image after a decision that applies to it."""
     ids = found.target_id.copy()
     doubtful = found.doubtful.copy()
     if decision.kind == 'exchanged':
         one, two = decision.target_id
-        # The exposure in which they were exchanged is not known, so they stay doubtful.
+        # The exposure in which they were exchanged is unknown, so they stay doubtful.
         doubtful |= np.isin(found.target_id, decision.target_id)
         ids = np.where(
             found.target_id == one, two, np.where(found.target_id == two, one, found.target_id)
@@ -161,16 +161,16 @@ def revise(found: MarkerFrame, decision: Decision) -> MarkerFrame:
 
 @dataclass(frozen=True)
 class Retraction:
-    """Ids of an image that were given and turned out to be wrong."""
+    """Ids of an image that were reported and turned out to be wrong."""
 
     frame: int
     target_id: tuple[int, ...]
 
 
 class EarlierImages:
-    """Markers of the images of a view, which later decisions change.
+    """Markers of the images of a view, which later decisions modify.
 
-    most: images that are kept; None for all of them.
+    most: number of images that are kept; None for all.
     """
 
     def __init__(self, most: int | None = None) -> None:
@@ -184,7 +184,7 @@ class EarlierImages:
         self._found.append(found)
 
     def revise(self, decision: Decision) -> list[Retraction]:
-        """Write a decision into the images that it holds for; return the ids that it changes."""
+        """Apply a decision to the images that it covers; return the ids that it changes."""
         out = []
         for row in range(len(self._found) - 1, -1, -1):
             found = self._found[row]
@@ -197,19 +197,19 @@ class EarlierImages:
         return out[::-1]
 
 
-DECIDED = 3  # exposures that agree before an id is confirmed, or disagree before it is wrong
-NEAR_PX = 1.0  # from where its body says, that a marker is; or so many
-NEAR_SIGMAS = 3.5
-FAR = 1.5  # times that, from which it is something else
-DOUBT_SIGMAS = 4.5  # from which it may be: chance exceeds them in one of 25,000 places
+DECIDED = 3  # exposures that agree before an id is confirmed, or disagree before it is dropped
+NEAR_PX = 1.0  # distance from the place that its body predicts, up to which a marker agrees
+NEAR_SIGMAS = 3.5  # the same in standard deviations; the larger one counts
+FAR = 1.5  # factor on that distance, beyond which the marker is another object
+DOUBT_SIGMAS = 4.5  # beyond them it may be one: chance exceeds them in one of 25,000 places
 
 
 class BodyDecisions:
-    """Decides on the ids of a view by the places that bodies say."""
+    """Decides on the ids of a view by the places that bodies predict."""
 
     def __init__(self, view: DecidedView) -> None:
         self._view = view
-        self._seen_right = np.zeros(len(view.target_id), dtype=int)  # last image in the place
+        self._seen_right = np.zeros(len(view.target_id), dtype=int)  # last image that agreed
 
     def decide(
         self,
@@ -230,7 +230,7 @@ class BodyDecisions:
         near = np.maximum(NEAR_PX, NEAR_SIGMAS * scatter)
         right = away < near
         wrong = away > FAR * near
-        # A body that another view shows hardly tells a place along the rays of that view.
+        # A body that only another view shows has uncertain places along the rays of that view.
         contradicted = (sd > NEAR_PX) & (exposure.standardised[view.view] > DISAGREE)
         right &= ~contradicted
         wrong |= contradicted
@@ -247,22 +247,22 @@ class BodyDecisions:
                 continue
             beside = np.linalg.norm(place - seen[row], axis=1)
             beside[row] = np.inf
-            # Another one that could be here as well leaves the doubt.
+            # If another marker could be here as well, the doubt stays.
             alone = np.nanmin(beside, initial=np.inf) > FAR * near[row]
             out += self._weigh(row, bool(right[row] and alone), frame)
         return out
 
     def _exchange(self, rows: tuple[int, int], frame: int) -> Decision:
-        """Exchange two ids, each of which is where the other one should be."""
+        """Exchange two ids, each of which is at the other's predicted place."""
         view = self._view
-        # They were not exchanged while one of them was where its body says.
+        # They cannot have been exchanged while one of them agreed with its body.
         together = int(self._seen_right[list(rows)].max()) + 1
         since = max(view.doubted_since(rows, frame), together)
         view.counts.clear(rows)
         return view.exchange(rows, frame, since)
 
     def _weigh(self, row: int, agrees: bool, frame: int) -> list[Decision]:
-        """Confirm or drop an id by the exposures up to the present one, which agrees or not."""
+        """Confirm or drop an id by the exposures up to the current one, which agrees or not."""
         view = self._view
         began = view.tracker.doubted_since(*view.ids(row))
         agreed = view.counts.agree(row, agrees, frame, began)
@@ -279,9 +279,9 @@ def _crossed(
     near: NDArray[np.float64],
     suspects: NDArray[np.int64],
 ) -> list[tuple[int, int]]:
-    """Pairs of suspects that are where bodies say that the other is.
+    """Return pairs of suspects that are at each other's predicted places.
 
-    Markers beside each other exchange places only if both are nearer to the other's.
+    Neighbouring markers are exchanged only if both are clearly nearer to the other's place.
     """
     if len(suspects) < 2:
         return []
@@ -298,25 +298,25 @@ def _crossed(
     return out
 
 
-DISAGREE = 6.0  # standardised epipolar distance from which two rays do not belong together
+DISAGREE = 6.0  # standardised epipolar distance from which two rays belong to different markers
 DECIDED_ALONE = 8  # exposures that agree before an id is confirmed
-MAX_COST = 50.0  # of a squared distance; and of evidence, from which it decides
+MAX_COST = 50.0  # limit of a squared distance, and evidence from which a decision is made
 
 
 class RayDecisions:
-    """Decides on the ids of a view by the epipolar distances of both ways round."""
+    """Decides on the ids of a view by epipolar distances, as they are and after an exchange."""
 
     def __init__(self, view: DecidedView, rays: MarkerRays) -> None:
         self._view = view
         self._rays = rays
-        # By two rows: what speaks against their exchange, and since when it is not believed.
+        # By pairs of rows: evidence against an exchange, and since when it is unlikely.
         self._evidence: dict[tuple[int, int], float] = {}
         self._kept: dict[tuple[int, int], int] = {}
 
     def decide(
         self, exposure: MarkerExposure, known: NDArray[np.bool_], frame: int
     ) -> list[Decision]:
-        """Confirm or exchange ids; known (n,) are those that bodies decide on."""
+        """Confirm or exchange ids; known (n,): markers that bodies decide on."""
         view = self._view
         out: list[Decision] = []
         lack = exposure.standardised[view.view]
@@ -345,12 +345,12 @@ class RayDecisions:
     def _both_ways(
         self, exposure: MarkerExposure, rows: tuple[int, int], frame: int
     ) -> list[Decision]:
-        """Weigh the epipolar distances of two markers of a view against those exchanged."""
+        """Compare the epipolar distances of two markers of a view with those after an exchange."""
         view = self._view
         other = self._rays.exchanged(exposure, view.view, rows)
         lack = exposure.standardised[view.view, list(rows)]
         if not (lack < AGREE).all() and not (other < AGREE).all():
-            # One of them is something else, which tells nothing of the other exposures.
+            # One of them is another object; this exposure is no evidence for the other exposures.
             if rows in self._evidence:
                 self._kept[rows] = frame + 1
             return []

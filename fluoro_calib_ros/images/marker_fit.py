@@ -3,9 +3,9 @@
 
 """Measure centres of moving markers: all windows of an image in one Gauss-Newton iteration.
 
-The model of a window is that of `shadow_fit`. A marker that moves while the light is on has a
-shadow that is the mean of shadows along its way (Gauss-Legendre quadrature), and its centre is
-that of the middle of the exposure.
+The model of a window is that of `shadow_fit`. If a marker moves while the light is on, its shadow
+is the mean of shadows along its path (Gauss-Legendre quadrature), and its centre is that in the
+middle of the exposure.
 """
 
 from __future__ import annotations
@@ -37,27 +37,27 @@ from .shadow_fit import (
 )
 
 SETTINGS = FitSettings(
-    steps=3,  # of markers whose shadows touch
+    steps=3,  # for markers whose shadows touch
     crossing_steps=(1,),
     crowds=((1, 3),),
     max_step_px=0.8,
     pooled=120.0,
     crossed=1.2,
 )
-STEPS_ALONE = 2
-CONVERGED_PX = 0.1  # a longer last step is followed by another one
-WAY_PX = 2.0  # of the largest motion, for each further point along the way
+STEPS_ALONE = 2  # steps of isolated markers
+CONVERGED_PX = 0.1  # length of the last step from which another step follows
+WAY_PX = 2.0  # length of the largest motion for each further quadrature point
 
 
 @dataclass(frozen=True)
 class MarkerGuess:
-    """Where markers may be, and what they look like."""
+    """Initial values of markers: places, depths of shadows, motion."""
 
     uv: NDArray[np.float64]  #: (n, 2), centres [px]
-    #: (n,), of their shadows, 1 for the profile
+    #: (n,), depths of the shadows, 1 for the profile
     depth: NDArray[np.float64]
     depth_sd: NDArray[np.float64]
-    motion: NDArray[np.float64]  #: (n, 2), way of their shadows while the light is on [px]
+    motion: NDArray[np.float64]  #: (n, 2), motion of their shadows while the light is on [px]
 
 
 def fit_markers(
@@ -67,10 +67,10 @@ def fit_markers(
     noise: Noise,
     inflation: dict[int, float],
 ) -> Beads:
-    """Measure all markers near a guess at once.
+    """Measure all markers near their initial values at once.
 
-    inflation: of variances by correlated noise, by the number of pixels in a window; it is the
-    same for all images, and noted here.
+    inflation: factors on variances for correlated noise, by the number of pixels in a window. They
+    are the same for all images, and new factors are added.
     """
     fit = _MarkerFit(windows, guess, profile, noise)
     pixels = len(fit.offset)
@@ -83,7 +83,7 @@ def fit_markers(
 
 @lru_cache(maxsize=8)
 def _gauss_points(count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Nodes and weights (count,) of the quadrature from -1 to 1."""
+    """Return nodes and weights (count,) of the quadrature from -1 to 1."""
     node, weight = np.polynomial.legendre.leggauss(count)
     return node, weight
 
@@ -115,7 +115,7 @@ class _MarkerFit(ShadowFit):
         self._set_groups(self._near(2 * reach + MARGIN_PX))
 
     def _near(self, together: float) -> NDArray[np.int64]:
-        """Neighbours (n, k) of the markers, -1 for none; notes the distances of the nearest."""
+        """Return neighbours (n, k) of the markers, -1 for none; note distances of the nearest."""
         distance = cdist(self.uv, self.uv)
         np.fill_diagonal(distance, np.inf)
         self.distance = distance.min(axis=1, initial=np.inf)
@@ -125,7 +125,7 @@ class _MarkerFit(ShadowFit):
         return np.where(np.take_along_axis(self.close, near, axis=1), near, -1)
 
     def run(self) -> None:
-        """Take Gauss-Newton steps; the last one gives standard deviations as well."""
+        """Take Gauss-Newton steps; the last step also yields standard deviations."""
         moved = np.zeros(len(self.uv))
         for step in range(self.settings.steps):
             if step in self.settings.crossing_steps and len(self.crowded):
@@ -155,11 +155,11 @@ class _MarkerFit(ShadowFit):
     def _shadow(
         self, rows: NDArray[np.int64], middle: NDArray[np.int64]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Shadows (g, k, m) in windows around pixels middle (g, 2), and derivatives by the centre.
+        """Return shadows (g, k, m) in windows around pixels middle (g, 2), and their derivatives.
 
-        rows (g, k) are the markers.
+        The derivatives are with respect to the centres. rows (g, k) are the markers.
         """
-        # Points along the way are the first axis; few large arrays are faster than many small.
+        # Points along the path are the first axis; few large arrays are faster than many small.
         centre = self.way[:, rows] + (self.uv[rows] - middle[:, None])
         centre = centre.astype(DTYPE)
         x = self.offset_u - centre[..., 0, None]
@@ -185,7 +185,7 @@ class _MarkerFit(ShadowFit):
     def _model(
         self, rows: NDArray[np.int64], near: NDArray[np.int64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-        """Light (g, m) and its derivatives (g, OWN + 3 k, m)."""
+        """Return light (g, m) and its derivatives (g, OWN + 3 k, m)."""
         everyone = np.concatenate([rows[:, None], near], axis=1)
         shadow, by_u, by_v = self._shadow(everyone, self.middle[rows])
         scatter = self.profile.scatter
@@ -223,7 +223,7 @@ class _MarkerFit(ShadowFit):
     def _depth_sd(
         self, rows: NDArray[np.int64], near: NDArray[np.int64]
     ) -> float | NDArray[np.float64]:
-        # The depth of a marker alone tells whether it is one, so it is hardly constrained.
+        # The depth of an isolated shadow is evidence for its marker, so it is hardly constrained.
         return self.guess.depth_sd[rows] if near.shape[1] else DEPTH_SD
 
     def _solve(
@@ -239,7 +239,7 @@ class _MarkerFit(ShadowFit):
         return (inverse @ equations.right[..., None])[..., 0]
 
     def _cross(self) -> None:
-        """Note what shadows that touch have together, beyond the product of both."""
+        """Compute how shadows that touch differ from the product of both shadows."""
         reach = 2 * (self.profile.radius_px + self.profile.blur_px)
         reach += float(np.abs(self.way).max(initial=0.0)) * 2
         rows = self.crowded[self.distance[self.crowded] < reach]
@@ -264,25 +264,25 @@ class _MarkerFit(ShadowFit):
             self.crossing[one] = grid.blurred(together) - apart
 
     def result(self) -> Beads:
-        """Return what was measured."""
+        """Return the measured markers."""
         away = np.abs(self.uv - self.start).max(axis=1, initial=0.0)
         measured = self.usable & np.isfinite(self.uv).all(axis=1) & np.isfinite(self.sigma)
         measured &= away < self.settings.steps * self.settings.max_step_px
         return self._beads(measured, self.typical())
 
 
-# Measurement of markers: shadows are assigned to all of them together, fitted and checked.
+# Measurement of markers: shadows are assigned to all markers together, fitted and checked.
 
-MAX_MISFIT = 10.0
-DEPTH = (0.5, 1.8)  # of a shadow, over that of its marker
+MAX_MISFIT = 10.0  # largest lack of fit over that of a typical marker
+DEPTH = (0.5, 1.8)  # limits of the depth of a shadow, relative to that of its marker
 
 
 class MarkerMeasurement:
     """Measures markers in shadows that were found near them.
 
-    profile: shadow of a typical marker. gate: distance from its prediction within which a marker
-    is looked for [standard deviations]. shutter: share of the time between two images during which
-    the light is on.
+    profile: shadow of a typical marker. gate: largest distance of a marker from its prediction
+    [standard deviations]. shutter: share of the time between two images during which the light is
+    on.
     """
 
     def __init__(self, profile: Profile, noise: Noise, *, gate: float, shutter: float) -> None:
@@ -323,7 +323,7 @@ class MarkerMeasurement:
     def _assign(
         self, found: Shadows, states: MarkerStates
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.float64]]:
-        """Places (n, 2) of shadows or predictions, which have one (n,), and free ones (k, 2)."""
+        """Return shadows or predictions (n, 2), whether each is a shadow, free shadows (k, 2)."""
         motion = states.motion
         variance = states.shadow_variance
         row, column = assign(motion.uv, variance, found.uv, self._gate)
@@ -336,10 +336,10 @@ class MarkerMeasurement:
     def _share_shadows(
         self, start: NDArray[np.float64], assigned: NDArray[np.bool_], motion: Motion
     ) -> None:
-        """Let markers without a shadow share that of a marker beside them.
+        """Let markers without a shadow share that of a neighbouring marker.
 
-        Both start from their predictions, moved together so that their middle is the shadow's.
-        start (n, 2) and assigned (n,) are changed.
+        Both start from their predictions, shifted so that their mean is the place of the shadow.
+        start (n, 2) and assigned (n,) are modified.
         """
         reach = 2 * self.profile.radius_px + self.profile.blur_px
         for row in np.flatnonzero(~assigned):
@@ -358,7 +358,7 @@ class MarkerMeasurement:
     def _acceptable(
         self, beads: Beads, rows: NDArray[np.int64], states: MarkerStates
     ) -> NDArray[np.bool_]:
-        """Return (k,) whether fitted shadows are those of the markers in rows (k,)."""
+        """Return (k,) whether fitted shadows belong to the markers in rows (k,)."""
         relative = beads.depth / states.depth[rows]
         away = beads.uv - states.motion.uv[rows]
         variance = states.motion.innovation_variance(np.zeros(1))[rows] + beads.sigma**2

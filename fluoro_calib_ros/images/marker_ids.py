@@ -4,11 +4,11 @@
 """Ids of markers from the shapes of their rigid bodies, in the images of one exposure.
 
 Rays of round shadows are intersected. Among these points in space, the members of a body are those
-with its distances: a search with backtracking, in the manner of the interpretation trees of
-Grimson and Lozano-Perez ("Localizing overlapping parts by searching the interpretation tree", IEEE
-PAMI 9, 1987). The mirror image of a body has the same distances, and is excluded by the rotation
-that fits. A body that fits in two ways is refused, and one that would be found as well among as
-many points anywhere.
+with its distances: a search with backtracking, like the interpretation trees of Grimson and
+Lozano-Perez ("Localizing overlapping parts by searching the interpretation tree", IEEE PAMI 9,
+1987). The mirror image of a body has the same distances, but no rotation fits it. If a body fits
+in several ways, only members on which they agree are kept. A body is refused if too few remain, or
+if it would be found as well among as many random points.
 """
 
 from __future__ import annotations
@@ -39,18 +39,18 @@ from .marker_points import ShadowPoints, all_among, shadow_points
 from .marker_rays import AGREE, CalibratedRig
 from .markers import MIN_MEMBERS, FirstMarkers
 
-CHANCE = float(erfc(AGREE / 2**0.5))  # of a distance between two members that does not agree
-MIN_SHARE = 0.6  # of the members that are found
-BETTER = 4.0  # factor on the square sum of another way to fit as many members
-# Number of fits as good that chance gives in an exposure: one in a day at 100 exposures a second.
+CHANCE = float(erfc(AGREE / 2**0.5))  # probability that a right distance does not agree
+MIN_SHARE = 0.6  # least share of the members that are found
+BETTER = 4.0  # factor on the sum of squares up to which another fit of as many members is a rival
+# Expected number of equally good random fits in an exposure: one in a day at 100 exposures/s.
 MAX_CHANCE = 1e-7
 MAX_SHADOWS = 120
-MAX_STEPS = 200_000  # of the search
+MAX_STEPS = 200_000  # largest number of steps of the search
 
 
 @dataclass(frozen=True)
 class _Fit:
-    """Points (k,) of the members of a body, -1 for none, and how well they fit."""
+    """Points (k,) of the members of a body, -1 for none, and the quality of their fit."""
 
     point: NDArray[np.int64]
     rms_mm: float
@@ -61,7 +61,7 @@ class _Fit:
         return int(np.count_nonzero(self.point >= 0))
 
     def only(self, members: NDArray[np.bool_]) -> _Fit:
-        """Return the fit without the points of other members than these (k,)."""
+        """Return the fit restricted to some members (k,)."""
         return replace(self, point=np.where(members, self.point, -1))
 
 
@@ -77,25 +77,25 @@ def identify_markers(
     Parameters
     ----------
     images : mapping of str to ndarray
-        Of two fluoroscopes or more.
+        Images of two fluoroscopes or more.
     calibrations : mapping of str to FluoroscopeCalibration
     orientation : RigOrientation
-        Of these.
+        Orientation of these fluoroscopes.
     bodies : sequence of Body
-        Of known shapes.
+        Bodies of known shapes.
     angles : mapping of str to float or None, optional
-        Of the C-arms [rad], for corrections that change with them; None where they are unknown.
+        Angles of the C-arms [rad], for corrections that depend on them; None if unknown.
 
     Returns
     -------
     dict of str to FirstMarkers
-        By fluoroscope, of the bodies that are found and that it sees. Members that are not seen
-        are where their body says.
+        Markers by fluoroscope, for the bodies that are found and that it sees. Members that are
+        not seen are at the places predicted by their body.
 
     Raises
     ------
     DataError
-        Where none of the bodies is found, or fits in one way only, and where no two fluoroscopes
+        If none of the bodies is found, or none fits in one way only, and if no two fluoroscopes
         see those that are found.
     """
     names = list(orientation.fluoroscopes)
@@ -106,8 +106,8 @@ def identify_markers(
     for name in names:
         check_image(images[name], calibrations[name].image_size)
     search = _ImageSearch(images, rig, bodies)
-    # What else is round in the images may be larger, and more distinct. Of many bodies, perhaps
-    # one is there.
+    # Other round objects in the images may be larger and more distinct. If there are many bodies,
+    # perhaps only one is visible.
     count = sum(len(body.target_id) for body in bodies)
     for scale, strongest in product(MARKER_SCALES[:3], (count, MIN_MEMBERS)):
         if strongest == count or len(search.missing) == len(bodies):
@@ -118,7 +118,7 @@ def identify_markers(
 
 
 class _ImageSearch:
-    """Looks for bodies in the images of one exposure, by shadows of one size after another."""
+    """Search for bodies in the images of one exposure, by shadows of one size after another."""
 
     def __init__(
         self, images: Mapping[str, np.ndarray], rig: CalibratedRig, bodies: Sequence[Body]
@@ -131,7 +131,7 @@ class _ImageSearch:
         self._reason: DataError | None = None
 
     def look(self, scale: float, strongest: int) -> None:
-        """Look for the bodies that are missing; so many shadows of a size tell how they look."""
+        """Search for the missing bodies; the strongest shadows of a size determine their look."""
         try:
             with ThreadPoolExecutor(len(self._images)) as threads:
                 parts = threads.map(_shadows_of, self._images.values(), repeat((scale, strongest)))
@@ -146,7 +146,7 @@ class _ImageSearch:
             self._found.setdefault(name, []).append(first)
 
     def markers(self) -> dict[str, FirstMarkers]:
-        """Return the markers of those that see some. Raises DataError where no two of them do."""
+        """Return the markers by fluoroscope. Raises DataError if no two fluoroscopes see some."""
         if not self._found and self._reason is not None:
             raise self._reason
         if len(self._found) < 2:
@@ -164,13 +164,13 @@ class _ImageSearch:
 
 
 def _shadows_of(image: FilteredImage, kind: tuple[float, int]) -> np.ndarray:
-    """Places (k, 2) of shadows, whose scale and strongest ones are of a kind. Raises DataError."""
+    """Return places (k, 2) of shadows; kind: their scale and number. Raises DataError."""
     scale, strongest = kind
     return first_shadows(image.of_scale(scale), strongest).strongest(MAX_SHADOWS).uv
 
 
 def identifiable(bodies: Sequence[Body]) -> tuple[Body, ...]:
-    """Return the bodies whose shapes are known well enough to give ids, with the known markers."""
+    """Return the bodies with enough known markers to give ids, restricted to these markers."""
     return tuple(
         body.rows(body.known) for body in bodies if np.count_nonzero(body.known) >= MIN_MEMBERS
     )
@@ -181,9 +181,8 @@ def find_bodies(
 ) -> tuple[dict[str, FirstMarkers], dict[str, DataError]]:
     """Find bodies among shadows (k, 2) of all views.
 
-    Returns their markers by fluoroscope, and by body why others are missing.
-
-    Views that see none of the bodies are left out.
+    Return their markers by fluoroscope, without views that see none of the bodies, and the reasons
+    why other bodies are missing, by name.
     """
     points = shadow_points(shadows, rig)
     fits: list[tuple[Body, _Fit]] = []
@@ -197,7 +196,7 @@ def find_bodies(
             continue
         fits.append((body, fit))
         taken = points.shadow[fit.point[fit.point >= 0]]
-        # A shadow is that of one marker, except where two lie behind each other.
+        # A shadow belongs to one marker, unless two lie behind each other.
         free &= ~all_among(points.shadow, taken)
     found = {}
     for view, name in enumerate(rig.orientation.fluoroscopes):
@@ -224,7 +223,7 @@ def _fit(body: Body, points: ShadowPoints, free: NDArray[np.bool_]) -> _Fit:
             f'body {body.name}: {best.count} of {len(body.target_id)} markers fit its shape in '
             f'this exposure, but so may others of {np.count_nonzero(free)} points by chance'
         )
-    # Where a body fits in more than one way, the members are known in which all ways agree.
+    # If a body fits in more than one way, keep the members on which all ways agree.
     rivals = [fit.point for fit in search.fits if fit.chi2 < BETTER * best.chi2]
     best = best.only((np.array(rivals) == best.point).all(axis=0))
     if best.count < least:
@@ -236,19 +235,19 @@ def _fit(body: Body, points: ShadowPoints, free: NDArray[np.bool_]) -> _Fit:
 
 
 def _by_chance(body: Body, fit: _Fit, xyz: NDArray[np.float64]) -> float:
-    """Expected number of fits as good among as many points anywhere in the space of xyz (n, 3).
+    """Return the expected number of equally good fits among as many random points.
 
-    The second member is on a sphere about the first, the third on a circle, and each further one
-    in a place that these tell, all to within twice the RMS of the fit (Grimson and Huttenlocher,
-    "On the verification of hypothesized matches in model-based recognition", IEEE PAMI 13, 1991;
-    the number is the one of Desolneux, Moisan and Morel, "From Gestalt Theory to Image Analysis",
-    2008).
+    The points are in the space of xyz (n, 3). The second member is on a sphere about the first,
+    the third on a circle, and each further member at a place that these determine, all to within
+    twice the RMS of the fit (Grimson and Huttenlocher, "On the verification of hypothesized
+    matches in model-based recognition", IEEE PAMI 13, 1991; the number is that of Desolneux,
+    Moisan and Morel, "From Gestalt Theory to Image Analysis", 2008).
     """
     reach = 2 * fit.rms_mm
     distance = float(pdist(body.xyz_mm[fit.point >= 0]).mean())
     density = len(xyz) / max(float(np.prod(np.ptp(xyz, axis=0))), 1.0)  # points per mm^3
     on_sphere = density * 4 * np.pi * distance**2 * 2 * reach
-    on_circle = density * np.pi * distance * (2 * reach) ** 2  # of half the distance
+    on_circle = density * np.pi * distance * (2 * reach) ** 2  # radius: half the distance
     at_place = density * 4 / 3 * np.pi * reach**3
     choices = comb(len(body.target_id), fit.count)
     expected = choices * len(xyz) * on_sphere * on_circle * at_place ** (fit.count - 3)
@@ -274,9 +273,9 @@ class _Search:
             for of_member, one in zip(wanted, body.sd_mm)
         ]
         self.free = free
-        self.fits: list[_Fit] = []  # with as many members as the best one
+        self.fits: list[_Fit] = []  # fits with as many members as the best
         self.steps = 0
-        self.choices: list[NDArray[np.int64]] = []  # complete ones that are not judged yet
+        self.choices: list[NDArray[np.int64]] = []  # complete choices that are not evaluated yet
         self.judged = 0
         self.point = np.full(len(body.target_id), -1)
 
@@ -286,7 +285,7 @@ class _Search:
         self._judge()
 
     def _extend(self, member: int, free: NDArray[np.bool_]) -> None:
-        """Choose a point for a member, and for those after it."""
+        """Choose a point for a member, and recursively for those after it."""
         self.steps += 1
         if self.steps > MAX_STEPS:
             raise DataError(f'body {self.body.name}: too many round shadows to search')
@@ -298,7 +297,7 @@ class _Search:
             return
         if member == size:
             self.choices.append(self.point.copy())
-            # Many are judged in the time of one, but what fits ends the search for fewer members.
+            # Many are evaluated in the time of one, but a fit ends the search for fewer members.
             if len(self.choices) > self.judged:
                 self._judge()
             return
@@ -314,7 +313,7 @@ class _Search:
         self._extend(member + 1, free)
 
     def _judge(self) -> None:
-        """Compare complete choices with the best ones, those of most members first."""
+        """Compare complete choices with the best fits, those with most members first."""
         by_count: dict[int, list[NDArray[np.int64]]] = {}
         for choice in self.choices:
             by_count.setdefault(int(np.count_nonzero(choice >= 0)), []).append(choice)
@@ -342,7 +341,7 @@ class _Search:
 
     @property
     def best(self) -> _Fit | None:
-        """The fit of most members, of several the closest one."""
+        """Closest fit among those with most members."""
         return min(self.fits, key=lambda fit: fit.chi2, default=None)
 
 
@@ -353,7 +352,7 @@ def _first(
     points: ShadowPoints,
     shadows: NDArray[np.float64],
 ) -> FirstMarkers | None:
-    """Return the markers of a view with these shadows, None where it sees none of the bodies."""
+    """Return the markers of a view with these shadows, None if it sees none of the bodies."""
     name = rig.orientation.fluoroscopes[view]
     ids = [np.zeros(0, dtype=np.int64)]
     places = [np.zeros((0, 2))]

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Light of an image around markers; where they are and how they look in their first image.
+"""Light of an image around markers; detection and appearance of markers in their first image.
 
-Only windows around predictions are looked at, which is a twentieth of an image. They are filtered
-as one tall image, so that a handful of calls to OpenCV serve all markers. The response to a round
-shadow is the smaller eigenvalue of the Hessian, as in `detection`.
+Only windows around predictions are evaluated, about a twentieth of an image. They are filtered as
+one tall image, so that a few calls to OpenCV serve all markers. The response to a round shadow is
+the smaller eigenvalue of the Hessian, as in `detection`.
 """
 
 from __future__ import annotations
@@ -35,32 +35,32 @@ from .measurement import circles, estimate_profile
 from .shadow_fit import Profile
 
 MARKER_SCALES = SCALES[:5]  # markers are smaller than beads
-MIN_CONTRAST = 0.02  # of a response, as a fraction of the light around it
-MIN_SNR = 4.5  # of a response, over the noise of the response
-SHARE = 0.35  # of the response to a typical marker, from which a shadow may be a marker
+MIN_CONTRAST = 0.02  # least response, as a fraction of the light around it
+MIN_SNR = 4.5  # least response, over the noise of the response
+SHARE = 0.35  # least response of a marker, over that to a typical marker
 BACKGROUND_PX = 6  # half the width of the box whose mean is the light around a pixel
-SAMPLED = 4  # rows and columns from one pixel to the next, where all are of one kind
-SAME_PX = 1.0  # between maxima that are one shadow
-BORDER = 3  # scales of the blur at the edge of a window that are not searched
+SAMPLED = 4  # step of rows and columns when pixels are subsampled
+SAME_PX = 1.0  # distance between maxima below which they are one shadow
+BORDER = 3  # width of the edge of a window that is not searched, in scales of the blur
 
 
 @dataclass(frozen=True)
 class Shadows:
-    """Round shadows: places (n, 2) [px] to some 0.1 px, and strengths (n,).
+    """Round shadows: places (n, 2) [px] to about 0.1 px, and strengths (n,).
 
-    A strength is the response over the light around the shadow.
+    The strength is the response over the light around the shadow.
     """
 
     uv: NDArray[np.float64]
     strength: NDArray[np.floating]
 
     def strongest(self, count: int) -> Shadows:
-        """Return so many of the shadows at most."""
+        """Return the strongest shadows, at most `count`."""
         order = np.argsort(-self.strength, kind='stable')[:count]
         return Shadows(self.uv[order], self.strength[order])
 
     def distinct(self) -> Shadows:
-        """Return the shadows without those at the place of a stronger one."""
+        """Return the shadows without those at the place of a stronger shadow."""
         order = np.argsort(-self.strength, kind='stable')
         uv = self.uv[order]
         tree = cKDTree(uv)
@@ -71,14 +71,14 @@ class Shadows:
 
 @dataclass(frozen=True)
 class MarkerLook:
-    """What markers look like in the images of a sequence."""
+    """Appearance of markers in the images of a sequence."""
 
-    scale: float  #: blur at which they stand out most [px]
-    inverted: bool  #: markers are bright in the image
+    scale: float  #: blur with the largest response [px]
+    inverted: bool  #: True if markers are bright in the image
     field: NDArray[np.bool_]  #: (h, w), the field of view
     strength: float  #: response to a typical marker over the light around it
-    floor: float  #: response below which noise is, in the light of the middle of the range
-    light: float  #: that light
+    floor: float  #: response below which noise is likely, at the usual light
+    light: float  #: usual light: the median in the field
 
     @property
     def radius_px(self) -> float:
@@ -88,21 +88,21 @@ class MarkerLook:
 
 @dataclass(frozen=True)
 class FilteredLight:
-    """Light (h, w) of an image in which markers are dark, filtered for shadows of one size."""
+    """Light (h, w) of an image with dark markers, filtered for shadows of one size."""
 
     scale: float
-    inverted: bool  # whether they are bright in the image
+    inverted: bool  # True if markers are bright in the image
     light: NDArray[np.float32]
     response: NDArray[np.float32]
-    around: NDArray[np.float32]  # mean of the light around
+    around: NDArray[np.float32]  # mean of the surrounding light
 
     @cached_property
     def relative(self) -> NDArray[np.float32]:
-        """Response (h, w) over the light around."""
+        """Response (h, w) over the surrounding light."""
         return self.relative_at(np.s_[:, :])
 
     def relative_at(self, pixels: Any) -> NDArray[np.float32]:
-        """The same at an index of pixels."""
+        """Return the same at an index of pixels."""
         light = np.maximum(self.around[pixels], self._least)
         return np.asarray(np.divide(self.response[pixels], light, out=light))
 
@@ -117,7 +117,7 @@ class FilteredLight:
 
     @cached_property
     def maxima(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Rows and columns (k,) of the local maxima."""
+        """Rows and columns (k,) of the local maxima of the relative response."""
         around = np.ones((2 * max(1, round(self.scale)) + 1,) * 2, np.uint8)
         dilated = cv2.dilate(self.relative, around)
         largest = self.relative >= dilated
@@ -127,21 +127,21 @@ class FilteredLight:
 
     @cached_property
     def noise(self) -> float:
-        """Median response where there is any; a part of the pixels tells it."""
+        """Median of the positive relative responses, from a part of the pixels."""
         part = self.relative_at(np.s_[::SAMPLED, ::SAMPLED])
         positive = part[part > 0]
         return float(np.median(positive)) if len(positive) else 0.0
 
     @cached_property
     def usual(self) -> float:
-        """Light of the middle of the range."""
+        """Median light in the field, from a part of the pixels."""
         part = self.light[::SAMPLED, ::SAMPLED]
         field = self.field[::SAMPLED, ::SAMPLED]
         return float(np.median(part[field])) if field.any() else float(self.light.mean())
 
 
 class FilteredImage:
-    """A whole image (h, w), filtered for shadows of one size after another, of each once."""
+    """A whole image (h, w), filtered once for each size of shadows, on demand."""
 
     def __init__(self, image: np.ndarray) -> None:
         self.image = image
@@ -152,7 +152,7 @@ class FilteredImage:
         self._lights = (grey, around), (top - grey, top - around)
 
     def of_scale(self, scale: float) -> tuple[FilteredLight, FilteredLight]:
-        """Return the image filtered for dark shadows, and for bright ones."""
+        """Return the image filtered for dark shadows and for bright shadows."""
         if scale not in self._by_scale:
             dark, bright = self._lights
             of_both = responses(dark[0], scale)
@@ -164,7 +164,7 @@ class FilteredImage:
 
 
 class LightWindows:
-    """Reads windows of one image, markers dark."""
+    """Reads windows of one image, in which markers are dark."""
 
     def __init__(self, image: np.ndarray, look: MarkerLook) -> None:
         self._flat = image.reshape(-1)
@@ -198,9 +198,9 @@ class LightWindows:
 
 
 def check_image(image: np.ndarray, size: tuple[int, int] | None = None) -> None:
-    """Raise DataError, in one sentence, for an image in which nothing can be seen.
+    """Raise DataError, in one sentence, if nothing can be seen in an image.
 
-    size is the width and height that it should have.
+    size: expected width and height.
     """
     if not isinstance(image, np.ndarray) or image.ndim != 2:
         raise DataError('an image must be an array of rows and columns of grey values')
@@ -213,7 +213,7 @@ def check_image(image: np.ndarray, size: tuple[int, int] | None = None) -> None:
         raise DataError(
             f'the image is {width} x {height} px, but the first one is {size[0]} x {size[1]} px'
         )
-    # A coarse look is enough, and takes no time.
+    # Check a coarse sample first, which takes no time.
     sample = image[::16, ::16]
     if sample.min() == sample.max() and image.min() == image.max():
         cause = f'the image is empty: every pixel has the grey value {int(image.flat[0])}'
@@ -223,29 +223,29 @@ def check_image(image: np.ndarray, size: tuple[int, int] | None = None) -> None:
 def _learn_look(
     image: FilteredImage, near: NDArray[np.float64]
 ) -> tuple[MarkerLook, FilteredLight]:
-    """Learn what markers look like, from an image and points (n, 2) near them.
+    """Learn the appearance of markers from an image and points (n, 2) near them.
 
-    Returns the light filtered for them, too. Raises DataError where there is nothing round.
+    Also return the light filtered for them. Raises DataError if there is nothing round.
     """
     best: _Typical | None = None
     for scale in MARKER_SCALES:
         lights: Sequence[FilteredLight] = image.of_scale(scale)
-        if best is not None and best.clear:  # dark or bright
+        if best is not None and best.clear:  # then the polarity is known
             lights = lights[int(best.light.inverted) :][:1]
         found = max((_Typical.near(one, near) for one in lights), key=lambda one: one.snr)
         if best is None or found.merit > best.merit:
             best = found
         elif best.clear:
-            break  # beyond the size of the markers, the response falls
+            break  # beyond the size of the markers, the response decreases
     assert best is not None
     return best.look('there is nothing round where the markers should be'), best.light
 
 
 def first_shadows(lights: Iterable[FilteredLight], count: int) -> Shadows:
-    """Find the shadows in an image that says itself what markers look like.
+    """Find shadows in an image and learn the appearance of markers from it.
 
-    lights: dark and bright ones of one size. count: of the strongest shadows, which tell the look.
-    Raises DataError where there is nothing round.
+    lights: dark and bright light of one size. count: number of strongest shadows from which the
+    appearance is learned. Raises DataError if there is nothing round.
     """
     best = max((_Typical.strongest(light, count) for light in lights), key=lambda one: one.snr)
     look = best.look('there are no markers in the image, nothing round rises above the noise')
@@ -253,14 +253,14 @@ def first_shadows(lights: Iterable[FilteredLight], count: int) -> Shadows:
 
 
 def search_image(image: np.ndarray, look: MarkerLook) -> Shadows:
-    """Search a whole image for shadows that may be markers."""
+    """Find shadows in a whole image that may be markers."""
     grey = image.astype(np.float32)
     light = float(np.iinfo(image.dtype).max) - grey if look.inverted else grey
     return _found(look, _filtered(light, (2 * BACKGROUND_PX + 1,) * 2, look))
 
 
 def _filtered(light: NDArray[np.float32], box: tuple[int, int], look: MarkerLook) -> FilteredLight:
-    """Filter light for shadows of a look; the light around is the mean of a box."""
+    """Filter light for shadows of a look; the surrounding light is the mean of a box."""
     (response,) = responses(light, look.scale, (False,))
     return FilteredLight(look.scale, look.inverted, light, response, cv2.blur(light, box))
 
@@ -274,7 +274,7 @@ class _Typical:
 
     @classmethod
     def near(cls, light: FilteredLight, uv: NDArray[np.float64]) -> _Typical:
-        """The median near points (n, 2)."""
+        """Return the median response near points (n, 2)."""
         height, width = light.response.shape
         around = np.rint(uv).astype(int)[:, None] + _square(int(np.ceil(GIVEN_GATE * GIVEN_SD_PX)))
         column = np.clip(around[..., 0], 0, width - 1)
@@ -283,35 +283,35 @@ class _Typical:
 
     @classmethod
     def strongest(cls, light: FilteredLight, count: int) -> _Typical:
-        """The median of the count strongest maxima."""
+        """Return the median of the `count` strongest maxima."""
         values = np.sort(light.relative[light.maxima])[::-1][: max(count, 3)]
         return cls(light, float(np.median(values)) if len(values) else 0.0)
 
     @property
     def snr(self) -> float:
-        """Strength over the noise, which tells whether markers are dark or bright.
+        """Strength over the noise; it decides whether markers are dark or bright.
 
-        Noise is the stronger, the less light there is, and may be stronger than markers.
+        The noise increases as the light decreases, and may be stronger than markers.
         """
         return self.strength / max(self.light.noise, 1e-9)
 
     @property
     def merit(self) -> float:
-        """How much its size stands out: small ones have the strongest response to noise, too."""
+        """Strength reduced by noise, to compare sizes: small sizes respond most to noise, too."""
         return self.strength**2 / max(self.strength + self.light.noise, 1e-9)
 
     @property
     def clear(self) -> bool:
-        """Whether noise does not explain it."""
+        """Whether noise does not explain the response."""
         return self.strength >= self.floor
 
     @property
     def floor(self) -> float:
-        """Response below which noise is."""
+        """Response below which noise is likely."""
         return max(MIN_SNR * self.light.noise, MIN_CONTRAST)
 
     def look(self, cause: str) -> MarkerLook:
-        """Return what markers look like. Raises DataError with the cause where there is noise."""
+        """Return the appearance of markers. Raises DataError with the cause if it is noise."""
         light = self.light
         if not self.clear:
             raise DataError(cause, kind=Kind.NO_MARKERS)
@@ -337,7 +337,7 @@ def _found(look: MarkerLook, light: FilteredLight) -> Shadows:
     row, column = row[clear], column[clear]
     response = light.relative
     at = response[row, column]
-    # To a part of a pixel.
+    # Interpolate to a part of a pixel.
     u = column + vertex(response[row, column - 1], at, response[row, column + 1])
     v = row + vertex(response[row - 1, column], at, response[row + 1, column])
     return Shadows(np.column_stack([u, v]), at)
@@ -346,7 +346,7 @@ def _found(look: MarkerLook, light: FilteredLight) -> Shadows:
 def search_windows(
     windows: LightWindows, middle: NDArray[np.int64], half: int, look: MarkerLook
 ) -> Shadows:
-    """Search windows of 2 half + 1 px around pixels middle (n, 2), each shadow found once."""
+    """Search windows of 2 half + 1 px around pixels middle (n, 2); find each shadow once."""
     border = int(np.ceil(BORDER * look.scale))
     size = 2 * (half + border) + 1
     grey, valid = windows.read(middle, _square(half + border))
@@ -360,45 +360,45 @@ def search_windows(
     place = found.uv.copy()
     place[:, 1] -= number * size
     place += middle[number] - half - border
-    # Windows that overlap contain the same shadow.
+    # Overlapping windows contain the same shadow.
     return Shadows(place, found.strength).distinct() if len(place) else found
 
 
 @lru_cache(maxsize=64)
 def _square(half: int) -> NDArray[np.int64]:
-    """Pixels (m, 2) of a square window, from its middle, row by row."""
+    """Return the pixels (m, 2) of a square window relative to its middle, row by row."""
     axis = np.arange(-half, half + 1)
     return np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
 
 
 def _floor(look: MarkerLook, around: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Relative response below which noise is, by the light around: it grows in the dark."""
+    """Return the relative response below which noise is likely; it increases in the dark."""
     light = np.maximum(around, 1e-3 * look.light)
     return np.asarray(look.floor * np.sqrt(np.maximum(look.light / light, 1.0)))
 
 
-MIN_DENSITY = 2e-6  # of false shadows [1/px^2]
+MIN_DENSITY = 2e-6  # least density of false shadows [1/px^2]
 
 
 @dataclass(frozen=True)
 class MarkerStart:
-    """What the first image says of the markers."""
+    """Properties of the markers in the first image."""
 
     states: MarkerStates
     look: MarkerLook
     profile: Profile  #: shadow of a typical marker
     noise: Noise
     size: tuple[int, int]  #: width and height of the images [px]
-    density: float  #: of false shadows [1/px^2]
+    density: float  #: density of false shadows [1/px^2]
 
 
-NOWHERE_PX = -2e4  # where markers are whose place is not known yet
+NOWHERE_PX = -2e4  # place of markers whose place is not known yet
 
 
 def learn_start(image: FilteredImage, target_id: NDArray[np.int64], uv: np.ndarray) -> MarkerStart:
-    """Learn from an image with markers near uv (n, 2) [px], NaN where places are not known yet.
+    """Learn from an image with markers near uv (n, 2) [px], NaN for places not known yet.
 
-    Raises DataError where the markers are not there.
+    Raises DataError if the markers are not in the image.
     """
     height, width = image.image.shape
     known = np.isfinite(uv).all(axis=1)
@@ -432,16 +432,16 @@ def learn_start(image: FilteredImage, target_id: NDArray[np.int64], uv: np.ndarr
     )
 
 
-MAX_HALF = 48  # of a search window [px]
-STRIPS = 6  # of an image that is searched in turn: a whole one takes as long as five exposures
+MAX_HALF = 48  # largest half width of a search window [px]
+STRIPS = 6  # strips of an image, searched in turn: a whole image takes as long as five exposures
 
 
 class MarkerSearch:
     """Finds shadows where markers may be.
 
-    gate: half the width of a search window [standard deviations of the prediction]. lost_after:
-    images without a marker after which it is lost. search_every: images in which all strips of
-    the image are searched in turn, where a marker is lost.
+    gate: half width of a search window [standard deviations of the prediction]. lost_after: images
+    without a marker after which it is lost. search_every: images in which all strips of the image
+    are searched in turn if a marker is lost.
     """
 
     def __init__(
@@ -464,7 +464,7 @@ class MarkerSearch:
     def shadows(
         self, image: np.ndarray, windows: LightWindows, states: MarkerStates, number: int
     ) -> Shadows:
-        """Find shadows in an image; number is that of images since the first one."""
+        """Find shadows in an image; number: number of images since the first."""
         lost = self.lost(states)
         parts = []
         if lost.any() and number % self._every == 0:
@@ -473,7 +473,7 @@ class MarkerSearch:
         near = ~lost | (reach <= MAX_HALF)
         half = np.minimum(reach, MAX_HALF).astype(int)
         middle = np.rint(states.motion.uv).astype(int)
-        # Few markers need wide windows; those of the others stay small.
+        # Few markers need wide windows; the other windows stay small.
         sizes = np.sort(half[near])
         small = int(sizes[3 * len(sizes) // 4]) if len(sizes) else 0
         for rows in (near & (half <= small), near & (half > small)):

@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Motion of markers in an image: prediction, assignment, and which ids may have been exchanged.
+"""Motion of markers in an image: prediction, assignment, and detection of possible exchanges.
 
 Each marker has a Kalman filter of constant velocity whose disturbance is a white acceleration
 (Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001,
-6.3.2), of a size that is learned from the innovations. Shadows are assigned to all markers
-together (Kuhn and Munkres, by scipy), at the largest likelihood: a squared Mahalanobis distance
-and the logarithm of the determinant of its covariance (ibid., 5.4).
+6.3.2). Its size is estimated from the innovations. Shadows are assigned to all markers together
+(Kuhn and Munkres, by scipy) at the largest likelihood: a squared Mahalanobis distance and the
+logarithm of the determinant of its covariance (ibid., 5.4).
 """
 
 from __future__ import annotations
@@ -21,34 +21,34 @@ from scipy.spatial import cKDTree
 
 from .shadow_fit import DEPTH_SD
 
-FIRST_SPEED_PX = 6.0  # standard deviation of the unknown first velocity [px a frame]
-FORGET = 0.9  # share that a running mean keeps of what was before
-COMPARED = 5  # images before the motion of two markers is known to be alike
-UNSTEADY_PX = 0.5  # by which velocities usually change in a frame, and differ [px a frame]
-LEADERS = 4  # markers whose motion another one follows
+FIRST_SPEED_PX = 6.0  # standard deviation of the unknown initial velocity [px/frame]
+FORGET = 0.9  # weight of the past in a running mean
+COMPARED = 5  # images after which it is known how alike two markers move
+UNSTEADY_PX = 0.5  # usual change of a velocity in a frame, or difference of two [px/frame]
+LEADERS = 4  # number of markers whose motion an unseen marker follows
 LED = 0.5  # share of the acceleration that they do not explain
-MAX_SD_PX = 60.0  # of a prediction
-MODEL_SD_PX = 0.05  # of a place, beyond the noise of the measurement
-SHADOW_SD_PX = 0.25  # of the place of a shadow before it is measured
-GIVEN_SD_PX = 1.5  # of a place that is given, or told by markers beside
-FAR = 1e6
-MIN_VOTES = 1.5  # for a shift of markers together
+MAX_SD_PX = 60.0  # largest standard deviation of a prediction
+MODEL_SD_PX = 0.05  # standard deviation of a place in addition to the noise of the measurement
+SHADOW_SD_PX = 0.25  # standard deviation of the place of a shadow before the fit
+GIVEN_SD_PX = 1.5  # standard deviation of a place that is given, or predicted from neighbours
+FAR = 1e6  # cost of an assignment outside the gate, and place without a measurement
+MIN_VOTES = 1.5  # least score of a common shift of markers
 
 
 @dataclass
 class Motion:
     """State of the filters of n markers."""
 
-    uv: NDArray[np.float64]  #: (n, 2) [px], [px a frame]
-    velocity: NDArray[np.float64]  #: (n, 2) [px], [px a frame]
+    uv: NDArray[np.float64]  #: (n, 2), places [px]
+    velocity: NDArray[np.float64]  #: (n, 2), velocities [px/frame]
     covariance: NDArray[np.float64]  #: (n, 2, 2), of place and velocity, the same along u and v
     squared: NDArray[np.float64]  #: (n,), running mean of squared accelerations
     unlike: NDArray[np.float64]  #: (n, n), running mean of squared differences of velocities
-    together: NDArray[np.int64]  #: (n, n), images in which they were compared
+    together: NDArray[np.int64]  #: (n, n), number of images in which they were compared
 
     @classmethod
     def start(cls, uv: np.ndarray, sd_px: float) -> Motion:
-        """Return filters of markers at uv (n, 2), whose velocity is not known."""
+        """Return filters of markers at uv (n, 2) with unknown velocity."""
         n = len(uv)
         covariance = np.zeros((n, 2, 2))
         covariance[:, 0, 0] = sd_px**2
@@ -72,9 +72,9 @@ class Motion:
         return self.covariance[:, 0, 0]
 
     def predict(self, frames: int, led: NDArray[np.bool_] | None = None) -> None:
-        """Move all markers on by a number of frames.
+        """Predict all markers after a number of frames.
 
-        led (n,) are those whose velocity follows that of others.
+        led (n,): True for markers whose velocity follows that of others.
         """
         t = float(frames)
         self.uv += t * self.velocity
@@ -95,7 +95,7 @@ class Motion:
     def innovation_variance(
         self, sigma: NDArray[np.float64], rows: NDArray[np.int64] | slice = np.s_[:]
     ) -> NDArray[np.float64]:
-        """Variances (n,) of a measured less a predicted coordinate, of some markers."""
+        """Return variances (n,) of measured minus predicted coordinates of some markers."""
         return self.variance[rows] + sigma**2 + MODEL_SD_PX**2
 
     def update(
@@ -105,7 +105,7 @@ class Motion:
         sigma: NDArray[np.float64],
         frames: int,
     ) -> None:
-        """Take in measured centres (m, 2) of some markers."""
+        """Update some markers with measured centres (m, 2)."""
         innovation = uv - self.uv[rows]
         settled = self.settled[rows]
         p = self.covariance[rows]
@@ -113,7 +113,7 @@ class Motion:
         self.uv[rows] += gain[:, :1] * innovation
         self.velocity[rows] += gain[:, 1:] * innovation
         self.covariance[rows] = p - gain[:, :, None] * p[:, None, 0, :]
-        # What the innovation says of the acceleration; a first or late one says little.
+        # Acceleration from the innovation; a first or late innovation has little information.
         seen = 0.5 * (innovation**2).sum(axis=1) / float(frames) ** 4
         seen = np.maximum(seen - sigma**2, 0)
         update = FORGET * self.squared[rows] + (1 - FORGET) * seen
@@ -122,10 +122,10 @@ class Motion:
     def lead(
         self, seen: NDArray[np.bool_], before: NDArray[np.float64], sure: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Let unseen markers follow those that move alike; returns (n,) which do.
+        """Let unseen markers follow markers that move alike; return (n,) which do.
 
-        seen (n,) were measured now, and had velocities before (n, 2). Which markers move alike is
-        learned from those that are sure (n,).
+        seen (n,): measured now; before (n, 2): velocities before these measurements. Which markers
+        move alike is learned from those with certain ids, sure (n,).
         """
         rows = np.flatnonzero(seen & self.settled)
         led = np.zeros(len(seen), dtype=bool)
@@ -148,9 +148,9 @@ class Motion:
         return led
 
     def company(self, row: int, among: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the LEADERS of some markers that move with one.
+        """Return the LEADERS among some markers that move most like a marker.
 
-        They are those that moved most alike, and the nearest where that is not known.
+        If it is not known which do, return the nearest.
         """
         away = np.linalg.norm(self.uv[among] - self.uv[row], axis=1)
         return among[np.lexsort((away, self.unlike[row, among]))[:LEADERS]]
@@ -160,8 +160,8 @@ class Motion:
     ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
         """Compare velocities with those of the markers that moved alike so far.
 
-        Returns, for markers in rows (k,), the ratio (k,) of the squared difference to what it used
-        to be, and the velocities (k, 2) of the others. seen (n,) were measured now.
+        Return, for markers in rows (k,), the ratio (k,) of the squared difference to the usual
+        one, and the velocities (k, 2) of the others. seen (n,): True for markers measured now.
         """
         rows = np.flatnonzero(seen & self.settled)
         if len(rows) <= LEADERS:
@@ -181,17 +181,17 @@ class Motion:
         velocity: NDArray[np.float64],
         sd_px: NDArray[np.float64],
     ) -> None:
-        """Put some markers where a better prediction says, if it is better."""
+        """Move some markers to other predictions if these are more precise."""
         better = sd_px**2 < self.variance[rows]
         self.redirect(rows[better], uv[better], velocity[better], sd_px[better])
 
     def scatter(self, row: int) -> None:
-        """Forget where a marker is."""
+        """Discard the place of a marker."""
         self.covariance[row] = np.diag([MAX_SD_PX**2, FIRST_SPEED_PX**2])
 
     @property
     def settled(self) -> NDArray[np.bool_]:
-        """Return (n,) whether the velocity of a marker is known."""
+        """Whether (n,) the velocity of a marker is known."""
         return np.asarray(self.covariance[:, 1, 1] < FIRST_SPEED_PX**2 / 4)
 
     def redirect(
@@ -201,7 +201,7 @@ class Motion:
         velocity: NDArray[np.float64],
         sd_px: NDArray[np.float64] | float,
     ) -> None:
-        """Put markers (k,) at places (k, 2), with velocities (k, 2) [px a frame]."""
+        """Set places (k, 2) and velocities (k, 2) [px/frame] of markers (k,)."""
         self.uv[rows] = uv
         self.velocity[rows] = velocity
         self.covariance[rows] = np.eye(2) * np.square(sd_px)[..., None, None]
@@ -219,7 +219,7 @@ class Motion:
 def costs(
     uv: NDArray[np.float64], variance: NDArray[np.float64], found: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Costs (n, m), -2 log likelihood, of places (m, 2) for markers predicted at uv (n, 2)."""
+    """Return costs (n, m), -2 log-likelihood, of places (m, 2) for predictions uv (n, 2)."""
     away = uv[:, None] - found[None]
     squared = (away * away).sum(axis=2)
     return squared / variance[:, None] + 2 * np.log(variance)[:, None]
@@ -231,9 +231,9 @@ def assign(
     found: NDArray[np.float64],
     gate_sigmas: float,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Assign places (m, 2) to markers predicted at uv (n, 2); rows of both.
+    """Assign places (m, 2) to markers predicted at uv (n, 2); return rows of both.
 
-    As many markers as possible get a place within their gate, at the smallest sum of costs.
+    As many markers as possible are assigned a place within their gate, at the least sum of costs.
     """
     if not len(uv) or not len(found):
         return np.zeros(0, dtype=int), np.zeros(0, dtype=int)
@@ -248,9 +248,9 @@ def assign(
 def common_shift(
     uv: NDArray[np.float64], row: int, beside: NDArray[np.int64], found: cKDTree, reach_px: float
 ) -> NDArray[np.float64] | None:
-    """Shift (2,) of a marker that takes most of the markers beside it to shadows, or None.
+    """Return the shift (2,) of a marker that moves most of its neighbours to shadows, or None.
 
-    uv (n, 2) are predictions, beside (k,) rows of markers that move with it.
+    uv (n, 2) are predictions, beside (k,) the rows of its neighbours.
     """
     near = found.query_ball_point(uv[row], reach_px)
     if not near:
@@ -272,49 +272,49 @@ def doubtful_pairs(
     found: NDArray[np.float64],
     margin: float,
 ) -> NDArray[np.int64]:
-    """Pairs (k, 2) of markers whose places could as well be exchanged.
+    """Return pairs (k, 2) of markers whose places could as well be exchanged.
 
     Parameters
     ----------
     uv : (n, 2) ndarray
         Predictions.
     variance : (n,) ndarray
-        Of a measured less a predicted coordinate.
+        Variances of a measured minus a predicted coordinate.
     measured : (n,) ndarray of bool
     found : (n, 2) ndarray
-        Measured centres; anything where there is none.
+        Measured centres; any value if there is none.
     margin : float
-        Of -2 log likelihood, below which the other way round is not excluded.
+        Least increase of -2 log-likelihood that excludes an exchange.
     """
     cost = costs(uv, variance, np.where(measured[:, None], found, FAR))
     own = np.where(measured, np.diagonal(cost), 0.0)
     other = np.where(measured[None], cost, 0.0)
-    # Both measured: exchanged. One measured: its place may be that of the other.
+    # Both measured: exchanged. One measured: its place may belong to the other.
     excess = other + other.T - own[:, None] - own[None]
     there = measured[:, None] | measured[None]
     one, two = np.nonzero(np.triu(there & (excess < margin), 1))
     return np.stack([one, two], axis=1)
 
 
-# What is known of markers from image to image: motion, depth of the shadow, images unseen.
+# States of markers between images: motion, depth of the shadow, number of images unseen.
 
-GIVEN_GATE = 3.0  # standard deviations from a given place, within which its marker is
-KNOWN_DEPTH_SD = 0.15
-RECENT = 4  # images in which a place tells the velocity
+GIVEN_GATE = 3.0  # largest distance of a marker from a given place [standard deviations]
+KNOWN_DEPTH_SD = 0.15  # standard deviation of the depth of a measured marker
+RECENT = 4  # images within which two given places determine the velocity
 
 
 @dataclass(frozen=True)
 class MeasuredMarkers:
     """Shadows of n markers in one image, by row."""
 
-    measured: NDArray[np.bool_]  #: (n,), the other values say nothing where it is False
+    measured: NDArray[np.bool_]  #: (n,); if False, the other values have no meaning
     uv: NDArray[np.float64]  #: (n, 2), centres [px]
-    shadow: NDArray[np.float64]  #: (n, 2), where their shadows were found, before the fit [px]
+    shadow: NDArray[np.float64]  #: (n, 2), places of the shadows before the fit [px]
     sigma: NDArray[np.float64]  #: (n,), standard deviation of a coordinate [px]
-    depth: NDArray[np.float64]  #: (n,)
-    #: (n,), the shadow of another marker reaches into that of the marker
+    depth: NDArray[np.float64]  #: (n,), depth of the shadow, 1 for that of a typical marker
+    #: (n,), True if the shadow of another marker reaches into that of the marker
     overlapped: NDArray[np.bool_]
-    free: NDArray[np.float64]  #: (k, 2), shadows that no marker has [px]
+    free: NDArray[np.float64]  #: (k, 2), shadows that are assigned to no marker [px]
 
     @classmethod
     def nothing(cls, count: int) -> MeasuredMarkers:
@@ -328,25 +328,25 @@ class MeasuredMarkers:
 
 @dataclass
 class MarkerStates:
-    """What is known of n markers, by row."""
+    """States of n markers, by row."""
 
     motion: Motion
-    #: (n,), of the shadow, 1 for that of a typical marker
+    #: (n,), depth of the shadow, 1 for that of a typical marker
     depth: NDArray[np.float64]
     depth_sd: NDArray[np.float64]
-    unseen: NDArray[np.int64]  #: (n,), images since a marker was measured
-    placed: NDArray[np.int64]  #: (n,), images since its place was given
+    unseen: NDArray[np.int64]  #: (n,), number of images since a marker was measured
+    placed: NDArray[np.int64]  #: (n,), number of images since its place was given
 
     @classmethod
     def start(cls, motion: Motion, unseen: np.ndarray) -> MarkerStates:
-        """Return the states of markers whose depth is not known."""
+        """Return the states of markers with unknown depth."""
         n = len(unseen)
         long_ago = np.full(n, 2 * RECENT)
         return cls(motion, np.ones(n), np.full(n, DEPTH_SD), unseen=unseen, placed=long_ago)
 
     @property
     def shadow_variance(self) -> NDArray[np.float64]:
-        """Variances (n,) of a coordinate of a shadow less that of the prediction [px^2]."""
+        """Variances (n,) of a coordinate of a shadow minus its prediction [px^2]."""
         return self.motion.variance + SHADOW_SD_PX**2
 
     def advance(self, frames: int, led: NDArray[np.bool_] | None) -> None:
@@ -356,10 +356,10 @@ class MarkerStates:
         self.placed += 1
 
     def place(self, rows: NDArray[np.int64], uv: NDArray[np.float64], frames: int) -> None:
-        """Put markers at given places (k, 2), frames after the image before.
+        """Set markers to given places (k, 2), `frames` after the previous image.
 
-        The second of two such images tells their velocities. Markers that are followed and there
-        anyway go on as they are.
+        The second of two such images determines their velocities. Markers that are tracked and
+        near the given place anyway keep their state.
         """
         motion = self.motion
         away = ((uv - motion.uv[rows]) ** 2).sum(axis=1)
@@ -368,7 +368,7 @@ class MarkerStates:
         rows, uv = rows[elsewhere], uv[elsewhere]
         again = there[elsewhere] & (self.placed[rows] < RECENT)
         again &= self.unseen[rows] <= self.placed[rows]
-        since = (self.unseen[rows] + frames - 1)[:, None]  # that they were measured
+        since = (self.unseen[rows] + frames - 1)[:, None]  # frames since they were measured
         before = motion.uv[rows] - since * motion.velocity[rows]
         velocity = np.where(again[:, None], (uv - before) / since, 0.0)
         motion.redirect(rows, uv, velocity, GIVEN_SD_PX)
@@ -377,11 +377,11 @@ class MarkerStates:
         self.placed[rows] = 0
 
     def update(self, found: MeasuredMarkers, frames: int) -> None:
-        """Take in the markers that were measured, frames after the image before."""
+        """Update the measured markers, `frames` after the previous image."""
         rows = np.flatnonzero(found.measured)
         self.motion.update(rows, found.uv[rows], found.sigma[rows], frames)
         self.unseen[rows] = 0
-        # The depth of a shadow is that of its marker alone.
+        # The depth of a shadow is only known if no other shadow overlaps.
         free = rows[~found.overlapped[rows]]
         first = self.depth_sd[free] > KNOWN_DEPTH_SD
         memory = np.where(first, 0.0, FORGET)
@@ -395,6 +395,6 @@ class MarkerStates:
             values[[one, other]] = values[[other, one]]
 
     def forget(self, row: int, unseen: int) -> None:
-        """Forget where a marker is, as if it had not been measured for a number of images."""
+        """Discard the place of a marker, as if it had not been measured for a number of images."""
         self.motion.scatter(row)
         self.unseen[row] = unseen

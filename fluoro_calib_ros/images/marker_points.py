@@ -3,9 +3,9 @@
 
 """Points in space where the rays of round shadows of several views meet.
 
-Shadows of every two views are intersected, each with each, as far as their rays meet (epipolar
-distance), and joined by those of further views that lie on the point. A point of fewer views is
-left out where points of more views explain all its shadows.
+All pairs of shadows of every two views whose rays meet (epipolar distance) are intersected, and
+joined by shadows of further views that lie on the point. A point of fewer views is discarded if
+points of more views explain all its shadows.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ class ShadowPoints:
     """Points in space where rays of shadows meet."""
 
     xyz: NDArray[np.float64]  #: (n, 3) [mm]
-    variance: NDArray[np.float64]  #: (n,) in the direction in which it is largest [mm^2]
-    shadow: NDArray[np.int64]  #: (n, F) row of the shadow in each view, -1 where there is none
+    variance: NDArray[np.float64]  #: (n,), variance in the direction in which it is largest [mm^2]
+    shadow: NDArray[np.int64]  #: (n, F), row of the shadow in each view, -1 if there is none
 
 
 def all_among(shadow: NDArray[np.int64], others: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Whether all shadows (n, F) of points are also shadows (k, F) of other points."""
+    """Return whether all shadows (n, F) of points are also shadows (k, F) of other points."""
     among = [np.isin(mine, theirs) for mine, theirs in zip(shadow.T, others.T)]
     return np.asarray((np.column_stack(among) | (shadow < 0)).all(axis=1))
 
 
 def shadow_points(shadows: Sequence[NDArray[np.float64]], rig: CalibratedRig) -> ShadowPoints:
-    """Points where rays of shadows (k, 2) of all views [px] meet."""
+    """Return the points where rays of shadows (k, 2) of all views [px] meet."""
     names = rig.orientation.fluoroscopes
     rays = _Rays(
         [
@@ -70,7 +70,7 @@ def shadow_points(shadows: Sequence[NDArray[np.float64]], rig: CalibratedRig) ->
 
 
 def _explaining(shadow: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Rows (k,) of points that are needed to explain shadows (n, F), each once."""
+    """Return rows (k,) of distinct points that are needed to explain shadows (n, F)."""
     _, once = np.unique(shadow, axis=0, return_index=True)
     rows = np.sort(once)
     count = (shadow[rows] >= 0).sum(axis=1)
@@ -90,7 +90,7 @@ class _Rays:
         self._fit = RayFit(orientation)
 
     def pairs(self) -> NDArray[np.int64]:
-        """Rows (n, F) of the shadows of every two views whose rays meet, -1 for other views."""
+        """Return rows (n, F) of the pairs of shadows whose rays meet, -1 for other views."""
         names = self._orientation.fluoroscopes
         out = [np.zeros((0, len(names)), dtype=np.int64)]
         for one, other in combinations(range(len(names)), 2):
@@ -108,7 +108,7 @@ class _Rays:
         return np.concatenate(out)
 
     def intersect(self, shadow: NDArray[np.int64]) -> tuple[IntersectedPoints, NDArray[np.bool_]]:
-        """Points of shadows (n, F), and whether (n,) all their rays meet."""
+        """Intersect shadows (n, F); return the points, and whether (n,) all their rays meet."""
         uv = self._uv(shadow)
         sigma = np.full(uv.shape[:2], np.nan)
         for view, (of_view, row) in enumerate(zip(self._corrected, shadow.T)):
@@ -121,16 +121,16 @@ class _Rays:
         return points, agree
 
     def variance(self, shadow: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Variances (n,) of points of shadows (n, F), in the direction of the largest one [mm^2].
+        """Return variances (n,) of points of shadows (n, F) in their largest direction [mm^2].
 
-        Errors of orientation and correction are the same for all members of a body, nearly.
+        Errors of orientation and correction are excluded: they hardly differ within a body.
         """
         uv = self._uv(shadow)
         points, _ = self._fit.intersect(uv, np.full(uv.shape[:2], SHADOW_SD_PX))
         return np.asarray(np.linalg.eigvalsh(points.covariance_noise)[:, -1])
 
     def _uv(self, shadow: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Corrected image points (F, n, 2) [px], NaN where there is no shadow."""
+        """Return corrected image points (F, n, 2) [px], NaN if there is no shadow."""
         uv = np.full((shadow.shape[1], len(shadow), 2), np.nan)
         for view, (of_view, row) in enumerate(zip(self._corrected, shadow.T)):
             there = row >= 0

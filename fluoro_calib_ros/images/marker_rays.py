@@ -25,19 +25,19 @@ from ..reconstruction.intersection import (
 from ..reconstruction.reconstruct import IntersectedViews, MatchedViews
 from .markers import MarkerFrame
 
-AGREE = 4.0  # standardised deviation up to which rays, or members of a body, belong together
-SYSTEMATIC_PX = 0.1  # of a corrected image point, beyond its standard deviation
+AGREE = 4.0  # largest standardised deviation of rays, or members of a body, that belong together
+SYSTEMATIC_PX = 0.1  # standard deviation of a corrected image point in addition to its own
 
 
 @dataclass(frozen=True)
 class MarkerExposure:
-    """Markers of one exposure in all F views, by row of all ids."""
+    """Markers of one exposure, in arrays over F views and n ids."""
 
-    observed: NDArray[np.float64]  #: (F, n, 2) [px], NaN where a view does not see a marker
-    doubtful: NDArray[np.bool_]  #: (F, n)
+    observed: NDArray[np.float64]  #: (F, n, 2) [px], NaN if a view does not see a marker
+    doubtful: NDArray[np.bool_]  #: (F, n), True if the id may be wrong in the view
     intersected: IntersectedViews  #: corrected image points and the places of the markers
-    #: (F, n) standardised lack of fit of the rays that one belongs to, NaN where there is none;
-    #: of two rays their epipolar distance; that of a false ray among others is that of all
+    #: (F, n), standardised lack of fit of the rays that are intersected, NaN without a ray; for
+    #: two rays their epipolar distance; for a dropped false ray that of all rays of the marker
     standardised: NDArray[np.float64]
 
     @property
@@ -57,18 +57,18 @@ class MarkerExposure:
 
     @property
     def agree(self) -> NDArray[np.bool_]:
-        """Return (F, n) whether a ray meets others of its marker."""
+        """Whether a ray (F, n) meets others of its marker."""
         return (self.standardised < AGREE) & np.isfinite(self.xyz_mm).all(axis=1)
 
     @property
     def sure(self) -> NDArray[np.bool_]:
-        """Return (n,) whether rays of a marker meet, of views that do not doubt its id."""
+        """Whether (n,) rays of a marker meet, from at least two views that do not doubt its id."""
         return np.asarray((self.agree & ~self.doubtful).sum(axis=0) >= 2)
 
 
 @dataclass(frozen=True)
 class MarkerPlaces:
-    """Places (n, 3) of markers [mm], NaN for unknown; covariances (n, 3, 3)."""
+    """Places (n, 3) of markers [mm], NaN for unknown places; covariances (n, 3, 3)."""
 
     xyz_mm: NDArray[np.float64]
     covariance: NDArray[np.float64]
@@ -80,11 +80,11 @@ class MarkerPlaces:
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """Whether (n,) it is known where a marker is."""
+        """Whether (n,) the place of a marker is known."""
         return np.asarray(np.isfinite(self.xyz_mm).all(axis=1))
 
     def filled(self, others: MarkerPlaces) -> MarkerPlaces:
-        """Return these places, and others where they are unknown."""
+        """Return these places, with unknown places filled from others."""
         known = self.known
         if known.all() or not others.known.any():
             return self
@@ -94,18 +94,18 @@ class MarkerPlaces:
         )
 
     def moved_on(self, before: MarkerPlaces, share: float) -> MarkerPlaces:
-        """Return where markers are expected that moved from other places to these.
+        """Extrapolate the places of markers that moved from other places to these.
 
-        share: of the time between them, in which they go on.
+        share: time of the extrapolation, as a share of the time between the two.
         """
         way = share * (self.xyz_mm - before.xyz_mm)
         wider = (1 + share) ** 2 * self.covariance + share**2 * before.covariance
-        # What they may do otherwise than go on is like the way itself, along any axis.
+        # The uncertainty of the extrapolation is as large as the motion itself, along any axis.
         unsteady = np.sum(way * way, axis=1)[:, None, None] / 3 * np.eye(3)
         return MarkerPlaces(self.xyz_mm + way, wider + unsteady)
 
 
-STEPS = 3  # the correction changes slowly
+STEPS = 3  # fixed-point iterations: the correction changes slowly
 
 
 @dataclass(frozen=True)
@@ -117,11 +117,10 @@ class CalibratedRig:
     angles: Mapping[str, float | None]
 
     def project(self, view: int, xyz_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Observed pixels (k, 2) of points (k, 3) in the rig frame [mm]; NaN where a point is.
+        """Return observed pixels (k, 2) of points (k, 3) in the rig frame [mm]; NaN stays NaN.
 
         view is the row of the fluoroscope in the orientation. The correction is a function of the
-        observed pixel, so it is solved for by fixed-point iteration; where it is not defined, it
-        is 0.
+        observed pixel, so it is found by fixed-point iteration; where it is not defined, it is 0.
         """
         rig = self.orientation
         name = rig.fluoroscopes[view]
@@ -140,9 +139,9 @@ class CalibratedRig:
     def spread(
         self, view: int, xyz_mm: NDArray[np.float64], covariance: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Standard deviations (k,) of a coordinate in a view [px] of points (k, 3).
+        """Return standard deviations (k,) of a coordinate in a view [px] for points (k, 3).
 
-        covariance (k, 3, 3) is that of the points [mm^2].
+        covariance: (k, 3, 3) of the points [mm^2].
         """
         rig = self.orientation
         axes = rig.rotation[view]
@@ -156,7 +155,7 @@ class CalibratedRig:
 class MarkerRays:
     """Rays of markers in calibrated views.
 
-    target_id: (n,) of all markers, ascending.
+    target_id: (n,) ids of all markers, ascending.
     """
 
     def __init__(self, rig: CalibratedRig, target_id: NDArray[np.int64]) -> None:
@@ -168,7 +167,7 @@ class MarkerRays:
     def intersect(
         self, views: Mapping[str, MarkerFrame], angles: Mapping[str, float | None]
     ) -> MarkerExposure:
-        """Correct and intersect the markers of an exposure at angles [rad]."""
+        """Correct and intersect the markers of an exposure at C-arm angles [rad]."""
         shape = (len(self._names), len(self._target_id))
         observed = np.full((*shape, 2), np.nan)
         corrected = np.full((*shape, 2), np.nan)
@@ -193,7 +192,7 @@ class MarkerRays:
     def exchanged(
         self, exposure: MarkerExposure, view: int, rows: Sequence[int]
     ) -> NDArray[np.float64]:
-        """Standardised lack of fit (2,) of two markers of a view if it exchanged them."""
+        """Return the standardised lack of fit (2,) of two markers of a view after an exchange."""
         pair = list(rows)
         uv = exposure.corrected[:, pair].copy()
         sigma = exposure.sigma[:, pair].copy()
@@ -205,9 +204,9 @@ class MarkerRays:
     def by_others(
         self, exposure: MarkerExposure, view: int, wanted: NDArray[np.bool_]
     ) -> MarkerPlaces:
-        """Places where two views and more, without this one, agree that markers are.
+        """Return the places of markers on which at least two other views agree.
 
-        wanted (n,): of these markers.
+        wanted: (n,) True for these markers.
         """
         out = MarkerPlaces.nowhere(len(self._target_id))
         seen = np.asarray(np.isfinite(exposure.corrected).all(axis=2))
@@ -226,9 +225,9 @@ class MarkerRays:
 
 
 class RayFit:
-    """Intersects rays, and says which of them belong together.
+    """Intersects rays, and determines which of them belong together.
 
-    Of three rays and more, a false one is dropped where the others agree without it.
+    Of three rays or more, a false ray is dropped if the others agree without it.
     """
 
     def __init__(self, orientation: RigOrientation) -> None:
@@ -236,15 +235,15 @@ class RayFit:
         self._all = Intersector(orientation, None)
         self._without_false = Intersector(orientation, AGREE)
         limits = largest_lack_of_fit(AGREE, len(orientation.fluoroscopes))
-        # By the number of rays: AGREE means the same probability for any number of them.
+        # By the number of rays: AGREE corresponds to the same probability for any number of them.
         self._scale = limits[2] / limits
 
     def intersect(
         self, uv: np.ndarray, sigma: NDArray[np.float64]
     ) -> tuple[IntersectedPoints, NDArray[np.float64]]:
-        """Intersect image points uv (F, n, 2) of standard deviations sigma (F, n) [px].
+        """Intersect image points uv (F, n, 2) with standard deviations sigma (F, n) [px].
 
-        Also returns the standardised lack of fit (F, n), see MarkerExposure.
+        Also return the standardised lack of fit (F, n), see MarkerExposure.
         """
         points = self._all.intersect(uv, sigma)
         seen = np.isfinite(uv).all(axis=2)
@@ -266,20 +265,20 @@ class RayFit:
         return IntersectedPoints(**values), standardised
 
 
-RIGID_MM = 0.1  # what a marker may move in its body, a standard deviation
-MIN_MEMBERS = 3  # of a body that give its pose
-# Share of the markers of a body that are seen again. Where there are fewer, something has moved
-# the body elsewhere, and what is seen may be anything.
+RIGID_MM = 0.1  # standard deviation of the motion of a marker in its body
+MIN_MEMBERS = 3  # members of a body that determine its pose
+# Share of the markers of a body that must be seen again. With fewer, the body has moved elsewhere,
+# and the measured shadows may be anything.
 MIN_SEEN = 0.5
 LEARNED = 40  # exposures from which the shape of a body is learned
-FRAME_NS = 10_000_000  # time of an exposure for the filter, which adapts to any
+FRAME_NS = 10_000_000  # nominal time of an exposure for the filter, which adapts to any
 
 
 class MarkerBodies:
     """All rigid bodies of markers.
 
-    orientation: of the fluoroscopes. target_id: (n,) of all markers, ascending. bodies: shapes
-    that are not given are learned; bodies of too few markers are ignored.
+    orientation: of the fluoroscopes. target_id: (n,) ids of all markers, ascending. bodies:
+    unknown shapes are learned; bodies with too few markers are ignored.
     """
 
     def __init__(
@@ -292,7 +291,7 @@ class MarkerBodies:
             if np.count_nonzero(there) >= MIN_MEMBERS:
                 self._bodies.append(body.rows(there))
         self._rows = [np.searchsorted(target_id, body.target_id) for body in self._bodies]
-        # Of all markers of bodies: their body, and their row in it.
+        # For all markers of bodies: the body, and the row in the body.
         self._member = (
             np.repeat(np.arange(len(self._rows)), [len(rows) for rows in self._rows]),
             np.array([k for rows in self._rows for k in range(len(rows))], dtype=int),
@@ -302,35 +301,35 @@ class MarkerBodies:
         ]
         self._learned = [
             np.where(body.known, LEARNED, 0) for body in self._bodies
-        ]  # exposures, by marker
+        ]  # number of exposures, by marker
         self._tracker: BodyTracker | None = None
         if self._bodies:
             self._tracker = BodyTracker(orientation, [_placed(body) for body in self._bodies])
         self.present = MarkerPlaces.nowhere(self._count)
 
     def lost(self) -> tuple[Body, ...]:
-        """Bodies whose pose is not known."""
+        """Return bodies with unknown pose."""
         if self._tracker is None:
             return ()
         alive = self._tracker.filter.alive.tolist()
         return tuple(body for body, is_alive in zip(self._bodies, alive) if not is_alive)
 
     def unplaced(self) -> NDArray[np.bool_]:
-        """Whether (n,) markers have a known place in a body whose pose is not known."""
+        """Return (n,) whether markers have a known place in a body with unknown pose."""
         out = np.zeros(self._count, dtype=bool)
         for body, rows in zip(self._bodies, self._rows):
             out[rows] = body.known
         return np.asarray(out & ~self.present.known)
 
     def among(self, supported: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Whether (n,) markers are of bodies with so many supported (n,) that give a pose."""
+        """Return (n,) whether markers are of bodies with enough supported markers for a pose."""
         out = np.zeros(self._count, dtype=bool)
         for rows in self._rows:
             out[rows] = np.count_nonzero(supported[rows]) >= MIN_MEMBERS
         return out
 
     def miss(self, measured: NDArray[np.bool_], before: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Give up bodies that are not where they were expected; returns their markers (n,).
+        """Mark bodies as lost if they are not at their expected places; return their markers (n,).
 
         measured, before (F, n): markers that are measured now, and in the last images of the same
         views.
@@ -348,7 +347,7 @@ class MarkerBodies:
         return out
 
     def predicted(self, frame: int) -> MarkerPlaces:
-        """Where markers are expected in the next exposure."""
+        """Return the expected places of markers in the next exposure."""
         if self._tracker is None:
             return self.present
         expected = self._tracker.predict(frame * FRAME_NS)
@@ -358,7 +357,7 @@ class MarkerBodies:
         return replace(out, covariance=out.covariance + RIGID_MM**2 * np.eye(3))
 
     def update(self, exposure: MarkerExposure, frame: int) -> None:
-        """Set where markers are at present, by the rays of those without a doubt."""
+        """Update the current places of markers from the rays of markers without a doubt."""
         if self._tracker is None:
             return
         usable = self._usable(exposure)
@@ -372,7 +371,7 @@ class MarkerBodies:
             self.present = self._placed(found.rotation, found.centre_mm, covariance)
 
     def _usable(self, exposure: MarkerExposure) -> NDArray[np.bool_]:
-        """Image points (F, n) whose ids are believed."""
+        """Return the image points (F, n) whose ids are trusted."""
         assert self._tracker is not None
         seen = np.isfinite(exposure.corrected).all(axis=2)
         out = seen & ~exposure.doubtful & (exposure.agree | (seen.sum(axis=0) < 2))
@@ -394,7 +393,7 @@ class MarkerBodies:
         centre: NDArray[np.float64],
         covariance: NDArray[np.float64],
     ) -> MarkerPlaces:
-        """Places of markers at poses of the bodies."""
+        """Return the places of markers at poses of the bodies."""
         assert self._tracker is not None
         out = MarkerPlaces.nowhere(self._count)
         arm = self._tracker.solver.xyz @ np.swapaxes(rotation, 1, 2)
@@ -408,7 +407,7 @@ class MarkerBodies:
         return out
 
     def learn(self, exposure: MarkerExposure, sure: NDArray[np.bool_]) -> None:
-        """Improve the shapes by an exposure, of which sure (n,) markers are trusted."""
+        """Improve the shapes with an exposure, of which sure (n,) markers are trusted."""
         if self._tracker is None:
             return
         away = np.linalg.norm(exposure.xyz_mm - self.present.xyz_mm, axis=1)
@@ -424,7 +423,7 @@ class MarkerBodies:
             covariance = exposure.intersected.points.covariance_noise[rows]
             self._seen[number].append((xyz, covariance))
             count = len(self._seen[number])
-            # Twice as many exposures make a difference, and so does a marker that is new.
+            # Relearn after twice as many exposures, and for each new marker.
             if count & (count - 1) == 0 or count == LEARNED or (fresh & ~known).any():
                 self._bodies[number] = learned_shape(
                     self._bodies[number],
@@ -437,7 +436,7 @@ class MarkerBodies:
 
 
 def _placed(body: Body) -> Body:
-    """Return a body with the uncertainty of its rigidity, and somewhere what is not known."""
+    """Return a body with the uncertainty of its rigidity, and some place for unknown markers."""
     known = body.known
     middle = body.centre if known.any() else np.zeros(3)
     return replace(

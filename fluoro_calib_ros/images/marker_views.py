@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Follow markers in several views together: each view checks and predicts the others.
+"""Track markers in several views together: each view checks and predicts the others.
 
 The image points of all views are corrected and intersected (`reconstruction`). Rays that do not
-meet, and a marker that is not where its rigid body says, reveal a wrong id. The predicted pose of
-a body tells where its markers are to be expected, also those that a view does not see.
+meet, or a marker that is away from the place in its rigid body, reveal a wrong id. The predicted
+pose of a body gives the expected places of its markers, also of those that a view does not see.
 """
 
 from __future__ import annotations
@@ -41,17 +41,17 @@ class ViewsFrame:
     """Markers of one exposure of all fluoroscopes."""
 
     views: Mapping[str, MarkerFrame]  #: by fluoroscope
-    #: they hold for the images since the doubt began; the views of this exposure obey them
+    #: decisions on the images since the doubt began; the views of this exposure already obey them
     decisions: tuple[Decision, ...] = ()
 
 
 class MarkerViews:
-    """Follows markers through the images of one fluoroscope, or of several that are calibrated.
+    """Tracks markers through the images of one fluoroscope, or of several calibrated fluoroscopes.
 
-    orientation: that they belong to; None for one fluoroscope. first: ids and places in the first
-    images, by fluoroscope; None for one that does not see them yet. bodies: shapes that are not
-    given are learned from the images. later: ids of markers whose places are given later. Raises
-    DataError for several fluoroscopes without orientation, and for those that it does not have.
+    orientation: of the fluoroscopes; None for a single one. first: ids and places in the first
+    images, by fluoroscope; None if it does not see them yet. bodies: unknown shapes are learned.
+    later: ids of markers whose places are given later. Raises DataError for several fluoroscopes
+    without an orientation, and for fluoroscopes that it does not contain.
     """
 
     def __init__(
@@ -99,9 +99,9 @@ class MarkerViews:
         """Measure the markers of the next images.
 
         images by fluoroscope; some may be missing, after the first exposure. frame is the number
-        of the exposure, above that of the one before. angles [rad] are those of the C-arms, for
-        corrections that change with them; None where they are unknown. Raises DataError as
-        MarkerTracker.update, and for an image of another size than the calibration's.
+        of the exposure, which must increase. angles [rad] are those of the C-arms, for corrections
+        that depend on them; None if unknown. Raises DataError as MarkerTracker.update does, and
+        for an image whose size differs from that of the calibration.
         """
         joined = self._joined
         if joined is not None:
@@ -109,7 +109,7 @@ class MarkerViews:
         trackers = self.trackers
         if all(tracker.begun for tracker in trackers.values()):
             found = {name: one.update(images.get(name), frame) for name, one in trackers.items()}
-        else:  # which takes the time of ten images
+        else:  # initialisation takes the time of ten images
             with ThreadPoolExecutor(len(trackers)) as threads:
                 given = [images.get(name) for name in trackers]
                 each = threads.map(MarkerTracker.update, trackers.values(), given, repeat(frame))
@@ -118,14 +118,14 @@ class MarkerViews:
 
 
 def _later(target_id: NDArray[np.int64], given: FirstMarkers | None) -> NDArray[np.int64]:
-    """Ids (k,) of the markers that are not given."""
+    """Return the ids (k,) of the markers that are not given."""
     return target_id if given is None else np.setdiff1d(target_id, given.target_id)
 
 
 def _names(
     first: Mapping[str, FirstMarkers | None], orientation: RigOrientation | None
 ) -> tuple[str, ...]:
-    """Fluoroscopes that are followed, in the order of the orientation. Raises DataError."""
+    """Return the tracked fluoroscopes in the order of the orientation. Raises DataError."""
     if len(first) > 1 and orientation is None:
         raise DataError('several fluoroscopes are followed together only with their calibration')
     known = tuple(first) if orientation is None else orientation.fluoroscopes
@@ -139,9 +139,9 @@ def _names(
 
 
 class JoinedViews:
-    """What calibrated views know together: predictions before, and decisions after an exposure.
+    """Joint knowledge of calibrated views: predictions before, decisions after an exposure.
 
-    target_id: (n,) of the markers of all views, ascending.
+    target_id: (n,) ids of the markers of all views, ascending.
     """
 
     def __init__(
@@ -156,7 +156,7 @@ class JoinedViews:
             for view, (name, tracker) in enumerate(trackers.items())
         ]
         self._target_id = target_id
-        # At the angles of the last exposure, and of the one before.
+        # At the angles of the last exposure, and of the previous one.
         self._rig = rig
         self._rig_before = rig
         self._rays = MarkerRays(rig, target_id)
@@ -166,10 +166,10 @@ class JoinedViews:
         nowhere = MarkerPlaces.nowhere(len(target_id))
         self._told = [_Told(nowhere, nowhere) for _ in self._views]
         self._frame = 0
-        # Lost bodies are searched from this exposure on, and then after so many more.
+        # Lost bodies are searched from this exposure on, and then after a pause of so many more.
         self._next_search = 0
         self._pause = self._views[0].tracker.options.search_every
-        self._again: list[Body] = []  # found in the last exposure: another one tells their speed
+        self._again: list[Body] = []  # found in the last exposure: another one gives their speed
         self._measured = np.zeros((len(self._views), len(target_id)), dtype=bool)
         self._missed = np.zeros(len(target_id), dtype=bool)  # of bodies that are elsewhere
 
@@ -179,7 +179,7 @@ class JoinedViews:
         frame: int,
         angles: Mapping[str, float | None],
     ) -> None:
-        """Tell the views where to look in the next images. Raises DataError for other sizes."""
+        """Suggest where to look in the next images. Raises DataError for other image sizes."""
         if self._frame == 0:
             self._check_sizes(images)
         self._rig_before, self._rig = self._rig, replace(self._rig, angles=dict(angles))
@@ -187,10 +187,10 @@ class JoinedViews:
             self._suggest(frame, self._search(images, frame))
 
     def decided(self, found: Mapping[str, MarkerFrame], frame: int) -> ViewsFrame:
-        """Return the markers of the views, after what they say of each other."""
+        """Return the markers of the views after decisions by the other views."""
         exposure = self._rays.intersect(self._without_missed(found, frame), self._rig.angles)
         self._bodies.update(exposure, frame)
-        self._missed &= ~self._bodies.present.known  # their own markers may tell where they are
+        self._missed &= ~self._bodies.present.known  # their bodies have a pose again
         self._doubt_unsupported(exposure, frame)
         decisions = self._decide(exposure, frame)
         decided = [number for decision in decisions for number in decision.target_id]
@@ -202,7 +202,7 @@ class JoinedViews:
         return ViewsFrame(revised, decisions)
 
     def _check_sizes(self, images: Mapping[str, np.ndarray | None]) -> None:
-        """Raise DataError for an image of another size than the calibration's."""
+        """Raise DataError if the size of an image differs from that of the calibration."""
         for view in self._views:
             image = images.get(view.name)
             expected = self._rig.calibrations[view.name].image_size
@@ -216,7 +216,7 @@ class JoinedViews:
     def _without_missed(
         self, found: Mapping[str, MarkerFrame], frame: int
     ) -> dict[str, MarkerFrame]:
-        """Doubt what is measured of bodies that are not where they were expected."""
+        """Doubt the measured markers of bodies that are not at their expected places."""
         views = [view for view in self._views if _is_of_image(found[view.name])]
         rows = [view.view for view in views]
         before = self._measured[rows]
@@ -237,9 +237,9 @@ class JoinedViews:
     def _doubt_unsupported(self, exposure: MarkerExposure, frame: int) -> None:
         """Doubt markers of bodies without a pose that no other view supports.
 
-        Those are in doubt that a view sees anew; all of a body that was found in one exposure
-        only, and has no speed yet; and all where others of the body are supported: something else
-        is among them.
+        These are markers that a view newly sees, all markers of a body that was found in one
+        exposure only and has no speed yet, and all of a body whose other markers are supported:
+        another object is among them.
         """
         unknown = self._bodies.unplaced()
         supported = np.asarray(exposure.agree.any(axis=0))
@@ -250,13 +250,13 @@ class JoinedViews:
             view.doubt(np.flatnonzero(unknown & alone & (doubted | anew)), frame)
 
     def _among(self, bodies: Sequence[Body]) -> NDArray[np.bool_]:
-        """Whether (n,) markers are of some of the bodies."""
+        """Return (n,) whether markers belong to some of the bodies."""
         return np.isin(self._target_id, np.concatenate([[], *(b.target_id for b in bodies)]))
 
     def _suggest(self, frame: int, placed: NDArray[np.bool_]) -> None:
-        """Offer each view predictions of the markers that it is not sure of.
+        """Suggest to each view predictions of the markers of which it is not certain.
 
-        placed (n,): those whose bodies have just been found.
+        placed (n,): markers of bodies that have just been found.
         """
         before = self._bodies.present
         now = self._bodies.predicted(frame)
@@ -274,9 +274,9 @@ class JoinedViews:
             view.tracker.suggest(self._target_id[rows], uv, velocity, sd)
 
     def _search(self, images: Mapping[str, np.ndarray | None], frame: int) -> NDArray[np.bool_]:
-        """Look in the whole images for bodies whose pose is lost, by their shapes.
+        """Search the whole images for bodies with a lost pose, by their shapes.
 
-        Returns (n,) which markers are those of bodies that are found.
+        Return (n,) which markers belong to bodies that are found.
         """
         placed = np.zeros(len(self._target_id), dtype=bool)
         wanted = {body.name: body for body in self._again}
@@ -305,19 +305,19 @@ class JoinedViews:
         return placed
 
     def _shadows(self, view: DecidedView, image: np.ndarray | None) -> NDArray[np.float64] | None:
-        """Places (k, 2) of shadows in a view [px], None where there is no image."""
+        """Return places (k, 2) of shadows in a view [px], None if there is no image."""
         if image is None or not view.tracker.begun:
             return None
         try:
             check_image(image, self._rig.calibrations[view.name].image_size)
-        except DataError:  # which the tracker tells
+        except DataError:  # the tracker reports it
             return None
         return view.tracker.shadows(image).strongest(MAX_SHADOWS).uv
 
     def _decide(self, exposure: MarkerExposure, frame: int) -> tuple[Decision, ...]:
-        """Confirm, exchange or drop ids, by bodies where these say a place.
+        """Confirm, exchange or drop ids, by bodies if these predict a place.
 
-        Markers of no body are where two views and more say that the one of another view is.
+        Markers of no body are expected where at least two other views intersect.
         """
         out: list[Decision] = []
         free = ~self._bodies.present.known
@@ -337,7 +337,7 @@ class JoinedViews:
 
 @dataclass(frozen=True)
 class _Told:
-    """Where the other views say that the markers of a view are, in the last two exposures."""
+    """Places of the markers of a view by the other views, in the last two exposures."""
 
     places: MarkerPlaces
     before: MarkerPlaces
@@ -345,15 +345,15 @@ class _Told:
     frame_before: int = 0
 
     def next(self, places: MarkerPlaces, frame: int) -> _Told:
-        """Return what is told with another exposure."""
+        """Return the places after another exposure."""
         return _Told(places, self.places, frame, self.frame)
 
     def expected(self, frame: int) -> MarkerPlaces:
-        """Return where the markers are expected in the next exposure."""
+        """Return the expected places of the markers in the next exposure."""
         share = (frame - self.frame) / max(self.frame - self.frame_before, 1)
         return self.places.moved_on(self.before, share)
 
 
 def _is_of_image(found: MarkerFrame) -> bool:
-    """Whether there was an image in which something could be seen."""
+    """Return whether there was an image in which something could be seen."""
     return found.finding is None or found.finding.kind is Kind.NO_MARKERS

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Watch on the ids of markers: what an image leaves open, and what it makes sure."""
+"""Monitoring of marker ids: which ids an image leaves doubtful, and which it confirms."""
 
 from __future__ import annotations
 
@@ -25,28 +25,28 @@ from .marker_motion import (
     doubtful_pairs,
 )
 
-FALSE_SHADOWS = 0.02  # expected in the gate, from which a marker found again is doubtful
-# Between predictions, within which two markers are one shadow. Neither of them is measured, until
-# one is lost; then the other one is, with a doubt.
+FALSE_SHADOWS = 0.02  # expected number in the gate from which a marker found again is doubtful
+# Distance between predictions within which two markers share one shadow. Neither of them is
+# measured until one is lost; then the other is measured, with a doubt.
 MERGED_PX = 5.0
 
 
 class MarkerWatch:
-    """Notes which ids may be wrong after an image.
+    """Notes which ids may be wrong after each image.
 
     Parameters
     ----------
     target_id : (n,) ndarray
     doubts : MarkerDoubts
-        In these markers; new ones are added.
+        Doubts in these markers; new doubts are added.
     gate : float
-        Distance from its prediction within which a marker is looked for [standard deviations].
+        Largest distance of a marker from its prediction [standard deviations].
     margin : float
-        Difference of twice the log likelihood below which two ids may have been exchanged.
+        Difference of twice the log-likelihood below which two ids may have been exchanged.
     lost_after : int
         Images without a marker after which it is lost.
     density : float
-        Of false shadows [1/px^2].
+        Density of false shadows [1/px^2].
     """
 
     def __init__(
@@ -76,15 +76,15 @@ class MarkerWatch:
     ) -> tuple[MeasuredMarkers, tuple[Finding, ...]]:
         """Note which markers may have been exchanged in an image.
 
-        A measurement that may be that of a marker beside it, which is not seen, is taken back.
-        is_first: places are not predicted, but given, to a pixel or two.
+        A measurement that may belong to an unseen neighbouring marker is revoked. is_first: True
+        if places are not predicted, but given, to a pixel or two.
         """
         motion = states.motion
         measured = found.measured.copy()
         out = []
         variance = motion.innovation_variance(found.sigma)
         pairs = doubtful_pairs(motion.uv, variance, measured, found.uv, self._margin)
-        # After the first image, nothing can be said before a velocity is known.
+        # After the first image, exchanges cannot be recognised before a velocity is known.
         settled = motion.settled | is_first
         apart = np.linalg.norm(motion.uv[pairs[:, 0]] - motion.uv[pairs[:, 1]], axis=1)
         for (one, two), distance in zip(pairs.tolist(), apart.tolist()):
@@ -107,7 +107,7 @@ class MarkerWatch:
     def found_again(
         self, found: MeasuredMarkers, states: MarkerStates, frame: int
     ) -> tuple[Finding, ...]:
-        """Note which markers, unseen before, may be a false shadow in their gate."""
+        """Note which newly seen markers may be a false shadow in their gate."""
         out = []
         for row in np.flatnonzero(found.measured & (states.unseen > 1)).tolist():
             area = np.pi * self._gate**2 * states.motion.variance[row]
@@ -119,13 +119,13 @@ class MarkerWatch:
     def other_shadows(
         self, found: MeasuredMarkers, states: MarkerStates, frame: int
     ) -> tuple[Finding, ...]:
-        """Note which markers could as well be a shadow that no marker has."""
+        """Note which markers could as well be a shadow that is assigned to no marker."""
         motion = states.motion
         rows = np.flatnonzero(found.measured & motion.settled)
         if not len(found.free) or not len(rows):
             return ()
         variance = motion.variance[rows] + SHADOW_SD_PX**2
-        # As they were found: a fit moves on to where the shadow of something else fits best.
+        # Use the places before the fit: it may move to another shadow that fits better.
         own = ((motion.uv[rows] - found.shadow[rows]) ** 2).sum(axis=1) / variance
         away = motion.uv[rows][:, None] - found.free[None]
         other = (away**2).sum(axis=2) / variance[:, None]
@@ -138,11 +138,11 @@ class MarkerWatch:
     def moving_alone(
         self, found: MeasuredMarkers, states: MarkerStates, frame: int, frames: int
     ) -> tuple[Finding, ...]:
-        """Doubt markers that move unlike those they moved with, and confirm some that do not.
+        """Doubt markers that move unlike their former company, and confirm some that move with it.
 
-        A shadow that is none of a marker, such as a screw, does not move with the bone. Markers
-        that may have been exchanged with another are left to the second view. The states are
-        those after the image, frames after the image before.
+        The shadow of another object, such as a screw, does not move with the bone. Markers that
+        may have been exchanged with another are left to the second view. The states are those
+        after the image, `frames` after the previous image.
         """
         alone, together = self._company.compare(
             states.motion, found.measured, self._doubts.doubtful, frames
@@ -155,12 +155,12 @@ class MarkerWatch:
         return tuple(out)
 
     def _doubt(self, kind: Kind, row: int, frame: int, **numbers: int) -> Finding:
-        """Note that a marker may be something else, and return why."""
+        """Note that a marker may be another object, and return the finding."""
         self._doubts.add(row, frame)
         return doubt_in(kind, frame, int(self._target_id[row]), **numbers)
 
 
-# Why an id may be wrong.
+# Reasons why an id may be wrong.
 DOUBTS = {
     Kind.SHADOWS_MET: 'their shadows met and parted',
     Kind.MARKER_FOUND_AGAIN: 'found again after {images} images',
@@ -170,7 +170,7 @@ DOUBTS = {
 
 
 class MarkerDoubts:
-    """Which of count markers may have a wrong id, by row."""
+    """Doubts in the ids of `count` markers, by row."""
 
     def __init__(self, count: int) -> None:
         self._since = np.zeros(count, dtype=int)
@@ -178,19 +178,19 @@ class MarkerDoubts:
 
     @property
     def doubtful(self) -> NDArray[np.bool_]:
-        """Return (n,) whether an id may be wrong."""
+        """Whether (n,) an id may be wrong."""
         return np.array([bool(partners) for partners in self._partners], dtype=bool)
 
     def since(self, row: int) -> int | None:
-        """Return the image since which an id may be wrong, None for one that is sure."""
+        """Return the image since which an id may be wrong, None if it is certain."""
         return int(self._since[row]) if self._partners[row] else None
 
     def partners(self, row: int) -> AbstractSet[int]:
-        """Return the rows that a marker may be exchanged with; its own for something else."""
+        """Return rows that a marker may be exchanged with; its own row means another object."""
         return self._partners[row]
 
     def add(self, row: int, frame: int) -> None:
-        """Note that a marker may be something else since an image."""
+        """Note that a marker may be another object since an image."""
         self.add_pair(row, row, frame)
 
     def add_pair(self, one: int, other: int, frame: int) -> None:
@@ -201,39 +201,39 @@ class MarkerDoubts:
             self._partners[row].add(partner)
 
     def confirm(self, row: int) -> None:
-        """Take back all doubts in a marker."""
+        """Revoke all doubts in a marker."""
         for other in self._partners[row] - {row}:
             self._partners[other].discard(row)
         self._partners[row].clear()
 
     def confirm_alone(self, row: int) -> None:
-        """Take back the doubt that a marker is something else, if there is no other doubt."""
+        """Revoke the doubt that a marker is another object, if there is no other doubt."""
         if self._partners[row] == {row}:
             self._partners[row].clear()
 
     def part(self, one: int, other: int) -> None:
-        """Take back the doubt that two markers were exchanged."""
+        """Revoke the doubt that two markers were exchanged."""
         self._partners[one].discard(other)
         self._partners[other].discard(one)
 
 
 def doubt_in(kind: Kind, frame: int, *target_id: int, **numbers: int) -> Finding:
-    """Return the finding that ids may be wrong from a frame on."""
+    """Return the finding that ids may be wrong from an image on."""
     place = Place((), (frame,), target_id, name='')
     cause = DOUBTS[kind].format(**numbers)
     return Finding(kind, cause, place, severity=Severity.WARNING, numbers=numbers)
 
 
-STRANGE = 7.0  # squared difference of velocities, over what it used to be
-STRANGE_FRAMES = 2
-SHARED_PX = 15.0  # way of the others since a doubt, after which a marker is no other shadow
-SHARED = 0.35  # if its own way differs by less than this share
+STRANGE = 7.0  # squared difference of velocities over the usual one, for a marker that moves alone
+STRANGE_FRAMES = 2  # consecutive images of such motion
+SHARED_PX = 15.0  # motion of the others since a doubt from which the doubt can be revoked
+SHARED = 0.35  # largest difference of its own motion from theirs, as a share of theirs
 
 
 def follow_beside(states: MarkerStates, frames: int) -> None:
-    """Give markers of unknown velocity that of those beside them, if there are some.
+    """Give markers of unknown velocity that of their neighbours, if there are any.
 
-    frames is the number of them since the image before.
+    frames: number of frames since the previous image.
     """
     motion = states.motion
     unsettled = np.flatnonzero(~motion.settled & (states.placed > 0)).tolist()
@@ -246,7 +246,7 @@ def follow_beside(states: MarkerStates, frames: int) -> None:
 
 
 def velocity_beside(states: MarkerStates, row: int) -> tuple[NDArray[np.float64], float] | None:
-    """Velocity (2,) of the company of a marker, and how much theirs differ; None without some."""
+    """Return the velocity (2,) of a marker's company and its spread; None without a company."""
     motion = states.motion
     known = np.flatnonzero(motion.settled & (states.unseen <= 1))
     known = known[known != row]
@@ -258,10 +258,10 @@ def velocity_beside(states: MarkerStates, row: int) -> tuple[NDArray[np.float64]
 
 
 def shift_together(states: MarkerStates, found: Shadows, gate: float, frames: int) -> None:
-    """Move markers with those beside them: of unknown velocity, or with too wide a gate to search.
+    """Shift markers of unknown velocity, or with too wide a gate to search, with their neighbours.
 
-    One alone could be any shadow in a wide gate; several that keep their places to each other
-    are hardly others. frames is the number of them since the image before.
+    A single marker could be any shadow in a wide gate; several that keep their relative places
+    are hardly other shadows. frames: number of frames since the previous image.
     """
     motion = states.motion
     wide = (~motion.settled | (gate * np.sqrt(motion.variance) > MAX_HALF)) & (states.placed > 0)
@@ -271,7 +271,7 @@ def shift_together(states: MarkerStates, found: Shadows, gate: float, frames: in
     before = motion.uv.copy()
     for row in np.flatnonzero(wide).tolist():
         beside = np.argsort(np.linalg.norm(before - before[row], axis=1), kind='stable')
-        # Where two bones overlap, half of the nearest are of the other one.
+        # If two bones overlap, half of the nearest markers belong to the other bone.
         beside = beside[(beside != row) & wide[beside]][: 2 * LEADERS]
         if not len(beside):
             continue
@@ -285,20 +285,20 @@ def shift_together(states: MarkerStates, found: Shadows, gate: float, frames: in
 
 
 class MarkerCompany:
-    """Compares the ways of count markers with those of the markers that they move with."""
+    """Compares the motions of `count` markers with those of their company."""
 
     def __init__(self, count: int) -> None:
-        self._strange = np.zeros(count, dtype=int)  # images in which one moves unlike them
-        self._shared = np.zeros((count, 2))  # way of these since a doubt
-        self._own = np.zeros((count, 2))  # its own way
+        self._strange = np.zeros(count, dtype=int)  # consecutive images of different motion
+        self._shared = np.zeros((count, 2))  # motion of the company since a doubt
+        self._own = np.zeros((count, 2))  # motion of the marker
 
     def compare(
         self, motion: Motion, measured: np.ndarray, doubtful: NDArray[np.bool_], frames: int
     ) -> tuple[list[int], list[int]]:
-        """Return rows that move alone from now on, and doubtful ones that do not.
+        """Return rows that move alone from now on, and doubtful rows that do not.
 
-        measured (n,) were measured now, frames after the image before; doubtful (n,) are those
-        whose id may be wrong.
+        measured (n,): measured now, `frames` after the previous image; doubtful (n,): the id may
+        be wrong.
         """
         rows, ratio, others = motion.strangeness(measured)
         strange = np.where(ratio > STRANGE, self._strange[rows] + 1, 0)

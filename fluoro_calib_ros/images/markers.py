@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Follow implanted markers through the images of one fluoroscope.
+"""Track implanted markers through the images of one fluoroscope.
 
 Ids come from a first frame. In every further image, shadows are searched near the predictions,
 assigned to all markers together, and measured at once. A marker that is not seen coasts, and is
-found again where it may be by then. Where two markers could have been exchanged, the tracker says
-so: their ids stay doubtful until a second view, or the user, confirms them.
+searched where it may be by then. If two markers could have been exchanged, the tracker reports
+it: their ids stay doubtful until a second view, or the user, confirms them.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from .marker_watch import (
 
 @dataclass(frozen=True)
 class MarkerOptions:
-    """Options of following. Raises ValueError for a value that an option cannot have."""
+    """Options of the tracker. Raises ValueError for a value outside the range of an option."""
 
     gate: float = option(
         4.5,
@@ -87,7 +87,7 @@ class MarkerOptions:
 class FirstMarkers:
     """Markers of one image: ids (n,) and places (n, 2) [px], to a pixel or two.
 
-    filtered: the image, where they were searched in it.
+    filtered: the filtered image, if the markers were searched in it.
     """
 
     target_id: NDArray[np.int64]
@@ -116,38 +116,38 @@ class MarkerFrame:
     """Markers of one image."""
 
     frame: int
-    target_id: NDArray[np.int64]  #: (n,), of the markers that were measured
-    uv: NDArray[np.float64]  #: (n, 2), centres [px], of the middle of the exposure
+    target_id: NDArray[np.int64]  #: (n,), ids of the measured markers
+    uv: NDArray[np.float64]  #: (n, 2), centres [px] in the middle of the exposure
     sigma: NDArray[np.float64]  #: (n,), standard deviation of a coordinate [px]
-    #: (n,), the shadow of another marker reaches into that of the marker
+    #: (n,), True if the shadow of another marker reaches into that of the marker
     overlapped: NDArray[np.bool_]
-    doubtful: NDArray[np.bool_]  #: (n,), the id may be wrong
+    doubtful: NDArray[np.bool_]  #: (n,), True if the id may be wrong
     missing: NDArray[np.int64]  #: (k,), markers that were not measured
-    #: (k, 2), where they are believed to be [px], NaN for those that were never seen
+    #: (k, 2), predicted places of these [px], NaN for markers that were never seen
     predicted: NDArray[np.float64]
-    lost: NDArray[np.bool_]  #: (k,), whether they are searched in the whole image
-    #: two markers that may have been exchanged, or one that may be something else; those that
-    #: began with this image
+    lost: NDArray[np.bool_]  #: (k,), True if they are searched in the whole image
+    #: new doubts in this image: two markers that may have been exchanged, or one that may be
+    #: another object
     doubts: tuple[Finding, ...] = ()
-    finding: Finding | None = None  #: why nothing was measured
+    finding: Finding | None = None  #: reason why nothing was measured
     seconds: float = 0.0
 
     @property
     def reason(self) -> str:
-        """Why nothing was measured, in words; '' where something was."""
+        """Reason in words why nothing was measured; '' if something was."""
         return '' if self.finding is None else self.finding.cause
 
 
-MIN_MEMBERS = 4  # of a body, that tell ids; following begins with as many that are suggested
+MIN_MEMBERS = 4  # members of a body that determine ids; suggested markers that start tracking
 
 
 def _inside(uv: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Return (n,) whether points (n, 2) are in an image of a shape."""
+    """Return (n,) whether points (n, 2) are inside an image of a shape."""
     return np.asarray(((uv > 0) & (uv < np.array(shape[::-1]) - 1)).all(axis=1))
 
 
 def _filtered(image: np.ndarray, first: FirstMarkers | None) -> FilteredImage:
-    """Return an image, filtered as it was when the first markers were searched in it."""
+    """Return the filtered image; reuse the one in which the first markers were searched."""
     if first is None or first.filtered is None or first.filtered.image is not image:
         return FilteredImage(image)
     return first.filtered
@@ -155,13 +155,13 @@ def _filtered(image: np.ndarray, first: FirstMarkers | None) -> FilteredImage:
 
 @dataclass(frozen=True)
 class _Followed:
-    """What follows markers, from the first image on."""
+    """State and steps of the tracker from the first image on."""
 
     states: MarkerStates  #: predicted, then updated
     doubts: MarkerDoubts
     look: MarkerLook
     size: tuple[int, int]  #: width and height of the images [px]
-    #: the steps of an image, in their order
+    #: the steps for an image, in order
     search: MarkerSearch
     measurement: MarkerMeasurement
     watch: MarkerWatch
@@ -170,7 +170,7 @@ class _Followed:
     def begun(
         cls, start: MarkerStart, target_id: NDArray[np.int64], options: MarkerOptions
     ) -> _Followed:
-        """Return what follows markers from the first image on."""
+        """Return the tracker's state and steps at the first image."""
         doubts = MarkerDoubts(len(target_id))
         return cls(
             start.states,
@@ -198,11 +198,11 @@ class _Followed:
 
 
 class MarkerTracker:
-    """Follows markers through the images of one fluoroscope.
+    """Tracks markers through the images of one fluoroscope.
 
-    first: ids and places in the first image; None: following begins with an image in which enough
-    suggested markers are seen. later (k,): ids of markers that are followed once their places are
-    given or suggested.
+    first: ids and places in the first image; None to start with an image in which enough suggested
+    markers are seen. later (k,): ids of markers that are tracked once their places are given or
+    suggested.
     """
 
     def __init__(
@@ -216,30 +216,30 @@ class MarkerTracker:
         self.first = first
         none = np.zeros(0, dtype=np.int64)
         known = none if first is None else first.target_id
-        self.target_id = np.append(known, none if later is None else later)  # of all markers
+        self.target_id = np.append(known, none if later is None else later)  # ids of all markers
         self._rows = {number: row for row, number in enumerate(self.target_id.tolist())}
         self._followed: _Followed | None = None
         self._frame = 0
         self._gap = 1  # frames between the last two images
-        self._images = 0  # since the first one
+        self._images = 0  # number of images since the first
         self._led: NDArray[np.bool_] | None = None
         self._suggested: list[tuple[np.ndarray, ...]] = []
-        self._given: list[FirstMarkers] = []  # in the next image
+        self._given: list[FirstMarkers] = []  # places given for the next image
         self._anew = np.zeros(len(self.target_id), dtype=bool)
-        self._tried = 0  # image from which suggested markers are looked for again
+        self._tried = 0  # image from which suggested markers are searched again
 
     @property
     def begun(self) -> bool:
-        """Whether markers are followed."""
+        """Whether the tracker has started."""
         return self._followed is not None
 
     def update(self, image: np.ndarray | None, frame: int) -> MarkerFrame:
-        """Measure the markers of the next image (h, w), of uint8 or uint16; None: there is none.
+        """Measure the markers of the next image (h, w) of uint8 or uint16; None if there is none.
 
-        frame is its number, above that of the one before; markers move on through numbers that are
-        left out. For an image in which nothing can be seen, all markers are missing, and the
-        finding says why. Raises DataError for a number that does not grow, and for a first image
-        without the markers.
+        frame is its number, which must increase; markers also move during skipped numbers. If
+        nothing can be seen in an image, all markers are missing, and the finding states the
+        reason. Raises DataError for a number that does not increase, and for a first image without
+        the markers.
         """
         begin = time.perf_counter()
         followed = self._followed
@@ -266,34 +266,34 @@ class MarkerTracker:
         return self._result(found, doubts, None if found.measured.any() else none_seen, begin)
 
     def doubted_since(self, target_id: int) -> int | None:
-        """Return the image since which an id may be wrong, None for one that is sure."""
+        """Return the image since which an id may be wrong, None if it is certain."""
         return self._known().doubts.since(self._row(target_id))
 
     def doubtful(self) -> NDArray[np.int64]:
-        """Ids (k,) of markers whose id may be wrong."""
+        """Return the ids (k,) that may be wrong."""
         if self._followed is None:
             return self.target_id[:0]
         return self.target_id[self._followed.doubts.doubtful]
 
     def confirm(self, target_id: int) -> None:
-        """Take back the doubt in a marker."""
+        """Revoke the doubt in a marker."""
         self._known().doubts.confirm(self._row(target_id))
 
     def exchange(self, one: int, other: int) -> None:
-        """Exchange two ids that were found to be the wrong way round."""
+        """Exchange two ids that were found to be swapped."""
         self._known().states.exchange(self._row(one), self._row(other))
 
     def partners(self, target_id: int) -> set[int]:
-        """Return the ids that a marker may be exchanged with; its own for something else."""
+        """Return ids that a marker may be exchanged with; its own id means another object."""
         rows = self._known().doubts.partners(self._row(target_id))
         return {int(self.target_id[row]) for row in rows}
 
     def part(self, one: int, other: int) -> None:
-        """Take back the doubt that two markers were exchanged."""
+        """Revoke the doubt that two markers were exchanged."""
         self._known().doubts.part(self._row(one), self._row(other))
 
     def forget(self, target_id: int) -> None:
-        """Give up the place of a marker that was found to be something else."""
+        """Discard the place of a marker that was found to be another object."""
         followed = self._known()
         row = self._row(target_id)
         followed.doubts.confirm(row)
@@ -304,14 +304,14 @@ class MarkerTracker:
         self._known().doubts.add(self._row(target_id), frame)
 
     def unsure(self) -> NDArray[np.int64]:
-        """Ids (k,) of markers that were not measured last, or are doubtful."""
+        """Return the ids (k,) of markers that were not measured last, or are doubtful."""
         followed = self._followed
         if followed is None:
             return self.target_id
         return self.target_id[(followed.states.unseen > 0) | followed.doubts.doubtful]
 
     def seen_anew(self) -> NDArray[np.int64]:
-        """Ids (k,) of markers that were measured last, and whose motion was not known before."""
+        """Return the ids (k,) of markers measured last whose motion was unknown before."""
         return self.target_id[self._anew]
 
     def shadows(self, image: np.ndarray) -> Shadows:
@@ -319,10 +319,10 @@ class MarkerTracker:
         return self._known().search.everywhere(image)
 
     def place(self, given: FirstMarkers) -> None:
-        """Follow markers from where they are in the next image, by a person or by their bodies.
+        """Set places of markers in the next image, given by a person or by their bodies.
 
-        Ids of those that are measured there are then sure. A marker that is there anyway goes on
-        as it is. Of two places, the one that is told first counts.
+        Ids of markers that are measured there are certain. A marker that is tracked to its place
+        anyway keeps its state. If a place is given twice, the first one counts.
         """
         self._given.append(given)
 
@@ -335,8 +335,8 @@ class MarkerTracker:
     ) -> None:
         """Offer predictions for the next image, such as those from another view.
 
-        target_id: (k,). uv, velocity: (k, 2) [px], [px a frame]. sd_px: (k,) where it is smaller
-        than that of the own prediction, this one is used.
+        target_id: (k,). uv, velocity: (k, 2) [px], [px/frame]. sd_px: (k,) standard deviations; a
+        prediction is used if it is more precise than the tracker's own.
         """
         rows = np.array([self._row(int(i)) for i in target_id], dtype=int)
         self._suggested.append((rows, np.asarray(uv), np.asarray(velocity), np.asarray(sd_px)))
@@ -353,20 +353,20 @@ class MarkerTracker:
         return row
 
     def _start(self, image: np.ndarray, frame: int) -> _Followed:
-        """Learn from the first image. Raises DataError where the markers are not there."""
+        """Learn from the first image. Raises DataError if the markers are not in it."""
         places = self._first_places(image.shape, frame)
         filtered = _filtered(image, self.first)
         if self.first is not None:
-            self.first = replace(self.first, filtered=None)  # which is large
+            self.first = replace(self.first, filtered=None)  # release a large image
         start = learn_start(filtered, self.target_id, places)
         for row in np.flatnonzero(np.isnan(places[:, 0])).tolist():
             start.states.forget(row, self.options.lost_after + 1)
         return _Followed.begun(start, self.target_id, self.options)
 
     def _first_places(self, shape: tuple[int, ...], frame: int) -> NDArray[np.float64]:
-        """Return places (n, 2) in the first image [px], NaN for unknown ones.
+        """Return places (n, 2) in the first image [px], NaN for unknown places.
 
-        Raises DataError where too few are suggested in an image of this shape.
+        Raises DataError if too few are suggested in an image of this shape.
         """
         places = np.full((len(self.target_id), 2), np.nan)
         if self.first is not None:
@@ -381,7 +381,7 @@ class MarkerTracker:
         return places
 
     def _advance(self, frame: int) -> None:
-        """Predict all markers that are followed for an image."""
+        """Predict all tracked markers for an image."""
         if self._followed is not None:
             states = self._followed.states
             self._gap = frame - self._frame
@@ -393,9 +393,9 @@ class MarkerTracker:
         self._suggested = []
 
     def _place_given(self) -> NDArray[np.int64]:
-        """Put markers where they are given in this image; returns the rows of all of them."""
+        """Set markers to the places given for this image; return the rows of all of them."""
         given = [np.zeros(0, dtype=np.int64)]
-        for markers in reversed(self._given):  # what was told first counts, so it is told last
+        for markers in reversed(self._given):  # the first place counts, so it is set last
             rows = np.array([self._row(int(i)) for i in markers.target_id])
             self._known().states.place(rows, markers.uv, self._gap)
             given.append(rows)
@@ -405,7 +405,7 @@ class MarkerTracker:
     def _believe(
         self, given: NDArray[np.int64], found: MeasuredMarkers, doubts: tuple[Finding, ...]
     ) -> tuple[Finding, ...]:
-        """Take back the doubts in markers that were given; returns those that remain."""
+        """Revoke the doubts in markers whose places were given; return the remaining doubts."""
         sure = given[found.measured[given]]
         for row in sure.tolist():
             self._known().doubts.confirm(row)
@@ -415,7 +415,7 @@ class MarkerTracker:
     def _measure(
         self, image: np.ndarray, frame: int
     ) -> tuple[MeasuredMarkers, tuple[Finding, ...]]:
-        """Find and measure the markers of an image, and say which ids it leaves doubtful."""
+        """Find and measure the markers of an image; return them with new doubts in their ids."""
         followed = self._known()
         states = followed.states
         watch = followed.watch
@@ -429,7 +429,7 @@ class MarkerTracker:
         found, doubts = watch.shadows_met(found, states, frame, is_first=self._images == 0)
         doubts += watch.found_again(found, states, frame)
         doubts += watch.other_shadows(found, states, frame)
-        # In the first image, and where places are given, ids are sure.
+        # In the first image, and at given places, ids are certain.
         self._anew = found.measured & unknown & (states.placed > 0) & (self._images > 0)
         velocity_before = states.motion.velocity.copy()
         states.update(found, self._gap)
@@ -445,7 +445,7 @@ class MarkerTracker:
         finding: Finding | None,
         begin: float,
     ) -> MarkerFrame:
-        """Return the markers of the present image."""
+        """Return the markers of the current image."""
         followed = self._followed
         measured = found.measured
         missing = ~measured

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Match beads of an image with a phantom, from nothing or from a pose nearby.
+"""Match beads of an image with a phantom, without prior knowledge or from a nearby pose.
 
-A pose is only accepted by evidence: most of the beads that it predicts are found, most of what is
-found is predicted, and no other pose, such as that of the phantom turned by a symmetry of its own,
-fits nearly as well.
+A pose is only accepted by evidence: most of the beads that it predicts are found, most of the
+detections are predicted, and no other pose fits nearly as well, such as that of the phantom
+turned by one of its symmetries.
 """
 
 from __future__ import annotations
@@ -36,49 +36,49 @@ from .pose_search import (
 from .view import Lens, View, fit_view
 
 MIN_BEADS = 10
-# Shares found and explained from which a pose is accepted. Where many beads overlap, fewer are
-# found, but nothing else is seen.
+# Shares found and explained from which a pose is accepted. If many beads overlap, fewer are
+# found, but nothing else is detected.
 EVIDENT = ((MIN_FOUND, MIN_EXPLAINED), (0.6, 0.85))
-# The same at which the search ends.
+# Shares found and explained from which the search ends.
 SURE = ((0.85, MIN_EXPLAINED), (0.75, 0.95))
-# By how much the score of the best pose must exceed that of another one: as a share of it, and in
-# beads. What is missed by chance is less.
+# Least lead in score of the best pose over any other, as a share of the score and in beads. Beads
+# missed by chance make a smaller difference.
 MARGIN = 0.06
 MARGIN_BEADS = 8
-NEIGHBOURS = (8, 6)  # of a bead in the phantom and in the image, which make triples with it
-# Levels of the search: beads tried (from, to), and limits of the scale by the extent of what is
-# seen. The first finds most poses, the second those that see all faces of a phantom from the edge.
-# The others find a phantom with other things around it, and a small part of a phantom. Beads are
-# tried until a right pose would have been found (pose_search.py).
+NEIGHBOURS = (8, 6)  # of a bead in phantom and image, which form triples with it
+# Levels of the search: range of beads tried, and limits of the scale relative to that from the
+# extent of the detections. The first level finds most poses, the second those that see all faces
+# of a phantom from the edge. The others find a phantom among other objects, and a small part of a
+# phantom. Beads are tried until a right pose would have been found (pose_search.py).
 LEVELS = (
     ((0, 8), (0.85, 1.4)),
     ((8, 80), (0.85, 1.4)),
     ((0, 24), (0.6, 0.85)),
     ((0, 6), (1.4, 3.0)),
 )
-FITTED = 12  # ways to lay a grid over what was found; a hexagonal one lies on itself in so many
+FITTED = 12  # number of ways to fit a grid to detections; a hexagonal grid has so many symmetries
 APART = 0.6  # share of the beads, those farthest from their neighbours, that are tried next
-AGREED = 3  # matches of the same pose after which the search ends, if it is evident
-MIN_SIZES = 0.1  # relative difference of diameters from which sizes tell beads apart
-LIKELIER = 10.0  # log-likelihood by which a pose must exceed another one
-SIZE_TAIL = 6.0  # residual of a response beyond which it counts no more [standard deviations]
-SIZE_NEIGHBOURS = 12  # that tell what response is usual
-# Of the logarithm of a response to that of a radius r. A disc has r^2 exp(-r^2 / 2 s^2) at a scale
-# s, where r < 1.2 s; a small sphere has its thickness as a further factor.
+AGREED = 3  # matches of the same pose after which the search ends if the pose is evident
+MIN_SIZES = 0.1  # relative difference of diameters from which sizes distinguish beads
+LIKELIER = 10.0  # least lead in log-likelihood of a pose over any other
+SIZE_TAIL = 6.0  # residual of a response at which it is clipped [standard deviations]
+SIZE_NEIGHBOURS = 12  # neighbours from which the usual response is estimated
+# Bounds of the slope of log response over log radius r. A disc has r^2 exp(-r^2 / 2 s^2) at a
+# scale s, where r < 1.2 s; a small sphere has its thickness as an additional factor.
 SIZE_SLOPES = (0.5, 3.0)
-CLOSER = 2.0  # factor on the residuals of one pose from which another is the better one
-SYMMETRY_SHARE = 0.4  # of the beads that a symmetry takes near to a bead
-SHIFTS = 6  # to neighbours, as candidates of symmetries
-SCALE_BY_SIZE = (0.55, 1.6)  # of a bead's image over its diameter, with the blur
+CLOSER = 2.0  # ratio of the residuals of two poses that decides between them
+SYMMETRY_SHARE = 0.4  # least share of the beads that a symmetry moves close to a bead
+SHIFTS = 6  # number of shifts to neighbours that are candidates of symmetries
+SCALE_BY_SIZE = (0.55, 1.6)  # ratio of a bead's image to its diameter, with the blur
 
 
 @dataclass(frozen=True)
 class Symmetry:
-    """A motion that takes many beads of a phantom near to others."""
+    """Motion of a phantom that moves many of its beads close to others."""
 
     rotation: NDArray[np.float64]  #: (3, 3)
     shift: NDArray[np.float64]  #: (3,) [mm]
-    row: NDArray[np.int64]  #: (n,), rows of the beads that beads are taken to, -1 for none
+    row: NDArray[np.int64]  #: (n,), row of the bead to which each bead is moved, -1 for none
 
     @property
     def turn_rad(self) -> float:
@@ -102,7 +102,7 @@ class PhantomModel:
     diameter_mm: NDArray[np.float64] | None  #: (n,)
     symmetries: tuple[Symmetry, ...]
     grid: FlatGrid | None  #: for a flat grid
-    #: any of several poses that fit equally well is taken: a regular grid looks alike in all
+    #: any of several poses that fit equally well is accepted: a regular grid looks alike in all
     regular: bool = False
 
     @classmethod
@@ -112,9 +112,9 @@ class PhantomModel:
         diameter_mm: NDArray[np.float64] | None = None,
         regular: bool = False,
     ) -> PhantomModel:
-        """Return the model of beads (n, 3) [mm] with diameters (n,) [mm], if they are known.
+        """Return the model of beads (n, 3) [mm] with diameters (n,) [mm], if known.
 
-        Raises DataError for a regular phantom that is no flat grid.
+        Raises DataError if a regular phantom is not a flat grid.
         """
         grid = FlatGrid.of(xyz)
         if regular and grid is None:
@@ -129,20 +129,20 @@ class PhantomModel:
 
     @property
     def sizes_differ(self) -> bool:
-        """Whether sizes tell beads apart."""
+        """Whether the sizes of the beads distinguish them."""
         diameter = self.diameter_mm
         return diameter is not None and np.ptp(diameter) >= MIN_SIZES * diameter.min()
 
     @cached_property
     def triples(self) -> Triples:
-        """Triples of beads, made when they are first needed."""
+        """Triples of beads, computed on first use."""
         return triples_of(self.xyz, NEIGHBOURS[0])
 
 
 def match(seen: Seen, model: PhantomModel, lens: Lens) -> Match:
-    """Match what was found in an image with a phantom.
+    """Match detections of an image with a phantom.
 
-    Raises DataError where no pose is sure, with the reason.
+    Raises DataError, with the reason, if no pose is certain.
     """
     if len(seen.uv) < MIN_BEADS:
         raise DataError(
@@ -176,14 +176,14 @@ def match(seen: Seen, model: PhantomModel, lens: Lens) -> Match:
 
 
 def _grid_match(grid: FlatGrid, seen: Seen, model: PhantomModel, lens: Lens) -> Match | None:
-    """Return the match of a flat grid, None where it is not numbered.
+    """Return the match of a flat grid, None if its beads cannot be numbered.
 
-    Raises DataError where the grid fits elsewhere as well, unless any place will do.
+    Raises DataError if the grid fits elsewhere as well, unless any place is accepted.
     """
     best: tuple[GridPose, Match] | None = None
     fitted: list[Match] = []
     for tried, pose in enumerate(grid_poses(grid, model.xyz, seen, lens)):
-        # A right one is among the first; others that fit as well may come later.
+        # A right pose is among the first; others that fit as well may come later.
         if (len(fitted) if best else tried) >= FITTED:
             break
         if best and (model.regular or not _could_be(pose, best[0])):
@@ -207,10 +207,10 @@ def _grid_match(grid: FlatGrid, seen: Seen, model: PhantomModel, lens: Lens) -> 
 
 
 def _could_be(pose: GridPose, best: GridPose) -> bool:
-    """Return whether a pose of a grid is too likely for the best one to be sure.
+    """Return whether a pose of a grid is too likely for the best pose to be certain.
 
-    A bead is not found, or something else found in its place, with a probability that the best
-    pose shows (with one more, for what it does not show).
+    The probability that a bead is missing, or that something else is detected in its place, is
+    estimated from the best pose, with one more such event than it shows.
     """
     log_odds = np.log(best.numbered / (best.against + 1))
     return bool((pose.against - best.against) * log_odds < LIKELIER)
@@ -227,14 +227,14 @@ def _ambiguous(best: Match, other: Match) -> DataError:
 
 
 def is_sure(best: Match) -> bool:
-    """Return whether a better match need not be searched for."""
+    """Return whether no better match needs to be searched for."""
     return any(best.found >= found and best.explained >= explained for found, explained in SURE)
 
 
 def _improved(one: Match, seen: Seen, model: PhantomModel) -> Match:
-    """Return a match that is nearly evident after further steps, while they find more beads.
+    """Refine a nearly evident match by further steps as long as they find more beads.
 
-    Where faces are seen from the edge, a pose reaches the far side of the phantom only by and by.
+    If faces are seen from the edge, a pose extends to the far side of the phantom only gradually.
     """
     while not is_sure(one) and one.found >= EVIDENT[1][0] and one.explained >= MIN_EXPLAINED:
         again = settle(one.view, model.xyz, seen)
@@ -245,12 +245,12 @@ def _improved(one: Match, seen: Seen, model: PhantomModel) -> Match:
 
 
 def is_evident(best: Match) -> bool:
-    """Return whether enough of what is predicted is found, and the reverse."""
+    """Return whether enough predicted beads are found, and enough detections are predicted."""
     return any(best.found >= found and best.explained >= explained for found, explained in EVIDENT)
 
 
 def _check_evidence(best: Match) -> None:
-    """Raise DataError where too few predicted beads are found, or the reverse."""
+    """Raise DataError if too few predicted beads are found or too few detections are predicted."""
     enough = best.explained < MIN_EXPLAINED or is_evident(best)
     if not enough or len(best.bead) < MIN_BEADS:
         cause = (
@@ -273,10 +273,10 @@ def _check_evidence(best: Match) -> None:
 
 
 def unambiguous(best: Match, seen: Seen, model: PhantomModel, turn_rad: float = np.pi) -> Match:
-    """Return the best of a match and what the symmetries of the phantom make of it.
+    """Return the best of a match and its transforms by the symmetries of the phantom.
 
-    Those that turn it by more than an angle do not count. Raises DataError where another one fits
-    nearly as well, unless the phantom is regular.
+    Symmetries that turn it by more than turn_rad are ignored. Raises DataError if another match
+    fits nearly as well, unless the phantom is regular.
     """
     if model.regular:
         return best
@@ -293,9 +293,9 @@ def unambiguous(best: Match, seen: Seen, model: PhantomModel, turn_rad: float = 
 
 
 def _best_by_size(matches: list[Match], seen: Seen, model: PhantomModel) -> Match | None:
-    """Return the match in which beads are seen as large as they are; None where none stands out.
+    """Return the match in which responses agree best with bead sizes; None if none stands out.
 
-    Matches are compared by the likelihood of the responses to the beads that all of them have.
+    Matches are compared by the likelihood of the responses to the beads that all of them contain.
     """
     diameter = model.diameter_mm
     if seen.strength is None or diameter is None or not model.sizes_differ:
@@ -321,7 +321,7 @@ def _best_by_size(matches: list[Match], seen: Seen, model: PhantomModel) -> Matc
 def _likelihood_of_sizes(
     size: NDArray[np.float64], response: NDArray[np.float64], uv: NDArray[np.float64]
 ) -> float:
-    """Log-likelihood of responses (n,) to shadows of sizes (n,), as logarithms, at uv (n, 2).
+    """Return the log-likelihood of log responses (n,) to shadows of log sizes (n,) at uv (n, 2).
 
     A response is linear in the size, and changes slowly across the image. Its scatter is that of
     the beads around: it is larger at the edge of a sheet, so that a mark elsewhere stands out.
@@ -341,9 +341,9 @@ def _likelihood_of_sizes(
 def _climbed(
     best: Match, seen: Seen, model: PhantomModel, turn_rad: float = np.pi
 ) -> tuple[Match, list[Match]]:
-    """Return the best match that symmetries of the phantom lead to, and those from it.
+    """Return the best match that symmetries of the phantom lead to, and its alternatives.
 
-    On a nearly regular phantom the search finds poses that are several steps of its pattern off.
+    On a nearly regular phantom the search finds poses that are several pattern steps off.
     """
     symmetries = [one for one in model.symmetries if one.turn_rad <= turn_rad]
     while True:
@@ -357,7 +357,7 @@ def _climbed(
 def _alternatives(
     best: Match, seen: Seen, model: PhantomModel, symmetries: Sequence[Symmetry]
 ) -> Iterator[Match]:
-    """Yield the matches of the phantom moved by its symmetries, where they fit at all."""
+    """Yield the matches of the phantom moved by its symmetries, if they fit at all."""
     for symmetry in symmetries:
         other = symmetry.row[best.bead]
         known = other >= 0
@@ -370,7 +370,7 @@ def _alternatives(
             STEPS,
             0.3,
         )
-        # In the end, beads are matched within this.
+        # The final matching uses the same tolerance.
         rival = settle(view, model.xyz, seen) if scale <= LAST_TOLERANCE_PX else None
         if rival is not None:
             yield rival
@@ -385,7 +385,7 @@ def _same(one: Match, other: Match) -> bool:
 
 
 def _candidates(seen: Seen, model: PhantomModel, lens: Lens) -> Iterator[Match]:
-    """Yield matches of poses, the likeliest first."""
+    """Yield matches of poses, likeliest first."""
     beads = nearby_map(seen.uv, lens.image_size, seen.tolerance_px)
     beads[~seen.field] = 2
     order = seeds_of(seen)
@@ -406,10 +406,10 @@ def _candidates(seen: Seen, model: PhantomModel, lens: Lens) -> Iterator[Match]:
 
 
 def seeds_of(seen: Seen) -> NDArray[np.int64]:
-    """Rows of beads to begin with: some of the middle, then those that stand apart, at random.
+    """Return rows of beads to start from: first some in the middle, then isolated ones, at random.
 
-    Distortion is least in the middle. Where faces are seen from the edge, beads of several faces
-    are neighbours in the image, the least so where beads stand apart.
+    Distortion is least in the middle. If faces are seen from the edge, neighbours in the image are
+    beads of several faces, but less so for isolated beads.
     """
     n = len(seen.uv)
     rng = np.random.default_rng(0)
@@ -426,7 +426,7 @@ def seeds_of(seen: Seen) -> NDArray[np.int64]:
 
 
 def _scales(seen: Seen, model: PhantomModel, limits: tuple[float, float]) -> tuple[float, float]:
-    """Smallest and largest scale [px/mm]; limits are those by the extent of what is seen."""
+    """Return least and largest scale [px/mm]; limits: factors on the scale by extent."""
     low, high = (_scale_by_extent(seen, model) * factor for factor in limits)
     if model.diameter_mm is None:
         return low, high
@@ -435,16 +435,16 @@ def _scales(seen: Seen, model: PhantomModel, limits: tuple[float, float]) -> tup
 
 
 def _scale_by_extent(seen: Seen, model: PhantomModel) -> float:
-    """Scale [px/mm] at which the phantom is as large as what is seen."""
+    """Return the scale [px/mm] at which the phantom is as large as the detections."""
     spread = np.sqrt(np.mean(np.sum((seen.uv - np.median(seen.uv, axis=0)) ** 2, axis=1)))
     extent = np.sqrt(np.mean(np.sum((model.xyz - model.xyz.mean(axis=0)) ** 2, axis=1)))
     return float(spread / (np.sqrt(2 / 3) * extent))
 
 
 def _symmetries(xyz: NDArray[np.float64]) -> Iterator[Symmetry]:
-    """Yield motions of a phantom (n, 3) onto itself: turns, and shifts by a neighbour.
+    """Yield motions of a phantom (n, 3) onto itself: rotations, and shifts by a neighbour.
 
-    The turns are the 24 of a cube, about the axes of the phantom's frame and its principal axes.
+    The rotations are the 24 of a cube, about the phantom's axes and its principal axes.
     """
     centre = (xyz.min(axis=0) + xyz.max(axis=0)) / 2
     tree = cKDTree(xyz)
@@ -476,7 +476,7 @@ def _turns_of_cube() -> Iterator[NDArray[np.float64]]:
 
 
 def _common(steps: NDArray[np.float64], reach: float) -> list[NDArray[np.float64]]:
-    """Return the steps (3,) to a neighbour that occur most often among steps (n, 3)."""
+    """Return the most frequent steps (3,) to a neighbour among steps (n, 3)."""
     cell = np.rint(steps / max(2 * reach, 1e-9)).astype(int)
     _, inverse, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
     most = np.argsort(-count, kind='stable')[: 2 * SHIFTS]

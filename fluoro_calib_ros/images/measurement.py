@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Measure centres of beads of a phantom: blurred shadows of spheres fitted to the grey values.
+"""Measure centres of beads of a phantom by fitting blurred shadows of spheres to the grey values.
 
-Hundreds of beads of different sizes are fitted at once, in single precision. Light that passes two
-beads is attenuated by both.
+Hundreds of beads of different sizes are fitted at once, in single precision. Light that passes
+through two beads is attenuated by both.
 """
 
 from __future__ import annotations
@@ -46,35 +46,35 @@ SETTINGS = FitSettings(
     crossed=1.0,
 )
 STEPS = SETTINGS.steps
-FIRST_STEPS = 3  # that only have to tell beads from other things
+FIRST_STEPS = 3  # steps that only have to separate beads from other objects
 PROFILE_STEPS = 3
-PROFILE_BEADS = 100
-# Rounds without a better fit, after which the best profile is chosen in windows of one size: a
-# hard edge with a wide blur looks like a sphere. Where the radius grows by a half, fits are worse
-# at first.
+PROFILE_BEADS = 100  # largest number of beads for the profile
+# Rounds without a better fit, after which the best profile is chosen in windows of equal size: a
+# hard edge with a wide blur looks like a sphere. If the radius grows by a half, fits get worse
+# before they get better.
 PATIENCE = 4
-PROFILE_ROUNDS = 30  # at most; 4 to 10 were needed
-MOST = 2.0  # factor between the radius of a bead and that of its detection
+PROFILE_ROUNDS = 30  # largest number of rounds; 4 to 10 were needed
+MOST = 2.0  # largest factor between the radius of a bead and that of its detection
 START_BLUR_PX = 0.9
 START_ATTENUATION = 1.5
 START_SCATTER = 0.1
-# Largest step of a coordinate of a bead that has settled: the next one is some ten times shorter,
-# and the centres of the sharpest beads are known to 0.01 px.
+# Largest step of a coordinate of a bead that has converged: the next step is about ten times
+# shorter, and the centres of the sharpest beads are known to 0.01 px.
 SETTLED_PX = 0.003
-MAX_SHIFT_PX = 4.0  # of a centre, beyond which the fit has lost its bead
-RADIUS_SD = 0.01  # of the radius of a shadow: what profile and distortion leave open
-# The same where the surrounding light is clipped, except for a small share of it. Only the dark
-# inside of a shadow is visible then, which hardly separates radius, attenuation and scattered
-# light. In 12 images of a cube at 1.65 times the light that a pixel holds, estimated radii were 13
-# to 25 % too small.
+MAX_SHIFT_PX = 4.0  # shift of a centre beyond which the fit has lost its bead
+RADIUS_SD = 0.01  # relative standard deviation of a shadow's radius, from profile and distortion
+# The same if nearly all of the surrounding light is clipped. Only the dark inside of a shadow is
+# visible then, which hardly separates radius, attenuation and scattered light. In 12 images of a
+# cube at 1.65 times the light at which a pixel saturates, estimated radii were 13 to 25 % too
+# small.
 CLIPPED_RADIUS_SD = 0.17
-SEEN_LIGHT = 0.05
-SETTLED = 0.1 * RADIUS_SD  # change of a radius at which a profile is kept
-HELD = 1e12  # weight of a term that stays zero
+SEEN_LIGHT = 0.05  # share of unclipped light below which the light counts as clipped
+SETTLED = 0.1 * RADIUS_SD  # relative change of the radius at which a profile has converged
+HELD = 1e12  # prior weight that keeps a term at zero
 
 
 def circles(radius: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Matrices (n, 2, 2) of circles of relative radii (n,)."""
+    """Return matrices (n, 2, 2) of circles of relative radii (n,)."""
     return radius[:, None, None] * np.eye(2)
 
 
@@ -85,9 +85,9 @@ def estimate_profile(
     radius_px: float,
     size: NDArray[np.float64] | None = None,
 ) -> Profile:
-    """Estimate the shadow of a typical bead from those that stand alone.
+    """Estimate the shadow of a typical bead from isolated beads.
 
-    radius_px: first value of its radius. The other arguments are those of `measure_beads`.
+    radius_px: initial value of its radius. The other arguments are those of `measure_beads`.
     """
     distance = cKDTree(uv).query(uv, k=[2])[0][:, 0] if len(uv) > 1 else np.full(1, np.inf)
     alone = np.argsort(-distance, kind='stable')[:PROFILE_BEADS]
@@ -107,14 +107,14 @@ def estimate_profile(
         if _settled(profile, before):
             return profile
     reach_px = max(profile.reach_px for profile in profiles)
-    # The first one is no estimate. Of shadows as small as their blur it fits about as well.
+    # Skip the initial guess: it fits shadows as small as their blur about as well.
     estimates = profiles[1:] or profiles
     fits = [_profile_fit(light, uv[alone], shapes, profile, reach_px) for profile in estimates]
     return min(fits, key=ShadowFit.typical).profile
 
 
 def _settled(profile: Profile, before: Profile) -> bool:
-    """Return whether neither radius nor blur of a profile changed by what would be seen."""
+    """Return whether radius and blur of a profile changed less than the tolerances."""
     radius = abs(profile.radius_px / before.radius_px - 1)
     blur = abs(profile.blur_px / before.blur_px - 1)
     return radius < SETTLED and blur < RADIUS_SD
@@ -127,9 +127,9 @@ def _profile_fit(
     profile: Profile,
     reach_px: float = 0.0,
 ) -> _BeadFit:
-    """Return the fit of shadows with a profile, in windows for a reach that is no smaller.
+    """Fit shadows with a fixed profile, in windows that reach at least as far as reach_px.
 
-    shapes: those and the sizes of the beads, as of `measure_beads`.
+    shapes: shapes and sizes of the beads, as in `measure_beads`.
     """
     noise = Noise(0.0, 1.0, np.ones((1, 1)))
     shape, size = shapes
@@ -148,11 +148,11 @@ def measure_beads(
     steps: int = STEPS,
     size: NDArray[np.float64] | None = None,
 ) -> Beads:
-    """Measure all beads near pixels uv (n, 2) at once, in so many Gauss-Newton steps.
+    """Measure all beads near pixels uv (n, 2) at once by a number of Gauss-Newton steps.
 
     shape: (n, 2, 2) matrices from the circle of a typical bead to the borders of shadows. size:
-    (n,) of the beads, 1 for a typical one, apart from what makes the shadows of equal ones differ;
-    None for equal ones.
+    (n,) relative sizes of the beads, 1 for a typical bead. They exclude the effects that make
+    shadows of equal beads differ. None for equal beads.
     """
     fit = _BeadFit(light, uv, shape, profile=profile, noise=noise, size=size)
     fit.run(steps)
@@ -167,9 +167,9 @@ def lack_of_fit(
     noise: Noise,
     size: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Mean squared residuals (n,) over the noise of beads of some sizes (n,).
+    """Return mean squared residuals (n,), over the noise, of beads of given sizes (n,).
 
-    No window is smaller than that of a typical bead: a small shadow has to explain what is there.
+    No window is smaller than that of a typical bead: a small shadow must explain its surroundings.
     """
     fit = _BeadFit(
         light,
@@ -185,7 +185,7 @@ def lack_of_fit(
 
 
 class _BeadFit(ShadowFit):
-    """Fit of beads of a phantom, whose radii differ."""
+    """Fit of beads of a phantom whose radii differ."""
 
     def __init__(
         self,
@@ -198,11 +198,11 @@ class _BeadFit(ShadowFit):
         reach_px: float = 0.0,
     ) -> None:
         self.stretch = np.sqrt(np.abs(np.linalg.det(shape)))
-        # Distances to a metric are those from the centre of the shadow of a typical bead.
+        # Distances in a metric are those from the centre of the shadow of a typical bead.
         inverse = np.linalg.inv(shape)
         self.metric = np.swapaxes(inverse, 1, 2) @ inverse
         self.size = np.ones(len(uv)) if size is None else size
-        # Sizes that differ by less than a radius is known share a table.
+        # Sizes share a table if they differ by less than the uncertainty of a radius.
         sizes, self.kind = np.unique(rounded(self.size, 1 + RADIUS_SD), return_inverse=True)
         self.shadows = Shadows([profile.sized(size) for size in sizes.tolist()])
         own_reach = np.maximum(profile.reach_px * self.size, reach_px) * self.stretch
@@ -214,29 +214,29 @@ class _BeadFit(ShadowFit):
         self.radius = self.stretch * self.size
         self.measured = np.zeros(len(uv), dtype=bool)
         self.disturbed = np.zeros(len(uv), dtype=bool)
-        self.moved = np.zeros(len(uv))  # by relative errors of 1 of radii, RMS of u and v [px]
+        self.moved = np.zeros(len(uv))  # RMS shift of u and v by relative errors 1 of radii [px]
         self.plane_only = False
-        self.residual = np.zeros((len(uv), len(self.offset)), dtype=np.float32)  # of the last step
+        self.residual = np.zeros((len(uv), len(self.offset)), dtype=np.float32)  # at the last step
         self.counted = np.zeros(self.residual.shape, dtype=bool)
         self._set_groups(self._near(window + reach))
         self._read(light, own_reach + MARGIN_PX)
 
     def _near(self, together: float) -> NDArray[np.int64]:
-        """Neighbours (n, k) of the beads, -1 for none; notes the distances of the nearest."""
+        """Return neighbours (n, k) of the beads, -1 for none; note distances of the nearest."""
         n = len(self.uv)
         count = min(self.settings.neighbours + 1, n)
         if count < 2:
             return np.zeros((n, 0), dtype=int)
         distance, near = cKDTree(self.uv).query(self.uv, k=count, distance_upper_bound=together)
         other = near != np.arange(n)[:, None]
-        # A bead at the very place of another is not always its own nearest.
+        # A bead that coincides with another is not always its own nearest neighbour.
         order = np.argsort(~other | ~np.isfinite(distance), axis=1, kind='stable')
         near = np.take_along_axis(np.where(other & np.isfinite(distance), near, -1), order, axis=1)
         self.distance = np.where(other, distance, np.inf).min(axis=1)
         return near[:, : count - 1]
 
     def _read(self, light: Light, window_px: NDArray[np.float64]) -> None:
-        """Read the windows (n, m) around the beads, each with a radius (n,) of its own."""
+        """Read the windows (n, m) around the beads, each with its own radius (n,)."""
         height, width = light.grey.shape
         places = self.middle[:, None] + self.offset
         inside = ((places >= 0) & (places < (width, height))).all(axis=2)
@@ -249,15 +249,15 @@ class _BeadFit(ShadowFit):
         self.high = light.high
         self._set_windows(grey, valid & own, bright=np.where(valid, grey, 0.0))
         self.usable = self.valid.sum(axis=1) >= MIN_INSIDE * own.sum(axis=1)
-        # Without a part of its border, a shadow that is not quite that of a sphere moves.
+        # If part of the border is missing, a shadow that is not quite that of a sphere moves.
         from_edge = np.minimum(self.uv, (width - 1, height - 1) - self.uv).min(axis=1)
         self.usable &= from_edge >= self.profile.radius_px * self.radius
 
     def run(self, steps: int) -> None:
-        """Take Gauss-Newton steps; the last one gives standard deviations as well.
+        """Take Gauss-Newton steps; the last step also yields standard deviations.
 
-        Beads that have settled take part in the last one, and where what is known of their windows
-        changes.
+        Converged beads only take part in the last step and after changes to the model of their
+        window.
         """
         active = np.ones(len(self.uv), dtype=bool)
         for step in range(steps):
@@ -282,9 +282,9 @@ class _BeadFit(ShadowFit):
                 active |= self.disturbed | (self.strength > 0)
 
     def _cross(self) -> NDArray[np.bool_]:
-        """Note what shadows that touch have together, beyond the product of both.
+        """Compute how shadows that touch differ from the product of both shadows.
 
-        It is computed of the two nearest neighbours. Returns the beads (n,) of which it is.
+        The two nearest neighbours are taken into account. Return the beads (n,) that are affected.
         """
         crossed = np.zeros(len(self.uv), dtype=bool)
         if self.crossing is None:
@@ -299,7 +299,7 @@ class _BeadFit(ShadowFit):
         return crossed
 
     def _touching(self, rows: NDArray[np.int64], near: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Whether (g,) the shadows of beads touch those of some others (g, k), -1 for none."""
+        """Return (g,) whether shadows of beads touch those of neighbours (g, k), -1 for none."""
         apart = np.linalg.norm(self.uv[rows, None] - self.uv[near], axis=2)
         radii = self.profile.radius_px * (self.radius[rows, None] + self.radius[near])
         reach = radii + 2 * self.profile.blur_px
@@ -308,7 +308,7 @@ class _BeadFit(ShadowFit):
     def _crossing(
         self, rows: NDArray[np.int64], members: NDArray[np.int64]
     ) -> NDArray[np.float64]:
-        """Differences (g, m) for windows of beads (g,) and shadows of members (g, k) or -1."""
+        """Return differences (g, m) in windows of beads (g,) with members (g, k), -1 for none."""
         grid = FineGrid(self.offset, self.profile.blur_px)
         axis = grid.axis
         raw = np.ones((len(rows), len(axis), len(axis)), dtype=np.float32)
@@ -335,14 +335,14 @@ class _BeadFit(ShadowFit):
     def _squared(
         self, beads: NDArray[np.int64], x: NDArray[np.float64], y: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Squared distances of pixels (g, ...) from beads (g,), in their metrics [px^2]."""
+        """Return squared distances of pixels (g, ...) from beads (g,) in their metrics [px^2]."""
         metric = self.metric[beads].reshape(-1, 4, *[1] * (np.ndim(x) - 1))
         return metric[:, 0] * x * x + 2 * metric[:, 1] * x * y + metric[:, 3] * y * y
 
     def _model(
         self, rows: NDArray[np.int64], near: NDArray[np.int64]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Light (g, m) and its derivatives (g, OWN + 3 k, m), of single precision."""
+        """Return light (g, m) and its derivatives (g, OWN + 3 k, m) in single precision."""
         everyone = np.concatenate([rows[:, None], near], axis=1)
         there = everyone >= 0
         centre = (self.middle[rows, None] - self.uv[everyone]).astype(np.float32)
@@ -409,9 +409,9 @@ class _BeadFit(ShadowFit):
         equations: NormalEquations,
         part: NDArray[np.int64],
     ) -> None:
-        """Note the shifts of centres (g,) by relative errors of 1 of radii, given their equations.
+        """Note how far centres (g,) move per relative error 1 of the radii, given their equations.
 
-        A shadow of which others hide a part of the edge moves with its radius, and with theirs.
+        If other shadows hide part of its edge, a shadow moves with its own radius and with theirs.
         """
         _, jacobian = self._model(rows, near)
         beads = np.concatenate([rows[:, None], near], axis=1)
@@ -423,7 +423,7 @@ class _BeadFit(ShadowFit):
         self.moved[rows] = np.sqrt(0.5 * (moved**2).sum(axis=(1, 2)))
 
     def absorbed(self) -> Absorbed:
-        """Return what beads absorb, in the pixels of those whose fit is good."""
+        """Return the light absorbed by beads, in the pixels of beads with a good fit."""
         plane = self._plane(np.arange(len(self.uv)))
         x, y = np.moveaxis(self.middle[:, None] + self.offset - self.uv[:, None], 2, 0)
         distance = np.sqrt(self._squared(np.arange(len(self.uv)), x, y))
@@ -436,7 +436,7 @@ class _BeadFit(ShadowFit):
         return Absorbed(distance[good], (1 - self.grey / plane)[good], weight[good], size[good])
 
     def result(self) -> Beads:
-        """Return what was measured."""
+        """Return the measured beads."""
         measured = self.measured & np.isfinite(self.uv).all(axis=1)
         typical = float(np.median(self.misfit[measured])) if measured.any() else 1.0
         beads = self._beads(measured, typical, self._noise(measured))
@@ -446,10 +446,10 @@ class _BeadFit(ShadowFit):
         return replace(beads, sigma=np.hypot(beads.sigma, radius_sd * self.moved))
 
     def _noise(self, measured: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Lack of fit (n,) beyond what the windows of usual beads show alike.
+        """Return the lack of fit (n,) beyond the residuals that usual beads have in common.
 
-        Where the shadow is not quite that of a sphere, residuals are alike in all windows. They
-        move no centre against the others, and are no noise.
+        If shadows are not exactly those of spheres, residuals are alike in all windows. Such
+        residuals are not noise and shift no centre relative to the others.
         """
         usual = measured & (self.strength == 0) & (self.misfit <= DISTURBED * self.typical())
         rest = less_common(self.uv, self.radius, self.residual, self.counted, usual)
@@ -458,7 +458,7 @@ class _BeadFit(ShadowFit):
         return np.where(self.strength > 0, 1.0, share) * self.misfit
 
     def _is_light_clipped(self, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Whether (g,) hardly any pixel beside the shadows of windows is not clipped."""
+        """Return (g,) whether nearly all pixels outside the shadows of windows are clipped."""
         if not (len(rows) and np.isfinite(self.high)):
             return np.zeros(len(rows), dtype=bool)
         reach = self.profile.reach_px * self.radius.max()
@@ -468,34 +468,34 @@ class _BeadFit(ShadowFit):
         return np.asarray(seen.sum(axis=1) < SEEN_LIGHT * light.sum(axis=1))
 
 
-# How an image shows beads: its noise, the shadow of a typical bead, the sizes of all.
+# Imaging of beads: noise, the shadow of a typical bead, the sizes of all beads.
 #
-# A phantom that does not tell its sizes may have several. A bead that stands alone has the size
-# with which its shadow fits best; where nearly all of a sample have the same size, all have.
+# A phantom without specified sizes may have several. An isolated bead has the size with which its
+# shadow fits best; if nearly all beads of a sample have the same size, all beads have.
 
-STEP = 1.25  # factor between sizes that are compared
+STEP = 1.25  # ratio of consecutive sizes in the first comparison
 SIZES = STEP ** np.arange(-4, 5)
-FINER_STEPS = (STEP**0.5, STEP**0.25, STEP**0.125)  # between those that are compared then
-FEW = 5  # beads alone, below which those that overlap tell their shadow as well
-SAMPLE = 40  # beads that tell whether sizes differ
-OTHERS = 0.2  # share of them with something else beside them
-ROUNDS = 2  # the second one with a profile of beads of one size
+FINER_STEPS = (STEP**0.5, STEP**0.25, STEP**0.125)  # ratios of sizes in the refinements
+FEW = 5  # isolated beads below which overlapping beads are used for the profile as well
+SAMPLE = 40  # beads that decide whether sizes differ
+OTHERS = 0.2  # largest share of beads in the sample with another object next to them
+ROUNDS = 2  # the second round uses a profile of beads of one size
 
 
 @dataclass(frozen=True)
 class Expected:
-    """Where shadows of beads are expected."""
+    """Expected shadows of beads."""
 
-    row: NDArray[np.int64]  #: (n,), of the phantom
+    row: NDArray[np.int64]  #: (n,), row of the bead in the phantom
     uv: NDArray[np.float64]  #: (n, 2) [px]
     #: (n, 2, 2), matrices from the circle of a typical bead to the borders of shadows of that size
     shape: NDArray[np.float64]
-    seen: NDArray[np.bool_]  #: (n,), something was found there
-    alone: NDArray[np.bool_]  #: (n,), no other shadow is near
+    seen: NDArray[np.bool_]  #: (n,), True if something was detected there
+    alone: NDArray[np.bool_]  #: (n,), True if no other shadow is near
 
     @property
     def radius(self) -> NDArray[np.float64]:
-        """Relative radii (n,) that beads of one size have here."""
+        """Relative radii (n,) that the shadows have if all beads are of typical size."""
         return np.sqrt(np.abs(np.linalg.det(self.shape)))
 
 
@@ -504,8 +504,8 @@ class Imaging:
     """Noise and shadows of an image."""
 
     noise: Noise
-    profile: Profile  #: of a typical bead
-    #: (n,), of all beads of the phantom, 1 for a typical one, NaN where it is not known
+    profile: Profile  #: shadow of a typical bead
+    #: (n,), relative size of each bead of the phantom; 1 is typical, NaN is unknown
     size: NDArray[np.float64]
 
     @property
@@ -514,7 +514,7 @@ class Imaging:
         return bool((self.size < LARGER[0]).all())
 
     def completed(self, light: Light, shadows: Expected) -> Imaging:
-        """Return it with the sizes of beads that were not known and stand alone here."""
+        """Return a copy that adds the unknown sizes of beads that are isolated in this image."""
         unknown = np.flatnonzero(shadows.alone & np.isnan(self.size[shadows.row]))
         if not len(unknown):
             return self
@@ -530,10 +530,10 @@ def first_imaging(
     radius_px: float,
     size: NDArray[np.float64],
 ) -> Imaging:
-    """Return what an image tells of its noise and shadows.
+    """Estimate the shadows and sizes of beads from an image.
 
-    radius_px: first value of the radius of a typical bead. size: (n,) relative sizes of all beads
-    of the phantom, NaN where they are not told.
+    radius_px: initial value of the radius of a typical bead. size: (n,) relative sizes of all
+    beads of the phantom, NaN if unspecified.
     """
     profile = _typical(light, shadows, size, radius_px)
     imaging = Imaging(noise, profile, size)
@@ -551,7 +551,7 @@ def first_imaging(
 def _typical(
     light: Light, shadows: Expected, size: NDArray[np.float64], radius_px: float
 ) -> Profile:
-    """Return the profile of a bead of size 1 from beads that stand alone."""
+    """Estimate the profile of a bead of size 1 from isolated beads."""
     seen = np.flatnonzero(shadows.seen & shadows.alone)
     if len(seen) < FEW:
         seen = np.flatnonzero(shadows.seen)
@@ -566,12 +566,12 @@ def _typical(
 
 
 def rounded(size: NDArray[np.float64], step: float) -> NDArray[np.float64]:
-    """Relative sizes (n,), rounded to powers of a step: few different ones."""
+    """Return relative sizes (n,) rounded to powers of a step, so that few values differ."""
     return np.asarray(step ** np.rint(np.log(size) / np.log(step)))
 
 
 class _Sizes:
-    """Comparison of sizes of beads in an image."""
+    """Comparison of bead sizes in an image."""
 
     def __init__(self, light: Light, shadows: Expected, imaging: Imaging) -> None:
         self.light = light
@@ -579,9 +579,9 @@ class _Sizes:
         self.imaging = imaging
 
     def are_equal(self, rows: NDArray[np.int64]) -> bool:
-        """Return whether nearly all of some beads that nothing is beside have the same size.
+        """Return whether nearly all beads without a disturbance nearby have the same size.
 
-        Another size counts where the common one fits as badly as if something were beside a bead.
+        A bead differs if the common size fits it as badly as if something disturbed it.
         """
         if not len(rows):
             return True
@@ -589,7 +589,7 @@ class _Sizes:
         smaller, common, larger = self.lacks(rows, [same / STEP, same, same * STEP])
         if np.mean(common > DISTURBED * np.minimum(smaller, larger)) <= OTHERS:
             return True
-        # A profile of beads of several sizes fits few of them.
+        # A mean profile of beads of several sizes fits few of them.
         sized = self.with_sizes(rows, self.best(rows))
         size = sized.imaging.size[self.shadows.row[rows]]
         own, common = sized.lacks(rows, [size, same])
@@ -598,7 +598,7 @@ class _Sizes:
         return bool(np.mean(differs[own < DISTURBED * np.median(own)]) <= OTHERS)
 
     def with_sizes(self, rows: NDArray[np.int64], found: NDArray[np.float64]) -> _Sizes:
-        """Return it with a profile of some beads, of which sizes (m,) were found."""
+        """Return a comparison whose profile is estimated from beads with sizes (m,) found."""
         middle = float(np.median(found))
         size = np.full_like(self.imaging.size, np.nan)
         size[self.shadows.row[rows]] = found / middle
@@ -607,7 +607,7 @@ class _Sizes:
         return _Sizes(self.light, self.shadows, Imaging(self.imaging.noise, profile, size))
 
     def best(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Sizes (m,) of best fit of some beads."""
+        """Return the best-fitting sizes (m,) of beads."""
         same = np.ones(len(rows))
         lack = self.lacks(rows, [one * same for one in SIZES])
         size = SIZES[np.clip(np.argmin(lack, axis=0), 1, len(SIZES) - 2)]
@@ -617,19 +617,19 @@ class _Sizes:
             lack = self.lacks(rows, list(tried))
             least = np.argmin(lack, axis=0)
             size = tried[least, row]
-        # Only where both neighbours fit worse, a parabola says more.
+        # A parabola only improves a size if both neighbouring sizes fit worse.
         return np.asarray(size * np.where(least == 1, FINER_STEPS[-1] ** vertex(*-lack), 1.0))
 
     def lacks(
         self, rows: NDArray[np.int64], sizes: Sequence[NDArray[np.float64]]
     ) -> NDArray[np.float64]:
-        """Lack of fit (k, m) of some beads (m,) with some sizes (m,) each.
+        """Return the lack of fit (k, m) of beads (m,) for k sets of sizes (m,).
 
-        The shadows around them are fitted as well.
+        The shadows around the beads are fitted as well.
         """
         shadows = self.shadows
         imaging = self.imaging
-        # The windows of the beads, and the largest shadow that may be around.
+        # The windows of the beads, and the largest shadow that may reach into them.
         largest = max(1.0, float(np.max(sizes))), np.nanmax(imaging.size, initial=1.0)
         reach = sum(largest) * imaging.profile.reach_px
         near = cKDTree(shadows.uv).query_ball_point(shadows.uv[rows], reach)

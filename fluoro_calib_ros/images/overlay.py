@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Pictures of what was found in a radiograph, matched and refused."""
+"""Pictures of detections in a radiograph that were matched or refused."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .detection import detect_beads
 from .extraction import Extraction
 from .markers import MarkerFrame
 
-# Blue, green, red.
+# Colours as blue, green, red.
 MATCHED = (80, 220, 60)
 OVERLAPPED = (230, 200, 40)
 REFUSED = (60, 60, 255)
@@ -26,7 +26,7 @@ UNEXPLAINED = (0, 190, 255)
 TEXT = (235, 235, 235)
 OUTLINE = (0, 0, 0)
 TEXT_HEIGHT = 18
-QUALITY = 80  # of a small JPEG
+QUALITY = 80  # quality of a small JPEG
 
 
 def draw_overlay(
@@ -34,9 +34,9 @@ def draw_overlay(
 ) -> NDArray[np.uint8]:
     """Draw a picture (h, w, 3) of uint8, blue, green, red, of an image (h, w).
 
-    Green circles are observations, light blue ones overlapped observations, red crosses predicted
-    beads without one, yellow squares what was found and is no bead of the phantom. Without an
-    extraction, all that was found is yellow, and reason says why it was refused.
+    Green circles are observations, light blue circles overlapped observations, red crosses
+    predicted beads without an observation, yellow squares detections that are no bead of the
+    phantom. Without an extraction, all detections are yellow, and reason says why it was refused.
     """
     picture, factor = _picture(image)
     if extraction is None:
@@ -45,7 +45,7 @@ def draw_overlay(
             for uv in detections.uv:
                 _square(picture, uv, factor, detections.radius_px)
         except DataError:
-            pass  # the reason says it
+            pass  # the label shows the reason
         return _labelled(picture, [(reason or 'refused', REFUSED)])
     radius = extraction.imaging.profile.reach_px
     explained = np.linalg.norm(
@@ -72,13 +72,13 @@ def draw_overlay(
 
 
 def full_contrast(image: np.ndarray) -> NDArray[np.uint8]:
-    """Return an image (h, w) as uint8 of full contrast."""
+    """Return an image (h, w) as uint8 with full contrast."""
     low, high = np.percentile(image[::4, ::4], [0.5, 99.8])
     return np.clip((image - low) * (255 / max(high - low, 1)), 0, 255).astype(np.uint8)
 
 
 def small_jpeg(image: np.ndarray, largest_px: int) -> bytes:
-    """Return an image (h, w) as JPEG of full contrast, a large one reduced to largest_px."""
+    """Return an image (h, w) as JPEG with full contrast, a large image reduced to largest_px."""
     factor = largest_px / max(image.shape)
     if factor < 1:
         image = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
@@ -86,7 +86,7 @@ def small_jpeg(image: np.ndarray, largest_px: int) -> bytes:
 
 
 def _picture(image: np.ndarray) -> tuple[NDArray[np.uint8], int]:
-    """Return an image as a picture of full contrast, small ones enlarged by a factor."""
+    """Return an image as a picture with full contrast, a small image enlarged, and the factor."""
     grey = full_contrast(image)
     factor = 2 if max(image.shape) <= 512 else 1
     grey = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_NEAREST)
@@ -94,7 +94,7 @@ def _picture(image: np.ndarray) -> tuple[NDArray[np.uint8], int]:
 
 
 def _place(uv: np.ndarray, factor: int) -> tuple[int, int]:
-    """Pixel of the picture of a pixel (2,) of the image."""
+    """Return the pixel of the picture for a pixel (2,) of the image."""
     u, v = np.rint((np.asarray(uv) + 0.5) * factor - 0.5).astype(int)
     return int(u), int(v)
 
@@ -119,7 +119,7 @@ def _labelled(
     return np.vstack([picture, band])
 
 
-# Pictures of the markers that were followed.
+# Pictures of tracked markers.
 
 RADIUS_PX = 7
 
@@ -129,8 +129,8 @@ def draw_markers(
 ) -> NDArray[np.uint8]:
     """Draw a picture (h, w, 3) of uint8, blue, green, red, of an image (h, w).
 
-    Green circles are markers, light blue ones overlapped markers, yellow ones markers whose id
-    is doubtful; red crosses are where markers that are not seen are believed to be.
+    Green circles are markers, light blue circles overlapped markers, yellow circles markers with a
+    doubtful id; red crosses are predictions of markers that are not seen.
     """
     target_names = target_names or {}
     picture, factor = _picture(image)
@@ -173,7 +173,7 @@ AXIS_COLOURS = ((80, 80, 255), (80, 255, 80), (255, 160, 80))  # x red, y green,
 class BodyView:
     """A body in an image: its name and status, markers (n, 2), and centre and ends of axes (4, 2).
 
-    Pixels; NaN where the body has no pose.
+    Places are pixels, NaN if the body has no pose.
     """
 
     name: str
@@ -185,8 +185,8 @@ class BodyView:
 def draw_bodies(image: np.ndarray, title: str, bodies: Sequence[BodyView]) -> NDArray[np.uint8]:
     """Draw a picture (h, w, 3) of uint8, blue, green, red, of an image (h, w), of even size.
 
-    Circles are markers where the pose of their body puts them, green where markers were seen;
-    lines are the axes of the body, x red, y green, z blue.
+    Circles are markers at the pose of their body, green where markers were seen; lines are the
+    axes of the body, x red, y green, z blue.
     """
     picture, factor = _picture(image)
     lines = [(title, TEXT)]
@@ -220,8 +220,8 @@ def draw_bodies(image: np.ndarray, title: str, bodies: Sequence[BodyView]) -> ND
 COVERED = (60, 150, 70)  # RGB
 MISSING = (90, 90, 90)
 NEXT = (255, 200, 0)
-TEXT_ROWS = 22  # px a line of text
-WIDTH = 480  # px
+TEXT_ROWS = 22  # height of a line of text [px]
+WIDTH = 480  # width of the picture [px]
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
@@ -231,11 +231,11 @@ def coverage_picture(
     lines: tuple[str, ...],
     areas: Sequence[int] = (),
 ) -> NDArray[np.uint8]:
-    """Draw covered cells green and missing ones grey, with lines of text below.
+    """Draw covered cells green and missing cells grey, with lines of text below.
 
-    covered: (rows, columns) of bool; image_size: (width, height) [px] of the image, whose shape
-    the picture has; areas: those that the next pose should show, framed, in rows of three from the
-    top left. Returns (h, w, 3) of uint8, RGB.
+    covered: (rows, columns) of bool; image_size: (width, height) [px] of the image, whose aspect
+    ratio the picture has; areas: those that the next pose should show, framed, numbered in rows of
+    three from the top left. Returns (h, w, 3) of uint8, RGB.
     """
     width, height = image_size
     rows = max(1, round(WIDTH * height / width))

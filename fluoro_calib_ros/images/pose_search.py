@@ -1,14 +1,14 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Where a phantom may stand: three beads of an image against triples of the phantom.
+"""Find candidate poses of a phantom: match three beads of an image with triples of the phantom.
 
 A bead of the image and two of its neighbours are compared with all triples of a bead of the
-phantom and two of its neighbours. Neighbours in the image are chosen in several directions: where
-a face is seen from its edge, the nearest ones lie in one line, or belong to other faces. Three
+phantom and two of its neighbours. Neighbours in the image are chosen in several directions: if a
+face is seen from its edge, the nearest ones lie on one line, or belong to other faces. Three
 points give a scaled-orthographic pose in closed form (Huttenlocher and Ullman, "Recognizing solid
 objects by alignment with an image", IJCV 5, 1990), with a mirror solution. Further neighbours vote
-for a pose if there is something at their predicted places.
+for a pose if there is a detection at their predicted places.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-MIN_SINE = 0.3  # of the angle between the sides of a triple of the phantom
-MIN_IMAGE_SINE = 0.2  # of the angle between the sides of three beads in the image
-# Neighbours that vote, of up to half of the beads: perspective moves those farther away from where
-# a scaled-orthographic pose has them, on a phantom of 18 balls by more than the tolerance.
+MIN_SINE = 0.3  # least sine of the angle between the sides of a triple of the phantom
+MIN_IMAGE_SINE = 0.2  # least sine of the angle between the sides of three beads in the image
+# Largest number of neighbours that vote, limited to half of the beads: perspective shifts distant
+# beads from their scaled-orthographic places, on a phantom of 18 balls by more than the tolerance.
 VOTERS = 18
-# The nearest of them, which select the poses that the others vote on: one of the first few must be
-# found, and the share FIRST_VOTE of all.
+# Number of nearest voters that preselect poses for the vote of all: one of the first few must be
+# found, and the share FIRST_VOTE of all of them.
 FIRST_VOTERS = (3, 6)
-MAX_POSES = 6000  # poses that all voters vote on
-FIRST_VOTE = 0.5
-MIN_VOTE = 0.55
-SURE_VOTE = 0.85
-PAIRS_AT_ONCE = 4
-FLAT = 0.1  # of the shorter side, within which voters lie in a plane
-KEPT = 10  # best poses of three beads
-# Nearest beads of an image from which each neighbour is chosen. In views along a tube of 503 beads
-# 18 % of the searches from one bead lead to the pose with the nearest six, 48 % with the nearest
-# in six directions, of 24 or 32 nearest beads, and 40 % of 14.
+MAX_POSES = 6000  # largest number of poses on which all voters vote
+FIRST_VOTE = 0.5  # least vote of the nearest voters
+MIN_VOTE = 0.55  # least vote of all voters
+SURE_VOTE = 0.85  # vote at which the search from a bead ends
+PAIRS_AT_ONCE = 4  # pairs of sides that are evaluated together
+FLAT = 0.1  # largest distance of voters from a plane, as a share of the shorter side
+KEPT = 10  # best poses of three beads that are kept
+# Number of nearest beads of an image from which each neighbour is chosen. In views along a tube of
+# 503 beads, 18 % of the searches from one bead lead to the pose with the nearest six; 48 % with
+# the nearest in six directions out of 24 or 32 nearest beads, and 40 % out of 14.
 CHOICE = 4
 
 
@@ -50,15 +50,15 @@ class Triples:
     bead: NDArray[np.int64]  #: (t, 3)
     #: (4, t), squares of both sides, their product [mm^2], and the determinant of these [mm^4]
     products: NDArray[np.float64]
-    #: (k, 3, t), neighbours of the first bead, the nearest first, in the axes of both sides
+    #: (k, 3, t), neighbours of the first bead, nearest first, in coordinates along both sides
     #: and their cross product
     voter: NDArray[np.float32]
     sides: NDArray[np.float64]  #: (t, 2, 3), from the first bead [mm]
-    #: (t,), all voters lie in one plane, so that both solutions have the same votes
+    #: (t,), True if all voters lie in one plane, so that both solutions have the same votes
     planar: NDArray[np.bool_]
 
     def of_beads(self, chosen: NDArray[np.bool_]) -> Triples:
-        """Return the triples whose first bead is one of those that are chosen (n,)."""
+        """Return the triples whose first bead is among the chosen beads (n,)."""
         row = np.flatnonzero(chosen[self.bead[:, 0]])
         return Triples(
             self.bead[row],
@@ -74,7 +74,7 @@ class LocalPose:
     """A scaled-orthographic pose around one bead."""
 
     bead: int  #: row of the phantom
-    uv: NDArray[np.float64]  #: (2,), its pixel
+    uv: NDArray[np.float64]  #: (2,), pixel of the bead
     #: (3, 3), phantom -> a sensor that looks along the ray of the bead
     rotation: NDArray[np.float64]
     scale: float  #: [px/mm]
@@ -121,13 +121,13 @@ def triples_of(xyz: NDArray[np.float64], neighbours: int) -> Triples:
 def neighbours_of(
     uv: NDArray[np.float64], row: NDArray[np.int64], count: int
 ) -> NDArray[np.int64]:
-    """Rows (m, k) of neighbours of some rows (m,) of pixels (n, 2), k = min(count, n - 1).
+    """Return rows (m, k) of neighbours of rows (m,) of pixels (n, 2), k = min(count, n - 1).
 
-    These are the nearest ones in so many directions, by angles from that of the nearest, and then
-    the nearest of the others.
+    These are the nearest in `count` directions, by angles from that of the nearest, and then
+    the nearest of the remaining neighbours.
     """
     _, near = cKDTree(uv).query(uv[row], k=min(CHOICE * count + 1, len(uv)))
-    # Of points at the same place, the point may not be the first.
+    # If points coincide, the point itself may not come first.
     near = np.take_along_axis(near, np.argsort(near != row[:, None], kind='stable'), axis=1)[:, 1:]
     offset = uv[near] - uv[row, None]
     angle = np.arctan2(offset[..., 1], offset[..., 0])
@@ -141,7 +141,7 @@ def neighbours_of(
 def nearby_map(
     uv: NDArray[np.float64], image_size: tuple[int, int], reach_px: float
 ) -> NDArray[np.uint8]:
-    """Mask (h, w) of uint8: 1 within a distance of a pixel (n, 2), else 0."""
+    """Return a mask (h, w) of uint8: 1 within a distance of a pixel (n, 2), else 0."""
     width, height = image_size
     empty = np.full((height, width), 255, dtype=np.uint8)
     places = np.rint(uv).astype(int)
@@ -159,7 +159,7 @@ def local_poses(
     found: NDArray[np.uint8],
     scales: tuple[float, float],
 ) -> list[LocalPose]:
-    """Return the poses with the most votes for a bead of the image, the best first.
+    """Return the poses with the most votes for a bead of the image, best first.
 
     Parameters
     ----------
@@ -168,10 +168,10 @@ def local_poses(
     uv : (n, 2) ndarray
         Beads of the image [px].
     neighbours : int
-        Number of its neighbours that make triples with it.
+        Number of its neighbours that form triples with it.
     triples : Triples
     found : (h, w) ndarray of uint8
-        1 near a bead of the image, 2 outside of the field, else 0.
+        1 near a bead of the image, 2 outside the field, else 0.
     scales : tuple of float
         Smallest and largest scale [px/mm].
     """
@@ -199,9 +199,9 @@ def _best(
     centre: NDArray[np.float32],
     found: NDArray[np.uint8],
 ) -> list[LocalPose]:
-    """Return the poses with the most votes of the solutions of several triples of an image."""
+    """Return the poses with the most votes among the solutions of several image triples."""
     triple, axes, scale = (np.concatenate(values) for values in zip(*parts))
-    # A frame of pixels around the image stands for all that is off it.
+    # A border of pixels around the image represents all places outside it.
     field = np.pad(found, 1, constant_values=2)
     kept, votes = _elected(centre, axes, triple, triples.voter, field)
     if len(kept) > MAX_POSES:
@@ -216,11 +216,11 @@ def _best(
         if votes[row] < MIN_VOTE or len(out) >= KEPT:
             break
         bead = int(triples.bead[triple[row], 0])
-        # Both solutions have the same votes where the neighbours lie in one plane.
+        # Both solutions have the same votes if the neighbours lie in one plane.
         for mirror in (1, -1):
             both = axes[row] * np.array([[1], [1], [mirror]])
             rotation = _rotation(triples.sides[triple[row]], both, scale[row])
-            # Poses of one bead that differ little are one.
+            # Poses of one bead that hardly differ count as one.
             key = (bead, *np.rint(rotation[2] * 4).astype(int).tolist())
             if key not in seen:
                 seen.add(key)
@@ -235,7 +235,7 @@ def _best(
 def _solutions(
     p: NDArray[np.float64], q: NDArray[np.float64], triples: Triples, scales: tuple[float, float]
 ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float64]]:
-    """Rows of triples, image (m, 3, 2) of their axes, scales (m,), for sides p and q (2,) [px]."""
+    """Return rows of triples, axes (m, 3, 2) in the image, scales (m,), for sides p, q [px]."""
     pp = p @ p
     qq = q @ q
     pq = p @ q
@@ -252,7 +252,7 @@ def _solutions(
     first = np.sqrt(np.maximum(squared * A[row] - pp, 0))
     second = np.sqrt(np.maximum(squared * B[row] - qq, 0))
     second = np.where(squared * C[row] < pq, -second, second)
-    # The image of the cross product of both sides; its sign tells the two solutions apart.
+    # Image of the cross product of both sides; its sign distinguishes the two solutions.
     normal = np.stack([p[1] * second - first * q[1], first * q[0] - p[0] * second], axis=1)
     normal = normal / scale[:, None]
     other = np.flatnonzero(~triples.planar[row])
@@ -275,7 +275,7 @@ def _elected(
     voter: NDArray[np.float32],
     field: NDArray[np.uint8],
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Rows (k,) of the solutions that the nearest voters elect, and their votes."""
+    """Return rows (k,) of the solutions that the nearest voters preselect, and their votes."""
     some, nearest = FIRST_VOTERS
     hits, inside = _hits(centre, axes, triple, voter[:some], field)
     row = np.flatnonzero(hits)
@@ -292,15 +292,15 @@ def _hits(
     voters: NDArray[np.float32],
     field: NDArray[np.uint8],
 ) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
-    """Numbers (m,) of voters (k, 3, t) that are found, and that are in the field of view.
+    """Return numbers (m,) of voters (k, 3, t) that are found, and that are in the field of view.
 
-    axes (m, 3, 2) are the images of the axes of triples (m,), field the map with its frame.
+    axes: (m, 3, 2) images of the axes of triples (m,); field: the map with its border.
     """
     hits = np.zeros(len(triple), dtype=np.int8)
     inside = np.zeros(len(triple), dtype=np.int8)
     height, width = field.shape
     flat = field.ravel()
-    # Voter after voter, coordinate after coordinate: numpy is slow with many small matrices.
+    # Loop over voters and coordinates: numpy is slow with many small matrices.
     a, b, c = np.ascontiguousarray(axes.transpose(1, 2, 0))
     for voter in voters:
         x, y, z = (values[triple] for values in voter)
@@ -315,9 +315,9 @@ def _hits(
 
 
 def _votes(hits: NDArray[np.int8], inside: NDArray[np.int8], voters: int) -> NDArray[np.float64]:
-    """Shares (m,) of the voters that are found.
+    """Return the shares (m,) of the voters that are found.
 
-    A pose that puts its voters off the image must not win by the rest of them.
+    A pose that moves its voters off the image must not win by the few that stay inside.
     """
     return hits / np.maximum(inside, 0.6 * voters)
 
@@ -325,10 +325,10 @@ def _votes(hits: NDArray[np.int8], inside: NDArray[np.int8], voters: int) -> NDA
 def _rotation(
     sides: NDArray[np.float64], axes: NDArray[np.floating], scale: float
 ) -> NDArray[np.float64]:
-    """Rotation (3, 3) that takes sides (2, 3) [mm] to their image (3, 2) [px]."""
+    """Return the rotation (3, 3) that takes sides (2, 3) [mm] to their image (3, 2) [px]."""
     a, b = sides
     normal = np.cross(a, b)
-    # Rows 1 and 2 of the scaled rotation, by the images of a, b and a x b.
+    # Rows 1 and 2 of the scaled rotation, from the images of a, b and a x b.
     images = axes.astype(float) / np.array([[scale], [scale], [scale]])
     rows = np.linalg.solve(np.stack([a, b, normal]), images)
     u, _, vt = np.linalg.svd(rows.T, full_matrices=False)
@@ -336,38 +336,38 @@ def _rotation(
     return np.stack([first, second, np.cross(first, second)])
 
 
-# How long a pose is searched for: until a right one would have been found, almost surely.
+# Length of a pose search: until a right pose would almost certainly have been found.
 #
 # A search from a bead of the image leads to the right pose if two of its neighbours in the image
 # are neighbours in the phantom as well. How often they are is counted in random views of the
-# phantom, in which as many beads are lost, and as much else is seen, as may be.
+# phantom, with as many missing beads and as many other objects as are tolerated.
 
 VIEWS = 48
-LEAST = 4  # beads that stand apart in a view in which the phantom can be found
+LEAST = 4  # isolated beads in a view in which the phantom can be found
 MIN_FOUND = 0.72  # share of the beads that are found
-MIN_EXPLAINED = 0.4  # share of what is found that are beads
-MERGED = 2.0  # radii between beads that are found as one
-# Chance that a search from three right beads leads to the pose. Of 47 images of the renderings
-# with a share of 0.95 of such beads, 31 were found from the first one, 8 from the second.
+MIN_EXPLAINED = 0.4  # share of the detections that are beads
+MERGED = 2.0  # distance in radii below which beads are detected as one
+# Probability that a search from three right beads leads to the pose. Of 47 images of the
+# renderings with a share of 0.95 of such beads, 31 were found from the first, 8 from the second.
 LEADS = 0.5
-MISSED = 1e-3  # chance that a right pose is missed
+MISSED = 1e-3  # accepted probability that a right pose is missed
 
 
 def enough_seeds(
     xyz: NDArray[np.float64], found: int, radius: float, neighbours: tuple[int, int]
 ) -> int:
-    """Return from how many beads a search is long enough; none where no view shows beads apart.
+    """Return the number of beads after which a search may end; 0 if no view shows isolated beads.
 
     Parameters
     ----------
     xyz : (n, 3) ndarray
         Beads of the phantom [mm].
     found : int
-        Number of what is found in the image.
+        Number of detections in the image.
     radius : float
-        Radius of a bead, with its blur, at the scale of the phantom [mm].
+        Radius of a bead, including its blur, at the scale of the phantom [mm].
     neighbours : tuple of int
-        Neighbours of a bead in the phantom and in the image that make triples with it.
+        Neighbours of a bead in the phantom and in the image that form triples with it.
     """
     share = float(np.clip(MIN_FOUND * len(xyz) / found, MIN_EXPLAINED, 1.0))
     chance = LEADS * _chances(xyz, share, MERGED * radius, neighbours)
@@ -382,10 +382,10 @@ def enough_seeds(
 def _chances(
     xyz: NDArray[np.float64], share: float, merged: float, neighbours: tuple[int, int]
 ) -> NDArray[np.float64]:
-    """Chances (v,) that something found is a bead with two neighbours that are its own.
+    """Return probabilities (v,) that a detection is a bead with two of its own neighbours.
 
-    Of the views in which beads stand apart. merged: distance within which they are found as one
-    [mm].
+    Only views with enough isolated beads count. merged: distance within which beads are detected
+    as one [mm].
     """
     rng = np.random.default_rng(0)
     in_space, in_image = neighbours

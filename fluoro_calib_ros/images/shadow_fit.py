@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Fit blurred shadows of spheres to the grey values of windows: what all such fits share.
+"""Fit blurred shadows of spheres to the grey values of windows: common part of all such fits.
 
-A window around a bead has a polynomial of degree 2 as its background. Neighbours that reach into
-it are fitted with it, so the standard deviation of a centre contains what the overlap leaves open.
-All windows of an image take their Gauss-Newton steps at once.
+The background of a window around a bead is a polynomial of degree 2. Neighbours that reach into
+the window are fitted as well, so the standard deviation of a centre includes the uncertainty due
+to overlap. All windows of an image take their Gauss-Newton steps at once.
 """
 
 from __future__ import annotations
@@ -22,26 +22,27 @@ from scipy.optimize import least_squares
 
 from .light import MIN_PIXELS, Cosines, Noise, Spectra, correlation_of, less_common
 
-MAX_SIGMA_PX = 0.3  # of a centre: a larger one is that of no shadow, or of one hardly seen
-MARGIN_PX = 2.0  # of background around the shadow
-DTYPE = np.float32  # of model and derivatives
-TERMS = 6  # of the background: a polynomial of degree 2
-OWN = TERMS + 3  # unknowns of a bead alone: its background, centre and depth
-# Of a step of a neighbour. With less, two beads that nearly coincide stay where they begin.
+MAX_SIGMA_PX = 0.3  # largest standard deviation of the centre of a visible shadow
+MARGIN_PX = 2.0  # width of the background around the shadow
+DTYPE = np.float32  # type of model and derivatives
+TERMS = 6  # terms of the background, a polynomial of degree 2
+OWN = TERMS + 3  # unknowns of an isolated bead: its background, centre and depth
+# Prior standard deviations of a step of a neighbour: place and depth. With a smaller one for the
+# place, two beads that nearly coincide stay at their initial values.
 NEIGHBOUR_SD_PX = 1.0
-NEIGHBOUR_SD = 0.2  # of a step of a neighbour's depth
-DEPTH_SD = 1.0  # of the depth of a shadow, 1 for the profile
-DEPTHS = (0.05, 3.0)  # bounds; a shadow takes light away
-MIN_PASSED = 0.02  # of the light, behind a bead: derivatives are divided by it
-MIN_INSIDE = 0.6  # of a window that lies in the field
-FINE = 3  # points across a pixel of the grid on which shadows that touch are blurred
-OVERLAP = 0.85  # times both reaches; shadows that are nearer overlap
-DISTURBED = 1.6  # lack of fit from which pixels with large residuals count less
-AT_ONCE = 2**18  # derivatives that are computed together, 1 MB: they fit a cache
-CORRELATED = 180  # windows that tell the correlation of the noise
-INFLUENCES = 20  # beads of whose pixels the influence is computed
-UNDISTURBED = 4.0  # times the median lack of fit, of a window without anything else
-ROBUST = 2.5  # residual of half weight [standard deviations of the noise]
+NEIGHBOUR_SD = 0.2
+DEPTH_SD = 1.0  # prior standard deviation of the depth of a shadow, which is 1 for the profile
+DEPTHS = (0.05, 3.0)  # bounds of the depth; a shadow removes light
+MIN_PASSED = 0.02  # least share of the light behind a bead: derivatives are divided by it
+MIN_INSIDE = 0.6  # least share of a window inside the field
+FINE = 3  # points per pixel of the grid on which shadows that touch are blurred
+OVERLAP = 0.85  # fraction of the sum of both reaches; shadows that are nearer overlap
+DISTURBED = 1.6  # relative lack of fit from which pixels with large residuals are down-weighted
+AT_ONCE = 2**18  # derivatives computed together, 1 MB: they fit into a cache
+CORRELATED = 180  # windows from which the correlation of the noise is estimated
+INFLUENCES = 20  # beads for which the influence of their pixels is computed
+UNDISTURBED = 4.0  # largest lack of fit, over the median, of a window without other objects
+ROBUST = 2.5  # residual at which the weight is halved [standard deviations of the noise]
 
 # Rows of beads (g,) and of their neighbours (g, k), -1 for none.
 Group = tuple[NDArray[np.int64], NDArray[np.int64]]
@@ -53,30 +54,30 @@ class Beads:
 
     uv: NDArray[np.float64]  #: (n, 2), centres [px]
     sigma: NDArray[np.float64]  #: (n,), standard deviation of a coordinate [px]
-    depth: NDArray[np.float64]  #: (n,), of the shadow, 1 for the profile
-    light: NDArray[np.float64]  #: (n,), grey values in the middle without the beads
-    #: (n,), mean squared residual over the noise, 1 where the model is right
+    depth: NDArray[np.float64]  #: (n,), depth of the shadow, 1 for the profile
+    light: NDArray[np.float64]  #: (n,), grey values at the centres without the beads
+    #: (n,), mean squared residual over the noise, relative to that of a typical bead
     misfit: NDArray[np.float64]
-    #: (n,), the shadow of another bead reaches into that of the bead
+    #: (n,), True if the shadow of another bead reaches into that of the bead
     overlapped: NDArray[np.bool_]
-    measured: NDArray[np.bool_]  #: (n,), False where the window is cut off or the fit failed
+    measured: NDArray[np.bool_]  #: (n,), False if the window is cut off or the fit failed
 
 
 @dataclass(frozen=True)
 class FitSettings:
-    """What differs between fits of shadows."""
+    """Settings that differ between fits of shadows."""
 
     steps: int  #: Gauss-Newton steps
-    crossing_steps: tuple[int, ...]  #: before which shadows that touch are blurred together
-    #: least and largest number of neighbours of the beads that are fitted together
+    crossing_steps: tuple[int, ...]  #: steps before which shadows that touch are blurred together
+    #: least and largest number of neighbours in each group of beads that is fitted together
     crowds: tuple[tuple[int, int], ...]
     max_step_px: float  #: largest step of a centre
-    pooled: float  #: degrees of freedom of the noise of all beads, in that of one
+    pooled: float  #: degrees of freedom with which the noise of all beads enters that of each bead
     crossed: float  #: factor on the standard deviation where shadows cross
 
     @property
     def neighbours(self) -> int:
-        """Neighbours that are fitted with a bead, at most."""
+        """Largest number of neighbours that are fitted with a bead."""
         return self.crowds[-1][1]
 
 
@@ -85,17 +86,17 @@ class NormalEquations:
     """Normal equations of some windows, for steps of u = 6 + 3 + 3 k unknowns."""
 
     matrix: NDArray[np.float64]  #: (g, u, u)
-    plain: NDArray[np.float64]  #: (g, u, u), with a background that is no more than the polynomial
+    plain: NDArray[np.float64]  #: (g, u, u), matrix if the background is only the polynomial
     right: NDArray[np.float64]  #: (g, u)
     weighted: NDArray[np.float32]  #: (g, u, m), derivatives of the pixels times their weights
-    #: (g, m), of the pixels, over their standard deviations; 0 for invalid
+    #: (g, m), residuals of the pixels over their standard deviations; 0 for invalid pixels
     residual: NDArray[np.floating]
     valid: NDArray[np.bool_]  #: (g, m)
 
 
 @lru_cache(maxsize=32)
 def window_offsets(radius_px: float) -> NDArray[np.int64]:
-    """Pixels (m, 2) of a round window, from its middle."""
+    """Return the pixels (m, 2) of a round window, relative to its middle."""
     half = int(np.ceil(radius_px))
     axis = np.arange(-half, half + 1)
     grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
@@ -105,10 +106,10 @@ def window_offsets(radius_px: float) -> NDArray[np.int64]:
 
 
 class FineGrid:
-    """Grid finer than the pixels, on which light that passes several beads is blurred.
+    """Grid finer than the pixels, on which light that passes through several beads is blurred.
 
-    The blur of the light that passes two beads is not the product of their blurred shadows. axis
-    (a,) are the coordinates of its points, from the middle of a window [px].
+    The blurred light behind two beads is not the product of their blurred shadows. axis: (a,)
+    coordinates of the points, relative to the middle of a window [px].
     """
 
     def __init__(self, offset: NDArray[np.int64], blur_px: float) -> None:
@@ -118,13 +119,13 @@ class FineGrid:
         self._column, self._row = (offset.T + half) * FINE
 
     def blurred(self, light: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Light (a, a), blurred, in the pixels (m,) of a window."""
+        """Return blurred light (a, a) at the pixels (m,) of a window."""
         smooth = cv2.GaussianBlur(light, (0, 0), self._sigma, borderType=cv2.BORDER_REPLICATE)
         return smooth[self._row, self._column]
 
 
 def _parts(rows: NDArray[np.int64], near: NDArray[np.int64], pixels: int) -> list[Group]:
-    """Parts of a group, with windows of so many pixels, that are computed one after the other."""
+    """Split a group with windows of so many pixels into parts that are computed in turn."""
     size = len(rows) * pixels * (OWN + 3 * near.shape[1])
     if size < AT_ONCE:
         return [(rows, near)]
@@ -135,8 +136,8 @@ def _parts(rows: NDArray[np.int64], near: NDArray[np.int64], pixels: int) -> lis
 class ShadowFit(ABC):
     """Gauss-Newton fit of windows, each with the neighbours of its bead.
 
-    uv: (n, 2) centres to start from [px]. depth: (n,) of the shadows, also what is expected of
-    them. window_px: radius of the windows.
+    uv: (n, 2) initial centres [px]. depth: (n,) initial and expected depths of the shadows.
+    window_px: radius of the windows.
     """
 
     def __init__(
@@ -155,29 +156,29 @@ class ShadowFit(ABC):
         self.uv = self.start.copy()
         self.expected_depth = np.array(depth, dtype=float)
         self.depth = self.expected_depth.copy()
-        self.radius = np.ones(len(self.uv))  # of the shadows, 1 for a typical one
+        self.radius = np.ones(len(self.uv))  # relative radii of shadows, 1 for a typical shadow
         self.middle = np.rint(self.uv).astype(int)
         self.offset = window_offsets(window_px)
         x, y = (self.offset.T / window_px).astype(DTYPE)
         self.basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
         n = len(self.uv)
         self.background = np.zeros((n, TERMS))
-        self.sigma = np.full(n, np.inf)  # of centres, where the noise of pixels is independent
-        self.noise_sigma = np.full(n, np.inf)  # the part of it that comes from the noise
+        self.sigma = np.full(n, np.inf)  # of centres, for independent noise of the pixels [px]
+        self.noise_sigma = np.full(n, np.inf)  # the part of it due to the noise
         self.correlation = noise.correlation
-        self.inflation: float | None = None  # factor on the variances of that part
+        self.inflation: float | None = None  # correlation: factor on the variances of that part
         self.misfit = np.full(n, np.inf)
-        self.distance = np.full(n, np.inf)  # of the nearest bead
-        self.low = -np.inf  # at which grey values are clipped
+        self.distance = np.full(n, np.inf)  # distance of the nearest bead
+        self.low = -np.inf  # grey values at which the image is clipped
         self.high = np.inf
         self.crossing: np.ndarray | None = None
-        self.strength = np.zeros(n)  # of the background beyond the polynomial
+        self.strength = np.zeros(n)  # strength of the background beyond the polynomial
         self.groups: list[Group] = []
 
     def _set_windows(self, grey: np.ndarray, valid: np.ndarray, bright: np.ndarray) -> None:
         """Note the grey values (n, m) of the windows, and whether they are valid.
 
-        bright has the grey values whose upper quartile is the first background.
+        bright: grey values whose upper quartile is the initial background.
         """
         self.grey = grey.astype(DTYPE)
         self.valid = valid
@@ -188,7 +189,7 @@ class ShadowFit(ABC):
     def _set_groups(self, near: np.ndarray) -> None:
         """Group beads by the number of their neighbours near (n, k), -1 for none, nearest first.
 
-        Those alone are the first group.
+        Isolated beads are the first group.
         """
         crowd = (near >= 0).sum(axis=1)
         for low, high in ((0, 0), *self.settings.crowds):
@@ -196,40 +197,40 @@ class ShadowFit(ABC):
             if len(rows):
                 self.groups.append((rows, near[rows, :high]))
 
-    # ---- what a fit must say
+    # ---- methods that a fit must implement
 
     @abstractmethod
     def _model(self, rows: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Light (g, m) and its derivatives (g, OWN + 3 k, m): background, then u, v, depth."""
+        """Return light (g, m), derivatives (g, OWN + 3 k, m): background, then u, v, depth."""
 
     @abstractmethod
     def _disturbed(self, rows: np.ndarray, near: np.ndarray, final: bool) -> NDArray[np.bool_]:
-        """Windows (g,) in which pixels with large residuals count less."""
+        """Return the windows (g,) in which pixels with large residuals are down-weighted."""
 
     @abstractmethod
     def _depth_sd(self, rows: np.ndarray, near: np.ndarray) -> float | NDArray[np.float64]:
-        """Standard deviation of what is expected of the depths."""
+        """Return the prior standard deviation of the depths."""
 
     @abstractmethod
     def _solve(
         self, rows: np.ndarray, near: np.ndarray, equations: NormalEquations, final: bool
     ) -> np.ndarray:
-        """Steps (g, u); where they are final, standard deviations are noted as well."""
+        """Return steps (g, u); if the step is final, note standard deviations as well."""
 
     # ---- parts of the model
 
     def _plane(self, rows: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Light (g, m) in windows without beads."""
+        """Return the light (g, m) in windows without beads."""
         background = self.background[rows].astype(DTYPE)
         plane = background @ self.basis.T
         return np.maximum(plane, 1e-3 * np.abs(background[:, :1]) + 1e-6)
 
     def _crossing_in(self, rows: NDArray[np.int64]) -> np.ndarray:
-        """What shadows that touch have together in windows, beyond the product of both."""
+        """Return how shadows that touch differ, in windows, from the product of both shadows."""
         return DTYPE(0) if self.crossing is None else self.crossing[rows]
 
     def _jacobian(self, relative: NDArray[np.floating], beads: int) -> NDArray[np.float32]:
-        """Derivatives (g, TERMS + 3 beads, m); only those by the background are set."""
+        """Return derivatives (g, TERMS + 3 beads, m) of which only the background's are set."""
         shape = (len(relative), TERMS + 3 * beads, len(self.offset))
         jacobian = np.empty(shape, dtype=DTYPE)
         np.multiply(relative[:, None], self.basis.T, out=jacobian[:, :TERMS])
@@ -240,7 +241,7 @@ class ShadowFit(ABC):
     def _step(
         self, rows: NDArray[np.int64], near: NDArray[np.int64], final: bool
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return centres, depths and backgrounds of some beads after a step."""
+        """Return centres, depths and backgrounds of beads after a step."""
         parts = _parts(rows, near, len(self.offset))
         usual = self.typical() if len(parts) > 1 else None
         step = np.concatenate(
@@ -255,7 +256,7 @@ class ShadowFit(ABC):
         )
 
     def _equations(self, group: Group, final: bool, usual: float | None) -> NormalEquations:
-        """Normal equations of some beads, and their lack of fit; usual: that of a typical bead."""
+        """Return normal equations of beads and note their lack of fit; usual: the typical one."""
         rows, near = group
         light, jacobian = self._model(rows, near)
         grey = self.grey[rows]
@@ -297,7 +298,7 @@ class ShadowFit(ABC):
         )
 
     def _add_texture(self) -> None:
-        """Give beads a background beyond the polynomial where pixels say so."""
+        """Add a background beyond the polynomial to beads whose pixels show one."""
         rows, residual, root, jacobians = self._standardised()
         plain = np.flatnonzero(self.misfit[rows] <= self.typical())
         plain = plain[:: len(plain) // CORRELATED + 1]
@@ -311,15 +312,15 @@ class ShadowFit(ABC):
             self.cosines.spectra(one[:, 0], jacobian=one, weight=weight, residual=left)
             for one, weight, left in zip(jacobians, np.split(root**2, ends), np.split(rest, ends))
         ]
-        # The waves are longer than the noise is correlated.
+        # The waves are longer than the correlation length of the noise.
         excess = float(self.correlation.sum())
         self.strength[rows] = Spectra.joined(spectra).strengths(excess)
 
     def _standardised(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[np.ndarray]]:
-        """Residuals of all windows over the noise.
+        """Return standardised residuals of all windows.
 
-        Returns the beads (n,), residuals (n, m), roots (n, m) of weights, 0 for invalid pixels,
-        and the derivatives of some windows after the other.
+        Return the beads (n,), residuals (n, m), roots (n, m) of weights, 0 for invalid pixels, and
+        the derivatives for each part of the windows in order.
         """
         groups = [part for group in self.groups for part in _parts(*group, len(self.offset))]
         lights, jacobians = zip(*(self._model(*part) for part in groups))
@@ -330,10 +331,10 @@ class ShadowFit(ABC):
         return rows, (grey - light) * root, root, list(jacobians)
 
     def _correlation(self, residual: np.ndarray, valid: np.ndarray) -> NDArray[np.float64]:
-        """Correlation of the noise from standardised residuals (g, m) of windows.
+        """Return the correlation of the noise from standardised residuals (g, m) of windows.
 
-        These contain what the model lacks, and the background of the image, which tells it as
-        well, the shadows of dense beads: the smaller one contains less of that.
+        The residuals contain errors of the model. The other estimate, from the background of the
+        image, contains the shadows of dense beads. The smaller one has less of either.
         """
         if valid.sum() < MIN_PIXELS:
             return self.noise.correlation
@@ -346,9 +347,9 @@ class ShadowFit(ABC):
         return Cosines(self.offset, DTYPE)
 
     def _valid(self, rows: np.ndarray, grey: np.ndarray, light: np.ndarray) -> NDArray[np.bool_]:
-        """Return (g, m) the pixels that count: a clipped one that agrees with the light does not.
+        """Return the valid pixels (g, m): a clipped pixel that agrees with the model is not valid.
 
-        grey, light: (g, m) values, and what is expected.
+        grey, light: (g, m) observed and expected values.
         """
         valid = self.valid[rows]
         if np.isfinite(self.high):
@@ -358,7 +359,7 @@ class ShadowFit(ABC):
         return valid
 
     def _prior(self, rows: NDArray[np.int64], near: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Weights (g, OWN + 3 k) of what is expected of the unknowns."""
+        """Return the prior weights (g, OWN + 3 k) of the unknowns."""
         prior = np.zeros((len(rows), OWN + 3 * near.shape[1]))
         prior[:, TERMS + 2] = self._depth_sd(rows, near) ** -2.0
         # An absent neighbour has no derivatives; any prior keeps its step zero.
@@ -367,7 +368,7 @@ class ShadowFit(ABC):
         return prior
 
     def typical(self) -> float:
-        """Median lack of fit of the beads whose fit goes on."""
+        """Return the median lack of fit of the usable beads."""
         values = self.misfit[self.usable & np.isfinite(self.misfit)]
         if not len(values):
             return 1.0
@@ -385,7 +386,7 @@ class ShadowFit(ABC):
                 np.linalg.inv(equations.plain[textured])
             )
         if self.inflation is None:
-            # The influence of pixels on a centre: noise of neighbouring pixels adds up.
+            # Influence of pixels on a centre: correlated noise of neighbouring pixels adds up.
             plain = equations.plain[:INFLUENCES]
             influence = np.linalg.solve(plain, equations.weighted[:INFLUENCES])
             both = influence[:, TERMS : TERMS + 2].reshape(-1, influence.shape[2])
@@ -393,7 +394,7 @@ class ShadowFit(ABC):
         return inverse
 
     def _images(self, windows: np.ndarray) -> NDArray[np.float64]:
-        """Square images (g, w, w) of round windows (g, m)."""
+        """Return square images (g, w, w) of round windows (g, m)."""
         half = int(np.abs(self.offset).max())
         images = np.zeros((len(windows), 2 * half + 1, 2 * half + 1))
         images[:, self.offset[:, 1] + half, self.offset[:, 0] + half] = windows
@@ -402,13 +403,13 @@ class ShadowFit(ABC):
     def _beads(
         self, measured: NDArray[np.bool_], typical: float, noise: NDArray[np.float64] | None = None
     ) -> Beads:
-        """Return what was measured, given the usual lack of fit.
+        """Return the measured beads, given the typical lack of fit.
 
-        noise: (n,) the part of the lack of fit that is noise; None for all of it.
+        noise: (n,) part of the lack of fit that is noise; None for all of it.
         """
         pixels = self.valid.sum(axis=1)
         pooled_freedom = self.settings.pooled
-        # The noise of one window is known to some 10 %; that of all windows helps.
+        # The noise of one window is known to about 10 %; pooling with all windows helps.
         usual = typical
         if noise is None:
             noise = self.misfit
@@ -417,7 +418,7 @@ class ShadowFit(ABC):
         pooled = (noise * pixels + usual * pooled_freedom) / (pixels + pooled_freedom)
         by_correlation = ((self.inflation or 1.0) - 1) * self.noise_sigma**2
         factor = np.sqrt(np.maximum(pooled, usual))
-        # Where shadows cross, their model is less right than its noise says.
+        # Where shadows touch, the model errs by more than the noise of the pixels suggests.
         touching = self.distance < 2 * self.profile.radius_px
         factor = np.where(touching, self.settings.crossed * factor, factor)
         return Beads(
@@ -432,13 +433,13 @@ class ShadowFit(ABC):
 
 
 def _within(values: NDArray[np.float64], low: float, high: float) -> NDArray[np.float64]:
-    """Values between bounds: np.clip, in a third of its time for a few."""
+    """Return values between bounds: like np.clip, in a third of its time for a few values."""
     return np.minimum(np.maximum(values, low), high)
 
 
 def _inflation(influence: NDArray[np.float64], correlation: NDArray[np.float64]) -> float:
-    """Return the factor on variances for correlated noise; influence (g, w, w) of pixels."""
-    # One tall image: what is filtered reaches into the rows of zeros between them.
+    """Return the factor on variances for correlated noise; influence: (g, w, w) of pixels."""
+    # Use one tall image: filtering reaches into the rows of zeros between the windows.
     tall = np.pad(influence, ((0, 0), (0, len(correlation) // 2), (0, 0)))
     tall = tall.reshape(-1, influence.shape[2])
     spread = cv2.filter2D(tall, cv2.CV_64F, correlation, borderType=cv2.BORDER_CONSTANT)
@@ -447,26 +448,26 @@ def _inflation(influence: NDArray[np.float64], correlation: NDArray[np.float64])
 
 
 def _sd_of_centre(covariance: np.ndarray) -> NDArray[np.float64]:
-    """Standard deviations (g,) of a coordinate of centres, from covariances (g, u, u)."""
+    """Return standard deviations (g,) of a coordinate of centres from covariances (g, u, u)."""
     variance = 0.5 * (covariance[:, TERMS, TERMS] + covariance[:, TERMS + 1, TERMS + 1])
     return np.sqrt(np.maximum(variance, 0))
 
 
-# Shadow of a sphere in an image: attenuated light, blurred, as a function of the distance.
+# Shadow of a sphere in an image: attenuated and blurred light as a function of the distance.
 #
 # A ray at a distance d from the centre of a sphere of radius r is attenuated by exp(-2 m sqrt(r^2
-# - d^2)) (Beer and Lambert). Focal spot, detector and pixel blur it, about as a Gaussian;
-# scattered light adds a part that no bead takes away.
+# - d^2)) (Beer and Lambert). Focal spot, detector and pixel blur it approximately as a Gaussian;
+# scattered light adds a part that beads do not attenuate.
 
-STEP = 0.2  # of the grid on which a profile is computed [px]
-TABLE_STEP = 0.05  # of the table of a profile [px]
-KERNEL_SIGMAS = 5.5  # at which a Gaussian is 3e-7
-REACH_SIGMAS = 3.2
-# Bounds of radius, blur [px], attenuation along the radius, and scattered light.
+STEP = 0.2  # step of the grid on which a profile is computed [px]
+TABLE_STEP = 0.05  # step of the table of a profile [px]
+KERNEL_SIGMAS = 5.5  # half width of a Gaussian kernel, at which it is 3e-7
+REACH_SIGMAS = 3.2  # standard deviations of the blur beyond the radius at which a shadow ends
+# Bounds of radius [px], blur [px], attenuation along the radius, and scattered light.
 LOW = (0.5, 0.35, 0.05, 0.0)
 HIGH = (40.0, 6.0, 6.0, 0.6)
-CHANGE = 1.5  # factor on the first three in one fit
-RING_PX = 0.25  # width of the rings whose means a profile is fitted to
+CHANGE = 1.5  # largest factor on the first three in one fit
+RING_PX = 0.25  # width of the rings to whose means a profile is fitted
 
 
 @dataclass(frozen=True)
@@ -474,47 +475,47 @@ class Profile:
     """Shadow of a bead."""
 
     radius_px: float
-    blur_px: float  #: standard deviation
-    attenuation: float  #: along the radius: coefficient times radius
+    blur_px: float  #: standard deviation of the blur
+    attenuation: float  #: attenuation coefficient times radius
     scatter: float = 0.0  #: share of the light that is not attenuated
 
     @property
     def reach_px(self) -> float:
-        """Distance from the centre at which the shadow has ended [px]."""
+        """Distance from the centre at which the shadow ends [px]."""
         return self.radius_px + REACH_SIGMAS * self.blur_px
 
     @cached_property
     def border_px(self) -> float:
-        """Distance from the centre at which the place of a shadow is measured, RMS [px].
+        """RMS distance from the centre of the pixels that determine the place of a shadow [px].
 
-        Light tells the place where it changes.
+        The pixels where the light changes determine the place.
         """
         distance = np.arange(0.0, self.reach_px, TABLE_STEP)
         weight = self.shadow(distance)[1] ** 2 * distance
         return float(np.sqrt((weight * distance**2).sum() / weight.sum()))
 
     def sized(self, size: float) -> Profile:
-        """Return the profile of a bead of another relative size, which absorbs more, or less."""
+        """Return the profile of a bead of another size, with attenuation in proportion."""
         attenuation = self.attenuation * size
         return Profile(self.radius_px * size, self.blur_px, attenuation, self.scatter)
 
     def absorbed(
         self, squared: NDArray[np.float64], size: NDArray[np.float64] | float = 1.0
     ) -> NDArray[np.float64]:
-        """Absorbed share of the light without blur at squared distances [px^2].
+        """Return the absorbed share of the light without blur at squared distances [px^2].
 
-        size: relative ones, of which squared distances are multiples of their squares.
+        size: relative sizes; the squared distances are divided by their squares.
         """
         return 1 - np.exp(-self.attenuation * size * self.chord(squared))
 
     def chord(self, squared: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Way through the bead in radii at squared distances [px^2] from its centre."""
+        """Return the path through the bead [radii] at squared distances from its centre [px^2]."""
         return 2 * np.sqrt(np.maximum(self.radius_px**2 - squared, 0)) / self.radius_px
 
     def shadow(
         self, distance: NDArray[np.floating]
     ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-        """Absorbed share of the light at distances [px], and its derivative [1/px]."""
+        """Return the absorbed share of the light at distances [px] and its derivative [1/px]."""
         return self._tables.shadow(distance)
 
     @cached_property
@@ -523,7 +524,7 @@ class Profile:
 
 
 class Shadows:
-    """Tables of the shadows of beads of one or of several profiles."""
+    """Tables of the shadows of beads of one or several profiles."""
 
     def __init__(self, profiles: Sequence[Profile]) -> None:
         tables = [_tabulated(one) for one in profiles]
@@ -536,9 +537,9 @@ class Shadows:
     def shadow(
         self, distance: NDArray[np.floating], profile: NDArray[np.int64] | int = 0
     ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-        """Absorbed share of the light at distances [px] (..., m), and its derivative [1/px].
+        """Return the absorbed share of light at distances [px] (..., m) and its derivative [1/px].
 
-        profile: (...,), which of the profiles.
+        profile: (...,) index of the profile.
         """
         value, slope, to_value, to_slope = self._tables(distance.dtype)
         first = np.asarray(self._first[profile])[..., None]
@@ -557,7 +558,7 @@ class Shadows:
         return absorbed, derivative
 
     def _tables(self, dtype: np.dtype) -> tuple[NDArray[np.floating], ...]:
-        """Absorbed shares (n,), derivatives (n,), and the steps (n - 1,) to the next of each."""
+        """Return absorbed shares (n,), derivatives (n,), and the differences (n - 1,) of each."""
         if dtype not in self._by_dtype:
             value, slope = self._table.astype(dtype)
             self._by_dtype[dtype] = (value, slope, np.diff(value), np.diff(slope))
@@ -580,7 +581,7 @@ class _Blurred:
         kernel = np.exp(-0.5 * (self._axis / self.sigma) ** 2)
         both = np.append(kernel[0], 2 * kernel[1:])
         self._across = both / both.sum() ** 2
-        # The blur is exact between the points of the row, too: a part of a step farther on.
+        # The blur is exact between the points of the row, too, at multiples of TABLE_STEP.
         self._away = (
             np.arange(-half, half + 1) * step + np.arange(self._parts)[:, None] * TABLE_STEP
         )
@@ -593,18 +594,18 @@ class _Blurred:
         return np.asarray(np.arange(self._size) * TABLE_STEP)
 
     def row(self, quarter: NDArray[np.float64], order: int = 0) -> NDArray[np.float64]:
-        """Blur a quarter of an image across its rows; order of the derivative, 0 or 2."""
+        """Blur a quarter of an image across its rows; order: that of the derivative, 0 or 2."""
         row = quarter @ (self._across * self._derivative(self._axis, order))
         return np.concatenate([row[:0:-1], row])
 
     def table(self, row: NDArray[np.float64], order: int = 0) -> NDArray[np.float64]:
-        """Blur a row along itself (n,); order of the derivative along it, 0 to 2."""
+        """Blur a row along itself (n,); order: that of the derivative along it, 0 to 2."""
         kernels = self._gauss * self._derivative(self._away, order)
         blurred = np.array([np.convolve(row, one, mode='same') for one in kernels])
         return np.asarray(blurred[:, len(row) // 2 :].T.reshape(-1)[: self._size])
 
     def _derivative(self, away: np.ndarray, order: int) -> NDArray[np.float64]:
-        """Derivative of a Gaussian over the Gaussian itself."""
+        """Return the derivative of a Gaussian divided by the Gaussian itself."""
         reduced = away / self.sigma
         if order == 0:
             return np.ones_like(reduced)
@@ -612,17 +613,17 @@ class _Blurred:
 
 
 def _tabulated(profile: Profile) -> NDArray[np.float64]:
-    """Absorbed shares and their derivatives (2, n) at multiples of TABLE_STEP from the centre."""
+    """Return absorbed shares and derivatives (2, n) at multiples of TABLE_STEP from the centre."""
     blurred = _Blurred(profile)
     row = blurred.row(profile.absorbed(blurred.squared))
     return np.stack([blurred.table(row), blurred.table(row, 1)])
 
 
 def shadow_derivatives(profile: Profile, distance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Derivatives (n, 3) of absorbed shares at distances (n,) [px].
+    """Return derivatives (n, 3) of absorbed shares at distances (n,) [px].
 
-    With respect to radius [1/px], blur [1/px] and attenuation. A wider blur is the diffusion of a
-    narrower one, dS/dsigma = sigma (S_xx + S_yy), and a larger bead is a scaled one.
+    They are with respect to radius [1/px], blur [1/px] and attenuation. A wider blur is a diffused
+    narrower blur, dS/dsigma = sigma (S_xx + S_yy), and a larger bead is a scaled bead.
     """
     blurred = _Blurred(profile)
     absorbed = profile.absorbed(blurred.squared)
@@ -637,15 +638,15 @@ def shadow_derivatives(profile: Profile, distance: NDArray[np.float64]) -> NDArr
 
 @dataclass(frozen=True)
 class Absorbed:
-    """What beads absorb in pixels, n of them."""
+    """Light that beads absorb in n pixels."""
 
-    distance: NDArray[np.float64]  #: (n,), from the centres, over the relative radii [px]
-    share: NDArray[np.floating]  #: (n,), of the light
+    distance: NDArray[np.float64]  #: (n,), distance from the centre, over the relative radius [px]
+    share: NDArray[np.floating]  #: (n,), absorbed share of the light
     weight: NDArray[np.floating]  #: (n,)
-    size: NDArray[np.float64]  #: (n,), relative sizes of the beads: few different ones
+    size: NDArray[np.float64]  #: (n,), relative sizes of the beads, with few different values
 
     def binned(self, profile: Profile) -> Iterator[_Binned]:
-        """Yield means of rings of the beads of each size, as wide as the profile reaches."""
+        """Yield means over rings for the beads of each size, up to the reach of the profile."""
         for size in np.unique(self.size):
             own = self.size == size
             edges = np.arange(0, profile.sized(float(size)).reach_px + 1, RING_PX)
@@ -669,15 +670,15 @@ class _Binned:
     size: float
     distance: NDArray[np.float64]
     share: NDArray[np.float64]
-    root: NDArray[np.float64]  #: (n,), of weights
+    root: NDArray[np.float64]  #: (n,), square roots of the weights
 
     def residual(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Weighted residuals (n,) of a profile's radius, blur, attenuation and scatter."""
+        """Return weighted residuals (n,) for radius, blur, attenuation and scatter."""
         value, _ = Profile(*unknowns[:3]).sized(self.size).shadow(self.distance)
         return self.root * ((1 - unknowns[3]) * value - self.share)
 
     def slopes(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Derivatives (n, 4) of the residuals."""
+        """Return derivatives (n, 4) of the residuals."""
         profile = Profile(*unknowns[:3]).sized(self.size)
         by_shape = (1 - unknowns[3]) * shadow_derivatives(profile, self.distance)
         by_scatter = -profile.shadow(self.distance)[0]
@@ -686,15 +687,15 @@ class _Binned:
 
 
 def fit_profile(absorbed: Absorbed, start: Profile) -> Profile:
-    """Fit the profile of a bead of size 1 to what beads absorb."""
+    """Fit the profile of a bead of size 1 to the light absorbed by beads."""
     parts = list(absorbed.binned(start))
     first = np.array([start.radius_px, start.blur_px, start.attenuation, start.scatter])
     first = np.clip(first, np.asarray(LOW) * 1.01 + 1e-3, np.asarray(HIGH) * 0.99)
-    # The backgrounds belong to the shadows before.
+    # The backgrounds were estimated with the previous profile.
     change = np.append(np.full(3, CHANGE), np.inf)
     bounds = (np.maximum(LOW, first / change), np.minimum(HIGH, first * change))
-    # A few steps: `absorbed` is renewed with each profile, and radius and attenuation of a small
-    # shadow are hardly told apart.
+    # Few evaluations: `absorbed` is updated with each profile, and the radius and attenuation of a
+    # small shadow are hardly separable.
     found = least_squares(
         lambda unknowns: np.concatenate([part.residual(unknowns) for part in parts]),
         first,

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The view of a fluoroscope in one exposure: orientation, principal distance and a polynomial.
+"""View of a fluoroscope in one exposure: orientation, principal distance and a polynomial.
 
-The polynomial is the distortion as a function of the undistorted pixel. It only has to predict
-where beads are, so its coefficients have a prior of zero: where observations do not determine it,
-a prediction falls back to the perspective of the pose. All unknowns are estimated at once by
-robust Gauss-Newton steps.
+The polynomial models the distortion as a function of the undistorted pixel. It only has to predict
+the places of beads, so its coefficients have a prior: where observations do not determine them, a
+prediction falls back to the expected distortion, by default none. All unknowns are estimated at
+once by robust Gauss-Newton steps.
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ from ..findings import Finding, Kind
 from ..photogrammetry.collinearity import project_with_jacobian
 from ..photogrammetry.rotations import matrix_from_vector
 
-# Standard deviations of coefficients by degree, at the border of the image, as fractions of half
-# its width. Pincushion is of degree 3; an image intensifier has up to some 6 % of it.
+# Prior standard deviations of the coefficients by degree, as displacements at the border of the
+# image relative to half its width. Pincushion has degree 3; image intensifiers reach about 6 %.
 PRIOR_SD = (0.01, 0.012, 0.03, 0.008, 0.008, 0.003, 0.003)
-TAIL = 2.5  # residual, in robust standard deviations, at which the weight is halved
-POSE = 7  # unknowns before the coefficients: rotation, shift, log of the principal distance
-DAMPING = 1e-6
-CONTOUR = 12  # points of the border of a shadow
+TAIL = 2.5  # residual at which the weight is halved [robust standard deviations]
+POSE = 7  # unknowns before the coefficients: position, rotation, log of the principal distance
+DAMPING = 1e-6  # relative increase of the diagonal of the normal matrix
+CONTOUR = 12  # points on the border of a shadow
 
 
 @dataclass(frozen=True)
 class Lens:
-    """What is known of a fluoroscope before an exposure is seen."""
+    """Prior knowledge of a fluoroscope before an exposure is evaluated."""
 
     image_size: tuple[int, int]  #: width and height [px]
     principal_distance_px: float
     principal_distance_sd: float = 0.08  #: relative standard deviation
-    #: (2, k), expected polynomial [px], of any degree; empty for zero
+    #: (2, k), expected coefficients [px], of any degree; empty for zero
     coefficients: NDArray[np.float64] = field(default_factory=lambda: np.zeros((2, 0)))
-    certainty: float = 1.0  #: factor on the standard deviations of the coefficients
+    certainty: float = 1.0  #: factor on the prior standard deviations of the coefficients
 
     @property
     def centre(self) -> NDArray[np.float64]:
@@ -48,18 +48,18 @@ class Lens:
 
     @property
     def half_px(self) -> float:
-        """Half the larger side of the image."""
+        """Half the larger side of the image [px]."""
         return max(self.image_size) / 2
 
     def expected(self, degree: int) -> NDArray[np.float64]:
-        """Expected coefficients (2, k) of a polynomial of some degree."""
+        """Return the expected coefficients (2, k) of a polynomial of some degree."""
         out = np.zeros((2, len(exponents(degree))))
         count = min(out.shape[1], self.coefficients.shape[1])
         out[:, :count] = self.coefficients[:, :count]
         return out
 
     def deviations(self, degree: int) -> NDArray[np.float64]:
-        """Standard deviations (k,) of the coefficients [px]."""
+        """Return the prior standard deviations (k,) of the coefficients [px]."""
         order = exponents(degree).sum(axis=1)
         return self.certainty * self.half_px * np.asarray(PRIOR_SD)[order - 1]
 
@@ -70,9 +70,9 @@ class View:
 
     lens: Lens
     rotation: NDArray[np.float64]  #: (3, 3), phantom -> sensor
-    position: NDArray[np.float64]  #: (3,), the source in the frame of the phantom [mm]
+    position: NDArray[np.float64]  #: (3,), source in the frame of the phantom [mm]
     principal_distance_px: float
-    coefficients: NDArray[np.float64]  #: (2, k), of the polynomial [px]
+    coefficients: NDArray[np.float64]  #: (2, k), coefficients of the polynomial [px]
     degree: int
 
     @property
@@ -88,20 +88,20 @@ class View:
         return replace(self, coefficients=coefficients, degree=degree)
 
     def project(self, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Predicted pixels (n, 2) of points (n, 3) [mm]; NaN for one behind the source."""
+        """Return predicted pixels (n, 2) of points (n, 3) [mm]; NaN if behind the source."""
         x = (xyz - self.position) @ self.rotation.T
         z = np.where(x[:, 2] > 1e-9, x[:, 2], np.nan)
         ideal = self.lens.centre + self.principal_distance_px * x[:, :2] / z[:, None]
         return ideal + self._distortion(ideal)[0]
 
     def shadow_shift(self, xyz: NDArray[np.float64], radius_px: np.ndarray) -> NDArray[np.float64]:
-        """Places (n, 2) of the shadows of spheres less those of their projected centres [px].
+        """Return shifts (n, 2) of the shadows of spheres from their projected centres [px].
 
         xyz (n, 3) [mm]; radius_px (n,). The rays that touch a sphere form a cone, whose section is
-        an ellipse that is not about the projected centre (Luhmann, "Eccentricity in images of
+        an ellipse that is not centred on the projected centre (Luhmann, "Eccentricity in images of
         circular and spherical targets and its impact on spatial intersection", Photogrammetric
-        Record 29, 2014), and the distortion bends it. The fit of a circle to its border is shifted
-        by twice the mean of the displacements along the normals.
+        Record 29, 2014), and the distortion bends it. A circle fitted to its border is shifted by
+        twice the mean of the displacements along the normals.
         """
         x = (xyz - self.position) @ self.rotation.T
         distance = np.linalg.norm(x, axis=1, keepdims=True)
@@ -123,15 +123,15 @@ class View:
         return np.asarray(2 / CONTOUR * along @ normal)
 
     def depth(self, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Distances (n,) of points (n, 3) from the source along the axis [mm]."""
+        """Return distances (n,) of points (n, 3) from the source along the axis [mm]."""
         return (xyz - self.position) @ self.rotation[2]
 
     def outlines(self, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Matrices (n, 2, 2) from unit circles to borders of shadows of spheres [px/mm].
+        """Return matrices (n, 2, 2) from unit circles to borders of shadows of spheres [px/mm].
 
-        xyz: (n, 3) their centres [mm]. The rays that touch a small sphere form a cone, whose
-        section is longer in the direction from the principal point by one over the cosine of the
-        angle there. Zero for spheres behind the source.
+        xyz: (n, 3) centres of the spheres [mm]. The rays that touch a small sphere form a cone.
+        Its section is longer in the direction from the principal point, by one over the cosine of
+        the angle there. The matrix is zero for spheres behind the source.
         """
         x = (xyz - self.position) @ self.rotation.T
         depth = np.where(x[:, 2] > 0, x[:, 2], np.inf)
@@ -145,8 +145,8 @@ class View:
     def _distortion(
         self, ideal: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Distortion (n, 2) [px] of undistorted pixels (n, 2), derivatives (n, 2, 2), basis."""
-        # Far outside of the image the polynomial stays what it is at one and a half of its size.
+        """Return distortion (n, 2) [px] at undistorted pixels, derivatives (n, 2, 2), basis."""
+        # Far outside the image the polynomial is constant, from 1.5 times half the image size.
         x = np.clip((ideal - self.lens.centre) / self.lens.half_px, -1.5, 1.5)
         basis, by_x, by_y = _monomials(x, self.degree)
         slope = np.stack([by_x @ self.coefficients.T, by_y @ self.coefficients.T], axis=2)
@@ -154,14 +154,14 @@ class View:
 
 
 def exponents(degree: int) -> NDArray[np.int64]:
-    """Exponents (k, 2) of the monomials of degree 1 to `degree`, in the order of degree."""
+    """Return exponents (k, 2) of the monomials of degree 1 to `degree`, in order of degree."""
     return np.array([(n - j, j) for n in range(1, degree + 1) for j in range(n + 1)])
 
 
 def _monomials(
     x: NDArray[np.float64], degree: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Values (n, k) of the monomials at points (n, 2), and their derivatives."""
+    """Return values (n, k) of the monomials at points (n, 2), and their derivatives."""
     powers = np.ones((degree + 1, *x.shape))
     for n in range(1, degree + 1):
         powers[n] = powers[n - 1] * x
@@ -179,7 +179,7 @@ def fit_view(
     steps: int = 2,
     floor_px: float = 0.05,
 ) -> tuple[View, float]:
-    """Refine a view by matched beads.
+    """Refine a view with matched beads.
 
     Parameters
     ----------
@@ -187,17 +187,17 @@ def fit_view(
     xyz : (n, 3) ndarray
         Beads [mm].
     uv : (n, 2) ndarray
-        Their pixels.
+        Observed pixels of the beads.
     steps : int
-        Robust Gauss-Newton steps.
+        Number of robust Gauss-Newton steps.
     floor_px : float
-        Smallest standard deviation of a residual.
+        Smallest standard deviation of a residual [px].
 
     Returns
     -------
     view : View
     scale : float
-        Robust standard deviation of a coordinate's residual before the last step [px].
+        Robust standard deviation of the residual of a coordinate before the last step [px].
     """
     lens = view.lens
     expected = lens.expected(view.degree).ravel()
@@ -237,7 +237,7 @@ def fit_view(
 def _linearised(
     view: View, xyz: NDArray[np.float64], uv: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Residuals (n, 2) and derivatives (n, 2, 7 + 2 k) of the predictions.
+    """Return residuals (n, 2) and derivatives (n, 2, 7 + 2 k) of the predictions.
 
     The first unknowns are those of `project_with_jacobian`: position, rotation vector.
     """
@@ -260,10 +260,10 @@ def _linearised(
 
 
 def _moved(view: View, step: NDArray[np.float64]) -> View:
-    """Return a view after a step of all unknowns."""
+    """Return the view after a step of all unknowns."""
     turn = step[3:6]
     angle = float(np.linalg.norm(turn))
-    if angle > 0.3:  # a first step from three beads may be wild
+    if angle > 0.3:  # a first step from three beads may be far too large
         turn = turn * (0.3 / angle)
     return replace(
         view,
@@ -275,29 +275,29 @@ def _moved(view: View, step: NDArray[np.float64]) -> View:
     )
 
 
-# What is assumed of a fluoroscope before an image, and from the other images of it.
+# Assumptions about a fluoroscope before an image, and from its other images.
 
-# Without a principal distance: that of image intensifiers and of biplane laboratories, which are
-# three to five times as far from the source as they are wide.
+# Principal distance in image widths, if none is given: image intensifiers and those of biplane
+# laboratories are three to five times as far from the source as they are wide.
 USUAL_DISTANCE = 4.0
-USUAL_SD = 0.25
-GIVEN_SD = 0.08
-SHARED_SD = 0.03  # of the principal distance, once other images of the fluoroscope are known
-SHARED_CERTAINTY = 0.3
-# Of images in which the beads were seen, and may be found with the distortion of the others.
+USUAL_SD = 0.25  # relative standard deviation of that distance
+GIVEN_SD = 0.08  # relative standard deviation of a given principal distance
+SHARED_SD = 0.03  # the same, once other images of the fluoroscope are solved
+SHARED_CERTAINTY = 0.3  # factor on the standard deviations of the coefficients then
+# Images in which beads were seen, and may be matched with the distortion of the other images.
 NOT_FOUND = (Kind.NO_POSE, Kind.POSE_UNSURE, Kind.POSE_AMBIGUOUS, Kind.BEADS_NOT_MEASURED)
-MIN_SHARED = 3  # images whose distortion helps with the others
+MIN_SHARED = 3  # solved images that are needed to share their distortion
 
 
 def assumed_lens(image_size: tuple[int, int], principal_distance_px: float | None) -> Lens:
-    """Return what is assumed of a fluoroscope before its first image; None: not known."""
+    """Return the lens assumed before the first image; a principal distance of None is unknown."""
     if principal_distance_px is not None:
         return Lens(image_size, principal_distance_px, GIVEN_SD)
     return Lens(image_size, USUAL_DISTANCE * max(image_size), USUAL_SD)
 
 
 def shared_lens(lens: Lens, views: Sequence[View]) -> Lens | None:
-    """Return the lens with the distortion of the images that were solved, None for too few."""
+    """Return the lens with the distortion of the solved views, None if there are too few."""
     if len(views) < MIN_SHARED:
         return None
     return replace(
@@ -310,5 +310,5 @@ def shared_lens(lens: Lens, views: Sequence[View]) -> Lens | None:
 
 
 def may_be_found(found: Finding | None) -> bool:
-    """Return whether an image is refused because no sure pose was found for its beads."""
+    """Return whether an image was refused because no certain pose was found for its beads."""
     return found is not None and found.kind in NOT_FOUND

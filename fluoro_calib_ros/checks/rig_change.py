@@ -161,12 +161,12 @@ class RigChange:
         factor, weight = _weights(design, rays.residual, variance)
         normal = rays.by_rig.T @ (rays.by_rig * weight[:, None])
         right = -rays.by_rig.T @ (weight * rays.residual)
-        information = Told(normal, right)
+        statistics = Told(normal, right)
         moments = np.zeros((len(self._hypotheses), len(SIZES), *normal.shape))
         evidence = []
         for moments_of_sizes, sd in zip(moments, self._hypotheses):
             rows = np.flatnonzero(sd)
-            selected = information.only(rows)
+            selected = statistics.only(rows)
             sizes = SIZES[:, None] * sd[rows]
             moments_of_sizes[:, rows[:, None], rows] = selected.moments(sizes)
             evidence.append(selected.evidence(sizes))

@@ -370,12 +370,12 @@ class PoseSolver:
         # with each other and with the prediction.
         prior_normal, pose_step = _pull_of(prediction, (solution.rotation, solution.centre))
         prior_normal = prior_normal[suspect]
-        pulled = (prior_normal @ pose_step[suspect, :, None])[:, None, :, 0] - gradient
+        pull = (prior_normal @ pose_step[suspect, :, None])[:, None, :, 0] - gradient
         unit, scale = _of_unit_diagonal(normal_of_others + prior_normal[:, None])
-        pulled = pulled / scale
+        pull = pull / scale
         inverse_of_others = np.linalg.inv(unit + WEAK * EYE_6)
         remaining = squares[suspect] + np.sum(
-            pulled * (inverse_of_others @ pulled[..., None])[..., 0], axis=-1
+            pull * (inverse_of_others @ pull[..., None])[..., 0], axis=-1
         )
         worst = np.argmax(np.where(excess > 1, remaining, -np.inf), axis=1)
         contradicting = np.flatnonzero((excess > 1).any(axis=1))
@@ -530,7 +530,7 @@ def _covariances(
     linear = solution.linear
     gain = np.swapaxes(linear.by_pose, 2, 3) @ marker.m  # (B, M, 6, 3)
     weighted = linear.by_place * marker.weight[..., None, None]
-    pulled = np.swapaxes(weighted, 3, 4)
+    weighted_transposed = np.swapaxes(weighted, 3, 4)
     rows = (*marker.weight.shape[:2], -1, 3)
     by_noise = (weighted * points.noise[..., None, None]).reshape(rows)
     by_correction = (weighted * points.correction[..., None, None]).reshape(rows)
@@ -539,7 +539,9 @@ def _covariances(
     gain_transposed = np.swapaxes(gain, 2, 3)
     noise = inverse @ (gain @ (flat @ by_noise) @ gain_transposed).sum(axis=1) @ inverse
     fixed = inverse @ (gain @ steady @ gain_transposed).sum(axis=1) @ inverse
-    by_view = (gain[:, :, None] @ (pulled @ cameras.by_orientation(linear))).sum(axis=1)
+    by_view = (gain[:, :, None] @ (weighted_transposed @ cameras.by_orientation(linear))).sum(
+        axis=1
+    )
     rig_root = -inverse @ (by_view @ cameras.root).sum(axis=1)
     return noise, fixed, rig_root
 

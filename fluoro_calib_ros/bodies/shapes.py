@@ -364,17 +364,23 @@ def _reduced(
     d = by_pose(shape @ np.swapaxes(rotation, 1, 2))
     transposed = np.swapaxes(d, 2, 3)
     to_body = np.swapaxes(rotation, 1, 2)[:, None]
-    turned = problem.information @ rotation[:, None]  # S R
+    rotated_information = problem.information @ rotation[:, None]  # S R
     pull = problem.information @ residual[..., None]  # s
     normal = (transposed @ problem.information @ d).sum(axis=1)
     # Markers on a line leave the rotation about it free, which affects nothing else.
     normal += REGULAR * normal.max(axis=(1, 2), keepdims=True) * np.eye(POSE_SIZE)
-    cross = (transposed @ turned).transpose(0, 2, 1, 3).reshape(exposures, POSE_SIZE, 3 * count)
+    cross = (
+        (transposed @ rotated_information)
+        .transpose(0, 2, 1, 3)
+        .reshape(exposures, POSE_SIZE, 3 * count)
+    )
     right = (transposed @ pull).sum(axis=1)
     solved = np.linalg.solve(normal, np.concatenate([cross, right], axis=2))
     flat = cross.reshape(-1, 3 * count)
     matrix = -flat.T @ solved[:, :, :-1].reshape(-1, 3 * count)
-    blocks = (to_body @ turned).sum(axis=0) + problem.ct_weight[:, None, None] * np.eye(3)
+    blocks = (to_body @ rotated_information).sum(axis=0) + problem.ct_weight[
+        :, None, None
+    ] * np.eye(3)
     for k in range(count):
         matrix[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += blocks[k]
     if not problem.ct_weight.any():

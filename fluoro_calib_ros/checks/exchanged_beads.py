@@ -32,23 +32,25 @@ def exchanged_beads(rays: Rays, targets: Targets) -> NDArray[np.int64]:
     """Return the target ids (n, 2) of pairs of beads that are exchanged."""
     place = _places(rays, targets)
     rejected = place != rays.target_id
-    moved = rejected & (place != NOWHERE)
+    is_moved = rejected & (place != NOWHERE)
     ids = np.sort(np.stack([rays.target_id, place], axis=1), axis=1)
     nearness = np.full(len(ids), len(targets.target_id))
-    nearness[moved] = _nearness(ids[moved], targets)
+    nearness[is_moved] = _nearness(ids[is_moved], targets)
     exchanged = []
-    pairs, times = np.unique(ids[moved], axis=0, return_counts=True)
+    pairs, times = np.unique(ids[is_moved], axis=0, return_counts=True)
     for pair in pairs[times > 1]:
         of_pair = np.isin(rays.target_id, pair)
-        at_other = moved & np.all(ids == pair, axis=1)
+        at_other = is_moved & np.all(ids == pair, axis=1)
         is_mutual = len(np.unique(place[at_other])) == 2
         if not is_mutual or 2 * at_other.sum() <= of_pair.sum():
             continue
         # For all other beads, by the rule of succession: rate of rejected image points, and share
         # of these that lie at the place of a bead as near as this one.
-        others = rejected & ~of_pair
-        share = rate_of(others.sum(), (~of_pair).sum())
-        share_near = rate_of(np.sum(others & (nearness <= nearness[at_other].max())), others.sum())
+        other_beads = rejected & ~of_pair
+        share = rate_of(other_beads.sum(), (~of_pair).sum())
+        share_near = rate_of(
+            np.sum(other_beads & (nearness <= nearness[at_other].max())), other_beads.sum()
+        )
         # Either image points are false independently, or ids are exchanged, which displaces two.
         chances = []
         for unit in (np.arange(len(of_pair)), rays.exposure):

@@ -163,13 +163,13 @@ def doubtful(scatter: PairScatter, side_px: int, noise_px: float) -> tuple[bool,
     place = Place((a, b), name=ORIENTED)
     if scatter.unexplained > DOUBTFUL_GROWTH and off_px >= noise_px:
         usable = off_px <= MAX_MISFIT * side_px or scatter.unexplained <= MAX_GROWTH
-        kind, moved, reason = _cause(scatter)
+        kind, exposures, reason = _cause(scatter)
         finding = Finding(
             kind,
             'the exposures contradict each other: the relative orientation of fluoroscopes '
             f'{a} and {b} differs between them by {off_px:.1f} px, {scatter.unexplained:.0f} '
             f'times its standard deviation; {reason}',
-            Place((a, b), moved, name=ORIENTED if usable else NOT_ORIENTED),
+            Place((a, b), exposures, name=ORIENTED if usable else NOT_ORIENTED),
             severity=Severity.WARNING,
             numbers={'off_px': off_px, 'ratio': float(scatter.unexplained)},
         )

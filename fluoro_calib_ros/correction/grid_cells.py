@@ -207,14 +207,14 @@ def write_coefficients(
     width = np.diff(columns)
     height = np.diff(rows)[:, None]
     corner = values[:, :-1, :-1]
-    of_x = (values[:, :-1, 1:] - corner) / width
-    of_y = (values[:, 1:, :-1] - corner) / height
-    of_xy = ((values[:, 1:, 1:] - values[:, 1:, :-1]) / width - of_x) / height
+    slope_x = (values[:, :-1, 1:] - corner) / width
+    slope_y = (values[:, 1:, :-1] - corner) / height
+    slope_xy = ((values[:, 1:, 1:] - values[:, 1:, :-1]) / width - slope_x) / height
     for k in range(3):
         a = corner[k]
-        b = of_x[k]
-        c = of_y[k]
-        d = of_xy[k]
+        b = slope_x[k]
+        c = slope_y[k]
+        d = slope_xy[k]
         out[:, :, k] = a - b * x - (c - d * x) * y
         out[:, :, 3 + k] = b - d * y
         out[:, :, 6 + k] = c - d * x

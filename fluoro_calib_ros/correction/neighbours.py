@@ -45,9 +45,11 @@ def blocks_with_candidates(
         if tree.n <= most:
             yield from zip(batch, tree.query_ball_point(centre, radius))
             continue
-        few = tree.query_ball_point(centre, radius, return_length=True) <= most
-        candidates = iter(tree.query_ball_point(centre[few], radius[few]) if few.any() else ())
-        for block, is_few in zip(batch, few):
+        has_few = tree.query_ball_point(centre, radius, return_length=True) <= most
+        candidates = iter(
+            tree.query_ball_point(centre[has_few], radius[has_few]) if has_few.any() else ()
+        )
+        for block, is_few in zip(batch, has_few):
             yield block, next(candidates) if is_few else None
 
 

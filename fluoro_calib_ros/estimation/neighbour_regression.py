@@ -217,10 +217,8 @@ class NeighbourRegression(RegressionStep[NeighbourModel]):
             self._table = NeighbourTable(self.points.uv, candidates[-1])
         self._all_candidates = candidates
         if given_k is None and self.k:  # k changes little from round to round
-            is_near = (candidates >= self.k / SEARCH_FACTOR) & (
-                candidates <= self.k * SEARCH_FACTOR
-            )
-            candidates = candidates[is_near]
+            close = (candidates >= self.k / SEARCH_FACTOR) & (candidates <= self.k * SEARCH_FACTOR)
+            candidates = candidates[close]
         self._validation = CrossValidation(
             self.model_type,
             self.points.uv[inliers],

@@ -70,14 +70,12 @@ def squared_error_of_kept(
     k = np.square(x)
     density = weight / 2 * end * 2 * k * np.exp(-k * half[:, None])
     evidence = density.sum(axis=1)
-    probability = evidence / (evidence + np.exp(-half))
+    chance = evidence / (evidence + np.exp(-half))
     density /= evidence[:, None]
     share = 1 - k
     variance = np.sum(density * share, axis=1)
     square = np.sum(density * np.square(share - kept[:, None]), axis=1)
-    return probability * (variance + 2 * half * square) + (1 - probability) * 2 * half * np.square(
-        kept
-    )
+    return chance * (variance + 2 * half * square) + (1 - chance) * 2 * half * np.square(kept)
 
 
 def covariance_with_uncertain_terms(
@@ -199,19 +197,17 @@ class StepwiseTerms(AdjustedTerms):
             return True
         score = prior @ coefficients  # gradient of the likelihood by terms fixed at zero
         mixed = np.linalg.solve(information[np.ix_(selected, selected)], information[selected])
-        conditional = np.diagonal(information) - np.einsum(
-            'ij,ij->j', information[selected], mixed
-        )
-        dependent = conditional <= 1e-9 * np.diagonal(information)
+        reduced = np.diagonal(information) - np.einsum('ij,ij->j', information[selected], mixed)
+        dependent = reduced <= 1e-9 * np.diagonal(information)
         with np.errstate(divide='ignore', invalid='ignore'):
             excluded = selected | self._rejected[f] | dependent
-            t = np.where(excluded, 0, score / np.sqrt(conditional))
+            t = np.where(excluded, 0, score / np.sqrt(reduced))
         for best in np.argsort(-np.abs(t)):
             if abs(t[best]) < limit:
                 return False
             direction = -mixed[:, best] if selected.any() else np.zeros(0)
             change = self._values[f][:, :, best] + self._values[f][:, :, selected] @ direction
-            if self._improves(f, result, rows, change * score[best] / conditional[best], t[best]):
+            if self._improves(f, result, rows, change * score[best] / reduced[best], t[best]):
                 selected[best] = True
                 return True
             self._rejected[f][best] = True

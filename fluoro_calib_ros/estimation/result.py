@@ -179,13 +179,16 @@ def combined_targets(
     right = (surveyed @ phantom.xyz_mm[row, :, None])[..., 0]
     for part in parts:
         rows = np.searchsorted(target_id, part.target_id)
-        inverse = np.linalg.inv(part.covariance - common[rows])
-        value, vector = np.linalg.eigh(inverse - surveyed[rows])
+        part_information = np.linalg.inv(part.covariance - common[rows])
+        value, vector = np.linalg.eigh(part_information - surveyed[rows])
         is_better = value > 0
         gained = (vector * (value * is_better)[:, None, :]) @ vector.transpose(0, 2, 1)
         information[rows] += gained
         # The point that the adjustment would give without the survey.
-        added = inverse @ part.xyz_mm[..., None] - (surveyed @ phantom.xyz_mm[row, :, None])[rows]
+        added = (
+            part_information @ part.xyz_mm[..., None]
+            - (surveyed @ phantom.xyz_mm[row, :, None])[rows]
+        )
         inside = (vector * is_better[:, None, :]) @ vector.transpose(0, 2, 1)
         right[rows] += (inside @ added)[..., 0]
     covariance = np.linalg.inv(information)
@@ -228,9 +231,9 @@ def _combined_jointly(
     right = information @ phantom.xyz_mm[phantom.index(target_id)].ravel()
     for part, covariance in zip(parts, joint):
         coordinates = 3 * np.searchsorted(target_id, part.target_id)[:, None] + np.arange(3)
-        inverse = np.linalg.inv(covariance)
-        information[np.ix_(coordinates.ravel(), coordinates.ravel())] += inverse
-        right[coordinates.ravel()] += inverse @ part.xyz_mm.ravel()
+        part_information = np.linalg.inv(covariance)
+        information[np.ix_(coordinates.ravel(), coordinates.ravel())] += part_information
+        right[coordinates.ravel()] += part_information @ part.xyz_mm.ravel()
     survey = np.repeat(1 / phantom.sd_mm[phantom.index(target_id)] ** 2, 3)
     relative = information / np.sqrt(np.outer(survey, survey))
     if np.linalg.eigvalsh(relative)[0] < 1 - ROUNDING:

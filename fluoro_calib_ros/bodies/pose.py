@@ -221,8 +221,7 @@ class PoseSolver:
             markers_of_row = used & (np.arange(len(used)) == row)[:, None]
             second = self._converge((rotation, centre), points, markers_of_row, None)
             squares = [
-                _own_squares(candidate.marker, self.variance)[row].sum()
-                for candidate in (solution, second)
+                _own_squares(pose.marker, self.variance)[row].sum() for pose in (solution, second)
             ]
             turn = second.rotation[row] @ solution.rotation[row].T
             angle = float(np.linalg.norm(vector_from_matrix(turn)))
@@ -373,10 +372,8 @@ class PoseSolver:
         pull = (prior_normal @ pose_step[suspect, :, None])[:, None, :, 0] - gradient
         unit, scale = _of_unit_diagonal(normal_of_others + prior_normal[:, None])
         pull = pull / scale
-        inverse_of_others = np.linalg.inv(unit + WEAK * EYE_6)
-        remaining = squares[suspect] + np.sum(
-            pull * (inverse_of_others @ pull[..., None])[..., 0], axis=-1
-        )
+        cofactor = np.linalg.inv(unit + WEAK * EYE_6)
+        remaining = squares[suspect] + np.sum(pull * (cofactor @ pull[..., None])[..., 0], axis=-1)
         worst = np.argmax(np.where(excess > 1, remaining, -np.inf), axis=1)
         contradicting = np.flatnonzero((excess > 1).any(axis=1))
         return suspect[contradicting], worst[contradicting]

@@ -217,11 +217,11 @@ def frame_of_landmarks(
 
     first = _vector(recipe.first, points, side)
     second = _vector(recipe.second, points, side)
-    across = second - (second @ first) * first
-    if np.linalg.norm(across) < MIN_SINE:
+    orthogonal = second - (second @ first) * first
+    if np.linalg.norm(orthogonal) < MIN_SINE:
         raise DataError(f'the landmarks {", ".join(names)} lie on a line')
     return frame_of_axes(
-        {recipe.first.axis: first, recipe.second.axis: across}, _mean(recipe.origin, points)
+        {recipe.first.axis: first, recipe.second.axis: orthogonal}, _mean(recipe.origin, points)
     )
 
 
@@ -312,12 +312,12 @@ def _sequences() -> Iterator[Convention]:
 def _isb(name: str, angles: str, translations: str, proximal: str, distal: str) -> Convention:
     """Return an ISB convention: flexion about z, floating axis x, rotation about y."""
     first, second, third = angles.split()
-    lateral, anterior, along = translations.split()
+    lateral, anterior, axial = translations.split()
     return Convention(
         name,
         'zxy',
         angles=(first, second, third),
-        translations=(lateral, anterior, along),
+        translations=(lateral, anterior, axial),
         lateral=2,
         proximal_landmarks=proximal,
         distal_landmarks=distal,

@@ -74,11 +74,11 @@ class Body:
         if len(repeated):
             raise DataError(f'body {self.name}: marker {repeated[0]} is given twice')
         known = np.isfinite(xyz).all(axis=1)[order]
-        bad = (known & ~(sd[order] >= 0)) | np.isinf(xyz[order]).any(axis=1)
-        if bad.any():
+        is_invalid = (known & ~(sd[order] >= 0)) | np.isinf(xyz[order]).any(axis=1)
+        if is_invalid.any():
             raise DataError(
                 f'body {self.name}: the coordinates or the standard deviation of marker '
-                f'{target_id[bad][0]} are not finite, or negative'
+                f'{target_id[is_invalid][0]} are not finite, or negative'
             )
         if self.covariance_mm2 is not None:
             rows = (3 * order[:, None] + np.arange(3)).ravel()
@@ -174,10 +174,10 @@ def solvable_bodies(bodies: Sequence[Body]) -> tuple[Body, ...]:
                 f'body {body.name}: the places of {np.count_nonzero(known)} of its '
                 f'{len(body.target_id)} markers are known, a pose needs three'
             )
-        loose = body.target_id[known & ~np.isfinite(body.sd_mm)]
-        if len(loose):
+        no_sd = body.target_id[known & ~np.isfinite(body.sd_mm)]
+        if len(no_sd):
             raise DataError(
-                f'body {body.name}: marker {loose[0]} has no standard deviation; it is estimated '
+                f'body {body.name}: marker {no_sd[0]} has no standard deviation; it is estimated '
                 'from a recording, or given'
             )
         out.append(body.rows(known))
@@ -251,8 +251,8 @@ class BodyPoses:
     @property
     def covariance(self) -> NDArray[np.float64]:
         """Covariances (T, 6, 6) from all errors [mm, rad]."""
-        by_rig = self.rig_root @ np.swapaxes(self.rig_root, 1, 2)
-        return self.covariance_noise + self.covariance_fixed + by_rig
+        covariance_rig = self.rig_root @ np.swapaxes(self.rig_root, 1, 2)
+        return self.covariance_noise + self.covariance_fixed + covariance_rig
 
     @property
     def sd(self) -> NDArray[np.float64]:
@@ -278,9 +278,9 @@ def fitted_pose(
     a = np.sum(share * source, axis=-2, keepdims=True)
     b = np.sum(share * target, axis=-2, keepdims=True)
     u, _, vt = np.linalg.svd(np.swapaxes(source - a, -1, -2) @ (share * (target - b)))
-    back = np.swapaxes(vt, -1, -2).copy()
-    back[..., 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
-    rotation = back @ np.swapaxes(u, -1, -2)
+    right_vectors = np.swapaxes(vt, -1, -2).copy()
+    right_vectors[..., 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
+    rotation = right_vectors @ np.swapaxes(u, -1, -2)
     return rotation, (b - a @ np.swapaxes(rotation, -1, -2))[..., 0, :]
 
 
@@ -297,12 +297,14 @@ def robust_pose(
     triples = np.array(list(combinations(range(count), 3)))
     triples = triples[np.linspace(0, len(triples) - 1, 84).astype(int)]  # all of nine points
     rotation, shift = fitted_pose(source[triples], target[triples])
-    away = np.linalg.norm(source @ np.swapaxes(rotation, 1, 2) + shift[:, None] - target, axis=2)
+    distance = np.linalg.norm(
+        source @ np.swapaxes(rotation, 1, 2) + shift[:, None] - target, axis=2
+    )
     middle = max(count // 2, 2)
-    median = np.partition(away, middle, axis=1)[:, middle]
+    median = np.partition(distance, middle, axis=1)[:, middle]
     best = int(np.argmin(median))
-    near = away[best] <= 3 * median[best]
-    return fitted_pose(source[near], target[near])
+    is_near = distance[best] <= 3 * median[best]
+    return fitted_pose(source[is_near], target[is_near])
 
 
 def by_pose(arm: NDArray[np.float64]) -> NDArray[np.float64]:

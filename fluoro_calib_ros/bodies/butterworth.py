@@ -43,8 +43,8 @@ def filtered_poses(poses: BodyPoses, cutoff_hz: float) -> BodyPoses:
 
     def smooth(values: NDArray[np.float64]) -> NDArray[np.float64]:
         flat = values.reshape(len(values), -1)
-        whole = np.stack([np.interp(time, time[known], v[known]) for v in flat.T], axis=1)
-        return scipy.signal.filtfilt(b, a, whole, axis=0).reshape(values.shape)
+        interpolated = np.stack([np.interp(time, time[known], v[known]) for v in flat.T], axis=1)
+        return scipy.signal.filtfilt(b, a, interpolated, axis=0).reshape(values.shape)
 
     quaternion = quaternion_from_matrix(np.where(known[:, None, None], poses.rotation, np.eye(3)))
     quaternion[known] = _continuous(quaternion[known])
@@ -74,8 +74,8 @@ def _rate(poses: BodyPoses) -> float:
 
 def _continuous(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return quaternions (T, 4) without sign changes."""
-    same = np.sum(quaternion[1:] * quaternion[:-1], axis=1) >= 0
-    sign = np.cumprod(np.concatenate([[1.0], np.where(same, 1.0, -1.0)]))
+    same_sign = np.sum(quaternion[1:] * quaternion[:-1], axis=1) >= 0
+    sign = np.cumprod(np.concatenate([[1.0], np.where(same_sign, 1.0, -1.0)]))
     return quaternion * sign[:, None]
 
 
@@ -89,8 +89,8 @@ def _propagated(
     impulse = np.zeros(2 * size + 1)
     impulse[size] = 1.0
     response = scipy.signal.filtfilt(*filter_, impulse) ** 2
-    wide = np.flatnonzero(response > SETTLED * response.max())
-    half = size - int(wide[0])
+    significant = np.flatnonzero(response > SETTLED * response.max())
+    half = size - int(significant[0])
     response = response[size - half : size + half + 1]
     filled = _nearest(covariance, known).reshape(size, -1)
     padded = np.pad(filled, ((half, half), (0, 0)), mode='edge')
@@ -104,5 +104,5 @@ def _nearest(values: NDArray[np.float64], known: NDArray[np.bool_]) -> NDArray[n
     after = np.searchsorted(rows, np.arange(len(known))).clip(0, len(rows) - 1)
     before = np.maximum(after - 1, 0)
     time = np.arange(len(known))
-    nearer = np.abs(rows[before] - time) < np.abs(rows[after] - time)
-    return values[np.where(nearer, rows[before], rows[after])]
+    before_is_nearer = np.abs(rows[before] - time) < np.abs(rows[after] - time)
+    return values[np.where(before_is_nearer, rows[before], rows[after])]

@@ -65,8 +65,8 @@ class Cameras:
         ids = views.target_id
         if self._ids is None or len(ids) != len(self._ids) or (ids != self._ids).any():
             order = np.argsort(ids)
-            found = np.searchsorted(ids[order], self.target_id.ravel())
-            rows = order[np.minimum(found, len(ids) - 1)] if len(ids) else found * 0 - 1
+            positions = np.searchsorted(ids[order], self.target_id.ravel())
+            rows = order[np.minimum(positions, len(ids) - 1)] if len(ids) else positions * 0 - 1
             known = (ids[rows] == self.target_id.ravel()) if len(ids) else rows >= 0
             self._rows = np.where(known, rows, len(ids))
             self._ids = ids
@@ -77,8 +77,8 @@ class Cameras:
         padded[:, :-1, 2] = views.sigma
         padded[:, :-1, 3] = views.correction_sd
         dropped = exposure.points.dropped_view
-        hit = np.flatnonzero(dropped >= 0)
-        padded[dropped[hit].astype(int), hit] = np.nan
+        with_dropped = np.flatnonzero(dropped >= 0)
+        padded[dropped[with_dropped].astype(int), with_dropped] = np.nan
         sorted_ = padded[:, self._rows].transpose(1, 0, 2).reshape(*shape, 4)
         seen = np.isfinite(sorted_).all(axis=-1)
         sorted_ = np.where(seen[..., None], sorted_, 0.0)
@@ -90,8 +90,10 @@ class Cameras:
     def places(self, exposure: IntersectedViews) -> NDArray[np.float64]:
         """Return places (B, M, 3) [mm] of markers in the last sorted exposure; NaN if unknown."""
         points = exposure.points
-        good = (points.status == OK) | (points.status == OUTSIDE)
-        xyz = np.concatenate([np.where(good[:, None], points.xyz_mm, np.nan), [[np.nan] * 3]])
+        intersected = (points.status == OK) | (points.status == OUTSIDE)
+        xyz = np.concatenate(
+            [np.where(intersected[:, None], points.xyz_mm, np.nan), [[np.nan] * 3]]
+        )
         return xyz[self._rows].reshape(*self.target_id.shape, 3)
 
     def linear(
@@ -112,9 +114,9 @@ class Cameras:
         depth = np.where(image[..., 2] > 0, image[..., 2], np.nan)
         uv = np.where(depth[..., None] > 0, image[..., :2] / depth[..., None], 0.0)
         by_place = (self._uv_rows - uv[..., None] * self._depth_rows) / depth[..., None, None]
-        good = points.seen & np.isfinite(depth)
-        residual = np.where(good[..., None], points.uv - uv, 0.0)
-        by_place = np.where(good[..., None, None], by_place, 0.0)
+        valid = points.seen & np.isfinite(depth)
+        residual = np.where(valid[..., None], points.uv - uv, 0.0)
+        by_place = np.where(valid[..., None, None], by_place, 0.0)
         return Linear(residual, by_place, uv, by_pose(arm))
 
     def by_orientation(self, linear: Linear) -> NDArray[np.float64]:

@@ -162,8 +162,8 @@ def joint_motion(
     covariance = jacobian @ relative.covariance @ np.swapaxes(jacobian, 1, 2)
     locked = _near_lock(of, angles, covariance)
     # Number of Gauss-Hermite nodes per axis: 3 for quadratic errors, 9 near gimbal lock.
-    for nodes, bent in ((3, _is_nonlinear(covariance) & ~locked), (9, locked)):
-        exposures = np.flatnonzero(bent)
+    for nodes, is_selected in ((3, _is_nonlinear(covariance) & ~locked), (9, locked)):
+        exposures = np.flatnonzero(is_selected)
         for start in range(0, len(exposures), BLOCK):
             rows = exposures[start : start + BLOCK]
             covariance[rows] = _second_moments(of, relative.of(rows), angles[rows], nodes)
@@ -219,10 +219,10 @@ def check_joints(joints: Sequence[Joint], bodies: Iterable[str]) -> None:
                 )
         children.setdefault(joint.proximal, []).append(joint.distal)
     for joint in joints:
-        reached = [joint.distal]
-        for body in reached:
-            reached += [child for child in children.get(body, ()) if child not in reached]
-        if joint.proximal in reached:
+        descendants = [joint.distal]
+        for body in descendants:
+            descendants += [child for child in children.get(body, ()) if child not in descendants]
+        if joint.proximal in descendants:
             raise DataError(
                 f'joint {joint.name} closes a cycle: {joint.proximal} is also distal of '
                 f'{joint.distal}'
@@ -231,9 +231,11 @@ def check_joints(joints: Sequence[Joint], bodies: Iterable[str]) -> None:
 
 def _check_poses(joint: Joint, proximal: BodyPoses, distal: BodyPoses) -> None:
     """Raise DataError for poses that do not belong to the joint."""
-    for wanted, poses in ((joint.proximal, proximal), (joint.distal, distal)):
-        if poses.body != wanted:
-            raise DataError(f'joint {joint.name}: the poses are of {poses.body}, not of {wanted}')
+    for expected, poses in ((joint.proximal, proximal), (joint.distal, distal)):
+        if poses.body != expected:
+            raise DataError(
+                f'joint {joint.name}: the poses are of {poses.body}, not of {expected}'
+            )
     if not np.array_equal(proximal.number, distal.number):
         raise DataError(f'joint {joint.name}: the poses of its bodies are of other exposures')
 
@@ -281,16 +283,16 @@ def _relative(
 
     covariance = np.zeros_like(by_p)
     for jacobian, poses in ((by_p, proximal), (by_d, distal)):
-        own = poses.covariance_noise
+        pose_covariance = poses.covariance_noise
         if not only_noise:
-            own = own + poses.covariance_fixed
-        covariance += jacobian @ own @ np.swapaxes(jacobian, 1, 2)
+            pose_covariance = pose_covariance + poses.covariance_fixed
+        covariance += jacobian @ pose_covariance @ np.swapaxes(jacobian, 1, 2)
     if not only_noise:
         root = by_p @ proximal.rig_root + by_d @ distal.rig_root
         covariance += root @ np.swapaxes(root, 1, 2)
         if joint.neutral_covariance is not None:
-            turned = rotation @ joint.neutral_covariance @ np.swapaxes(rotation, 1, 2)
-            covariance[:, :3, :3] += turned
+            neutral_covariance = rotation @ joint.neutral_covariance @ np.swapaxes(rotation, 1, 2)
+            covariance[:, :3, :3] += neutral_covariance
     return _Relative(rotation, translation, covariance)
 
 
@@ -326,14 +328,14 @@ def _axes(of: Convention, angles: NDArray[np.float64]) -> NDArray[np.float64]:
     sine_1, sine_2 = np.moveaxis(np.sin(angles[..., :2]), -1, 0)
     cosine_1, cosine_2 = np.moveaxis(np.cos(angles[..., :2]), -1, 0)
     # Components of R_j k along i and along the third unit vector, which R_i rotates.
-    along, across = (cosine_2, -sign * sine_2) if of.is_euler else (sign * sine_2, cosine_2)
+    part_i, part_m = (cosine_2, -sign * sine_2) if of.is_euler else (sign * sine_2, cosine_2)
     axes = np.zeros((*angles.shape, 3))
     axes[..., i, 0] = 1.0
     axes[..., j, 1] = cosine_1
     axes[..., m, 1] = sign * sine_1
-    axes[..., i, 2] = along
-    axes[..., j, 2] = -sign * across * sine_1
-    axes[..., m, 2] = across * cosine_1
+    axes[..., i, 2] = part_i
+    axes[..., j, 2] = -sign * part_m * sine_1
+    axes[..., m, 2] = part_m * cosine_1
     return axes
 
 
@@ -401,27 +403,27 @@ def _second_moments(
     z = np.stack(np.meshgrid(node, node, node, indexing='ij'), axis=-1).reshape(-1, 3)
     weight = np.einsum('i,j,k->ijk', weight, weight, weight).ravel() / weight.sum() ** 3
 
-    of_turn = relative.covariance[:, :3, :3]
-    values, vectors = np.linalg.eigh(of_turn)
+    turn_covariance = relative.covariance[:, :3, :3]
+    values, vectors = np.linalg.eigh(turn_covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     turn = z @ np.swapaxes(root, 1, 2)
-    gain = relative.covariance[:, 3:, :3] @ np.linalg.pinv(of_turn, hermitian=True)
-    rest = relative.covariance[:, 3:, 3:] - gain @ relative.covariance[:, :3, 3:]
+    gain = relative.covariance[:, 3:, :3] @ np.linalg.pinv(turn_covariance, hermitian=True)
+    remainder = relative.covariance[:, 3:, 3:] - gain @ relative.covariance[:, :3, 3:]
 
     rotation = matrix_from_vector(turn) @ relative.rotation[:, None]
     translation = relative.translation[:, None] + turn @ np.swapaxes(gain, 1, 2)
-    at = _angles(of, rotation)
-    difference = angle_errors(of, at, angles[:, None])
-    axes = _axes(of, at)
+    node_angles = _angles(of, rotation)
+    difference = angle_errors(of, node_angles, angles[:, None])
+    axes = _axes(of, node_angles)
     before = _translations(of, _axes(of, angles), relative.translation)
-    moved = _translations(of, axes, translation) - before[:, None]
-    error = np.concatenate([difference, moved], axis=-1)
+    shift = _translations(of, axes, translation) - before[:, None]
+    error = np.concatenate([difference, shift], axis=-1)
     moments = np.swapaxes(error * weight[:, None], 1, 2) @ error
     if of.along_axes:
-        by_rest = np.swapaxes(axes, -1, -2) @ rest[:, None] @ axes
-        moments[:, 3:, 3:] += np.sum(weight[:, None, None] * by_rest, axis=1)
+        along_axes = np.swapaxes(axes, -1, -2) @ remainder[:, None] @ axes
+        moments[:, 3:, 3:] += np.sum(weight[:, None, None] * along_axes, axis=1)
     else:
-        moments[:, 3:, 3:] += rest
+        moments[:, 3:, 3:] += remainder
     return moments
 
 
@@ -440,8 +442,8 @@ def angle_errors(
     else:
         sign = np.where(angles[..., 1] > 0, 1, -1) * (1 if (j - i) % 3 == 1 else -1)
     first = difference[..., 0] - 2 * np.pi * _turns(difference[..., 0])
-    both = difference[..., 2] + sign * difference[..., 0]
-    third = both - 2 * np.pi * _turns(both) - sign * first
+    combined = difference[..., 2] + sign * difference[..., 0]
+    third = combined - 2 * np.pi * _turns(combined) - sign * first
     return np.stack([first, difference[..., 1], third], axis=-1)
 
 
@@ -453,19 +455,19 @@ def _unwrapped(
     Near gimbal lock noise may turn an angle, so each is compared with the last angle away from it.
     """
     known = np.isfinite(angles).all(axis=1)
-    firm = known & ~locked
-    chain = angles[firm]
+    determined = known & ~locked
+    unwrapped = angles[determined]
     # Count whole turns, so that processing one exposure at a time gives the same values.
-    turns = -np.cumsum(_turns(np.diff(chain, axis=0, prepend=chain[:1])), axis=0)
+    turns = -np.cumsum(_turns(np.diff(unwrapped, axis=0, prepend=unwrapped[:1])), axis=0)
     if before is not None:
         start = np.asarray(before, dtype=float)
-        turns = turns - _turns(chain[:1] - start)
+        turns = turns - _turns(unwrapped[:1] - start)
     else:
-        start = chain[0] if len(chain) else np.zeros(3)
-    chain = chain + 2 * np.pi * turns
-    out = np.concatenate([start[None], chain])[np.cumsum(firm)]
-    loose = known & locked
-    out[loose] = angles[loose] - 2 * np.pi * _turns(angles[loose] - out[loose])
+        start = unwrapped[0] if len(unwrapped) else np.zeros(3)
+    unwrapped = unwrapped + 2 * np.pi * turns
+    out = np.concatenate([start[None], unwrapped])[np.cumsum(determined)]
+    near_lock = known & locked
+    out[near_lock] = angles[near_lock] - 2 * np.pi * _turns(angles[near_lock] - out[near_lock])
     out[~known] = np.nan
     return out
 

@@ -153,8 +153,8 @@ def pose_after(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return rotations (B, 3, 3) and centres (B, 3) after twists (B, 6) about these centres."""
     shift = left_jacobian(twist[:, 3:]) @ twist[:, :3, None]
-    turned = Rotation.from_rotvec(twist[:, 3:]).as_matrix() @ rotation
-    return turned, centre + shift[:, :, 0]
+    new_rotation = Rotation.from_rotvec(twist[:, 3:]).as_matrix() @ rotation
+    return new_rotation, centre + shift[:, :, 0]
 
 
 def twist_between(
@@ -225,22 +225,22 @@ class MotionFilter:
         if log_q is not None:
             self.log_q = log_q
         turn = dt_s * self.mean[:, 9:12] + dt_s**2 / 2 * self.mean[:, 15:18]
-        into = _transition(dt_s, turn)
+        transition = _transition(dt_s, turn)
         noise = _noise(dt_s, self.log_q)
-        mean = (into @ self.mean[:, :, None])[:, :, 0]
+        mean = (transition @ self.mean[:, :, None])[:, :, 0]
         mean[:, 3:6] = 0
-        reference = into[:, 3:6, 3:6] @ self.rotation
-        into[:, :, POSE] = into[:, :, POSE] @ self._turned
-        back = np.swapaxes(into, 1, 2)
-        covariance = into @ self.covariance @ back + noise[:, 0] + noise[:, 1]
+        reference = transition[:, 3:6, 3:6] @ self.rotation
+        transition[:, :, POSE] = transition[:, :, POSE] @ self._turned
+        transposed = np.swapaxes(transition, 1, 2)
+        covariance = transition @ self.covariance @ transposed + noise[:, 0] + noise[:, 1]
         self._pending = self._slope, self._log_variance
         if log_q is None:
-            slope = into[:, None] @ self._slope @ back[:, None] + noise
+            slope = transition[:, None] @ self._slope @ transposed[:, None] + noise
             variance = np.minimum(self._log_variance + WALK * dt_s, START_LOG_SD**2)
             self._pending = slope, variance
         self._predicted = _Step(
             dt_s,
-            into,
+            transition,
             reference=reference,
             mean=mean,
             covariance=covariance,
@@ -271,9 +271,9 @@ class MotionFilter:
         right = np.where(self.alive[:, None], seen.right, 0)
         predicted = step.reference, step.mean[:, :3]
         difference = twist_between(predicted, (seen.rotation, seen.centre_mm))
-        back = turn_of_twists(seen.rotation, step.reference)
-        normal = back @ normal @ np.swapaxes(back, 1, 2)
-        right = (back @ right[:, :, None] + normal @ difference[:, :, None])[:, :, 0]
+        turn = turn_of_twists(seen.rotation, step.reference)
+        normal = turn @ normal @ np.swapaxes(turn, 1, 2)
+        right = (turn @ right[:, :, None] + normal @ difference[:, :, None])[:, :, 0]
         _weigh(step, step.covariance[:, POSE, POSE], (normal, right))
         if adapt:
             self._adapt(step, (normal, right))
@@ -282,8 +282,8 @@ class MotionFilter:
         self._turned = turn_of_twists(step.reference, self.rotation)
         covariance = step.covariance - gain @ step.m @ np.swapaxes(gain, 1, 2)
         if adapt:
-            kept = _EYE_STATE - gain @ step.m @ _POSE_ROWS
-            self._slope = kept[:, None] @ self._slope @ np.swapaxes(kept, 1, 2)[:, None]
+            factor = _EYE_STATE - gain @ step.m @ _POSE_ROWS
+            self._slope = factor[:, None] @ self._slope @ np.swapaxes(factor, 1, 2)[:, None]
         self.covariance = (covariance + np.swapaxes(covariance, 1, 2)) / 2
         self.steps.append(step)
         if self.lag is not None:
@@ -302,10 +302,10 @@ class MotionFilter:
         mean[:, :3] = seen.centre_mm
         step.mean = np.where(start[:, None], mean, step.mean)
         # The prior of the pose is diffuse: ten times the standard deviations of this exposure.
-        wide = np.zeros((len(start), STATE, STATE)) + np.diag(START_SD**2)
+        diffuse = np.zeros((len(start), STATE, STATE)) + np.diag(START_SD**2)
         known = np.where(start[:, None, None], seen.normal, np.eye(6))
-        wide[:, POSE, POSE] = 100 * np.linalg.inv(known)
-        step.covariance = np.where(start[:, None, None], wide, step.covariance)
+        diffuse[:, POSE, POSE] = 100 * np.linalg.inv(known)
+        step.covariance = np.where(start[:, None, None], diffuse, step.covariance)
         self.alive = self.alive | start
         self.log_q = np.where(start[:, None], START_LOG, self.log_q)
         self._log_variance[start] = START_LOG_SD**2
@@ -327,10 +327,10 @@ class MotionFilter:
         for _ in range(ADAPTATIONS):
             slope = growth[:, :, None, None] * first
             z = step.z[:, None, :, None]
-            moved = step.m[:, None] @ slope
-            expected = moved.trace(axis1=2, axis2=3)
+            product = step.m[:, None] @ slope
+            expected = product.trace(axis1=2, axis2=3)
             gradient = 0.5 * ((np.swapaxes(z, 2, 3) @ slope @ z)[..., 0, 0] - expected)
-            information = 0.5 * (moved * np.swapaxes(moved, 2, 3)).sum(axis=(2, 3))
+            information = 0.5 * (product * np.swapaxes(product, 2, 3)).sum(axis=(2, 3))
             variance = 1 / (1 / self._log_variance + information)
             gradient = gradient - (self.log_q - prior) / self._log_variance
             change = np.clip(variance * gradient, -MAX_STEP, MAX_STEP)
@@ -338,12 +338,12 @@ class MotionFilter:
             if not (change > ROUND_ENDS).any():
                 break
             growth = growth * np.maximum(np.exp(change), 1)
-            more = ((growth - 1)[:, :, None, None] * first).sum(axis=1)
-            _weigh(step, step.covariance[:, POSE, POSE] + more, seen)
+            added = ((growth - 1)[:, :, None, None] * first).sum(axis=1)
+            _weigh(step, step.covariance[:, POSE, POSE] + added, seen)
         self._log_variance = variance
-        grown = growth[:, :, None, None] * self._slope
-        step.covariance = step.covariance + (grown - self._slope).sum(axis=1)
-        self._slope = grown
+        new_slope = growth[:, :, None, None] * self._slope
+        step.covariance = step.covariance + (new_slope - self._slope).sum(axis=1)
+        self._slope = new_slope
 
     def smoothed(self) -> Motion:
         """Return the motion in the stored exposures, smoothed by all of them."""
@@ -404,23 +404,23 @@ def _smooth(steps: Sequence[_Step]) -> tuple[Motion, _Scores]:
         step = steps[k]
         # r and n already contain L'F'r and L'F'N F L of the next step.
         gain = step.covariance[:, :, POSE]
-        kept = _EYE_STATE - gain @ step.m @ _POSE_ROWS
-        back = np.swapaxes(kept, 1, 2)
-        r = (back @ r[:, :, None])[:, :, 0]
-        n = back @ n @ kept
+        factor = _EYE_STATE - gain @ step.m @ _POSE_ROWS
+        transposed = np.swapaxes(factor, 1, 2)
+        r = (transposed @ r[:, :, None])[:, :, 0]
+        n = transposed @ n @ factor
         r[:, POSE] += step.z
         n[:, POSE, POSE] += step.m
         rotation, mean = _moved(step, (step.covariance @ r[:, :, None])[:, :, 0])
-        turned = turn_of_twists(step.reference, rotation)
-        covariance = _turned_covariance(_smoothed_covariance(step.covariance, n), turned)
+        turn = turn_of_twists(step.reference, rotation)
+        covariance = _turned_covariance(_smoothed_covariance(step.covariance, n), turn)
         motion.rotation[k] = rotation
         motion.centre_mm[k] = mean[:, :3]
         motion.velocity[k] = mean[:, 6:12]
         motion.acceleration[k] = mean[:, 12:]
         motion.covariance[k] = covariance
         for kind, noise in enumerate(np.swapaxes(_noise(step.dt_s, step.log_q), 0, 1)):
-            moved = noise @ n
-            information = np.trace(moved, axis1=1, axis2=2)
+            product = noise @ n
+            information = np.trace(product, axis1=1, axis2=2)
             squared = (r[:, None] @ noise @ r[:, :, None])[:, 0, 0]
             scores.gradient[k, :, kind] = np.where(step.started, 0, 0.5 * (squared - information))
             scores.information[k, :, kind] = np.where(step.started, 0, 0.5 * information)
@@ -462,14 +462,14 @@ def _smoothed_covariance(
     There it is L (I - L'NL) L' with P = LL', whose middle factor gets no negative eigenvalues.
     """
     out = covariance - covariance @ n @ covariance
-    left, whole = (np.diagonal(each, axis1=1, axis2=2) for each in (out, covariance))
-    lost = np.flatnonzero((left < LOST_DIGITS * whole).any(axis=1))
-    if len(lost):
-        scale = np.sqrt(np.diagonal(covariance[lost], axis1=1, axis2=2))[:, :, None]
-        root = scale * np.linalg.cholesky(covariance[lost] / (scale * np.swapaxes(scale, 1, 2)))
-        values, vectors = np.linalg.eigh(_EYE_STATE - np.swapaxes(root, 1, 2) @ n[lost] @ root)
+    after, before = (np.diagonal(matrix, axis1=1, axis2=2) for matrix in (out, covariance))
+    rows = np.flatnonzero((after < LOST_DIGITS * before).any(axis=1))
+    if len(rows):
+        scale = np.sqrt(np.diagonal(covariance[rows], axis1=1, axis2=2))[:, :, None]
+        root = scale * np.linalg.cholesky(covariance[rows] / (scale * np.swapaxes(scale, 1, 2)))
+        values, vectors = np.linalg.eigh(_EYE_STATE - np.swapaxes(root, 1, 2) @ n[rows] @ root)
         root = root @ vectors * np.sqrt(np.maximum(values, 0))[:, None]
-        out[lost] = root @ np.swapaxes(root, 1, 2)
+        out[rows] = root @ np.swapaxes(root, 1, 2)
     return out
 
 
@@ -534,8 +534,8 @@ def _improved(
         out[:, body, kind] = np.clip(h + step, *LOG_RANGE)
         largest = max(largest, float(np.abs(step).max()))
         spread = _variance_of_steps(banded)
-        moved = np.diff(out[:, body, kind]) ** 2 + spread
-        new_walk[body, kind] = np.sum(moved) / np.sum(dt_s[1:])
+        squares = np.diff(out[:, body, kind]) ** 2 + spread
+        new_walk[body, kind] = np.sum(squares) / np.sum(dt_s[1:])
     return out, largest, new_walk
 
 
@@ -547,17 +547,17 @@ def _variance_of_steps(banded: NDArray[np.float64]) -> NDArray[np.float64]:
     SIAM J. Matrix Anal. Appl. 13, 1992).
     """
     diagonal = banded[1]
-    off = banded[0, 1:]
+    off_diagonal = banded[0, 1:]
     size = len(diagonal)
     forward = np.empty(size)
     backward = np.empty(size)
     forward[0] = diagonal[0]
     backward[-1] = diagonal[-1]
     for k in range(1, size):
-        forward[k] = diagonal[k] - off[k - 1] ** 2 / forward[k - 1]
-        backward[-1 - k] = diagonal[-1 - k] - off[-k] ** 2 / backward[-k]
+        forward[k] = diagonal[k] - off_diagonal[k - 1] ** 2 / forward[k - 1]
+        backward[-1 - k] = diagonal[-1 - k] - off_diagonal[-k] ** 2 / backward[-k]
     variance = 1 / (forward + backward - diagonal)
-    covariance = -off / forward[:-1] * variance[1:]
+    covariance = -off_diagonal / forward[:-1] * variance[1:]
     return variance[:-1] + variance[1:] - 2 * covariance
 
 

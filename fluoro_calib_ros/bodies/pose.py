@@ -142,8 +142,8 @@ class PoseSolver:
     ) -> None:
         self.bodies = tuple(bodies)
         self.orientation = orientation
-        most = max(len(body.target_id) for body in bodies)
-        shape = (len(bodies), most)
+        max_markers = max(len(body.target_id) for body in bodies)
+        shape = (len(bodies), max_markers)
         self.target_id = np.full(shape, -1)
         self.centre = np.array([body.centre for body in bodies])
         self.xyz = np.zeros((*shape, 3))
@@ -157,8 +157,8 @@ class PoseSolver:
         self.cameras = Cameras(orientation, self.target_id)
         # Fraction of each element of a step that remains as the next step.
         source = orientation.position_mm
-        far = np.linalg.norm(source - source.mean(axis=0), axis=1).max()
-        self._share_left = np.repeat([1 / max(far, 1.0), 1.0], 3)
+        radius = np.linalg.norm(source - source.mean(axis=0), axis=1).max()
+        self._share_left = np.repeat([1 / max(radius, 1.0), 1.0], 3)
         tail = erfc(reject / np.sqrt(2))
         freedom = np.arange(max(2 * len(orientation.fluoroscopes), 3) + 1)
         self._limit = np.where(freedom > 0, chdtri(np.maximum(freedom, 1), tail), np.inf)
@@ -178,22 +178,22 @@ class PoseSolver:
         # Each body may lose all its markers, one at a time, and is restarted once.
         for _ in range(self.xyz.shape[1] + len(self.bodies)):
             solution = self._converge((rotation, centre), points, used, prediction)
-            wrong, worst = self._false_markers(solution, (points, used), prediction, test)
+            contradicting, worst = self._false_markers(solution, (points, used), prediction, test)
             rotation, centre = solution.rotation, solution.centre
             # From a prediction that is far off, as after two almost equal stamps, an iteration may
             # converge elsewhere. Then restart from the points in space.
-            doubted = ~solution.alone & from_prediction
-            doubted[wrong] = from_prediction[wrong]
-            again = self._start(
-                exposure, points, np.flatnonzero(doubted), (rotation, centre, started)
+            is_doubtful = ~solution.alone & from_prediction
+            is_doubtful[contradicting] = from_prediction[contradicting]
+            restarted = self._start(
+                exposure, points, np.flatnonzero(is_doubtful), (rotation, centre, started)
             )
-            from_prediction = from_prediction & ~doubted
-            if again:
-                test[doubted] = np.nan
+            from_prediction = from_prediction & ~is_doubtful
+            if restarted:
+                test[is_doubtful] = np.nan
                 continue
-            if not len(wrong):
+            if not len(contradicting):
                 break
-            used[wrong, worst] = False
+            used[contradicting, worst] = False
         ambiguous = self._ambiguous(solution, points, used, prediction)
         return self._result(solution, (points, used), prediction, test, ambiguous)
 
@@ -218,14 +218,14 @@ class PoseSolver:
             # The centre of these markers does not move.
             centre = solution.centre.copy()
             centre[row] += (solution.rotation[row] - rotation[row]) @ markers.mean(axis=0)
-            only = used & (np.arange(len(used)) == row)[:, None]
-            second = self._converge((rotation, centre), points, only, None)
+            markers_of_row = used & (np.arange(len(used)) == row)[:, None]
+            second = self._converge((rotation, centre), points, markers_of_row, None)
             squares = [
-                _own_squares(one.marker, self.variance)[row].sum() for one in (solution, second)
+                _own_squares(pose.marker, self.variance)[row].sum() for pose in (solution, second)
             ]
             turn = second.rotation[row] @ solution.rotation[row].T
-            away = float(np.linalg.norm(vector_from_matrix(turn)))
-            fits = squares[1] - squares[0] < self._limit[1] and away > LINEAR_RAD
+            angle = float(np.linalg.norm(vector_from_matrix(turn)))
+            fits = squares[1] - squares[0] < self._limit[1] and angle > LINEAR_RAD
             out[row] = fits and not _excludes(prediction, row, second, self._limit[3])
         return out
 
@@ -245,12 +245,12 @@ class PoseSolver:
         rotation, centre, started = pose
         xyz = self.cameras.places(exposure)
         seen = np.isfinite(xyz).all(axis=2) & (points.seen.sum(axis=2) > 1)
-        enough = rows[np.count_nonzero(seen[rows], axis=1) >= 3]
-        for row in enough.tolist():
+        solvable = rows[np.count_nonzero(seen[rows], axis=1) >= 3]
+        for row in solvable.tolist():
             markers = seen[row]
             rotation[row], centre[row] = robust_pose(self.xyz[row, markers], xyz[row, markers])
             started[row] = True
-        return len(enough) > 0
+        return len(solvable) > 0
 
     def _converge(
         self,
@@ -272,20 +272,20 @@ class PoseSolver:
             parts = _eigen(normal)
             alone = _is_determined(parts)
             if prediction is not None and not alone.all():
-                held, away = _pull_of(prediction, (rotation, centre))
-                held = np.where(alone[:, None, None], 0.0, held)
-                normal = normal + held
-                right = right + (held @ away[:, :, None])[:, :, 0]
+                prior_normal, prior_step = _pull_of(prediction, (rotation, centre))
+                prior_normal = np.where(alone[:, None, None], 0.0, prior_normal)
+                normal = normal + prior_normal
+                right = right + (prior_normal @ prior_step[:, :, None])[:, :, 0]
                 parts = _eigen(normal)
             step = _solved(parts, right)
             centre = centre + step[:, :3]
             rotation = Rotation.from_rotvec(step[:, 3:]).as_matrix() @ rotation
-            left = ((step * self._share_left) ** 2).sum(axis=1)
-            if not (left * (step * right).sum(axis=1) > LAST_STEP).any():
+            remaining = ((step * self._share_left) ** 2).sum(axis=1)
+            if not (remaining * (step * right).sum(axis=1) > LAST_STEP).any():
                 break
         # The derivatives remain valid; only the residuals change by the last step.
-        moved = (linear.by_pose @ step[:, None, :, None])[:, :, None]
-        linear = replace(linear, residual=linear.residual - (linear.by_place @ moved)[..., 0])
+        shift = (linear.by_pose @ step[:, None, :, None])[:, :, None]
+        linear = replace(linear, residual=linear.residual - (linear.by_place @ shift)[..., 0])
         s_vector = _vectors(_weighted(linear, weight), linear.residual)
         marker = replace(
             marker,
@@ -339,26 +339,26 @@ class PoseSolver:
         # Markers are compared with each other only. A prediction that they contradict is no reason
         # to reject them: the body may have been hit.
         normal = by_marker.sum(axis=1)
-        own = _own_squares(marker, self.variance)
+        squares = _own_squares(marker, self.variance)
         if not solution.alone.all():
-            away = _solved(_eigen(normal), gradient.sum(axis=1))[:, None, :, None]
-            change = (by_marker @ away)[..., 0]
-            own = own + np.sum((change - 2 * gradient) * away[..., 0], axis=-1)
+            pose_step = _solved(_eigen(normal), gradient.sum(axis=1))[:, None, :, None]
+            change = (by_marker @ pose_step)[..., 0]
+            squares = squares + np.sum((change - 2 * gradient) * pose_step[..., 0], axis=-1)
             gradient = gradient - change
         limit = self._limit[2 * points.seen.sum(axis=2) * used]
-        suspect = np.flatnonzero((own.sum(axis=1)[:, None] > limit).any(axis=1))
+        suspect = np.flatnonzero((squares.sum(axis=1)[:, None] > limit).any(axis=1))
         if not len(suspect):
             return suspect, suspect
         limit = limit[suspect]
         gradient = gradient[suspect]
-        others = normal[suspect, None] - by_marker[suspect]
+        normal_of_others = normal[suspect, None] - by_marker[suspect]
         # A marker that the others do not predict is tested by its own rays only.
-        unit, scale = _of_unit_diagonal(others)
+        unit, scale = _of_unit_diagonal(normal_of_others)
         predicted = np.linalg.eigvalsh(unit)[..., 0] > WEAK
         inverse = np.linalg.inv(np.where(predicted[..., None, None], unit, EYE_6))
         reduced = gradient / scale
         gain = np.sum(reduced * (inverse @ reduced[..., None])[..., 0], axis=-1)
-        excess = (own[suspect] + np.where(predicted, gain, 0.0)) / limit
+        excess = (squares[suspect] + np.where(predicted, gain, 0.0)) / limit
         excess = np.where(used[suspect], excess, 0.0)
         if (excess > 1).any():
             excess = excess / _growth_by_rig(self.cameras, solution, points, normal, suspect)
@@ -367,16 +367,16 @@ class PoseSolver:
             return suspect[:0], suspect[:0]
         # If several contradict each other, exclude the one without which the others agree best
         # with each other and with the prediction.
-        held, away = _pull_of(prediction, (solution.rotation, solution.centre))
-        held = held[suspect]
-        pulled = (held @ away[suspect, :, None])[:, None, :, 0] - gradient
-        unit, scale = _of_unit_diagonal(others + held[:, None])
-        pulled = pulled / scale
-        rest = np.linalg.inv(unit + WEAK * EYE_6)
-        left = own[suspect] + np.sum(pulled * (rest @ pulled[..., None])[..., 0], axis=-1)
-        worst = np.argmax(np.where(excess > 1, left, -np.inf), axis=1)
-        wrong = np.flatnonzero((excess > 1).any(axis=1))
-        return suspect[wrong], worst[wrong]
+        prior_normal, pose_step = _pull_of(prediction, (solution.rotation, solution.centre))
+        prior_normal = prior_normal[suspect]
+        pull = (prior_normal @ pose_step[suspect, :, None])[:, None, :, 0] - gradient
+        unit, scale = _of_unit_diagonal(normal_of_others + prior_normal[:, None])
+        pull = pull / scale
+        cofactor = np.linalg.inv(unit + WEAK * EYE_6)
+        remaining = squares[suspect] + np.sum(pull * (cofactor @ pull[..., None])[..., 0], axis=-1)
+        worst = np.argmax(np.where(excess > 1, remaining, -np.inf), axis=1)
+        contradicting = np.flatnonzero((excess > 1).any(axis=1))
+        return suspect[contradicting], worst[contradicting]
 
     def _result(
         self,
@@ -397,14 +397,14 @@ class PoseSolver:
         # A filter treats shape and correction as exact, since their errors are constant.
         linear = solution.linear
         variance = points.noise
-        held = np.flatnonzero(seen & ~alone)
-        if len(held):
-            turned = turn_of_twists(prediction.rotation[held], solution.rotation[held])
-            expected = turned @ prediction.covariance[held] @ np.swapaxes(turned, 1, 2)
-            squares = _curvature(linear.by_place[held], linear.by_pose[held], expected)
+        predicted = np.flatnonzero(seen & ~alone)
+        if len(predicted):
+            turn = turn_of_twists(prediction.rotation[predicted], solution.rotation[predicted])
+            expected = turn @ prediction.covariance[predicted] @ np.swapaxes(turn, 1, 2)
+            squares = _curvature(linear.by_place[predicted], linear.by_pose[predicted], expected)
             variance = variance.copy()
-            variance[held] = _variance_of_last(
-                variance[held], squares, prediction.weak[held, None, None]
+            variance[predicted] = _variance_of_last(
+                variance[predicted], squares, prediction.weak[predicted, None, None]
             )
         s_matrix, s_vector = marker_sums(linear, _weight(points, used, variance))
         transposed = np.swapaxes(linear.by_pose, 2, 3)
@@ -451,13 +451,13 @@ def _growth_by_rig(
     weight = solution.marker.weight[rows]
     by_place = linear.by_place[rows]
     by_rig = cameras.by_orientation(linear)[rows] @ cameras.root  # (S, M, F, 2, k)
-    pulled = (np.swapaxes(by_place * weight[..., None, None], 3, 4) @ by_rig).sum(axis=2)
+    pull = (np.swapaxes(by_place * weight[..., None, None], 3, 4) @ by_rig).sum(axis=2)
     d = linear.by_pose[rows]
-    right = (np.swapaxes(d, 2, 3) @ solution.marker.m[rows] @ pulled).sum(axis=1)
+    right = (np.swapaxes(d, 2, 3) @ solution.marker.m[rows] @ pull).sum(axis=1)
     unit, scale = _of_unit_diagonal(normal[rows])
-    moved = np.linalg.solve(unit + WEAK * EYE_6, right / scale[..., None]) / scale[..., None]
-    taken = by_place @ (d @ moved[:, None])[:, :, None]
-    squares = np.sum((by_rig - taken) ** 2, axis=(3, 4)) * weight
+    pose_change = np.linalg.solve(unit + WEAK * EYE_6, right / scale[..., None]) / scale[..., None]
+    absorbed = by_place @ (d @ pose_change[:, None])[:, :, None]
+    squares = np.sum((by_rig - absorbed) ** 2, axis=(3, 4)) * weight
     return 1 + squares.sum(axis=2) / np.maximum(2 * points.seen[rows].sum(axis=2), 1)
 
 
@@ -502,10 +502,10 @@ def _curvature(
     by_move = (by_pose @ covariance[:, None] @ np.swapaxes(by_pose, 2, 3))[:, :, None, None]
     cross = cross_matrix(by_place)  # (B, M, F, 2, 3, 3)
     mixed = cross @ by_turn[:, :, None, None]
-    turned = cross @ covariance[:, None, None, None, 3:, 3:] @ np.swapaxes(cross, -1, -2)
+    turn_variance = cross @ covariance[:, None, None, None, 3:, 3:] @ np.swapaxes(cross, -1, -2)
     squares = (
         np.trace(mixed, axis1=-2, axis2=-1) ** 2
-        + np.trace(turned @ by_move, axis1=-2, axis2=-1)
+        + np.trace(turn_variance @ by_move, axis1=-2, axis2=-1)
         + np.trace(mixed @ mixed, axis1=-2, axis2=-1)
     )
     return squares.mean(axis=-1) / 4
@@ -527,16 +527,18 @@ def _covariances(
     linear = solution.linear
     gain = np.swapaxes(linear.by_pose, 2, 3) @ marker.m  # (B, M, 6, 3)
     weighted = linear.by_place * marker.weight[..., None, None]
-    pulled = np.swapaxes(weighted, 3, 4)
+    weighted_transposed = np.swapaxes(weighted, 3, 4)
     rows = (*marker.weight.shape[:2], -1, 3)
     by_noise = (weighted * points.noise[..., None, None]).reshape(rows)
     by_correction = (weighted * points.correction[..., None, None]).reshape(rows)
     flat = np.swapaxes(weighted.reshape(rows), 2, 3)
-    stays = flat @ by_correction + variance[..., None, None] * (marker.s_matrix @ marker.s_matrix)
-    back = np.swapaxes(gain, 2, 3)
-    noise = inverse @ (gain @ (flat @ by_noise) @ back).sum(axis=1) @ inverse
-    fixed = inverse @ (gain @ stays @ back).sum(axis=1) @ inverse
-    by_view = (gain[:, :, None] @ (pulled @ cameras.by_orientation(linear))).sum(axis=1)
+    steady = flat @ by_correction + variance[..., None, None] * (marker.s_matrix @ marker.s_matrix)
+    gain_transposed = np.swapaxes(gain, 2, 3)
+    noise = inverse @ (gain @ (flat @ by_noise) @ gain_transposed).sum(axis=1) @ inverse
+    fixed = inverse @ (gain @ steady @ gain_transposed).sum(axis=1) @ inverse
+    by_view = (gain[:, :, None] @ (weighted_transposed @ cameras.by_orientation(linear))).sum(
+        axis=1
+    )
     rig_root = -inverse @ (by_view @ cameras.root).sum(axis=1)
     return noise, fixed, rig_root
 
@@ -634,7 +636,7 @@ def _pull_of(
     """Return normal matrices (B, 6, 6) of predictions at poses, and twists (B, 6) to them."""
     normal = np.linalg.inv(prediction.covariance + 1e-12 * EYE_6)
     normal = np.where(prediction.known[:, None, None], normal, 0.0)
-    turned = turn_of_twists(prediction.rotation, pose[0])
-    away = twist_between((prediction.rotation, prediction.centre_mm), pose)
-    held = turned @ normal @ np.swapaxes(turned, 1, 2)
-    return held, -(turned @ away[:, :, None])[:, :, 0]
+    turn = turn_of_twists(prediction.rotation, pose[0])
+    twist = twist_between((prediction.rotation, prediction.centre_mm), pose)
+    prior_normal = turn @ normal @ np.swapaxes(turn, 1, 2)
+    return prior_normal, -(turn @ twist[:, :, None])[:, :, 0]

@@ -127,8 +127,8 @@ def condition_number(xyz_mm: NDArray[np.float64]) -> float:
     """
     centred = xyz_mm - xyz_mm.mean(axis=0)
     values = np.linalg.svd(centred, compute_uv=False)
-    across = float(np.sqrt(np.sum(values[1:] ** 2)))
-    return 1000.0 / across if across > 0 else np.inf
+    breadth = float(np.sqrt(np.sum(values[1:] ** 2)))
+    return 1000.0 / breadth if breadth > 0 else np.inf
 
 
 def estimate_shape(body: Body, places: BodyPlaces) -> EstimatedShape:
@@ -149,24 +149,29 @@ def estimate_shape(body: Body, places: BodyPlaces) -> EstimatedShape:
     start = _start(body, places)
     if start is None:
         return _unchanged(body, [_unseen(body)])
-    wrong = _wrong_frame(body, places)
-    if wrong:
-        return _unchanged(body, wrong)
+    findings_on_frame = _wrong_frame(body, places)
+    if findings_on_frame:
+        return _unchanged(body, findings_on_frame)
     adjustment = _adjust(body, places, start)
     # A false place also affects the other markers of its exposure, which are then excluded, too.
-    while (false := _false_places(adjustment)).any():
-        places = places.without(false)
+    while (is_false := _false_places(adjustment)).any():
+        places = places.without(is_false)
         start = _start(body, places)
         if start is None:
             return _unchanged(body, [_unseen(body)])
         adjustment = _adjust(body, places, start)
     known = np.isfinite(adjustment.xyz).all(axis=1)
     findings = _contradictions(body, places, adjustment)
-    moved = [marker for one in findings if one.kind in _MOVED for marker in one.place.target_id]
-    if moved:  # their CT coordinates are not observations of these markers
-        sd = np.where(np.isin(body.target_id, moved), np.inf, body.sd_mm)
-        freed = replace(body, sd_mm=sd)
-        adjustment = _adjust(freed, places, _start(freed, places) or start)
+    moved_markers = [
+        marker
+        for finding in findings
+        if finding.kind in _MOVED
+        for marker in finding.place.target_id
+    ]
+    if moved_markers:  # their CT coordinates are not observations of these markers
+        sd = np.where(np.isin(body.target_id, moved_markers), np.inf, body.sd_mm)
+        without_ct = replace(body, sd_mm=sd)
+        adjustment = _adjust(without_ct, places, _start(without_ct, places) or start)
     shape = adjustment.xyz
     frame, relative = _datum(shape[known], adjustment.covariance)
     sd = np.full(len(shape), np.inf)
@@ -192,14 +197,16 @@ def learned_shape(
     xyz_mm (T, m, 3) and covariance (T, m, 3, 3): as in BodyPlaces. Constant errors are omitted, as
     later observations that are compared with the shape have the same ones.
     """
-    blank = replace(body, xyz_mm=np.full_like(body.xyz_mm, np.nan))
-    found = estimate_shape(blank, BodyPlaces(xyz_mm, covariance, np.zeros_like(covariance))).body
-    found = replace(found, covariance_mm2=None)
-    both = found.known & body.known
-    if np.count_nonzero(both) < 2:
-        return found
-    rotation, shift = fitted_pose(found.xyz_mm[both], body.xyz_mm[both])
-    return replace(found, xyz_mm=found.xyz_mm @ rotation.T + shift)
+    without_shape = replace(body, xyz_mm=np.full_like(body.xyz_mm, np.nan))
+    learned = estimate_shape(
+        without_shape, BodyPlaces(xyz_mm, covariance, np.zeros_like(covariance))
+    ).body
+    learned = replace(learned, covariance_mm2=None)
+    known_in_both = learned.known & body.known
+    if np.count_nonzero(known_in_both) < 2:
+        return learned
+    rotation, shift = fitted_pose(learned.xyz_mm[known_in_both], body.xyz_mm[known_in_both])
+    return replace(learned, xyz_mm=learned.xyz_mm @ rotation.T + shift)
 
 
 @dataclass(frozen=True)
@@ -225,26 +232,26 @@ def _start(body: Body, places: BodyPlaces) -> tuple[NDArray[np.float64], NDArray
     frame.
     """
     seen = places.seen
-    least = min(3, len(body.target_id))  # a body of two markers needs only two
-    richest = int(np.argmax(seen.sum(axis=1))) if len(seen) else 0
-    if not len(seen) or np.count_nonzero(seen[richest]) < least:
+    min_markers = min(3, len(body.target_id))  # a body of two markers needs only two
+    reference = int(np.argmax(seen.sum(axis=1))) if len(seen) else 0
+    if not len(seen) or np.count_nonzero(seen[reference]) < min_markers:
         return None
-    xyz = np.where(seen[richest][:, None], places.xyz_mm[richest], np.nan)
-    for marker in np.flatnonzero(~seen[richest]):
+    xyz = np.where(seen[reference][:, None], places.xyz_mm[reference], np.nan)
+    for marker in np.flatnonzero(~seen[reference]):
         for place in places.xyz_mm[seen[:, marker]]:
-            common = np.isfinite(place).all(axis=1) & np.isfinite(xyz).all(axis=1)
-            if np.count_nonzero(common) >= 3:
-                rotation, shift = fitted_pose(place[common], xyz[common])
+            in_both = np.isfinite(place).all(axis=1) & np.isfinite(xyz).all(axis=1)
+            if np.count_nonzero(in_both) >= 3:
+                rotation, shift = fitted_pose(place[in_both], xyz[in_both])
                 xyz[marker] = rotation @ place[marker] + shift
                 break
-    found = np.isfinite(xyz).all(axis=1)
-    given = found & body.known & np.isfinite(body.sd_mm)
-    if np.count_nonzero(given) >= 3:
-        rotation, shift = fitted_pose(xyz[given], body.xyz_mm[given])
+    is_placed = np.isfinite(xyz).all(axis=1)
+    has_ct = is_placed & body.known & np.isfinite(body.sd_mm)
+    if np.count_nonzero(has_ct) >= 3:
+        rotation, shift = fitted_pose(xyz[has_ct], body.xyz_mm[has_ct])
         xyz = xyz @ rotation.T + shift
     else:
-        xyz = xyz - xyz[found].mean(axis=0)
-    return xyz, np.flatnonzero(np.count_nonzero(seen & found, axis=1) >= least)
+        xyz = xyz - xyz[is_placed].mean(axis=0)
+    return xyz, np.flatnonzero(np.count_nonzero(seen & is_placed, axis=1) >= min_markers)
 
 
 @dataclass(frozen=True)
@@ -285,10 +292,10 @@ def _adjust(
         reduced = _reduced(problem, shape, rotation, shift)
         covariance = np.linalg.inv(reduced.matrix)
         step = covariance @ reduced.right
-        of_pose = reduced.solved[:, :, -1] - reduced.solved[:, :, :-1] @ step
+        pose_step = reduced.solved[:, :, -1] - reduced.solved[:, :, :-1] @ step
         shape = shape + step.reshape(-1, 3)
-        shift = shift + of_pose[:, :3]
-        rotation = _turned(rotation, of_pose[:, 3:])
+        shift = shift + pose_step[:, :3]
+        rotation = _turned(rotation, pose_step[:, 3:])
     residual = _residual(problem, shape, rotation, shift)
     out = xyz.copy()
     out[known] = shape
@@ -298,11 +305,11 @@ def _adjust(
     )
     test = np.full(len(xyz), np.nan)
     test[known] = _squares_over_expectation(problem, reduced, squares[np.ix_(rows, known)])
-    stays = _stays(places, (rows, known), problem, reduced, rotation)
+    systematic = _stays(places, (rows, known), problem, reduced, rotation)
     count = max(np.count_nonzero(problem.seen), 1)
     return _Adjustment(
         out,
-        covariance + covariance @ stays @ covariance,
+        covariance + covariance @ systematic @ covariance,
         test=test,
         squares=squares,
         mean_error_mm=float(np.sqrt(np.sum(residual**2) / count)),
@@ -318,10 +325,10 @@ def _problem(
 ) -> _Problem:
     """Return the observations in the chosen exposures and of the chosen markers."""
     known = chosen[1]
-    given = body.known[known] & np.isfinite(body.sd_mm[known])
-    if np.count_nonzero(given) < 3:  # too few to define a frame
-        given[:] = False
-    weight = np.where(given, 1 / np.maximum(body.sd_mm[known], 1e-6) ** 2, 0.0)
+    has_ct = body.known[known] & np.isfinite(body.sd_mm[known])
+    if np.count_nonzero(has_ct) < 3:  # too few to define a frame
+        has_ct[:] = False
+    weight = np.where(has_ct, 1 / np.maximum(body.sd_mm[known], 1e-6) ** 2, 0.0)
     seen = places.seen[np.ix_(*chosen)]
     total = (places.covariance + places.fixed)[np.ix_(*chosen)]
     information = np.linalg.inv(np.where(seen[..., None, None], total, np.eye(3)))
@@ -329,7 +336,7 @@ def _problem(
         np.where(seen[..., None], places.xyz_mm[np.ix_(*chosen)], 0.0),
         np.where(seen[..., None, None], information, 0.0),
         seen,
-        ct=np.where(given[:, None], body.xyz_mm[known], xyz[known]),
+        ct=np.where(has_ct[:, None], body.xyz_mm[known], xyz[known]),
         ct_weight=weight,
     )
 
@@ -356,26 +363,32 @@ def _reduced(
     residual = _residual(problem, shape, rotation, shift)
     d = by_pose(shape @ np.swapaxes(rotation, 1, 2))
     transposed = np.swapaxes(d, 2, 3)
-    back = np.swapaxes(rotation, 1, 2)[:, None]
-    turned = problem.information @ rotation[:, None]  # S R
-    told = problem.information @ residual[..., None]  # s
+    to_body = np.swapaxes(rotation, 1, 2)[:, None]
+    rotated_information = problem.information @ rotation[:, None]  # S R
+    pull = problem.information @ residual[..., None]  # s
     normal = (transposed @ problem.information @ d).sum(axis=1)
     # Markers on a line leave the rotation about it free, which affects nothing else.
     normal += REGULAR * normal.max(axis=(1, 2), keepdims=True) * np.eye(POSE_SIZE)
-    cross = (transposed @ turned).transpose(0, 2, 1, 3).reshape(exposures, POSE_SIZE, 3 * count)
-    right = (transposed @ told).sum(axis=1)
+    cross = (
+        (transposed @ rotated_information)
+        .transpose(0, 2, 1, 3)
+        .reshape(exposures, POSE_SIZE, 3 * count)
+    )
+    right = (transposed @ pull).sum(axis=1)
     solved = np.linalg.solve(normal, np.concatenate([cross, right], axis=2))
     flat = cross.reshape(-1, 3 * count)
     matrix = -flat.T @ solved[:, :, :-1].reshape(-1, 3 * count)
-    own = (back @ turned).sum(axis=0) + problem.ct_weight[:, None, None] * np.eye(3)
+    blocks = (to_body @ rotated_information).sum(axis=0) + problem.ct_weight[
+        :, None, None
+    ] * np.eye(3)
     for k in range(count):
-        matrix[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += own[k]
+        matrix[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += blocks[k]
     if not problem.ct_weight.any():
         # Inner constraints: the centre and the attitude of the markers are those of the initial
         # coordinates (Foerstner and Wrobel 2016, 4.3.2).
         motion = _motion(shape)
         matrix += np.trace(matrix) / (3 * count) * (motion @ np.linalg.pinv(motion))
-    by_shape = (back @ told)[..., 0].sum(axis=0)
+    by_shape = (to_body @ pull)[..., 0].sum(axis=0)
     by_shape += problem.ct_weight[:, None] * (problem.ct - shape)
     return _Reduced(
         matrix,
@@ -390,9 +403,9 @@ def _squares_over_expectation(
     problem: _Problem, reduced: _Reduced, squares: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return sums (k,) of weighted squares (T, k) over their redundancy; NaN without any."""
-    of_place = reduced.by_pose @ np.linalg.inv(reduced.normal)[:, None]
-    of_place = of_place @ np.swapaxes(reduced.by_pose, 2, 3)
-    share = np.trace(of_place @ problem.information, axis1=2, axis2=3)
+    place_covariance = reduced.by_pose @ np.linalg.inv(reduced.normal)[:, None]
+    place_covariance = place_covariance @ np.swapaxes(reduced.by_pose, 2, 3)
+    share = np.trace(place_covariance @ problem.information, axis1=2, axis2=3)
     freedom = np.where(problem.seen, 3 - share, 0.0).sum(axis=0)
     return np.where(freedom > 1, squares.sum(axis=0) / np.maximum(freedom, 1), np.nan)
 
@@ -402,13 +415,15 @@ def _false_places(adjustment: _Adjustment) -> NDArray[np.bool_]:
 
     A marker that moves has large squares in many exposures; its places are not excluded.
     """
-    used = np.where(adjustment.squares > 0, adjustment.squares, np.nan)
-    ordinary = np.ones(used.shape[1])
-    some = np.isfinite(used).any(axis=0)
+    squares = np.where(adjustment.squares > 0, adjustment.squares, np.nan)
+    typical = np.ones(squares.shape[1])
+    is_used = np.isfinite(squares).any(axis=0)
     # The median of three squares is chdtri(3, 0.5).
-    ordinary[some] = np.maximum(1.0, np.nanmedian(used[:, some], axis=0) / chdtri(3, 0.5))
-    false = adjustment.squares > ordinary * chdtri(3, REJECT_TAIL)
-    return np.asarray(false & (false.sum(axis=0) <= FALSE_SHARE * np.isfinite(used).sum(axis=0)))
+    typical[is_used] = np.maximum(1.0, np.nanmedian(squares[:, is_used], axis=0) / chdtri(3, 0.5))
+    is_false = adjustment.squares > typical * chdtri(3, REJECT_TAIL)
+    return np.asarray(
+        is_false & (is_false.sum(axis=0) <= FALSE_SHARE * np.isfinite(squares).sum(axis=0))
+    )
 
 
 def _stays(
@@ -424,22 +439,24 @@ def _stays(
     neighbouring markers move the body as a whole.
     """
     known = chosen[1]
-    alike = np.eye(len(known)) if places.alike is None else places.alike[np.ix_(known, known)]
+    correlation = (
+        np.eye(len(known)) if places.alike is None else places.alike[np.ix_(known, known)]
+    )
     seen = problem.seen
     exposures, count = seen.shape
     fixed = np.where(seen[..., None, None], places.fixed[np.ix_(*chosen)], 0.0)
     mean = fixed.sum(axis=0) / np.maximum(seen.sum(axis=0), 1)[:, None, None]
     direct = (np.swapaxes(rotation, 1, 2)[:, None] @ problem.information).sum(axis=0)
-    told = np.swapaxes(reduced.by_pose, 2, 3) @ problem.information  # (T, k, 6, 3), D'S
-    told = told.transpose(0, 2, 1, 3).reshape(exposures * POSE_SIZE, 3 * count)
-    pulled = -reduced.solved[:, :, :-1].reshape(-1, 3 * count).T @ told
+    weighted = np.swapaxes(reduced.by_pose, 2, 3) @ problem.information  # (T, k, 6, 3), D'S
+    weighted = weighted.transpose(0, 2, 1, 3).reshape(exposures * POSE_SIZE, 3 * count)
+    influence = -reduced.solved[:, :, :-1].reshape(-1, 3 * count).T @ weighted
     root = np.zeros((3 * count, 3 * count))
     for k in range(count):
         rows = slice(3 * k, 3 * k + 3)
-        pulled[rows, rows] += direct[k]
+        influence[rows, rows] += direct[k]
         root[rows, rows] = _root_of(mean[k])
-    root = pulled @ root
-    return root @ np.kron(alike, np.eye(3)) @ root.T
+    root = influence @ root
+    return root @ np.kron(correlation, np.eye(3)) @ root.T
 
 
 def _root_of(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -458,9 +475,9 @@ def _datum(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return covariances of the frame (6, 6) about the centre, and of coordinates in its datum."""
     motion = _motion(xyz)
-    read = np.linalg.pinv(motion)
-    relative = np.eye(len(covariance)) - motion @ read
-    return read @ covariance @ read.T, relative @ covariance @ relative.T
+    inverse_motion = np.linalg.pinv(motion)
+    relative = np.eye(len(covariance)) - motion @ inverse_motion
+    return inverse_motion @ covariance @ inverse_motion.T, relative @ covariance @ relative.T
 
 
 def _motion(xyz: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -511,9 +528,9 @@ def _wrong_frame(body: Body, places: BodyPlaces) -> list[Finding]:
     row = int(np.argmax(count))
     if count[row] < 3:
         return []
-    given = body.xyz_mm[seen[row]]
+    ct = body.xyz_mm[seen[row]]
     measured = places.xyz_mm[row][seen[row]]
-    spread = [np.sqrt(np.sum((x - x.mean(axis=0)) ** 2)) for x in (given, measured)]
+    spread = [np.sqrt(np.sum((x - x.mean(axis=0)) ** 2)) for x in (ct, measured)]
     factor = float(spread[1] / spread[0])
     for scale, unit in MISTAKEN_UNITS.items():
         if abs(factor / scale - 1) < SCALE_TOLERANCE:
@@ -527,7 +544,7 @@ def _wrong_frame(body: Body, places: BodyPlaces) -> list[Finding]:
         return []
     errors = []
     for sign in (1.0, -1.0):
-        mirrored = given * np.array([sign, 1.0, 1.0])
+        mirrored = ct * np.array([sign, 1.0, 1.0])
         rotation, shift = fitted_pose(mirrored, measured)
         errors.append(float(np.sqrt(np.mean((mirrored @ rotation.T + shift - measured) ** 2))))
     sd = float(np.sqrt(np.mean(np.where(np.isfinite(body.sd_mm), body.sd_mm, 0.0) ** 2)))
@@ -551,9 +568,9 @@ def _contradictions(body: Body, places: BodyPlaces, adjustment: _Adjustment) -> 
     test = adjustment.test
     typical = float(np.nanmedian(test)) if np.isfinite(test).any() else 1.0
     limit = _limit_of_ratio(places)
-    loose = np.flatnonzero(test > limit * max(1.0, typical))
+    moving = np.flatnonzero(test > limit * max(1.0, typical))
     is_stable = adjustment.mean_error_mm <= MAX_MEAN_ERROR_MM  # otherwise reported elsewhere
-    if typical > limit and not len(loose) and is_stable:
+    if typical > limit and not len(moving) and is_stable:
         ratio = float(np.sqrt(typical))
         cause = (
             'it is not rigid: the places of its markers scatter '
@@ -567,7 +584,7 @@ def _contradictions(body: Body, places: BodyPlaces, adjustment: _Adjustment) -> 
                 {'ratio': ratio, 'mean_error_mm': adjustment.mean_error_mm},
             )
         )
-    for row in loose:
+    for row in moving:
         marker = int(body.target_id[row])
         cause = (
             f'marker {marker} moves against the others: its places scatter '
@@ -590,8 +607,8 @@ def _limit_of_ratio(places: BodyPlaces) -> float:
 
     Constant errors are the same in many exposures: count at most ten independent ones.
     """
-    independent = 3 * min(10, int(np.count_nonzero(places.seen.any(axis=1))))
-    return float(chdtri(independent, REJECT_TAIL) / independent)
+    freedom = 3 * min(10, int(np.count_nonzero(places.seen.any(axis=1))))
+    return float(chdtri(freedom, REJECT_TAIL) / freedom)
 
 
 def _migrated(body: Body, adjustment: _Adjustment, known: NDArray[np.bool_]) -> list[Finding]:
@@ -600,8 +617,8 @@ def _migrated(body: Body, adjustment: _Adjustment, known: NDArray[np.bool_]) -> 
     limit = float(chdtri(3, REJECT_TAIL))
     given = body.xyz_mm[rows]
     sd = np.maximum(body.sd_mm[rows], 1e-3)
-    found = adjustment.xyz[rows]
-    pair = _exchanged(given, found, sd)
+    estimated = adjustment.xyz[rows]
+    pair = _exchanged(given, estimated, sd)
     if pair is not None:
         markers = [int(body.target_id[rows[k]]) for k in pair]
         distance = float(np.linalg.norm(given[pair[0]] - given[pair[1]]))
@@ -617,14 +634,14 @@ def _migrated(body: Body, adjustment: _Adjustment, known: NDArray[np.bool_]) -> 
     out: list[int] = []
     while len(rows) - len(out) >= 4:
         kept = [k for k in range(len(rows)) if k not in out]
-        tests = [_against_others(given, found, sd, k, kept) for k in kept]
+        tests = [_against_others(given, estimated, sd, k, kept) for k in kept]
         worst = int(np.argmax(tests))
         if tests[worst] <= limit:
             break
         out.append(kept[worst])
     kept = [k for k in range(len(rows)) if k not in out]
-    rotation, shift = fitted_pose(found[kept], given[kept], 1 / sd[kept] ** 2)
-    shifts = found @ rotation.T + shift - given
+    rotation, shift = fitted_pose(estimated[kept], given[kept], 1 / sd[kept] ** 2)
+    shifts = estimated @ rotation.T + shift - given
     findings = []
     for k in out:
         marker = int(body.target_id[rows[k]])
@@ -659,9 +676,9 @@ def _against_others(
     arm = np.concatenate([given[others], given[[marker]]]) - given[others].mean(axis=0)
     motion = by_pose(arm)
     normal = (np.swapaxes(motion[:-1], 1, 2) @ (motion[:-1] * weight[:, None, None])).sum(axis=0)
-    away = rotation @ found[marker] + shift - given[marker]
+    deviation = rotation @ found[marker] + shift - given[marker]
     covariance = sd[marker] ** 2 * np.eye(3) + motion[-1] @ np.linalg.solve(normal, motion[-1].T)
-    return float(away @ np.linalg.solve(covariance, away))
+    return float(deviation @ np.linalg.solve(covariance, deviation))
 
 
 def _misfit(
@@ -669,8 +686,8 @@ def _misfit(
 ) -> float:
     """Return the weighted squares of a fit of coordinates (k, 3) to CT, over their limit."""
     rotation, shift = fitted_pose(found, given, 1 / sd**2)
-    away = (found @ rotation.T + shift - given) / sd[:, None]
-    return float(np.sum(away**2) / chdtri(3 * len(given) - POSE_SIZE, REJECT_TAIL))
+    deviation = (found @ rotation.T + shift - given) / sd[:, None]
+    return float(np.sum(deviation**2) / chdtri(3 * len(given) - POSE_SIZE, REJECT_TAIL))
 
 
 def _exchanged(
@@ -680,13 +697,13 @@ def _exchanged(
     if _misfit(given, found, sd) <= 1:
         return None
     pairs = list(combinations(range(len(given)), 2))
-    tried = []
+    misfits = []
     for first, second in pairs:
         order = np.arange(len(given))
         order[[first, second]] = second, first
-        tried.append(_misfit(given[order], found, sd))
-    best = int(np.argmin(tried))
-    return pairs[best] if tried[best] <= 1 else None
+        misfits.append(_misfit(given[order], found, sd))
+    best = int(np.argmin(misfits))
+    return pairs[best] if misfits[best] <= 1 else None
 
 
 def _stability(body: Body, condition: float, mean_error_mm: float) -> list[Finding]:
@@ -729,9 +746,9 @@ def places_of(
     fixed = np.full((*shape, 3, 3), np.nan)
     uv = np.full((*shape, views, 2), np.nan)
     for row, (ids, values) in enumerate(zip(target_ids, points)):
-        _, own, given = np.intersect1d(body.target_id, ids, return_indices=True)
-        xyz[row, own] = values['xyz_mm'][given]
-        noise[row, own] = values['noise'][given]
-        fixed[row, own] = values['fixed'][given]
-        uv[row, own] = values['uv'][given]
+        _, columns, rows = np.intersect1d(body.target_id, ids, return_indices=True)
+        xyz[row, columns] = values['xyz_mm'][rows]
+        noise[row, columns] = values['noise'][rows]
+        fixed[row, columns] = values['fixed'][rows]
+        uv[row, columns] = values['uv'][rows]
     return BodyPlaces(xyz, noise, fixed, alike=covariance_of_means(uv).mean(axis=0))

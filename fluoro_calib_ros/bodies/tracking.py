@@ -148,8 +148,8 @@ class BodyTracker:
         """Replace the shapes of the bodies by better ones in the same frames."""
         before = self.solver.centre
         self.solver = PoseSolver(self.solver.orientation, bodies, self._reject)
-        moved = self.filter.rotation @ (self.solver.centre - before)[:, :, None]
-        self.filter.mean[:, :3] += moved[:, :, 0]
+        shift = self.filter.rotation @ (self.solver.centre - before)[:, :, None]
+        self.filter.mean[:, :3] += shift[:, :, 0]
         self._expected = None
 
     def use(self, orientation: RigOrientation) -> None:
@@ -163,16 +163,18 @@ class BodyTracker:
             return []
         motion = self.filter.smoothed()
         first = len(motion.centre_mm) - len(self._taken)
-        taken, self._taken = self._taken, []
-        return [self._report(one, motion, first + k) for k, one in enumerate(taken)]
+        pending, self._taken = self._taken, []
+        return [self._report(exposure, motion, first + k) for k, exposure in enumerate(pending)]
 
     def smoothed(self) -> list[TrackedExposure]:
         """Return all exposures smoothed by the whole trial; requires lag None."""
         if not self._taken:
             return []
-        motion = smooth_trial(self.filter, [one.frame.information for one in self._taken])
-        taken = _filled_backwards(self._taken)
-        return [self._report(one, motion, k) for k, one in enumerate(taken)]
+        motion = smooth_trial(
+            self.filter, [exposure.frame.information for exposure in self._taken]
+        )
+        exposures = _filled_backwards(self._taken)
+        return [self._report(exposure, motion, k) for k, exposure in enumerate(exposures)]
 
     def _keep(self, number: int, stamp_ns: int, frame: FramePoses) -> None:
         """Store an exposure, and the constant errors of bodies that are seen."""
@@ -226,10 +228,10 @@ def _filled_backwards(taken: Sequence[_Taken]) -> list[_Taken]:
     out: list[_Taken] = []
     fixed = taken[-1].fixed
     root = taken[-1].rig_root
-    for one in reversed(taken):
-        fixed = np.where(np.isnan(one.fixed), fixed, one.fixed)
-        root = np.where(np.isnan(one.rig_root), root, one.rig_root)
-        out.append(replace(one, fixed=fixed, rig_root=root))
+    for exposure in reversed(taken):
+        fixed = np.where(np.isnan(exposure.fixed), fixed, exposure.fixed)
+        root = np.where(np.isnan(exposure.rig_root), root, exposure.rig_root)
+        out.append(replace(exposure, fixed=fixed, rig_root=root))
     return out[::-1]
 
 
@@ -255,38 +257,38 @@ def twists_of(
     and the angular velocity w, both in the rig frame, they are R'v - R'w x x and R'w; a rotation
     error th changes R'v by R'(v x th).
     """
-    back = np.swapaxes(exposure.rotation, 1, 2)
-    velocity, spin = exposure.velocity[:, :3], exposure.velocity[:, 3:]
+    to_body = np.swapaxes(exposure.rotation, 1, 2)
+    velocity, angular_velocity = exposure.velocity[:, :3], exposure.velocity[:, 3:]
     centre = cross_matrix(np.array([body.centre for body in bodies]))
-    turned = (back @ spin[:, :, None])[:, :, 0]
-    moved = (back @ velocity[:, :, None] + centre @ turned[:, :, None])[:, :, 0]
+    angular = (to_body @ angular_velocity[:, :, None])[:, :, 0]
+    linear = (to_body @ velocity[:, :, None] + centre @ angular[:, :, None])[:, :, 0]
     by_state = np.zeros((len(bodies), 6, exposure.covariance.shape[1]))
-    by_state[:, 3:, 3:6] = back @ cross_matrix(spin)
-    by_state[:, 3:, 9:12] = back
+    by_state[:, 3:, 3:6] = to_body @ cross_matrix(angular_velocity)
+    by_state[:, 3:, 9:12] = to_body
     by_state[:, :3] = centre @ by_state[:, 3:]
-    by_state[:, :3, 3:6] += back @ cross_matrix(velocity)
-    by_state[:, :3, 6:9] = back
+    by_state[:, :3, 3:6] += to_body @ cross_matrix(velocity)
+    by_state[:, :3, 6:9] = to_body
     covariance = by_state @ exposure.covariance @ np.swapaxes(by_state, 1, 2)
-    return np.concatenate([moved, turned], axis=1), covariance
+    return np.concatenate([linear, angular], axis=1), covariance
 
 
 def poses_alone(bodies: Sequence[Body], exposures: Sequence[TrackedExposure]) -> list[BodyPoses]:
     """Return the poses that each exposure gives alone, without a filter."""
-    frames = [one.frame for one in exposures]
-    alone = _by_body(frames, 'alone')
+    frames = [exposure.frame for exposure in exposures]
+    is_determined = _by_body(frames, 'alone')
     return _poses(
         bodies,
         exposures,
         pose=(_by_body(frames, 'rotation'), _by_body(frames, 'centre_mm')),
         noise=_by_body(frames, 'covariance_noise'),
         fixed=_by_body(frames, 'covariance_fixed'),
-        status=np.where(alone, PoseStatus.OK, PoseStatus.FAILED).astype(np.uint8),
+        status=np.where(is_determined, PoseStatus.OK, PoseStatus.FAILED).astype(np.uint8),
     )
 
 
 def _by_body(exposures: Sequence[object], name: str) -> np.ndarray:
     """Stack values (B, T, ...) of T exposures."""
-    return np.stack([getattr(one, name) for one in exposures], axis=1)
+    return np.stack([getattr(exposure, name) for exposure in exposures], axis=1)
 
 
 def _poses(
@@ -304,22 +306,22 @@ def _poses(
     """
     rotation, centre = pose
     arm = (rotation @ np.array([body.centre for body in bodies])[:, None, :, None])[..., 0]
-    move = np.zeros(noise.shape)
-    move[..., range(POSE_SIZE), range(POSE_SIZE)] = 1.0
-    move[..., :3, 3:] = cross_matrix(arm)
-    back = np.swapaxes(move, 2, 3)
+    transformation = np.zeros(noise.shape)
+    transformation[..., range(POSE_SIZE), range(POSE_SIZE)] = 1.0
+    transformation[..., :3, 3:] = cross_matrix(arm)
+    transposed = np.swapaxes(transformation, 2, 3)
     frames = np.array([body.frame_covariance for body in bodies])
     if frames.any():
-        axes = np.zeros_like(move)
+        axes = np.zeros_like(transformation)
         axes[..., :3, :3] = axes[..., 3:, 3:] = rotation
         fixed = fixed + axes @ frames[:, None] @ np.swapaxes(axes, 2, 3)
     position = centre - arm
-    noise = move @ noise @ back
-    fixed = move @ fixed @ back
-    rig_root = move @ _by_body(exposures, 'rig_root')
-    markers = _by_body([one.frame for one in exposures], 'markers')
-    number = np.array([one.number for one in exposures])
-    stamp_ns = np.array([one.stamp_ns for one in exposures])
+    noise = transformation @ noise @ transposed
+    fixed = transformation @ fixed @ transposed
+    rig_root = transformation @ _by_body(exposures, 'rig_root')
+    markers = _by_body([exposure.frame for exposure in exposures], 'markers')
+    number = np.array([exposure.number for exposure in exposures])
+    stamp_ns = np.array([exposure.stamp_ns for exposure in exposures])
     return [
         BodyPoses(
             body.name,
@@ -395,8 +397,8 @@ class JointTracker:
             self.error = DataError(f'joint {self.joint.name}: the neutral trial was not seen')
             return
         try:
-            both = (_joined(poses) for poses in zip(*collected))
-            self.joint = with_neutral(self.joint, *both)
+            trials = (_joined(poses) for poses in zip(*collected))
+            self.joint = with_neutral(self.joint, *trials)
             self.needs_neutral = False
         except DataError as error:
             self.error = error
@@ -405,10 +407,10 @@ class JointTracker:
 def _joined(poses: Sequence[BodyPoses]) -> BodyPoses:
     """Return the poses of several exposures as those of one trial."""
     names = [entry.name for entry in fields(BodyPoses) if entry.name != 'body']
-    joined: dict[str, Any] = {
-        name: np.concatenate([getattr(one, name) for one in poses]) for name in names
+    values: dict[str, Any] = {
+        name: np.concatenate([getattr(part, name) for part in poses]) for name in names
     }
-    return replace(poses[0], **joined)
+    return replace(poses[0], **values)
 
 
 def unknown_motion(motion: JointMotion) -> JointMotion:

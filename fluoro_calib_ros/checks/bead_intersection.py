@@ -37,8 +37,8 @@ class Beads:
 
     def without(self, target_id: NDArray[np.int64]) -> Beads:
         """Return the beads except those with a target id."""
-        keep = ~np.isin(self.target_id, target_id)
-        return Beads(*(getattr(self, name)[keep] for name in self.__dataclass_fields__))
+        is_kept = ~np.isin(self.target_id, target_id)
+        return Beads(*(getattr(self, name)[is_kept] for name in self.__dataclass_fields__))
 
     @property
     def misclosure(self) -> NDArray[np.float64]:
@@ -111,16 +111,18 @@ def least_chi2_without_a_ray(
     rays = rays_of(job, frames)
     out = np.zeros(len(target_id))
     for number, target in enumerate(target_id):
-        own = np.flatnonzero(rays.target_id == target)
-        count = len(own)
+        bead_rays = np.flatnonzero(rays.target_id == target)
+        count = len(bead_rays)
         # One copy of the bead for each excluded ray.
-        copy, used = np.nonzero(~np.eye(count, dtype=bool))
-        part = Rays(*(getattr(rays, name)[own[used]] for name in rays.__dataclass_fields__))
+        copy, remaining = np.nonzero(~np.eye(count, dtype=bool))
+        part = Rays(
+            *(getattr(rays, name)[bead_rays[remaining]] for name in rays.__dataclass_fields__)
+        )
         start = job.targets.xyz_mm[np.searchsorted(job.targets.target_id, target)]
         ids = np.full(count, target)
-        found = _beads(part, ids, copy, np.tile(start, (count, 1)), phantom)
-        if len(found.target_id) == count:
-            out[number] = found.chi2.min()
+        beads = _beads(part, ids, copy, np.tile(start, (count, 1)), phantom)
+        if len(beads.target_id) == count:
+            out[number] = beads.chi2.min()
     return out
 
 
@@ -143,8 +145,8 @@ def _beads(
         )
         r = rays.uv - ideal
         q = np.nan_to_num(np.sum(r * r, axis=1) / rays.variance, nan=np.inf)
-        agree = q <= INLIER_Q
-        weight = 1 / np.sqrt(np.maximum(q, 1.0)) if step < STEPS_L1 else agree
+        is_inlier = q <= INLIER_Q
+        weight = 1 / np.sqrt(np.maximum(q, 1.0)) if step < STEPS_L1 else is_inlier
         weight = weight / rays.variance
         normal = np.zeros((len(points), 3, 3))
         right = np.zeros((len(points), 3))
@@ -155,7 +157,7 @@ def _beads(
         normal += DAMPING * np.eye(3)
         points = points + np.linalg.solve(normal, right[..., None])[..., 0]
     covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
-    views = np.bincount(bead, agree, len(points)).astype(int)
+    views = np.bincount(bead, is_inlier, len(points)).astype(int)
     seen = np.bincount(bead, minlength=len(points))
     valid = (views >= MIN_RAYS) & (2 * views > seen)
     valid &= np.sqrt(np.trace(covariance, axis1=1, axis2=2)) < MAX_SD_MM
@@ -173,7 +175,7 @@ def _beads(
 def distances(beads: Beads) -> DistanceComparison:
     """Compare the distances between all pairs of beads with the survey; needs two or more."""
     i, j = np.triu_indices(len(beads.target_id), 1)
-    found = beads.xyz_mm[j] - beads.xyz_mm[i]
+    offset = beads.xyz_mm[j] - beads.xyz_mm[i]
     surveyed = beads.survey_mm[j] - beads.survey_mm[i]
     length = np.linalg.norm(surveyed, axis=1)
     direction = surveyed / np.maximum(length, 1e-9)[:, None]
@@ -181,7 +183,7 @@ def distances(beads: Beads) -> DistanceComparison:
     variance = np.stack(
         [np.einsum('na,nab,nb->n', direction, total[k], direction) for k in (i, j)]
     )
-    error = np.linalg.norm(found, axis=1) - length
+    error = np.linalg.norm(offset, axis=1) - length
     scale, scale_sd = _scale(beads)
     return DistanceComparison(
         float(np.sqrt(np.mean(error**2))),
@@ -208,8 +210,8 @@ def _degrees_of_freedom(
     products = direction[:, :, None] * direction[:, None, :]
     for index in np.triu_indices(len(covariance), 1):
         np.add.at(diagonal, index, products)
-    own = diagonal @ covariance
-    squares = 2 * np.sum(variance[0] * variance[1]) + np.sum(own * own.transpose(0, 2, 1))
+    product = diagonal @ covariance
+    squares = 2 * np.sum(variance[0] * variance[1]) + np.sum(product * product.transpose(0, 2, 1))
     return float(np.sum(variance) ** 2 / squares)
 
 

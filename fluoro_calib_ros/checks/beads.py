@@ -73,16 +73,16 @@ class DisplacedLayer:
         """Description of the displacement."""
         name = 'xyz'[self.axis]
         if self.low is None:
-            where = f'the face of the phantom with {name} < {self.high:.0f} mm'
+            layer = f'the face of the phantom with {name} < {self.high:.0f} mm'
         elif self.high is None:
-            where = f'the face of the phantom with {name} > {self.low:.0f} mm'
+            layer = f'the face of the phantom with {name} > {self.low:.0f} mm'
         else:
-            where = (
+            layer = (
                 f'the layer of the phantom with {name} from {self.low:.0f} to {self.high:.0f} mm'
             )
         x, y, z = self.shift_mm
         return (
-            f'{where} ({len(self.target_id)} beads) is displaced as a whole against its survey: '
+            f'{layer} ({len(self.target_id)} beads) is displaced as a whole against its survey: '
             f'by {np.linalg.norm(self.shift_mm):.1f} mm ({x:.1f}, {y:.1f}, {z:.1f}) and tilted by '
             f'{np.rad2deg(self.tilt_rad):.2f} deg'
         )
@@ -108,8 +108,8 @@ class _Candidate:
         count = len(self.order)
         if 2 * (self.stop - self.start) != count or (self.start and self.stop < count):
             return [self]
-        other = (self.stop, count) if self.start == 0 else (0, self.start)
-        return [self, replace(self, start=other[0], stop=other[1])]
+        complement = (self.stop, count) if self.start == 0 else (0, self.start)
+        return [self, replace(self, start=complement[0], stop=complement[1])]
 
 
 def displaced_layer(beads: Beads) -> DisplacedLayer | None:
@@ -117,11 +117,11 @@ def displaced_layer(beads: Beads) -> DisplacedLayer | None:
     if len(beads.target_id) < 2 * MIN_LAYER:
         return None
     fit = _Fit(beads)
-    tried = [candidate for axis in range(3) for candidate in fit.candidates(axis)]
-    if not tried:
+    candidates = [candidate for axis in range(3) for candidate in fit.candidates(axis)]
+    if not candidates:
         return None
-    best = max(tried, key=lambda candidate: candidate.gain)
-    critical = float(chdtri(POSE_SIZE, CONTRADICTION / len(tried)))
+    best = max(candidates, key=lambda candidate: candidate.gain)
+    critical = float(chdtri(POSE_SIZE, CONTRADICTION / len(candidates)))
     if (
         best.gain < critical
         or fit.excess <= 0
@@ -130,8 +130,8 @@ def displaced_layer(beads: Beads) -> DisplacedLayer | None:
     ):
         return None
     # Of two equal plates either may have moved against the other: choose the smaller motion.
-    found = [fit.described(candidate, critical) for candidate in best.halves()]
-    return min(found, key=lambda layer: float(np.linalg.norm(layer.shift_mm)))
+    layers = [fit.described(candidate, critical) for candidate in best.halves()]
+    return min(layers, key=lambda layer: float(np.linalg.norm(layer.shift_mm)))
 
 
 class _Fit:
@@ -150,18 +150,18 @@ class _Fit:
     @property
     def excess(self) -> float:
         """Weighted sum of squares after one motion of all beads, minus its expectation."""
-        left = self._beads.misclosure - self._design @ self._all.motion
-        return float(self._squares(left, slice(None)).sum() - 3 * len(left))
+        misclosure = self._beads.misclosure - self._design @ self._all.motion
+        return float(self._squares(misclosure, slice(None)).sum() - 3 * len(misclosure))
 
     def candidates(self, axis: int) -> list[_Candidate]:
         """Return the layers along an axis, with the gain of their own motion."""
         coordinate = self._beads.survey_mm[:, axis]
         order = np.argsort(coordinate, kind='stable')
         start, stop = _layers(coordinate[order], self._beads.survey_sd_mm[order]).T
-        own = _Equations(
+        equations = _Equations(
             _sums(self._normals[order], start, stop), _sums(self._rights[order], start, stop)
         )
-        gain = own.decrease + self._all.without(own).decrease - self._all.decrease
+        gain = equations.decrease + self._all.without(equations).decrease - self._all.decrease
         return [
             _Candidate(axis, order, *bounds)
             for bounds in zip(start.tolist(), stop.tolist(), gain.tolist())
@@ -169,17 +169,19 @@ class _Fit:
 
     def improvement(self, candidate: _Candidate) -> float:
         """Return the factor by which its own motion decreases the median square of a layer."""
-        own = candidate.own
-        motions = self._motion_and_rest(own)
+        rows = candidate.own
+        motions = self._motion_and_rest(rows)
         after, before = (
-            np.median(self._squares(self._beads.misclosure[own] - self._design[own] @ motion, own))
+            np.median(
+                self._squares(self._beads.misclosure[rows] - self._design[rows] @ motion, rows)
+            )
             for motion in motions
         )
         return float(before / after)
 
     def described(self, candidate: _Candidate, critical: float) -> DisplacedLayer:
         """Return a layer with its relative motion; critical: largest gain without significance."""
-        own = candidate.own
+        rows = candidate.own
         survey = self._beads.survey_mm
         coordinate = survey[candidate.order, candidate.axis]
 
@@ -188,16 +190,16 @@ class _Fit:
                 return None
             return float(coordinate[at - 1 : at + 1].mean())
 
-        motion, rest = self._motion_and_rest(own)
-        relative = motion - rest
-        moved = self._design[own] @ relative
-        size = float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
-        middle = by_pose(survey[own].mean(axis=0) - self._centre)
+        motion, motion_of_others = self._motion_and_rest(rows)
+        relative = motion - motion_of_others
+        shifts = self._design[rows] @ relative
+        size = float(np.sqrt(np.mean(np.sum(shifts**2, axis=1))))
+        middle = by_pose(survey[rows].mean(axis=0) - self._centre)
         return DisplacedLayer(
             candidate.axis,
             border(candidate.start),
             high=border(candidate.stop),
-            target_id=self._beads.target_id[own],
+            target_id=self._beads.target_id[rows],
             shift_mm=middle @ relative,
             tilt_rad=float(np.linalg.norm(relative[3:])),
             size_mm=size,
@@ -208,8 +210,8 @@ class _Fit:
         self, own: NDArray[np.int64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the motions (6,) of the given beads and of all other beads."""
-        layer = _Equations(self._normals[own].sum(axis=0), self._rights[own].sum(axis=0))
-        return layer.motion, self._all.without(layer).motion
+        equations = _Equations(self._normals[own].sum(axis=0), self._rights[own].sum(axis=0))
+        return equations.motion, self._all.without(equations).motion
 
     def _squares(
         self, left: NDArray[np.float64], rows: NDArray[np.int64] | slice
@@ -228,8 +230,8 @@ def _layers(coordinate: NDArray[np.float64], sd: NDArray[np.float64]) -> NDArray
     gaps = np.argsort(-gap, kind='stable')[:BORDERS] + 1
     regular = np.linspace(0, count, BORDERS // 2).astype(int)[1:-1]
     inner = np.concatenate([gaps, regular])
-    clear = gap > BORDER_SDS * np.hypot(sd[1:], sd[:-1])
-    borders = np.unique(np.concatenate([[0, count], inner[clear[inner - 1]]]))
+    is_border = gap > BORDER_SDS * np.hypot(sd[1:], sd[:-1])
+    borders = np.unique(np.concatenate([[0, count], inner[is_border[inner - 1]]]))
     pairs = borders[np.stack(np.triu_indices(len(borders), 1), axis=1)]
     size = pairs[:, 1] - pairs[:, 0]
     return pairs[(size >= MIN_LAYER) & (size <= count // 2)]
@@ -276,23 +278,23 @@ DISTANCES_LIMIT = 1.12
 
 def check_beads(evidence: Evidence, names: Sequence[str]) -> list[Check]:
     """Compare the beads intersected from all fluoroscopes with their survey."""
-    found = intersect(evidence.result, evidence.frames, evidence.phantom)
-    has_trend = any(common.is_significant for common in evidence.trends.values())
+    intersected = intersect(evidence.result, evidence.frames, evidence.phantom)
+    has_trend = any(trend.is_significant for trend in evidence.trends.values())
 
     def least_chi2(target_id: NDArray[np.int64]) -> NDArray[np.float64]:
         return least_chi2_without_a_ray(
             evidence.result, evidence.frames, evidence.phantom, target_id
         )
 
-    checks = compare_with_survey(found, has_trend, least_chi2)
+    checks = compare_with_survey(intersected, has_trend, least_chi2)
     result = evidence.result
     exchanged = exchanged_beads(rays_of(result, evidence.frames), result.targets)
-    doubted = rejected_beads(result.residuals)
+    doubtful = rejected_beads(result.residuals)
     is_wrong = any(check.passed is False for check in checks)
     if len(exchanged) and (not is_wrong or set(checks[0].place.target_id) <= set(exchanged.flat)):
         checks[0] = _exchanged(exchanged).after_trend(has_trend)
-    elif len(doubted) and not is_wrong:
-        checks[0] = _rejected(doubted).after_trend(has_trend)
+    elif len(doubtful) and not is_wrong:
+        checks[0] = _rejected(doubtful).after_trend(has_trend)
     return checks
 
 
@@ -309,13 +311,13 @@ def rejected_beads(residuals: ResidualTable | None) -> NDArray[np.int64]:
     seen = np.bincount(bead)
     rejected = np.bincount(bead, residuals.outlier)
     chance = bdtrc(rejected - 1, seen, np.mean(residuals.outlier))
-    doubted = (2 * rejected > seen) & (chance * len(target_id) < FALSE_ALARM)
-    several = seen > 1
-    expected = np.exp(np.bincount(bead, np.log(_rate_of_exposure(residuals))))[several].sum()
-    without = several & (rejected == seen)
-    if pdtrc(np.count_nonzero(without) - 1, expected) < FALSE_ALARM:
-        doubted |= without
-    return target_id[doubted]
+    doubtful = (2 * rejected > seen) & (chance * len(target_id) < FALSE_ALARM)
+    seen_often = seen > 1
+    expected = np.exp(np.bincount(bead, np.log(_rate_of_exposure(residuals))))[seen_often].sum()
+    never_accepted = seen_often & (rejected == seen)
+    if pdtrc(np.count_nonzero(never_accepted) - 1, expected) < FALSE_ALARM:
+        doubtful |= never_accepted
+    return target_id[doubtful]
 
 
 def _rate_of_exposure(residuals: ResidualTable) -> NDArray[np.float64]:
@@ -376,7 +378,7 @@ def compare_with_survey(
     if least_chi2 is not None and len(suspects):
         square[suspects] = np.minimum(square[suspects], least_chi2(beads.target_id[suspects]))
     order = np.argsort(-square)
-    wrong = order[square[order] > limit]
+    wrong_rows = order[square[order] > limit]
     size = np.linalg.norm(beads.misclosure, axis=1)
     worst = order[0]
     named = beads.target_id[[worst]]
@@ -393,12 +395,12 @@ def compare_with_survey(
         named = layer.target_id
         cause = layer.cause
         numbers |= layer.numbers
-        if not len(wrong):
+        if not len(wrong_rows):
             value = layer.size_mm
             highest = layer.limit_mm
-    elif len(wrong) and not has_trend:
-        named = beads.target_id[wrong]
-        cause = _wrong_beads(named, size[wrong])
+    elif len(wrong_rows) and not has_trend:
+        named = beads.target_id[wrong_rows]
+        cause = _wrong_beads(named, size[wrong_rows])
     check = Check(
         Kind.BEADS,
         cause,
@@ -429,8 +431,10 @@ def _not_made(kind: Kind, count: int) -> Check:
 
 def _wrong_beads(target_id: NDArray[np.int64], size: NDArray[np.float64]) -> str:
     """Return the names of the beads with a wrong survey, and their errors [mm], as text."""
-    wrong = first_few(f'{target} is wrong by {mm:.1f} mm' for target, mm in zip(target_id, size))
-    return f'the survey of bead {wrong}'
+    description = first_few(
+        f'{target} is wrong by {mm:.1f} mm' for target, mm in zip(target_id, size)
+    )
+    return f'the survey of bead {description}'
 
 
 def _check_distances(beads: Beads, has_trend: bool) -> Check:
@@ -439,18 +443,18 @@ def _check_distances(beads: Beads, has_trend: bool) -> Check:
             Kind.DISTANCES,
             'check distances could not be made, too few beads agree with their survey',
         )
-    found = distances(beads)
-    by_chance = float(np.sqrt(chdtri(found.freedom, FALSE_ALARM) / found.freedom))
+    measured = distances(beads)
+    by_chance = float(np.sqrt(chdtri(measured.freedom, FALSE_ALARM) / measured.freedom))
     return Check(
         Kind.DISTANCES,
-        f'distances between beads differ from the survey by {found.rmse_mm:.3f} mm, '
-        f'{found.expected_mm:.3f} mm are expected (scale {1 + found.scale:.6f}, '
-        f'sd {found.scale_sd:.6f})',
+        f'distances between beads differ from the survey by {measured.rmse_mm:.3f} mm, '
+        f'{measured.expected_mm:.3f} mm are expected (scale {1 + measured.scale:.6f}, '
+        f'sd {measured.scale_sd:.6f})',
         advice='the survey is less precise than its sd says, or the calibration is wrong if other '
         'checks fail too; survey the phantom again, or give a larger sd',
-        numbers={'scale': 1 + found.scale, 'scale_sd': found.scale_sd},
-        value=found.rmse_mm,
-        limit=max(DISTANCES_LIMIT, by_chance) * found.expected_mm,
+        numbers={'scale': 1 + measured.scale, 'scale_sd': measured.scale_sd},
+        value=measured.rmse_mm,
+        limit=max(DISTANCES_LIMIT, by_chance) * measured.expected_mm,
         unit='mm',
     ).after_trend(has_trend)
 

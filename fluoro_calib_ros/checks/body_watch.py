@@ -118,12 +118,12 @@ class BodyWatch:
         self._variance = np.zeros(shape)
         self._known = np.ones(shape, dtype=bool)  # padding without a marker counts as known
         for row, body in enumerate(bodies):
-            own = slice(len(body.target_id))
+            columns = slice(len(body.target_id))
             known = body.known
-            target_id[row, own] = body.target_id
-            self._known[row, own] = known
-            self._xyz[row, own] = np.where(known[:, None], body.xyz_mm, 0.0)
-            self._variance[row, own] = np.where(known, body.sd_mm, 0.0) ** 2
+            target_id[row, columns] = body.target_id
+            self._known[row, columns] = known
+            self._xyz[row, columns] = np.where(known[:, None], body.xyz_mm, 0.0)
+            self._variance[row, columns] = np.where(known, body.sd_mm, 0.0) ** 2
         self._cameras = Cameras(self._orientation, target_id)
 
     def add(self, exposure: IntersectedViews) -> None:
@@ -133,9 +133,9 @@ class BodyWatch:
         points = self._cameras.sorted(exposure)
         places = self._cameras.places(exposure)
         # Depth needs two intersecting rays.
-        there = (points.seen.sum(axis=2) > 1) & np.isfinite(places).all(axis=2)
-        points = replace(points, seen=points.seen & there[..., None])
-        self._seen.append(_Seen(points, np.where(there[..., None], places, np.nan)))
+        has_place = (points.seen.sum(axis=2) > 1) & np.isfinite(places).all(axis=2)
+        points = replace(points, seen=points.seen & has_place[..., None])
+        self._seen.append(_Seen(points, np.where(has_place[..., None], places, np.nan)))
 
     def block(self) -> BodyBlock | None:
         """Return the statistics of the exposures since the last call, or None without any.
@@ -146,9 +146,9 @@ class BodyWatch:
             return None
         seen, self._seen = self._seen, []
         if not self._known.all():
-            unknown = [one.points.seen.any(axis=2) & ~self._known for one in seen]
+            unknown = [exposure.points.seen.any(axis=2) & ~self._known for exposure in seen]
             self._blocks += np.any(unknown, axis=0)
-            new = [one for one, of_it in zip(seen, unknown) if of_it.any()]
+            new = [exposure for exposure, is_unknown in zip(seen, unknown) if is_unknown.any()]
             self._learning = (self._learning + new)[-MAX_LEARNING:]
         return self._statistics(_joined(seen), len(seen))
 
@@ -157,13 +157,13 @@ class BodyWatch:
 
         Call it after the start of the stream. A marker that appears later is learned later.
         """
-        fresh = ~self._known & (self._blocks >= self._least_blocks)
-        rows = np.flatnonzero(fresh.any(axis=1))
+        learnable = ~self._known & (self._blocks >= self._least_blocks)
+        rows = np.flatnonzero(learnable.any(axis=1))
         if not len(rows):
             return
         bodies = list(self.bodies)
         for row in rows.tolist():
-            bodies[row] = self._learned(row, fresh[row])
+            bodies[row] = self._learned(row, learnable[row])
         self._blocks[rows] = 0
         self._set_bodies(bodies)
         if self._known.all():
@@ -173,59 +173,61 @@ class BodyWatch:
         """Return a body with learned places of fresh (M,) markers; known places do not change."""
         body = self.bodies[row]
         count = len(body.target_id)
-        wanted = (fresh | self._known[row])[:count]
-        every = max(1, len(self._learning) // LEARNED)
-        seen = [one for one in self._learning[::every] if one.points.seen[row].any()]
-        points = _joined([_row(one, row) for one in seen]).points
+        is_used = (fresh | self._known[row])[:count]
+        step = max(1, len(self._learning) // LEARNED)
+        seen = [exposure for exposure in self._learning[::step] if exposure.points.seen[row].any()]
+        points = _joined([_row(exposure, row) for exposure in seen]).points
         xyz = np.where(
-            wanted[:, None], np.stack([one.places[row, :count] for one in seen]), np.nan
+            is_used[:, None], np.stack([exposure.places[row, :count] for exposure in seen]), np.nan
         )
-        places = np.nan_to_num(np.stack([one.places[row] for one in seen]))
+        places = np.nan_to_num(np.stack([exposure.places[row] for exposure in seen]))
         weight = np.where(points.seen, 1 / points.noise, 0.0)
-        still = (np.eye(3)[None], np.zeros((1, 3)))
-        information, _ = marker_sums(self._cameras.linear(places, still, points), weight)
+        identity = (np.eye(3)[None], np.zeros((1, 3)))
+        information, _ = marker_sums(self._cameras.linear(places, identity, points), weight)
         known = np.asarray(np.isfinite(xyz).all(axis=2))
-        of_known = np.where(known[..., None, None], information[:, :count], np.eye(3))
-        covariance = np.linalg.inv(of_known)
-        found = learned_shape(body, xyz, covariance)
-        new = found.known & ~body.known
+        known_information = np.where(known[..., None, None], information[:, :count], np.eye(3))
+        covariance = np.linalg.inv(known_information)
+        shape = learned_shape(body, xyz, covariance)
+        new = shape.known & ~body.known
         return replace(
             body,
-            xyz_mm=np.where(new[:, None], found.xyz_mm, body.xyz_mm),
-            sd_mm=np.where(new, found.sd_mm, body.sd_mm),
+            xyz_mm=np.where(new[:, None], shape.xyz_mm, body.xyz_mm),
+            sd_mm=np.where(new, shape.sd_mm, body.sd_mm),
         )
 
     def _statistics(self, seen: _Seen, exposures: int) -> BodyBlock:
         """Return the statistics of the bodies in exposures, all of which are solved at once."""
-        there = seen.points.seen.any(axis=2) & np.tile(self._known, (exposures, 1))
-        rows = np.flatnonzero(np.count_nonzero(there, axis=1) > 1)
+        has_marker = seen.points.seen.any(axis=2) & np.tile(self._known, (exposures, 1))
+        rows = np.flatnonzero(np.count_nonzero(has_marker, axis=1) > 1)
         shape = (COMPONENTS * len(self._sizes), len(self._areas))
         if not len(rows):
-            nothing = np.zeros((len(self.bodies), *shape))
-            return BodyBlock(nothing, nothing, np.zeros(shape), np.zeros(shape, bool), 0)
+            zeros = np.zeros((len(self.bodies), *shape))
+            return BodyBlock(zeros, zeros, np.zeros(shape), np.zeros(shape, bool), 0)
         body = rows % len(self.bodies)
-        there = there[rows]
+        has_marker = has_marker[rows]
         points = ImagePoints(*(getattr(seen.points, e.name)[rows] for e in fields(ImagePoints)))
-        points = replace(points, seen=points.seen & there[..., None])
-        places = np.where(there[..., None], seen.places[rows], 0.0)
-        pose = fitted_pose(self._xyz[body], places, there.astype(float))
+        points = replace(points, seen=points.seen & has_marker[..., None])
+        places = np.where(has_marker[..., None], seen.places[rows], 0.0)
+        pose = fitted_pose(self._xyz[body], places, has_marker.astype(float))
         linear = self._cameras.linear(self._xyz[body], pose, points)
         drift = _Drift.of(linear, points, self._variance[body])
         inside = self._inside(points)
-        told = _by_area(drift, self._clipped(drift), inside)
+        statistics = _by_area(drift, self._clipped(drift), inside)
         score, information, amplitude = np.zeros((3, len(self.bodies), *shape))
-        for total, values in zip((score, information, amplitude), told):
+        for total, values in zip((score, information, amplitude), statistics):
             np.add.at(total, body, values)
         with np.errstate(divide='ignore', invalid='ignore'):
             systematic = amplitude.sum(axis=0) / information.sum(axis=0)
-        within = inside.sum(axis=2)
-        pairs = (within * (there.sum(axis=1)[:, None, None] - within)).sum(axis=0)
+        markers_inside = inside.sum(axis=2)
+        pairs = (markers_inside * (has_marker.sum(axis=1)[:, None, None] - markers_inside)).sum(
+            axis=0
+        )
         return BodyBlock(
             score,
             information,
             COMMON_SYSTEMATIC * systematic,
             np.repeat(pairs > MIN_PAIRS * exposures, COMPONENTS, axis=0),
-            int(there.sum()),
+            int(has_marker.sum()),
         )
 
     def _inside(self, points: ImagePoints) -> NDArray[np.float64]:
@@ -246,26 +248,28 @@ class BodyWatch:
         """
         options = self._options
         noise = np.sqrt(chdtri(3, erfc(options.clip / np.sqrt(2))))
-        strongest = np.sqrt(drift.square.max(axis=(2, 3)))
+        largest = np.sqrt(drift.square.max(axis=(2, 3)))
         limit = (
             noise
             + options.band_start * np.sqrt(3 * drift.systematic)
-            + (options.tolerance_px + 2 * options.step_px) * strongest
+            + (options.tolerance_px + 2 * options.step_px) * largest
         )
         count = len(limit)
         gradient = drift.pulled @ drift.displacement[..., None]
-        told = np.concatenate([drift.pulled @ drift.by_pose, gradient], axis=3)
-        told = told.reshape(count, -1, POSE_SIZE * (POSE_SIZE + 1))
+        contributions = np.concatenate([drift.pulled @ drift.by_pose, gradient], axis=3)
+        contributions = contributions.reshape(count, -1, POSE_SIZE * (POSE_SIZE + 1))
         p = drift.displacement
         for _ in range(REWEIGHTINGS):
             length = np.sqrt(np.sum(p * (drift.s_matrix @ p[..., None])[..., 0], axis=2))
             weight = np.minimum(1.0, limit / np.maximum(length, 1e-9))[..., None]
-            sums = (weight.transpose(0, 2, 1) @ told).reshape(count, POSE_SIZE, POSE_SIZE + 1)
+            sums = (weight.transpose(0, 2, 1) @ contributions).reshape(
+                count, POSE_SIZE, POSE_SIZE + 1
+            )
             step = _inverse(sums[..., :POSE_SIZE]) @ sums[..., POSE_SIZE:]
             p = drift.displacement - (drift.by_pose @ step[:, None])[..., 0]
         p = p * weight
-        taken = drift.inverse @ (drift.pulled @ p[..., None]).sum(axis=1)
-        return p - (drift.by_pose @ taken[:, None])[..., 0]
+        absorbed = drift.inverse @ (drift.pulled @ p[..., None]).sum(axis=1)
+        return p - (drift.by_pose @ absorbed[:, None])[..., 0]
 
 
 @dataclass(frozen=True)
@@ -322,7 +326,7 @@ def _by_area(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return score, information, systematic error of the score (n, 2F, A) of shifts of areas."""
     n, views, markers, areas = inside.shape
-    told = np.concatenate(
+    columns = np.concatenate(
         [
             (drift.weighted @ displacement[:, :, None, :, None])[..., 0],
             drift.square,
@@ -330,13 +334,13 @@ def _by_area(
         ],
         axis=3,
     )
-    sums = np.swapaxes(inside, 2, 3) @ np.swapaxes(told, 1, 2)  # (n, F, A, .)
-    taken = sums[..., 2 * COMPONENTS :].reshape(n, views, areas, COMPONENTS, POSE_SIZE)
-    taken = np.sum((taken @ drift.inverse[:, None, None]) * taken, axis=-1)
-    information = np.maximum(sums[..., COMPONENTS : 2 * COMPONENTS] - taken, 0.0)
+    sums = np.swapaxes(inside, 2, 3) @ np.swapaxes(columns, 1, 2)  # (n, F, A, .)
+    absorbed = sums[..., 2 * COMPONENTS :].reshape(n, views, areas, COMPONENTS, POSE_SIZE)
+    absorbed = np.sum((absorbed @ drift.inverse[:, None, None]) * absorbed, axis=-1)
+    information = np.maximum(sums[..., COMPONENTS : 2 * COMPONENTS] - absorbed, 0.0)
     # A systematic error of the images affects the score like noise, but in all exposures.
-    there = inside.any(axis=(1, 3)).sum(axis=1)
-    share = drift.systematic.sum(axis=1) / there
+    marker_count = inside.any(axis=(1, 3)).sum(axis=1)
+    share = drift.systematic.sum(axis=1) / marker_count
     amplitude = np.sqrt(share[:, None, None, None] * information)
     score, information, amplitude = (
         np.swapaxes(values, 2, 3).reshape(n, -1, areas)
@@ -349,11 +353,11 @@ def _joined(seen: Sequence[_Seen]) -> _Seen:
     """Return all exposures as a single one with correspondingly more bodies."""
     points = ImagePoints(
         *(
-            np.concatenate([getattr(one.points, entry.name) for one in seen])
+            np.concatenate([getattr(exposure.points, entry.name) for exposure in seen])
             for entry in fields(ImagePoints)
         )
     )
-    return _Seen(points, np.concatenate([one.places for one in seen]))
+    return _Seen(points, np.concatenate([exposure.places for exposure in seen]))
 
 
 def _row(seen: _Seen, row: int) -> _Seen:

@@ -102,7 +102,7 @@ class Evidence:
         residuals = residuals_of(self.result, name, self.frames[name])
         noise = noise_of(residuals, calibration, self.frames[name])
         inliers = residuals.inliers(noise)
-        claimed = float(
+        correction_sd = float(
             np.sqrt(np.mean(calibration.correction(inliers.uv, inliers.angle).sd ** 2))
         )
         size = calibration.image_size
@@ -114,7 +114,7 @@ class Evidence:
         return CommonTrend(
             inliers,
             common_trend(inliers, size),
-            claimed,
+            correction_sd,
             area,
             rejected_exposure(rejected, inliers),
         )
@@ -131,9 +131,9 @@ class Evidence:
         targets = self.result.targets
         return EarlierCalibration(
             {
-                name: one.model.series
-                for name, one in self.calibrations.items()
-                if one.model.series
+                name: calibration.model.series
+                for name, calibration in self.calibrations.items()
+                if calibration.model.series
             },
             frozenset(varying),
             noise_of_calibrations(self.request.options.loss, self.calibrations.values()),
@@ -144,8 +144,8 @@ class Evidence:
     def _is_varying(self, name: str) -> bool:
         if self.calibrations[name].angle_field is not None:
             return True
-        found = self.variations[name]
-        return found is not None and found.is_varying
+        estimate = self.variations[name]
+        return estimate is not None and estimate.is_varying
 
     @cached_property
     def variations(self) -> dict[str, Variation | None]:
@@ -186,9 +186,9 @@ class Evidence:
         if options.model == CollocationModel.kind:
             starts = replace(self.starts, earlier=self.earlier)
             with contextlib.suppress(DataError):
-                found = calibrate_part(part, starts, self.calibrations)
-                if not self._has_lost_points(found, frames):
-                    return found
+                calibrations = calibrate_part(part, starts, self.calibrations)
+                if not self._has_lost_points(calibrations, frames):
+                    return calibrations
         # The part has a different gauge. With a large distortion, outliers can prevent the
         # exposures of a part from reaching it.
         return calibrate_part(part, self.starts, self.calibrations)
@@ -204,9 +204,9 @@ class Evidence:
     def _has_lost_points(self, found: Calibrations, frames: Frames) -> bool:
         """Return whether a part rejects clearly more image points than the whole."""
         for name, calibration in found.items():
-            kept = _share_of_inliers(calibration, frames[name])
-            of_whole = _share_of_inliers(self.calibrations[name], self.frames[name])
-            if kept < of_whole - MAX_LOST:
+            share = _share_of_inliers(calibration, frames[name])
+            share_of_whole = _share_of_inliers(self.calibrations[name], self.frames[name])
+            if share < share_of_whole - MAX_LOST:
                 return True
         return False
 

@@ -131,5 +131,5 @@ def too_little_data(kind: Kind, fluoroscope: str, reason: str, count: int) -> Ch
 
 def more_exposures(count: int) -> str:
     """Return the advice on how many exposures to record in addition to `count`."""
-    more = max(RECOMMENDED_EXPOSURES - count, MIN_MORE_EXPOSURES)
-    return f'take {more} more exposures (there are {count})'
+    number = max(RECOMMENDED_EXPOSURES - count, MIN_MORE_EXPOSURES)
+    return f'take {number} more exposures (there are {count})'

@@ -78,11 +78,11 @@ def difference(
     """
     grid = image_grid(one.image_size)
     corrections = at_common_angle(grid, one, other)
-    both = ~(corrections[0].outside | corrections[1].outside)
-    if both.sum() < MIN_PIXELS:
+    inside = ~(corrections[0].outside | corrections[1].outside)
+    if inside.sum() < MIN_PIXELS:
         return None
-    parts = [_part(correction, both) for correction in corrections]
-    return _difference(grid[both], (one.interior, other.interior), parts)
+    parts = [_part(correction, inside) for correction in corrections]
+    return _difference(grid[inside], (one.interior, other.interior), parts)
 
 
 def _part(correction: Correction, rows: NDArray[np.bool_]) -> Correction:
@@ -112,9 +112,9 @@ def _difference(
 def place_name(uv: ArrayLike, image_size: tuple[int, int]) -> str:
     """Return the name of the ninth of the image with a pixel (2,), such as 'upper left'."""
     column, row = cells_of(uv, image_size, 3)
-    across = ('left', 'middle', 'right')[column]
-    down = ('upper', 'middle', 'lower')[row]
-    return 'middle' if across == down else f'{down} {across}'
+    horizontal = ('left', 'middle', 'right')[column]
+    vertical = ('upper', 'middle', 'lower')[row]
+    return 'middle' if horizontal == vertical else f'{vertical} {horizontal}'
 
 
 def describe_place(uv: ArrayLike, image_size: tuple[int, int]) -> str:
@@ -193,14 +193,14 @@ def compare_calibrations(
         raise DataError(f'fluoroscope {name}: the images are {sizes[0]} and {sizes[1]}')
     _, uv = cell_centres(first.image_size, CELLS)
     fields = at_common_angle(uv, first, second)
-    common = ~(fields[0].outside | fields[1].outside)
-    if common.sum() < MIN_PIXELS:
+    inside = ~(fields[0].outside | fields[1].outside)
+    if inside.sum() < MIN_PIXELS:
         raise DataError(
             f'fluoroscope {name}: the calibrated areas have hardly any image in common'
         )
-    uv = uv[common]
-    parts = [_part(field, common) for field in fields]
-    found = _difference(uv, (first.interior, second.interior), parts)
+    uv = uv[inside]
+    parts = [_part(field, inside) for field in fields]
+    compared = _difference(uv, (first.interior, second.interior), parts)
     covariance = first.interior_covariance + second.interior_covariance
     difference = second.interior - first.interior
     if first.interior_estimated and second.interior_estimated:
@@ -214,8 +214,8 @@ def compare_calibrations(
         interior_test=test,
         interior_limit=limit,
         uv=uv,
-        duv=found.duv,  # rays change by the negative correction
-        sd=found.sd,
+        duv=compared.duv,  # rays change by the negative correction
+        sd=compared.sd,
     )
 
 

@@ -243,11 +243,13 @@ class EpipolarObservations:
 
     def usable(self) -> EpipolarObservations:
         """Return the rows that are finite and have positive standard deviations and factors."""
-        good = (self.sd_noise > 0) & (self.factor_a > 0) & (self.factor_b > 0)
+        is_usable = (self.sd_noise > 0) & (self.factor_a > 0) & (self.factor_b > 0)
         for field in fields(self):
             finite = np.isfinite(getattr(self, field.name))
-            good &= finite if finite.ndim == 1 else finite.all(axis=1)
-        return EpipolarObservations(*(getattr(self, field.name)[good] for field in fields(self)))
+            is_usable &= finite if finite.ndim == 1 else finite.all(axis=1)
+        return EpipolarObservations(
+            *(getattr(self, field.name)[is_usable] for field in fields(self))
+        )
 
     @classmethod
     def concatenate(cls, parts: Sequence[EpipolarObservations]) -> EpipolarObservations:
@@ -302,20 +304,23 @@ class ImageAreas:
         """Return corners (u0, v0, u1, v1) [px] of an area in an image of a size, and its name."""
         u0, v0, u1, v1 = self.box[area]
         corners = tuple(float(x) for x in self.box[area] * np.tile(size, 2) - 0.5)
-        across = _side(u0 + u1, 'left', 'right')
-        down = _side(v0 + v1, 'upper', 'lower')
+        horizontal = _side(u0 + u1, 'left', 'right')
+        vertical = _side(v0 + v1, 'upper', 'lower')
         width = u1 - u0
         height = v1 - v0
         if width == 1 and height == 1:
             return corners, 'whole image'
         if width == 1 or height == 1:
-            return corners, f'{across if height == 1 else down} half'
+            return corners, f'{horizontal if height == 1 else vertical} half'
         if width < 0.5:
             middle = self.box[area].reshape(2, 2).mean(axis=0) * size - 0.5
-            return corners, f'{down} {across} quarter, about ({middle[0]:.0f}, {middle[1]:.0f}) px'
-        if 'middle' in (across, down):
-            return corners, 'middle' if across == down else f'{down} {across}'
-        return corners, f'{down} {across} quarter'
+            return (
+                corners,
+                f'{vertical} {horizontal} quarter, about ({middle[0]:.0f}, {middle[1]:.0f}) px',
+            )
+        if 'middle' in (horizontal, vertical):
+            return corners, 'middle' if horizontal == vertical else f'{vertical} {horizontal}'
+        return corners, f'{vertical} {horizontal} quarter'
 
 
 def _side(edges: float, low: str, high: str) -> str:
@@ -395,9 +400,9 @@ class CusumCharts:
             gain = step * (sign * score - band * information - step / 2 * information) / factor
         max_gain = self._cap / EVIDENCE_CAP / MIN_BLOCKS_TO_ALARM
         gain = np.where(seen & testing, np.minimum(gain, max_gain), 0.0)
-        fresh = (self.evidence <= 0) & (gain > 0)
-        self.begin[fresh] = stamp_ns
-        self._run[:, fresh] = 0
+        begins = (self.evidence <= 0) & (gain > 0)
+        self.begin[begins] = stamp_ns
+        self._run[:, begins] = 0
         self._run += np.where(seen & testing, np.stack([score, information]), 0)[:, None]
         self.evidence = np.clip(self.evidence + gain, 0, self._cap)
 
@@ -407,17 +412,17 @@ class CusumCharts:
         """Add the differences from the last block; return the previous factor (K, A)."""
         factor = self.variance_factor()
         with np.errstate(divide='ignore', invalid='ignore'):
-            now = np.stack([score / information, 1 / information])
-            square = (now[0] - self._last[0]) ** 2 / (now[1] + self._last[1])
-        both = np.isfinite(square)
-        decay = np.where(both, self._decay, 1)
+            estimate = np.stack([score / information, 1 / information])
+            square = (estimate[0] - self._last[0]) ** 2 / (estimate[1] + self._last[1])
+        has_both = np.isfinite(square)
+        decay = np.where(has_both, self._decay, 1)
         self._squares *= decay
         self._count *= decay
         # The onset of a drift is one large difference. It must not increase the variance with
         # which the drift is tested.
-        self._squares[both] += np.minimum(square, 9 * factor)[both]
-        self._count[both] += 1
-        self._last = np.where(seen, now, self._last)
+        self._squares[has_both] += np.minimum(square, 9 * factor)[has_both]
+        self._count[has_both] += 1
+        self._last = np.where(seen, estimate, self._last)
         return factor
 
     def log_likelihood(self) -> NDArray[np.float64]:

@@ -191,14 +191,14 @@ class EpipolarEvidence(Evidence):
         reference = series % SERIES_OF_PAIR // 2
         candidates = {}
         for name in self._names:
-            own = [
+            series_of_name = [
                 SERIES_OF_PAIR * number + 2 * reference + pair.index(name)
                 for number, pair in enumerate(self._pairs)
                 if name in pair
             ]
-            total = likelihood[own].sum(axis=0)
+            total = likelihood[series_of_name].sum(axis=0)
             area = int(np.argmax(total))
-            best = own[int(np.argmax(likelihood[own, area]))]
+            best = series_of_name[int(np.argmax(likelihood[series_of_name, area]))]
             candidates[name] = _Candidate(float(total[area]), best, area)
         return self._ranked(candidates)
 
@@ -238,9 +238,9 @@ class BodyEvidence(Evidence):
         candidates = {}
         for view, name in enumerate(self._names):
             first = COMPONENTS * view
-            own = likelihood[first : first + COMPONENTS]
-            component, area = np.unravel_index(np.argmax(own), own.shape)
-            value = float(own[component, area])
+            block = likelihood[first : first + COMPONENTS]
+            component, area = np.unravel_index(np.argmax(block), block.shape)
+            value = float(block[component, area])
             candidates[name] = _Candidate(value, int(first + component), int(area))
         return self._ranked(candidates)
 
@@ -253,9 +253,9 @@ class BodyEvidence(Evidence):
         significance = sign * score / np.sqrt(np.maximum(information, MIN_INFORMATION))
         strongest = int(np.argmax(significance))
         factor = float(np.median(self.charts.variance_factor()[series]))
-        others = np.arange(len(score)) != strongest
-        noise = np.sqrt(max(information[others].sum() * factor, MIN_INFORMATION))
-        confirmed = bool(sign * score[others].sum() / noise > SURE)
+        other_bodies = np.arange(len(score)) != strongest
+        noise = np.sqrt(max(information[other_bodies].sum() * factor, MIN_INFORMATION))
+        confirmed = bool(sign * score[other_bodies].sum() / noise > SURE)
         source = f'cluster {self._bodies[strongest]}'
         return np.eye(COMPONENTS)[series % COMPONENTS], source, confirmed
 

@@ -149,10 +149,10 @@ class DriftWatch:
 
         Returns the present state. Raises ValueError for an unknown pair of fluoroscopes.
         """
-        number, swapped = self._pair_number(a, b)
+        number, is_swapped = self._pair_number(a, b)
         self._advance(stamp_ns)
         if len(observations):
-            self._collected[number].append(observations.swapped() if swapped else observations)
+            self._collected[number].append(observations.swapped() if is_swapped else observations)
         return self.state
 
     def add_points(self, stamp_ns: int, exposure: IntersectedViews) -> DriftState:
@@ -185,9 +185,9 @@ class DriftWatch:
         ended_ns = self._clock.advance(stamp_ns)
         if ended_ns is None:
             return
-        tested = self._close_residuals(ended_ns)
-        tested |= self._close_bodies(ended_ns)
-        self._tested_blocks += bool(tested)
+        is_tested = self._close_residuals(ended_ns)
+        is_tested |= self._close_bodies(ended_ns)
+        self._tested_blocks += bool(is_tested)
         self.state = self._present_state()
 
     def _close_residuals(self, begin_ns: int) -> bool:
@@ -207,14 +207,14 @@ class DriftWatch:
             if not len(observations):
                 continue
             block = self._watches[number].block(observations)
-            own = slice(SERIES_OF_PAIR * number, SERIES_OF_PAIR * (number + 1))
+            rows = slice(SERIES_OF_PAIR * number, SERIES_OF_PAIR * (number + 1))
             seen.append(number)
             self._observations += len(observations)
-            record.score[own] = block.score
-            record.information[own] = block.information
-            record.systematic[own] = block.systematic
+            record.score[rows] = block.score
+            record.information[rows] = block.information
+            record.systematic[rows] = block.systematic
             record.detail[number] = block.normals
-            testing[own] = block.enough & self._has_learned(self._learned_blocks[number])
+            testing[rows] = block.enough & self._has_learned(self._learned_blocks[number])
         if not seen:
             return False
         stretch = np.array([watch.stretch() for watch in self._watches])
@@ -268,8 +268,8 @@ class DriftWatch:
     def _is_learning(self) -> bool:
         """Return whether no start has begun yet, or one is still being learned."""
         counts = [*self._learned_blocks, self._learned_body_blocks]
-        begun = [count for count in counts if count]
-        return not begun or not all(self._has_learned(count) for count in begun)
+        started = [count for count in counts if count]
+        return not started or not all(self._has_learned(count) for count in started)
 
     def _present_state(self) -> DriftState:
         """Return the state according to the present charts."""
@@ -287,14 +287,14 @@ class DriftWatch:
         if level != OK:
             estimate = strongest.estimate(min(peak, warn))
             return self._drift_state(level, estimate, peak)
-        learning = self._is_learning()
+        is_learning = self._is_learning()
         if not self._observations:
-            found = Finding(Kind.NO_MARKERS, 'no markers were seen', severity=OK)
-        elif learning:
-            found = Finding(Kind.LEARNING, 'the start is being learned', severity=OK)
+            finding = Finding(Kind.NO_MARKERS, 'no markers were seen', severity=OK)
+        elif is_learning:
+            finding = Finding(Kind.LEARNING, 'the start is being learned', severity=OK)
         else:
-            found = Finding(Kind.NO_DRIFT, 'no drift is seen', severity=OK)
-        return DriftState(found, peak, warn, error, self._observations, learning=learning)
+            finding = Finding(Kind.NO_DRIFT, 'no drift is seen', severity=OK)
+        return DriftState(finding, peak, warn, error, self._observations, learning=is_learning)
 
     def _drift_state(self, level: Severity, estimate: DriftEstimate, peak: float) -> DriftState:
         """Return the state of an alarm; peak is the largest evidence."""
@@ -370,21 +370,21 @@ class BlockClock:
 
         A late frame belongs to the present block.
         """
-        now = int(stamp_ns) + self._offset_ns
+        time_ns = int(stamp_ns) + self._offset_ns
         if self._begin_ns is None:
-            self._begin_ns = now
-            self.newest_ns = now
-        if now < self.newest_ns:
+            self._begin_ns = time_ns
+            self.newest_ns = time_ns
+        if time_ns < self.newest_ns:
             self._late += 1
-        elif now > self.newest_ns:
+        elif time_ns > self.newest_ns:
             self._late = 0
-        if now < self.newest_ns - RESTART_NS or self._late > MAX_LATE:
+        if time_ns < self.newest_ns - RESTART_NS or self._late > MAX_LATE:
             self._late = 0
-            self._offset_ns += self.newest_ns - now
-            now = self.newest_ns
-        self.newest_ns = max(self.newest_ns, now)
+            self._offset_ns += self.newest_ns - time_ns
+            time_ns = self.newest_ns
+        self.newest_ns = max(self.newest_ns, time_ns)
         ended = self._begin_ns
-        if now < ended + self._length_ns:
+        if time_ns < ended + self._length_ns:
             return None
-        self._begin_ns += (now - ended) // self._length_ns * self._length_ns
+        self._begin_ns += (time_ns - ended) // self._length_ns * self._length_ns
         return ended

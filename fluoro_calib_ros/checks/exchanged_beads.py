@@ -32,34 +32,38 @@ def exchanged_beads(rays: Rays, targets: Targets) -> NDArray[np.int64]:
     """Return the target ids (n, 2) of pairs of beads that are exchanged."""
     place = _places(rays, targets)
     rejected = place != rays.target_id
-    moved = rejected & (place != NOWHERE)
+    is_moved = rejected & (place != NOWHERE)
     ids = np.sort(np.stack([rays.target_id, place], axis=1), axis=1)
-    near = np.full(len(ids), len(targets.target_id))
-    near[moved] = _nearness(ids[moved], targets)
-    found = []
-    pairs, times = np.unique(ids[moved], axis=0, return_counts=True)
+    nearness = np.full(len(ids), len(targets.target_id))
+    nearness[is_moved] = _nearness(ids[is_moved], targets)
+    exchanged = []
+    pairs, times = np.unique(ids[is_moved], axis=0, return_counts=True)
     for pair in pairs[times > 1]:
-        own = np.isin(rays.target_id, pair)
-        at_other = moved & np.all(ids == pair, axis=1)
-        both = len(np.unique(place[at_other])) == 2
-        if not both or 2 * at_other.sum() <= own.sum():
+        of_pair = np.isin(rays.target_id, pair)
+        at_other = is_moved & np.all(ids == pair, axis=1)
+        is_mutual = len(np.unique(place[at_other])) == 2
+        if not is_mutual or 2 * at_other.sum() <= of_pair.sum():
             continue
         # For all other beads, by the rule of succession: rate of rejected image points, and share
         # of these that lie at the place of a bead as near as this one.
-        others = rejected & ~own
-        share = rate_of(others.sum(), (~own).sum())
-        share_near = rate_of(np.sum(others & (near <= near[at_other].max())), others.sum())
+        other_beads = rejected & ~of_pair
+        share = rate_of(other_beads.sum(), (~of_pair).sum())
+        share_near = rate_of(
+            np.sum(other_beads & (nearness <= nearness[at_other].max())), other_beads.sum()
+        )
         # Either image points are false independently, or ids are exchanged, which displaces two.
         chances = []
-        for unit in (np.arange(len(own)), rays.exposure):
-            count = [len(np.unique(unit[rows])) for rows in (own, own & rejected, at_other)]
+        for unit in (np.arange(len(of_pair)), rays.exposure):
+            count = [
+                len(np.unique(unit[rows])) for rows in (of_pair, of_pair & rejected, at_other)
+            ]
             chance = bdtrc(count[1] - 1, count[0], share) * bdtrc(
                 count[2] - 1, count[1], share_near
             )
             chances.append(chance - xlogy(chance, chance))
         if max(chances) * len(targets.target_id) < FALSE_ALARM:
-            found.append(pair)
-    return np.array(found, dtype=np.int64).reshape(-1, 2)
+            exchanged.append(pair)
+    return np.array(exchanged, dtype=np.int64).reshape(-1, 2)
 
 
 def rate_of(events: ArrayLike, count: ArrayLike) -> NDArray[np.float64]:
@@ -73,7 +77,10 @@ def _nearness(ids: NDArray[np.int64], targets: Targets) -> NDArray[np.int64]:
     distance = np.linalg.norm(first - second, axis=1) * (1 + ROUNDING)
     tree = cKDTree(targets.xyz_mm)
     return np.minimum(
-        *(tree.query_ball_point(one, distance, return_length=True) for one in (first, second))
+        *(
+            tree.query_ball_point(centre, distance, return_length=True)
+            for centre in (first, second)
+        )
     )
 
 
@@ -89,14 +96,14 @@ def _places(rays: Rays, targets: Targets) -> NDArray[np.int64]:
         ideal, _, d_point, _ = project_with_jacobian(
             rays.rotation[first], rays.position_mm[first], targets.xyz_mm, rays.interior[first]
         )
-        of_bead = np.einsum('nij,njk,nlk->nil', d_point, targets.covariance, d_point)
+        bead_covariance = np.einsum('nij,njk,nlk->nil', d_point, targets.covariance, d_point)
         tree = cKDTree(np.nan_to_num(ideal, nan=FAR))
         nearest = tree.query(np.nan_to_num(rays.uv[rows], nan=-FAR))[1]
-        own = np.searchsorted(targets.target_id, rays.target_id[rows])
-        both = np.stack([own, nearest])
-        r = rays.uv[rows] - ideal[both]
-        covariance = rays.variance[rows, None, None] * np.eye(2) + of_bead[both]
+        claimed = np.searchsorted(targets.target_id, rays.target_id[rows])
+        beads = np.stack([claimed, nearest])
+        r = rays.uv[rows] - ideal[beads]
+        covariance = rays.variance[rows, None, None] * np.eye(2) + bead_covariance[beads]
         q = np.einsum('...i,...ij,...j', r, np.linalg.inv(covariance), r)
-        other = np.where(q[1] <= INLIER_Q, targets.target_id[nearest], NOWHERE)
-        out[rows] = np.where(q[0] <= INLIER_Q, rays.target_id[rows], other)
+        alternative = np.where(q[1] <= INLIER_Q, targets.target_id[nearest], NOWHERE)
+        out[rows] = np.where(q[0] <= INLIER_Q, rays.target_id[rows], alternative)
     return out

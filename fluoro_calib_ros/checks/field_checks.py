@@ -39,29 +39,29 @@ def check_precision(evidence: Evidence, names: Sequence[str]) -> list[Check]:
 
 
 def _precision(evidence: Evidence, name: str) -> Check:
-    common = evidence.trends[name]
+    trends = evidence.trends[name]
     # Use the noise instead of residuals: these are smaller, as all unknowns follow the noise.
     noise = evidence.calibrations[name].image_sd
     count = len(evidence.frames[name])
     advice = f'{more_exposures(count)}, or a phantom with more beads'
-    if common.trend.size > common.trend.limit:
+    if trends.trend.size > trends.trend.limit:
         # Distortion that a model cannot follow enlarges its residuals and its claimed sd.
-        misfit = common.trend.size**2 / _redundancy(evidence, name)
+        misfit = trends.trend.size**2 / _redundancy(evidence, name)
         noise = float(np.sqrt(max(noise**2 - misfit, 0.0)))
         if evidence.request.options.model_name != AUTO:
             advice = f'choose another model (--model auto), or {advice}'
-    ratio = common.claimed_sd / noise if noise > 0 else np.inf
-    told = 'residuals that its lack of fit explains: the image noise is not known'
+    ratio = trends.claimed_sd / noise if noise > 0 else np.inf
+    comparison = 'residuals that its lack of fit explains: the image noise is not known'
     if np.isfinite(ratio):
         growth = 100 * (np.sqrt(1 + ratio**2) - 1)
-        told = f'an image noise of {noise:.3f} px: it makes the errors of corrected points '
-        told += f'{growth:.0f} % larger'
+        comparison = f'an image noise of {noise:.3f} px: it makes the errors of corrected points '
+        comparison += f'{growth:.0f} % larger'
     return Check(
         Kind.PRECISION,
-        f'the correction has a standard deviation of {common.claimed_sd:.3f} px, at {told}',
+        f'the correction has a standard deviation of {trends.claimed_sd:.3f} px, at {comparison}',
         Place((name,)),
         advice,
-        numbers={'sd_px': common.claimed_sd, 'noise_px': noise, 'exposures': count},
+        numbers={'sd_px': trends.claimed_sd, 'noise_px': noise, 'exposures': count},
         value=ratio,
         limit=MAX_RATIO,
         unit='noise sd',
@@ -104,25 +104,25 @@ def _too_few_points(evidence: Evidence, name: str) -> Check:
 
 def _variation(evidence: Evidence, name: str) -> Check:
     count = len(evidence.frames[name])
-    found = evidence.variations[name]
-    if found is None:
+    variation = evidence.variations[name]
+    if variation is None:
         return _too_few_points(evidence, name)
     return Check(
         Kind.VARIATION,
-        f'the distortion differs between exposures by {found.size_px:.3f} px '
-        f'(chi2/dof {found.chi2_per_dof:.2f}, constant up to {VARYING:.2f})',
+        f'the distortion differs between exposures by {variation.size_px:.3f} px '
+        f'(chi2/dof {variation.chi2_per_dof:.2f}, constant up to {VARYING:.2f})',
         Place((name,)),
         f'{_angles(evidence, name)}, a lens that was focused or zoomed, a source or detector '
         'that is not rigid, or a phantom that moved, was bent or is surveyed wrongly; '
         f'{more_exposures(count)} at the angle and setting that are used, or calibrate each'
         + _how_to_give_angles(evidence, name),
         numbers={
-            'chi2_per_dof': found.chi2_per_dof,
-            'noise_px': found.noise_px,
+            'chi2_per_dof': variation.chi2_per_dof,
+            'noise_px': variation.noise_px,
             'angle_range_deg': float(np.rad2deg(np.ptp(angles_of(evidence.frames[name])))),
         },
-        value=found.size_px,
-        limit=HARMLESS * found.noise_px,
+        value=variation.size_px,
+        limit=HARMLESS * variation.noise_px,
         unit='px',
     ).after_trend(evidence.trends[name].is_significant)
 
@@ -169,21 +169,21 @@ def check_halves(evidence: Evidence, names: Sequence[str]) -> list[Check]:
 def _agreement(
     name: str, one: FluoroscopeCalibration, other: FluoroscopeCalibration, count: int
 ) -> Check:
-    found = difference(one, other)
-    if found is None:
+    compared = difference(one, other)
+    if compared is None:
         reason = 'two halves of the exposures cover too little of the image in common'
         return too_little_data(Kind.HALVES, name, reason, count)
-    expected = float(np.sqrt(np.mean(found.sd**2)))
+    expected = float(np.sqrt(np.mean(compared.sd**2)))
     return Check(
         Kind.HALVES,
         'two halves of the exposures give corrections that differ by '
-        f'{found.rms_px:.3f} px, where {expected:.3f} px is predicted, most at '
-        f'{describe_place(found.worst, one.image_size)}',
-        Place.at(name, found.worst),
+        f'{compared.rms_px:.3f} px, where {expected:.3f} px is predicted, most at '
+        f'{describe_place(compared.worst, one.image_size)}',
+        Place.at(name, compared.worst),
         f'{more_exposures(count)} that show beads there, and see that phantom and fluoroscope '
         'stand still in each',
-        numbers={'difference_px': found.rms_px, 'predicted_px': expected},
-        value=found.normalised,
+        numbers={'difference_px': compared.rms_px, 'predicted_px': expected},
+        value=compared.normalised,
         limit=LIMIT,
         unit='predicted sd',
     )
@@ -196,11 +196,11 @@ def check_trends(evidence: Evidence, names: Sequence[str]) -> list[Check]:
     """Test the residuals of all exposures for a common trend, and for its change."""
     checks = []
     for name in names:
-        common = evidence.trends[name]
+        trend = evidence.trends[name]
         checks += [
-            _whiteness(evidence, name, common),
-            _worst_area(evidence, name, common),
-            _drift(evidence, name, common),
+            _whiteness(evidence, name, trend),
+            _worst_area(evidence, name, trend),
+            _drift(evidence, name, trend),
         ]
     return checks
 
@@ -208,10 +208,10 @@ def check_trends(evidence: Evidence, names: Sequence[str]) -> list[Check]:
 def _whiteness(evidence: Evidence, name: str, common: CommonTrend) -> Check:
     trend = common.trend
     model = evidence.calibrations[name].model
-    where = describe_place(trend.place, evidence.calibrations[name].image_size)
+    position = describe_place(trend.place, evidence.calibrations[name].image_size)
     return Check(
         Kind.WHITENESS,
-        f'the residuals have a trend of {trend.size:.3f} px, most at {where}',
+        f'the residuals have a trend of {trend.size:.3f} px, most at {position}',
         Place.at(name, trend.place),
         _advice(evidence.request.options.model_name, model, len(evidence.frames[name])),
         value=trend.size,
@@ -224,10 +224,10 @@ def _advice(requested: str, model: CorrectionModel, count: int) -> str:
     """Return the advice on a trend; requested: model option, model: model in use."""
     if not model.corrects:
         return 'calibrate with a correction model (--model auto), it was made without one'
-    other = '' if requested == 'auto' else ', or choose another model (--model auto)'
+    alternative = '' if requested == 'auto' else ', or choose another model (--model auto)'
     return (
         f'the correction model {model.kind} does not follow the distortion there; '
-        f'{more_exposures(count)} that show beads there{other}'
+        f'{more_exposures(count)} that show beads there{alternative}'
     )
 
 
@@ -237,7 +237,9 @@ def _worst_area(evidence: Evidence, name: str, common: CommonTrend) -> Check:
         return _rejected_area(evidence, name, rejected)
     trend = common.trend
     calibration = evidence.calibrations[name]
-    claimed = max(float(calibration.model.evaluate(trend.place[None]).sd[0]), common.claimed_sd)
+    correction_sd = max(
+        float(calibration.model.evaluate(trend.place[None]).sd[0]), common.claimed_sd
+    )
     return Check(
         Kind.WORST_AREA,
         f'the worst mean residual of an area, {trend.cell_size:.3f} px, is at '
@@ -246,7 +248,7 @@ def _worst_area(evidence: Evidence, name: str, common: CommonTrend) -> Check:
         f'{more_exposures(len(evidence.frames[name]))} that show beads there, or choose '
         'another model',
         value=trend.cell_size,
-        limit=np.hypot(trend.cell_limit, SURE * claimed),
+        limit=np.hypot(trend.cell_limit, SURE * correction_sd),
         unit='px',
     )
 
@@ -274,7 +276,7 @@ def _drift(evidence: Evidence, name: str, common: CommonTrend) -> Check:
     size = evidence.calibrations[name].image_size
     change = change_of_trend(common.inliers, size)
     # The whole image decides, unless only the worst area has changed.
-    whole = change.size > change.limit or change.cell_size <= change.cell_limit
+    is_of_image = change.size > change.limit or change.cell_size <= change.cell_limit
     return Check(
         Kind.DRIFT,
         f'earlier and later exposures differ by {change.size:.3f} px, '
@@ -282,8 +284,8 @@ def _drift(evidence: Evidence, name: str, common: CommonTrend) -> Check:
         Place.at(name, change.place),
         'the distortion has changed between the exposures; take all of them again in one '
         'session, with nothing switched, moved or warming up',
-        value=change.size if whole else change.cell_size,
-        limit=change.limit if whole else change.cell_limit,
+        value=change.size if is_of_image else change.cell_size,
+        limit=change.limit if is_of_image else change.cell_limit,
         unit='px',
     ).after_trend(common.is_significant)
 

@@ -96,17 +96,17 @@ def corrected_already(
     names = [name for name in misfits(result, calibrations, frames) if name not in fit]
     if not names:
         return None
-    one, other = (
-        max(rms(found.fluoroscopes[name].rmse_after) for name in names)
-        for found in (result, without)
+    rmse, rmse_without = (
+        max(rms(adjusted.fluoroscopes[name].rmse_after) for name in names)
+        for adjusted in (result, without)
     )
     return Finding(
         Kind.CORRECTED_ALREADY,
-        f'the image points are corrected already, their RMSE is {one:.2f} px with the correction '
-        f'and {other:.2f} px without',
+        f'the image points are corrected already, their RMSE is {rmse:.2f} px with the correction '
+        f'and {rmse_without:.2f} px without',
         Place(tuple(names)),
         'give the observed ones',
-        numbers={'rmse_px': one, 'rmse_without_px': other},
+        numbers={'rmse_px': rmse, 'rmse_without_px': rmse_without},
     )
 
 
@@ -119,17 +119,17 @@ def poor_fits(
         after = rms(result.fluoroscopes[name].rmse_after)
         before = rms(result.fluoroscopes[name].rmse_before)
         kind = Kind.POOR_CALIBRATION_FIT
-        why = 'the image has changed, or the calibration is that of another fluoroscope'
+        reason = 'the image has changed, or the calibration is that of another fluoroscope'
         if before < CORRECTED * after:
             kind = Kind.CORRECTED_ALREADY
-            why = 'the image points seem to be corrected already'
+            reason = 'the image points seem to be corrected already'
         out.append(
             Finding(
                 kind,
                 f'RMSE {after:.2f} px with the calibration fixed, {ratio:.1f} times the noise '
                 'with which it was determined',
                 Place((name,)),
-                why,
+                reason,
                 numbers={'rmse_px': after, 'ratio': ratio},
             )
         )
@@ -181,9 +181,9 @@ def check_held_out(evidence: Evidence, names: Sequence[str]) -> list[Check]:
                 f'{"+".join(names)}: held-out exposures, part {fold + 1} of {FOLDS}'
             )
             if fold < folds:
-                found = _hold_out(evidence, names, fold, folds)
+                squares = _hold_out(evidence, names, fold, folds)
                 for name in names:
-                    sums[name] += found[name]
+                    sums[name] += squares[name]
     except DataError as error:
         reason = f'a part of the exposures cannot be calibrated or adjusted alone ({error})'
         return [too_little_data(kind, name, reason, fewest) for name in names for kind in KINDS]
@@ -195,8 +195,8 @@ def _hold_out(
 ) -> dict[str, list[ExposureSums]]:
     """Calibrate without the exposures of a fold; return the sums of the fold by fluoroscope."""
     frames = evidence.part(names, lambda i: i % folds == fold)
-    others = evidence.part(names, lambda i: i % folds != fold)
-    calibrations = evidence.calibrate(others)
+    training = evidence.part(names, lambda i: i % folds != fold)
+    calibrations = evidence.calibrate(training)
     job_outside = evidence.adjust(frames, calibrations)
     job_inside = evidence.adjust(frames, {name: evidence.calibrations[name] for name in names})
     out: dict[str, list[ExposureSums]] = {}
@@ -237,17 +237,17 @@ def _white(uv: NDArray[np.float64], r: NDArray[np.float64], sd: NDArray[np.float
     the ratio of the mean square successive difference to the variance", Annals of Mathematical
     Statistics 12, 1941).
     """
-    _, near = cKDTree(uv).query(uv, k=[min(2, len(uv))])
-    squares = np.sum((r - r[near[:, 0]]) ** 2, axis=1) / 2
+    _, nearest = cKDTree(uv).query(uv, k=[min(2, len(uv))])
+    squares = np.sum((r - r[nearest[:, 0]]) ** 2, axis=1) / 2
     return float(np.sum(np.minimum(squares, INLIER_Q * sd**2)))
 
 
 def _checks(evidence: Evidence, name: str, sums: Sequence[ExposureSums]) -> list[Check]:
-    common = evidence.trends[name]
+    trends = evidence.trends[name]
     count = len(evidence.frames[name])
     number, n, weight, outside, inside, predicted, white = map(np.array, zip(*sums))
     # A trend that remains in sample is not noise.
-    noise = np.maximum(inside - 2 * weight * common.trend.size**2, MIN_NOISE * inside)
+    noise = np.maximum(inside - 2 * weight * trends.trend.size**2, MIN_NOISE * inside)
     value = float(np.sqrt(outside.sum() / (2 * n.sum())))
     expected = float(np.sqrt((noise + predicted).sum() / (2 * n.sum())))
     limit = 1 + MARGIN * np.sqrt(RECOMMENDED_EXPOSURES / count)
@@ -279,10 +279,10 @@ def _checks(evidence: Evidence, name: str, sums: Sequence[ExposureSums]) -> list
         limit=limits[worst],
         unit='1',
     )
-    agreeing = common.of_exposure
-    if agreeing is not None and agreeing.agreement > agreeing.limit and exposures.passed:
-        exposures = _rejected_exposure(name, agreeing)
-    return [check.after_trend(common.is_significant) for check in (held_out, exposures)]
+    rejected = trends.of_exposure
+    if rejected is not None and rejected.agreement > rejected.limit and exposures.passed:
+        exposures = _rejected_exposure(name, rejected)
+    return [check.after_trend(trends.is_significant) for check in (held_out, exposures)]
 
 
 def _rejected_exposure(name: str, found: RejectedExposure) -> Check:
@@ -312,8 +312,8 @@ def exposure_limits(ratio: NDArray[np.float64], white: NDArray[np.float64]) -> N
     size = np.log(ratio)
     scatter = np.median(np.abs(size - np.median(size))) / NORMAL_MEDIAN
     factor = EXPOSURE_SCATTER + SCATTER_OF_FEW / len(ratio)
-    of_noise = EXPOSURE_LIMIT * np.maximum(1.0, white)
-    return np.clip(np.exp(factor * scatter), EXPOSURE_LIMIT, of_noise)
+    upper_limit = EXPOSURE_LIMIT * np.maximum(1.0, white)
+    return np.clip(np.exp(factor * scatter), EXPOSURE_LIMIT, upper_limit)
 
 
 HELD_OUT = Subject(check_held_out, steps=FOLDS)

@@ -108,19 +108,19 @@ class Fit:
 
 def validate_magnitudes(frames: Frames, phantom: Phantom) -> None:
     """Raise DataError for implausible numbers, which would spoil every calculation."""
-    large = np.abs(phantom.xyz_mm).max(axis=1) > MAX_COORDINATE_MM
-    if large.any():
-        target = int(phantom.target_id[large][0])
+    is_remote = np.abs(phantom.xyz_mm).max(axis=1) > MAX_COORDINATE_MM
+    if is_remote.any():
+        target = int(phantom.target_id[is_remote][0])
         raise DataError(
             f'the coordinates of target {target} are larger than {MAX_COORDINATE_MM:g} mm',
             kind=Kind.IMPLAUSIBLE_NUMBER,
             place=replace(_PHANTOM, target_id=(target,)),
         )
     low, high = SD_MM
-    wrong = (phantom.sd_mm < low) | (phantom.sd_mm > high)
-    if wrong.any():
-        target = int(phantom.target_id[wrong][0])
-        sd = float(phantom.sd_mm[wrong][0])
+    is_wrong = (phantom.sd_mm < low) | (phantom.sd_mm > high)
+    if is_wrong.any():
+        target = int(phantom.target_id[is_wrong][0])
+        sd = float(phantom.sd_mm[is_wrong][0])
         raise DataError(
             f'the standard deviation of target {target} is {sd:g} mm, between {low:g} and '
             f'{high:g} mm are plausible',
@@ -161,8 +161,8 @@ def why_excluded(frame: Frame, phantom: Phantom) -> Finding | None:
 
 def find_wrong_phantom(frames: Frames, phantom: Phantom) -> list[Finding]:
     """Return a finding for every group of targets with implausible coordinates."""
-    every = [frame.target_id for exposures in frames.values() for frame in exposures]
-    seen = np.isin(phantom.target_id, np.concatenate(every or [np.empty(0, int)]))
+    target_ids = [frame.target_id for exposures in frames.values() for frame in exposures]
+    seen = np.isin(phantom.target_id, np.concatenate(target_ids or [np.empty(0, int)]))
     if not seen.any():
         return []
     seen_id = phantom.target_id[seen]
@@ -172,9 +172,9 @@ def find_wrong_phantom(frames: Frames, phantom: Phantom) -> list[Finding]:
     out = []
     places, place, count = np.unique(xyz, axis=0, return_inverse=True, return_counts=True)
     if count.max() > 1:
-        most = int(np.argmax(count))
-        ids = seen_id[place.reshape(-1) == most]
-        x, y, z = places[most]
+        most_frequent = int(np.argmax(count))
+        ids = seen_id[place.reshape(-1) == most_frequent]
+        x, y, z = places[most_frequent]
         out.append(
             Finding(
                 Kind.REPEATED_COORDINATES,
@@ -185,17 +185,17 @@ def find_wrong_phantom(frames: Frames, phantom: Phantom) -> list[Finding]:
         )
     distance = np.linalg.norm(xyz - np.median(xyz, axis=0), axis=1)
     extent = float(np.quantile(distance, EXTENT_SHARE))
-    far = distance > MAX_EXTENT * extent
-    if extent > 0 and far.any():
+    remote = distance > MAX_EXTENT * extent
+    if extent > 0 and remote.any():
         out.append(
             Finding(
                 Kind.REMOTE_TARGETS,
-                f'target {first_few(seen_id[far])} is {distance[far].max():.0f} mm from the '
+                f'target {first_few(seen_id[remote])} is {distance[remote].max():.0f} mm from the '
                 f'middle of the others, most of which are within {extent:.0f} mm',
-                replace(_PHANTOM, target_id=tuple(seen_id[far].tolist())),
+                replace(_PHANTOM, target_id=tuple(seen_id[remote].tolist())),
                 'a wrong coordinate, another unit, or a fill value for targets that are not '
                 'surveyed',
-                numbers={'distance_mm': float(distance[far].max()), 'extent_mm': extent},
+                numbers={'distance_mm': float(distance[remote].max()), 'extent_mm': extent},
             )
         )
     return out
@@ -206,15 +206,15 @@ def _validate_sigma(frame: Frame) -> None:
         return
     low, high = SIGMA_PX
     sigma = np.asarray(frame.sigma)
-    wrong = (sigma < low) | (sigma > high)
-    if wrong.any():
-        target = int(np.asarray(frame.target_id)[wrong][0])
+    is_wrong = (sigma < low) | (sigma > high)
+    if is_wrong.any():
+        target = int(np.asarray(frame.target_id)[is_wrong][0])
         raise DataError(
-            f'sigma of target {target} is {sigma[wrong][0]:g} px, between {low:g} and '
+            f'sigma of target {target} is {sigma[is_wrong][0]:g} px, between {low:g} and '
             f'{high:g} px are plausible',
             kind=Kind.IMPLAUSIBLE_NUMBER,
             place=replace(frame.place, target_id=(target,)),
-            numbers={'sigma_px': float(sigma[wrong][0])},
+            numbers={'sigma_px': float(sigma[is_wrong][0])},
         )
 
 
@@ -266,9 +266,9 @@ def find_wrong_input(frames: Frames, phantom: Phantom) -> list[Finding]:
     """
     out = []
     for name, exposures in frames.items():
-        found = wrong_image_size(exposures) or _wrong_exposures(exposures, phantom)
-        if found is not None:
-            out.append(replace(found, place=Place((name,))))
+        finding = wrong_image_size(exposures) or _wrong_exposures(exposures, phantom)
+        if finding is not None:
+            out.append(replace(finding, place=Place((name,))))
     return out
 
 
@@ -291,15 +291,15 @@ def require_phantom(frames: Frames, phantom: Phantom) -> None:
 
     Invalid exposures and those with fewer than FEW_TARGETS targets are not tested.
     """
-    found = []
+    findings = []
     for name, exposures in valid_frames(frames).items():
-        tested = [frame for frame in exposures if len(frame.target_id) >= FEW_TARGETS]
-        wrong = _wrong_exposures(tested, phantom)
-        if wrong is not None:
-            found.append(replace(wrong, place=Place((name,))))
-    if found:
+        testable = [frame for frame in exposures if len(frame.target_id) >= FEW_TARGETS]
+        finding = _wrong_exposures(testable, phantom)
+        if finding is not None:
+            findings.append(replace(finding, place=Place((name,))))
+    if findings:
         mixed = mixed_units(valid_frames(frames), phantom, is_suspicious=True)
-        raise DataError(*([mixed] if mixed else found))
+        raise DataError(*([mixed] if mixed else findings))
 
 
 def find_wrong_orientation(
@@ -312,8 +312,8 @@ def find_wrong_orientation(
         limit = WRONG_ORIENTATION * max(frames[name][0].image_size) if frames[name] else np.inf
         fits = [
             other
-            for other, theirs in known.items()
-            if other != name and _median_residual(frames[name], phantom, theirs) <= limit
+            for other, candidate in known.items()
+            if other != name and _median_residual(frames[name], phantom, candidate) <= limit
         ]
         if median > limit and fits:
             out.append(
@@ -325,13 +325,13 @@ def find_wrong_orientation(
                 )
             )
         elif median > limit:
-            behind = 'most targets would lie behind the source'
-            far = f'image points are {median:.0f} px off in the median'
+            all_behind = 'most targets would lie behind the source'
+            all_far = f'image points are {median:.0f} px off in the median'
             out.append(
                 Finding(
                     Kind.WRONG_KNOWN_ORIENTATION,
                     f'the known orientation does not fit, '
-                    f'{far if np.isfinite(median) else behind}',
+                    f'{all_far if np.isfinite(median) else all_behind}',
                     Place((name,)),
                     'check the unit and the frame of the lab, that R and t lead from the lab to '
                     'the sensor, and that v runs down',
@@ -407,10 +407,10 @@ def wrong_unit(distance_mm: float, phantom: Phantom) -> Finding | None:
             numbers=numbers,
         )
     units = [unit for mm, unit in MISTAKEN_UNITS.items() if low <= distance_mm * mm <= high]
-    perhaps = f', but perhaps in {" or ".join(units)}' if units else ''
+    guess = f', but perhaps in {" or ".join(units)}' if units else ''
     return Finding(
         Kind.WRONG_UNIT,
-        f'the coordinates of the phantom are not in mm{perhaps}: it would be {extent:.3g} mm '
+        f'the coordinates of the phantom are not in mm{guess}: it would be {extent:.3g} mm '
         f'large and {distance_mm:.3g} mm from the source',
         numbers=numbers,
     )
@@ -420,24 +420,24 @@ def _cause(frame: Frame, phantom: Phantom) -> Finding | None:
     """Return what is wrong with an exposure, or None if no error is found."""
     ids = np.asarray(frame.target_id, dtype=np.int64)
     side = max(frame.image_size)
-    given = fit_to_phantom(frame, phantom, ids)
-    if given is None:
+    fit = fit_to_phantom(frame, phantom, ids)
+    if fit is None:
         return None
-    if given.misfit_px < FIT * side:
-        return _MIRRORED if given.is_behind else _unit_cause(phantom, given)
+    if fit.misfit_px < FIT * side:
+        return _MIRRORED if fit.is_behind else _unit_cause(phantom, fit)
     for confusion, relabel in CONFUSIONS:
-        other = fit_to_phantom(frame, phantom, relabel(ids, phantom))
+        relabelled = fit_to_phantom(frame, phantom, relabel(ids, phantom))
         if (
-            other is not None
-            and other.misfit_px < BETTER * given.misfit_px
-            and other.misfit_px < AT * side
+            relabelled is not None
+            and relabelled.misfit_px < BETTER * fit.misfit_px
+            and relabelled.misfit_px < AT * side
         ):
             return confusion
-    if given.misfit_px > OFF * side:
+    if fit.misfit_px > OFF * side:
         return _OTHER_PHANTOM
-    if given.is_behind:
+    if fit.is_behind:
         return _MIRRORED
-    return _unit_cause(phantom, given)
+    return _unit_cause(phantom, fit)
 
 
 def _unit_cause(phantom: Phantom, fit: Fit) -> Finding | None:
@@ -459,16 +459,16 @@ def copied_exposures(exposures: Sequence[Frame]) -> list[tuple[Frame, Frame]]:
         return []
     ids = np.unique(np.concatenate([frame.target_id for frame in ordered]))
     uv = np.full((len(ordered), len(ids), 2), np.nan)
-    for own, frame in zip(uv, ordered):
-        own[np.searchsorted(ids, frame.target_id)] = frame.uv
+    for row_uv, frame in zip(uv, ordered):
+        row_uv[np.searchsorted(ids, frame.target_id)] = frame.uv
     out = []
-    kept: list[int] = []
+    distinct: list[int] = []
     for row, frame in enumerate(ordered):
-        originals = np.flatnonzero(_are_copied(uv[row], uv[kept]))
+        originals = np.flatnonzero(_are_copied(uv[row], uv[distinct]))
         if len(originals):
-            out.append((frame, ordered[kept[originals[0]]]))
+            out.append((frame, ordered[distinct[originals[0]]]))
         else:
-            kept.append(row)
+            distinct.append(row)
     return out
 
 
@@ -477,24 +477,24 @@ def shared_exposures(one: Sequence[Frame], other: Sequence[Frame]) -> list[tuple
 
     This does not occur with two fluoroscopes: one recording was given for both.
     """
-    both = [replace(f, number=2 * f.number) for f in one]
-    both += [replace(f, number=2 * f.number + 1) for f in other]
-    found = []
-    for copy, original in copied_exposures(both):
+    renumbered = [replace(f, number=2 * f.number) for f in one]
+    renumbered += [replace(f, number=2 * f.number + 1) for f in other]
+    shared = []
+    for copy, original in copied_exposures(renumbered):
         if copy.number % 2 != original.number % 2:
             pair = sorted((copy, original), key=lambda f: f.number % 2)
             first, second = (replace(f, number=f.number // 2) for f in pair)
-            found.append((first, second))
-    return found
+            shared.append((first, second))
+    return shared
 
 
 def _are_copied(uv: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return which (k,) of others (k, n, 2) have image points uv (n, 2) [px]; NaN if unseen."""
     u, v = np.moveaxis(np.abs(others - uv), 2, 0)
     distance = np.maximum(u, v)  # max() along such a short axis takes ten times as long
-    common = np.sum(np.isfinite(distance), axis=1)
-    same = np.sum(distance <= SAME_PX, axis=1)
-    return (common >= MIN_COMMON_TARGETS) & (same >= COPIED * common)
+    seen_in_both = np.sum(np.isfinite(distance), axis=1)
+    equal = np.sum(distance <= SAME_PX, axis=1)
+    return (seen_in_both >= MIN_COMMON_TARGETS) & (equal >= COPIED * seen_in_both)
 
 
 # Absolute tests of a calibration, for results that no fluoroscope can have.
@@ -523,17 +523,17 @@ def implausible(request: CalibrationRequest, result: CalibrationResult) -> list[
             _wrong_distance(figures, request),
             _wrong_interior(figures, result.calibrations[name]),
         )
-        out += [replace(found, place=Place((name,))) for found in tests if found is not None]
+        out += [replace(finding, place=Place((name,))) for finding in tests if finding is not None]
     return out
 
 
 def _large_residuals(figures: FluoroscopeResult, frames: Sequence[Frame]) -> Finding | None:
     """Return a finding if residuals are larger than distortion and noise explain."""
     rmse = rms(figures.rmse_after)
-    given = [np.median(frame.sigma) for frame in frames if frame.sigma is not None]
+    sigmas = [np.median(frame.sigma) for frame in frames if frame.sigma is not None]
     limit = MAX_MISFIT * max(figures.image_size)
-    if given:
-        limit = max(limit, MAX_MISFIT_SD * float(np.median(given)))
+    if sigmas:
+        limit = max(limit, MAX_MISFIT_SD * float(np.median(sigmas)))
     if rmse <= limit:
         return None
     return Finding(
@@ -571,8 +571,8 @@ def _wrong_interior(
     xp, yp, c = figures.interior
     sd = figures.interior_sd
     side = max(figures.image_size)
-    if not np.any(sd) and (found := _wrong_given_distance(calibration)):
-        return found
+    if not np.any(sd) and (finding := _wrong_given_distance(calibration)):
+        return finding
     if sd[2] > MAX_RELATIVE_SD * c or max(sd[:2]) > MAX_SD_POINT * side:
         return Finding(
             Kind.INTERIOR_UNDETERMINED,
@@ -597,16 +597,16 @@ def _wrong_interior(
 
 def _wrong_given_distance(calibration: FluoroscopeCalibration) -> Finding | None:
     """Return a finding if the fixed principal distance is far from that of the correction."""
-    given = float(calibration.interior[2])
-    found = float(_interior_about_middle(calibration)[2])
-    if abs(found / given - 1) <= MAX_DISTANCE_CHANGE:
+    given_px = float(calibration.interior[2])
+    shown_px = float(_interior_about_middle(calibration)[2])
+    if abs(shown_px / given_px - 1) <= MAX_DISTANCE_CHANGE:
         return None
     return Finding(
         Kind.WRONG_PRINCIPAL_DISTANCE,
-        f'the principal distance is fixed at {given:.0f} px, but the exposures show about '
-        f'{found:.0f} px',
+        f'the principal distance is fixed at {given_px:.0f} px, but the exposures show about '
+        f'{shown_px:.0f} px',
         advice='it has to be given in pixels',
-        numbers={'given_px': given, 'shown_px': found},
+        numbers={'given_px': given_px, 'shown_px': shown_px},
     )
 
 

@@ -51,27 +51,31 @@ def mixed_units(frames: Frames, phantom: Phantom, is_suspicious: bool = False) -
     frames: exposures by fluoroscope, each of them valid. is_suspicious: whether the exposures do
     not fit the phantom, so that there may be no majority.
     """
-    every = [_on_phantom(frame, phantom) for of_one in frames.values() for frame in of_one]
-    every = [frame for frame in every if len(frame.target_id) >= MIN_TARGETS_OF_EXPOSURE]
+    exposures = [
+        _on_phantom(frame, phantom)
+        for of_fluoroscope in frames.values()
+        for frame in of_fluoroscope
+    ]
+    exposures = [frame for frame in exposures if len(frame.target_id) >= MIN_TARGETS_OF_EXPOSURE]
     tested = [
         frame
         for name in frames
         for frame in sorted(
-            (f for f in every if f.fluoroscope == name), key=lambda f: -len(f.target_id)
+            (f for f in exposures if f.fluoroscope == name), key=lambda f: -len(f.target_id)
         )[:MAX_TESTED]
     ]
     for frame in tested:
-        found = _factor_of(frame, phantom, is_suspicious)
-        if found is None:
+        suspect = _factor_of(frame, phantom, is_suspicious)
+        if suspect is None:
             continue
-        factor, group = found
-        scaled, distance = _whole_group(every, phantom, factor, group)
-        others = _seen(every, phantom) & ~scaled
-        if min(scaled.sum(), others.sum()) < MIN_GROUP:
+        factor, group = suspect
+        scaled, distance = _whole_group(exposures, phantom, factor, group)
+        unscaled = _seen(exposures, phantom) & ~scaled
+        if min(scaled.sum(), unscaled.sum()) < MIN_GROUP:
             continue
         low, high = DISTANCES_MM
         if not low <= distance <= high and low <= distance / factor <= high:
-            scaled, factor = others, 1 / factor  # these are in the wrong unit
+            scaled, factor = unscaled, 1 / factor  # these are in the wrong unit
         return _finding(phantom.target_id[scaled], factor)
     return None
 
@@ -104,13 +108,13 @@ def _factor_of(
     except (DataError, np.linalg.LinAlgError):
         return None
     residual = np.sqrt(squared_residuals(projection, xyz, frame.uv))
-    off = residual > OFF * limit
+    is_off = residual > OFF * limit
     for factor in (*MISTAKEN_UNITS, *(1 / factor for factor in MISTAKEN_UNITS)):
         scaled = np.sqrt(squared_residuals(projection, factor * xyz, frame.uv))
-        there = off & (scaled < AT * limit)
-        if there.sum() >= MIN_GROUP and (residual < AT * limit).sum() > there.sum():
-            return factor, _chosen(phantom, rows[there])
-    if not is_suspicious and np.mean(~off) > UNCLEAR:
+        fits_scaled = is_off & (scaled < AT * limit)
+        if fits_scaled.sum() >= MIN_GROUP and (residual < AT * limit).sum() > fits_scaled.sum():
+            return factor, _chosen(phantom, rows[fits_scaled])
+    if not is_suspicious and np.mean(~is_off) > UNCLEAR:
         return None
     return _factor_by_samples(frame, xyz, rows, phantom)
 
@@ -122,17 +126,19 @@ def _factor_by_samples(
     rng = np.random.default_rng(0)
     limit = max(frame.image_size)
     samples = np.argsort(rng.random((SAMPLES, len(xyz))), axis=1)[:, :SAMPLE_SIZE]
-    which = rng.integers(0, 2, samples.shape)
+    choice = rng.integers(0, 2, samples.shape)
     for factor in MISTAKEN_UNITS:
         versions = np.stack([xyz, factor * xyz])
         try:
             with np.errstate(all='ignore'):
                 candidates = direct_linear_transformation(
-                    versions[which, samples],
+                    versions[choice, samples],
                     frame.uv[samples],
                     least=least_vectors_with_last_one,
                 )
-                squared = [squared_residuals(candidates, each, frame.uv) for each in versions]
+                squared = [
+                    squared_residuals(candidates, version, frame.uv) for version in versions
+                ]
                 best = candidates[np.argmin(np.median(np.minimum(*squared), axis=1))]
                 scaled, median = _refined(best, versions, frame.uv)
         except (DataError, np.linalg.LinAlgError):
@@ -146,15 +152,15 @@ def _refined(
     projection: NDArray[np.float64], versions: NDArray[np.float64], uv: NDArray[np.float64]
 ) -> tuple[NDArray[np.bool_], float]:
     """Return which (n,) of versions (2, n, 3) are multiples, and the median residual."""
-    every = np.arange(len(uv))
+    points = np.arange(len(uv))
     scaled = np.zeros(len(uv), dtype=int)
     for _ in range(STEPS):
-        squared = np.stack([squared_residuals(projection, each, uv) for each in versions])
+        squared = np.stack([squared_residuals(projection, version, uv) for version in versions])
         before, scaled = scaled, np.argmin(squared, axis=0)
-        projection = robust_dlt(versions[scaled, every], uv)
+        projection = robust_dlt(versions[scaled, points], uv)
         if np.array_equal(before, scaled):
             break
-    squared = squared_residuals(projection, versions[scaled, every], uv)
+    squared = squared_residuals(projection, versions[scaled, points], uv)
     return scaled == 1, float(np.sqrt(np.median(squared)))
 
 
@@ -186,12 +192,12 @@ def _whole_group(
             except (DataError, np.linalg.LinAlgError):
                 continue
             limit = max(frame.image_size)
-            own, scaled = (
+            unscaled, scaled = (
                 np.sqrt(squared_residuals(projection, f * phantom.xyz_mm[rows], frame.uv))
                 for f in (1.0, factor)
             )
-            is_multiple = (scaled < AT * limit) & (own > OFF * limit)
-            is_own = own < AT * limit
+            is_multiple = (scaled < AT * limit) & (unscaled > OFF * limit)
+            is_own = unscaled < AT * limit
             if is_multiple.any() and is_own.sum() < MIN_GROUP:
                 continue  # multiples alone look like a larger phantom, farther away
             votes[rows] += is_multiple
@@ -206,11 +212,11 @@ def _whole_group(
 def _finding(ids: NDArray[np.int64], factor: float) -> Finding:
     """Return the finding on targets that fit after multiplication by a factor."""
     unit = MISTAKEN_UNITS.get(factor)
-    meant = f' ({unit} in place of mm)' if unit else ''
+    remark = f' ({unit} in place of mm)' if unit else ''
     return Finding(
         Kind.MIXED_UNITS,
         f'{len(ids)} targets, {first_few(ids)}, are in another unit than the others',
         Place(target_id=tuple(ids.tolist()), name='phantom'),
-        f'they fit when their coordinates are multiplied by {factor:.4g}{meant}',
+        f'they fit when their coordinates are multiplied by {factor:.4g}{remark}',
         numbers={'factor': factor},
     )

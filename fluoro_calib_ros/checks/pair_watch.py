@@ -77,12 +77,12 @@ class PairWatch:
         r = float(np.clip(r, MIN_CORRELATION, MAX_CORRELATION))
         s = min((v2 - v1) / (r * (1 - r)), v1 / (1 - r))
         n = max(self._frames / self._count, 1.0)
-        long = (1 + r) / (1 - r)
+        long_run = (1 + r) / (1 - r)
         # Variance of means of n values and covariance of two successive means, times n.
-        own = long - 2 * r * (1 - r**n) / (n * (1 - r) ** 2)
+        variance = long_run - 2 * r * (1 - r**n) / (n * (1 - r) ** 2)
         shared = r * (1 - r**n) ** 2 / (n * (1 - r) ** 2)
         white = v1 - s * (1 - r)
-        return max(1.0, (white + s * long) / (white + s * (own - shared)))
+        return max(1.0, (white + s * long_run) / (white + s * (variance - shared)))
 
     def _update_correlation(
         self, marker: NDArray[np.int64], standardised: NDArray[np.float64]
@@ -111,9 +111,11 @@ class PairWatch:
         _, marker = np.unique(observations.target_id, return_inverse=True)
         sd = observations.sd_noise
         systematic = observations.sd_systematic
-        found = [self.field.interpolation(uv, side) for side, uv in enumerate(observations.uv)]
-        nodes = np.concatenate([nodes for nodes, _ in found], axis=1)
-        weights = np.concatenate([weights for _, weights in found], axis=1)
+        interpolations = [
+            self.field.interpolation(uv, side) for side, uv in enumerate(observations.uv)
+        ]
+        nodes = np.concatenate([nodes for nodes, _ in interpolations], axis=1)
+        weights = np.concatenate([weights for _, weights in interpolations], axis=1)
         variance = sd * sd
         limit = (
             options.clip * sd
@@ -173,16 +175,16 @@ class PairWatch:
             *observations.normal[side].T,
         ]
         sums = self._area_sums(cell, np.stack(columns))
-        both = [side, 2 + side]
-        out.score[both] = sums[:2]
-        out.information[both] = sums[2]
+        rows = [side, 2 + side]
+        out.score[rows] = sums[:2]
+        out.information[rows] = sums[2]
         with np.errstate(divide='ignore', invalid='ignore'):
             out.systematic[side] = sums[3] / sums[2]
         out.normals[side] = sums[4:].T
-        present = np.zeros((areas.n**2, marker.max() + 1))
-        present[cell, marker] = 1
-        markers = ((areas.member @ present) > 0).sum(axis=1)
-        out.enough[both] = markers >= self._options.min_markers
+        is_in_cell = np.zeros((areas.n**2, marker.max() + 1))
+        is_in_cell[cell, marker] = 1
+        markers = ((areas.member @ is_in_cell) > 0).sum(axis=1)
+        out.enough[rows] = markers >= self._options.min_markers
 
     def _area_sums(
         self, cell: NDArray[np.int64], columns: NDArray[np.float64]
@@ -240,9 +242,9 @@ class SystematicErrorField:
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return nodes (n, 4) and their bilinear weights (n, 4) at uv (n, 2) of image 0 or 1."""
         x = np.clip((uv + 0.5) * ((NODES - 1) / self._sizes[side]), 0, NODES - 1)
-        low = np.minimum(x.astype(int), NODES - 2)
-        fu, fv = (x - low).T
-        first = low[:, 0] + NODES * low[:, 1] + side * self._nodes
+        corner = np.minimum(x.astype(int), NODES - 2)
+        fu, fv = (x - corner).T
+        first = corner[:, 0] + NODES * corner[:, 1] + side * self._nodes
         weights = np.stack([(1 - fu) * (1 - fv), fu * (1 - fv), (1 - fu) * fv, fu * fv], axis=1)
         return first[:, None] + np.array([0, 1, NODES, NODES + 1]), weights
 

@@ -223,8 +223,8 @@ def change_of_trend(residuals: Residuals, image_size: tuple[int, int]) -> Residu
     """
     joins = _joins(residuals, CHANGE.neighbours)
     later = np.arange(len(residuals.numbers)) >= len(residuals.numbers) // 2
-    same = later[joins.earlier] == later[joins.later]
-    squared, limit = _mean_and_limit(joins, same, CHANGE.false_alarm)
+    is_same = later[joins.earlier] == later[joins.later]
+    squared, limit = _mean_and_limit(joins, is_same, CHANGE.false_alarm)
     # Halves that differ by t have residuals of t/2 on both sides of their mean.
     return _trend(4 * squared, 4 * limit, _worst_cell(residuals, image_size, later, CHANGE))
 
@@ -254,24 +254,24 @@ def unexplained(rejected: Residuals, reach: float) -> Residuals:
     of false matches have random directions.
     """
     limit = special.ndtri(1 - FALSE_ALARM)
-    keep = np.ones(len(rejected.r), dtype=bool)
+    is_kept = np.ones(len(rejected.r), dtype=bool)
     for row in range(len(rejected.numbers)):
-        own = np.flatnonzero(rejected.exposure == row)
-        others = np.flatnonzero(rejected.exposure != row)
-        if not len(own) or not len(others):
+        rows = np.flatnonzero(rejected.exposure == row)
+        other_rows = np.flatnonzero(rejected.exposure != row)
+        if not len(rows) or not len(other_rows):
             continue
-        distance, near = cKDTree(rejected.uv[others]).query(rejected.uv[own])
-        close = distance <= reach
+        distance, nearest = cKDTree(rejected.uv[other_rows]).query(rejected.uv[rows])
+        is_close = distance <= reach
         # Points near one point of another exposure count together, as it has one direction.
-        sums = np.zeros((len(others), 2))
-        np.add.at(sums, near[close], rejected.r[own[close]])
-        r = rejected.r[others]
-        along = np.sum(sums * r, axis=1)
+        sums = np.zeros((len(other_rows), 2))
+        np.add.at(sums, nearest[is_close], rejected.r[rows[is_close]])
+        r = rejected.r[other_rows]
+        products = np.sum(sums * r, axis=1)
         sd = np.sqrt(np.sum(np.sum(sums**2, axis=1) * np.sum(r**2, axis=1)) / 2)
-        agreeing = len(np.unique(rejected.exposure[others[along > 0]]))
-        if agreeing >= MIN_EXPOSURES and along.sum() > limit * sd:
-            keep[own[close]] = False
-    return rejected._part(keep)
+        agreeing = len(np.unique(rejected.exposure[other_rows[products > 0]]))
+        if agreeing >= MIN_EXPOSURES and products.sum() > limit * sd:
+            is_kept[rows[is_close]] = False
+    return rejected._part(is_kept)
 
 
 def rejected_exposure(rejected: Residuals, inliers: Residuals) -> RejectedExposure | None:
@@ -282,39 +282,42 @@ def rejected_exposure(rejected: Residuals, inliers: Residuals) -> RejectedExposu
     exposure, or None if no exposure has two rejected image points.
     """
     limit = float(special.ndtri(1 - FALSE_ALARM / len(rejected.numbers)))
-    found = []
+    tested = []
     for row, number in enumerate(rejected.numbers.tolist()):
-        own = rejected.exposure == row
-        if own.sum() < 2:
+        rows = rejected.exposure == row
+        if rows.sum() < 2:
             continue
-        r = rejected.r[own]
-        _, near = cKDTree(rejected.uv[own]).query(rejected.uv[own], k=[2])
-        pairs = np.unique(np.sort([np.arange(len(r)), near[:, 0]], axis=0), axis=1)
+        r = rejected.r[rows]
+        _, nearest = cKDTree(rejected.uv[rows]).query(rejected.uv[rows], k=[2])
+        pairs = np.unique(np.sort([np.arange(len(r)), nearest[:, 0]], axis=0), axis=1)
         i, j = pairs[:, pairs[0] != pairs[1]]
         squares = np.sum(r**2, axis=1)
         sd = np.sqrt(np.sum(squares[i] * squares[j]) / 2)
         agreement = float(np.sum(r[i] * r[j]) / sd) if sd > 0 else 0.0
         total = len(r) + int(np.sum(inliers.exposure == row))
-        found.append(RejectedExposure(number, len(r), total, agreement, limit))
-    return max(found, key=lambda one: one.agreement, default=None)
+        tested.append(RejectedExposure(number, len(r), total, agreement, limit))
+    return max(tested, key=lambda exposure: exposure.agreement, default=None)
 
 
 def _joins(residuals: Residuals, neighbours: int) -> Joins:
     """Return the products of neighbouring residuals of different exposures."""
     m = len(residuals.numbers)
     count = min(neighbours + 1, len(residuals.uv))
-    _, near = cKDTree(residuals.uv).query(residuals.uv, k=count)
-    i = np.repeat(np.arange(len(near)), count - 1)
-    j = near[:, 1:].ravel()
+    _, nearest = cKDTree(residuals.uv).query(residuals.uv, k=count)
+    i = np.repeat(np.arange(len(nearest)), count - 1)
+    j = nearest[:, 1:].ravel()
     earlier, later = np.sort([residuals.exposure[i], residuals.exposure[j]], axis=0)
     product = np.sum(residuals.r[i] * residuals.r[j], axis=1)
     pair = earlier * m + later
     number = np.bincount(pair, None, m * m)
     total = np.bincount(pair, product, m * m)
     earlier, later = np.divmod(np.arange(m * m), m)
-    keep = (earlier < later) & (number > 0)
+    is_used = (earlier < later) & (number > 0)
     return Joins(
-        total[keep] / number[keep], number[keep].astype(float), earlier[keep], later[keep]
+        total[is_used] / number[is_used],
+        number[is_used].astype(float),
+        earlier[is_used],
+        later[is_used],
     )
 
 
@@ -361,11 +364,11 @@ def _cell_sums(
     column, row = cells_of(residuals.uv, image_size, parts).T
     m = len(residuals.numbers)
     # Sums and numbers of residuals, by rows of parts, columns and exposures.
-    found = np.zeros((parts, parts, m, 3))
+    part_sums = np.zeros((parts, parts, m, 3))
     values = np.column_stack([residuals.r, np.ones(len(residuals.r))])
-    np.add.at(found, (row, column, residuals.exposure), values)
+    np.add.at(part_sums, (row, column, residuals.exposure), values)
     places = parts - overlap + 1
-    rows = np.sum([found[i : i + places] for i in range(overlap)], axis=0)
+    rows = np.sum([part_sums[i : i + places] for i in range(overlap)], axis=0)
     cells = np.sum([rows[:, j : j + places] for j in range(overlap)], axis=0)
     cells = cells.reshape(places**2, m, 3)
     v, u = np.divmod(np.arange(places**2), places)
@@ -383,12 +386,12 @@ def _worst_cell(
     sums, counts, centres = _cell_sums(residuals, image_size, plan.overlap)
     groups = [group for group in (part, ~part) if group.any()]
     n = np.stack([counts[:, g].sum(axis=1) for g in groups])
-    keep = (n >= MIN_IN_CELL).all(axis=0)
-    if not keep.any():
+    is_full = (n >= MIN_IN_CELL).all(axis=0)
+    if not is_full.any():
         return CellTrend(0.0, np.inf, np.asarray(image_size) / 2)
-    sums = sums[keep]
-    counts = counts[keep]
-    n = n[:, keep]
+    sums = sums[is_full]
+    counts = counts[is_full]
+    n = n[:, is_full]
     means = [sums[:, g].sum(axis=1) / k[:, None] for g, k in zip(groups, n)]
     scatter, freedom = _scatter(sums, counts, groups, means)
     # Variance of a residual: that of the cell, or of all cells if it is larger.
@@ -398,7 +401,7 @@ def _worst_cell(
     worst = int(np.argmax(length / np.sqrt(variance)))
     chance = plan.cell_false_alarm / len(sums)  # Bonferroni over the cells
     limit = np.sqrt(2 * variance[worst] * special.fdtri(2, max(freedom.sum(), 1), 1 - chance))
-    return CellTrend(float(length[worst]), float(limit), centres[keep][worst])
+    return CellTrend(float(length[worst]), float(limit), centres[is_full][worst])
 
 
 def _scatter(
@@ -445,7 +448,7 @@ def doubtful_observations(
     """
     failed = [c for c in checks if c.kind is Kind.EXPOSURES and c.passed is False]
     excluded = [f for f in result.findings if f.severity is Severity.NOTE and f.kind in BAD]
-    out = [one for finding in (*failed, *excluded) for one in _of_finding(finding)]
+    out = [doubtful for finding in (*failed, *excluded) for doubtful in _of_finding(finding)]
     if result.residuals is not None:
         out += _outlying_points(result, result.residuals)
     return out
@@ -469,13 +472,13 @@ def _outlying_points(result: CalibrationResult, table: ResidualTable) -> Iterato
         sorted(result.outliers[0], key=of_exposure), of_exposure
     ):
         tests = {point['target_id']: point for point in points}
-        here = (table.fluoroscope == name) & (table.exposure == exposure)
-        rows = np.flatnonzero(here & np.isin(table.target_id, list(tests)))
+        in_exposure = (table.fluoroscope == name) & (table.exposure == exposure)
+        rows = np.flatnonzero(in_exposure & np.isin(table.target_id, list(tests)))
         lengths = np.linalg.norm(table.residual[rows], axis=1)
-        found = [tests[target] for target in table.target_id[rows].tolist()]
-        sd = np.sqrt([point['value'] for point in found])
-        limit = np.sqrt([point['critical'] for point in found])
-        may_be = _may_be(result, table, here, rows, lengths * limit / sd)
+        failed = [tests[target] for target in table.target_id[rows].tolist()]
+        sd = np.sqrt([point['value'] for point in failed])
+        limit = np.sqrt([point['critical'] for point in failed])
+        candidates = _may_be(result, table, in_exposure, rows, lengths * limit / sd)
         for k, row in enumerate(rows):
             yield Doubtful(
                 name,
@@ -484,7 +487,7 @@ def _outlying_points(result: CalibrationResult, table: ResidualTable) -> Iterato
                 int(table.target_id[row]),
                 f'residual {lengths[k]:.2f} px, {sd[k]:.1f} times its standard deviation '
                 f'(limit {limit[k]:.1f})',
-                others=may_be[k],
+                others=candidates[k],
                 uv=(round(float(table.uv[row, 0]), 4), round(float(table.uv[row, 1]), 4)),
                 residual_px=round(float(lengths[k]), 3),
             )
@@ -509,18 +512,18 @@ def _may_be(
     ids = result.targets.target_id
     fits = here.copy()
     fits[rows] = False
-    others = ~np.isin(ids, table.target_id[fits])
-    if not others.any():
+    is_free = ~np.isin(ids, table.target_id[fits])
+    if not is_free.any():
         return [()] * len(rows)
-    points = result.targets.xyz_mm[others]
+    points = result.targets.xyz_mm[is_free]
     rotation = matrix_from_quaternion(pose.quaternion_wxyz)
     uv: Any = project(rotation, pose.position_mm, points, figures.interior)
     seen = table.uv[rows] - table.correction[rows]
     distance = np.linalg.norm(seen[:, None] - uv, axis=2)
     nearest = distance.argmin(axis=0) == np.arange(len(rows))[:, None]
     fitting = nearest & (distance < limit_px[:, None])
-    own = table.target_id[rows][:, None] == ids[others]
+    is_own = table.target_id[rows][:, None] == ids[is_free]
     return [
-        tuple(ids[others][order][good[order]].tolist())
-        for order, good in zip(np.argsort(distance, axis=1), fitting & ~own)
+        tuple(ids[is_free][order][accepted[order]].tolist())
+        for order, accepted in zip(np.argsort(distance, axis=1), fitting & ~is_own)
     ]

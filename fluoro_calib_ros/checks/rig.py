@@ -66,21 +66,23 @@ def interchanged(
     turn, shift = _relative(pairs)
     numbers = [a.exposure for a, _ in pairs]
     middle = int(np.argmin(np.median(_distances(turn, shift, turn, shift), axis=1)))
-    there = turn[middle : middle + 1]
+    mean_turn = turn[middle : middle + 1]
     base = shift[middle : middle + 1]
-    far = _distances(turn, shift, there, base)[:, 0] > INTERCHANGED
+    is_far = _distances(turn, shift, mean_turn, base)[:, 0] > INTERCHANGED
     inverse_turn = turn.transpose(0, 2, 1)
     inverse_shift = -(turn @ shift[..., None])[..., 0]
-    near = _distances(inverse_turn, inverse_shift, there, base)[:, 0] < INTERCHANGED / 2
-    wrong = tuple(int(number) for number, is_wrong in zip(numbers, far & near) if is_wrong)
-    if not wrong:
+    is_inverse = _distances(inverse_turn, inverse_shift, mean_turn, base)[:, 0] < INTERCHANGED / 2
+    swapped = tuple(
+        int(number) for number, is_wrong in zip(numbers, is_far & is_inverse) if is_wrong
+    )
+    if not swapped:
         return None
     a, b = names
     cause = (
         f'the frames of fluoroscopes {a} and {b} are interchanged in exposure'
-        f'{"s" * (len(wrong) > 1)} {", ".join(map(str, wrong))}'
+        f'{"s" * (len(swapped) > 1)} {", ".join(map(str, swapped))}'
     )
-    return Finding(Kind.FLUOROSCOPES_INTERCHANGED, cause, Place(names, wrong, name=''))
+    return Finding(Kind.FLUOROSCOPES_INTERCHANGED, cause, Place(names, swapped, name=''))
 
 
 def _pairs(
@@ -110,8 +112,8 @@ def _distances(
     """Return distances (k, l) of relative orientations: angle [rad] plus relative shift."""
     angle = rotation_angle(turn[:, None] @ other_turn[None].transpose(0, 1, 3, 2))
     length = np.linalg.norm(other_shift, axis=-1)[None]
-    apart = np.linalg.norm(shift[:, None] - other_shift[None], axis=-1)
-    return angle + apart / np.maximum(length, 1e-9)
+    distance = np.linalg.norm(shift[:, None] - other_shift[None], axis=-1)
+    return angle + distance / np.maximum(length, 1e-9)
 
 
 def contradiction(
@@ -157,25 +159,25 @@ def doubtful(scatter: PairScatter, side_px: int, noise_px: float) -> tuple[bool,
     points. Without an orientation the finding contains the reason.
     """
     a, b = scatter.fluoroscopes
-    off = float(np.median(scatter.off_px[scatter.used]))
+    off_px = float(np.median(scatter.off_px[scatter.used]))
     place = Place((a, b), name=ORIENTED)
-    if scatter.unexplained > DOUBTFUL_GROWTH and off >= noise_px:
-        usable = off <= MAX_MISFIT * side_px or scatter.unexplained <= MAX_GROWTH
-        kind, moved, why = _cause(scatter)
-        found = Finding(
+    if scatter.unexplained > DOUBTFUL_GROWTH and off_px >= noise_px:
+        usable = off_px <= MAX_MISFIT * side_px or scatter.unexplained <= MAX_GROWTH
+        kind, exposures, reason = _cause(scatter)
+        finding = Finding(
             kind,
             'the exposures contradict each other: the relative orientation of fluoroscopes '
-            f'{a} and {b} differs between them by {off:.1f} px, {scatter.unexplained:.0f} times '
-            f'its standard deviation; {why}',
-            Place((a, b), moved, name=ORIENTED if usable else NOT_ORIENTED),
+            f'{a} and {b} differs between them by {off_px:.1f} px, {scatter.unexplained:.0f} '
+            f'times its standard deviation; {reason}',
+            Place((a, b), exposures, name=ORIENTED if usable else NOT_ORIENTED),
             severity=Severity.WARNING,
-            numbers={'off_px': off, 'ratio': float(scatter.unexplained)},
+            numbers={'off_px': off_px, 'ratio': float(scatter.unexplained)},
         )
-        return usable, [found]
+        return usable, [finding]
     out = []
     if not scatter.used.all():
         excluded = tuple(scatter.exposures[~scatter.used].tolist())
-        found = Finding(
+        finding = Finding(
             Kind.PAIRS_EXCLUDED,
             f'not from exposure {", ".join(map(str, excluded))}, in which fluoroscopes {a} and '
             f'{b} stand otherwise to each other by {_size(scatter.off_px[~scatter.used])}',
@@ -184,9 +186,9 @@ def doubtful(scatter: PairScatter, side_px: int, noise_px: float) -> tuple[bool,
             severity=Severity.WARNING,
             numbers={'off_px': float(np.max(scatter.off_px[~scatter.used]))},
         )
-        out.append(found)
+        out.append(finding)
     if not scatter.corrected and scatter.angle_px >= noise_px:
-        found = Finding(
+        finding = Finding(
             Kind.RIG_DEPENDS_ON_ANGLE,
             f'the relative orientation of fluoroscopes {a} and {b} changes with the angle of the '
             f'C-arm, by {scatter.angle_px:.1f} px',
@@ -196,7 +198,7 @@ def doubtful(scatter: PairScatter, side_px: int, noise_px: float) -> tuple[bool,
             severity=Severity.WARNING,
             numbers={'angle_px': float(scatter.angle_px)},
         )
-        out.append(found)
+        out.append(finding)
     return True, out
 
 
@@ -224,15 +226,15 @@ def _cause(scatter: PairScatter) -> tuple[Kind, tuple[int, ...], str]:
     )
     steps = steps_of(count)
     fits = [_squares(place, np.hstack([columns, step])) for step in steps]
-    left = [squares for squares, _ in fits]
-    if count < MIN_PAIRS_MOVED or min(left) > MOVED_SHARE * _squares(place, columns)[0]:
+    remaining = [squares for squares, _ in fits]
+    if count < MIN_PAIRS_MOVED or min(remaining) > MOVED_SHARE * _squares(place, columns)[0]:
         cause = (
             'frames with the same number are not of the same exposure, the phantom moved between '
             'them, the fluoroscopes or their images do not stand still, or the corrections do not '
             'hold in all of them'
         )
         return Kind.PAIRS_CONTRADICT, (), cause
-    best = int(np.argmin(left))
+    best = int(np.argmin(remaining))
     split = 2 + best
     numbers = scatter.exposures[order]
     step = fits[best][1][-1]
@@ -273,7 +275,10 @@ class RigFindings:
     def notes(self) -> tuple[Finding, ...]:
         """Findings that a user has to know in addition to the check."""
         decided = {Kind.PAIRS_CONTRADICT, Kind.RIG_MOVED, Kind.RIG_NOT_ORIENTED}
-        return (*(one for one in self.doubts if one.kind not in decided), *self.trusted)
+        return (
+            *(finding for finding in self.doubts if finding.kind not in decided),
+            *self.trusted,
+        )
 
 
 def rig_findings(
@@ -298,9 +303,9 @@ def rig_findings(
     adjusted = [name for name in names if name in figures]
     for name in adjusted[1:]:
         first = adjusted[0]
-        found = contradiction((first, name), figures[first], figures[name])
-        if found is not None:
-            return RigFindings(names, None, (found,), noise_px=noise)
+        finding = contradiction((first, name), figures[first], figures[name])
+        if finding is not None:
+            return RigFindings(names, None, (finding,), noise_px=noise)
     try:
         orientation, scatter = orientation_and_scatter(
             {name: frames[name] for name in names},
@@ -309,23 +314,23 @@ def rig_findings(
             starts=result.starts,
         )
     except DataError as error:
-        why = f'{NOT_ORIENTED}: {error}'
-        found = Finding(
-            Kind.RIG_NOT_ORIENTED, why, Place(names, name=''), severity=Severity.WARNING
+        cause = f'{NOT_ORIENTED}: {error}'
+        finding = Finding(
+            Kind.RIG_NOT_ORIENTED, cause, Place(names, name=''), severity=Severity.WARNING
         )
-        return RigFindings(names, None, (found,), noise_px=noise)
+        return RigFindings(names, None, (finding,), noise_px=noise)
     side = max(max(calibration.image_size) for calibration in calibrations.values())
-    of_pairs = [doubtful(pairs, side, noise) for pairs in scatter]
-    refused = tuple(one for usable, doubts in of_pairs for one in doubts if not usable)
-    doubts = refused or tuple(one for _, doubts in of_pairs for one in doubts)
-    trusted = tuple(_trusted(frames, pairs, noise) for pairs in scatter)
+    tested = [doubtful(pairs, side, noise) for pairs in scatter]
+    refused = tuple(doubt for usable, doubts in tested for doubt in doubts if not usable)
+    doubts = refused or tuple(doubt for _, doubts in tested for doubt in doubts)
+    assumptions = tuple(_trusted(frames, pairs, noise) for pairs in scatter)
     return RigFindings(
         names,
         None if refused else orientation,
         doubts,
         scatter,
         noise_px=noise,
-        trusted=tuple(one for one in trusted if one is not None),
+        trusted=tuple(assumption for assumption in assumptions if assumption is not None),
     )
 
 
@@ -354,21 +359,21 @@ def check_rig(found: RigFindings) -> list[Check]:
 def _check(found: RigFindings, pairs: PairScatter) -> Check:
     """Return the check of the scatter of the pairs of two fluoroscopes."""
     a, b = pairs.fluoroscopes
-    off = float(np.median(pairs.off_px[pairs.used]))
-    predicted = off / max(pairs.unexplained, 1.0)
-    wrong = [one for one in found.doubts if one.place.fluoroscopes == (a, b)]
-    wrong = [one for one in wrong if one.kind in (Kind.PAIRS_CONTRADICT, Kind.RIG_MOVED)]
+    off_px = float(np.median(pairs.off_px[pairs.used]))
+    predicted = off_px / max(pairs.unexplained, 1.0)
+    doubts = [doubt for doubt in found.doubts if doubt.place.fluoroscopes == (a, b)]
+    doubts = [doubt for doubt in doubts if doubt.kind in (Kind.PAIRS_CONTRADICT, Kind.RIG_MOVED)]
     cause = (
         f'the relative orientation of fluoroscopes {a} and {b} differs between the exposures by '
-        f'{off:.3f} px, {pairs.unexplained:.1f} times its standard deviation'
+        f'{off_px:.3f} px, {pairs.unexplained:.1f} times its standard deviation'
     )
     return Check(
         Kind.ORIENTATION,
-        wrong[0].cause if wrong else cause,
-        wrong[0].place if wrong else Place((a, b), name=ORIENTED),
-        '' if wrong and wrong[0].kind is Kind.RIG_MOVED else CAPTURE,  # its cause contains it
+        doubts[0].cause if doubts else cause,
+        doubts[0].place if doubts else Place((a, b), name=ORIENTED),
+        '' if doubts and doubts[0].kind is Kind.RIG_MOVED else CAPTURE,  # its cause contains it
         numbers={'ratio': float(pairs.unexplained), 'noise_px': found.noise_px},
-        value=off,
+        value=off_px,
         limit=max(found.noise_px, DOUBTFUL_GROWTH * predicted),
         unit='px',
     )
@@ -381,20 +386,20 @@ def _trusted(frames: Frames, pairs: PairScatter, noise_px: float) -> Finding | N
     exposures, moves by less than the noise in the time between the frames of a pair.
     """
     a, b = pairs.fluoroscopes
-    moved = motion_between_stamps(frames[a], frames[b])
-    if moved is not None and moved <= noise_px:
+    moved_px = motion_between_stamps(frames[a], frames[b])
+    if moved_px is not None and moved_px <= noise_px:
         return None
-    why = 'they have no stamps'
-    if moved is not None:
-        why = f'by their stamps the image moves by {moved:.1f} px between them'
+    reason = 'they have no stamps'
+    if moved_px is not None:
+        reason = f'by their stamps the image moves by {moved_px:.1f} px between them'
     return Finding(
         Kind.TAKEN_ON_TRUST,
         f'the orientation of fluoroscopes {a} and {b} takes on trust that frames of one number '
-        f'are of one exposure, or that the phantom stands still ({why}): a delay that is always '
-        'the same looks like another orientation where the phantom turns steadily',
+        f'are of one exposure, or that the phantom stands still ({reason}): a delay that is '
+        'always the same looks like another orientation where the phantom turns steadily',
         Place((a, b), name=''),
-        severity=Severity.NOTE if moved is None else Severity.WARNING,
-        numbers={} if moved is None else {'moved_px': moved},
+        severity=Severity.NOTE if moved_px is None else Severity.WARNING,
+        numbers={} if moved_px is None else {'moved_px': moved_px},
     )
 
 
@@ -403,14 +408,14 @@ def motion_between_stamps(one: Sequence[Frame], other: Sequence[Frame]) -> float
 
     It is the median over the exposures, at the speed of the image between exposures.
     """
-    there = {frame.number: frame for frame in other if frame.stamp_ns}
+    by_number = {frame.number: frame for frame in other if frame.stamp_ns}
     stamped = sorted((f for f in one if f.stamp_ns), key=lambda frame: frame.stamp_ns)
-    moved = []
+    motions = []
     for before, after in pairwise(stamped):
-        partner = there.get(after.number)
-        by = displacement(before, after)
+        partner = by_number.get(after.number)
+        shift = displacement(before, after)
         interval = after.stamp_ns - before.stamp_ns
-        if partner is None or not np.isfinite(by) or not interval:
+        if partner is None or not np.isfinite(shift) or not interval:
             continue
-        moved.append(by * abs(partner.stamp_ns - after.stamp_ns) / interval)
-    return float(np.median(moved)) if moved else None
+        motions.append(shift * abs(partner.stamp_ns - after.stamp_ns) / interval)
+    return float(np.median(motions)) if motions else None

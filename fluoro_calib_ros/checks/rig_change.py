@@ -91,7 +91,7 @@ class RigChange:
 
         noise (n,): variances of the residuals due to noise alone.
         """
-        good = np.isfinite(found.residual)
+        is_finite = np.isfinite(found.residual)
         columns = (
             target_id,
             *uv,
@@ -100,7 +100,7 @@ class RigChange:
             found.sd_total**2 - noise,
             np.abs(found.residual) > CERTAIN * found.sd_total,
         )
-        self._open[number].append(tuple(column[good] for column in columns))
+        self._open[number].append(tuple(column[is_finite] for column in columns))
 
     def close(self) -> None:
         """End a block."""
@@ -137,14 +137,14 @@ class RigChange:
         _, first, count = np.unique(target_id[order], return_index=True, return_counts=True)
         rows = order[first + count // 2]
         i, j, geometry = self._pairs[number]
-        by_rig = np.zeros((len(rows), ORIENTATION_SIZE * len(self._orientation.fluoroscopes)))
+        derivative = np.zeros((len(rows), ORIENTATION_SIZE * len(self._orientation.fluoroscopes)))
         columns_of_pair = self._orientation.covariance_rows([i, j])
-        by_rig[:, columns_of_pair] = geometry.by_orientation(uv_a[rows], uv_b[rows])
+        derivative[:, columns_of_pair] = geometry.by_orientation(uv_a[rows], uv_b[rows])
         return _Rays(
             residual[rows],
             MEDIAN_VARIANCE * noise[rows] / count,
             np.maximum(systematic[rows], 0.0),
-            by_rig,
+            derivative,
             is_apart[rows],
         )
 
@@ -161,15 +161,15 @@ class RigChange:
         factor, weight = _weights(design, rays.residual, variance)
         normal = rays.by_rig.T @ (rays.by_rig * weight[:, None])
         right = -rays.by_rig.T @ (weight * rays.residual)
-        told = Told(normal, right)
+        statistics = Told(normal, right)
         moments = np.zeros((len(self._hypotheses), len(SIZES), *normal.shape))
         evidence = []
-        for of_sizes, sd in zip(moments, self._hypotheses):
+        for moments_of_sizes, sd in zip(moments, self._hypotheses):
             rows = np.flatnonzero(sd)
-            of_change = told.only(rows)
-            tried = SIZES[:, None] * sd[rows]
-            of_sizes[:, rows[:, None], rows] = of_change.moments(tried)
-            evidence.append(of_change.evidence(tried))
+            selected = statistics.only(rows)
+            sizes = SIZES[:, None] * sd[rows]
+            moments_of_sizes[:, rows[:, None], rows] = selected.moments(sizes)
+            evidence.append(selected.evidence(sizes))
         share = np.exp(np.array(evidence) - np.max(evidence))
         covariance = np.tensordot(share / share.sum(), moments, axes=2)
         return Addition(
@@ -221,9 +221,9 @@ def _weights(
     for _ in range(ITERATIONS):
         normal = design.T @ (design * weight[:, None]) + unit
         inverse = np.linalg.inv(normal)
-        rest = residual - design @ (inverse @ (design.T @ (weight * residual)))
-        squares = rest**2 / variance
-        free = max(len(rest) - len(unit) + float(np.trace(inverse)), 1.0)
-        factor = max(1.0, float(np.median(squares)) / NORMAL_MEDIAN**2 * len(rest) / free)
+        remainder = residual - design @ (inverse @ (design.T @ (weight * residual)))
+        squares = remainder**2 / variance
+        free = max(len(remainder) - len(unit) + float(np.trace(inverse)), 1.0)
+        factor = max(1.0, float(np.median(squares)) / NORMAL_MEDIAN**2 * len(remainder) / free)
         weight = (NU + 1) / (NU + squares / factor) / (variance * factor)
     return factor, weight

@@ -109,8 +109,8 @@ class RigDriftWatch:
             return intersector, 0.0
         if self._wide is None or self._wide[0] is not intersector:
             covariance = self._orientation.covariance + added.covariance
-            wide = replace(self._orientation, covariance=covariance)
-            self._wide = intersector, Intersector(wide, intersector.reject)
+            orientation = replace(self._orientation, covariance=covariance)
+            self._wide = intersector, Intersector(orientation, intersector.reject)
         return self._wide[1], added.image_sd
 
     def add_exposure(self, stamp_ns: int, exposure: IntersectedViews) -> DriftState:
@@ -124,22 +124,22 @@ class RigDriftWatch:
         uv, sigma = exposure.views.uv, exposure.views.sigma
         noise2 = np.maximum(sigma * sigma - exposure.views.correction_sd**2, 0)
         for number, (i, j, geometry) in enumerate(self._pairs):
-            found = geometry.residuals(uv[i], uv[j], sigma[i], sigma[j])
-            noise = found.factor_a**2 * noise2[i] + found.factor_b**2 * noise2[j]
-            limit = CERTAIN * found.sd_total + FALSE_MATCH_PX
-            self._change.add(number, target_id, (uv[i], uv[j]), found, noise=noise)
-            good = np.flatnonzero(np.abs(found.residual) <= limit)
+            residuals = geometry.residuals(uv[i], uv[j], sigma[i], sigma[j])
+            noise = residuals.factor_a**2 * noise2[i] + residuals.factor_b**2 * noise2[j]
+            limit = CERTAIN * residuals.sd_total + FALSE_MATCH_PX
+            self._change.add(number, target_id, (uv[i], uv[j]), residuals, noise=noise)
+            accepted = np.flatnonzero(np.abs(residuals.residual) <= limit)
             observations = EpipolarObservations(
-                target_id[good],
-                uv[i][good],
-                uv_b=uv[j][good],
-                residual=found.residual[good],
-                sd_noise=np.sqrt(noise[good]),
-                sd_systematic=np.sqrt(np.maximum(found.sd_total**2 - noise, 0))[good],
-                normal_a=found.normal_a[good],
-                normal_b=found.normal_b[good],
-                factor_a=found.factor_a[good],
-                factor_b=found.factor_b[good],
+                target_id[accepted],
+                uv[i][accepted],
+                uv_b=uv[j][accepted],
+                residual=residuals.residual[accepted],
+                sd_noise=np.sqrt(noise[accepted]),
+                sd_systematic=np.sqrt(np.maximum(residuals.sd_total**2 - noise, 0))[accepted],
+                normal_a=residuals.normal_a[accepted],
+                normal_b=residuals.normal_b[accepted],
+                factor_a=residuals.factor_a[accepted],
+                factor_b=residuals.factor_b[accepted],
             )
             self._watch.add_residuals(stamp_ns, self._names[i], self._names[j], observations)
         if self._has_bodies:
@@ -202,19 +202,21 @@ class RigDriftWatch:
     def _widening(self, exposure: IntersectedViews, added: Addition) -> Finding | None:
         """Return the increase of the standard deviations of the points of an exposure."""
         views = exposure.views
-        given = Intersector(self._orientation, None)
-        wide, image_sd = self.widened(given)
+        as_calibrated = Intersector(self._orientation, None)
+        with_change, image_sd = self.widened(as_calibrated)
         self._wide = None
-        before, now = (
-            one.intersect(views.uv, np.hypot(views.sigma, sd))
-            for one, sd in ((given, 0.0), (wide, image_sd))
+        before, after = (
+            intersector.intersect(views.uv, np.hypot(views.sigma, sd))
+            for intersector, sd in ((as_calibrated, 0.0), (with_change, image_sd))
         )
-        good = (before.status == INTERSECTED) & (now.status == INTERSECTED)
-        if not good.any():
+        intersected = (before.status == INTERSECTED) & (after.status == INTERSECTED)
+        if not intersected.any():
             return None
         sd_before_mm, sd_mm = (
-            float(np.sqrt(np.median(np.trace(one.covariance[good], axis1=1, axis2=2)) / 3))
-            for one in (before, now)
+            float(
+                np.sqrt(np.median(np.trace(points.covariance[intersected], axis1=1, axis2=2)) / 3)
+            )
+            for points in (before, after)
         )
         return widened(sd_before_mm, sd_mm, miss_px=added.miss, image_sd_px=added.image_sd)
 
@@ -297,11 +299,11 @@ class RecordingDriftWatch(RigDriftWatch):
             self._worst = state
             self._worst_ns = stamp_ns
         widest = self._widest
-        wide = self.widening
-        if wide is not None and (
-            widest is None or wide.numbers['sd_mm'] > widest.numbers['sd_mm']
+        widening = self.widening
+        if widening is not None and (
+            widest is None or widening.numbers['sd_mm'] > widest.numbers['sd_mm']
         ):
-            self._widest = wide
+            self._widest = widening
         return state
 
     def verdict(self) -> DriftVerdict:
@@ -322,28 +324,28 @@ class RecordingDriftWatch(RigDriftWatch):
         min_s = MIN_BLOCKS_TO_ALARM * self.options.block_s
         if watched >= min_s:
             cause = f'no drift is seen in {watched:.1f} s'
-            found = Finding(Kind.NO_DRIFT, cause, severity=OK, numbers={'watched_s': watched})
-            return DriftVerdict(found, level_at_end=level_at_end, watched_s=watched)
+            finding = Finding(Kind.NO_DRIFT, cause, severity=OK, numbers={'watched_s': watched})
+            return DriftVerdict(finding, level_at_end=level_at_end, watched_s=watched)
         learn_s = self.options.learn_s
         length_s = 0.0
         if self._last_ns is not None and self._first_ns is not None:
             length_s = (self._last_ns - self._first_ns) / 1e9
         cause = 'there are too few markers in two views to detect a drift'
-        found = Finding(Kind.NOT_WATCHED, cause, severity=WARN)
+        finding = Finding(Kind.NOT_WATCHED, cause, severity=WARN)
         if length_s < learn_s + min_s:
-            found = Finding(
+            finding = Finding(
                 Kind.SHORT_RECORDING,
                 f'the recording is too short to detect a drift: it has {length_s:.1f} s, of '
                 f'which the first {learn_s:g} s are learned',
                 severity=WARN,
                 numbers={'length_s': length_s, 'learn_s': learn_s},
             )
-        return DriftVerdict(found, watched_s=watched)
+        return DriftVerdict(finding, watched_s=watched)
 
     def _drift(self, worst: DriftState) -> Finding:
         """Return the finding on the recording for the drift of the worst state."""
         found_s = (self._found_ns - (self._first_ns or 0)) / 1e9
         ended = '; it was gone at the end' if self.state.level == OK else ''
-        verb = 'no longer holds' if worst.level == ERROR else 'may no longer hold'
+        statement = 'no longer holds' if worst.level == ERROR else 'may no longer hold'
         cause = f'{worst.finding.cause}; found {found_s:.1f} s after the beginning{ended}'
-        return replace(worst.finding, cause=cause, advice=f'the calibration {verb}')
+        return replace(worst.finding, cause=cause, advice=f'the calibration {statement}')

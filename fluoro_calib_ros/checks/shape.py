@@ -78,22 +78,22 @@ def strain_of_survey(evidence: Evidence) -> Strain | None:
     tensors, displacement = _strains(survey)
     displacement = _without_similarity(displacement, survey, solved.measured.network.survey_sd_mm)
     score = _score(evidence, solved, displacement)
-    shown = _strains_that_show(displacement)
-    information = shown.T @ score.information @ shown
-    t = np.linalg.solve(information, shown.T @ score.pull)
+    visible = _strains_that_show(displacement)
+    information = visible.T @ score.information @ visible
+    t = np.linalg.solve(information, visible.T @ score.pull)
     critical = SD_FACTOR**2 * _dispersion(evidence) * float(chdtri(len(t), FALSE_ALARM))
     variance = np.diagonal(evidence.result.targets.covariance, axis1=1, axis2=2)
-    of_points = (score.followed / np.sqrt(variance)[..., None]).reshape(-1, STRAINS) @ shown
-    harm = of_points.T @ of_points / len(of_points)
-    hidden, modes = eigh(critical * harm, information)
+    standardised = (score.followed / np.sqrt(variance)[..., None]).reshape(-1, STRAINS) @ visible
+    nse_matrix = standardised.T @ standardised / len(standardised)
+    hidden, modes = eigh(critical * nse_matrix, information)
     return Strain(
-        np.tensordot(shown @ t, tensors, 1),
-        rms_mm=float(np.sqrt(np.mean(np.sum((displacement @ (shown @ t)) ** 2, axis=1)))),
+        np.tensordot(visible @ t, tensors, 1),
+        rms_mm=float(np.sqrt(np.mean(np.sum((displacement @ (visible @ t)) ** 2, axis=1)))),
         test=float(t @ information @ t),
         critical=critical,
-        nse=float(t @ harm @ t),
+        nse=float(t @ nse_matrix @ t),
         hidden_nse=float(hidden[-1]),
-        hidden=np.tensordot(np.sqrt(critical) * (shown @ modes[:, -1]), tensors, 1),
+        hidden=np.tensordot(np.sqrt(critical) * (visible @ modes[:, -1]), tensors, 1),
     )
 
 
@@ -119,7 +119,7 @@ def _score(evidence: Evidence, solved: SolvedNetwork, displacement: NDArray[np.f
     free = [evidence.calibrations[name].interior_estimated for name in names]
     network = replace(network, interior_free=np.array(free), additional=tuple(functions))
     parameters = replace(
-        adjustment.parameters, additional=tuple(np.zeros(one.count) for one in functions)
+        adjustment.parameters, additional=tuple(np.zeros(added.count) for added in functions)
     )
     factor = adjustment.noise.information_factor(adjustment.q)
     equations = normal_equations(network, parameters, solved.correction, adjustment.noise, factor)
@@ -127,10 +127,10 @@ def _score(evidence: Evidence, solved: SolvedNetwork, displacement: NDArray[np.f
     weighted = displacement / network.survey_sd_mm[:, None, None] ** 2
     followed = covariance_times_points(matrix, weighted).points
     step = matrix.solve(UnknownVector(equations.e, equations.p, equations.g)).points[..., 0]
-    left = network.survey_mm - parameters.points_mm - step
+    misclosure = network.survey_mm - parameters.points_mm - step
     return _Score(
         np.einsum('nai,naj->ij', weighted, displacement - followed),
-        np.einsum('nai,na->i', weighted, left),
+        np.einsum('nai,na->i', weighted, misclosure),
         followed,
     )
 
@@ -141,8 +141,12 @@ def _dispersion(evidence: Evidence) -> float:
     A strain shows in such terms, as does a distortion that differs between exposures, which
     inflates the statistic (McCullagh and Nelder, "Generalized Linear Models", 1989, 4.5).
     """
-    found = [one.chi2_per_dof / VARYING for one in evidence.variations.values() if one is not None]
-    return max((1.0, *found))
+    ratios = [
+        variation.chi2_per_dof / VARYING
+        for variation in evidence.variations.values()
+        if variation is not None
+    ]
+    return max((1.0, *ratios))
 
 
 def _change(evidence: Evidence, network: Network, f: int, name: str) -> AdditionalParameters:
@@ -150,8 +154,8 @@ def _change(evidence: Evidence, network: Network, f: int, name: str) -> Addition
     calibration = evidence.calibrations[name]
     rows = network.rows(f)
     functions = exposure_functions(network.uv[rows], calibration.image_size, calibration.interior)
-    claimed = max(evidence.trends[name].claimed_sd, 1e-3 * calibration.image_sd)
-    return AdditionalParameters(functions, np.eye(functions.shape[2]) / claimed**2)
+    correction_sd = max(evidence.trends[name].claimed_sd, 1e-3 * calibration.image_sd)
+    return AdditionalParameters(functions, np.eye(functions.shape[2]) / correction_sd**2)
 
 
 def _strains(survey_mm: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -172,28 +176,28 @@ def _without_similarity(
     similarity = similarity_directions(survey_mm, survey_mm.mean(axis=0))
     weight = 1 / sd_mm[:, None, None]
     rows = 3 * len(survey_mm)
-    left = (weight * similarity).reshape(rows, -1)
+    weighted = (weight * similarity).reshape(rows, -1)
     right = (weight * displacement).reshape(rows, STRAINS)
-    return displacement - similarity @ np.linalg.lstsq(left, right, rcond=None)[0]
+    return displacement - similarity @ np.linalg.lstsq(weighted, right, rcond=None)[0]
 
 
 def _strains_that_show(displacement: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the strains (5, k) that displace beads (n, 3, 5), as columns of unit length."""
-    of_beads = displacement.reshape(-1, STRAINS)
-    values, vectors = np.linalg.eigh(of_beads.T @ of_beads)
+    flat = displacement.reshape(-1, STRAINS)
+    values, vectors = np.linalg.eigh(flat.T @ flat)
     return vectors[:, values > MIN_DISPLACEMENT * values[-1]]
 
 
 def check_shape(evidence: Evidence, names: Sequence[str]) -> list[Check]:
     """Test the survey for a strain that all beads have in common."""
-    found = strain_of_survey(evidence)
-    if found is None:
+    strain = strain_of_survey(evidence)
+    if strain is None:
         return []  # reported by check 'beads'
-    value = found.rms_mm
-    significant = value * np.sqrt(found.critical / max(found.test, TINY))
-    matters = value * np.sqrt(HARMLESS_NSE / max(found.nse, TINY))
-    direction, size = _principal(found.tensor)
-    hidden_direction, hidden_size = _principal(found.hidden)
+    value = strain.rms_mm
+    significant_mm = value * np.sqrt(strain.critical / max(strain.test, TINY))
+    harmful_mm = value * np.sqrt(HARMLESS_NSE / max(strain.nse, TINY))
+    direction, size = _principal(strain.tensor)
+    hidden_direction, hidden_size = _principal(strain.hidden)
     return [
         Check(
             Kind.SHAPE,
@@ -202,15 +206,15 @@ def check_shape(evidence: Evidence, names: Sequence[str]) -> list[Check]:
             advice='survey the phantom again, or give a larger sd, and calibrate again',
             numbers={
                 'strain': size,
-                'test': found.test,
-                'critical': found.critical,
-                'nse': found.nse,
-                'hidden_nse': found.hidden_nse,
+                'test': strain.test,
+                'critical': strain.critical,
+                'nse': strain.nse,
+                'hidden_nse': strain.hidden_nse,
                 'hidden_strain': hidden_size,
                 **dict(zip(HIDDEN, hidden_direction.tolist())),
             },
             value=value,
-            limit=max(significant, matters),
+            limit=max(significant_mm, harmful_mm),
             unit='mm',
         )
     ]
@@ -223,13 +227,13 @@ def trusted_shape(checks: Sequence[Check]) -> list[Finding]:
         hidden_nse = check.numbers.get('hidden_nse', 0.0)
         if check.kind is Kind.SHAPE and hidden_nse > TRUSTED_NSE:
             size = abs(check.numbers['hidden_strain'])
-            along = _text(np.array([check.numbers[name] for name in HIDDEN]))
+            direction = _text(np.array([check.numbers[name] for name in HIDDEN]))
             out.append(
                 Finding(
                     Kind.TAKEN_ON_TRUST,
                     f'the shape of the phantom is taken on trust: a strain of {1e2 * size:.2f} % '
-                    f'along {along} would not be seen in these exposures, and make the errors of '
-                    f'beads {np.sqrt(1 + hidden_nse):.1f} times their standard deviations',
+                    f'along {direction} would not be seen in these exposures, and make the errors '
+                    f'of beads {np.sqrt(1 + hidden_nse):.1f} times their standard deviations',
                     Place(name=''),
                     'tilt the phantom about more than one axis',
                     severity=Severity.NOTE,

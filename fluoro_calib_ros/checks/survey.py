@@ -32,11 +32,11 @@ UNKNOWN = 1e6  # variance of an unknown datum, over that of the beads
 
 def unsurveyed(beads: SurveyedBeads) -> list[Finding]:
     """Return findings for beads with too few rays, and for beads with too acute intersections."""
-    few = beads.rays < MIN_RAYS
-    acute = ~few & (beads.angle_rad < MIN_ANGLE_RAD)
+    has_few_rays = beads.rays < MIN_RAYS
+    is_acute = ~has_few_rays & (beads.angle_rad < MIN_ANGLE_RAD)
     out = []
-    if few.any():
-        ids = beads.target_id[few]
+    if has_few_rays.any():
+        ids = beads.target_id[has_few_rays]
         out.append(
             Finding(
                 Kind.FEW_RAYS,
@@ -47,8 +47,8 @@ def unsurveyed(beads: SurveyedBeads) -> list[Finding]:
                 numbers={'beads': len(ids)},
             )
         )
-    if acute.any():
-        ids = beads.target_id[acute]
+    if is_acute.any():
+        ids = beads.target_id[is_acute]
         out.append(
             Finding(
                 Kind.WEAK_INTERSECTION,
@@ -65,12 +65,12 @@ def unsurveyed(beads: SurveyedBeads) -> list[Finding]:
 def displaced(beads: SurveyedBeads) -> Finding | None:
     """Return a finding for beads that are not at their given coordinates."""
     variance = beads.covariance + beads.given_sd_mm[:, None, None] ** 2 * np.eye(3)
-    off = beads.xyz_mm - beads.given_mm
-    square = np.einsum('na,nab,nb->n', off, np.linalg.inv(variance), off)
-    wrong = square > chdtri(3, CONTRADICTION / len(off))
-    if not wrong.any():
+    offset = beads.xyz_mm - beads.given_mm
+    square = np.einsum('na,nab,nb->n', offset, np.linalg.inv(variance), offset)
+    is_wrong = square > chdtri(3, CONTRADICTION / len(offset))
+    if not is_wrong.any():
         return None
-    order = np.flatnonzero(wrong)[np.argsort(-beads.off_mm[wrong])]
+    order = np.flatnonzero(is_wrong)[np.argsort(-beads.off_mm[is_wrong])]
     ids = beads.target_id[order]
     largest = float(beads.off_mm[order[0]])
     return Finding(
@@ -98,30 +98,32 @@ def check_survey_halves(one: SurveyedBeads, other: SurveyedBeads) -> Check:
 
     Neither has a datum of its own: each is fitted to the given coordinates of its beads.
     """
-    common = np.intersect1d(one.target_id, other.target_id)
-    if len(common) < MIN_BEADS:
+    common_ids = np.intersect1d(one.target_id, other.target_id)
+    if len(common_ids) < MIN_BEADS:
         return halves_not_compared(
-            f'two halves of the exposures have {len(common)} beads in common'
+            f'two halves of the exposures have {len(common_ids)} beads in common'
         )
-    one, other = (beads.without(np.setdiff1d(beads.target_id, common)) for beads in (one, other))
+    one, other = (
+        beads.without(np.setdiff1d(beads.target_id, common_ids)) for beads in (one, other)
+    )
     difference = (one.xyz_mm - other.xyz_mm).reshape(-1, 1)
     covariance = one.covariance + other.covariance
     flat = similarity_directions(one.given_mm, one.given_mm.mean(axis=0)).reshape(-1, DATUM_DEFECT)
     flat = flat / np.linalg.norm(flat, axis=0)
     weighted = _weighted_by(one, other, flat)
-    left = difference - flat @ np.linalg.solve(
+    remainder = difference - flat @ np.linalg.solve(
         flat.T @ weighted(flat), flat.T @ weighted(difference)
     )
-    square = float(np.sum(left * weighted(left)))
-    freedom = 3 * len(common) - DATUM_DEFECT
-    rms = float(np.sqrt(np.mean(left**2)))
+    square = float(np.sum(remainder * weighted(remainder)))
+    freedom = 3 * len(common_ids) - DATUM_DEFECT
+    rms = float(np.sqrt(np.mean(remainder**2)))
     expected = float(np.sqrt(np.trace(covariance, axis1=1, axis2=2).mean() / 3))
     return Check(
         Kind.HALVES,
         f'two halves of the exposures give coordinates that differ by {rms:.3f} mm, where '
         f'{expected:.3f} mm is predicted',
         advice='see that phantom and fluoroscope stand still in each exposure, and take more',
-        numbers={'difference_mm': rms, 'predicted_mm': expected, 'beads': len(common)},
+        numbers={'difference_mm': rms, 'predicted_mm': expected, 'beads': len(common_ids)},
         value=square / freedom,
         limit=max(HALVES_LIMIT, float(chdtri(freedom, CONTRADICTION)) / freedom),
         unit='predicted variance',
@@ -146,8 +148,8 @@ def _weighted_by(
     correction; the datum (3n, 7), with unit columns, is not known to either survey.
     """
     if one.joint_covariance is not None and other.joint_covariance is not None:
-        joint = one.joint_covariance + other.joint_covariance
-        information = np.linalg.inv(joint + UNKNOWN * np.trace(joint) * datum @ datum.T)
+        total = one.joint_covariance + other.joint_covariance
+        information = np.linalg.inv(total + UNKNOWN * np.trace(total) * datum @ datum.T)
         return lambda values: information @ values
     blocks = np.linalg.inv(one.covariance + other.covariance)
     return lambda values: (blocks @ values.reshape(len(blocks), 3, -1)).reshape(values.shape)
@@ -188,17 +190,22 @@ def _check_distances(beads: SurveyedBeads) -> Check:
         )
     ratio = np.abs(beads.scaled.normalised)
     worst = int(np.argmax(ratio))
-    off = float(beads.scaled.error_mm[worst])
+    error = float(beads.scaled.error_mm[worst])
     # With two distances, either may be wrong.
     named = beads.distances if len(ratio) == 2 else beads.distances[worst : worst + 1]
-    names = ' or '.join(one.name for one in named)
+    names = ' or '.join(distance.name for distance in named)
     return Check(
         Kind.DISTANCES,
         f'{scale} times that of the given coordinates by {len(ratio)} distances; {names} is off '
-        f'by {abs(off):.3f} mm, {ratio[worst]:.1f} times its sd, the most',
-        Place(target_id=tuple(end for one in named for end in (one.first, one.second)), name=''),
+        f'by {abs(error):.3f} mm, {ratio[worst]:.1f} times its sd, the most',
+        Place(
+            target_id=tuple(
+                end for distance in named for end in (distance.first, distance.second)
+            ),
+            name='',
+        ),
         'measure again, between the centres of the beads, or give a larger sd',
-        numbers={**numbers, 'error_mm': off, 'normalised': float(ratio[worst])},
+        numbers={**numbers, 'error_mm': error, 'normalised': float(ratio[worst])},
         value=beads.scaled.chi2,
         limit=float(chdtri(beads.scaled.freedom, CONTRADICTION)),
         unit='chi2',
@@ -208,31 +215,31 @@ def _check_distances(beads: SurveyedBeads) -> Check:
 def _check_layout(beads: SurveyedBeads) -> Check:
     """Check for beads further off than half a spacing, which may be others unless sds allow it."""
     nearest = float(np.median(KDTree(beads.given_mm).query(beads.given_mm, k=2)[0][:, 1]))
-    off = float(np.sqrt(np.mean(beads.off_mm**2)))
-    allowed = OFF_SD * np.sqrt(3) * float(np.sqrt(np.mean(beads.given_sd_mm**2)))
+    off_mm = float(np.sqrt(np.mean(beads.off_mm**2)))
+    tolerance = OFF_SD * np.sqrt(3) * float(np.sqrt(np.mean(beads.given_sd_mm**2)))
     return Check(
         Kind.OTHER_PHANTOM,
-        f'the beads lie {off:.2f} mm from the given coordinates, neighbours are {nearest:.2f} mm '
-        'apart',
+        f'the beads lie {off_mm:.2f} mm from the given coordinates, neighbours are {nearest:.2f} '
+        'mm apart',
         advice='check that the ids of the image points are those of the given coordinates, and '
         'that their sd says how rough they are',
-        numbers={'off_mm': off, 'spacing_mm': nearest},
-        value=off,
-        limit=max(nearest / 2, allowed),
+        numbers={'off_mm': off_mm, 'spacing_mm': nearest},
+        value=off_mm,
+        limit=max(nearest / 2, tolerance),
         unit='mm',
     )
 
 
 def _check_precision(beads: SurveyedBeads) -> Check:
     sd = float(np.median(beads.sd_mm))
-    given = float(np.median(beads.given_sd_mm))
+    given_sd = float(np.median(beads.given_sd_mm))
     return Check(
         Kind.PRECISION,
         f'the coordinates have a standard deviation of {sd:.3f} mm (median), the given ones '
-        f'{given:.3f} mm',
+        f'{given_sd:.3f} mm',
         advice='take more exposures, and measure longer distances, or keep the given coordinates',
-        numbers={'sd_mm': sd, 'given_sd_mm': given},
+        numbers={'sd_mm': sd, 'given_sd_mm': given_sd},
         value=sd,
-        limit=given,
+        limit=given_sd,
         unit='mm',
     )

@@ -62,21 +62,21 @@ def with_given_interior(evidence: Evidence, checks: Sequence[Check]) -> list[Che
     distance = request.principal_distance
     if request.options.interior_sd is None or distance is None:
         return list(checks)
-    found: list[Check] = []
+    contradictions: list[Check] = []
     for names in request.groups:
         names = tuple(name for name in names if name not in request.known_orientations)
         if names:
-            found += _contradictions(evidence, names, distance)
-    if not found:
+            contradictions += _contradictions(evidence, names, distance)
+    if not contradictions:
         return list(checks)
-    wrong = {'', *(check.place.fluoroscope for check in found)}
-    others = [
+    contradicted = {'', *(check.place.fluoroscope for check in contradictions)}
+    remaining = [
         replace(check, advice=REPAIR_FIRST)
-        if check.passed is False and check.place.fluoroscope in wrong
+        if check.passed is False and check.place.fluoroscope in contradicted
         else check
         for check in checks
     ]
-    return [*found, *others]
+    return [*contradictions, *remaining]
 
 
 def _contradictions(evidence: Evidence, names: Sequence[str], distance: float) -> list[Check]:
@@ -93,19 +93,21 @@ def _contradictions(evidence: Evidence, names: Sequence[str], distance: float) -
 def _given_interior_check(
     evidence: Evidence, name: str, free: FluoroscopeCalibration, distance: float
 ) -> Check | None:
-    present = evidence.calibrations[name]
-    rmse, rmse_free = rms(present.rmse_after), rms(free.rmse_after)
+    calibration = evidence.calibrations[name]
+    rmse, rmse_free = rms(calibration.rmse_after), rms(free.rmse_after)
     gain = rmse / rmse_free
-    given = nominal_interior(present.image_size, distance)
+    given_interior = nominal_interior(calibration.image_size, distance)
     given_sd = np.asarray(evidence.request.options.interior_sd)
     sd = np.sqrt(np.diag(free.interior_covariance))
-    off = np.abs(free.interior - given) / np.hypot(given_sd, sd)
-    least = MIN_GAIN if present.model.corrects else MIN_GAIN_UNCORRECTED
-    if not gain > least or not off.max() > CERTAIN:
+    deviation = np.abs(free.interior - given_interior) / np.hypot(given_sd, sd)
+    min_gain = MIN_GAIN if calibration.model.corrects else MIN_GAIN_UNCORRECTED
+    if not gain > min_gain or not deviation.max() > CERTAIN:
         return None
-    wrong = [i for i in np.argsort(-off) if off[i] > CERTAIN]
-    stated = ', '.join(f'{LABELS[i]} = {given[i]:.1f} (sd {given_sd[i]:g})' for i in wrong)
-    shown = ', '.join(f'{LABELS[i]} = {free.interior[i]:.1f} (sd {sd[i]:.1f})' for i in wrong)
+    deviating = [i for i in np.argsort(-deviation) if deviation[i] > CERTAIN]
+    stated = ', '.join(
+        f'{LABELS[i]} = {given_interior[i]:.1f} (sd {given_sd[i]:g})' for i in deviating
+    )
+    shown = ', '.join(f'{LABELS[i]} = {free.interior[i]:.1f} (sd {sd[i]:.1f})' for i in deviating)
     return Check(
         Kind.GIVEN_INTERIOR,
         f'the given interior orientation, {stated} px, contradicts the '
@@ -117,7 +119,7 @@ def _given_interior_check(
             **{f'{label}_px': float(x) for label, x in zip(LABELS, free.interior)},
             **{f'sd_{label}_px': float(x) for label, x in zip(LABELS, sd)},
         },
-        value=off.max(),
+        value=deviation.max(),
         limit=CERTAIN,
         unit='sd',
     )
@@ -226,9 +228,9 @@ def _achieved_sd(evidence: Evidence, name: str, checks: Sequence[Check]) -> floa
         for check in checks
         if check.place.fluoroscope == name and np.isfinite(check.value)
     }
-    common = evidence.trends[name]
-    claimed = common.claimed_sd * max(1.0, values.get(Kind.HALVES, 1.0))
-    parts = (claimed, values.get(Kind.WHITENESS, 0.0), values.get(Kind.VARIATION, 0.0))
+    trend = evidence.trends[name]
+    correction_sd = trend.claimed_sd * max(1.0, values.get(Kind.HALVES, 1.0))
+    parts = (correction_sd, values.get(Kind.WHITENESS, 0.0), values.get(Kind.VARIATION, 0.0))
     return float(np.linalg.norm(parts))
 
 
@@ -264,7 +266,7 @@ class _StepCounter:
 def _used_frames(frames: Frames, result: CalibrationResult) -> dict[str, list[Frame]]:
     """Return the frames that an adjustment used, in the order of their numbers."""
     out = {}
-    for name, of_fluoroscope in frames.items():
-        used = {e.exposure for e in result.fluoroscopes[name].exposures}
-        out[name] = sorted((f for f in of_fluoroscope if f.number in used), key=lambda f: f.number)
+    for name, exposures in frames.items():
+        numbers = {e.exposure for e in result.fluoroscopes[name].exposures}
+        out[name] = sorted((f for f in exposures if f.number in numbers), key=lambda f: f.number)
     return out

@@ -32,8 +32,8 @@ MAX_DISTANCE = np.deg2rad(15)  # maximum angle to the nearest calibrated angle [
 def harmonics(angle: ArrayLike) -> NDArray[np.float64]:
     """Return cosines and sines (..., 4) of angles (...) [rad], ordered by harmonic."""
     multiple = np.asarray(angle, dtype=float)[..., None] * np.arange(1, ORDERS + 1)
-    both = np.stack([np.cos(multiple), np.sin(multiple)], axis=-1)
-    return both.reshape(*both.shape[:-2], HARMONICS)
+    waves = np.stack([np.cos(multiple), np.sin(multiple)], axis=-1)
+    return waves.reshape(*waves.shape[:-2], HARMONICS)
 
 
 @dataclass(frozen=True)
@@ -159,10 +159,10 @@ class AngleField:
     def _change_at(
         self, uv: NDArray[np.float64], angle: float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        found = self._unknown if np.isnan(angle) else self._known(angle)
-        values = self._values(uv, found.coefficients)
-        variance = self._at(uv, found.variance)
-        if found.scatters:
+        change = self._unknown if np.isnan(angle) else self._known(angle)
+        values = self._values(uv, change.coefficients)
+        variance = self._at(uv, change.variance)
+        if change.scatters:
             variance = variance + np.einsum('nka,nka->n', values[:, 1:], values[:, 1:]) / 2
         return values[:, 0], variance
 
@@ -173,8 +173,8 @@ class AngleField:
             weights = harmonics(angle) - self._mean
             last = angle, self._change(weights, np.outer(weights, weights), weights[None])
             self.__dict__['_last'] = last  # one assignment, safe for other threads
-        found: _Change = last[1]
-        return found
+        change: _Change = last[1]
+        return change
 
     @cached_property
     def _unknown(self) -> _Change:

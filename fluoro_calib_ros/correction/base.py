@@ -96,8 +96,8 @@ class CorrectionModel(ABC):
         if not (np.isfinite(uv).all() and np.isfinite(duv).all()):
             raise ValueError('a training point or its correction is not a number')
         if (self.series is not None) != self.has_series:
-            needs = 'needs a series' if self.has_series else 'has no series'
-            raise ValueError(f'the correction model {self.kind} {needs}')
+            requirement = 'needs a series' if self.has_series else 'has no series'
+            raise ValueError(f'the correction model {self.kind} {requirement}')
         if self.min_k is not None and not self.min_k <= self.k <= len(uv):
             raise ValueError(
                 f'{self.kind} with k = {self.k} is not possible with {len(uv)} training points'
@@ -222,11 +222,11 @@ def _holes_of(uv: NDArray[np.float64], hull: NDArray[np.float64]) -> Holes | Non
         HOLE_SPACINGS * float(np.sqrt(area / len(uv))), float(np.max(high - low)) / (SD_GRID - 1)
     )
     u, v = (np.arange(a, b, radius / 3) for a, b in zip(low, high))  # candidate centres
-    tried = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
-    tried = tried[~_beyond(hull, tried)]
-    distance, _ = cKDTree(uv).query(tried, distance_upper_bound=radius)
+    centres = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    centres = centres[~_beyond(hull, centres)]
+    distance, _ = cKDTree(uv).query(centres, distance_upper_bound=radius)
     empty = np.isinf(distance)
-    return Holes(cKDTree(tried[empty]), radius) if empty.any() else None
+    return Holes(cKDTree(centres[empty]), radius) if empty.any() else None
 
 
 def _beyond(hull: NDArray[np.float64], uv: NDArray[np.float64]) -> NDArray[np.bool_]:

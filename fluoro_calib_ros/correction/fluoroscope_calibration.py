@@ -261,15 +261,15 @@ class FluoroscopeCalibration:
 
         angle: angle of the C-arm [rad], a number or (n,); None or NaN where it is unknown.
         """
-        found = self.model.evaluate(uv)
+        correction = self.model.evaluate(uv)
         if self.angle_field is None:
-            return found
+            return correction
         angle = np.nan if angle is None else angle
         duv, variance = self.angle_field.change(uv, angle)
         return Correction(
-            found.duv + duv,
-            np.sqrt(np.maximum(found.sd**2 + variance, 0)),
-            found.outside | ~self.angle_field.covers(angle),
+            correction.duv + duv,
+            np.sqrt(np.maximum(correction.sd**2 + variance, 0)),
+            correction.outside | ~self.angle_field.covers(angle),
         )
 
     def at_angle(self, angle: float | None) -> FluoroscopeCalibration:
@@ -375,34 +375,36 @@ class FluoroscopeCalibration:
     ) -> None:
         """Add the change with the angle to a correction and its status, in place."""
         valid = status != int(CorrectionStatus.INVALID)
-        on = slice(None) if valid.all() else np.flatnonzero(valid)
+        valid_rows = slice(None) if valid.all() else np.flatnonzero(valid)
         angle = np.asarray(np.nan if angle is None else angle, dtype=float)
-        angle = angle[on] if angle.ndim else angle
-        duv, variance = field.change(np.column_stack([uv[0][on], uv[1][on]]), angle)
+        angle = angle[valid_rows] if angle.ndim else angle
+        duv, variance = field.change(
+            np.column_stack([uv[0][valid_rows], uv[1][valid_rows]]), angle
+        )
         du, dv, sd = correction
-        du[on] += duv[:, 0]
-        dv[on] += duv[:, 1]
-        sd[on] = np.sqrt(np.maximum(sd[on] ** 2 + variance, 0))
-        beyond = ~field.covers(angle)
-        if beyond.any():
-            status[on] = np.where(beyond, CorrectionStatus.OUTSIDE, status[on])
+        du[valid_rows] += duv[:, 0]
+        dv[valid_rows] += duv[:, 1]
+        sd[valid_rows] = np.sqrt(np.maximum(sd[valid_rows] ** 2 + variance, 0))
+        outside = ~field.covers(angle)
+        if outside.any():
+            status[valid_rows] = np.where(outside, CorrectionStatus.OUTSIDE, status[valid_rows])
 
     def _correct_exactly(
         self, uv: NDArray[np.float64], sigma: NDArray[np.float64] | float, angle: ArrayLike | None
     ) -> CorrectedPoints:
         """Correct points with the model itself."""
-        good = points_on_image(uv, self.image_size)
+        valid = points_on_image(uv, self.image_size)
         out = CorrectedPoints(
             np.full(uv.shape, np.nan),
             np.full(len(uv), np.nan),
             np.full(len(uv), CorrectionStatus.INVALID, dtype=np.uint8),
         )
         if angle is not None and np.ndim(angle):
-            angle = np.asarray(angle)[good]
-        correction = self.correction(uv[good], angle)
-        out.uv[good] = uv[good] - correction.duv
-        out.sigma[good] = np.sqrt(np.broadcast_to(sigma, len(uv))[good] ** 2 + correction.sd**2)
-        out.status[good] = np.where(
+            angle = np.asarray(angle)[valid]
+        correction = self.correction(uv[valid], angle)
+        out.uv[valid] = uv[valid] - correction.duv
+        out.sigma[valid] = np.sqrt(np.broadcast_to(sigma, len(uv))[valid] ** 2 + correction.sd**2)
+        out.status[valid] = np.where(
             correction.outside, CorrectionStatus.OUTSIDE, CorrectionStatus.OK
         )
         return out
@@ -487,4 +489,4 @@ Calibrations = Mapping[str, FluoroscopeCalibration]  # by name of the fluoroscop
 
 def ids_of(calibrations: Calibrations) -> dict[str, str]:
     """Return the ids of calibrations by fluoroscope."""
-    return {name: one.calibration_id for name, one in calibrations.items()}
+    return {name: calibration.calibration_id for name, calibration in calibrations.items()}

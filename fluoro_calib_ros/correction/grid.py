@@ -72,11 +72,11 @@ class LookupWorkspace:
         rows, columns = shape
         number = np.array([columns, rows])
         cells_per_px = (number - 2 * EDGE) / np.array(image_size)
-        whole = np.ones((2, n))
-        self._cells_per_px = whole * cells_per_px[:, None]
-        self._shift = whole * (0.5 * cells_per_px + 1 + EDGE)[:, None]
-        self._lowest = whole * 0.5
-        self._highest = whole * (number[:, None] + 1.5)
+        ones = np.ones((2, n))
+        self._cells_per_px = ones * cells_per_px[:, None]
+        self._shift = ones * (0.5 * cells_per_px + 1 + EDGE)[:, None]
+        self._lowest = ones * 0.5
+        self._highest = ones * (number[:, None] + 1.5)
         self._columns_of_table = np.full(n, columns + 2)
         pixels = np.zeros((9, n))  # u three times, v six times
         self._u = pixels[:3]
@@ -200,9 +200,9 @@ class CorrectionGrid:
             axis[k] + part * (axis[k + 1] - axis[k])
             for axis, k, part in zip(self.nodes, (divided.column, divided.row), place)
         )
-        found = self.look_up(u.ravel(), v.ravel())[0]
+        looked_up = self.look_up(u.ravel(), v.ravel())[0]
         exact = model.evaluate_in_bulk(np.stack([u.ravel(), v.ravel()], axis=1))
-        error = np.abs(found - exact).reshape(3, *u.shape).max(axis=1)
+        error = np.abs(looked_up - exact).reshape(3, *u.shape).max(axis=1)
         return np.stack([error[:2].max(axis=0), error[2]])
 
     def __getstate__(self) -> dict[str, Any]:
@@ -264,18 +264,18 @@ class CorrectionGrid:
 
     def _look_up_parts(self, workspace: LookupWorkspace) -> None:
         """Replace the results of points in divided cells, whose status is DIVIDED or more."""
-        which = np.flatnonzero(workspace.status >= DIVIDED)
-        if not len(which):
+        divided = np.flatnonzero(workspace.status >= DIVIDED)
+        if not len(divided):
             return
-        cell = np.searchsorted(self._divided_cells, workspace.row[which])
+        cell = np.searchsorted(self._divided_cells, workspace.row[divided])
         parts = self._parts[cell]
-        place = workspace.place[:, which]
+        place = workspace.place[:, divided]
         column, row = np.minimum(((place - np.floor(place)) * parts).astype(np.intp), parts - 1)
         columns = self._parts_table[self._first[cell] + row * parts + column].T
-        u, v = workspace.uv[:, which]
+        u, v = workspace.uv[:, divided]
         half = columns[6:] * v + columns[:6]
-        workspace.result[:, which] = half[3:] * u + half[:3]
-        workspace.status[which] -= DIVIDED
+        workspace.result[:, divided] = half[3:] * u + half[:3]
+        workspace.status[divided] -= DIVIDED
 
 
 def _no_workspaces() -> list[list[LookupWorkspace]]:

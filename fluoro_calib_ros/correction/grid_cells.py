@@ -40,11 +40,11 @@ def errors_of_finer_grid(values: NDArray[np.float64]) -> NDArray[np.float64]:
     corner = values[:, ::2, ::2]
     along_u = (corner[:, :, :-1] + corner[:, :, 1:]) / 2
     along_v = (corner[:, :-1] + corner[:, 1:]) / 2
-    of_u = np.abs(values[:, ::2, 1::2] - along_u)
-    of_v = np.abs(values[:, 1::2, ::2] - along_v)
+    edge_u = np.abs(values[:, ::2, 1::2] - along_u)
+    edge_v = np.abs(values[:, 1::2, ::2] - along_v)
     error = np.abs(values[:, 1::2, 1::2] - (along_u[:, :-1] + along_u[:, 1:]) / 2)
-    for other in (of_u[:, :-1], of_u[:, 1:], of_v[:, :, :-1], of_v[:, :, 1:]):
-        np.maximum(error, other, out=error)
+    for edge_error in (edge_u[:, :-1], edge_u[:, 1:], edge_v[:, :, :-1], edge_v[:, :, 1:]):
+        np.maximum(error, edge_error, out=error)
     return np.stack([error[:2].max(axis=0), error[2]])
 
 
@@ -88,8 +88,8 @@ def _second_differences(values: NDArray[np.float64]) -> NDArray[np.float64]:
     at_node = np.zeros(values.shape[1:])
     at_node[:, 1:-1] = np.abs(np.diff(values[:2], 2, axis=2)).max(axis=0)
     at_node[1:-1] += np.abs(np.diff(values[:2], 2, axis=1)).max(axis=0)
-    of_cell = np.maximum(at_node[:-1], at_node[1:])
-    return np.maximum(of_cell[:, :-1], of_cell[:, 1:])
+    largest_of_rows = np.maximum(at_node[:-1], at_node[1:])
+    return np.maximum(largest_of_rows[:, :-1], largest_of_rows[:, 1:])
 
 
 CELL_PX = (8, 4, 2)  # sizes of cells to try; those of a saved lookup grid are the largest
@@ -158,12 +158,12 @@ def divide_cells(model: CorrectionModel, cells: Cells) -> DividedCells | None:
     # between the measured points.
     halvings = 1 + np.ceil(np.log2(error[j, i] / TARGET_PX))
     parts = np.minimum(2 ** halvings.astype(np.intp), MAX_PARTS)
-    kept = _affordable_cells(error[j, i], parts, cells.work)
-    if not len(kept):
+    affordable = _affordable_cells(error[j, i], parts, cells.work)
+    if not len(affordable):
         return None
-    j = j[kept]
-    i = i[kept]
-    parts = parts[kept]
+    j = j[affordable]
+    i = i[affordable]
+    parts = parts[affordable]
     part_nodes = [
         (
             np.linspace(columns[x], columns[x + 1], n + 1),
@@ -175,10 +175,10 @@ def divide_cells(model: CorrectionModel, cells: Cells) -> DividedCells | None:
     values = np.split(exact, np.cumsum((parts + 1) ** 2)[:-1], axis=1)
     first = np.concatenate([[0], np.cumsum(parts**2)[:-1]])
     table = aligned_array((int(np.sum(parts**2)), COEFFICIENTS))
-    for nodes, n, start, of_cell in zip(part_nodes, parts, first, values):
+    for nodes, n, start, cell_values in zip(part_nodes, parts, first, values):
         write_coefficients(
             nodes,
-            of_cell.reshape(3, n + 1, n + 1),
+            cell_values.reshape(3, n + 1, n + 1),
             table[start : start + n * n].reshape(n, n, COEFFICIENTS),
         )
     return DividedCells(j, i, parts, first, table)
@@ -207,14 +207,14 @@ def write_coefficients(
     width = np.diff(columns)
     height = np.diff(rows)[:, None]
     corner = values[:, :-1, :-1]
-    of_x = (values[:, :-1, 1:] - corner) / width
-    of_y = (values[:, 1:, :-1] - corner) / height
-    of_xy = ((values[:, 1:, 1:] - values[:, 1:, :-1]) / width - of_x) / height
+    slope_x = (values[:, :-1, 1:] - corner) / width
+    slope_y = (values[:, 1:, :-1] - corner) / height
+    slope_xy = ((values[:, 1:, 1:] - values[:, 1:, :-1]) / width - slope_x) / height
     for k in range(3):
         a = corner[k]
-        b = of_x[k]
-        c = of_y[k]
-        d = of_xy[k]
+        b = slope_x[k]
+        c = slope_y[k]
+        d = slope_xy[k]
         out[:, :, k] = a - b * x - (c - d * x) * y
         out[:, :, 3 + k] = b - d * y
         out[:, :, 6 + k] = c - d * x
@@ -236,18 +236,18 @@ def _nodes_and_values(
     nodes = _nodes(image_size, sizes[0], 1)
     values = None
     for number in range(len(sizes) - 1):
-        finer = _nodes(image_size, sizes[0], 2 ** (number + 1))
-        finer_values = _exact_values(model, finer)
+        finer_nodes = _nodes(image_size, sizes[0], 2 ** (number + 1))
+        finer_values = _exact_values(model, finer_nodes)
         values = finer_values[:, ::2, ::2]
         errors = errors_of_finer_grid(finer_values)
         if np.mean(errors[0] > TARGET_PX) <= MAX_SHARE_DIVIDED:
             return nodes, values, errors
-        nodes = finer
+        nodes = finer_nodes
         values = finer_values
     if values is None:
         values = _exact_values(model, nodes)
-    affordable = int(MAX_WORK / 4 / work)
-    return nodes, values, errors_where_curved(model, nodes, values, affordable)
+    max_cells = int(MAX_WORK / 4 / work)
+    return nodes, values, errors_where_curved(model, nodes, values, max_cells)
 
 
 def _affordable_sizes(

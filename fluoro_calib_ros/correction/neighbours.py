@@ -41,14 +41,16 @@ def blocks_with_candidates(
     points; the latter are None if there are more than most, such as where many coincide.
     """
     per_query = int(np.clip(MAX_AT_ONCE // min(tree.n, most), 1, BLOCKS_PER_QUERY))
-    for some, centre, radius in _circles(tree, uv, k, per_query):
+    for batch, centre, radius in _circles(tree, uv, k, per_query):
         if tree.n <= most:
-            yield from zip(some, tree.query_ball_point(centre, radius))
+            yield from zip(batch, tree.query_ball_point(centre, radius))
             continue
-        few = tree.query_ball_point(centre, radius, return_length=True) <= most
-        found = iter(tree.query_ball_point(centre[few], radius[few]) if few.any() else ())
-        for block, is_few in zip(some, few):
-            yield block, next(found) if is_few else None
+        has_few = tree.query_ball_point(centre, radius, return_length=True) <= most
+        candidates = iter(
+            tree.query_ball_point(centre[has_few], radius[has_few]) if has_few.any() else ()
+        )
+        for block, is_few in zip(batch, has_few):
+            yield block, next(candidates) if is_few else None
 
 
 def work_of_blocks(tree: cKDTree, uv: NDArray[np.float64], k: int, limit: float) -> int:
@@ -57,10 +59,10 @@ def work_of_blocks(tree: cKDTree, uv: NDArray[np.float64], k: int, limit: float)
     Counting stops above the limit.
     """
     total = 0
-    for some, centre, radius in _circles(tree, uv, k, BLOCKS_PER_QUERY):
+    for batch, centre, radius in _circles(tree, uv, k, BLOCKS_PER_QUERY):
         counts = tree.query_ball_point(centre, radius, return_length=True)
-        total += sum(len(block) * int(count) for block, count in zip(some, counts))
-        total += len(some) * (WORK_OF_BLOCK + WORK_OF_NEIGHBOUR * k)
+        total += sum(len(block) * int(count) for block, count in zip(batch, counts))
+        total += len(batch) * (WORK_OF_BLOCK + WORK_OF_NEIGHBOUR * k)
         if total > limit:
             break
     return total
@@ -73,13 +75,13 @@ def _circles(
     reach = np.median(tree.query(uv[:: len(uv) // 32 + 1], k=[k])[0])  # for a sample of pixels
     blocks = _blocks(uv, reach)
     for start in range(0, len(blocks), per_query):
-        some = blocks[start : start + per_query]
-        low = np.array([np.min(uv[block], axis=0) for block in some])
-        high = np.array([np.max(uv[block], axis=0) for block in some])
+        batch = blocks[start : start + per_query]
+        low = np.array([np.min(uv[block], axis=0) for block in batch])
+        high = np.array([np.max(uv[block], axis=0) for block in batch])
         centre = (low + high) / 2
         diagonal = np.linalg.norm(high - low, axis=1)
         kth = tree.query(centre, k=[k])[0][:, 0]
-        yield some, centre, (kth + diagonal) * (1 + 1e-9) + 1e-9
+        yield batch, centre, (kth + diagonal) * (1 + 1e-9) + 1e-9
 
 
 def _blocks(uv: NDArray[np.float64], reach: float) -> list[NDArray[np.int64]]:
@@ -90,11 +92,11 @@ def _blocks(uv: NDArray[np.float64], reach: float) -> list[NDArray[np.int64]]:
     """
     low = uv.min(axis=0)
     high = uv.max(axis=0)
-    of_one = np.sqrt(np.prod(high - low + 1) / len(uv))
+    spacing = np.sqrt(np.prod(high - low + 1) / len(uv))
     side = min(
-        np.sqrt(BLOCK) * of_one,
+        np.sqrt(BLOCK) * spacing,
         max(MAX_BLOCK_PX, reach / 2),
-        max(reach, np.sqrt(MIN_BLOCK) * of_one),
+        max(reach, np.sqrt(MIN_BLOCK) * spacing),
     )
     column, row = ((uv - low) / side).astype(np.intp).T
     block = row * (column.max() + 1) + column
@@ -206,30 +208,30 @@ class NeighbourTable:
 
         allowed : (N,) ndarray of bool
         """
-        near = self._near[rows]
-        good = allowed[near]
-        rank = np.cumsum(good, axis=1)
+        neighbours = self._near[rows]
+        usable = allowed[neighbours]
+        rank = np.cumsum(usable, axis=1)
         out = np.empty((len(rows), count), dtype=np.intp)
-        selected = good & (rank <= count)
-        full = rank[:, -1] >= count
-        out[full] = near[full][selected[full]].reshape(-1, count)
-        if not full.all():
+        selected = usable & (rank <= count)
+        is_full = rank[:, -1] >= count
+        out[is_full] = neighbours[is_full][selected[is_full]].reshape(-1, count)
+        if not is_full.all():
             # Near the image border, or where a whole exposure is excluded: search again.
             points = np.flatnonzero(allowed)
-            _, found = cKDTree(self._uv[points]).query(
-                self._uv[rows[~full]], k=np.arange(1, count + 1)
+            _, nearest = cKDTree(self._uv[points]).query(
+                self._uv[rows[~is_full]], k=np.arange(1, count + 1)
             )
-            out[~full] = points[found]
+            out[~is_full] = points[nearest]
         return out
 
     def restricted(self, selected: NDArray[np.bool_]) -> NeighbourTable:
         """Return the table of the selected points (N, bool) only, renumbered."""
-        other = NeighbourTable.__new__(NeighbourTable)
-        other._uv = self._uv[selected]
+        restricted = NeighbourTable.__new__(NeighbourTable)
+        restricted._uv = self._uv[selected]
         number = np.cumsum(selected) - 1
         count = int(np.min(np.sum(selected[self._near[selected]], axis=1)))
-        other._near = number[self.nearest(np.flatnonzero(selected), selected, count)]
-        return other
+        restricted._near = number[self.nearest(np.flatnonzero(selected), selected, count)]
+        return restricted
 
 
 # Polynomial trend of a distortion, fitted to the training corrections.
@@ -358,19 +360,19 @@ class NeighbourModel(CorrectionModel):
         """Return du, dv and standard deviation (3, n) [px] at many pixels uv (n, 2)."""
         out = np.zeros((3, len(uv)))
         norm2 = np.zeros(len(uv))
-        most = MAX_CANDIDATES * (self.k + 1)
-        for block, near in blocks_with_candidates(self.tree, uv, self.k, most):
-            if near is None:
+        max_candidates = MAX_CANDIDATES * (self.k + 1)
+        for block, candidates in blocks_with_candidates(self.tree, uv, self.k, max_candidates):
+            if candidates is None:
                 predicted, norm2[block] = self._local_part(uv[block])
                 out[:2, block] = predicted.T
                 continue
-            rows = max(1, MAX_AT_ONCE // len(near))
+            rows = max(1, MAX_AT_ONCE // len(candidates))
             for start in range(0, len(block), rows):
-                some = block[start : start + rows]
-                weights = self.weights_of_candidates(self.train_uv[near], uv[some], self.k)
-                for axis, remainder in enumerate(self.remainder[near].T):
-                    out[axis, some] = np.einsum('nk,k->n', weights, remainder)
-                norm2[some] = np.einsum('nk,nk->n', weights, weights)
+                batch = block[start : start + rows]
+                weights = self.weights_of_candidates(self.train_uv[candidates], uv[batch], self.k)
+                for axis, remainder in enumerate(self.remainder[candidates].T):
+                    out[axis, batch] = np.einsum('nk,k->n', weights, remainder)
+                norm2[batch] = np.einsum('nk,nk->n', weights, weights)
         for start in range(0, len(uv), BULK_CHUNK):
             part = slice(start, start + BULK_CHUNK)
             out[:2, part] += self._global_part(uv[part]).T

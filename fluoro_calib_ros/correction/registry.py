@@ -98,10 +98,10 @@ class LookupModel(CorrectionModel):
     def _prepare(self) -> None:
         columns, rows = _grid_shape(self.train_uv)
         nodes = columns * rows
-        low = self.train_uv[0]
+        origin = self.train_uv[0]
         self._set(
-            _low=low,
-            _per_px=(np.array([columns, rows]) - 1) / (self.train_uv[nodes - 1] - low),
+            _low=origin,
+            _per_px=(np.array([columns, rows]) - 1) / (self.train_uv[nodes - 1] - origin),
             _du=self.train_duv[:nodes, 0].reshape(rows, columns),
             _dv=self.train_duv[:nodes, 1].reshape(rows, columns),
         )
@@ -150,8 +150,8 @@ def _grid_shape(uv: NDArray[np.float64]) -> tuple[int, int]:
     """
     in_first_row = np.cumprod(uv[:, 1] == uv[:1, 1])
     columns = int(in_first_row.sum())
-    whole = uv[: len(uv) - len(uv) % columns] if columns else uv[:0]
-    table = whole.reshape(-1, max(columns, 1), 2)
+    complete = uv[: len(uv) - len(uv) % columns] if columns else uv[:0]
+    table = complete.reshape(-1, max(columns, 1), 2)
     same_columns = (table[:, :, 0] == table[:1, :, 0]).all(axis=1)
     same_row = (table[:, :, 1] == table[:, :1, 1]).all(axis=1)
     rows = int(np.cumprod(same_columns & same_row).sum())

@@ -60,10 +60,10 @@ class Functions:
             np.arange(1, self.modes + 1), np.arange(1, self.modes + 1), indexing='ij'
         )
         number = MARGIN * np.hypot(i / extent[0], j / extent[1])
-        keep = number <= self.modes + 0.5
+        is_kept = number <= self.modes + 0.5
         if self.absent:
-            keep &= ~np.isin(np.rint(number), self.absent)
-        return np.stack([i[keep], j[keep]], axis=1)
+            is_kept &= ~np.isin(np.rint(number), self.absent)
+        return np.stack([i[is_kept], j[is_kept]], axis=1)
 
     @cached_property
     def frequency(self) -> NDArray[np.float64]:
@@ -104,8 +104,10 @@ class Functions:
         corner = np.hypot(*self.image_size) / max(self.image_size)
         out = np.zeros((self.rings, RING_DEGREE // 2 + self.rings))
         for row, values in enumerate(out):
-            found = ring_coefficients(RING_DEGREE + 2 * row)
-            values[: len(found)] = found / corner ** (2 * np.arange(len(found)) + 1)
+            coefficients = ring_coefficients(RING_DEGREE + 2 * row)
+            values[: len(coefficients)] = coefficients / corner ** (
+                2 * np.arange(len(coefficients)) + 1
+            )
         return out
 
     def as_polynomials(
@@ -122,12 +124,12 @@ class Functions:
         matrix = out.converted(self, coefficients.ravel()).reshape(2, -1)
         number = {power: k for k, power in enumerate(out.powers)}
         for k, polynomial in enumerate(self._ring_polynomials):
-            own = coefficients[:, len(self.powers) + 2 * k :][:, :2]
+            ring = coefficients[:, len(self.powers) + 2 * k :][:, :2]
             for order, factor in enumerate(polynomial):
                 for i in range(order + 1):
                     part = factor * comb(order, i)
-                    matrix[:, number[2 * i + 1, 2 * (order - i)]] += part * own[:, 0]
-                    matrix[:, number[2 * i, 2 * (order - i) + 1]] += part * own[:, 1]
+                    matrix[:, number[2 * i + 1, 2 * (order - i)]] += part * ring[:, 0]
+                    matrix[:, number[2 * i, 2 * (order - i) + 1]] += part * ring[:, 1]
         return out, matrix
 
     def converted(
@@ -138,8 +140,8 @@ class Functions:
         A function that is not among the other functions gets the coefficient 0.
         """
         number = {key: column for column, key in enumerate(other._keys())}
-        mine = np.asarray([number.get(key, -1) for key in self._keys()])
-        return np.where(mine >= 0, coefficients.reshape(2, -1)[:, mine], 0.0).ravel()
+        columns = np.asarray([number.get(key, -1) for key in self._keys()])
+        return np.where(columns >= 0, coefficients.reshape(2, -1)[:, columns], 0.0).ravel()
 
     def as_rings(
         self, coefficients: NDArray[np.float64], degree: int, rings: int
@@ -157,10 +159,12 @@ class Functions:
         units = np.eye(out.trend)
         columns = [trend.as_polynomials(unit.reshape(1, -1).repeat(2, axis=0)) for unit in units]
         highest = columns[0][0]
-        mine = highest.converted(replace(self, modes=0), coefficients[:, : self.trend].ravel())
+        trend_coefficients = highest.converted(
+            replace(self, modes=0), coefficients[:, : self.trend].ravel()
+        )
         design = np.stack([values[0] for _, values in columns], axis=1)
-        found = np.linalg.lstsq(design, mine.reshape(2, -1).T, rcond=None)[0]
-        matrix[:, : out.trend] = found.T
+        solution = np.linalg.lstsq(design, trend_coefficients.reshape(2, -1).T, rcond=None)[0]
+        matrix[:, : out.trend] = solution.T
         return out, matrix
 
     def _keys(self) -> list[tuple[Any, ...]]:
@@ -178,18 +182,18 @@ class Functions:
         """Return values (n, m) at pixels uv (n, 2) of the polynomials, the rings, the sines."""
         x, y = self._coordinates(uv)
         out = np.empty((len(x), len(self)))
-        of_x, of_y = (np.vander(a, self.degree + 1, increasing=True) for a in (x, y))
+        x_basis, y_basis = (np.vander(a, self.degree + 1, increasing=True) for a in (x, y))
         for column, (i, j) in enumerate(self.powers):
-            np.multiply(of_x[:, i], of_y[:, j], out=out[:, column])
+            np.multiply(x_basis[:, i], y_basis[:, j], out=out[:, column])
         if self.rings:
             squares = np.vander(x * x + y * y, self._ring_polynomials.shape[1], increasing=True)
             rings = squares @ self._ring_polynomials.T
             out[:, len(self.powers) : self.trend : 2] = rings * x[:, None]
             out[:, len(self.powers) + 1 : self.trend : 2] = rings * y[:, None]
         if self.modes:
-            of_x, of_y = self._waves_of_both(x, y)
+            x_basis, y_basis = self._waves_of_both(x, y)
             i, j = self._sines.T - 1
-            np.multiply(of_x[:, i], of_y[:, j], out=out[:, self.trend :])
+            np.multiply(x_basis[:, i], y_basis[:, j], out=out[:, self.trend :])
         return out
 
     def sums_of_sines(
@@ -200,10 +204,10 @@ class Functions:
         The sums of squares of the sines are (s,). Each sine is a product of one along u and one
         along v, so the sines need not be evaluated at every pixel.
         """
-        of_x, of_y = self._waves_of_both(*self._coordinates(uv))
+        x_basis, y_basis = self._waves_of_both(*self._coordinates(uv))
         i, j = self._sines.T - 1
-        sums = [(of_x.T @ (column[:, None] * of_y))[i, j] for column in values.T]
-        return np.stack(sums, axis=1), (np.square(of_x).T @ np.square(of_y))[i, j]
+        sums = [(x_basis.T @ (column[:, None] * y_basis))[i, j] for column in values.T]
+        return np.stack(sums, axis=1), (np.square(x_basis).T @ np.square(y_basis))[i, j]
 
     def _waves_of_both(
         self, x: NDArray[np.float64], y: NDArray[np.float64]
@@ -234,15 +238,15 @@ class Series:
 
     def plus(self, other: Series) -> Series:
         """Return the sum of this series and another one with independent errors."""
-        mine, own = self.functions.as_polynomials(self.coefficients)
-        both = Functions(
-            mine.image_size,
-            max(mine.degree, other.functions.degree),
-            max(mine.modes, other.functions.modes),
+        functions, coefficients = self.functions.as_polynomials(self.coefficients)
+        joint = Functions(
+            functions.image_size,
+            max(functions.degree, other.functions.degree),
+            max(functions.modes, other.functions.modes),
         )
-        total = both.converted(mine, own.ravel())
-        total += both.converted(other.functions, other.coefficients.ravel())
-        return Series(both, total.reshape(2, -1), np.hypot(self.sd, other.sd))
+        total = joint.converted(functions, coefficients.ravel())
+        total += joint.converted(other.functions, other.coefficients.ravel())
+        return Series(joint, total.reshape(2, -1), np.hypot(self.sd, other.sd))
 
     def predict(self, uv: ArrayLike) -> NDArray[np.float64]:
         """Return corrections (n, 2) [px] at pixels uv (n, 2).
@@ -252,13 +256,13 @@ class Series:
         x, y = self.functions._coordinates(uv)
         out = np.zeros((len(x), 2))
         powers, sines = self._by_axes
-        of_axes = (np.vander(a, powers.shape[1], increasing=True) for a in (x, y))
-        for coefficients, (of_x, of_y) in (
-            (powers, of_axes),
+        vandermonde = (np.vander(a, powers.shape[1], increasing=True) for a in (x, y))
+        for coefficients, (x_basis, y_basis) in (
+            (powers, vandermonde),
             (sines, self.functions._waves_of_both(x, y)),
         ):
             for column, matrix in zip(out.T, coefficients):
-                column += np.einsum('ni,ni->n', of_x @ matrix, of_y)
+                column += np.einsum('ni,ni->n', x_basis @ matrix, y_basis)
         return out
 
     @cached_property

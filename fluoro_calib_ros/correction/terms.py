@@ -158,17 +158,19 @@ def trend_transformation(degree: int, rings: int = 0) -> tuple[NDArray[np.float6
     """
     if degree < 0:
         return np.zeros((0, 0)), 0
-    own = cubic_terms()
-    cubic = [polynomial_coefficients(degree, parts) for parts in [*own.values(), *GAUGE.values()]]
+    terms = cubic_terms()
+    cubic = [
+        polynomial_coefficients(degree, parts) for parts in [*terms.values(), *GAUGE.values()]
+    ]
     m = cubic[0].shape[1]
     columns = np.zeros((2 * m + 4 * rings, 2, m + 2 * rings))
-    first = len(own)
+    first = len(terms)
     last = first + 4 * rings
     columns[:first, :, :m] = cubic[:first]
     columns[last:, :, :m] = cubic[first:]
     for k in range(rings):
         # Factors of x R / r and y R / r in u and in v.
         pairs = [[(1, 0), (0, 1)], [(0, -1), (1, 0)], [(1, 0), (0, -1)], [(0, 1), (1, 0)]]
-        at = m + 2 * k
-        columns[first + 4 * k : first + 4 * k + 4, :, at : at + 2] = pairs
+        column = m + 2 * k
+        columns[first + 4 * k : first + 4 * k + 4, :, column : column + 2] = pairs
     return np.linalg.inv(columns.reshape(len(columns), -1).T), last

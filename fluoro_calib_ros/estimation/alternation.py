@@ -208,8 +208,8 @@ class _Alternation:
         )
         information, noise = _information(self._network, after, correction)
         image = regressions.without_gauge(after.residuals + correction, after.parameters.interior)
-        core = regressions.inliers()
-        change = float(np.sqrt(np.mean((regressions.smooth(image) - correction)[core] ** 2)))
+        inliers = regressions.inliers()
+        change = float(np.sqrt(np.mean((regressions.smooth(image) - correction)[inliers] ** 2)))
         self._history.add(after, score, regressions.k, change)
         self.correction = correction
         self._image = image

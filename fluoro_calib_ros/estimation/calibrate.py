@@ -131,12 +131,12 @@ def calibrate_request(
         for group in request.groups:
             start = time.perf_counter()
             label = '+'.join(group)
-            of_group = {name: request.frames[name] for name in group}
-            run = _calibrated_group(request, of_group, _progress_of(label, progress), starts)
+            group_frames = {name: request.frames[name] for name in group}
+            run = _calibrated_group(request, group_frames, _progress_of(label, progress), starts)
             seconds = time.perf_counter() - start
             runs[label] = run
             figures |= _figures_of_run(run)
-            calibrations |= _calibrations_of_run(run, of_group, request.phantom, seconds)
+            calibrations |= _calibrations_of_run(run, group_frames, request.phantom, seconds)
         relative = [
             relative_orientations(run, options.relative_orientation) for run in runs.values()
         ]
@@ -152,12 +152,14 @@ def calibrate_request(
         ),
         history={label: run.history for label, run in runs.items()},
         runs=runs,
-        findings=tuple(found for run in runs.values() for found in run.measured.excluded),
+        findings=tuple(finding for run in runs.values() for finding in run.measured.excluded),
         converged=all(run.converged for run in runs.values()),
         seconds=time.perf_counter() - began,
-        relative=tuple(one for of_run in relative for one in of_run),
+        relative=tuple(orientation for orientations in relative for orientation in orientations),
         outliers=_outliers_of_all(runs.values()),
-        correlations=tuple(one for run in runs.values() for one in correlations_of(run)),
+        correlations=tuple(
+            correlation for run in runs.values() for correlation in correlations_of(run)
+        ),
         statistics=tuple(
             statistics_of(run.measured, run.after, run.precision) for run in runs.values()
         ),
@@ -258,14 +260,14 @@ def _calibrated_group(
         earlier = None if starts is None else starts.earlier
         run = self_calibrate(measured, request.options, progress, earlier)
         misfits = exposures_that_do_not_fit(run)
-        kept = {
+        fitting = {
             name: [f for f in exposures if (name, f.number) not in misfits]
             for name, exposures in frames.items()
         }
-        if not misfits or any(len(exposures) < MIN_EXPOSURES for exposures in kept.values()):
+        if not misfits or any(len(exposures) < MIN_EXPOSURES for exposures in fitting.values()):
             break
         excluded += tuple(misfits.values())
-        frames = kept
+        frames = fitting
     return replace(
         run, measured=replace(run.measured, excluded=(*excluded, *run.measured.excluded))
     )
@@ -290,15 +292,15 @@ def _progress_of(
     """Return a callback that reports rounds under a label; None: nothing is to be reported."""
     if progress is None:
         return None
-    return lambda one: progress(label, one)
+    return lambda current: progress(label, current)
 
 
 def _outliers_of_all(runs: Iterable[SelfCalibration]) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
     """Return the outliers of all runs: image points, and targets."""
-    found = [outliers_of(run) for run in runs]
+    outliers = [outliers_of(run) for run in runs]
     return (
-        tuple(point for points, _ in found for point in points),
-        tuple(target for _, targets in found for target in targets),
+        tuple(point for points, _ in outliers for point in points),
+        tuple(target for _, targets in outliers for target in targets),
     )
 
 
@@ -323,8 +325,8 @@ def adjust_with_calibrations(
     Raises DataError if a frame is invalid or has another image size than its calibration.
     """
     began = time.perf_counter()
-    for name, of_fluoroscope in frames.items():
-        for frame in of_fluoroscope:
+    for name, exposures in frames.items():
+        for frame in exposures:
             validate_frame(frame, phantom, calibrations[name].image_size)
     with threadpool_limits(1):
         measured = network_of_calibrations(

@@ -192,10 +192,12 @@ class CollocationTerms(AdjustedTerms):
             part.use_interior(interior)
         solved = solved_additional(matrix, network, adjustment)
         self._renew_exposure_terms(network, adjustment)
-        equations = [part.equations(network, matrix, own) for part, own in zip(self.parts, solved)]
+        equations = [
+            part.equations(network, matrix, solution) for part, solution in zip(self.parts, solved)
+        ]
         steady = [
-            _renew_prior(part, own, more_places)
-            for part, own, more_places in zip(self.parts, equations, self._more_places)
+            _renew_prior(part, part_equations, more_places)
+            for part, part_equations, more_places in zip(self.parts, equations, self._more_places)
         ]
         return Solution(self.parts, adjustment, equations, all(steady))
 
@@ -205,12 +207,12 @@ class CollocationTerms(AdjustedTerms):
             return
         estimates = estimates_beside_free_points(network, adjustment)
         for part, (mean, variance) in zip(self.parts, estimates):
-            own = part.own
-            if own is not None:
+            terms = part.own
+            if terms is not None:
                 first = part.of_series.stop
-                before = own.size_px
-                own.renew(mean[first:], variance[first:])
-                if abs(own.size_px - before) > SETTLED_VARIATION * before:
+                before = terms.size_px
+                terms.renew(mean[first:], variance[first:])
+                if abs(terms.size_px - before) > SETTLED_VARIATION * before:
                     self._steady_renewals = 0
 
     def _changed(
@@ -218,14 +220,14 @@ class CollocationTerms(AdjustedTerms):
     ) -> tuple[NDArray[np.float64], ...]:
         """Change the terms; return the coefficients to continue with."""
         out = []
-        for part, modes, present in zip(self.parts, change.modes, coefficients):
+        for part, modes, current in zip(self.parts, change.modes, coefficients):
             f = part.number
             part.prior = change.priors.get(f, part.prior)
-            converted = part.use_modes(modes, present)
+            new = part.use_modes(modes, current)
             if f in change.coefficients:
-                converted[part.of_series] = change.coefficients[f]
+                new[part.of_series] = change.coefficients[f]
             part.own = change.exposure_terms.get(f, part.own)
-            out.append(np.pad(converted, (0, part.count - len(converted))))
+            out.append(np.pad(new, (0, part.count - len(new))))
         return tuple(out)
 
     def fit_angles(self, f: int, adjustment: Adjustment, precise: Precision) -> AngleField | None:
@@ -245,10 +247,10 @@ class CollocationTerms(AdjustedTerms):
         self, f: int, network: Network, adjustment: Adjustment, precise: Precision
     ) -> NDArray[np.float64]:
         """See `AdjustedTerms`."""
-        found = self.parts[f].variance_between_exposures(network, adjustment, precise)
-        if found is None:
+        variances = self.parts[f].variance_between_exposures(network, adjustment, precise)
+        if variances is None:
             return super().variance_between_exposures(f, network, adjustment, precise)
-        return found
+        return variances
 
 
 def _renew_prior(

@@ -234,8 +234,8 @@ def relative_orientations(
             pairs = measured.network.relative[b - 1].pairs
             pose = parameters.relative[b - 1]
             covariance = run.precision.relative[b - 1]
-        off = discrepancies(RelativeConstraint((0, b), pairs, 1.0, 1.0), pose, parameters)
-        scatter = np.sqrt(np.sum(off**2, axis=0) / max(len(off) - 1, 1))
+        deviations = discrepancies(RelativeConstraint((0, b), pairs, 1.0, 1.0), pose, parameters)
+        scatter = np.sqrt(np.sum(deviations**2, axis=0) / max(len(deviations) - 1, 1))
         out.append(
             RelativeOrientation(
                 names,
@@ -273,12 +273,12 @@ def _mean_of_pairs(
         RelativeConstraint((0, 1), pairs, 1.0, 1.0), pose, after.parameters
     )
     count = len(pairs)
-    one, other = (a.ravel() for a in np.indices((count, count)))
+    i, j = (a.ravel() for a in np.indices((count, count)))
     mixed: NDArray[np.float64] = np.zeros(())
     for p, d_p in zip(pairs.T, (d_a, d_b)):
         for q, d_q in zip(pairs.T, (d_a, d_b)):
-            between = blocks.between(p[one], q[other])
-            mixed = mixed + d_p[one] @ between @ d_q[other].transpose(0, 2, 1)
+            between = blocks.between(p[i], q[j])
+            mixed = mixed + d_p[i] @ between @ d_q[j].transpose(0, 2, 1)
     mixed = mixed.reshape(count, count, 6, 6)
     weights = np.linalg.inv(mixed[np.arange(count), np.arange(count)])
     inverse = np.linalg.inv(weights.sum(axis=0))

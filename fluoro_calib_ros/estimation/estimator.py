@@ -190,10 +190,10 @@ def interior_about(
     reference = np.array([*centre, interior[2]])
 
     def misclosure(x: NDArray[np.float64]) -> NDArray[np.float64]:
-        turned = rays @ matrix_from_vector(x[3:]).T
-        if not (turned[:, 2] > 0).all():
+        rotated = rays @ matrix_from_vector(x[3:]).T
+        if not (rotated[:, 2] > 0).all():
             raise ValueError('no orientation about this principal point')
-        ideal = x[:2] + x[2] * turned[:, :2] / turned[:, 2:]
+        ideal = x[:2] + x[2] * rotated[:, :2] / rotated[:, 2:]
         return gauge_coefficients(uv, uv - ideal, reference)
 
     start = np.concatenate([interior, np.zeros(3)])

@@ -89,14 +89,14 @@ def exposure_functions(
     as_polynomials = np.linalg.inv(to_terms)[:, :count].reshape(2, -1, count)
     values = np.einsum('nm,amt->nat', Functions(image_size, CUBIC)(uv), as_polynomials)
     gauge = gauge_basis(uv, interior)
-    both = np.concatenate([gauge, values], axis=2).reshape(2 * len(uv), -1)
-    q = np.linalg.qr(both)[0][:, gauge.shape[2] :]
+    columns = np.concatenate([gauge, values], axis=2).reshape(2 * len(uv), -1)
+    q = np.linalg.qr(columns)[0][:, gauge.shape[2] :]
     if with_interior:
         turns = gauge_basis(uv, interior, GaugeKind.TURNS).reshape(2 * len(uv), -1)
         turns = np.linalg.qr(turns)[0]
         flat = gauge.reshape(2 * len(uv), -1)
-        left = flat - turns @ (turns.T @ flat)
-        q = np.hstack([q, np.linalg.svd(left, full_matrices=False)[0][:, :INTERIOR_SIZE]])
+        remainder = flat - turns @ (turns.T @ flat)
+        q = np.hstack([q, np.linalg.svd(remainder, full_matrices=False)[0][:, :INTERIOR_SIZE]])
     return q.reshape(len(uv), 2, -1) * np.sqrt(2 * len(uv))
 
 
@@ -114,25 +114,25 @@ def variation(
     `exposure_functions`. The noise variance is that of the residuals after a fit of the terms.
     """
     explained = 0.0
-    left = 0.0
+    unexplained = 0.0
     dof = 0
     dof_left = 0
     points = 0
     for number in np.unique(exposure):
-        own = exposure == number
-        if own.sum() < MIN_POINTS:
+        rows = exposure == number
+        if rows.sum() < MIN_POINTS:
             continue
-        a = functions[own].reshape(-1, functions.shape[2])
+        a = functions[rows].reshape(-1, functions.shape[2])
         q, _ = np.linalg.qr(a)
-        square = float(np.sum((q.T @ residuals[own].ravel()) ** 2))
+        square = float(np.sum((q.T @ residuals[rows].ravel()) ** 2))
         explained += square
-        left += float(np.sum(residuals[own] ** 2)) - square
+        unexplained += float(np.sum(residuals[rows] ** 2)) - square
         dof += a.shape[1]
         dof_left += len(a) - a.shape[1] - EXTERIOR_SIZE
         points += len(a)
-    if not dof or left <= 0:
+    if not dof or unexplained <= 0:
         return Variation(0.0, 0.0, 0.0)
-    noise = left / dof_left
+    noise = unexplained / dof_left
     excess = max(explained - VARYING * dof * noise, 0.0)
     size = float(np.sqrt(excess / points))
     return Variation(explained / (dof * noise), size, float(np.sqrt(noise)))
@@ -165,10 +165,10 @@ class ExposureTerms:
     @property
     def values(self) -> NDArray[np.float64]:
         """Functions (N, 2, t e) at the image points; those of other exposures are zero."""
-        own = self.functions
-        out = np.zeros((len(own.group), 2, self.exposures, own.values.shape[2]))
-        out[np.arange(len(own.group)), :, own.group] = own.values
-        return out.reshape(len(own.group), 2, -1)
+        functions = self.functions
+        out = np.zeros((len(functions.group), 2, self.exposures, functions.values.shape[2]))
+        out[np.arange(len(functions.group)), :, functions.group] = functions.values
+        return out.reshape(len(functions.group), 2, -1)
 
     @property
     def precision(self) -> NDArray[np.float64]:
@@ -186,11 +186,11 @@ class ExposureTerms:
         posterior = posterior.reshape(self.exposures, -1)
         determined = np.clip(1 - posterior / self.variance, 1e-6, 1).sum(axis=0)
         squares = np.sum(mean**2, axis=0)
-        others = np.sum(squares[:TERMS]) / np.sum(determined[:TERMS])
-        of_interior = np.arange(len(squares)) >= TERMS
-        squares = squares + LIKE_OTHERS * others * of_interior
+        typical = np.sum(squares[:TERMS]) / np.sum(determined[:TERMS])
+        is_interior = np.arange(len(squares)) >= TERMS
+        squares = squares + LIKE_OTHERS * typical * is_interior
         # The mean of inverse chi squared has two degrees of freedom less.
-        exposures = determined + (LIKE_OTHERS - 2) * of_interior
+        exposures = determined + (LIKE_OTHERS - 2) * is_interior
         self.variance = np.maximum(squares / exposures, ABSENT_VARIANCE)
 
 
@@ -204,9 +204,9 @@ def without_exposure_terms(
 
     precision (p - c,): prior precisions of the eliminated coefficients.
     """
-    rest = information[count:, count:] + np.diag(precision)
+    eliminated = information[count:, count:] + np.diag(precision)
     mixed = information[count:, :count]
-    solved = np.linalg.solve(rest, np.column_stack([mixed, right[count:]]))
+    solved = np.linalg.solve(eliminated, np.column_stack([mixed, right[count:]]))
     reduced = information[:count, :count] - mixed.T @ solved[:, :-1]
     return reduced, right[:count] - mixed.T @ solved[:, -1]
 
@@ -241,7 +241,10 @@ def estimates_beside_free_points(
     matrix = factorize(free, equations)
     means = solved_additional(matrix, free, adjustment)
     informations = (information_of_additional(matrix, f) for f in range(len(means)))
-    return tuple((mean, np.diagonal(np.linalg.inv(one))) for mean, one in zip(means, informations))
+    return tuple(
+        (mean, np.diagonal(np.linalg.inv(information)))
+        for mean, information in zip(means, informations)
+    )
 
 
 def variance_between_exposures(
@@ -283,8 +286,8 @@ def variance_between_exposures(
     expected = float(variance @ np.diagonal(information))
     if not expected > 0:
         return np.zeros(int(adjustment.inliers[network.rows(f)].sum()))
-    found = float(coefficients @ information @ coefficients + np.sum(information * covariance))
-    return found / expected * _variances_left(network, adjustment, f, terms)
+    estimated = float(coefficients @ information @ coefficients + np.sum(information * covariance))
+    return estimated / expected * _variances_left(network, adjustment, f, terms)
 
 
 def _information(
@@ -293,18 +296,20 @@ def _information(
     """Return the information (p, p) of the terms if only orientations and points are unknown."""
     additional: list[AdditionalParameters | None] = [None] * network.n_fluoroscopes
     start: list[NDArray[np.float64] | None] = [None] * network.n_fluoroscopes
-    none = np.zeros((len(network.rows(f)), 0))
-    additional[f] = AdditionalParameters(none, np.diag(terms.precision), terms.functions)
+    no_functions = np.zeros((len(network.rows(f)), 0))
+    additional[f] = AdditionalParameters(no_functions, np.diag(terms.precision), terms.functions)
     start[f] = np.zeros(terms.count)
-    plain = replace(
+    fixed_network = replace(
         network,
         sigma=np.where(adjustment.inliers, network.sigma, UNUSED * network.sigma),
         interior_free=np.zeros(network.n_fluoroscopes, dtype=bool),
         additional=tuple(additional),
     )
     parameters = replace(adjustment.parameters, additional=tuple(start))
-    equations = normal_equations(plain, parameters, 0.0, Noise('gaussian', adjustment.noise.scale))
-    matrix = factorize(plain, equations)
+    equations = normal_equations(
+        fixed_network, parameters, 0.0, Noise('gaussian', adjustment.noise.scale)
+    )
+    matrix = factorize(fixed_network, equations)
     return information_of_additional(matrix, f) - np.diag(terms.precision)
 
 
@@ -318,13 +323,13 @@ def _variances_left(
     exposure = network.exposure[rows]
     squares = np.zeros(len(rows))
     for number in np.unique(exposure):
-        at = inliers & (exposure == number)
-        own = terms.functions.values[at].reshape(2 * int(at.sum()), -1)
+        selected = inliers & (exposure == number)
+        values = terms.functions.values[selected].reshape(2 * int(selected.sum()), -1)
         # Scale the six unknowns so that they matter alike.
-        absorbed = by_exterior[rows[at]].reshape(len(own), -1)
+        absorbed = by_exterior[rows[selected]].reshape(len(values), -1)
         absorbed = absorbed / np.linalg.norm(absorbed, axis=0)
-        left = own - absorbed @ np.linalg.lstsq(absorbed, own, rcond=None)[0]
-        squares[at] = (left**2 @ terms.variance).reshape(-1, 2).mean(axis=1)
+        remainder = values - absorbed @ np.linalg.lstsq(absorbed, values, rcond=None)[0]
+        squares[selected] = (remainder**2 @ terms.variance).reshape(-1, 2).mean(axis=1)
     return squares[inliers]
 
 
@@ -393,8 +398,8 @@ def _fit(estimated: SeriesWithExposures, angles: NDArray[np.float64]) -> AngleFi
     """Compute `fit_angles`; raises LinAlgError."""
     h = harmonics(angles) - harmonics(angles).mean(axis=0)
     c = 2 * len(estimated.functions)
-    own = estimated.covariance[c:, c:]
-    precision = np.linalg.inv(own)
+    term_covariance = estimated.covariance[c:, c:]
+    precision = np.linalg.inv(term_covariance)
     precision = (precision + precision.T) / 2
     effects = _Effects(estimated.terms, h)
     mean, covariance = effects.estimate(
@@ -403,19 +408,19 @@ def _fit(estimated: SeriesWithExposures, angles: NDArray[np.float64]) -> AngleFi
     if effects.explained(h) < MIN_SHARE:
         return None
     # A change of the terms changes the series by their covariance.
-    by_terms = np.linalg.solve(own, estimated.covariance[c:, :c]).T
-    moved = effects.design @ mean - estimated.coefficients[c:]
-    lost = own - effects.design @ covariance @ effects.design.T
-    of_series = estimated.covariance[:c, :c] - by_terms @ lost @ by_terms.T
+    by_terms = np.linalg.solve(term_covariance, estimated.covariance[c:, :c]).T
+    change = effects.design @ mean - estimated.coefficients[c:]
+    reduction = term_covariance - effects.design @ covariance @ effects.design.T
+    series_covariance = estimated.covariance[:c, :c] - by_terms @ reduction @ by_terms.T
     count = effects.count
     mixed = by_terms @ effects.design @ covariance[:, :count]
-    of_field = Effects(mean[:count], covariance[:count, :count], mixed)
+    field_effects = Effects(mean[:count], covariance[:count, :count], mixed)
     return AngleFit(
-        field_of(estimated, angles, of_field),
-        estimated.coefficients[:c] + by_terms @ moved,
-        of_series,
+        field_of(estimated, angles, field_effects),
+        estimated.coefficients[:c] + by_terms @ change,
+        series_covariance,
         1 - effects.explained(h),
-        of_field,
+        field_effects,
     )
 
 
@@ -430,8 +435,8 @@ class _Effects:
         terms = len(own.variance)
         self.design = np.hstack([np.kron(h, np.eye(terms)), np.eye(len(h) * terms)])
         self.count = HARMONICS * terms
-        of_harmonics = np.repeat(np.arange(HARMONICS) // 2, terms)
-        self._factor_of = np.append(of_harmonics, np.full(len(h) * terms, ORDERS))
+        order_of_harmonic = np.repeat(np.arange(HARMONICS) // 2, terms)
+        self._factor_of = np.append(order_of_harmonic, np.full(len(h) * terms, ORDERS))
         size = float(np.mean(h**2))
         unit = np.append(np.full(self.count, 1 / size), np.ones(len(h) * terms))
         self._unit = unit * np.tile(own.variance, HARMONICS + len(h))
@@ -467,8 +472,8 @@ class _Effects:
     def explained(self, h: NDArray[np.float64]) -> float:
         """Return the share of the variance between exposures that harmonics h (e, 4) explain."""
         variance = self._variance
-        of_harmonics = variance[: self.count].reshape(HARMONICS, -1).sum(axis=1)
-        by_angle = float(np.mean(h**2, axis=0) @ of_harmonics)
+        harmonic_variance = variance[: self.count].reshape(HARMONICS, -1).sum(axis=1)
+        by_angle = float(np.mean(h**2, axis=0) @ harmonic_variance)
         at_random = float(variance[self.count :].sum()) / len(h)
         return by_angle / (by_angle + at_random)
 
@@ -476,8 +481,8 @@ class _Effects:
 def _inverse_root(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return a lower triangular R such that R^T R is the inverse of a positive definite matrix."""
     factor = np.asfortranarray(np.linalg.cholesky(matrix))
-    root, failed = lapack.dtrtri(factor, lower=1, overwrite_c=1)
-    if failed:
+    root, info = lapack.dtrtri(factor, lower=1, overwrite_c=1)
+    if info:
         raise np.linalg.LinAlgError('the terms of the exposures are not determined')
     return root
 
@@ -489,9 +494,9 @@ def field_of(
     size = estimated.functions.image_size
     cubic = Functions(size, CUBIC)
     values = cubic(estimated.uv)
-    of_terms = estimated.terms.functions.values
+    term_values = estimated.terms.functions.values
     # This solution is exact, because the terms are cubic polynomials.
-    to_cubic = [np.linalg.lstsq(values, of_terms[:, axis], rcond=None)[0] for axis in (0, 1)]
+    to_cubic = [np.linalg.lstsq(values, term_values[:, axis], rcond=None)[0] for axis in (0, 1)]
     by_harmonic = effects.mean.reshape(HARMONICS, -1)
     coefficients = np.stack([by_harmonic @ matrix.T for matrix in to_cubic], axis=1)
     pixels = sd_grid_pixels(size)

@@ -77,7 +77,7 @@ class SolvedNetwork:
         network = self.measured.network
         parameters = self.adjustment.parameters
         angles = np.full((network.n_exposures, 3), np.nan)
-        others = [p.ravel() for p in parameters.additional if p is not None]
+        additional = [p.ravel() for p in parameters.additional if p is not None]
         relative = [np.append(p.translation_mm, angles[0]) for p in parameters.relative]
         return JointPrecision(
             (*self._names(), *global_names(network, self.measured.fluoroscopes)),
@@ -87,7 +87,7 @@ class SolvedNetwork:
                     parameters.points_mm.ravel(),
                     parameters.interior.ravel(),
                     *relative,
-                    *others,
+                    *additional,
                 ]
             ),
             self._as_stated(joint_covariance(blocks).matrix),
@@ -103,8 +103,8 @@ class SolvedNetwork:
         blocks = self._blocks()
         factor = np.ones((len(blocks.pp), 3))
         if self.stated is not None:
-            claimed = np.diagonal(self.stated.points, axis1=1, axis2=2)
-            factor = np.sqrt(claimed / np.diagonal(blocks.pp, axis1=1, axis2=2))
+            stated = np.diagonal(self.stated.points, axis1=1, axis2=2)
+            factor = np.sqrt(stated / np.diagonal(blocks.pp, axis1=1, axis2=2))
 
         def between(p: NDArray[np.int64], q: NDArray[np.int64]) -> NDArray[np.float64]:
             covariance = blocks.points_between(p, q)
@@ -131,16 +131,16 @@ class SolvedNetwork:
         """Scale a covariance matrix to the stated standard deviations of the unknowns."""
         if self.stated is None:
             return covariance
-        claimed = np.concatenate(
+        stated = np.concatenate(
             [
                 np.diagonal(blocks, axis1=1, axis2=2).ravel()
                 for blocks in (self.stated.exterior, self.stated.points, self.stated.interior)
             ]
         )
-        variance = np.diagonal(covariance)[: len(claimed)]
+        variance = np.diagonal(covariance)[: len(stated)]
         scale = np.ones(len(covariance))
         free = variance > 0  # exclude fixed unknowns
-        scale[: len(claimed)][free] = np.sqrt(claimed[free] / variance[free])
+        scale[: len(stated)][free] = np.sqrt(stated[free] / variance[free])
         return scale[:, None] * covariance * scale
 
     def _names(self) -> list[str]:
@@ -207,21 +207,21 @@ def fixed_corrections(
     for f, name in enumerate(measured.fluoroscopes):
         rows = network.rows(f)
         calibration = calibrations[name]
-        found = calibration.correction(network.uv[rows], _angles(measured, rows))
-        correction[rows] = found.duv
-        without = rows[~has_sigma[network.exposure[rows]]]
-        sigma[without] *= calibration.noise_factors(network.uv[without])
-        sigma[rows] = np.hypot(sigma[rows], found.sd / calibration.sigma0)
+        evaluated = calibration.correction(network.uv[rows], _angles(measured, rows))
+        correction[rows] = evaluated.duv
+        without_sigma = rows[~has_sigma[network.exposure[rows]]]
+        sigma[without_sigma] *= calibration.noise_factors(network.uv[without_sigma])
+        sigma[rows] = np.hypot(sigma[rows], evaluated.sd / calibration.sigma0)
     return correction, replace(network, sigma=sigma)
 
 
 def noise_of_calibrations(loss: str, calibrations: Iterable[FluoroscopeCalibration]) -> Noise:
     """Return the noise model of calibrations: medians of their scales and degrees of freedom."""
-    used = list(calibrations)
+    known = list(calibrations)
     return replace(
         start_noise(loss),
-        scale=float(np.median([c.sigma0 for c in used])),
-        nu=float(np.median([c.nu for c in used])),
+        scale=float(np.median([c.sigma0 for c in known])),
+        nu=float(np.median([c.nu for c in known])),
     )
 
 
@@ -242,10 +242,12 @@ def start_within_survey(
     survey_px = network.survey_sd_mm[network.point] * magnification[network.exposure]
     scale = float(np.hypot(noise.scale, np.median(survey_px / network.sigma)))
     while scale > 2 * noise.scale:
-        wide = replace(noise, scale=scale)
+        wide_noise = replace(noise, scale=scale)
         options = SolverOptions(tolerance=ROUND_TOLERANCE)
-        wider = adjust(network, start, correction=correction, noise=wide, options=options)
-        start = wider.parameters
+        adjustment = adjust(
+            network, start, correction=correction, noise=wide_noise, options=options
+        )
+        start = adjustment.parameters
         scale /= 2
     return start
 

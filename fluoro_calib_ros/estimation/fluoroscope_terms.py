@@ -92,8 +92,8 @@ class FluoroscopeTerms:
             problem.image_sizes[number], CUBIC, modes, rings=RINGS if modes else 0
         )
         out = cls(problem, number, functions)
-        core = problem.before.residuals[out.rows][problem.before.inliers[out.rows]]
-        sd = max(float(np.sqrt(np.mean(core**2))), MIN_START_SD_PX)
+        inliers = problem.before.residuals[out.rows][problem.before.inliers[out.rows]]
+        sd = max(float(np.sqrt(np.mean(inliers**2))), MIN_START_SD_PX)
         out.prior = starting_prior(functions, sd)
         return out
 
@@ -186,9 +186,9 @@ class FluoroscopeTerms:
 
     def inliers(self, adjustment: Adjustment) -> FittedPoints:
         """Return the inliers of an adjustment."""
-        core = adjustment.inliers[self.rows]
+        inliers = adjustment.inliers[self.rows]
         return FittedPoints(
-            self.uv[core], adjustment.residuals[self.rows][core], self.exposure[core]
+            self.uv[inliers], adjustment.residuals[self.rows][inliers], self.exposure[inliers]
         )
 
     def functions_with(self, modes: int, prior: Prior) -> Functions:
@@ -217,10 +217,10 @@ class FluoroscopeTerms:
 
         network: has the terms with their last priors. solved (p,): estimates with these priors.
         """
-        present = prior_of_additional(network, self.number)
-        information = information_of_additional(matrix, self.number) - present
+        prior = prior_of_additional(network, self.number)
+        information = information_of_additional(matrix, self.number) - prior
         information *= matrix.information_factor
-        right = (information + present) @ solved
+        right = (information + prior) @ solved
         if self.own is not None:
             information, right = without_exposure_terms(
                 information, right, self.own.precision, self.of_series.stop
@@ -238,8 +238,10 @@ class FluoroscopeTerms:
         values = coefficients[self.of_series].reshape(2, -1)
         if has_rings(functions, self.prior):
             return Series(*functions.as_polynomials(values), sd)
-        plain = replace(functions, rings=0, absent=())
-        return Series(plain, plain.converted(functions, values.ravel()).reshape(2, -1), sd)
+        without_rings = replace(functions, rings=0, absent=())
+        return Series(
+            without_rings, without_rings.converted(functions, values.ravel()).reshape(2, -1), sd
+        )
 
     def fitted_series(self, adjustment: Adjustment, precise: Precision) -> Series:
         """See `AdjustedTerms`; with a field of the angle, the series that belongs to it."""
@@ -247,10 +249,10 @@ class FluoroscopeTerms:
         if fit is not None:
             return self.series(fit.coefficients, fit.covariance)
         coefficients, covariance = estimated_terms(self.number, adjustment, precise)
-        of_series = self.of_series
-        coefficients = coefficients[of_series]
+        rows = self.of_series
+        coefficients = coefficients[rows]
         covariance = covariance_of_series(
-            self.functions, self.prior, coefficients, covariance[of_series, of_series]
+            self.functions, self.prior, coefficients, covariance[rows, rows]
         )
         last = self._last_equations
         if last is not None:

@@ -155,7 +155,7 @@ class Measured:
         exposures = [
             np.unique(network.exposure[network.rows(f)]) for f in range(len(self.fluoroscopes))
         ]
-        return [angles_of(self.frames[j] for j in own) for own in exposures]
+        return [angles_of(self.frames[j] for j in rows) for rows in exposures]
 
 
 @dataclass(frozen=True)
@@ -264,28 +264,30 @@ def measured_network(
     """
     task = _Task(phantom, sensors, principal_distance, known or {}, starts)
     return _measured(
-        task, {name: _resected(task, name, of_one) for name, of_one in frames.items()}
+        task, {name: _resected(task, name, exposures) for name, exposures in frames.items()}
     )
 
 
 def _measured(task: _Task, found: Mapping[str, _Resected]) -> Measured:
     """Return the network of resected exposures {fluoroscope: _Resected}."""
-    frames = [frame for one in found.values() for frame in one.frames]
-    resections = [resection for one in found.values() for resection in one.resections]
-    fluoroscope = np.repeat(np.arange(len(found)), [len(one.frames) for one in found.values()])
+    frames = [frame for resected in found.values() for frame in resected.frames]
+    resections = [resection for resected in found.values() for resection in resected.resections]
+    fluoroscope = np.repeat(
+        np.arange(len(found)), [len(resected.frames) for resected in found.values()]
+    )
     network, target_id = _index(frames, fluoroscope, task, len(found))
     if task.known:
         network = replace(network, exterior=_exterior_prior(task, frames))
     earlier = None if task.starts is None or task.sensors is not None else task.starts.earlier
     start = Parameters(
-        np.array([one.interior for one in found.values()]),
+        np.array([resected.interior for resected in found.values()]),
         np.array([resection.rotation for resection in resections]),
         np.array([resection.position_mm for resection in resections]),
         network.survey_mm.copy() if earlier is None else earlier.points(target_id),
     )
-    sizes = tuple(one.frames[0].image_size for one in found.values())
-    excluded = tuple(one for resected in found.values() for one in resected.excluded)
-    untilted = tuple(one.untilted for one in found.values())
+    sizes = tuple(resected.frames[0].image_size for resected in found.values())
+    excluded = tuple(finding for resected in found.values() for finding in resected.excluded)
+    untilted = tuple(resected.untilted for resected in found.values())
     known = {name: task.known[name] for name in found if name in task.known}
     return Measured(
         network=network,
@@ -319,22 +321,26 @@ def _resected(task: _Task, name: str, frames: Sequence[Frame]) -> _Resected:
     ordered, excluded = _usable_frames(task, name, frames)
     untilted = False
     if name in task.known:
-        found, interior, misfits = _place_all(task, name, ordered)
+        resections, interior, misfits = _place_all(task, name, ordered)
     elif task.has_starts(name, ordered):
-        found, interior, misfits = _start_all(task, name, ordered)
+        resections, interior, misfits = _start_all(task, name, ordered)
     else:
-        found, interior, misfits = _resect_all(task, name, ordered)
+        resections, interior, misfits = _resect_all(task, name, ordered)
     if task.sensors is None and name not in task.known:
-        untilted = _are_untilted(task, ordered, found)
-        _require_determined(task, name, found, untilted)
+        untilted = _are_untilted(task, ordered, resections)
+        _require_determined(task, name, resections, untilted)
     excluded += misfits
-    fitting = [(frame, one) for frame, one in zip(ordered, found) if one is not None]
+    fitting = [
+        (frame, resection)
+        for frame, resection in zip(ordered, resections)
+        if resection is not None
+    ]
     needed = task.min_exposures(name, untilted)
     if len(fitting) < needed:
         if not misfits:
             raise DataError(_too_few(name, len(fitting), needed, excluded))
         raise DataError(
-            f'only {len(fitting)} of {len(found)} exposures fit the phantom, '
+            f'only {len(fitting)} of {len(resections)} exposures fit the phantom, '
             f'{needed} are needed; the first that does not: {excluded[0]}',
             kind=excluded[0].kind,
             place=Place((name,), excluded[0].place.exposures, name=f'fluoroscope {name}'),
@@ -342,7 +348,7 @@ def _resected(task: _Task, name: str, frames: Sequence[Frame]) -> _Resected:
         )
     return _Resected(
         [frame for frame, _ in fitting],
-        [one for _, one in fitting],
+        [resection for _, resection in fitting],
         interior,
         excluded,
         untilted,
@@ -361,15 +367,15 @@ def _place_all(
     sensor = None if task.sensors is None else task.sensors[name]
     correction = _no_correction if sensor is None else sensor.correction
     interior = known.interior if sensor is None else np.asarray(sensor.interior)
-    found: list[Resection | None] = []
+    resections: list[Resection | None] = []
     for frame in frames:
         xyz = task.phantom.xyz_mm[task.phantom.index(frame.target_id)]
-        found.append(
+        resections.append(
             resection_at(
                 known.rotation, known.position_mm, xyz, frame.uv - correction(frame), interior
             )
         )
-    return found, interior, _reject_poor_fits(frames, found)
+    return resections, interior, _reject_poor_fits(frames, resections)
 
 
 def _start_all(
@@ -381,30 +387,33 @@ def _start_all(
     earlier = task.starts.earlier
     correction = _no_correction if sensor is None else sensor.correction
     interior = task.starts.interior[name] if sensor is None else np.asarray(sensor.interior)
-    found: list[Resection | None] = []
+    resections: list[Resection | None] = []
     for frame in frames:
         rotation, position = task.starts.exterior[name, frame.number]
         xyz = task.phantom.xyz_mm[task.phantom.index(frame.target_id)]
         if sensor is None and earlier is not None:
             uv = frame.uv - earlier.series[name].predict(frame.uv)
-            found.append(resection_at(rotation, position, xyz, uv, interior))
+            resections.append(resection_at(rotation, position, xyz, uv, interior))
             continue
         # The sensor may have another gauge than the earlier adjustment.
-        found.append(
+        resections.append(
             refine_resection(xyz, frame.uv - correction(frame), interior, rotation, position)
         )
-    return found, interior, _reject_poor_fits(frames, found)
+    return resections, interior, _reject_poor_fits(frames, resections)
 
 
 def _are_untilted(task: _Task, frames: Sequence[Frame], found: Sequence[Resection | None]) -> bool:
     """Whether all exposures show flat targets parallel to the image."""
-    for frame, one in zip(frames, found):
-        if one is None:
+    for frame, resection in zip(frames, found):
+        if resection is None:
             continue
         xyz = task.phantom.xyz_mm[task.phantom.index(frame.target_id)]
-        if flatness(xyz) >= MIN_FLATNESS or tilt_of(one.rotation, plane_of(xyz)) > UNTILTED_RAD:
+        if (
+            flatness(xyz) >= MIN_FLATNESS
+            or tilt_of(resection.rotation, plane_of(xyz)) > UNTILTED_RAD
+        ):
             return False
-    return any(one is not None for one in found)
+    return any(resection is not None for resection in found)
 
 
 def is_hardly_tilted(measured: Measured) -> bool:
@@ -458,10 +467,10 @@ def _usable_frames(
 
 def _too_few(name: str, count: int, needed: int, excluded: Sequence[Finding]) -> Finding:
     """Return the finding that a fluoroscope has too few exposures."""
-    few = f', {len(excluded)} more have too few targets' if excluded else ''
+    remark = f', {len(excluded)} more have too few targets' if excluded else ''
     return Finding(
         Kind.FEW_EXPOSURES,
-        f'{count} exposures are too few, {needed} are needed{few}',
+        f'{count} exposures are too few, {needed} are needed{remark}',
         Place((name,)),
         numbers={'exposures': count, 'needed': needed, 'few_targets': len(excluded)},
     )
@@ -488,17 +497,17 @@ def _resect_all(
         interior = _start_interior(task, name, [view for view in views if not view.error])
     else:
         interior = np.asarray(sensor.interior)
-    found: list[Resection | None] = []
+    resections: list[Resection | None] = []
     for view in views:
         try:
-            found.append(None if view.error else orient_view(view, interior))
+            resections.append(None if view.error else orient_view(view, interior))
         except DataError as error:
-            found.append(None)
+            resections.append(None)
             excluded.append(_not_oriented(view.frame, error.finding))
     if sensor is None:
-        found = settle_planes(views, found, interior)
-    excluded += _reject_poor_fits(frames, found)
-    return found, interior, excluded
+        resections = settle_planes(views, resections, interior)
+    excluded += _reject_poor_fits(frames, resections)
+    return resections, interior, excluded
 
 
 def _start_interior(task: _Task, name: str, views: Sequence[View]) -> NDArray[np.float64]:
@@ -514,19 +523,19 @@ def _start_interior(task: _Task, name: str, views: Sequence[View]) -> NDArray[np
 
 def _reject_poor_fits(frames: Sequence[Frame], found: list[Resection | None]) -> list[Finding]:
     """Replace resections with too large residuals by None; return a finding for each."""
-    scales = [one.scale for one in found if one is not None]
+    scales = [resection.scale for resection in found if resection is not None]
     typical = np.median(scales) if scales else np.inf
     out = []
-    for row, (frame, one) in enumerate(zip(frames, found)):
-        if one is not None and one.scale > MAX_MISFIT * typical:
+    for row, (frame, resection) in enumerate(zip(frames, found)):
+        if resection is not None and resection.scale > MAX_MISFIT * typical:
             out.append(
                 Finding(
                     Kind.POOR_FIT,
                     'the image points do not fit the phantom, their residuals are about '
-                    f'{one.scale:.0f} px',
+                    f'{resection.scale:.0f} px',
                     frame.place,
                     severity=Severity.NOTE,
-                    numbers={'residual_px': float(one.scale)},
+                    numbers={'residual_px': float(resection.scale)},
                 )
             )
             found[row] = None
@@ -541,19 +550,21 @@ def _not_oriented(frame: Frame, why: Finding) -> Finding:
 
 def _require_different_poses(name: str, resections: Sequence[Resection | None]) -> None:
     """Raise DataError if all exposures show the phantom in the same pose."""
-    found = [one for one in resections if one is not None]
-    if len(found) < 2:
+    oriented = [resection for resection in resections if resection is not None]
+    if len(oriented) < 2:
         return
-    turn = max(rotation_angle(one.rotation @ found[0].rotation.T) for one in found)
-    places = np.array([-one.rotation @ one.position_mm for one in found])
+    turn = max(
+        rotation_angle(resection.rotation @ oriented[0].rotation.T) for resection in oriented
+    )
+    places = np.array([-resection.rotation @ resection.position_mm for resection in oriented])
     shift = np.max(np.abs(places - places[0]) / (1, 1, AXIAL_FACTOR))
     if turn < MIN_POSE_RAD and shift < MIN_POSE_MM:
         raise DataError(
-            f'all {len(found)} exposures show the phantom in one pose (turned by at most '
+            f'all {len(oriented)} exposures show the phantom in one pose (turned by at most '
             f'{np.rad2deg(turn):.1f} degrees); turn and move it between the exposures',
             kind=Kind.ONE_POSE,
             place=Place((name,)),
-            numbers={'exposures': len(found), 'turn_deg': float(np.rad2deg(turn))},
+            numbers={'exposures': len(oriented), 'turn_deg': float(np.rad2deg(turn))},
         )
 
 

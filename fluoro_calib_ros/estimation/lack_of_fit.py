@@ -161,24 +161,24 @@ class _Products:
 def _products(points: FittedPoints) -> _Products:
     """Return the products of the image points that have neighbours of other exposures."""
     count = min(NEIGHBOURS + 1, len(points.uv))
-    distance, near = cKDTree(points.uv).query(points.uv, k=np.arange(2, count + 1))
-    other = points.exposure[near] != points.exposure[:, None]
+    distance, neighbours = cKDTree(points.uv).query(points.uv, k=np.arange(2, count + 1))
+    other_exposure = points.exposure[neighbours] != points.exposure[:, None]
     r = points.residuals
     redundancy = np.broadcast_to(points.redundancy, len(r))
-    number = other.sum(axis=1)
+    number = other_exposure.sum(axis=1)
     usable = number > 0
 
     def mean(of_pairs: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.where(other, of_pairs, 0.0).sum(axis=1)[usable] / number[usable]
+        return np.where(other_exposure, of_pairs, 0.0).sum(axis=1)[usable] / number[usable]
 
-    product = np.einsum('na,nka->nk', r, r[near]) / 2
+    product = np.einsum('na,nka->nk', r, r[neighbours]) / 2
     return _Products(
         points.uv[usable],
         mean(product),
-        shown=mean(redundancy[:, None] * redundancy[near]),
+        shown=mean(redundancy[:, None] * redundancy[neighbours]),
         exposure=points.exposure[usable],
         distance=mean(distance),
-        growth=_growth(product, distance, other),
+        growth=_growth(product, distance, other_exposure),
     )
 
 
@@ -215,22 +215,22 @@ def sd_with_lack_of_fit(
     if len(products.uv) < 2 * POINTS:
         return variance**0.5 if left_out is None else np.hypot(series.sd, left_out.sd_px)
     pixels = sd_grid_pixels(series.functions.image_size)
-    beyond = np.zeros(len(pixels))
+    left_out_variance = np.zeros(len(pixels))
     if left_out is not None:
-        beyond += _variance_beyond(products, series, left_out)
+        left_out_variance += _variance_beyond(products, series, left_out)
         if left_out.places is not None:
-            beyond += _variance_in_places(products, series, left_out.places, pixels)
-    _, near = cKDTree(products.uv).query(pixels, k=POINTS)
-    mean = products.value[near].mean(axis=1)
+            left_out_variance += _variance_in_places(products, series, left_out.places, pixels)
+    _, neighbours = cKDTree(products.uv).query(pixels, k=POINTS)
+    mean = products.value[neighbours].mean(axis=1)
     # Each product occurs twice among the points about a node.
-    error = products.value[near].std(axis=1) * np.sqrt(2 / POINTS)
-    everywhere = products.is_significant()
-    shown = (mean > SIGNIFICANT_LOCAL * error) | everywhere
-    if everywhere:
+    error = products.value[neighbours].std(axis=1) * np.sqrt(2 / POINTS)
+    is_significant = products.is_significant()
+    shows_lack = (mean > SIGNIFICANT_LOCAL * error) | is_significant
+    if is_significant:
         mean = mean * products.growth
-    common = mean / products.shown[near].mean(axis=1) + variance.ravel()
-    found = np.where(shown, np.maximum(common, beyond), beyond)
-    return np.sqrt(variance + found.reshape(variance.shape))
+    observed = mean / products.shown[neighbours].mean(axis=1) + variance.ravel()
+    lack_of_fit = np.where(shows_lack, np.maximum(observed, left_out_variance), left_out_variance)
+    return np.sqrt(variance + lack_of_fit.reshape(variance.shape))
 
 
 def sd_of_rejected(
@@ -248,27 +248,27 @@ def sd_of_rejected(
     distance, _ = cKDTree(inliers.uv).query(inliers.uv, k=[2])
     reach = AGREE_REACH * float(np.median(distance))
     size = np.linalg.norm(rejected.residuals, axis=1)
-    possible = np.flatnonzero(size < LARGEST_SD * noise)
-    if len(possible) <= AGREE_WITH:
+    candidates = np.flatnonzero(size < LARGEST_SD * noise)
+    if len(candidates) <= AGREE_WITH:
         return out.reshape(series.sd.shape)
-    there = FittedPoints(
-        rejected.uv[possible], rejected.residuals[possible], rejected.exposure[possible]
+    points = FittedPoints(
+        rejected.uv[candidates], rejected.residuals[candidates], rejected.exposure[candidates]
     )
-    uv = there.uv
-    i, j, agree, opposite = _pairs_of_rejected(inliers, there, reach, AGREE_SD * noise)
+    uv = points.uv
+    i, j, agree, opposite = _pairs_of_rejected(inliers, points, reach, AGREE_SD * noise)
     pairs = np.count_nonzero(agree), np.count_nonzero(opposite)
     if pairs[0] - pairs[1] <= AGREE_SIGNIFICANT * np.sqrt(sum(pairs)):
         return out.reshape(series.sd.shape)
-    number = np.bincount(np.concatenate([i[agree], j[agree]]), minlength=len(possible))
-    found = np.flatnonzero(number >= AGREE_WITH)
-    beside = cKDTree(inliers.uv).query_ball_point(uv, reach, return_length=True)
-    share = (number + 1) / (number + 1 + beside)
+    number = np.bincount(np.concatenate([i[agree], j[agree]]), minlength=len(candidates))
+    agreeing = np.flatnonzero(number >= AGREE_WITH)
+    inliers_nearby = cKDTree(inliers.uv).query_ball_point(uv, reach, return_length=True)
+    share = (number + 1) / (number + 1 + inliers_nearby)
     pixels = sd_grid_pixels(series.functions.image_size)
     # Each of them affects the nodes about it.
     cell = np.linalg.norm(np.asarray(series.functions.image_size) / (SD_GRID - 1))
-    for row in found:
-        near = np.linalg.norm(pixels - uv[row], axis=1) < max(reach, cell)
-        out[near] = np.maximum(out[near], size[possible[row]] * np.sqrt(share[row] / 2))
+    for row in agreeing:
+        nodes = np.linalg.norm(pixels - uv[row], axis=1) < max(reach, cell)
+        out[nodes] = np.maximum(out[nodes], size[candidates[row]] * np.sqrt(share[row] / 2))
     return out.reshape(series.sd.shape)
 
 
@@ -280,23 +280,27 @@ def _pairs_of_rejected(
     reach [px]: largest distance of neighbours of different exposures; limit [px]: largest
     difference of residuals that agree. Chance makes as many pairs opposite as it makes agree.
     """
-    near = cKDTree(inliers.uv).query_ball_point(rejected.uv, reach)
+    neighbours = cKDTree(inliers.uv).query_ball_point(rejected.uv, reach)
     exposure = rejected.exposure
-    alone = np.flatnonzero(
-        [np.all(inliers.exposure[rows] == own) for rows, own in zip(near, exposure)]
+    isolated = np.flatnonzero(
+        [np.all(inliers.exposure[rows] == number) for rows, number in zip(neighbours, exposure)]
     )
-    apart = cKDTree(rejected.uv).query_pairs(reach, output_type='ndarray')
-    apart = apart[exposure[apart[:, 0]] != exposure[apart[:, 1]]]
-    same = alone[
-        cKDTree(rejected.uv[alone]).query_pairs(AGREE_REACH * reach, output_type='ndarray')
+    across_exposures = cKDTree(rejected.uv).query_pairs(reach, output_type='ndarray')
+    across_exposures = across_exposures[
+        exposure[across_exposures[:, 0]] != exposure[across_exposures[:, 1]]
     ]
-    same = same[exposure[same[:, 0]] == exposure[same[:, 1]]]
-    i, j = np.concatenate([apart, same]).T
+    within_exposure = isolated[
+        cKDTree(rejected.uv[isolated]).query_pairs(AGREE_REACH * reach, output_type='ndarray')
+    ]
+    within_exposure = within_exposure[
+        exposure[within_exposure[:, 0]] == exposure[within_exposure[:, 1]]
+    ]
+    i, j = np.concatenate([across_exposures, within_exposure]).T
     r = rejected.residuals
     limits = np.full(len(i), limit)
     # Beyond the last inliers, the error of a correction grows fast.
-    larger = np.linalg.norm(r[same], axis=2).max(axis=1, initial=0.0)
-    limits[len(apart) :] = np.maximum(limit, ALONE_AGREE * larger)
+    larger_residual = np.linalg.norm(r[within_exposure], axis=2).max(axis=1, initial=0.0)
+    limits[len(across_exposures) :] = np.maximum(limit, ALONE_AGREE * larger_residual)
     agree = np.linalg.norm(r[i] - r[j], axis=1) < limits
     opposite = np.linalg.norm(r[i] + r[j], axis=1) < limits
     return i, j, agree, opposite
@@ -321,8 +325,8 @@ def areas_of_rejected(
     cell = np.asarray(image_size) / CELLS
     corners = list(np.ndindex(2 * CELLS - 1, 2 * CELLS - 1))
     rate = len(target) / (len(target) + len(inliers))
-    several: list[_Area] = []
-    few: list[_Area] = []
+    areas: list[_Area] = []
+    clusters: list[_Area] = []
     for corner in corners:
         rows = _inside(rejected.uv, np.array(corner) / 2, cell)
         number = len(np.unique(target[rows]))
@@ -332,12 +336,12 @@ def areas_of_rejected(
         by_chance = len(corners) * bdtrc(number - 1, total, rate)
         area = _Area.of(rejected, target, rows, clustered=bool(by_chance < CONTRADICTION))
         if number >= MIN_TARGETS:
-            several.append(area)
+            areas.append(area)
         elif area.clustered:
-            few.append(area)
+            clusters.append(area)
     # Bonferroni correction. Areas with few targets are a separate test, of clusters only.
-    return [area.tested(len(several)) for area in several] + [
-        area.tested_by_draws(len(few)) for area in few
+    return [area.tested(len(areas)) for area in areas] + [
+        area.tested_by_draws(len(clusters)) for area in clusters
     ]
 
 
@@ -345,8 +349,8 @@ def _inside(
     uv: NDArray[np.float64], corner: NDArray[np.float64], cell: NDArray[np.float64]
 ) -> NDArray[np.int64]:
     """Return rows of image points (n, 2) in a cell (2,) [px]; corner (2,): in units of cells."""
-    at = (uv + 0.5) / cell - corner
-    return np.flatnonzero(((at >= 0) & (at < 1)).all(axis=1))
+    relative = (uv + 0.5) / cell - corner
+    return np.flatnonzero(((relative >= 0) & (relative < 1)).all(axis=1))
 
 
 @dataclass(frozen=True)
@@ -370,23 +374,23 @@ class _Area:
         _, place = np.unique(target[rows], return_inverse=True)
         number = np.bincount(place)
         r = rejected.residuals[rows]
-        of_target = np.stack([np.bincount(place, r[:, i]) / number for i in (0, 1)], axis=1)
-        along = np.bincount(rejected.exposure[rows], r @ of_target.mean(axis=0))
-        return _Area(rows, of_target, int(np.count_nonzero(along > 0)), clustered)
+        target_means = np.stack([np.bincount(place, r[:, i]) / number for i in (0, 1)], axis=1)
+        projected = np.bincount(rejected.exposure[rows], r @ target_means.mean(axis=0))
+        return _Area(rows, target_means, int(np.count_nonzero(projected > 0)), clustered)
 
     def tested(self, areas: int) -> RejectedArea:
         """Test the mean residual: many residuals of any direction have a Gaussian mean."""
         chance = float(np.sqrt(np.sum(self.of_target**2))) / len(self.of_target)
-        alarm = CLUSTERED_FALSE_ALARM if self.clustered else FALSE_ALARM
-        limit = chance * float(np.sqrt(np.log(areas / alarm)))
+        false_alarm = CLUSTERED_FALSE_ALARM if self.clustered else FALSE_ALARM
+        limit = chance * float(np.sqrt(np.log(areas / false_alarm)))
         return RejectedArea(self._size(MIN_EXPOSURES), limit, self.rows)
 
     def tested_by_draws(self, areas: int) -> RejectedArea:
         """Test the mean of few residuals, by random draws of their directions."""
         length = np.linalg.norm(self.of_target, axis=1)
         angle = np.random.default_rng(0).uniform(0, 2 * np.pi, (DRAWS, len(length)))
-        drawn = np.abs(np.mean(length * np.exp(1j * angle), axis=1))
-        limit = float(np.quantile(drawn, 1 - CLUSTERED_FALSE_ALARM / areas))
+        means = np.abs(np.mean(length * np.exp(1j * angle), axis=1))
+        limit = float(np.quantile(means, 1 - CLUSTERED_FALSE_ALARM / areas))
         return RejectedArea(self._size(FEW_EXPOSURES), limit, self.rows)
 
     def _size(self, exposures: int) -> float:
@@ -406,7 +410,7 @@ def _variance_in_places(
     inside = expected > PLACE * np.max(expected, initial=0.0)
     if not inside.any():
         return places.variance(pixels)
-    within = replace(
+    selected = replace(
         products,
         **{
             name: getattr(products, name)[inside]
@@ -414,8 +418,8 @@ def _variance_in_places(
         },
     )
     mean = float(np.mean(expected[inside]))
-    found = _variance_beyond(within, series, LeftOut(mean**0.5, places.correlation))
-    return found / mean * places.variance(pixels)
+    variance = _variance_beyond(selected, series, LeftOut(mean**0.5, places.correlation))
+    return variance / mean * places.variance(pixels)
 
 
 def _variance_beyond(products: _Products, series: Series, left_out: LeftOut) -> float:
@@ -429,17 +433,17 @@ def _variance_beyond(products: _Products, series: Series, left_out: LeftOut) -> 
     """
     mean, error = products.mean_of_all()
     expected = left_out.sd_px**2
-    part = float(products.shown.mean())
+    redundancy = float(products.shown.mean())
     correlation = float(np.mean(left_out.correlation(products.distance)))
     if not expected > 0 or not 0 < error < np.inf or correlation < MIN_CORRELATION:
         return expected
-    error /= part * correlation
-    found = (mean / part + float(np.mean(series.sd_at(products.uv) ** 2))) / correlation
-    at = found / error - error / expected
-    if at < -FAR:  # the tail is exponential
-        return float(-error / at)
-    density = np.exp(-(at**2) / 2 - log_ndtr(at)) / np.sqrt(2 * np.pi)
-    return min(float(error * (at + density)), expected)
+    error /= redundancy * correlation
+    observed = (mean / redundancy + float(np.mean(series.sd_at(products.uv) ** 2))) / correlation
+    location = observed / error - error / expected
+    if location < -FAR:  # the tail is exponential
+        return float(-error / location)
+    density = np.exp(-(location**2) / 2 - log_ndtr(location)) / np.sqrt(2 * np.pi)
+    return min(float(error * (location + density)), expected)
 
 
 MIN_POINTS = 100  # image points that a profile needs

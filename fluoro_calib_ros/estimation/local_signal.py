@@ -64,8 +64,8 @@ class LocalSignal:
         """Return variances (n,) [px^2] at pixels uv (n, 2) of what the sines of a series omit."""
         width = WIDTH * max(functions.image_size)
         squares = np.sum((uv[:, None] - self.nodes[None]) ** 2, axis=2)
-        whole = np.exp(-squares / width**2) @ self.of_bumps
-        return whole * np.exp(-((functions.highest * width) ** 2))
+        variance = np.exp(-squares / width**2) @ self.of_bumps
+        return variance * np.exp(-((functions.highest * width) ** 2))
 
     def change(self, other: LocalSignal | None) -> float:
         """Return the mean change of the log variances; infinite if the windows differ."""
@@ -85,12 +85,14 @@ class LocalSignal:
         determined = np.sum(1 - variance / self.of_bumps, axis=0)
         determined = np.bincount(self.window, determined, count)
         variances = squares / np.maximum(determined, MIN_DETERMINED)
-        kept = variances > MIN_VARIANCE
-        if not kept.any():
+        has_variance = variances > MIN_VARIANCE
+        if not has_variance.any():
             return None
-        own = kept[self.window]
-        number = np.cumsum(kept) - 1
-        return LocalSignal(self.nodes[own], number[self.window[own]], variances[kept])
+        retained = has_variance[self.window]
+        number = np.cumsum(has_variance) - 1
+        return LocalSignal(
+            self.nodes[retained], number[self.window[retained]], variances[has_variance]
+        )
 
 
 @dataclass(frozen=True)
@@ -113,7 +115,7 @@ class SineEstimates:
         covariances: NDArray[np.float64],
     ) -> SineEstimates:
         """Return them from K^-1 (s, s), estimates (s, 2) and covariances (k, s, s)."""
-        evidence = [precision - precision @ one @ precision for one in covariances]
+        evidence = [precision - precision @ covariance @ precision for covariance in covariances]
         return cls(precision @ mean, np.stack(evidence))
 
 
@@ -140,24 +142,26 @@ def with_likely_places(
 
     estimates: with the present places, local. Returns local if there are no more places.
     """
-    shown = _ShownBumps.of(functions, estimates)
-    taken = np.zeros(len(shown.nodes), dtype=bool)
+    shown_bumps = _ShownBumps.of(functions, estimates)
+    taken = np.zeros(len(shown_bumps.nodes), dtype=bool)
     if local is not None:
-        taken = (np.abs(shown.nodes[:, None] - local.nodes[None]).max(axis=2) < 1).any(axis=1)
-    windows = shown.windows()
-    band = shown.most_likely_band(taken)
+        taken = (np.abs(shown_bumps.nodes[:, None] - local.nodes[None]).max(axis=2) < 1).any(
+            axis=1
+        )
+    windows = shown_bumps.windows()
+    band = shown_bumps.most_likely_band(taken)
     if band is not None and band.gain > max(MIN_GAIN, *(place.gain for place in windows)):
         # The gains of the windows change with this band in the prior, and are computed next time.
-        return _joined(local, shown.nodes[band.rows], band.variance)
+        return _joined(local, shown_bumps.nodes[band.rows], band.variance)
     out = local
     reach = 1.01 * max(functions.image_size) / NODES
     for place in sorted(windows, key=lambda window: -window.gain):
         if place.gain < MIN_GAIN_BESIDE:
             break
-        nodes = shown.nodes[place.rows]
+        nodes = shown_bumps.nodes[place.rows]
         if taken[place.rows].any():
             continue
-        if place.gain < MIN_GAIN and not _is_beside(nodes, shown.nodes[taken], reach):
+        if place.gain < MIN_GAIN and not _is_beside(nodes, shown_bumps.nodes[taken], reach):
             continue
         taken[place.rows] = True
         out = _joined(out, nodes, place.variance)
@@ -166,9 +170,9 @@ def with_likely_places(
 
 def largest_gain(functions: Functions, estimates: SineEstimates) -> float:
     """Return the largest gain of the logarithm of the likelihood by one more window or band."""
-    shown = _ShownBumps.of(functions, estimates)
-    places = shown.windows()
-    band = shown.most_likely_band(np.zeros(len(shown.nodes), dtype=bool))
+    shown_bumps = _ShownBumps.of(functions, estimates)
+    places = shown_bumps.windows()
+    band = shown_bumps.most_likely_band(np.zeros(len(shown_bumps.nodes), dtype=bool))
     return max(place.gain for place in (*places, *([] if band is None else [band])))
 
 
@@ -202,7 +206,7 @@ class _ShownBumps:
         """Return the information on the bumps from that on the sines."""
         nodes = _all_nodes(functions.image_size)
         base = bumps(functions, nodes)
-        products = np.stack([base.T @ (one @ base) for one in estimates.evidence])
+        products = np.stack([base.T @ (evidence @ base) for evidence in estimates.evidence])
         return cls(functions.image_size, nodes, base.T @ estimates.pull, products)
 
     def windows(self) -> list[_Place]:
@@ -224,11 +228,11 @@ class _ShownBumps:
         score = (bands @ np.where(taken, 0.0, excess)) / np.sqrt(np.maximum(number, 1))
         score[number < NODES] = -np.inf
         best = np.argsort(score)[-LIKELY_BANDS:]
-        likely = [
+        candidates = [
             self._place(np.flatnonzero((bands[i] > 0) & ~taken))
             for i in best[score[best] > -np.inf]
         ]
-        return max(likely, key=lambda band: band.gain, default=None)
+        return max(candidates, key=lambda band: band.gain, default=None)
 
     def _place(self, rows: NDArray[np.int64]) -> _Place:
         """Return the place with some bumps (b,)."""
@@ -249,7 +253,7 @@ def _windows(image_size: tuple[int, int], nodes: NDArray[np.float64]) -> list[ND
     count = [max(1, int(np.ceil(2 * side / size)) - 1) for side in image_size]
     corners = np.array(list(np.ndindex(*count))) * size / 2
     inside = ((nodes >= corners[:, None]) & (nodes < corners[:, None] + size)).all(axis=2)
-    return [np.flatnonzero(one) for one in np.asarray(inside) if np.any(one)]
+    return [np.flatnonzero(mask) for mask in np.asarray(inside) if np.any(mask)]
 
 
 @lru_cache(maxsize=4)
@@ -259,9 +263,9 @@ def _bands(image_size: tuple[int, int]) -> NDArray[np.float64]:
     half = BAND * max(image_size) / NODES
     out = []
     for angle in np.arange(NODES) * np.pi / NODES:
-        across = nodes @ [np.cos(angle), np.sin(angle)]
-        lines = np.arange(across.min(), across.max() + half, half)
-        out.append(np.abs(across - lines[:, None]) <= half)
+        distance = nodes @ [np.cos(angle), np.sin(angle)]
+        lines = np.arange(distance.min(), distance.max() + half, half)
+        out.append(np.abs(distance - lines[:, None]) <= half)
     return np.concatenate(out).astype(float)
 
 

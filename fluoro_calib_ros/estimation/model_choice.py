@@ -57,21 +57,21 @@ def with_errors_by(
         rows = run.measured.network.rows(f)
         uv = run.measured.network.uv[rows[run.trained[rows]]]
         interior = run.after.parameters.interior[f]
-        other = reference.models[name]
+        reference_model = reference.models[name]
         size = run.measured.image_size[f]
         pixels = sd_grid_pixels(size)
-        inside = ~(model.outside(pixels) | other.outside(pixels))
+        inside = ~(model.outside(pixels) | reference_model.outside(pixels))
         if inside.sum() < MIN_PIXELS:
             models[name] = model
             continue
         # A difference of the gauges is no error.
         basis = gauge_basis(uv, interior, gauges[f])
-        flat = (model.predict(uv) - other.predict(uv)).ravel()
+        flat = (model.predict(uv) - reference_model.predict(uv)).ravel()
         shared = np.linalg.lstsq(basis.reshape(len(flat), -1), flat, rcond=None)[0]
-        found = other.evaluate(pixels)
-        difference = model.predict(pixels) - found.duv
+        expected = reference_model.evaluate(pixels)
+        difference = model.predict(pixels) - expected.duv
         difference = difference - gauge_basis(pixels, interior, gauges[f]) @ shared
-        square = np.mean(difference**2, axis=1) + found.sd**2
+        square = np.mean(difference**2, axis=1) + expected.sd**2
         models[name] = _with_variance(model, pixels, square, inside)
     return replace(run, models=models, stated=_precision_by(reference, run))
 
@@ -81,12 +81,12 @@ def _precision_by(reference: SelfCalibration, run: SelfCalibration) -> Precision
 
     Covariances with additional parameters and other global unknowns are those of the network.
     """
-    found = run.after.parameters
-    other = reference.after.parameters
-    points = found.points_mm - other.points_mm
-    turn = vector_from_matrix(found.rotation @ other.rotation.transpose(0, 2, 1))
-    exterior = np.concatenate([found.position_mm - other.position_mm, turn], axis=1)
-    interior = found.interior - other.interior
+    estimated = run.after.parameters
+    expected = reference.after.parameters
+    points = estimated.points_mm - expected.points_mm
+    turn = vector_from_matrix(estimated.rotation @ expected.rotation.transpose(0, 2, 1))
+    exterior = np.concatenate([estimated.position_mm - expected.position_mm, turn], axis=1)
+    interior = estimated.interior - expected.interior
     precise = reference.precision
     joint = precise.joint_points
     return replace(
@@ -117,8 +117,8 @@ def _with_variance(
     if isinstance(model, SeriesModel):
         sd = np.sqrt(square).reshape(model.series.sd.shape)
         return replace(model, series=replace(model.series, sd=sd))
-    random = model.standard_deviation(pixels[inside]) ** 2 - model.bias_px**2
-    bias2 = float(np.mean(square[inside] - random))
+    random_variance = model.standard_deviation(pixels[inside]) ** 2 - model.bias_px**2
+    bias2 = float(np.mean(square[inside] - random_variance))
     return replace(model, bias_px=float(np.sqrt(max(bias2, 0.0))))
 
 
@@ -145,7 +145,7 @@ def better_model(run: SelfCalibration, terms: AdjustedTerms) -> str | None:
     run: self-calibration by collocation; terms: its terms.
     """
     assert isinstance(terms, CollocationTerms)
-    if any(own is not None for own in terms.exposure_terms):
+    if any(part_terms is not None for part_terms in terms.exposure_terms):
         return None  # no other model can follow differences between exposures
     network = run.measured.network
     after = run.after
@@ -165,13 +165,13 @@ def better_model(run: SelfCalibration, terms: AdjustedTerms) -> str | None:
         weight = weight / (after.noise.scale * network.sigma[rows]) ** 2
         fold = exposure_folds(network.exposure[rows])
         tested = np.unique(np.linspace(0, len(uv) - 1, MAX_TESTED).astype(int))
-        near = NeighbourTable(uv, min(max(MAX_NEIGHBOURS.values()), len(uv)), tested)
+        neighbours = NeighbourTable(uv, min(max(MAX_NEIGHBOURS.values()), len(uv)), tested)
         information = weight[:, None, None] * np.eye(2)
         for model_type, max_k in MAX_NEIGHBOURS.items():
             candidates = model_type.candidate_k(len(uv))
             candidates = candidates[candidates <= max_k]
             validation = CrossValidation(
-                model_type, uv, fold=fold, candidates=candidates, near=near, tested=tested
+                model_type, uv, fold=fold, candidates=candidates, near=neighbours, tested=tested
             )
             scores[model_type.kind] += float(np.min(validation.scores(values, information)))
         held_out = {
@@ -207,10 +207,10 @@ def _prior_of(terms: CollocationTerms, f: int) -> _SeriesPrior:
     m = len(functions)
     t = functions.trend
     precision = prior_precision(functions, part.prior)
-    at = trend_columns(functions)
+    trend = trend_columns(functions)
     rows = gauge_rows(part.values, part.uv, part.interior, part.gauge_kind)
     return _SeriesPrior(
-        precision[np.ix_(at, at)],
+        precision[np.ix_(trend, trend)],
         precision[t:m, t:m],
         rows.reshape(-1, 2, m).transpose(1, 0, 2) / GAUGE_SD_PX,
     )
@@ -230,14 +230,14 @@ def _held_out(
     out = np.empty_like(values)
     root = np.sqrt(weight)[:, None]
     scaled = root * functions
-    goal = root * values
+    observed = root * values
     folds = [np.flatnonzero(fold == number) for number in np.unique(fold)]
     grams = [scaled[rows].T @ scaled[rows] for rows in folds]
-    rights = [scaled[rows].T @ goal[rows] for rows in folds]
+    rights = [scaled[rows].T @ observed[rows] for rows in folds]
     gram = np.sum(grams, axis=0)
     right = np.sum(rights, axis=0)
-    for rows, own_gram, own_right in zip(folds, grams, rights):
-        out[rows] = functions[rows] @ _solved(prior, gram - own_gram, right - own_right)
+    for rows, held_out_gram, held_out_right in zip(folds, grams, rights):
+        out[rows] = functions[rows] @ _solved(prior, gram - held_out_gram, right - held_out_right)
     return out
 
 
@@ -251,33 +251,33 @@ def _solved(
     """
     t = len(gram) - len(prior.signal)
     g = prior.gauge.shape[1]
-    of_trend = gram[t:, :t]
-    of_gauge = prior.gauge[:, :, t:]
-    columns = np.column_stack([of_trend, *of_gauge.transpose(0, 2, 1), right[t:]])
+    trend_part = gram[t:, :t]
+    gauge_part = prior.gauge[:, :, t:]
+    columns = np.column_stack([trend_part, *gauge_part.transpose(0, 2, 1), right[t:]])
     factor = cho_factor(gram[t:, t:] + prior.signal, lower=True)
     solved = cho_solve(factor, columns)
     by_trend = solved[:, :t]
     by_gauge = [solved[:, t : t + g], solved[:, t + g : t + 2 * g]]
     by_right = solved[:, t + 2 * g :]
     size = 2 * t + g
-    rest = np.zeros((size, size))
-    rest_right = np.zeros(size)
-    rest[: 2 * t, : 2 * t] = prior.trend
-    rest[2 * t :, 2 * t :] = -np.eye(g)
+    reduced = np.zeros((size, size))
+    reduced_right = np.zeros(size)
+    reduced[: 2 * t, : 2 * t] = prior.trend
+    reduced[2 * t :, 2 * t :] = -np.eye(g)
     for axis in (0, 1):
-        own = slice(axis * t, (axis + 1) * t)
-        rest[own, own] += gram[:t, :t] - of_trend.T @ by_trend
-        mixed = prior.gauge[axis, :, :t].T - of_trend.T @ by_gauge[axis]
-        rest[own, 2 * t :] = mixed
-        rest[2 * t :, own] = mixed.T
-        rest[2 * t :, 2 * t :] -= of_gauge[axis] @ by_gauge[axis]
-        rest_right[own] = right[:t, axis] - of_trend.T @ by_right[:, axis]
-        rest_right[2 * t :] -= of_gauge[axis] @ by_right[:, axis]
-    found = np.linalg.solve(rest, rest_right)
+        block = slice(axis * t, (axis + 1) * t)
+        reduced[block, block] += gram[:t, :t] - trend_part.T @ by_trend
+        mixed = prior.gauge[axis, :, :t].T - trend_part.T @ by_gauge[axis]
+        reduced[block, 2 * t :] = mixed
+        reduced[2 * t :, block] = mixed.T
+        reduced[2 * t :, 2 * t :] -= gauge_part[axis] @ by_gauge[axis]
+        reduced_right[block] = right[:t, axis] - trend_part.T @ by_right[:, axis]
+        reduced_right[2 * t :] -= gauge_part[axis] @ by_right[:, axis]
+    solution = np.linalg.solve(reduced, reduced_right)
     out = np.empty((len(gram), 2))
     for axis in (0, 1):
-        out[:t, axis] = found[axis * t : (axis + 1) * t]
-        eliminated = by_trend @ out[:t, axis] + by_gauge[axis] @ found[2 * t :]
+        out[:t, axis] = solution[axis * t : (axis + 1) * t]
+        eliminated = by_trend @ out[:t, axis] + by_gauge[axis] @ solution[2 * t :]
         out[t:, axis] = by_right[:, axis] - eliminated
     return out
 
@@ -302,8 +302,10 @@ def _held_out_of_terms(
     grams = [part.T @ part for part in parts]
     rights = [part.T @ right[rows].ravel() for part, rows in zip(parts, folds)]
     gram = np.sum(grams, axis=0)
-    everything = np.sum(rights, axis=0)
-    for rows, part, own, own_right in zip(folds, parts, grams, rights):
-        found = np.linalg.lstsq(gram - own, everything - own_right, rcond=1e-12)[0]
-        out[rows] = (part @ found).reshape(-1, 2) / root[rows]
+    total_right = np.sum(rights, axis=0)
+    for rows, part, held_out_gram, held_out_right in zip(folds, parts, grams, rights):
+        coefficients = np.linalg.lstsq(
+            gram - held_out_gram, total_right - held_out_right, rcond=1e-12
+        )[0]
+        out[rows] = (part @ coefficients).reshape(-1, 2) / root[rows]
     return out

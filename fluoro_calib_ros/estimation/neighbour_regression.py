@@ -88,9 +88,9 @@ class CrossValidation:
             self._trend.append((held_out, train, least_squares_map(basis[train])))
         self._basis = basis
         self._near = Neighbourhoods(uv[self._index], uv[self._tested])
-        few = len(self._tested) * int(np.sum(self.candidates)) <= MAX_CACHED_WEIGHTS
-        cached = few and not model_type.equal_weights
-        self._weights = list(self._all_weights()) if cached else None
+        fits_in_memory = len(self._tested) * int(np.sum(self.candidates)) <= MAX_CACHED_WEIGHTS
+        is_cached = fits_in_memory and not model_type.equal_weights
+        self._weights = list(self._all_weights()) if is_cached else None
 
     def _all_weights(self) -> Iterable[NDArray[np.float64]]:
         """Yield the weights (T, k) for every candidate k."""
@@ -100,31 +100,34 @@ class CrossValidation:
         self, values: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return values less trend at neighbours (2, T, K), and trend (T, 2), by other folds."""
-        near = np.empty((2,) + self._index.shape)
+        neighbour_values = np.empty((2,) + self._index.shape)
         trend = np.zeros((len(self._tested), 2))
         for held_out, train, fit in self._trend:
             coefficients = fit @ values[train]
             remainder = (values - self._basis @ coefficients).T
-            near[:, held_out] = remainder[:, self._index[held_out]]
+            neighbour_values[:, held_out] = remainder[:, self._index[held_out]]
             trend[held_out] = self._basis[self._tested[held_out]] @ coefficients
-        return near, trend
+        return neighbour_values, trend
 
     def predictions(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return held-out predictions (K, T, 2) of values (N, 2), for every candidate."""
-        near, trend = self._neighbour_values(values)
+        neighbour_values, trend = self._neighbour_values(values)
         if self.model_type.equal_weights:
-            sums = np.cumsum(near, axis=2)[:, :, self.candidates - 1]
+            sums = np.cumsum(neighbour_values, axis=2)[:, :, self.candidates - 1]
             return trend + (sums / self.candidates).transpose(2, 1, 0)
         weights = self._weights or self._all_weights()
         return np.stack(
-            [trend + np.einsum('nk,cnk->nc', w, near[:, :, : w.shape[1]]) for w in weights]
+            [
+                trend + np.einsum('nk,cnk->nc', w, neighbour_values[:, :, : w.shape[1]])
+                for w in weights
+            ]
         )
 
     def predictions_for(self, k: int, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return held-out predictions (T, 2) of values (N, 2) with k neighbours."""
-        near, trend = self._neighbour_values(values)
+        neighbour_values, trend = self._neighbour_values(values)
         weights = self.model_type.weights(self._near, k)
-        return trend + np.einsum('nk,cnk->nc', weights, near[:, :, :k])
+        return trend + np.einsum('nk,cnk->nc', weights, neighbour_values[:, :, :k])
 
     def scores(
         self, values: NDArray[np.float64], information: NDArray[np.float64]
@@ -181,9 +184,9 @@ class NeighbourRegression(RegressionStep[NeighbourModel]):
             self._set_inliers(inliers)
             scores = self._validation.scores(values[inliers], information[inliers])
             best = int(np.argmin(scores))
-        present = np.flatnonzero(self._validation.candidates == self.k)
-        if len(present) and scores[present[0]] <= scores[best] * (1 + MIN_GAIN):
-            best = int(present[0])
+        current = np.flatnonzero(self._validation.candidates == self.k)
+        if len(current) and scores[current[0]] <= scores[best] * (1 + MIN_GAIN):
+            best = int(current[0])
         self.k = int(self._validation.candidates[best])
         self.score = float(scores[best])
         self.changed = self.changed or before != self.k
@@ -203,19 +206,19 @@ class NeighbourRegression(RegressionStep[NeighbourModel]):
         """Prepare the cross-validation with the inliers. Raises ValueError for too few."""
         count = int(inliers.sum())
         require_training(count)
-        given = self._given_k
-        if given is not None and not self.model_type.min_k <= given <= count:
+        given_k = self._given_k
+        if given_k is not None and not self.model_type.min_k <= given_k <= count:
             raise ValueError(
-                f'{self.model_type.kind} with k = {given} is not possible with {count} inliers'
+                f'{self.model_type.kind} with k = {given_k} is not possible with {count} inliers'
             )
         self.inliers = inliers
-        candidates = self.model_type.candidate_k(count) if given is None else np.array([given])
+        candidates = self.model_type.candidate_k(count) if given_k is None else np.array([given_k])
         if self._table is None:
             self._table = NeighbourTable(self.points.uv, candidates[-1])
         self._all_candidates = candidates
-        if given is None and self.k:  # k changes little from round to round
-            near = (candidates >= self.k / SEARCH_FACTOR) & (candidates <= self.k * SEARCH_FACTOR)
-            candidates = candidates[near]
+        if given_k is None and self.k:  # k changes little from round to round
+            close = (candidates >= self.k / SEARCH_FACTOR) & (candidates <= self.k * SEARCH_FACTOR)
+            candidates = candidates[close]
         self._validation = CrossValidation(
             self.model_type,
             self.points.uv[inliers],
@@ -226,10 +229,10 @@ class NeighbourRegression(RegressionStep[NeighbourModel]):
 
     def _at_border(self, best: int) -> bool:
         """Whether the best candidate is first or last of those tried, but not of all."""
-        tried = self._validation.candidates
-        possible = self._all_candidates
-        at_start = best == 0 and tried[0] > possible[0]
-        at_end = best == len(tried) - 1 and len(tried) > 1 and tried[-1] < possible[-1]
+        tried_k = self._validation.candidates
+        possible_k = self._all_candidates
+        at_start = best == 0 and tried_k[0] > possible_k[0]
+        at_end = best == len(tried_k) - 1 and len(tried_k) > 1 and tried_k[-1] < possible_k[-1]
         return bool(at_start or at_end)
 
     def smooth(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -281,8 +284,8 @@ class NeighbourRegression(RegressionStep[NeighbourModel]):
         inside = self.inliers
         error2 = np.mean((values[inside] - self.smooth(values)[inside]) ** 2)
         norm2 = np.mean(np.sum(self._weights[inside] ** 2, axis=1))
-        own = self._index == np.arange(len(self._index))[:, None]
-        trace = np.mean(np.sum(self._weights * own, axis=1)[inside])
+        is_itself = self._index == np.arange(len(self._index))[:, None]
+        trace = np.mean(np.sum(self._weights * is_itself, axis=1)[inside])
         noise2 = error2 / max(1 - 2 * trace + norm2, 0.1)
         held_out = self._validation.predictions_for(self.k, values[inside])
         bias2 = np.mean((values[inside] - held_out) ** 2) - noise2 * (1 + norm2)

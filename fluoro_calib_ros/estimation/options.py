@@ -68,17 +68,17 @@ def resolve_model(name: str) -> Any:
         return name
     module, _, attribute = name.partition(':')
     try:
-        found = getattr(importlib.import_module(module), attribute)
+        regressor = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError, ValueError) as error:
         raise ValueError(f'model {name!r} cannot be imported: {error}') from None
-    if not is_regressor(found):
+    if not is_regressor(regressor):
         try:
-            found = found()
+            regressor = regressor()
         except TypeError as error:
             raise ValueError(f'model {name!r} cannot be made without arguments: {error}') from None
-    if not is_regressor(found):
+    if not is_regressor(regressor):
         raise ValueError(f'model {name!r} is not a scikit-learn regressor')
-    return found
+    return regressor
 
 
 def is_regressor(thing: Any) -> bool:
@@ -375,8 +375,8 @@ class CalibrationRequest:
     def with_exposures(self, numbers: Mapping[str, Container[int]]) -> CalibrationRequest:
         """Return the request with only the exposures of these numbers, by fluoroscope."""
         frames = {
-            name: [frame for frame in of_one if frame.number in numbers[name]]
-            for name, of_one in self.frames.items()
+            name: [frame for frame in exposures if frame.number in numbers[name]]
+            for name, exposures in self.frames.items()
         }
         return replace(self, frames=frames)
 

@@ -86,11 +86,11 @@ def functions_of_angles(angles: Sequence[NDArray[np.float64]]) -> NDArray[np.flo
     The first is 1; few pairs allow fewer orders of harmonics, and unknown angles allow none.
     """
     count = len(angles[0])
-    one, other = angles
-    different = [one] if np.array_equal(one, other) else [one, other]
+    angles_a, angles_b = angles
+    distinct = [angles_a] if np.array_equal(angles_a, angles_b) else [angles_a, angles_b]
     columns = [np.ones((count, 1))]
     for order in (HARMONICS, HARMONICS // 2):
-        known = [harmonics(each)[:, :order] for each in different if can_be_fitted(each)]
+        known = [harmonics(angle)[:, :order] for angle in distinct if can_be_fitted(angle)]
         if known and PAIRS_OF_COLUMN * (1 + order * len(known)) <= count:
             return np.concatenate([*columns, *known], axis=1)
     return columns[0]
@@ -110,13 +110,13 @@ def agreeing(
     pairs = constraint.pairs
     used, off_sd = _plain(parameters, constraint, weights)
     growth = _growth(off_sd, used, 1)
-    nothing = np.zeros((len(pairs), 6))
-    plain = Agreement(used, off_sd, growth, growth, nothing)
+    no_trend = np.zeros((len(pairs), 6))
+    without_trend = Agreement(used, off_sd, growth, growth, no_trend)
     if columns.shape[1] == 1:
-        return plain
+        return without_trend
     with_trend = _with_trend(parameters, constraint, weights, columns)
     explained = with_trend.unexplained**2 <= MAX_REMAINING * growth**2
-    return with_trend if explained else plain
+    return with_trend if explained else without_trend
 
 
 def _plain(
@@ -124,10 +124,10 @@ def _plain(
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     """Return which pairs (k,) agree, and the deviations (k,) of all pairs over their sd."""
     pairs = constraint.pairs
-    every = np.ones(len(pairs), dtype=bool)
+    all_pairs = np.ones(len(pairs), dtype=bool)
     robust = len(pairs) >= MIN_PAIRS_ROBUST
     pose = mean_pose(parameters, pairs, None if robust else weights)
-    used = every
+    used = all_pairs
     for _ in range(STEPS if robust else 0):
         deviation = _deviations(parameters, constraint, pose, weights)
         before, used = used, _near(deviation)
@@ -139,8 +139,12 @@ def _plain(
 
 def _near(deviation: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return which pairs (k,) agree; all if too many disagree."""
-    near = deviation <= CERTAIN * max(1.0, float(np.median(deviation)))
-    return near if np.sum(~near) <= MAX_LEFT_OUT * len(near) else np.ones(len(near), dtype=bool)
+    agrees = deviation <= CERTAIN * max(1.0, float(np.median(deviation)))
+    return (
+        agrees
+        if np.sum(~agrees) <= MAX_LEFT_OUT * len(agrees)
+        else np.ones(len(agrees), dtype=bool)
+    )
 
 
 def _growth(off_sd: NDArray[np.float64], used: NDArray[np.bool_], columns: int) -> float:
@@ -157,23 +161,23 @@ def _with_trend(
 ) -> Agreement:
     """Find the pairs that agree on a relative orientation that changes with the angle."""
     pairs = constraint.pairs
-    off = discrepancies(constraint, mean_pose(parameters, pairs), parameters)
+    residuals = discrepancies(constraint, mean_pose(parameters, pairs), parameters)
     share = np.ones(len(pairs))
     for _ in range(STEPS):
-        deviation, _ = _about_trend(off, weights * share[:, None, None], weights, columns)
+        deviation, _ = _about_trend(residuals, weights * share[:, None, None], weights, columns)
         median = max(float(np.median(deviation)), 1e-12)
         share = 1 / (1 + (deviation / (CORE * median)) ** 2)
     used = _near(deviation)
-    if np.sum(~used) > 1 and _moved_once(off, weights, columns):
+    if np.sum(~used) > 1 and _moved_once(residuals, weights, columns):
         used[:] = True  # the disagreeing pairs are not single exposures
     pose = mean_pose(parameters, pairs[used], weights[used])
-    off = discrepancies(constraint, pose, parameters)
-    deviation, trend = _about_trend(off, weights * used[:, None, None], weights, columns)
-    plain = _deviations(parameters, constraint, pose, weights)
+    residuals = discrepancies(constraint, pose, parameters)
+    deviation, trend = _about_trend(residuals, weights * used[:, None, None], weights, columns)
+    without_trend = _deviations(parameters, constraint, pose, weights)
     return Agreement(
         used,
         deviation,
-        _growth(plain, used, 1),
+        _growth(without_trend, used, 1),
         _growth(deviation, used, columns.shape[1]),
         trend,
     )
@@ -183,12 +187,12 @@ def _moved_once(
     off: NDArray[np.float64], weights: NDArray[np.float64], columns: NDArray[np.float64]
 ) -> bool:
     """Whether one step explains nearly all of discrepancies (k, 6) about a trend."""
-    left = [
+    remaining = [
         np.sum(_about_trend(off, weights, weights, np.hstack([columns, step]))[0] ** 2)
         for step in steps_of(len(off))
     ]
     total = np.sum(_about_trend(off, weights, weights, columns)[0] ** 2)
-    return bool(left) and min(left) <= MOVED_SHARE * total
+    return bool(remaining) and min(remaining) <= MOVED_SHARE * total
 
 
 def steps_of(count: int) -> list[NDArray[np.float64]]:
@@ -214,8 +218,8 @@ def _about_trend(
     right = np.einsum('ka,kij,kj->ai', columns, shared, off).ravel()
     coefficients = np.linalg.lstsq(normal, right, rcond=None)[0]
     trend = columns @ coefficients.reshape(columns.shape[1], -1)
-    left = off - trend
-    return np.sqrt(np.einsum('ki,kij,kj->k', left, weights, left) / 6), trend
+    residuals = off - trend
+    return np.sqrt(np.einsum('ki,kij,kj->k', residuals, weights, residuals) / 6), trend
 
 
 def _deviations(
@@ -225,8 +229,8 @@ def _deviations(
     weights: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """Return the deviations (k,) of pairs from a relative orientation over their sd."""
-    off = discrepancies(constraint, pose, parameters)
-    return np.sqrt(np.einsum('ki,kij,kj->k', off, weights, off) / 6)
+    residuals = discrepancies(constraint, pose, parameters)
+    return np.sqrt(np.einsum('ki,kij,kj->k', residuals, weights, residuals) / 6)
 
 
 def displacements(
@@ -251,10 +255,10 @@ def displacements(
             if others is None
             else [_exterior(parameters, a, others[k])]
         )
-        one, other = (
+        uv_a, uv_b = (
             project(rotation, source, points, interior) for rotation, source in exteriors
         )
-        out[k] = np.sqrt(np.mean((one - other) ** 2))
+        out[k] = np.sqrt(np.mean((uv_a - uv_b) ** 2))
     return np.where(np.isnan(out), np.inf, out)  # NaN: points behind the source
 
 

@@ -70,12 +70,12 @@ def squared_error_of_kept(
     k = np.square(x)
     density = weight / 2 * end * 2 * k * np.exp(-k * half[:, None])
     evidence = density.sum(axis=1)
-    exists = evidence / (evidence + np.exp(-half))
+    chance = evidence / (evidence + np.exp(-half))
     density /= evidence[:, None]
-    of_kept = 1 - k
-    variance = np.sum(density * of_kept, axis=1)
-    square = np.sum(density * np.square(of_kept - kept[:, None]), axis=1)
-    return exists * (variance + 2 * half * square) + (1 - exists) * 2 * half * np.square(kept)
+    share = 1 - k
+    variance = np.sum(density * share, axis=1)
+    square = np.sum(density * np.square(share - kept[:, None]), axis=1)
+    return chance * (variance + 2 * half * square) + (1 - chance) * 2 * half * np.square(kept)
 
 
 def covariance_with_uncertain_terms(
@@ -92,13 +92,15 @@ def covariance_with_uncertain_terms(
     covariance: (p, p) posterior of the coefficients with these variances. Returns (p, p).
     """
     mixed = covariance @ to_terms.T
-    of_terms = np.einsum('tp,pt->t', to_terms, mixed)
-    kept = np.clip(1 - of_terms / variance, 1e-12, 1.0)
-    alone = of_terms / kept  # variances of the estimates without their priors
-    ratio = to_terms @ mean / kept / np.sqrt(alone)
-    more = np.maximum(squared_error_of_kept(ratio, kept) * alone - of_terms, 0.0)
-    along = mixed * (np.sqrt(more) / of_terms)
-    return covariance + along @ along.T
+    term_variances = np.einsum('tp,pt->t', to_terms, mixed)
+    kept_share = np.clip(1 - term_variances / variance, 1e-12, 1.0)
+    without_prior = term_variances / kept_share  # variances of the estimates without their priors
+    ratio = to_terms @ mean / kept_share / np.sqrt(without_prior)
+    added_variance = np.maximum(
+        squared_error_of_kept(ratio, kept_share) * without_prior - term_variances, 0.0
+    )
+    directions = mixed * (np.sqrt(added_variance) / term_variances)
+    return covariance + directions @ directions.T
 
 
 ZERO_PRECISION = 1e12  # prior precision that fixes a term at zero
@@ -126,9 +128,9 @@ class StepwiseTerms(AdjustedTerms):
             values = functions(uv)
             interior = problem.before.parameters.interior[f]
             # The terms themselves have no shift, scale or tilt.
-            kind = problem.gauges[f]
-            kind = GaugeKind.NONE if kind is GaugeKind.TREND else kind
-            terms_f = _without_gauge(terms, values, gauge_basis(uv, interior, kind))
+            gauge_kind = problem.gauges[f]
+            gauge_kind = GaugeKind.NONE if gauge_kind is GaugeKind.TREND else gauge_kind
+            terms_f = _without_gauge(terms, values, gauge_basis(uv, interior, gauge_kind))
             self.functions.append(functions)
             self._maps.append(terms_f.reshape(len(terms), -1))
             self._values.append(np.einsum('nm,tam->nat', values, terms_f))
@@ -180,8 +182,8 @@ class StepwiseTerms(AdjustedTerms):
         self, f: int, network: Network, matrix: FactorizedNormalMatrix, result: Adjustment
     ) -> bool:
         """Add the best term of fluoroscope f, or remove a term that has become insignificant."""
-        present = prior_of_additional(network, f)
-        information = information_of_additional(matrix, f) - present
+        prior = prior_of_additional(network, f)
+        information = information_of_additional(matrix, f) - prior
         coefficients = coefficients_of(result)[f]
         selected = self.selected[f]
         rows = network.rows(f)
@@ -193,19 +195,19 @@ class StepwiseTerms(AdjustedTerms):
         limit = stdtrit(max(dof, 1), 1 - SIGNIFICANCE / (2 * len(self.names)))  # quantile of t
         if self._remove_insignificant(f, information, coefficients, limit):
             return True
-        score = present @ coefficients  # gradient of the likelihood by terms fixed at zero
+        score = prior @ coefficients  # gradient of the likelihood by terms fixed at zero
         mixed = np.linalg.solve(information[np.ix_(selected, selected)], information[selected])
-        own = np.diagonal(information) - np.einsum('ij,ij->j', information[selected], mixed)
-        dependent = own <= 1e-9 * np.diagonal(information)
+        reduced = np.diagonal(information) - np.einsum('ij,ij->j', information[selected], mixed)
+        dependent = reduced <= 1e-9 * np.diagonal(information)
         with np.errstate(divide='ignore', invalid='ignore'):
             excluded = selected | self._rejected[f] | dependent
-            t = np.where(excluded, 0, score / np.sqrt(own))
+            t = np.where(excluded, 0, score / np.sqrt(reduced))
         for best in np.argsort(-np.abs(t)):
             if abs(t[best]) < limit:
                 return False
             direction = -mixed[:, best] if selected.any() else np.zeros(0)
             change = self._values[f][:, :, best] + self._values[f][:, :, selected] @ direction
-            if self._improves(f, result, rows, change * score[best] / own[best], t[best]):
+            if self._improves(f, result, rows, change * score[best] / reduced[best], t[best]):
                 selected[best] = True
                 return True
             self._rejected[f][best] = True
@@ -240,13 +242,13 @@ class StepwiseTerms(AdjustedTerms):
         t: float,
     ) -> bool:
         """Whether a significant change (n, 2) of the correction reduces the RMSE or the trend."""
-        core = result.inliers[rows]
+        inliers = result.inliers[rows]
         residuals = result.residuals[rows]
-        square = np.sum(result.q[rows][core])
+        square = np.sum(result.q[rows][inliers])
         drop = 1 - np.sqrt(max(square - t * t, 0.0) / square)
         if drop >= MIN_DROP:
             return True
-        return self._trend(f, residuals - change, core) < self._trend(f, residuals, core)
+        return self._trend(f, residuals - change, inliers) < self._trend(f, residuals, inliers)
 
     def _trend(self, f: int, residuals: NDArray[np.float64], core: NDArray[np.bool_]) -> float:
         """Return the mean product of residuals with the mean of their neighbours [px^2]."""
@@ -267,6 +269,6 @@ def _without_gauge(
     flat = gauge.reshape(-1, gauge.shape[2])
     as_polynomials = np.linalg.lstsq(values, gauge.reshape(len(values), -1), rcond=None)[0]
     as_polynomials = as_polynomials.reshape(values.shape[1], 2, -1).transpose(2, 1, 0)
-    own = np.einsum('nm,tam->nat', values, terms).reshape(-1, len(terms))
-    share = np.linalg.lstsq(flat, own, rcond=None)[0]
+    columns = np.einsum('nm,tam->nat', values, terms).reshape(-1, len(terms))
+    share = np.linalg.lstsq(flat, columns, rcond=None)[0]
     return terms - np.einsum('gt,gam->tam', share, as_polynomials)

@@ -89,10 +89,10 @@ def prior_precision(functions: Functions, prior: Prior) -> NDArray[np.float64]:
     out = np.zeros((2 * len(functions),) * 2)
     if functions.modes:
         signal = signal_precision(functions, prior)
-        for own in _sines(functions):
-            out[own, own] = signal
-    at = trend_columns(functions)
-    out[np.ix_(at, at)] = _trend_precision(functions, prior)
+        for block in _sines(functions):
+            out[block, block] = signal
+    trend = trend_columns(functions)
+    out[np.ix_(trend, trend)] = _trend_precision(functions, prior)
     return out
 
 
@@ -145,9 +145,11 @@ def covariance_of_series(
     """
     to_terms, _ = trend_transformation(functions.degree, functions.rings)
     rows = _terms_that_can_exist(functions)
-    whole = np.zeros((len(rows), 2 * len(functions)))
-    whole[:, trend_columns(functions)] = to_terms[rows]
-    return covariance_with_uncertain_terms(whole, prior.trend[rows], coefficients, covariance)
+    to_terms_of_both = np.zeros((len(rows), 2 * len(functions)))
+    to_terms_of_both[:, trend_columns(functions)] = to_terms[rows]
+    return covariance_with_uncertain_terms(
+        to_terms_of_both, prior.trend[rows], coefficients, covariance
+    )
 
 
 def covariance_by_signal(
@@ -171,9 +173,11 @@ def covariance_by_signal(
     signals = plausible_signals(prior.signal, equations, max(functions.image_size))
     mean, covariance = _posterior(functions, base, right, prior)
     for signal in signals:
-        other_mean, other = _posterior(functions, base, right, replace(prior, signal=signal))
-        change = other_mean - mean
-        out += (other - covariance + np.outer(change, change)) / len(signals)
+        new_mean, new_covariance = _posterior(
+            functions, base, right, replace(prior, signal=signal)
+        )
+        change = new_mean - mean
+        out += (new_covariance - covariance + np.outer(change, change)) / len(signals)
     return out
 
 
@@ -233,11 +237,11 @@ def _most_likely_signal(
 ) -> Prior:
     """Return the prior with an updated signal."""
     equations = _signal_equations(functions, information, right, prior)
-    found = most_likely_signal(prior.signal, equations, max(functions.image_size))
+    signal = most_likely_signal(prior.signal, equations, max(functions.image_size))
     local = prior.local
     if local is not None:
-        local = _renewed(local, equations, found.variance(functions.frequency))
-    return replace(prior, signal=found, local=local)
+        local = _renewed(local, equations, signal.variance(functions.frequency))
+    return replace(prior, signal=signal, local=local)
 
 
 def _signal_equations(
@@ -247,10 +251,10 @@ def _signal_equations(
     prior: Prior,
 ) -> SignalEquations:
     """Return normal equations with all priors except the signal's; information: with the gauge."""
-    at = trend_columns(functions)
+    trend = trend_columns(functions)
     base = information.copy(order='F')
-    base[np.ix_(at, at)] += _trend_precision(functions, prior)
-    columns = np.setdiff1d(np.arange(len(right)), at)
+    base[np.ix_(trend, trend)] += _trend_precision(functions, prior)
+    columns = np.setdiff1d(np.arange(len(right)), trend)
     if prior.local is not None:
         base, right = _with_bumps(functions, base, right, prior.local)
     return SignalEquations(functions.frequency, base, right, columns)
@@ -269,12 +273,12 @@ def _with_bumps(
     """
     base = bumps(functions, local.nodes)
     sines = _sines(functions)
-    mixed = np.concatenate([matrix[:, own] @ base for own in sines], axis=1)
-    corner = np.concatenate([base.T @ mixed[own] for own in sines])
+    mixed = np.concatenate([matrix[:, block] @ base for block in sines], axis=1)
+    corner = np.concatenate([base.T @ mixed[block] for block in sines])
     size = corner.shape[0]
     corner[np.diag_indices(size)] += 1 / np.tile(local.of_bumps, 2)
     out = np.asfortranarray(np.block([[matrix, mixed], [mixed.T, corner]]))
-    return out, np.concatenate([right, *(base.T @ right[own] for own in sines)])
+    return out, np.concatenate([right, *(base.T @ right[block] for block in sines)])
 
 
 def _renewed(
@@ -311,17 +315,17 @@ def with_shown_places(
 
     def estimates(given: Prior) -> SineEstimates:
         precision = signal_precision(functions, given)
-        whole = matrix.copy()
-        whole[t:, t:] += precision
-        factor = cho_factor(whole, lower=True)
-        covariance = cho_solve(factor, np.eye(len(whole))[:, t:])[t:]
+        with_prior = matrix.copy()
+        with_prior[t:, t:] += precision
+        factor = cho_factor(with_prior, lower=True)
+        covariance = cho_solve(factor, np.eye(len(with_prior))[:, t:])[t:]
         return SineEstimates.of(precision, cho_solve(factor, right)[t:], covariance[None])
 
     if largest_gain(functions, estimates(prior)) < SUSPECTED_GAIN:
         return prior
     columns = np.concatenate([axis * len(matrix) + np.arange(t, len(matrix)) for axis in (0, 1)])
-    both = np.asfortranarray(block_diag(matrix, matrix))
-    equations = SignalEquations(functions.frequency, both, right.T.ravel(), columns)
+    joint_matrix = np.asfortranarray(block_diag(matrix, matrix))
+    equations = SignalEquations(functions.frequency, joint_matrix, right.T.ravel(), columns)
     side = max(functions.image_size)
     for _ in range(SWEEPS):
         prior = replace(prior, signal=most_likely_signal(prior.signal, equations, side))
@@ -341,7 +345,7 @@ def with_more_places(
     """
     coefficients, covariance = _posterior(functions, information + gauge, right, prior)
     mean = coefficients.reshape(2, -1).T[functions.trend :]
-    covariances = np.stack([covariance[own, own] for own in _sines(functions)])
+    covariances = np.stack([covariance[block, block] for block in _sines(functions)])
     estimates = SineEstimates.of(signal_precision(functions, prior), mean, covariances)
     return replace(prior, local=with_likely_places(functions, estimates, prior.local))
 
@@ -357,9 +361,9 @@ def _most_likely_trend(
     if not count:
         return prior
     matrix, right = _trend_alone(functions, information, right, prior)
-    back = np.linalg.inv(to_terms)
-    matrix = back.T @ matrix @ back
-    right = back.T @ right
+    from_terms = np.linalg.inv(to_terms)
+    matrix = from_terms.T @ matrix @ from_terms
+    right = from_terms.T @ right
     variance = prior.trend.copy()
     rings = _first_ring(functions)
     for _ in range(SWEEPS):
@@ -386,15 +390,15 @@ def _trend_alone(
     prior: Prior,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Eliminate the signal; return information and right side of the trend coefficients."""
-    at = trend_columns(functions)
-    rest = np.setdiff1d(np.arange(len(right)), at)
-    if not len(rest):
+    trend = trend_columns(functions)
+    sines = np.setdiff1d(np.arange(len(right)), trend)
+    if not len(sines):
         return information, right
-    signal = information[np.ix_(rest, rest)].copy()
-    own = signal_precision(functions, prior)
-    signal[: len(own), : len(own)] += own
-    signal[len(own) :, len(own) :] += own
-    mixed = information[np.ix_(rest, at)]
-    solved = cho_solve(cho_factor(signal, lower=True), np.column_stack([mixed, right[rest]]))
-    reduced = information[np.ix_(at, at)] - mixed.T @ solved[:, :-1]
-    return reduced, right[at] - mixed.T @ solved[:, -1]
+    signal = information[np.ix_(sines, sines)].copy()
+    precision = signal_precision(functions, prior)
+    signal[: len(precision), : len(precision)] += precision
+    signal[len(precision) :, len(precision) :] += precision
+    mixed = information[np.ix_(sines, trend)]
+    solved = cho_solve(cho_factor(signal, lower=True), np.column_stack([mixed, right[sines]]))
+    reduced = information[np.ix_(trend, trend)] - mixed.T @ solved[:, :-1]
+    return reduced, right[trend] - mixed.T @ solved[:, -1]

@@ -138,13 +138,13 @@ class NumberOfSines:
         level = float(np.mean(np.diagonal(information)[functions.trend : len(functions)]))
         numbers = np.arange(MIN_MODES, MAX_MODES + 1)
         variance = part.prior.signal.density(numbers * functions.frequency_of_mode)
-        enough = numbers[variance * level < NEGLIGIBLE]
-        wanted = int(enough[0]) if len(enough) else MAX_MODES
+        sufficient = numbers[variance * level < NEGLIGIBLE]
+        number = int(sufficient[0]) if len(sufficient) else MAX_MODES
         if part.prior.local is not None:
-            wanted = max(wanted, LOCAL_MODES)
-        present = functions.complete
-        kept = FEWER_MODES * present <= wanted <= present
-        return present if kept and self._changes else wanted
+            number = max(number, LOCAL_MODES)
+        current = functions.complete
+        is_close = FEWER_MODES * current <= number <= current
+        return current if is_close and self._changes else number
 
 
 class Once:
@@ -174,14 +174,14 @@ def ripples(solution: Solution) -> Change | None:
         f = part.number
         signal = part.prior.signal
         points = part.inliers(solution.adjustment)
-        found = _shown_ripples(part, points, points.residuals, modes[f])
-        if found is None and modes[f] > GAP_FROM:
-            found = _followed_ripples(part, points, coefficients)
-            if found is not None:
+        shown = _shown_ripples(part, points, points.residuals, modes[f])
+        if shown is None and modes[f] > GAP_FROM:
+            shown = _followed_ripples(part, points, coefficients)
+            if shown is not None:
                 signal = signal.without_short_field(max(part.image_size))
                 modes[f] = GAP_FROM
-        if found is not None:
-            signal = replace(signal, ripples=found)
+        if shown is not None:
+            signal = replace(signal, ripples=shown)
             priors[f] = replace(part.prior, signal=signal)
     return Change(modes, priors) if priors else None
 
@@ -191,11 +191,11 @@ def _followed_ripples(
 ) -> Ripples | None:
     """Return ripples that the sines beyond those of a smooth field have followed, or None."""
     functions = part.functions
-    short = np.concatenate([np.zeros(functions.trend), functions.band > GAP_FROM])
-    own = coefficients[part.of_series].reshape(2, -1) * short
-    followed = points.residuals + functions(points.uv) @ own.T
-    found = _shown_ripples(part, points, followed, GAP_FROM)
-    return None if found is None else found.alone()
+    is_short = np.concatenate([np.zeros(functions.trend), functions.band > GAP_FROM])
+    short_coefficients = coefficients[part.of_series].reshape(2, -1) * is_short
+    values = points.residuals + functions(points.uv) @ short_coefficients.T
+    shown = _shown_ripples(part, points, values, GAP_FROM)
+    return None if shown is None else shown.alone()
 
 
 def _shown_ripples(
@@ -209,24 +209,26 @@ def _shown_ripples(
 
 def exposure_terms(solution: Solution) -> Change | None:
     """Return terms of exposures where residuals show that the exposures differ."""
-    found = {}
+    terms = {}
     for part in solution.parts:
         functions = exposure_functions(part.uv, part.image_size, part.interior)
-        core = solution.adjustment.inliers[part.rows]
+        inliers = solution.adjustment.inliers[part.rows]
         shown = variation(
-            solution.adjustment.residuals[part.rows][core], part.exposure[core], functions[core]
+            solution.adjustment.residuals[part.rows][inliers],
+            part.exposure[inliers],
+            functions[inliers],
         )
-        few = len(np.unique(part.exposure)) <= MAX_VARYING_EXPOSURES
-        if not shown.is_varying or not few:
+        has_few_exposures = len(np.unique(part.exposure)) <= MAX_VARYING_EXPOSURES
+        if not shown.is_varying or not has_few_exposures:
             continue
         if can_be_fitted(part.angles):
             functions = exposure_functions(
                 part.uv, part.image_size, part.interior, with_interior=True
             )
-        found[part.number] = ExposureTerms(functions, part.exposure, shown.size_px)
-    if not found:
+        terms[part.number] = ExposureTerms(functions, part.exposure, shown.size_px)
+    if not terms:
         return None
-    return Change([min(number, START_MODES) for number in solution.modes], exposure_terms=found)
+    return Change([min(number, START_MODES) for number in solution.modes], exposure_terms=terms)
 
 
 class AgreeingOutliers:
@@ -249,7 +251,7 @@ class AgreeingOutliers:
         priors = {}
         coefficients = {}
         adjustment = solution.adjustment
-        for part, present in zip(solution.parts, solution.coefficients):
+        for part, current in zip(solution.parts, solution.coefficients):
             f = part.number
             rows = _agreeing(part, adjustment)
             tried = self._tried.setdefault(f, set())
@@ -262,7 +264,7 @@ class AgreeingOutliers:
             priors[f], coefficients[f] = _followed(
                 part,
                 modes[f],
-                adjustment.residuals[part.rows] + part.correction(present),
+                adjustment.residuals[part.rows] + part.correction(current),
                 used=used,
                 scale=adjustment.noise.scale,
             )
@@ -274,12 +276,12 @@ def _agreeing(part: FluoroscopeTerms, adjustment: Adjustment) -> NDArray[np.int6
     residuals = adjustment.residuals[part.rows]
     inliers = adjustment.inliers[part.rows]
     noise = adjustment.noise.scale * part.sigma
-    small = np.sum(residuals**2, axis=1) < (LARGEST_SD * noise) ** 2
-    rejected = np.flatnonzero(~inliers & small)
+    is_small = np.sum(residuals**2, axis=1) < (LARGEST_SD * noise) ** 2
+    rejected = np.flatnonzero(~inliers & is_small)
     points = FittedPoints(part.uv[rejected], residuals[rejected], part.exposure[rejected])
     areas = areas_of_rejected(points, part.point[rejected], part.uv[inliers], part.image_size)
-    found = [area.rows for area in areas if area.size_px > area.limit_px]
-    return rejected[np.unique(np.concatenate(found))] if found else rejected[:0]
+    agreeing = [area.rows for area in areas if area.size_px > area.limit_px]
+    return rejected[np.unique(np.concatenate(agreeing))] if agreeing else rejected[:0]
 
 
 def _followed(
@@ -320,14 +322,14 @@ def places(solution: Solution) -> Change | None:
     for part, coefficients in zip(solution.parts, solution.coefficients):
         f = part.number
         fine = replace(part.functions, modes=max(LOCAL_MODES, part.functions.modes))
-        used = solution.adjustment.inliers[part.rows]
-        weight = noise.weight(solution.adjustment.q[part.rows][used])
-        root = (np.sqrt(weight) / (noise.scale * part.sigma[used]))[:, None]
-        residuals = solution.adjustment.residuals[part.rows][used]
-        observed = residuals + part.correction(coefficients)[used]
-        values = fine(part.uv[used])
-        found = with_shown_places(fine, values * root, observed * root, part.prior)
-        if found.local is not None:
-            priors[f] = found
+        inliers = solution.adjustment.inliers[part.rows]
+        weight = noise.weight(solution.adjustment.q[part.rows][inliers])
+        root = (np.sqrt(weight) / (noise.scale * part.sigma[inliers]))[:, None]
+        residuals = solution.adjustment.residuals[part.rows][inliers]
+        observed = residuals + part.correction(coefficients)[inliers]
+        values = fine(part.uv[inliers])
+        prior = with_shown_places(fine, values * root, observed * root, part.prior)
+        if prior.local is not None:
+            priors[f] = prior
             modes[f] = fine.complete
     return Change(modes, priors) if priors else None

@@ -68,13 +68,13 @@ class KnnRegressor(KNeighborsRegressor):
         if sample_weight is not None:
             samples, targets = validated(self, X, y, multi_output=True, accept_sparse='csr')
             weight = _check_sample_weight(sample_weight, samples)
-            positive = weight > 0
-            X = samples[positive]
-            y = targets[positive]
-            self.sample_weight_ = weight[positive]
+            has_weight = weight > 0
+            X = samples[has_weight]
+            y = targets[has_weight]
+            self.sample_weight_ = weight[has_weight]
         super().fit(X, y)
-        fast = self.weights == 'uniform' and self.effective_metric_ == 'euclidean'
-        self._scipy_tree = None if issparse(X) or not fast else cKDTree(self._fit_X)
+        uses_scipy = self.weights == 'uniform' and self.effective_metric_ == 'euclidean'
+        self._scipy_tree = None if issparse(X) or not uses_scipy else cKDTree(self._fit_X)
         return self
 
     def predict(self, X: ArrayLike) -> NDArray[np.float64]:
@@ -127,11 +127,11 @@ class LocalLinearRegressor(RegressorMixin, BaseEstimator):
         weight = np.ones(len(samples))
         if sample_weight is not None:
             weight = _check_sample_weight(sample_weight, samples, dtype=np.float64)
-        positive = weight > 0
-        samples = samples[positive]
+        has_weight = weight > 0
+        samples = samples[has_weight]
         self._single_output = targets.ndim == 1
-        targets = targets[positive].reshape(len(samples), -1).astype(np.float64)
-        self._weight = weight[positive]
+        targets = targets[has_weight].reshape(len(samples), -1).astype(np.float64)
+        self._weight = weight[has_weight]
         self._centre = samples.mean(axis=0)
         self._scale = max(float(np.max(np.abs(samples - self._centre))), 1e-300)
         basis = self._basis(samples)

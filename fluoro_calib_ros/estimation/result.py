@@ -162,12 +162,12 @@ def combined_targets(
     seen = np.zeros(len(row))
     for part in parts:
         seen[np.searchsorted(target_id, part.target_id)] += 1
-    further = ((seen - 1) * weighted)[:, None, None] * survey
+    repeated_survey = ((seen - 1) * weighted)[:, None, None] * survey
     joint = [part.joint_covariance for part in parts if part.joint_covariance is not None]
     if weighted and len(joint) == len(parts):
-        together = _combined_jointly(parts, joint, further, phantom)
-        if together is not None:
-            return together
+        combined = _combined_jointly(parts, joint, repeated_survey, phantom)
+        if combined is not None:
+            return combined
     common = np.zeros_like(survey)
     if weighted and open_datum:
         common = _common_covariance(phantom.xyz_mm[row], phantom.sd_mm[row])
@@ -178,16 +178,19 @@ def combined_targets(
     information = surveyed.copy()
     right = (surveyed @ phantom.xyz_mm[row, :, None])[..., 0]
     for part in parts:
-        at = np.searchsorted(target_id, part.target_id)
-        own = np.linalg.inv(part.covariance - common[at])
-        value, vector = np.linalg.eigh(own - surveyed[at])
+        rows = np.searchsorted(target_id, part.target_id)
+        part_information = np.linalg.inv(part.covariance - common[rows])
+        value, vector = np.linalg.eigh(part_information - surveyed[rows])
         is_better = value > 0
-        better = (vector * (value * is_better)[:, None, :]) @ vector.transpose(0, 2, 1)
-        information[at] += better
+        gained = (vector * (value * is_better)[:, None, :]) @ vector.transpose(0, 2, 1)
+        information[rows] += gained
         # The point that the adjustment would give without the survey.
-        added = own @ part.xyz_mm[..., None] - (surveyed @ phantom.xyz_mm[row, :, None])[at]
+        added = (
+            part_information @ part.xyz_mm[..., None]
+            - (surveyed @ phantom.xyz_mm[row, :, None])[rows]
+        )
         inside = (vector * is_better[:, None, :]) @ vector.transpose(0, 2, 1)
-        right[at] += (inside @ added)[..., 0]
+        right[rows] += (inside @ added)[..., 0]
     covariance = np.linalg.inv(information)
     return Targets(target_id, (covariance @ right[..., None])[..., 0], covariance + common)
 
@@ -198,8 +201,8 @@ def _common_covariance(
     """Return the covariances (n, 3, 3) [mm^2] of surveyed points (n, 3) due to their datum."""
     directions = similarity_directions(xyz_mm, xyz_mm.mean(axis=0))
     scaled = (directions / sd_mm[:, None, None]).reshape(-1, directions.shape[2])
-    of_datum = np.linalg.pinv(scaled.T @ scaled, hermitian=True)
-    return np.asarray(directions @ of_datum @ directions.transpose(0, 2, 1))
+    datum_covariance = np.linalg.pinv(scaled.T @ scaled, hermitian=True)
+    return np.asarray(directions @ datum_covariance @ directions.transpose(0, 2, 1))
 
 
 def _contains(part: Targets, common: NDArray[np.float64]) -> bool:
@@ -227,14 +230,14 @@ def _combined_jointly(
     information = -block_diag(*further)
     right = information @ phantom.xyz_mm[phantom.index(target_id)].ravel()
     for part, covariance in zip(parts, joint):
-        at = 3 * np.searchsorted(target_id, part.target_id)[:, None] + np.arange(3)
-        own = np.linalg.inv(covariance)
-        information[np.ix_(at.ravel(), at.ravel())] += own
-        right[at.ravel()] += own @ part.xyz_mm.ravel()
+        coordinates = 3 * np.searchsorted(target_id, part.target_id)[:, None] + np.arange(3)
+        part_information = np.linalg.inv(covariance)
+        information[np.ix_(coordinates.ravel(), coordinates.ravel())] += part_information
+        right[coordinates.ravel()] += part_information @ part.xyz_mm.ravel()
     survey = np.repeat(1 / phantom.sd_mm[phantom.index(target_id)] ** 2, 3)
     relative = information / np.sqrt(np.outer(survey, survey))
     if np.linalg.eigvalsh(relative)[0] < 1 - ROUNDING:
         return None
-    found = np.linalg.inv(information)
-    blocks = found.reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n), :]
-    return Targets(target_id, (found @ right).reshape(n, 3), blocks, found)
+    joint_covariance = np.linalg.inv(information)
+    blocks = joint_covariance.reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n), :]
+    return Targets(target_id, (joint_covariance @ right).reshape(n, 3), blocks, joint_covariance)

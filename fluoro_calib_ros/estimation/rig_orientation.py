@@ -136,16 +136,16 @@ class _FixedAdjustment:
     def covariance(self, e: NDArray[np.int64], f: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return covariances (k, 6, 6) of exposures e (k,) with f (k,), for known interiors."""
         derivative = self.by_interior
-        of_interiors = derivative[e] @ self.blocks.gg @ derivative[f].transpose(0, 2, 1)
-        return self.blocks.between(e, f) - of_interiors
+        from_interiors = derivative[e] @ self.blocks.gg @ derivative[f].transpose(0, 2, 1)
+        return self.blocks.between(e, f) - from_interiors
 
     def covariance_of_all(self) -> NDArray[np.float64]:
         """Return the covariance (6m, 6m) of all exposures, for known interiors."""
         count = len(self.measured.frames)
-        every = np.arange(count)
+        exposures = np.arange(count)
         rows = [
-            self.covariance(np.full(count, e), every).transpose(1, 0, 2).reshape(6, 6 * count)
-            for e in every
+            self.covariance(np.full(count, e), exposures).transpose(1, 0, 2).reshape(6, 6 * count)
+            for e in exposures
         ]
         return np.concatenate(rows)
 
@@ -198,15 +198,15 @@ def orientation_of_capture(
         of another image size, there are too few targets, or the phantom moves.
     """
     _validate(frames, phantom, calibrations)
-    still = {name: [frame] for name, frame in standing_frames(frames, calibrations).items()}
-    for name, (frame,) in still.items():
+    standing = {name: [frame] for name, frame in standing_frames(frames, calibrations).items()}
+    for name, (frame,) in standing.items():
         if len(frame.target_id) < MIN_TARGETS_OF_EXPOSURE:
             raise DataError(
                 f'fluoroscope {name}: the capture shows {len(frame.target_id)} targets of the '
                 f'phantom, {MIN_TARGETS_OF_EXPOSURE} are needed'
             )
     with threadpool_limits(1):
-        measured = network_of_calibrations(still, phantom, calibrations)
+        measured = network_of_calibrations(standing, phantom, calibrations)
         fixed = _adjusted(measured, calibrations, True)
         known = fixed.covariance_of_all()
     parameters = fixed.after.parameters
@@ -217,7 +217,7 @@ def orientation_of_capture(
         known,
         fixed.by_interior.reshape(6 * count, -1),
     )
-    exposures = min(len(of_one) for of_one in frames.values())
+    exposures = min(len(captured) for captured in frames.values())
     origin = _Origin(frame_id, 'capture', _last_stamp(frames), exposures)
     return _orientation(fixed, exteriors, calibrations, origin)
 
@@ -245,15 +245,19 @@ def orientation_and_scatter(
     with threadpool_limits(1):
         measured = network_of_calibrations(paired, phantom, calibrations, starts=starts)
         fixed = _adjusted(measured, calibrations, False)
-        turning = {name for name, each in calibrations.items() if each.angle_field is not None}
+        turning = {
+            name
+            for name, calibration in calibrations.items()
+            if calibration.angle_field is not None
+        }
         exteriors, scatter = _relative_to_first(fixed, turning)
     first = fixed.measured.fluoroscopes[0]
     frame_id = calibrations[first].frame_id or f'{first}_optical'
-    exposures = min(int(of_one.used.sum()) for of_one in scatter)
+    exposures = min(int(pair.used.sum()) for pair in scatter)
     origin = _Origin(frame_id, 'joint calibration', _last_stamp(paired), exposures)
-    found = _orientation(fixed, exteriors, calibrations, origin)
+    orientation = _orientation(fixed, exteriors, calibrations, origin)
     try:
-        return with_datum_of_points(found, _seen_by_first(fixed)), scatter
+        return with_datum_of_points(orientation, _seen_by_first(fixed)), scatter
     except np.linalg.LinAlgError:
         raise DataError(
             'the fluoroscopes see the phantom from one place, so that their rays do not intersect'
@@ -281,11 +285,11 @@ def _relative_to_first(
             raise DataError(_unpaired(names, b))
         rows = slice(6 * b, 6 * b + 6)
         corrected = names[0] in turning or names[b] in turning
-        pose, operator[rows], of_pairs = _mean_of_pairs(fixed, pairs, corrected)
-        growth[rows] = of_pairs.growth
+        pose, operator[rows], pair_scatter = _mean_of_pairs(fixed, pairs, corrected)
+        growth[rows] = pair_scatter.growth
         rotation[b] = pose.rotation
         position[b] = pose.translation_mm
-        scatter.append(of_pairs)
+        scatter.append(pair_scatter)
     known = growth[:, None] * (operator @ fixed.covariance_of_all() @ operator.T) * growth
     by_interior = operator @ fixed.by_interior.reshape(operator.shape[1], -1)
     return _Exteriors(rotation, position, known, by_interior), tuple(scatter)
@@ -308,19 +312,19 @@ def _validate(frames: Frames, phantom: Phantom, calibrations: Calibrations) -> N
             'a rig has two fluoroscopes or more, there are frames of '
             f'{", ".join(frames) or "none"} only'
         )
-    for name, of_one in frames.items():
+    for name, exposures in frames.items():
         if name not in calibrations:
             raise DataError(
                 f'there is no calibration of fluoroscope {name}, only of {", ".join(calibrations)}'
             )
-        if not of_one:
+        if not exposures:
             raise DataError(f'fluoroscope {name}: there is no frame of the phantom')
-        for frame in of_one:
+        for frame in exposures:
             validate_frame(frame, phantom, calibrations[name].image_size)
 
 
 def _last_stamp(frames: Frames) -> int:
-    return max(frame.stamp_ns for of_one in frames.values() for frame in of_one)
+    return max(frame.stamp_ns for exposures in frames.values() for frame in exposures)
 
 
 def standing_frames(frames: Frames, calibrations: Calibrations) -> dict[str, Frame]:
@@ -331,7 +335,8 @@ def standing_frames(frames: Frames, calibrations: Calibrations) -> dict[str, Fra
     phantom moves.
     """
     return {
-        name: _mean_frame(of_one, calibrations[name].image_sd) for name, of_one in frames.items()
+        name: _mean_frame(exposures, calibrations[name].image_sd)
+        for name, exposures in frames.items()
     }
 
 
@@ -348,12 +353,12 @@ def _mean_frame(frames: Sequence[Frame], image_sd: float) -> Frame:
     order = np.argsort(row, kind='stable')
     ends = np.cumsum(np.bincount(row))[:-1]
     middle = np.array([np.median(uv[part], axis=0) for part in np.split(order, ends)])
-    off = uv - middle[row]
+    offset = uv - middle[row]
     limit = max(MAX_STILL_PX, MAX_MATCH_SD * image_sd)
-    weight = np.where(np.linalg.norm(off, axis=1) <= limit, sigma**-2.0, 0.0)
+    weight = np.where(np.linalg.norm(offset, axis=1) <= limit, sigma**-2.0, 0.0)
     total = np.bincount(row, weight, len(ids))
     matched = total > 0
-    sums = np.column_stack([np.bincount(row, weight * off[:, i], len(ids)) for i in (0, 1)])
+    sums = np.column_stack([np.bincount(row, weight * offset[:, i], len(ids)) for i in (0, 1)])
     mean = sums[matched] / total[matched, None]
     last = max(frames, key=lambda f: (f.stamp_ns, f.number))
     return Frame(
@@ -376,11 +381,11 @@ def _require_still(frames: Sequence[Frame], still_px: float) -> None:
     """
     to_first = ((frames[0], frame) for frame in frames[2:])
     for before, frame in [*pairwise(frames), *to_first]:
-        moved = displacement(before, frame)
-        if np.isfinite(moved) and moved > still_px:
+        distance = displacement(before, frame)
+        if np.isfinite(distance) and distance > still_px:
             raise DataError(
                 f'fluoroscope {frame.fluoroscope}: the phantom does not stand still, between '
-                f'frames {before.number} and {frame.number} it moves by {moved:.1f} px'
+                f'frames {before.number} and {frame.number} it moves by {distance:.1f} px'
             )
 
 
@@ -390,7 +395,7 @@ def _paired(frames: Frames) -> dict[str, list[Frame]]:
     Raises DataError if a fluoroscope shares no frames with the first.
     """
     first, *others = frames
-    numbers = {name: {frame.number for frame in of_one} for name, of_one in frames.items()}
+    numbers = {name: {frame.number for frame in exposures} for name, exposures in frames.items()}
     for b, name in enumerate(others, 1):
         if not numbers[name] & numbers[first]:
             raise DataError(_unpaired(tuple(frames), b))
@@ -399,10 +404,10 @@ def _paired(frames: Frames) -> dict[str, list[Frame]]:
     complete = [n for n in common if all(n in numbers[name] for name in others)]
     usable = complete if len(complete) >= MAX_PAIRS else common
     selected = np.unique(np.linspace(0, len(usable) - 1, MAX_PAIRS).astype(int))
-    used = {usable[i] for i in selected}
+    selected_numbers = {usable[i] for i in selected}
     return {
-        name: [frame for frame in of_one if frame.number in used]
-        for name, of_one in frames.items()
+        name: [frame for frame in exposures if frame.number in selected_numbers]
+        for name, exposures in frames.items()
     }
 
 
@@ -422,21 +427,21 @@ def _adjusted(
     noise_fixed: use the noise of the calibrations; otherwise it is used only if there are too few
     exposures to estimate it. Raises DataError.
     """
-    used = [calibrations[name] for name in measured.fluoroscopes]
+    known = [calibrations[name] for name in measured.fluoroscopes]
     correction, network = fixed_corrections(measured, calibrations)
     after, _ = adjusted_with_precision(
         network,
         measured.start,
         correction,
-        noise_of_calibrations('student_t', used),
+        noise_of_calibrations('student_t', known),
         noise_fixed=noise_fixed or too_few_rays_for_noise(network),
     )
     if not np.isfinite(after.parameters.position_mm).all():
         raise DataError('the exposures do not determine the orientation of the fluoroscopes')
     blocks = _with_free_interiors(network, after, correction)
     by_interior = blocks.eg @ np.linalg.inv(blocks.gg)
-    of_interiors = block_diag(*(calibration.interior_covariance for calibration in used))
-    return _FixedAdjustment(measured, after, by_interior, blocks, of_interiors)
+    interior_covariance = block_diag(*(calibration.interior_covariance for calibration in known))
+    return _FixedAdjustment(measured, after, by_interior, blocks, interior_covariance)
 
 
 def _with_free_interiors(
@@ -474,8 +479,8 @@ def _mean_of_pairs(
     _, d_a, d_b, _ = discrepancies_with_jacobian(constraint, start, parameters)
     weights = np.linalg.inv(_covariance_of_pairs(fixed, pairs, d_a, d_b))
     columns = functions_of_angles(angles)
-    found = agreeing(parameters, constraint, weights, columns)
-    used = found.used
+    agreement = agreeing(parameters, constraint, weights, columns)
+    used = agreement.used
     pose = mean_pose(parameters, pairs[used], weights[used])
     operator = np.zeros((6, len(fixed.measured.frames), 6))
     share = np.linalg.solve(
@@ -483,7 +488,7 @@ def _mean_of_pairs(
     ).reshape(6, -1, 6)
     for rows, derivative in zip(pairs[used].T, (d_a[used], d_b[used])):
         operator[:, rows] += np.einsum('ika,kab->ikb', share, derivative)
-    poses = [pose.updated(step) for step in found.trend]
+    poses = [pose.updated(step) for step in agreement.trend]
     network = fixed.measured.network
     by_angle = displacements(network, parameters, pairs, poses, [pose] * len(poses))
     turn, shift = relative_poses(parameters, pairs)
@@ -491,10 +496,10 @@ def _mean_of_pairs(
         fluoroscopes=(frames[pairs[0, 0]].fluoroscope, frames[pairs[0, 1]].fluoroscope),
         exposures=np.array([frames[row].number for row in pairs[:, 0]]),
         off_px=displacements(network, parameters, pairs, poses),
-        off_sd=found.off_sd,
+        off_sd=agreement.off_sd,
         used=used,
-        growth=found.growth,
-        unexplained=found.unexplained,
+        growth=agreement.growth,
+        unexplained=agreement.unexplained,
         angle_px=float(np.sqrt(np.mean(by_angle**2))),
         columns=columns,
         corrected=corrected,
@@ -529,26 +534,26 @@ def _orientation(
 ) -> RigOrientation:
     """Return the rig orientation of exteriors, with the uncertainty of the interiors."""
     names = fixed.measured.fluoroscopes
-    used = [calibrations[name] for name in names]
+    known = [calibrations[name] for name in names]
     by_interior = exteriors.by_interior
     mixed = by_interior @ fixed.interiors
     total = exteriors.covariance + mixed @ by_interior.T
-    every = np.block([[total, mixed], [mixed.T, fixed.interiors]])
+    joint = np.block([[total, mixed], [mixed.T, fixed.interiors]])
     count = len(names)
     order = np.concatenate(
         [np.r_[6 * f : 6 * f + 6, 6 * count + 3 * f : 6 * count + 3 * f + 3] for f in range(count)]
     )
-    covariance = every[np.ix_(order, order)].reshape(ORIENTATION_SIZE * count, -1)
+    covariance = joint[np.ix_(order, order)].reshape(ORIENTATION_SIZE * count, -1)
     return RigOrientation(
         fluoroscopes=names,
-        interior=np.array([calibration.interior for calibration in used]),
+        interior=np.array([calibration.interior for calibration in known]),
         rotation=exteriors.rotation,
         position_mm=exteriors.position_mm,
         covariance=(covariance + covariance.T) / 2,
         frame_id=origin.frame_id,
         source=origin.source,
-        calibration_ids=tuple(calibration.calibration_id for calibration in used),
+        calibration_ids=tuple(calibration.calibration_id for calibration in known),
         stamp_ns=origin.stamp_ns,
         exposures=origin.exposures,
-        optical_frame_ids=tuple(c.frame_id or f'{name}_optical' for name, c in zip(names, used)),
+        optical_frame_ids=tuple(c.frame_id or f'{name}_optical' for name, c in zip(names, known)),
     ).rounded()

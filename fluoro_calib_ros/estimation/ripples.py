@@ -57,8 +57,8 @@ class Ripples:
 
     def with_variances(self, variances: NDArray[np.float64]) -> Ripples:
         """Return ripples in the same bands, with these variances (n,) of all bands."""
-        own = np.where(np.asarray(self.variances) > 0, variances, 0.0)
-        return replace(self, variances=tuple(float(value) for value in own))
+        new_variances = np.where(np.asarray(self.variances) > 0, variances, 0.0)
+        return replace(self, variances=tuple(float(value) for value in new_variances))
 
     def alone(self) -> Ripples | None:
         """Return the ripples in the bands about the strongest; None: longer waves are as strong.
@@ -156,8 +156,8 @@ def _are_common(
     limit = -stdtrit(len(first) - 1, FALSE_ALARM)
     out = []
     for band in bands:
-        own = sums[:, functions.band == band].reshape(len(sums), -1)
-        product = (own @ own.T)[first, second]
+        band_sums = sums[:, functions.band == band].reshape(len(sums), -1)
+        product = (band_sums @ band_sums.T)[first, second]
         error = np.std(product, ddof=1) / np.sqrt(len(product))
         out.append(np.mean(product) > limit * error)
     return np.array(out)

@@ -125,12 +125,12 @@ def _has_settled(rounds: Sequence[Round], tolerance: float) -> bool:
     if len(rounds) < 2:
         return False
     last = rounds[-2]
-    now = rounds[-1]
+    current = rounds[-1]
     # F is a log-likelihood and may pass through zero, so its change is also compared with G, which
     # is about the number of image points.
-    d_f = abs(now.F - last.F) / max(abs(now.F), now.G)
-    d_g = abs(now.G - last.G) / max(now.G, 1e-300)
-    return d_f <= tolerance and d_g <= tolerance and now.change <= SETTLED_PX
+    d_f = abs(current.F - last.F) / max(abs(current.F), current.G)
+    d_g = abs(current.G - last.G) / max(current.G, 1e-300)
+    return d_f <= tolerance and d_g <= tolerance and current.change <= SETTLED_PX
 
 
 def rmse_of_inliers(adjustment: Adjustment, rows: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -214,7 +214,7 @@ def statistics_of(
         + precise.survey_redundancy.sum()
         + sum(part.sum() for part in precise.relative_redundancy)
     )
-    good = precise.redundancy[weight >= 0.5]
+    well_weighted = precise.redundancy[weight >= 0.5]
     rays = np.bincount(network.point, minlength=network.n_points)
     return AdjustmentStatistics(
         fluoroscopes=tuple(measured.fluoroscopes),
@@ -229,8 +229,8 @@ def statistics_of(
         outliers=int((~adjustment.inliers).sum()),
         exposures=network.n_exposures,
         targets=network.n_points,
-        least_redundancy=float(good.min()) if len(good) else float('nan'),
-        mean_redundancy=float(good.mean()) if len(good) else float('nan'),
+        least_redundancy=float(well_weighted.min()) if len(well_weighted) else float('nan'),
+        mean_redundancy=float(well_weighted.mean()) if len(well_weighted) else float('nan'),
         least_rays=float(rays.min()),
         mean_rays=float(rays.mean()),
     )
@@ -275,27 +275,27 @@ MIN_FITTING = 0.5  # least share of fitting image points, of an exposure or of a
 
 def undetermined_unknowns(measured: Measured) -> Finding | None:
     """Return a finding on unknowns that are undetermined at the initial values, or None."""
-    found = undetermined_directions(
+    directions = undetermined_directions(
         measured.network, measured.start, measured.fluoroscopes, _exposure_numbers(measured)
     )
-    if not found:
+    if not directions:
         return None
     return Finding(
         Kind.UNDETERMINED,
-        f'the exposures do not determine the unknowns: {describe_directions(found)}; '
+        f'the exposures do not determine the unknowns: {describe_directions(directions)}; '
         'add exposures with the phantom turned and moved, with more targets',
-        numbers={'directions': len(found)},
+        numbers={'directions': len(directions)},
     )
 
 
 def raise_if_undetermined(measured: Measured, adjustment: Adjustment, precise: Precision) -> None:
     """Raise DataError for undetermined interior orientations, with a finding for each."""
     scale = adjustment.noise.scale
-    found = undetermined_interiors(
+    findings = undetermined_interiors(
         measured.network, adjustment.parameters, precise, measured.fluoroscopes, scale
     )
-    if found:
-        raise DataError(*found)
+    if findings:
+        raise DataError(*findings)
 
 
 def correlations_of(run: SelfCalibration) -> tuple[tuple[str, str, float], ...]:
@@ -312,26 +312,26 @@ def correlations_of(run: SelfCalibration) -> tuple[tuple[str, str, float], ...]:
 def outliers_of(run: SelfCalibration) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Return outliers of a self-calibration: image points and targets, with test statistics."""
     measured = run.measured
-    found = find_outliers(measured.network, run.after, run.precision)
-    exposures = measured.network.exposure[found.image_point]
+    detected = find_outliers(measured.network, run.after, run.precision)
+    exposures = measured.network.exposure[detected.image_point]
     points = [
         {
             'fluoroscope': measured.frames[j].fluoroscope,
             'exposure': measured.frames[j].number,
             'target_id': int(measured.target_id[measured.network.point[row]]),
             'value': float(value),
-            'critical': found.critical_image,
+            'critical': detected.critical_image,
         }
-        for row, j, value in zip(found.image_point, exposures, found.value)
+        for row, j, value in zip(detected.image_point, exposures, detected.value)
     ]
     targets = [
         {
             'target_id': int(measured.target_id[row]),
             'offset_mm': offset,
             'value': float(value),
-            'critical': found.critical_target,
+            'critical': detected.critical_target,
         }
-        for row, offset, value in zip(found.target, found.offset_mm, found.target_value)
+        for row, offset, value in zip(detected.target, detected.offset_mm, detected.target_value)
     ]
     return points, targets
 
@@ -351,8 +351,8 @@ def exposures_that_do_not_fit(run: SelfCalibration) -> dict[tuple[str, int], Fin
     share = fitting / count
     out = {}
     for row, frame in enumerate(run.measured.frames):
-        own = network.fluoroscope == network.fluoroscope[row]
-        if share[row] < MIN_FITTING and np.median(share[own]) >= MIN_FITTING:
+        same_fluoroscope = network.fluoroscope == network.fluoroscope[row]
+        if share[row] < MIN_FITTING and np.median(share[same_fluoroscope]) >= MIN_FITTING:
             out[frame.fluoroscope, frame.number] = Finding(
                 Kind.FALSE_MATCHES,
                 f'only {100 * share[row]:.0f} % of the image points fit, the others are false '

@@ -133,10 +133,10 @@ def estimator_of(model: Any) -> Estimator:
         )
     if model in ESTIMATORS:
         return ESTIMATORS[model]
-    kind = model_type(model)
-    if not issubclass(kind, NeighbourModel):
+    model_class = model_type(model)
+    if not issubclass(model_class, NeighbourModel):
         raise ValueError(f'correction model {model} has no estimator')
-    return Estimator(model, regression=partial(NeighbourRegression, kind))
+    return Estimator(model, regression=partial(NeighbourRegression, model_class))
 
 
 def self_calibrate(
@@ -164,10 +164,10 @@ def self_calibrate(
     job = _Job(measured, before, gauges_of(measured, options), options)
     if options.model == AUTO:
         run, terms = job.by_collocation(progress)
-        better = better_model(run, terms)
-        if better is None:
+        alternative = better_model(run, terms)
+        if alternative is None:
             return run
-        return with_errors_by(run, job.by_model(estimator_of(better), progress), job.gauges)
+        return with_errors_by(run, job.by_model(estimator_of(alternative), progress), job.gauges)
     source = estimator_of(options.model)
     run = job.by_model(source, progress)
     if source.kind in (START_MODEL, NoCorrection.kind):
@@ -394,7 +394,7 @@ def calibrate_by_adjustment(
         history=tuple(history.rounds),
         converged=converged,
         between_exposures=between,
-        angle_fields={name: found for name, found in fields.items() if found is not None},
+        angle_fields={name: field for name, field in fields.items() if field is not None},
     )
 
 
@@ -468,9 +468,9 @@ def adjust_with_terms(
     converged = False
     for number in range(max_rounds):
         network = terms.with_additional(plain)
-        final = converged or number == max_rounds - 1
-        tolerance = terms.final_tolerance if final else terms.intermediate_tolerance
-        if not number and not final:
+        is_final = converged or number == max_rounds - 1
+        tolerance = terms.final_tolerance if is_final else terms.intermediate_tolerance
+        if not number and not is_final:
             tolerance = max(tolerance, FIRST_TOLERANCE * network.n_image_points)
         result, matrix = adjust_with_matrix(
             network,
@@ -482,7 +482,7 @@ def adjust_with_terms(
         last = correction
         correction = network.additional_correction(result.parameters)
         report(result, float(np.sqrt(np.mean((correction - last) ** 2))))
-        if final:
+        if is_final:
             break
         factor = noise.information_factor(result.q)
         if matrix is None or factor < NEARLY_ONE or terms.needs_solution:
@@ -490,9 +490,9 @@ def adjust_with_terms(
                 network, normal_equations(network, result.parameters, zero, noise, factor)
             )
         blocks = covariance_blocks(matrix)
-        renewed = estimate_noise(network, result, blocks, matrix.information_factor)
+        new_noise = estimate_noise(network, result, blocks, matrix.information_factor)
         converged, coefficients = terms.renew(network, matrix, result)
-        converged &= abs(renewed.scale - noise.scale) <= terms.noise_tolerance * noise.scale
+        converged &= abs(new_noise.scale - noise.scale) <= terms.noise_tolerance * noise.scale
         parameters = replace(result.parameters, additional=coefficients)
-        noise = renewed
+        noise = new_noise
     return network, result, bool(converged and result.converged)

@@ -91,9 +91,9 @@ class Signal:
     @property
     def fields(self) -> tuple[tuple[float, float, float], ...]:
         """Standard deviation, correlation length and smoothness of each field."""
-        long = (self.sd, self.reach, self.smoothness)
+        long_field = (self.sd, self.reach, self.smoothness)
         fine = (self.fine_sd, self.fine_reach, FINE_SMOOTHNESS)
-        return (long, fine) if self.fine_sd else (long,)
+        return (long_field, fine) if self.fine_sd else (long_field,)
 
     def density(self, frequency: np.ndarray) -> NDArray[np.float64]:
         """Return the variances (s,) of the coefficients by the fields alone."""
@@ -191,8 +191,8 @@ def _slopes(signal: Signal, frequency: NDArray[np.float64]) -> NDArray[np.float6
         by_reach = 2 * (nu + 1) * part - 2 * nu
         by_smoothness = 1 + nu + nu * np.log(part) - (nu + 1) * part
         out += [2 * density, by_reach * density, by_smoothness * density]
-    long, fine = out[:3], out[3:]
-    columns = [*long[:2], *fine[:2], long[2]]
+    long_slopes, fine_slopes = out[:3], out[3:]
+    columns = [*long_slopes[:2], *fine_slopes[:2], long_slopes[2]]
     return np.stack(columns, axis=1) / signal.variance(frequency)[:, None]
 
 
@@ -227,35 +227,35 @@ class _Likelihood:
 
 def most_likely_signal(signal: Signal, coefficients: SignalEquations, side: float) -> Signal:
     """Return a signal with a larger marginal likelihood; side: longer side of the image [px]."""
-    found = _more_likely(signal, coefficients, side)
-    if found.ripples is not None:
-        found = _with_likely_ripples(found, found.ripples, coefficients)
-    return found
+    updated = _more_likely(signal, coefficients, side)
+    if updated.ripples is not None:
+        updated = _with_likely_ripples(updated, updated.ripples, coefficients)
+    return updated
 
 
 def _more_likely(signal: Signal, coefficients: SignalEquations, side: float) -> Signal:
     """Return the signal after some steps of Fisher scoring."""
     low, high = _ranges(side)
-    at = np.clip(_parameters(signal), low, high)
-    here = _likelihood(at, coefficients, ripples=signal.ripples)
-    if here is None:
+    point = np.clip(_parameters(signal), low, high)
+    current = _likelihood(point, coefficients, ripples=signal.ripples)
+    if current is None:
         return signal
     damping = RIDGE
     for _ in range(STEPS):
-        step = np.linalg.solve(here.curvature + damping * np.eye(len(at)), -here.slopes)
+        step = np.linalg.solve(current.curvature + damping * np.eye(len(point)), -current.slopes)
         step = step / max(1.0, np.max(np.abs(step)) / MAX_STEP)
-        trial = np.clip(at + step, low, high)
-        there = _likelihood(trial, coefficients, here.cost, signal.ripples)
-        if there is None or there.cost > here.cost:
+        trial = np.clip(point + step, low, high)
+        proposed = _likelihood(trial, coefficients, current.cost, signal.ripples)
+        if proposed is None or proposed.cost > current.cost:
             damping *= 30
             continue
-        gain = here.cost - there.cost
-        at = trial
-        here = there
+        gain = current.cost - proposed.cost
+        point = trial
+        current = proposed
         damping = max(RIDGE, damping / 10)
         if gain < MIN_GAIN:
             break
-    return _signal(at, signal.ripples)
+    return _signal(point, signal.ripples)
 
 
 def plausible_signals(signal: Signal, coefficients: SignalEquations, side: float) -> list[Signal]:
@@ -269,16 +269,16 @@ def plausible_signals(signal: Signal, coefficients: SignalEquations, side: float
     signal: the most likely signal; side: longer side of the image [px]. Returns an empty list if
     there is no posterior.
     """
-    here = _likelihood(_parameters(signal), coefficients, ripples=signal.ripples)
-    if here is None:
+    likelihood = _likelihood(_parameters(signal), coefficients, ripples=signal.ripples)
+    if likelihood is None:
         return []
-    values, vectors = np.linalg.eigh(here.curvature[np.ix_(LONG_FIELD, LONG_FIELD)])
+    values, vectors = np.linalg.eigh(likelihood.curvature[np.ix_(LONG_FIELD, LONG_FIELD)])
     out = []
     for value, vector in zip(values, vectors.T):
-        step = np.zeros(len(here.slopes))
+        step = np.zeros(len(likelihood.slopes))
         step[LONG_FIELD] = vector * min(NODE / np.sqrt(max(value, RIDGE**2)), FARTHEST)
         for direction in (step, -step):
-            out.append(_node(signal, direction, coefficients, here.cost, side))
+            out.append(_node(signal, direction, coefficients, likelihood.cost, side))
     return out
 
 
@@ -293,18 +293,18 @@ def _node(
 
     cost: cost of the most likely signal.
     """
-    at = _parameters(signal)
+    point = _parameters(signal)
     low, high = _ranges(side)
-    beyond = at + AT_LIMIT * step
-    step = np.where((beyond > high) | (beyond < low), 0.0, step)
+    ahead = point + AT_LIMIT * step
+    step = np.where((ahead > high) | (ahead < low), 0.0, step)
     if not step.any():
         return signal
-    room = np.where(step > 0, high - at, low - at)[step != 0] / step[step != 0]
+    room = np.where(step > 0, high - point, low - point)[step != 0] / step[step != 0]
     farthest = np.min([*room, FARTHEST / np.max(np.abs(step))])
     scale = min(1.0, farthest)
     node = signal
     for _ in range(NODE_TRIALS):
-        node = _signal(at + scale * step, signal.ripples)
+        node = _signal(point + scale * step, signal.ripples)
         rise = max(_cost(node, coefficients) - cost, MIN_RISE)
         ratio = max(NODE / np.sqrt(2 * rise), MIN_RATIO)  # zero if there is no likelihood
         if abs(np.log(ratio)) < NODE_TOLERANCE or (ratio > 1 and scale == farthest):
@@ -316,10 +316,10 @@ def _node(
 def _cost(signal: Signal, coefficients: SignalEquations) -> float:
     """Return the cost of the likelihood of a signal; infinite if there is no likelihood."""
     variance = np.tile(signal.variance(coefficients.frequency), 2)
-    found = _factorised(variance, coefficients)
-    if found is None:
+    factorised = _factorised(variance, coefficients)
+    if factorised is None:
         return np.inf
-    return found.cost + _cost_of_priors(_parameters(signal), coefficients.extent)
+    return factorised.cost + _cost_of_priors(_parameters(signal), coefficients.extent)
 
 
 def _signal(at: NDArray[np.float64], ripples: Ripples | None) -> Signal:
@@ -342,10 +342,12 @@ def _with_likely_ripples(
     band = ripples.band(frequency)
     for _ in range(RIPPLE_STEPS):
         variance = np.tile(signal.variance(frequency), 2)
-        found = _posterior(variance, coefficients)
-        if found is None:
+        posterior = _posterior(variance, coefficients)
+        if posterior is None:
             return signal
-        mean, square = (np.sum(a.reshape(2, -1), axis=0) for a in (found.mean**2, found.variance))
+        mean, square = (
+            np.sum(a.reshape(2, -1), axis=0) for a in (posterior.mean**2, posterior.variance)
+        )
         determined = np.clip(2 - square / variance[: len(frequency)], MIN_DETERMINED, 2)
         count = len(ripples.variances)
         sums = [np.bincount(band, a, count)[:count] for a in (mean, determined)]
@@ -406,8 +408,8 @@ def _factorised(
     columns = coefficients.columns
     matrix = coefficients.information.copy(order='F')
     matrix[columns, columns] += 1 / variance
-    factor, failed = lapack.dpotrf(matrix, lower=1, overwrite_a=1)
-    if failed:
+    factor, info = lapack.dpotrf(matrix, lower=1, overwrite_a=1)
+    if info:
         return None
     z = solve_triangular(factor, coefficients.right, lower=True, check_finite=False)
     cost = np.sum(np.log(np.diagonal(factor))) + np.sum(np.log(variance)) / 2 - z @ z / 2
@@ -421,17 +423,19 @@ def _posterior(
 
     None if there is no posterior, or its cost exceeds the limit.
     """
-    found = _factorised(variance, coefficients)
-    if found is None or found.cost > limit:
+    factorised = _factorised(variance, coefficients)
+    if factorised is None or factorised.cost > limit:
         return None
     columns = coefficients.columns
-    mean = solve_triangular(found.factor, found.z, trans='T', lower=True, check_finite=False)
-    inverse, failed = lapack.dtrtri(found.factor, lower=1, overwrite_c=1)
-    if failed:
+    mean = solve_triangular(
+        factorised.factor, factorised.z, trans='T', lower=True, check_finite=False
+    )
+    inverse, info = lapack.dtrtri(factorised.factor, lower=1, overwrite_c=1)
+    if info:
         return None
     # Columns are contiguous, and zero above the diagonal.
     squares = np.sum(np.square(inverse, out=inverse), axis=0)
-    return _Posterior(found.cost, mean[columns], squares[columns])
+    return _Posterior(factorised.cost, mean[columns], squares[columns])
 
 
 def _likelihood(
@@ -447,14 +451,16 @@ def _likelihood(
     signal = _signal(at, ripples)
     frequency = coefficients.frequency
     variance = np.tile(signal.variance(frequency), 2)
-    found = _posterior(variance, coefficients, limit - _cost_of_priors(at, coefficients.extent))
-    if found is None:
+    posterior = _posterior(
+        variance, coefficients, limit - _cost_of_priors(at, coefficients.extent)
+    )
+    if posterior is None:
         return None
     slopes = np.tile(_slopes(signal, frequency), (2, 1))
-    determined = np.clip(1 - found.variance / variance, 0, 1)
+    determined = np.clip(1 - posterior.variance / variance, 0, 1)
     likelihood = _Likelihood(
-        found.cost,
-        slopes.T @ (1 - (found.mean**2 + found.variance) / variance) / 2,
+        posterior.cost,
+        slopes.T @ (1 - (posterior.mean**2 + posterior.variance) / variance) / 2,
         (slopes * (determined**2)[:, None]).T @ slopes / 2,
     )
     return _with_priors(likelihood, at, coefficients.extent)

@@ -109,35 +109,35 @@ def principal_distance_of_views(
 
     Raises DataError if there are only planes that are not tilted.
     """
-    solid = [v.projection for v in views if v.projection is not None and not v.needs_samples]
-    in_space = solid or [v.projection for v in views if v.projection is not None]
+    certain = [v.projection for v in views if v.projection is not None and not v.needs_samples]
+    in_space = certain or [v.projection for v in views if v.projection is not None]
     distances = [principal_distance_of(projection) for projection in in_space]
     if distances:
         return float(np.median(distances))
     planes = [v.plane_image for v in views if v.plane_image is not None]
-    found = principal_distance_of_planes(planes, principal_point) if planes else None
+    distance = principal_distance_of_planes(planes, principal_point) if planes else None
     low, high = (factor * max(image_size) for factor in DISTANCES)
-    if found is None or not low <= found <= high:
+    if distance is None or not low <= distance <= high:
         raise DataError(UNTILTED)
-    return found
+    return distance
 
 
 def orient_view(view: View, interior: NDArray[np.float64]) -> Resection:
     """Return the exterior orientation of a view with the smallest residuals. Raises DataError."""
     if view.projection is not None and not view.needs_samples:
         return resect(view.xyz, view.uv, interior, view.projection, tolerance=START_TOLERANCE)
-    found = []
+    resections = []
     errors: list[Finding] = []
     for start in _starts(view, interior):
         try:
-            found.append(start())
+            resections.append(start())
         except DataError as error:
             errors.append(error.finding)
         except np.linalg.LinAlgError as error:
             errors.append(Finding(Kind.NOT_ORIENTED, str(error)))
-    if not found:
+    if not resections:
         raise DataError(errors[0] if errors else view.error)
-    return min(found, key=lambda one: one.scale)
+    return min(resections, key=lambda resection: resection.scale)
 
 
 def _starts(view: View, interior: NDArray[np.float64]) -> list[Callable[[], Resection]]:
@@ -164,14 +164,14 @@ def settle_planes(
     alternates between a preliminary correction of all residuals and the poses with it.
     """
     out = list(found)
-    if not any(view.is_flat and one is not None for view, one in zip(views, out)):
+    if not any(view.is_flat and resection is not None for view, resection in zip(views, out)):
         return out
     for _ in range(ROUNDS):
-        correct = _preliminary_correction(views, out, interior)
-        for row, (view, present) in enumerate(zip(views, out)):
-            if present is not None:
-                corrected = replace(view, uv=view.uv - correct(view.uv))
-                out[row] = _better_pose(corrected, present, interior)
+        correction = _preliminary_correction(views, out, interior)
+        for row, (view, resection) in enumerate(zip(views, out)):
+            if resection is not None:
+                corrected = replace(view, uv=view.uv - correction(view.uv))
+                out[row] = _better_pose(corrected, resection, interior)
     return out
 
 
@@ -186,7 +186,7 @@ def _better_pose(view: View, present: Resection, interior: NDArray[np.float64]) 
             refined.append(refine_resection(view.xyz, view.uv, interior, *start))
         except (DataError, np.linalg.LinAlgError):
             continue
-    return min(refined, key=lambda one: one.scale, default=present)
+    return min(refined, key=lambda resection: resection.scale, default=present)
 
 
 def _preliminary_correction(
@@ -196,10 +196,10 @@ def _preliminary_correction(
     functions = Functions(views[0].frame.image_size, CUBIC)
     pixels = []
     residuals = []
-    for view, one in zip(views, found):
-        if one is None:
+    for view, resection in zip(views, found):
+        if resection is None:
             continue
-        predicted = project(one.rotation, one.position_mm, view.xyz, interior)
+        predicted = project(resection.rotation, resection.position_mm, view.xyz, interior)
         in_front = np.isfinite(predicted).all(axis=1)
         pixels.append(view.uv[in_front])
         residuals.append((view.uv - predicted)[in_front])

@@ -103,26 +103,26 @@ def scaled_by_distances(
     variance = 1 / float(length @ weight)
     difference = distances.length_mm - length
     change = variance * float(weight @ difference)
-    left = difference - change * length
+    remainder = difference - change * length
     gain = mixed @ inverse
-    moved = mixed @ (inverse @ left)
+    shift = mixed @ (inverse @ remainder)
     arm = xyz_mm - centre_mm
-    along = arm - gain @ length
-    pull = inverse @ left
+    by_scale = arm - gain @ length
+    pull = inverse @ remainder
     # Variances of the pulls; infinite for a distance that no other distance checks.
     variance_of_pull = np.diagonal(inverse - variance * np.outer(weight, weight))
     is_checked = variance_of_pull > ROUNDING * np.diagonal(inverse)
     variance_of_pull = np.where(is_checked, variance_of_pull, np.inf)
     return Scaled(
-        xyz_mm + change * arm + moved,
+        xyz_mm + change * arm + shift,
         covariance
         - np.einsum('nak,nbk->nab', gain, mixed)
-        + variance * along[:, :, None] * along[:, None, :],
+        + variance * by_scale[:, :, None] * by_scale[:, None, :],
         1 + change,
         float(np.sqrt(variance)),
         error_mm=pull / variance_of_pull,
         normalised=pull / np.sqrt(variance_of_pull),
-        chi2=float(left @ pull),
+        chi2=float(remainder @ pull),
         freedom=k - 1,
     )
 
@@ -144,11 +144,11 @@ class MeasuredDistance:
     sd_mm: float
 
     def __post_init__(self) -> None:
-        where = Place(target_id=(self.first, self.second), name=self.name)
+        place = Place(target_id=(self.first, self.second), name=self.name)
         if self.first == self.second:
-            raise DataError('both ends are the same bead', place=where)
+            raise DataError('both ends are the same bead', place=place)
         if not (0 < self.length_mm < np.inf and 0 < self.sd_mm < np.inf):
-            raise DataError('length and standard deviation are numbers above 0', place=where)
+            raise DataError('length and standard deviation are numbers above 0', place=place)
 
     @property
     def name(self) -> str:
@@ -184,15 +184,15 @@ class SurveyedBeads:
 
     def without(self, target_id: Iterable[int]) -> SurveyedBeads:
         """Return the beads except those with some target ids; the scale does not change."""
-        keep = ~np.isin(self.target_id, list(target_id))
-        of_beads = ('target_id', 'xyz_mm', 'covariance', 'given_mm', 'given_sd_mm')
-        names = (*of_beads, 'rays', 'angle_rad')
+        is_kept = ~np.isin(self.target_id, list(target_id))
+        bead_fields = ('target_id', 'xyz_mm', 'covariance', 'given_mm', 'given_sd_mm')
+        names = (*bead_fields, 'rays', 'angle_rad')
         joint = self.joint_covariance
         if joint is not None:
-            rows = np.flatnonzero(np.repeat(keep, 3))
+            rows = np.flatnonzero(np.repeat(is_kept, 3))
             joint = joint[np.ix_(rows, rows)]
-        kept = {name: getattr(self, name)[keep] for name in names}
-        return replace(self, joint_covariance=joint, **kept)
+        values = {name: getattr(self, name)[is_kept] for name in names}
+        return replace(self, joint_covariance=joint, **values)
 
     @property
     def off_mm(self) -> NDArray[np.float64]:
@@ -253,20 +253,20 @@ def surveyed_beads(
 
 def _rows(distances: Sequence[MeasuredDistance], target_id: NDArray[np.int64]) -> Distances:
     """Return the distances by rows of targets. Raises DataError for an end without a row."""
-    for one in distances:
-        for end in (one.first, one.second):
+    for distance in distances:
+        for end in (distance.first, distance.second):
             if end not in target_id:
                 raise DataError(
                     f'bead {end} is not found from the images: it is not on the phantom, or too '
                     'few exposures show it',
                     kind=Kind.FEW_RAYS,
-                    place=Place(target_id=(end,), name=one.name),
+                    place=Place(target_id=(end,), name=distance.name),
                 )
-    pairs = np.array([(one.first, one.second) for one in distances])
+    pairs = np.array([(distance.first, distance.second) for distance in distances])
     return Distances(
         np.searchsorted(target_id, pairs),
-        np.array([one.length_mm for one in distances], dtype=float),
-        np.array([one.sd_mm for one in distances], dtype=float),
+        np.array([distance.length_mm for distance in distances], dtype=float),
+        np.array([distance.sd_mm for distance in distances], dtype=float),
     )
 
 
@@ -288,8 +288,8 @@ def _rays(
     order = np.argsort(point, kind='stable')
     count = np.bincount(point, minlength=network.n_points)
     angle = np.zeros(network.n_points)
-    for number, own in enumerate(np.split(ray[order], np.cumsum(count)[:-1])):
-        if len(own) > 1:
+    for number, directions in enumerate(np.split(ray[order], np.cumsum(count)[:-1])):
+        if len(directions) > 1:
             # Rays from opposite sides have the same line, and intersect as badly as parallel rays.
-            angle[number] = np.arccos(np.clip(np.abs(own @ own.T).min(), 0, 1))
+            angle[number] = np.arccos(np.clip(np.abs(directions @ directions.T).min(), 0, 1))
     return count, angle

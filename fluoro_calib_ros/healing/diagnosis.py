@@ -88,7 +88,7 @@ class Diagnosis:
     @property
     def sure(self) -> bool:
         """Whether the causes explain the data, and no other cause does nearly as well."""
-        return self.complete and all(one > SURE_OF_CAUSE for one in self.probability)
+        return self.complete and all(value > SURE_OF_CAUSE for value in self.probability)
 
 
 @dataclass(frozen=True)
@@ -139,18 +139,18 @@ class Diagnostician:
         best = _Tried((), observed, healthy, solution, 0.0)
         probability: list[float] = []
         rivals: list[Change | None] = []
-        rest = 1.0
+        p_no_further = 1.0
         while len(best.changes) < MAX_CAUSES:
-            tried = self._tried(best, poses)
-            chances = _probabilities([best, *tried], self._causes)
-            rest = float(chances[0])
-            if rest > 1 - SURE:
+            hypotheses = self._tried(best, poses)
+            chances = _probabilities([best, *hypotheses], self._causes)
+            p_no_further = float(chances[0])
+            if p_no_further > 1 - SURE:
                 break
             winner, rival = (np.argsort(chances[1:])[::-1].tolist() + [-1])[:2]
-            rivals.append(tried[rival].changes[-1] if rival >= 0 else None)
-            best = tried[winner]
+            rivals.append(hypotheses[rival].changes[-1] if rival >= 0 else None)
+            best = hypotheses[winner]
             probability.append(float(chances[1:][winner]))
-            rest = 0.0
+            p_no_further = 0.0
             if best.changes[-1].cause in until:
                 break
         return Diagnosis(
@@ -161,7 +161,7 @@ class Diagnostician:
             best.prior,
             solution=best.solution,
             noise=_noise(best.solution),
-            rest=rest,
+            rest=p_no_further,
         )
 
     # -- hypotheses
@@ -172,15 +172,15 @@ class Diagnostician:
         changes += self._exchanges(best)
         start = np.zeros(self.adjustment.size), first
         if best.changes:  # otherwise values and poses may be wrong due to the wrong rig
-            found = best.solution
-            start = found.values, found.poses.or_else(first, found.inliers_of_pose > FITS)
+            solution = best.solution
+            start = solution.values, solution.poses.or_else(first, solution.inliers_of_pose > FITS)
         leader = best
         out: list[_Tried] = []
         for change in changes:
             if self._is_hopeless(change, best, leader):
                 continue
             out.append(self._with(best, change, start))
-            leader = max(leader, out[-1], key=lambda one: one.evidence)
+            leader = max(leader, out[-1], key=lambda hypothesis: hypothesis.evidence)
         return out
 
     def _is_hopeless(self, change: Change, best: _Tried, leader: _Tried) -> bool:
@@ -191,10 +191,10 @@ class Diagnostician:
         """
         if change.cause in OF_RIG:
             return False
-        lost = best.solution.losses[change.body]
-        most = best.evidence + 0.5 * float(lost[list(change.markers) or slice(None)].sum())
-        behind = (leader.evidence - most) / _noise(leader.solution) ** 2
-        return bool(behind > np.log(self._causes / (1 - SURE_OF_CAUSE)))
+        losses = best.solution.losses[change.body]
+        bound = best.evidence + 0.5 * float(losses[list(change.markers) or slice(None)].sum())
+        deficit = (leader.evidence - bound) / _noise(leader.solution) ** 2
+        return bool(deficit > np.log(self._causes / (1 - SURE_OF_CAUSE)))
 
     def knocks(self) -> list[Change]:
         """Return the observable changes of the orientation."""
@@ -213,21 +213,21 @@ class Diagnostician:
         solution takes most image points of a pose for false matches: these have no weight in the
         derivatives.
         """
-        told = self.adjustment.told(best.observed, best.prior, best.solution)
-        lost = (best.solution.inliers_of_pose < FITS).any()  # due to a change, hardly by chance
+        statistics = self.adjustment.told(best.observed, best.prior, best.solution)
+        is_lost = (best.solution.inliers_of_pose < FITS).any()  # due to a change, hardly by chance
         places = self._of_rig()
         places += [Change(Cause.MIGRATED, body=b, markers=(m,)) for b, m in self._markers]
         gains = [
-            (self._sizes(told, place).evidence, place)
+            (self._sizes(statistics, place).evidence, place)
             for place in places
             if place not in best.changes and not _is_told(place, best.changes)
         ]
-        gains.sort(key=lambda one: -one[0])
-        if not gains or (gains[0][0] <= 0 and not lost):
+        gains.sort(key=lambda entry: -entry[0])
+        if not gains or (gains[0][0] <= 0 and not is_lost):
             return []
-        of_rig = [change for _, change in gains if change.cause in OF_RIG]
-        of_markers = [one for one in gains if one[1].cause is Cause.MIGRATED][:TRIED]
-        return of_rig + [change for gain, change in of_markers if gain > 0]
+        rig_changes = [change for _, change in gains if change.cause in OF_RIG]
+        marker_gains = [entry for entry in gains if entry[1].cause is Cause.MIGRATED][:TRIED]
+        return rig_changes + [change for gain, change in marker_gains if gain > 0]
 
     def _scattering(self, best: _Tried) -> list[Change]:
         """Return the marker and the body that scatter most, if this is worth an unknown.
@@ -245,23 +245,23 @@ class Diagnostician:
             n = float(freedom[rows].sum())
             s2 = max(1.0, float(squares[rows].sum()) / max(n, 1.0))
             gain = 0.5 * n * (s2 - 1 - np.log(s2)) - 0.5 * np.log(max(n, 1.0))
-            told = change in best.changes or _is_told(change, best.changes)
-            if not told and gain > max(0.0, out.get(change.cause, (0.0,))[0]):
+            is_explained = change in best.changes or _is_told(change, best.changes)
+            if not is_explained and gain > max(0.0, out.get(change.cause, (0.0,))[0]):
                 out[change.cause] = gain, change
         return [change for _, change in out.values()]
 
     def _exchanges(self, best: _Tried) -> list[Change]:
         """Return exchanges of markers that do not fit, in bodies where most others do."""
         inliers = best.solution.inliers
-        lost = [
+        misfitting = [
             (b, m)
             for b, m in self._markers
             if inliers[b, m] < 0.5 < np.nanmax(inliers[b], initial=0.0)
         ]
-        lost.sort(key=lambda one: best.solution.inliers[one])
+        misfitting.sort(key=lambda marker: best.solution.inliers[marker])
         pairs = [
             Change(Cause.EXCHANGED, body=b, markers=(min(m, n), max(m, n)))
-            for (b, m), (c, n) in combinations(lost[: TRIED + 1], 2)
+            for (b, m), (c, n) in combinations(misfitting[: TRIED + 1], 2)
             if b == c
         ]
         return [change for change in pairs if change not in best.changes]
@@ -278,24 +278,28 @@ class Diagnostician:
             prior = replace(prior, inflation=self._inflation(best, change))
         # Start with the usual size; the solution then determines the size.
         solution = self._solve(observed, prior.widened(self.sd_of(change)), start)
-        tried = _Tried((*best.changes, change), observed, prior, solution, best.by_size)
+        hypothesis = _Tried((*best.changes, change), observed, prior, solution, best.by_size)
         rows = self.rows_of(change)
         if not len(rows):
-            return tried
+            return hypothesis
         sd = np.zeros(self.adjustment.size)
         sd[rows] = self._sizes(self.adjustment.told(observed, prior, solution), change).rms
         widened = prior.widened(sd)
         start = solution.values, solution.poses
         solution = self.adjustment.refine(observed, widened, start)
-        told = self.adjustment.told(observed, prior, solution)
-        by_size = self._sizes(told, change).evidence - float(told.only(rows).evidence(sd[rows]))
-        return replace(tried, prior=widened, solution=solution, by_size=best.by_size + by_size)
+        statistics = self.adjustment.told(observed, prior, solution)
+        by_size = self._sizes(statistics, change).evidence - float(
+            statistics.only(rows).evidence(sd[rows])
+        )
+        return replace(
+            hypothesis, prior=widened, solution=solution, by_size=best.by_size + by_size
+        )
 
     def _solve(
         self, observed: ObservedBodies, prior: Prior, start: tuple[NDArray[np.float64], Poses]
     ) -> RigSolution:
-        found = self.adjustment.solve(observed, prior, start)
-        return with_best_modes(self.adjustment, observed, prior, found)
+        solution = self.adjustment.solve(observed, prior, start)
+        return with_best_modes(self.adjustment, observed, prior, solution)
 
     def rows_of(self, change: Change) -> NDArray[np.int64]:
         """Return the unknowns (k,) that a change affects."""
@@ -313,14 +317,14 @@ class Diagnostician:
         """Return standard deviations (p, K) of unknowns for parts of a change of usual size."""
         adjustment = self.adjustment
         number = np.arange(adjustment.size)
-        of_rig = number[adjustment.rig]
+        rig_columns = number[adjustment.rig]
         parts: list[tuple[NDArray[np.int64], NDArray[np.float64] | float]] = []
         if change.cause is Cause.ORIENTATION:
             knock = parts_of_knock(adjustment.orientation, change.fluoroscope)
-            parts = [(of_rig, part) for part in knock]
+            parts = [(rig_columns, part) for part in knock]
         elif change.cause is Cause.INTERIOR:
             shift = parts_of_interior(adjustment.orientation, change.fluoroscope)
-            parts = [(of_rig, part) for part in shift]
+            parts = [(rig_columns, part) for part in shift]
         elif change.cause is Cause.DISTORTION:
             drift = number[adjustment.drift].reshape(len(adjustment.functions), -1)
             one_px = adjustment.sd_of_drift(change.fluoroscope)
@@ -352,11 +356,12 @@ class Diagnostician:
 def _is_told(change: Change, changes: Sequence[Change]) -> bool:
     """Return whether a change of a marker is part of another one: soft body or loose marker."""
     return change.body >= 0 and any(
-        one.body == change.body
+        earlier.body == change.body
         and (
-            one.cause is Cause.SOFT or (one.cause is Cause.LOOSE and one.markers == change.markers)
+            earlier.cause is Cause.SOFT
+            or (earlier.cause is Cause.LOOSE and earlier.markers == change.markers)
         )
-        for one in changes
+        for earlier in changes
     )
 
 
@@ -372,14 +377,14 @@ def _probabilities(tried: Sequence[_Tried], causes: int) -> NDArray[np.float64]:
     If image points scatter more than claimed, the evidence is scaled down. A loose marker or a
     soft body has one more unknown, its scatter, known to 1/sqrt(2 n) from n squares.
     """
-    found = np.array([one.evidence for one in tried])
-    noise = _noise(tried[int(np.argmax(found))].solution)
-    log = found / noise**2
-    for row, one in enumerate(tried[1:], 1):
-        if one.changes[-1].cause in (Cause.LOOSE, Cause.SOFT):
-            change = one.changes[-1]
-            of_body = one.solution.freedom[change.body]
-            count = of_body[change.markers[0]] if change.markers else of_body.sum()
+    evidence = np.array([hypothesis.evidence for hypothesis in tried])
+    noise = _noise(tried[int(np.argmax(evidence))].solution)
+    log = evidence / noise**2
+    for row, hypothesis in enumerate(tried[1:], 1):
+        if hypothesis.changes[-1].cause in (Cause.LOOSE, Cause.SOFT):
+            change = hypothesis.changes[-1]
+            freedom = hypothesis.solution.freedom[change.body]
+            count = freedom[change.markers[0]] if change.markers else freedom.sum()
             log[row] -= 0.5 * np.log(max(float(count), 1.0))
     log = log - log.max()
     # No further change and some further change are equally likely, and so are all causes,

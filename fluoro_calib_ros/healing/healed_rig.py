@@ -61,7 +61,7 @@ def healed_rig(
     for change in changes or diagnostician.knocks():
         largest = np.hypot(largest, diagnostician.sd_of(change))
     free = largest > 0
-    drifted = [change.fluoroscope for change in changes if change.cause is Cause.DISTORTION]
+    drifted_views = [change.fluoroscope for change in changes if change.cause is Cause.DISTORTION]
     sd = diagnosis.prior.sd.copy()
     sd[adjustment.rig] = np.maximum(sd, largest)[adjustment.rig]
     prior = replace(diagnosis.prior, sd=sd)
@@ -77,7 +77,7 @@ def healed_rig(
     unseen = {
         f: (adjustment.functions[f], _unseen_drift(diagnostician, diagnosis, f, held))
         for f in range(views)
-        if f not in drifted
+        if f not in drifted_views
     }
     orientation = replace(
         adjustment.rig_at(values),
@@ -87,7 +87,7 @@ def healed_rig(
         exposures=exposures,
     ).rounded()
     drift = {}
-    for f in drifted:
+    for f in drifted_views:
         number = _coefficients(adjustment, f)
         drift[f] = (
             adjustment.functions[f],
@@ -113,12 +113,12 @@ def _of_unseen_knocks(diagnostician: Diagnostician, diagnosis: Diagnosis) -> NDA
     """
     adjustment = diagnostician.adjustment
     calibrated = diagnosis.prior.orientation
-    sd = np.linalg.norm([diagnostician.sd_of(one) for one in diagnostician.knocks()], axis=0)
+    sd = np.linalg.norm([diagnostician.sd_of(knock) for knock in diagnostician.knocks()], axis=0)
     rows = np.flatnonzero(sd)
-    exact = replace(diagnosis.prior, orientation=np.zeros_like(calibrated))
-    told = adjustment.told(diagnosis.observed, exact, diagnosis.solution)
+    fixed_prior = replace(diagnosis.prior, orientation=np.zeros_like(calibrated))
+    statistics = adjustment.told(diagnosis.observed, fixed_prior, diagnosis.solution)
     out = calibrated.copy()
-    moments = told.only(rows).with_noise(diagnosis.noise).mean_moments(sd[None, rows])
+    moments = statistics.only(rows).with_noise(diagnosis.noise).mean_moments(sd[None, rows])
     out[np.ix_(rows, rows)] += moments
     return out
 
@@ -139,31 +139,31 @@ def _unseen_drift(
     """
     adjustment = diagnostician.adjustment
     observed = diagnosis.observed
-    own = _coefficients(adjustment, fluoroscope)
+    columns = _coefficients(adjustment, fluoroscope)
     sd = diagnosis.prior.sd.copy()
-    smooth = sd[own]  # due to the error of the correction
+    smooth = sd[columns]  # due to the error of the correction
     sd[adjustment.rig] = 0.0
-    sd[own] = 0.0
-    certain = np.zeros_like(diagnosis.prior.orientation)
+    sd[columns] = 0.0
+    no_covariance = np.zeros_like(diagnosis.prior.orientation)
     known = np.zeros(adjustment.size)
     known[adjustment.rig] = held
-    exact = replace(diagnosis.prior, orientation=certain, sd=sd)
-    told = adjustment.told(observed, exact, diagnosis.solution, known)
-    parts = diagnostician.parts_of(Change(Cause.DISTORTION, fluoroscope))[:, own]
-    moments = told.only(own).with_noise(diagnosis.noise).mean_moments(parts, smooth)
+    fixed_prior = replace(diagnosis.prior, orientation=no_covariance, sd=sd)
+    statistics = adjustment.told(observed, fixed_prior, diagnosis.solution, known)
+    parts = diagnostician.parts_of(Change(Cause.DISTORTION, fluoroscope))[:, columns]
+    moments = statistics.only(columns).with_noise(diagnosis.noise).mean_moments(parts, smooth)
     functions = adjustment.functions[fluoroscope]
     pixel = observed.pixel[..., fluoroscope, :][observed.seen[..., fluoroscope]]
-    of_both = np.kron(np.eye(2), _without_affine(functions, pixel))
-    return np.asarray(of_both @ moments @ of_both.T)
+    projection = np.kron(np.eye(2), _without_affine(functions, pixel))
+    return np.asarray(projection @ moments @ projection.T)
 
 
 def _without_affine(functions: Functions, pixel: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the matrix (n, n) that removes the best affine fit at pixels (m, 2)."""
     values = functions(pixel)
     affine = np.flatnonzero([i + j <= 1 for i, j in functions.powers])
-    rest = np.eye(len(functions))
-    rest[affine] -= np.linalg.lstsq(values[:, affine], values, rcond=None)[0]
-    return rest
+    projection = np.eye(len(functions))
+    projection[affine] -= np.linalg.lstsq(values[:, affine], values, rcond=None)[0]
+    return projection
 
 
 def unseen_distortion(diagnostician: Diagnostician, diagnosis: Diagnosis) -> tuple[float, float]:
@@ -194,5 +194,5 @@ def _weakest(
     if not len(rows):
         return 0.0
     before = adjustment.orientation.covariance + np.diag(sd[adjustment.rig] ** 2)
-    of_rows = np.ix_(rows, rows)
-    return float(np.sqrt(eigh(covariance[of_rows], before[of_rows], eigvals_only=True)[-1]))
+    block = np.ix_(rows, rows)
+    return float(np.sqrt(eigh(covariance[block], before[block], eigvals_only=True)[-1]))

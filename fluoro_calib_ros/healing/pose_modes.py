@@ -41,29 +41,29 @@ def with_best_modes(
     From the pose of the nearest exposure without these, each image point and, for bodies with few,
     each pair of them is excluded once, and the pose with the largest likelihood is taken.
     """
-    lost = observed.seen.sum(axis=(2, 3)) * (1 - found.inliers_of_pose) > 1.5
-    exposures = np.flatnonzero(lost.any(axis=1))
-    if not len(exposures) or lost.mean() > BY_CHANCE:
+    has_false = observed.seen.sum(axis=(2, 3)) * (1 - found.inliers_of_pose) > 1.5
+    exposures = np.flatnonzero(has_false.any(axis=1))
+    if not len(exposures) or has_false.mean() > BY_CHANCE:
         return found
-    without = _choices(observed.seen.shape[2:])
-    rows = np.tile(exposures, len(without))
-    tried = observed.exposures(rows)
-    trusted = tried.seen & np.repeat(~without, len(exposures), axis=0)[:, None]
-    start = _from_neighbours(found.poses, lost).exposures(rows)
-    poses = _posed(adjustment, tried, prior, (found.values, start), trusted)
-    loss = _loss(adjustment, tried, prior, (found.values, poses))
-    best = np.argmin(loss.reshape(len(without), len(exposures), -1), axis=0)
+    excluded = _choices(observed.seen.shape[2:])
+    rows = np.tile(exposures, len(excluded))
+    repeated = observed.exposures(rows)
+    trusted = repeated.seen & np.repeat(~excluded, len(exposures), axis=0)[:, None]
+    start = _from_neighbours(found.poses, has_false).exposures(rows)
+    poses = _posed(adjustment, repeated, prior, (found.values, start), trusted)
+    loss = _loss(adjustment, repeated, prior, (found.values, poses))
+    best = np.argmin(loss.reshape(len(excluded), len(exposures), -1), axis=0)
     best = best * len(exposures) + np.arange(len(exposures))[:, None]
     before = _loss(adjustment, observed, prior, (found.values, found.poses))[exposures]
-    better = lost[exposures] & (np.take_along_axis(loss, best, axis=0) < before)
+    is_better = has_false[exposures] & (np.take_along_axis(loss, best, axis=0) < before)
     rotation, centre = found.poses.rotation.copy(), found.poses.centre_mm.copy()
-    row, body = np.nonzero(better)
-    at = exposures[row], body
-    rotation[at] = poses.rotation[best[row, body], body]
-    centre[at] = poses.centre_mm[best[row, body], body]
-    again = Poses(rotation, centre, found.poses.known)
-    refined = adjustment.refine(observed, prior, (found.values, again))
-    return max(found, refined, key=lambda one: one.evidence)
+    row, body = np.nonzero(is_better)
+    improved = exposures[row], body
+    rotation[improved] = poses.rotation[best[row, body], body]
+    centre[improved] = poses.centre_mm[best[row, body], body]
+    restart = Poses(rotation, centre, found.poses.known)
+    refined = adjustment.refine(observed, prior, (found.values, restart))
+    return max(found, refined, key=lambda solution: solution.evidence)
 
 
 def _choices(shape: tuple[int, ...]) -> NDArray[np.bool_]:
@@ -83,9 +83,9 @@ def _from_neighbours(poses: Poses, lost: NDArray[np.bool_]) -> Poses:
     """Return poses with lost (T, B) ones replaced by those of the nearest exposures not lost."""
     rotation, centre = poses.rotation.copy(), poses.centre_mm.copy()
     for t, b in np.argwhere(lost):
-        good = np.flatnonzero(poses.known[:, b] & ~lost[:, b])
-        if len(good):
-            nearest = good[np.argmin(np.abs(good - t))]
+        usable = np.flatnonzero(poses.known[:, b] & ~lost[:, b])
+        if len(usable):
+            nearest = usable[np.argmin(np.abs(usable - t))]
             rotation[t, b], centre[t, b] = rotation[nearest, b], centre[nearest, b]
     return Poses(rotation, centre, poses.known)
 
@@ -102,14 +102,14 @@ def _posed(
     start: values (K,) of the unknowns, taken as certain, and initial poses.
     """
     values, poses = start
-    certain = np.zeros(adjustment.size, dtype=bool)
+    none_uncertain = np.zeros(adjustment.size, dtype=bool)
     for step in range(2 * STEPS):
         linear = LinearPoints.of(adjustment, observed, values, poses)
         terms = Mixture.of(adjustment, linear, observed, prior)
         weight = terms.weight(1.0)
         if step < STEPS:
             weight = np.where(trusted & linear.good, 1 / terms.variance, 0.0)
-        normal = adjustment.normal_of(linear, weight, certain)
+        normal = adjustment.normal_of(linear, weight, none_uncertain)
         poses = moved_poses(poses, normal, np.zeros(adjustment.size))
     return poses
 

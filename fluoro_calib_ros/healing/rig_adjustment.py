@@ -195,9 +195,9 @@ class RigAdjustment:
         self.target_id = np.full((len(bodies), count), -1)
         self.xyz = np.zeros((len(bodies), count, 3))
         for row, body in enumerate(bodies):
-            own = len(body.target_id)
-            self.target_id[row, :own] = body.target_id
-            self.xyz[row, :own] = body.xyz_mm - body.centre
+            stop = len(body.target_id)
+            self.target_id[row, :stop] = body.target_id
+            self.xyz[row, :stop] = body.xyz_mm - body.centre
         self._of_shapes = [_shape_covariance(body, count) for body in bodies]
         self._views = len(orientation.fluoroscopes)
         sizes = [
@@ -223,13 +223,13 @@ class RigAdjustment:
         sd = np.zeros(self.size)
         sd[self.scale] = shape_scale
         drift = sd[self.drift].reshape(self._views, -1)
-        sides = [max(functions.image_size) for functions in self.functions]
+        longer_sides = [max(functions.image_size) for functions in self.functions]
         pixel = np.where(observed.seen[..., None], observed.pixel, np.nan)
-        pixel = pixel.reshape(len(pixel), -1, *pixel.shape[3:]) / np.array(sides)[:, None]
-        of_markers = np.sqrt(observed.correction).reshape(-1, self._views).T
-        means = covariance_of_means(pixel) * of_markers[:, :, None] * of_markers[:, None]
-        stays = np.diagonal(means, axis1=1, axis2=2).T.reshape(observed.correction.shape)
-        differs = np.broadcast_to(observed.correction - stays, observed.seen.shape)
+        pixel = pixel.reshape(len(pixel), -1, *pixel.shape[3:]) / np.array(longer_sides)[:, None]
+        correction_sd = np.sqrt(observed.correction).reshape(-1, self._views).T
+        means = covariance_of_means(pixel) * correction_sd[:, :, None] * correction_sd[:, None]
+        constant_part = np.diagonal(means, axis1=1, axis2=2).T.reshape(observed.correction.shape)
+        varying_part = np.broadcast_to(observed.correction - constant_part, observed.seen.shape)
         for f in range(self._views):
             seen = observed.seen[..., f]
             one_px = self.sd_of_drift(f)
@@ -237,7 +237,7 @@ class RigAdjustment:
             # A drift of 1 px at the edges does not have a variance of 1 px^2 at the markers.
             variance = np.sum((values * one_px[: values.shape[1]]) ** 2)
             if variance > 0:
-                smooth = max(0.0, differs[..., f][seen].sum())
+                smooth = max(0.0, varying_part[..., f][seen].sum())
                 drift[f] = one_px * np.sqrt(smooth / variance)
         return Prior(self.orientation.covariance, sd, means, np.ones(self.target_id.shape))
 
@@ -253,16 +253,16 @@ class RigAdjustment:
         root[self.rig, self.rig] = replace(
             self.orientation, covariance=covariance
         ).covariance_root()
-        of_shapes = sd[self.shape].reshape(len(self.bodies), -1)
-        for row, (covariance, widened) in enumerate(zip(self._of_shapes, of_shapes)):
+        shape_sds = sd[self.shape].reshape(len(self.bodies), -1)
+        for row, (covariance, widened) in enumerate(zip(self._of_shapes, shape_sds)):
             first = self.shape.start + row * len(widened)
             rows = slice(first, first + len(widened))
             root[rows, rows] = root_of(covariance + np.diag(widened**2))
         number = np.arange(self.size)[self.bias].reshape(-1, self._views, 2)
         for f, covariance in enumerate(prior.correction):
-            own = root_of(covariance)
+            correction_root = root_of(covariance)
             for axis in range(2):
-                root[np.ix_(number[:, f, axis], number[:, f, axis])] = own
+                root[np.ix_(number[:, f, axis], number[:, f, axis])] = correction_root
         return root[:, (root != 0).any(axis=0)]
 
     def rig_at(self, values: NDArray[np.float64]) -> RigOrientation:
@@ -317,11 +317,11 @@ class RigAdjustment:
         The solution may be that of another prior. known (K,): changes that are certain.
         """
         normal, right = self.normal_at(observed, prior, solution)
-        both = np.column_stack([normal, right + normal @ (solution.values - known)])
+        system = np.column_stack([normal, right + normal @ (solution.values - known)])
         root = self.root(prior)
         whitened = np.eye(root.shape[1]) + root.T @ normal @ root
-        both -= normal @ root @ np.linalg.solve(whitened, root.T @ both)
-        return Told((both[:, :-1] + both[:, :-1].T) / 2, both[:, -1])
+        system -= normal @ root @ np.linalg.solve(whitened, root.T @ system)
+        return Told((system[:, :-1] + system[:, :-1].T) / 2, system[:, -1])
 
     def covariance_at(
         self, observed: ObservedBodies, prior: Prior, solution: RigSolution
@@ -354,22 +354,22 @@ class RigAdjustment:
         """
         fixed = np.zeros(self.size, dtype=bool)
         fixed[self.rig] = ~free[self.rig]
-        only = replace(
+        fixed_prior = replace(
             prior,
             orientation=np.where(
                 fixed[self.rig] | fixed[self.rig][:, None], 0.0, prior.orientation
             ),
         )
         values = np.where(fixed, 0.0, solution.values)
-        found = self.refine(observed, only, (values, solution.poses))
-        normal, _ = self.normal_at(observed, only, found)
-        of_fixed = np.zeros((self.size, self.size))
-        of_fixed[self.rig, self.rig] = prior.orientation
-        of_fixed[~fixed] = 0.0
-        of_fixed[:, ~fixed] = 0.0
-        pulled = np.eye(self.size) - found.covariance @ np.where(fixed, normal, 0.0)
-        covariance = found.covariance + pulled @ of_fixed @ pulled.T
-        return replace(found, covariance=covariance)
+        refined = self.refine(observed, fixed_prior, (values, solution.poses))
+        normal, _ = self.normal_at(observed, fixed_prior, refined)
+        fixed_covariance = np.zeros((self.size, self.size))
+        fixed_covariance[self.rig, self.rig] = prior.orientation
+        fixed_covariance[~fixed] = 0.0
+        fixed_covariance[:, ~fixed] = 0.0
+        derivative = np.eye(self.size) - refined.covariance @ np.where(fixed, normal, 0.0)
+        covariance = refined.covariance + derivative @ fixed_covariance @ derivative.T
+        return replace(refined, covariance=covariance)
 
     def solve(
         self, observed: ObservedBodies, prior: Prior, start: tuple[NDArray[np.float64], Poses]
@@ -379,14 +379,14 @@ class RigAdjustment:
         The solution is repeated from its result while this helps: a pose misled by false matches
         recovers once the rig is right.
         """
-        found = self._converge(observed, prior, start, np.inf)
+        solution = self._converge(observed, prior, start, np.inf)
         for _ in range(MAX_REPEATS):
-            again = self._converge(observed, prior, (found.values, found.poses), np.inf)
-            gain = again.evidence - found.evidence
-            found = again if gain > 0 else found
+            repeated = self._converge(observed, prior, (solution.values, solution.poses), np.inf)
+            gain = repeated.evidence - solution.evidence
+            solution = repeated if gain > 0 else solution
             if gain < LAST_GAIN:
                 break
-        return found
+        return solution
 
     def refine(
         self, observed: ObservedBodies, prior: Prior, start: tuple[NDArray[np.float64], Poses]
@@ -403,7 +403,7 @@ class RigAdjustment:
     ) -> RigSolution:
         """Iterate; standard deviations start larger, by up to widest, halved with each step."""
         root = self.root(prior)
-        unsure = (root != 0).any(axis=1)
+        is_uncertain = (root != 0).any(axis=1)
         values, poses = start
         z = np.linalg.lstsq(root, values, rcond=None)[0]
         widening = np.full((1, 1, 1, 1), widest)
@@ -413,7 +413,7 @@ class RigAdjustment:
             terms = Mixture.of(self, linear, observed, prior)
             widening = np.clip(terms.scale, 1.0, np.maximum(widening / 2, 1.0))
             weight = terms.weight(widening)
-            normal = self.normal_of(linear, weight, unsure)
+            normal = self.normal_of(linear, weight, is_uncertain)
             whitened = np.eye(root.shape[1]) + root.T @ normal.matrix @ root
             right = root.T @ normal.right - z
             step = np.linalg.solve(whitened, right)
@@ -447,21 +447,21 @@ class RigAdjustment:
         """
         matrix = np.zeros((self.size, self.size))
         right = np.zeros(self.size)
-        back = []
+        substitutions = []
         unit = np.eye(POSE_SIZE)
         for row in range(len(self.bodies)):
-            columns, told, cross, normal = _summed(self, linear, row, weight[:, row], unsure)
+            columns, system, cross, normal = _summed(self, linear, row, weight[:, row], unsure)
             normal[~linear.poses.known[:, row]] = unit
-            least = LOOSEST + ROUNDING * np.trace(normal, axis1=1, axis2=2)
-            normal += least[:, None, None] * unit
+            damping = LOOSEST + ROUNDING * np.trace(normal, axis1=1, axis2=2)
+            normal += damping[:, None, None] * unit
             inverse = np.linalg.inv(np.linalg.cholesky(normal))
             half = inverse @ cross
             flat = half.reshape(-1, half.shape[2])
-            told -= flat.T @ flat
-            matrix[np.ix_(columns, columns)] += told[:-1, :-1]
-            right[columns] += told[:-1, -1]
-            back.append(_Back(columns, inverse, half))
-        return _Normal(matrix, right, back)
+            system -= flat.T @ flat
+            matrix[np.ix_(columns, columns)] += system[:-1, :-1]
+            right[columns] += system[:-1, -1]
+            substitutions.append(_Back(columns, inverse, half))
+        return _Normal(matrix, right, substitutions)
 
     def of_body(self, row: int) -> _Unknowns:
         """Return the indices of the unknowns on which the points of a body depend."""
@@ -486,8 +486,8 @@ class _Unknowns(NamedTuple):
 
     def of_coordinate(self, view: int, axis: int) -> NDArray[np.int64]:
         """Return the indices for a coordinate of a view, in the order of `_design`."""
-        own = self.rig[view], self.drift[view, axis], self.shape, self.scale
-        return np.concatenate([*own, self.bias[:, view, axis]])
+        unknowns = self.rig[view], self.drift[view, axis], self.shape, self.scale
+        return np.concatenate([*unknowns, self.bias[:, view, axis]])
 
 
 def _summed(
@@ -508,22 +508,22 @@ def _summed(
     columns = columns[unsure[columns]]
     place = np.zeros(adjustment.size, dtype=int)
     place[columns] = np.arange(len(columns))
-    told = np.zeros((len(columns) + 1,) * 2)
+    system = np.zeros((len(columns) + 1,) * 2)
     cross = np.zeros((len(columns) + 1, len(weight), POSE_SIZE))
     normal = np.zeros((len(weight), POSE_SIZE, POSE_SIZE))
-    of_pose = linear.by_pose(row)
+    pose_derivatives = linear.by_pose(row)
     for f, axis in np.ndindex(*unknowns.drift.shape[:2]):
         root = np.sqrt(weight[..., f])[..., None]
         number = unknowns.of_coordinate(f, axis)
-        kept = unsure[number]
-        design = _design(linear, row, f, axis)[..., np.append(kept, True)] * root
-        by_pose = np.swapaxes(of_pose[:, :, f, axis] * root, 1, 2)
-        rows = np.append(place[number[kept]], len(columns))
+        is_uncertain = unsure[number]
+        design = _design(linear, row, f, axis)[..., np.append(is_uncertain, True)] * root
+        by_pose = np.swapaxes(pose_derivatives[:, :, f, axis] * root, 1, 2)
+        rows = np.append(place[number[is_uncertain]], len(columns))
         flat = design.reshape(-1, len(rows))
-        told[np.ix_(rows, rows)] += flat.T @ flat
+        system[np.ix_(rows, rows)] += flat.T @ flat
         cross[rows] += (by_pose @ design).transpose(2, 0, 1)
         normal += by_pose @ np.swapaxes(by_pose, 1, 2)
-    return columns, told, cross.transpose(1, 2, 0), normal
+    return columns, system, cross.transpose(1, 2, 0), normal
 
 
 def _design(linear: LinearPoints, row: int, view: int, axis: int) -> NDArray[np.float64]:
@@ -533,17 +533,17 @@ def _design(linear: LinearPoints, row: int, view: int, axis: int) -> NDArray[np.
     the mean errors of the correction.
     """
     by_place = linear.by_place[:, row, :, view, axis]  # (T, M, 3)
-    turned = by_place @ linear.poses.rotation[:, row]
-    exposures, count, _ = turned.shape
+    by_marker = by_place @ linear.poses.rotation[:, row]
+    exposures, count, _ = by_marker.shape
     marker = np.arange(count)
     by_shape = np.zeros((exposures, count, count, 3))
-    by_shape[:, marker, marker] = turned
+    by_shape[:, marker, marker] = by_marker
     return np.concatenate(
         [
             linear.by_orientation[:, row, :, view, axis],
             linear.functions[:, row, :, view],
             by_shape.reshape(exposures, count, -1),
-            np.sum(turned * linear.shape[row], axis=2, keepdims=True),
+            np.sum(by_marker * linear.shape[row], axis=2, keepdims=True),
             np.broadcast_to(np.eye(count), (exposures, count, count)),
             linear.residual[:, row, :, view, axis, None],
         ],
@@ -576,38 +576,38 @@ class LinearPoints:
         grid = observed.seen.shape  # (T, B, M, F)
         cameras = Cameras(adjustment.rig_at(values), adjustment.target_id)
         shape = adjustment.shapes_at(values)
-        good = observed.seen & poses.known[:, :, None, None]
+        valid = observed.seen & poses.known[:, :, None, None]
         bias = values[adjustment.bias].reshape(*grid[1:], 2)
         points = ImagePoints(
             (observed.uv - bias).reshape(-1, *grid[2:], 2),
             observed.variance.reshape(-1, *grid[2:]),
             np.zeros((1, 1, 1)),
-            good.reshape(-1, *grid[2:]),
+            valid.reshape(-1, *grid[2:]),
         )
         xyz = np.broadcast_to(shape, (grid[0], *shape.shape)).reshape(-1, *shape.shape[1:])
         pose = poses.rotation.reshape(-1, 3, 3), poses.centre_mm.reshape(-1, 3)
         linear = cameras.linear(xyz, pose, points)
         by_orientation = cameras.by_orientation(linear)
-        turned = values[adjustment.rig].reshape(-1, ORIENTATION_SIZE)[:, 3:6]
-        by_orientation[..., 3:6] = by_orientation[..., 3:6] @ _by_vector(turned)
+        rotation_change = values[adjustment.rig].reshape(-1, ORIENTATION_SIZE)[:, 3:6]
+        by_orientation[..., 3:6] = by_orientation[..., 3:6] @ _by_vector(rotation_change)
         predicted = linear.uv.reshape(*grid, 2)
         residual = linear.residual.reshape(*grid, 2)
         coefficients = adjustment.drift_at(values)
         # Evaluate the drift at the image point predicted by the model. At the observed pixel,
         # which has noise, a drift that shrinks the image would also shrink the noise, and be
         # preferred for it.
-        pixel = np.where(good[..., None], observed.pixel, 0.0)
+        pixel = np.where(valid[..., None], observed.pixel, 0.0)
         drift = _drift(adjustment.functions_at(pixel), coefficients)
         noise = np.clip(residual - drift, -MAX_NOISE_PX, MAX_NOISE_PX)
-        functions = adjustment.functions_at(pixel - np.where(good[..., None], noise, 0.0))
-        residual = residual - np.where(good[..., None], _drift(functions, coefficients), 0.0)
+        functions = adjustment.functions_at(pixel - np.where(valid[..., None], noise, 0.0))
+        residual = residual - np.where(valid[..., None], _drift(functions, coefficients), 0.0)
         return cls(
             residual,
             linear.by_place.reshape(*grid, 2, 3),
             by_orientation.reshape(*grid, 2, ORIENTATION_SIZE),
             functions,
             place_by_pose=linear.by_pose.reshape(*grid[:3], 3, POSE_SIZE),
-            good=good & np.isfinite(predicted).all(axis=-1),
+            good=valid & np.isfinite(predicted).all(axis=-1),
             shape=shape,
             poses=poses,
         )
@@ -687,14 +687,14 @@ class Mixture:
         share = np.where(count > 2 * POSE_SIZE, 1 - POSE_SIZE / np.maximum(count, 1), 0.0)
         weighted = inlier * (share > 0)[..., None, None]
         with np.errstate(invalid='ignore', divide='ignore'):
-            of_marker = inlier.sum(axis=(0, 3)) / self.good.sum(axis=(0, 3))
-            of_pose = inlier.sum(axis=(2, 3)) / self.good.sum(axis=(2, 3))
+            marker_share = inlier.sum(axis=(0, 3)) / self.good.sum(axis=(0, 3))
+            pose_share = inlier.sum(axis=(2, 3)) / self.good.sum(axis=(2, 3))
         return {
             'losses': self.losses.sum(axis=(0, 3)),
             'squares': (weighted * self.squares * self.inflation).sum(axis=(0, 3)),
             'freedom': (2 * weighted * share[..., None, None]).sum(axis=(0, 3)),
-            'inliers': of_marker,
-            'inliers_of_pose': of_pose,
+            'inliers': marker_share,
+            'inliers_of_pose': pose_share,
         }
 
 
@@ -705,19 +705,19 @@ def _quantile(values: NDArray[np.float64], share: float) -> NDArray[np.float64]:
     Statistical Packages", 1996, definition 7).
     """
     ordered = np.sort(values, axis=1)  # NaN last
-    at = share * (np.count_nonzero(np.isfinite(ordered), axis=1) - 1)
-    below = np.floor(at).astype(int)
+    position = share * (np.count_nonzero(np.isfinite(ordered), axis=1) - 1)
+    below = np.floor(position).astype(int)
     row = np.arange(len(ordered))
     lower = ordered[row, below]
-    return lower + (at - below) * (ordered[row, np.ceil(at).astype(int)] - lower)
+    return lower + (position - below) * (ordered[row, np.ceil(position).astype(int)] - lower)
 
 
 def _shape_covariance(body: Body, count: int) -> NDArray[np.float64]:
     """Return the covariance (3 count, 3 count) of the shape of a body; 0 for padding."""
     out = np.zeros((3 * count, 3 * count))
-    own = slice(3 * len(body.sd_mm))
+    block = slice(3 * len(body.sd_mm))
     known = body.covariance_mm2
-    out[own, own] = np.diag(np.repeat(body.sd_mm**2, 3)) if known is None else known
+    out[block, block] = np.diag(np.repeat(body.sd_mm**2, 3)) if known is None else known
     return out
 
 
@@ -755,8 +755,8 @@ def moved_poses(poses: Poses, normal: _Normal, step: NDArray[np.float64]) -> Pos
     """Move the poses according to a step (K,) of the other unknowns."""
     rotation = poses.rotation.copy()
     centre = poses.centre_mm.copy()
-    for row, back in enumerate(normal.back):
-        of_pose = np.where(poses.known[:, row, None], back.poses(step), 0.0)
-        centre[:, row] += of_pose[:, :3]
-        rotation[:, row] = matrix_from_vector(of_pose[:, 3:]) @ rotation[:, row]
+    for row, substitution in enumerate(normal.back):
+        pose_step = np.where(poses.known[:, row, None], substitution.poses(step), 0.0)
+        centre[:, row] += pose_step[:, :3]
+        rotation[:, row] = matrix_from_vector(pose_step[:, 3:]) @ rotation[:, row]
     return replace(poses, rotation=rotation, centre_mm=centre)

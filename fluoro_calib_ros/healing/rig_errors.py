@@ -55,8 +55,8 @@ def drift_errors(
     rows = np.r_[adjustment.rig, adjustment.drift]
     root = root_of(covariance[np.ix_(rows, rows)])
     noise = np.sqrt(np.mean(np.sum(image.by_uv**2, axis=(1, 2))))
-    moved = image.moved(np.concatenate(derivatives, axis=-1)) @ root
-    return _errors(points_mm, moved), float(noise)
+    motions = image.moved(np.concatenate(derivatives, axis=-1)) @ root
+    return _errors(points_mm, motions), float(noise)
 
 
 @dataclass(frozen=True)
@@ -97,11 +97,13 @@ class _Intersected:
 
 def _errors(points_mm: NDArray[np.float64], moved: NDArray[np.float64]) -> RigErrors:
     """Return errors of points (n, 3) with motions moved (3n, k) by unknowns of unit variance."""
-    similar = similarity_directions(points_mm, points_mm.mean(axis=0)).reshape(-1, DATUM_DEFECT)
-    rigid = similar[:, :POSE_SIZE].copy()
-    scale = np.linalg.pinv(similar)[-1] @ moved
-    common = rigid @ (np.linalg.pinv(rigid) @ moved)
-    by_coordinate = (np.sqrt(np.mean(np.sum(x**2, axis=1))) for x in (moved - common, common))
+    similarity = similarity_directions(points_mm, points_mm.mean(axis=0)).reshape(-1, DATUM_DEFECT)
+    rigid = similarity[:, :POSE_SIZE].copy()
+    scale = np.linalg.pinv(similarity)[-1] @ moved
+    rigid_part = rigid @ (np.linalg.pinv(rigid) @ moved)
+    by_coordinate = (
+        np.sqrt(np.mean(np.sum(x**2, axis=1))) for x in (moved - rigid_part, rigid_part)
+    )
     place_mm, common_mm = map(float, by_coordinate)
     return RigErrors(
         float(np.sqrt(scale @ scale)), place_mm, common_mm=float(np.sqrt(3)) * common_mm

@@ -87,8 +87,8 @@ class Told:
         parts (p, k): standard deviations of the unknowns for each part of the usual size. least
         (k,): standard deviations without the change.
         """
-        some = SIZES if len(parts) < MANY else SIZES[::2]
-        size = np.array(list(product(some, repeat=len(parts))))
+        step_sizes = SIZES if len(parts) < MANY else SIZES[::2]
+        size = np.array(list(product(step_sizes, repeat=len(parts))))
         prior = np.log(size / (1 + size**2)).sum(axis=1)
         sd = np.sqrt(size**2 @ parts**2 + np.square(least))
         log = self.evidence(sd) + prior

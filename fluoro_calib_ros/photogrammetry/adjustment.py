@@ -121,11 +121,11 @@ def total_cost(
         difference = parameters.interior - network.interior_mean
         square += float(np.sum(network.interior_weight * difference**2))
     if network.exterior is not None:
-        off = network.exterior.discrepancies(parameters.rotation, parameters.position_mm)
-        square += float(np.sum(network.exterior.weights * off**2))
+        discrepancy = network.exterior.discrepancies(parameters.rotation, parameters.position_mm)
+        square += float(np.sum(network.exterior.weights * discrepancy**2))
     for constraint, pose in zip(network.relative, parameters.relative):
-        off = discrepancies(constraint, pose, parameters)
-        square += float(np.sum(off**2 @ constraint.weights))
+        discrepancy = discrepancies(constraint, pose, parameters)
+        square += float(np.sum(discrepancy**2 @ constraint.weights))
     value = noise.cost(q, network.sigma) + square / 2
     return float(value) if np.isfinite(value) else np.inf
 
@@ -181,7 +181,7 @@ class _Problem:
     def is_large(self) -> bool:
         """Whether right sides take a small part of the time of normal equations."""
         network = self.network
-        has_additional = any(one is not None for one in network.additional)
+        has_additional = any(parameters is not None for parameters in network.additional)
         return has_additional or network.n_image_points >= LARGE
 
     def factorize(self, system: BorderedSystem, mu: float) -> _Solver:
@@ -312,10 +312,10 @@ class _LevenbergMarquardt:
         """
         solver = self._problem.at(self.current.parameters, solver)
         step = self._problem.step(solver)
-        slow = min(SLOWER * self._rate, REPEATED_SLOW)
+        slow_rate = min(SLOWER * self._rate, REPEATED_SLOW)
         limit = REPEATED_DECREASE * self._problem.network.n_image_points
         # If an exposure had almost no weight, the step may be of any size, even infinite.
-        if not step.predicted <= min(max(REPEATED, slow) * self._predicted, limit):
+        if not step.predicted <= min(max(REPEATED, slow_rate) * self._predicted, limit):
             return False
         trial = self._problem.after(self.current, step)
         if self._is_worse(trial):
@@ -392,19 +392,19 @@ def adjust_with_matrix(
     iteration = _LevenbergMarquardt(problem, start, options.tolerance)
     while not iteration.finished and iteration.steps < options.max_steps:
         iteration.step()
-    found = iteration.current
+    solution = iteration.current
     adjustment = Adjustment(
-        parameters=transform_to_datum(network, found.parameters),
-        residuals=found.residuals,
-        q=found.q,
+        parameters=transform_to_datum(network, solution.parameters),
+        residuals=solution.residuals,
+        q=solution.q,
         noise=noise,
-        cost=found.cost,
+        cost=solution.cost,
         steps=iteration.steps,
         converged=iteration.converged,
         exposure=network.exposure,
     )
-    used = iteration.used
-    if used is None or used.mu > UNDAMPED or network.datum != 'survey':
+    solver = iteration.used
+    if solver is None or solver.mu > UNDAMPED or network.datum != 'survey':
         return adjustment, None
-    factor = noise.information_factor(found.q)
-    return adjustment, FactorizedNormalMatrix(elimination, used.factor, None, factor)
+    factor = noise.information_factor(solution.q)
+    return adjustment, FactorizedNormalMatrix(elimination, solver.factor, None, factor)

@@ -177,8 +177,8 @@ class AdditionalParameters:
         common = coefficients[: self._common]
         out = np.stack([f @ common[columns] for f, columns in self._by_axis()], axis=1)
         if self.own is not None:
-            of_point = self.own.split(coefficients[self._common :])[self.own.group]
-            out += (self.own.values @ of_point[:, :, None])[:, :, 0]
+            point_coefficients = self.own.split(coefficients[self._common :])[self.own.group]
+            out += (self.own.values @ point_coefficients[:, :, None])[:, :, 0]
         return out
 
     def normal_matrix(self, weight: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -218,22 +218,22 @@ class AdditionalParameters:
         for axis, (f, columns) in enumerate(self._by_axis()):
             out[: self._common][columns] += values[:, axis] @ f
         if self.own is not None:
-            of_point = (values[:, None] @ self.own.values)[:, 0]
-            np.add.at(self.own.split(out[self._common :]), self.own.group, of_point)
+            products = (values[:, None] @ self.own.values)[:, 0]
+            np.add.at(self.own.split(out[self._common :]), self.own.group, products)
         return out
 
     def _ordered(self, index: NDArray[np.int64]) -> _Ordered:
         """Return functions (N, k) ordered by an index (N,); cache the last unordered index."""
-        kept: _Ordered | None = self.__dict__.get('_kept')
-        if kept is not None and np.array_equal(kept.index, index):
-            return kept
+        cached: _Ordered | None = self.__dict__.get('_kept')
+        if cached is not None and np.array_equal(cached.index, index):
+            return cached
         steps = np.diff(index)
         if np.all(steps >= 0):
             return _Ordered(index, ALL, self.functions, _groups(index))
         order = np.argsort(index, kind='stable')
-        made = _Ordered(index, order, self.functions[order], _groups(index[order]))
-        self.__dict__['_kept'] = made
-        return made
+        ordered = _Ordered(index, order, self.functions[order], _groups(index[order]))
+        self.__dict__['_kept'] = ordered
+        return ordered
 
     def grouped_products(
         self, index: NDArray[np.int64], count: int, a: NDArray[np.float64]
@@ -247,28 +247,28 @@ class AdditionalParameters:
         if self.functions.ndim == 2:
             k = self.functions.shape[1]
             ordered = self._ordered(index)
-            both = a.reshape(n, 2 * q)[ordered.order]
+            stacked = a.reshape(n, 2 * q)[ordered.order]
             for start, stop, group in ordered.groups:
-                found = both[start:stop].T @ ordered.functions[start:stop]
-                out[group, :, :k] = found[:q]
-                out[group, :, k : 2 * k] = found[q:]
+                product = stacked[start:stop].T @ ordered.functions[start:stop]
+                out[group, :, :k] = product[:q]
+                out[group, :, k : 2 * k] = product[q:]
         else:
             rows = (index[:, None] * q + np.arange(q)).ravel()
             starts = np.arange(0, n * q + 1, q)
             flat = out.reshape(count * q, -1)
             for axis in (0, 1):
                 shape = (count * q, n)
-                gather = sparse.csc_matrix((a[:, axis].ravel(), rows, starts), shape=shape)
-                flat += gather @ self._contiguous[axis]
+                summation = sparse.csc_matrix((a[:, axis].ravel(), rows, starts), shape=shape)
+                flat += summation @ self._contiguous[axis]
         if self.own is not None:
-            own = self.own
-            groups = int(own.group[-1]) + 1
-            products = (a.transpose(0, 2, 1) @ own.values).reshape(n, -1)
-            pairs = index * groups + own.group
-            gather = sparse.csc_matrix(
+            functions = self.own
+            groups = int(functions.group[-1]) + 1
+            products = (a.transpose(0, 2, 1) @ functions.values).reshape(n, -1)
+            pairs = index * groups + functions.group
+            summation = sparse.csc_matrix(
                 (np.ones(n), pairs, np.arange(n + 1)), shape=(count * groups, n)
             )
-            sums = (gather @ products).reshape(count, groups, q, -1)
+            sums = (summation @ products).reshape(count, groups, q, -1)
             out[:, :, self._common :] = sums.transpose(0, 2, 1, 3).reshape(count, q, -1)
         return out
 
@@ -304,8 +304,8 @@ class AdditionalParameters:
             for f, _ in self._by_axis():
                 out += np.einsum('np,np->n', f[part] @ common, f[part])
         if self.own is not None:
-            own = self._own_covariance(self.own, covariance, part)
-            out += np.trace(own, axis1=1, axis2=2)
+            own_covariance = self._own_covariance(self.own, covariance, part)
+            out += np.trace(own_covariance, axis1=1, axis2=2)
         return out
 
     def _own_covariance(
@@ -336,8 +336,8 @@ class AdditionalParameters:
         out = self._common_cross_covariance(covariance[:, :, : self._common], index, part)
         if self.own is not None:
             by_group = self.own.split(covariance[:, :, self._common :])
-            of_point = by_group[index, :, self.own.group[part]]
-            out += of_point @ self.own.values[part].transpose(0, 2, 1)
+            covariance_of_point = by_group[index, :, self.own.group[part]]
+            out += covariance_of_point @ self.own.values[part].transpose(0, 2, 1)
         return out
 
     def _common_cross_covariance(
@@ -353,18 +353,18 @@ class AdditionalParameters:
             k = self.functions.shape[1]
             f = self.functions[part]
             f = f if np.all(np.diff(order) == 1) else f[order]
-            both = covariance.reshape(sets, 2 * q, k)  # of every unknown, u first
-            found = np.empty((n, 2 * q))
+            flat = covariance.reshape(sets, 2 * q, k)  # of every unknown, u first
+            products = np.empty((n, 2 * q))
             for start, stop, group in groups:
-                np.matmul(f[start:stop], both[group].T, out=found[start:stop])
-            out[order] = found.reshape(n, q, 2)
+                np.matmul(f[start:stop], flat[group].T, out=products[start:stop])
+            out[order] = products.reshape(n, q, 2)
             return out
         for axis in (0, 1):
             ordered = self._contiguous[axis][part][order]
-            of_axis = np.empty((n, q))
+            axis_product = np.empty((n, q))
             for start, stop, group in groups:
-                np.matmul(ordered[start:stop], covariance[group].T, out=of_axis[start:stop])
-            out[order, :, axis] = of_axis
+                np.matmul(ordered[start:stop], covariance[group].T, out=axis_product[start:stop])
+            out[order, :, axis] = axis_product
         return out
 
 

@@ -175,9 +175,9 @@ def _distance_correlations(
     exterior, mixed = _turned_to_sensor(parameters, precision.exterior, precision.exterior_global)
     out = np.ones(network.n_fluoroscopes)
     for f, columns in enumerate(network.layout.interiors):
-        own = network.fluoroscope == f
-        sd = np.sqrt(exterior[own, 2, 2] * precision.interior[f, 2, 2])
-        covariance = mixed[own, 2, columns][:, 2]
+        rows = network.fluoroscope == f
+        sd = np.sqrt(exterior[rows, 2, 2] * precision.interior[f, 2, 2])
+        covariance = mixed[rows, 2, columns][:, 2]
         with np.errstate(divide='ignore', invalid='ignore'):
             out[f] = np.min(np.abs(covariance) / sd)
     return np.nan_to_num(out)
@@ -221,9 +221,9 @@ def undetermined_directions(
     free_names = np.array(global_names(network, fluoroscopes))[network.layout.free]
     names = np.concatenate([exterior_names(network, fluoroscopes, numbers), free_names])
     values, vectors = eigh(matrix / np.outer(scale, scale))
-    skipped = network.layout.datum_defect
+    defect = network.layout.datum_defect
     out = []
-    for value, vector in zip(values[skipped:], vectors.T[skipped:]):
+    for value, vector in zip(values[defect:], vectors.T[defect:]):
         if value > SINGULAR:
             break
         square = vector**2
@@ -239,8 +239,8 @@ def describe_directions(directions: Sequence[Sequence[str]]) -> str:
     for names in directions[:3]:
         exposures = sorted({name.split(':')[0] for name in names if name.startswith('exposure')})
         interior = [name for name in names if name.endswith((': xp', ': yp', ': c'))]
-        others = [n for n in names if n not in interior and not n.startswith('exposure')]
-        named = ', '.join((interior + others)[:4])
+        other_names = [n for n in names if n not in interior and not n.startswith('exposure')]
+        named = ', '.join((interior + other_names)[:4])
         if named and exposures:
             parts.append(
                 f'{named} cannot be separated from the orientation of {first_few(exposures)}'

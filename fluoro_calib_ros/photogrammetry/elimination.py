@@ -293,8 +293,8 @@ class EliminatePoints(Elimination):
         pairs, pg = self._split_border(covariance.border)
 
         def points_between(p: NDArray[np.int64], q: NDArray[np.int64]) -> NDArray[np.float64]:
-            same = (p == q)[:, None, None]
-            fixed = np.where(same, covariance.conditional[p], 0.0)
+            is_same = (p == q)[:, None, None]
+            fixed = np.where(is_same, covariance.conditional[p], 0.0)
             return fixed - covariance.border[p] @ covariance.gain[q].transpose(0, 2, 1)
 
         return CovarianceBlocks(
@@ -320,13 +320,13 @@ class EliminateExposures(Elimination):
     def __init__(self, network: Network) -> None:
         super().__init__(network)
         self.layout = network.layout.without_exposures
-        head = np.arange(network.n_exposures)
+        representative = np.arange(network.n_exposures)
         place = np.zeros(network.n_exposures, dtype=int)
         for number, constraint in enumerate(network.relative):
             a, b = constraint.pairs.T
-            head[b] = a
+            representative[b] = a
             place[b] = number + 1
-        self.cell = np.unique(head, return_inverse=True)[1]
+        self.cell = np.unique(representative, return_inverse=True)[1]
         self.place = place
         self.n_cells = int(self.cell.max()) + 1
         self.n_places = len(network.relative) + 1
@@ -343,11 +343,11 @@ class EliminateExposures(Elimination):
 
     def right_sides(self, right: UnknownVector) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return right sides of cells (k, s), and of points and free globals (q,)."""
-        of_cells = np.zeros((self.n_cells, self.n_places, EXTERIOR_SIZE))
-        of_cells[self.cell, self.place] = right.exteriors
+        cell_right = np.zeros((self.n_cells, self.n_places, EXTERIOR_SIZE))
+        cell_right[self.cell, self.place] = right.exteriors
         free = self.network.layout.free
         rest = np.concatenate([right.points.ravel(), right.globals[free]])
-        return of_cells.reshape(self.n_cells, -1), rest
+        return cell_right.reshape(self.n_cells, -1), rest
 
     def _cell_blocks(self, equations: NormalEquations) -> NDArray[np.float64]:
         """Return blocks (k, s, s) of the cells; an empty place has ones in its diagonal."""
@@ -458,8 +458,8 @@ class FactorizedNormalMatrix:
     def solve(self, right: UnknownVector) -> UnknownVector:
         """Solve the normal equations for a right side; returns (..., 1)."""
         block_right, rest_right = self.elimination.right_sides(right)
-        found = self.factor.solve(block_right[..., None], rest_right[:, None])
-        return self.elimination.to_unknowns(*found)
+        solution = self.factor.solve(block_right[..., None], rest_right[:, None])
+        return self.elimination.to_unknowns(*solution)
 
 
 def factorize(

@@ -170,7 +170,7 @@ class Network:
             pose.updated(step.globals[columns])
             for pose, columns in zip(parameters.relative, layout.relative)
         )
-        moved = Parameters(
+        updated = Parameters(
             parameters.interior + interior_step,
             matrix_from_vector(step.exteriors[:, 3:]) @ parameters.rotation,
             position_mm=parameters.position_mm + step.exteriors[:, :3],
@@ -178,7 +178,7 @@ class Network:
             additional=additional,
             relative=relative,
         )
-        return exposures_after_step(self.relative, layout, parameters, moved, step)
+        return exposures_after_step(self.relative, layout, parameters, updated, step)
 
 
 DATUMS = ('survey', 'inner')
@@ -264,14 +264,14 @@ def transform_to_datum(network: Network, parameters: Parameters) -> Parameters:
     """
     if network.datum == 'survey':
         return parameters
-    used = slice(None) if network.in_datum is None else network.in_datum
-    centre = parameters.points_mm[used].mean(axis=0)
-    survey_centre = network.survey_mm[used].mean(axis=0)
-    found = parameters.points_mm[used] - centre
-    wanted = network.survey_mm[used] - survey_centre
-    u, _, vt = np.linalg.svd(wanted.T @ found)
+    in_datum = slice(None) if network.in_datum is None else network.in_datum
+    centre = parameters.points_mm[in_datum].mean(axis=0)
+    survey_centre = network.survey_mm[in_datum].mean(axis=0)
+    estimated = parameters.points_mm[in_datum] - centre
+    surveyed = network.survey_mm[in_datum] - survey_centre
+    u, _, vt = np.linalg.svd(surveyed.T @ estimated)
     turn = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
-    scale = np.sum(wanted**2) / np.sum(wanted * (found @ turn.T))
+    scale = np.sum(surveyed**2) / np.sum(surveyed * (estimated @ turn.T))
 
     def transform(points: NDArray[np.float64]) -> NDArray[np.float64]:
         return survey_centre + scale * (points - centre) @ turn.T

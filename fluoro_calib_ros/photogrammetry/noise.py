@@ -334,7 +334,7 @@ def _estimate_nu(q: NDArray[np.float64], share: NDArray[np.float64]) -> float:
         nu = np.exp(log_nu)
         return float((nu + 2) / 2 * np.dot(share, np.log1p(q / nu)))
 
-    found = minimize_scalar(
+    optimum = minimize_scalar(
         cost, bounds=np.log(NU_RANGE), method='bounded', options={'xatol': 1e-3}
     )
-    return float(np.exp(found.x))
+    return float(np.exp(optimum.x))

@@ -223,10 +223,10 @@ def _chunks(network: Network) -> Iterator[tuple[int, int, NDArray[np.int64]]]:
     starts = np.searchsorted(network.exposure, np.arange(m + 1))
     first = 0
     while first < m:
-        others = np.flatnonzero(network.fluoroscope[first:] != network.fluoroscope[first])
-        end = first + (others[0] if len(others) else m - first)
-        full = int(np.searchsorted(starts, starts[first] + CHUNK, side='right')) - 1
-        stop = max(first + 1, min(end, full))
+        boundaries = np.flatnonzero(network.fluoroscope[first:] != network.fluoroscope[first])
+        end = first + (boundaries[0] if len(boundaries) else m - first)
+        chunk_end = int(np.searchsorted(starts, starts[first] + CHUNK, side='right')) - 1
+        stop = max(first + 1, min(end, chunk_end))
         yield first, stop, starts[first : stop + 1]
         first = stop
 
@@ -351,16 +351,16 @@ def right_sides(
     if network.exterior is not None:
         exteriors += _exterior_pull(network, parameters)
     layout = network.layout
-    of_globals = np.zeros(layout.n_globals)
+    global_right = np.zeros(layout.n_globals)
     for f, columns in enumerate(layout.interiors):
-        of_globals[columns] = by_exposure[network.fluoroscope == f, 6:].sum(axis=0)
+        global_right[columns] = by_exposure[network.fluoroscope == f, 6:].sum(axis=0)
     if network.interior_sd is not None:
-        of_globals[layout.all_interiors] += _interior_pull(network, parameters)
+        global_right[layout.all_interiors] += _interior_pull(network, parameters)
     for f, (additional, columns) in enumerate(zip(network.additional, layout.additional)):
         if additional is not None:
             pull = additional.prior @ parameters.additional_of(f)
-            of_globals[columns] = additional.right_side(weighted[network.rows(f)]) - pull
-    return UnknownVector(exteriors, points.T + _survey_pull(network, parameters), of_globals)
+            global_right[columns] = additional.right_side(weighted[network.rows(f)]) - pull
+    return UnknownVector(exteriors, points.T + _survey_pull(network, parameters), global_right)
 
 
 def _survey_weight(network: Network) -> NDArray[np.float64]:
@@ -378,8 +378,8 @@ def _survey_pull(network: Network, parameters: Parameters) -> NDArray[np.float64
 def _exterior_pull(network: Network, parameters: Parameters) -> NDArray[np.float64]:
     """Return the contribution (m, 6) of known exterior orientations to the right side."""
     assert network.exterior is not None
-    off = network.exterior.discrepancies(parameters.rotation, parameters.position_mm)
-    return -network.exterior.weights * off
+    discrepancies = network.exterior.discrepancies(parameters.rotation, parameters.position_mm)
+    return -network.exterior.weights * discrepancies
 
 
 def _interior_pull(network: Network, parameters: Parameters) -> NDArray[np.float64]:
@@ -424,10 +424,10 @@ class _GlobalBlocks:
         """Fill in the interior orientations and their prior."""
         network = self.network
         for f, columns in enumerate(network.layout.interiors):
-            own = network.fluoroscope == f
-            self.gg[columns, columns] = sums.by_exposure[own, 6:9, 6:9].sum(axis=0)
-            self.g[columns] = sums.by_exposure[own, 6:9, 9].sum(axis=0)
-            self.eg[own, :, columns] = sums.by_exposure[own, :6, 6:9]
+            rows = network.fluoroscope == f
+            self.gg[columns, columns] = sums.by_exposure[rows, 6:9, 6:9].sum(axis=0)
+            self.g[columns] = sums.by_exposure[rows, 6:9, 9].sum(axis=0)
+            self.eg[rows, :, columns] = sums.by_exposure[rows, :6, 6:9]
             by_point = sums.by_point[f, 9:]
             self.pg[:, :, columns] = by_point.T.reshape(network.n_points, 3, 3)
         if network.interior_sd is not None:

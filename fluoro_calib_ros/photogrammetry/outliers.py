@@ -71,19 +71,19 @@ class TargetTest:
 def find_outliers(network: Network, adjustment: Adjustment, precision: Precision) -> Outliers:
     """Find image points and targets that fail the test."""
     targets = target_statistics(network, adjustment, precision)
-    wrong = np.flatnonzero(targets.value > targets.critical)
+    wrong_targets = np.flatnonzero(targets.value > targets.critical)
     image, critical_image = image_statistics(network, adjustment, precision)
     # An image point that fits its target at the position by the images is not at fault.
-    explained = np.isin(network.point, wrong) & (targets.ray_square <= critical_image)
-    found = np.flatnonzero((image > critical_image) & ~explained)
+    explained = np.isin(network.point, wrong_targets) & (targets.ray_square <= critical_image)
+    wrong_points = np.flatnonzero((image > critical_image) & ~explained)
     return Outliers(
-        image_point=found,
-        value=image[found],
+        image_point=wrong_points,
+        value=image[wrong_points],
         critical_image=critical_image,
-        target=wrong,
-        target_value=targets.value[wrong],
+        target=wrong_targets,
+        target_value=targets.value[wrong_targets],
         critical_target=targets.critical,
-        offset_mm=targets.offset_mm[wrong],
+        offset_mm=targets.offset_mm[wrong_targets],
         tested=(int(np.isfinite(image).sum()), int(np.isfinite(targets.value).sum())),
     )
 
@@ -104,21 +104,21 @@ def image_statistics(
     unit = np.eye(2)
     # C_r = s^2 / w - P, so this is 1 - w P / s^2.
     part = precision.residual * (weight / variance)[:, None, None]
-    tested = np.linalg.eigvalsh(part)[:, 0] > MIN_REDUNDANCY
-    inverse = np.linalg.inv(np.where(tested[:, None, None], part, unit))
+    testable = np.linalg.eigvalsh(part)[:, 0] > MIN_REDUNDANCY
+    inverse = np.linalg.inv(np.where(testable[:, None, None], part, unit))
     fitted = (unit - part) * (variance / weight)[:, None, None]
     factor = noise.information_factor(adjustment.q)
     covariance = variance[:, None, None] * unit + fitted @ inverse / factor
-    without = (inverse @ adjustment.residuals[..., None])[..., 0]
-    standardised = np.linalg.solve(covariance, without[..., None])[..., 0]
-    value = np.einsum('ni,ni->n', without, standardised)
-    count = max(int(tested.sum()), 1)
+    left_out_residuals = (inverse @ adjustment.residuals[..., None])[..., 0]
+    standardised = np.linalg.solve(covariance, left_out_residuals[..., None])[..., 0]
+    value = np.einsum('ni,ni->n', left_out_residuals, standardised)
+    count = max(int(testable.sum()), 1)
     redundancy = float(precision.redundancy.sum())
     if noise.loss == 'gaussian':
         # Use the variance without the contribution of the image point itself.
         value = value * (redundancy - 2) / np.maximum(redundancy - value, 1e-3 * redundancy)
     critical = 2 * _f_limit(significance / count, min(noise.nu, redundancy - 2))
-    return np.where(tested, value, np.nan), float(critical)
+    return np.where(testable, value, np.nan), float(critical)
 
 
 def _f_limit(probability: float, freedom: float) -> float:
@@ -144,18 +144,18 @@ def target_statistics(
     """
     n = network.n_points
     if network.datum != 'survey':
-        untested = np.full(n, np.nan)
+        no_values = np.full(n, np.nan)
         return TargetTest(
-            untested, np.inf, np.zeros((n, 3)), np.full(network.n_image_points, np.inf)
+            no_values, np.inf, np.zeros((n, 3)), np.full(network.n_image_points, np.inf)
         )
     rays = _rays_of(network, adjustment, precision)
     offset, covariance, square = _intersect(network, rays, adjustment.noise)
     covariance = covariance + (network.survey_sd_mm**2)[:, None, None] * np.eye(3)
     testable = np.isfinite(offset).all(axis=1)
-    tested = offset[testable]
-    standardised = np.linalg.solve(covariance[testable], tested[..., None])[..., 0]
+    tested_offset = offset[testable]
+    standardised = np.linalg.solve(covariance[testable], tested_offset[..., None])[..., 0]
     value = np.full(n, np.nan)
-    value[testable] = np.einsum('ni,ni->n', tested, standardised)
+    value[testable] = np.einsum('ni,ni->n', tested_offset, standardised)
     critical = special.chdtri(3, significance / max(int(testable.sum()), 1))
     return TargetTest(value, float(critical), np.where(testable[:, None], offset, 0.0), square)
 
@@ -184,11 +184,11 @@ def _rays_of(network: Network, adjustment: Adjustment, precision: Precision) -> 
     by_interior = np.stack(
         [precision.exterior_global[:, :, columns] for columns in network.layout.interiors]
     )
-    across = d_e @ by_interior[f, e] @ d_i.transpose(0, 2, 1)
+    mixed = d_e @ by_interior[f, e] @ d_i.transpose(0, 2, 1)
     covariance = (
         d_e @ precision.exterior[e] @ d_e.transpose(0, 2, 1)
-        + across
-        + across.transpose(0, 2, 1)
+        + mixed
+        + mixed.transpose(0, 2, 1)
         + d_i @ precision.interior[f] @ d_i.transpose(0, 2, 1)
     )
     variance = (adjustment.noise.scale * network.sigma) ** 2
@@ -221,15 +221,15 @@ def _intersect(
         scale = np.sqrt(np.maximum(np.diagonal(normal, axis1=1, axis2=2), 1e-300))
         smallest = np.linalg.eigvalsh(normal / scale[:, :, None] / scale[:, None, :])[:, 0]
         # two rays, or nearly so by their weights
-        good = (count > 1.5) & (smallest > MIN_INTERSECTION_EIGENVALUE)
-        covariance[good] = np.linalg.inv(normal[good])
-        offset[good] = (covariance[good] @ right[good][..., None])[..., 0]
+        determined = (count > 1.5) & (smallest > MIN_INTERSECTION_EIGENVALUE)
+        covariance[determined] = np.linalg.inv(normal[determined])
+        offset[determined] = (covariance[determined] @ right[determined][..., None])[..., 0]
         residual = rays.residual - (a @ offset[p][..., None])[..., 0]
         square = np.einsum('ni,nij,nj->n', residual, rays.information, residual)
         weight = noise.weight(square) if noise.loss != 'gaussian' else weight
     limit = special.chdtri(np.maximum(2 * count, 1), CONTRADICTION)
     contradicting = np.bincount(p, square * weight, n) > limit
-    offset[~good | contradicting] = np.nan
+    offset[~determined | contradicting] = np.nan
     return offset, covariance, square
 
 
@@ -272,7 +272,7 @@ def adjust_and_estimate_noise(
     _, q = residuals_and_q(network, start, correction, noise)
     if np.isfinite(q).all():
         noise = _first_noise(network, q * noise.scale**2, noise)
-    loose = replace(options, tolerance=LOOSE)
+    loose_options = replace(options, tolerance=LOOSE)
     parameters = start
     settled = False
     for _ in range(40):  # a few are enough
@@ -281,7 +281,7 @@ def adjust_and_estimate_noise(
             parameters,
             correction=correction,
             noise=noise,
-            options=loose,
+            options=loose_options,
         )
         parameters = result.parameters
         equations = normal_equations(network, parameters, correction, noise)
@@ -314,8 +314,8 @@ def _first_noise(network: Network, squared: NDArray[np.float64], noise: Noise) -
     share = np.bincount(network.exposure, core) / np.bincount(network.exposure)
     if np.min(share) > MIN_CORE:
         return mixed
-    plain = replace(noise, gross=0.0).estimate_from(squared)
-    return replace(plain, gross=noise.gross)
+    estimated = replace(noise, gross=0.0).estimate_from(squared)
+    return replace(estimated, gross=noise.gross)
 
 
 def estimate_noise(

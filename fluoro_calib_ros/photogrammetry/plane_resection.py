@@ -90,11 +90,11 @@ def _normalised(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArr
     mean = points.mean(axis=-2, keepdims=True)
     square = np.mean(np.sum((points - mean) ** 2, axis=-1), axis=-1)[..., None, None]
     size = np.sqrt(np.maximum(square, 1e-300) / 2)
-    back = np.zeros(points.shape[:-2] + (3, 3))
-    back[..., [0, 1], [0, 1]] = size[..., 0]
-    back[..., :2, 2] = mean[..., 0, :]
-    back[..., 2, 2] = 1
-    return (points - mean) / size, back
+    denormalisation = np.zeros(points.shape[:-2] + (3, 3))
+    denormalisation[..., [0, 1], [0, 1]] = size[..., 0]
+    denormalisation[..., :2, 2] = mean[..., 0, :]
+    denormalisation[..., 2, 2] = 1
+    return (points - mean) / size, denormalisation
 
 
 def robust_homography(xy: NDArray[np.float64], uv: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -116,9 +116,9 @@ def robust_homography(xy: NDArray[np.float64], uv: NDArray[np.float64]) -> NDArr
     best = squared[np.argmin(np.median(squared, axis=1))]
     for _ in range(DLT_ITERATIONS):
         weights = Noise(nu=NU).weight(best / robust_variance(best))
-        found = homography(xy, uv, weights)
-        best = squared_residuals(found, xy, uv)
-    return found
+        h = homography(xy, uv, weights)
+        best = squared_residuals(h, xy, uv)
+    return h
 
 
 def principal_distance_of_planes(
@@ -133,10 +133,10 @@ def principal_distance_of_planes(
     product = 0.0
     size = 0.0
     for h in homographies:
-        shifted = h.copy()
-        shifted[:2] -= np.outer(principal_point, h[2])
-        a, b = shifted[:2, :2].T
-        l_a, l_b = shifted[2, :2]
+        centred = h.copy()
+        centred[:2] -= np.outer(principal_point, h[2])
+        a, b = centred[:2, :2].T
+        l_a, l_b = centred[2, :2]
         # With x = 1/c^2: x a'b + l_a l_b = 0 and x (a'a - b'b) + l_a^2 - l_b^2 = 0.
         factors = np.array([a @ b, (a @ a - b @ b) / 2])
         constants = np.array([l_a * l_b, (l_a**2 - l_b**2) / 2])
@@ -185,8 +185,8 @@ def _pose(
     axes: NDArray[np.float64], middle: NDArray[np.float64], plane: Plane
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the pose with these axes (3, 2) and centre (3,) of the plane in the sensor frame."""
-    turned = np.column_stack([axes, np.cross(axes[:, 0], axes[:, 1])])
-    rotation = turned @ plane.axes
+    plane_axes = np.column_stack([axes, np.cross(axes[:, 0], axes[:, 1])])
+    rotation = plane_axes @ plane.axes
     return rotation, plane.centre_mm - rotation.T @ middle
 
 

@@ -110,14 +110,14 @@ def information_of_additional(matrix: FactorizedNormalMatrix, f: int) -> NDArray
     additional = layout.all_additional
     size = additional.stop - additional.start  # all of them are free
     last = slice(len(matrix.factor.schur) - size, None)
-    everything = square_of_lower(matrix.factor.schur[last, last])
+    information = square_of_lower(matrix.factor.schur[last, last])
     columns = layout.additional[f]
-    own = np.arange(columns.start, columns.stop) - additional.start
-    others = np.setdiff1d(np.arange(size), own)
-    out = everything[np.ix_(own, own)]
-    if len(others):
-        mixed = everything[np.ix_(others, own)]
-        out = out - mixed.T @ np.linalg.solve(everything[np.ix_(others, others)], mixed)
+    selected = np.arange(columns.start, columns.stop) - additional.start
+    eliminated = np.setdiff1d(np.arange(size), selected)
+    out = information[np.ix_(selected, selected)]
+    if len(eliminated):
+        mixed = information[np.ix_(eliminated, selected)]
+        out = out - mixed.T @ np.linalg.solve(information[np.ix_(eliminated, eliminated)], mixed)
     return out
 
 
@@ -237,12 +237,12 @@ def _mixed_covariance(
     e = network.exposure[part]
     p = network.point[part]
     columns = network.layout.additional[f]
-    own = blocks.gg[None, network.layout.interiors[f], columns]
+    interior_covariance = blocks.gg[None, network.layout.interiors[f], columns]
     return np.concatenate(
         [
             additional.cross_covariance(blocks.eg[:, :, columns], e, local),
             additional.cross_covariance(blocks.pg[:, :, columns], p, local),
-            additional.cross_covariance(own, np.zeros_like(e), local),
+            additional.cross_covariance(interior_covariance, np.zeros_like(e), local),
         ],
         axis=1,
     )
@@ -339,10 +339,10 @@ def joint_covariance(blocks: CovarianceBlocks) -> JointCovariance:
         columns: int,
     ) -> NDArray[np.float64]:
         i, j = (a.ravel() for a in np.indices((rows, columns)))
-        found = of_pairs(i, j)
-        height, width = found.shape[1:]
-        found = found.reshape(rows, columns, height, width).transpose(0, 2, 1, 3)
-        return found.reshape(rows * height, columns * width)
+        pair_blocks = of_pairs(i, j)
+        height, width = pair_blocks.shape[1:]
+        pair_blocks = pair_blocks.reshape(rows, columns, height, width).transpose(0, 2, 1, 3)
+        return pair_blocks.reshape(rows * height, columns * width)
 
     size = len(blocks.gg)
     return JointCovariance(
@@ -409,8 +409,8 @@ def geometric_redundancy(
     cannot be used to estimate the noise from the residuals. Raises numpy.linalg.LinAlgError if the
     network does not determine the unknowns.
     """
-    plain = Noise('gaussian', noise.scale)
-    equations = normal_equations(network, parameters, 0.0, plain)
+    gaussian = Noise('gaussian', noise.scale)
+    equations = normal_equations(network, parameters, 0.0, gaussian)
     blocks = covariance_blocks(factorize(network, equations))
     variance = (noise.scale * network.sigma) ** 2
     return 1 - variance_of_projection(network, parameters, blocks) / (2 * variance)
@@ -462,7 +462,7 @@ def precision_with_fixed_interiors(
     blocks = covariance_blocks(factorize(free, equations))
     return replace(
         precise,
-        interior=np.stack([blocks.gg[own, own] for own in free.layout.interiors]),
+        interior=np.stack([blocks.gg[columns, columns] for columns in free.layout.interiors]),
         exterior=blocks.ee,
         points=blocks.pp,
         all_global=blocks.gg,
@@ -487,8 +487,8 @@ def equations_with_fixed_interiors(
     factor = adjustment.noise.information_factor(adjustment.q)
     equations = normal_equations(free, adjustment.parameters, correction, adjustment.noise, factor)
     prior = np.zeros_like(equations.gg)
-    for own, covariance in zip(free.layout.interiors, covariances):
-        prior[own, own] = np.linalg.inv(covariance + MIN_SD_PX**2 * np.eye(3))
+    for columns, covariance in zip(free.layout.interiors, covariances):
+        prior[columns, columns] = np.linalg.inv(covariance + MIN_SD_PX**2 * np.eye(3))
     with_prior = replace(equations, gg=equations.gg + prior)
     schur = np.tril(factorize(free, with_prior).factor.schur)
     # The last rows of a Cholesky factor are the factor of their Schur complement.

@@ -68,8 +68,8 @@ def least_vectors_with_last_one(forms: NDArray[np.float64]) -> NDArray[np.float6
     k = forms.shape[-1] - 1
     # This small addition to the diagonal also solves singular equations.
     ridge = 1e-14 * np.trace(forms, axis1=-2, axis2=-1)[..., None, None] * np.eye(k)
-    found = np.linalg.solve(forms[..., :k, :k] + ridge, -forms[..., :k, k:])
-    return np.concatenate([found[..., 0], np.ones_like(found[..., :1, 0])], axis=-1)
+    components = np.linalg.solve(forms[..., :k, :k] + ridge, -forms[..., :k, k:])
+    return np.concatenate([components[..., 0], np.ones_like(components[..., :1, 0])], axis=-1)
 
 
 def dlt_rows(
@@ -245,9 +245,9 @@ def robust_p3p(
                 best = (median, rotation, np.ravel(shift))
 
     for _ in range(SAMPLES):
-        three = rng.permutation(len(xyz))[:3]
+        sample = rng.permutation(len(xyz))[:3]
         _, turns, shifts = cv2.solveP3P(
-            xyz[three, None], rays[three, None], np.eye(3), None, cv2.SOLVEPNP_AP3P
+            xyz[sample, None], rays[sample, None], np.eye(3), None, cv2.SOLVEPNP_AP3P
         )
         keep_better(turns, shifts)
     if best is None:
@@ -255,10 +255,12 @@ def robust_p3p(
             'the image points do not fit the phantom: targets would lie behind the source'
         )
     x = xyz @ best[1].T + best[2]
-    near = np.argsort(np.sum((x[:, :2] / x[:, 2:] - rays) ** 2, axis=1))[: (len(xyz) + 1) // 2 + 1]
-    if len(near) >= 3:
+    nearest = np.argsort(np.sum((x[:, :2] / x[:, 2:] - rays) ** 2, axis=1))[
+        : (len(xyz) + 1) // 2 + 1
+    ]
+    if len(nearest) >= 3:
         _, turns, shifts, _ = cv2.solvePnPGeneric(
-            xyz[near, None], rays[near, None], np.eye(3), None, flags=cv2.SOLVEPNP_SQPNP
+            xyz[nearest, None], rays[nearest, None], np.eye(3), None, flags=cv2.SOLVEPNP_SQPNP
         )
         keep_better(turns, shifts)
     _, rotation, shift = best
@@ -440,13 +442,13 @@ def _start_orientation(
     centre = problem.xyz.mean(axis=0)
     position = centre + (position - centre) * c / np.sqrt(k[0, 0] * k[1, 1])
     pixel = np.median(problem.uv, axis=0)
-    present = rotation @ (centre - position)
-    wanted = np.array([(pixel[0] - xp) / c, (pixel[1] - yp) / c, 1.0])
-    present = present / np.linalg.norm(present)
-    wanted = wanted / np.linalg.norm(wanted)
-    axis = np.cross(present, wanted)
+    current = rotation @ (centre - position)
+    target = np.array([(pixel[0] - xp) / c, (pixel[1] - yp) / c, 1.0])
+    current = current / np.linalg.norm(current)
+    target = target / np.linalg.norm(target)
+    axis = np.cross(current, target)
     sine = np.linalg.norm(axis)
     if sine < 1e-12:
         return rotation, position
-    angle = np.arctan2(sine, present @ wanted)
+    angle = np.arctan2(sine, current @ target)
     return matrix_from_vector(axis / sine * angle) @ rotation, position

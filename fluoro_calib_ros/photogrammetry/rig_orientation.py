@@ -128,9 +128,11 @@ class RigOrientation:
                 f'rig orientation: the fluoroscopes are {", ".join(names) or "none"}, '
                 'but each must have a name of its own'
             )
-        for what, given in (('calibrations', ids), ('optical frames', frames)):
-            if len(given) != count:
-                raise DataError(f'rig orientation: {count} fluoroscopes, but {len(given)} {what}')
+        for label, values in (('calibrations', ids), ('optical frames', frames)):
+            if len(values) != count:
+                raise DataError(
+                    f'rig orientation: {count} fluoroscopes, but {len(values)} {label}'
+                )
         if self.source not in SOURCES:
             raise DataError(
                 f'rig orientation: its source is one of {", ".join(SOURCES)}, not {self.source!r}'
@@ -304,8 +306,8 @@ def _check_orientation(
     names: Sequence[str], interior: NDArray[np.float64], rotation: np.ndarray
 ) -> None:
     """Raise DataError for a negative principal distance or an invalid rotation matrix."""
-    large = (np.abs(rotation) > 1 + ROUNDING).any(axis=(1, 2))
-    rotation = np.where(large[:, None, None], 0.0, rotation)  # avoid overflow; refused below
+    is_invalid = (np.abs(rotation) > 1 + ROUNDING).any(axis=(1, 2))
+    rotation = np.where(is_invalid[:, None, None], 0.0, rotation)  # avoid overflow; refused below
     product = rotation @ rotation.transpose(0, 2, 1)
     errors = np.max(np.abs(product - np.eye(3)), axis=(1, 2))
     signs = np.linalg.det(rotation)
@@ -338,11 +340,11 @@ def _rounded_rotation(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     """
     q = quaternion_from_matrix(rotation)
     rows = np.arange(len(q))
-    large = np.argmax(np.abs(q) > 0.43, axis=1)  # at least one component is 0.5 or more
-    q = np.where(q[rows, large] < 0, -1.0, 1.0)[:, None] * q
+    largest = np.argmax(np.abs(q) > 0.43, axis=1)  # at least one component is 0.5 or more
+    q = np.where(q[rows, largest] < 0, -1.0, 1.0)[:, None] * q
     q = _to_steps(q, QUATERNION_STEP)
-    q[rows, large] = 0.0
-    q[rows, large] = np.sqrt(1.0 - (q[:, 0] ** 2 + q[:, 1] ** 2 + q[:, 2] ** 2 + q[:, 3] ** 2))
+    q[rows, largest] = 0.0
+    q[rows, largest] = np.sqrt(1.0 - (q[:, 0] ** 2 + q[:, 1] ** 2 + q[:, 2] ** 2 + q[:, 3] ** 2))
     return matrix_from_quaternion(q)
 
 
@@ -389,8 +391,10 @@ class ExteriorPrior:
         For a rotation R they are log(R R0^T), whose derivative by a rotation from the left is the
         unit matrix to first order (Barfoot, "State Estimation for Robotics", 2017, 7.1).
         """
-        turned = rotation @ self.rotation.transpose(0, 2, 1)
-        return np.concatenate([position_mm - self.position_mm, vector_from_matrix(turned)], axis=1)
+        relative = rotation @ self.rotation.transpose(0, 2, 1)
+        return np.concatenate(
+            [position_mm - self.position_mm, vector_from_matrix(relative)], axis=1
+        )
 
 
 MAX_SKEW = 0.05  # of a calibration matrix, and of its ratio of scales; the correction absorbs them

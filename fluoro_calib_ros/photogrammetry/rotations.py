@@ -165,13 +165,13 @@ def left_jacobian(w: ArrayLike) -> NDArray[np.float64]:
     square = (w * w).sum(axis=-1)[..., None, None]
     k = cross_matrix(w)
     # Use series where the quotients (1 - cos a) / a^2 and (a - sin a) / a^3 would lose digits.
-    small = square < 0.05**2
+    is_small = square < 0.05**2
     first = (1 - square / 12 * (1 - square / 30)) / 2
     second = (1 - square / 20 * (1 - square / 42)) / 6
-    if not small.all():
-        a = np.sqrt(np.where(small, 1.0, square))
-        first = np.where(small, first, (1 - np.cos(a)) / a**2)
-        second = np.where(small, second, (a - np.sin(a)) / a**3)
+    if not is_small.all():
+        a = np.sqrt(np.where(is_small, 1.0, square))
+        first = np.where(is_small, first, (1 - np.cos(a)) / a**2)
+        second = np.where(is_small, second, (a - np.sin(a)) / a**3)
     out = first * k + second * (k @ k)
     out[..., (0, 1, 2), (0, 1, 2)] += 1.0
     return out

@@ -253,9 +253,9 @@ def inverse_left_jacobian(w: NDArray[np.float64]) -> NDArray[np.float64]:
     half = np.linalg.norm(w, axis=-1)[..., None, None] / 2
     k = cross_matrix(w)
     # (1 - h cot h) / (4 h^2) is 0/0 at zero, where its limit is 1/12.
-    small = half < 1e-3
-    safe = np.where(small, 1.0, half)
-    factor = np.where(small, 1 / 12 + half**2 / 180, (1 - safe / np.tan(safe)) / (4 * safe**2))
+    is_small = half < 1e-3
+    safe = np.where(is_small, 1.0, half)
+    factor = np.where(is_small, 1 / 12 + half**2 / 180, (1 - safe / np.tan(safe)) / (4 * safe**2))
     return np.eye(3) - k / 2 + factor * (k @ k)
 
 
@@ -306,15 +306,15 @@ def discrepancies_with_jacobian(
     turn, shift = relative_poses(parameters, constraint.pairs)
     scale, d_scale = _translation_scale(constraint, pose)
     w = vector_from_matrix(turn @ pose.rotation.T)
-    back = inverse_left_jacobian(w)
+    inverse_jacobian = inverse_left_jacobian(w)
     d_a = np.zeros((len(a), POSE_SIZE, POSE_SIZE))
     d_b = np.zeros_like(d_a)
     d_pose = np.zeros_like(d_a)
     d_a[:, :3, :3] = -scale * parameters.rotation[a]
     d_b[:, :3, :3] = scale * parameters.rotation[a]
     d_a[:, :3, 3:] = -scale * cross_matrix(shift)
-    d_a[:, 3:, 3:] = -back @ turn
-    d_b[:, 3:, 3:] = back
+    d_a[:, 3:, 3:] = -inverse_jacobian @ turn
+    d_b[:, 3:, 3:] = inverse_jacobian
     d_pose[:, :3, :3] = -scale * np.eye(3) + (shift - pose.translation_mm)[:, :, None] * d_scale
     d_pose[:, 3:, 3:] = -inverse_left_jacobian(-w)
     return np.concatenate([scale * (shift - pose.translation_mm), w], axis=1), d_a, d_b, d_pose

@@ -219,12 +219,14 @@ class RecentMisses:
 
     def finding(self) -> Finding | None:
         """Return what is wrong if the points of the recent exposures are implausible, or None."""
-        bad, total, single = (sum(column) for column in zip(*list(self._recent) or [(0, 0, 0)]))
+        rejected, total, single = (
+            sum(column) for column in zip(*list(self._recent) or [(0, 0, 0)])
+        )
         if not total and single >= MIN_POINTS:
             return UNMATCHED
-        if total < MIN_POINTS or bad <= MAX_REJECTED * total:
+        if total < MIN_POINTS or rejected <= MAX_REJECTED * total:
             return None
-        return missing_rays(bad / total, UNKNOWN)
+        return missing_rays(rejected / total, UNKNOWN)
 
 
 def missing_rays(share: float, why: Finding) -> Finding:
@@ -236,15 +238,15 @@ def missing_rays(share: float, why: Finding) -> Finding:
 def share_rejected(found: Sequence[ReconstructedFrame]) -> tuple[float, int]:
     """Return the share of rejected points, and the number of points in two views."""
     status = np.concatenate([frame.points.status for frame in found] or [np.empty(0, int)])
-    bad, total, _ = _counts(status)
-    return bad / max(total, 1), total
+    rejected, total, _ = _counts(status)
+    return rejected / max(total, 1), total
 
 
 def _counts(status: NDArray[np.integer]) -> tuple[int, int, int]:
     """Return the numbers of rejected points, of points in two views, and in a single one."""
     counts = np.bincount(status, minlength=len(STATUS_NAMES))
-    bad = int(counts[REJECTED] + counts[FAILED])
-    return bad, bad + int(counts[OK] + counts[OUTSIDE]), int(counts[SINGLE_VIEW])
+    rejected = int(counts[REJECTED] + counts[FAILED])
+    return rejected, rejected + int(counts[OK] + counts[OUTSIDE]), int(counts[SINGLE_VIEW])
 
 
 def mismatch(
@@ -262,11 +264,11 @@ def mismatch(
     if total < MIN_POINTS or share <= MAX_REJECTED:
         return None
     names = intersector.orientation.fluoroscopes
-    for why, changed in _trials(frames, names, _largest(found)):
-        tried, _ = reconstruct_recording(changed, calibrations, intersector, pairing)
-        rejected, count = share_rejected(tried)
+    for cause, changed in _trials(frames, names, _largest(found)):
+        reconstructed, _ = reconstruct_recording(changed, calibrations, intersector, pairing)
+        rejected, count = share_rejected(reconstructed)
         if count >= MIN_POINTS and rejected < BETTER * share:
-            return missing_rays(share, why)
+            return missing_rays(share, cause)
     return missing_rays(share, UNKNOWN)
 
 
@@ -288,13 +290,13 @@ def cause_of_misses(
         name: replace(calibrations[name], model=no_correction(), angle_field=None)
         for name in names
     }
-    tried = {name: [f for f in frames[name] if f.number in numbers] for name in names}
-    trials = [(CORRECTED, tried), *_trials(frames, names, numbers)]
+    selected = {name: [f for f in frames[name] if f.number in numbers] for name in names}
+    trials = [(CORRECTED, selected), *_trials(frames, names, numbers)]
     misses = []
-    for why, changed in trials:
-        used = uncorrected if why is CORRECTED else calibrations
-        again, _ = reconstruct_recording(changed, used, intersector, pairing)
-        misses.append(_miss(again))
+    for cause, changed in trials:
+        trial_calibrations = uncorrected if cause is CORRECTED else calibrations
+        reconstructed, _ = reconstruct_recording(changed, trial_calibrations, intersector, pairing)
+        misses.append(_miss(reconstructed))
     best = int(np.argmin(misses))
     return trials[best][0] if misses[best] < limit else None
 
@@ -319,31 +321,31 @@ def _trials(frames: Frames, names: Sequence[str], numbers: set[int]) -> list[Tri
 
     numbers: numbers of the frames to try.
     """
-    tried = {name: [f for f in frames[name] if f.number in numbers] for name in names}
+    selected = {name: [f for f in frames[name] if f.number in numbers] for name in names}
     out = []
     for one, other in pairwise(names):
-        if _size(tried[one]) == _size(tried[other]):
+        if _size(selected[one]) == _size(selected[other]):
             exchanged = {
-                **tried,
-                one: [replace(frame, fluoroscope=one) for frame in tried[other]],
-                other: [replace(frame, fluoroscope=other) for frame in tried[one]],
+                **selected,
+                one: [replace(frame, fluoroscope=one) for frame in selected[other]],
+                other: [replace(frame, fluoroscope=other) for frame in selected[one]],
             }
             cause = f'fluoroscopes {one} and {other} are interchanged'
             out.append((Finding(Kind.FLUOROSCOPES_INTERCHANGED, cause), exchanged))
     for name in names[1:]:
-        for step, word in ((1, 'small'), (-1, 'large')):
+        for step, direction in ((1, 'small'), (-1, 'large')):
             numbered = [replace(f, number=f.number + step) for f in frames[name]]
             numbered = [f for f in numbered if f.number in numbers]
-            labelled = [replace(f, target_id=f.target_id + step) for f in tried[name]]
-            for kind, what, right in (
+            labelled = [replace(f, target_id=f.target_id + step) for f in selected[name]]
+            for kind, label, corrected in (
                 (Kind.FRAMES_SHIFTED, 'frame numbers', numbered),
                 (Kind.IDS_SHIFTED, 'target ids', labelled),
             ):
-                cause = f'the {what} of fluoroscope {name} are too {word} by 1'
+                cause = f'the {label} of fluoroscope {name} are too {direction} by 1'
                 out.append(
-                    (Finding(kind, cause, numbers={'shift': -step}), {**tried, name: right})
+                    (Finding(kind, cause, numbers={'shift': -step}), {**selected, name: corrected})
                 )
-    return out + _other_axes(tried)
+    return out + _other_axes(selected)
 
 
 def _other_axes(frames: Mapping[str, list[Frame]]) -> list[Trial]:
@@ -353,11 +355,11 @@ def _other_axes(frames: Mapping[str, list[Frame]]) -> list[Trial]:
         (Kind.IMAGE_TRANSPOSED, 'u and v are interchanged', _transposed),
         (Kind.IMAGE_MIRRORED, 'v runs upwards', _upside_down),
     ):
-        everywhere = {name: [change(f) for f in of_one] for name, of_one in frames.items()}
-        out.append((Finding(kind, cause), everywhere))
+        all_changed = {name: [change(f) for f in exposures] for name, exposures in frames.items()}
+        out.append((Finding(kind, cause), all_changed))
         out += [
             (Finding(kind, f'{cause} in fluoroscope {name}'), {**frames, name: changed})
-            for name, changed in everywhere.items()
+            for name, changed in all_changed.items()
         ]
     return out
 

@@ -194,11 +194,11 @@ class Intersector:
                 f'not {uv.shape} and {sigma.shape}'
             )
         with np.errstate(all='ignore'):
-            found = self._intersect(uv.transpose(1, 0, 2), sigma.T**-2.0, scatter)
+            points = self._intersect(uv.transpose(1, 0, 2), sigma.T**-2.0, scatter)
         if outside is not None and np.any(outside):
-            used = np.isfinite(sigma) & (np.arange(self._count)[:, None] != found.dropped_view)
-            found.status[(found.status == OK) & (used & outside).any(axis=0)] = OUTSIDE
-        return found
+            used = np.isfinite(sigma) & (np.arange(self._count)[:, None] != points.dropped_view)
+            points.status[(points.status == OK) & (used & outside).any(axis=0)] = OUTSIDE
+        return points
 
     def _intersect(
         self, uv: NDArray[np.float64], weight: NDArray[np.float64], scatter: ObservedScatter | None
@@ -210,15 +210,15 @@ class Intersector:
             return self._classified(uv, weight, rays, self._solve(uv, weight, rays), scatter)
         uv = np.where(seen[:, :, None], uv, 0.0)
         weight = np.where(seen, weight, 0.0)
-        enough = rays >= 2
-        found = self._classified(
-            uv[enough],
-            weight[enough],
-            rays[enough],
-            self._solve(uv[enough], weight[enough], rays[enough]),
+        intersecting = rays >= 2
+        points = self._classified(
+            uv[intersecting],
+            weight[intersecting],
+            rays[intersecting],
+            self._solve(uv[intersecting], weight[intersecting], rays[intersecting]),
             scatter,
         )
-        return found if enough.all() else _expanded(found, enough, rays)
+        return points if intersecting.all() else _expanded(points, intersecting, rays)
 
     def _solve(
         self, uv: NDArray[np.float64], weight: NDArray[np.float64], rays: NDArray[np.int64]
@@ -290,13 +290,13 @@ class Intersector:
         n, count = depth.shape
         functions = np.empty((count, n, _FUNCTIONS))
         xy = ((predicted - self._point) / self._distance).transpose(1, 0, 2)
-        near = 1 / depth.T
+        inverse_depth = 1 / depth.T
         functions[:, :, 0] = 1
         functions[:, :, 1:3] = xy
         functions[:, :, 3:5] = xy * xy
         functions[:, :, 5] = xy[:, :, 0] * xy[:, :, 1]
-        functions[:, :, 6] = near
-        functions[:, :, 7:9] = xy * near[:, :, None]
+        functions[:, :, 6] = inverse_depth
+        functions[:, :, 7:9] = xy * inverse_depth[:, :, None]
         return (
             (functions @ self._by_orientation)
             .transpose(1, 0, 2)
@@ -317,10 +317,10 @@ class Intersector:
             size = np.where(solution.failed, np.nan, solution.standardised) / self._median[rays]
             scatter.add(size, solution.by_rig, limit[2] / self._median[2])
             limit = scatter.factor * limit
-        wrong = solution.failed | (solution.standardised > limit[rays])
+        is_wrong = solution.failed | (solution.standardised > limit[rays])
         dropped_view = np.full(len(rays), -1)
-        if wrong.any():
-            rows = np.flatnonzero(wrong & (rays > 2))
+        if is_wrong.any():
+            rows = np.flatnonzero(is_wrong & (rays > 2))
             if len(rows):
                 solution, dropped_view[rows] = self._drop_one_ray(
                     uv[rows],
@@ -331,9 +331,11 @@ class Intersector:
                     limit=limit,
                 )
                 rays = rays - (dropped_view >= 0)
-                wrong = wrong & (dropped_view < 0)
-            solution = _without_points(solution, wrong)
-        status = np.where(wrong, np.where(solution.failed, FAILED, REJECTED), OK).astype(np.uint8)
+                is_wrong = is_wrong & (dropped_view < 0)
+            solution = _without_points(solution, is_wrong)
+        status = np.where(is_wrong, np.where(solution.failed, FAILED, REJECTED), OK).astype(
+            np.uint8
+        )
         return IntersectedPoints(
             xyz_mm=solution.xyz,
             covariance=solution.covariance,
@@ -363,9 +365,9 @@ class Intersector:
         """
         m, count = weight.shape
         remaining = (weight[:, None, :] * (1 - np.eye(count))).reshape(m * count, count)
-        fewer = np.repeat(rays - 1, count)
-        tried = self._solve(np.repeat(uv, count, axis=0), remaining, fewer)
-        agree = ~tried.failed & (tried.standardised <= limit[fewer])
+        remaining_rays = np.repeat(rays - 1, count)
+        candidates = self._solve(np.repeat(uv, count, axis=0), remaining, remaining_rays)
+        agree = ~candidates.failed & (candidates.standardised <= limit[remaining_rays])
         agree = agree.reshape(m, count) & (weight > 0)
         dropped = np.where(agree.sum(axis=1) == 1, agree.argmax(axis=1), -1)
         identified = np.flatnonzero(dropped >= 0)
@@ -375,7 +377,7 @@ class Intersector:
         values = {}
         for field in fields(_Solution):
             values[field.name] = getattr(solution, field.name).copy()
-            values[field.name][rows[identified]] = getattr(tried, field.name)[chosen]
+            values[field.name][rows[identified]] = getattr(candidates, field.name)[chosen]
         return _Solution(**values), dropped
 
 
@@ -445,9 +447,9 @@ def _medians(count: int) -> NDArray[np.float64]:
 def _depth_of_axes(orientation: RigOrientation) -> NDArray[np.float64]:
     """Return the depths (F,) [mm] of the point nearest to the axes of all fluoroscopes."""
     axis = orientation.rotation[:, 2]
-    across = np.eye(3) - axis[:, :, None] * axis[:, None, :]
-    right = (across @ orientation.position_mm[:, :, None]).sum(axis=0)[:, 0]
-    point = np.linalg.lstsq(across.sum(axis=0), right)[0]
+    projector = np.eye(3) - axis[:, :, None] * axis[:, None, :]
+    right = (projector @ orientation.position_mm[:, :, None]).sum(axis=0)[:, 0]
+    point = np.linalg.lstsq(projector.sum(axis=0), right)[0]
     depth = np.sum(axis * (point - orientation.position_mm), axis=1)
     return np.where(depth > 0, depth, 1.0)
 

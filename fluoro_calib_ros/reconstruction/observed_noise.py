@@ -66,8 +66,8 @@ def with_observed_noise(
     determined. Raises DataError for frames that cannot be corrected.
     """
     names = orientation.fluoroscopes
-    given = [frame for name in names for frame in frames.get(name, ())]
-    if any(frame.sigma is not None for frame in given):
+    given_frames = [frame for name in names for frame in frames.get(name, ())]
+    if any(frame.sigma is not None for frame in given_frames):
         return frames, None
     exposures, _ = pair_recording(frames, names, pairing or RecordedPairing())
     if len(exposures) < 2:
@@ -75,16 +75,16 @@ def with_observed_noise(
     count = min(MAX_PAIRS, len(exposures) - 1)
     starts = np.unique(np.linspace(0, len(exposures) - 2, count).astype(int)).tolist()
     rows = {*starts, *(start + 1 for start in starts)}
-    found = {row: _residuals(exposures[row], calibrations, orientation) for row in rows}
-    factor = _factor([(found[start], found[start + 1]) for start in starts])
-    if factor < MIN_FACTOR or (must_explain and not _explains(factor, list(found.values()))):
+    residuals = {row: _residuals(exposures[row], calibrations, orientation) for row in rows}
+    factor = _factor([(residuals[start], residuals[start + 1]) for start in starts])
+    if factor < MIN_FACTOR or (must_explain and not _explains(factor, list(residuals.values()))):
         return frames, None
     changed = {
         name: [
             replace(frame, sigma=factor * calibrations[name].image_sd_at(frame.uv))
-            for frame in of_one
+            for frame in view_frames
         ]
-        for name, of_one in frames.items()
+        for name, view_frames in frames.items()
         if name in names
     }
     return {**frames, **changed}, _finding(factor, [calibrations[name] for name in names])
@@ -115,7 +115,7 @@ def _factor(pairs: Sequence[tuple[_Residuals, _Residuals]]) -> float:
 
 def _explains(factor: float, found: Sequence[_Residuals]) -> bool:
     """Return whether residuals agree with noise larger by a factor than the calibration's."""
-    size = [np.abs(one.value) / np.hypot(factor * one.noise_sd, one.other_sd) for one in found]
+    size = [np.abs(part.value) / np.hypot(factor * part.noise_sd, part.other_sd) for part in found]
     return bool(np.median(np.concatenate(size)) <= MAX_UNEXPLAINED * NORMAL_MEDIAN)
 
 
@@ -124,8 +124,8 @@ def _differences(one: _Residuals, other: _Residuals) -> NDArray[np.float64]:
     keys = {tuple(key): row for row, key in enumerate(other.key.tolist())}
     rows = [(i, keys[tuple(key)]) for i, key in enumerate(one.key.tolist()) if tuple(key) in keys]
     i, j = np.array(rows, dtype=int).reshape(-1, 2).T
-    near = (np.abs(one.place[i] - other.place[j]) <= NEAR).all(axis=1)
-    i, j = i[near], j[near]
+    is_near = (np.abs(one.place[i] - other.place[j]) <= NEAR).all(axis=1)
+    i, j = i[is_near], j[is_near]
     sd = np.hypot(one.noise_sd[i], other.noise_sd[j])
     return np.asarray(np.abs(one.value[i] - other.value[j]) / sd)
 
@@ -145,16 +145,16 @@ def _residuals(
         )
         geometry = EpipolarGeometry(orientation, names[a], names[b])
         uv = views.uv[a, rows], views.uv[b, rows]
-        of_noise = geometry.residuals(*uv, noise[a, rows], noise[b, rows])
-        whole = geometry.residuals(*uv, views.sigma[a, rows], views.sigma[b, rows])
+        by_noise = geometry.residuals(*uv, noise[a, rows], noise[b, rows])
+        by_total = geometry.residuals(*uv, views.sigma[a, rows], views.sigma[b, rows])
         pair = np.full(len(rows), number)
         parts.append(
             _Residuals(
                 np.column_stack([pair, views.target_id[rows]]),
                 np.column_stack([uv[0] / widths[a], uv[1] / widths[b]]),
-                of_noise.residual,
-                noise_sd=of_noise.sd,
-                other_sd=np.sqrt(np.maximum(whole.sd_total**2 - of_noise.sd**2, 0.0)),
+                by_noise.residual,
+                noise_sd=by_noise.sd,
+                other_sd=np.sqrt(np.maximum(by_total.sd_total**2 - by_noise.sd**2, 0.0)),
             )
         )
     return _Residuals(*(np.concatenate(values) for values in zip(*parts)))

@@ -182,13 +182,13 @@ def reconstruct_exposure(
     examines the exposure. scatter: scatter of the recording so far. Raises DataError for an image
     whose size differs from that of the calibration, and for a repeated target.
     """
-    found, present = intersect_frames(exposure, calibrations, intersector, scatter, watch)
+    intersected, available = intersect_frames(exposure, calibrations, intersector, scatter, watch)
     return ReconstructedFrame(
-        present[0].number,
-        present[0].stamp_ns,
-        found.target_id,
-        found.points,
-        tuple(frame.fluoroscope for frame in present),
+        available[0].number,
+        available[0].stamp_ns,
+        intersected.target_id,
+        intersected.points,
+        tuple(frame.fluoroscope for frame in available),
     )
 
 
@@ -208,22 +208,22 @@ def intersect_frames(
         None if frame is None else corrected_view(frame, calibrations[frame.fluoroscope])
         for frame in frames
     ]
-    present = [frame for frame in frames if frame is not None]
+    available = [frame for frame in frames if frame is not None]
     if watch is None:
-        return intersect_exposure(views, intersector, scatter), present
-    wide, image_sd = watch.widened(intersector)
-    found = intersect_exposure(views, wide, scatter, image_sd)
-    watch_exposure(watch, present[0].stamp_ns, found)
-    return found, present
+        return intersect_exposure(views, intersector, scatter), available
+    widened, image_sd = watch.widened(intersector)
+    intersected = intersect_exposure(views, widened, scatter, image_sd)
+    watch_exposure(watch, available[0].stamp_ns, intersected)
+    return intersected, available
 
 
 def corrected_view(frame: Frame, calibration: FluoroscopeCalibration) -> CorrectedView:
     """Correct a frame. Raises DataError for a wrong image size, and for a repeated target."""
-    where = f'fluoroscope {frame.fluoroscope}, frame {frame.number}'
+    label = f'fluoroscope {frame.fluoroscope}, frame {frame.number}'
     error = image_size_error(frame.image_size, calibration.image_size)
     error = error or repeated_target_error(frame.target_id)
     if error:
-        raise DataError(f'{where}: {error}')
+        raise DataError(f'{label}: {error}')
     u, v, sigma, correction_sd, status = calibration.correct_arrays(
         frame.uv[:, 0], frame.uv[:, 1], frame.sigma, frame.angle
     )
